@@ -1,0 +1,51 @@
+# One command for each habit. `make demo` and `make test` set everything up by themselves.
+PYTHON ?= python3
+BIN := .venv/bin
+# cdk.json runs `python app.py`.
+bootstrap deploy destroy: export PATH := $(CURDIR)/$(BIN):$(PATH)
+
+.PHONY: help demo test check setup bench-agent layer bootstrap deploy destroy lock clean
+
+help: ## show this
+	@grep -hE '^[a-z-]+:.*## ' Makefile | sed -E 's/^([a-z-]+):.*## /\1\t/' | expand -t 14
+
+setup: ## set up .venv, node_modules and build/, nothing outside this folder
+	@$(PYTHON) scripts/setup.py
+
+demo: setup ## drive a car through the embedded cloud: DURATION=20 BAG=drive.bag REPORT=report.json PORT=8080
+	@$(BIN)/python -m local.demo $(if $(DURATION),--duration $(DURATION)) $(if $(BAG),--bag "$(BAG)") \
+		$(if $(REPORT),--report "$(REPORT)") $(if $(PORT),--port $(PORT))
+
+test: setup ## run every test; REQUIRE_ALL=1 makes a skip a failure
+	@$(BIN)/python -m pytest
+
+check: setup ## run the linters and the type checkers
+	@$(BIN)/ruff check . && $(BIN)/ruff format --check . && $(BIN)/mypy app.py contract.py scripts device functions stacks station local bench && $(BIN)/npm run --silent check
+
+bench-agent: setup ## measure the agent on a real ROS 1 graph: DURATION=30 SOAK=600 REPORT=figures.json
+	@$(BIN)/python -m bench.agent $(if $(DURATION),--seconds $(DURATION)) $(if $(SOAK),--soak $(SOAK)) \
+		$(if $(REPORT),--json "$(REPORT)")
+
+layer: ## build Lambda 1's layer for AWS
+	@$(PYTHON) scripts/setup.py --layer lambda
+
+CDK := $(BIN)/node node_modules/aws-cdk/bin/cdk
+
+bootstrap: layer ## prepare an AWS account and region for the CDK, once
+	@$(CDK) bootstrap
+
+deploy: layer ## deploy to the AWS account of your credentials; ARGS="-c key=value" sets parameters
+	@$(CDK) deploy --all $(ARGS)
+
+destroy: layer ## remove everything from it again, the data included
+	@$(CDK) destroy --all $(ARGS)
+
+lock: setup ## compile requirements/*.in to the locked *.txt
+	@$(BIN)/uv pip compile --quiet --universal --generate-hashes --no-emit-index-url --python-version 3.10 \
+		requirements/dev.in -o requirements/dev.txt
+	@$(BIN)/uv pip compile --quiet --universal --generate-hashes --no-emit-index-url --python-version 3.10 \
+		-c requirements/dev.txt requirements/layer.in -o requirements/layer.txt
+
+clean: ## remove what was made
+	find . -name __pycache__ -type d -prune -exec rm -rf {} +
+	rm -rf .venv node_modules build cdk.out *.egg-info station/*.egg-info .mypy_cache .ruff_cache .pytest_cache .hypothesis

@@ -1,0 +1,55 @@
+"""The CDK app: builds the stacks and passes objects from one to the next.
+
+Needs no credentials, no network and no Docker. What may differ between deployments is in
+stacks/settings.py.
+"""
+
+from __future__ import annotations
+
+import os
+import sys
+from typing import Any
+
+from aws_cdk import App, CliCredentialsStackSynthesizer, Tags
+
+from stacks.fleet import Fleet
+from stacks.ingest import Ingest
+from stacks.monitoring import Monitoring
+from stacks.portable import refuse_what_the_embedded_cloud_drops
+from stacks.processing import Processing
+from stacks.settings import Settings, SettingsError
+from stacks.storage import Storage
+
+
+def build(app: App, settings: Settings) -> None:
+    """Add every stack to the app."""
+    name = settings.namespace
+
+    def stack(noun: str) -> dict[str, Any]:
+        # The embedded cloud knows one caller, not the roles that bootstrapping makes on AWS.
+        synthesizer = CliCredentialsStackSynthesizer() if settings.embedded else None
+        return {"construct_id": f"{name}-{noun}", "synthesizer": synthesizer}
+
+    Fleet(app, **stack("fleet"), namespace=name)
+    storage = Storage(app, **stack("storage"))
+    processing = Processing(app, **stack("processing"), settings=settings, storage=storage)
+    ingest = Ingest(app, **stack("ingest"), settings=settings, storage=storage, processing=processing)
+    Monitoring(
+        app, **stack("monitoring"), settings=settings, storage=storage, processing=processing, ingest=ingest
+    )
+    Tags.of(app).add("project", name)
+    refuse_what_the_embedded_cloud_drops(app)
+
+
+def main() -> None:
+    """Synthesize into the folder that the CDK CLI asks for, cdk.out otherwise."""
+    app = App(outdir=os.environ.get("CDK_OUTDIR", "cdk.out"))
+    try:
+        build(app, Settings.from_context(app))
+    except SettingsError as error:
+        sys.exit(f"app.py: {error}")
+    app.synth()
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,61 @@
+"""The node's own cycle: from a message's bytes in the callback to the batch in the spool, no network.
+
+    python -m bench.cycle SAMPLES
+
+Uses the agent's own parts, a spool on disk, and the uplink that keeps messages in memory; prints the
+cycle's percentiles in milliseconds as JSON.
+"""
+
+from __future__ import annotations
+
+import json
+import struct
+import sys
+import tempfile
+import time
+from pathlib import Path
+from statistics import quantiles
+
+from bench.ros_message import DEFINITION, TYPE, body
+from device.agent import Agent
+from device.clock import SystemClock
+from device.config import Config, QueueConfig
+from device.dispatch import Dispatcher
+from device.loopback import Loopback
+from device.sources.ros1 import Intake, TopicConfig
+from device.sources.sim import SimConfig
+from device.sqlite_spool import make_spool
+
+
+def main() -> None:
+    """Feed the callback as fast as it takes, and time each call."""
+    samples = int(sys.argv[1])
+    with tempfile.TemporaryDirectory() as folder:
+        clock = SystemClock()
+        uplink = Loopback(clock, Dispatcher())
+        config = Config(
+            robot="bench",
+            endpoint="",
+            certificate=Path(),
+            private_key=Path(),
+            sources=(SimConfig(),),
+            queue=QueueConfig(path=Path(folder) / "spool.db"),
+        )
+        spool = make_spool(config, clock)
+        agent = Agent(config, uplink=uplink, spool=spool, clock=clock)
+        intake = Intake("/sensors/core", TopicConfig("vesc", "header"), emit=agent.emit, clock=clock)
+        header = {"type": TYPE, "md5sum": "bench", "message_definition": DEFINITION}
+        cycles = []
+        for i in range(samples):
+            now_ns = time.time_ns()
+            data = struct.pack("<III", i, now_ns // 10**9, now_ns % 10**9) + body(i)
+            began = time.perf_counter()
+            intake.take(header, data)
+            cycles.append((time.perf_counter() - began) * 1000)
+        spool.close()
+    percents = quantiles(cycles, n=100)
+    print(json.dumps({"p50": percents[49], "p95": percents[94], "p99": percents[98]}))
+
+
+if __name__ == "__main__":
+    main()

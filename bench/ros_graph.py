@@ -1,0 +1,99 @@
+"""A ROS 1 master and nodes of its own, for the bench: a Python that sees rospy, on a free port."""
+
+from __future__ import annotations
+
+import os
+import shutil
+import socket
+import subprocess
+import time
+import xmlrpc.client
+from pathlib import Path
+from types import TracebackType
+
+from typing_extensions import Self
+
+ROOT = Path(__file__).resolve().parent.parent
+SYSTEM_PYTHON = "/usr/bin/python3"
+PACKAGES = "python3-rospy python3-rosmaster python3-std-msgs python3-venv"
+_START_S = 20.0
+
+
+class RosError(Exception):
+    """There is no ROS 1 here, or it does not start; the text says what to do."""
+
+
+def python_with_rospy() -> str:
+    """A Python that sees rospy and what the agent needs: IORT_ROS_PYTHON, or one made in build/."""
+    given = os.environ.get("IORT_ROS_PYTHON")
+    if given:
+        return given
+    if shutil.which("rosmaster") is None:
+        raise RosError(f"ROS 1 is not installed: apt install {PACKAGES}")
+    folder = ROOT / "build" / "ros-venv"
+    python, ready = folder / "bin" / "python", folder / "ready"
+    if not ready.exists():
+        shutil.rmtree(folder, ignore_errors=True)
+        subprocess.run([SYSTEM_PYTHON, "-m", "venv", "--system-site-packages", folder], check=True)
+        subprocess.run([python, "-m", "pip", "install", "-q", "awsiotsdk>=1.22,<2"], check=True)
+        ready.touch()
+    return str(python)
+
+
+class RosGraph:
+    """The master from `__enter__` to `__exit__`, and `start` for nodes."""
+
+    def __init__(self, python: str, folder: Path) -> None:
+        self._python, self._folder = python, folder
+        with socket.socket() as probe:
+            probe.bind(("127.0.0.1", 0))
+            self._port = int(probe.getsockname()[1])
+        self.environment = {
+            **{name: value for name, value in os.environ.items() if not name.startswith("ROS_")},
+            "ROS_MASTER_URI": f"http://127.0.0.1:{self._port}",
+            "ROS_IP": "127.0.0.1",
+            "ROS_LOG_DIR": str(folder),
+            "ROS_HOME": str(folder),
+            "PYTHONPATH": str(ROOT),
+            "PYTHONUNBUFFERED": "1",
+        }
+        self._processes: list[subprocess.Popen[str]] = []
+
+    def __enter__(self) -> Self:
+        self._run([SYSTEM_PYTHON, str(shutil.which("rosmaster")), "--core", "-p", str(self._port)])
+        deadline = time.monotonic() + _START_S
+        while True:
+            try:
+                with xmlrpc.client.ServerProxy(self.environment["ROS_MASTER_URI"]) as master:
+                    master.getPid("/bench")
+            except OSError as error:
+                if time.monotonic() > deadline:
+                    raise RosError(f"rosmaster does not answer: {error}") from error
+                # It has no other way to tell that it is there.
+                time.sleep(0.05)
+            else:
+                return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        for process in reversed(self._processes):
+            process.kill()
+            process.communicate()
+
+    def start(self, module: str, *arguments: object) -> subprocess.Popen[str]:
+        """Run a module under the Python that sees rospy."""
+        return self._run([self._python, "-m", module, *map(str, arguments)])
+
+    def _run(self, command: list[str]) -> subprocess.Popen[str]:
+        process = subprocess.Popen(
+            command,
+            env=self.environment,
+            cwd=ROOT,
+            text=True,
+            stdin=subprocess.PIPE,
+            stdout=subprocess.PIPE,
+            stderr=(self._folder / f"{len(self._processes)}.log").open("w"),
+        )
+        self._processes.append(process)
+        return process

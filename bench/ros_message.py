@@ -1,0 +1,37 @@
+"""The message of the bench, VescStateStamped of the ROS 1 driver, as text and as bytes."""
+
+from __future__ import annotations
+
+import struct
+
+TYPE = "vesc_msgs/VescStateStamped"
+FIELDS = (
+    "voltage_input temperature_pcb current_motor current_input speed duty_cycle charge_drawn charge_regen "
+    "energy_drawn energy_regen displacement distance_traveled"
+).split()
+_SEPARATOR = "=" * 80
+DEFINITION = "\n".join(
+    [
+        "Header header",
+        "VescState state",
+        _SEPARATOR,
+        "MSG: std_msgs/Header",
+        "uint32 seq",
+        "time stamp",
+        "string frame_id",
+        _SEPARATOR,
+        "MSG: vesc_msgs/VescState",
+        *(f"float64 {name}" for name in FIELDS),
+        "int32 fault_code",
+    ]
+)
+
+
+def values(i: int) -> list[float]:
+    """The fields of the i-th message; the speed counts."""
+    return [float(i) if name == "speed" else 11.5 + (i % 97) * 0.1 for name in FIELDS]
+
+
+def body(i: int) -> bytes:
+    """The i-th message as ROS 1 serializes it, from the frame_id on."""
+    return struct.pack(f"<I9s{len(FIELDS)}di", 9, b"base_link", *values(i), 0)

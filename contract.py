@@ -1,0 +1,747 @@
+"""What both ends of every wire agree on: names, units, envelopes and limits.
+
+The robot, the Lambda functions, the stacks and the operator's station all import this one file,
+so it needs nothing but Python 3.8's standard library. Units are in the names (``_us`` microseconds,
+``_ms`` milliseconds, ``_s`` seconds since the Unix epoch) or in `VESC_FIELDS`.
+
+Everything here that refuses its input raises `ContractError`, and nothing else.
+"""
+
+from __future__ import annotations
+
+import base64
+import binascii
+import json
+import math
+import re
+import zlib
+from dataclasses import dataclass
+from itertools import accumulate
+from typing import Any, Mapping, NamedTuple, Sequence, Union
+
+SCHEMA_VERSION = 1
+DEFAULT_NAMESPACE = "iort"
+
+# AWS IoT Core closes a connection that publishes more than 128 KB ("Message size", service quotas),
+# and an MQTT 5 client counts topic and header in: a kilobyte is left to them.
+MAX_MESSAGE_BYTES = 127 * 1024
+# PubNub refuses a message above 32 KiB, measured after URL encoding.
+MAX_PUBNUB_BYTES = 32 * 1024
+# A live message older than this when Lambda 1 sees it is dropped: the dashboard shows now.
+LIVE_MAX_AGE_MS = 2_000
+LIVE_MAX_RATE_HZ = 10.0
+
+# Bounds that keep a hostile or broken message from costing more than a good one.
+MAX_SAMPLES = 50_000
+# A batch closes after a second, so a range read starts one second early and misses nothing.
+MAX_BATCH_SPAN_US = 1_000_000
+MAX_FIELDS = 512
+MAX_COLUMNS_BYTES = 8 * 1024 * 1024
+
+Value = Union[None, bool, int, float, str]
+
+
+class ContractError(ValueError):
+    """A name, topic, message or item that the contract does not allow; the text says which."""
+
+
+# --- names and topics ---------------------------------------------------------------------------
+
+_NAME = re.compile(r"[A-Za-z0-9_-]{1,64}")
+# Rule names allow no dash and start the names of two stages apart, so the namespace is stricter.
+_NAMESPACE = re.compile(r"[a-z][a-z0-9]{0,15}")
+# A ROS field name, or a path of them; a number in a path is an array's index.
+_FIELD = re.compile(r"[A-Za-z][A-Za-z0-9_]*(\.[A-Za-z0-9_]+)*")
+
+RECORD, LIVE, FLEET, CMD, PING, PONG = "dt", "live", "fleet", "cmd", "ping", "pong"
+LANES = (RECORD, LIVE, FLEET, CMD, PING, PONG)
+BROKER, RULE, LAMBDA = "broker", "rule", "lambda"
+PING_PATHS = (BROKER, RULE, LAMBDA)
+# Round trips are a stream like any other: one sample a pong, the other paths' fields None.
+RTT_STREAM = "rtt"
+RTT_FIELDS = {path: f"{path}_ms" for path in PING_PATHS}
+# What the agent says of itself; the fields are AGENT_FIELDS.
+AGENT_STREAM = "agent"
+# The streams that every robot has and no source gives.
+OWN_STREAMS = frozenset({RTT_STREAM, AGENT_STREAM})
+# The named shadow of a robot's thing that carries the agent's settings.
+SHADOW = "agent"
+
+
+class Topic(NamedTuple):
+    """A parsed topic, ``<lane>/<namespace>/<robot>/<name>``.
+
+    ``name`` is the stream (record, live), the path (ping, pong) or the message's own (fleet, cmd).
+    """
+
+    lane: str
+    namespace: str
+    robot: str
+    name: str
+
+    def __str__(self) -> str:
+        return "/".join(self)
+
+
+def check_robot(name: str) -> str:
+    """Return ``name`` if it may name a robot: thing name, client id and topic level alike."""
+    return _checked(_NAME, name, "robot name", "1 to 64 of A-Z a-z 0-9 _ -")
+
+
+def check_stream(name: str) -> str:
+    """Return ``name`` if it may name a stream or be the last level of any topic."""
+    return _checked(_NAME, name, "stream name", "1 to 64 of A-Z a-z 0-9 _ -")
+
+
+def check_field(name: str) -> str:
+    """Return ``name`` if it may name a field."""
+    return _checked(_FIELD, name, "field name", "a ROS field name or a dotted path of them")
+
+
+def check_namespace(name: str) -> str:
+    """Return ``name`` if it may be a deployment's namespace."""
+    return _checked(_NAMESPACE, name, "namespace", "a lower-case letter, then up to 15 of a-z 0-9")
+
+
+def _checked(pattern: re.Pattern[str], name: str, what: str, allowed: str) -> str:
+    if not isinstance(name, str) or not pattern.fullmatch(name):
+        raise ContractError(f"{what} {_show(name)}: allowed is {allowed}")
+    return name
+
+
+def build_topic(lane: str, robot: str, name: str, namespace: str = DEFAULT_NAMESPACE) -> str:
+    """The topic of a robot's message; raises `ContractError` where a level is not allowed."""
+    if lane not in LANES:
+        raise ContractError(f"lane {_show(lane)}: allowed is one of {', '.join(LANES)}")
+    return str(Topic(lane, check_namespace(namespace), check_robot(robot), check_stream(name)))
+
+
+def parse_topic(topic: str) -> Topic:
+    """Take a topic apart; raises `ContractError` for one that `build_topic` cannot have built."""
+    levels = topic.split("/") if isinstance(topic, str) else []
+    if len(levels) != 4:
+        raise ContractError(f"topic {_show(topic)}: expected <lane>/<namespace>/<robot>/<name>")
+    build_topic(levels[0], levels[2], levels[3], levels[1])
+    return Topic(*levels)
+
+
+def record_topic(robot: str, stream: str, namespace: str = DEFAULT_NAMESPACE) -> str:
+    """Where a robot publishes its batches: straight to the rule, by Basic Ingest, which costs no
+    messaging. The rule's ``topic()`` sees ``dt/<namespace>/<robot>/<stream>``."""
+    topic = build_topic(RECORD, robot, stream, namespace)
+    return f"$aws/rules/{rule_name('record', namespace)}/{topic}"
+
+
+# --- rules, tables, metrics, PubNub --------------------------------------------------------------
+
+RULES = ("record", "live", "pong", "echo")
+
+# Attributes of the telemetry and summary tables that are not the robot's own.
+TOPIC, T_US, SECOND = "topic", "t", "second"
+RECEIVED_MS, EXPIRES_S = "received_ms", "expires_s"
+ROBOT = "robot"
+STATS = ("min", "mean", "max", "last")
+# Of a second in the summary: samples, batches they came in, batches missing before those, holes
+# between samples, values that were not finite.
+SAMPLES, BATCHES, MISSING_BATCHES = "n", "batches", "missing_batches"
+GAPS, NONFINITE = "gaps", "nonfinite"
+
+METRIC_NAMESPACE = "iort"
+METRICS = {
+    "live": ("LivePublished", "LiveStale", "LiveRefused", "PubNubFailed", "CarToLambdaMs"),
+    "summarize": ("BatchesSummarized", "SamplesSummarized", "BatchesRefused", "BatchesMissing"),
+    "echo": ("PongsSent",),
+}
+
+
+def rule_name(rule: str, namespace: str = DEFAULT_NAMESPACE) -> str:
+    """The physical name of a topic rule; robots need the record rule's for Basic Ingest."""
+    if rule not in RULES:
+        raise ContractError(f"rule {_show(rule)}: allowed is one of {', '.join(RULES)}")
+    return f"{check_namespace(namespace)}_{rule}"
+
+
+def rule_sql(rule: str, namespace: str = DEFAULT_NAMESPACE, retention_s: int = 90 * 86_400) -> str:
+    """The SELECT of a topic rule. What only the cloud may say (whose message, when received, when
+    it expires) comes last, so that it overrides what the message claims."""
+    name = check_namespace(namespace)
+    received = f"timestamp() AS {RECEIVED_MS}"
+    if rule == "record":
+        expires = f"floor(timestamp() / 1000) + {retention_s} AS {EXPIRES_S}"
+        return f"SELECT *, topic() AS {TOPIC}, {received}, {expires} FROM '{RECORD}/{name}/+/+'"
+    if rule == "live":
+        return f"SELECT *, topic() AS {TOPIC}, {received} FROM '{LIVE}/{name}/+/+'"
+    if rule == "pong":
+        return f"SELECT *, {received} FROM '{PING}/{name}/+/{RULE}'"
+    if rule == "echo":
+        return f"SELECT *, topic() AS {TOPIC}, {received} FROM '{PING}/{name}/+/{LAMBDA}'"
+    raise ContractError(f"rule {_show(rule)}: allowed is one of {', '.join(RULES)}")
+
+
+def pong_template(namespace: str = DEFAULT_NAMESPACE) -> str:
+    """The republish action's topic; the rules engine expands ``${topic(3)}`` to the robot."""
+    return f"{PONG}/{check_namespace(namespace)}/${{topic(3)}}/{RULE}"
+
+
+def pubnub_parameter(namespace: str = DEFAULT_NAMESPACE) -> str:
+    """The Parameter Store name (SecureString) of PubNub's keys: a JSON object with ``publish_key``,
+    ``subscribe_key`` and, for a server other than PubNub's own, ``origin`` and ``tls``."""
+    return f"/{check_namespace(namespace)}/pubnub"
+
+
+def fleet_name(namespace: str = DEFAULT_NAMESPACE) -> str:
+    """The name shared by the robots' thing type, thing group, IoT policy and provisioning template."""
+    return f"{check_namespace(namespace)}-robot"
+
+
+def claim_name(namespace: str = DEFAULT_NAMESPACE) -> str:
+    """The name of the claims' IoT policy, and what a client id that uses a claim begins with."""
+    return f"{check_namespace(namespace)}-claim"
+
+
+def channel(robot: str, namespace: str = DEFAULT_NAMESPACE) -> str:
+    """The PubNub channel of a robot; ``<namespace>.*`` subscribes to the whole fleet."""
+    return f"{check_namespace(namespace)}.{check_robot(robot)}"
+
+
+# --- the VESC's fields ---------------------------------------------------------------------------
+
+
+class Field(NamedTuple):
+    """One field of VescStateStamped: its unit, what it means and which driver reports it."""
+
+    name: str
+    unit: str
+    meaning: str
+    ros: tuple[int, ...]
+
+
+# Sources: vesc_msgs/VescState.msg of the ROS 1 and the ROS 2 driver and COMM_GET_VALUES of the
+# firmware. Charge and energy are in the unit the ROS 1 driver really sends, whatever its comments
+# say: the integer of 1e-4 Ah and Wh straight off the wire.
+VESC_STREAM = "vesc"
+VESC_FIELDS: dict[str, Field] = {
+    f.name: f
+    for f in (
+        Field("voltage_input", "V", "battery voltage at the controller", (1, 2)),
+        Field("temperature_pcb", "degC", "temperature of the controller's board", (1,)),
+        Field("temp_fet", "degC", "temperature of the MOSFETs (driver may leave 0)", (2,)),
+        Field("temp_motor", "degC", "temperature of the motor (driver may leave 0)", (2,)),
+        Field("current_motor", "A", "motor current, negative while braking", (1, 2)),
+        Field("current_input", "A", "battery current, negative while regenerating", (1, 2)),
+        Field("avg_id", "A", "direct-axis current", (2,)),
+        Field("avg_iq", "A", "quadrature-axis current", (2,)),
+        Field("speed", "erpm", "electrical speed of the motor, revolutions per minute", (1, 2)),
+        Field("duty_cycle", "1", "share of the battery voltage on the motor, -1 to 1", (1, 2)),
+        Field("charge_drawn", "1e-4 Ah", "charge drawn since power-on", (1, 2)),
+        Field("charge_regen", "1e-4 Ah", "charge recovered since power-on", (1, 2)),
+        Field("energy_drawn", "1e-4 Wh", "energy drawn since power-on", (1, 2)),
+        Field("energy_regen", "1e-4 Wh", "energy recovered since power-on", (1, 2)),
+        Field("displacement", "counts", "tachometer, net", (1, 2)),
+        Field("distance_traveled", "counts", "tachometer, absolute", (1, 2)),
+        Field("fault_code", "enum", "0 none, otherwise see FAULTS", (1, 2)),
+        Field("pid_pos_now", "deg", "rotor position of the position controller", (2,)),
+        Field("controller_id", "id", "CAN id of the controller", (2,)),
+        Field("ntc_temp_mos1", "degC", "temperature of MOSFET 1", (2,)),
+        Field("ntc_temp_mos2", "degC", "temperature of MOSFET 2", (2,)),
+        Field("ntc_temp_mos3", "degC", "temperature of MOSFET 3", (2,)),
+        Field("avg_vd", "V", "direct-axis voltage", (2,)),
+        Field("avg_vq", "V", "quadrature-axis voltage", (2,)),
+    )
+}
+FAULTS = {
+    0: "none",
+    1: "over voltage",
+    2: "under voltage",
+    3: "DRV8302",
+    4: "absolute over-current",
+    5: "MOSFET over-temperature",
+    6: "motor over-temperature",
+}
+# The agent's own figures. Counts grow from 0 at its start; the offset is what to add to the car's
+# clock to have the cloud's, known to within its uncertainty, and null before the first pong.
+AGENT_FIELDS = {
+    "cpu_percent": "% of one core, since the sample before",
+    "rss_mb": "MB of memory in use",
+    "samples_per_s": "samples/s from all sources, since the sample before",
+    "backlog_batches": "batches in the spool",
+    "backlog_bytes": "bytes in the spool",
+    "dropped_batches": "batches dropped because the spool was full",
+    "connects": "connections made",
+    "clock_offset_ms": "ms, cloud minus car",
+    "clock_uncertainty_ms": "ms, either way",
+}
+# Derived in the summary from the vehicle's parameters (robots table) and the fields above.
+DERIVED_UNITS = {"speed_mps": "m/s", "power_w": "W"}
+
+
+# --- record lane: the batch envelope ---------------------------------------------------------------
+
+CODEC = "columns+zlib+base64"
+
+
+@dataclass(frozen=True)
+class Batch:
+    """Consecutive samples of one stream.
+
+    ``boot`` names the agent's run; ``seq`` numbers the stream's batches without a hole, across
+    restarts where the spool is durable; ``times_us`` are microseconds since the epoch, one a sample,
+    strictly increasing and within `MAX_BATCH_SPAN_US`; ``columns`` holds a list of equal length a
+    field; ``nonfinite`` counts the NaNs and infinities that became None.
+    """
+
+    boot: str
+    seq: int
+    times_us: Sequence[int]
+    columns: Mapping[str, Sequence[Value]]
+    nonfinite: int = 0
+
+    @property
+    def t_us(self) -> int:
+        """The first sample's time, which is the stored item's sort key."""
+        return self.times_us[0]
+
+
+def encode(batch: Batch) -> bytes:
+    """The envelope as JSON. NaN and infinities become null and are added to ``nonfinite``.
+
+    Raises `ContractError` where the batch is not allowed; a batch too large for one message is
+    encoded all the same: compare with `MAX_MESSAGE_BYTES` and use `split`.
+    """
+    _check_header(batch.boot, batch.seq, batch.nonfinite)
+    times, n = batch.times_us, len(batch.times_us)
+    if not 1 <= n <= MAX_SAMPLES:
+        raise ContractError(f"batch of {n} samples: allowed is 1 to {MAX_SAMPLES}")
+    if len(batch.columns) > MAX_FIELDS:
+        raise ContractError(f"batch of {len(batch.columns)} fields: allowed is up to {MAX_FIELDS}")
+    nonfinite = batch.nonfinite
+    fields: dict[str, list[Value]] = {}
+    for name, column in batch.columns.items():
+        _checked(_FIELD, name, "field name", "a ROS field name or a dotted path of them")
+        if len(column) != n:
+            raise ContractError(f"field {name}: {len(column)} values for {n} samples")
+        fields[name], nulled = _wire_column(name, column)
+        nonfinite += nulled
+    _check_header(batch.boot, batch.seq, nonfinite)
+    _check_times(times)
+    dt = [0] + [b - a for a, b in zip(times, times[1:])]
+    text = json.dumps({"dt": dt, "fields": fields}, separators=(",", ":"), allow_nan=False)
+    if len(text) > MAX_COLUMNS_BYTES:
+        raise ContractError(f"batch of {len(text)} bytes of columns: allowed is up to {MAX_COLUMNS_BYTES}")
+    samples = base64.b64encode(zlib.compress(text.encode(), 6)).decode()
+    envelope = {
+        "v": SCHEMA_VERSION,
+        "boot": batch.boot,
+        "seq": batch.seq,
+        T_US: times[0],
+        SAMPLES: n,
+        NONFINITE: nonfinite,
+        "codec": CODEC,
+        "samples": samples,
+    }
+    return json.dumps(envelope, separators=(",", ":")).encode()
+
+
+def decode(message: bytes | str | Mapping[str, Any]) -> Batch:
+    """The batch in an envelope: the message as sent, or the attributes of a stored item.
+
+    Raises `ContractError`, naming what is wrong, for anything that `encode` cannot have written.
+    """
+    envelope = message if isinstance(message, Mapping) else _json_object(message, "envelope")
+    _check_version(envelope)
+    if envelope.get("codec") != CODEC:
+        raise ContractError(f"codec {_show(envelope.get('codec'))}: this side knows {CODEC}")
+    seq = _integer(envelope, "seq")
+    first_us, n = _integer(envelope, T_US), _integer(envelope, SAMPLES)
+    nonfinite = _integer(envelope, NONFINITE)
+    boot = _check_header(envelope.get("boot"), seq, nonfinite)
+    if not 1 <= n <= MAX_SAMPLES:
+        raise ContractError(f"envelope says {n} samples: allowed is 1 to {MAX_SAMPLES}")
+    body = _json_object(_inflate(envelope.get("samples")), "samples")
+    dt, fields = body.get("dt"), body.get("fields")
+    if not isinstance(dt, list) or len(dt) != n or not isinstance(fields, dict):
+        raise ContractError(f"samples: expected {n} dt and an object of fields")
+    if len(fields) > MAX_FIELDS:
+        raise ContractError(f"samples of {len(fields)} fields: allowed is up to {MAX_FIELDS}")
+    if dt[0] != 0 or not set(map(type, dt)) <= {int}:
+        raise ContractError("samples: dt must be integers, the first 0")
+    for name, column in fields.items():
+        _checked(_FIELD, name, "field name", "a ROS field name or a dotted path of them")
+        if not isinstance(column, list) or len(column) != n:
+            raise ContractError(f"field {name}: expected {n} values")
+        if _wire_column(name, column)[1]:
+            raise ContractError(f"field {name}: a number is not finite")
+    times = list(accumulate(dt, initial=first_us))[1:]
+    _check_times(times)
+    return Batch(boot, seq, times, fields, nonfinite)
+
+
+def split(batch: Batch) -> tuple[Batch, Batch]:
+    """The two halves of a batch, the second with the next ``seq``.
+
+    Raises `ContractError` for a single sample, which cannot be made smaller.
+    """
+    half = len(batch.times_us) // 2
+    if half == 0:
+        raise ContractError(f"one sample of {len(batch.columns)} fields does not fit in a message")
+    first = {name: column[:half] for name, column in batch.columns.items()}
+    second = {name: column[half:] for name, column in batch.columns.items()}
+    return (
+        Batch(batch.boot, batch.seq, batch.times_us[:half], first, batch.nonfinite),
+        Batch(batch.boot, batch.seq + 1, batch.times_us[half:], second, 0),
+    )
+
+
+# --- live lane, pings ------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class LiveSample:
+    """The newest sample of a stream, as the live lane carries it.
+
+    ``seq`` numbers the run's live messages; ``t_us`` is the sample's time, ``sent_us`` the time it
+    left the car; ``sample`` maps field to value. Fields stand in an object of their own, so that no
+    ROS field can be taken for one of ours; a rule filters on ``sample.fault_code``.
+    """
+
+    boot: str
+    seq: int
+    t_us: int
+    sent_us: int
+    sample: Mapping[str, Value]
+    nonfinite: int = 0
+
+
+def encode_live(live: LiveSample) -> bytes:
+    """The live message as JSON; NaN and infinities become null and are counted."""
+    _check_header(live.boot, live.seq, live.nonfinite)
+    if len(live.sample) > MAX_FIELDS:
+        raise ContractError(f"sample of {len(live.sample)} fields: allowed is up to {MAX_FIELDS}")
+    nonfinite = live.nonfinite
+    sample: dict[str, Value] = {}
+    for name, value in live.sample.items():
+        _checked(_FIELD, name, "field name", "a ROS field name or a dotted path of them")
+        (sample[name],), nulled = _wire_column(name, (value,))
+        nonfinite += nulled
+    _check_header(live.boot, live.seq, nonfinite)
+    message = {
+        "v": SCHEMA_VERSION,
+        "boot": live.boot,
+        "seq": live.seq,
+        T_US: _check_time(live.t_us, "sample time"),
+        "sent_us": _check_time(live.sent_us, "sent_us"),
+        NONFINITE: nonfinite,
+        "sample": sample,
+    }
+    return json.dumps(message, separators=(",", ":"), allow_nan=False).encode()
+
+
+def decode_live(message: bytes | str | Mapping[str, Any]) -> LiveSample:
+    """The sample in a live message; raises `ContractError` for what `encode_live` cannot write."""
+    envelope = message if isinstance(message, Mapping) else _json_object(message, "live message")
+    _check_version(envelope)
+    seq, nonfinite = _integer(envelope, "seq"), _integer(envelope, NONFINITE)
+    boot = _check_header(envelope.get("boot"), seq, nonfinite)
+    sample = envelope.get("sample")
+    if not isinstance(sample, dict) or len(sample) > MAX_FIELDS:
+        raise ContractError(f"sample: expected an object of up to {MAX_FIELDS} fields")
+    for name, value in sample.items():
+        _checked(_FIELD, name, "field name", "a ROS field name or a dotted path of them")
+        if _wire_column(name, (value,))[1]:
+            raise ContractError(f"field {name}: the number is not finite")
+    t_us = _check_time(_integer(envelope, T_US), "sample time")
+    sent_us = _check_time(_integer(envelope, "sent_us"), "sent_us")
+    return LiveSample(boot, seq, t_us, sent_us, sample, nonfinite)
+
+
+def live_update(
+    robot: str, stream: str, live: LiveSample, received_ms: int, lambda_us: int
+) -> dict[str, Any]:
+    """What Lambda 1 sends to PubNub: the sample and the time of every hop it has passed."""
+    return {
+        "v": SCHEMA_VERSION,
+        ROBOT: robot,
+        "stream": stream,
+        "boot": live.boot,
+        "seq": live.seq,
+        T_US: live.t_us,
+        "hops": {"sent_us": live.sent_us, RECEIVED_MS: received_ms, "lambda_us": lambda_us},
+        "sample": dict(live.sample),
+    }
+
+
+def encode_ping(ping_id: int, sent_us: int, padding: str = "") -> bytes:
+    """A ping; the pong has the same content, and the cloud's ``received_ms``."""
+    if type(ping_id) is not int or not 0 <= ping_id <= _MAX_SEQ:
+        raise ContractError(f"ping id {_show(ping_id)}: allowed is an integer from 0")
+    ping: dict[str, Any] = {"v": SCHEMA_VERSION, "id": ping_id}
+    ping["sent_us"] = _check_time(sent_us, "sent_us")
+    if padding:
+        ping["padding"] = padding
+    return json.dumps(ping, separators=(",", ":")).encode()
+
+
+class Pong(NamedTuple):
+    """The answer to a ping; ``received_ms`` is None on the broker path, which the cloud never sees."""
+
+    id: int
+    sent_us: int
+    received_ms: int | None
+
+
+def decode_pong(message: bytes | str) -> Pong:
+    """Read a pong, or a ping that came straight back; raises `ContractError` otherwise."""
+    envelope = _json_object(message, "pong")
+    received = _integer(envelope, RECEIVED_MS) if RECEIVED_MS in envelope else None
+    return Pong(_integer(envelope, "id"), _integer(envelope, "sent_us"), received)
+
+
+# --- commands, and what robots tell each other ------------------------------------------------------
+
+# However long an operator asks for: a command is for now, and a motion must not go on by itself.
+MAX_VALID_MS, MAX_LEASE_MS = 60_000, 10_000
+# A message for others to act on is worth nothing later; LIVE_MAX_AGE_MS is for eyes.
+FLEET_MAX_AGE_MS = 2_000
+
+
+@dataclass(frozen=True)
+class Command:
+    """A ROS message for a robot to publish.
+
+    Commands are in the order of ``started_us``, ``session``, ``seq``: ``session`` names an operator's
+    session, which began at ``started_us``, and ``seq`` numbers its commands; a later session takes
+    over. After ``valid_ms`` from ``sent_us`` the command is stale. ``lease_ms``, without which a motion
+    is refused, is how long it may go on until the next one. ``message`` is the ROS message.
+    """
+
+    session: str
+    started_us: int
+    seq: int
+    sent_us: int
+    valid_ms: int
+    message: Mapping[str, Any]
+    lease_ms: int | None = None
+
+    @property
+    def order(self) -> tuple[int, str, int]:
+        """What of two commands the later one has more of."""
+        return (self.started_us, self.session, self.seq)
+
+
+def encode_command(command: Command) -> bytes:
+    """The command as JSON. Raises `ContractError` for one that is not allowed."""
+    _check_command(command)
+    envelope: dict[str, Any] = {
+        "v": SCHEMA_VERSION,
+        "session": command.session,
+        "started_us": command.started_us,
+        "seq": command.seq,
+        "sent_us": command.sent_us,
+        "valid_ms": command.valid_ms,
+    }
+    if command.lease_ms is not None:
+        envelope["lease_ms"] = command.lease_ms
+    return _message_json({**envelope, "message": command.message})
+
+
+def decode_command(payload: bytes | str) -> Command:
+    """Read a command; raises `ContractError` for what `encode_command` cannot have written."""
+    envelope = _message_envelope(payload, "command")
+    command = Command(
+        session=envelope.get("session"),  # type: ignore[arg-type]
+        started_us=_integer(envelope, "started_us"),
+        seq=_integer(envelope, "seq"),
+        sent_us=_integer(envelope, "sent_us"),
+        valid_ms=_integer(envelope, "valid_ms"),
+        message=envelope["message"],
+        lease_ms=_integer(envelope, "lease_ms") if "lease_ms" in envelope else None,
+    )
+    _check_command(command)
+    return command
+
+
+@dataclass(frozen=True)
+class FleetMessage:
+    """A robot's ROS message for other robots: the newest only, ``seq`` growing within a ``boot``."""
+
+    boot: str
+    seq: int
+    sent_us: int
+    message: Mapping[str, Any]
+
+
+def encode_fleet(fleet: FleetMessage) -> bytes:
+    """The message as JSON. Raises `ContractError` for one that is not allowed."""
+    envelope = {
+        "v": SCHEMA_VERSION,
+        "boot": _check_header(fleet.boot, fleet.seq, 0),
+        "seq": fleet.seq,
+        "sent_us": _check_time(fleet.sent_us, "sent_us"),
+    }
+    return _message_json({**envelope, "message": fleet.message})
+
+
+def decode_fleet(payload: bytes | str) -> FleetMessage:
+    """Read another robot's message; raises `ContractError` for what `encode_fleet` cannot write."""
+    envelope = _message_envelope(payload, "fleet message")
+    seq = _integer(envelope, "seq")
+    boot = _check_header(envelope.get("boot"), seq, 0)
+    sent_us = _check_time(_integer(envelope, "sent_us"), "sent_us")
+    return FleetMessage(boot, seq, sent_us, envelope["message"])
+
+
+def _check_command(command: Command) -> None:
+    _checked(_BOOT, command.session, "session", "8 to 32 of 0-9 a-f")
+    _check_header(command.session, command.seq, 0)
+    if _check_time(command.started_us, "started_us") > _check_time(command.sent_us, "sent_us"):
+        raise ContractError("the command was sent before its session started")
+    for name, value, most in (
+        ("valid_ms", command.valid_ms, MAX_VALID_MS),
+        ("lease_ms", command.lease_ms, MAX_LEASE_MS),
+    ):
+        if value is None and name == "lease_ms":
+            continue
+        if type(value) is not int or not 1 <= value <= most:
+            raise ContractError(f"{name} {_show(value)}: allowed is an integer from 1 to {most}")
+
+
+def _message_json(envelope: Mapping[str, Any]) -> bytes:
+    if not isinstance(envelope["message"], dict):
+        raise ContractError(f"message {_show(envelope['message'])}: expected an object")
+    try:
+        payload = json.dumps(envelope, separators=(",", ":"), allow_nan=False).encode()
+    except (TypeError, ValueError, RecursionError) as error:
+        raise ContractError(f"the message is not JSON: {error}") from error
+    if len(payload) > MAX_MESSAGE_BYTES:
+        raise ContractError(f"the message would have {len(payload)} of {MAX_MESSAGE_BYTES} bytes")
+    return payload
+
+
+def _message_envelope(payload: bytes | str, what: str) -> dict[str, Any]:
+    envelope = _json_object(payload, what)
+    _check_version(envelope)
+    if not isinstance(envelope.get("message"), dict):
+        raise ContractError(f"message {_show(envelope.get('message'))}: expected an object")
+    return envelope
+
+
+# --- the checks beneath ----------------------------------------------------------------------------
+
+_BOOT = re.compile(r"[0-9a-f]{8,32}")
+_MAX_SEQ = 2**53
+# Microseconds within +-285 years of the epoch: what a JavaScript number holds exactly.
+_MAX_TIME_US = 2**53
+_PLAIN = {int, float, bool, str, type(None)}
+_MAX_INT, _MIN_INT, _MAX_TEXT = 2**64 - 1, -(2**63), 4096
+
+
+def _wire_column(name: str, column: Sequence[Any]) -> tuple[list[Value], int]:
+    """The column with None for what is not finite and integers for whole floats; how many nulled."""
+    kinds = set(map(type, column))
+    if not kinds <= _PLAIN:
+        odd = next(value for value in column if type(value) not in _PLAIN)
+        raise ContractError(f"field {name}: {_show(odd)} is neither number, text, true, false nor null")
+    nulled = 0
+    out: list[Value] = list(column)
+    if float in kinds:
+        for i, value in enumerate(out):
+            if type(value) is float:
+                if not math.isfinite(value):
+                    out[i] = None
+                    nulled += 1
+                elif value.is_integer() and -(2.0**53) < value < 2.0**53:
+                    out[i] = int(value)
+    if int in kinds and any(type(v) is int and not _MIN_INT <= v <= _MAX_INT for v in out):
+        raise ContractError(f"field {name}: an integer does not fit in 64 bits")
+    if str in kinds and any(type(v) is str and not _is_text(v) for v in out):
+        raise ContractError(f"field {name}: a text is over {_MAX_TEXT} characters or not Unicode")
+    return out, nulled
+
+
+def _is_text(value: str) -> bool:
+    return len(value) <= _MAX_TEXT and not any(0xD800 <= ord(c) <= 0xDFFF for c in value)
+
+
+def _check_version(envelope: Mapping[str, Any]) -> None:
+    version = _integer(envelope, "v")
+    if version != SCHEMA_VERSION:
+        raise ContractError(f"schema version {version}: this side knows {SCHEMA_VERSION}")
+
+
+def _check_header(boot: Any, seq: Any, nonfinite: Any) -> str:
+    if not isinstance(boot, str) or not _BOOT.fullmatch(boot):
+        raise ContractError(f"boot {_show(boot)}: allowed is 8 to 32 of 0-9 a-f")
+    if type(seq) is not int or not 0 <= seq <= _MAX_SEQ:
+        raise ContractError(f"seq {_show(seq)}: allowed is an integer from 0")
+    if type(nonfinite) is not int or not 0 <= nonfinite <= MAX_SAMPLES * MAX_FIELDS:
+        raise ContractError(f"{NONFINITE} {_show(nonfinite)}: allowed is an integer from 0")
+    return boot
+
+
+def _check_time(t_us: Any, what: str) -> int:
+    if type(t_us) is not int or not -_MAX_TIME_US < t_us < _MAX_TIME_US:
+        raise ContractError(f"{what} {_show(t_us)}: allowed is whole microseconds since the epoch")
+    return t_us
+
+
+def _check_times(times_us: Sequence[int]) -> None:
+    for t_us in times_us:
+        _check_time(t_us, "sample time")
+    if any(b <= a for a, b in zip(times_us, times_us[1:])):
+        raise ContractError("sample times must strictly increase within a batch")
+    if times_us[-1] - times_us[0] >= MAX_BATCH_SPAN_US:
+        raise ContractError(f"a batch must span less than {MAX_BATCH_SPAN_US} microseconds")
+
+
+def _integer(envelope: Mapping[str, Any], key: str) -> int:
+    value: Any = envelope.get(key)
+    try:
+        # Numbers of a stored item arrive as Decimal, which compares equal to the integer it holds.
+        # The bounds come first: the integer of Decimal("1E+999999") is a megabyte of digits.
+        if not isinstance(value, bool) and _MIN_INT <= value <= _MAX_INT:
+            integer = int(value)
+            if integer == value:
+                return integer
+    except (TypeError, ValueError, ArithmeticError) as error:
+        raise ContractError(f"{key} {_show(value)}: expected an integer") from error
+    raise ContractError(f"{key} {_show(value)}: expected an integer")
+
+
+def _inflate(samples: Any) -> bytes:
+    if not isinstance(samples, (str, bytes)):
+        raise ContractError(f"samples {_show(samples)}: expected base64 text")
+    try:
+        packed = base64.b64decode(samples, validate=True)
+        inflater = zlib.decompressobj()
+        body = inflater.decompress(packed, MAX_COLUMNS_BYTES + 1)
+    except (binascii.Error, ValueError, zlib.error) as error:
+        raise ContractError(f"samples are not base64 of zlib: {error}") from error
+    if len(body) > MAX_COLUMNS_BYTES:
+        raise ContractError(f"samples inflate to over {MAX_COLUMNS_BYTES} bytes")
+    if not inflater.eof or inflater.unused_data:
+        raise ContractError("samples are cut short, or more follows them")
+    return body
+
+
+def _json_object(text: Any, what: str) -> dict[str, Any]:
+    try:
+        value = json.loads(text, parse_constant=_refuse_constant)
+    except RecursionError as error:
+        raise ContractError(f"{what} is nested too deeply") from error
+    except (TypeError, ValueError) as error:
+        raise ContractError(f"{what} is not JSON: {error}") from error
+    if not isinstance(value, dict):
+        raise ContractError(f"{what} is not a JSON object")
+    return value
+
+
+def _refuse_constant(name: str) -> None:
+    raise ContractError(f"{name} is not JSON")
+
+
+def _show(value: Any) -> str:
+    try:
+        text = repr(value)
+    except (ValueError, RecursionError):  # an integer of thousands of digits, a list within lists
+        text = f"<{type(value).__name__}>"
+    return text if len(text) <= 60 else text[:57] + "..."

@@ -1,0 +1,323 @@
+"""The agent: sources, batches, spool, lanes, pings and the shadow around one uplink, from start to
+clean end."""
+
+from __future__ import annotations
+
+import logging
+import os
+import threading
+import uuid
+from typing import Any, Mapping
+
+import contract
+from contract import Value
+from device.allowance import Allowance
+from device.batch import Batcher, StreamCounts
+from device.clock import Clock
+from device.config import Config
+from device.downlink import make_downlink
+from device.errors import SourceError
+from device.live import LiveLane
+from device.logs import Troubles, set_level
+from device.metrics import AgentMetrics, Rates
+from device.offset import ClockOffset
+from device.pack import Packer
+from device.pings import Pings
+from device.record import RecordLane
+from device.remote import Remote
+from device.sources import Source
+from device.spool import Spool
+from device.tuning import Tuning, from_config
+from device.uplink import Uplink
+
+_log = logging.getLogger(__name__)
+
+_TICK_S = 0.05
+_RATES_S = 1.0
+_CLOSE_S = 5.0
+# A Lambda function that is warm answers well within this.
+_LAST_PONGS_S = 2.0
+
+
+class Agent:
+    """One run of the agent. `run` is called once."""
+
+    def __init__(
+        self,
+        config: Config,
+        *,
+        uplink: Uplink,
+        spool: Spool,
+        clock: Clock,
+        troubles: Troubles | None = None,
+    ) -> None:
+        self.boot = uuid.uuid4().hex[:16]
+        self._config = config
+        self._uplink = uplink
+        self._spool = spool
+        self._clock = clock
+        self._troubles = troubles
+        self._began = clock.monotonic()
+        allowance = Allowance(clock)
+        names = {"robot": config.robot, "namespace": config.namespace}
+        shared: dict[str, Any] = {**names, "uplink": uplink, "clock": clock, "allowance": allowance}
+        self._record = RecordLane(spool=spool, **shared)
+        self._live = LiveLane(boot=self.boot, rate_hz=config.live.rate_hz, **shared)
+        self._offset = ClockOffset(clock)
+        ping = config.ping
+        self._pings = Pings(
+            paths=ping.paths,
+            rate_hz=ping.rate_hz,
+            padding_bytes=ping.padding_bytes,
+            emit=self.record,
+            on_stamp=self._offset.add if config.metrics.enabled else None,
+            **shared,
+        )
+        self._downlink = make_downlink(
+            config.downlink, config.share, sources=config.sources, boot=self.boot, **shared
+        )
+        self._lock = threading.Lock()
+        self._batchers: dict[str, Batcher] = {}
+        self._counts: dict[str, StreamCounts] = {}
+        self._fields: dict[str, Any] = {}
+        self._failed: list[str] = []
+        self._sources = [(source.describe(), source.build(clock)) for source in config.sources]
+        self._stop = threading.Event()
+        self._rates = Rates(clock)
+        self._metrics = AgentMetrics(clock=clock, spool=spool, uplink=uplink, offset=self._offset)
+        self._tuning = from_config(config)
+        self._remote = Remote(
+            robot=config.robot,
+            base=self._tuning,
+            apply=self.tune,
+            known_fields=lambda: dict(self._fields),
+            uplink=uplink,
+            clock=clock,
+            allowance=allowance,
+        )
+        self.tune(self._tuning)
+
+    def stop(self) -> None:
+        """Ask the agent to end in good order; from any thread, or a signal handler."""
+        self._stop.set()
+
+    def tune(self, tuning: Tuning) -> None:
+        """Bring other settings into force, at once and from any thread."""
+        if tuning.log_level != self._tuning.log_level:
+            set_level(tuning.log_level)
+        self._live.enabled = tuning.live_enabled
+        self._live.set_rate(tuning.live_rate_hz)
+        self._pings.set_rate(tuning.ping_rate_hz)
+        self._tuning = tuning
+
+    def emit(self, stream: str, t_us: int, values: Mapping[str, Value]) -> None:
+        """Take a sample from a source, for both lanes. The live lane first: it is the one in a hurry."""
+        if self._tuning.fields and stream in self._tuning.fields:
+            self._fields.setdefault(stream, values.keys())
+            values = {name: values[name] for name in self._tuning.fields[stream] if name in values}
+        self._live.offer(stream, t_us, values)
+        self.record(stream, t_us, values)
+
+    def record(self, stream: str, t_us: int, values: Mapping[str, Value]) -> None:
+        """Take a sample for the record lane alone."""
+        batcher = self._batchers.get(stream)
+        if batcher is None:
+            batcher = self._new_batcher(stream, values)
+        if self._tuning.record_enabled:
+            batcher.add(t_us, values)
+
+    def run(self, *, drain_s: float) -> int:
+        """Run until every source has ended or `stop` is called, then deliver what is left.
+
+        Returns the exit status: 0, or 1 if a source failed or a batch could not be delivered within
+        ``drain_s``. Raises `UplinkError` where the uplink cannot start at all.
+        """
+        self._uplink.start()
+        if self._downlink is not None:
+            self._downlink.start()
+        record_stop = threading.Event()
+        lane = self._thread("record", lambda: self._record.run(record_stop))
+        ticker = self._thread("ticker", self._tick)
+        sources = [
+            self._thread(f"source {i}", self._source(what, source))
+            for i, (what, source) in enumerate(self._sources)
+        ]
+        watcher = self._thread("watcher", lambda: self._end_with(sources))
+        pinger = self._thread("pings", lambda: self._pings.run(self._stop))
+        self._stop.wait()
+        if self._downlink is not None:
+            self._downlink.halt()
+        self._pings.wake()
+        for thread in (*sources, watcher, ticker, pinger):
+            thread.join()
+        self._pings.close(min(_LAST_PONGS_S, drain_s))
+        delivered = self._drain(drain_s)
+        if self._downlink is not None:
+            self._downlink.close()
+        record_stop.set()
+        self._record.wake()
+        lane.join()
+        self._uplink.stop(_CLOSE_S)
+        return 0 if delivered and not self._failed else 1
+
+    def report(self) -> dict[str, Any]:
+        """What became of everything, for a file or a test."""
+        left, dropped = self._spool.backlog(), self._spool.dropped()
+        pings = self._pings.report() if self._tuning.ping_rate_hz else {}
+        return {
+            "robot": self._config.robot,
+            "boot": self.boot,
+            "streams": {name: vars(counts).copy() for name, counts in sorted(self._counts.items())},
+            "live_published": self._live.published,
+            "live_refused": self._live.refused,
+            "spool": {
+                "left_batches": left.batches,
+                "left_samples": left.samples,
+                "dropped_batches": dropped.batches,
+                "dropped_samples": dropped.samples,
+            },
+            "pings": {path: report._asdict() for path, report in pings.items()},
+            "failed_sources": list(self._failed),
+            "sources": [{"source": what, **source.report()} for what, source in self._sources],
+            **({"downlink": self._downlink.report()} if self._downlink is not None else {}),
+        }
+
+    def status(self) -> dict[str, Any]:
+        """How it goes right now, for `iort-agent status`."""
+        uplink, backlog, dropped = self._uplink.status(), self._spool.backlog(), self._spool.dropped()
+        tuning, offset = self._tuning, self._offset.estimate()
+        alarms = [self._spool.alarm] if self._spool.alarm else []
+        alarms += [f"source failed: {what}" for what in self._failed]
+        return {
+            "robot": self._config.robot,
+            "boot": self.boot,
+            "pid": os.getpid(),
+            "uptime_s": round(self._clock.monotonic() - self._began, 1),
+            "connection": {
+                **uplink._asdict(),
+                "endpoint": f"{self._config.endpoint}:{self._config.port}",
+            },
+            "lanes": {
+                "record": {"enabled": tuning.record_enabled},
+                "live": {
+                    "enabled": tuning.live_enabled,
+                    "rate_hz": tuning.live_rate_hz,
+                    "published": self._live.published,
+                    "refused": self._live.refused,
+                },
+                "ping": {"rate_hz": tuning.ping_rate_hz},
+            },
+            "sources": [{"source": what, **source.report()} for what, source in self._sources],
+            "streams": {
+                name: {
+                    **vars(counts),
+                    "per_s": self._rates.per_s.get(name, 0.0),
+                    "silent_s": self._rates.silent_s(name),
+                    "fields": list(tuning.fields.get(name, ())),
+                }
+                for name, counts in sorted(self._counts.copy().items())
+            },
+            "spool": {
+                "batches": backlog.batches,
+                "samples": backlog.samples,
+                "bytes": backlog.payload_bytes,
+                "dropped_batches": dropped.batches,
+                "dropped_samples": dropped.samples,
+            },
+            "clock": offset._asdict() if offset is not None else None,
+            "pings": {path: report._asdict() for path, report in self._pings.report().items()},
+            "alarms": alarms,
+            "troubles": self._troubles.last() if self._troubles is not None else [],
+        }
+
+    def _new_batcher(self, stream: str, values: Mapping[str, Value]) -> Batcher:
+        with self._lock:
+            if stream not in self._batchers:
+                contract.check_stream(stream)
+                self._fields.setdefault(stream, values.keys())
+                counts = self._counts[stream] = StreamCounts()
+                packer = Packer(
+                    stream=stream,
+                    boot=self.boot,
+                    spool=self._spool,
+                    counts=counts,
+                    stored=self._record.wake,
+                )
+                self._batchers[stream] = Batcher(
+                    packer.store, batch_s=self._config.record.batch_s, clock=self._clock, counts=counts
+                )
+            return self._batchers[stream]
+
+    def _source(self, what: str, source: Source) -> Any:
+        def run() -> None:
+            _log.info("source started: %s", what)
+            try:
+                source.run(self.emit, self._stop)
+            except SourceError as error:
+                _log.error("source failed: %s: %s", what, error)
+                self._failed.append(what)
+            except Exception:  # noqa: BLE001 - whatever a driver raises
+                # The other sources must go on.
+                _log.exception("source failed: %s", what)
+                self._failed.append(what)
+            else:
+                _log.info("source ended: %s", what)
+
+        return run
+
+    def _end_with(self, sources: list[threading.Thread]) -> None:
+        for thread in sources:
+            thread.join()
+        self._stop.set()
+
+    def _tick(self) -> None:
+        measured = looked = self._clock.monotonic()
+        while not self._clock.wait(self._stop, _TICK_S):
+            for batcher in list(self._batchers.values()):
+                batcher.tick()
+            self._live.tick()
+            self._pings.tick()
+            self._remote.tick()
+            now = self._clock.monotonic()
+            if now - looked >= _RATES_S:
+                looked = now
+                self._rates.update(self._counts.copy())
+            if self._config.metrics.enabled and now - measured >= self._config.metrics.every_s:
+                measured = now
+                self._measure()
+
+    def _measure(self) -> None:
+        """A sample of the agent's own stream."""
+        counts = self._counts.copy()
+        samples = sum(c.samples for name, c in counts.items() if name not in contract.OWN_STREAMS)
+        self.record(contract.AGENT_STREAM, self._clock.now_us(), self._metrics.sample(samples))
+
+    def _drain(self, drain_s: float) -> bool:
+        for batcher in list(self._batchers.values()):
+            batcher.flush()
+        left = self._spool.backlog()
+        if left.batches:
+            _log.info("delivering the last %d batches", left.batches)
+        if self._record.wait_empty(drain_s):
+            dropped = self._spool.dropped()
+            if dropped.batches:
+                _log.error("%d samples were dropped because the queue was full", dropped.samples)
+            return dropped.batches == 0
+        left = self._spool.backlog()
+        if self._spool.durable:
+            _log.warning(
+                "%d samples in %d batches were not delivered within %g s; the next run sends them",
+                left.samples, left.batches, drain_s,
+            )  # fmt: skip
+            return True
+        _log.error(
+            "%d samples in %d batches could not be delivered within %g s and are lost",
+            left.samples, left.batches, drain_s,
+        )  # fmt: skip
+        return False
+
+    @staticmethod
+    def _thread(name: str, target: Any) -> threading.Thread:
+        thread = threading.Thread(target=target, name=name, daemon=True)
+        thread.start()
+        return thread

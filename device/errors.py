@@ -1,0 +1,35 @@
+"""Every error of the agent. Errors of libraries are wrapped at the adapter, `from` their cause.
+
+AgentError
+ConfigError    the configuration file says something it may not
+SourceError    a source cannot give samples (a bag unreadable, a type unknown)
+UplinkError    the broker cannot be reached, or refused a message
+IdentityError  certificate or key cannot be read, do not belong together, or cannot be had
+MessageError   a ROS message, or its definition, is not what it should be
+"""
+
+from __future__ import annotations
+
+
+class AgentError(Exception):
+    """Root of the agent's errors; its text is meant for the person who runs the robot."""
+
+
+class ConfigError(AgentError):
+    """A mistake in the configuration; the text names file, key, what was found and what is allowed."""
+
+
+class SourceError(AgentError):
+    """A source cannot give samples, or no more of them."""
+
+
+class UplinkError(AgentError):
+    """The connection, a publish or a subscription failed; the text has the broker's own words."""
+
+
+class MessageError(AgentError):
+    """A ROS message does not fit its definition, or the definition is none."""
+
+
+class IdentityError(AgentError):
+    """Certificate or key cannot be used or obtained; the text says which file, or who refused."""

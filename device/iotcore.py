@@ -1,0 +1,473 @@
+"""The uplink to AWS IoT Core: MQTT 5 over mTLS, with AWS' own client.
+
+The client could reconnect by itself, but knows no shortest wait (measured: 0.25 s between attempts)
+and would never notice a new certificate. So it is stopped after every failure and every loss, and a
+thread of ours starts it again when `device.reconnect` says so. It is told to fail publishes with the
+connection instead of keeping them, because the spool is the only place that keeps batches; and to
+begin a clean session each time, because a broker that lost the session would otherwise leave the
+robot deaf.
+"""
+
+from __future__ import annotations
+
+import functools
+import logging
+import threading
+import time
+from concurrent.futures import Future
+from pathlib import Path
+from typing import Any, Callable
+
+from awscrt import io, mqtt5
+from awsiot import mqtt5_client_builder
+
+from device.certificate import Certificate, read_certificate, stamp
+from device.clock import Clock
+from device.dispatch import Dispatcher
+from device.errors import IdentityError, UplinkError
+from device.nodelay import send_at_once
+from device.reconnect import SETTLED_S, SHORTEST_S, Backoff, Cause, Causes
+from device.uplink import Done, Message, OnConnection, OnMessage, UplinkStatus, matches
+
+_log = logging.getLogger(__name__)
+
+# A frozen broker shows within the keep-alive and the wait for the answer to it.
+KEEP_ALIVE_S = 30
+PING_TIMEOUT_S = 10
+_ACK_TIMEOUT_S = 20
+# The client's own reconnects: so late that ours always come first.
+_NEVER_MS = 24 * 3600 * 1000
+_RESUBSCRIBE_S, _RESUBSCRIBE_SLOWLY_S = 10.0, 60.0
+# How often to look whether certificate, key or root_ca were replaced.
+_LOOK_S = 2.0
+_CLIENT_STOPS_S = 15.0
+
+_TLS_FAILED = "AWS_IO_TLS_ERROR_NEGOTIATION_FAILURE"
+_HUNG_UP = "AWS_ERROR_MQTT_UNEXPECTED_HANGUP"
+_CLOSED = "AWS_IO_SOCKET_CLOSED"
+_OUR_WISH = "AWS_ERROR_MQTT5_USER_REQUESTED_STOP"
+# CONNACK codes that nothing but a person changes.
+_REFUSALS = frozenset(
+    {
+        mqtt5.ConnectReasonCode.NOT_AUTHORIZED,
+        mqtt5.ConnectReasonCode.BAD_USERNAME_OR_PASSWORD,
+        mqtt5.ConnectReasonCode.BANNED,
+        mqtt5.ConnectReasonCode.CLIENT_IDENTIFIER_NOT_VALID,
+    }
+)
+
+# What the person in the lab should look at, by the client's name for what went wrong.
+_HINTS = {
+    "AWS_IO_DNS_INVALID_NAME": "the endpoint's name does not resolve",
+    "AWS_IO_DNS_QUERY_FAILED": "the endpoint's name does not resolve",
+    "AWS_IO_SOCKET_CONNECTION_REFUSED": "nothing listens at the endpoint's port",
+    "AWS_IO_SOCKET_TIMEOUT": "the endpoint does not answer",
+    "AWS_IO_SOCKET_NO_ROUTE_TO_HOST": "there is no network",
+    "AWS_IO_TLS_NEGOTIATION_TIMEOUT": "the endpoint accepts connections but does not answer",
+    _TLS_FAILED: "TLS failed",
+    "AWS_ERROR_MQTT5_PING_RESPONSE_TIMEOUT": "the broker no longer answers",
+    _HUNG_UP: "the broker or the network closed the connection",
+    _CLOSED: "the broker or the network closed the connection",
+}
+_ADVICE = (
+    "Nothing recorded is lost meanwhile, as far as the queue reaches. "
+    "`iort-agent check` says more; tried again within minutes, and at once when "
+    "certificate, private_key or root_ca is replaced"
+)
+
+
+class IotCore:
+    """An `device.uplink.Uplink` to one endpoint, as one robot. Without a ``root_ca`` the broker's
+    certificate is held against the system's trust store, which knows AWS'."""
+
+    def __init__(
+        self,
+        *,
+        endpoint: str,
+        port: int,
+        client_id: str,
+        certificate: Path,
+        private_key: Path,
+        root_ca: Path | None,
+        clock: Clock,
+        dispatcher: Dispatcher,
+        backoff: Backoff | None = None,
+        keep_alive_s: int = KEEP_ALIVE_S,
+        ping_timeout_s: float = PING_TIMEOUT_S,
+    ) -> None:
+        self._endpoint, self._port = f"{endpoint}:{port}", port
+        self._client_id = client_id
+        self._clock = clock
+        self._dispatcher = dispatcher
+        self._certificate_file = certificate
+        self._files = (certificate, private_key, root_ca)
+        self._build = functools.partial(
+            mqtt5_client_builder.mtls_from_path,
+            str(certificate),
+            str(private_key),
+            endpoint=endpoint,
+            port=port,
+            ca_filepath=None if root_ca is None else str(root_ca),
+            client_id=client_id,
+            keep_alive_interval_sec=keep_alive_s,
+            ping_timeout_ms=round(ping_timeout_s * 1000),
+            ack_timeout_sec=_ACK_TIMEOUT_S,
+            session_behavior=mqtt5.ClientSessionBehaviorType.CLEAN,
+            offline_queue_behavior=mqtt5.ClientOperationQueueBehaviorType.FAIL_ALL_ON_DISCONNECT,
+            retry_jitter_mode=mqtt5.ExponentialBackoffJitterMode.NONE,
+            min_reconnect_delay_ms=_NEVER_MS,
+            max_reconnect_delay_ms=_NEVER_MS,
+        )
+        self._bootstrap: Any = None
+        self._client: Any = None
+        self._generation = 0
+        self._stamp = stamp(*self._files)
+        self._certificate: Certificate | None = None
+        self._thread = threading.Thread(target=self._keep_connected, name="uplink", daemon=True)
+        self._backoff = backoff or Backoff()
+        self._causes = Causes()
+        # Set when the attempt or the connection is over, or somebody wants it to be.
+        self._down, self._client_stopped = threading.Event(), threading.Event()
+        self._stop = threading.Event()
+        self._slow = False
+        self._connected = False
+        self._connects = 0
+        self._since = clock.monotonic()
+        self._last_error: str | None = None
+        self._handlers: list[OnConnection] = []
+        self._subscriptions: dict[str, OnMessage] = {}
+        self._confirmed: set[str] = set()
+        self._refused: set[str] = set()
+
+    def on_connection(self, handler: OnConnection) -> None:
+        """Tell the handler of every connect and loss."""
+        self._handlers.append(handler)
+
+    def subscribe(self, topic_filter: str, handler: OnMessage) -> None:
+        """Receive what matches the filter, from now or the next connect on."""
+        self._subscriptions[topic_filter] = handler
+        if self._connected:
+            self._dispatcher.post(self._resubscribe)
+
+    def subscribed(self, topic_filter: str) -> bool:
+        """Whether the broker has confirmed the subscription on this connection."""
+        return topic_filter in self._confirmed
+
+    def connected(self) -> bool:
+        """Whether the broker has accepted the connection and it is not known to be lost."""
+        return self._connected
+
+    def status(self) -> UplinkStatus:
+        """How the connection stands."""
+        return UplinkStatus(
+            self._connected,
+            self._clock.monotonic() - self._since,
+            self._connects,
+            self._last_error,
+            self._certificate.id if self._certificate is not None else None,
+        )
+
+    def start(self) -> None:
+        """Connect in the background, and again after every loss.
+
+        Raises `UplinkError` where the certificate or key cannot be used.
+        """
+        group = io.EventLoopGroup(1)
+        self._bootstrap = io.ClientBootstrap(group, io.DefaultHostResolver(group))
+        try:
+            self._new_client()
+        except Exception as error:
+            raise UplinkError(f"certificate, private_key or root_ca cannot be used: {error}") from error
+        self._dispatcher.start()
+        _log.info("connecting to %s as %s", self._endpoint, self._client_id)
+        self._thread.start()
+
+    def stop(self, timeout_s: float) -> None:
+        """Unsubscribe, disconnect and end, within the time."""
+        if not self._thread.is_alive():
+            return
+        until = self._clock.monotonic() + timeout_s
+        if self._connected and self._confirmed:
+            gone = threading.Event()
+            future = self._client.unsubscribe(mqtt5.UnsubscribePacket(topic_filters=sorted(self._confirmed)))
+            future.add_done_callback(lambda _: gone.set())
+            gone.wait(timeout_s / 2)
+        self._stop.set()
+        self._down.set()
+        self._thread.join(max(0.1, until - self._clock.monotonic()))
+        if self._thread.is_alive():
+            _log.warning("the connection did not close in time")
+        self._dispatcher.stop(max(0.1, until - self._clock.monotonic()))
+
+    def publish(self, topic: str, payload: bytes, *, qos: int, done: Done) -> None:
+        """Hand a message to the client; ``done`` hears of the PUBACK (QoS 1) or the write (QoS 0)."""
+        if not self._connected:
+            self._dispatcher.post(lambda: done(UplinkError("not connected")))
+            return
+        packet = mqtt5.PublishPacket(topic=topic, payload=payload, qos=mqtt5.QoS(qos))
+        self._operate(lambda: self._client.publish(packet), lambda future: done(_publish_error(future)))
+
+    def _operate(self, start: Callable[[], Future[Any]], finish: Callable[[Future[Any]], None]) -> None:
+        """Start an operation of the client's; its result, or its refusal, comes by the dispatcher."""
+        try:
+            future = start()
+        except Exception as error:  # noqa: BLE001 - the client raises AwsCrtError, TypeError, ...
+            future = Future()
+            future.set_exception(error)
+        future.add_done_callback(lambda result: self._dispatcher.post(lambda: finish(result)))
+
+    # What follows is called in the uplink's own thread.
+
+    def _keep_connected(self) -> None:
+        """One attempt after another, until asked to stop."""
+        while not self._stop.is_set():
+            began = self._clock.monotonic()
+            self._down.clear()
+            self._client_stopped.clear()
+            self._slow = False
+            if self._stop.is_set():
+                break
+            self._client.start()
+            while not self._clock.wait(self._down, _LOOK_S):
+                if self._connected and self._replaced():
+                    _log.info("%s was replaced: connecting with it", self._certificate_file)
+                    self._backoff.reset()
+                    break
+            self._stop_client()
+            if not self._stop.is_set():
+                self._pause(began)
+
+    def _stop_client(self) -> None:
+        self._client.stop(mqtt5.DisconnectPacket() if self._connected else None)
+        if not self._client_stopped.wait(_CLIENT_STOPS_S):
+            _log.warning("the MQTT client did not stop in time; going on with a new one")
+            self._try_new_client()
+
+    def _pause(self, began: float) -> None:
+        """Wait until the next attempt is due. Replaced files make it due, a second after the last."""
+        earliest = began + SHORTEST_S
+        due = max(earliest, self._clock.monotonic() + self._backoff.next_s(slow=self._slow))
+        while not self._stop.is_set():
+            if self._replaced():
+                due = earliest
+                self._try_new_client()
+            left = due - self._clock.monotonic()
+            if left <= 0:
+                return
+            self._clock.wait(self._stop, min(left, _LOOK_S))
+
+    def _replaced(self) -> bool:
+        """Whether a file differs from what the client was made of; not while one is missing."""
+        now = stamp(*self._files)
+        return now != self._stamp and None not in now
+
+    def _try_new_client(self) -> None:
+        try:
+            self._new_client()
+        except Exception as error:  # noqa: BLE001 - whatever the library makes of a wrong file
+            _log.error(
+                "certificate, private_key or root_ca was replaced by one that cannot be used, "
+                "going on with the one before: %s",
+                error,
+            )
+
+    def _new_client(self) -> None:
+        """A client made of the files as they are now."""
+        self._stamp = stamp(*self._files)
+        generation = self._generation + 1
+
+        def ours(handler: Callable[[Any], None]) -> Callable[[Any], None]:
+            # What a client that was replaced still has to say is of no interest.
+            return lambda data: handler(data) if self._generation == generation else None
+
+        client = self._build(
+            client_bootstrap=self._bootstrap,
+            on_publish_received=ours(self._on_publish),
+            on_lifecycle_connection_success=ours(self._on_connected),
+            on_lifecycle_connection_failure=ours(self._on_refused),
+            on_lifecycle_disconnection=ours(self._on_lost),
+            on_lifecycle_stopped=ours(self._on_stopped),
+        )
+        try:
+            self._certificate = read_certificate(self._certificate_file)
+        except IdentityError as error:
+            # The library could read it, so it is good enough; only its dates stay unknown.
+            _log.warning("%s", error)
+            self._certificate = None
+        self._client, self._generation = client, generation
+
+    # What follows is called in the client's own thread, which must not wait.
+
+    def _on_publish(self, data: Any) -> None:
+        at = self._clock.monotonic()
+        packet = data.publish_packet
+        message = Message(packet.topic, bytes(packet.payload or b""), at)
+        for topic_filter, handler in list(self._subscriptions.items()):
+            if matches(topic_filter, message.topic):
+                self._dispatcher.post(functools.partial(handler, message))
+
+    def _on_connected(self, _: Any) -> None:
+        send_at_once(self._port)
+        self._switch(connected=True)
+        self._connects += 1
+        self._causes.connected()
+        _log.info("connected to %s as %s", self._endpoint, self._client_id)
+        self._dispatcher.post(self._resubscribe)
+        self._tell(connected=True)
+
+    def _on_refused(self, data: Any) -> None:
+        if not self._stop.is_set():
+            cause = self._cause(data)
+            self._slow = cause.slow
+            self._last_error = cause.text
+            level = logging.DEBUG
+            if self._causes.is_news(cause):
+                level = logging.ERROR if cause.slow else logging.WARNING
+            _log.log(level, "cannot connect to %s as %s: %s", self._endpoint, self._client_id, cause.text)
+        self._down.set()
+
+    def _cause(self, data: Any) -> Cause:
+        """What to make of a connection that was not made."""
+        packet = data.connack_packet
+        code = packet.reason_code if packet is not None else None
+        name = _error_name(data.exception)
+        words = said(packet) if code is not None else explain(data.exception)
+        suspicious = code in _REFUSALS or name in (_TLS_FAILED, _HUNG_UP, _CLOSED)
+        if suspicious and (invalid := self._invalid_now()) is not None:
+            return Cause("validity", f"{invalid} ({words}). {_ADVICE}", slow=True)
+        if code in _REFUSALS:
+            text = (
+                f"{words}: the certificate is not active, not attached to a thing named {self._client_id}, "
+                f"or its policy does not let it connect. {_ADVICE}"
+            )
+            return Cause("refused", text, slow=True)
+        if suspicious and self._causes.hung_up():
+            if name == _TLS_FAILED:
+                text = f"{words}: the broker's certificate does not fit root_ca, or the broker refuses ours"
+            else:
+                text = (
+                    f"{words}, again and again: it may be restarting, or the robot's certificate is unknown, "
+                    "inactive or revoked"
+                )
+            # Where TLS was not even agreed on, the broker may just as well be down behind a proxy.
+            return Cause(f"hangup {name}", f"{text}. {_ADVICE}", slow=name != _CLOSED)
+        return Cause(words, words)
+
+    def _invalid_now(self) -> str | None:
+        """What the clock says against the robot's certificate."""
+        if self._certificate is None:
+            return None
+        now_s = self._clock.now_us() // 1_000_000
+        if now_s > self._certificate.not_after_s:
+            day = time.strftime("%Y-%m-%d", time.gmtime(self._certificate.not_after_s))
+            return f"the robot's certificate expired on {day}; get a new one with `iort-agent provision`"
+        if now_s < self._certificate.not_before_s:
+            today = time.strftime("%Y-%m-%d", time.gmtime(now_s))
+            return f"the robot's certificate is not valid yet: its clock says {today}; set the clock"
+        return None
+
+    def _on_lost(self, data: Any) -> None:
+        self._confirmed.clear()
+        if self._clock.monotonic() - self._since > SETTLED_S:
+            self._backoff.reset()
+        self._switch(connected=False)
+        packet = data.disconnect_packet
+        if self._stop.is_set() or _error_name(data.exception) == _OUR_WISH:
+            _log.info("disconnected from %s", self._endpoint)
+        elif packet is not None and packet.reason_code == mqtt5.DisconnectReasonCode.SESSION_TAKEN_OVER:
+            self._last_error = f"another client has connected as {self._client_id}"
+            _log.error(
+                "disconnected: another client has connected as %s. A robot's name may be in use only once; "
+                "both will keep on taking the connection from each other",
+                self._client_id,
+            )
+        else:
+            self._last_error = said(packet) if packet is not None else explain(data.exception)
+            _log.warning("connection to %s lost: %s", self._endpoint, self._last_error)
+        self._tell(connected=False)
+        self._down.set()
+
+    def _on_stopped(self, _: Any) -> None:
+        self._client_stopped.set()
+
+    def _switch(self, *, connected: bool) -> None:
+        self._connected = connected
+        self._since = self._clock.monotonic()
+
+    def _tell(self, *, connected: bool) -> None:
+        for handler in self._handlers:
+            self._dispatcher.post(functools.partial(handler, connected))
+
+    # What follows is called by the dispatcher.
+
+    def _resubscribe(self) -> None:
+        for topic_filter in list(self._subscriptions):
+            if self._connected and not self._stop.is_set() and topic_filter not in self._confirmed:
+                packet = mqtt5.SubscribePacket([mqtt5.Subscription(topic_filter, mqtt5.QoS.AT_LEAST_ONCE)])
+                self._operate(
+                    functools.partial(self._client.subscribe, packet),
+                    functools.partial(self._on_suback, topic_filter),
+                )
+
+    def _on_suback(self, topic_filter: str, future: Future[Any]) -> None:
+        error = future.exception()
+        if error is None:
+            packet = future.result()
+            code = packet.reason_codes[0] if packet.reason_codes else None
+            if code is not None and code < 128:
+                if self._connected:
+                    self._confirmed.add(topic_filter)
+                    self._refused.discard(topic_filter)
+                return
+            why = f"the broker says {_name(code)}" + (
+                f", {packet.reason_string}" if packet.reason_string else ""
+            )
+        else:
+            why = explain(error)
+        if not self._connected or self._stop.is_set():
+            return  # the next connect subscribes anew
+        delay_s = _RESUBSCRIBE_SLOWLY_S if topic_filter in self._refused else _RESUBSCRIBE_S
+        if topic_filter not in self._refused:
+            self._refused.add(topic_filter)
+            self._last_error = f"cannot subscribe to {topic_filter}: {why}"
+            _log.error(
+                "cannot subscribe to %s, nothing will arrive there; trying again every minute: %s. "
+                "If it is not authorized, the robot's policy is older than this agent",
+                topic_filter, why,
+            )  # fmt: skip
+        timer = threading.Timer(delay_s, self._dispatcher.post, (self._resubscribe,))
+        timer.daemon = True
+        timer.start()
+
+
+def _publish_error(future: Future[Any]) -> UplinkError | None:
+    error = future.exception()
+    if error is not None:
+        return UplinkError(explain(error))
+    puback = future.result().puback
+    code = getattr(puback, "reason_code", None)
+    # QoS 0 has no reason code; "no matching subscribers" is a rule's normal answer on some brokers.
+    if code is None or code < 128:
+        return None
+    return UplinkError(said(puback))
+
+
+def said(packet: Any) -> str:
+    """What the broker said in a CONNACK, DISCONNECT or PUBACK."""
+    reason = f", {packet.reason_string}" if packet.reason_string else ""
+    return f"the broker says {_name(packet.reason_code)}{reason}"
+
+
+def _name(code: Any) -> str:
+    return str(getattr(code, "name", code)).replace("_", " ").lower()
+
+
+def explain(error: Any) -> str:
+    """What the client says, and what to look at."""
+    name = _error_name(error)
+    hint = _HINTS.get(name)
+    return f"{hint} ({name})" if hint else f"{name}: {getattr(error, 'message', error)}"
+
+
+def _error_name(error: Any) -> str:
+    return str(getattr(error, "name", type(error).__name__))

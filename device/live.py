@@ -1,0 +1,135 @@
+"""The live lane: of each stream the newest sample, at most so many a second, never a queue.
+
+The first sample of a burst goes at once, from the thread that brought it. What comes before the next
+one is due replaces what waits; it goes with the first sample that is due, or, if the stream falls
+silent, half a period later. While a message is not written yet, or there is no connection, nothing
+is sent at all, so that the first one afterwards is the newest.
+"""
+
+from __future__ import annotations
+
+import functools
+import logging
+import threading
+from typing import Mapping, NamedTuple
+
+import contract
+from contract import ContractError, LiveSample, Value
+from device.allowance import Allowance
+from device.clock import Clock
+from device.errors import UplinkError
+from device.uplink import Uplink
+
+_log = logging.getLogger(__name__)
+
+
+class _Newest(NamedTuple):
+    t_us: int
+    values: Mapping[str, Value]
+    offered: float
+
+
+class _Slot:
+    """What the lane knows of one stream."""
+
+    def __init__(self, topic: str) -> None:
+        self.topic = topic
+        self.newest: _Newest | None = None
+        self.due = 0.0
+        self.seq = 0
+        self.writing = False
+
+
+class LiveLane:
+    """Sends the newest samples. `offer` is called by sources, `tick` now and then."""
+
+    def __init__(
+        self,
+        *,
+        robot: str,
+        namespace: str,
+        boot: str,
+        rate_hz: float,
+        uplink: Uplink,
+        clock: Clock,
+        allowance: Allowance,
+    ) -> None:
+        self._robot = robot
+        self._namespace = namespace
+        self._boot = boot
+        self.enabled = True
+        self._period_s = 1 / rate_hz
+        self._uplink = uplink
+        self._clock = clock
+        self._allowance = allowance
+        self._lock = threading.Lock()
+        self._slots: dict[str, _Slot] = {}
+        self.published = 0
+        self.refused = 0
+
+    def set_rate(self, rate_hz: float) -> None:
+        """Another rate, from now on."""
+        with self._lock:
+            self._period_s = 1 / rate_hz
+            now = self._clock.monotonic()
+            for slot in self._slots.values():
+                # What was due late at a slow rate is due soon at a fast one.
+                slot.due = min(slot.due, now + self._period_s)
+
+    def offer(self, stream: str, t_us: int, values: Mapping[str, Value]) -> None:
+        """The newest sample of a stream; replaces the one before it."""
+        if not self.enabled:
+            return
+        now = self._clock.monotonic()
+        with self._lock:
+            slot = self._slots.get(stream)
+            if slot is None:
+                topic = contract.build_topic(contract.LIVE, self._robot, stream, self._namespace)
+                slot = self._slots[stream] = _Slot(topic)
+            slot.newest = _Newest(t_us, values, now)
+            if now >= slot.due:
+                self._send(slot, now)
+
+    def tick(self) -> None:
+        """Send what a stream left behind when it fell silent or the connection was down."""
+        now = self._clock.monotonic()
+        with self._lock:
+            for slot in self._slots.values():
+                if slot.newest is None:
+                    continue
+                if now - slot.newest.offered > contract.LIVE_MAX_AGE_MS / 1000:
+                    slot.newest = None
+                elif now >= slot.due + self._period_s / 2:
+                    self._send(slot, now)
+
+    def _send(self, slot: _Slot, now: float) -> None:
+        if slot.writing or slot.newest is None or not self._uplink.connected():
+            return
+        newest, slot.newest = slot.newest, None
+        sample = LiveSample(self._boot, slot.seq, newest.t_us, self._clock.now_us(), newest.values)
+        try:
+            payload = _encode(sample)
+        except ContractError as error:
+            level = logging.DEBUG if self.refused else logging.WARNING
+            _log.log(level, "live: a sample cannot be sent on %s: %s", slot.topic, error)
+            self.refused += 1
+            return
+        slot.seq += 1
+        # On a grid, so that a sample a little late does not slow the rate down, but never twice as fast.
+        slot.due = max(slot.due, now - self._period_s / 2) + self._period_s
+        slot.writing = True
+        self._allowance.spend(slot.topic, payload)
+        self._uplink.publish(slot.topic, payload, qos=0, done=functools.partial(self._done, slot))
+
+    def _done(self, slot: _Slot, error: UplinkError | None) -> None:
+        with self._lock:
+            slot.writing = False
+            if error is None:
+                self.published += 1
+
+
+def _encode(sample: LiveSample) -> bytes:
+    payload = contract.encode_live(sample)
+    if len(payload) > contract.MAX_MESSAGE_BYTES:
+        raise ContractError(f"the message would have {len(payload)} of {contract.MAX_MESSAGE_BYTES} bytes")
+    return payload

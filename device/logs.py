@@ -1,0 +1,68 @@
+"""Log lines for a terminal or for journald, and the last ones that matter, for `iort-agent status`."""
+
+from __future__ import annotations
+
+import logging
+import os
+import sys
+from collections import deque
+from typing import Any
+
+# syslog's words for it: 3 error, 4 warning, 6 info, 7 debug.
+_SYSLOG = ((logging.CRITICAL, 2), (logging.ERROR, 3), (logging.WARNING, 4), (logging.INFO, 6), (0, 7))
+_KEPT = 5
+
+
+class Troubles(logging.Handler):
+    """Keeps the last few warnings and errors."""
+
+    def __init__(self) -> None:
+        super().__init__(logging.WARNING)
+        self._lines: deque[dict[str, Any]] = deque(maxlen=_KEPT)
+
+    def emit(self, record: logging.LogRecord) -> None:
+        """Keep a record's text."""
+        self._lines.append(
+            {"at_s": round(record.created, 3), "level": record.levelname.lower(), "text": record.getMessage()}
+        )
+
+    def last(self) -> list[dict[str, Any]]:
+        """The newest last."""
+        return list(self._lines)
+
+
+class JournalFormatter(logging.Formatter):
+    """Lines as journald reads them from a service: the level in front, no time; every line of a
+    traceback has the level."""
+
+    def format(self, record: logging.LogRecord) -> str:
+        """The record's text with its level."""
+        prefix = f"<{next(number for level, number in _SYSLOG if record.levelno >= level)}>"
+        return "\n".join(prefix + line for line in super().format(record).split("\n"))
+
+
+def set_up(level: str) -> Troubles:
+    """Log to standard error from now on; what is kept for `iort-agent status`."""
+    lines, troubles = logging.StreamHandler(sys.stderr), Troubles()
+    lines.setFormatter(
+        JournalFormatter("%(message)s")
+        if is_journal()
+        else logging.Formatter("%(asctime)s %(levelname)-7s %(message)s")
+    )
+    logging.basicConfig(handlers=[lines, troubles])
+    set_level(level)
+    return troubles
+
+
+def set_level(level: str) -> None:
+    """Log from this level on."""
+    logging.getLogger().setLevel(level.upper())
+
+
+def is_journal() -> bool:
+    """Whether standard error goes to journald, which says so by device and inode."""
+    try:
+        status = os.fstat(sys.stderr.fileno())
+    except (OSError, ValueError, AttributeError):
+        return False
+    return os.environ.get("JOURNAL_STREAM") == f"{status.st_dev}:{status.st_ino}"

@@ -1,0 +1,70 @@
+"""Closed batches become messages in the spool; what the contract or the broker would refuse does not."""
+
+from __future__ import annotations
+
+import logging
+import math
+from typing import Callable, Mapping, Sequence
+
+import contract
+from contract import Batch, ContractError, Value
+from device.batch import StreamCounts
+from device.spool import Spool
+
+_log = logging.getLogger(__name__)
+
+
+class Packer:
+    """Encodes one stream's batches, halving those that do not fit, down to the sample to refuse."""
+
+    def __init__(
+        self, *, stream: str, boot: str, spool: Spool, counts: StreamCounts, stored: Callable[[], None]
+    ) -> None:
+        self._stream = stream
+        self._boot = boot
+        self._spool = spool
+        self._counts = counts
+        self._stored = stored
+
+    def store(self, times_us: list[int], samples: list[Mapping[str, Value]]) -> None:
+        """Encode the samples and put them into the spool, in as many messages as they need."""
+        columns = {name: [sample[name] for sample in samples] for name in samples[0]}
+        self._put(Batch(self._boot, 0, times_us, columns))
+        self._stored()
+
+    def _put(self, batch: Batch) -> None:
+        seq = self._spool.next_seq(self._stream)
+        n = len(batch.times_us)
+        try:
+            payload = contract.encode(Batch(batch.boot, seq, batch.times_us, batch.columns))
+        except ContractError as error:
+            # One bad value must not cost the others: halve until it stands alone.
+            if n == 1:
+                self._refuse(str(error))
+                return
+        else:
+            if len(payload) <= contract.MAX_MESSAGE_BYTES:
+                self._spool.put(self._stream, seq, payload, samples=n)
+                self._counts.batches += 1
+                self._counts.nulled += _nonfinite(batch.columns)
+                return
+            if n == 1:
+                self._refuse(f"the message would have {len(payload)} of {contract.MAX_MESSAGE_BYTES} bytes")
+                return
+        for half in contract.split(batch):
+            self._put(half)
+
+    def _refuse(self, why: str) -> None:
+        self._counts.refused += 1
+        # A stream that is wrong is wrong at its full rate; the first one says it all.
+        level = logging.WARNING if self._counts.refused == 1 else logging.DEBUG
+        _log.log(level, "stream %s: a sample cannot be sent: %s", self._stream, why)
+
+
+def _nonfinite(columns: Mapping[str, Sequence[Value]]) -> int:
+    return sum(
+        1
+        for column in columns.values()
+        for value in column
+        if type(value) is float and not math.isfinite(value)
+    )

@@ -1,0 +1,235 @@
+"""Plays a recording: ROS 1 ``.bag``, ROS 2 folders of ``.db3`` or ``.mcap``, VESC Tool's ``.csv``.
+
+Needs no ROS.
+"""
+
+# ruff: noqa: RUF009 - `setting` makes a dataclass field, as `field` does
+
+from __future__ import annotations
+
+import logging
+import threading
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, ContextManager, Iterator, Mapping, Sequence
+
+import contract
+from device.clock import Clock
+from device.errors import SourceError
+from device.schema import choice, existing_path, flag, number, pairs, setting, text
+from device.sources import Emit
+from device.sources.flatten import flatten
+from device.sources.player import NOW, ORIGINAL, Message, Open, Playback, play
+from device.sources.vesc_csv import VescLog
+
+_log = logging.getLogger(__name__)
+
+VESC_TYPE = "vesc_msgs/msg/VescStateStamped"
+# A header's stamp this far from when the message was recorded is a clock not yet set, or a simulation's.
+_BELIEVABLE_NS = 3600 * 1_000_000_000
+
+
+@dataclass(frozen=True)
+class BagConfig:
+    """A recording to play.
+
+    ``topics`` maps ROS topics to streams; without it, every VescStateStamped becomes ``stream``, as does
+    a log of VESC Tool, which has no topics. ``speed`` is a factor, 0 for as fast as possible. ``stamps``:
+    ``now`` moves the recording to when it is played, ``original`` keeps its own times. ``duration_s`` is
+    counted in the recording's time.
+    """
+
+    path: Path = setting(existing_path(folder=True))
+    topics: tuple[tuple[str, str], ...] | None = setting(
+        pairs(text(contract.check_stream), what="a mapping of ROS topic to stream name"), default=None
+    )
+    speed: float = setting(number(0, 1000), 1.0)
+    stamps: str = setting(choice(NOW, ORIGINAL), NOW)
+    loop: bool = setting(flag(), default=False)
+    duration_s: float | None = setting(number(0.001, 1e9, unit="s"), None)
+    stream: str = setting(text(contract.check_stream), contract.VESC_STREAM)
+
+    def streams(self) -> Sequence[str]:
+        """The streams named; several topics may share one."""
+        return sorted({stream for _, stream in self.topics}) if self.topics else [self.stream]
+
+    def describe(self) -> str:
+        """The source in a few words."""
+        return f"bag {self.path}"
+
+    def build(self, clock: Clock) -> BagSource:
+        """Make the source; the file is opened when it runs."""
+        return BagSource(self, clock)
+
+
+class BagSource:
+    """Emits the messages of a recording at the recording's own pace."""
+
+    def __init__(self, config: BagConfig, clock: Clock) -> None:
+        self._config = config
+        self._clock = clock
+
+    def report(self) -> Mapping[str, Any]:
+        """Nothing that the streams' own counts do not say."""
+        return {}
+
+    def run(self, emit: Emit, stop: threading.Event) -> None:
+        """Play until the end, or for ever with ``loop``. Raises `SourceError`."""
+        config = self._config
+        how = Playback(config.speed, config.stamps, config.loop, config.duration_s)
+        play(self._recording(), how, self._clock, emit, stop)
+
+    def open(self) -> ContextManager[Iterator[Message]]:
+        """The recording's messages, in the order recorded, for a ``with`` block. Raises `SourceError`."""
+        return self._recording()()
+
+    def _recording(self) -> Open:
+        config = self._config
+        if config.path.suffix.lower() != ".csv":
+            return lambda: Recording(config.path, config.topics, config.stream)
+        if config.topics is not None:
+            raise SourceError(f"{config.path}: a log of VESC Tool has no topics; `stream` names its stream")
+        return VescLog(config.path, config.stream, config.stamps).open
+
+
+class Recording:
+    """A bag, open for reading. What the library raises comes out as `SourceError`."""
+
+    def __init__(self, path: Path, topics: Sequence[tuple[str, str]] | None, stream: str) -> None:
+        try:
+            # Only a robot that plays recordings needs the library: pip install iort[bag].
+            from rosbags.highlevel import AnyReader  # noqa: PLC0415
+        except ImportError as error:
+            raise SourceError("playing a bag needs the package rosbags: pip install 'iort[bag]'") from error
+        # rosbags opens the folder of a ROS 2 recording; people name the file in it.
+        in_folder = path.suffix in (".db3", ".mcap") and (path.parent / "metadata.yaml").exists()
+        self._path = path
+        self._topics = topics
+        self._stream = stream
+        with self._wrapped("cannot be opened"):
+            self._reader = AnyReader([path.parent if in_folder else path], default_typestore=_known_types())
+
+    def __enter__(self) -> Iterator[Message]:
+        with self._wrapped("cannot be read"):
+            self._reader.open()
+        store = self._reader.typestore
+        # Renamed between the versions for Python 3.8 and later.
+        self._fields: dict[str, Any] = store.fielddefs if hasattr(store, "fielddefs") else store.FIELDDEFS
+        try:
+            return self._messages(self._streams())
+        except SourceError:
+            self._reader.close()
+            raise
+
+    def __exit__(self, *_: object) -> None:
+        self._reader.close()
+
+    def _streams(self) -> dict[str, str]:
+        """ROS topic -> stream, of those asked for. Raises `SourceError` that lists what there is."""
+        there = {c.topic: c.msgtype for c in self._reader.connections}
+        wanted = dict(self._topics or [(t, self._stream) for t, kind in there.items() if kind == VESC_TYPE])
+        listed = ", ".join(f"{topic} ({kind})" for topic, kind in sorted(there.items())) or "no topic"
+        missing = [topic for topic in wanted if topic not in there]
+        if missing:
+            raise SourceError(f"{self._path}: no topic {', '.join(missing)}; the recording has {listed}")
+        if not wanted:
+            raise SourceError(
+                f"{self._path}: no topic of type {VESC_TYPE}, so `topics` must name some; "
+                f"the recording has {listed}"
+            )
+        for topic in wanted:
+            if there[topic] not in self._fields:
+                raise SourceError(
+                    f"{self._path}: the topic {topic} is of type {there[topic]}, whose definition is neither "
+                    "in the recording nor known to the agent; `ros2 bag convert` into MCAP adds it"
+                )
+        return wanted
+
+    def _messages(self, streams: Mapping[str, str]) -> Iterator[Message]:
+        """The messages of these topics in the order in which they were recorded."""
+        connections = [c for c in self._reader.connections if c.topic in streams]
+        start_ns = int(self._reader.start_time)
+        iterator = iter(self._reader.messages(connections=connections))
+        while True:
+            with self._wrapped("is damaged"):
+                found = next(iterator, None)
+                if found is None:
+                    return
+                connection, recorded_ns, raw = found
+                message = self._reader.deserialize(raw, connection.msgtype)
+            try:
+                values = flatten(message, self._fields_of)
+            except SourceError as error:
+                raise SourceError(f"{self._path}: topic {connection.topic}: {error}") from error
+            stamp_ns = _stamp_ns(message, recorded_ns)
+            yield Message(streams[connection.topic], recorded_ns - start_ns, stamp_ns, values)
+
+    def _fields_of(self, value: Any) -> list[str] | None:
+        # The object's own attributes would include the constants of its type.
+        definition = self._fields.get(getattr(value, "__msgtype__", ""))
+        return None if definition is None else [name for name, _ in definition[1]]
+
+    def _wrapped(self, what: str) -> _Wrapped:
+        return _Wrapped(f"{self._path}: {what}")
+
+
+class _Wrapped:
+    """Turns whatever a bag library raises into `SourceError`: damaged files raise about anything."""
+
+    def __init__(self, what: str) -> None:
+        self._what = what
+
+    def __enter__(self) -> None:
+        pass
+
+    def __exit__(self, _kind: object, error: BaseException | None, _trace: object) -> None:
+        if isinstance(error, Exception) and not isinstance(error, SourceError):
+            raise SourceError(f"{self._what}: {type(error).__name__}: {error}") from error
+
+
+def _stamp_ns(message: Any, recorded_ns: int) -> int:
+    """The header's stamp, or when the message was recorded if there is none to believe."""
+    stamp = getattr(getattr(message, "header", None), "stamp", None)
+    if stamp is None:
+        return recorded_ns
+    stamp_ns = int(stamp.sec) * 1_000_000_000 + int(stamp.nanosec)
+    return stamp_ns if abs(stamp_ns - recorded_ns) < _BELIEVABLE_NS else recorded_ns
+
+
+# Of vesc_msgs for ROS 2: recordings of Foxy and Humble hold no definitions. The order is the wire's.
+_VESC_STATE_ROS2 = """
+float64 temp_fet
+float64 temp_motor
+float64 current_motor
+float64 current_input
+float64 avg_id
+float64 avg_iq
+float64 duty_cycle
+float64 speed
+float64 voltage_input
+float64 charge_drawn
+float64 charge_regen
+float64 energy_drawn
+float64 energy_regen
+int32 displacement
+int32 distance_traveled
+int32 fault_code
+float64 pid_pos_now
+int32 controller_id
+float64 ntc_temp_mos1
+float64 ntc_temp_mos2
+float64 ntc_temp_mos3
+float64 avg_vd
+float64 avg_vq
+"""
+
+
+def _known_types() -> Any:
+    """The types of ROS 2 itself and the VESC driver's, for recordings without definitions."""
+    from rosbags.typesys import Stores, get_types_from_msg, get_typestore  # noqa: PLC0415
+
+    store = get_typestore(Stores.ROS2_HUMBLE)
+    state = "vesc_msgs/msg/VescState"
+    store.register(get_types_from_msg(_VESC_STATE_ROS2, state))
+    store.register(get_types_from_msg(f"std_msgs/Header header\n{state} state\n", VESC_TYPE))
+    return store

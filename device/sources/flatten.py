@@ -1,0 +1,57 @@
+"""A ROS message as one flat sample: field path -> value.
+
+Nested messages flatten to dotted paths and arrays to indexes: ``pose.position.x``, ``covariance.0``.
+The header and a type's constants are left out. A message that is a header and exactly one nested
+message (VescStateStamped, PoseStamped) gives that message's fields without a prefix: the stamp is the
+sample's time, and what is left is the thing itself.
+"""
+
+from __future__ import annotations
+
+from typing import Any, Callable, Optional, Sequence
+
+from contract import MAX_FIELDS, Value
+from device.errors import SourceError
+
+# The names of a message's fields, without constants; None for what is not a message.
+FieldsOf = Callable[[Any], Optional[Sequence[str]]]
+
+HEADER = "header"
+
+
+def flatten(message: Any, fields_of: FieldsOf) -> dict[str, Value]:
+    """The sample in a message. Raises `SourceError` where it has more fields than a sample may."""
+    names = fields_of(message) or ()
+    body = [name for name in names if name != HEADER]
+    if len(body) == 1 and len(names) == 2:
+        inner = getattr(message, body[0])
+        inner_names = fields_of(inner)
+        if inner_names is not None:
+            message, body = inner, [name for name in inner_names if name != HEADER]
+    flat: dict[str, Value] = {}
+    for name in body:
+        _put(flat, name, getattr(message, name), fields_of)
+    return flat
+
+
+def _put(flat: dict[str, Value], path: str, value: Any, fields_of: FieldsOf) -> None:
+    if type(value) in (float, int, bool, str):
+        flat[path] = value
+        return
+    names = fields_of(value)
+    if names is not None:
+        for name in names:
+            if name != HEADER:
+                _put(flat, f"{path}.{name}", getattr(value, name), fields_of)
+        return
+    # numpy's arrays and numbers give plain Python values this way.
+    plain = value.tolist() if hasattr(value, "tolist") else value
+    if isinstance(plain, (list, tuple, bytes, bytearray)):
+        if len(flat) + len(plain) > MAX_FIELDS:
+            raise SourceError(
+                f"field {path} has {len(plain)} elements; a sample may have {MAX_FIELDS} fields"
+            )
+        for i, item in enumerate(plain):
+            _put(flat, f"{path}.{i}", item, fields_of)
+    else:
+        flat[path] = plain

@@ -1,0 +1,235 @@
+"""A node in a ROS 1 graph: any topic, of any message type, whose class need not be installed.
+
+The publisher sends its message's definition when it connects; the decoder is made of that, once for
+each type and checksum, so a changed definition is just another decoder.
+"""
+
+from __future__ import annotations
+
+import logging
+import re
+import threading
+from dataclasses import dataclass
+from typing import Any, Mapping, Sequence
+
+import contract
+from device.clock import Clock
+from device.errors import MessageError, SourceError
+from device.ros1_node import ANY_TYPE, DEFAULT_NODE, definition_of, shared
+from device.ros1_types import Definition, parse
+from device.schema import Where, choice, items, pairs, section, setting, text
+from device.seldom import Seldom
+from device.sources import Emit
+from device.sources.ros1_decode import Decoder
+
+_log = logging.getLogger(__name__)
+
+HEADER, ARRIVAL = "header", "arrival"
+# A stamp this far from the wall clock is a clock not yet set, or a simulation's.
+_BELIEVABLE_US = 3600 * 1_000_000
+_SILENT_S = 5.0
+_LOOK_S = 1.0
+# A topic changes its definition when somebody rebuilds a package, not all the time.
+_MAX_DECODERS = 32
+
+_ROS_NAME = re.compile(r"(/[A-Za-z]\w*)(/\w+)*", re.ASCII)
+
+
+def ros_name(value: str) -> str:
+    """The full name of a topic. Raises `ContractError` for what is none."""
+    if not _ROS_NAME.fullmatch(value):
+        raise contract.ContractError(f"ROS topic {value!r}: allowed is a full name such as /sensors/core")
+    return value
+
+
+def _node_name(value: str) -> str:
+    if not re.fullmatch(r"[A-Za-z]\w*", value, re.ASCII):
+        raise contract.ContractError(f"ROS node {value!r}: allowed is a letter, then letters, digits and _")
+    return value
+
+
+@dataclass(frozen=True)
+class TopicConfig:
+    """What becomes of a topic.
+
+    ``time`` must be said: ``header`` is when it was measured, by the clock of the computer that did;
+    ``arrival`` is when the agent received it, by its own clock. ``fields`` are the paths wanted, or
+    what they begin with (``pose.position``); without it, all.
+    """
+
+    stream: str = setting(text(contract.check_stream))
+    time: str = setting(choice(HEADER, ARRIVAL))
+    fields: tuple[str, ...] | None = setting(
+        items(text(), at_least=1, what="a list of at least one field"), default=None
+    )
+
+
+def _topics(value: Any, where: Where) -> Any:
+    rule = pairs(section(TopicConfig), what="a mapping of ROS topic to its stream and time")
+    for topic in value if isinstance(value, dict) else ():
+        text(ros_name)(topic, where)
+    return rule(value, where)
+
+
+@dataclass(frozen=True)
+class Ros1Config:
+    """Topics of the ROS 1 graph whose master the environment's ROS_MASTER_URI names."""
+
+    topics: tuple[tuple[str, TopicConfig], ...] = setting(_topics)
+    node: str = setting(text(_node_name), DEFAULT_NODE)
+
+    def streams(self) -> Sequence[str]:
+        """The streams named; several topics may share one."""
+        return sorted({topic.stream for _, topic in self.topics})
+
+    def describe(self) -> str:
+        """The source in a few words."""
+        return f"ROS 1 topics {', '.join(topic for topic, _ in self.topics)}"
+
+    def build(self, clock: Clock) -> Ros1Source:
+        """Make the source; rospy is looked for when it runs."""
+        return Ros1Source(self, clock)
+
+
+class Ros1Source:
+    """Emits each message of the topics, in the threads that receive them."""
+
+    def __init__(self, config: Ros1Config, clock: Clock) -> None:
+        self._config = config
+        self._clock = clock
+        self._intakes: dict[str, Intake] = {}
+
+    def run(self, emit: Emit, stop: threading.Event) -> None:
+        """Be subscribed until ``stop`` is set. Raises `SourceError` without rospy, or if the node ends."""
+        node = shared(self._config.node, self._clock)
+        try:
+            for topic, settings in self._config.topics:
+                intake = Intake(topic, settings, emit=emit, clock=self._clock)
+                self._intakes[topic] = intake
+                node.subscribe(topic, intake.take)
+            node.start()
+            while not self._clock.wait(stop, _LOOK_S):
+                if node.failed:
+                    raise SourceError(node.failed)
+                for topic, intake in self._intakes.items():
+                    intake.sim_time = node.sim_time
+                    if node.ready.is_set():
+                        intake.look(node.connections(topic))
+        finally:
+            for topic, intake in self._intakes.items():
+                node.unsubscribe(topic, intake.take)
+            node.release()
+
+    def report(self) -> dict[str, Any]:
+        """What became of the messages, by topic."""
+        return {topic: intake.report() for topic, intake in self._intakes.items()}
+
+
+class Intake:
+    """One topic's messages, from bytes to samples. Knows nothing of rospy."""
+
+    def __init__(self, topic: str, config: TopicConfig, *, emit: Emit, clock: Clock) -> None:
+        self.sim_time = False
+        self._topic = topic
+        self._config = config
+        self._emit = emit
+        self._clock = clock
+        self._seldom = Seldom(_log, clock)
+        self._header: Mapping[str, str] | None = None
+        self._decoder: Decoder | None = None
+        self._decoders: dict[tuple[str, str], Decoder | None] = {}
+        self._lock = threading.Lock()
+        self._messages = self._seen = 0
+        self._heard = clock.monotonic()
+        self._silent = False
+
+    def take(self, header: Mapping[str, str], data: bytes) -> None:
+        """Take a message with the header of the connection that it came by. Never raises."""
+        arrival_us = self._clock.now_us()
+        self._messages += 1
+        # Two publishers of one topic are two threads; almost always there is one.
+        with self._lock:
+            if header is not self._header:
+                self._decoder = self._decoder_for(header)
+                self._header = header
+            decoder = self._decoder
+        if decoder is None:
+            self._seldom.warn("undecodable", f"topic {self._topic}: its messages cannot be decoded")
+            return
+        try:
+            values, t_us = decoder.decode(data)
+        except MessageError as error:
+            self._seldom.warn("malformed", f"topic {self._topic}: {error}")
+            return
+        if t_us is None or self.sim_time or not -_BELIEVABLE_US < t_us - arrival_us < _BELIEVABLE_US:
+            if self._config.time == HEADER:
+                self._flag(t_us, arrival_us)
+            t_us = arrival_us
+        if not values:
+            self._seldom.warn("empty", f"topic {self._topic}: there is no field in its messages to send")
+            return
+        self._emit(self._config.stream, t_us, values)
+
+    def look(self, connections: int) -> None:
+        """Say it when the topic falls silent, and when it is heard again."""
+        now = self._clock.monotonic()
+        if self._messages != self._seen:
+            self._seen, self._heard = self._messages, now
+            if self._silent:
+                _log.info("topic %s is heard again", self._topic)
+            self._silent = False
+        elif not self._silent and now - self._heard >= _SILENT_S:
+            self._silent = True
+            there = f"connected to {connections} publisher(s)" if connections else "nobody publishes it"
+            _log.warning("topic %s has been silent for %g s: %s", self._topic, _SILENT_S, there)
+
+    def report(self) -> dict[str, Any]:
+        """What became of the messages."""
+        left_out: dict[str, int] = {}
+        for decoder in list(self._decoders.values()):
+            for path, count in decoder.left_out.items() if decoder is not None else ():
+                left_out[path] = left_out.get(path, 0) + count
+        return {
+            "messages": self._messages,
+            "silent": self._silent,
+            "left_out": left_out,
+            **self._seldom.counts(),
+        }
+
+    def _flag(self, t_us: int | None, arrival_us: int) -> None:
+        if t_us is None:
+            reason, why = "no_stamp", "its messages have no header, so there is no time in them"
+        elif self.sim_time:
+            reason, why = "unbelieved_stamps", "its time is a simulation's (/use_sim_time)"
+        else:
+            off = (t_us - arrival_us) / 1e6
+            reason, why = "unbelieved_stamps", f"its stamps are {off:.0f} s off the clock"
+        self._seldom.warn(reason, f"topic {self._topic}: {why}; using the time of arrival")
+
+    def _decoder_for(self, header: Mapping[str, str]) -> Decoder | None:
+        key = (header.get("type", ""), header.get("md5sum", ""))
+        if key not in self._decoders or key[1] == ANY_TYPE:
+            if len(self._decoders) >= _MAX_DECODERS:
+                self._decoders.clear()
+            self._decoders[key] = self._compile(*key, header.get("message_definition", ""))
+        return self._decoders[key]
+
+    def _compile(self, kind: str, md5sum: str, definition: str) -> Decoder | None:
+        config = self._config
+        try:
+            decoder = Decoder(
+                _definition(kind, definition), select=config.fields, stamp=config.time == HEADER
+            )
+        except (MessageError, SourceError) as error:
+            _log.error("topic %s: its messages cannot be decoded: %s", self._topic, error)
+            return None
+        _log.info("topic %s: %s, %s", self._topic, kind, md5sum)
+        if decoder.unknown:
+            unknown = ", ".join(decoder.unknown)
+            _log.warning("topic %s: %s has no field %s", self._topic, kind, unknown)
+        return decoder
+
+
+def _definition(kind: str, definition: str) -> Definition:
+    # Some small clients send none; then only an installed class can tell.
+    return parse(kind, definition) if definition.strip() else definition_of(kind)[0]

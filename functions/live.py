@@ -1,0 +1,106 @@
+"""Lambda 1: the newest sample of a car, from the live rule to the car's PubNub channel."""
+
+from __future__ import annotations
+
+import json
+import logging
+import os
+import time
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from functools import cache
+from typing import Any
+
+from contract import (
+    LIVE_MAX_AGE_MS,
+    RECEIVED_MS,
+    TOPIC,
+    ContractError,
+    LiveSample,
+    channel,
+    decode_live,
+    live_update,
+    parse_topic,
+)
+from functions.legs import Legs
+from functions.metrics import emit
+from functions.pubnub_client import PublishError, PubNubPublisher
+
+_log = logging.getLogger(__name__)
+_log.setLevel(logging.INFO)
+
+Publish = Callable[[str, dict[str, Any]], None]
+
+
+@dataclass(frozen=True)
+class LiveSettings:
+    """Which fields of which stream go to the dashboard; a stream not named sends all its fields."""
+
+    fields: Mapping[str, frozenset[str]]
+
+    @classmethod
+    def from_environment(cls) -> LiveSettings:
+        """Read ``LIVE_FIELDS``, a JSON object of stream to list of fields."""
+        named: dict[str, list[str]] = json.loads(os.environ["LIVE_FIELDS"])
+        return cls({stream: frozenset(fields) for stream, fields in named.items()})
+
+
+def age_ms(live: LiveSample, received_ms: int, now_us: int, excess_us: int = 0) -> float:
+    """How old the sample is: its time in the car and its time in the cloud, each by its own clock, and
+    by how much the leg between was slower than it usually is (`functions.legs`).
+
+    A car's clock may be off by more than any of them, so it is never compared with the cloud's.
+    """
+    in_car_us = live.sent_us - live.t_us
+    in_cloud_us = now_us - received_ms * 1000
+    return (in_car_us + excess_us + in_cloud_us) / 1000
+
+
+def process(
+    event: Mapping[str, Any], settings: LiveSettings, publish: Publish, legs: Legs, now_us: int
+) -> None:
+    """Publish one live message, or count why not. A live message is never worth a retry."""
+    try:
+        topic = parse_topic(event[TOPIC])
+        live = decode_live(event)
+        received_ms = int(event[RECEIVED_MS])
+    except (ContractError, KeyError, TypeError, ValueError, OverflowError) as error:
+        _log.warning("refused a live message: %s: %.500r", error, event)
+        emit("live", LiveRefused=1)
+        return
+    excess_us = legs.excess_us(live.boot, live.sent_us, received_ms)
+    if age_ms(live, received_ms, now_us, excess_us) > LIVE_MAX_AGE_MS:
+        emit("live", LiveStale=1)
+        return
+    chosen = settings.fields.get(topic.name)
+    if chosen is not None:
+        picked = {name: value for name, value in live.sample.items() if name in chosen}
+        live = LiveSample(live.boot, live.seq, live.t_us, live.sent_us, picked, live.nonfinite)
+    update = live_update(topic.robot, topic.name, live, received_ms, now_us)
+    try:
+        publish(channel(topic.robot, topic.namespace), update)
+    except PublishError as error:
+        _log.warning("not published for %s: %s", topic.robot, error)
+        emit("live", PubNubFailed=1)
+        return
+    emit("live", LivePublished=1, CarToLambdaMs=max(0.0, (now_us - live.sent_us) / 1000))
+
+
+@cache
+def _settings() -> LiveSettings:
+    return LiveSettings.from_environment()
+
+
+@cache
+def _publisher() -> PubNubPublisher:
+    return PubNubPublisher.from_parameter(os.environ["PUBNUB_PARAMETER"])
+
+
+@cache
+def _legs() -> Legs:
+    return Legs()
+
+
+def handler(event: dict[str, Any], _context: object) -> None:
+    """Entry point of the live rule's Lambda action."""
+    process(event, _settings(), _publisher().publish, _legs(), time.time_ns() // 1000)

@@ -1,0 +1,208 @@
+"""Lambda 2: batches off the telemetry table's stream, one item a second into the summary table.
+
+A second is computed from the table, not from the records: whatever order, number or grouping they
+arrive in, the last record of a second leaves the same item behind.
+"""
+
+from __future__ import annotations
+
+import logging
+import os
+from collections import defaultdict
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
+from functools import cache
+from itertools import islice
+from typing import Any, NamedTuple
+
+import boto3
+
+from contract import (
+    EXPIRES_S,
+    MAX_BATCH_SPAN_US,
+    T_US,
+    TOPIC,
+    Batch,
+    ContractError,
+    Value,
+    decode,
+    parse_topic,
+)
+from functions.metrics import emit
+from functions.statistics import missing_before, summarize_second
+from functions.tables import Tables, plain
+
+_log = logging.getLogger(__name__)
+_log.setLevel(logging.INFO)
+_SECOND_US = 1_000_000
+# Seconds closer than this are read together: a query costs more than the batches between them.
+_READ_TOGETHER_S = 60
+# A neighbour that cannot be decoded is passed over for the next; so many of them end the search.
+_NEIGHBOURS = 10
+
+BatchKey = tuple[int, str, int]
+
+
+@dataclass
+class Decoded:
+    """The good batches of some stream records by topic, and the sequence numbers of the bad ones."""
+
+    batches: dict[str, list[Batch]] = field(default_factory=lambda: defaultdict(list))
+    refused: list[str] = field(default_factory=list)
+
+
+def decode_records(records: Iterable[Mapping[str, Any]]) -> Decoded:
+    """Read stream records. Removals (expiry) carry no image and are passed over."""
+    decoded = Decoded()
+    for record in records:
+        image = record["dynamodb"].get("NewImage")
+        if image is None:
+            continue
+        try:
+            item = plain(image)
+            batch = decode(item)
+            topic = str(parse_topic(item[TOPIC]))
+        except ContractError as error:
+            _log.warning("refused %s of %s: %s", record["dynamodb"]["Keys"], record["eventID"], error)
+            decoded.refused.append(record["dynamodb"]["SequenceNumber"])
+        else:
+            decoded.batches[topic].append(batch)
+    return decoded
+
+
+class Stored(NamedTuple):
+    """A batch as the telemetry table holds it."""
+
+    batch: Batch
+    expires_s: int | None
+
+
+@dataclass
+class Summaries:
+    """Of one topic: a summary a second, and the batches missing just before those of the event."""
+
+    seconds: dict[int, dict[str, Value]] = field(default_factory=dict)
+    missing: int = 0
+
+
+def summarize_topic(tables: Tables, topic: str, batches: Sequence[Batch]) -> Summaries:
+    """The summaries of every second that the batches touch, and of the second of the batch after
+    each: a late batch fills the hole that its successor had reported."""
+    known = {_key(batch): batch for batch in batches}
+    vehicle = tables.vehicle(parse_topic(topic).robot)
+    summaries = Summaries()
+    for touched in _runs({t_us // _SECOND_US for batch in batches for t_us in batch.times_us}):
+        stored = _read(tables, topic, touched[0], touched[-1], known)
+        seconds = set(touched)
+        previous: Batch | None = None
+        for batch, _ in stored:
+            if previous is not None and _key(previous) in known:
+                seconds.add(batch.t_us // _SECOND_US)
+            if _key(batch) in known:
+                summaries.missing += missing_before(previous, batch)
+            previous = batch
+        for second in seconds:
+            near = around(stored, second)
+            summary = summarize_second(second, [entry.batch for entry in near], vehicle)
+            if summary is None:
+                continue
+            # It is kept as long as what it was made from, which has the time of its receipt: the
+            # samples' own may be years off, in a replayed drive or under a car's wrong clock.
+            if expires := [entry.expires_s for entry in near if entry.expires_s]:
+                summary[EXPIRES_S] = max(expires)
+            summaries.seconds[second] = summary
+    return summaries
+
+
+def around(stored: Sequence[Stored], second: int) -> Sequence[Stored]:
+    """Of batches in order of time, those with samples in the second and the one before them."""
+    start_us, end_us = second * _SECOND_US, (second + 1) * _SECOND_US
+    inside = [i for i, (b, _) in enumerate(stored) if b.t_us < end_us and b.times_us[-1] >= start_us]
+    return stored[max(0, inside[0] - 1) : inside[-1] + 1] if inside else []
+
+
+def _runs(seconds: set[int]) -> list[list[int]]:
+    """The seconds in order, apart where they are: a car whose clock jumped touches 1970 and today."""
+    runs: list[list[int]] = []
+    for second in sorted(seconds):
+        if not runs or second - runs[-1][-1] > _READ_TOGETHER_S:
+            runs.append([])
+        runs[-1].append(second)
+    return runs
+
+
+def _read(tables: Tables, topic: str, first: int, last: int, known: Mapping[BatchKey, Batch]) -> list[Stored]:
+    """The stored batches with samples from the first second to the last, the one before them, and
+    all of the second in which the one after them starts."""
+    start_us, end_us = first * _SECOND_US, (last + 1) * _SECOND_US
+    stored = list(_stored(tables.batches(topic, start_us - MAX_BATCH_SPAN_US, end_us - 1), known))
+    if stored and stored[0].batch.t_us >= start_us:
+        stored = [*_nearest(tables, topic, stored[0].batch.t_us, known, later=False), *stored]
+    for after in _nearest(tables, topic, end_us - 1, known, later=True):
+        second_us = after.batch.t_us // _SECOND_US * _SECOND_US
+        stored += _stored(tables.batches(topic, second_us, second_us + _SECOND_US - 1), known)
+    return stored
+
+
+def _nearest(
+    tables: Tables, topic: str, t_us: int, known: Mapping[BatchKey, Batch], *, later: bool
+) -> list[Stored]:
+    found = _stored(islice(tables.neighbours(topic, t_us, later=later), _NEIGHBOURS), known)
+    return list(islice(found, 1))
+
+
+def _stored(items: Iterable[Mapping[str, Any]], known: Mapping[BatchKey, Batch]) -> Iterator[Stored]:
+    """The items that are batches. Of one that is not, the own record has been or will be refused;
+    here it only must not stop its neighbours."""
+    for item in items:
+        try:
+            batch = known.get((int(item[T_US]), item["boot"], int(item["seq"]))) or decode(item)
+            expires_s = int(item[EXPIRES_S]) if EXPIRES_S in item else None
+        except (ContractError, KeyError, TypeError, ValueError, OverflowError):
+            continue
+        yield Stored(batch, expires_s)
+
+
+def _key(batch: Batch) -> BatchKey:
+    return batch.t_us, batch.boot, batch.seq
+
+
+def process(event: Mapping[str, Any], tables: Tables) -> dict[str, Any]:
+    """Summarise the event's records; the answer names those that cannot be decoded.
+
+    The good records behind a bad one are kept as well: the service sends them again, which changes
+    nothing, and a second need not wait for the bad one's retries to run out.
+    """
+    decoded = decode_records(event["Records"])
+    topics = {topic: summarize_topic(tables, topic, batches) for topic, batches in decoded.batches.items()}
+    tables.put_seconds(
+        {
+            (topic, second): summary
+            for topic, summaries in topics.items()
+            for second, summary in summaries.seconds.items()
+        }
+    )
+    good = [batch for batches in decoded.batches.values() for batch in batches]
+    emit(
+        "summarize",
+        BatchesSummarized=len(good),
+        SamplesSummarized=sum(len(batch.times_us) for batch in good),
+        BatchesRefused=len(decoded.refused),
+        BatchesMissing=sum(summaries.missing for summaries in topics.values()),
+    )
+    return {"batchItemFailures": [{"itemIdentifier": number} for number in decoded.refused]}
+
+
+@cache
+def _tables() -> Tables:
+    return Tables(
+        boto3.client("dynamodb"),
+        telemetry=os.environ["TELEMETRY_TABLE"],
+        summary=os.environ["SUMMARY_TABLE"],
+        robots=os.environ["ROBOTS_TABLE"],
+    )
+
+
+def handler(event: dict[str, Any], _context: object) -> dict[str, Any]:
+    """Entry point of the telemetry table's stream mapping."""
+    return process(event, _tables())

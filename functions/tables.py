@@ -1,0 +1,135 @@
+"""The adapter to DynamoDB: batches out of the telemetry table, seconds into the summary table."""
+
+from __future__ import annotations
+
+import logging
+import math
+import time
+from collections.abc import Iterator, Mapping, Sequence
+from itertools import islice
+from typing import Any
+
+from boto3.dynamodb.types import TypeDeserializer
+
+from contract import ROBOT, SECOND, T_US, TOPIC, Value
+from functions.statistics import Vehicle
+
+_log = logging.getLogger(__name__)
+_deserialize = TypeDeserializer().deserialize
+# BatchWriteItem takes at most this many items a call.
+_WRITE_SIZE = 25
+_WRITE_ATTEMPTS = 8
+_VEHICLE_CACHE_S = 60.0
+# What a DynamoDB number can hold, "Supported data types": 38 digits, 1e-130 to 9.99e125.
+_LARGEST, _SMALLEST = 9.99e125, 1e-130
+
+
+class TableError(Exception):
+    """DynamoDB did not take what it was given in the time there was; the caller may try again."""
+
+
+def plain(image: Mapping[str, Any]) -> dict[str, Any]:
+    """An item as Python values; numbers are Decimal."""
+    return {name: _deserialize(value) for name, value in image.items()}
+
+
+def attribute(value: Value) -> dict[str, Any]:
+    """A value as a DynamoDB attribute. A number too small becomes 0, one too large its own text."""
+    if value is None:
+        return {"NULL": True}
+    if isinstance(value, bool):
+        return {"BOOL": value}
+    if isinstance(value, str):
+        return {"S": value}
+    if isinstance(value, float):
+        if not math.isfinite(value) or abs(value) > _LARGEST:
+            return {"S": repr(value)}
+        if abs(value) < _SMALLEST:
+            return {"N": "0"}
+    return {"N": repr(value)}
+
+
+class Tables:
+    """The three tables as Lambda 2 sees them; ``client`` is a boto3 DynamoDB client or a fake of it."""
+
+    def __init__(self, client: Any, *, telemetry: str, summary: str, robots: str) -> None:
+        self._client = client
+        self._telemetry, self._summary, self._robots = telemetry, summary, robots
+        self._vehicles: dict[str, tuple[float, Vehicle | None]] = {}
+
+    def batches(self, topic: str, first_us: int, last_us: int) -> Iterator[dict[str, Any]]:
+        """The stored batches of a topic that start in the range, both ends included, in order of time."""
+        pages = self._client.get_paginator("query").paginate(
+            TableName=self._telemetry,
+            ConsistentRead=True,
+            KeyConditionExpression="#topic = :topic AND #t BETWEEN :first AND :last",
+            ExpressionAttributeNames={"#topic": TOPIC, "#t": T_US},
+            ExpressionAttributeValues={
+                ":topic": {"S": topic},
+                ":first": {"N": str(first_us)},
+                ":last": {"N": str(last_us)},
+            },
+        )
+        for page in pages:
+            yield from map(plain, page["Items"])
+
+    def neighbours(self, topic: str, t_us: int, *, later: bool) -> Iterator[dict[str, Any]]:
+        """The stored batches of a topic that start before or after the time, the nearest first. Each
+        is read when it is asked for, since the first is nearly always the one that is wanted."""
+        pages = self._client.get_paginator("query").paginate(
+            TableName=self._telemetry,
+            ConsistentRead=True,
+            KeyConditionExpression=f"#topic = :topic AND #t {'>' if later else '<'} :t",
+            ExpressionAttributeNames={"#topic": TOPIC, "#t": T_US},
+            ExpressionAttributeValues={":topic": {"S": topic}, ":t": {"N": str(t_us)}},
+            ScanIndexForward=later,
+            PaginationConfig={"PageSize": 1},
+        )
+        for page in pages:
+            yield from map(plain, page["Items"])
+
+    def vehicle(self, robot: str) -> Vehicle | None:
+        """The robot's parameters, read at most once a minute; None where none are registered."""
+        now = time.monotonic()
+        cached = self._vehicles.get(robot)
+        if cached is None or now - cached[0] > _VEHICLE_CACHE_S:
+            answer = self._client.get_item(TableName=self._robots, Key={ROBOT: {"S": robot}})
+            cached = self._vehicles[robot] = (now, _vehicle(plain(answer.get("Item", {}))))
+        return cached[1]
+
+    def put_seconds(self, seconds: Mapping[tuple[str, int], Mapping[str, Value]]) -> None:
+        """Write the summaries, keyed by topic and second; raises `TableError` if some stay unwritten."""
+        requests = (
+            {"PutRequest": {"Item": self._second_item(topic, second, summary)}}
+            for (topic, second), summary in seconds.items()
+        )
+        while chunk := list(islice(requests, _WRITE_SIZE)):
+            self._write(chunk)
+
+    def _second_item(self, topic: str, second: int, summary: Mapping[str, Value]) -> dict[str, Any]:
+        item = {name: attribute(value) for name, value in summary.items()}
+        return {**item, TOPIC: {"S": topic}, SECOND: {"N": str(second)}}
+
+    def _write(self, requests: Sequence[Mapping[str, Any]]) -> None:
+        for attempt in range(_WRITE_ATTEMPTS):
+            answer = self._client.batch_write_item(RequestItems={self._summary: requests})
+            requests = answer.get("UnprocessedItems", {}).get(self._summary, [])
+            if not requests:
+                return
+            # DynamoDB asks for exponential backoff before unprocessed items are sent again.
+            time.sleep(0.02 * 2**attempt)
+        raise TableError(f"{len(requests)} summaries not written after {_WRITE_ATTEMPTS} attempts")
+
+
+def _vehicle(row: Mapping[str, Any]) -> Vehicle | None:
+    """The vehicle in a row of the registry; a row that is wrong must not stop its robot's summaries."""
+    if "speed_to_erpm_gain" not in row:
+        return None
+    try:
+        gain, offset = float(row["speed_to_erpm_gain"]), float(row.get("speed_to_erpm_offset", 0))
+    except (TypeError, ValueError):
+        gain = offset = math.nan
+    if not gain or not math.isfinite(gain) or not math.isfinite(offset):
+        _log.warning("vehicle parameters of %s are not numbers, or the gain is 0", row.get(ROBOT))
+        return None
+    return Vehicle(gain, offset)

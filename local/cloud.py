@@ -1,0 +1,230 @@
+"""The embedded cloud: the emulator with the project's own stacks in it, and PubNub's stand-in.
+
+    with EmbeddedCloud(folder) as embedded:
+        embedded.cloud.client("dynamodb")...
+
+Everything it writes is below its folder, everything it starts is stopped on the way out, and every
+socket listens on loopback unless another host is asked for.
+"""
+
+from __future__ import annotations
+
+import errno
+import fcntl
+import json
+import os
+import secrets
+import shutil
+import signal
+import socket
+import ssl
+import sys
+import urllib.error
+import urllib.request
+from collections.abc import Callable
+from contextlib import ExitStack
+from dataclasses import replace
+from pathlib import Path
+from types import TracebackType
+from typing import Any
+
+from typing_extensions import Self
+
+from contract import DEFAULT_NAMESPACE, LAMBDA, PING, TOPIC, build_topic, encode_ping
+from local import gateway_certificate
+from local.deployment import ROOT, deploy
+from local.errors import LocalError
+from local.processes import Child
+from local.pubnub_standin import PubNubStandIn
+from station import keys
+from station.cloud import EMBEDDED, Cloud
+
+FOLDER = EMBEDDED.parent
+
+_REGION = "eu-west-1"
+_LEAST_FREE_BYTES = 500 * 1024 * 1024
+_READY_S = 30.0
+_POLL_S = 0.05
+
+Progress = Callable[[str], None]
+
+
+class EmbeddedCloud:
+    """One embedded cloud, from `__enter__` to `__exit__`.
+
+    ``ports`` may fix ``gateway``, ``mqtt`` and ``pubnub``; others are free ones. ``progress`` hears
+    the name of every step as it begins. Raises `LocalError` where it cannot start, saying what to do.
+    """
+
+    def __init__(
+        self,
+        folder: Path = FOLDER,
+        *,
+        namespace: str = DEFAULT_NAMESPACE,
+        host: str = "127.0.0.1",
+        ports: dict[str, int] | None = None,
+        progress: Progress = lambda _step: None,
+    ) -> None:
+        self.folder, self.namespace, self.host = folder, namespace, host
+        self._ports, self._progress = ports or {}, progress
+        self._exit = ExitStack()
+        self.cloud: Cloud
+        self.pubnub: PubNubStandIn
+        self.emulator: Child
+        self.subscribe_key = f"sub-c-{secrets.token_hex(8)}"
+        self._publish_key = f"pub-c-{secrets.token_hex(8)}"
+
+    def __enter__(self) -> Self:
+        try:
+            self._start()
+        except BaseException:
+            self._exit.close()
+            raise
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self._exit.close()
+
+    def _start(self) -> None:
+        self._take_folder()
+        ports = {name: self._port(name) for name in ("gateway", "mqtt", "pubnub")}
+        certificate, key = gateway_certificate.write(self.folder, self.host)
+        self.cloud = Cloud(
+            namespace=self.namespace,
+            region=_REGION,
+            endpoint_url=f"https://{self.host}:{ports['gateway']}",
+            ca_bundle=str(certificate),
+            access_key_id="test",
+            secret_access_key="test",  # noqa: S106 what the emulator takes for its root user
+            mqtt_host=self.host,
+            mqtt_port=ports["mqtt"],
+        )
+        self._progress("emulator")
+        self.start_emulator(certificate, key)
+        root_ca = self._get("/_ministack/iot/ca.pem").decode()
+        self.cloud = replace(self.cloud, root_ca_pem=root_ca)
+        self._progress("PubNub stand-in")
+        self.pubnub = PubNubStandIn(
+            self.host, ports["pubnub"], publish_key=self._publish_key, subscribe_key=self.subscribe_key
+        )
+        self.pubnub.start()
+        self._exit.callback(self.pubnub.stop)
+        deploy(self.cloud, self.folder, self._progress)
+        keys.store(
+            self.cloud,
+            keys.PubNubKeys(
+                publish_key=self._publish_key,
+                subscribe_key=self.subscribe_key,
+                origin=self.pubnub.origin,
+                tls=False,
+            ),
+        )
+        self._warm_up()
+        self.cloud.save(self.folder / EMBEDDED.name)
+        self._exit.callback((self.folder / EMBEDDED.name).unlink, missing_ok=True)
+
+    def _take_folder(self) -> None:
+        self.folder.mkdir(parents=True, exist_ok=True)
+        if shutil.disk_usage(self.folder).free < _LEAST_FREE_BYTES:
+            raise LocalError(f"less than {_LEAST_FREE_BYTES // 2**20} MB free for {self.folder}: free some")
+        # The file stays open, and locked, as long as this cloud runs.
+        lock = self._exit.enter_context((self.folder.parent / f"{self.folder.name}.lock").open("a+"))
+        try:
+            fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except OSError as error:
+            lock.seek(0)
+            owner = lock.read().strip()
+            raise LocalError(
+                f"an embedded cloud is already running in {self.folder} (process {owner}): "
+                f"use it, or stop it with Ctrl-C in its terminal or `kill {owner}`"
+            ) from error
+        lock.truncate(0)
+        lock.write(str(os.getpid()))
+        lock.flush()
+        # What an earlier run left, after a kill -9, is of no use to this one.
+        shutil.rmtree(self.folder)
+        (self.folder / "tmp").mkdir(parents=True, mode=0o700)
+
+    def _port(self, name: str) -> int:
+        wanted = self._ports.get(name, 0)
+        with socket.socket() as probe:
+            probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+            try:
+                probe.bind((self.host, wanted))
+            except OSError as error:
+                if error.errno == errno.EADDRINUSE:
+                    raise LocalError(f"port {wanted} ({name}) is in use: give another, or none") from error
+                raise LocalError(f"cannot listen on {self.host}:{wanted} ({name}): {error}") from error
+            return int(probe.getsockname()[1])
+
+    def start_emulator(self, certificate: Path, key: Path) -> None:
+        """Start the emulator and wait until both its listeners answer."""
+        gateway = (self.cloud.endpoint_url or "").rsplit(":", 1)[-1]
+        environment = {
+            # Not our own environment: its functions would inherit the operator's credentials.
+            "PATH": os.environ.get("PATH", os.defpath),
+            "HOME": str(self.folder),
+            "TMPDIR": str(self.folder / "tmp"),
+            "STATE_DIR": str(self.folder / "state"),
+            "S3_DATA_DIR": str(self.folder / "s3"),
+            "AUTH": "true",
+            "BIND_HOST": self.host,
+            "MINISTACK_HOST": self.host,
+            "MINISTACK_REGION": _REGION,
+            "GATEWAY_PORT": gateway,
+            "IOT_MTLS_PORT": str(self.cloud.mqtt_port),
+            "SFTP_ENABLED": "0",
+            "USE_SSL": "1",
+            "MINISTACK_SSL_CERT": str(certificate),
+            "MINISTACK_SSL_KEY": str(key),
+            "AWS_CA_BUNDLE": str(certificate),
+            "PYTHONDONTWRITEBYTECODE": "1",
+        }
+        self.emulator = Child(
+            "the emulator",
+            [sys.executable, "-m", "local.emulator"],
+            environment=environment,
+            cwd=ROOT,
+            log=self.folder / "emulator.log",
+            # It has nothing to put in order, and its workers end with it.
+            orphaned=signal.SIGKILL,
+        )
+        self._exit.callback(self.emulator.stop)
+        for _ in range(int(_READY_S / _POLL_S)):
+            self.emulator.check()
+            try:
+                self._get("/_ministack/ready")
+            except (urllib.error.URLError, ConnectionError):
+                # It has no other way to tell that it listens.
+                self.emulator.wait(_POLL_S)
+            else:
+                return
+        raise LocalError(f"the emulator was not ready after {_READY_S:.0f} s:\n{self.emulator.tail()}")
+
+    def _get(self, path: str) -> bytes:
+        context = ssl.create_default_context(cafile=self.cloud.ca_bundle)
+        with urllib.request.urlopen(  # noqa: S310 always https
+            f"{self.cloud.endpoint_url}{path}", timeout=5, context=context
+        ) as response:
+            return bytes(response.read())
+
+    def _warm_up(self) -> None:
+        """Have every function started once, with an event that it accepts or refuses without effect.
+
+        The first invocation of a function takes longest where the machine is smallest, and a live
+        message that waits for it is stale by then.
+        """
+        self._progress("functions")
+        warm_up: dict[str, dict[str, Any]] = {"Live": {}, "Summarize": {"Records": []}, "Echo": self._ping()}
+        client = self.cloud.client("lambda")
+        for name, event in warm_up.items():
+            function = self.cloud.output("processing", f"{name}Function")
+            answer = client.invoke(FunctionName=function, Payload=json.dumps(event).encode())
+            if "FunctionError" in answer:
+                reason = answer["Payload"].read().decode(errors="replace")
+                raise LocalError(f"function {name} does not start: {reason[:500]}")
+
+    def _ping(self) -> dict[str, Any]:
+        return {TOPIC: build_topic(PING, "warm-up", LAMBDA, self.namespace), **json.loads(encode_ping(0, 0))}

@@ -1,0 +1,249 @@
+"""`make demo`: a car drives through the embedded cloud, and what arrived is counted.
+
+python -m local.demo --duration 20 --bag drive.bag --report report.json
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import signal
+import socket
+import sys
+import threading
+import time
+from collections.abc import Iterator
+from contextlib import ExitStack, contextmanager
+from pathlib import Path
+from typing import Any, NoReturn
+
+from botocore.exceptions import BotoCoreError, ClientError
+from rich.console import Console
+
+from contract import OWN_STREAMS, PING_PATHS, RTT_STREAM, VESC_STREAM
+from device.clock import SystemClock
+from device.errors import SourceError
+from device.sources.bag import BagConfig, BagSource
+from local.cloud import FOLDER, EmbeddedCloud
+from local.deployment import ROOT
+from local.errors import LocalError
+from local.figures import Figures, Spread, round_trips
+from local.processes import Child
+from station import delivery, robots
+from station.errors import StationError
+from station.listener import Listener
+from station.page import PageServer
+
+ROBOT = "car1"
+_SOURCE_RATE_HZ = 50
+# Ten pings a second of half a kilobyte over each path.
+_PING = {"rate_hz": 10, "paths": list(PING_PATHS), "padding_bytes": 430}
+_CATCH_UP_S = 30.0
+_STATUS_S = 1.0
+
+
+def main() -> None:
+    """Run the demo; exit status 0 if no sample was lost, 1 otherwise, 2 where it could not run."""
+    options = _options()
+    # As Ctrl-C: whatever stops the demo stops what it started.
+    signal.signal(signal.SIGTERM, _interrupt)
+    signal.signal(signal.SIGHUP, _interrupt)
+    console = Console()
+    try:
+        figures = _Demo(options, console).run()
+    except (LocalError, StationError) as error:
+        console.print(f"demo: {error}", style="red", markup=False, highlight=False)
+        sys.exit(2)
+    except (BotoCoreError, ClientError) as error:
+        console.print(f"demo: the embedded cloud refused a call: {error}", style="red", markup=False)
+        sys.exit(2)
+    except KeyboardInterrupt:
+        console.print("stopped; nothing is left running")
+        sys.exit(130)
+    sys.exit(1 if figures.samples_lost else 0)
+
+
+def _interrupt(_signal: int, _frame: object) -> NoReturn:
+    raise KeyboardInterrupt
+
+
+def _options() -> argparse.Namespace:
+    parser = argparse.ArgumentParser(prog="make demo", description=(__doc__ or "").splitlines()[0])
+    parser.add_argument("--duration", type=_positive, metavar="S", help="seconds to drive (default 60)")
+    parser.add_argument(
+        "--bag", type=Path, metavar="FILE", help="drive a recording instead of a simulated car"
+    )
+    parser.add_argument("--report", type=Path, metavar="FILE", help="write the figures as JSON")
+    parser.add_argument("--port", type=int, default=0, help="the page's port (default: a free one)")
+    parser.add_argument(
+        "--folder", type=Path, default=FOLDER, help="where the embedded cloud keeps its state"
+    )
+    options = parser.parse_args()
+    if options.bag is not None and not options.bag.exists():
+        parser.error(f"BAG={options.bag}: there is no such file")
+    if options.bag is not None:
+        try:
+            with BagSource(BagConfig(path=options.bag), SystemClock()).open() as messages:
+                next(messages, None)
+        except SourceError as error:
+            parser.error(f"BAG={error}")
+    if options.report is not None and not options.report.absolute().parent.is_dir():
+        parser.error(f"REPORT={options.report}: there is no such folder")
+    if not 0 <= options.port <= 65535:
+        parser.error(f"PORT={options.port}: allowed is 1 to 65535")
+    try:
+        socket.create_server(("127.0.0.1", options.port)).close()
+    except OSError as error:
+        parser.error(f"PORT={options.port}: {error.strerror}; give another, or none for a free one")
+    return options
+
+
+def _positive(value: str) -> float:
+    try:
+        seconds = float(value)
+    except ValueError:
+        seconds = 0.0
+    if not 0 < seconds <= 86_400:
+        raise argparse.ArgumentTypeError(f"DURATION={value}: allowed is more than 0 and up to 86400 seconds")
+    return seconds
+
+
+class _Demo:
+    def __init__(self, options: argparse.Namespace, console: Console) -> None:
+        self._options, self._console = options, console
+        self._began = time.monotonic()
+
+    def run(self) -> Figures:
+        with ExitStack() as stack:
+            embedded = stack.enter_context(EmbeddedCloud(self._options.folder, progress=self._step))
+            vehicles = {ROBOT: dict(robots.F1TENTH)}
+            page = stack.enter_context(
+                PageServer(
+                    namespace=embedded.namespace,
+                    subscribe_key=embedded.subscribe_key,
+                    origin=embedded.pubnub.origin,
+                    tls=False,
+                    vehicles=vehicles,
+                    port=self._options.port,
+                )
+            )
+            listener = stack.enter_context(
+                Listener(
+                    subscribe_key=embedded.subscribe_key,
+                    robot=ROBOT,
+                    namespace=embedded.namespace,
+                    origin=embedded.pubnub.origin,
+                    tls=False,
+                )
+            )
+            self._step("car")
+            bundle = robots.add(
+                embedded.cloud, ROBOT, out=embedded.folder / "robots", settings=self._settings()
+            )
+            self._console.print(f"\n[bold]Watch the car:[/bold] {page.url}\n", highlight=False)
+            report = self._drive(embedded, bundle, listener)
+            figures = self._count(embedded, report, listener)
+            self._console.print(figures.as_table())
+            if self._options.report is not None:
+                self._options.report.write_text(json.dumps(figures.as_json(), indent=2) + "\n")
+            if sys.stdin.isatty() and sys.stdout.isatty():
+                self._stay(embedded, bundle, page.url)
+            return figures
+
+    def _step(self, name: str) -> None:
+        self._console.print(f"{time.monotonic() - self._began:5.1f} s  {name}", highlight=False)
+
+    def _settings(self) -> dict[str, Any]:
+        source: dict[str, Any]
+        if self._options.bag is not None:
+            source = {"type": "bag", "path": str(self._options.bag.resolve())}
+        else:
+            source = {"type": "sim", "stream": VESC_STREAM, "rate_hz": _SOURCE_RATE_HZ}
+        duration_s = self._options.duration
+        if duration_s is None and self._options.bag is None:
+            duration_s = 60.0
+        if duration_s is not None:
+            source["duration_s"] = duration_s
+        return {"sources": [source], "ping": _PING}
+
+    def _drive(self, embedded: EmbeddedCloud, bundle: robots.Bundle, listener: Listener) -> dict[str, Any]:
+        report = embedded.folder / "agent-report.json"
+        with _agent(embedded, bundle, "--report", str(report)) as agent:
+            began = time.monotonic()
+            with self._console.status("starting the agent") as status:
+                while agent.wait(_STATUS_S) is None:
+                    embedded.emulator.check()
+                    status.update(self._status_line(embedded, listener, time.monotonic() - began))
+            if not report.exists():
+                raise LocalError(f"the agent stopped with status {agent.poll()}:\n{agent.tail()}")
+            if agent.poll():
+                self._console.print(
+                    f"the agent reports a failure:\n{agent.tail()}", style="red", markup=False
+                )
+        written: dict[str, Any] = json.loads(report.read_text())
+        return written
+
+    def _status_line(self, embedded: EmbeddedCloud, listener: Listener, seconds: float) -> str:
+        stored = sum(len(b.times_us) for b in delivery.batches(embedded.cloud, ROBOT, VESC_STREAM))
+        heard = list(listener.heard)
+        delay = f"{heard[-1].delay_ms:.0f} ms" if heard else "-"
+        return (
+            f"driving {seconds:3.0f} s, stored {stored:,} samples, live {len(heard):,} updates, delay {delay}"
+        )
+
+    def _count(self, embedded: EmbeddedCloud, report: dict[str, Any], listener: Listener) -> Figures:
+        """Read the tables until Lambda 2 has caught up with what they hold, or long enough."""
+        streams = [name for name in report["streams"] if name not in OWN_STREAMS]
+        sent = sum(report["streams"][name]["samples"] for name in streams)
+        deadline = time.monotonic() + _CATCH_UP_S
+        while True:
+            found = [delivery.delivery(embedded.cloud, ROBOT, stream) for stream in streams]
+            summarized = sum(one.samples_summarized for one in found)
+            stored = sum(one.samples_stored for one in found)
+            if summarized >= sent or time.monotonic() > deadline:
+                break
+            # The stream that invokes Lambda 2 tells nobody when it is empty.
+            threading.Event().wait(0.2)
+        return Figures(
+            samples_sent=sent,
+            samples_stored=stored,
+            samples_summarized=summarized,
+            live_published=report["live_published"],
+            live_received=len({(h.stream, h.boot, h.seq) for h in listener.heard}),
+            rtt_ms=round_trips(delivery.batches(embedded.cloud, ROBOT, RTT_STREAM)),
+            car_to_dashboard_ms=Spread.of([h.delay_ms for h in listener.heard]),
+        )
+
+    def _stay(self, embedded: EmbeddedCloud, bundle: robots.Bundle, url: str) -> None:
+        """Keep the car on the road, so that there is something to look at."""
+        settings = self._settings()
+        settings["sources"][0].pop("duration_s", None)
+        if self._options.bag is not None:
+            settings["sources"][0]["loop"] = True
+        robots.configure(bundle, settings)
+        self._console.print(f"\nThe car drives on: {url}  Ctrl-C stops everything.", highlight=False)
+        with _agent(embedded, bundle) as agent:
+            agent.wait()
+            raise LocalError(f"the agent stopped with status {agent.poll()}:\n{agent.tail()}")
+
+
+@contextmanager
+def _agent(embedded: EmbeddedCloud, bundle: robots.Bundle, *arguments: str) -> Iterator[Child]:
+    command = [str(Path(sys.executable).parent / "iort-agent"), "--config", str(bundle.config), *arguments]
+    agent = Child(
+        "the agent",
+        command,
+        environment={"PATH": "", "HOME": str(embedded.folder)},
+        cwd=ROOT,
+        log=embedded.folder / "agent.log",
+    )
+    try:
+        yield agent
+    finally:
+        agent.interrupt()
+        agent.wait(15.0)
+        agent.stop()
+
+
+if __name__ == "__main__":
+    main()

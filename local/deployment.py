@@ -1,0 +1,116 @@
+"""Deploys the project's own stacks into the embedded cloud, with the pinned CDK command line."""
+
+from __future__ import annotations
+
+import hashlib
+import os
+import shlex
+import shutil
+import sys
+from collections.abc import Callable
+from pathlib import Path
+
+from local.errors import LocalError
+from local.processes import run
+from station.cloud import Cloud
+
+ROOT = Path(__file__).resolve().parent.parent
+_ACCOUNT = "000000000000"
+_STEP_S = 180.0
+# What a synthesized assembly is made of: the same again is deployed as it is.
+_MADE_OF = ("app.py", "contract.py", "cdk.json", "requirements/dev.txt", "requirements/layer.txt")
+_MADE_OF_FOLDERS = ("stacks", "functions")
+_KEPT = 4
+
+
+def deploy(cloud: Cloud, folder: Path, progress: Callable[[str], None]) -> None:
+    """Bootstrap and deploy every stack; logs go into ``folder``. Raises `LocalError` where that fails."""
+    cdk = ROOT / "node_modules" / "aws-cdk" / "bin" / "cdk"
+    path = f"{Path(sys.executable).parent}{os.pathsep}{os.environ.get('PATH', os.defpath)}"
+    node = shutil.which("node", path=path)
+    if node is None or not cdk.exists():
+        raise LocalError("the CDK command line is not installed: run `make setup`")
+    environment = {
+        "PATH": path,
+        "HOME": str(folder),
+        "AWS_ENDPOINT_URL": cloud.endpoint_url or "",
+        "AWS_CA_BUNDLE": cloud.ca_bundle or "",
+        "NODE_EXTRA_CA_CERTS": cloud.ca_bundle or "",
+        "AWS_ACCESS_KEY_ID": cloud.access_key_id or "",
+        "AWS_SECRET_ACCESS_KEY": cloud.secret_access_key or "",
+        "AWS_REGION": cloud.region or "",
+        "AWS_EC2_METADATA_DISABLED": "true",
+        "CDK_DISABLE_VERSION_CHECK": "1",
+        "CDK_DISABLE_CLI_TELEMETRY": "true",
+        "JSII_RUNTIME_PACKAGE_CACHE_ROOT": str(ROOT / "build" / "jsii-cache"),
+    }
+
+    def step(name: str, *arguments: str) -> None:
+        progress(name)
+        run(
+            name,
+            [node, str(cdk), *arguments, "--no-color"],
+            environment=environment,
+            cwd=ROOT,
+            log=folder / f"{name.replace(' ', '-')}.log",
+            timeout_s=_STEP_S,
+        )
+
+    def synthesize(output: Path) -> None:
+        settings = {"embedded": "true", "namespace": cloud.namespace, "layer": "build/layer/local"}
+        context = [part for key, value in settings.items() for part in ("-c", f"{key}={value}")]
+        step(
+            "cdk synth",
+            "synth",
+            "--app",
+            f"{shlex.quote(sys.executable)} app.py",
+            "--output",
+            str(output),
+            "--quiet",
+            *context,
+        )
+
+    kept = assembly(ROOT, ROOT / "build" / "assembly", namespace=cloud.namespace, synthesize=synthesize)
+    step("cdk bootstrap", "bootstrap", f"aws://{_ACCOUNT}/{cloud.region}", "--app", str(kept))
+    step(
+        "cdk deploy",
+        "deploy",
+        "--all",
+        "--app",
+        str(kept),
+        "--require-approval",
+        "never",
+        "--method",
+        "direct",
+    )
+
+
+def assembly(root: Path, folder: Path, *, namespace: str, synthesize: Callable[[Path], None]) -> Path:
+    """The synthesized stacks of the checkout as it is: kept ones, or what ``synthesize`` writes."""
+    kept = folder / _key(root, namespace)
+    if kept.is_dir():
+        kept.touch()
+        return kept
+    folder.mkdir(parents=True, exist_ok=True)
+    making = kept.with_suffix(f".{os.getpid()}")
+    shutil.rmtree(making, ignore_errors=True)
+    synthesize(making)
+    try:
+        making.rename(kept)
+    except OSError:
+        # Another process has made the same meanwhile.
+        shutil.rmtree(making, ignore_errors=True)
+    by_age = sorted(folder.iterdir(), key=lambda path: path.stat().st_mtime)
+    for old in by_age[:-_KEPT]:
+        shutil.rmtree(old, ignore_errors=True)
+    return kept
+
+
+def _key(root: Path, namespace: str) -> str:
+    digest = hashlib.sha256(f"{sys.version} {namespace}".encode())
+    sources = [root / name for name in _MADE_OF]
+    for name in _MADE_OF_FOLDERS:
+        sources += sorted((root / name).rglob("*.py"))
+    for source in sources:
+        digest.update(f"{source.relative_to(root)}\0".encode() + source.read_bytes())
+    return digest.hexdigest()[:16]

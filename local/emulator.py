@@ -1,0 +1,19 @@
+"""The emulator's process: ministack with its gaps closed. Configured by ministack's own environment."""
+
+from __future__ import annotations
+
+from ministack import app
+
+from local import gaps
+
+
+def main() -> None:
+    """Serve until SIGTERM or SIGINT."""
+    gaps.install()
+    # Under USE_SSL it would also take port 443 of the machine, where it may.
+    app._port_is_bindable = lambda _host, _port: False  # noqa: SLF001
+    app.main()
+
+
+if __name__ == "__main__":
+    main()

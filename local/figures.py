@@ -1,0 +1,105 @@
+"""The figures of a drive, each beside the thesis' that the project began from."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+from statistics import quantiles
+from typing import Any
+
+from rich.table import Table
+
+from contract import BROKER, LAMBDA, PING_PATHS, RTT_FIELDS, RULE, Batch
+
+# Round trips and delay in ms, measured in 2018 from a car in Europe to AWS (tables 6.4 and 6.6).
+THESIS = {BROKER: "50 - 60", RULE: "100 - 110", LAMBDA: "150 - 200", "dashboard": "< 300"}
+_NOT_MEASURED = "-"
+
+
+@dataclass(frozen=True)
+class Spread:
+    """The median and the 95th percentile in ms of so many values; None of none."""
+
+    p50: float | None
+    p95: float | None
+    n: int
+
+    @classmethod
+    def of(cls, values: Sequence[float]) -> Spread:
+        """Summarise the values."""
+        if len(values) < 2:
+            only = round(values[0], 3) if values else None
+            return cls(only, only, len(values))
+        percents = quantiles(values, n=100, method="inclusive")
+        return cls(round(percents[49], 3), round(percents[94], 3), len(values))
+
+    def __str__(self) -> str:
+        if self.p50 is None or self.p95 is None:
+            return _NOT_MEASURED
+        return f"{self.p50:.1f} ms (p95 {self.p95:.1f})"
+
+
+@dataclass(frozen=True)
+class Figures:
+    """What one drive came to."""
+
+    samples_sent: int
+    samples_stored: int
+    samples_summarized: int
+    live_published: int
+    live_received: int
+    rtt_ms: dict[str, Spread]
+    car_to_dashboard_ms: Spread
+
+    @property
+    def samples_lost(self) -> int:
+        """Sent and not stored, or stored and not summarised."""
+        return self.samples_sent - min(self.samples_stored, self.samples_summarized)
+
+    def as_json(self) -> dict[str, Any]:
+        """The figures under the names that the report promises."""
+        return {
+            "samples_sent": self.samples_sent,
+            "samples_stored": self.samples_stored,
+            "samples_summarized": self.samples_summarized,
+            "samples_lost": self.samples_lost,
+            "live_published": self.live_published,
+            "live_received": self.live_received,
+            "rtt_ms": {path: {"p50": s.p50, "p95": s.p95} for path, s in self.rtt_ms.items()},
+            "car_to_dashboard_ms": {
+                "p50": self.car_to_dashboard_ms.p50,
+                "p95": self.car_to_dashboard_ms.p95,
+            },
+        }
+
+    def as_table(self) -> Table:
+        """The figures for a person."""
+        table = Table(title="The drive", title_justify="left", title_style="bold")
+        table.add_column("figure")
+        table.add_column("here", justify="right")
+        table.add_column("thesis, 2018", justify="right")
+        for name, count in (
+            ("samples sent by the car", self.samples_sent),
+            ("samples stored", self.samples_stored),
+            ("samples summarised", self.samples_summarized),
+            ("samples lost", self.samples_lost),
+            ("live messages published", self.live_published),
+            ("live messages received", self.live_received),
+        ):
+            style = "bold red" if name == "samples lost" and count else ""
+            table.add_row(name, f"{count:,}", _NOT_MEASURED, style=style)
+        table.add_section()
+        for path in PING_PATHS:
+            table.add_row(f"round trip, {path}", str(self.rtt_ms[path]), f"{THESIS[path]} ms")
+        table.add_row("car to dashboard", str(self.car_to_dashboard_ms), f"{THESIS['dashboard']} ms")
+        return table
+
+
+def round_trips(batches: Iterable[Batch]) -> dict[str, Spread]:
+    """The round trips over every path, from the stored batches of the stream ``rtt``."""
+    values: dict[str, list[float]] = {path: [] for path in PING_PATHS}
+    for batch in batches:
+        for path, found in values.items():
+            column = batch.columns.get(RTT_FIELDS[path], ())
+            found.extend(float(value) for value in column if isinstance(value, (int, float)))
+    return {path: Spread.of(found) for path, found in values.items()}

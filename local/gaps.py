@@ -1,0 +1,197 @@
+"""What the embedded cloud lacks of AWS and this project relies on.
+
+ministack is pinned, and each gap is one wrapper around one of its functions; tests/local/test_gaps.py
+fails when a release changes what is wrapped or closes the gap itself. In order:
+
+- a republish action's topic is not expanded: ``${topic(3)}`` stays literal;
+- the SQL function floor() gives nothing;
+- a message above 128 KB is taken from an MQTT 3.1.1 client or by HTTP (AWS refuses it);
+- on Python 3.10 the MQTT listener pauses reading too early, loses the ClientHello and never answers;
+- a rule's SQS action counts as plain HTTP, which the queues' policies refuse (AWS calls itself by TLS);
+- fleet provisioning has no CreateCertificateFromCsr over MQTT, only keys made in the cloud;
+- a rule invokes Lambda at once, in a thread a message, and a throttled message is lost (AWS queues
+  asynchronous events, and a burst waits for free concurrency).
+"""
+
+from __future__ import annotations
+
+import asyncio
+import contextvars
+import json
+import math
+import os
+import re
+import secrets
+import time
+from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
+from functools import wraps
+from typing import Any
+
+from ministack.core import iam_evaluator
+from ministack.services import iot, lambda_svc
+
+# "Message size" in AWS IoT Core's service quotas.
+AWS_MESSAGE_BYTES = 128 * 1024
+_CSR = "create-from-csr"
+_TEMPLATE = re.compile(r"\$\{\s*(topic\(\s*\d*\s*\))\s*\}")
+
+
+class MessageTooLargeError(ConnectionError):
+    """A publish above AWS IoT Core's message size; as a connection error it ends the session."""
+
+
+def install() -> None:
+    """Close the gaps in this process, before the emulator starts."""
+    iot._run_rule_actions = _expanding_republish(iot._run_rule_actions)  # noqa: SLF001
+    iot._eval_select_function = _with_floor(iot._eval_select_function)  # noqa: SLF001
+    iot._IMPLEMENTED_SQL_FUNCS |= {"floor"}  # noqa: SLF001
+    iot.broker_publish = _refusing_large(iot.broker_publish)
+    iot._MtlsAcceptor.connection_made = _once_reading(iot._MtlsAcceptor.connection_made)  # noqa: SLF001
+    iot._dispatch_rule_sqs = _over_tls(iot._dispatch_rule_sqs)  # noqa: SLF001
+    iot._parse_fleet_provisioning_topic = _with_csr(iot._parse_fleet_provisioning_topic)  # noqa: SLF001
+    iot._fleet_provisioning_reply = _certifying(iot._fleet_provisioning_reply)  # noqa: SLF001
+    iot._dispatch_rule_to_lambda = AsyncInvocations().dispatch  # noqa: SLF001
+
+
+def expand_topic(template: str, topic: str) -> str:
+    """The republish topic for a message on ``topic``; a level it does not have leaves nothing."""
+    levels = topic.split("/")
+
+    def level(match: re.Match[str]) -> str:
+        index = match[1][len("topic(") : -1].strip()
+        if not index:
+            return topic
+        return levels[int(index) - 1] if 1 <= int(index) <= len(levels) else ""
+
+    return _TEMPLATE.sub(level, template)
+
+
+def _expanding_republish(run_rule_actions: Callable[..., Any]) -> Callable[..., Any]:
+    @wraps(run_rule_actions)
+    async def run(account: str, region: str, rule: dict[str, Any], payload: bytes, *rest: Any) -> None:
+        topic = rest[0] if rest else ""
+        if rule and any("republish" in action for action in rule.get("actions") or []):
+            rule = {**rule, "actions": [_expanded(action, topic) for action in rule["actions"]]}
+        await run_rule_actions(account, region, rule, payload, *rest)
+
+    return run
+
+
+def _expanded(action: dict[str, Any], topic: str) -> dict[str, Any]:
+    republish = action.get("republish")
+    if republish is None:
+        return action
+    return {"republish": {**republish, "topic": expand_topic(republish["topic"], topic)}}
+
+
+def _with_floor(evaluate: Callable[..., Any]) -> Callable[..., Any]:
+    @wraps(evaluate)
+    def evaluate_function(name: str, args: list[str], *context: Any) -> Any:
+        if name != "floor" or len(args) != 1:
+            return evaluate(name, args, *context)
+        value = iot._sql_as_number(iot._eval_select_expr(args[0], *context))  # noqa: SLF001
+        return iot._MISSING if value is None else math.floor(value)  # noqa: SLF001
+
+    return evaluate_function
+
+
+def _refusing_large(publish: Callable[..., Any]) -> Callable[..., Any]:
+    @wraps(publish)
+    async def broker_publish(account: str, region: str, topic: str, payload: bytes, **rest: Any) -> None:
+        if len(payload) > AWS_MESSAGE_BYTES:
+            raise MessageTooLargeError(f"{len(payload)} bytes on {topic}")
+        await publish(account, region, topic, payload, **rest)
+
+    return broker_publish
+
+
+def _once_reading(connection_made: Callable[..., None]) -> Callable[..., None]:
+    @wraps(connection_made)
+    def made(self: Any, transport: Any) -> None:
+        # Up to Python 3.10 the loop starts to read after this call, whether or not it was paused here.
+        asyncio.get_running_loop().call_soon(connection_made, self, transport)
+
+    return made
+
+
+def _over_tls(dispatch: Callable[..., None]) -> Callable[..., None]:
+    @wraps(dispatch)
+    def dispatch_rule_sqs(*arguments: Any) -> None:
+        context = contextvars.copy_context()
+        context.run(iam_evaluator.pin_request_origin, "127.0.0.1", True)
+        context.run(dispatch, *arguments)
+
+    return dispatch_rule_sqs
+
+
+def _with_csr(parse: Callable[..., Any]) -> Callable[..., Any]:
+    @wraps(parse)
+    def parse_topic(topic: str) -> tuple[str, str | None] | None:
+        return (_CSR, None) if topic == "$aws/certificates/create-from-csr/json" else parse(topic)
+
+    return parse_topic
+
+
+def _certifying(reply: Callable[..., Any]) -> Callable[..., Any]:
+    @wraps(reply)
+    async def answer(account: str, region: str, operation: str, *rest: Any) -> Any:
+        if operation != _CSR:
+            return await reply(account, region, operation, *rest)
+        request = _json_object(rest[1]).get("certificateSigningRequest")
+        try:
+            pem = iot.sign_certificate_request(*iot._ensure_ca(), request or "")  # noqa: SLF001
+        except ValueError:
+            return iot._fleet_rejected("InvalidCsr", "CSR violates constraints")  # noqa: SLF001
+        number, token = iot.get_certificate_id(pem), secrets.token_urlsafe(48)
+        with iot.request_scope(account, region):
+            record = iot._certificate_record(number, pem, "PENDING_ACTIVATION")  # noqa: SLF001
+            iot._certificates[number] = record  # noqa: SLF001
+            expires = time.time() + iot._OWNERSHIP_TOKEN_SECONDS  # noqa: SLF001
+            iot._ownership_tokens[token] = {"certificateId": number, "expiration": expires}  # noqa: SLF001
+        return "accepted", {
+            "certificateId": number,
+            "certificatePem": pem,
+            "certificateOwnershipToken": token,
+        }
+
+    return answer
+
+
+def _json_object(payload: bytes) -> dict[str, Any]:
+    try:
+        value = json.loads(payload)
+    except ValueError:
+        value = None
+    return value if isinstance(value, dict) else {}
+
+
+class AsyncInvocations:
+    """A queue of asynchronous events for each function, served by as many threads as the function
+    may run at once: its reserved concurrency, and no more than this machine has cores."""
+
+    def __init__(self) -> None:
+        self._pools: dict[str, ThreadPoolExecutor] = {}
+
+    def dispatch(self, account: str, region: str, function_arn: str, event: Any) -> None:
+        """Queue one event; raises `LookupError` for a function that is not there."""
+        function, config, _ = lambda_svc._get_func_record_for_ref_in_scope(  # noqa: SLF001
+            function_arn, account_id=account, region=region
+        )
+        if not function or not config:
+            raise LookupError(f"function {function_arn} not found")
+        record = lambda_svc._execution_record_for_config(function, config)  # noqa: SLF001
+        pool = self._pools.get(function_arn)
+        if pool is None:
+            reserved = lambda_svc._reserved_concurrency(function, config)  # noqa: SLF001
+            cores = os.cpu_count() or 1
+            pool = ThreadPoolExecutor(cores if reserved is None else max(1, min(cores, reserved)))
+            self._pools[function_arn] = pool
+        retries = (function.get("event_invoke_config") or {}).get("MaximumRetryAttempts", 2)
+        pool.submit(_invoke, record, event, 1 + int(retries))
+
+
+def _invoke(record: dict[str, Any], event: Any, attempts: int) -> None:
+    for _ in range(attempts):
+        if not lambda_svc._execute_function_with_config_scope(record, event).get("error"):  # noqa: SLF001
+            return

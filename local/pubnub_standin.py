@@ -1,0 +1,397 @@
+"""Stands in for PubNub, which cannot be reached from everywhere: a small HTTP server that PubNub's own,
+unmodified SDKs talk to, given its ``origin`` and no TLS.
+
+It does publish (GET and POST), subscribe (long poll, several channels, ``iort.*``), presence heartbeats
+and time, on one event loop in one thread. What it does not do, it refuses in PubNub's error shapes;
+only channel groups, which are always empty here, are let through.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import json
+import socket
+import threading
+import time
+import zlib
+from collections import OrderedDict, deque
+from concurrent.futures import Future
+from typing import TYPE_CHECKING, NamedTuple
+from urllib.parse import quote, unquote
+
+from aiohttp import web
+
+import contract
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator
+    from types import TracebackType
+
+    from typing_extensions import Self
+
+# PubNub answers an idle long poll a little before its SDKs, which wait 310 s, take it for dead.
+POLL_S = 280.0
+# A subscriber that has not read its answer after this long is cut off; its SDK reconnects.
+WRITE_S = 10.0
+# What is kept for subscribers that are away, and what bounds the memory it takes.
+KEPT_A_CHANNEL = 100
+KEPT_CHANNELS = 1_000
+KEPT_BYTES = 64 * 1024 * 1024
+MESSAGES_AN_ANSWER = 100
+MAX_POLLS = 1_000
+# Above what the SDKs can send, so that a message too large is told so by us.
+MAX_LINE_BYTES = 4 * contract.MAX_PUBNUB_BYTES
+
+# PubNub features that change what is delivered and to whom: without them the answer would be wrong.
+UNSUPPORTED = ("custom_message_type", "filter-expr", "meta", "norep")
+
+
+class Refusal(Exception):  # noqa: N818
+    """A request that is answered with an error, in one of PubNub's two shapes."""
+
+    def __init__(self, status: int, message: str, service: str | None = None) -> None:
+        super().__init__(message)
+        self.status, self.message, self.service = status, message, service
+
+    def body(self, token: int) -> str:
+        """A list where publish reports failure, an object from every other service."""
+        if self.service is None:
+            return json.dumps([0, self.message, str(token)])
+        return json.dumps(
+            {"status": self.status, "service": self.service, "error": True, "message": self.message}
+        )
+
+
+class Message(NamedTuple):
+    """One publish; the payload stays the JSON text that was sent."""
+
+    token: int
+    channel: str
+    publisher: str
+    payload: str
+
+
+class Subscription:
+    """The channels a request asks for: plain names, and wildcards by what they start with."""
+
+    def __init__(self, channels: list[str]) -> None:
+        self.names = {name for name in channels if not name.endswith(".*")}
+        self._prefixes = {name[:-1]: name for name in channels if name.endswith(".*")}
+
+    def match(self, channel: str) -> str | None:
+        """Which entry of the subscription the channel belongs to, the plain name first."""
+        if channel in self.names:
+            return channel
+        for prefix, wildcard in self._prefixes.items():
+            if channel.startswith(prefix):
+                return wildcard
+        return None
+
+
+class History:
+    """The newest messages of every channel, up to a number a channel and a size for all."""
+
+    def __init__(self) -> None:
+        self._channels: OrderedDict[str, deque[Message]] = OrderedDict()
+        self._bytes = 0
+
+    def add(self, message: Message) -> None:
+        """Keep the message; the channel silent for longest makes room when there is none."""
+        kept = self._channels.setdefault(message.channel, deque())
+        self._channels.move_to_end(message.channel)
+        kept.append(message)
+        self._bytes += len(message.payload)
+        if len(kept) > KEPT_A_CHANNEL:
+            self._bytes -= len(kept.popleft().payload)
+        while len(self._channels) > KEPT_CHANNELS or (self._bytes > KEPT_BYTES and len(self._channels) > 1):
+            _, dropped = self._channels.popitem(last=False)
+            self._bytes -= sum(len(old.payload) for old in dropped)
+
+    def after(self, cursor: int, wanted: Subscription) -> list[tuple[str, Message]]:
+        """The oldest messages after the cursor, as many as one answer holds, each with its match."""
+        found: list[tuple[str, Message]] = []
+        for channel, kept in self._channels.items():
+            match = wanted.match(channel)
+            if match is not None and kept[-1].token > cursor:
+                found.extend((match, message) for message in kept if message.token > cursor)
+        found.sort(key=lambda entry: entry[1].token)
+        return found[:MESSAGES_AN_ANSWER]
+
+
+class PubNubStandIn:
+    """The server, in a thread of its own: ``with PubNubStandIn() as pubnub: ... pubnub.origin``.
+
+    With keys given it refuses other keys. ``port=0`` takes a free port. The counters may be read from
+    any thread: ``published`` messages taken, ``delivered`` messages sent to subscribers (once for each
+    of them) and ``refused`` requests.
+    """
+
+    def __init__(
+        self,
+        host: str = "127.0.0.1",
+        port: int = 0,
+        publish_key: str | None = None,
+        subscribe_key: str | None = None,
+        *,
+        poll_s: float = POLL_S,
+    ) -> None:
+        self.host, self.port = host, port
+        self.published = self.delivered = self.refused = 0
+        self._keys = (publish_key, subscribe_key)
+        self._poll_s = poll_s
+        self._history = History()
+        self._polls: dict[asyncio.Future[None], Subscription] = {}
+        self._last_token = 0
+        self._thread: threading.Thread | None = None
+        self._loop: asyncio.AbstractEventLoop
+        self._stopping: asyncio.Event
+
+    @property
+    def origin(self) -> str:
+        """What the SDKs are given as ``origin``, beside ``ssl`` switched off."""
+        return f"{self.host}:{self.port}"
+
+    def start(self) -> Self:
+        """Listen, and return once connections are taken. Raises `OSError` where the port is not free."""
+        if self._thread is not None:
+            raise RuntimeError("the PubNub stand-in is running already")
+        listening = socket.create_server((self.host, self.port))
+        self.port = listening.getsockname()[1]
+        started: Future[None] = Future()
+        thread = threading.Thread(
+            target=self._run, args=(listening, started), name="pubnub-standin", daemon=True
+        )
+        thread.start()
+        try:
+            started.result()
+        except BaseException:
+            thread.join()
+            listening.close()
+            raise
+        self._thread = thread
+        return self
+
+    def stop(self) -> None:
+        """Drop every connection and end the thread; a second call does nothing."""
+        if self._thread is not None:
+            self._loop.call_soon_threadsafe(self._stopping.set)
+            self._thread.join()
+            self._thread = None
+
+    def __enter__(self) -> Self:
+        return self.start()
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self.stop()
+
+    # --- the thread ----------------------------------------------------------------------------
+
+    def _run(self, listening: socket.socket, started: Future[None]) -> None:
+        try:
+            asyncio.run(self._serve(listening, started))
+        except BaseException as error:
+            if started.done():
+                raise
+            started.set_exception(error)
+
+    async def _serve(self, listening: socket.socket, started: Future[None]) -> None:
+        self._loop, self._stopping = asyncio.get_running_loop(), asyncio.Event()
+        server = web.Server(
+            self._handle,
+            handler_cancellation=True,
+            access_log=None,
+            max_line_size=MAX_LINE_BYTES,
+            auto_decompress=False,
+        )
+        runner = web.ServerRunner(server, shutdown_timeout=1)
+        await runner.setup()
+        try:
+            await web.SockSite(runner, listening).start()
+            started.set_result(None)
+            await self._stopping.wait()
+            # First no new connections, then no old ones: asyncio loses one that comes in while it closes.
+            self._loop.remove_reader(listening)
+            await _drop_connections(server)
+        finally:
+            await runner.cleanup()
+
+    async def _handle(self, request: web.BaseRequest) -> web.StreamResponse:
+        try:
+            status, messages, body = 200, 0, ""
+            if request.method == "OPTIONS":
+                return await self._write(request, web.Response(status=204, headers=_preflight(request)))
+            messages, body = await self._route(request)
+        except Refusal as refusal:
+            self.refused += 1
+            status, body = refusal.status, refusal.body(self._token())
+        response = web.Response(
+            status=status,
+            body=body.encode(),
+            content_type="text/javascript",
+            charset="UTF-8",
+            headers={"Access-Control-Allow-Origin": "*", "Cache-Control": "no-cache"},
+        )
+        self.delivered += messages
+        return await self._write(request, response)
+
+    async def _write(self, request: web.BaseRequest, response: web.Response) -> web.Response:
+        try:
+            await asyncio.wait_for(_send(request, response), WRITE_S)
+        except asyncio.TimeoutError:
+            self._cut(request)
+        return response
+
+    def _cut(self, request: web.BaseRequest) -> None:
+        if request.transport is not None:
+            request.transport.abort()
+
+    async def _route(self, request: web.BaseRequest) -> tuple[int, str]:
+        """How many messages the answer delivers, and the answer."""
+        path = request.raw_path.partition("?")[0].split("/")[1:]
+        for name in UNSUPPORTED:
+            if name in request.query:
+                raise Refusal(400, f"{name} is not supported by the stand-in", "Stand-in")
+        match [request.method, *path]:
+            case ["GET", "publish", publish_key, subscribe_key, "0", channel, _, payload]:
+                self._check_keys(publish_key, subscribe_key, None)
+                return 0, self._publish(request, channel, _text(payload))
+            case ["POST", "publish", publish_key, subscribe_key, "0", channel, _]:
+                self._check_keys(publish_key, subscribe_key, None)
+                return 0, self._publish(request, channel, await _read(request))
+            case ["GET", "v2", "subscribe", subscribe_key, channels, "0"]:
+                self._check_keys(None, subscribe_key, "Access Manager")
+                return await self._subscribe(request, subscribe_key, channels)
+            case ["GET", "v2", "presence", "sub-key", subscribe_key, "channel", _, "heartbeat" | "leave"]:
+                self._check_keys(None, subscribe_key, "Presence")
+                return 0, '{"status":200,"message":"OK","service":"Presence"}'
+            case ["GET", "time", "0"]:
+                return 0, f"[{self._token()}]"
+        raise Refusal(404, "Not Found", "Stand-in")
+
+    def _check_keys(self, publish_key: str | None, subscribe_key: str, service: str | None) -> None:
+        for key, expected in zip((publish_key, subscribe_key), self._keys, strict=True):
+            if key is not None and expected is not None and unquote(key) != expected:
+                raise Refusal(400, "Invalid Key", service)
+
+    def _publish(self, request: web.BaseRequest, channel: str, payload: str) -> str:
+        channel = _text(channel)
+        if not channel or any(c in ",*/:\\" or c < " " for c in channel):
+            raise Refusal(400, "Invalid Channel")
+        # PubNub's own formula: both, as they would stand in an URL, and 100 bytes.
+        if len(quote(channel + payload, safe="!~*'()")) + 100 > contract.MAX_PUBNUB_BYTES:
+            raise Refusal(413, "Message Too Large")
+        try:
+            json.loads(payload, parse_constant=_refuse_constant)
+        except (ValueError, RecursionError):
+            raise Refusal(400, "Invalid JSON") from None
+        message = Message(self._token(), channel, request.query.get("uuid", ""), payload)
+        self._history.add(message)
+        self.published += 1
+        for poll, wanted in self._polls.items():
+            if not poll.done() and wanted.match(channel) is not None:
+                poll.set_result(None)
+        return f'[1,"Sent","{message.token}"]'
+
+    async def _subscribe(self, request: web.BaseRequest, key: str, channels: str) -> tuple[int, str]:
+        wanted = Subscription([_text(name) for name in channels.split(",") if name])
+        try:
+            cursor = int(request.query.get("tt", "0"))
+        except ValueError:
+            raise Refusal(400, "Invalid Timetoken", "Stand-in") from None
+        if cursor <= 0:
+            return 0, f'{{"t":{{"t":"{self._token()}","r":1}},"m":[]}}'
+        # A cursor of a clock that was set back since must not be deaf until the clock catches up.
+        cursor = min(cursor, self._token())
+        found = self._history.after(cursor, wanted)
+        if not found:
+            with self._polling(wanted) as poll:
+                await asyncio.wait([poll], timeout=self._poll_s)
+            found = self._history.after(cursor, wanted)
+        token = found[-1][1].token if found else cursor
+        entries = ",".join(_entry(match, message, unquote(key)) for match, message in found)
+        return len(found), f'{{"t":{{"t":"{token}","r":1}},"m":[{entries}]}}'
+
+    @contextlib.contextmanager
+    def _polling(self, wanted: Subscription) -> Iterator[asyncio.Future[None]]:
+        """A future that the next message wanted completes."""
+        if len(self._polls) >= MAX_POLLS:
+            raise Refusal(429, "Too Many Requests", "Stand-in")
+        poll: asyncio.Future[None] = self._loop.create_future()
+        self._polls[poll] = wanted
+        try:
+            yield poll
+        finally:
+            del self._polls[poll]
+
+    def _token(self) -> int:
+        """A timetoken: 100 ns since the epoch, 17 digits, greater than any before."""
+        self._last_token = max(self._last_token + 1, time.time_ns() // 100)
+        return self._last_token
+
+
+async def _drop_connections(server: web.Server) -> None:
+    """Every connection is a task, and so is one being accepted, which `web.Server` does not list yet."""
+    for _ in range(100):  # one or two rounds do; what is left after a second, asyncio.run cancels
+        others = asyncio.all_tasks() - {asyncio.current_task()}
+        if not others:
+            return
+        for connection in server.connections:
+            if connection.transport is not None:
+                connection.transport.abort()
+        await asyncio.wait(others, timeout=0.01)
+
+
+async def _send(request: web.BaseRequest, response: web.Response) -> None:
+    await response.prepare(request)
+    await response.write_eof()
+
+
+async def _read(request: web.BaseRequest) -> str:
+    try:
+        body = await request.read()
+        if request.headers.get("Content-Encoding") == "gzip":
+            # 47: gzip's header or zlib's, as the Python SDK says the one and sends the other.
+            inflater = zlib.decompressobj(47)
+            body = inflater.decompress(body, contract.MAX_PUBNUB_BYTES)
+            if inflater.unconsumed_tail:
+                raise Refusal(413, "Message Too Large")
+            if not inflater.eof:
+                raise Refusal(400, "Invalid Encoding")
+        return body.decode()
+    except web.HTTPRequestEntityTooLarge:
+        raise Refusal(413, "Message Too Large") from None
+    except (UnicodeDecodeError, zlib.error):
+        raise Refusal(400, "Invalid Encoding") from None
+
+
+def _text(quoted: str) -> str:
+    try:
+        return unquote(quoted, errors="strict")
+    except UnicodeDecodeError:
+        raise Refusal(400, "Invalid Encoding") from None
+
+
+def _refuse_constant(name: str) -> None:
+    raise ValueError(name)
+
+
+def _entry(match: str, message: Message, key: str) -> str:
+    # No "e": a 0 there makes the JavaScript SDK take the message for a file.
+    head = {"a": "1", "f": 0, "i": message.publisher, "p": {"t": str(message.token), "r": 1}, "k": key}
+    names = {"c": message.channel, "b": match}
+    return f'{json.dumps(head)[:-1]},{json.dumps(names)[1:-1]},"d":{message.payload}}}'
+
+
+def _preflight(request: web.BaseRequest) -> dict[str, str]:
+    """Any page may ask, as with PubNub; a page on another machine of the network included."""
+    asked = request.headers
+    return {
+        "Access-Control-Allow-Origin": "*",
+        "Access-Control-Allow-Methods": "GET, POST, OPTIONS",
+        "Access-Control-Allow-Headers": asked.get("Access-Control-Request-Headers", "*"),
+        "Access-Control-Allow-Private-Network": "true",
+        "Access-Control-Max-Age": "7200",
+    }

@@ -1,0 +1,33 @@
+"""Writes the field table of contract.py into README.md: `python scripts/fields.py`."""
+
+from __future__ import annotations
+
+import re
+import sys
+from pathlib import Path
+
+ROOT = Path(__file__).resolve().parent.parent
+sys.path.insert(0, str(ROOT))
+
+from contract import VESC_FIELDS  # noqa: E402 the path comes first
+
+_BLOCK = re.compile(r"(<!-- fields:.*?-->\n).*?(\n<!-- /fields -->)", re.DOTALL)
+
+
+def table() -> str:
+    """The table as Markdown."""
+    rows = ["| field | unit | meaning | ROS |", "|---|---|---|---|"]
+    for field in VESC_FIELDS.values():
+        versions = ", ".join(map(str, field.ros))
+        rows.append(f"| `{field.name}` | {field.unit} | {field.meaning} | {versions} |")
+    return "\n".join(rows)
+
+
+def filled(readme: str) -> str:
+    """The README with the table in its place."""
+    return _BLOCK.sub(lambda match: match[1] + table() + match[2], readme)
+
+
+if __name__ == "__main__":
+    path = ROOT / "README.md"
+    path.write_text(filled(path.read_text()))

@@ -1,0 +1,172 @@
+"""Sets the checkout up: .venv, node_modules, the built page and Lambda 1's layer. Nothing outside it.
+
+    python3 scripts/setup.py [--layer lambda]
+
+Needs only a Python from 3.10 on with the venv module. A step whose inputs have not changed since it
+last succeeded is passed over, so running it again costs nothing.
+"""
+
+from __future__ import annotations
+
+import argparse
+import hashlib
+import importlib.util
+import os
+import shutil
+import subprocess
+import sys
+import time
+from collections.abc import Callable, Iterable, Sequence
+from pathlib import Path
+
+ROOT = Path(__file__).resolve().parent.parent
+VENV, BUILD = ROOT / ".venv", ROOT / "build"
+PYTHON = VENV / "bin" / "python"
+# The interpreter itself, also when this runs in a virtual environment, even in the one made here.
+BASE_PYTHON = Path(getattr(sys, "_base_executable", sys.executable)).resolve()
+OLDEST = (3, 10)
+LEAST_FREE_BYTES = 3 * 1024**3
+# Where `cdk deploy` sends it: stacks/processing.py names the same runtime and architecture.
+# Amazon Linux 2023 has glibc 2.34; the newest platform that a package was built for is taken.
+LAMBDA_PLATFORMS = ("manylinux_2_28_aarch64", "manylinux_2_17_aarch64", "manylinux2014_aarch64")
+LAMBDA_PYTHON = "3.13"
+# No compiler is needed: pubnub, which publishes no wheel, is Python alone.
+LOCKED = ("--require-hashes", "--no-deps", "--only-binary", ":all:", "--no-binary", "pubnub")
+STARTED = time.monotonic()
+# npm's and pip's caches are theirs to keep elsewhere; nothing of ours goes outside the checkout.
+CACHES = {"npm_config_cache": str(BUILD / "npm-cache"), "npm_config_update_notifier": "false"}
+
+
+class SetupError(Exception):
+    """A step that failed; the text says what to do."""
+
+
+def main() -> None:
+    """Run the steps that are due."""
+    parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
+    parser.add_argument("--layer", choices=["lambda"], help="also build the layer that `cdk deploy` needs")
+    asked = parser.parse_args()
+    try:
+        check_machine()
+        step("virtual environment", [], make_venv, stamp="venv")
+        step("Python packages", [ROOT / "requirements" / "dev.txt"], install_python, stamp="python")
+        installed = [ROOT / "pyproject.toml", ROOT / "station" / "pyproject.toml"]
+        step("the project itself", installed, install_project, stamp="project")
+        step("CDK and page packages", [ROOT / "package-lock.json"], install_node, stamp="node")
+        page = [*sorted((ROOT / "station" / "web").rglob("*")), ROOT / "package-lock.json"]
+        step("live page", page, build_page, stamp="page")
+        layer = ROOT / "requirements" / "layer.txt"
+        step("Lambda layer, this machine", [layer], lambda: build_layer("local"), stamp="layer-local")
+        if asked.layer:
+            step("Lambda layer, AWS", [layer], lambda: build_layer("lambda"), stamp="layer-lambda")
+    except SetupError as error:
+        sys.exit(f"setup: {error}")
+    except KeyboardInterrupt:
+        sys.exit("\nsetup: stopped; the same command goes on from here")
+
+
+def check_machine() -> None:
+    """Refuse a machine on which a later step would fail for a reason that is hard to see there."""
+    if sys.version_info < OLDEST:
+        wanted = ".".join(map(str, OLDEST))
+        raise SetupError(
+            f"Python {sys.version.split()[0]} is too old, {wanted} is the oldest that will do: "
+            "install a newer one and run `make setup PYTHON=python3.12`"
+        )
+    for module in ("venv", "ensurepip"):
+        if importlib.util.find_spec(module) is None:
+            raise SetupError(
+                f"this Python has no {module} module: install it (Debian: `apt install python3-venv`)"
+            )
+    if not (ROOT / ".venv").exists() and shutil.disk_usage(ROOT).free < LEAST_FREE_BYTES:
+        raise SetupError(f"less than {LEAST_FREE_BYTES // 1024**3} GB free in {ROOT}: free some")
+
+
+def step(title: str, inputs: Iterable[Path], action: Callable[[], None], *, stamp: str) -> None:
+    """Run ``action`` unless it succeeded before with the same inputs."""
+    mark = BUILD / "setup" / stamp
+    key = hashlib.sha256(f"{BASE_PYTHON} {sys.version}".encode())
+    for path in inputs:
+        if path.is_file():
+            key.update(str(path).encode() + path.read_bytes())
+    if mark.exists() and mark.read_text() == key.hexdigest() and PYTHON.exists():
+        return
+    mark.parent.mkdir(parents=True, exist_ok=True)
+    print(f"setup: {title} ...", end="", flush=True)  # noqa: T201 a command prints
+    began = time.monotonic()
+    action()
+    mark.write_text(key.hexdigest())
+    now = time.monotonic()
+    print(f" {now - began:.0f} s ({now - STARTED:.0f} s so far)", flush=True)  # noqa: T201
+
+
+def make_venv() -> None:
+    """Make .venv anew, with this Python."""
+    shutil.rmtree(BUILD / "setup", ignore_errors=True)
+    (BUILD / "setup").mkdir(parents=True)
+    run([BASE_PYTHON, "-m", "venv", "--clear", VENV])
+
+
+def install_python() -> None:
+    """Install exactly what is locked; every file is checked against its hash."""
+    pip("install", *LOCKED, "-r", "requirements/dev.txt")
+
+
+def install_project() -> None:
+    """Put iort-agent and iort into .venv/bin, reading the checkout itself."""
+    pip("install", "--no-deps", "--no-build-isolation", "--editable", ".", "--editable", "station")
+
+
+def install_node() -> None:
+    """Install exactly what package-lock.json locks, with the npm that came from PyPI."""
+    run([VENV / "bin" / "npm", "ci", "--no-progress"])
+
+
+def build_page() -> None:
+    """Bundle the live page into build/web."""
+    run([VENV / "bin" / "npm", "run", "build"])
+
+
+def build_layer(target: str) -> None:
+    """Build Lambda 1's layer for this machine or for the platform that AWS runs it on."""
+    folder = BUILD / "layer" / target
+    shutil.rmtree(folder, ignore_errors=True)
+    platform: list[str] = []
+    if target == "lambda":
+        platform = [part for name in LAMBDA_PLATFORMS for part in ("--platform", name)]
+        platform += ["--python-version", LAMBDA_PYTHON]
+    pip(
+        "install", *LOCKED, "--no-compile", *platform,
+        "--target", str(folder / "python"), "-r", "requirements/layer.txt",
+    )  # fmt: skip
+
+
+def pip(*arguments: str) -> None:
+    """Run .venv's pip."""
+    run([PYTHON, "-m", "pip", "--disable-pip-version-check", "--quiet", *arguments])
+
+
+def run(command: Sequence[str | Path]) -> None:
+    """Run a command; raises `SetupError` with the end of its output if it fails."""
+    log = BUILD / "setup" / "log"
+    log.parent.mkdir(parents=True, exist_ok=True)
+    # The venv's own node and npm come before any that the machine may have.
+    path = f"{VENV / 'bin'}{os.pathsep}{os.environ.get('PATH', os.defpath)}"
+    with log.open("wb") as output:
+        done = subprocess.run(  # noqa: S603 the commands are the ones above
+            list(map(str, command)),
+            cwd=ROOT,
+            env={**os.environ, "PATH": path, **CACHES},
+            stdin=subprocess.DEVNULL,
+            stdout=output,
+            stderr=subprocess.STDOUT,
+            check=False,
+        )
+    if done.returncode:
+        tail = "\n".join(log.read_text(errors="replace").splitlines()[-15:])
+        shown = " ".join(map(str, command))
+        raise SetupError(f"`{shown}` failed:\n{tail}\nIs the package registry reachable? Log: {log}")
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,212 @@
+"""Who may connect, and how a robot gets its certificate: thing type, thing group, IoT policies and
+the provisioning template."""
+
+from __future__ import annotations
+
+import json
+from typing import Any
+
+from aws_cdk import Stack
+from aws_cdk import aws_iam as iam
+from aws_cdk import aws_iot as iot
+from constructs import Construct
+
+from contract import (
+    BROKER,
+    CMD,
+    FLEET,
+    LIVE,
+    PING,
+    PONG,
+    RECORD,
+    SHADOW,
+    claim_name,
+    fleet_name,
+    rule_name,
+)
+
+# A robot's name is its thing name and its client id; the certificate is attached to the thing.
+_ME = "${iot:Connection.Thing.ThingName}"
+
+
+class Fleet(Stack):
+    """What every robot is registered with. One policy serves all: its variables bind each
+    certificate to the topics of the thing that it is attached to.
+
+    ``hook`` is the ARN of a function that decides whether a claim may have the name it asks for;
+    without one, only the serial number keeps a second robot from a name that is taken.
+    """
+
+    def __init__(
+        self,
+        scope: Construct,
+        construct_id: str,
+        *,
+        namespace: str,
+        hook: str | None = None,
+        **kwargs: Any,
+    ) -> None:
+        super().__init__(scope, construct_id, **kwargs)
+        name = fleet_name(namespace)
+        robot_type = iot.CfnThingType(
+            self,
+            "RobotType",
+            thing_type_name=name,
+            thing_type_properties=iot.CfnThingType.ThingTypePropertiesProperty(
+                thing_type_description="A robot that runs the iort agent",
+                searchable_attributes=["vehicle"],
+            ),
+        )
+        robots = iot.CfnThingGroup(self, "Robots", thing_group_name=name)
+        policy = iot.CfnPolicy(
+            self, "RobotPolicy", policy_name=name, policy_document=robot_policy(self, namespace=namespace)
+        )
+        iot.CfnPolicy(
+            self,
+            "ClaimPolicy",
+            policy_name=claim_name(namespace),
+            policy_document=claim_policy(self, namespace=namespace),
+        )
+        role = self._provisioning_role(name)
+        template = iot.CfnProvisioningTemplate(
+            self,
+            "Provisioning",
+            template_name=name,
+            description="Registers a robot that made its own key",
+            enabled=True,
+            provisioning_role_arn=role.role_arn,
+            pre_provisioning_hook=None
+            if hook is None
+            else iot.CfnProvisioningTemplate.ProvisioningHookProperty(
+                payload_version="2020-04-01", target_arn=hook
+            ),
+            template_body=json.dumps(provisioning_template(namespace)),
+        )
+        # RegisterThing names them, and the role's policy must be there before the role is tried.
+        for needed in (robot_type, robots, policy, role):
+            template.node.add_dependency(needed)
+
+    def _provisioning_role(self, name: str) -> iam.Role:
+        """What AWS IoT does in the template's name: this fleet's things, and certificates."""
+        principal = iam.ServicePrincipal(
+            "iot.amazonaws.com", conditions={"StringEquals": {"aws:SourceAccount": self.account}}
+        )
+        role = iam.Role(self, "ProvisioningRole", assumed_by=principal)
+
+        def allow(actions: list[str], *resources: tuple[str, str]) -> None:
+            arns = [self.format_arn(service="iot", resource=r, resource_name=n) for r, n in resources]
+            role.add_to_policy(
+                iam.PolicyStatement(actions=[f"iot:{action}" for action in actions], resources=arns or ["*"])
+            )
+
+        group, kind = ("thinggroup", name), ("thingtype", name)
+        allow(
+            ["CreateThing", "DescribeThing", "ListThingGroupsForThing", "ListThingPrincipals"],
+            ("thing", "*"),
+            kind,
+        )
+        allow(["DescribeThingType"], kind)
+        allow(["DescribeThingGroup"], group)
+        allow(["AddThingToThingGroup"], ("thing", "*"), group)
+        allow(["AttachPolicy", "DescribeCertificate", "UpdateCertificate"], ("cert", "*"))
+        allow(["AttachThingPrincipal"], ("thing", "*"), ("cert", "*"))
+        allow(["GetPolicy"], ("policy", name))
+        # These know no resources.
+        allow(["ListAttachedPolicies", "ListPrincipalThings", "RegisterThing"])
+        return role
+
+
+def provisioning_template(namespace: str) -> dict[str, Any]:
+    """The template's body. A thing that exists keeps its attributes, and one with another serial
+    number is refused: two robots do not share a name."""
+    name = fleet_name(namespace)
+    return {
+        "Parameters": {"Robot": {"Type": "String"}, "Serial": {"Type": "String"}},
+        "Resources": {
+            "certificate": {
+                "Type": "AWS::IoT::Certificate",
+                "Properties": {"CertificateId": {"Ref": "AWS::IoT::Certificate::Id"}, "Status": "Active"},
+            },
+            "policy": {"Type": "AWS::IoT::Policy", "Properties": {"PolicyName": name}},
+            "thing": {
+                "Type": "AWS::IoT::Thing",
+                "Properties": {
+                    "ThingName": {"Ref": "Robot"},
+                    "ThingTypeName": name,
+                    "ThingGroups": [name],
+                    "AttributePayload": {"vehicle": "vesc", "serial": {"Ref": "Serial"}},
+                },
+                "OverrideSettings": {
+                    "AttributePayload": "FAIL",
+                    "ThingTypeName": "FAIL",
+                    "ThingGroups": "DO_NOTHING",
+                },
+            },
+        },
+    }
+
+
+def claim_policy(stack: Stack, *, namespace: str) -> dict[str, Any]:
+    """The IoT policy document of a lasting claim: provisioning with this fleet's template, no more."""
+
+    def arns(kind: str, *names: str) -> list[str]:
+        return [stack.format_arn(service="iot", resource=kind, resource_name=name) for name in names]
+
+    asked = (
+        "$aws/certificates/create-from-csr/json",
+        f"$aws/provisioning-templates/{fleet_name(namespace)}/provision/json",
+    )
+    answered = [f"{topic}/{answer}" for topic in asked for answer in ("accepted", "rejected")]
+    client = f"{claim_name(namespace)}-*"
+    return {
+        "Version": "2012-10-17",
+        "Statement": [
+            {"Effect": "Allow", "Action": "iot:Connect", "Resource": arns("client", client)},
+            {"Effect": "Allow", "Action": "iot:Publish", "Resource": arns("topic", *asked)},
+            {"Effect": "Allow", "Action": "iot:Subscribe", "Resource": arns("topicfilter", *answered)},
+            {"Effect": "Allow", "Action": "iot:Receive", "Resource": arns("topic", *answered)},
+        ],
+    }
+
+
+def robot_policy(stack: Stack, *, namespace: str) -> dict[str, Any]:
+    """The IoT policy document of a robot: its own topics and shadow, and other robots' words to the fleet.
+
+    AWS allows 2048 characters; with the longest namespace and region this is some 30 below.
+    """
+
+    def arns(kind: str, *names: str) -> list[str]:
+        return [stack.format_arn(service="iot", resource=kind, resource_name=name) for name in names]
+
+    mine = f"{namespace}/{_ME}"
+    shadow = f"$aws/things/{_ME}/shadow/name/{SHADOW}"
+    publish = (
+        # Basic Ingest: the rule is named in the topic, and no other rule may be.
+        f"$aws/rules/{rule_name('record', namespace)}/{RECORD}/{mine}/*",
+        f"{LIVE}/{mine}/*",
+        f"{FLEET}/{mine}/*",
+        f"{PING}/{mine}/*",
+        f"{shadow}/*",
+    )
+    listen = (
+        f"{CMD}/{mine}/*",
+        f"{PONG}/{mine}/*",
+        f"{PING}/{mine}/{BROKER}",
+        f"{FLEET}/{namespace}/*",
+        f"{shadow}/*",
+    )
+    attached = {"Bool": {"iot:Connection.Thing.IsAttached": ["true"]}}
+    return {
+        "Version": "2012-10-17",
+        "Statement": [
+            {
+                "Effect": "Allow",
+                "Action": "iot:Connect",
+                "Resource": arns("client", _ME),
+                "Condition": attached,
+            },
+            {"Effect": "Allow", "Action": "iot:Publish", "Resource": arns("topic", *publish)},
+            {"Effect": "Allow", "Action": "iot:Subscribe", "Resource": arns("topicfilter", *listen)},
+            {"Effect": "Allow", "Action": "iot:Receive", "Resource": arns("topic", *listen)},
+        ],
+    }

@@ -1,0 +1,117 @@
+"""What comes in: the topic rules, each with a role of its own and a queue for what fails."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from aws_cdk import CfnOutput, Duration, Stack
+from aws_cdk import aws_iam as iam
+from aws_cdk import aws_iot as iot
+from aws_cdk import aws_lambda as lambda_
+from aws_cdk import aws_sqs as sqs
+from constructs import Construct
+
+from contract import PONG, RULE, pong_template, rule_name, rule_sql
+from stacks.processing import Processing
+from stacks.settings import Settings
+from stacks.storage import Storage
+
+Action = iot.CfnTopicRule.ActionProperty
+
+
+class Ingest(Stack):
+    """The rules record, live, pong and echo. What an action cannot take goes to ``rejected``, with
+    the message's own bytes (base64OriginalPayload) and the reason."""
+
+    def __init__(
+        self,
+        scope: Construct,
+        construct_id: str,
+        *,
+        settings: Settings,
+        storage: Storage,
+        processing: Processing,
+        **kwargs: Any,
+    ) -> None:
+        super().__init__(scope, construct_id, **kwargs)
+        self._settings = settings
+        self.rejected = sqs.Queue(
+            self,
+            "Rejected",
+            encryption=sqs.QueueEncryption.SQS_MANAGED,
+            enforce_ssl=True,
+            retention_period=Duration.days(14),
+        )
+        CfnOutput(self, "RejectedQueue", value=self.rejected.queue_url)
+        self.rules = [
+            self._record(storage),
+            self._lambda_rule("live", processing.live),
+            self._pong(),
+            self._lambda_rule("echo", processing.echo),
+        ]
+
+    def _record(self, storage: Storage) -> iot.CfnTopicRule:
+        role = self._role("record")
+        storage.telemetry.grant(role, "dynamodb:PutItem")
+        put = iot.CfnTopicRule.DynamoDBv2ActionProperty(
+            role_arn=role.role_arn,
+            put_item=iot.CfnTopicRule.PutItemInputProperty(table_name=storage.telemetry.table_name),
+        )
+        return self._rule("record", role, Action(dynamo_d_bv2=put))
+
+    def _pong(self) -> iot.CfnTopicRule:
+        role = self._role("pong")
+        topic = f"{PONG}/{self._settings.namespace}/*/{RULE}"
+        role.add_to_policy(
+            iam.PolicyStatement(
+                actions=["iot:Publish"],
+                resources=[self.format_arn(service="iot", resource="topic", resource_name=topic)],
+            )
+        )
+        republish = iot.CfnTopicRule.RepublishActionProperty(
+            role_arn=role.role_arn, topic=pong_template(self._settings.namespace), qos=0
+        )
+        return self._rule("pong", role, Action(republish=republish))
+
+    def _lambda_rule(self, name: str, function: lambda_.Function) -> iot.CfnTopicRule:
+        action = Action(lambda_=iot.CfnTopicRule.LambdaActionProperty(function_arn=function.function_arn))
+        rule = self._rule(name, self._role(name), action)
+        # On this stack, not on the function, which would make the two stacks depend on each other.
+        lambda_.CfnPermission(
+            self,
+            f"{name.capitalize()}Permission",
+            action="lambda:InvokeFunction",
+            function_name=function.function_arn,
+            principal="iot.amazonaws.com",
+            source_account=self.account,
+            source_arn=rule.attr_arn,
+        )
+        return rule
+
+    def _role(self, name: str) -> iam.Role:
+        principal = iam.ServicePrincipal(
+            "iot.amazonaws.com", conditions={"StringEquals": {"aws:SourceAccount": self.account}}
+        )
+        role = iam.Role(self, f"{name.capitalize()}Role", assumed_by=principal)
+        self.rejected.grant(role, "sqs:SendMessage")
+        return role
+
+    def _rule(self, name: str, role: iam.Role, action: iot.CfnTopicRule.ActionProperty) -> iot.CfnTopicRule:
+        retention_s = self._settings.retention_days * 86_400
+        rejected = iot.CfnTopicRule.SqsActionProperty(
+            queue_url=self.rejected.queue_url, role_arn=role.role_arn, use_base64=False
+        )
+        rule = iot.CfnTopicRule(
+            self,
+            name.capitalize(),
+            rule_name=rule_name(name, self._settings.namespace),
+            topic_rule_payload=iot.CfnTopicRule.TopicRulePayloadProperty(
+                sql=rule_sql(name, self._settings.namespace, retention_s),
+                aws_iot_sql_version="2016-03-23",
+                actions=[action],
+                error_action=Action(sqs=rejected),
+            ),
+        )
+        # IoT Core tries the role when the rule is made, so its policy must be there before.
+        rule.node.add_dependency(role)
+        return rule

@@ -1,0 +1,158 @@
+"""What is computed: Lambda 1 live, Lambda 2 summarize and echo, each with a role and a log of its own."""
+
+from __future__ import annotations
+
+import json
+from typing import Any
+
+from aws_cdk import CfnOutput, Duration, IgnoreMode, RemovalPolicy, Stack
+from aws_cdk import aws_iam as iam
+from aws_cdk import aws_lambda as lambda_
+from aws_cdk import aws_lambda_event_sources as sources
+from aws_cdk import aws_logs as logs
+from aws_cdk import aws_sqs as sqs
+from constructs import Construct
+
+from contract import LAMBDA, PONG, pubnub_parameter
+from stacks.settings import ROOT, Settings
+from stacks.storage import Storage
+
+RUNTIME = lambda_.Runtime.PYTHON_3_13
+# The emulator runs the functions on the machine it stands on, so the architecture means nothing there.
+ARCHITECTURE = lambda_.Architecture.ARM_64
+# Exactly what a function imports; see the wiring tests.
+CODE_EXCLUDES = ["/*", "!/contract.py", "!/functions", "__pycache__", ".mypy_cache", ".ruff_cache"]
+
+
+class Processing(Stack):
+    """The functions, and the grants that each of them needs and no more."""
+
+    def __init__(
+        self, scope: Construct, construct_id: str, *, settings: Settings, storage: Storage, **kwargs: Any
+    ) -> None:
+        super().__init__(scope, construct_id, **kwargs)
+        self._code = lambda_.Code.from_asset(str(ROOT), exclude=CODE_EXCLUDES, ignore_mode=IgnoreMode.GIT)
+        self.undecodable = sqs.Queue(
+            self,
+            "Undecodable",
+            encryption=sqs.QueueEncryption.SQS_MANAGED,
+            enforce_ssl=True,
+            retention_period=Duration.days(14),
+        )
+        self.live = self._live(settings)
+        self.summarize = self._summarize(storage)
+        self.echo = self._echo(settings)
+        self.functions = (self.live, self.summarize, self.echo)
+
+    def _live(self, settings: Settings) -> lambda_.Function:
+        name = pubnub_parameter(settings.namespace)
+        live = self._function(
+            "Live",
+            module="live",
+            memory_mb=256,
+            environment={"PUBNUB_PARAMETER": name, "LIVE_FIELDS": json.dumps(settings.live_fields)},
+            layers=[
+                lambda_.LayerVersion(
+                    self,
+                    "PubNub",
+                    code=lambda_.Code.from_asset(str(settings.layer), exclude=["**/__pycache__"]),
+                    compatible_runtimes=[RUNTIME],
+                )
+            ],
+            reserved_concurrency=settings.live_concurrency,
+        )
+        # A live message is late after 2 s; the shortest age that Lambda allows is a minute.
+        live.configure_async_invoke(max_event_age=Duration.minutes(1), retry_attempts=0)
+        live.add_to_role_policy(
+            iam.PolicyStatement(
+                actions=["ssm:GetParameter"],
+                resources=[
+                    self.format_arn(service="ssm", resource="parameter", resource_name=name.lstrip("/"))
+                ],
+            )
+        )
+        return live
+
+    def _summarize(self, storage: Storage) -> lambda_.Function:
+        summarize = self._function(
+            "Summarize",
+            module="summarize",
+            memory_mb=512,
+            timeout_s=60,
+            environment={
+                "TELEMETRY_TABLE": storage.telemetry.table_name,
+                "SUMMARY_TABLE": storage.summary.table_name,
+                "ROBOTS_TABLE": storage.robots.table_name,
+            },
+        )
+        storage.telemetry.grant(summarize, "dynamodb:Query")
+        storage.summary.grant(summarize, "dynamodb:BatchWriteItem")
+        storage.robots.grant(summarize, "dynamodb:GetItem")
+        summarize.add_event_source(
+            sources.DynamoEventSource(
+                storage.telemetry,
+                starting_position=lambda_.StartingPosition.TRIM_HORIZON,
+                batch_size=100,
+                bisect_batch_on_error=True,
+                report_batch_item_failures=True,
+                retry_attempts=5,
+                max_record_age=Duration.hours(6),
+                on_failure=sources.SqsDlq(self.undecodable),
+                # What expires leaves the stream too, and is nothing to summarise.
+                filters=[
+                    lambda_.FilterCriteria.filter({"eventName": lambda_.FilterRule.is_equal("INSERT")}),
+                    lambda_.FilterCriteria.filter({"eventName": lambda_.FilterRule.is_equal("MODIFY")}),
+                ],
+            )
+        )
+        return summarize
+
+    def _echo(self, settings: Settings) -> lambda_.Function:
+        echo = self._function("Echo", module="echo", memory_mb=256)
+        echo.configure_async_invoke(max_event_age=Duration.minutes(1), retry_attempts=0)
+        topic = f"{PONG}/{settings.namespace}/*/{LAMBDA}"
+        echo.add_to_role_policy(
+            iam.PolicyStatement(
+                actions=["iot:Publish"],
+                resources=[self.format_arn(service="iot", resource="topic", resource_name=topic)],
+            )
+        )
+        return echo
+
+    def _function(
+        self,
+        name: str,
+        *,
+        module: str,
+        memory_mb: int,
+        timeout_s: int = 10,
+        environment: dict[str, str] | None = None,
+        layers: list[lambda_.ILayerVersion] | None = None,
+        reserved_concurrency: int = 0,
+    ) -> lambda_.Function:
+        log = logs.LogGroup(
+            self,
+            f"{name}Log",
+            retention=logs.RetentionDays.ONE_MONTH,
+            removal_policy=RemovalPolicy.DESTROY,
+        )
+        # A role of its own instead of AWSLambdaBasicExecutionRole, which may write to every log.
+        role = iam.Role(self, f"{name}Role", assumed_by=iam.ServicePrincipal("lambda.amazonaws.com"))
+        log.grant_write(role)
+        function = lambda_.Function(
+            self,
+            name,
+            runtime=RUNTIME,
+            architecture=ARCHITECTURE,
+            code=self._code,
+            handler=f"functions.{module}.handler",
+            role=role,
+            log_group=log,
+            memory_size=memory_mb,
+            timeout=Duration.seconds(timeout_s),
+            environment=environment,
+            layers=layers,
+            reserved_concurrent_executions=reserved_concurrency or None,
+        )
+        CfnOutput(self, f"{name}Function", value=function.function_name)
+        return function

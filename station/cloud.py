@@ -1,0 +1,107 @@
+"""Where the operator's cloud is: an AWS account, or the embedded cloud of this checkout.
+
+Both are the same to the rest of the station: clients of AWS' services, the names that the stacks
+put out, and the address where robots connect.
+"""
+
+from __future__ import annotations
+
+import json
+from dataclasses import asdict, dataclass, field
+from functools import cache, cached_property
+from pathlib import Path
+from typing import Any
+
+import boto3
+from botocore.config import Config
+from botocore.exceptions import BotoCoreError, ClientError
+
+from contract import DEFAULT_NAMESPACE
+from station.errors import StationError
+
+# Where an embedded cloud that runs in this checkout says how to reach it.
+EMBEDDED = Path(__file__).resolve().parent.parent / "build" / "local" / "cloud.json"
+
+_CONFIG = Config(retries={"mode": "standard", "max_attempts": 5}, connect_timeout=5, read_timeout=20)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Cloud:
+    """A deployment of the stacks. The fields that are empty follow AWS' usual chain."""
+
+    namespace: str = DEFAULT_NAMESPACE
+    region: str | None = None
+    profile: str | None = None
+    endpoint_url: str | None = None
+    ca_bundle: str | None = None
+    access_key_id: str | None = None
+    secret_access_key: str | None = field(default=None, repr=False)
+    mqtt_host: str | None = None
+    mqtt_port: int = 8883
+    root_ca_pem: str | None = None
+
+    @classmethod
+    def load(cls, path: Path) -> Cloud:
+        """The embedded cloud that wrote ``path``; raises `StationError` where none is running."""
+        try:
+            return cls(**json.loads(path.read_text()))
+        except FileNotFoundError as error:
+            raise StationError(f"no embedded cloud is running: {path} is not there") from error
+        except (OSError, TypeError, ValueError) as error:
+            raise StationError(f"{path} does not describe an embedded cloud: {error}") from error
+
+    def save(self, path: Path) -> None:
+        """Write what `load` reads."""
+        path.write_text(json.dumps(asdict(self)))
+
+    @cached_property
+    def _session(self) -> boto3.Session:
+        return boto3.Session(
+            profile_name=self.profile,
+            region_name=self.region,
+            aws_access_key_id=self.access_key_id,
+            aws_secret_access_key=self.secret_access_key,
+        )
+
+    @cached_property
+    def _clients(self) -> dict[str, Any]:
+        return {}
+
+    def client(self, service: str) -> Any:
+        """A boto3 client, made once; raises `StationError` where region or credentials are missing."""
+        if service not in self._clients:
+            try:
+                self._clients[service] = self._session.client(
+                    service, endpoint_url=self.endpoint_url, verify=self.ca_bundle, config=_CONFIG
+                )
+            except BotoCoreError as error:
+                raise StationError(f"no AWS client for {service}: {error}") from error
+        return self._clients[service]
+
+    @cached_property
+    def mqtt_endpoint(self) -> str:
+        """The host that robots connect to."""
+        if self.mqtt_host:
+            return self.mqtt_host
+        answer = self.client("iot").describe_endpoint(endpointType="iot:Data-ATS")
+        return str(answer["endpointAddress"])
+
+    def output(self, noun: str, name: str) -> str:
+        """An output of a stack, such as ``("storage", "TelemetryTable")``.
+
+        Raises `StationError` where the stack is not deployed or has no such output.
+        """
+        stack = f"{self.namespace}-{noun}"
+        try:
+            outputs = _outputs(self.client("cloudformation"), stack)
+        except (BotoCoreError, ClientError) as error:
+            raise StationError(f"stack {stack} cannot be read; is it deployed? {error}") from error
+        if name not in outputs:
+            raise StationError(f"stack {stack} has no output {name}; deploy the current stacks")
+        return outputs[name]
+
+
+@cache
+def _outputs(cloudformation: Any, stack: str) -> dict[str, str]:
+    described = cloudformation.describe_stacks(StackName=stack)["Stacks"][0]
+    return {output["OutputKey"]: output["OutputValue"] for output in described.get("Outputs", [])}

@@ -1,0 +1,74 @@
+"""What arrived: samples counted in the tables, never taken from the sender's word."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from typing import Any
+
+from boto3.dynamodb.types import TypeDeserializer
+
+from contract import RECORD, SAMPLES, TOPIC, Batch, build_topic, decode
+from station.cloud import Cloud
+
+_deserialize = TypeDeserializer().deserialize
+
+
+@dataclass(frozen=True)
+class Delivery:
+    """Of one stream: samples and batches stored, batches missing between those, samples summarised."""
+
+    samples_stored: int
+    batches_stored: int
+    batches_missing: int
+    samples_summarized: int
+
+
+def batches(cloud: Cloud, robot: str, stream: str) -> Iterator[Batch]:
+    """Every stored batch of a stream, in order of time, page by page.
+
+    Raises `contract.ContractError` for an item that is not a batch.
+    """
+    yield from map(decode, items(cloud, robot, stream))
+
+
+def items(cloud: Cloud, robot: str, stream: str) -> Iterator[dict[str, Any]]:
+    """Every stored item of a stream as it is, in order of time."""
+    return _query(cloud, "TelemetryTable", robot, stream)
+
+
+def delivery(cloud: Cloud, robot: str, stream: str) -> Delivery:
+    """Count what the tables hold of a stream."""
+    stored = list(batches(cloud, robot, stream))
+    numbers: dict[str, set[int]] = {}
+    for batch in stored:
+        numbers.setdefault(batch.boot, set()).add(batch.seq)
+    missing = sum(max(seqs) - min(seqs) + 1 - len(seqs) for seqs in numbers.values())
+    return Delivery(
+        samples_stored=sum(len(batch.times_us) for batch in stored),
+        batches_stored=len(stored),
+        batches_missing=missing,
+        samples_summarized=samples_summarized(cloud, robot, stream),
+    )
+
+
+def samples_summarized(cloud: Cloud, robot: str, stream: str) -> int:
+    """The samples that the summary's seconds account for."""
+    return sum(int(item[SAMPLES]) for item in _query(cloud, "SummaryTable", robot, stream, SAMPLES))
+
+
+def _query(
+    cloud: Cloud, table: str, robot: str, stream: str, only: str | None = None
+) -> Iterator[dict[str, Any]]:
+    names = {"#topic": TOPIC} | ({"#only": only} if only else {})
+    pages = cloud.client("dynamodb").get_paginator("query")
+    for page in pages.paginate(
+        TableName=cloud.output("storage", table),
+        KeyConditionExpression="#topic = :topic",
+        ExpressionAttributeNames=names,
+        ExpressionAttributeValues={":topic": {"S": build_topic(RECORD, robot, stream, cloud.namespace)}},
+        ConsistentRead=True,
+        **({"ProjectionExpression": "#only"} if only else {}),
+    ):
+        for item in page["Items"]:
+            yield {name: _deserialize(value) for name, value in item.items()}

@@ -1,0 +1,46 @@
+"""PubNub's keys, kept encrypted in Parameter Store; only Lambda 1 and the operator read them."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import dataclass, field
+from typing import Any
+
+from contract import pubnub_parameter
+from station.cloud import Cloud
+from station.errors import StationError
+
+
+@dataclass(frozen=True, kw_only=True)
+class PubNubKeys:
+    """A key set; ``origin`` and ``tls`` name a server other than PubNub's own."""
+
+    publish_key: str = field(repr=False)
+    subscribe_key: str = field(repr=False)
+    origin: str = ""
+    tls: bool = True
+
+    def server(self) -> dict[str, Any]:
+        """The server as keyword arguments; none for PubNub's own."""
+        return {"origin": self.origin, "tls": self.tls} if self.origin else {}
+
+
+def store(cloud: Cloud, keys: PubNubKeys) -> None:
+    """Write the keys, replacing those that are there."""
+    value = {"publish_key": keys.publish_key, "subscribe_key": keys.subscribe_key, **keys.server()}
+    cloud.client("ssm").put_parameter(
+        Name=pubnub_parameter(cloud.namespace), Value=json.dumps(value), Type="SecureString", Overwrite=True
+    )
+
+
+def load(cloud: Cloud) -> PubNubKeys:
+    """Read the keys; raises `StationError` where none are stored."""
+    ssm, name = cloud.client("ssm"), pubnub_parameter(cloud.namespace)
+    try:
+        answer = ssm.get_parameter(Name=name, WithDecryption=True)
+    except ssm.exceptions.ParameterNotFound as error:
+        raise StationError("PubNub's keys are not stored yet: run `iort pubnub`") from error
+    try:
+        return PubNubKeys(**json.loads(answer["Parameter"]["Value"]))
+    except (TypeError, ValueError) as error:
+        raise StationError(f"parameter {name} does not hold PubNub's keys") from error

@@ -1,0 +1,96 @@
+"""Listens to the fleet's PubNub channels, as the dashboard does, and keeps what it needs of each update."""
+
+from __future__ import annotations
+
+import threading
+import time
+from types import TracebackType
+from typing import Any, NamedTuple
+
+from pubnub.callbacks import SubscribeCallback
+from pubnub.enums import PNReconnectionPolicy, PNStatusCategory
+from pubnub.pnconfiguration import PNConfiguration
+from pubnub.pubnub import PubNub
+from typing_extensions import Self
+
+from contract import DEFAULT_NAMESPACE, ROBOT, channel
+from station.errors import StationError
+
+_CONNECT_S = 15.0
+
+
+class Heard(NamedTuple):
+    """One update: whose, which, and how long it took from leaving the car to being here."""
+
+    robot: str
+    stream: str
+    boot: str
+    seq: int
+    delay_ms: float
+
+
+class Listener:
+    """Subscribed from `__enter__` to `__exit__`; `heard` grows meanwhile.
+
+    The delay compares the car's clock with this machine's, so it is only as good as the two agree.
+    Raises `StationError` where PubNub does not answer.
+    """
+
+    def __init__(
+        self,
+        *,
+        subscribe_key: str,
+        robot: str,
+        namespace: str = DEFAULT_NAMESPACE,
+        origin: str = "",
+        tls: bool = True,
+    ) -> None:
+        config = PNConfiguration()
+        config.subscribe_key, config.user_id = subscribe_key, "iort-station"
+        if origin:
+            config.origin = origin
+        config.ssl, config.daemon = tls, True
+        config.disable_config_locking = False
+        config.reconnect_policy = PNReconnectionPolicy.EXPONENTIAL
+        self._channel = channel(robot, namespace)
+        self._callback = _Callback()
+        self._client = PubNub(config)
+        self._client.add_listener(self._callback)
+
+    @property
+    def heard(self) -> list[Heard]:
+        """What came so far, in order of arrival."""
+        return self._callback.heard
+
+    def __enter__(self) -> Self:
+        self._client.subscribe().channels(self._channel).execute()
+        if not self._callback.connected.wait(_CONNECT_S):
+            self._client.stop()
+            raise StationError(f"PubNub did not accept the subscription within {_CONNECT_S:.0f} s")
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self._client.stop()
+
+
+class _Callback(SubscribeCallback):  # type: ignore[misc]  # the SDK's base class has no types
+    def __init__(self) -> None:
+        self.connected = threading.Event()
+        self.heard: list[Heard] = []
+
+    def status(self, _pubnub: Any, status: Any) -> None:
+        if status.category == PNStatusCategory.PNConnectedCategory:
+            self.connected.set()
+
+    def presence(self, _pubnub: Any, _presence: Any) -> None:
+        pass
+
+    def message(self, _pubnub: Any, message: Any) -> None:
+        now_us = time.time_ns() // 1000
+        update = message.message
+        sent_us = update["hops"]["sent_us"]
+        self.heard.append(
+            Heard(update[ROBOT], update["stream"], update["boot"], update["seq"], (now_us - sent_us) / 1000)
+        )

@@ -1,0 +1,29 @@
+// What the page is told by the server that serves it: where to listen, and what the fields mean.
+
+export interface Config {
+  readonly namespace: string;
+  readonly subscribe_key: string;
+  readonly origin: string;
+  readonly tls: boolean;
+  readonly vehicles: Readonly<Record<string, { readonly speed_to_erpm_gain?: number }>>;
+}
+
+export interface FieldTable {
+  /** The contract's schema version: messages of another are refused. */
+  readonly version: number;
+  /** The stream that carries the VESC's fields. */
+  readonly stream: string;
+  readonly fields: Readonly<Record<string, { readonly unit: string; readonly meaning: string }>>;
+  readonly faults: Readonly<Record<string, string>>;
+}
+
+export async function load(): Promise<{ config: Config; table: FieldTable }> {
+  const [config, table] = await Promise.all([fetchJson<Config>("config.json"), fetchJson<FieldTable>("fields.json")]);
+  return { config, table };
+}
+
+async function fetchJson<T>(name: string): Promise<T> {
+  const answer = await fetch(name, { cache: "no-store" });
+  if (!answer.ok) throw new Error(`${name}: the server answered ${answer.status}`);
+  return (await answer.json()) as T;
+}

@@ -1,0 +1,78 @@
+// How values are written: unit, scale and digits follow from the contract's field table.
+
+import type { FieldTable } from "./config";
+import type { Value } from "./message";
+
+export interface Spec {
+  readonly label: string;
+  readonly meaning: string;
+  readonly unit: string;
+  /** What is shown is the value sent, times this. */
+  readonly scale: number;
+  /** Digits after the point, where fixed. */
+  readonly digits: number | undefined;
+  readonly texts?: Readonly<Record<string, string>>;
+}
+
+export const NOTHING = "–";
+
+const DIGITS: Readonly<Record<string, number>> = {
+  V: 2, A: 2, degC: 1, erpm: 0, deg: 1, counts: 0, Ah: 4, Wh: 3, id: 0, "m/s": 2, W: 1, ms: 0, "%": 1,
+};
+const UNITS: Readonly<Record<string, string>> = { degC: "°C", deg: "°", enum: "", id: "" };
+const CAPITALS = new Set(["pcb", "fet", "ntc", "pid", "id", "iq", "vd", "vq", "imu", "gps", "cpu", "mos1", "mos2", "mos3"]);
+
+export function spec(field: string, table: FieldTable): Spec {
+  const known = Object.hasOwn(table.fields, field) ? table.fields[field] : undefined;
+  const label = humanise(field);
+  if (!known) return { label, meaning: "", unit: "", scale: 1, digits: undefined };
+  const { unit, meaning } = known;
+  if (field === "fault_code") return { label, meaning: "", unit: "", scale: 1, digits: 0, texts: table.faults };
+  // A share is read best in percent, and 1e-4 Ah in Ah.
+  if (unit === "1") return { label, meaning, unit: "%", scale: 100, digits: 1 };
+  const scaled = /^1e(-?\d+) (.+)$/.exec(unit);
+  const plain = scaled ? scaled[2]! : unit;
+  return {
+    label,
+    meaning,
+    unit: UNITS[plain] ?? plain,
+    scale: scaled ? 10 ** Number(scaled[1]) : 1,
+    digits: DIGITS[plain],
+  };
+}
+
+export function write(value: Value | undefined, { scale, digits, texts }: Spec): string {
+  if (value === null || value === undefined) return NOTHING;
+  if (typeof value === "number") return texts?.[String(value)] ?? number(value * scale, digits);
+  return String(value);
+}
+
+/** A number with a real minus sign, and thin spaces between thousands. */
+export function number(value: number, digits?: number): string {
+  if (!Number.isFinite(value)) return NOTHING;
+  const magnitude = Math.abs(value);
+  let text: string;
+  if (digits !== undefined && magnitude < 1e12) text = magnitude.toFixed(digits);
+  else if (magnitude !== 0 && (magnitude >= 1e12 || magnitude < 1e-4)) text = magnitude.toExponential(3);
+  else text = Number.isInteger(magnitude) ? String(magnitude) : magnitude.toPrecision(6).replace(/\.?0+$/, "");
+  const [whole = "", rest] = text.split(".");
+  if (whole.length > 4 && !text.includes("e")) text = whole.replace(/\B(?=(\d{3})+$)/g, "\u202f") + (rest ? `.${rest}` : "");
+  return value < 0 && /[1-9]/.test(text) ? `\u2212${text}` : text;
+}
+
+/** An age or a duration: 0.3 s, 12 s, 3 min, 2 h. */
+export function age(seconds: number): string {
+  if (seconds < 9.95) return `${Math.max(0, seconds).toFixed(1)} s`;
+  if (seconds < 99.5) return `${seconds.toFixed(0)} s`;
+  return seconds < 5940 ? `${(seconds / 60).toFixed(0)} min` : `${(seconds / 3600).toFixed(0)} h`;
+}
+
+export function milliseconds(value: number): string {
+  return number(value, Math.abs(value) < 9.95 ? 1 : 0);
+}
+
+function humanise(field: string): string {
+  const words = field.split(/[_.]/).map((word) => (CAPITALS.has(word) ? word.toUpperCase() : word));
+  const text = words.join(" ");
+  return text.charAt(0).toUpperCase() + text.slice(1);
+}

@@ -1,0 +1,166 @@
+// The connection to PubNub. The SDK gives up after a few failures and, when it comes back, delivers what
+// it missed; a live page must neither give up nor fall behind, so it starts a new subscription each time.
+
+import PubNub from "pubnub";
+import type { Config } from "./config";
+
+export type LinkState =
+  | { readonly kind: "connecting" }
+  | { readonly kind: "paused" }
+  | { readonly kind: "live"; readonly downFor: number | undefined }
+  | { readonly kind: "lost"; readonly since: number; readonly retryAt: number; readonly reason: string };
+
+const FIRST_RETRY_S = 0.5;
+const LAST_RETRY_S = 5;
+const REFUSED_RETRY_S = 30;
+// With nothing heard for this long, a time request tells a quiet fleet from a dead connection.
+const PROBE_S = 8;
+const ANSWER_S = 5;
+// PubNub bills every message to every page, so one that nobody sees stops listening after this long.
+const HIDDEN_S = 60;
+
+const REASONS: Readonly<Record<string, string>> = {
+  PNAccessDeniedCategory: "PubNub refuses the access",
+  PNBadRequestCategory: "PubNub refuses the request: is the subscribe key right?",
+  PNNetworkIssuesCategory: "PubNub cannot be reached",
+  PNTimeoutCategory: "PubNub does not answer",
+  PNMalformedResponseCategory: "an answer that is not PubNub's",
+};
+
+export class Link {
+  state: LinkState = { kind: "connecting" };
+  private readonly pubnub: PubNub;
+  private readonly channel: string;
+  private attempt = 0;
+  private retry: number | undefined;
+  private pause: number | undefined;
+  private heardAt = 0;
+  private probing = false;
+  /** Statuses of a subscription that was given up may still arrive. */
+  private subscribed = false;
+
+  constructor(
+    config: Config,
+    private readonly now: () => number,
+    onMessage: (channel: string, message: unknown) => void,
+    private readonly onState: (state: LinkState) => void,
+  ) {
+    this.channel = `${config.namespace}.*`;
+    this.pubnub = new PubNub({
+      subscribeKey: config.subscribe_key,
+      userId: userId(),
+      origin: config.origin,
+      ssl: config.tls,
+      restore: false,
+      suppressLeaveEvents: true,
+      listenToBrowserNetworkEvents: false,
+      transactionalRequestTimeout: ANSWER_S,
+      subscribeRequestTimeout: 310,
+      retryConfiguration: PubNub.NoneRetryPolicy(),
+    });
+    this.pubnub.addListener({
+      message: (event) => {
+        this.heardAt = this.now();
+        onMessage(event.channel, event.message);
+      },
+      status: (event) => this.take(event.category, "error" in event ? event.error : undefined),
+    });
+    window.addEventListener("online", () => this.state.kind === "lost" && this.connect());
+    window.addEventListener("offline", () => this.lose("this device is offline", LAST_RETRY_S));
+    document.addEventListener("visibilitychange", () => this.seen(!document.hidden));
+    window.setInterval(() => this.probe(), 1000);
+  }
+
+  connect(): void {
+    window.clearTimeout(this.retry);
+    this.subscribed = false;
+    this.pubnub.unsubscribeAll();
+    this.subscribed = true;
+    this.heardAt = this.now();
+    this.pubnub.subscribe({ channels: [this.channel] });
+    this.retry = window.setTimeout(() => this.lose("PubNub does not answer", FIRST_RETRY_S), ANSWER_S * 1000);
+  }
+
+  private seen(visible: boolean): void {
+    window.clearTimeout(this.pause);
+    if (!visible) this.pause = window.setTimeout(() => this.stop(), HIDDEN_S * 1000);
+    else if (this.state.kind === "paused") {
+      this.change({ kind: "connecting" });
+      this.connect();
+    }
+  }
+
+  private stop(): void {
+    window.clearTimeout(this.retry);
+    this.subscribed = false;
+    this.pubnub.unsubscribeAll();
+    this.change({ kind: "paused" });
+  }
+
+  private take(category: string | undefined, error: unknown): void {
+    if (!this.subscribed) return;
+    switch (category) {
+      case PubNub.CATEGORIES.PNConnectedCategory:
+        window.clearTimeout(this.retry);
+        this.attempt = 0;
+        this.heardAt = this.now();
+        this.change({ kind: "live", downFor: this.state.kind === "lost" ? this.now() - this.state.since : undefined });
+        break;
+      case PubNub.CATEGORIES.PNConnectionErrorCategory:
+      case PubNub.CATEGORIES.PNDisconnectedUnexpectedlyCategory:
+      case PubNub.CATEGORIES.PNNetworkIssuesCategory:
+      case PubNub.CATEGORIES.PNTimeoutCategory:
+      case PubNub.CATEGORIES.PNAccessDeniedCategory:
+      case PubNub.CATEGORIES.PNBadRequestCategory:
+      case PubNub.CATEGORIES.PNMalformedResponseCategory: {
+        const cause = typeof error === "string" ? error : category;
+        const refused = cause === "PNAccessDeniedCategory" || cause === "PNBadRequestCategory";
+        const backoff = Math.min(LAST_RETRY_S, FIRST_RETRY_S * 2 ** this.attempt) * (0.75 + Math.random() / 2);
+        this.lose(REASONS[cause] ?? "the connection ended", refused ? REFUSED_RETRY_S : backoff);
+        break;
+      }
+    }
+  }
+
+  private lose(reason: string, wait: number): void {
+    if (this.state.kind === "paused") return;
+    this.subscribed = false;
+    this.attempt += 1;
+    window.clearTimeout(this.retry);
+    this.retry = window.setTimeout(() => this.connect(), wait * 1000);
+    const since = this.state.kind === "lost" ? this.state.since : this.now();
+    this.change({ kind: "lost", since, retryAt: this.now() + wait, reason });
+  }
+
+  private async probe(): Promise<void> {
+    if (this.state.kind !== "live" || this.probing || document.hidden || this.now() - this.heardAt < PROBE_S) return;
+    this.probing = true;
+    const asked = this.now();
+    try {
+      await this.pubnub.time();
+      this.heardAt = this.now();
+    } catch {
+      if (this.heardAt < asked) this.lose("PubNub does not answer", FIRST_RETRY_S);
+    } finally {
+      this.probing = false;
+    }
+  }
+
+  private change(state: LinkState): void {
+    this.state = state;
+    this.onState(state);
+  }
+}
+
+/** One id a browser: PubNub bills by users, and a reload is not a new one. */
+function userId(): string {
+  const fresh = `page-${Array.from(crypto.getRandomValues(new Uint8Array(8)), (b) => b.toString(16).padStart(2, "0")).join("")}`;
+  try {
+    const known = localStorage.getItem("iort.user");
+    if (known && /^page-[0-9a-f]{16}$/.test(known)) return known;
+    localStorage.setItem("iort.user", fresh);
+  } catch {
+    // A browser that stores nothing is a new user each time.
+  }
+  return fresh;
+}

@@ -1,0 +1,64 @@
+// The live update as Lambda 1 sends it (contract.live_update), checked field by field: whatever else
+// arrives on the channel is refused with a reason.
+
+export type Value = null | boolean | number | string;
+
+export interface Hops {
+  readonly sent_us: number;
+  readonly received_ms: number;
+  readonly lambda_us: number;
+}
+
+export interface Update {
+  readonly robot: string;
+  readonly stream: string;
+  readonly boot: string;
+  readonly seq: number;
+  readonly t_us: number;
+  readonly hops: Hops;
+  readonly sample: ReadonlyMap<string, Value>;
+}
+
+const NAME = /^[A-Za-z0-9_-]{1,64}$/;
+const BOOT = /^[0-9a-f]{8,32}$/;
+const FIELD = /^[A-Za-z][A-Za-z0-9_]*(\.[A-Za-z0-9_]+)*$/;
+const MAX_FIELDS = 512;
+
+/** The update, or what is wrong with it. Whose it is follows from the channel, never from the body. */
+export function parseUpdate(namespace: string, version: number, channel: string, message: unknown): Update | string {
+  const robot = channel.startsWith(`${namespace}.`) ? channel.slice(namespace.length + 1) : "";
+  if (!NAME.test(robot)) return "a channel that names no robot";
+  if (!isObject(message)) return "not an object";
+  const { v, stream, boot, seq, t, hops, sample } = message;
+  if (v !== version) return "another schema version";
+  if (message["robot"] !== robot) return "another robot's name";
+  if (typeof stream !== "string" || !NAME.test(stream)) return "no stream name";
+  if (typeof boot !== "string" || !BOOT.test(boot)) return "no boot id";
+  if (!isInteger(seq) || seq < 0) return "no sequence number";
+  if (!isInteger(t)) return "no sample time";
+  if (!isObject(hops)) return "no hop times";
+  const { sent_us, received_ms, lambda_us } = hops;
+  if (!isInteger(sent_us) || !isInteger(received_ms) || !isInteger(lambda_us)) return "a hop without its time";
+  if (!isObject(sample)) return "no sample";
+  const entries = Object.entries(sample);
+  if (entries.length > MAX_FIELDS) return "too many fields";
+  const values = new Map<string, Value>();
+  for (const [name, value] of entries) {
+    if (!FIELD.test(name)) return "a field name that is not allowed";
+    if (!isValue(value)) return "a value that is neither number, text, true, false nor null";
+    values.set(name, value);
+  }
+  return { robot, stream, boot, seq, t_us: t, hops: { sent_us, received_ms, lambda_us }, sample: values };
+}
+
+function isObject(value: unknown): value is Record<string, unknown> {
+  return typeof value === "object" && value !== null && !Array.isArray(value);
+}
+
+function isInteger(value: unknown): value is number {
+  return Number.isSafeInteger(value);
+}
+
+function isValue(value: unknown): value is Value {
+  return value === null || typeof value === "boolean" || typeof value === "number" || typeof value === "string";
+}

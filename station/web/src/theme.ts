@@ -1,0 +1,52 @@
+// Dark or light: as the system says, unless the viewer has chosen. Charts ask here for their colours.
+
+const KEY = "iort.theme";
+const CHOICES = ["auto", "light", "dark"] as const;
+type Choice = (typeof CHOICES)[number];
+
+const listeners: (() => void)[] = [];
+const probe = document.createElement("span");
+
+export function startTheme(button: HTMLElement): void {
+  probe.hidden = true;
+  document.body.append(probe);
+  let choice = stored();
+  const apply = (): void => {
+    if (choice === "auto") delete document.documentElement.dataset["theme"];
+    else document.documentElement.dataset["theme"] = choice;
+    button.dataset["choice"] = choice;
+    button.setAttribute("aria-label", `Theme: ${choice}`);
+    button.title = `Theme: ${choice}`;
+    for (const listener of listeners) listener();
+  };
+  button.addEventListener("click", () => {
+    choice = CHOICES[(CHOICES.indexOf(choice) + 1) % CHOICES.length]!;
+    try {
+      localStorage.setItem(KEY, choice);
+    } catch {
+      // It holds until the page is closed.
+    }
+    apply();
+  });
+  window.matchMedia("(prefers-color-scheme: dark)").addEventListener("change", apply);
+  apply();
+}
+
+export function onTheme(listener: () => void): void {
+  listeners.push(listener);
+}
+
+/** A custom property's colour as the canvas understands it. */
+export function colour(property: string): string {
+  probe.style.color = `var(${property})`;
+  return getComputedStyle(probe).color;
+}
+
+function stored(): Choice {
+  try {
+    const known = localStorage.getItem(KEY);
+    return CHOICES.find((choice) => choice === known) ?? "auto";
+  } catch {
+    return "auto";
+  }
+}

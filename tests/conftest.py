@@ -1,0 +1,77 @@
+"""What every test shares: the synthesized app, and what a skip means."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Generator, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+
+def skips_fail() -> bool:
+    return os.environ.get("REQUIRE_ALL", "").lower() in {"1", "true", "yes"}
+
+
+@pytest.hookimpl(wrapper=True)
+def pytest_runtest_makereport() -> Generator[None, Any, Any]:
+    """REQUIRE_ALL=1: a machine that is said to have everything has nothing to skip."""
+    report = yield
+    return failed_if_skipped(report)
+
+
+@pytest.hookimpl(wrapper=True)
+def pytest_make_collect_report() -> Generator[None, Any, Any]:
+    report = yield
+    return failed_if_skipped(report)
+
+
+def failed_if_skipped(report: Any) -> Any:
+    # An expected failure is reported as skipped, and is none.
+    if report.skipped and skips_fail() and not hasattr(report, "wasxfail"):
+        reason = report.longrepr[2] if isinstance(report.longrepr, tuple) else report.longrepr
+        report.outcome = "failed"
+        report.longrepr = f"REQUIRE_ALL is set, and this was skipped: {reason}"
+    return report
+
+
+@dataclass(frozen=True)
+class Synthesized:
+    """The app as it is deployed: a template a stack, and the folder with the assets."""
+
+    folder: Path
+    templates: Mapping[str, dict[str, Any]]
+
+    def resources(self, kind: str, stack: str | None = None) -> dict[str, dict[str, Any]]:
+        """Logical id to properties of every resource of a type."""
+        return {
+            name: resource.get("Properties", {})
+            for noun, template in self.templates.items()
+            for name, resource in template["Resources"].items()
+            if resource["Type"] == kind and stack in (None, noun)
+        }
+
+    def asset(self, key: dict[str, Any]) -> Path:
+        """The folder that a resource's S3Key was made from."""
+        return self.folder / f"asset.{key['S3Key'].removesuffix('.zip')}"
+
+
+@pytest.fixture(scope="session")
+def synthesized(tmp_path_factory: pytest.TempPathFactory) -> Synthesized:
+    """app.build with default settings; imported here, because CDK takes seconds to load."""
+    from aws_cdk import App
+
+    from app import build
+    from stacks.settings import Settings
+
+    layer, folder = tmp_path_factory.mktemp("layer"), tmp_path_factory.mktemp("cdk.out")
+    (layer / "python").mkdir()
+    (layer / "python" / "nothing.py").touch()
+    app = App(outdir=str(folder))
+    settings = Settings(layer=layer)
+    build(app, settings)
+    stacks = app.synth().stacks
+    prefix = f"{settings.namespace}-"
+    return Synthesized(folder, {s.stack_name.removeprefix(prefix): s.template for s in stacks})

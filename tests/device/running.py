@@ -1,0 +1,59 @@
+"""A source in a thread of its own, and what it has given."""
+
+from __future__ import annotations
+
+import threading
+import time
+from collections.abc import Callable
+from typing import Any
+
+from typing_extensions import Self
+
+from device.clock import SystemClock
+
+
+class Running:
+    """Runs a source while it is entered."""
+
+    def __init__(self, config: Any) -> None:
+        self.source = config.build(SystemClock())
+        self.samples: list[tuple[str, int, Any]] = []
+        self.stop = threading.Event()
+        self.failed: Exception | None = None
+        self.thread = threading.Thread(target=self._run, daemon=True)
+        self._more = threading.Condition()
+
+    def __enter__(self) -> Self:
+        self.thread.start()
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.stop.set()
+        self.thread.join(5)
+        assert not self.thread.is_alive()
+        assert self.failed is None
+
+    def wait_for(self, count: int, *, more: bool = False) -> None:
+        """Wait until there are so many samples, or so many more than now."""
+        with self._more:
+            wanted = count + (len(self.samples) if more else 0)
+            assert self._more.wait_for(lambda: len(self.samples) >= wanted, 20), len(self.samples)
+
+    def _run(self) -> None:
+        try:
+            self.source.run(self._emit, self.stop)
+        except Exception as error:  # noqa: BLE001 - the test's to see
+            self.failed = error
+
+    def _emit(self, *sample: Any) -> None:
+        with self._more:
+            self.samples.append(sample)
+            self._more.notify_all()
+
+
+def eventually(condition: Callable[[], Any]) -> None:
+    """For what nobody tells of."""
+    deadline = time.monotonic() + 20
+    while not condition():
+        assert time.monotonic() < deadline
+        time.sleep(0.01)

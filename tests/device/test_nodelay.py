@@ -1,0 +1,44 @@
+"""Small messages leave at once."""
+
+from __future__ import annotations
+
+import os
+import socket
+
+from device.nodelay import send_at_once
+
+
+def nodelay(sock: socket.socket) -> bool:
+    return bool(sock.getsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY))
+
+
+def test_only_the_sockets_to_that_port_are_set():
+    with socket.create_server(("127.0.0.1", 0)) as broker, socket.create_server(("127.0.0.1", 0)) as other:
+        port = broker.getsockname()[1]
+        with (
+            socket.create_connection(("127.0.0.1", port)) as uplink,
+            socket.create_connection(("127.0.0.1", other.getsockname()[1])) as stranger,
+            socket.socket() as unconnected,
+        ):
+            assert not nodelay(uplink)
+            assert send_at_once(port) == 1
+            assert nodelay(uplink)
+            assert not nodelay(stranger)
+            assert not nodelay(unconnected)
+            # The duplicate is closed, the socket is not.
+            uplink.sendall(b"x")
+
+
+def test_other_sockets_stay_as_they_are_under_a_default_timeout():
+    # rospy sets one; its own server socket must go on blocking.
+    with socket.create_server(("127.0.0.1", 0)) as broker, socket.create_server(("127.0.0.1", 0)) as other:
+        port = broker.getsockname()[1]
+        before = socket.getdefaulttimeout()
+        with socket.create_connection(("127.0.0.1", port)):
+            socket.setdefaulttimeout(60)
+            try:
+                assert send_at_once(port) == 1
+            finally:
+                socket.setdefaulttimeout(before)
+            assert os.get_blocking(other.fileno())
+            assert os.get_blocking(broker.fileno())

@@ -1,0 +1,300 @@
+"""The rosbridge source against a server on loopback that restarts, falls silent and talks nonsense."""
+
+from __future__ import annotations
+
+import logging
+import sys
+import threading
+import time
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+pytest.importorskip("aiohttp")
+pytest.importorskip("websocket")
+
+from device.clock import SystemClock
+from device.config import load_config
+from device.errors import ConfigError, SourceError
+from device.sources import rosbridge
+from device.sources.rosbridge import RosbridgeConfig, TopicConfig
+from tests.device.running import Running, eventually
+from tests.rosbridge_standin import RosbridgeStandin, free_port
+
+CORE = "/sensors/core"
+VESC = "vesc_msgs/VescStateStamped"
+
+
+@pytest.fixture
+def server() -> Iterator[RosbridgeStandin]:
+    with RosbridgeStandin() as standin:
+        yield standin
+
+
+@pytest.fixture
+def log(caplog: pytest.LogCaptureFixture) -> pytest.LogCaptureFixture:
+    caplog.set_level(logging.INFO, "device")
+    return caplog
+
+
+@pytest.fixture(autouse=True)
+def soon(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(rosbridge, "_BACKOFF_S", (0.05, 0.2))
+
+
+def config(server: RosbridgeStandin, topic: str = CORE, **settings: Any) -> RosbridgeConfig:
+    settings = {"stream": "vesc", "time": "arrival", **settings}
+    return RosbridgeConfig(url=server.url, topics=((topic, TopicConfig(**settings)),))
+
+
+def state(n: float = 0, **stamp: int) -> dict[str, Any]:
+    """As rosbridge of ROS 1 or ROS 2 sends a VescStateStamped, by the parts of its stamp."""
+    return {"header": {"stamp": stamp, "frame_id": ""}, "state": {"speed": n, "fault_code": 0}}
+
+
+def test_messages_become_samples(server: RosbridgeStandin, log: pytest.LogCaptureFixture) -> None:
+    before = time.time_ns() // 1000
+    with Running(config(server, type=VESC, throttle_ms=20)) as running:
+        asked = server.wait_for("subscribe")
+        for n in range(100):
+            server.publish(CORE, state(n + 0.5, secs=1, nsecs=2))
+        running.wait_for(100)
+    assert (asked["topic"], asked["type"], asked["throttle_rate"]) == (CORE, VESC, 20)
+    assert [values for _, _, values in running.samples] == [
+        {"speed": n + 0.5, "fault_code": 0} for n in range(100)
+    ], "in order, and without the wrapper"
+    assert {stream for stream, _, _ in running.samples} == {"vesc"}
+    times = [t_us for _, t_us, _ in running.samples]
+    assert before < times[0] <= times[-1] < time.time_ns() // 1000
+    assert "WARNING" not in log.text
+
+
+def test_what_a_message_may_hold(server: RosbridgeStandin) -> None:
+    message = {
+        "header": {"stamp": {"sec": 1, "nanosec": 2}},
+        "pose": {"position": {"x": 1.5, "y": None}},
+        "covariance": [0.1, 0.2],
+        "ranges": [1.0] * 65,
+        "name": "left",
+        "blob": "A" * 5000,
+        "ok": True,
+        "lap": {"secs": 3, "nsecs": 4},
+    }
+    with Running(config(server, "/odd")) as running:
+        server.wait_for("subscribe")
+        server.publish("/odd", message)
+        server.send('{"op": "publish", "topic": "/odd", "msg": {"a": NaN, "b": 1}}')
+        running.wait_for(2)
+    assert running.samples[0][2] == {
+        "pose.position.x": 1.5,
+        "pose.position.y": None,
+        "covariance.0": 0.1,
+        "covariance.1": 0.2,
+        "name": "left",
+        "ok": True,
+        "lap.sec": 3,
+        "lap.nanosec": 4,
+    }
+    assert running.samples[1][2]["a"] != running.samples[1][2]["a"], "the contract counts it"
+
+
+def test_selected_fields_only(server: RosbridgeStandin, log: pytest.LogCaptureFixture) -> None:
+    message = {"pose": {"x": 1, "y": 2}, "pose_age": 3, "ranges": list(range(100))}
+    with Running(config(server, "/odd", fields=("pose", "ranges.77", "height"))) as running:
+        server.wait_for("subscribe")
+        server.publish("/odd", message)
+        server.publish("/odd", message)
+        running.wait_for(2)
+    assert running.samples[0][2] == {"pose.x": 1, "pose.y": 2, "ranges.77": 77}
+    assert log.text.count("have no field height") == 1
+
+
+@pytest.mark.parametrize("parts", [("secs", "nsecs"), ("sec", "nanosec")])
+def test_the_stamp_of_either_ros(server: RosbridgeStandin, parts: tuple[str, str]) -> None:
+    sec = int(time.time()) - 60
+    with Running(config(server, time="header")) as running:
+        server.wait_for("subscribe")
+        server.publish(CORE, state(1, **dict(zip(parts, (sec, 123_456_789), strict=True))))
+        running.wait_for(1)
+    assert running.samples[0][1] == sec * 1_000_000 + 123_456
+
+
+@pytest.mark.parametrize(
+    ("message", "words", "reason"),
+    [
+        (state(1, secs=12, nsecs=0), "s off the clock; using the time of arrival", "unbelieved_stamps"),
+        ({"data": 1}, "no time in them; using the time of arrival", "no_stamp"),
+        ({"header": {"stamp": 7}, "data": 1}, "using the time of arrival", "no_stamp"),
+    ],
+)
+def test_a_stamp_not_to_be_believed(
+    server: RosbridgeStandin, log: pytest.LogCaptureFixture, message: Any, words: str, reason: str
+) -> None:
+    before = time.time_ns() // 1000
+    with Running(config(server, time="header")) as running:
+        server.wait_for("subscribe")
+        for _ in range(3):
+            server.publish(CORE, message)
+        running.wait_for(3)
+    assert before < running.samples[0][1] < time.time_ns() // 1000
+    assert log.text.count(words) == 1
+    assert running.source.report()[CORE] == {"messages": 3, reason: 3}
+
+
+@pytest.mark.parametrize("how", ["closed", "cut"])
+def test_it_comes_back_and_resubscribes_each_time(
+    server: RosbridgeStandin, log: pytest.LogCaptureFixture, how: str
+) -> None:
+    with Running(config(server)) as running:
+        for n in range(1, 4):
+            server.wait_for("subscribe", n)
+            server.publish(CORE, state(n))
+            running.wait_for(n)
+            if how == "cut":
+                server.cut()
+            else:
+                server.__exit__()
+                server.__enter__()
+        server.wait_for("subscribe", 4)
+    assert [values["speed"] for _, _, values in running.samples] == [1, 2, 3], "nothing twice"
+    assert "connection lost" in log.text
+
+
+def test_started_before_the_server(log: pytest.LogCaptureFixture) -> None:
+    server = RosbridgeStandin(free_port())
+    with Running(config(server)) as running:
+        eventually(lambda: "nobody listens there: is rosbridge_server running?" in log.text)
+        with server:
+            server.wait_for("subscribe")
+            server.publish(CORE, state())
+            running.wait_for(1)
+    assert log.text.count("nobody listens there") == 1
+
+
+def test_a_silent_topic_is_subscribed_to_afresh(
+    server: RosbridgeStandin, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(rosbridge, "_PATIENCE_S", 0.5)
+    with Running(config(server)) as running:
+        server.wait_for("unsubscribe", topic=CORE)
+        server.wait_for("subscribe", 2)
+        server.publish(CORE, state())
+        running.wait_for(1)
+    assert running.source.connection.connects == 1
+
+
+def test_a_quiet_connection_is_held_with_pings(
+    server: RosbridgeStandin, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(rosbridge, "_PING_S", 0.5)
+    monkeypatch.setattr(rosbridge, "_DEAD_S", 3.0)
+    with Running(config(server)) as running:
+        eventually(lambda: server.pings >= 4)
+    assert running.source.connection.connects == 1
+
+
+def test_a_server_that_answers_nothing_is_left(
+    server: RosbridgeStandin, monkeypatch: pytest.MonkeyPatch, log: pytest.LogCaptureFixture
+) -> None:
+    monkeypatch.setattr(rosbridge, "_PING_S", 0.5)
+    monkeypatch.setattr(rosbridge, "_DEAD_S", 2.0)
+    server.deaf = True
+    with Running(config(server)):
+        server.wait_for("subscribe", 2)
+    assert "no answer for 2 s" in log.text
+
+
+@pytest.mark.parametrize(
+    "nonsense",
+    [
+        "no JSON", "[]", "7", "null", '{"op": "publish"}', '{"op": "publish", "topic": "/other", "msg": {}}',
+        '{"op": "publish", "topic": ["/sensors/core"], "msg": {}}', "[" * 100_000,
+        '{"op": "publish", "topic": "/sensors/core", "msg": [1]}',
+        '{"op": "publish", "topic": "/sensors/core", "msg": {"header": {}}}',
+        '{"op": "publish", "topic": "/sensors/core", "msg": {"a": ' + "[" * 400 + "1" + "]" * 400 + "}}",
+        '{"op": "publish", "topic": "/sensors/core", "msg": {"a": {"/b c": 1}}}',
+        '{"op": "service_response", "id": 1}',
+    ],
+    ids=lambda text: text[:40],
+)  # fmt: skip
+def test_nonsense_does_not_stop_it(server: RosbridgeStandin, nonsense: str) -> None:
+    with Running(config(server)) as running:
+        server.wait_for("subscribe")
+        server.send(nonsense)
+        server.publish(CORE, state(5))
+        eventually(lambda: running.samples and running.samples[-1][2] == {"speed": 5, "fault_code": 0})
+    assert running.source.connection.connects == 1
+
+
+def test_what_the_server_complains_of_is_told(
+    server: RosbridgeStandin, log: pytest.LogCaptureFixture
+) -> None:
+    with Running(config(server)):
+        server.wait_for("subscribe")
+        server.send('{"op": "status", "level": "error", "msg": "Unable to load vesc_msgs.msg"}')
+        eventually(lambda: "the server says: Unable to load vesc_msgs.msg" in log.text)
+
+
+def test_something_else_listens_there(log: pytest.LogCaptureFixture) -> None:
+    with RosbridgeStandin() as server:
+        url = f"{server.url}/elsewhere"
+        with Running(RosbridgeConfig(url=url, topics=((CORE, TopicConfig(stream="vesc", time="arrival")),))):
+            eventually(lambda: "is no rosbridge server" in log.text)
+
+
+def test_publishing(server: RosbridgeStandin) -> None:
+    with Running(config(server)) as running:
+        connection = running.source.connection
+        server.wait_for("subscribe")
+        connection.publish("/drive", "std_msgs/Float64", {"data": 1.5})
+        connection.publish("/drive", "std_msgs/Float64", {"data": 2.5})
+        assert server.wait_for("publish", 2)["msg"] == {"data": 2.5}
+        assert [op["op"] for op in server.operations if op["op"] != "subscribe"] == [
+            "advertise", "publish", "publish",
+        ]  # fmt: skip
+        with pytest.raises(SourceError, match="/drive cannot be published"):
+            connection.publish("/drive", "std_msgs/Float64", {"data": float("nan")})
+        server.__exit__()
+        eventually(lambda: connection._socket is None)
+        with pytest.raises(SourceError, match="not connected"):
+            connection.publish("/drive", "std_msgs/Float64", {"data": 3.5})
+        server.__enter__()
+        server.wait_for("subscribe", 2)
+        connection.publish("/drive", "std_msgs/Float64", {"data": 4.5})
+        server.wait_for("advertise", 2)
+        server.wait_for("publish", 3)
+
+
+def test_without_websocket_client_it_says_what_to_install(
+    server: RosbridgeStandin, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setitem(sys.modules, "websocket", None)
+    with pytest.raises(SourceError, match=r"pip install 'iort\[rosbridge\]'"):
+        config(server).build(SystemClock()).run(lambda *_: None, threading.Event())
+
+
+CAR = "robot: car1\nendpoint: a.example\ncertificate: x\nprivate_key: x\nroot_ca: x\nsources:\n"
+
+
+def test_the_configuration(tmp_path: Path) -> None:
+    (tmp_path / "x").touch()
+    (tmp_path / "car.yaml").write_text(
+        CAR + "  - type: rosbridge\n    url: wss://robot.local:9090/\n    topics:\n"
+        "      /sensors/core: {stream: vesc, time: header, type: vesc_msgs/VescStateStamped}\n"
+        "      /imu: {stream: imu, time: arrival, fields: [a.x], throttle_ms: 100}\n"
+    )
+    (source,) = load_config(tmp_path / "car.yaml").sources
+    assert list(source.streams()) == ["imu", "vesc"]
+    assert source.describe() == "rosbridge wss://robot.local:9090/, topics /sensors/core, /imu"
+
+
+@pytest.mark.parametrize("url", ["http://a:9090", "localhost:9090", "ws://", "ws://a:x", "ws://[", "7"])
+def test_a_wrong_address(tmp_path: Path, url: str) -> None:
+    (tmp_path / "x").touch()
+    (tmp_path / "car.yaml").write_text(
+        CAR + f"  - {{type: rosbridge, url: '{url}', topics: {{/a: {{stream: a, time: arrival}}}}}}\n"
+    )
+    with pytest.raises(ConfigError, match=r"sources\[0\]\.url: .*such as ws://localhost:9090"):
+        load_config(tmp_path / "car.yaml")

@@ -1,0 +1,268 @@
+"""The VESC source over a real pseudo-terminal, against a stand-in that behaves and misbehaves."""
+
+from __future__ import annotations
+
+import logging
+import sys
+import threading
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+import serial
+
+from device.clock import SystemClock
+from device.config import load_config
+from device.errors import SourceError
+from device.sources.vesc_serial import VescConfig, _why
+from tests.device.running import Running, eventually
+from tests.vesc_standin import FIRMWARE, VescStandin, framed, values
+
+
+def numbers(running: Running) -> list[int]:
+    return [values["displacement"] for _, _, values in running.samples]
+
+
+@pytest.fixture
+def vesc(tmp_path: Path) -> Iterator[VescStandin]:
+    with VescStandin(tmp_path / "usb-STMicroelectronics_ChibiOS_RT_Virtual_COM_Port") as standin:
+        yield standin
+
+
+@pytest.fixture
+def log(caplog: pytest.LogCaptureFixture) -> pytest.LogCaptureFixture:
+    caplog.set_level(logging.DEBUG, "device")
+    return caplog
+
+
+def config(vesc: VescStandin, **settings: Any) -> VescConfig:
+    return VescConfig(port=str(vesc.link), **{"rate_hz": 200.0, **settings})
+
+
+def test_values_at_the_rate_asked_for(vesc: VescStandin, log: pytest.LogCaptureFixture) -> None:
+    started = time.time_ns() // 1000
+    with Running(config(vesc)) as running:
+        running.wait_for(200)
+        skipped = running.source.counts.skipped_polls
+    ended = time.time_ns() // 1000
+    assert numbers(running) == list(range(len(running.samples)))
+    stream, _, first = running.samples[0]
+    assert (stream, first["voltage_input"], first["charge_drawn"]) == ("vesc", 11.8, 281)
+    times = [t_us for _, t_us, _ in running.samples]
+    assert started < times[0] < times[-1] < ended
+    # Deadlines 5 ms apart, of which a machine this busy may skip some: lateness does not add up.
+    assert times[199] - times[0] == pytest.approx((199 + skipped) * 5_000, abs=40_000)
+    assert vesc.asked[0] == b"\x00"
+    assert "VESC with firmware 6.02 on 60_MK6" in log.text
+    assert "WARNING" not in log.text
+
+
+def test_a_controller_behind_the_can_bus(vesc: VescStandin) -> None:
+    with Running(config(vesc, can_id=17, stream="rear")) as running:
+        running.wait_for(5)
+    assert set(vesc.asked) == {b"\x22\x11\x00", b"\x22\x11\x04"}
+    assert (running.samples[0][0], running.samples[0][2]["controller_id"]) == ("rear", 17)
+
+
+@pytest.mark.parametrize("length", [54, 59, 73])
+def test_older_firmware(vesc: VescStandin, length: int) -> None:
+    vesc.length = length
+    with Running(config(vesc)) as running:
+        running.wait_for(20)
+    assert ("avg_vq" in running.samples[0][2]) == (length == 73)
+    assert running.source.counts.timeouts == 0
+
+
+def test_garbage_around_every_answer_costs_no_sample(vesc: VescStandin) -> None:
+    noise = b"\x02\x03\xff\x00\x02\x4a\x04"
+    vesc.answer = lambda frame, n: [noise, frame[:30], frame[30:], noise]
+    with Running(config(vesc)) as running:
+        running.wait_for(100)
+    counts = running.source.counts
+    assert numbers(running) == list(range(len(running.samples)))
+    assert counts.timeouts == 0
+    assert counts.garbage >= 99 * 2 * len(noise) - 100
+    assert running.samples[50][2]["voltage_input"] == 11.8
+
+
+def test_frames_that_nobody_asked_for_are_passed_over(vesc: VescStandin) -> None:
+    """A script on the controller prints, another program's answer is still under way."""
+    vesc.answer = lambda frame, n: [framed(b"\x15hello"), framed(FIRMWARE), frame]
+    with Running(config(vesc)) as running:
+        running.wait_for(20)
+    assert numbers(running) == list(range(len(running.samples)))
+    assert (running.source.counts.unknown, running.source.counts.timeouts) == (0, 0)
+
+
+def test_half_frames_and_wrong_crcs_cost_their_own_sample_only(
+    vesc: VescStandin, log: pytest.LogCaptureFixture
+) -> None:
+    def answer(frame: bytes, n: int) -> list[bytes]:
+        if n % 10 == 3:
+            return [frame[:40]]
+        if n % 10 == 7:
+            return [frame[:20] + bytes([frame[20] ^ 0x40]) + frame[21:]]
+        return [frame]
+
+    vesc.answer = answer
+    with Running(config(vesc, timeout_s=0.05)) as running:
+        running.wait_for(60)
+    counts = running.source.counts
+    expected = [n for n in range(vesc.sent) if n % 10 not in (3, 7)]
+    assert numbers(running) == expected[: len(running.samples)]
+    assert len(expected) - len(running.samples) <= 1
+    assert counts.timeouts >= 14
+    assert counts.bad_crc >= 7
+    assert counts.opened == 1, "no reason to open the port afresh"
+    assert "WARNING" not in log.text, "nor to speak of it"
+
+
+def test_an_unknown_length_is_said_once_and_never_misread(
+    vesc: VescStandin, log: pytest.LogCaptureFixture
+) -> None:
+    vesc.answer = lambda frame, n: [framed(values(n) + b"\x00\x00")]
+    with Running(config(vesc)) as running:
+        eventually(lambda: running.source.counts.unknown >= 20)
+    assert running.samples == []
+    errors = [record for record in log.records if record.levelno >= logging.WARNING]
+    assert len(errors) == 1
+    assert "values of 76 bytes; known are those of 54, 56, 58" in errors[0].getMessage()
+
+
+def test_a_late_answer_is_not_taken_for_the_next_ones(vesc: VescStandin) -> None:
+    """Every fifth answer comes only after its timeout, before the next request."""
+    kept: list[bytes] = []
+
+    def answer(frame: bytes, n: int) -> list[bytes]:
+        if n % 5 == 4:
+            kept.append(frame)
+            return []
+        return [frame]
+
+    vesc.answer = answer
+    with Running(config(vesc, rate_hz=5.0, timeout_s=0.02)) as running:
+        eventually(lambda: running.source.counts.timeouts == 1)
+        vesc.say(kept[0])
+        running.wait_for(6)
+        assert running.source.counts.late == 1
+    assert numbers(running)[:6] == [0, 1, 2, 3, 5, 6]
+
+
+def test_unplugged_and_plugged_again(vesc: VescStandin, log: pytest.LogCaptureFixture) -> None:
+    with Running(config(vesc)) as running:
+        for i in range(3):
+            running.wait_for(10, more=True)
+            vesc.unplug()
+            eventually(lambda: log.text.count("waiting for it to be plugged in") == i + 1)  # noqa: B023
+            vesc.plug()
+        running.wait_for(10, more=True)
+        assert running.source.counts.opened == 4
+    assert log.text.count("samples are coming again") == 3
+    assert numbers(running) == sorted(set(numbers(running))), "nothing twice"
+
+
+def test_plugged_in_only_after_the_start(tmp_path: Path, log: pytest.LogCaptureFixture) -> None:
+    vesc = VescStandin(tmp_path / "vesc")
+    with Running(config(vesc)) as running:
+        eventually(lambda: "waiting for it to be plugged in" in log.text)
+        with vesc:
+            running.wait_for(3)
+
+
+def test_silence_is_told_and_got_over(vesc: VescStandin, log: pytest.LogCaptureFixture) -> None:
+    with Running(config(vesc, timeout_s=0.05)) as running:
+        running.wait_for(5)
+        vesc.answer = lambda frame, n: []
+        eventually(lambda: "no answer: is it a VESC" in log.text)
+        eventually(lambda: running.source.counts.opened >= 2)
+        vesc.answer = lambda frame, n: [frame]
+        running.wait_for(5, more=True)
+    assert log.text.count("no answer: is it a VESC") == 1
+    assert log.text.count("samples are coming again") == 1
+
+
+def test_a_wrong_baud_rate_looks_like_noise(vesc: VescStandin, log: pytest.LogCaptureFixture) -> None:
+    vesc.answer = lambda frame, n: [bytes(byte ^ 0x5A for byte in frame) * 20]
+    with Running(config(vesc, timeout_s=0.05)):
+        eventually(lambda: "is the baud rate right?" in log.text)
+
+
+def test_a_slow_controller_skips_polls_and_never_queues(vesc: VescStandin) -> None:
+    release = threading.Semaphore(0)
+
+    def answer(frame: bytes, n: int) -> list[bytes]:
+        release.acquire(timeout=0.02)
+        return [frame]
+
+    vesc.answer = answer
+    with Running(config(vesc, rate_hz=1000.0)) as running:
+        running.wait_for(20)
+    counts = running.source.counts
+    assert numbers(running) == list(range(len(running.samples)))
+    assert counts.skipped_polls > 10 * 20
+    assert counts.timeouts == 0
+
+
+def test_two_programs_cannot_share_the_port(vesc: VescStandin, log: pytest.LogCaptureFixture) -> None:
+    with Running(config(vesc)) as first:
+        first.wait_for(3)
+        with Running(config(vesc)) as second:
+            eventually(lambda: "in use by another program" in log.text)
+        assert second.samples == []
+        first.wait_for(3, more=True)
+
+
+@pytest.mark.parametrize(
+    ("make", "words"),
+    [
+        (lambda path: path.write_bytes(b""), "is no serial port"),
+        (lambda path: path.mkdir(), "cannot be opened"),
+    ],
+)
+def test_what_is_no_serial_port(
+    tmp_path: Path, log: pytest.LogCaptureFixture, make: Callable[[Path], Any], words: str
+) -> None:
+    make(tmp_path / "port")
+    with Running(VescConfig(port=str(tmp_path / "port"))):
+        eventually(lambda: words in log.text)
+
+
+def test_a_port_of_another_group_says_which() -> None:
+    error = serial.SerialException(13, "could not open port /dev/ttyACM0: Permission denied")
+    assert "usermod -aG dialout" in _why(error, was_open=False)
+
+
+@pytest.mark.parametrize("trouble", ["plugged", "silent", "absent"])
+def test_stops_at_once(vesc: VescStandin, trouble: str) -> None:
+    if trouble == "silent":
+        vesc.answer = lambda frame, n: []
+    if trouble == "absent":
+        vesc.unplug()
+    with Running(config(vesc, timeout_s=5.0)) as running:
+        eventually(lambda: trouble == "absent" or bool(vesc.asked))
+        before = time.monotonic()
+        running.stop.set()
+        running.thread.join(5)
+        assert time.monotonic() - before < 1
+
+
+def test_without_pyserial_it_says_what_to_install(vesc: VescStandin, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(sys.modules, "serial", None)
+    with pytest.raises(SourceError, match=r"pip install 'iort\[serial\]'"):
+        config(vesc).build(SystemClock()).run(lambda *_: None, threading.Event())
+
+
+def test_the_configuration(tmp_path: Path) -> None:
+    for name in ("cert.pem", "key.pem", "ca.pem"):
+        (tmp_path / name).touch()
+    (tmp_path / "car.yaml").write_text(
+        "robot: car1\nendpoint: a.example\ncertificate: cert.pem\nprivate_key: key.pem\nroot_ca: ca.pem\n"
+        "sources:\n  - {type: vesc, port: /dev/vesc}\n"
+        "  - {type: vesc, port: /dev/vesc2, baudrate: 57600, rate_hz: 20, stream: rear, can_id: 3}\n"
+    )
+    front, rear = load_config(tmp_path / "car.yaml").sources
+    assert front == VescConfig(port="/dev/vesc")
+    assert rear.describe() == "VESC on /dev/vesc2, CAN id 3, at 20 Hz"
+    assert (list(front.streams()), list(rear.streams())) == (["vesc"], ["rear"])

@@ -1,0 +1,112 @@
+"""DynamoDB in memory, as far as functions/tables.py asks: what hypothesis can run a thousand times."""
+
+from __future__ import annotations
+
+import re
+from collections import Counter
+from collections.abc import Iterator
+from decimal import Decimal
+from typing import Any
+
+from boto3.dynamodb.types import TypeSerializer
+
+import contract
+from contract import EXPIRES_S, RECEIVED_MS, ROBOT, SECOND, T_US, TOPIC, Batch
+from functions.tables import Tables, plain
+
+serialize = TypeSerializer().serialize
+
+TELEMETRY, SUMMARY, ROBOTS = "telemetry", "summary", "robots"
+NAMES = {"telemetry": TELEMETRY, "summary": SUMMARY, "robots": ROBOTS}
+KEYS = {TELEMETRY: (TOPIC, T_US), SUMMARY: (TOPIC, SECOND), ROBOTS: (ROBOT,)}
+TOPIC_OF_CAR = contract.build_topic(contract.RECORD, "car", contract.VESC_STREAM)
+EXPIRES = 1_800_000_000
+
+
+class FakeDynamoDB:
+    """The client's three calls. A page holds ``page_items`` items, as AWS' hold 1 MB; of every write
+    the first ``unprocessed`` attempts take only the first item."""
+
+    def __init__(self, *, page_items: int = 2, unprocessed: int = 0) -> None:
+        self.page_items, self.unprocessed = page_items, unprocessed
+        self.items: dict[str, dict[tuple[Any, ...], dict[str, Any]]] = {name: {} for name in KEYS}
+        self.calls: Counter[str] = Counter()
+        self.read = 0
+
+    def put(self, table: str, item: dict[str, Any]) -> None:
+        first, *rest = (next(iter(item[name].values())) for name in KEYS[table])
+        self.items[table][(first, *map(Decimal, rest))] = item
+
+    def get_paginator(self, operation: str) -> FakeDynamoDB:
+        assert operation == "query"
+        return self
+
+    def paginate(self, **query: Any) -> Iterator[dict[str, Any]]:
+        assert query["ConsistentRead"]
+        names, values = query["ExpressionAttributeNames"], query["ExpressionAttributeValues"]
+        assert names == {"#topic": TOPIC, "#t": T_US}
+        topic = values[":topic"]["S"]
+        bounds = {name: Decimal(value["N"]) for name, value in values.items() if name != ":topic"}
+        match = re.fullmatch(r"#topic = :topic AND #t (.+)", query["KeyConditionExpression"])
+        assert match
+        inside = {
+            "< :t": lambda t: t < bounds[":t"],
+            "> :t": lambda t: t > bounds[":t"],
+            "BETWEEN :first AND :last": lambda t: bounds[":first"] <= t <= bounds[":last"],
+        }[match[1]]
+        found = sorted(key for key in self.items[query["TableName"]] if key[0] == topic and inside(key[1]))
+        if not query.get("ScanIndexForward", True):
+            found.reverse()
+        size = query.get("PaginationConfig", {}).get("PageSize", self.page_items)
+        for start in range(0, max(1, len(found)), size):
+            page = [self.items[query["TableName"]][key] for key in found[start : start + size]]
+            self.calls["query"] += 1
+            self.read += len(page)
+            yield {"Items": page}
+
+    def get_item(self, *, TableName: str, Key: dict[str, Any]) -> dict[str, Any]:  # noqa: N803
+        self.calls["get_item"] += 1
+        item = self.items[TableName].get((Key[ROBOT]["S"],))
+        return {"Item": item} if item else {}
+
+    def batch_write_item(self, *, RequestItems: dict[str, Any]) -> dict[str, Any]:  # noqa: N803
+        self.calls["batch_write_item"] += 1
+        ((table, requests),) = RequestItems.items()
+        items = [request["PutRequest"]["Item"] for request in requests]
+        keys = [tuple(str(item[name]) for name in KEYS[table]) for item in items]
+        assert 1 <= len(items) <= 25, "BatchWriteItem takes 1 to 25 items"
+        assert len(set(keys)) == len(keys), "BatchWriteItem refuses two writes of one item"
+        taken = items if self.calls["batch_write_item"] > self.unprocessed else items[:1]
+        for item in taken:
+            self.put(table, item)
+        left = requests[len(taken) :]
+        return {"UnprocessedItems": {table: left} if left else {}}
+
+
+def tables(client: Any) -> Tables:
+    return Tables(client, **NAMES)
+
+
+def item_of(batch: Batch, topic: str = TOPIC_OF_CAR, expires_s: int = EXPIRES) -> dict[str, Any]:
+    """The telemetry item that the record rule makes of a batch."""
+    return item_of_message(contract.encode(batch), topic, expires_s)
+
+
+def item_of_message(message: bytes, topic: str = TOPIC_OF_CAR, expires_s: int = EXPIRES) -> dict[str, Any]:
+    envelope = contract._json_object(message, "envelope")
+    envelope.update({TOPIC: topic, RECEIVED_MS: 1_700_000_000_000, EXPIRES_S: expires_s})
+    return {name: serialize(value) for name, value in envelope.items()}
+
+
+def record_of(item: dict[str, Any], number: int = 1, kind: str = "INSERT") -> dict[str, Any]:
+    """The stream record that the table makes of an item."""
+    keys = {name: item[name] for name in KEYS[TELEMETRY]}
+    change = {"Keys": keys, "SequenceNumber": f"{number:021}", "StreamViewType": "NEW_IMAGE"}
+    if kind != "REMOVE":
+        change["NewImage"] = item
+    return {"eventID": f"e{number}", "eventName": kind, "eventSource": "aws:dynamodb", "dynamodb": change}
+
+
+def summary_of(client: FakeDynamoDB, topic: str = TOPIC_OF_CAR) -> dict[int, dict[str, Any]]:
+    """What the summary table holds of a topic, by second."""
+    return {int(key[1]): plain(item) for key, item in client.items[SUMMARY].items() if key[0] == topic}

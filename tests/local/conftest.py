@@ -1,0 +1,57 @@
+"""One embedded cloud for all tests of this folder, deployed as `make demo` deploys it."""
+
+from __future__ import annotations
+
+import json
+import re
+import subprocess
+import sys
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from local.cloud import EmbeddedCloud
+from local.deployment import ROOT
+from station import robots
+
+
+@pytest.fixture(scope="session")
+def embedded(tmp_path_factory: pytest.TempPathFactory) -> Iterator[EmbeddedCloud]:
+    with EmbeddedCloud(tmp_path_factory.mktemp("cloud") / "local") as cloud:
+        yield cloud
+
+
+@pytest.fixture
+def bundle(
+    embedded: EmbeddedCloud, tmp_path: Path, request: pytest.FixtureRequest
+) -> Callable[..., robots.Bundle]:
+    """Registers a robot of its own for each test: `bundle("a", sources=[...])`."""
+
+    def register(suffix: str = "", **settings: Any) -> robots.Bundle:
+        # The end of the name tells the cases of a parametrized test apart.
+        name = re.sub(r"[^A-Za-z0-9_-]+", "-", f"{request.node.name}{suffix}")[-50:].strip("-")
+        return robots.add(embedded.cloud, name, out=tmp_path, settings=settings)
+
+    return register
+
+
+def run_agent(bundle: robots.Bundle, *, timeout_s: float = 120) -> dict[str, Any]:
+    """Run the installed agent to the end of its sources; its own report."""
+    report = bundle.folder / "report.json"
+    command = [Path(sys.executable).parent / "iort-agent", "--config", bundle.config, "--report", report]
+    done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, timeout=timeout_s, check=False)
+    assert done.returncode == 0, done.stderr
+    written: dict[str, Any] = json.loads(report.read_text())
+    return written
+
+
+def until(condition: Callable[[], Any], *, seconds: float = 20.0) -> Any:
+    """The condition's first true value; the tables tell nobody when they change."""
+    deadline = time.monotonic() + seconds
+    while not (value := condition()):
+        assert time.monotonic() < deadline, f"not true within {seconds} s"
+        time.sleep(0.05)
+    return value

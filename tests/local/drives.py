@@ -1,0 +1,95 @@
+"""Drives whose every sample can be told apart: a log of a counter, played by the real agent."""
+
+from __future__ import annotations
+
+import json
+import os
+import subprocess
+import sys
+import threading
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+from local.cloud import EmbeddedCloud
+from local.deployment import ROOT
+from station import delivery, robots
+
+RATE_HZ = 50
+# The log's column and the contract's field in which the counter is.
+_COLUMN, FIELD = "erpm", "speed"
+
+
+def counter_log(path: Path, seconds: float) -> Path:
+    """A VESC Tool log in which the speed counts the samples, from 0."""
+    count = int(seconds * RATE_HZ)
+    step_ms = 1000 // RATE_HZ
+    rows = (f"{1000 + i * step_ms};12.0;{i}" for i in range(count))
+    path.write_text("\n".join([f"ms_today;input_voltage;{_COLUMN}", *rows]) + "\n")
+    return path
+
+
+def counted(embedded: EmbeddedCloud, robot: str) -> list[int]:
+    """The counter in the table, in the table's order; batches must be numbered in order too."""
+    batches = list(delivery.batches(embedded.cloud, robot, "vesc"))
+    seqs = [batch.seq for batch in batches]
+    assert seqs == sorted(set(seqs)), "a batch number stands twice, or out of order"
+    return [int(value) for batch in batches for value in batch.columns[FIELD]]
+
+
+class Agent:
+    """The installed agent in a process of its own; ``before`` wraps its command, ``environment`` adds."""
+
+    def __init__(
+        self,
+        bundle: robots.Bundle,
+        *,
+        drain_s: float = 60,
+        before: Sequence[str] = (),
+        environment: dict[str, str] | None = None,
+    ) -> None:
+        self._report = bundle.folder / "report.json"
+        self._command = [str(Path(sys.executable).parent / "iort-agent")]
+        self._config = ["--config", str(bundle.config)]
+        running = ["run", *self._config, "--report", str(self._report), "--drain-s", str(drain_s)]
+        self.process = subprocess.Popen(
+            [*before, *self._command, *running],
+            cwd=ROOT,
+            env={**os.environ, **(environment or {})},
+            stdout=subprocess.DEVNULL,
+            stderr=subprocess.PIPE,
+            text=True,
+        )
+        self.log: list[str] = []
+        self._reader = threading.Thread(target=self._read, daemon=True)
+        self._reader.start()
+
+    def _read(self) -> None:
+        assert self.process.stderr is not None
+        with self.process.stderr as lines:
+            self.log.extend(lines)
+
+    def said(self, text: str) -> bool:
+        """Whether the log has a line with the text."""
+        return any(text in line for line in self.log)
+
+    def status(self) -> dict[str, Any]:
+        """What `iort-agent status` says; empty while there is no agent to ask."""
+        command = [*self._command, "status", *self._config, "--json"]
+        done = subprocess.run(command, capture_output=True, text=True, cwd=ROOT, check=False, timeout=30)
+        answer: dict[str, Any] = json.loads(done.stdout) if done.returncode == 0 else {}
+        return answer
+
+    def kill(self) -> None:
+        """End it as `kill -9` does."""
+        self.process.kill()
+        self.process.wait()
+        self._reader.join()
+
+    def report(self, *, timeout_s: float = 180) -> dict[str, Any]:
+        """Wait for its end, which must be a good one; its own report."""
+        status = self.process.wait(timeout_s)
+        self._reader.join()
+        assert status == 0, "".join(self.log[-30:])
+        report: dict[str, Any] = json.loads(self._report.read_text())
+        return report

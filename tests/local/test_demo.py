@@ -1,0 +1,148 @@
+"""`make demo` as a user runs it: figures, exit status, clear refusals, and nothing left behind."""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+import socket
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from local.deployment import ROOT
+from tests.local.conftest import until
+from tests.recordings import recording
+
+TIMEOUT_S = 180
+
+
+def demo(folder: Path, *arguments: str) -> subprocess.Popen[str]:
+    return subprocess.Popen(
+        [sys.executable, "-m", "local.demo", "--folder", str(folder), *arguments],
+        cwd=ROOT,
+        stdin=subprocess.DEVNULL,
+        stdout=subprocess.PIPE,
+        stderr=subprocess.STDOUT,
+        text=True,
+    )
+
+
+def processes_of(folder: Path) -> list[str]:
+    """The command lines of living processes that name the folder or have it in their environment."""
+    found = []
+    for process in Path("/proc").glob("[0-9]*"):
+        try:
+            text = (process / "environ").read_bytes() + (process / "cmdline").read_bytes()
+            alive = (process / "stat").read_text().rsplit(")", 1)[1].split()[0] != "Z"
+        except OSError:
+            continue
+        if alive and int(process.name) != os.getpid() and str(folder).encode() in text:
+            found.append((process / "cmdline").read_bytes().replace(b"\0", b" ").decode())
+    return found
+
+
+def test_figures_are_those_of_the_recording(tmp_path):
+    bag, report = recording("f1tenth-motor-servo.bag"), tmp_path / "report.json"
+    run = demo(tmp_path / "local", "--bag", str(bag), "--duration", "5", "--report", str(report))
+    output, _ = run.communicate(timeout=TIMEOUT_S)
+    assert run.returncode == 0, output
+    figures = json.loads(report.read_text())
+    # The recording's clock runs at 49.99 Hz.
+    assert figures["samples_sent"] == pytest.approx(250, abs=3)
+    assert figures["samples_sent"] == figures["samples_stored"] == figures["samples_summarized"]
+    assert figures["samples_lost"] == 0
+    assert 0 < figures["live_received"] <= figures["live_published"]
+    for spread in (*figures["rtt_ms"].values(), figures["car_to_dashboard_ms"]):
+        assert 0 < spread["p50"] <= spread["p95"]
+    assert "car to dashboard" in output
+    assert not processes_of(tmp_path)
+
+
+def test_one_at_a_time_and_ctrl_c_leaves_nothing_running(tmp_path):
+    folder = tmp_path / "local"
+    first = demo(folder, "--duration", "600")
+    try:
+        until((folder / "agent.log").exists, seconds=90)
+        second = demo(folder)
+        output, _ = second.communicate(timeout=TIMEOUT_S)
+        assert second.returncode == 2
+        assert (
+            f"already running in {folder}" in output.replace("\n", " ").replace("  ", " ")
+            or str(first.pid) in output
+        )
+        assert str(first.pid) in output
+        assert processes_of(folder)
+    finally:
+        first.send_signal(signal.SIGINT)
+        output, _ = first.communicate(timeout=TIMEOUT_S)
+    assert first.returncode == 130, output
+    assert not processes_of(folder)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "said"),
+    [
+        (("--duration", "-3"), "DURATION=-3"),
+        (("--duration", "soon"), "DURATION=soon"),
+        (("--bag", "no/such.bag"), "no such file"),
+        (("--report", "no/such/folder/r.json"), "no such folder"),
+        (("--port", "70000"), "PORT=70000"),
+    ],
+)
+def test_wrong_use_is_said_at_once(tmp_path, arguments, said):
+    run = demo(tmp_path / "local", *arguments)
+    output, _ = run.communicate(timeout=TIMEOUT_S)
+    assert run.returncode == 2
+    assert said in output
+    assert "Traceback" not in output
+
+
+def test_busy_port_is_named(tmp_path):
+    with socket.create_server(("127.0.0.1", 0)) as taken:
+        port = taken.getsockname()[1]
+        run = demo(tmp_path / "local", "--port", str(port), "--duration", "1")
+        output, _ = run.communicate(timeout=TIMEOUT_S)
+    assert run.returncode == 2
+    assert str(port) in output
+    assert "Traceback" not in output
+    assert not processes_of(tmp_path)
+
+
+@pytest.mark.parametrize("content", [b"not a bag", b"", b"#ROSBAG V2.0\n" + bytes(500)])
+def test_recording_that_is_none_is_refused_at_once(tmp_path, content):
+    bag = tmp_path / "x.bag"
+    bag.write_bytes(content)
+    run = demo(tmp_path / "local", "--bag", str(bag))
+    output, _ = run.communicate(timeout=TIMEOUT_S)
+    assert run.returncode == 2
+    assert str(bag) in output.replace("\n", "")
+    assert "Traceback" not in output
+    assert not (tmp_path / "local").exists()
+
+
+def test_recording_without_a_vesc_topic_says_what_it_has(tmp_path):
+    from rosbags.rosbag1 import Writer
+    from rosbags.typesys import Stores, get_typestore
+
+    store = get_typestore(Stores.ROS1_NOETIC)
+    with Writer(tmp_path / "other.bag") as writer:
+        text = store.types["std_msgs/msg/Float64"](data=1.0)
+        connection = writer.add_connection("/servo", "std_msgs/msg/Float64", typestore=store)
+        writer.write(connection, 1, store.serialize_ros1(text, "std_msgs/msg/Float64"))
+    run = demo(tmp_path / "local", "--bag", str(tmp_path / "other.bag"))
+    output, _ = run.communicate(timeout=TIMEOUT_S)
+    assert run.returncode == 2
+    assert "/servo" in output
+
+
+@pytest.mark.parametrize("number", [signal.SIGHUP, signal.SIGKILL])
+def test_nothing_is_left_when_the_terminal_closes_or_it_is_killed(tmp_path, number):
+    folder = tmp_path / "local"
+    run = demo(folder, "--duration", "600")
+    until((folder / "agent.log").exists, seconds=90)
+    run.send_signal(number)
+    run.communicate(timeout=TIMEOUT_S)
+    until(lambda: not processes_of(folder), seconds=30)

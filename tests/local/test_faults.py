@@ -1,0 +1,245 @@
+"""What goes wrong between a car and its cloud: every sample is in the table once, in order, all the same.
+
+The processes are real: the agent as it is installed, the embedded cloud's broker, and a proxy between
+the two that is killed, freezes, resets and delays. Faults of the network run side by side, each with
+a car of its own.
+"""
+
+from __future__ import annotations
+
+import os
+import shutil
+import socket
+import subprocess
+import threading
+import time
+from pathlib import Path
+
+import pytest
+
+from local.cloud import EmbeddedCloud
+from station import delivery, robots
+from tests.local.conftest import until
+from tests.local.drives import RATE_HZ, Agent, counted, counter_log
+from tests.proxy import FREEZE, PASS, REFUSE, Proxy
+
+OUTAGE_S = 60
+DRIVE_S = 75
+FAKETIME = next(Path("/usr/lib").glob("*/faketime/libfaketime.so.1"), None)
+as_root = pytest.mark.skipif(os.geteuid() != 0, reason="mounting needs root")
+
+
+def _settings(log: Path, port: int, **more):
+    return {
+        "port": port,
+        "queue": {"path": "spool.db", **more.pop("queue", {})},
+        "sources": [{"type": "bag", "path": str(log)}],
+        **more,
+    }
+
+
+@pytest.fixture
+def proxy(embedded: EmbeddedCloud):
+    with Proxy("127.0.0.1", embedded.cloud.mqtt_port) as running:
+        yield running
+
+
+def _killed(proxy: Proxy, over: threading.Event) -> None:
+    over.wait(5)
+    proxy.mode = REFUSE
+    over.wait(OUTAGE_S)
+    proxy.mode = PASS
+
+
+def _frozen(proxy: Proxy, over: threading.Event) -> None:
+    over.wait(5)
+    proxy.mode = FREEZE
+    over.wait(50)
+    proxy.mode = PASS
+
+
+def _reset(proxy: Proxy, over: threading.Event) -> None:
+    proxy.reset_every(2)
+    over.wait()
+    proxy.reset_every(None)
+
+
+def _slow(proxy: Proxy, over: threading.Event) -> None:
+    proxy.latency_s = 0.25
+    for _ in range(4):
+        if over.wait(10):
+            return
+        proxy.mode = FREEZE
+        over.wait(4)
+        proxy.mode = PASS
+
+
+FAULTS = {"killed": _killed, "frozen": _frozen, "reset": _reset, "slow": _slow}
+
+
+@pytest.fixture(scope="module")
+def drives(embedded: EmbeddedCloud, tmp_path_factory):
+    """Every fault of the network with a car of its own, all at once: name -> (car, agent, report)."""
+    folder = tmp_path_factory.mktemp("faults")
+    log = counter_log(folder / "counter.csv", DRIVE_S)
+    finished = {}
+
+    def drive(name, fault):
+        over = threading.Event()
+        with Proxy("127.0.0.1", embedded.cloud.mqtt_port) as proxy:
+            car = robots.add(embedded.cloud, f"fault-{name}", out=folder, settings=_settings(log, proxy.port))
+            agent = Agent(car, drain_s=90)
+            meddler = threading.Thread(target=fault, args=(proxy, over))
+            meddler.start()
+            agent.process.wait(DRIVE_S + 120)
+            over.set()
+            meddler.join()
+            finished[name] = (car.robot, agent, agent.report())
+
+    threads = [threading.Thread(target=drive, args=item) for item in FAULTS.items()]
+    for thread in threads:
+        thread.start()
+    for thread in threads:
+        thread.join()
+    return finished
+
+
+@pytest.mark.parametrize("name", FAULTS)
+def test_fault_of_the_network_loses_nothing(embedded, drives, name):
+    robot, agent, report = drives[name]
+    assert counted(embedded, robot) == list(range(DRIVE_S * RATE_HZ))
+    assert report["spool"]["dropped_samples"] == 0
+    assert report["streams"]["vesc"]["samples"] == DRIVE_S * RATE_HZ
+    until(lambda: delivery.samples_summarized(embedded.cloud, robot, "vesc") == DRIVE_S * RATE_HZ)
+    if name != "slow":
+        assert agent.said("connected to")
+
+
+def test_live_lane_shows_now_while_the_backlog_drains(embedded, bundle, proxy, tmp_path):
+    from station.listener import Listener
+
+    log = counter_log(tmp_path / "counter.csv", 50)
+    car = bundle(**_settings(log, proxy.port))
+    with Listener(
+        subscribe_key=embedded.subscribe_key,
+        robot=car.robot,
+        namespace=embedded.namespace,
+        origin=embedded.pubnub.origin,
+        tls=False,
+    ) as listener:
+        proxy.mode = REFUSE
+        agent = Agent(car)
+        until(lambda: len(proxy.attempts) >= 2, seconds=60)
+        threading.Event().wait(8)
+        proxy.mode = PASS
+        agent.report()
+    # What was heard was new when it left the car, and nothing of the outage was shown late.
+    assert listener.heard
+    assert max(heard.delay_ms for heard in listener.heard) < 2_500
+    assert counted(embedded, car.robot) == list(range(50 * RATE_HZ))
+
+
+@pytest.mark.parametrize("broker", [PASS, REFUSE])
+def test_killed_agent_goes_on_where_it_was(embedded, bundle, proxy, tmp_path, broker):
+    """What was in a closed batch survives; at most the open batch, a second, goes with the process."""
+    log = counter_log(tmp_path / "counter.csv", 12)
+    car = bundle(**_settings(log, proxy.port))
+    first = Agent(car)
+    until(lambda: first.said("connected to"))
+    proxy.mode = broker
+    began = time.monotonic()
+    threading.Event().wait(6)
+    first.kill()
+    driven = (time.monotonic() - began) * RATE_HZ
+    proxy.mode = PASS
+    Agent(car).report()
+    found = counted(embedded, car.robot)
+    restart = found.index(0, 1)
+    assert found[:restart] == list(range(restart))
+    assert restart >= driven - 1.5 * RATE_HZ
+    assert found[restart:] == list(range(12 * RATE_HZ))
+
+
+@pytest.mark.skipif(FAKETIME is None, reason="libfaketime is not installed: apt install faketime")
+def test_clock_set_back_an_hour(embedded, bundle, tmp_path):
+    log = counter_log(tmp_path / "counter.csv", 10)
+    car = bundle(queue={"path": "spool.db"}, sources=[{"type": "bag", "path": str(log)}])
+    clock = tmp_path / "clock"
+    clock.write_text("+0")
+    agent = Agent(
+        car,
+        environment={
+            "LD_PRELOAD": str(FAKETIME),
+            "FAKETIME_TIMESTAMP_FILE": str(clock),
+            "FAKETIME_CACHE_DURATION": "1",
+            "FAKETIME_DONT_FAKE_MONOTONIC": "1",
+        },
+    )
+    until(lambda: agent.said("connected to"))
+    threading.Event().wait(3)
+    clock.write_text("-1h")
+    report = agent.report()
+    batches = list(delivery.batches(embedded.cloud, car.robot, "vesc"))
+    values = [int(v) for batch in sorted(batches, key=lambda b: b.seq) for v in batch.columns["speed"]]
+    assert values == list(range(10 * RATE_HZ))
+    assert report["spool"]["left_samples"] == 0
+
+
+@as_root
+def test_disk_full_and_free_again(embedded, bundle, proxy, tmp_path):
+    disk = tmp_path / "disk"
+    disk.mkdir()
+    subprocess.run(["mount", "-t", "tmpfs", "-o", "size=2m", "tmpfs", str(disk)], check=True)
+    try:
+        log = counter_log(tmp_path / "counter.csv", 12)
+        settings = _settings(log, proxy.port, queue={"path": str(disk / "spool.db")})
+        car = bundle(**settings)
+        agent = Agent(car)
+        until(lambda: agent.said("connected to"))
+        proxy.mode = REFUSE
+        filler = disk / "filler"
+        with pytest.raises(OSError, match="No space left"):
+            filler.write_bytes(bytes(4 * 1024 * 1024))
+        until(lambda: agent.status().get("alarms"), seconds=30)
+        filler.unlink()
+        proxy.mode = PASS
+        agent.report()
+    finally:
+        subprocess.run(["umount", str(disk)], check=True)
+    assert counted(embedded, car.robot) == list(range(12 * RATE_HZ))
+
+
+def test_corrupt_spool_is_set_aside(embedded, bundle, proxy, tmp_path):
+    log = counter_log(tmp_path / "counter.csv", 12)
+    car = bundle(**_settings(log, proxy.port))
+    agent = Agent(car)
+    until(lambda: agent.said("connected to"))
+    proxy.mode = REFUSE
+    threading.Event().wait(3)
+    spool = car.folder / "spool.db"
+    with spool.open("r+b") as file:
+        file.write(os.urandom(min(8192, spool.stat().st_size)))
+    threading.Event().wait(3)
+    proxy.mode = PASS
+    agent.report()
+    found = counted(embedded, car.robot)
+    assert found == sorted(set(found))
+    assert found[-1] == 12 * RATE_HZ - 1
+
+
+@as_root
+def test_name_that_does_not_resolve_at_boot(embedded, bundle, tmp_path):
+    if shutil.which("unshare") is None:
+        pytest.skip("unshare is not installed: apt install util-linux")
+    log = counter_log(tmp_path / "counter.csv", 6)
+    name = socket.gethostname()
+    car = bundle(endpoint=name, sources=[{"type": "bag", "path": str(log)}])
+    hosts = tmp_path / "hosts"
+    hosts.write_text("127.0.0.1 localhost\n")
+    mount = f'mount --bind {hosts} /etc/hosts && exec "$@"'
+    agent = Agent(car, before=["unshare", "--mount", "sh", "-c", mount, "sh"])
+    until(lambda: agent.said("does not resolve"), seconds=30)
+    with hosts.open("a") as file:
+        file.write(f"127.0.0.1 {name}\n")
+    agent.report()
+    assert counted(embedded, car.robot) == list(range(6 * RATE_HZ))

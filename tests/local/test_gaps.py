@@ -1,0 +1,70 @@
+"""The gaps are closed, and are still gaps: a release of the emulator that closes one tells us here."""
+
+from __future__ import annotations
+
+import asyncio
+import inspect
+
+import pytest
+from ministack.services import iot, lambda_svc
+
+from local import gaps
+
+
+@pytest.mark.parametrize(
+    ("template", "topic"),
+    [
+        ("pong/iort/${topic(3)}/rule", "pong/iort/car1/rule"),
+        ("${topic(1)}/x", "ping/x"),
+        ("all/${topic()}", "all/ping/iort/car1/rule"),
+        ("none/${ topic( 9 ) }/x", "none//x"),
+        ("plain/topic", "plain/topic"),
+    ],
+)
+def test_republish_topic_is_expanded(template, topic):
+    assert gaps.expand_topic(template, "ping/iort/car1/rule") == topic
+
+
+def test_wrapped_functions_take_what_the_wrappers_pass():
+    assert list(inspect.signature(iot._run_rule_actions).parameters)[:5] == [
+        "account_id", "region", "rule", "payload", "topic",
+    ]  # fmt: skip
+    assert list(inspect.signature(iot._dispatch_rule_to_lambda).parameters) == [
+        "account_id", "region", "function_arn", "event",
+    ]  # fmt: skip
+    assert list(inspect.signature(iot.broker_publish).parameters)[:4] == [
+        "account_id", "region", "topic", "payload",
+    ]  # fmt: skip
+    assert list(inspect.signature(iot._fleet_provisioning_reply).parameters) == [
+        "account_id", "region", "operation", "template_name", "payload", "connection",
+    ]  # fmt: skip
+    for name in (
+        "_get_func_record_for_ref_in_scope",
+        "_execution_record_for_config",
+        "_reserved_concurrency",
+    ):
+        assert callable(getattr(lambda_svc, name))
+
+
+def test_gaps_are_still_gaps():
+    assert "floor" not in iot._IMPLEMENTED_SQL_FUNCS
+    assert "topic(" not in inspect.getsource(iot._dispatch_rule_republish)
+    assert "128 * 1024" not in inspect.getsource(iot.broker_publish)
+    assert iot._parse_fleet_provisioning_topic("$aws/certificates/create-from-csr/json") is None
+    assert "secure" not in inspect.getsource(iot._dispatch_rule_sqs)
+
+
+def test_floor():
+    evaluate = gaps._with_floor(iot._eval_select_function)
+    assert evaluate("floor", ["3.7"], "", b"", {}) == 3
+    assert evaluate("floor", ["x"], "", b"", {"x": -1.5}) == -2
+    assert evaluate("topic", ["1"], "a/b", b"", {}) == "a"
+
+
+def test_large_publish_is_refused_before_anything_happens():
+    async def publish(*_args, **_named):
+        raise AssertionError
+
+    refuse = gaps._refusing_large(publish)
+    with pytest.raises(gaps.MessageTooLargeError):
+        asyncio.run(refuse("0", "r", "t", b"x" * (gaps.AWS_MESSAGE_BYTES + 1)))

@@ -1,0 +1,164 @@
+"""From a claim to a robot that drives, and to its next certificate, on the embedded cloud."""
+
+from __future__ import annotations
+
+import json
+import stat
+import subprocess
+import sys
+from pathlib import Path
+from typing import Any
+
+import pytest
+import yaml
+
+from contract import ROBOT, claim_name
+from local.cloud import ROOT
+from station import delivery, robots
+from tests.local.conftest import run_agent, until
+from tests.local.robot import Robot
+
+AGENT = Path(sys.executable).parent / "iort-agent"
+
+
+def command(*arguments: object, status: int = 0) -> subprocess.CompletedProcess[str]:
+    done = subprocess.run(
+        [AGENT, *map(str, arguments)], cwd=ROOT, capture_output=True, text=True, timeout=120, check=False
+    )
+    assert done.returncode == status, done.stdout + done.stderr
+    return done
+
+
+def certificates(embedded: Any, robot: str) -> list[str]:
+    found: list[str] = embedded.cloud.client("iot").list_thing_principals(thingName=robot)["principals"]
+    return found
+
+
+def test_a_claim_becomes_a_robot_that_drives(embedded, tmp_path):
+    claim = robots.claim(embedded.cloud, "claimed", out=tmp_path / "claim")
+    command("provision", "--config", claim)
+    bundle = robots.Bundle("claimed", tmp_path / "claim")
+    for name in ("private.key", "certificate.pem", "car.yaml", "claim-private.key", "claim.yaml"):
+        assert stat.S_IMODE((bundle.folder / name).stat().st_mode) == 0o600, name
+    described = embedded.cloud.client("iot").describe_thing(thingName="claimed")
+    assert (described["thingTypeName"], described["attributes"]["vehicle"]) == ("iort-robot", "vesc")
+    assert any(row[ROBOT] == "claimed" for row in robots.listed(embedded.cloud))
+    robots.configure(bundle, {"sources": [{"type": "sim", "stream": "vesc", "rate_hz": 50, "duration_s": 1}]})
+    run_agent(bundle)
+    until(lambda: delivery.delivery(embedded.cloud, "claimed", "vesc").samples_stored == 50)
+    robots.remove(embedded.cloud, "claimed")
+
+
+def test_a_second_robot_cannot_take_a_name(embedded, tmp_path):
+    first = robots.claim(embedded.cloud, "taken", out=tmp_path / "first")
+    command("provision", "--config", first)
+    second = robots.claim(embedded.cloud, None, out=tmp_path / "second", lasting=True)
+    settings = yaml.safe_load(second.read_text())
+    second.write_text(yaml.safe_dump({**settings, "serial": "another-machine"}))
+    done = command("provision", "--config", second, "--robot", "taken", status=1)
+    assert "RegisterThing was refused" in done.stderr
+    assert "another-machine" in done.stderr
+    assert "Traceback" not in done.stderr
+    assert not (tmp_path / "second" / "car.yaml").exists()
+
+
+def test_a_lasting_claim_is_good_for_provisioning_only(embedded, tmp_path):
+    claim = robots.claim(embedded.cloud, None, out=tmp_path, lasting=True)
+    command("provision", "--config", claim, status=2)  # no name
+    command("provision", "--config", claim, "--robot", "lasting")
+    # As a robot the claim may do nothing at all.
+    for name in ("certificate.pem", "private.key"):
+        (tmp_path / f"claim-{name}").replace(tmp_path / name)
+    with Robot(tmp_path, client_id="lasting") as robot:
+        assert robot.refused.wait(15)
+    with Robot(tmp_path, client_id=f"{claim_name()}-x") as robot:
+        assert robot.online().publish("dt/iort/lasting/vesc", b"{}") == "NOT_AUTHORIZED"
+        assert robot.subscribe("#") == "NOT_AUTHORIZED"
+        assert robot.subscribe("$aws/certificates/create-from-csr/json/accepted") == "GRANTED_QOS_1"
+        assert robot.subscribe("$aws/certificates/create/json/accepted") == "NOT_AUTHORIZED"
+
+
+def test_a_used_up_claim_is_told(embedded, tmp_path):
+    claim = robots.claim(embedded.cloud, None, out=tmp_path, lasting=True)
+    iot = embedded.cloud.client("iot")
+    for certificate in iot.list_targets_for_policy(policyName=claim_name())["targets"]:
+        iot.update_certificate(certificateId=certificate.rsplit("/", 1)[-1], newStatus="REVOKED")
+    done = command("provision", "--config", claim, "--robot", "late", status=1)
+    assert "the claim does not connect" in done.stderr
+    assert "iort robots claim" in done.stderr
+
+
+def test_an_existing_configuration_is_updated_and_keeps_its_comments(embedded, tmp_path):
+    claim = robots.claim(embedded.cloud, "updated", out=tmp_path)
+    car = tmp_path / "car.yaml"
+    car.write_text("# my car\nrobot: other\nport: 1  # wrong\nsources:\n  - type: sim # a comment\n")
+    command("provision", "--config", claim)
+    text = car.read_text()
+    assert "# my car" in text
+    assert "# a comment" in text
+    assert yaml.safe_load(text)["robot"] == "updated"
+    assert yaml.safe_load(text)["port"] == embedded.cloud.mqtt_port
+
+
+def test_renewal_without_an_agent(embedded, bundle, tmp_path):
+    car = bundle()
+    before = (car.folder / "certificate.pem").read_text()
+    claim = robots.claim(embedded.cloud, car.robot, out=tmp_path / "claim")
+    command("renew", "--config", car.config, "--claim", claim)
+    assert (car.folder / "certificate.pem").read_text() != before
+    assert not list(car.folder.glob("*.previous"))
+    assert len(certificates(embedded, car.robot)) == 2
+    with Robot(car.folder) as robot:
+        robot.online()
+
+
+def test_renewal_that_does_not_connect_leaves_the_old_certificate(embedded, bundle, tmp_path, monkeypatch):
+    from device import identity
+    from device.errors import IdentityError
+
+    car = bundle()
+    before = (car.folder / "certificate.pem").read_text(), (car.folder / "private.key").read_text()
+    claim = robots.claim(embedded.cloud, car.robot, out=tmp_path / "claim")
+
+    def fails(*_: object) -> None:
+        raise IdentityError("no")
+
+    monkeypatch.setattr(identity, "_try_alone", fails)
+    with pytest.raises(IdentityError):
+        identity.renew(car.config, claim, status_socket=tmp_path / "none.sock")
+    assert before == (
+        (car.folder / "certificate.pem").read_text(),
+        (car.folder / "private.key").read_text(),
+    )
+
+
+def test_renewal_while_the_agent_runs(embedded, bundle, tmp_path):
+    car = bundle(sources=[{"type": "sim", "stream": "vesc", "rate_hz": 50}])
+    claim = robots.claim(embedded.cloud, car.robot, out=tmp_path / "claim")
+    report = tmp_path / "report.json"
+    with subprocess.Popen([AGENT, "--config", car.config, "--report", report], cwd=ROOT) as agent:
+        try:
+            until(lambda: _connected(car.config))
+            command("renew", "--config", car.config, "--claim", claim)
+            state = json.loads(command("status", "--config", car.config, "--json").stdout)
+            # The old one is not needed any more.
+            old, new = sorted(
+                certificates(embedded, car.robot),
+                key=lambda arn: arn.endswith(state["connection"]["certificate_id"]),
+            )
+            assert new.endswith(state["connection"]["certificate_id"])
+            embedded.cloud.client("iot").update_certificate(
+                certificateId=old.rsplit("/", 1)[-1], newStatus="REVOKED"
+            )
+        finally:
+            agent.terminate()
+            assert agent.wait(30) == 0
+    sent = json.loads(report.read_text())["streams"]["vesc"]["samples"]
+    until(lambda: delivery.delivery(embedded.cloud, car.robot, "vesc").samples_stored == sent)
+
+
+def _connected(config: Path) -> bool:
+    done = subprocess.run(
+        [AGENT, "status", "--config", config, "--json"], capture_output=True, text=True, check=False
+    )
+    return done.returncode == 0 and bool(json.loads(done.stdout)["connection"]["connected"])

@@ -1,0 +1,145 @@
+"""`iort-agent check`, `status` and the agent's own stream, on the embedded cloud."""
+
+from __future__ import annotations
+
+import json
+import shutil
+import subprocess
+import sys
+import threading
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+from xmlrpc.server import SimpleXMLRPCServer
+
+import pytest
+
+import contract
+from device.check import OK, Finding, _ros_master
+from local.cloud import ROOT
+from station import delivery
+from tests.local.conftest import until
+from tests.local.test_uplink import self_signed, set_status
+
+AGENT = Path(sys.executable).parent / "iort-agent"
+
+
+def findings(config: Path, *, status: int) -> dict[str, dict[str, str]]:
+    done = subprocess.run(
+        [AGENT, "check", "--config", config, "--json"], cwd=ROOT, capture_output=True, text=True, check=False
+    )
+    assert done.returncode == status, done.stdout + done.stderr
+    return {one["what"]: one for one in json.loads(done.stdout)}
+
+
+def test_a_good_robot_is_all_right(bundle):
+    car = bundle(queue={"path": "queue.db"})
+    found = findings(car.config, status=0)
+    assert {one["level"] for one in found.values()} == {OK}, found
+    assert found["broker"]["text"] == f"accepts {car.robot}"
+    assert "certificate's" in found["private key"]["text"]
+
+
+def test_a_revoked_certificate(embedded, bundle):
+    car = bundle()
+    set_status(embedded, car.robot, "REVOKED")
+    found = findings(car.config, status=1)
+    assert found["certificate"]["level"] == found["TLS"]["level"] == OK
+    assert found["broker"]["level"] == "fail"
+    assert "not active" in found["broker"]["todo"]
+
+
+def test_another_robots_certificate(bundle):
+    one, other = bundle("one"), bundle("other")
+    shutil.copy(other.folder / "certificate.pem", one.folder / "certificate.pem")
+    found = findings(one.config, status=1)
+    assert "is not the key of" in found["private key"]["text"]
+    shutil.copy(other.folder / "private.key", one.folder / "private.key")
+    assert "not authorized" in findings(one.config, status=1)["broker"]["text"]
+
+
+def test_another_authority_an_open_key_and_what_the_sources_need(bundle, tmp_path):
+    topics = {"/a": {"stream": "a", "time": "arrival"}}
+    car = bundle(
+        sources=[
+            {"type": "vesc", "port": str(tmp_path / "ttyACM0")},
+            {"type": "rosbridge", "url": "ws://127.0.0.1:9", "topics": topics},
+        ]
+    )
+    self_signed(tmp_path)
+    shutil.copy(tmp_path / "certificate.pem", car.folder / "root-ca.pem")
+    (car.folder / "private.key").chmod(0o644)
+    found = findings(car.config, status=1)
+    assert found["TLS"]["level"] == "fail"
+    assert "root_ca" in found["TLS"]["todo"]
+    assert found["key's mode"]["level"] == "warn"
+    vesc, rosbridge = (one for what, one in found.items() if what.startswith("source"))
+    assert "is not there" in vesc["text"]
+    assert rosbridge["level"] == "fail"
+
+
+@pytest.fixture
+def ros_master(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
+    with SimpleXMLRPCServer(("127.0.0.1", 0), logRequests=False) as server:
+        server.register_function(lambda _caller: [1, "", 4711], "getPid")
+        threading.Thread(target=server.serve_forever, daemon=True).start()
+        monkeypatch.setenv("ROS_MASTER_URI", f"http://127.0.0.1:{server.server_address[1]}")
+        yield
+        server.shutdown()
+
+
+def test_a_ros_master(ros_master):
+    *_, found = _ros_master("ros")
+    assert (found.level, "process 4711" in found.text) == (OK, True)
+
+
+def test_no_ros_master(monkeypatch):
+    monkeypatch.setenv("ROS_MASTER_URI", "http://127.0.0.1:9")
+    found: list[Finding] = list(_ros_master("ros"))
+    assert found[-1].level == "fail"
+    assert "roscore" in found[-1].todo
+
+
+def test_a_running_agent_tells_of_itself(embedded, bundle):
+    car = bundle(sources=[{"type": "sim", "stream": "vesc", "rate_hz": 50}], metrics={"every_s": 1}, queue={})
+    with subprocess.Popen([AGENT, "run", "--config", car.config], cwd=ROOT) as agent:
+        try:
+            state = until(lambda: _state(car.config))
+            assert state["robot"] == car.robot
+            until(lambda: _state(car.config)["clock"])
+            state = _state(car.config)
+            assert state["connection"]["connected"]
+            assert 40 < state["streams"]["vesc"]["per_s"] < 60
+            # One machine, one clock: the emulator's stamps are ours.
+            assert abs(state["clock"]["offset_ms"]) <= state["clock"]["uncertainty_ms"] + 1
+            found = findings(car.config, status=0)
+            assert found["broker"]["text"] == "the running agent is connected"
+            assert _state(car.config)["connection"]["connects"] == 1, "check took the connection"
+            shown = subprocess.run(
+                [AGENT, "status", "--config", car.config], capture_output=True, text=True, check=True
+            )
+            assert "connected for" in shown.stdout
+            second = subprocess.run(
+                [AGENT, "--config", car.config], capture_output=True, text=True, check=False, timeout=30
+            )
+            assert (second.returncode, "already running" in second.stderr) == (1, True), second.stderr
+            samples = until(lambda: _own_samples(embedded, car.robot))
+        finally:
+            agent.terminate()
+            assert agent.wait(30) == 0
+    assert samples.keys() == contract.AGENT_FIELDS.keys()
+    assert samples["connects"][-1] == 1
+    assert 1 < samples["rss_mb"][-1] < 200
+    assert not (car.folder / "agent.sock").exists()
+
+
+def _state(config: Path) -> Any:
+    done = subprocess.run(
+        [AGENT, "status", "--config", config, "--json"], capture_output=True, text=True, check=False
+    )
+    return json.loads(done.stdout) if done.returncode == 0 else None
+
+
+def _own_samples(embedded: Any, robot: str) -> dict[str, Any] | None:
+    found = list(delivery.batches(embedded.cloud, robot, contract.AGENT_STREAM))
+    return dict(found[-1].columns) if found else None

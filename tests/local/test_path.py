@@ -1,0 +1,156 @@
+"""The main job on the embedded cloud: what a car sends is stored, summarised and shown, whole."""
+
+from __future__ import annotations
+
+import base64
+import json
+import math
+import os
+import signal
+import threading
+import time
+
+import pytest
+
+import contract
+from local.cloud import EmbeddedCloud
+from local.figures import round_trips
+from station import delivery
+from station.listener import Listener
+from tests.local.conftest import run_agent, until
+from tests.local.drives import Agent
+from tests.local.robot import Robot
+from tests.recordings import recording
+
+
+def _listener(embedded: EmbeddedCloud, robot: str) -> Listener:
+    return Listener(
+        subscribe_key=embedded.subscribe_key,
+        robot=robot,
+        namespace=embedded.namespace,
+        origin=embedded.pubnub.origin,
+        tls=False,
+    )
+
+
+def test_simulated_drive_arrives_whole_on_both_lanes(embedded, bundle):
+    car = bundle(
+        sources=[{"type": "sim", "stream": "vesc", "rate_hz": 50, "duration_s": 4}],
+        ping={"rate_hz": 5, "padding_bytes": 430},
+    )
+    with _listener(embedded, car.robot) as listener:
+        report = run_agent(car)
+        until(lambda: len(listener.heard) >= report["live_published"] * 0.9)
+    assert report["streams"]["vesc"]["samples"] == 200
+    until(lambda: delivery.samples_summarized(embedded.cloud, car.robot, "vesc") == 200)
+    found = delivery.delivery(embedded.cloud, car.robot, "vesc")
+    assert (found.samples_stored, found.batches_missing) == (200, 0)
+    assert {heard.robot for heard in listener.heard} == {car.robot}
+    trips = round_trips(delivery.batches(embedded.cloud, car.robot, contract.RTT_STREAM))
+    assert all(spread.n >= 10 and spread.p50 is not None for spread in trips.values()), trips
+
+
+def test_recorded_drive_arrives_whole_and_exact(embedded, bundle):
+    from rosbags.highlevel import AnyReader
+
+    path = recording("f1tenth-motor-servo.bag")
+    car = bundle(
+        sources=[{"type": "bag", "path": str(path), "speed": 0, "stamps": "original"}],
+        live={"enabled": False},
+    )
+    run_agent(car)
+    stored = list(delivery.batches(embedded.cloud, car.robot, "vesc"))
+    assert sum(len(batch.times_us) for batch in stored) == 2244
+    with AnyReader([path]) as reader:
+        connections = [c for c in reader.connections if c.topic == "/sensors/core"]
+        sent = [reader.deserialize(raw, c.msgtype).state for c, _, raw in reader.messages(connections)]
+    for field in (name for name, f in contract.VESC_FIELDS.items() if 1 in f.ros):
+        kept = [value for batch in stored for value in batch.columns[field]]
+        assert kept == [getattr(state, field) for state in sent], field
+    until(lambda: delivery.samples_summarized(embedded.cloud, car.robot, "vesc") == 2244)
+
+
+def test_seconds_are_summarised_with_speed_in_mps(embedded, bundle):
+    car = bundle(sources=[{"type": "sim", "stream": "vesc", "rate_hz": 20, "duration_s": 2}])
+    run_agent(car)
+    until(lambda: delivery.samples_summarized(embedded.cloud, car.robot, "vesc") == 40)
+    topic = contract.build_topic(contract.RECORD, car.robot, "vesc", embedded.namespace)
+    items = embedded.cloud.client("dynamodb").query(
+        TableName=embedded.cloud.output("storage", "SummaryTable"),
+        KeyConditionExpression="topic = :topic",
+        ExpressionAttributeValues={":topic": {"S": topic}},
+    )["Items"]
+    for item in items:
+        assert math.isclose(
+            float(item["speed_mps_last"]["N"]),
+            float(item["speed_last"]["N"]) / 4614,
+            rel_tol=1e-9,
+            abs_tol=1e-12,
+        )
+        assert int(item["expires_s"]["N"]) > int(item["second"]["N"])
+
+
+@pytest.mark.parametrize(
+    "payload",
+    [b"not json", b"\xff\xfe\x00", b'{"v": 1}', b"[]", b'{"t": "text"}'],
+    ids=["text", "not-utf8", "no-key", "array", "key-of-another-type"],
+)
+def test_malformed_record_is_quarantined_with_its_bytes(embedded, bundle, payload):
+    car = bundle()
+    sqs, url = embedded.cloud.client("sqs"), embedded.cloud.output("ingest", "RejectedQueue")
+    with Robot(car.folder) as robot:
+        answer = robot.online().publish(contract.record_topic(car.robot, "vesc", embedded.namespace), payload)
+        assert answer == "SUCCESS"
+
+    def mine():
+        for message in sqs.receive_message(QueueUrl=url, MaxNumberOfMessages=10).get("Messages", []):
+            body = json.loads(message["Body"])
+            if car.robot in body["topic"]:
+                return body
+        return None
+
+    body = until(mine)
+    assert base64.b64decode(body["base64OriginalPayload"]) == payload
+    assert body["failures"][0]["failedAction"] == "DynamoDBv2Action"
+
+
+def test_undecodable_batch_is_kept_and_its_neighbours_summarised(embedded, bundle):
+    car = bundle()
+    now_us = int(time.time()) * 1_000_000
+    good = [contract.Batch("0badcafe", seq, [now_us + seq * 1_000_000], {"speed": [1.5]}) for seq in (0, 2)]
+    bad = json.loads(contract.encode(contract.Batch("0badcafe", 1, [now_us + 1_000_000], {"speed": [1.0]})))
+    bad["samples"] = "AAAA"
+    topic = contract.record_topic(car.robot, "vesc", embedded.namespace)
+    with Robot(car.folder) as robot:
+        robot.online()
+        for payload in (contract.encode(good[0]), json.dumps(bad).encode(), contract.encode(good[1])):
+            assert robot.publish(topic, payload) == "SUCCESS"
+    until(lambda: delivery.samples_summarized(embedded.cloud, car.robot, "vesc") == 2)
+    stored = delivery.items(embedded.cloud, car.robot, "vesc")
+    assert [item["samples"] for item in stored][1] == "AAAA"
+
+
+def test_live_message_without_our_envelope_never_reaches_the_dashboard(embedded, bundle):
+    car = bundle()
+    good = contract.LiveSample("0badcafe", 7, time.time_ns() // 1000, time.time_ns() // 1000, {"speed": 3})
+    live = contract.build_topic(contract.LIVE, car.robot, "vesc", embedded.namespace)
+    with _listener(embedded, car.robot) as listener, Robot(car.folder) as robot:
+        robot.online()
+        robot.publish(live, b'{"speed": 99}')
+        robot.publish(live, contract.encode_live(good))
+        until(lambda: listener.heard)
+    assert [heard.seq for heard in listener.heard] == [7]
+
+
+def test_messages_that_a_stalled_broker_held_up_are_not_shown(embedded, bundle):
+    car = bundle(sources=[{"type": "sim", "stream": "vesc", "rate_hz": 50, "duration_s": 14}])
+    with _listener(embedded, car.robot) as listener:
+        agent = Agent(car)
+        until(lambda: len(listener.heard) > 20)
+        os.kill(embedded.emulator.pid, signal.SIGSTOP)
+        threading.Event().wait(6)
+        os.kill(embedded.emulator.pid, signal.SIGCONT)
+        agent.report()
+        until(lambda: listener.heard[-1].delay_ms < 1_000)
+    delays = [heard.delay_ms for heard in listener.heard]
+    assert max(delays) < 2_500, sorted(delays)[-5:]

@@ -1,0 +1,168 @@
+"""Lambda 1's publisher: PubNub's own SDK against the stand-in, over a real connection."""
+
+from __future__ import annotations
+
+import http.server
+import json
+import logging
+import socket
+import threading
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+
+import pytest
+
+import contract
+from functions.pubnub_client import PublishError, PubNubPublisher
+from local.pubnub_standin import PubNubStandIn
+
+KEYS = {"publish_key": "pub-c-ours", "subscribe_key": "sub-c-ours"}
+MESSAGE = {"robot": "car", "sample": {"speed": 1200, "text": 'a "quoted" ä'}}
+
+
+@pytest.fixture
+def standin():
+    with PubNubStandIn(**KEYS) as standin:
+        yield standin
+
+
+@pytest.fixture
+def publisher():
+    """Make publishers, each closed at the end."""
+    made = []
+
+    def make(origin, **keys):
+        made.append(PubNubPublisher(**{**KEYS, **keys}, origin=origin, tls=False))
+        return made[-1]
+
+    yield make
+    for one in made:
+        one._client._request_handler.close()
+
+
+@pytest.fixture(autouse=True)
+def quiet(caplog):
+    """Whatever happens, neither error nor log line may show a key, not even to who logs everything."""
+    with caplog.at_level(logging.DEBUG):
+        yield
+    for record in caplog.get_records("call"):
+        assert "c-ours" not in record.getMessage(), record.name
+
+
+def received(standin):
+    return [message for _, message in standin._history.after(0, Everything())]
+
+
+class Everything:
+    def match(self, channel):
+        return channel
+
+
+def refused(publisher):
+    """The error of a publish, and how long it took."""
+    began = time.monotonic()
+    with pytest.raises(PublishError) as caught:
+        publisher.publish("iort.car", MESSAGE)
+    assert "c-ours" not in str(caught.value)
+    return str(caught.value), time.monotonic() - began
+
+
+def test_a_publish_arrives(standin, publisher):
+    publisher(standin.origin).publish("iort.car", MESSAGE)
+    (message,) = received(standin)
+    assert (message.channel, message.publisher) == ("iort.car", "iort-live")
+    assert json.loads(message.payload) == MESSAGE
+    assert (standin.published, standin.refused) == (1, 0)
+
+
+def test_one_connection_is_kept(standin, publisher, monkeypatch):
+    accepted = []
+    connect = socket.create_connection
+    monkeypatch.setattr(socket, "create_connection", lambda *a, **k: accepted.append(a) or connect(*a, **k))
+    one = publisher(standin.origin)
+    for _ in range(20):
+        one.publish("iort.car", MESSAGE)
+    assert standin.published == 20
+    assert len(accepted) == 1
+
+
+def test_a_message_too_large_is_refused_here_or_there(standin, publisher):
+    one = publisher(standin.origin)
+    with pytest.raises(PublishError, match="bytes after URL encoding"):
+        one.publish("iort.car", {"text": "x" * contract.MAX_PUBNUB_BYTES})
+    assert standin.refused == 0
+    # PubNub counts the channel and its own overhead too: what just passes here is refused there.
+    just = contract.MAX_PUBNUB_BYTES - len("%7B%22text%22%3A%22%22%7D")
+    with pytest.raises(PublishError, match="status 413"):
+        one.publish("iort.car", {"text": "x" * just})
+    one.publish("iort.car", {"text": "x" * (just - 200)})
+    assert (standin.published, standin.refused) == (1, 1)
+
+
+def test_keys_that_are_refused_are_not_shown(standin, publisher):
+    text, _ = refused(publisher(standin.origin, publish_key="other-c-ours"))
+    assert text == "PubNubException, status 400"
+
+
+def test_a_dead_server_costs_a_second_at_most_and_its_return_is_noticed(publisher):
+    with PubNubStandIn(**KEYS) as standin:
+        one = publisher(standin.origin)
+        one.publish("iort.car", MESSAGE)
+        port = standin.port
+    for _ in range(2):
+        text, took_s = refused(one)
+        assert text.startswith("PubNubException")
+        assert took_s < 3
+    with PubNubStandIn(port=port, **KEYS) as standin:
+        one.publish("iort.car", MESSAGE)
+        assert standin.published == 1
+
+
+def test_a_server_that_takes_and_never_answers_costs_a_second(publisher):
+    with socket.create_server(("127.0.0.1", 0)) as silent:
+        one = publisher(f"127.0.0.1:{silent.getsockname()[1]}")
+        text, took_s = refused(one)
+        assert text.startswith("PubNubException")
+        assert 0.9 < took_s < 4
+
+
+@contextmanager
+def answering(status: int, body: bytes) -> Iterator[str]:
+    """A server that is not PubNub: a proxy's login page, a gateway's error."""
+
+    class Handler(http.server.BaseHTTPRequestHandler):
+        def do_POST(self):
+            self.rfile.read(int(self.headers["Content-Length"]))
+            self.send_response(status)
+            self.send_header("Content-Length", str(len(body)))
+            self.end_headers()
+            self.wfile.write(body)
+
+        def log_message(self, *_arguments):
+            pass
+
+    with http.server.ThreadingHTTPServer(("127.0.0.1", 0), Handler) as server:
+        thread = threading.Thread(target=server.serve_forever, daemon=True)
+        thread.start()
+        yield f"127.0.0.1:{server.server_address[1]}"
+        server.shutdown()
+        thread.join()
+
+
+@pytest.mark.parametrize(
+    ("status", "body"),
+    [
+        (200, b"<html>Sign in</html>"),
+        (200, b""),
+        (200, b"{}"),
+        (200, b"[1]"),
+        (500, b"<html>Bad gateway: pub-c-ours</html>"),
+        (403, b'{"message": "sub-c-ours", "error": true}'),
+        (400, b'[0, "Invalid Key pub-c-ours", "0"]'),
+        (429, b""),
+    ],
+)
+def test_an_answer_that_is_not_a_confirmation_is_an_error_of_ours(publisher, status, body):
+    with answering(status, body) as origin:
+        refused(publisher(origin))

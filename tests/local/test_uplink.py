@@ -1,0 +1,253 @@
+"""The uplink against the embedded cloud's broker, through a proxy that fails as networks do."""
+
+from __future__ import annotations
+
+import logging
+import os
+import shutil
+import subprocess
+import threading
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+import contract
+from device import iotcore
+from device.clock import SystemClock
+from device.dispatch import Dispatcher
+from device.iotcore import IotCore
+from device.reconnect import SLOW_SHORTEST_S
+from local.cloud import EmbeddedCloud
+from station import robots
+from tests.local.conftest import until
+from tests.local.robot import Robot
+from tests.proxy import FREEZE, PASS, REFUSE, Proxy
+
+
+@pytest.fixture
+def proxy(embedded: EmbeddedCloud) -> Iterator[Proxy]:
+    with Proxy("127.0.0.1", embedded.cloud.mqtt_port) as proxy:
+        yield proxy
+
+
+class Told:
+    """What the uplink tells its handlers, and what arrives on the robot's ping topic."""
+
+    def __init__(self, uplink: IotCore, robot: str) -> None:
+        self.connections: list[bool] = []
+        self.messages: list[bytes] = []
+        self.topic = contract.build_topic(contract.PING, robot, contract.BROKER)
+        self.uplink = uplink
+        uplink.on_connection(self.connections.append)
+        uplink.subscribe(self.topic, lambda message: self.messages.append(message.payload))
+
+    def echo(self, payload: bytes) -> None:
+        """A message there and back, which takes a subscription."""
+        until(lambda: self.uplink.subscribed(self.topic), seconds=40)
+        self.uplink.publish(self.topic, payload, qos=1, done=lambda _: None)
+        until(lambda: payload in self.messages)
+
+
+@contextmanager
+def connecting(bundle: robots.Bundle, proxy: Proxy, **other: Any) -> Iterator[Told]:
+    settings: dict[str, Any] = {
+        "endpoint": "127.0.0.1",
+        "port": proxy.port,
+        "client_id": bundle.robot,
+        "certificate": bundle.folder / "certificate.pem",
+        "private_key": bundle.folder / "private.key",
+        "root_ca": bundle.folder / "root-ca.pem",
+        "clock": SystemClock(),
+        "dispatcher": Dispatcher(),
+    }
+    uplink = IotCore(**{**settings, **other})
+    told = Told(uplink, bundle.robot)
+    uplink.start()
+    try:
+        yield told
+    finally:
+        uplink.stop(5.0)
+
+
+def set_status(embedded: EmbeddedCloud, robot: str, status: str) -> None:
+    iot = embedded.cloud.client("iot")
+    (arn,) = iot.list_thing_principals(thingName=robot)["principals"]
+    iot.update_certificate(certificateId=arn.rsplit("/", 1)[-1], newStatus=status)
+
+
+def self_signed(folder: Path) -> None:
+    subprocess.run(
+        ["openssl", "req", "-x509", "-newkey", "rsa:2048", "-nodes", "-days", "1", "-subj", "/CN=unknown",
+         "-keyout", folder / "private.key", "-out", folder / "certificate.pem"],
+        check=True, capture_output=True,
+    )  # fmt: skip
+
+
+def test_it_connects_again_and_subscribes_again_after_a_reset(bundle, proxy):
+    with connecting(bundle(), proxy) as told:
+        told.echo(b"before")
+        proxy.reset()
+        until(lambda: told.connections[:2] == [True, False])
+        told.echo(b"after")
+        assert told.connections == [True, False, True]
+        status = told.uplink.status()
+        assert (status.connected, status.connects) == (True, 2)
+        assert "closed the connection" in (status.last_error or "")
+
+
+def test_a_connection_reset_every_moment_costs_one_attempt_a_second_at_most(bundle, proxy):
+    with connecting(bundle(), proxy):
+        proxy.reset_every(0.3)
+        assert proxy.wait_attempts(5, 60)
+    assert min(proxy.gaps_s()) >= 1.0
+
+
+def test_refused_connections_are_tried_once_a_second_at_most_and_ever_less(bundle, proxy, caplog):
+    proxy.mode = REFUSE
+    with connecting(bundle(), proxy):
+        assert proxy.wait_attempts(5, 60)
+        proxy.mode = PASS
+        # Not more than the cap, whatever happened before.
+        assert proxy.wait_attempts(6, 35)
+    assert min(proxy.gaps_s()) >= 1.0
+    said = [r.getMessage() for r in caplog.records if "cannot connect" in r.message and r.levelno > 10]
+    assert len(said) == 2, "the loss, and after three in a row what it may mean"
+    assert "again and again" in said[1]
+
+
+def test_a_broker_that_is_stopped_and_started(bundle, embedded):
+    with Proxy("127.0.0.1", embedded.cloud.mqtt_port) as proxy, connecting(bundle(), proxy) as told:
+        told.echo(b"before")
+        proxy.mode = REFUSE
+        until(lambda: not told.uplink.connected())
+        refused: list[Any] = []
+        told.uplink.publish(told.topic, b"lost", qos=1, done=refused.append)
+        until(lambda: refused)
+        assert "not connected" in str(refused[0])
+        assert proxy.wait_attempts(3, 30)
+        proxy.mode = PASS
+        told.echo(b"after")
+
+
+def test_a_frozen_broker_is_noticed(bundle, proxy):
+    assert iotcore.KEEP_ALIVE_S + iotcore.PING_TIMEOUT_S <= 45
+    with connecting(bundle(), proxy, keep_alive_s=2, ping_timeout_s=1) as told:
+        told.echo(b"before")
+        proxy.mode = FREEZE
+        until(lambda: told.connections == [True, False], seconds=10)
+        assert "no longer answers" in (told.uplink.status().last_error or "")
+        proxy.mode = PASS
+        told.echo(b"after")
+
+
+def test_half_a_second_of_latency_is_no_loss(bundle, embedded):
+    with (
+        Proxy("127.0.0.1", embedded.cloud.mqtt_port, latency_s=0.5) as proxy,
+        connecting(bundle(), proxy) as told,
+    ):
+        told.echo(b"slow")
+        assert told.connections == [True]
+
+
+def test_takeover_is_shown_as_what_it_is(bundle, proxy, caplog):
+    car = bundle()
+    with connecting(car, proxy) as told:
+        told.echo(b"before")
+        with Robot(car.folder) as other:
+            assert other.connected.wait(10)
+            until(lambda: told.connections[:2] == [True, False])
+        assert f"another client has connected as {car.robot}" in caplog.text
+
+
+def test_a_certificate_revoked_while_connected(embedded, bundle, proxy, caplog):
+    caplog.set_level(logging.INFO)
+    car = bundle()
+    with connecting(car, proxy) as told:
+        told.echo(b"before")
+        set_status(embedded, car.robot, "REVOKED")
+        # AWS disconnects within minutes; the embedded cloud leaves it to the next connect.
+        proxy.reset()
+        until(lambda: "inactive or revoked" in caplog.text, seconds=40)
+        attempts = len(proxy.attempts)
+        errors = [r for r in caplog.records if r.levelno == logging.ERROR]
+        assert len(errors) == 1
+        assert "`iort-agent check`" in errors[0].getMessage()
+        # Slowly now, but at once when the file changes.
+        assert not proxy.wait_attempts(attempts + 1, 3)
+        set_status(embedded, car.robot, "ACTIVE")
+        os.utime(car.folder / "certificate.pem")
+        told.echo(b"after")
+
+
+def test_another_robots_name_is_refused_and_said_once(bundle, proxy, caplog):
+    with connecting(bundle(), proxy, client_id="somebody-else"):
+        until(lambda: "does not let it connect" in caplog.text)
+        assert not proxy.wait_attempts(2, 3), f"the next attempt is due after {SLOW_SHORTEST_S} s"
+    (error,) = [r for r in caplog.records if r.levelno == logging.ERROR]
+    assert "not authorized" in error.getMessage()
+
+
+def test_an_unknown_certificate_is_replaced_by_a_good_one(bundle, proxy, caplog, tmp_path):
+    car = bundle()
+    good = tmp_path / "good"
+    shutil.copytree(car.folder, good)
+    self_signed(car.folder)
+    with connecting(car, proxy) as told:
+        until(lambda: "certificate is unknown" in caplog.text, seconds=40)
+        assert told.connections == []
+        for name in ("private.key", "certificate.pem"):
+            (good / name).replace(car.folder / name)
+        told.echo(b"good")
+    assert min(proxy.gaps_s()) >= 1.0
+
+
+def test_an_expired_certificate_is_called_expired(bundle, proxy, caplog):
+    class Later(SystemClock):
+        def now_us(self) -> int:
+            return 4_000_000_000_000_000
+
+    car = bundle()
+    self_signed(car.folder)
+    with connecting(car, proxy, clock=Later()):
+        until(lambda: "certificate expired on" in caplog.text)
+        assert not proxy.wait_attempts(2, 2)
+
+
+def test_a_broker_of_another_authority_is_not_talked_to(bundle, proxy, tmp_path, caplog):
+    car = bundle()
+    self_signed(tmp_path)
+    with connecting(car, proxy, root_ca=tmp_path / "certificate.pem") as told:
+        # The client waits up to half a minute after a failed handshake, on purpose.
+        until(lambda: "TLS failed" in caplog.text, seconds=40)
+        assert told.connections == []
+
+
+def test_without_a_root_ca_the_system_decides(bundle, proxy, caplog):
+    with connecting(bundle(), proxy, root_ca=None) as told:
+        until(lambda: "TLS failed" in caplog.text, seconds=40)
+        assert told.connections == []
+
+
+def test_a_refused_subscription_is_said_once_and_spoils_no_other(bundle, proxy, caplog, monkeypatch):
+    monkeypatch.setattr(iotcore, "_RESUBSCRIBE_S", 0.1)
+    monkeypatch.setattr(iotcore, "_RESUBSCRIBE_SLOWLY_S", 0.1)
+    with connecting(bundle(), proxy) as told:
+        told.uplink.subscribe("cmd/iort/somebody-else/drive", lambda _: None)
+        told.echo(b"good")
+        until(lambda: "cannot subscribe" in caplog.text)
+        threading.Event().wait(0.5)
+        assert caplog.text.count("cannot subscribe") == 1
+        assert told.connections == [True]
+
+
+def test_a_subscription_made_while_connected(bundle, proxy):
+    car = bundle()
+    with connecting(car, proxy) as told:
+        told.echo(b"before")
+        heard: list[bytes] = []
+        topic = contract.build_topic(contract.CMD, car.robot, "drive")
+        told.uplink.subscribe(topic, lambda message: heard.append(message.payload))
+        until(lambda: told.uplink.subscribed(topic))

@@ -1,0 +1,170 @@
+"""A TCP proxy that misbehaves on request: what lies between a car and its broker."""
+
+from __future__ import annotations
+
+import asyncio
+import socket
+import struct
+import threading
+import time
+from typing import Any
+
+from typing_extensions import Self
+
+PASS, REFUSE, FREEZE = "pass", "refuse", "freeze"
+_CHUNK = 65536
+
+
+class Proxy:
+    """Listens on a port of its own and forwards to the target.
+
+    ``mode`` is `PASS`, `REFUSE` (every connection is reset as it comes) or `FREEZE` (connections stand
+    and nothing passes, to what is open too); ``latency_s`` delays every byte, each way; ``attempts``
+    holds the monotonic time of every connection that came, whatever became of it.
+    """
+
+    def __init__(self, host: str, port: int, *, latency_s: float = 0.0) -> None:
+        self._target = (host, port)
+        self.latency_s = latency_s
+        self.attempts: list[float] = []
+        self._mode = PASS
+        self._open: set[asyncio.StreamWriter] = set()
+        self._loop = asyncio.new_event_loop()
+        self._flowing = asyncio.Event()
+        self._thread = threading.Thread(target=self._loop.run_forever, name="proxy", daemon=True)
+        self._changed = threading.Condition()
+        self._server: asyncio.Server
+        self._resetter: asyncio.Task[None] | None = None
+        self.port = 0
+
+    def __enter__(self) -> Self:
+        self._thread.start()
+        self._run(self._start())
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._run(self._stop())
+        self._loop.call_soon_threadsafe(self._loop.stop)
+        self._thread.join()
+        self._loop.close()
+
+    @property
+    def mode(self) -> str:
+        """What happens to connections now."""
+        return self._mode
+
+    @mode.setter
+    def mode(self, mode: str) -> None:
+        self._run(self._switch(mode))
+
+    def reset(self) -> None:
+        """Reset every connection that is open."""
+        self._run(self._reset())
+
+    def reset_every(self, seconds: float | None) -> None:
+        """Reset every connection again and again; None ends it."""
+        self._run(self._reset_every(seconds))
+
+    def wait_attempts(self, count: int, seconds: float) -> bool:
+        """Wait until so many connections have come; whether they have."""
+        with self._changed:
+            return self._changed.wait_for(lambda: len(self.attempts) >= count, seconds)
+
+    def gaps_s(self) -> list[float]:
+        """The times between one connection and the next."""
+        return [after - before for before, after in zip(self.attempts, self.attempts[1:], strict=False)]
+
+    def _run(self, coroutine: Any) -> Any:
+        return asyncio.run_coroutine_threadsafe(coroutine, self._loop).result(10)
+
+    async def _start(self) -> None:
+        self._flowing.set()
+        self._server = await asyncio.start_server(self._accept, "127.0.0.1", 0)
+        self.port = self._server.sockets[0].getsockname()[1]
+
+    async def _stop(self) -> None:
+        await self._reset_every(None)
+        self._server.close()
+        await self._reset()
+        tasks = asyncio.all_tasks() - {asyncio.current_task()}
+        for task in tasks:
+            task.cancel()
+        await asyncio.gather(*tasks, return_exceptions=True)
+
+    async def _switch(self, mode: str) -> None:
+        self._mode = mode
+        (self._flowing.clear if mode == FREEZE else self._flowing.set)()
+        if mode == REFUSE:
+            await self._reset()
+
+    async def _reset(self) -> None:
+        for writer in list(self._open):
+            _abort(writer)
+
+    async def _reset_every(self, seconds: float | None) -> None:
+        if self._resetter is not None:
+            self._resetter.cancel()
+            self._resetter = None
+        if seconds is not None:
+            self._resetter = asyncio.create_task(self._resetting(seconds))
+
+    async def _resetting(self, seconds: float) -> None:
+        while True:
+            await asyncio.sleep(seconds)
+            await self._reset()
+
+    async def _accept(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
+        with self._changed:
+            self.attempts.append(time.monotonic())
+            self._changed.notify_all()
+        if self._mode == REFUSE:
+            _abort(writer)
+            return
+        self._open.add(writer)
+        out: asyncio.StreamWriter | None = None
+        try:
+            await self._flowing.wait()
+            back, out = await asyncio.open_connection(*self._target)
+            self._open.add(out)
+            await asyncio.wait(
+                [asyncio.create_task(self._pump(reader, out)), asyncio.create_task(self._pump(back, writer))],
+                return_when=asyncio.FIRST_COMPLETED,
+            )
+        except (OSError, asyncio.CancelledError):
+            pass  # the target is down, or we stop: the connection ends as it would without us
+        finally:
+            for one in (writer, out):
+                if one is not None:
+                    self._open.discard(one)
+                    _abort(one)
+
+    async def _pump(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
+        queue: asyncio.Queue[tuple[float, bytes]] = asyncio.Queue()
+        sender = asyncio.create_task(self._send(queue, writer))
+        try:
+            while data := await reader.read(_CHUNK):
+                queue.put_nowait((self._loop.time() + self.latency_s, data))
+            queue.put_nowait((self._loop.time() + self.latency_s, b""))
+            await sender
+        except OSError:
+            pass
+        finally:
+            sender.cancel()
+
+    async def _send(self, queue: asyncio.Queue[tuple[float, bytes]], writer: asyncio.StreamWriter) -> None:
+        while True:
+            due, data = await queue.get()
+            await asyncio.sleep(max(0.0, due - self._loop.time()))
+            await self._flowing.wait()
+            if not data:
+                return
+            writer.write(data)
+            await writer.drain()
+
+
+def _abort(writer: asyncio.StreamWriter) -> None:
+    """Close with a reset, as a router that has forgotten the connection does."""
+    connection = writer.get_extra_info("socket")
+    if connection is not None and connection.fileno() >= 0:
+        connection.setsockopt(socket.SOL_SOCKET, socket.SO_LINGER, struct.pack("ii", 1, 0))
+    writer.transport.abort()

@@ -1,0 +1,44 @@
+"""The agent's ros1 source alone, in a process of its own; each sample is a line of JSON on standard output.
+
+``collector.py CONFIG.json`` with the source's settings; ``quit`` on standard input ends it, and the
+source's report is the last line.
+"""
+
+from __future__ import annotations
+
+import json
+import logging
+import sys
+import threading
+from pathlib import Path
+
+from device.clock import SystemClock
+from device.schema import Where, load
+from device.sources.ros1 import Ros1Config
+
+
+def say(line: str) -> None:
+    """Write a line at once; print writes its end by itself, and two threads' lines would run together."""
+    sys.stdout.write(f"{line}\n")
+    sys.stdout.flush()
+
+
+logging.basicConfig(stream=sys.stderr, level="INFO", format="%(levelname)s %(message)s")
+file = Path(sys.argv[1])
+config = load(Ros1Config, json.loads(file.read_text()), Where(file))
+source, stop = config.build(SystemClock()), threading.Event()
+
+
+def listen() -> None:
+    for _ in sys.stdin:
+        break
+    stop.set()
+
+
+def emit(stream, t_us, values):
+    say(json.dumps([stream, t_us, dict(values)]))
+
+
+threading.Thread(target=listen, daemon=True).start()
+source.run(emit, stop)
+say(json.dumps(source.report()))

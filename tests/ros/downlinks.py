@@ -1,0 +1,80 @@
+"""The downlinks of one robot or two, in one ROS graph and over a broker in memory.
+
+``downlinks.py CONFIG.json`` with ``downlink`` and ``share``. Each line of input is a command: ``send
+MILLISECONDS JSON`` (a lease and a message), ``pose ROBOT JSON``, ``await TOPIC COUNT`` (of subscribers;
+says ``heard``), ``cut``, ``quit``.
+"""
+
+from __future__ import annotations
+
+import itertools
+import json
+import logging
+import sys
+import time
+from pathlib import Path
+
+import contract
+from device.allowance import Allowance
+from device.clock import SystemClock
+from device.dispatch import Dispatcher
+from device.downlink import DownlinkConfig, make_downlink, share_rule
+from device.loopback import Loopback
+from device.ros1_node import DEFAULT_NODE
+from device.ros1_publish import Ros1Graph
+from device.schema import Where, load
+
+
+def say(line: str) -> None:
+    """Write a line at once; print writes its end by itself, and two threads' lines would run together."""
+    sys.stdout.write(f"{line}\n")
+    sys.stdout.flush()
+
+
+logging.basicConfig(stream=sys.stderr, level="INFO", format="%(levelname)s %(message)s")
+file = Path(sys.argv[1])
+settings, where, clock = json.loads(file.read_text()), Where(file), SystemClock()
+uplink = Loopback(clock, Dispatcher())
+graph = Ros1Graph(DEFAULT_NODE, clock)
+downlink = make_downlink(
+    load(DownlinkConfig, settings.get("downlink", {}), where),
+    share_rule()(settings["share"], where) if "share" in settings else (),
+    sources=(),
+    graph=graph,
+    robot="car1",
+    namespace="iort",
+    boot="0badcafe",
+    uplink=uplink,
+    clock=clock,
+    allowance=Allowance(clock),
+)
+assert downlink is not None
+uplink.start()
+downlink.start()
+say("started")
+started_us = clock.now_us()
+for seq, line in zip(itertools.count(), sys.stdin):
+    verb, _, rest = line.strip().partition(" ")
+    if verb == "quit":
+        break
+    if verb == "cut":
+        uplink.cut()
+    elif verb == "await":
+        # A subscriber knows of a connection before its publisher does, and rospy tells nobody.
+        topic, _, count = rest.partition(" ")
+        while graph._node.listeners(topic) < int(count):
+            time.sleep(0.01)
+        say("heard")
+    elif verb == "pose":
+        robot, _, message = rest.partition(" ")
+        fleet = contract.FleetMessage("1badcafe", seq, clock.now_us(), json.loads(message))
+        uplink.deliver(f"fleet/iort/{robot}/pose", contract.encode_fleet(fleet))
+    else:
+        lease, _, message = rest.partition(" ")
+        now_us = clock.now_us()
+        command = contract.Command("feedbeef", started_us, seq, now_us, 500, json.loads(message), int(lease))
+        uplink.deliver("cmd/iort/car1/drive", contract.encode_command(command))
+downlink.halt()
+uplink.stop(1)
+downlink.close()
+say(json.dumps([downlink.report(), [m.topic for m in uplink.published]]))

@@ -1,0 +1,45 @@
+"""A rospy node that hears a topic: ``listener.py NAME TOPIC TYPE``; each message a line of JSON."""
+
+import json
+import sys
+import threading
+import time
+
+import roslib.message
+import rospy
+
+
+def say(line: str) -> None:
+    """Write a line at once; print writes its end by itself, and two threads' lines would run together."""
+    sys.stdout.write(f"{line}\n")
+    sys.stdout.flush()
+
+
+def plain(value):
+    if hasattr(value, "__slots__"):
+        return {name: plain(getattr(value, name)) for name in value.__slots__}
+    return [plain(item) for item in value] if isinstance(value, (list, tuple)) else value
+
+
+name, topic, kind = sys.argv[1:4]
+rospy.init_node(name, disable_signals=True)
+subscriber = rospy.Subscriber(
+    topic,
+    roslib.message.get_message_class(kind),
+    lambda message: say(json.dumps([time.time(), plain(message)])),
+    tcp_nodelay=True,
+)
+stop = threading.Event()
+
+
+def listen():
+    sys.stdin.readline()
+    stop.set()
+
+
+threading.Thread(target=listen, daemon=True).start()
+while subscriber.get_num_connections() == 0 and not stop.wait(0.01):
+    pass
+say("connected")
+stop.wait()
+rospy.signal_shutdown("done")

@@ -1,0 +1,132 @@
+"""From the broker to real ROS topics: commands, their leases, and another robot's pose."""
+
+from __future__ import annotations
+
+import functools
+import json
+from typing import Any
+
+import pytest
+
+from tests.ros.conftest import Graph, Process
+
+CONFIG = {
+    "downlink": {
+        "cmd": {
+            "drive": {
+                "topic": "/cmd_vel",
+                "type": "geometry_msgs/TwistStamped",
+                "partial": True,
+                "motion": {"lease_s": 0.5, "stop": {"twist": {"linear": {"x": 0.0}}}},
+            }
+        },
+        "fleet": {"pose": {"topic": "/fleet/{robot}/pose", "type": "geometry_msgs/PoseStamped"}},
+    },
+    "share": {"/pose": {"name": "pose", "rate_hz": 20}},
+}
+POSE = {"pose": {"position": {"x": 1, "y": 2, "z": 3}, "orientation": {"x": 0, "y": 0, "z": 0, "w": 1}}}
+
+
+def start(graph: Graph) -> Process:
+    file = graph.folder / "downlink.json"
+    file.write_text(json.dumps(CONFIG))
+    process = graph.run("downlinks.py", file)
+    process.until(lambda: "started" in process.lines, "start")
+    return process
+
+
+def heard(listener: Process) -> list[tuple[float, dict[str, Any]]]:
+    lines = [line for line in listener.lines if line != "connected"]
+    return [(at, message) for at, message in map(json.loads, lines)]
+
+
+def has(listener: Process, speed: float) -> bool:
+    return speed in speeds(listener)
+
+
+def speeds(listener: Process) -> list[float]:
+    return [message["twist"]["linear"]["x"] for _, message in heard(listener)]
+
+
+@pytest.fixture
+def driven(graph: Graph) -> tuple[Process, Process]:
+    downlink = start(graph)
+    listener = graph.run("listener.py", "driver", "/cmd_vel", "geometry_msgs/TwistStamped")
+    connected(downlink)
+    return downlink, listener
+
+
+def connected(downlink: Process, topic: str = "/cmd_vel", count: int = 1) -> None:
+    before = downlink.lines.count("heard")
+    downlink.say(f"await {topic} {count}")
+    downlink.until(lambda: downlink.lines.count("heard") > before, "connection")
+
+
+def drive(downlink: Process, x: float, lease_ms: int = 300) -> None:
+    downlink.say(f"send {lease_ms} " + json.dumps({"twist": {"linear": {"x": x}}}))
+
+
+def test_a_command_is_published_and_its_lease_ends_in_stops(driven: tuple[Process, Process]) -> None:
+    downlink, listener = driven
+    drive(downlink, 1.5)
+    listener.until(lambda: len(speeds(listener)) == 6, "command and five stops")
+    assert speeds(listener) == [1.5, 0, 0, 0, 0, 0]
+    at = [when for when, _ in heard(listener)]
+    assert 0.29 < at[1] - at[0] < 0.8
+    assert heard(listener)[1][1]["header"]["stamp"]["secs"] == pytest.approx(at[1], abs=5)
+
+
+def test_a_renewed_lease_does_not_end(driven: tuple[Process, Process]) -> None:
+    downlink, listener = driven
+    for i in range(1, 21):
+        drive(downlink, i, 5000)
+        listener.until(functools.partial(has, listener, i), f"command {i}")
+    assert speeds(listener) == list(range(1, 21))
+
+
+@pytest.mark.parametrize("end", ["cut", "quit"])
+def test_a_lost_connection_and_the_agents_end_stop_the_car(driven: tuple[Process, Process], end: str) -> None:
+    downlink, listener = driven
+    drive(downlink, 1.5, 10_000)
+    listener.until(lambda: speeds(listener) == [1.5], "command")
+    downlink.say(end)
+    listener.until(lambda: len(speeds(listener)) > 1, "stop")
+    assert set(speeds(listener)[1:]) == {0}
+    after = [when for when, _ in heard(listener)]
+    assert after[1] - after[0] < 0.45, "not only when the lease ended"
+
+
+def test_nonsense_is_refused(driven: tuple[Process, Process]) -> None:
+    downlink, listener = driven
+    downlink.say('send 300 {"twist": {"linear": {"x": "fast"}}}')
+    downlink.until_said("twist.linear.x: found 'fast'; allowed is a number")
+    drive(downlink, 2.5)
+    listener.until(lambda: 2.5 in speeds(listener), "command")
+    assert speeds(listener)[0] == 2.5
+
+
+def test_another_robots_pose_is_a_topic(graph: Graph) -> None:
+    downlink = start(graph)
+    downlink.say("pose car-2 " + json.dumps(POSE))
+    listener = graph.run("listener.py", "map", "/fleet/car_2/pose", "geometry_msgs/PoseStamped")
+    connected(downlink, "/fleet/car_2/pose")
+    downlink.say("pose car-2 " + json.dumps(POSE))
+    listener.until(lambda: heard(listener), "pose")
+    assert heard(listener)[0][1]["pose"]["position"] == {"x": 1, "y": 2, "z": 3}
+
+
+def test_commands_still_arrive_after_a_restart_of_the_master(
+    graph: Graph, driven: tuple[Process, Process]
+) -> None:
+    downlink, first = driven
+    graph.master.kill()
+    downlink.until_said("does not answer")
+    graph.start_master()
+    downlink.until_said("had forgotten /pose, /cmd_vel: registered again")
+    second = graph.run("listener.py", "another", "/cmd_vel", "geometry_msgs/TwistStamped")
+    connected(downlink, count=2)
+    drive(downlink, 1.5)
+    for listener in (first, second):
+        listener.until(functools.partial(has, listener, 1.5), "command")
+    report, _ = json.loads(downlink.quit()[-1])
+    assert report["commands"]["drive"]["passed"] == 1

@@ -1,0 +1,169 @@
+"""The ros1 source in a real graph: rospy publishers of types that the agent's Python has not."""
+
+from __future__ import annotations
+
+import json
+import time
+from typing import Any
+
+import pytest
+
+from tests.ros.conftest import Graph, Process
+
+RULE = "=" * 80
+HEADER = f"{RULE}\nMSG: std_msgs/Header\nuint32 seq\ntime stamp\nstring frame_id\n"
+WHEEL = f"""# A type that nobody has installed.
+uint8 LEFT=0
+Header header
+WheelState state
+{HEADER}{RULE}
+MSG: strange_msgs/WheelState
+int32 turns        # whole ones
+string name
+float32[2] load
+Bearing[] bearings
+duration since
+{RULE}
+MSG: strange_msgs/Bearing
+float64 wear
+"""
+WHEEL_2 = WHEEL.replace("string name", "string name\nbool locked")
+
+
+class Cars:
+    """Publishers and the collector in one graph."""
+
+    def __init__(self, graph: Graph) -> None:
+        self.graph = graph
+
+    def publisher(self, name: str, definition: str = WHEEL, topic: str = "/wheel", **options: Any) -> Process:
+        file = self.graph.folder / f"{name}.msg"
+        file.write_text(definition)
+        arguments = [part for key, value in options.items() for part in (f"--{key}", value)]
+        return self.graph.run(
+            "publisher.py", name, topic, "strange_msgs/Wheel", file, "--field", "state.turns", *arguments
+        )
+
+    def collector(self, *topics: str, **settings: Any) -> Process:
+        file = self.graph.folder / "source.json"
+        each = {"time": "header", **settings}
+        file.write_text(json.dumps({"topics": {t: {"stream": t[1:], **each} for t in topics or ("/wheel",)}}))
+        return self.graph.run("collector.py", file)
+
+
+@pytest.fixture
+def cars(graph: Graph) -> Cars:
+    return Cars(graph)
+
+
+def samples(collector: Process, stream: str = "wheel") -> list[tuple[int, dict[str, Any]]]:
+    found = [json.loads(line) for line in list(collector.lines)]
+    return [(s[1], s[2]) for s in found if isinstance(s, list) and s[0] == stream]
+
+
+def turns(collector: Process, stream: str = "wheel") -> list[int]:
+    return [values["turns"] for _, values in samples(collector, stream)]
+
+
+def until_turns(collector: Process, least: int, stream: str = "wheel") -> None:
+    collector.until(lambda: max(turns(collector, stream), default=-1) >= least, f"turn {least} of {stream}")
+
+
+def test_any_type_without_its_class_and_every_message_of_it(cars: Cars) -> None:
+    collector = cars.collector()
+    cars.publisher("pub", rate=200, count=300).until(lambda: True, "publisher")
+    until_turns(collector, 299)
+    report = json.loads(collector.quit()[-1])
+    assert turns(collector) == list(range(300))
+    assert report["/wheel"] == {"messages": 300, "silent": False, "left_out": {}}
+    t_us, values = samples(collector)[-1]
+    assert abs(t_us / 1e6 - time.time()) < 60
+    assert values == {
+        "turns": 299, "name": "", "load.0": 0.0, "load.1": 0.0, "since.sec": 0, "since.nanosec": 0,
+    }  # fmt: skip
+
+
+def test_only_the_selected_fields(cars: Cars) -> None:
+    collector = cars.collector(fields=["turns", "load.1"])
+    cars.publisher("pub")
+    until_turns(collector, 5)
+    assert samples(collector)[-1][1].keys() == {"turns", "load.1"}
+
+
+def test_started_before_the_master_and_the_master_started_again(cars: Cars) -> None:
+    cars.graph.master.kill()
+    collector = cars.collector("/wheel", "/other")
+    collector.until_said("no ROS master at")
+    cars.graph.start_master()
+    cars.publisher("pub", rate=50)
+    until_turns(collector, 20)
+    cars.graph.master.kill()
+    collector.until_said("does not answer")
+    cars.graph.start_master()
+    collector.until_said("had forgotten /wheel, /other: registered again")
+    # A publisher that came after the restart finds us, and the one from before was never interrupted.
+    cars.publisher("second", topic="/other")
+    until_turns(collector, 20, "other")
+    found = turns(collector)
+    assert found == list(range(len(found)))
+
+
+@pytest.mark.parametrize("end", ["quit", "kill"])
+def test_a_publisher_started_again(cars: Cars, end: str) -> None:
+    collector = cars.collector()
+    first = cars.publisher("pub")
+    until_turns(collector, 20)
+    getattr(first, end)()
+    cars.publisher("pub", start=1000)
+    until_turns(collector, 1020)
+    found = turns(collector)
+    assert found == sorted(set(found))
+    assert [turn for turn in found if turn >= 1000][:10] == list(range(1000, 1010))
+
+
+def test_a_changed_definition(cars: Cars) -> None:
+    collector = cars.collector()
+    first = cars.publisher("pub")
+    until_turns(collector, 5)
+    first.quit()
+    cars.publisher("pub", WHEEL_2, start=1000)
+    until_turns(collector, 1005)
+    fields = [("locked" in values, values["turns"] >= 1000) for _, values in samples(collector)]
+    assert all(new == later for new, later in fields)
+
+
+def test_two_publishers_of_one_topic_with_two_definitions(cars: Cars) -> None:
+    collector = cars.collector()
+    cars.publisher("one", count=50)
+    cars.publisher("two", WHEEL_2, start=1000, count=50)
+    collector.until(lambda: len(turns(collector)) == 100, "100 samples")
+    assert sorted(turns(collector)) == [*range(50), *range(1000, 1050)]
+
+
+def test_stamps_of_a_simulation_are_flagged_and_not_believed(cars: Cars) -> None:
+    collector = cars.collector()
+    cars.publisher("pub", stamp=100, count=10)
+    until_turns(collector, 9)
+    assert all(abs(t_us / 1e6 - time.time()) < 60 for t_us, _ in samples(collector))
+    assert json.loads(collector.quit()[-1])["/wheel"]["unbelieved_stamps"] == 10
+
+
+def test_use_sim_time_is_seen_while_running(cars: Cars) -> None:
+    collector = cars.collector()
+    cars.publisher("pub")
+    until_turns(collector, 5)
+    cars.graph.parameter("/use_sim_time", True)
+    collector.until_said("/use_sim_time")
+
+
+def test_another_node_of_the_same_name_ends_the_source(cars: Cars) -> None:
+    collector = cars.collector()
+    cars.publisher("pub")
+    until_turns(collector, 5)
+    cars.publisher("iort_agent", topic="/elsewhere")
+    collector.until_said("another node took its name")
+
+
+def test_decoding_agrees_with_genpy(graph: Graph) -> None:
+    found = graph.run("against_genpy.py")
+    found.until(lambda: "agreed" in "".join(found.lines), "agreement")

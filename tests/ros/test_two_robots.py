@@ -1,0 +1,106 @@
+"""Two robots, each with a ROS graph of its own, share poses and take commands through the cloud."""
+
+from __future__ import annotations
+
+import functools
+import json
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+import contract
+from local.cloud import EmbeddedCloud
+from station import robots
+from tests.local.conftest import bundle, embedded  # noqa: F401 - fixtures
+from tests.ros.conftest import Graph, Process
+from tests.unit.test_device_downlink import POSE
+
+POSE_TYPE = "geometry_msgs/PoseStamped"
+DRIVE = {
+    "topic": "/speed",
+    "type": "std_msgs/Float64",
+    "motion": {"lease_s": 0.5, "stop": {"data": 0.0}},
+}
+
+
+@pytest.fixture
+def graphs(ros_python: str, tmp_path: Path) -> Iterator[list[Graph]]:
+    found = []
+    try:
+        for name in ("a", "b"):
+            (tmp_path / name).mkdir()
+            graph = Graph(ros_python, tmp_path / name)
+            found.append(graph)
+            graph.start_master()
+        yield found
+    finally:
+        for graph in found:
+            graph.stop()
+
+
+def some(listener: Process) -> bool:
+    return len(messages(listener)) > 5
+
+
+def messages(listener: Process) -> list[Any]:
+    return [json.loads(line)[1] for line in list(listener.lines) if line.startswith("[")]
+
+
+def test_two_robots_see_each_others_poses_and_take_commands(
+    embedded: EmbeddedCloud,  # noqa: F811
+    bundle: Callable[..., robots.Bundle],  # noqa: F811
+    graphs: list[Graph],
+) -> None:
+    settings = {
+        "sources": [{"type": "ros1", "topics": {"/pose": {"stream": "pose", "time": "header"}}}],
+        "share": {"/pose": {"name": "pose", "rate_hz": 10}},
+        "downlink": {
+            "cmd": {"drive": DRIVE},
+            "fleet": {"pose": {"topic": "/fleet/{robot}/pose", "type": POSE_TYPE}},
+        },
+    }
+    cars = [bundle(name, **settings) for name in ("-a", "-b")]
+    agents = [
+        graph.module("device.main", "run", "--config", car.config, "--drain-s", 10)
+        for graph, car in zip(graphs, cars, strict=True)
+    ]
+    for i, graph in enumerate(graphs):
+        text = graph.folder / "pose.msg"
+        text.write_text(POSE)
+        graph.run(
+            "publisher.py", "pub", "/pose", POSE_TYPE, text, "--field", "pose.position.x", "--start",
+            1000 * (i + 1),
+        )  # fmt: skip
+    listeners = [
+        graph.run("listener.py", "map", f"/fleet/{other.robot.replace('-', '_')}/pose", POSE_TYPE)
+        for graph, other in zip(graphs, reversed(cars), strict=True)
+    ]
+    for listener, agent, other in zip(listeners, agents, (2, 1), strict=True):
+        agent.until_said("connected to")
+        listener.until(functools.partial(some, listener), "poses" + "\n".join(agent.errors))
+        assert all(
+            1000 * other <= m["pose"]["position"]["x"] < 1000 * other + 999 for m in messages(listener)
+        )
+
+    # The operator drives one of them, and then says no more.
+    driver = graphs[0].run("listener.py", "driver", "/speed", "std_msgs/Float64")
+    driver.until(lambda: "connected" in driver.lines, "connection")
+    operator, started_us, seq = embedded.cloud.client("iot-data"), time.time_ns() // 1000, 0
+    topic = contract.build_topic(contract.CMD, cars[0].robot, "drive", embedded.namespace)
+    while 1.5 not in [m["data"] for m in messages(driver)]:
+        command = contract.Command(
+            "feedbeef", started_us, seq, time.time_ns() // 1000, 1000, {"data": 1.5}, 300
+        )
+        operator.publish(topic=topic, qos=1, payload=contract.encode_command(command))
+        seq += 1
+        assert seq < 300, "\n".join(agents[0].errors)
+        time.sleep(0.1)  # an operator's stick
+    driver.until(lambda: messages(driver)[-1]["data"] == 0, "stop")
+
+    assert [agent.terminate() for agent in agents] == [0, 0]
+    for agent in agents:
+        log = "\n".join(agent.errors)
+        assert "Traceback" not in log, log

@@ -1,0 +1,45 @@
+"""Templates as text that can be compared: intrinsic functions written out, hashes taken off."""
+
+from __future__ import annotations
+
+import re
+from typing import Any
+
+from tests.conftest import Synthesized
+
+_HASH = re.compile(r"[0-9A-F]{8}$")
+
+
+def name(logical_id: str) -> str:
+    """A logical id without the hash that CDK ends it with."""
+    return _HASH.sub("", logical_id)
+
+
+class Reader:
+    """Reads values of a synthesized app; an import is read as what the other stack exports."""
+
+    def __init__(self, synthesized: Synthesized) -> None:
+        self.exports = {
+            output["Export"]["Name"]: output["Value"]
+            for template in synthesized.templates.values()
+            for output in template.get("Outputs", {}).values()
+            if "Export" in output
+        }
+
+    def text(self, value: Any) -> str:
+        """``arn:${AWS::Partition}:sqs:...``, ``Telemetry.Arn`` for an attribute, ``Live`` for a reference."""
+        match value:
+            case str():
+                return value
+            case {"Fn::Join": [separator, parts]}:
+                return separator.join(map(self.text, parts))
+            case {"Fn::GetAtt": [logical_id, attribute]}:
+                return f"{name(logical_id)}.{attribute}"
+            case {"Ref": str() as ref}:
+                return "${" + ref + "}" if ref.startswith("AWS::") else name(ref)
+            case {"Fn::ImportValue": export}:
+                return self.text(self.exports[export])
+        raise AssertionError(f"no text for {value}")
+
+    def texts(self, value: Any) -> list[str]:
+        return [self.text(one) for one in (value if isinstance(value, list) else [value])]

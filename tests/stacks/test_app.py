@@ -1,0 +1,120 @@
+"""app.py as one runs it: no credentials, the same result twice, and a clear word for a mistake."""
+
+from __future__ import annotations
+
+import json
+import os
+import subprocess
+import sys
+
+import pytest
+
+from stacks.settings import ROOT, Settings, SettingsError
+
+
+def run(tmp_path, name, **context):
+    """Start app.py in an environment that has nothing of this machine's AWS."""
+    env = {
+        "PATH": os.environ["PATH"],
+        "HOME": str(tmp_path),
+        "CDK_OUTDIR": str(tmp_path / name),
+        "CDK_CONTEXT_JSON": json.dumps({"layer": str(tmp_path / "layer"), **context}),
+        # Every attempt to look anything up goes to a port where nobody is.
+        "AWS_EC2_METADATA_DISABLED": "true",
+        "HTTPS_PROXY": "http://127.0.0.1:9",
+        "HTTP_PROXY": "http://127.0.0.1:9",
+    }
+    return subprocess.Popen(
+        [sys.executable, "app.py"],
+        cwd=ROOT,
+        env=env,
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+    )
+
+
+def finished(process):
+    out, err = process.communicate(timeout=240)
+    return process.returncode, out, err
+
+
+@pytest.fixture
+def layer(tmp_path):
+    (tmp_path / "layer" / "python").mkdir(parents=True)
+    (tmp_path / "layer" / "python" / "nothing.py").touch()
+
+
+def test_it_runs_without_credentials_and_twice_gives_the_same(tmp_path, layer):
+    for name in ("one", "two"):
+        returncode, _, err = finished(run(tmp_path, name))
+        assert returncode == 0, err
+    one, two = (
+        {path.name: path.read_bytes() for path in (tmp_path / name).glob("*.template.json")}
+        for name in ("one", "two")
+    )
+    assert len(one) == 5
+    assert one == two
+    assert not any(str(tmp_path).encode() in template for template in one.values())
+
+
+def test_a_wrong_value_is_one_line(tmp_path, layer):
+    returncode, _, err = finished(run(tmp_path, "out", retention_days="soon"))
+    assert returncode == 1
+    (line,) = [line for line in err.splitlines() if line.startswith("app.py")]
+    assert line == "app.py: context retention_days = 'soon': allowed is a whole number from 1 to 3650"
+    assert "Traceback" not in err
+    assert not list((tmp_path / "out").glob("*.template.json"))
+
+
+@pytest.fixture
+def settings(tmp_path, layer):
+    def read(**context):
+        from aws_cdk import App
+
+        return Settings.from_context(App(context={"layer": str(tmp_path / "layer"), **context}))
+
+    return read
+
+
+def test_what_the_context_says(settings, tmp_path):
+    assert settings() == Settings(layer=tmp_path / "layer")
+    # The CDK CLI gives every -c as text.
+    given = settings(namespace="lab2", retention_days="7", live_concurrency="0", embedded="true")
+    assert (given.namespace, given.retention_days, given.live_concurrency, given.embedded) == (
+        "lab2",
+        7,
+        0,
+        True,
+    )
+    assert settings(embedded="false").embedded is False
+    # cdk.json's numbers arrive as JavaScript's.
+    assert settings(retention_days=7.0, embedded=True) == settings(retention_days="7", embedded="true")
+
+
+@pytest.mark.parametrize(
+    ("context", "words"),
+    [
+        ({"namespace": "Lab"}, ["namespace", "'Lab'", "lower-case"]),
+        ({"namespace": "lab-2"}, ["namespace", "'lab-2'"]),
+        ({"namespace": ""}, ["namespace", "''"]),
+        ({"namespace": 7}, ["namespace", "7"]),
+        ({"retention_days": "0"}, ["retention_days", "'0'", "1 to 3650"]),
+        ({"retention_days": "1.5"}, ["retention_days", "'1.5'"]),
+        ({"retention_days": 1.5}, ["retention_days", "1.5"]),
+        ({"retention_days": True}, ["retention_days", "True"]),
+        ({"retention_days": ""}, ["retention_days", "''"]),
+        ({"live_concurrency": "-1"}, ["live_concurrency", "'-1'", "0 to 1000"]),
+        ({"live_concurrency": "many"}, ["live_concurrency", "'many'"]),
+        ({"live_concurrency": [5]}, ["live_concurrency", "[5]"]),
+        ({"embedded": "maybe"}, ["embedded", "'maybe'", "true", "false"]),
+        ({"layer": "build/nowhere"}, ["build/nowhere", "make layer"]),
+    ],
+)
+def test_a_wrong_value_names_the_key_what_was_found_and_what_is_allowed(settings, context, words):
+    with pytest.raises(SettingsError) as caught:
+        settings(**context)
+    text = str(caught.value)
+    assert "\n" not in text
+    for word in words:
+        assert word in text

@@ -1,0 +1,343 @@
+"""Who may do what: every IoT and IAM statement, by name. A grant that is not listed here fails."""
+
+from __future__ import annotations
+
+import json
+import re
+
+import pytest
+
+import contract
+from contract import BROKER, CMD, FLEET, LIVE, PING, PONG, RULES, build_topic, record_topic, rule_name
+
+ME = "${iot:Connection.Thing.ThingName}"
+IOT = "arn:${AWS::Partition}:iot:${AWS::Region}:${AWS::AccountId}"
+SHADOW = f"$aws/things/{ME}/shadow/name/agent/*"
+LISTEN = (f"cmd/iort/{ME}/*", f"pong/iort/{ME}/*", f"ping/iort/{ME}/broker", "fleet/iort/*", SHADOW)
+ROBOT_POLICY = [
+    {
+        "Effect": "Allow",
+        "Action": "iot:Connect",
+        "Resource": [f"{IOT}:client/{ME}"],
+        "Condition": {"Bool": {"iot:Connection.Thing.IsAttached": ["true"]}},
+    },
+    {
+        "Effect": "Allow",
+        "Action": "iot:Publish",
+        "Resource": [
+            f"{IOT}:topic/$aws/rules/iort_record/dt/iort/{ME}/*",
+            f"{IOT}:topic/live/iort/{ME}/*",
+            f"{IOT}:topic/fleet/iort/{ME}/*",
+            f"{IOT}:topic/ping/iort/{ME}/*",
+            f"{IOT}:topic/{SHADOW}",
+        ],
+    },
+    {"Effect": "Allow", "Action": "iot:Subscribe", "Resource": [f"{IOT}:topicfilter/{t}" for t in LISTEN]},
+    {"Effect": "Allow", "Action": "iot:Receive", "Resource": [f"{IOT}:topic/{t}" for t in LISTEN]},
+]
+
+# Provisioning with this fleet's template, and hearing what becomes of it.
+ASKED = ("$aws/certificates/create-from-csr/json", "$aws/provisioning-templates/iort-robot/provision/json")
+ANSWERED = [f"{topic}/{answer}" for topic in ASKED for answer in ("accepted", "rejected")]
+CLAIM_POLICY = [
+    {"Effect": "Allow", "Action": "iot:Connect", "Resource": [f"{IOT}:client/iort-claim-*"]},
+    {"Effect": "Allow", "Action": "iot:Publish", "Resource": [f"{IOT}:topic/{topic}" for topic in ASKED]},
+    {"Effect": "Allow", "Action": "iot:Subscribe", "Resource": [f"{IOT}:topicfilter/{t}" for t in ANSWERED]},
+    {"Effect": "Allow", "Action": "iot:Receive", "Resource": [f"{IOT}:topic/{t}" for t in ANSWERED]},
+]
+THINGS, CERTIFICATES = f"{IOT}:thing/*", f"{IOT}:cert/*"
+GROUP, KIND = f"{IOT}:thinggroup/iort-robot", f"{IOT}:thingtype/iort-robot"
+PROVISIONING = (
+    {
+        (f"iot:{action}", resource)
+        for action in ("CreateThing", "DescribeThing", "ListThingGroupsForThing", "ListThingPrincipals")
+        for resource in (THINGS, KIND)
+    }
+    | {
+        (f"iot:{action}", CERTIFICATES)
+        for action in ("AttachPolicy", "DescribeCertificate", "UpdateCertificate")
+    }
+    | {("iot:AddThingToThingGroup", THINGS), ("iot:AddThingToThingGroup", GROUP)}
+    | {("iot:AttachThingPrincipal", THINGS), ("iot:AttachThingPrincipal", CERTIFICATES)}
+    | {("iot:DescribeThingType", KIND), ("iot:DescribeThingGroup", GROUP)}
+    | {("iot:GetPolicy", f"{IOT}:policy/iort-robot")}
+    | {(f"iot:{action}", "*") for action in ("ListAttachedPolicies", "ListPrincipalThings", "RegisterThing")}
+)
+
+LOG = {"logs:CreateLogStream", "logs:PutLogEvents"}
+REJECT = ("sqs:SendMessage", "Rejected.Arn")
+# Of every role, each action on each resource, and who may take the role.
+ROLES = {
+    "LiveRole": (
+        "lambda.amazonaws.com",
+        {(action, "LiveLog.Arn") for action in LOG}
+        | {
+            (
+                "ssm:GetParameter",
+                "arn:${AWS::Partition}:ssm:${AWS::Region}:${AWS::AccountId}:parameter/iort/pubnub",
+            )
+        },
+    ),
+    "SummarizeRole": (
+        "lambda.amazonaws.com",
+        {(action, "SummarizeLog.Arn") for action in LOG}
+        | {
+            ("dynamodb:Query", "Telemetry.Arn"),
+            ("dynamodb:BatchWriteItem", "Summary.Arn"),
+            ("dynamodb:GetItem", "Robots.Arn"),
+            ("dynamodb:DescribeStream", "Telemetry.StreamArn"),
+            ("dynamodb:GetRecords", "Telemetry.StreamArn"),
+            ("dynamodb:GetShardIterator", "Telemetry.StreamArn"),
+            ("dynamodb:ListStreams", "*"),
+            ("sqs:SendMessage", "Undecodable.Arn"),
+            ("sqs:GetQueueAttributes", "Undecodable.Arn"),
+            ("sqs:GetQueueUrl", "Undecodable.Arn"),
+        },
+    ),
+    "EchoRole": (
+        "lambda.amazonaws.com",
+        {(action, "EchoLog.Arn") for action in LOG} | {("iot:Publish", f"{IOT}:topic/pong/iort/*/lambda")},
+    ),
+    "ProvisioningRole": ("iot.amazonaws.com", PROVISIONING),
+    "ingest/RecordRole": ("iot.amazonaws.com", {REJECT, ("dynamodb:PutItem", "Telemetry.Arn")}),
+    "ingest/LiveRole": ("iot.amazonaws.com", {REJECT}),
+    "ingest/PongRole": ("iot.amazonaws.com", {REJECT, ("iot:Publish", f"{IOT}:topic/pong/iort/*/rule")}),
+    "ingest/EchoRole": ("iot.amazonaws.com", {REJECT}),
+}
+# The only statements about every resource, each with why it cannot name one.
+EVERY_RESOURCE = {
+    # "Actions, resources, and condition keys for Amazon DynamoDB": ListStreams has no resource type.
+    ("SummarizeRole", "dynamodb:ListStreams"),
+    # "Actions defined by AWS IoT": these have no resource type.
+    *(
+        ("ProvisioningRole", f"iot:{a}")
+        for a in ("ListAttachedPolicies", "ListPrincipalThings", "RegisterThing")
+    ),
+}
+
+
+@pytest.fixture(scope="module")
+def iot_policies(synthesized, reader):
+    return {
+        policy["PolicyName"]: [
+            {**statement, "Resource": reader.texts(statement["Resource"])}
+            for statement in policy["PolicyDocument"]["Statement"]
+        ]
+        for policy in synthesized.resources("AWS::IoT::Policy").values()
+    }
+
+
+@pytest.fixture(scope="module")
+def robot_policy(iot_policies):
+    return iot_policies[contract.fleet_name()]
+
+
+def qualified(synthesized, kind):
+    """Resources by name, those of ingest with the stack's, because two stacks have a LiveRole."""
+    from tests.stacks.templates import name
+
+    for stack in synthesized.templates:
+        for logical_id, properties in synthesized.resources(kind, stack).items():
+            yield ("ingest/" if stack == "ingest" else "") + name(logical_id), stack, logical_id, properties
+
+
+# --- robots -----------------------------------------------------------------------------------------
+
+
+def test_the_iot_policies_statement_by_statement(iot_policies):
+    assert iot_policies == {contract.fleet_name(): ROBOT_POLICY, contract.claim_name(): CLAIM_POLICY}
+
+
+def test_every_resource_of_the_robots_policy_is_bound_to_its_thing(robot_policy):
+    for statement in robot_policy:
+        assert statement["Effect"] == "Allow"
+        assert statement["Action"] in {"iot:Connect", "iot:Publish", "iot:Subscribe", "iot:Receive"}
+        for resource in statement["Resource"]:
+            if ME not in resource:
+                assert statement["Action"] in {"iot:Subscribe", "iot:Receive"}
+                assert resource.endswith("/fleet/iort/*")
+            # A wildcard stands only below the thing's own level, and no other variable is trusted.
+            assert "*" not in resource.removesuffix("/*")
+            assert set(re.findall(r"\$\{iot:[^}]*\}", resource)) <= {ME}
+
+
+def allows(policy, action, kind, topic, thing="car"):
+    """IoT Core's rule: * and ? are wildcards in the policy, + and # are characters like any other."""
+    for statement in policy:
+        if statement["Action"] != f"iot:{action}":
+            continue
+        for resource in statement["Resource"]:
+            pattern = re.escape(resource.removeprefix(f"{IOT}:").replace(ME, thing))
+            if re.fullmatch(pattern.replace(r"\*", ".*").replace(r"\?", "."), f"{kind}/{topic}"):
+                return True
+    return False
+
+
+def test_a_robot_may_publish_what_the_agent_builds_and_only_under_its_own_name(robot_policy):
+    own = [
+        record_topic("car", "vesc"),
+        build_topic(LIVE, "car", "vesc"),
+        build_topic(FLEET, "car", "pose"),
+        *(build_topic(PING, "car", path) for path in contract.PING_PATHS),
+    ]
+    for topic in own:
+        assert allows(robot_policy, "Publish", "topic", topic), topic
+        for other in ("car2", "ca", "Car", "*", "+", "other/car"):
+            assert not allows(robot_policy, "Publish", "topic", topic.replace("/car/", f"/{other}/")), other
+        assert not allows(robot_policy, "Publish", "topic", topic, "car2"), topic
+        assert not allows(robot_policy, "Publish", "topic", topic.replace("iort", "lab2"))
+
+
+def test_a_robot_may_not_publish_what_is_for_others_to_say(robot_policy):
+    for topic in (
+        build_topic(CMD, "car", "stop"),
+        build_topic(PONG, "car", "rule"),
+        # The record lane costs messaging unless it is sent by Basic Ingest.
+        build_topic(contract.RECORD, "car", "vesc"),
+        "$aws/things/car/shadow/update",
+        "$aws/things/car/shadow/name/other/update",
+        "$aws/things/car2/shadow/name/agent/update",
+        *(f"$aws/rules/{rule_name(rule)}/dt/iort/car/vesc" for rule in RULES if rule != "record"),
+        f"$aws/rules/{rule_name('record')}/live/iort/car/vesc",
+    ):
+        assert not allows(robot_policy, "Publish", "topic", topic), topic
+
+
+def test_a_robot_hears_its_own_topics_and_the_fleet(robot_policy):
+    for topic_filter in (
+        "cmd/iort/car/#",
+        "cmd/iort/car/+",
+        "pong/iort/car/+",
+        "fleet/iort/+/#",
+        "fleet/iort/car2/pose",
+    ):
+        assert allows(robot_policy, "Subscribe", "topicfilter", topic_filter), topic_filter
+    assert allows(robot_policy, "Subscribe", "topicfilter", build_topic(PING, "car", BROKER))
+    for topic_filter in (
+        "#",
+        "+/iort/car/#",
+        "cmd/iort/+/#",
+        "cmd/iort/car2/#",
+        "pong/iort/+/rule",
+        "ping/iort/+/broker",
+        "dt/iort/car/#",
+        "live/iort/car/#",
+        "$aws/#",
+        "fleet/lab2/+/#",
+        "fleet/#",
+    ):
+        assert not allows(robot_policy, "Subscribe", "topicfilter", topic_filter), topic_filter
+    for topic in (
+        build_topic(CMD, "car", "stop"),
+        build_topic(FLEET, "car2", "pose"),
+        build_topic(PONG, "car", "rule"),
+    ):
+        assert allows(robot_policy, "Receive", "topic", topic), topic
+    for topic in (
+        build_topic(CMD, "car2", "stop"),
+        build_topic(LIVE, "car", "vesc"),
+        build_topic(PONG, "car2", "rule"),
+    ):
+        assert not allows(robot_policy, "Receive", "topic", topic), topic
+
+
+def test_a_robot_connects_as_its_thing_and_nobody_else(robot_policy):
+    assert allows(robot_policy, "Connect", "client", "car")
+    assert not allows(robot_policy, "Connect", "client", "car2")
+    assert not allows(robot_policy, "Connect", "client", "car/2")
+
+
+# --- roles ------------------------------------------------------------------------------------------
+
+
+def test_every_role_may_do_exactly_this(synthesized, reader):
+    granted = {role: set() for role, *_ in qualified(synthesized, "AWS::IAM::Role")}
+    for _, stack, _, policy in qualified(synthesized, "AWS::IAM::Policy"):
+        (ref,) = policy["Roles"]
+        role = ("ingest/" if stack == "ingest" else "") + reader.text(ref)
+        for statement in policy["PolicyDocument"]["Statement"]:
+            assert statement.keys() <= {"Action", "Effect", "Resource"}
+            assert statement["Effect"] == "Allow"
+            for action in reader.texts(statement["Action"]):
+                granted[role] |= {(action, resource) for resource in reader.texts(statement["Resource"])}
+    assert granted == {role: actions for role, (_, actions) in ROLES.items()}
+
+
+def test_every_role_is_for_one_service_of_this_account(synthesized, reader):
+    for role, _, _, properties in qualified(synthesized, "AWS::IAM::Role"):
+        (statement,) = properties["AssumeRolePolicyDocument"]["Statement"]
+        service, _ = ROLES[role]
+        assert (statement["Effect"], statement["Action"]) == ("Allow", "sts:AssumeRole")
+        assert statement["Principal"] == {"Service": service}
+        if service == "iot.amazonaws.com":
+            # The service acts for every account; only for ours may it take our role.
+            condition = statement["Condition"]
+            assert condition == {"StringEquals": {"aws:SourceAccount": {"Ref": "AWS::AccountId"}}}
+        assert properties.keys() <= {"AssumeRolePolicyDocument", "Tags"}, "no managed or inline policies"
+
+
+def test_no_statement_is_about_every_resource_or_action(synthesized, reader):
+    wild = set()
+    for role, (_, actions) in ROLES.items():
+        for action, resource in actions:
+            assert "*" not in action
+            if resource == "*":
+                wild.add((role, action))
+            else:
+                # A wildcard within an ARN stands for the robot's name alone.
+                # Things and certificates have no names before they are provisioned.
+                named = resource.replace(":topic/pong/iort/*/", "")
+                assert "*" not in named or (role == "ProvisioningRole" and named in {THINGS, CERTIFICATES})
+    assert wild == EVERY_RESOURCE
+    # And nothing grants that is not a role's policy or a robot's, such as a policy of its own.
+    kinds = {r["Type"] for t in synthesized.templates.values() for r in t["Resources"].values()}
+    assert {k for k in kinds if k.startswith("AWS::IAM::")} == {"AWS::IAM::Role", "AWS::IAM::Policy"}
+    assert {k for k in kinds if k.endswith("Permission")} == {"AWS::Lambda::Permission"}
+
+
+def test_only_its_rule_may_call_a_function(synthesized, reader):
+    permissions = synthesized.resources("AWS::Lambda::Permission")
+    called = {}
+    for permission in permissions.values():
+        assert permission["Action"] == "lambda:InvokeFunction"
+        assert permission["Principal"] == "iot.amazonaws.com"
+        assert permission["SourceAccount"] == {"Ref": "AWS::AccountId"}
+        called[reader.text(permission["FunctionName"])] = reader.text(permission["SourceArn"])
+    assert called == {"Live.Arn": "Live.Arn", "Echo.Arn": "Echo.Arn"}
+    # Both are named Live; one is the function, the other the rule.
+    for permission in permissions.values():
+        rule = permission["SourceArn"]["Fn::GetAtt"][0]
+        assert synthesized.templates["ingest"]["Resources"][rule]["Type"] == "AWS::IoT::TopicRule"
+
+
+def test_queues_are_encrypted_and_refuse_what_is_not_tls(synthesized, reader):
+    queues = {name: properties for name, _, _, properties in qualified(synthesized, "AWS::SQS::Queue")}
+    assert queues.keys() == {"ingest/Rejected", "Undecodable"}
+    for properties in queues.values():
+        assert properties["SqsManagedSseEnabled"] is True
+        assert properties["MessageRetentionPeriod"] == 14 * 86_400
+    closed = set()
+    for _, _, _, policy in qualified(synthesized, "AWS::SQS::QueuePolicy"):
+        (statement,) = policy["PolicyDocument"]["Statement"]
+        assert (statement["Effect"], statement["Action"]) == ("Deny", "sqs:*")
+        assert statement["Condition"] == {"Bool": {"aws:SecureTransport": "false"}}
+        assert statement["Principal"] == {"AWS": "*"}
+        closed |= {reader.text(statement["Resource"])}
+    assert closed == {"Rejected.Arn", "Undecodable.Arn"}
+
+
+# --- secrets ----------------------------------------------------------------------------------------
+
+
+def test_no_template_holds_a_secret_an_account_or_a_path_of_this_machine(synthesized):
+    text = json.dumps(dict(synthesized.templates))
+    from stacks.settings import ROOT
+
+    # A retention in seconds or a queue's name has no twelve digits; an account id has.
+    assert not re.search(r"(?<![0-9a-f])\d{12}(?![0-9a-f])", text)
+    assert str(ROOT) not in text
+    assert str(synthesized.folder) not in text
+    assert not re.search(r"AKIA|aws_secret|password|BEGIN [A-Z ]*PRIVATE KEY|(pub|sub|sec)-c-", text)
+    for properties in synthesized.resources("AWS::Lambda::Function").values():
+        for key, value in properties.get("Environment", {}).get("Variables", {}).items():
+            assert not re.search(r"KEY|SECRET|TOKEN|PASSWORD", key), (key, value)

@@ -1,0 +1,163 @@
+"""What the stacks promise beyond permissions: rules, tables, functions, logs."""
+
+from __future__ import annotations
+
+import json
+
+import pytest
+
+import contract
+from contract import RULES, pong_template, rule_name, rule_sql
+from tests.stacks.templates import name
+
+
+@pytest.fixture(scope="module")
+def rules(synthesized):
+    rules = synthesized.resources("AWS::IoT::TopicRule").values()
+    return {rule["RuleName"]: rule["TopicRulePayload"] for rule in rules}
+
+
+@pytest.fixture(scope="module")
+def functions(synthesized):
+    return {name(k): v for k, v in synthesized.resources("AWS::Lambda::Function").items()}
+
+
+# --- rules ------------------------------------------------------------------------------------------
+
+
+def test_the_rules_are_the_contracts(rules):
+    assert set(rules) == {rule_name(rule) for rule in RULES}
+    for rule in RULES:
+        payload = rules[rule_name(rule)]
+        assert payload["Sql"] == rule_sql(rule, retention_s=90 * 86_400)
+        assert payload["AwsIotSqlVersion"] == "2016-03-23"
+        assert not payload.get("RuleDisabled")
+
+
+def test_every_rule_has_one_action_and_it_is_this(rules, reader):
+    actions = {rule.removeprefix("iort_"): payload["Actions"] for rule, payload in rules.items()}
+    assert all(len(each) == 1 for each in actions.values())
+    (record,), (live,), (pong,), (echo,) = (actions[rule] for rule in RULES)
+    assert reader.text(record["DynamoDBv2"]["PutItem"]["TableName"]) == "Telemetry"
+    assert reader.text(live["Lambda"]["FunctionArn"]) == "Live.Arn"
+    assert reader.text(echo["Lambda"]["FunctionArn"]) == "Echo.Arn"
+    assert (pong["Republish"]["Topic"], pong["Republish"]["Qos"]) == (pong_template(), 0)
+    assert [len(each[0]) for each in actions.values()] == [1] * 4
+
+
+@pytest.mark.parametrize("rule", RULES)
+def test_every_rule_has_an_error_action_that_keeps_the_message(rules, reader, rule):
+    payload = rules[rule_name(rule)]
+    assert payload["ErrorAction"].keys() == {"Sqs"}
+    sqs = payload["ErrorAction"]["Sqs"]
+    assert sqs["QueueUrl"]["Ref"].startswith("Rejected")
+    # The error message holds the payload in base64 already: base64OriginalPayload.
+    assert sqs["UseBase64"] is False
+    # A rule's actions have one role, its own.
+    assert reader.text(sqs["RoleArn"]) == f"{rule.capitalize()}Role.Arn"
+    for action in payload["Actions"]:
+        for settings in action.values():
+            assert reader.text(settings.get("RoleArn", sqs["RoleArn"])) == f"{rule.capitalize()}Role.Arn"
+
+
+def test_a_rule_is_made_after_its_roles_policy(synthesized):
+    """IoT Core tries the role when the rule is made."""
+    resources = synthesized.templates["ingest"]["Resources"]
+    for logical_id, resource in resources.items():
+        if resource["Type"] == "AWS::IoT::TopicRule":
+            depends = {name(other) for other in resource["DependsOn"]}
+            assert depends == {f"{name(logical_id)}Role", f"{name(logical_id)}RoleDefaultPolicy"}
+
+
+# --- tables -----------------------------------------------------------------------------------------
+
+
+def test_the_tables_keys_are_the_contracts(synthesized):
+    tables = {name(k): v for k, v in synthesized.resources("AWS::DynamoDB::Table").items()}
+
+    def keys(table):
+        types = {a["AttributeName"]: a["AttributeType"] for a in tables[table]["AttributeDefinitions"]}
+        return [
+            (k["AttributeName"], k["KeyType"], types[k["AttributeName"]]) for k in tables[table]["KeySchema"]
+        ]
+
+    assert keys("Telemetry") == [(contract.TOPIC, "HASH", "S"), (contract.T_US, "RANGE", "N")]
+    assert keys("Summary") == [(contract.TOPIC, "HASH", "S"), (contract.SECOND, "RANGE", "N")]
+    assert keys("Robots") == [(contract.ROBOT, "HASH", "S")]
+    expires = {"AttributeName": contract.EXPIRES_S, "Enabled": True}
+    assert {t: v.get("TimeToLiveSpecification") for t, v in tables.items()} == {
+        "Telemetry": expires,
+        "Summary": expires,
+        "Robots": None,
+    }
+    streams = {t: v.get("StreamSpecification") for t, v in tables.items()}
+    assert streams == {"Telemetry": {"StreamViewType": "NEW_IMAGE"}, "Summary": None, "Robots": None}
+    assert {v["BillingMode"] for v in tables.values()} == {"PAY_PER_REQUEST"}
+
+
+# --- functions --------------------------------------------------------------------------------------
+
+
+def test_concurrency_is_reserved_where_a_burst_would_start_workers(functions):
+    reserved = {k: v.get("ReservedConcurrentExecutions") for k, v in functions.items()}
+    assert reserved == {"Live": 5, "Summarize": None, "Echo": None}
+
+
+def test_functions_run_on_one_runtime_with_a_log_each_that_ends(synthesized, functions, reader):
+    logs = {name(k): v for k, v in synthesized.resources("AWS::Logs::LogGroup").items()}
+    assert logs.keys() == {"LiveLog", "SummarizeLog", "EchoLog"}
+    assert {v["RetentionInDays"] for v in logs.values()} == {30}
+    for noun, function in functions.items():
+        assert reader.text(function["LoggingConfig"]["LogGroup"]) == f"{noun}Log"
+        assert reader.text(function["Role"]) == f"{noun}Role.Arn"
+        assert (function["Runtime"], function["Architectures"]) == ("python3.13", ["arm64"])
+        assert function["Timeout"] <= 60
+
+
+def test_a_live_message_or_a_ping_is_not_tried_again(synthesized, reader):
+    configs = synthesized.resources("AWS::Lambda::EventInvokeConfig").values()
+    assert {reader.text(c["FunctionName"]): c["MaximumRetryAttempts"] for c in configs} == {
+        "Live": 0,
+        "Echo": 0,
+    }
+    assert {c["MaximumEventAgeInSeconds"] for c in configs} == {60}
+
+
+def test_the_stream_never_blocks_for_good(synthesized, reader):
+    (mapping,) = synthesized.resources("AWS::Lambda::EventSourceMapping").values()
+    assert reader.text(mapping["EventSourceArn"]) == "Telemetry.StreamArn"
+    assert reader.text(mapping["FunctionName"]) == "Summarize"
+    assert mapping["FunctionResponseTypes"] == ["ReportBatchItemFailures"]
+    assert mapping["BisectBatchOnFunctionError"] is True
+    assert mapping["MaximumRetryAttempts"] == 5
+    assert mapping["MaximumRecordAgeInSeconds"] == 6 * 3600
+    assert reader.text(mapping["DestinationConfig"]["OnFailure"]["Destination"]) == "Undecodable.Arn"
+    # From the beginning: what was stored before the first deployment of the mapping is summarised too.
+    assert mapping["StartingPosition"] == "TRIM_HORIZON"
+
+
+def test_every_resource_that_can_be_is_tagged_with_the_project(synthesized):
+    for template in synthesized.templates.values():
+        for resource in template["Resources"].values():
+            tags = resource.get("Properties", {}).get("Tags")
+            if tags is not None:
+                assert {"Key": "project", "Value": "iort"} in tags
+
+
+def test_two_stages_share_an_account(tmp_path_factory, synthesized):
+    """Every name that is not CloudFormation's own has the namespace in it."""
+    from aws_cdk import App
+
+    from app import build
+    from stacks.settings import Settings
+
+    layer = tmp_path_factory.mktemp("layer")
+    (layer / "nothing.py").touch()
+    app = App(outdir=str(tmp_path_factory.mktemp("cdk.out")))
+    build(app, Settings(namespace="lab2", layer=layer, live_concurrency=0, retention_days=7))
+    stacks = app.synth().stacks
+    assert {stack.stack_name for stack in stacks} == {f"lab2-{noun}" for noun in synthesized.templates}
+    text = json.dumps([stack.template for stack in stacks])
+    assert not any(word in text for word in ("iort/", "/iort", "iort_", "iort-", "iort."))
+    assert f"+ {7 * 86_400} AS expires_s" in text
+    assert "ReservedConcurrentExecutions" not in text

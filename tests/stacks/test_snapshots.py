@@ -1,0 +1,23 @@
+"""One snapshot a stack: a change of what is deployed shows in the diff. Update: pytest --snapshot-update."""
+
+from __future__ import annotations
+
+import json
+import re
+
+import pytest
+
+STACKS = ("fleet", "storage", "processing", "ingest", "monitoring")
+_ASSET = re.compile(r"[0-9a-f]{64}")
+
+
+def test_the_stacks_are_these(synthesized):
+    assert set(synthesized.templates) == set(STACKS)
+
+
+@pytest.mark.parametrize("stack", STACKS)
+def test_template(synthesized, snapshot, stack):
+    template = {k: v for k, v in synthesized.templates[stack].items() if k not in ("Parameters", "Rules")}
+    # What the code and the layer hold is other tests' business; so is which CDK numbered the layer.
+    masked = _ASSET.sub("<asset>", json.dumps(template))
+    assert json.loads(masked) == snapshot

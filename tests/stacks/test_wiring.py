@@ -1,0 +1,287 @@
+"""Both ends of every wire agree: handlers and assets, metrics and dashboard, rules and topics."""
+
+from __future__ import annotations
+
+import ast
+import importlib.util
+import json
+import os
+import re
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+import contract
+from contract import BROKER, LAMBDA, LIVE, PING, PONG, RECORD, RULE, build_topic, record_topic, rule_name
+from stacks.settings import ROOT
+from tests.stacks.templates import name
+
+FUNCTIONS = sorted((ROOT / "functions").glob("*.py"))
+# Lambda's Python has boto3 and what boto3 needs.
+RUNTIME_PACKAGES = ("boto3", "botocore", "dateutil", "jmespath", "s3transfer", "six", "urllib3")
+
+
+@pytest.fixture(scope="module")
+def functions(synthesized):
+    return {name(k): v for k, v in synthesized.resources("AWS::Lambda::Function").items()}
+
+
+# --- assets -----------------------------------------------------------------------------------------
+
+
+def test_the_asset_holds_exactly_the_contract_and_the_functions(synthesized, functions):
+    assets = {synthesized.asset(function["Code"]) for function in functions.values()}
+    (asset,) = assets
+    packaged = {
+        str(path.relative_to(asset)): path.read_bytes() for path in asset.rglob("*") if path.is_file()
+    }
+    expected = {ROOT / "contract.py", *FUNCTIONS}
+    assert packaged == {str(path.relative_to(ROOT)): path.read_bytes() for path in expected}
+
+
+@pytest.fixture(scope="module")
+def runtime(tmp_path_factory):
+    """What Lambda's Python has beside the asset: boto3, and nothing else of this environment."""
+    folder = tmp_path_factory.mktemp("runtime")
+    for package in RUNTIME_PACKAGES:
+        spec = importlib.util.find_spec(package)
+        assert spec is not None
+        assert spec.origin is not None
+        origin = Path(spec.origin)
+        origin = origin.parent if origin.name == "__init__.py" else origin
+        (folder / origin.name).symlink_to(origin)
+    return folder
+
+
+@pytest.mark.parametrize("function", ["Live", "Summarize", "Echo"])
+def test_every_handler_imports_from_its_asset_alone(synthesized, functions, runtime, tmp_path, function):
+    properties = functions[function]
+    asset = synthesized.asset(properties["Code"])
+    path = [str(asset)]
+    if "Layers" in properties:
+        layer = ROOT / "build" / "layer" / "local" / "python"
+        if not layer.is_dir():
+            pytest.skip(f"{layer} is not there: run `make setup`")
+        (tmp_path / "layer").symlink_to(layer)
+        path.append(str(tmp_path / "layer"))
+    path.append(str(runtime))
+    program = """
+import importlib, json, sys
+sys.path[:0] = json.loads(sys.argv[1])
+module, _, attribute = sys.argv[2].rpartition(".")
+handler = getattr(importlib.import_module(module), attribute)
+assert callable(handler)
+files = {n: m.__file__ for n, m in sys.modules.items() if getattr(m, "__file__", None)}
+print(json.dumps(files))
+"""
+    # -I and -S: neither this environment's packages nor the checkout are on the path.
+    done = subprocess.run(
+        [sys.executable, "-I", "-S", "-B", "-c", program, json.dumps(path), properties["Handler"]],
+        cwd=tmp_path,
+        env={"PATH": os.environ["PATH"]},
+        capture_output=True,
+        text=True,
+        check=False,
+        timeout=120,
+    )
+    assert done.returncode == 0, done.stderr
+    files = json.loads(done.stdout)
+    own = {
+        module: file for module, file in files.items() if module.split(".")[0] in ("functions", "contract")
+    }
+    assert {"contract", "functions", properties["Handler"].rpartition(".")[0]} <= own.keys()
+    for file in own.values():
+        assert Path(file).is_relative_to(asset)
+    assert not [
+        file for file in files.values() if Path(file).is_relative_to(ROOT) and asset not in Path(file).parents
+    ]
+    # pubnub takes 240 ms to load: only the function that publishes pays for it.
+    assert ("pubnub" in files) == (function == "Live")
+
+
+def test_every_function_module_with_a_handler_is_deployed(functions):
+    modules = {f"functions.{p.stem}.handler" for p in FUNCTIONS if "def handler(" in p.read_text()}
+    assert {function["Handler"] for function in functions.values()} == modules
+
+
+# --- environment variables --------------------------------------------------------------------------
+
+
+def imported(module):
+    """The modules of functions/ that one of them loads, itself included."""
+    found, todo = set(), [module]
+    while todo:
+        one = todo.pop()
+        if one in found:
+            continue
+        found.add(one)
+        todo += [
+            node.module.split(".")[1]
+            for node in ast.walk(ast.parse((ROOT / "functions" / f"{one}.py").read_text()))
+            if isinstance(node, ast.ImportFrom) and (node.module or "").startswith("functions.")
+        ]
+    return found
+
+
+def variables_read(module):
+    read = set()
+    for one in imported(module):
+        tree = ast.parse((ROOT / "functions" / f"{one}.py").read_text())
+        uses = [n for n in ast.walk(tree) if isinstance(n, ast.Attribute) and n.attr in ("environ", "getenv")]
+        known = [
+            n
+            for n in ast.walk(tree)
+            if isinstance(n, ast.Subscript)
+            and isinstance(n.value, ast.Attribute)
+            and n.value.attr == "environ"
+        ]
+        assert len(uses) == len(known), (
+            f'functions/{one}.py reads the environment other than by os.environ["X"]'
+        )
+        read |= {ast.literal_eval(n.slice) for n in known}
+    return read
+
+
+@pytest.mark.parametrize("function", ["Live", "Summarize", "Echo"])
+def test_a_function_reads_exactly_the_variables_that_it_is_given(functions, function):
+    properties = functions[function]
+    given = set(properties.get("Environment", {}).get("Variables", {}))
+    assert variables_read(properties["Handler"].split(".")[1]) == given
+
+
+def test_what_the_variables_say_is_what_the_functions_expect(functions, reader, monkeypatch):
+    from functions.live import LiveSettings
+
+    live = functions["Live"]["Environment"]["Variables"]
+    monkeypatch.setenv("LIVE_FIELDS", live["LIVE_FIELDS"])
+    assert LiveSettings.from_environment().fields == {contract.VESC_STREAM: frozenset(contract.VESC_FIELDS)}
+    assert live["PUBNUB_PARAMETER"] == contract.pubnub_parameter()
+    tables = functions["Summarize"]["Environment"]["Variables"]
+    assert {key: reader.text(value) for key, value in tables.items()} == {
+        "TELEMETRY_TABLE": "Telemetry",
+        "SUMMARY_TABLE": "Summary",
+        "ROBOTS_TABLE": "Robots",
+    }
+
+
+# --- metrics ----------------------------------------------------------------------------------------
+
+
+@pytest.fixture(scope="module")
+def shown(synthesized):
+    """Every metric on the dashboard: namespace, name, dimensions, options."""
+    (dashboard,) = synthesized.resources("AWS::CloudWatch::Dashboard").values()
+    separator, parts = dashboard["DashboardBody"]["Fn::Join"]
+    assert separator == ""
+    # What is only known when it is deployed stands for itself; none of it needs escaping.
+    body = json.loads(
+        "".join(
+            part if isinstance(part, str) else f"<{json.dumps(part)}>".replace('"', "'") for part in parts
+        )
+    )
+    metrics = []
+    for widget in body["widgets"]:
+        for row in widget["properties"]["metrics"]:
+            namespace, metric, *rest = row
+            options = rest.pop() if isinstance(rest[-1], dict) else {}
+            metrics.append((namespace, metric, dict(zip(rest[::2], rest[1::2], strict=True)), options))
+    return metrics
+
+
+def emitted():
+    """Every metric that a function's code emits, by function."""
+    found = {}
+    for path in FUNCTIONS:
+        for node in ast.walk(ast.parse(path.read_text())):
+            if isinstance(node, ast.Call) and getattr(node.func, "id", "") == "emit":
+                function = ast.literal_eval(node.args[0])
+                found.setdefault(function, set()).update(keyword.arg for keyword in node.keywords)
+    return found
+
+
+def test_the_dashboard_shows_what_the_functions_emit_and_nothing_else(shown):
+    by_function = {}
+    for namespace, metric, dimensions, options in shown:
+        if namespace == contract.METRIC_NAMESPACE:
+            assert dimensions.keys() == {"Function"}
+            by_function.setdefault(dimensions["Function"], set()).add(metric)
+            assert options["stat"] == ("p95" if metric.endswith("Ms") else "Sum")
+    assert by_function == {function: set(names) for function, names in contract.METRICS.items()}
+    assert emitted() == by_function
+
+
+def test_the_dashboard_covers_every_service_of_the_path(shown):
+    assert {namespace for namespace, *_ in shown} == {
+        "AWS/IoT",
+        "AWS/DynamoDB",
+        "AWS/Lambda",
+        "AWS/SQS",
+        contract.METRIC_NAMESPACE,
+    }
+    rules = {dimensions["RuleName"] for _, _, dimensions, _ in shown if "RuleName" in dimensions}
+    assert rules == {rule_name(rule) for rule in contract.RULES}
+
+
+def test_the_dashboards_action_types_are_those_of_the_rules(shown, synthesized):
+    shown_types = {d["RuleName"]: d["ActionType"] for _, _, d, _ in shown if "ActionType" in d}
+    for rule in synthesized.resources("AWS::IoT::TopicRule").values():
+        (action,) = rule["TopicRulePayload"]["Actions"]
+        assert shown_types[rule["RuleName"]] == next(iter(action))
+
+
+# --- rules and topics -------------------------------------------------------------------------------
+
+
+def matches(topic_filter, topic):
+    """MQTT 5, 4.7: + is one level, # the rest."""
+    levels, wanted = topic.split("/"), topic_filter.split("/")
+    if wanted[-1] == "#":
+        levels, wanted = levels[: len(wanted) - 1], wanted[:-1]
+    return len(levels) == len(wanted) and all(
+        w in ("+", level) for w, level in zip(wanted, levels, strict=True)
+    )
+
+
+@pytest.fixture(scope="module")
+def filters(synthesized):
+    found = {}
+    for rule in synthesized.resources("AWS::IoT::TopicRule").values():
+        (topic_filter,) = re.findall(r"FROM '([^']+)'", rule["TopicRulePayload"]["Sql"])
+        found[rule["RuleName"]] = topic_filter
+    return found
+
+
+def test_every_topic_of_the_agent_meets_exactly_the_rule_that_it_is_for(filters):
+    basic_ingest = record_topic("car", "vesc")
+    rule, topic = re.fullmatch(r"\$aws/rules/([^/]+)/(.+)", basic_ingest).groups()
+    # Basic Ingest leaves the rest of the topic to the rule it names, which filters it like any other.
+    assert rule == rule_name("record")
+    assert topic == build_topic(RECORD, "car", "vesc")
+    expected = {
+        topic: {"iort_record"},
+        build_topic(LIVE, "car", "vesc"): {"iort_live"},
+        build_topic(PING, "car", RULE): {"iort_pong"},
+        build_topic(PING, "car", LAMBDA): {"iort_echo"},
+        build_topic(PING, "car", BROKER): set(),
+        build_topic(PONG, "car", RULE): set(),
+        build_topic(PONG, "car", LAMBDA): set(),
+        build_topic(contract.FLEET, "car", "pose"): set(),
+        build_topic(contract.CMD, "car", "stop"): set(),
+        build_topic(LIVE, "car", "vesc", "lab2"): set(),
+    }
+    for one, rules in expected.items():
+        assert {rule for rule, topic_filter in filters.items() if matches(topic_filter, one)} == rules, one
+
+
+def test_the_pongs_topic_is_what_the_agent_expects(synthesized):
+    topics = {
+        rule["RuleName"]: action["Republish"]["Topic"]
+        for rule in synthesized.resources("AWS::IoT::TopicRule").values()
+        for action in rule["TopicRulePayload"]["Actions"]
+        if "Republish" in action
+    }
+    ping = build_topic(PING, "car", RULE).split("/")
+    expanded = re.sub(r"\$\{topic\((\d)\)\}", lambda m: ping[int(m[1]) - 1], topics["iort_pong"])
+    assert expanded == build_topic(PONG, "car", RULE)

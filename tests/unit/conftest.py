@@ -1,0 +1,44 @@
+"""Unit tests touch no network: a socket is an error."""
+
+from __future__ import annotations
+
+import os
+
+import boto3
+import pytest
+from moto import mock_aws
+from pytest_socket import disable_socket, enable_socket
+
+from tests.fakes import NAMES
+
+
+@pytest.fixture(autouse=True)
+def no_network():
+    # A pair of Unix sockets is how asyncio wakes itself, and reaches nobody.
+    disable_socket(allow_unix_socket=True)
+    yield
+    enable_socket()
+
+
+@pytest.fixture
+def aws(monkeypatch):
+    """AWS in this process, with nothing in it; the machine's own settings and keys are out of reach."""
+    for name in [name for name in os.environ if name.startswith("AWS_")]:
+        monkeypatch.delenv(name)
+    monkeypatch.setenv("AWS_DEFAULT_REGION", "eu-west-1")
+    with mock_aws():
+        yield
+
+
+@pytest.fixture
+def dynamodb(aws, synthesized):
+    """moto's DynamoDB with the three tables as the template declares them."""
+    client = boto3.client("dynamodb")
+    for logical, properties in synthesized.resources("AWS::DynamoDB::Table").items():
+        client.create_table(
+            TableName=next(name for noun, name in NAMES.items() if logical.lower().startswith(noun)),
+            KeySchema=properties["KeySchema"],
+            AttributeDefinitions=properties["AttributeDefinitions"],
+            BillingMode=properties["BillingMode"],
+        )
+    return client

@@ -1,0 +1,71 @@
+"""The kept assembly is used as long as it is right, and not a moment longer."""
+
+from __future__ import annotations
+
+import pytest
+
+from local import deployment
+
+
+@pytest.fixture
+def checkout(tmp_path):
+    for name in deployment._MADE_OF:
+        (tmp_path / name).parent.mkdir(parents=True, exist_ok=True)
+        (tmp_path / name).write_text(name)
+    for name in deployment._MADE_OF_FOLDERS:
+        (tmp_path / name).mkdir()
+        (tmp_path / name / "one.py").write_text("1")
+    return tmp_path
+
+
+@pytest.fixture
+def assembly(checkout):
+    made = []
+
+    def synthesize(output):
+        output.mkdir()
+        (output / "manifest.json").write_text(str(len(made)))
+        made.append(output)
+
+    def get(namespace="iort"):
+        folder = deployment.assembly(checkout, checkout / "build", namespace=namespace, synthesize=synthesize)
+        assert (folder / "manifest.json").exists()
+        return len(made)
+
+    return get
+
+
+def test_same_again_is_not_synthesized_again(assembly):
+    assert [assembly(), assembly(), assembly()] == [1, 1, 1]
+
+
+@pytest.mark.parametrize(
+    "changed", ["app.py", "contract.py", "cdk.json", "stacks/one.py", "functions/one.py"]
+)
+def test_any_change_is_synthesized(assembly, checkout, changed):
+    assembly()
+    (checkout / changed).write_text("changed")
+    assert assembly() == 2
+
+
+def test_new_file_and_another_namespace_are_synthesized(assembly, checkout):
+    assembly()
+    (checkout / "functions" / "two.py").write_text("")
+    assert assembly() == 2
+    assert assembly("other") == 3
+
+
+def test_failed_synthesis_leaves_nothing_to_be_used(checkout):
+    def fail(output):
+        output.mkdir()
+        raise RuntimeError
+
+    for _ in range(2):
+        with pytest.raises(RuntimeError):
+            deployment.assembly(checkout, checkout / "build", namespace="iort", synthesize=fail)
+
+
+def test_old_ones_are_removed(assembly, checkout):
+    for i in range(8):
+        assembly(f"n{i}")
+    assert len(list((checkout / "build").iterdir())) == deployment._KEPT

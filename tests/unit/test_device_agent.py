@@ -1,0 +1,264 @@
+"""The whole agent over an uplink in memory, and the command around it."""
+
+from __future__ import annotations
+
+import threading
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+import contract
+from device.agent import Agent
+from device.clock import Clock, SystemClock
+from device.config import Config, MetricsConfig, PingConfig, RecordConfig
+from device.dispatch import Dispatcher
+from device.errors import SourceError
+from device.loopback import Loopback, Published
+from device.main import main
+from device.sources import Emit
+from device.spool import REJECT_NEW, MemorySpool
+from device.uplink import matches
+
+T0 = 1_700_000_000_000_000
+
+
+class Script:
+    """A source that runs a function."""
+
+    def __init__(self, run: Any) -> None:
+        self.run = run
+
+    def streams(self) -> list[str]:
+        return ["vesc"]
+
+    def describe(self) -> str:
+        return "script"
+
+    def build(self, clock: Clock) -> Script:
+        return self
+
+    def report(self) -> dict[str, Any]:
+        return {"played": True}
+
+
+def drive(emit: Emit, stop: threading.Event) -> None:
+    for i in range(500):
+        emit("vesc", T0 + i * 20_000, {"speed": i})
+
+
+class Rig:
+    def __init__(self, *sources: Any, connected: bool = True, **settings: Any) -> None:
+        config = Config("car1", "host", Path(), Path(), tuple(Script(run) for run in sources))
+        self.clock = SystemClock()
+        self.uplink = Loopback(self.clock, Dispatcher(), connected=connected)
+        self.spool = MemorySpool(max_bytes=settings.pop("max_bytes", 10**9), policy=REJECT_NEW)
+        self.agent = Agent(
+            replace(config, **settings), uplink=self.uplink, spool=self.spool, clock=self.clock
+        )
+
+    def recorded(self, stream: str = "vesc") -> list[Any]:
+        topic = f"$aws/rules/iort_record/dt/iort/car1/{stream}"
+        batches = [contract.decode(m.payload) for m in self.uplink.published if m.topic == topic]
+        self.seqs = [batch.seq for batch in batches]
+        return [value for batch in batches for value in batch.columns["speed"]]
+
+
+def test_every_sample_is_recorded_and_the_report_says_so() -> None:
+    rig = Rig(drive)
+    assert rig.agent.run(drain_s=10) == 0
+    assert rig.recorded() == list(range(500))
+    assert rig.seqs == list(range(10))
+    report = rig.agent.report()
+    assert report["streams"]["vesc"] == {
+        "samples": 500, "batches": 10, "refused": 0, "restamped": 0, "nulled": 0,
+    }  # fmt: skip
+    assert report["spool"]["left_batches"] == report["spool"]["dropped_batches"] == 0
+    assert report["boot"] == contract.decode(rig.uplink.published[-1].payload).boot
+    live = [m for m in rig.uplink.published if m.topic == "live/iort/car1/vesc"]
+    assert report["live_published"] == len(live) > 0
+    assert rig.uplink.stopped
+
+
+def test_a_signal_ends_it_in_good_order() -> None:
+    def endless(emit: Emit, stop: threading.Event) -> None:
+        drive(emit, stop)
+        rig.agent.stop()
+        assert stop.wait(10)
+
+    rig = Rig(endless)
+    assert rig.agent.run(drain_s=10) == 0
+    assert rig.recorded() == list(range(500))
+
+
+def test_what_cannot_be_delivered_in_time_is_told(caplog: pytest.LogCaptureFixture) -> None:
+    rig = Rig(drive, connected=False)
+    assert rig.agent.run(drain_s=0.05) == 1
+    assert "500 samples in 10 batches could not be delivered within 0.05 s" in caplog.text
+    assert rig.agent.report()["spool"]["left_samples"] == 500
+
+
+def test_a_backlog_is_delivered_when_the_connection_comes_at_last() -> None:
+    def late(emit: Emit, stop: threading.Event) -> None:
+        drive(emit, stop)
+        rig.uplink.connect()
+
+    rig = Rig(late, connected=False)
+    assert rig.agent.run(drain_s=10) == 0
+    assert rig.recorded() == list(range(500))
+
+
+def test_dropped_samples_are_not_a_success(caplog: pytest.LogCaptureFixture) -> None:
+    def late(emit: Emit, stop: threading.Event) -> None:
+        drive(emit, stop)
+        rig.uplink.connect()
+
+    rig = Rig(late, connected=False, max_bytes=1000)
+    assert rig.agent.run(drain_s=10) == 1
+    assert "were dropped because the queue was full" in caplog.text
+    dropped = rig.agent.report()["spool"]["dropped_samples"]
+    assert dropped > 0
+    assert len(rig.recorded()) == 500 - dropped
+    assert len(rig.seqs) == 10 - rig.agent.report()["spool"]["dropped_batches"]
+    assert rig.seqs == sorted(set(rig.seqs)), "the numbers of those dropped are missing"
+
+
+@pytest.mark.parametrize(
+    ("error", "text"), [(SourceError("no such bag"), "no such bag"), (ZeroDivisionError(), "Traceback")]
+)
+def test_a_source_that_fails_does_not_take_the_others_with_it(
+    error: Exception, text: str, caplog: pytest.LogCaptureFixture
+) -> None:
+    def broken(emit: Emit, stop: threading.Event) -> None:
+        raise error
+
+    rig = Rig(broken, drive)
+    assert rig.agent.run(drain_s=10) == 1
+    assert rig.recorded() == list(range(500))
+    assert rig.agent.report()["failed_sources"] == ["script"]
+    assert text in caplog.text
+
+
+def test_round_trips_are_recorded_like_any_stream() -> None:
+    enough = threading.Event()
+
+    def wait_for_pings(emit: Emit, stop: threading.Event) -> None:
+        assert enough.wait(10)
+
+    rig = Rig(wait_for_pings, ping=PingConfig(rate_hz=20, paths=("broker",)))
+    seen: list[Published] = []
+
+    def count(message: Published) -> None:
+        seen.append(message)
+        if sum(m.topic == "ping/iort/car1/broker" for m in seen) == 3:
+            enough.set()
+
+    rig.uplink.verdict = count
+    assert rig.agent.run(drain_s=10) == 0
+    batches = [
+        contract.decode(m.payload) for m in seen if m.topic == "$aws/rules/iort_record/dt/iort/car1/rtt"
+    ]
+    values = [value for batch in batches for value in batch.columns["broker_ms"]]
+    ping = rig.agent.report()["pings"]["broker"]
+    assert len(values) == ping["received"] == ping["sent"] >= 3
+    assert ping["lost"] == 0
+    assert not [m for m in seen if m.topic == "live/iort/car1/rtt"]
+
+
+def test_the_record_lane_can_be_switched_off() -> None:
+    rig = Rig(drive, record=RecordConfig(enabled=False))
+    assert rig.agent.run(drain_s=10) == 0
+    assert rig.recorded() == []
+    assert rig.agent.report()["live_published"] > 0
+
+
+def test_lanes_fields_and_rates_change_while_it_runs() -> None:
+    def tuned(emit: Emit, stop: threading.Event) -> None:
+        emit("vesc", T0, {"speed": 1, "voltage_input": 40})
+        tuning = rig.agent._tuning
+        rig.agent.tune(replace(tuning, fields={"vesc": ("speed", "gone")}))
+        emit("vesc", T0 + 1_000_000, {"speed": 2, "voltage_input": 40})
+        rig.agent.tune(replace(tuning, record_enabled=False, live_enabled=False))
+        live = rig.agent.report()["live_published"]
+        for i in range(100):
+            emit("vesc", T0 + 2_000_000 + i, {"speed": 3, "voltage_input": 40})
+        assert rig.agent.report()["live_published"] <= live + 1
+        rig.agent.tune(tuning)
+        emit("vesc", T0 + 3_000_000, {"speed": 4, "voltage_input": 40})
+
+    rig = Rig(tuned)
+    began = rig.clock.monotonic()
+    assert rig.agent.run(drain_s=10) == 0
+    assert rig.clock.monotonic() - began < 10, "it waited for something that does not come"
+    assert rig.recorded() == [1, 2, 4]
+    topic = "$aws/rules/iort_record/dt/iort/car1/vesc"
+    batches = [contract.decode(m.payload) for m in rig.uplink.published if m.topic == topic]
+    assert [sorted(batch.columns) for batch in batches] == [
+        ["speed", "voltage_input"], ["speed"], ["speed", "voltage_input"],
+    ]  # fmt: skip
+
+
+def test_its_own_figures_are_a_stream() -> None:
+    seen = threading.Event()
+
+    def wait(emit: Emit, stop: threading.Event) -> None:
+        assert seen.wait(10)
+
+    rig = Rig(wait, metrics=MetricsConfig(every_s=0.1), record=RecordConfig(batch_s=0))
+    topic = "$aws/rules/iort_record/dt/iort/car1/agent"
+    rig.uplink.verdict = lambda message: seen.set() if message.topic == topic else None
+    assert rig.agent.run(drain_s=10) == 0
+    batch = next(contract.decode(m.payload) for m in rig.uplink.published if m.topic == topic)
+    assert list(batch.columns) == list(contract.AGENT_FIELDS)
+    assert not [m for m in rig.uplink.published if m.topic == "live/iort/car1/agent"]
+
+
+@pytest.mark.parametrize(
+    ("topic_filter", "topic", "expected"),
+    [
+        ("a/b", "a/b", True),
+        ("a/b", "a/b/c", False),
+        ("a/b/c", "a/b", False),
+        ("a/+/c", "a/b/c", True),
+        ("a/+", "a/b/c", False),
+        ("a/#", "a/b/c", True),
+        ("a/#", "b/b/c", False),
+        ("+/+", "a/b", True),
+    ],
+)
+def test_topic_filters(topic_filter: str, topic: str, expected: bool) -> None:
+    assert matches(topic_filter, topic) is expected
+
+
+def config_file(folder: Path, source: str) -> Path:
+    for name in ("cert.pem", "key.pem", "ca.pem"):
+        (folder / name).write_text("not a certificate")
+    file = folder / "car.yaml"
+    file.write_text(
+        "robot: car1\nendpoint: localhost\ncertificate: cert.pem\nprivate_key: key.pem\nroot_ca: ca.pem\n"
+        f"sources: [{source}]\n"
+    )
+    return file
+
+
+def test_the_command_checks_a_configuration(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["--config", str(config_file(tmp_path, "{type: sim}")), "--check-config"]) == 0
+    assert "good, robot car1, 1 source" in capsys.readouterr().out
+
+
+def test_a_wrong_configuration_is_a_message_and_status_2(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert main(["--config", str(config_file(tmp_path, "{type: sum}"))]) == 2
+    error = capsys.readouterr().err
+    assert error.startswith("iort-agent: ")
+    assert "sources[0].type" in error
+    assert "Traceback" not in error
+
+
+@pytest.mark.parametrize("arguments", [[], ["--config", "x", "--drain-s", "-1"], ["--config", "x", "--no"]])
+def test_wrong_arguments(arguments: list[str]) -> None:
+    with pytest.raises(SystemExit) as raised:
+        main(arguments)
+    assert raised.value.code == 2

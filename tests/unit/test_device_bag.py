@@ -1,0 +1,235 @@
+"""Recordings: a real car's, and ROS 1 and ROS 2 ones written here."""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from rosbags.rosbag1 import Writer as Writer1
+from rosbags.rosbag2 import StoragePlugin
+from rosbags.rosbag2 import Writer as Writer2
+from rosbags.typesys import Stores, get_types_from_msg, get_typestore
+
+import contract
+from device.clock import ManualClock
+from device.errors import SourceError
+from device.sources.bag import _VESC_STATE_ROS2, VESC_TYPE, BagConfig
+from tests.recordings import recording
+
+NOW = 1_700_000_000_000_000
+# When the written recordings start, in nanoseconds.
+START = 1_600_000_000_000_000_000
+
+Sample = tuple[str, int, Any]
+
+
+def play(path: Path, clock: ManualClock | None = None, **settings: Any) -> list[Sample]:
+    out: list[Sample] = []
+    source = BagConfig(path=path, **settings).build(clock or ManualClock(now_us=NOW))
+    source.run(lambda *sample: out.append(sample), threading.Event())
+    return out
+
+
+STATE_ROS1 = "int32 FAULT_CODE_NONE=0\nfloat64 speed\nint32 fault_code\n"
+
+
+def write_ros1(
+    path: Path, *, count: int = 10, stamps: Callable[[int], int] = lambda t: t - 5_000_000
+) -> Path:
+    """Messages at 10 Hz, a stamp 5 ms before each is recorded, and a second topic."""
+    store = get_typestore(Stores.ROS1_NOETIC)
+    store.register(get_types_from_msg(STATE_ROS1, "vesc_msgs/msg/VescState"))
+    store.register(get_types_from_msg("Header header\nvesc_msgs/VescState state\n", VESC_TYPE))
+    types = store.types
+    with Writer1(path) as writer:
+        core = writer.add_connection("/sensors/core", VESC_TYPE, typestore=store)
+        extra = writer.add_connection("/servo", "std_msgs/msg/Float64", typestore=store)
+        for i in range(count):
+            at = START + i * 100_000_000
+            sec, nanosec = divmod(stamps(at), 1_000_000_000)
+            stamp = types["builtin_interfaces/msg/Time"](sec=sec, nanosec=nanosec)
+            header = types["std_msgs/msg/Header"](seq=i, stamp=stamp, frame_id="")
+            state = types["vesc_msgs/msg/VescState"](speed=float(i), fault_code=0)
+            message = types[VESC_TYPE](header=header, state=state)
+            writer.write(core, at, store.serialize_ros1(message, VESC_TYPE))
+            servo = types["std_msgs/msg/Float64"](data=i / 10)
+            writer.write(extra, at + 1, store.serialize_ros1(servo, "std_msgs/msg/Float64"))
+    return path
+
+
+def ros2_store() -> Any:
+    store = get_typestore(Stores.ROS2_HUMBLE)
+    state = "vesc_msgs/msg/VescState"
+    # As in the driver, with the constants that the agent's own definition leaves out.
+    store.register(get_types_from_msg("int32 FAULT_CODE_NONE=0\n" + _VESC_STATE_ROS2, state))
+    store.register(get_types_from_msg(f"std_msgs/Header header\n{state} state\n", VESC_TYPE))
+    store.register(get_types_from_msg("float64[3] xs\nfloat32[] ys\n", "lab_msgs/msg/Odd"))
+    return store
+
+
+def write_ros2(path: Path, plugin: StoragePlugin, *, count: int = 10) -> Path:
+    store = ros2_store()
+    types = store.types
+    names = [name for name, field in contract.VESC_FIELDS.items() if 2 in field.ros]
+    whole = {"displacement", "distance_traveled", "fault_code", "controller_id"}
+    with Writer2(path, version=8, storage_plugin=plugin) as writer:
+        core = writer.add_connection("/sensors/core", VESC_TYPE, typestore=store)
+        odd = writer.add_connection("/odd", "lab_msgs/msg/Odd", typestore=store)
+        for i in range(count):
+            at = START + i * 100_000_000
+            stamp = types["builtin_interfaces/msg/Time"](sec=at // 10**9, nanosec=at % 10**9)
+            header = types["std_msgs/msg/Header"](stamp=stamp, frame_id="")
+            values = {name: k + i if name in whole else k + i + 0.5 for k, name in enumerate(names)}
+            state = types["vesc_msgs/msg/VescState"](**values)
+            message = types[VESC_TYPE](header=header, state=state)
+            writer.write(core, at, store.serialize_cdr(message, VESC_TYPE))
+            arrays = types["lab_msgs/msg/Odd"](
+                xs=np.array([1.0, 2.0, 3.0]), ys=np.array([i, 0.5], dtype=np.float32)
+            )
+            writer.write(odd, at, store.serialize_cdr(arrays, "lab_msgs/msg/Odd"))
+    return path
+
+
+def test_a_real_drive() -> None:
+    samples = play(recording("f1tenth-motor-servo.bag"))
+    assert len(samples) == 2244
+    assert {stream for stream, _, _ in samples} == {"vesc"}
+    expected = {name for name, field in contract.VESC_FIELDS.items() if 1 in field.ros}
+    assert all(set(values) == expected for _, _, values in samples)
+    assert samples[0][2]["voltage_input"] == 11.7
+    times = [t_us for _, t_us, _ in samples]
+    assert times[0] == NOW
+    assert times == sorted(set(times))
+    assert 44.8e6 < times[-1] - times[0] < 44.9e6
+
+
+def test_the_pace_is_the_recordings(tmp_path: Path) -> None:
+    path = write_ros1(tmp_path / "a.bag")
+    for speed, seconds in ((1.0, 0.9), (2.0, 0.45), (0.0, 0.0)):
+        clock = ManualClock(now_us=NOW)
+        samples = play(path, clock, speed=speed)
+        assert clock.now_us() - NOW == pytest.approx(seconds * 1e6, abs=100)
+        assert samples[-1][1] - NOW == pytest.approx(seconds * 1e6, abs=100)
+        assert len(samples) == 10
+
+
+def test_original_stamps_are_the_headers(tmp_path: Path) -> None:
+    samples = play(write_ros1(tmp_path / "a.bag"), stamps="original")
+    assert [t for _, t, _ in samples] == [START // 1000 + i * 100_000 - 5_000 for i in range(10)]
+
+
+def test_a_stamp_of_1970_is_not_believed(tmp_path: Path) -> None:
+    samples = play(write_ros1(tmp_path / "a.bag", stamps=lambda _: 7), stamps="original")
+    assert samples[0][1] == START // 1000
+
+
+def test_topics_and_streams_are_the_users_choice(tmp_path: Path) -> None:
+    samples = play(write_ros1(tmp_path / "a.bag"), topics=(("/servo", "servo"), ("/sensors/core", "car")))
+    assert [(stream, values) for stream, _, values in samples[:4]] == [
+        ("car", {"speed": 0.0, "fault_code": 0}),
+        ("servo", {"data": 0.0}),
+        ("car", {"speed": 1.0, "fault_code": 0}),
+        ("servo", {"data": 0.1}),
+    ]
+
+
+@pytest.mark.parametrize("stamps", ["now", "original"])
+def test_a_loop_goes_on_in_time(tmp_path: Path, stamps: str) -> None:
+    path = write_ros1(tmp_path / "a.bag", count=5)
+    samples = play(path, loop=True, duration_s=1.2, stamps=stamps)
+    assert [values["speed"] for _, _, values in samples[:7]] == [0, 1, 2, 3, 4, 0, 1]
+    times = [t for _, t, _ in samples]
+    assert times == sorted(set(times))
+    # Two topics are recorded, one is played: a round of five lasts half a second all the same.
+    assert [t - times[0] for t in times] == [i * 100_000 for i in range(12)]
+
+
+def test_duration_cuts(tmp_path: Path) -> None:
+    assert len(play(write_ros1(tmp_path / "a.bag"), duration_s=0.35)) == 4
+
+
+def test_stops_when_asked(tmp_path: Path) -> None:
+    path = write_ros1(tmp_path / "a.bag")
+    stop = threading.Event()
+    seen: list[Any] = []
+
+    def emit(*sample: Any) -> None:
+        seen.append(sample)
+        stop.set()
+
+    BagConfig(path=path).build(ManualClock()).run(emit, stop)
+    assert len(seen) == 1
+
+
+@pytest.mark.parametrize("plugin", [StoragePlugin.MCAP, StoragePlugin.SQLITE3])
+@pytest.mark.parametrize("by_file", [False, True])
+def test_ros_2(tmp_path: Path, plugin: StoragePlugin, by_file: bool) -> None:
+    folder = write_ros2(tmp_path / "drive", plugin)
+    path = next(p for p in folder.iterdir() if p.suffix in (".mcap", ".db3")) if by_file else folder
+    samples = play(path)
+    assert len(samples) == 10
+    values = samples[3][2]
+    expected = [name for name, field in contract.VESC_FIELDS.items() if 2 in field.ros]
+    assert sorted(values) == sorted(expected)
+    assert values["voltage_input"] == expected.index("voltage_input") + 3.5
+    assert values["fault_code"] == expected.index("fault_code") + 3
+    arrays = play(path, topics=(("/odd", "odd"),))[2][2] if plugin is StoragePlugin.MCAP else None
+    if arrays is not None:
+        assert arrays == {"xs.0": 1.0, "xs.1": 2.0, "xs.2": 3.0, "ys.0": 2.0, "ys.1": 0.5}
+
+
+def strip_definitions(folder: Path) -> None:
+    """What Foxy and Humble write: a database without definitions."""
+    import sqlite3
+
+    with sqlite3.connect(next(folder.glob("*.db3"))) as database:
+        database.execute("DELETE FROM message_definitions")
+    database.close()
+
+
+def test_ros_2_without_definitions_knows_the_vesc_but_not_the_labs_types(tmp_path: Path) -> None:
+    folder = write_ros2(tmp_path / "drive", StoragePlugin.SQLITE3)
+    strip_definitions(folder)
+    assert len(play(folder)) == 10
+    with pytest.raises(SourceError, match=r"/odd is of type lab_msgs/msg/Odd, whose definition"):
+        play(folder, topics=(("/odd", "odd"),))
+
+
+def test_a_topic_that_is_not_there_gets_a_list_of_those_that_are(tmp_path: Path) -> None:
+    path = write_ros1(tmp_path / "a.bag")
+    with pytest.raises(SourceError) as raised:
+        play(path, topics=(("/core", "vesc"),))
+    for part in ("no topic /core", "/sensors/core (vesc_msgs/msg/VescStateStamped)", "/servo (std_msgs"):
+        assert part in str(raised.value)
+
+
+def test_a_recording_without_a_vesc_needs_topics(tmp_path: Path) -> None:
+    store = get_typestore(Stores.ROS1_NOETIC)
+    with Writer1(tmp_path / "a.bag") as writer:
+        topic = writer.add_connection("/servo", "std_msgs/msg/Float64", typestore=store)
+        servo = store.types["std_msgs/msg/Float64"](data=0.1)
+        writer.write(topic, START, store.serialize_ros1(servo, "std_msgs/msg/Float64"))
+    with pytest.raises(SourceError, match=r"no topic of type vesc_msgs.*/servo \(std_msgs/msg/Float64\)"):
+        play(tmp_path / "a.bag")
+
+
+@pytest.mark.parametrize("name", ["a.bag", "drive"])
+def test_what_is_no_recording(tmp_path: Path, name: str) -> None:
+    path = tmp_path / name
+    if name == "drive":
+        path.mkdir()
+    else:
+        path.write_bytes(b"not a bag")
+    with pytest.raises(SourceError, match=name):
+        play(path)
+
+
+def test_a_recording_cut_short_says_so(tmp_path: Path) -> None:
+    path = write_ros1(tmp_path / "a.bag")
+    path.write_bytes(path.read_bytes()[:-200])
+    with pytest.raises(SourceError, match=r"a\.bag"):
+        play(path)

@@ -1,0 +1,97 @@
+"""Certificates read without a library, held against one that can."""
+
+from __future__ import annotations
+
+import datetime as dt
+import hashlib
+import os
+from pathlib import Path
+
+import pytest
+from cryptography import x509
+from cryptography.hazmat.primitives import hashes, serialization
+from cryptography.hazmat.primitives.asymmetric import ec
+from cryptography.x509.oid import NameOID
+from hypothesis import given
+from hypothesis import strategies as st
+
+from device.certificate import check_pair, parse_certificate, read_certificate, stamp
+from device.errors import IdentityError
+
+
+def made(before: dt.datetime, after: dt.datetime, subject: str = "car") -> tuple[x509.Certificate, str]:
+    key = ec.generate_private_key(ec.SECP256R1())
+    name = x509.Name([x509.NameAttribute(NameOID.COMMON_NAME, subject)])
+    certificate = (
+        x509.CertificateBuilder()
+        .subject_name(name)
+        .issuer_name(name)
+        .public_key(key.public_key())
+        .serial_number(x509.random_serial_number())
+        .not_valid_before(before)
+        .not_valid_after(after)
+        .sign(key, hashes.SHA256())
+    )
+    pem = key.private_bytes(
+        serialization.Encoding.PEM, serialization.PrivateFormat.PKCS8, serialization.NoEncryption()
+    )
+    return certificate, pem.decode()
+
+
+def text(certificate: x509.Certificate) -> str:
+    return certificate.public_bytes(serialization.Encoding.PEM).decode()
+
+
+@pytest.mark.parametrize(
+    ("before", "after"),
+    [
+        ((2020, 1, 2), (2049, 12, 31)),
+        ((1999, 12, 31), (2050, 1, 1)),  # the year that times are written differently from
+        ((1950, 1, 1), (9999, 12, 31)),
+    ],
+)
+def test_it_reads_what_the_library_reads(before: tuple[int, int, int], after: tuple[int, int, int]) -> None:
+    certificate, _ = made(dt.datetime(*before), dt.datetime(*after))  # noqa: DTZ001
+    found = parse_certificate("some text before\n" + text(certificate) + "and behind")
+    assert found.not_before_s == certificate.not_valid_before_utc.timestamp()
+    assert found.not_after_s == certificate.not_valid_after_utc.timestamp()
+    der = certificate.public_bytes(serialization.Encoding.DER)
+    assert found.id == hashlib.sha256(der).hexdigest(), "as AWS numbers certificates"
+
+
+@given(st.binary(max_size=300))
+def test_what_is_no_certificate_is_refused(der: bytes) -> None:
+    import base64
+
+    pem = f"-----BEGIN CERTIFICATE-----\n{base64.b64encode(der).decode()}\n-----END CERTIFICATE-----\n"
+    with pytest.raises(IdentityError):
+        parse_certificate(pem)
+
+
+def test_pairs(tmp_path: Path) -> None:
+    year = (dt.datetime(2020, 1, 1), dt.datetime(2040, 1, 1))  # noqa: DTZ001
+    (one, one_key), (_, other_key) = made(*year), made(*year)
+    for name, content in (("c", text(one)), ("k", one_key), ("o", other_key), ("x", "no key")):
+        (tmp_path / name).write_text(content)
+    check_pair(tmp_path / "c", tmp_path / "k")
+    with pytest.raises(IdentityError, match="is not the key of"):
+        check_pair(tmp_path / "c", tmp_path / "o")
+    with pytest.raises(IdentityError, match="cannot be used"):
+        check_pair(tmp_path / "c", tmp_path / "x")
+    with pytest.raises(IdentityError, match="cannot be read"):
+        read_certificate(tmp_path / "none")
+    with pytest.raises(IdentityError, match="no PEM certificate"):
+        read_certificate(tmp_path / "x")
+
+
+def test_a_stamp_tells_of_every_replacement(tmp_path: Path) -> None:
+    file, other = tmp_path / "a", tmp_path / "b"
+    assert stamp(file, None) == (None,)
+    file.write_text("1")
+    seen = [stamp(file)]
+    other.write_text("1")
+    other.replace(file)
+    seen.append(stamp(file))
+    os.utime(file, (1, 1))
+    seen.append(stamp(file))
+    assert len(set(seen)) == 3

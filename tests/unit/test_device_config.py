@@ -1,0 +1,156 @@
+"""The configuration file: what it may say, and what one is told of what it may not."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+from device.config import load_config
+from device.errors import ConfigError
+from device.sources.bag import BagConfig
+from device.sources.sim import SimConfig
+
+GOOD = """\
+robot: car1
+endpoint: abc-ats.iot.eu-west-1.amazonaws.com
+certificate: pki/cert.pem
+private_key: pki/key.pem
+root_ca: pki/ca.pem
+sources:
+  - type: sim
+"""
+
+
+@pytest.fixture
+def folder(tmp_path: Path) -> Path:
+    (tmp_path / "pki").mkdir()
+    for name in ("cert.pem", "key.pem", "ca.pem"):
+        (tmp_path / "pki" / name).write_text("x")
+    (tmp_path / "drive.bag").write_text("x")
+    return tmp_path
+
+
+def write(folder: Path, text: str) -> Path:
+    file = folder / "car.yaml"
+    file.write_text(text)
+    return file
+
+
+def test_a_short_file_is_enough(folder: Path) -> None:
+    config = load_config(write(folder, GOOD))
+    assert (config.robot, config.namespace, config.port) == ("car1", "iort", 8883)
+    assert config.certificate == folder / "pki" / "cert.pem", "relative to the file"
+    assert config.sources == (SimConfig(),)
+    assert (config.record.batch_s, config.live.rate_hz, config.ping.rate_hz) == (1.0, 10.0, 0.0)
+    assert config.queue.policy == "OverwriteOldestData"
+
+
+def test_everything_can_be_said(folder: Path) -> None:
+    text = GOOD.replace("  - type: sim\n", "") + (
+        "  - {type: bag, path: drive.bag, topics: {/sensors/core: vesc, /imu: imu}, speed: 0,\n"
+        "     stamps: original, loop: true, duration_s: 5}\n"
+        "  - {type: sim, stream: sim, rate_hz: 100, duration_s: 2, seed: 3, vehicle: {mass_kg: 5}}\n"
+        "namespace: dev\nport: 443\n"
+        "record: {enabled: false, batch_s: 0.1}\nlive: {enabled: false, rate_hz: 2}\n"
+        "ping: {rate_hz: 10, paths: [rule], padding_bytes: 450}\n"
+        "queue: {max_bytes: 1000000, policy: RejectNewData}\n"
+    )
+    config = load_config(write(folder, text))
+    bag, sim = config.sources
+    assert bag == BagConfig(
+        path=folder / "drive.bag",
+        topics=(("/sensors/core", "vesc"), ("/imu", "imu")),
+        speed=0,
+        stamps="original",
+        loop=True,
+        duration_s=5,
+    )
+    assert isinstance(sim, SimConfig)
+    assert (sim.rate_hz, sim.seed, sim.vehicle.mass_kg) == (100, 3, 5)
+    assert config.record.enabled is config.live.enabled is False
+    assert config.ping.paths == ("rule",)
+
+
+def test_a_section_left_empty_has_its_defaults(folder: Path) -> None:
+    assert load_config(write(folder, GOOD + "live:\n")).live.rate_hz == 10
+
+
+SIM = "  - type: sim\n"
+
+
+@pytest.mark.parametrize(
+    ("change", "parts"),
+    [
+        (("robot: car1\n", ""), ["robot: required"]),
+        (("car1", "car/1"), ["robot: ", "'car/1'", "A-Z a-z 0-9 _ -"]),
+        (("robot: car1", "robot: 17"), ["robot: ", "17 (a number)", "a text", "quotes"]),
+        (("robot: car1", "robot: {a: 1}"), ["robot: ", "(a mapping)", "a text"]),
+        (("robot:", "robto: x\nrobot:"), ["robto: unknown key", "'x'", "did you mean robot?"]),
+        (("robot:", "robot: x\nrobot:"), ["the key 'robot' is given twice", "line 2"]),
+        (
+            ("pki/key.pem", "pki/no.pem"),
+            ["private_key: ", "'pki/no.pem'", "a file that exists", "/pki/no.pem"],
+        ),
+        (("pki/key.pem", "pki"), ["private_key: ", "'pki'", "a file that exists"]),
+        (("abc-ats", "https://abc-ats"), ["endpoint: ", "'https://abc-ats", "a host name"]),
+        ((SIM, ""), ["sources: found nothing", "at least one source"]),
+        ((SIM, "  []\n"), ["sources: found [] (a list)", "at least one source"]),
+        ((SIM, "  - sim\n"), ["sources[0]: found 'sim'", "a mapping with the key type"]),
+        ((SIM, "  - {}\n"), ["sources[0].type: found nothing", "bag, ros1, rosbridge, sim, vesc"]),
+        ((SIM, "  - {type: sum}\n"), ["sources[0].type: found 'sum'", "bag, ros1", "did you mean sim?"]),
+        ((SIM, SIM + "    rate_hz: fast\n"), ["sources[0].rate_hz: found 'fast'", "0.1 to 2000 (Hz)"]),
+        ((SIM, SIM + "    rate_hz: .nan\n"), ["sources[0].rate_hz: found nan", "0.1 to 2000"]),
+        ((SIM, SIM + "    seed: 1.5\n"), ["sources[0].seed: found 1.5", "a whole number"]),
+        ((SIM, SIM + "    stream: a/b\n"), ["sources[0].stream: ", "'a/b'"]),
+        ((SIM, SIM + "    stream: rtt\n"), ["sources[0]: ", "the stream rtt is taken"]),
+        ((SIM, SIM + SIM), ["sources[1]: ", "the stream vesc is taken"]),
+        (
+            (SIM, SIM + "    vehicle: {mas_kg: 2}\n"),
+            ["sources[0].vehicle.mas_kg: unknown key", "did you mean mass_kg?"],
+        ),
+        ((SIM, "  - {type: bag}\n"), ["sources[0].path: required"]),
+        ((SIM, "  - {type: bag, path: no.bag}\n"), ["sources[0].path: found 'no.bag'", "exists"]),
+        ((SIM, "  - {type: bag, path: drive.bag, speed: -1}\n"), ["sources[0].speed: found -1", "from 0"]),
+        ((SIM, "  - {type: bag, path: drive.bag, stamps: new}\n"), ["stamps: found 'new'", "now, original"]),
+        ((SIM, "  - {type: bag, path: drive.bag, loop: 1}\n"), ["loop: found 1 (a number)", "true or false"]),
+        ((SIM, "  - {type: bag, path: drive.bag, topics: [/a]}\n"), ["topics: ", "mapping of ROS topic"]),
+        (
+            (SIM, "  - {type: bag, path: drive.bag, topics: {/a: 'b c'}}\n"),
+            ["sources[0].topics./a: ", "'b c'"],
+        ),
+        ((SIM, SIM + "live: {rate_hz: 50}\n"), ["live.rate_hz: found 50", "from 0.01 to 10 (Hz)"]),
+        ((SIM, SIM + "live: yes\n"), ["live: found True (true or false)", "enabled, rate_hz"]),
+        ((SIM, SIM + "record: {batch_s: 2}\n"), ["record.batch_s: found 2", "from 0 to 1 (s)"]),
+        ((SIM, SIM + "ping: {paths: [brokr]}\n"), ["ping.paths[0]: found 'brokr'", "did you mean broker?"]),
+        ((SIM, SIM + "ping: {paths: broker}\n"), ["ping.paths: found 'broker'", "a list"]),
+        ((SIM, SIM + "queue: {policy: Drop}\n"), ["queue.policy: found 'Drop'", "RejectNewData"]),
+        ((SIM, SIM + "port: 88830\n"), ["port: found 88830", "1 to 65535"]),
+        ((SIM, SIM + "namespace: Iort\n"), ["namespace: ", "'Iort'", "lower-case"]),
+        ((SIM, "  - type: sim\n   x: 1\n"), ["is not YAML", "line 8"]),
+    ],
+    ids=lambda case: case[1].strip()[:40] if isinstance(case, tuple) else "",
+)
+def test_a_wrong_file_is_told_where_what_and_what_instead(
+    folder: Path, change: tuple[str, str], parts: list[str]
+) -> None:
+    assert change[0] in GOOD
+    file = write(folder, GOOD.replace(change[0], change[1]))
+    with pytest.raises(ConfigError) as raised:
+        load_config(file)
+    for part in [str(file), *parts]:
+        assert part in str(raised.value)
+
+
+@pytest.mark.parametrize("text", ["", "# nothing\n", "- a\n", "just text\n"])
+def test_a_file_that_is_no_mapping(folder: Path, text: str) -> None:
+    with pytest.raises(ConfigError, match=r"car\.yaml: (is empty|found)"):
+        load_config(write(folder, text))
+
+
+def test_a_file_that_cannot_be_read(folder: Path) -> None:
+    with pytest.raises(ConfigError, match=r"no\.yaml: cannot be read: No such file"):
+        load_config(folder / "no.yaml")
+    (folder / "latin.yaml").write_bytes(b"robot: \xe9")
+    with pytest.raises(ConfigError, match="is not UTF-8"):
+        load_config(folder / "latin.yaml")

@@ -1,0 +1,176 @@
+"""The live lane: the newest only, at once when it may, never more often, never late."""
+
+from __future__ import annotations
+
+import contract
+from device.allowance import Allowance
+from device.clock import ManualClock
+from device.dispatch import Dispatcher
+from device.live import LiveLane
+from device.loopback import Loopback
+
+T0 = 1_700_000_000_000_000
+
+
+class Rig:
+    def __init__(self, *, rate_hz: float = 10, connected: bool = True, deaf: bool = False) -> None:
+        self.clock = ManualClock(now_us=T0)
+        self.dispatcher = Dispatcher()
+        self.uplink = Loopback(self.clock, self.dispatcher)
+        self.deaf = deaf
+        if connected:
+            self.uplink.connect()
+        self.lane = LiveLane(
+            robot="car1",
+            namespace="iort",
+            boot="0123456789abcdef",
+            rate_hz=rate_hz,
+            uplink=self.uplink,
+            clock=self.clock,
+            allowance=Allowance(self.clock),
+        )
+
+    def offer(self, speed: float, stream: str = "vesc") -> None:
+        self.lane.offer(stream, self.clock.now_us(), {"speed": speed})
+        if not self.deaf:
+            self.dispatcher.run_pending()
+
+    def tick(self) -> None:
+        self.lane.tick()
+        if not self.deaf:
+            self.dispatcher.run_pending()
+
+    def sent(self, stream: str = "vesc") -> list[contract.LiveSample]:
+        topic = f"live/iort/car1/{stream}"
+        return [contract.decode_live(m.payload) for m in self.uplink.published if m.topic == topic]
+
+    def speeds(self) -> list[object]:
+        return [live.sample["speed"] for live in self.sent()]
+
+
+def test_the_first_sample_goes_at_once_with_both_times() -> None:
+    rig = Rig()
+    rig.clock.advance(5)
+    rig.lane.offer("vesc", T0 + 4_990_000, {"speed": 7, "bad": float("nan")})
+    (live,) = rig.sent()
+    assert (live.t_us, live.sent_us, live.seq) == (T0 + 4_990_000, T0 + 5_000_000, 0)
+    assert live.sample == {"speed": 7, "bad": None}
+    assert rig.uplink.published[0].qos == 0
+
+
+def test_50_hz_becomes_10_hz_without_waiting() -> None:
+    rig = Rig()
+    for i in range(500):
+        rig.offer(i)
+        rig.clock.advance(0.02)
+    assert 95 <= len(rig.sent()) <= 101
+    assert all(live.sent_us == live.t_us for live in rig.sent()), "each goes the moment it comes"
+    assert [live.seq for live in rig.sent()] == list(range(len(rig.sent())))
+
+
+def test_never_more_than_the_rate_however_fast_samples_come() -> None:
+    rig = Rig(rate_hz=4)
+    for i in range(10_000):
+        rig.offer(i)
+        rig.clock.advance(0.001)
+        if i % 50 == 0:
+            rig.tick()
+    assert 39 <= len(rig.sent()) <= 41
+
+
+def test_samples_a_little_late_do_not_slow_the_rate() -> None:
+    rig = Rig()
+    for i in range(400):
+        rig.offer(i)
+        rig.clock.advance(0.03 if i % 2 else 0.021)
+    seconds = 400 * 0.0255
+    assert len(rig.sent()) >= seconds * 10 * 0.95
+
+
+def test_the_last_sample_before_a_silence_is_shown() -> None:
+    rig = Rig()
+    rig.offer(1)
+    rig.clock.advance(0.02)
+    rig.offer(2)
+    rig.clock.advance(0.02)
+    rig.offer(3)
+    rig.tick()
+    assert rig.speeds() == [1]
+    rig.clock.advance(0.12)
+    rig.tick()
+    rig.tick()
+    assert rig.speeds() == [1, 3], "the newest, once, and 2 never"
+
+
+def test_streams_do_not_share_a_rate() -> None:
+    rig = Rig()
+    rig.offer(1, "vesc")
+    rig.offer(1, "imu")
+    assert len(rig.sent("vesc")) == len(rig.sent("imu")) == 1
+    assert rig.sent("imu")[0].seq == 0
+
+
+def test_nothing_is_kept_over_an_outage_but_the_newest() -> None:
+    rig = Rig(connected=False)
+    for i in range(100):
+        rig.offer(i)
+        rig.clock.advance(0.02)
+        rig.tick()
+    rig.uplink.connect()
+    rig.tick()
+    assert rig.speeds() == [99]
+
+
+def test_an_old_sample_is_not_sent_after_an_outage() -> None:
+    rig = Rig(connected=False)
+    rig.offer(1)
+    rig.clock.advance(3)
+    rig.uplink.connect()
+    rig.tick()
+    assert rig.speeds() == []
+
+
+def test_a_message_not_yet_written_holds_back_the_next_ones() -> None:
+    rig = Rig(deaf=True)
+    for i in range(50):
+        rig.offer(i)
+        rig.clock.advance(0.1)
+    assert rig.speeds() == [0], "a socket that stalls is not given a queue"
+    rig.dispatcher.run_pending()
+    rig.offer(50)
+    assert rig.speeds() == [0, 50]
+
+
+def test_a_bad_sample_is_refused_and_counted() -> None:
+    rig = Rig()
+    rig.lane.offer("vesc", T0, {"speed": b"x"})  # type: ignore[dict-item]
+    rig.lane.offer("vesc", T0, {f"f{i}": "x" * 4096 for i in range(64)})
+    rig.offer(1)
+    assert rig.lane.refused == 2
+    assert rig.speeds() == [1]
+
+
+def test_only_written_messages_count_as_published() -> None:
+    rig = Rig()
+    rig.offer(1)
+    rig.uplink.verdict = lambda _: "full"
+    rig.clock.advance(1)
+    rig.offer(2)
+    assert rig.lane.published == 1
+
+
+def test_the_rate_and_the_lane_itself_can_be_changed() -> None:
+    rig = Rig(rate_hz=0.1)
+    rig.offer(0)
+    rig.lane.set_rate(10)
+    for i in range(1, 101):
+        rig.clock.advance(0.02)
+        rig.offer(i)
+    assert 19 <= len(rig.sent()) <= 21, "what was due in ten seconds is due in a tenth"
+    rig.lane.enabled = False
+    count = len(rig.sent())
+    for i in range(100):
+        rig.clock.advance(0.02)
+        rig.offer(i)
+        rig.tick()
+    assert len(rig.sent()) <= count + 1, "what was offered before"

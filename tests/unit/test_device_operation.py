@@ -1,0 +1,232 @@
+"""What the agent says of itself: logs, metrics, clock offset, status."""
+
+from __future__ import annotations
+
+import json
+import logging
+import os
+import random
+import stat
+import sys
+from pathlib import Path
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+import contract
+from device.batch import StreamCounts
+from device.clock import ManualClock
+from device.dispatch import Dispatcher
+from device.errors import AgentError
+from device.logs import JournalFormatter, Troubles, is_journal
+from device.loopback import Loopback
+from device.main import main
+from device.metrics import AgentMetrics, Rates, rss_mb
+from device.offset import ClockOffset
+from device.spool import MemorySpool
+from device.status import StatusServer, fetch, render
+
+
+def record(level: int, text: str) -> logging.LogRecord:
+    return logging.LogRecord("x", level, "f", 1, text, (), None)
+
+
+@pytest.mark.parametrize(
+    ("level", "prefix"),
+    [(logging.ERROR, "<3>"), (logging.WARNING, "<4>"), (logging.INFO, "<6>"), (10, "<7>")],
+)
+def test_journald_reads_the_level_of_every_line(level: int, prefix: str) -> None:
+    assert JournalFormatter("%(message)s").format(record(level, "a\nb")) == f"{prefix}a\n{prefix}b"
+
+
+def test_the_journal_is_known_by_its_stream(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    with (tmp_path / "journal").open("w") as file:
+        monkeypatch.setattr(sys, "stderr", file)
+        status = os.fstat(file.fileno())
+        monkeypatch.setenv("JOURNAL_STREAM", f"{status.st_dev}:{status.st_ino}")
+        assert is_journal()
+        monkeypatch.setenv("JOURNAL_STREAM", f"{status.st_dev}:{status.st_ino + 1}")
+        assert not is_journal()
+
+
+def test_the_last_troubles_are_kept() -> None:
+    troubles = Troubles()
+    for i in range(9):
+        troubles.handle(record(logging.WARNING, f"trouble {i}"))
+    assert [line["text"] for line in troubles.last()] == [f"trouble {i}" for i in range(4, 9)]
+
+
+@given(
+    st.floats(-1e7, 1e7), st.lists(st.tuples(st.floats(0.2, 500), st.floats(0, 1)), min_size=1), st.randoms()
+)
+def test_the_offset_is_within_its_uncertainty(
+    true_ms: float, trips: list[tuple[float, float]], chance: random.Random
+) -> None:
+    clock = ManualClock()
+    offset = ClockOffset(clock)
+    for trip_ms, share in trips:
+        sent = clock.monotonic()
+        # The cloud stamps somewhere on the way, in whole milliseconds.
+        stamp_ms = int(clock.now_us() / 1000 + trip_ms * share + true_ms)
+        clock.advance(trip_ms / 1000)
+        offset.add(sent, clock.monotonic(), stamp_ms)
+        clock.advance(chance.random())
+    found = offset.estimate()
+    assert found is not None
+    assert abs(found.offset_ms - true_ms) <= found.uncertainty_ms + 0.51
+    assert found.uncertainty_ms >= min(trip_ms for trip_ms, _ in trips) / 2
+
+
+def test_the_offset_is_right_at_once_when_the_clock_was_set() -> None:
+    clock = ManualClock()
+    offset = ClockOffset(clock)
+    assert offset.estimate() is None
+    sent = clock.monotonic()
+    clock.advance(0.01)
+    offset.add(sent, clock.monotonic(), clock.now_us() // 1000 - 5)
+    before = offset.estimate()
+    clock.set_wall(clock.now_us() - 3_600_000_000)
+    after = offset.estimate()
+    assert before is not None
+    assert after is not None
+    assert after.offset_ms - before.offset_ms == pytest.approx(3_600_000)
+
+
+def test_the_shortest_round_trip_counts_until_it_is_old() -> None:
+    clock = ManualClock()
+    offset = ClockOffset(clock)
+    for trip_ms in (10, 2, 200):
+        sent = clock.monotonic()
+        clock.advance(trip_ms / 1000)
+        offset.add(sent, clock.monotonic(), clock.now_us() // 1000)
+    found = offset.estimate()
+    assert found is not None
+    assert found.uncertainty_ms == pytest.approx(1.5, abs=0.02)
+    clock.advance(60)
+    aged = offset.estimate()
+    assert aged is not None
+    assert aged.uncertainty_ms == pytest.approx(4.5, abs=0.02), "the clocks may have drifted by 3 ms"
+
+
+def test_a_sample_of_the_agent_has_the_contracts_fields() -> None:
+    clock = ManualClock()
+    spool, uplink = MemorySpool(max_bytes=1000), Loopback(clock, Dispatcher())
+    metrics = AgentMetrics(clock=clock, spool=spool, uplink=uplink, offset=ClockOffset(clock))
+    spool.put("vesc", 0, b"x" * 100, samples=1)
+    uplink.connect()
+    clock.advance(2)
+    values = metrics.sample(100)
+    assert list(values) == list(contract.AGENT_FIELDS)
+    assert values["samples_per_s"] == 50
+    assert (values["backlog_batches"], values["backlog_bytes"], values["connects"]) == (1, 100, 1)
+    assert values["clock_offset_ms"] is None
+    clock.advance(1)
+    assert metrics.sample(100)["samples_per_s"] == 0
+    assert 1 < rss_mb() < 10_000
+
+
+def test_rates_and_silence() -> None:
+    clock = ManualClock()
+    rates, counts = Rates(clock), {"vesc": StreamCounts(samples=0)}
+    counts["vesc"].samples = 50
+    clock.advance(1)
+    rates.update(counts)
+    assert (rates.per_s["vesc"], rates.silent_s("vesc")) == (50, 0)
+    for _ in range(7):
+        clock.advance(1)
+        rates.update(counts)
+    assert (rates.per_s["vesc"], rates.silent_s("vesc")) == (0, 7)
+
+
+def test_the_socket_is_the_owners_alone_and_goes_with_the_agent(tmp_path: Path) -> None:
+    path = tmp_path / "agent.sock"
+    server = StatusServer(path, lambda: {"pid": 7})
+    server.start()
+    assert stat.S_IMODE(path.stat().st_mode) == 0o600
+    assert fetch(path) == fetch(path) == {"pid": 7}
+    second = StatusServer(path, dict)
+    with pytest.raises(AgentError, match=r"already running.*process 7"):
+        second.start()
+    server.stop()
+    assert not path.exists()
+    with pytest.raises(AgentError, match="no agent is running"):
+        fetch(path)
+
+
+def test_a_long_path_is_no_obstacle(tmp_path: Path) -> None:
+    folder = tmp_path / ("x" * 100)
+    folder.mkdir()
+    server = StatusServer(folder / "agent.sock", lambda: {"pid": 1})
+    server.start()
+    assert fetch(folder / "agent.sock") == {"pid": 1}
+    server.stop()
+    assert not list(folder.iterdir())
+
+
+def test_a_socket_left_by_a_killed_agent_is_taken_over(tmp_path: Path) -> None:
+    import socket
+
+    path = tmp_path / "agent.sock"
+    with socket.socket(socket.AF_UNIX) as left:
+        left.bind(str(path))
+    server = StatusServer(path, lambda: {"pid": 1})
+    server.start()
+    assert fetch(path) == {"pid": 1}
+    server.stop()
+
+
+@pytest.mark.parametrize("name", ["x" * 120, "no/such/folder/agent.sock"])
+def test_an_agent_without_a_socket_goes_on(
+    name: str, tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    server = StatusServer(tmp_path / name, dict)
+    server.start()
+    server.stop()
+    assert "set status_socket" in caplog.text
+
+
+def test_a_file_in_the_sockets_place_is_left_alone(tmp_path: Path) -> None:
+    file = tmp_path / "agent.sock"
+    file.write_text("precious")
+    server = StatusServer(file, dict)
+    server.start()
+    server.stop()
+    assert file.read_text() == "precious"
+
+
+def test_status_and_check_by_command(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    import socket
+
+    from tests.unit.test_device_agent import config_file
+
+    def unknown(*_: object, **__: object) -> None:
+        raise socket.gaierror("Name or service not known")
+
+    monkeypatch.setattr(socket, "getaddrinfo", unknown)
+
+    file = config_file(tmp_path, "{type: sim}")
+    assert main(["status", "--config", str(file)]) == 1
+    assert "no agent is running" in capsys.readouterr().err
+    assert main(["check", "--config", str(file), "--json"]) == 1
+    findings = {one["what"]: one for one in json.loads(capsys.readouterr().out)}
+    assert findings["certificate"]["level"] == "fail"
+    assert findings["key's mode"]["level"] == "warn"
+    assert findings["key's mode"]["todo"].startswith("chmod 600 ")
+    assert findings["queue"]["level"] == "warn"
+    assert findings["endpoint"]["level"] == "fail"
+
+
+def test_status_of_an_agent_for_a_person() -> None:
+    from tests.unit.test_device_agent import Rig, drive
+
+    rig = Rig(drive)
+    assert rig.agent.run(drain_s=10) == 0
+    state = rig.agent.status()
+    text = render(json.loads(json.dumps(state)))
+    assert "robot     car1" in text
+    assert "stream    vesc: " in text
+    assert "500 samples" in text
+    assert "NOT connected" in text

@@ -1,0 +1,180 @@
+"""Pings: round trips, losses, and round trips as samples."""
+
+from __future__ import annotations
+
+import json
+import threading
+from typing import Any
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+import contract
+from device.allowance import Allowance
+from device.clock import ManualClock
+from device.dispatch import Dispatcher
+from device.loopback import Loopback
+from device.pings import CLOCK_EVERY_S, TIMEOUT_S, Pings, percentile
+
+T0 = 1_700_000_000_000_000
+
+
+class Rig:
+    def __init__(self, *, rate_hz: float = 1, padding_bytes: int = 0) -> None:
+        self.clock = ManualClock(now_us=T0)
+        self.dispatcher = Dispatcher()
+        self.uplink = Loopback(self.clock, self.dispatcher)
+        self.samples: list[tuple[str, int, Any]] = []
+        self.pings = Pings(
+            robot="car1",
+            namespace="iort",
+            paths=contract.PING_PATHS,
+            rate_hz=rate_hz,
+            padding_bytes=padding_bytes,
+            uplink=self.uplink,
+            clock=self.clock,
+            allowance=Allowance(self.clock),
+            emit=lambda stream, t_us, values: self.samples.append((stream, t_us, values)),
+        )
+        self.uplink.connect()
+
+    def answer(self, path: str, message: int = -1) -> None:
+        """The cloud's answer to one of the pings sent."""
+        ping = json.loads(self.uplink.published[message].payload)
+        payload = json.dumps({**ping, contract.RECEIVED_MS: 5}).encode()
+        self.uplink.deliver(f"pong/iort/car1/{path}", payload)
+        self.dispatcher.run_pending()
+
+
+def test_a_ping_over_the_broker_comes_straight_back() -> None:
+    rig = Rig()
+    rig.pings.send("broker")
+    rig.clock.advance(0.0125)
+    rig.dispatcher.run_pending()
+    # The time counts from the arrival, not from when the callback ran.
+    assert rig.pings.report()["broker"] == (1, 1, 0, 0.0, 0.0)
+    assert rig.uplink.published[0].topic == "ping/iort/car1/broker"
+    assert rig.uplink.published[0].qos == 0
+
+
+@pytest.mark.parametrize("path", ["rule", "lambda"])
+def test_the_cloud_answers_on_the_pong_topic(path: str) -> None:
+    rig = Rig()
+    rig.pings.send(path)
+    rig.clock.advance(0.0125)
+    rig.answer(path)
+    assert rig.pings.report()[path] == (1, 1, 0, 12.5, 12.5)
+    ((stream, t_us, values),) = rig.samples
+    assert (stream, t_us) == ("rtt", T0 + 12_500)
+    others = {f"{name}_ms": None for name in contract.PING_PATHS if name != path}
+    assert values == {**others, f"{path}_ms": 12.5}
+
+
+def test_lost_pings_are_counted_and_late_answers_ignored() -> None:
+    rig = Rig()
+    for _ in range(3):
+        rig.pings.send("rule")
+    rig.answer("rule", 0)
+    rig.clock.advance(TIMEOUT_S + 1)
+    rig.pings.tick()
+    rig.answer("rule", 1)
+    report = rig.pings.report()["rule"]
+    assert (report.sent, report.received, report.lost) == (3, 1, 2)
+    assert len(rig.samples) == 1
+
+
+def test_what_is_no_answer_of_ours_is_ignored() -> None:
+    rig = Rig()
+    rig.pings.send("rule")
+    for payload in (b"", b"[]", b'{"id": "x"}', b'{"id": 999, "sent_us": 1}', b"\xff"):
+        rig.uplink.deliver("pong/iort/car1/rule", payload)
+    rig.answer("lambda")  # the right number by the wrong path
+    rig.answer("rule")
+    rig.answer("rule")  # twice
+    assert rig.pings.report()["rule"][:3] == (1, 1, 0)
+    assert rig.pings.report()["lambda"][:3] == (0, 0, 0)
+
+
+def test_no_ping_without_a_way_back() -> None:
+    rig = Rig()
+    rig.uplink.cut()
+    rig.pings.send("broker")
+    assert rig.pings.report()["broker"].sent == 0
+
+
+def test_paths_take_turns_at_the_rate() -> None:
+    rig = Rig(rate_hz=10, padding_bytes=450)
+    stop = threading.Event()
+    start, times = rig.clock.monotonic(), []
+
+    def verdict(message: Any) -> None:
+        times.append((message.topic.rsplit("/", 1)[1], round(rig.clock.monotonic() - start, 6)))
+        if len(times) == 30:
+            stop.set()
+
+    rig.uplink.verdict = verdict
+    rig.pings.run(stop)
+    assert [path for path, _ in times[:3]] == ["broker", "rule", "lambda"]
+    assert [at for path, at in times if path == "rule"] == [round(1 / 30 + i / 10, 6) for i in range(10)]
+    assert 480 < len(rig.uplink.published[0].payload) < 560
+
+
+def test_the_end_waits_for_answers_but_not_for_ever() -> None:
+    rig = Rig()
+    rig.pings.send("broker")
+    rig.pings.send("rule")
+    rig.dispatcher.run_pending()
+    rig.pings.close(0)
+    assert rig.pings.report()["broker"].lost == 0
+    assert rig.pings.report()["rule"].lost == 1
+
+
+@given(st.lists(st.floats(0, 1e6), min_size=1), st.integers(1, 100))
+def test_percentile_is_a_value_with_that_share_below(values: list[float], percent: int) -> None:
+    found = percentile(values, percent)
+    assert found in values
+    assert sum(v <= found for v in values) >= len(values) * percent / 100
+    assert sum(v < found for v in values) < len(values) * percent / 100
+
+
+def test_without_round_trips_a_ping_now_and_then_finds_the_clocks_offset() -> None:
+    rig = Rig(rate_hz=0)
+    stamps: list[tuple[float, float, int]] = []
+    rig.pings._on_stamp = lambda *stamp: stamps.append(stamp)
+    stop, times = threading.Event(), []
+
+    def verdict(message: Any) -> None:
+        assert message.topic == "ping/iort/car1/rule"
+        times.append(rig.clock.monotonic())
+        if len(times) == 3:
+            stop.set()
+
+    rig.uplink.verdict = verdict
+    rig.pings.run(stop)
+    assert [times[i + 1] - times[i] for i in range(len(times) - 1)] == [CLOCK_EVERY_S] * 2
+    rig.answer("rule")
+    assert stamps == [(times[-1], rig.clock.monotonic(), 5)]
+    assert rig.samples == [], "it measures no round trips"
+
+
+def test_the_rate_can_be_changed_while_it_runs() -> None:
+    rig = Rig(rate_hz=1)
+    stop, times = threading.Event(), []
+
+    def verdict(_: Any) -> None:
+        times.append(rig.clock.monotonic())
+        if len(times) == 6:
+            rig.pings.set_rate(10)
+        if len(times) == 12:
+            stop.set()
+
+    rig.uplink.verdict = verdict
+    rig.pings.run(stop)
+    gaps = [times[i + 1] - times[i] for i in range(len(times) - 1)]
+    assert gaps[1] == pytest.approx(1 / 3)
+    assert gaps[-1] == pytest.approx(1 / 30)
+
+
+def test_percentile_of_nothing() -> None:
+    assert percentile([], 50) is None

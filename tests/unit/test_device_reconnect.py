@@ -1,0 +1,55 @@
+"""When to connect again, and what to say about why."""
+
+from __future__ import annotations
+
+import random
+
+from hypothesis import given
+from hypothesis import strategies as st
+
+from device.reconnect import HANGUPS, Backoff, Cause, Causes
+
+
+class Least(random.Random):
+    def random(self) -> float:
+        return 0.0
+
+
+class Most(random.Random):
+    def random(self) -> float:
+        return 1.0
+
+
+@given(st.lists(st.booleans(), max_size=40), st.integers())
+def test_never_below_a_second_nor_above_the_cap(slow: list[bool], seed: int) -> None:
+    backoff = Backoff(random.Random(seed))
+    for one in slow:
+        low, high = (60, 300) if one else (1, 30)
+        assert low <= backoff.next_s(slow=one) <= high
+
+
+def test_the_ceiling_doubles_and_the_first_wait_is_jittered_too() -> None:
+    backoff = Backoff(Most())
+    assert [backoff.next_s() for _ in range(6)] == [2, 4, 8, 16, 30, 30]
+    assert [backoff.next_s(slow=True) for _ in range(4)] == [120, 240, 300, 300]
+    backoff.reset()
+    assert backoff.next_s(slow=True) == 120
+    assert backoff.next_s() == 2, "another kind of cause begins anew"
+    assert [Backoff(Least()).next_s() for _ in range(3)] == [1, 1, 1]
+
+
+def test_a_cause_is_news_once() -> None:
+    causes = Causes()
+    a, b = Cause("a", "first"), Cause("b", "second")
+    assert [causes.is_news(cause) for cause in (a, a, Cause("a", "other words"), b, a)] == [
+        True, False, False, True, True,
+    ]  # fmt: skip
+    causes.connected()
+    assert causes.is_news(a)
+
+
+def test_hangups_become_a_refusal_only_in_a_row() -> None:
+    causes = Causes()
+    assert [causes.hung_up() for _ in range(HANGUPS)] == [False] * (HANGUPS - 1) + [True]
+    causes.connected()
+    assert not causes.hung_up()

@@ -1,0 +1,235 @@
+"""The shadow: wishes, refusals and reports, over an uplink in memory."""
+
+from __future__ import annotations
+
+import json
+from typing import Any
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from device.allowance import Allowance
+from device.clock import ManualClock
+from device.dispatch import Dispatcher
+from device.loopback import Loopback
+from device.remote import Remote, _difference, _merged
+from device.tuning import Tuning, overlay
+
+BASE = Tuning(record_enabled=True, live_enabled=True, live_rate_hz=10.0, ping_rate_hz=0.0, log_level="info")
+PREFIX = "$aws/things/car1/shadow/name/agent"
+DOCUMENT = BASE.as_document()
+
+
+class Rig:
+    """A robot and its shadow, kept as AWS keeps it."""
+
+    def __init__(self, **desired: Any) -> None:
+        self.clock, self.dispatcher = ManualClock(), Dispatcher()
+        self.uplink = Loopback(self.clock, self.dispatcher)
+        self.applied: list[Tuning] = []
+        self.shadow: dict[str, Any] = {"desired": desired, "reported": {}} if desired else {}
+        self.version = 1 if desired else 0
+        self.remote = Remote(
+            robot="car1",
+            base=BASE,
+            apply=self.applied.append,
+            known_fields=lambda: {"vesc": {"speed", "voltage_input"}},
+            uplink=self.uplink,
+            clock=self.clock,
+            allowance=Allowance(self.clock),
+        )
+        self.seen = 0
+        self.uplink.connect()
+        self.settle()
+
+    def settle(self) -> None:
+        for _ in range(4):
+            self.dispatcher.run_pending()
+            self.remote.tick()
+            for message in self.uplink.published[self.seen :]:
+                self.answer(message.topic, message.payload)
+            self.seen = len(self.uplink.published)
+
+    def answer(self, topic: str, payload: bytes) -> None:
+        if topic.endswith("/get"):
+            if not self.version:
+                self.deliver("get/rejected", {"code": 404, "message": "No shadow exists"})
+            else:
+                self.deliver("get/accepted", {"state": self.shadow, "version": self.version})
+        elif topic.endswith("/update"):
+            self.change(json.loads(payload)["state"])
+
+    def change(self, state: dict[str, Any], *, arrives: bool = True) -> None:
+        self.shadow = _merged(self.shadow, state)
+        self.version += 1
+        if arrives:
+            self.deliver("update/accepted", {"state": state, "version": self.version})
+
+    def wish(self, *, arrives: bool = True, **desired: Any) -> None:
+        self.change({"desired": desired}, arrives=arrives)
+        self.settle()
+
+    def deliver(self, answer: str, document: Any) -> None:
+        self.uplink.deliver(f"{PREFIX}/{answer}", json.dumps(document).encode())
+
+    @property
+    def reported(self) -> Any:
+        return self.shadow.get("reported")
+
+
+def test_without_a_shadow_it_makes_one() -> None:
+    rig = Rig()
+    assert rig.reported == {key: value for key, value in DOCUMENT.items() if value != {}}
+    assert rig.applied == []
+
+
+def test_a_wish_from_before_comes_into_force() -> None:
+    rig = Rig(live={"rate_hz": 2}, record={"enabled": False})
+    assert rig.applied[-1].live_rate_hz == 2
+    assert rig.reported["live"] == {"enabled": True, "rate_hz": 2}
+    assert rig.reported["record"] == {"enabled": False}
+
+
+def test_a_wish_meanwhile_and_its_withdrawal() -> None:
+    rig = Rig()
+    rig.wish(log_level="debug", fields={"vesc": ["speed"]})
+    assert rig.applied[-1].log_level == "debug"
+    assert rig.reported["fields"] == {"vesc": ["speed"]}
+    rig.wish(log_level=None, fields=None)
+    assert rig.applied[-1] == BASE
+    assert rig.reported["log_level"] == "info"
+    assert not rig.reported["fields"]
+    count = len(rig.uplink.published)
+    rig.clock.advance(3600)
+    rig.settle()
+    assert len(rig.uplink.published) == count, "nothing more to say"
+
+
+@pytest.mark.parametrize(
+    ("wish", "name", "reason"),
+    [
+        ({"live": {"rate_hz": 50}}, "live.rate_hz", "found 50 (a number); allowed is a number from 0.01"),
+        ({"live": {"rate_hz": True}}, "live.rate_hz", "found True"),
+        ({"live": 3}, "live", "cannot be changed"),
+        ({"record": {"enabled": "no"}}, "record.enabled", "true or false"),
+        ({"log_level": "loud"}, "log_level", "one of debug, info"),
+        ({"fields": {"vesc": ["sped"]}}, "fields.vesc", "did you mean speed?"),
+        ({"fields": {"vesc": "speed"}}, "fields.vesc", "a list of field names"),
+        ({"fields": {"a b": ["speed"]}}, "fields.a b", "stream name"),
+        ({"fields": {"imu": ["a b"]}}, "fields.imu[0]", "field name"),
+        ({"robot": "car2"}, "robot", "cannot be changed; allowed is"),
+        ({"live": {"rate": 1}}, "live.rate", "did you mean live.rate_hz?"),
+    ],
+)  # fmt: skip
+def test_a_bad_wish_is_refused_with_its_reason_and_the_others_hold(
+    wish: dict[str, Any], name: str, reason: str
+) -> None:
+    rig = Rig()
+    rig.wish(**wish, ping={"rate_hz": 5})
+    key = name.partition("[")[0]
+    assert reason in rig.reported["rejected"][key]["reason"]
+    assert f"shadow agent: {name}" in rig.reported["rejected"][key]["reason"]
+    assert rig.applied[-1].ping_rate_hz == 5
+    assert rig.reported["live"] == DOCUMENT["live"]
+
+
+def test_a_wish_for_what_is_in_force_ends_the_refusal() -> None:
+    rig = Rig()
+    rig.wish(live={"rate_hz": 50})
+    assert rig.reported["rejected"]
+    # Equal to what is reported: AWS sends no delta for it.
+    rig.wish(live={"rate_hz": 10})
+    assert not rig.reported["rejected"]
+
+
+def test_what_was_missed_is_fetched() -> None:
+    rig = Rig()
+    rig.wish(arrives=False, live={"rate_hz": 3})
+    assert rig.applied == []
+    rig.wish(ping={"rate_hz": 1})
+    assert (rig.applied[-1].live_rate_hz, rig.applied[-1].ping_rate_hz) == (3, 1)
+
+
+def test_a_wish_made_while_offline_is_fetched_at_the_next_connect() -> None:
+    rig = Rig()
+    rig.uplink.cut()
+    rig.wish(arrives=False, live={"rate_hz": 3})
+    rig.uplink.connect()
+    rig.settle()
+    assert rig.reported["live"]["rate_hz"] == 3
+
+
+def test_old_and_odd_messages_change_nothing() -> None:
+    rig = Rig()
+    rig.wish(live={"rate_hz": 3})
+    rig.deliver("update/accepted", {"state": {"desired": {"live": {"rate_hz": 9}}}, "version": 1})
+    rig.settle()
+    assert [tuning.live_rate_hz for tuning in rig.applied] == [3], "older than what it has"
+    rig.uplink.cut()
+    rig.settle()
+    count = len(rig.uplink.published)
+    rig.clock.advance(100)
+    rig.settle()
+    assert len(rig.uplink.published) == count, "nothing to fetch without a connection"
+    rig.uplink.connect()
+    rig.settle()
+    oddities: list[Any] = [[], 7]
+    for odd in (
+        *oddities,
+        {"state": 3, "version": rig.version + 1},
+        {"version": "x"},
+        {"state": {"desired": 1}},
+    ):
+        rig.deliver("update/accepted", odd)
+        rig.deliver("get/rejected", odd)
+        rig.deliver("update/rejected", odd)
+    rig.uplink.deliver(f"{PREFIX}/update/accepted", b"\xff")
+    rig.settle()
+    assert rig.remote.tuning.live_rate_hz in (3, 10)
+    assert rig.applied[0].live_rate_hz == 3
+
+
+def test_a_report_that_gets_no_answer_is_sent_again() -> None:
+    rig = Rig()
+    rig.uplink.verdict = lambda message: "no" if message.topic.endswith("/update") else None
+    rig.wish(live={"rate_hz": 3})
+    assert rig.reported["live"]["rate_hz"] == 10
+    rig.uplink.verdict = lambda _: None
+    rig.clock.advance(31)
+    rig.settle()
+    assert rig.reported["live"]["rate_hz"] == 3
+
+
+def test_a_long_value_is_not_reported_whole() -> None:
+    rig = Rig()
+    rig.wish(log_level="x" * 5000)
+    assert len(json.dumps(rig.reported)) < 2000
+
+
+JSON = st.recursive(
+    st.booleans() | st.integers() | st.text(max_size=3),
+    lambda inner: st.dictionaries(st.text(max_size=2), inner, max_size=3) | st.lists(inner, max_size=2),
+    max_leaves=8,
+)
+OBJECT = st.dictionaries(st.text(max_size=2), JSON, max_size=4)
+
+
+def bare(value: Any) -> Any:
+    """Without empty objects, which a shadow does not keep apart from none."""
+    if not isinstance(value, dict):
+        return value
+    inner = {key: bare(item) for key, item in value.items()}
+    return {key: item for key, item in inner.items() if item != {}}
+
+
+@given(OBJECT, OBJECT)
+def test_a_difference_merged_into_the_old_is_the_new(old: dict[str, Any], new: dict[str, Any]) -> None:
+    assert bare(_merged(old, _difference(old, new))) == bare(new)
+
+
+@given(OBJECT)
+def test_no_wish_whatever_brings_it_down(wished: dict[str, Any]) -> None:
+    tuning, rejected = overlay(BASE, wished, {})
+    assert 0.01 <= tuning.live_rate_hz <= 10
+    json.dumps(rejected)

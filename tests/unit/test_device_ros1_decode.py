@@ -1,0 +1,448 @@
+"""ROS 1 messages from their bytes, by the definition that comes with them; no ROS is needed.
+
+rosbags, which is independent of it, serialises the messages and says what must come out.
+"""
+
+from __future__ import annotations
+
+import struct
+import sys
+import threading
+from typing import Any
+
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from device.clock import ManualClock
+from device.errors import MessageError, SourceError
+from device.ros1_types import VARIABLE, parse
+from device.sources.flatten import flatten
+from device.sources.ros1 import Intake, Ros1Config, TopicConfig
+from device.sources.ros1_decode import MAX_ELEMENTS, MAX_TEXT, Decoder
+from tests.recordings import recording
+
+HEADER = """
+================================================================================
+MSG: std_msgs/Header
+# the sequence ID: consecutively increasing
+uint32 seq
+time stamp
+string frame_id
+"""
+
+
+def u32(*values: int) -> bytes:
+    return struct.pack(f"<{len(values)}I", *values)
+
+
+def text(value: str) -> bytes:
+    return u32(len(value.encode())) + value.encode()
+
+
+def header(sec: int = 5, nanosec: int = 7000, frame: str = "base_link") -> bytes:
+    return u32(1, sec, nanosec) + text(frame)
+
+
+def decoded(definition: str, data: bytes, **how: Any) -> dict[str, Any]:
+    return Decoder(parse("a_msgs/A", definition), **how).decode(data).values
+
+
+@pytest.mark.parametrize(
+    ("definition", "data", "values"),
+    [
+        ("float64 data", struct.pack("<d", 1.5), {"data": 1.5}),
+        ("bool a\nbyte b\nchar c\nint8 d\nuint8 e", b"\x02\xff\xff\x80\x80",
+         {"a": True, "b": -1, "c": 255, "d": -128, "e": 128}),
+        ("int16 a\nuint16 b\nint32 c\nuint32 d\nint64 e\nuint64 f",
+         struct.pack("<hHiIqQ", -1, 2, -3, 4, -5, 2**64 - 1),
+         {"a": -1, "b": 2, "c": -3, "d": 4, "e": -5, "f": 2**64 - 1}),
+        ("time t\nduration d", struct.pack("<IIii", 1, 2, -3, 4),
+         {"t.sec": 1, "t.nanosec": 2, "d.sec": -3, "d.nanosec": 4}),
+        ("string s\nuint8 n", text("grün") + b"\x01", {"s": "grün", "n": 1}),
+        ("string s", u32(2) + b"\xff\xfe", {"s": "\ufffd\ufffd"}),
+        ("uint8[3] a\nint16[] b\nuint8 c", b"\x01\x02\x03" + u32(2) + struct.pack("<hh", 4, -5) + b"\x06",
+         {"a.0": 1, "a.1": 2, "a.2": 3, "b.0": 4, "b.1": -5, "c": 6}),
+        ("string[] s\nstring[2] t", u32(1) + text("a") + text("b") + text(""),
+         {"s.0": "a", "t.0": "b", "t.1": ""}),
+        ("B[] b\nuint8 c\n" + "=" * 80 + "\nMSG: a_msgs/B\nstring s\nuint8[2] u",
+         u32(2) + text("x") + b"\x01\x02" + text("yy") + b"\x03\x04" + b"\x05",
+         {"b.0.s": "x", "b.0.u.0": 1, "b.0.u.1": 2, "b.1.s": "yy", "b.1.u.0": 3, "b.1.u.1": 4, "c": 5}),
+        ("B[2] b\nuint8 c\n" + "=" * 80 + "\nMSG: a_msgs/B\nuint8 u", b"\x01\x02\x03",
+         {"b.0.u": 1, "b.1.u": 2, "c": 3}),
+        ("Header header\nuint8 a" + HEADER, header() + b"\x01", {"a": 1}),
+        ("Header header\na_msgs/B b" + HEADER + "=" * 80 + "\nMSG: a_msgs/B\nHeader header\nuint8 u\nuint8 v",
+         header() + header() + b"\x01\x02", {"u": 1, "v": 2}),
+        ("uint8 a\nHeader header" + HEADER, b"\x01" + header(), {"a": 1}),
+        ("Header header\ntime t" + HEADER, header() + u32(3, 4), {"sec": 3, "nanosec": 4}),
+        ("uint8 X=1 # one\nstring S=a # is = part of it\nfloat32 PI = 3\nuint8 y # = 5", b"\x09", {"y": 9}),
+        ("B b\n" + "=" * 80 + "\nMSG: a_msgs/B\nuint8 NOTHING=0", b"", {}),
+        ("B[] b\n" + "=" * 80 + "\nMSG: a_msgs/B\n", u32(2**32 - 1), {}),
+        ("", b"", {}),
+    ],
+)  # fmt: skip
+def test_decode(definition: str, data: bytes, values: dict[str, Any]) -> None:
+    found = decoded(definition, data)
+    assert found == values
+    assert [type(v) for v in found.values()] == [type(v) for v in values.values()]
+
+
+STAMPED = "Header header\nB b" + HEADER + "=" * 80 + "\nMSG: a_msgs/B\n"
+
+
+def test_the_stamp_is_exact_to_the_microsecond() -> None:
+    decoder = Decoder(parse("a_msgs/A", STAMPED + "uint8 u"), stamp=True)
+    assert decoder.decode(header(1_700_000_000, 999_999_999) + b"\x01") == ({"u": 1}, 1_700_000_000_999_999)
+    assert Decoder(parse("a_msgs/A", STAMPED + "uint8 u")).decode(header() + b"\x01").stamp_us is None
+    assert Decoder(parse("a_msgs/A", "uint8 u"), stamp=True).decode(b"\x01").stamp_us is None
+
+
+SELECTABLE = (
+    "float64 speed\nstring name\nB b\nB[2] two\nB[] many\nuint8[100] large\nfloat32[] ranges\nuint8 last\n"
+    + "=" * 80
+    + "\nMSG: a_msgs/B\nint16 x\nstring y\nint16 z"
+)
+
+
+def b_bytes(x: int) -> bytes:
+    return struct.pack("<h", x) + text(f"y{x}") + struct.pack("<h", -x)
+
+
+SELECT_DATA = (
+    struct.pack("<d", 2.5) + text("n") + b_bytes(1) + b_bytes(2) + b_bytes(3) + u32(3) + b_bytes(4)
+    + b_bytes(5) + b_bytes(6) + bytes(range(100)) + u32(200) + struct.pack("<200f", *range(200)) + b"\x07"
+)  # fmt: skip
+
+
+@pytest.mark.parametrize(
+    ("select", "values", "unknown"),
+    [
+        (["speed"], {"speed": 2.5}, []),
+        (["last"], {"last": 7}, []),
+        (["b", "name"], {"name": "n", "b.x": 1, "b.y": "y1", "b.z": -1}, []),
+        (["b.z", "two.1.x"], {"b.z": -1, "two.1.x": 3}, []),
+        (["many.1.y"], {"many.1.y": "y5"}, []),
+        (["many.9.y"], {}, []),
+        (["many"], {f"many.{i}.{k}": v for i, n in enumerate((4, 5, 6))
+                    for k, v in (("x", n), ("y", f"y{n}"), ("z", -n))}, []),
+        (["large.99", "ranges.150"], {"large.99": 99, "ranges.150": 150.0}, []),
+        (["sped", "speed", "two.2.x", "b.w"], {"speed": 2.5}, ["b.w", "sped", "two.2.x"]),
+    ],
+)  # fmt: skip
+def test_only_what_is_selected(select: list[str], values: dict[str, Any], unknown: list[str]) -> None:
+    decoder = Decoder(parse("a_msgs/A", SELECTABLE), select=select)
+    assert decoder.decode(SELECT_DATA).values == values
+    assert decoder.unknown == unknown
+    assert not decoder.left_out
+
+
+def test_what_is_no_telemetry_is_left_out_and_counted() -> None:
+    definition = "uint8[] image\nfloat32[] ranges\nfloat64[100] grid\nstring s\nuint8 last"
+    data = u32(3) + b"abc" + u32(65) + bytes(65 * 4) + bytes(800) + text("x" * (MAX_TEXT + 1)) + b"\x01"
+    decoder = Decoder(parse("a_msgs/A", definition))
+    for _ in range(2):
+        assert decoder.decode(data).values == {"last": 1}
+    assert decoder.left_out == {"image": 2, "ranges": 2, "grid": 2, "s": 2}
+    small = u32(0) + u32(MAX_ELEMENTS) + bytes(MAX_ELEMENTS * 4) + bytes(800) + text("") + b"\x01"
+    assert len(decoder.decode(small).values) == MAX_ELEMENTS + 2
+
+
+@pytest.mark.parametrize(
+    "definition",
+    [
+        "float64[64] a\nfloat64[64] b\n" * 5,
+        "B[64] b\n" + "=" * 80 + "\nMSG: a_msgs/B\nC[64] c\n" + "=" * 80 + "\nMSG: a_msgs/C\nuint8[64] u",
+    ],
+)
+def test_too_many_fields(definition: str) -> None:
+    with pytest.raises(MessageError, match="has over 512 fields; select some"):
+        Decoder(parse("a_msgs/A", definition))
+
+
+def test_too_many_fields_of_a_message() -> None:
+    nested = "B[] b\n" + "=" * 80 + "\nMSG: a_msgs/B\nfloat64[64] u"
+    decoder = Decoder(parse("a_msgs/A", nested))
+    with pytest.raises(MessageError, match="over 512 fields"):
+        decoder.decode(u32(9) + bytes(9 * 64 * 8))
+
+
+@pytest.mark.parametrize(
+    ("definition", "data", "error"),
+    [
+        ("float64 a", bytes(7), "7 bytes is cut short"),
+        ("float64 a", bytes(9), "has 9 bytes, its definition 8"),
+        ("string s", u32(5) + b"abc", "has 7 bytes, its definition 9"),
+        ("string s", b"\x01", "cut short"),
+        ("float64[] a", u32(2**32 - 1), "cut short"),
+        ("uint8[] a", u32(2**32 - 1), "cut short"),
+        ("string[] a", u32(2**32 - 1), "cut short"),
+        ("string[1000000] a", b"", "cut short"),
+    ],
+)
+def test_bytes_that_do_not_fit(definition: str, data: bytes, error: str) -> None:
+    with pytest.raises(MessageError, match=error):
+        decoded(definition, data)
+    with pytest.raises(MessageError):
+        decoded(definition, data, select=["nothing"])
+
+
+@pytest.mark.parametrize(
+    ("definition", "error"),
+    [
+        ("float64", "has the line 'float64'"),
+        ("float64 a b", "has the line"),
+        ("flo at64 a[3]", "has the line"),
+        ("Unknown a", "the definition of a_msgs/Unknown is missing"),
+        ("A a", "contains itself"),
+        ("B b\n" + "=" * 80 + "\nMSG: a_msgs/B\nA a", "contains itself"),
+        ("B b\n" + "=" * 80 + "\nuint8 a", "not with MSG"),
+        ("uint8[99999999999] a", "99999999999 elements"),
+    ],
+)
+def test_a_text_that_is_no_definition(definition: str, error: str) -> None:
+    with pytest.raises(MessageError, match=error):
+        parse("a_msgs/A", definition)
+
+
+def test_fields_and_lengths() -> None:
+    fields = parse("a_msgs/A", "uint8[] a\nuint8[3] b\nuint8 c\nHeader h\n" + HEADER).fields()
+    assert [f.length for f in fields] == [VARIABLE, 3, None, None]
+    assert fields[3].kind == "std_msgs/Header"
+
+
+def test_a_real_recording_is_what_rosbags_reads() -> None:
+    from rosbags.highlevel import AnyReader
+
+    with AnyReader([recording("f1tenth-motor-servo.bag")]) as reader:
+        fields = reader.typestore.fielddefs
+
+        def fields_of(value: Any) -> list[str] | None:
+            known = fields.get(getattr(value, "__msgtype__", ""))
+            return None if known is None else [name for name, _ in known[1]]
+
+        counts: dict[str, int] = {}
+        for connection in reader.connections:
+            kind = connection.msgtype.replace("/msg/", "/")
+            decoder = Decoder(parse(kind, connection.msgdef.data), stamp=True)
+            for _, _, raw in reader.readers[0].messages([connection]):
+                message = reader.deserialize(raw, connection.msgtype)
+                sample = decoder.decode(raw)
+                assert sample.values == flatten(message, fields_of)
+                if sample.stamp_us is not None:
+                    stamp = message.header.stamp
+                    assert sample.stamp_us == stamp.sec * 1_000_000 + stamp.nanosec // 1000
+                counts[connection.topic] = counts.get(connection.topic, 0) + 1
+    assert counts == {"/sensors/core": 2244, "/sensors/servo_position_command": 879}
+
+
+# Random definitions, and messages of them, serialised by rosbags.
+
+FLOATS = {"float32": 32, "float64": 64}
+INTS = {f"{sign}int{bits}": (bits, sign) for sign in ("", "u") for bits in (8, 16, 32, 64)}
+NAMES = [f"f{i}" for i in range(6)]
+
+
+def values_of(kind: str) -> st.SearchStrategy[Any]:
+    if kind in FLOATS:
+        return st.floats(width=FLOATS[kind], allow_nan=False)  # type: ignore[arg-type]
+    if kind in INTS:
+        bits, sign = INTS[kind]
+        return st.integers(0, 2**bits - 1) if sign else st.integers(-(2 ** (bits - 1)), 2 ** (bits - 1) - 1)
+    return st.booleans() if kind == "bool" else st.text(max_size=5)
+
+
+KINDS = st.sampled_from([*FLOATS, *INTS, "bool", "string"])
+FIELDS = st.lists(st.tuples(KINDS, st.sampled_from(["", "[]", "[2]"])), min_size=1, max_size=5)
+
+
+@st.composite
+def messages(draw: st.DrawFn) -> tuple[str, list[Any], list[Any]]:
+    """The definition of A, whose last field is an array of B; the values of A and of the Bs."""
+    a, b = draw(FIELDS), draw(FIELDS)
+    array = draw(st.sampled_from(["", "[]", "[2]"]))
+
+    def lines(fields: list[tuple[str, str]]) -> str:
+        return "".join(
+            f"{kind}{length} {name}\n" for (kind, length), name in zip(fields, NAMES, strict=False)
+        )
+
+    def content(fields: list[tuple[str, str]]) -> list[Any]:
+        out = []
+        for kind, length in fields:
+            one = values_of(kind)
+            many = st.lists(one, max_size=4) if length == "[]" else st.lists(one, min_size=2, max_size=2)
+            out.append(draw(many if length else one))
+        return out
+
+    definition = lines(a) + f"B{array} nested\n" + "=" * 80 + "\nMSG: a_msgs/B\n" + lines(b)
+    count = {"": 1, "[2]": 2}.get(array, draw(st.integers(0, 3)))
+    return definition, content(a), [array, [content(b) for _ in range(count)]]
+
+
+@settings(max_examples=150, deadline=None)
+@given(messages())
+def test_any_message_is_what_rosbags_wrote(case: tuple[str, list[Any], list[Any]]) -> None:
+    import numpy as np
+    from rosbags.typesys import Stores, get_types_from_msg, get_typestore
+
+    definition, a_values, (array, b_values) = case
+    store = get_typestore(Stores.EMPTY)
+    store.register(get_types_from_msg(definition, "a_msgs/msg/A"))
+    types = {name.rsplit("/", 1)[1]: store.types[name] for name in ("a_msgs/msg/A", "a_msgs/msg/B")}
+    parsed = parse("a_msgs/A", definition)
+
+    def arrays(kind: str, values: list[Any]) -> list[Any]:
+        return [
+            np.array(value, dtype=field.kind) if isinstance(value, list) and field.kind != "string" else value
+            for field, value in zip(parsed.fields(kind), values, strict=False)
+        ]
+
+    nested = [types["B"](*arrays("a_msgs/B", values)) for values in b_values]
+    message = types["A"](*arrays("a_msgs/A", a_values), nested if array else nested[0])
+    data = bytes(store.serialize_ros1(message, "a_msgs/msg/A"))
+
+    def fields_of(value: Any) -> list[str] | None:
+        kind = getattr(value, "__msgtype__", None)
+        return None if kind is None else [field.name for field in parsed.fields(kind.replace("/msg/", "/"))]
+
+    expected = flatten(message, fields_of)
+    blobs = tuple(
+        f"{prefix}{field.name}."
+        for kind, prefixes in (
+            ("a_msgs/A", [""]),
+            ("a_msgs/B", ["nested.", *(f"nested.{i}." for i in range(3))]),
+        )
+        for field in parsed.fields(kind)
+        for prefix in prefixes
+        if field.kind == "uint8" and field.length == VARIABLE
+    )
+    expected = {name: value for name, value in expected.items() if not name.startswith(blobs)}
+    assert Decoder(parsed).decode(data).values == expected
+    for name, value in expected.items():
+        assert Decoder(parsed, select=[name]).decode(data).values == {name: value}
+
+
+@given(st.binary(max_size=60), st.sampled_from([None, ["b.1.x"]]))
+def test_garbage_is_refused_and_nothing_else(data: bytes, select: list[str] | None) -> None:
+    try:
+        decoded(SELECTABLE, data, select=select)
+    except MessageError:
+        return
+
+
+# One topic's intake, from the connection header to the sample.
+
+T0 = 1_700_000_000_000_000
+CONNECTION = {"type": "a_msgs/A", "md5sum": "1", "message_definition": STAMPED + "uint8 u"}
+
+
+class Desk:
+    def __init__(self, **settings: Any) -> None:
+        self.clock = ManualClock(now_us=T0)
+        self.samples: list[tuple[str, int, dict[str, Any]]] = []
+        config = TopicConfig(**{"stream": "s", "time": "header", **settings})
+        self.intake = Intake("/t", config, emit=self._emit, clock=self.clock)
+
+    def _emit(self, stream: str, t_us: int, values: Any) -> None:
+        self.samples.append((stream, t_us, values))
+
+    def take(self, data: bytes, **header: str) -> None:
+        self.intake.take({**CONNECTION, **header}, data)
+
+
+def test_a_believable_stamp_is_the_samples_time() -> None:
+    desk = Desk()
+    desk.take(header(T0 // 1_000_000 - 1) + b"\x01")
+    assert desk.samples == [("s", T0 - 999_993, {"u": 1})]
+    assert desk.intake.report() == {"messages": 1, "silent": False, "left_out": {}}
+
+
+@pytest.mark.parametrize("sec", [0, 12, 1_600_000_000, 1_700_003_700, 1_699_996_300])
+def test_a_stamp_that_cannot_be_is_flagged_and_not_believed(
+    sec: int, caplog: pytest.LogCaptureFixture
+) -> None:
+    desk = Desk()
+    for _ in range(3):
+        desk.take(header(sec, 0) + b"\x01")
+    assert [t_us for _, t_us, _ in desk.samples] == [T0] * 3
+    assert desk.intake.report()["unbelieved_stamps"] == 3
+    assert caplog.text.count("off the clock; using the time of arrival") == 1
+    desk.clock.advance(60)
+    desk.take(header(sec, 0) + b"\x01")
+    assert "(and 2 more like it)" in caplog.text
+
+
+def test_no_stamp_is_believed_in_a_simulation(caplog: pytest.LogCaptureFixture) -> None:
+    desk = Desk()
+    desk.intake.sim_time = True
+    desk.take(header(T0 // 1_000_000 - 1) + b"\x01")
+    assert desk.samples[0][1] == T0
+    assert "/use_sim_time" in caplog.text
+
+
+def test_arrival_time_asks_no_stamp(caplog: pytest.LogCaptureFixture) -> None:
+    desk = Desk(time="arrival")
+    desk.take(header(0) + b"\x01")
+    assert desk.samples[0][1] == T0
+    assert not caplog.records
+
+
+def test_header_time_without_a_header_is_flagged() -> None:
+    desk = Desk()
+    desk.take(b"\x01", message_definition="uint8 u")
+    assert desk.samples == [("s", T0, {"u": 1})]
+    assert desk.intake.report()["no_stamp"] == 1
+
+
+def test_a_changed_definition_is_another_decoder() -> None:
+    desk = Desk(time="arrival")
+    desk.take(b"\x01", message_definition="uint8 u")
+    desk.take(b"\x01\x02", md5sum="2", message_definition="uint8 u\nuint8 v")
+    desk.take(b"\x03", message_definition="uint8 u")
+    assert [values for _, _, values in desk.samples] == [{"u": 1}, {"u": 1, "v": 2}, {"u": 3}]
+
+
+@pytest.mark.parametrize("definition", ["Unknown u", "not a definition", "float64[64] a\n" * 9, ""])
+def test_what_cannot_be_decoded_is_counted(definition: str, caplog: pytest.LogCaptureFixture) -> None:
+    desk = Desk()
+    for _ in range(3):
+        desk.take(b"\x01", message_definition=definition)
+    assert desk.samples == []
+    assert desk.intake.report()["undecodable"] == 3
+    assert len(caplog.records) == 2, "why, and that"
+
+
+def test_malformed_messages_are_counted() -> None:
+    desk = Desk(time="arrival")
+    desk.take(b"\x01\x02", message_definition="uint8 u")
+    desk.take(b"\x01", message_definition="uint8 u")
+    assert (len(desk.samples), desk.intake.report()["malformed"]) == (1, 1)
+
+
+def test_fields_that_do_not_exist_are_told(caplog: pytest.LogCaptureFixture) -> None:
+    desk = Desk(time="arrival", fields=("w",))
+    desk.take(b"\x01", message_definition="uint8 u")
+    assert desk.samples == []
+    assert "a_msgs/A has no field w" in caplog.text
+    assert desk.intake.report()["empty"] == 1
+
+
+def test_silence_is_told_once_and_its_end_too(caplog: pytest.LogCaptureFixture) -> None:
+    caplog.set_level("INFO")
+    desk = Desk(time="arrival")
+    for _ in range(12):
+        desk.clock.advance(1)
+        desk.intake.look(0)
+    assert caplog.text.count("topic /t has been silent for 5 s: nobody publishes it") == 1
+    assert desk.intake.report()["silent"]
+    desk.take(b"\x01", message_definition="uint8 u")
+    desk.intake.look(1)
+    assert "is heard again" in caplog.text
+    assert desk.intake.report()["silent"] is False
+
+
+def test_without_rospy_the_source_says_how_to_get_it(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(sys.modules, "rospy", None)
+    source = Ros1Config(topics=(("/t", TopicConfig("s", "header")),)).build(ManualClock())
+    with pytest.raises(SourceError, match=r"cannot import rospy.*--system-site-packages"):
+        source.run(lambda *_: None, threading.Event())

@@ -1,0 +1,128 @@
+"""The simulated car: exact in time, the same for a seed, and plausible."""
+
+from __future__ import annotations
+
+import math
+import operator
+import threading
+from typing import Any
+
+import pytest
+
+import contract
+from device.clock import ManualClock
+from device.sources.sim import SimConfig
+from device.sources.vehicle import VehicleConfig
+
+T0 = 1_700_000_000_000_000
+
+
+def drive(**settings: Any) -> list[tuple[str, int, Any]]:
+    out: list[tuple[str, int, Any]] = []
+    source = SimConfig(**settings).build(ManualClock(now_us=T0))
+    source.run(lambda *sample: out.append(sample), threading.Event())
+    return out
+
+
+@pytest.mark.parametrize(("rate_hz", "duration_s", "count"), [(50, 60, 3000), (7, 3, 21), (1000, 2, 2000)])
+def test_as_many_samples_as_asked_for_at_even_times(rate_hz: float, duration_s: float, count: int) -> None:
+    samples = drive(rate_hz=rate_hz, duration_s=duration_s)
+    assert len(samples) == count
+    for i, (_, t_us, _) in enumerate(samples):
+        assert abs(t_us - T0 - i * 1_000_000 / rate_hz) < 1000, "no drift"
+
+
+def test_a_slow_reader_does_not_shift_later_samples() -> None:
+    clock, times = ManualClock(now_us=T0), []
+
+    def emit(stream: str, t_us: int, values: Any) -> None:
+        times.append(t_us - T0)
+        clock.advance(0.2 if len(times) == 10 else 0.001)
+
+    SimConfig(duration_s=1).build(clock).run(emit, threading.Event())
+    assert len(times) == 50
+    assert abs(times[-1] - 980_000) < 1000
+
+
+def test_stops_when_asked() -> None:
+    stop, seen = threading.Event(), []
+
+    def emit(stream: str, t_us: int, values: Any) -> None:
+        seen.append(t_us)
+        if len(seen) == 7:
+            stop.set()
+
+    SimConfig().build(ManualClock()).run(emit, stop)
+    assert len(seen) == 7
+
+
+def test_the_fields_are_those_of_the_ros_1_driver() -> None:
+    expected = [name for name, field in contract.VESC_FIELDS.items() if 1 in field.ros]
+    for stream, _, values in drive(duration_s=1):
+        assert stream == "vesc"
+        assert sorted(values) == sorted(expected)
+        assert len(expected) == 13
+
+
+def test_the_same_seed_drives_the_same_lap() -> None:
+    assert drive(duration_s=20, seed=5) == drive(duration_s=20, seed=5)
+    assert drive(duration_s=20, seed=5) != drive(duration_s=20, seed=6)
+
+
+@pytest.mark.parametrize("seed", [1, 2, 3])
+def test_the_figures_hang_together(seed: int) -> None:
+    config = VehicleConfig()
+    rows = [values for _, _, values in drive(duration_s=120, seed=seed)]
+
+    def column(name: str) -> list[float]:
+        return [row[name] for row in rows]
+
+    speed_mps = [erpm / config.speed_to_erpm_gain for erpm in column("speed")]
+    assert 5 < max(speed_mps) <= config.max_speed_mps * 1.05
+    assert min(speed_mps[200:]) < 3, "corners are slower"
+    assert min(column("current_motor")) < -5, "it brakes"
+    assert min(column("current_input")) < 0, "and regenerates"
+    assert -1 <= min(column("duty_cycle")) <= max(column("duty_cycle")) <= 1
+    assert set(column("fault_code")) == {0}
+
+    # Energy: what flowed at the terminals is what the counters say.
+    wh = sum(map(operator.mul, column("voltage_input"), column("current_input"))) / 50 / 3600
+    counted = (rows[-1]["energy_drawn"] - rows[-1]["energy_regen"]) * 1e-4
+    assert counted == pytest.approx(wh, rel=0.02)
+    ah = sum(column("current_input")) / 50 / 3600
+    assert (rows[-1]["charge_drawn"] - rows[-1]["charge_regen"]) * 1e-4 == pytest.approx(ah, rel=0.02)
+    for name in ("charge_drawn", "charge_regen", "energy_drawn", "energy_regen", "distance_traveled"):
+        assert column(name) == sorted(column(name)), f"{name} only grows"
+        assert all(float(value).is_integer() for value in column(name))
+
+    # Distance: six counts an electrical revolution.
+    counts = sum(column("speed")) / 60 * 6 / 50
+    assert rows[-1]["distance_traveled"] == pytest.approx(counts, rel=0.01)
+
+    # The voltage sags with the current drawn, and the duty cycle follows the speed.
+    hard = [row["voltage_input"] for row in rows if row["current_input"] > 8]
+    light = [row["voltage_input"] for row in rows if abs(row["current_input"]) < 1]
+    assert sum(hard) / len(hard) < sum(light) / len(light) - 0.15
+    for row in rows[::37]:
+        volts = row["speed"] / config.pole_pairs / config.motor_kv
+        volts += row["current_motor"] * config.motor_resistance_ohm
+        assert row["duty_cycle"] == pytest.approx(volts / row["voltage_input"], abs=0.02)
+    assert 20 < column("temperature_pcb")[0] < column("temperature_pcb")[-1] < 80
+
+
+def test_a_heavier_car_is_slower_and_thirstier() -> None:
+    light = drive(duration_s=20)[-1][2]
+    heavy = drive(duration_s=20, vehicle=VehicleConfig(mass_kg=8.0))[-1][2]
+    after_a_second = [drive(duration_s=1, vehicle=VehicleConfig(mass_kg=m))[-1][2] for m in (3.7, 8.0)]
+    assert after_a_second[1]["speed"] < after_a_second[0]["speed"] * 0.7
+    assert heavy["energy_drawn"] / heavy["distance_traveled"] > (
+        light["energy_drawn"] / light["distance_traveled"]
+    )
+
+
+@pytest.mark.parametrize(
+    "vehicle", [VehicleConfig(battery_resistance_ohm=10.0), VehicleConfig(cells=1, mass_kg=5000.0)]
+)
+def test_an_impossible_car_still_gives_numbers(vehicle: VehicleConfig) -> None:
+    for _, _, values in drive(duration_s=10, vehicle=vehicle):
+        assert all(math.isfinite(value) for value in values.values())

@@ -1,0 +1,276 @@
+"""Logs of VESC Tool: a real ride's, and ones written here with everything that may be wrong with them."""
+
+from __future__ import annotations
+
+import logging
+import threading
+import time
+from pathlib import Path
+from typing import Any
+
+import pytest
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+
+import contract
+from device.clock import ManualClock
+from device.errors import SourceError
+from device.sources.bag import BagConfig
+from tests.recordings import recording
+
+NOW = 1_700_000_000_000_000
+HEADER = "ms_today;input_voltage;temp_motor;erpm;amp_hours_used;fault_code;roll"
+
+Sample = tuple[str, int, Any]
+
+
+@pytest.fixture
+def log(caplog: pytest.LogCaptureFixture) -> pytest.LogCaptureFixture:
+    caplog.set_level(logging.INFO, "device")
+    return caplog
+
+
+def play(path: Path, clock: ManualClock | None = None, **how: Any) -> list[Sample]:
+    out: list[Sample] = []
+    source = BagConfig(path=path, **how).build(clock or ManualClock(now_us=NOW))
+    source.run(lambda *sample: out.append(sample), threading.Event())
+    return out
+
+
+def write(folder: Path, *rows: str, header: str = HEADER, name: str = "ride.csv") -> Path:
+    path = folder / name
+    path.write_text("\n".join([header, *rows]) + "\n", encoding="utf-8")
+    return path
+
+
+def row(ms: int, *, volts: str = "46.4", motor: str = "25", fault: str = "0", roll: str = "0.5") -> str:
+    return f"{ms};{volts};{motor};1200;0.0281;{fault};{roll};"
+
+
+def test_a_real_ride(log: pytest.LogCaptureFixture) -> None:
+    clock = ManualClock(now_us=NOW)
+    samples = play(recording("vesc-tool-ride.csv"), clock)
+    assert len(samples) == 877
+    stream, t_us, first = samples[0]
+    assert (stream, t_us) == ("vesc", NOW)
+    ros2 = {name for name, field in contract.VESC_FIELDS.items() if 2 in field.ros}
+    assert ros2 <= set(first)
+    assert first["voltage_input"] == 46.4
+    assert first["temp_fet"] == 32.7
+    assert first["charge_drawn"] == 281
+    assert first["energy_drawn"] == 12908
+    assert (first["displacement"], first["distance_traveled"]) == (106353, 109537)
+    assert first["pid_pos_now"] == 307.511
+    assert all(values["temp_motor"] is None for _, _, values in samples), "no sensor is fitted"
+    # The columns that are not the contract's keep their names, the time of day is no field.
+    assert first["battery_level"] == 9.152
+    assert "ms_today" not in first
+    assert "ms_today_imu" in first
+    assert len(first) == 46
+    assert max(values["speed"] for _, _, values in samples) == 27383
+    assert samples[-1][1] - NOW == 73_648_000
+    assert clock.now_us() - NOW == pytest.approx(73_648_000, abs=100)
+    assert {frozenset(values) for _, _, values in samples} == {frozenset(first)}
+    counters = ("charge_drawn", "charge_regen", "energy_drawn", "energy_regen")
+    assert {type(values[name]) for _, _, values in samples for name in counters} == {int}
+    assert log.text == ""
+
+
+def test_it_goes_through_the_contract() -> None:
+    samples = play(recording("vesc-tool-ride.csv"))[:10]
+    columns = {name: [values[name] for _, _, values in samples] for name in samples[0][2]}
+    batch = contract.Batch("0123456789abcdef", 0, [t_us for _, t_us, _ in samples], columns)
+    assert contract.decode(contract.encode(batch)).columns["charge_drawn"] == [281] * 10
+
+
+@pytest.mark.parametrize(("speed", "seconds"), [(1.0, 0.4), (4.0, 0.1), (0.0, 0.0)])
+def test_the_pace_is_the_logs(tmp_path: Path, speed: float, seconds: float) -> None:
+    clock = ManualClock(now_us=NOW)
+    samples = play(write(tmp_path, *(row(1000 + i * 100) for i in range(5))), clock, speed=speed)
+    assert clock.now_us() - NOW == pytest.approx(seconds * 1e6, abs=10)
+    assert samples[-1][1] - NOW == pytest.approx(seconds * 1e6, abs=10)
+
+
+def test_loop_and_duration(tmp_path: Path) -> None:
+    path = write(tmp_path, *(row(1000 + i * 100, volts=str(i)) for i in range(3)))
+    samples = play(path, loop=True, duration_s=0.8, stream="ride")
+    assert [values["voltage_input"] for _, _, values in samples] == [0, 1, 2, 0, 1, 2, 0, 1]
+    assert [t - NOW for _, t, _ in samples] == [i * 100_000 for i in range(8)]
+    assert {stream for stream, _, _ in samples} == {"ride"}
+
+
+def test_midnight(tmp_path: Path) -> None:
+    ms = [86_399_900, 86_399_950, 0, 50]
+    samples = play(write(tmp_path, *map(row, ms)))
+    assert [t - NOW for _, t, _ in samples] == [0, 50_000, 100_000, 150_000]
+
+
+def test_a_clock_set_back_a_little_is_no_midnight(tmp_path: Path) -> None:
+    samples = play(write(tmp_path, *map(row, [5000, 5100, 4000, 5050, 5200])))
+    assert [t - NOW for _, t, _ in samples] == [0, 100_000, 100_000, 100_000, 200_000]
+
+
+@pytest.fixture
+def berlin(monkeypatch: pytest.MonkeyPatch) -> Any:
+    monkeypatch.setenv("TZ", "Europe/Berlin")
+    time.tzset()
+    yield
+    monkeypatch.undo()
+    time.tzset()
+
+
+@pytest.mark.usefixtures("berlin")
+@pytest.mark.parametrize(
+    ("name", "ms", "expected"),
+    [
+        # 00:34:31 in Berlin's summer is 22:34:31 UTC of the day before.
+        ("2024-06-12_00-34-31.csv", 2_071_500, 1_718_145_271_500_000),
+        # Begun just before midnight, the first row comes after it.
+        ("log 2024-06-11_23-59-59.csv", 500, 1_718_143_200_500_000),
+    ],
+)
+def test_original_stamps_take_the_day_from_the_files_name(
+    tmp_path: Path, name: str, ms: int, expected: int
+) -> None:
+    samples = play(write(tmp_path, row(ms), row(ms + 100), name=name), stamps="original")
+    assert [t for _, t, _ in samples] == [expected, expected + 100_000]
+
+
+@pytest.mark.parametrize("name", ["ride.csv", "2024-13-12_00-34-31.csv"])
+def test_original_stamps_without_a_day_are_refused(tmp_path: Path, name: str) -> None:
+    with pytest.raises(SourceError, match=r"needs the day.*2024-06-12_00-34-31\.csv"):
+        play(write(tmp_path, row(1000), name=name), stamps="original")
+
+
+@pytest.mark.parametrize(
+    ("bad", "why"),
+    [
+        ("1100;46.4;25;", "4 columns, and the first line names 7"),
+        ("1100;46.4;25;1200;0.0281;0;0.5;9;", "9 columns"),
+        ("1100;46.x;25;1200;0.0281;0;0.5;", "input_voltage is '46.x', which is no number"),
+        (row(1100, volts="46,4"), "input_voltage is '46,4'"),
+        (row(1100, volts="1_000"), "input_voltage is '1_000'"),
+        (row(86_400_000), "a day has 86400000 ms"),
+        (row(-1), "a day has"),
+        (row(1100).replace("1100", ""), "ms_today is ''"),
+        (row(1100).replace("1100", "nan"), "ms_today is 'nan'"),
+        (row(1100, roll="left"), "roll is 'left', which is no number"),
+        ("\x00\x00\x00\x00", "1 columns"),
+    ],
+)
+def test_a_malformed_row_is_skipped_and_told_once(
+    tmp_path: Path, log: pytest.LogCaptureFixture, bad: str, why: str
+) -> None:
+    path = write(tmp_path, row(1000), bad, row(1200), bad, row(1300))
+    samples = play(path, loop=True, duration_s=0.7)
+    assert [t - NOW for _, t, _ in samples[:3]] == [0, 200_000, 300_000]
+    told = [record.getMessage() for record in log.records]
+    assert len([text for text in told if "row 3 is skipped" in text]) == 1
+    assert why in log.text
+    assert any("2 rows have been skipped" in text for text in told)
+    assert not any("row 5" in text for text in told)
+
+
+def test_a_first_row_cut_short_says_nothing_about_the_others(tmp_path: Path) -> None:
+    path = write(tmp_path, "1000;4", row(1000, roll="x;y"), row(1100, volts="46.5", roll="0.25"))
+    assert [values["roll"] for _, _, values in play(path)] == [0.25]
+
+
+def test_a_decimal_comma(tmp_path: Path, log: pytest.LogCaptureFixture) -> None:
+    whole = row(1000).replace("46.4", "46").replace("0.0281", "0").replace("0.5", "0")
+    comma = [row(ms).replace(".", ",") for ms in (1100, 1200)]
+    samples = play(write(tmp_path, whole, *comma, row(1300)))
+    assert [values["voltage_input"] for _, _, values in samples] == [46, 46.4, 46.4]
+    assert samples[1][2]["charge_drawn"] == 281
+    assert "row 5 is skipped" in log.text
+
+
+def test_neither_is_guessed_at(tmp_path: Path, log: pytest.LogCaptureFixture) -> None:
+    assert len(play(write(tmp_path, row(1000, volts="46,4"), row(1100)))) == 1
+    assert "both point and comma" in log.text
+
+
+@pytest.mark.parametrize("separator", ["\t", ","])
+def test_other_separators(tmp_path: Path, separator: str) -> None:
+    path = write(tmp_path, row(1000).replace(";", separator), header=HEADER.replace(";", separator))
+    assert play(path)[0][2]["voltage_input"] == 46.4
+
+
+def test_what_windows_adds(tmp_path: Path) -> None:
+    path = tmp_path / "RIDE.CSV"
+    path.write_bytes(
+        b"\xef\xbb\xbf" + "\r\n".join([HEADER + ";", row(1000), "", row(1100)]).encode() + b"\r\n"
+    )
+    assert len(play(path)) == 2
+
+
+@pytest.mark.parametrize(
+    ("text", "code"),
+    [
+        ("FAULT_CODE_NONE", 0),
+        ("FAULT_CODE_DRV", 3),
+        ("FAULT_CODE_DRV8302", 3),
+        ("OVER_TEMP_FET", 5),
+        ("FAULT_CODE_ENCODER_NO_MAGNET", 25),
+        ("7", 7),
+        ("FAULT_CODE_GREMLINS", None),
+    ],
+)
+def test_faults_by_name(tmp_path: Path, log: pytest.LogCaptureFixture, text: str, code: int | None) -> None:
+    samples = play(write(tmp_path, row(1000, fault=text), row(1100, fault=text)))
+    assert [values["fault_code"] for _, _, values in samples] == [code, code]
+    assert log.text.count("GREMLINS") == (1 if code is None else 0)
+
+
+@pytest.mark.parametrize(("motor", "value"), [("-57", None), ("-50", None), ("-49.9", -49.9), ("31", 31)])
+def test_no_sensor_is_no_temperature(tmp_path: Path, motor: str, value: float | None) -> None:
+    assert play(write(tmp_path, row(1000, motor=motor)))[0][2]["temp_motor"] == value
+
+
+def test_columns_that_are_no_fields(tmp_path: Path, log: pytest.LogCaptureFixture) -> None:
+    header = HEADER + ";note;gnss lat;speed;extra"
+    rows = [row(1000 + i) + "abc;1.5;3;2.25" for i in range(3)]
+    samples = play(write(tmp_path, *rows, header=header))
+    assert set(samples[0][2]) == {
+        "voltage_input", "temp_motor", "speed", "charge_drawn", "fault_code", "roll", "extra",
+    }  # fmt: skip
+    assert samples[0][2]["speed"] == 1200, "the contract's, not a column that happens to have its name"
+    assert log.text.count("columns that hold no numbers: note, gnss lat, speed") == 1
+
+
+def test_empty_cells_are_null_and_nan_stays_for_the_contract_to_count(tmp_path: Path) -> None:
+    samples = play(write(tmp_path, row(1000, volts="", roll="nan"), row(1100)))
+    assert samples[0][2]["voltage_input"] is None
+    assert samples[0][2]["roll"] != samples[0][2]["roll"]
+    assert set(samples[0][2]) == set(samples[1][2])
+
+
+@pytest.mark.parametrize(
+    ("content", "words"),
+    [
+        ("", "no column ms_today"),
+        ("time;speed\n1;2\n", "no column ms_today"),
+        (HEADER + "\n", "no row in it that can be read"),
+        (HEADER + "\n1;2\n", "no row in it that can be read"),
+        (HEADER + ";roll\n", "roll are there twice"),
+    ],
+)
+def test_what_is_no_log(tmp_path: Path, content: str, words: str) -> None:
+    path = tmp_path / "ride.csv"
+    path.write_text(content)
+    with pytest.raises(SourceError, match=words):
+        play(path)
+
+
+def test_a_log_has_no_topics(tmp_path: Path) -> None:
+    with pytest.raises(SourceError, match="has no topics; `stream` names its stream"):
+        play(write(tmp_path, row(1000)), topics=(("/sensors/core", "vesc"),))
+
+
+@settings(suppress_health_check=[HealthCheck.function_scoped_fixture], deadline=None)
+@given(st.binary(max_size=300))
+def test_whatever_stands_in_it_the_good_rows_come_out(tmp_path: Path, junk: bytes) -> None:
+    path = tmp_path / "ride.csv"
+    junk = junk.replace(b";", b"").replace(b"\t", b"")
+    path.write_bytes(f"{HEADER}\n{row(1000)}\n".encode() + junk + f"\n{row(1200)}\n".encode())
+    assert [t - NOW for _, t, _ in play(path)] == [0, 200_000]

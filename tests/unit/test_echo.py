@@ -1,0 +1,68 @@
+"""Echo: the pong has the ping's content, goes to the ping's robot and nowhere else."""
+
+from __future__ import annotations
+
+import json
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+import contract
+from contract import LAMBDA, PING, PONG, RECEIVED_MS, TOPIC, ContractError, build_topic, decode_pong
+from functions import echo
+
+robots = st.from_regex(r"[A-Za-z0-9_-]{1,64}", fullmatch=True)
+
+
+def event(robot="car", namespace="iort", ping_id=7, sent_us=1_700_000_000_000_000, padding=""):
+    """What the echo rule makes of a ping."""
+    ping = json.loads(contract.encode_ping(ping_id, sent_us, padding))
+    return {**ping, TOPIC: build_topic(PING, robot, LAMBDA, namespace), RECEIVED_MS: 1_700_000_000_123}
+
+
+@given(
+    robots, st.from_regex(r"[a-z][a-z0-9]{0,15}", fullmatch=True), st.integers(0, 2**53), st.text(max_size=9)
+)
+def test_the_pong_has_what_the_ping_had(robot, namespace, ping_id, padding):
+    topic, payload = echo.pong(event(robot, namespace, ping_id, padding=padding))
+    assert topic == build_topic(PONG, robot, LAMBDA, namespace)
+    assert decode_pong(payload) == (ping_id, 1_700_000_000_000_000, 1_700_000_000_123)
+    content = json.loads(payload)
+    assert content.get("padding", "") == padding
+    assert TOPIC not in content
+
+
+@pytest.mark.parametrize(
+    "topic", ["ping/iort/car", "ping/iort/ca+r/lambda", "ping/iort/#/lambda", "", None, 7]
+)
+def test_a_topic_that_is_not_ours_is_refused(topic):
+    with pytest.raises(ContractError, match=r"topic|robot"):
+        echo.pong({**event(), TOPIC: topic})
+
+
+def test_the_handler_publishes_and_counts(monkeypatch, capsys):
+    published = []
+
+    class Broker:
+        def publish(self, **arguments):
+            published.append(arguments)
+
+    monkeypatch.setattr(echo, "_iot_data", Broker)
+    assert echo.handler(event(), None) is None
+    topic, payload = echo.pong(event())
+    assert published == [{"topic": topic, "qos": 0, "payload": payload}]
+    assert json.loads(capsys.readouterr().out)["PongsSent"] == 1
+
+
+def test_the_handler_publishes_through_boto3(aws, capsys):
+    from moto.backends import get_backend
+    from moto.core import DEFAULT_ACCOUNT_ID
+
+    echo._iot_data.cache_clear()
+    echo.handler(event(), None)
+    echo._iot_data.cache_clear()
+    backend = get_backend("iot-data")[DEFAULT_ACCOUNT_ID]["eu-west-1"]
+    topic, payload = echo.pong(event())
+    assert backend.published_payloads == [(topic, payload)]
+    assert json.loads(capsys.readouterr().out)["PongsSent"] == 1

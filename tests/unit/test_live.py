@@ -1,0 +1,320 @@
+"""Lambda 1: the chosen fields go to the car's channel, and whatever is wrong is counted, never raised."""
+
+from __future__ import annotations
+
+import json
+import logging
+import math
+
+import boto3
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+import contract
+from contract import LIVE, LIVE_MAX_AGE_MS, RECEIVED_MS, TOPIC, LiveSample, build_topic
+from functions import live
+from functions.legs import Legs
+from functions.live import LiveSettings, age_ms, process
+from functions.pubnub_client import PublishError, PubNubPublisher
+
+T_US = 1_700_000_000_000_000
+SENT_US = T_US + 4_000
+RECEIVED = (SENT_US + 30_000) // 1000
+NOW_US = SENT_US + 35_000
+SETTINGS = LiveSettings({"vesc": frozenset({"speed", "voltage_input"})})
+SAMPLE = {"speed": 1200, "voltage_input": 15.8, "fault_code": 0}
+
+
+def event(stream="vesc", robot="car", namespace="iort", **changes):
+    """What the live rule makes of a live message."""
+    sample = changes.pop("sample", SAMPLE)
+    message = json.loads(contract.encode_live(LiveSample("0123abcd", 3, T_US, SENT_US, sample)))
+    return {**message, TOPIC: build_topic(LIVE, robot, stream, namespace), RECEIVED_MS: RECEIVED, **changes}
+
+
+class Channels:
+    """Stands for PubNub: what was published, or the error that it answers with."""
+
+    def __init__(self, error=None):
+        self.sent, self.error = [], error
+
+    def __call__(self, channel, message):
+        if self.error is not None:
+            raise self.error
+        self.sent.append((channel, message))
+
+
+@pytest.fixture
+def counted(capsys):
+    """The metrics written since the last call, summed by name; every line is checked on the way."""
+
+    def read():
+        totals = {}
+        for line in capsys.readouterr().out.splitlines():
+            entry = json.loads(line, parse_constant=pytest.fail)
+            (directive,) = entry["_aws"]["CloudWatchMetrics"]
+            for metric in directive["Metrics"]:
+                assert metric["Name"] in contract.METRICS["live"]
+                totals[metric["Name"]] = totals.get(metric["Name"], 0) + entry[metric["Name"]]
+        return totals
+
+    return read
+
+
+def test_the_chosen_fields_go_to_the_cars_channel_with_every_hops_time(counted):
+    channels = Channels()
+    process(event(), SETTINGS, channels, Legs(), NOW_US)
+    ((channel, message),) = channels.sent
+    assert channel == contract.channel("car")
+    assert message == {
+        "v": contract.SCHEMA_VERSION,
+        "robot": "car",
+        "stream": "vesc",
+        "boot": "0123abcd",
+        "seq": 3,
+        "t": T_US,
+        "hops": {"sent_us": SENT_US, "received_ms": RECEIVED, "lambda_us": NOW_US},
+        "sample": {"speed": 1200, "voltage_input": 15.8},
+    }
+    assert counted() == {"LivePublished": 1, "CarToLambdaMs": 35}
+
+
+def test_a_stream_that_is_not_configured_sends_every_field():
+    channels = Channels()
+    process(event("imu"), SETTINGS, channels, Legs(), NOW_US)
+    assert channels.sent[0][1]["sample"] == SAMPLE
+    assert channels.sent[0][1]["stream"] == "imu"
+
+
+def test_a_stream_configured_with_no_field_sends_none_and_fields_that_are_not_there_are_not_made_up():
+    channels = Channels()
+    process(event(), LiveSettings({"vesc": frozenset()}), channels, Legs(), NOW_US)
+    process(event(), LiveSettings({"vesc": frozenset({"speed", "absent"})}), channels, Legs(), NOW_US)
+    assert [message["sample"] for _, message in channels.sent] == [{}, {"speed": 1200}]
+
+
+def test_another_deployment_has_channels_of_its_own():
+    channels = Channels()
+    process(event(namespace="lab2"), SETTINGS, channels, Legs(), NOW_US)
+    assert channels.sent[0][0] == contract.channel("car", "lab2")
+
+
+def test_the_robot_is_the_topics_whatever_the_message_claims():
+    channels = Channels()
+    process(event(robot="mine", channel="iort.other"), SETTINGS, channels, Legs(), NOW_US)
+    assert channels.sent[0][0] == contract.channel("mine")
+    assert channels.sent[0][1]["robot"] == "mine"
+
+
+@pytest.mark.parametrize(
+    ("in_car_ms", "in_cloud_ms", "stale"),
+    [
+        (0, 0, False),
+        (LIVE_MAX_AGE_MS, 0, False),
+        (LIVE_MAX_AGE_MS + 1, 0, True),
+        (0, LIVE_MAX_AGE_MS, False),
+        (0, LIVE_MAX_AGE_MS + 1, True),
+        (LIVE_MAX_AGE_MS / 2, LIVE_MAX_AGE_MS / 2, False),
+        (LIVE_MAX_AGE_MS / 2 + 1, LIVE_MAX_AGE_MS / 2, True),
+    ],
+)
+# A car whose clock is a day off is as fresh as any other.
+@pytest.mark.parametrize("clock_error_us", [0, 86_400_000_000, -86_400_000_000])
+def test_stale_by_its_time_in_the_car_and_in_the_cloud(
+    in_car_ms, in_cloud_ms, stale, clock_error_us, counted
+):
+    sent_us = SENT_US + clock_error_us
+    t_us = sent_us - round(in_car_ms * 1000)
+    now_us = RECEIVED * 1000 + round(in_cloud_ms * 1000)
+    channels = Channels()
+    process(event(t=t_us, sent_us=sent_us), SETTINGS, channels, Legs(), now_us)
+    assert age_ms(LiveSample("0123abcd", 0, t_us, sent_us, {}), RECEIVED, now_us) == in_car_ms + in_cloud_ms
+    assert len(channels.sent) == (not stale)
+    totals = counted()
+    assert totals.get("LiveStale", 0) == stale
+    assert totals.get("LivePublished", 0) == (not stale)
+    # By a clock that is ahead it arrives before it was sent; that is no duration.
+    assert totals.get("CarToLambdaMs", 0) >= 0
+
+
+without = [
+    {key: value for key, value in event().items() if key != gone} for gone in event() if gone != "nonfinite"
+]
+MALFORMED = [
+    *without,
+    {},
+    event(topic="live/iort/car"),
+    event(topic=None),
+    event(topic="live/iort/c r/vesc"),
+    event(v=2),
+    event(v="1"),
+    event(boot="XYZ"),
+    event(seq=-1),
+    {**event(), "sample": None},
+    {**event(), "sample": [1, 2]},
+    {**event(), "sample": {"speed": [1]}},
+    {**event(), "sample": {"": 1}},
+    {**event(), "sample": {"speed": math.nan}},
+    {**event(), "t": 1e300},
+    {**event(), "sent_us": "now"},
+    {**event(), RECEIVED_MS: None},
+    {**event(), RECEIVED_MS: "soon"},
+    {**event(), RECEIVED_MS: math.inf},
+    {**event(), RECEIVED_MS: math.nan},
+    {**event(), RECEIVED_MS: {}},
+    [],
+    [event()],
+    "text",
+    7,
+    None,
+]
+
+
+@pytest.mark.parametrize("malformed", MALFORMED, ids=range(len(MALFORMED)))
+def test_a_malformed_event_is_refused_and_counted_and_never_raises(malformed, counted, caplog):
+    channels = Channels()
+    process(malformed, SETTINGS, channels, Legs(), NOW_US)
+    assert channels.sent == []
+    assert counted() == {"LiveRefused": 1}
+    (record,) = caplog.records
+    assert "refused" in record.getMessage()
+    assert len(record.getMessage()) < 1000
+
+
+json_values = st.recursive(
+    st.none() | st.booleans() | st.integers() | st.floats() | st.text(max_size=10),
+    lambda inner: st.lists(inner, max_size=3) | st.dictionaries(st.text(max_size=5), inner, max_size=3),
+    max_leaves=8,
+)
+
+
+@given(st.dictionaries(st.sampled_from(sorted(event())), json_values), json_values)
+def test_nothing_in_an_event_raises(changes, anything):
+    channels = Channels()
+    process({**event(), **changes}, SETTINGS, channels, Legs(), NOW_US)
+    process(anything, SETTINGS, channels, Legs(), NOW_US)
+    for channel, message in channels.sent:
+        assert channel.startswith("iort.")
+        json.dumps(message, allow_nan=False)
+
+
+def test_what_pubnub_does_not_take_is_counted_and_not_raised(counted, caplog):
+    process(event(), SETTINGS, Channels(PublishError("status 403")), Legs(), NOW_US)
+    assert counted() == {"PubNubFailed": 1}
+    assert "car: status 403" in caplog.text
+
+
+def test_the_settings_come_from_the_environment(monkeypatch):
+    monkeypatch.setenv("LIVE_FIELDS", '{"vesc": ["speed", "speed"], "imu": []}')
+    assert LiveSettings.from_environment() == LiveSettings({"vesc": frozenset({"speed"}), "imu": frozenset()})
+
+
+def test_the_handler_wires_settings_publisher_and_clock(monkeypatch, counted):
+    channels = Channels()
+    monkeypatch.setattr(live, "_settings", lambda: SETTINGS)
+    monkeypatch.setattr(
+        live, "_publisher", lambda: type("Publisher", (), {"publish": staticmethod(channels)})
+    )
+    monkeypatch.setattr(live.time, "time_ns", lambda: NOW_US * 1000)
+    assert live.handler(event(), None) is None
+    assert channels.sent[0][1]["hops"]["lambda_us"] == NOW_US
+    assert counted()["LivePublished"] == 1
+
+
+# --- the publisher, without a network -------------------------------------------------------------
+
+KEYS = {"publish_key": "pub-c-secret", "subscribe_key": "sub-c-secret"}
+
+
+@pytest.mark.parametrize(
+    ("extra", "origin", "tls"),
+    [({}, "ps.pndsn.com", True), ({"origin": "127.0.0.1:9", "tls": False}, "127.0.0.1:9", False)],
+)
+def test_the_keys_come_from_a_secure_parameter(aws, extra, origin, tls):
+    name = contract.pubnub_parameter()
+    value = json.dumps({**KEYS, **extra})
+    boto3.client("ssm").put_parameter(Name=name, Type="SecureString", Value=value)
+    config = PubNubPublisher.from_parameter(name)._client.config
+    assert (config.publish_key, config.subscribe_key) == tuple(KEYS.values())
+    assert (config.origin, config.ssl) == (origin, tls)
+    assert config.connect_timeout == config.non_subscribe_request_timeout == 1
+
+
+def test_the_publisher_is_made_once_an_environment(aws, monkeypatch):
+    name = contract.pubnub_parameter("lab2")
+    boto3.client("ssm").put_parameter(Name=name, Type="SecureString", Value=json.dumps(KEYS))
+    monkeypatch.setenv("PUBNUB_PARAMETER", name)
+    live._publisher.cache_clear()
+    try:
+        assert live._publisher() is live._publisher()
+    finally:
+        live._publisher.cache_clear()
+
+
+def test_a_message_too_large_is_refused_before_it_is_sent():
+    publisher = PubNubPublisher(**KEYS)
+    with pytest.raises(PublishError, match=r"\d+ bytes after URL encoding; PubNub takes 32768"):
+        publisher.publish("iort.car", {"text": "x" * contract.MAX_PUBNUB_BYTES})
+    # Measured as PubNub measures: a quote is three bytes in a URL.
+    with pytest.raises(PublishError, match="after URL encoding"):
+        publisher.publish("iort.car", {"text": '"' * (contract.MAX_PUBNUB_BYTES // 6)})
+
+
+def test_whatever_the_sdk_raises_is_a_publish_error_without_keys(monkeypatch):
+    publisher = PubNubPublisher(**KEYS)
+
+    def broken(*_arguments):
+        raise ValueError("https://ps.pndsn.com/publish/pub-c-secret/sub-c-secret/0/iort.car/0")
+
+    monkeypatch.setattr(publisher._client, "request_sync", broken)
+    with pytest.raises(PublishError) as caught:
+        publisher.publish("iort.car", {})
+    assert "secret" not in str(caught.value)
+    assert "ValueError" in str(caught.value)
+
+
+def test_the_loggers_that_would_show_the_keys_are_quiet():
+    for name in ("httpx", "httpcore", "pubnub"):
+        assert not logging.getLogger(name).isEnabledFor(logging.INFO)
+
+
+def late(sent_us, received_ms, legs, channels):
+    """A live message that was received at once by Lambda, however long it took to get there."""
+    process(
+        {**event(t=sent_us, sent_us=sent_us), "received_ms": received_ms},
+        SETTINGS,
+        channels,
+        legs,
+        received_ms * 1000,
+    )
+
+
+@pytest.mark.parametrize("offset_us", [0, 3_600_000_000, -3_600_000_000])
+def test_messages_that_a_stall_held_up_are_stale_whatever_the_cars_clock(capsys, offset_us):
+    channels, legs = Channels(), Legs()
+    start_us = NOW_US
+    for i in range(20):
+        late(start_us + i * 100_000 + offset_us, (start_us + i * 100_000) // 1000 + 30, legs, channels)
+    assert len(channels.sent) == 20
+    # Six seconds of messages come all at once.
+    for i in range(20, 80):
+        late(start_us + i * 100_000 + offset_us, (start_us + 80 * 100_000) // 1000 + 30, legs, channels)
+    assert len(channels.sent) == 20 + 20
+    assert capsys.readouterr().out.count('LiveStale":1') == 40
+
+
+def test_clock_set_back_is_believed_after_the_window():
+    legs = Legs()
+    assert legs.excess_us("0badcafe", 0, 0) == 0
+    assert legs.excess_us("0badcafe", -5_000_000, 100) == 5_100_000
+    for second in range(1, 40):
+        excess = legs.excess_us("0badcafe", second * 1_000_000 - 5_000_000, second * 1000)
+    assert excess == 0
+
+
+def test_legs_remember_a_bounded_number_of_runs():
+    legs = Legs()
+    for i in range(3000):
+        legs.excess_us(f"{i:08x}", 0, 0)
+    assert len(legs._runs) == 1000

@@ -1,0 +1,49 @@
+"""The README says what the code does."""
+
+from __future__ import annotations
+
+import base64
+import itertools
+import json
+import re
+import zlib
+
+import contract
+from scripts.fields import ROOT, filled
+
+README = (ROOT / "README.md").read_text()
+
+
+def test_field_table_is_the_contracts():
+    assert filled(README) == README
+
+
+def test_three_lines_decode_a_batch():
+    code = next(block for block in re.findall(r"```python\n(.*?)```", README, re.DOTALL) if "zlib" in block)
+    batch = contract.Batch("0badcafe", 0, [10, 20, 35], {"speed": [1, 2.5, None]})
+    names = {"json": json, "zlib": zlib, "base64": base64, "itertools": itertools}
+    names["batch"] = json.loads(contract.encode(batch))
+    exec(code, names)
+    assert names["times_us"] == [10, 20, 35]
+    assert names["speed_erpm"] == [1, 2.5, None]
+
+
+def test_car_yaml_names_settings_that_the_agent_knows(tmp_path):
+    from device.config import load_config
+
+    text = next(block for block in re.findall(r"```yaml\n(.*?)```", README, re.DOTALL))
+    (tmp_path / "car.yaml").write_text(text)
+    for name in ("certificate.pem", "private.key"):
+        (tmp_path / name).touch()
+    assert load_config(tmp_path / "car.yaml").robot == "car7"
+
+
+def test_every_make_target_it_names_is_there():
+    targets = set(re.findall(r"^([a-z-]+):", (ROOT / "Makefile").read_text(), re.MULTILINE))
+    named = set(re.findall(r"`make ([a-z-]+)|^make ([a-z-]+)", README, re.MULTILINE))
+    assert {first or second for first, second in named} <= targets
+
+
+def test_every_file_it_links_to_is_there():
+    for link in re.findall(r"\]\(([^)h][^)]*)\)", README):
+        assert (ROOT / link).exists(), link

@@ -1,0 +1,61 @@
+"""REQUIRE_ALL=1 makes a skip a failure, and nothing else."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+
+import pytest
+
+from stacks.settings import ROOT
+
+MODULES = {
+    "test_skips.py": """
+import pytest
+def test_good(): pass
+def test_skipped(): pytest.skip("no Chromium")
+@pytest.mark.skip(reason="no recording")
+def test_marked(): pass
+@pytest.mark.xfail(strict=True)
+def test_expected(): assert False
+""",
+    "test_module.py": """
+import pytest
+pytest.importorskip("there_is_no_such_module")
+""",
+}
+
+
+@pytest.mark.parametrize(
+    ("require", "code", "counts"),
+    [
+        ("", 0, ["1 passed", "3 skipped", "1 xfailed"]),
+        ("0", 0, ["3 skipped"]),
+        (
+            "1",
+            1,
+            ["1 passed", "1 failed", "2 errors", "1 xfailed", "no Chromium", "no recording", "REQUIRE_ALL"],
+        ),
+    ],
+)
+def test_a_skip_is_a_failure_where_everything_is_said_to_be_there(tmp_path, require, code, counts):
+    for name, text in MODULES.items():
+        (tmp_path / name).write_text(text)
+    flags = ["-p", "tests.conftest", "-p", "no:cacheprovider", "--rootdir", tmp_path]
+    if require == "1":
+        # An error of collection would end the run before the tests.
+        flags.append("--continue-on-collection-errors")
+    done = subprocess.run(
+        [sys.executable, "-m", "pytest", *flags, tmp_path],
+        cwd=ROOT,
+        env={**os.environ, "REQUIRE_ALL": require},
+        capture_output=True,
+        text=True,
+        check=False,
+        timeout=120,
+    )
+    assert done.returncode == code, done.stdout
+    for count in counts:
+        assert count in done.stdout
+    assert ("skipped" in done.stdout.splitlines()[-1]) == (code == 0)

@@ -1,0 +1,225 @@
+"""A second's summary: every sample once, whichever batches it came in."""
+
+from __future__ import annotations
+
+import math
+from fractions import Fraction
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from contract import Batch
+from functions.statistics import (
+    Vehicle,
+    count_holes,
+    derive,
+    missing_before,
+    summarize_second,
+)
+
+S = 1_000_000
+SECOND = 1_700_000_000
+T0 = SECOND * S
+CAR = Vehicle(speed_to_erpm_gain=4614.0, speed_to_erpm_offset=10.0)
+
+
+def batch(times_us, columns=None, *, seq=0, boot="aaaaaaaa", nonfinite=0):
+    return Batch(boot, seq, list(times_us), columns or {}, nonfinite)
+
+
+def every(step_us, n, start_us=T0):
+    return [start_us + i * step_us for i in range(n)]
+
+
+# --- one second -------------------------------------------------------------------------------------
+
+
+def test_min_mean_max_and_last_of_every_field_and_what_the_stream_lacked():
+    first = batch(every(100_000, 5), {"speed": [4624, 10, 9238, 10, 10], "mode": ["a", "b", None, "c", "d"]})
+    assert summarize_second(SECOND, [first], CAR) == {
+        "n": 5,
+        "batches": 1,
+        "missing_batches": 0,
+        "gaps": 0,
+        "nonfinite": 0,
+        "speed_min": 10,
+        "speed_mean": 2778.4,
+        "speed_max": 9238,
+        "speed_last": 10,
+        "mode_last": "d",
+        "speed_mps_min": 0.0,
+        "speed_mps_mean": 0.6,
+        "speed_mps_max": 2.0,
+        "speed_mps_last": 0.0,
+    }
+
+
+def test_a_second_without_a_sample_has_no_summary():
+    assert summarize_second(SECOND, [], CAR) is None
+    assert summarize_second(SECOND, [batch([T0 - 1], {"a": [1]}), batch([T0 + S], {"a": [1]})], CAR) is None
+
+
+def test_a_batch_over_the_boundary_counts_in_each_second_with_its_own_samples():
+    across = batch([T0 - 20_000, T0 - 1, T0, T0 + 20_000], {"a": [1, 2, 3, 4]}, seq=4, nonfinite=3)
+    before, after = (summarize_second(second, [across], None) for second in (SECOND - 1, SECOND))
+    assert (before["n"], before["a_min"], before["a_max"], before["a_last"]) == (2, 1, 2, 2)
+    assert (after["n"], after["a_min"], after["a_max"], after["a_last"]) == (2, 3, 4, 4)
+    assert (before["batches"], after["batches"]) == (1, 1)
+    # What belongs to the batch as a whole belongs to the second in which it starts, once.
+    assert (before["missing_batches"], after["missing_batches"]) == (4, 0)
+    assert (before["nonfinite"], after["nonfinite"]) == (3, 0)
+
+
+def test_seconds_before_the_epoch_are_seconds_too():
+    early = batch([-1, 0, 999_999], {"a": [1, 2, 3]})
+    assert summarize_second(-1, [early], None)["n"] == 1
+    assert summarize_second(0, [early], None)["n"] == 2
+
+
+def test_fields_appear_and_vanish_from_batch_to_batch():
+    batches = [
+        batch(every(10_000, 2), {"a": [1, 2], "voltage_input": [10, 11]}, seq=0),
+        batch(every(10_000, 2, T0 + 20_000), {"b": [5, None], "current_input": [2, 3]}, seq=1),
+        batch(
+            every(10_000, 2, T0 + 40_000),
+            {"a": [None, 7], "voltage_input": [12, 13], "current_input": [1, 2]},
+        ),
+    ]
+    second = summarize_second(SECOND, batches, None)
+    assert (second["a_min"], second["a_mean"], second["a_max"], second["a_last"]) == (
+        1,
+        pytest.approx(10 / 3),
+        7,
+        7,
+    )
+    assert (second["b_min"], second["b_last"]) == (5, 5)
+    # Power needs both in the same sample.
+    assert (second["power_w_min"], second["power_w_max"], second["power_w_last"]) == (12, 26, 26)
+
+
+def test_a_field_of_nulls_leaves_nothing_and_a_field_of_text_or_bools_its_last():
+    columns = {
+        "none": [None] * 3,
+        "text": ["a", "b", None],
+        "flag": [True, False, None],
+        "mixed": [1, "x", 2.5],
+    }
+    second = summarize_second(SECOND, [batch(every(1, 3), columns)], None)
+    assert {k: v for k, v in second.items() if "_" in k and not k.startswith("missing")} == {
+        "text_last": "b",
+        "flag_last": False,
+        "mixed_last": 2.5,
+    }
+
+
+@pytest.mark.parametrize(
+    "column",
+    [
+        [1e308, 1.7e308, 1.79e308],
+        [-1.7e308, -1.7e308, 1.7e308],
+        [5e-324, 5e-324, 0],
+        [2**64 - 1, 2**53 + 1, -(2**63)],
+        [2**53 + 1, 2**53 + 1, 2**53 + 1],
+        [1e300, 5e-324, 2**64 - 1],
+        [0.1, 0.1, 0.1],
+        [1234567891, 1234567891, 1234567891],
+    ],
+)
+def test_numbers_at_the_ends_of_their_ranges(column):
+    second = summarize_second(SECOND, [batch(every(1, 3), {"a": column})], None)
+    assert (second["a_min"], second["a_max"], second["a_last"]) == (min(column), max(column), column[-1])
+    assert second["a_min"] <= second["a_mean"] <= second["a_max"]
+    exact = float(sum(map(Fraction, column)) / 3)
+    assert second["a_mean"] == pytest.approx(exact, rel=1e-8, abs=max(map(abs, column)) * 1e-15)
+
+
+numbers = st.integers(-(2**63), 2**64 - 1) | st.floats(allow_nan=False, allow_infinity=False)
+
+
+@given(st.lists(numbers, min_size=1, max_size=30), st.lists(numbers, min_size=1, max_size=30))
+def test_every_number_has_a_finite_summary_within_its_bounds(column, other):
+    n = min(len(column), len(other))
+    columns = {"speed": column[:n], "voltage_input": column[:n], "current_input": other[:n]}
+    for vehicle in (None, CAR, Vehicle(1e-100), Vehicle(-1e300, 1e308)):
+        second = summarize_second(SECOND, [batch(every(1, n), columns)], vehicle)
+        for field in ("speed", "voltage_input", "current_input", "power_w", "speed_mps"):
+            if f"{field}_mean" in second:
+                assert math.isfinite(second[f"{field}_mean"])
+                assert second[f"{field}_min"] <= second[f"{field}_mean"] <= second[f"{field}_max"]
+            else:
+                assert field in ("power_w", "speed_mps")
+
+
+# --- derived ----------------------------------------------------------------------------------------
+
+
+def test_speed_needs_the_vehicle_and_power_needs_both_fields():
+    columns = {
+        "speed": [4624.0, None, "fast", True],
+        "voltage_input": [16, 16, None, 16],
+        "current_input": [2] * 4,
+    }
+    assert derive(columns, CAR)["speed_mps"] == [1.0, None, None, None]
+    assert derive(columns, None).keys() == {"power_w"}
+    assert derive(columns, None)["power_w"] == [32, 32, None, 32]
+    assert derive({"voltage_input": [16]}, CAR) == {}
+    assert derive({}, CAR) == {}
+
+
+def test_what_is_derived_is_never_infinite():
+    columns = {"speed": [1e308], "voltage_input": [1e308], "current_input": [-1e308]}
+    assert derive(columns, Vehicle(1e-10)) == {"speed_mps": [None], "power_w": [None]}
+
+
+# --- missing batches and holes ----------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("previous", "seq", "boot", "missing"),
+    [
+        (None, 0, "aaaaaaaa", 0),
+        (None, 3, "aaaaaaaa", 3),
+        (0, 1, "aaaaaaaa", 0),
+        (0, 2, "aaaaaaaa", 1),
+        (7, 70, "aaaaaaaa", 62),
+        # A restart whose spool is durable counts on; one whose spool was lost begins again.
+        (7, 8, "bbbbbbbb", 0),
+        (7, 9, "bbbbbbbb", 1),
+        (7, 0, "bbbbbbbb", 0),
+        (7, 2, "bbbbbbbb", 2),
+        # Out of order by the car's clock, or twice: nothing is known to be missing.
+        (7, 7, "aaaaaaaa", 0),
+        (7, 3, "aaaaaaaa", 0),
+    ],
+)
+def test_missing_batches_by_their_numbers(previous, seq, boot, missing):
+    before = None if previous is None else batch([T0], seq=previous)
+    assert missing_before(before, batch([T0 + 1], seq=seq, boot=boot)) == missing
+
+
+@pytest.mark.parametrize(
+    ("steps", "holes"),
+    [
+        ([], 0),
+        ([20, 20], 0),
+        ([20, 2000], 0),
+        ([20, 20, 20], 0),
+        ([20, 60, 20], 0),
+        ([20, 61, 20], 1),
+        ([20, 20, 500, 20, 20, 90], 2),
+        ([20, 50, 20, 5, 35], 0),
+    ],
+)
+def test_holes_are_steps_over_three_times_the_usual(steps, holes):
+    times = [T0]
+    for step in steps:
+        times.append(times[-1] + step)
+    assert count_holes(times) == holes
+
+
+def test_a_hole_between_two_batches_is_seen_from_the_second_after():
+    before = batch(every(20_000, 40, T0 - S), seq=0)
+    after = batch(every(20_000, 50), seq=1)
+    assert summarize_second(SECOND, [before, after], None)["gaps"] == 1
+    assert summarize_second(SECOND, [after], None)["gaps"] == 0

@@ -1,0 +1,225 @@
+"""The adapter to DynamoDB, against moto and against a fake that pages and throttles."""
+
+from __future__ import annotations
+
+import math
+from decimal import Decimal
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from contract import EXPIRES_S, SECOND, T_US, TOPIC, Batch
+from functions import tables as tables_module
+from functions.statistics import Vehicle
+from functions.tables import TableError, attribute, plain
+from tests.fakes import (
+    ROBOTS,
+    SUMMARY,
+    TELEMETRY,
+    TOPIC_OF_CAR,
+    FakeDynamoDB,
+    item_of,
+    serialize,
+    summary_of,
+    tables,
+)
+
+T0 = 1_700_000_000_000_000
+
+
+@pytest.fixture(params=["moto", "fake"])
+def client(request):
+    return FakeDynamoDB() if request.param == "fake" else request.getfixturevalue("dynamodb")
+
+
+@pytest.fixture
+def slept(monkeypatch):
+    waits = []
+    monkeypatch.setattr(tables_module.time, "sleep", waits.append)
+    return waits
+
+
+def put(client, table, item):
+    if isinstance(client, FakeDynamoDB):
+        client.put(table, item)
+    else:
+        client.put_item(TableName=table, Item=item)
+
+
+def store(client, *times_us, topic=TOPIC_OF_CAR):
+    for seq, t_us in enumerate(times_us):
+        put(client, TELEMETRY, item_of(Batch("aaaaaaaa", seq, [t_us], {"a": [seq]}), topic))
+
+
+# --- telemetry --------------------------------------------------------------------------------------
+
+
+def test_the_range_has_both_its_ends_one_topic_and_the_order_of_time(client):
+    store(client, T0 + 5, T0 + 1, T0 + 2, T0, T0 + 4, T0 + 3)
+    store(client, T0 + 2, topic="dt/iort/other/vesc")
+    found = list(tables(client).batches(TOPIC_OF_CAR, T0 + 1, T0 + 4))
+    assert [item[T_US] for item in found] == [T0 + 1, T0 + 2, T0 + 3, T0 + 4]
+    assert {item[TOPIC] for item in found} == {TOPIC_OF_CAR}
+
+
+def test_every_page_is_read():
+    client = FakeDynamoDB(page_items=2)
+    store(client, *range(T0, T0 + 7))
+    assert len(list(tables(client).batches(TOPIC_OF_CAR, T0, T0 + 10))) == 7
+    assert client.calls["query"] == 4
+
+
+@pytest.mark.parametrize(("later", "expected"), [(False, [T0 + 1, T0]), (True, [T0 + 3, T0 + 4])])
+def test_neighbours_come_nearest_first(client, later, expected):
+    store(client, T0, T0 + 1, T0 + 2, T0 + 3, T0 + 4)
+    store(client, T0 + 2, topic="dt/iort/other/vesc")
+    found = tables(client).neighbours(TOPIC_OF_CAR, T0 + 2, later=later)
+    assert [item[T_US] for item in found] == expected
+
+
+def test_only_the_neighbours_that_are_asked_for_are_read():
+    client = FakeDynamoDB(page_items=100)
+    store(client, *range(T0, T0 + 9))
+    next(tables(client).neighbours(TOPIC_OF_CAR, T0 + 8, later=False))
+    assert client.read == 1
+
+
+def test_a_topic_with_nothing_stored(client):
+    assert list(tables(client).batches(TOPIC_OF_CAR, T0, T0 + 1)) == []
+    assert list(tables(client).neighbours(TOPIC_OF_CAR, T0, later=True)) == []
+
+
+# --- robots -----------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("row", "vehicle"),
+    [
+        ({"speed_to_erpm_gain": Decimal(4614), "speed_to_erpm_offset": Decimal("0.5")}, Vehicle(4614.0, 0.5)),
+        ({"speed_to_erpm_gain": Decimal(-4614)}, Vehicle(-4614.0, 0.0)),
+        ({"pole_pairs": Decimal(2)}, None),
+        ({"speed_to_erpm_gain": Decimal(0)}, None),
+        ({"speed_to_erpm_gain": None}, None),
+        ({"speed_to_erpm_gain": "fast"}, None),
+        ({"speed_to_erpm_gain": "nan"}, None),
+        ({"speed_to_erpm_gain": Decimal(1), "speed_to_erpm_offset": None}, None),
+        ({"speed_to_erpm_gain": Decimal(1), "speed_to_erpm_offset": ["1"]}, None),
+    ],
+)
+def test_a_vehicle_is_what_its_row_says_and_a_wrong_row_is_none(client, row, vehicle):
+    put(client, ROBOTS, {name: serialize(value) for name, value in {"robot": "car", **row}.items()})
+    assert tables(client).vehicle("car") == vehicle
+
+
+def test_a_robot_that_is_not_registered_has_no_vehicle(client):
+    assert tables(client).vehicle("nobody") is None
+
+
+def test_the_registry_is_read_once_a_minute(monkeypatch):
+    client, now = FakeDynamoDB(), [0.0]
+    monkeypatch.setattr(tables_module.time, "monotonic", lambda: now[0])
+    asked = tables(client)
+    for now[0] in (0.0, 30.0, 60.0):
+        assert asked.vehicle("car") is None
+    assert client.calls["get_item"] == 1
+    put(client, ROBOTS, {"robot": {"S": "car"}, "speed_to_erpm_gain": {"N": "4614"}})
+    now[0] = 60.1
+    assert asked.vehicle("car") == Vehicle(4614.0)
+    assert client.calls["get_item"] == 2
+
+
+# --- summary ----------------------------------------------------------------------------------------
+
+
+def test_seconds_are_written_flat_and_read_back(client):
+    summary = {"n": 50, "a_min": -1.5, "b_last": "text", "c_last": False, EXPIRES_S: 1_800_000_000}
+    tables(client).put_seconds({(TOPIC_OF_CAR, 1_700_000_000): summary})
+    if isinstance(client, FakeDynamoDB):
+        (item,) = summary_of(client).values()
+    else:
+        item = plain(client.scan(TableName=SUMMARY)["Items"][0])
+    assert item == {TOPIC: TOPIC_OF_CAR, SECOND: 1_700_000_000, **summary}
+
+
+@pytest.mark.parametrize("n", [0, 1, 25, 26, 60])
+def test_writes_go_out_in_calls_of_at_most_25(n):
+    client = FakeDynamoDB()
+    tables(client).put_seconds({(TOPIC_OF_CAR, second): {"n": 1} for second in range(n)})
+    assert sorted(summary_of(client)) == list(range(n))
+    assert client.calls["batch_write_item"] == math.ceil(n / 25)
+
+
+def test_more_than_one_call_of_seconds_against_moto(dynamodb):
+    tables(dynamodb).put_seconds({(TOPIC_OF_CAR, second): {"n": 1} for second in range(60)})
+    assert dynamodb.scan(TableName=SUMMARY, Select="COUNT")["Count"] == 60
+
+
+def test_what_dynamodb_did_not_process_is_sent_again_after_ever_longer_waits(slept):
+    client = FakeDynamoDB(unprocessed=3)
+    tables(client).put_seconds({(TOPIC_OF_CAR, second): {"n": second} for second in range(30)})
+    assert {second: item["n"] for second, item in summary_of(client).items()} == {s: s for s in range(30)}
+    assert len(slept) == 3
+    assert slept == sorted(slept)
+    assert slept[0] < slept[-1]
+
+
+def test_what_dynamodb_never_processes_is_an_error_in_the_time_there_is(slept):
+    client = FakeDynamoDB(unprocessed=10**9)
+    with pytest.raises(TableError, match=r"12 summaries not written after 8 attempts"):
+        tables(client).put_seconds({(TOPIC_OF_CAR, second): {"n": 1} for second in range(20)})
+    # Lambda 2 has 60 s; a call takes a few milliseconds.
+    assert sum(slept) < 10
+
+
+# --- values -----------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("value", "expected"),
+    [
+        (None, {"NULL": True}),
+        (True, {"BOOL": True}),
+        (False, {"BOOL": False}),
+        ("", {"S": ""}),
+        ("1", {"S": "1"}),
+        (0, {"N": "0"}),
+        (2**64 - 1, {"N": "18446744073709551615"}),
+        (-(2**63), {"N": "-9223372036854775808"}),
+        (0.1, {"N": "0.1"}),
+        (1e21, {"N": "1e+21"}),
+        (1e-130, {"N": "1e-130"}),
+        (9.9e-131, {"N": "0"}),
+        (5e-324, {"N": "0"}),
+        (-5e-324, {"N": "0"}),
+        (9.99e125, {"N": "9.99e+125"}),
+        (1e126, {"S": "1e+126"}),
+        (1e300, {"S": "1e+300"}),
+        (-1e300, {"S": "-1e+300"}),
+        (math.inf, {"S": "inf"}),
+        (math.nan, {"S": "nan"}),
+    ],
+)
+def test_a_value_is_the_attribute_that_dynamodb_takes(value, expected):
+    assert attribute(value) == expected
+
+
+values = (
+    st.none()
+    | st.booleans()
+    | st.integers(-(2**63), 2**64 - 1)
+    | st.floats(allow_nan=False, allow_infinity=False)
+    | st.text(max_size=9)
+)
+
+
+@given(values)
+def test_every_value_is_read_back_as_it_was_or_as_near_as_dynamodb_can(value):
+    back = plain({"a": attribute(value)})["a"]
+    if isinstance(value, float) and abs(value) > 9.99e125:
+        assert back == repr(value)
+    elif isinstance(value, float):
+        assert float(back) == value or (back == 0 and abs(value) < 1e-130)
+    else:
+        assert back == value
+        assert isinstance(back, bool) == isinstance(value, bool)

@@ -1,0 +1,186 @@
+"""The page's web server, over loopback: what it serves, what it refuses, and what it never tells."""
+
+from __future__ import annotations
+
+import gzip
+import http.client
+import json
+import socket
+from pathlib import Path
+from typing import Any
+from urllib.parse import urlsplit
+
+import pytest
+
+import contract
+from station.errors import StationError
+from station.page import PageServer, config, field_table
+
+TOLD: dict[str, Any] = {
+    "namespace": "iort",
+    "subscribe_key": "sub-c-1",
+    "origin": "127.0.0.1:9",
+    "tls": False,
+}
+
+
+@pytest.fixture
+def built(tmp_path: Path) -> Path:
+    folder = tmp_path / "web"
+    folder.mkdir()
+    (folder / "index.html").write_text("<!doctype html><title>page</title>")
+    (folder / "page.js").write_text("'use strict'")
+    (folder / "style.css").write_text("body {}")
+    (folder / "page.js.LEGAL.txt").write_text("no type of its own: not served")
+    (tmp_path / "secret.json").write_text("{}")
+    return folder
+
+
+def ask(
+    page: PageServer, path: str, method: str = "GET", headers: dict[str, str] | None = None
+) -> tuple[http.client.HTTPResponse, bytes]:
+    address = urlsplit(page.url)
+    connection = http.client.HTTPConnection(address.hostname or "", address.port, timeout=5)
+    connection.request(method, path, headers=headers or {})
+    answer = connection.getresponse()
+    body = answer.read()
+    connection.close()
+    return answer, body
+
+
+@pytest.mark.parametrize(
+    ("path", "kind"),
+    [
+        ("/", "text/html; charset=utf-8"),
+        ("/index.html?x=1", "text/html; charset=utf-8"),
+        ("/page.js", "text/javascript; charset=utf-8"),
+        ("/style.css", "text/css; charset=utf-8"),
+        ("/config.json", "application/json"),
+        ("/fields.json", "application/json"),
+    ],
+)
+def test_files_come_with_their_type_and_the_policy(built: Path, path: str, kind: str) -> None:
+    with PageServer(**TOLD, built=built) as page:
+        answer, body = ask(page, path)
+        packed, packed_body = ask(page, path, headers={"Accept-Encoding": "gzip, br"})
+        head, no_body = ask(page, path, "HEAD")
+    assert answer.status == 200
+    assert answer.headers["Content-Type"] == kind
+    assert answer.headers["X-Content-Type-Options"] == "nosniff"
+    policy = answer.headers["Content-Security-Policy"]
+    assert "default-src 'none'" in policy
+    assert "connect-src 'self' http://127.0.0.1:9;" in policy
+    assert "unsafe" not in policy
+    assert packed.headers["Content-Encoding"] == "gzip"
+    assert gzip.decompress(packed_body) == body
+    assert head.headers["Content-Length"] == str(len(body))
+    assert no_body == b""
+
+
+@pytest.mark.parametrize(
+    "path",
+    [
+        "/nothing",
+        "/.",
+        "/..",
+        "/../secret.json",
+        "/%2e%2e/secret.json",
+        "//etc/passwd",
+        "/page.js/",
+        "/page.js.LEGAL.txt",
+        "http://elsewhere/page.js",
+    ],
+)
+def test_nothing_else_is_served(built: Path, path: str) -> None:
+    with PageServer(**TOLD, built=built) as page:
+        answer, body = ask(page, path)
+    assert answer.status == 404
+    assert b"<" not in body
+    assert "default-src 'none'" in answer.headers["Content-Security-Policy"]
+
+
+def test_it_takes_no_other_method(built: Path) -> None:
+    with PageServer(**TOLD, built=built) as page:
+        assert ask(page, "/", "POST")[0].status == 501
+
+
+def test_the_page_is_told_where_to_listen_and_nothing_more(built: Path) -> None:
+    vehicles = {"car-1": {"speed_to_erpm_gain": 4614.0}}
+    with PageServer(**TOLD, vehicles=vehicles, built=built) as page:
+        told = json.loads(ask(page, "/config.json")[1])
+    assert told == {**TOLD, "vehicles": vehicles}
+
+
+def test_the_page_reads_the_contracts_fields(built: Path) -> None:
+    with PageServer(**TOLD, built=built) as page:
+        table = json.loads(ask(page, "/fields.json")[1])
+    assert table == field_table()
+    assert table["fields"].keys() == contract.VESC_FIELDS.keys()
+    assert table["fields"]["speed"]["unit"] == "erpm"
+    assert table["faults"]["5"] == contract.FAULTS[5]
+
+
+@pytest.mark.parametrize(
+    ("change", "says"),
+    [
+        ({"namespace": "Iort!"}, "namespace"),
+        ({"subscribe_key": "pub-c-1"}, "no page may see"),
+        ({"subscribe_key": "sec-c-1"}, "no page may see"),
+        ({"subscribe_key": ""}, "subscribe_key"),
+        ({"origin": "evil.example; script-src *"}, "origin"),
+        ({"origin": "https://ps.pndsn.com"}, "origin"),
+        ({"vehicles": {"a/b": {}}}, "robot name"),
+        ({"vehicles": {"car": {"speed_to_erpm_gain": 0.0}}}, "speed_to_erpm_gain"),
+        ({"vehicles": {"car": {"speed_to_erpm_gain": float("nan")}}}, "speed_to_erpm_gain"),
+    ],
+)
+def test_what_no_page_may_be_told_is_refused(change: dict[str, Any], says: str) -> None:
+    with pytest.raises(StationError, match=says):
+        config(**{**TOLD, **change})
+
+
+def test_a_busy_port_says_so(built: Path) -> None:
+    with socket.create_server(("127.0.0.1", 0)) as taken:
+        port = taken.getsockname()[1]
+        with pytest.raises(StationError, match=f"port {port}: the port is in use"):
+            PageServer(**TOLD, port=port, built=built).start()
+
+
+@pytest.mark.parametrize("port", [-1, 70_000])
+def test_a_port_that_is_none_says_so(built: Path, port: int) -> None:
+    with pytest.raises(StationError, match="cannot serve the page"):
+        PageServer(**TOLD, port=port, built=built).start()
+
+
+def test_a_page_that_is_not_built_says_how(tmp_path: Path) -> None:
+    with pytest.raises(StationError, match="npm run build"):
+        PageServer(**TOLD, built=tmp_path)
+
+
+def test_the_port_is_free_again_afterwards(built: Path) -> None:
+    with PageServer(**TOLD, built=built) as page:
+        ask(page, "/")
+        port = page.port
+    with PageServer(**TOLD, built=built, port=port) as page:
+        assert page.port == port
+        assert ask(page, "/")[0].status == 200
+
+
+def test_a_silent_connection_does_not_keep_the_server_from_stopping(built: Path) -> None:
+    page = PageServer(**TOLD, built=built).start()
+    with socket.create_connection(("127.0.0.1", page.port)):
+        page.stop()
+        page.stop()
+
+
+@pytest.mark.skipif(not socket.has_ipv6, reason="this machine has no IPv6")
+def test_it_serves_ipv6(built: Path) -> None:
+    try:
+        page = PageServer(**TOLD, built=built, host="::1").start()
+    except StationError as error:
+        pytest.skip(f"this machine has no IPv6 loopback: {error}")
+    try:
+        assert page.url == f"http://[::1]:{page.port}/"
+        assert ask(page, "/")[0].status == 200
+    finally:
+        page.stop()
