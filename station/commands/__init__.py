@@ -1,0 +1,1 @@
+"""The commands of `iort`, a subject a file; station/cli.py puts them together."""

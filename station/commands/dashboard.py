@@ -1,0 +1,42 @@
+"""`iort dashboard`: the live page."""
+
+from __future__ import annotations
+
+import threading
+from typing import Annotated
+
+import typer
+from rich.console import Console
+
+from contract import ROBOT
+from station import keys, robots
+from station.page import PageServer
+
+commands = typer.Typer()
+_out = Console(highlight=False)
+
+
+@commands.command("dashboard")
+def dashboard(
+    context: typer.Context,
+    port: Annotated[int, typer.Option(help="The page's port; 0 for a free one.")] = 8080,
+    host: Annotated[str, typer.Option(help="The address to listen on.")] = "127.0.0.1",
+) -> None:
+    """Serve the live page until Ctrl-C."""
+    cloud = context.obj.cloud()
+    pubnub_keys = keys.load(cloud)
+    vehicles = {
+        str(row[ROBOT]): {"speed_to_erpm_gain": float(row["speed_to_erpm_gain"])}
+        for row in robots.listed(cloud)
+        if row.get("speed_to_erpm_gain")
+    }
+    with PageServer(
+        namespace=cloud.namespace,
+        subscribe_key=pubnub_keys.subscribe_key,
+        vehicles=vehicles,
+        host=host,
+        port=port,
+        **pubnub_keys.server(),
+    ) as page:
+        _out.print(f"{page.url}  (Ctrl-C stops)")
+        threading.Event().wait()

@@ -1,0 +1,33 @@
+"""Which cloud an `iort` command means, by the options before its name."""
+
+from __future__ import annotations
+
+import os
+import sys
+from dataclasses import dataclass
+from pathlib import Path
+
+from station.cloud import Cloud
+
+# Whoever has set one of these means an AWS account.
+_AWS_NAMED = ("AWS_PROFILE", "AWS_REGION", "AWS_DEFAULT_REGION", "AWS_ACCESS_KEY_ID")
+
+
+@dataclass
+class Where:
+    """The options that name a cloud; a command finds it in ``context.obj``."""
+
+    namespace: str
+    profile: str | None
+    region: str | None
+    local: bool
+    embedded: Path
+
+    def cloud(self) -> Cloud:
+        """The cloud that they name: an embedded one that runs here, unless something says AWS."""
+        said = self.profile or self.region or any(os.environ.get(name) for name in _AWS_NAMED)
+        if self.local or (not said and self.embedded.exists()):
+            if not self.local:
+                print("iort: on the embedded cloud that runs in this checkout", file=sys.stderr)  # noqa: T201
+            return Cloud.load(self.embedded)
+        return Cloud(namespace=self.namespace, profile=self.profile, region=self.region)
