@@ -29,6 +29,9 @@ MAX_MESSAGE_BYTES = 127 * 1024
 MAX_PUBNUB_BYTES = 32 * 1024
 # A live message older than this when Lambda 1 sees it is dropped: the dashboard shows now.
 LIVE_MAX_AGE_MS = 2_000
+# A car says by how much its clock and the cloud's differ only where it knows that well enough to judge
+# by: wrong by a quarter of the age above at most.
+CLOCK_MAX_UNCERTAINTY_MS = 500
 LIVE_MAX_RATE_HZ = 10.0
 
 # Bounds that keep a hostile or broken message from costing more than a good one.
@@ -401,7 +404,9 @@ class LiveSample:
 
     ``seq`` numbers the run's live messages; ``t_us`` is the sample's time, ``sent_us`` the time it
     left the car; ``sample`` maps field to value. Fields stand in an object of their own, so that no
-    ROS field can be taken for one of ours; a rule filters on ``sample.fault_code``.
+    ROS field can be taken for one of ours; a rule filters on ``sample.fault_code``. ``offset_us`` is what
+    to add to the car's clock to have the cloud's, where the car knows it to within
+    `CLOCK_MAX_UNCERTAINTY_MS`.
     """
 
     boot: str
@@ -410,6 +415,7 @@ class LiveSample:
     sent_us: int
     sample: Mapping[str, Value]
     nonfinite: int = 0
+    offset_us: int | None = None
 
 
 def encode_live(live: LiveSample) -> bytes:
@@ -431,6 +437,7 @@ def encode_live(live: LiveSample) -> bytes:
         T_US: _check_time(live.t_us, "sample time"),
         "sent_us": _check_time(live.sent_us, "sent_us"),
         NONFINITE: nonfinite,
+        **_offset_us(live.offset_us),
         "sample": sample,
     }
     return json.dumps(message, separators=(",", ":"), allow_nan=False).encode()
@@ -451,13 +458,17 @@ def decode_live(message: bytes | str | Mapping[str, Any]) -> LiveSample:
             raise ContractError(f"field {name}: the number is not finite")
     t_us = _check_time(_integer(envelope, T_US), "sample time")
     sent_us = _check_time(_integer(envelope, "sent_us"), "sent_us")
-    return LiveSample(boot, seq, t_us, sent_us, sample, nonfinite)
+    offset_us = _integer(envelope, "offset_us") if "offset_us" in envelope else None
+    _offset_us(offset_us)
+    return LiveSample(boot, seq, t_us, sent_us, sample, nonfinite, offset_us)
 
 
 def live_update(
     robot: str, stream: str, live: LiveSample, received_ms: int, lambda_us: int
 ) -> dict[str, Any]:
-    """What Lambda 1 sends to PubNub: the sample and the time of every hop it has passed."""
+    """What Lambda 1 sends to PubNub: the sample, the time of every hop it has passed and, where the car
+    knows it, what to add to the car's times to have the cloud's."""
+    hops = {"sent_us": live.sent_us, RECEIVED_MS: received_ms, "lambda_us": lambda_us}
     return {
         "v": SCHEMA_VERSION,
         ROBOT: robot,
@@ -465,7 +476,7 @@ def live_update(
         "boot": live.boot,
         "seq": live.seq,
         T_US: live.t_us,
-        "hops": {"sent_us": live.sent_us, RECEIVED_MS: received_ms, "lambda_us": lambda_us},
+        "hops": {**hops, **_offset_us(live.offset_us)},
         "sample": dict(live.sample),
     }
 
@@ -682,6 +693,10 @@ def _check_time(t_us: Any, what: str) -> int:
     if type(t_us) is not int or not -_MAX_TIME_US < t_us < _MAX_TIME_US:
         raise ContractError(f"{what} {_show(t_us)}: allowed is whole microseconds since the epoch")
     return t_us
+
+
+def _offset_us(offset_us: Any) -> dict[str, int]:
+    return {} if offset_us is None else {"offset_us": _check_time(offset_us, "offset_us")}
 
 
 def _check_times(times_us: Sequence[int]) -> None:

@@ -62,15 +62,17 @@ class Agent:
         names = {"robot": config.robot, "namespace": config.namespace}
         shared: dict[str, Any] = {**names, "uplink": uplink, "clock": clock, "allowance": allowance}
         self._record = RecordLane(spool=spool, **shared)
-        self._live = LiveLane(boot=self.boot, rate_hz=config.live.rate_hz, **shared)
         self._offset = ClockOffset(clock)
+        self._live = LiveLane(
+            boot=self.boot, rate_hz=config.live.rate_hz, offset_us=self._offset.known_us, **shared
+        )
         ping = config.ping
         self._pings = Pings(
             paths=ping.paths,
             rate_hz=ping.rate_hz,
             padding_bytes=ping.padding_bytes,
             emit=self.record,
-            on_stamp=self._offset.add if config.metrics.enabled else None,
+            on_stamp=self._offset.add,
             **shared,
         )
         self._downlink = make_downlink(

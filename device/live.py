@@ -11,7 +11,7 @@ from __future__ import annotations
 import functools
 import logging
 import threading
-from typing import Mapping, NamedTuple
+from typing import Callable, Mapping, NamedTuple
 
 import contract
 from contract import ContractError, LiveSample, Value
@@ -41,7 +41,8 @@ class _Slot:
 
 
 class LiveLane:
-    """Sends the newest samples. `offer` is called by sources, `tick` now and then."""
+    """Sends the newest samples. `offer` is called by sources, `tick` now and then; ``offset_us`` says by
+    how much the cloud's clock is ahead of this one, if it is known."""
 
     def __init__(
         self,
@@ -53,6 +54,7 @@ class LiveLane:
         uplink: Uplink,
         clock: Clock,
         allowance: Allowance,
+        offset_us: Callable[[], int | None],
     ) -> None:
         self._robot = robot
         self._namespace = namespace
@@ -62,6 +64,7 @@ class LiveLane:
         self._uplink = uplink
         self._clock = clock
         self._allowance = allowance
+        self._offset_us = offset_us
         self._lock = threading.Lock()
         self._slots: dict[str, _Slot] = {}
         self.published = 0
@@ -106,7 +109,14 @@ class LiveLane:
         if slot.writing or slot.newest is None or not self._uplink.connected():
             return
         newest, slot.newest = slot.newest, None
-        sample = LiveSample(self._boot, slot.seq, newest.t_us, self._clock.now_us(), newest.values)
+        sample = LiveSample(
+            boot=self._boot,
+            seq=slot.seq,
+            t_us=newest.t_us,
+            sent_us=self._clock.now_us(),
+            sample=newest.values,
+            offset_us=self._offset_us(),
+        )
         try:
             payload = _encode(sample)
         except ContractError as error:

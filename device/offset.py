@@ -8,16 +8,15 @@ again at once when the wall clock is set.
 from __future__ import annotations
 
 import threading
-from collections import deque
 from typing import NamedTuple
 
+from contract import CLOCK_MAX_UNCERTAINTY_MS
 from device.clock import Clock
 
 # timestamp() in a rule is whole milliseconds, cut off.
 _STAMP_MS = 0.5
 # Two oscillators drift apart by so much: an old narrow estimate becomes worse than a new wide one.
 _DRIFT_MS_PER_S = 0.05
-_KEPT = 100
 
 
 class Offset(NamedTuple):
@@ -32,31 +31,49 @@ class _Seen(NamedTuple):
     cloud_minus_monotonic_ms: float
     half_trip_ms: float
 
+    def uncertainty_ms(self, now: float) -> float:
+        return self.half_trip_ms + _STAMP_MS + (now - self.at) * _DRIFT_MS_PER_S
+
 
 class ClockOffset:
-    """The estimate from the best of the newest round trips. Safe to use from several threads."""
+    """The estimate from the best round trip so far. Safe to use from several threads."""
 
     def __init__(self, clock: Clock) -> None:
         self._clock = clock
         self._lock = threading.Lock()
-        self._seen: deque[_Seen] = deque(maxlen=_KEPT)
+        self._best: _Seen | None = None
 
     def add(self, sent: float, received: float, stamp_ms: int) -> None:
         """Take a round trip: monotonic times of sending and receiving, and the cloud's stamp."""
         half_trip_ms = (received - sent) * 500
-        cloud_ms = stamp_ms + _STAMP_MS
+        seen = _Seen(received, stamp_ms + _STAMP_MS - sent * 1000 - half_trip_ms, half_trip_ms)
         with self._lock:
-            self._seen.append(_Seen(received, cloud_ms - sent * 1000 - half_trip_ms, half_trip_ms))
+            if self._best is None or _replaces(seen, self._best):
+                self._best = seen
 
     def estimate(self) -> Offset | None:
         """The offset now; None before the first round trip."""
-        now = self._clock.monotonic()
-        with self._lock:
-            found = [(s.half_trip_ms + _STAMP_MS + (now - s.at) * _DRIFT_MS_PER_S, s) for s in self._seen]
-        if not found:
+        best = self._best
+        if best is None:
             return None
-        uncertainty_ms, best = min(found)
+        now = self._clock.monotonic()
         wall_minus_monotonic_ms = self._clock.now_us() / 1000 - now * 1000
         return Offset(
-            round(best.cloud_minus_monotonic_ms - wall_minus_monotonic_ms, 3), round(uncertainty_ms, 3)
+            round(best.cloud_minus_monotonic_ms - wall_minus_monotonic_ms, 3),
+            round(best.uncertainty_ms(now), 3),
         )
+
+    def known_us(self) -> int | None:
+        """The offset in microseconds, if it is known well enough to judge by."""
+        found = self.estimate()
+        if found is None or found.uncertainty_ms > CLOCK_MAX_UNCERTAINTY_MS:
+            return None
+        return round(found.offset_ms * 1000)
+
+
+def _replaces(new: _Seen, old: _Seen) -> bool:
+    """Whether it is the narrower one now, or the old one cannot be right any more: a computer that slept
+    stopped its monotonic clock, or the cloud's clock was set."""
+    apart_ms = abs(new.cloud_minus_monotonic_ms - old.cloud_minus_monotonic_ms)
+    new_ms, old_ms = new.uncertainty_ms(new.at), old.uncertainty_ms(new.at)
+    return new_ms <= old_ms or apart_ms > new_ms + old_ms

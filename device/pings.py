@@ -15,9 +15,9 @@ from device.sources import Emit
 from device.uplink import Message, Uplink
 
 TIMEOUT_S = 10.0
-# Without round trips to measure, a ping through a rule now and then still finds the clock's offset.
-CLOCK_EVERY_S = 30.0
-_NOT_YET_S = 1.0
+# Where round trips through a rule are not measured, a ping now and then still finds the clock's offset,
+# and more often until one came back.
+CLOCK_EVERY_S, CLOCK_FIRST_EVERY_S = 30.0, 1.0
 # Percentiles are of the newest so many, so that a run of weeks does not grow.
 _KEPT = 20_000
 
@@ -49,8 +49,8 @@ OnStamp = Callable[[float, float, int], None]
 class Pings:
     """Sends pings, takes pongs, and emits each round trip as a sample of `contract.RTT_STREAM`.
 
-    With ``on_stamp``, a rate of 0 leaves one ping through a rule every `CLOCK_EVERY_S`, which is told
-    to ``on_stamp`` alone."""
+    Every round trip through a rule is told to ``on_stamp``; where none is measured, one every
+    `CLOCK_EVERY_S` is made for that alone."""
 
     def __init__(
         self,
@@ -64,7 +64,7 @@ class Pings:
         clock: Clock,
         allowance: Allowance,
         emit: Emit,
-        on_stamp: OnStamp | None = None,
+        on_stamp: OnStamp,
     ) -> None:
         self._rate_hz = rate_hz
         self._changed = threading.Event()
@@ -78,7 +78,8 @@ class Pings:
         self._next_id = 0
         self._paths: dict[str, _Path] = {}
         self._names = list(paths)
-        for name in [*paths, *([contract.RULE] if on_stamp and contract.RULE not in paths else [])]:
+        self._clock_every_s, self._clock_due = CLOCK_FIRST_EVERY_S, clock.monotonic()
+        for name in dict.fromkeys([*paths, contract.RULE]):
             ping = contract.build_topic(PING, robot, name, namespace)
             # Over the broker alone the ping itself comes back; the cloud answers on a topic of its own.
             lane = PING if name == contract.BROKER else PONG
@@ -98,10 +99,7 @@ class Pings:
                 self.send(self._names[turn % len(self._names)])
                 turn += 1
             if not rate_hz:
-                wait_s = None
-                if self._on_stamp is not None:
-                    wait_s = CLOCK_EVERY_S if self.send(contract.RULE) else _NOT_YET_S
-                self._clock.wait(self._changed, wait_s)
+                self._clock.wait(self._changed, None)
 
     def set_rate(self, rate_hz: float) -> None:
         """Another rate, from the next ping on."""
@@ -128,8 +126,12 @@ class Pings:
         return True
 
     def tick(self) -> None:
-        """Count as lost what has not come back in time."""
-        self._expire(self._clock.monotonic() - TIMEOUT_S)
+        """Count as lost what has not come back in time, and send what finds the clock's offset."""
+        now = self._clock.monotonic()
+        self._expire(now - TIMEOUT_S)
+        measured = self._rate_hz and contract.RULE in self._names
+        if not measured and now >= self._clock_due and self.send(contract.RULE):
+            self._clock_due = now + self._clock_every_s
 
     def close(self, timeout_s: float) -> None:
         """Wait a little for the last answers, then count as lost what is still out."""
@@ -167,7 +169,8 @@ class Pings:
             path.received += 1
             path.rtts_ms.append(rtt_ms)
             self._lock.notify_all()
-        if name == contract.RULE and self._on_stamp is not None and pong.received_ms is not None:
+        if name == contract.RULE and pong.received_ms is not None:
+            self._clock_every_s = CLOCK_EVERY_S
             self._on_stamp(sent, message.at, pong.received_ms)
         if not self._rate_hz or name not in self._names:
             return

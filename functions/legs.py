@@ -22,9 +22,10 @@ class Legs:
     """Compares each message with the fastest of its run in the last 15 to 30 s.
 
     The difference of the car's clock and the cloud's is in both, and falls out. What it cannot see is
-    a delay that all messages of half a minute have in common, and the first message of a run. When a
-    car's clock is set back, its messages look late until the window has passed. One environment of the
-    function keeps one, of the newest thousand runs.
+    a delay that all messages of half a minute have in common, and the first message of a run, also in an
+    environment of the function that has just started: it serves the messages of cars that do not know
+    their clock's offset (`contract.LiveSample`). When a car's clock is set back, its messages look late
+    until the window has passed. One environment keeps one, of the newest thousand runs.
     """
 
     def __init__(self) -> None:

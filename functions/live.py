@@ -7,7 +7,7 @@ import logging
 import os
 import time
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cache
 from typing import Any
 
@@ -45,14 +45,18 @@ class LiveSettings:
         return cls({stream: frozenset(fields) for stream, fields in named.items()})
 
 
-def age_ms(live: LiveSample, received_ms: int, now_us: int, excess_us: int = 0) -> float:
-    """How old the sample is: its time in the car and its time in the cloud, each by its own clock, and
-    by how much the leg between was slower than it usually is (`functions.legs`).
+def age_ms(live: LiveSample, received_ms: int, now_us: int, legs: Legs) -> float:
+    """How old the sample is, whatever the car's clock says.
 
-    A car's clock may be off by more than any of them, so it is never compared with the cloud's.
+    A car that has measured how far the cloud's clock is from its own says so in the message: then the
+    whole way is on one clock. Of any other the age is its time in the car and its time in the cloud, each
+    by its own clock, and by how much the leg between was slower than it usually is.
     """
+    if live.offset_us is not None:
+        return (now_us - live.t_us - live.offset_us) / 1000
     in_car_us = live.sent_us - live.t_us
     in_cloud_us = now_us - received_ms * 1000
+    excess_us = legs.excess_us(live.boot, live.sent_us, received_ms)
     return (in_car_us + excess_us + in_cloud_us) / 1000
 
 
@@ -68,14 +72,13 @@ def process(
         _log.warning("refused a live message: %s: %.500r", error, event)
         emit("live", LiveRefused=1)
         return
-    excess_us = legs.excess_us(live.boot, live.sent_us, received_ms)
-    if age_ms(live, received_ms, now_us, excess_us) > LIVE_MAX_AGE_MS:
+    if age_ms(live, received_ms, now_us, legs) > LIVE_MAX_AGE_MS:
         emit("live", LiveStale=1)
         return
     chosen = settings.fields.get(topic.name)
     if chosen is not None:
         picked = {name: value for name, value in live.sample.items() if name in chosen}
-        live = LiveSample(live.boot, live.seq, live.t_us, live.sent_us, picked, live.nonfinite)
+        live = replace(live, sample=picked)
     update = live_update(topic.robot, topic.name, live, received_ms, now_us)
     try:
         publish(channel(topic.robot, topic.namespace), update)
@@ -83,7 +86,8 @@ def process(
         _log.warning("not published for %s: %s", topic.robot, error)
         emit("live", PubNubFailed=1)
         return
-    emit("live", LivePublished=1, CarToLambdaMs=max(0.0, (now_us - live.sent_us) / 1000))
+    took_us = now_us - live.sent_us - (live.offset_us or 0)
+    emit("live", LivePublished=1, CarToLambdaMs=max(0.0, took_us / 1000))
 
 
 @cache

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import threading
 import time
+from collections.abc import Mapping
 from types import TracebackType
 from typing import Any, NamedTuple
 
@@ -13,20 +14,23 @@ from pubnub.pnconfiguration import PNConfiguration
 from pubnub.pubnub import PubNub
 from typing_extensions import Self
 
-from contract import DEFAULT_NAMESPACE, ROBOT, channel
+from contract import DEFAULT_NAMESPACE, ROBOT, T_US, channel
 from station.errors import StationError
 
 _CONNECT_S = 15.0
 
 
 class Heard(NamedTuple):
-    """One update: whose, which, and how long it took from leaving the car to being here."""
+    """One update: whose, which, how long it took from leaving the car to being here, its sample's time
+    (microseconds) and the hops' (`contract.live_update`)."""
 
     robot: str
     stream: str
     boot: str
     seq: int
     delay_ms: float
+    t_us: int
+    hops: Mapping[str, int]
 
 
 class Listener:
@@ -90,7 +94,15 @@ class _Callback(SubscribeCallback):  # type: ignore[misc]  # the SDK's base clas
     def message(self, _pubnub: Any, message: Any) -> None:
         now_us = time.time_ns() // 1000
         update = message.message
-        sent_us = update["hops"]["sent_us"]
+        hops = update["hops"]
         self.heard.append(
-            Heard(update[ROBOT], update["stream"], update["boot"], update["seq"], (now_us - sent_us) / 1000)
+            Heard(
+                robot=update[ROBOT],
+                stream=update["stream"],
+                boot=update["boot"],
+                seq=update["seq"],
+                delay_ms=(now_us - hops["sent_us"]) / 1000,
+                t_us=update[T_US],
+                hops=hops,
+            )
         )

@@ -48,7 +48,7 @@ def run_agent(bundle: robots.Bundle, *, timeout_s: float = 120) -> dict[str, Any
     return written
 
 
-def until(condition: Callable[[], Any], *, seconds: float = 20.0) -> Any:
+def until(condition: Callable[[], Any], *, seconds: float = 60.0) -> Any:
     """The condition's first true value; the tables tell nobody when they change."""
     deadline = time.monotonic() + seconds
     while not (value := condition()):

@@ -80,6 +80,10 @@ class Agent:
         answer: dict[str, Any] = json.loads(done.stdout) if done.returncode == 0 else {}
         return answer
 
+    def stop(self) -> None:
+        """Ask it to end in good order, as Ctrl-C and systemd do."""
+        self.process.terminate()
+
     def kill(self) -> None:
         """End it as `kill -9` does."""
         self.process.kill()

@@ -55,7 +55,7 @@ def batches(draw, kinds=values):
 
 
 samples = st.dictionaries(names, values, max_size=8)
-lives = st.builds(LiveSample, boots, seqs, times, times, samples, st.integers(0, 1000))
+lives = st.builds(LiveSample, boots, seqs, times, times, samples, st.integers(0, 1000), st.none() | times)
 
 
 def same(one, other):
@@ -291,6 +291,8 @@ def test_value_refused(value, named):
         ({"t_us": 2**53}, "sample time"),
         ({"t_us": 1.5}, "sample time"),
         ({"sent_us": True}, "sent_us"),
+        ({"offset_us": 0.5}, "offset_us"),
+        ({"offset_us": 2**53}, "offset_us"),
         ({"sample": {f"f{i}": 0 for i in range(513)}}, "513 fields"),
         ({"sample": {"a b": 1}}, "field name"),
         ({"sample": {"speed": math.nan}, "nonfinite": MOST_NONFINITE}, "nonfinite"),
@@ -906,7 +908,10 @@ def test_field(field):
 def test_live_update_carries_every_hop():
     live = LiveSample(BOOT, 9, 1_000, 2_000, {"speed": 1})
     update = contract.live_update("car", "vesc", live, 3, 4_000)
-    assert update["hops"] == {"sent_us": 2_000, "received_ms": 3, "lambda_us": 4_000}
+    hops = {"sent_us": 2_000, "received_ms": 3, "lambda_us": 4_000}
+    assert update["hops"] == hops
+    known = contract.live_update("car", "vesc", replace(live, offset_us=-5), 3, 4_000)
+    assert known["hops"] == {**hops, "offset_us": -5}
     assert (update["robot"], update["stream"], update["t"], update["seq"]) == ("car", "vesc", 1_000, 9)
     assert update["sample"] == {"speed": 1}
     full = dict.fromkeys(contract.VESC_FIELDS, -1234.56789)

@@ -18,6 +18,7 @@ class Rig:
         self.dispatcher = Dispatcher()
         self.uplink = Loopback(self.clock, self.dispatcher)
         self.deaf = deaf
+        self.offset_us: int | None = None
         if connected:
             self.uplink.connect()
         self.lane = LiveLane(
@@ -28,6 +29,7 @@ class Rig:
             uplink=self.uplink,
             clock=self.clock,
             allowance=Allowance(self.clock),
+            offset_us=lambda: self.offset_us,
         )
 
     def offer(self, speed: float, stream: str = "vesc") -> None:
@@ -174,3 +176,12 @@ def test_the_rate_and_the_lane_itself_can_be_changed() -> None:
         rig.offer(i)
         rig.tick()
     assert len(rig.sent()) <= count + 1, "what was offered before"
+
+
+def test_a_message_says_how_far_the_cloud_s_clock_is_where_that_is_known() -> None:
+    rig = Rig()
+    rig.offer(1)
+    rig.offset_us = -3_600_000_000
+    rig.clock.advance(1)
+    rig.offer(2)
+    assert [live.offset_us for live in rig.sent()] == [None, -3_600_000_000]

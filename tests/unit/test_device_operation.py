@@ -109,6 +109,38 @@ def test_the_shortest_round_trip_counts_until_it_is_old() -> None:
     assert aged.uncertainty_ms == pytest.approx(4.5, abs=0.02), "the clocks may have drifted by 3 ms"
 
 
+def test_an_offset_not_known_well_enough_is_not_judged_by() -> None:
+    clock = ManualClock()
+    offset = ClockOffset(clock)
+    assert offset.known_us() is None
+    for trip_s, known in ((1.5, False), (0.9, True), (8, True)):
+        sent = clock.monotonic()
+        stamp_ms = clock.now_us() // 1000 + 60_000
+        clock.advance(trip_s)
+        offset.add(sent, clock.monotonic(), stamp_ms)
+        assert (offset.known_us() is not None) == known
+    known_us = offset.known_us()
+    assert known_us is not None
+    assert abs(known_us - 60_000_000) <= contract.CLOCK_MAX_UNCERTAINTY_MS * 1000
+    clock.advance(86_400)
+    assert offset.known_us() is None, "two oscillators drift apart"
+
+
+def test_a_round_trip_that_excludes_the_best_one_replaces_it() -> None:
+    """A computer that slept stopped its monotonic clock, and its wall clock went on."""
+    clock = ManualClock()
+    offset = ClockOffset(clock)
+    slept_us = 0
+    for trip_s in (0.002, 0.3):
+        sent = clock.monotonic()
+        clock.advance(trip_s)
+        offset.add(sent, clock.monotonic(), (clock.now_us() + slept_us) // 1000)
+        slept_us += 600_000_000
+    found = offset.estimate()
+    assert found is not None
+    assert found.offset_ms == pytest.approx(600_000, abs=found.uncertainty_ms)
+
+
 def test_a_sample_of_the_agent_has_the_contracts_fields() -> None:
     clock = ManualClock()
     spool, uplink = MemorySpool(max_bytes=1000), Loopback(clock, Dispatcher())

@@ -15,27 +15,35 @@ from device.allowance import Allowance
 from device.clock import ManualClock
 from device.dispatch import Dispatcher
 from device.loopback import Loopback
-from device.pings import CLOCK_EVERY_S, TIMEOUT_S, Pings, percentile
+from device.pings import CLOCK_EVERY_S, CLOCK_FIRST_EVERY_S, TIMEOUT_S, Pings, percentile
 
 T0 = 1_700_000_000_000_000
 
 
 class Rig:
-    def __init__(self, *, rate_hz: float = 1, padding_bytes: int = 0) -> None:
+    def __init__(
+        self,
+        *,
+        rate_hz: float = 1,
+        padding_bytes: int = 0,
+        paths: tuple[str, ...] = contract.PING_PATHS,
+    ) -> None:
         self.clock = ManualClock(now_us=T0)
         self.dispatcher = Dispatcher()
         self.uplink = Loopback(self.clock, self.dispatcher)
         self.samples: list[tuple[str, int, Any]] = []
+        self.stamps: list[tuple[float, float, int]] = []
         self.pings = Pings(
             robot="car1",
             namespace="iort",
-            paths=contract.PING_PATHS,
+            paths=paths,
             rate_hz=rate_hz,
             padding_bytes=padding_bytes,
             uplink=self.uplink,
             clock=self.clock,
             allowance=Allowance(self.clock),
             emit=lambda stream, t_us, values: self.samples.append((stream, t_us, values)),
+            on_stamp=lambda *stamp: self.stamps.append(stamp),
         )
         self.uplink.connect()
 
@@ -138,24 +146,41 @@ def test_percentile_is_a_value_with_that_share_below(values: list[float], percen
     assert sum(v < found for v in values) < len(values) * percent / 100
 
 
-def test_without_round_trips_a_ping_now_and_then_finds_the_clocks_offset() -> None:
-    rig = Rig(rate_hz=0)
-    stamps: list[tuple[float, float, int]] = []
-    rig.pings._on_stamp = lambda *stamp: stamps.append(stamp)
-    stop, times = threading.Event(), []
+@pytest.mark.parametrize(
+    ("rate_hz", "paths"), [(0, contract.PING_PATHS), (0, ("broker",)), (5, ("broker", "lambda"))]
+)
+def test_where_no_trip_through_a_rule_is_measured_a_ping_now_and_then_finds_the_clocks_offset(
+    rate_hz: float, paths: tuple[str, ...]
+) -> None:
+    rig = Rig(rate_hz=rate_hz, paths=paths)
+    start, times = rig.clock.monotonic(), []
+    rig.uplink.cut()
+    for step in range(800):
+        if step == 40:
+            rig.uplink.connect()
+        sent = len(rig.uplink.published)
+        rig.pings.tick()
+        if len(rig.uplink.published) > sent:
+            assert rig.uplink.published[-1].topic == "ping/iort/car1/rule"
+            times.append(round(rig.clock.monotonic() - start, 3))
+            if len(times) == 3:
+                rig.answer("rule")
+        rig.clock.advance(0.125)
+    # As soon as there is a connection, often until one was answered, then seldom.
+    first = [5 + i * CLOCK_FIRST_EVERY_S for i in range(4)]
+    assert times == [*first, *(first[-1] + i * CLOCK_EVERY_S for i in (1, 2, 3))]
+    assert rig.stamps == [(start + times[2], start + times[2], 5)]
+    assert rig.samples == [], "it is no measurement of round trips"
 
-    def verdict(message: Any) -> None:
-        assert message.topic == "ping/iort/car1/rule"
-        times.append(rig.clock.monotonic())
-        if len(times) == 3:
-            stop.set()
 
-    rig.uplink.verdict = verdict
-    rig.pings.run(stop)
-    assert [times[i + 1] - times[i] for i in range(len(times) - 1)] == [CLOCK_EVERY_S] * 2
+def test_measured_trips_through_a_rule_are_told_too_and_need_no_other() -> None:
+    rig = Rig()
+    rig.pings.send("rule")
+    rig.clock.advance(0.5)
     rig.answer("rule")
-    assert stamps == [(times[-1], rig.clock.monotonic(), 5)]
-    assert rig.samples == [], "it measures no round trips"
+    assert [stamp_ms for _, _, stamp_ms in rig.stamps] == [5]
+    rig.pings.tick()
+    assert len(rig.uplink.published) == 1
 
 
 def test_the_rate_can_be_changed_while_it_runs() -> None:

@@ -129,7 +129,8 @@ def test_stale_by_its_time_in_the_car_and_in_the_cloud(
     now_us = RECEIVED * 1000 + round(in_cloud_ms * 1000)
     channels = Channels()
     process(event(t=t_us, sent_us=sent_us), SETTINGS, channels, Legs(), now_us)
-    assert age_ms(LiveSample("0123abcd", 0, t_us, sent_us, {}), RECEIVED, now_us) == in_car_ms + in_cloud_ms
+    age = age_ms(LiveSample("0123abcd", 0, t_us, sent_us, {}), RECEIVED, now_us, Legs())
+    assert age == in_car_ms + in_cloud_ms
     assert len(channels.sent) == (not stale)
     totals = counted()
     assert totals.get("LiveStale", 0) == stale
@@ -158,6 +159,8 @@ MALFORMED = [
     {**event(), "sample": {"speed": math.nan}},
     {**event(), "t": 1e300},
     {**event(), "sent_us": "now"},
+    {**event(), "offset_us": "0"},
+    {**event(), "offset_us": None},
     {**event(), RECEIVED_MS: None},
     {**event(), RECEIVED_MS: "soon"},
     {**event(), RECEIVED_MS: math.inf},
@@ -302,6 +305,26 @@ def test_messages_that_a_stall_held_up_are_stale_whatever_the_cars_clock(capsys,
         late(start_us + i * 100_000 + offset_us, (start_us + 80 * 100_000) // 1000 + 30, legs, channels)
     assert len(channels.sent) == 20 + 20
     assert capsys.readouterr().out.count('LiveStale":1') == 40
+
+
+@pytest.mark.parametrize("clock_error_us", [0, 86_400_000_000, -86_400_000_000])
+@pytest.mark.parametrize(
+    ("leg_ms", "stale"), [(0, False), (LIVE_MAX_AGE_MS, False), (LIVE_MAX_AGE_MS + 1, True), (60_000, True)]
+)
+def test_a_car_that_knows_its_clocks_offset_is_judged_by_it_in_an_environment_without_history(
+    leg_ms, stale, clock_error_us, counted
+):
+    received_ms = SENT_US // 1000 + leg_ms
+    sent_us = SENT_US + clock_error_us
+    message = event(t=sent_us, sent_us=sent_us, offset_us=-clock_error_us)
+    channels = Channels()
+    process({**message, RECEIVED_MS: received_ms}, SETTINGS, channels, Legs(), received_ms * 1000)
+    assert len(channels.sent) == (not stale)
+    totals = counted()
+    assert (totals.get("LiveStale", 0), totals.get("LivePublished", 0)) == (stale, not stale)
+    if not stale:
+        assert totals.get("CarToLambdaMs", 0) == leg_ms
+        assert channels.sent[0][1]["hops"]["offset_us"] == -clock_error_us
 
 
 def test_clock_set_back_is_believed_after_the_window():
