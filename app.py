@@ -31,7 +31,7 @@ def build(app: App, settings: Settings) -> None:
         return {"construct_id": f"{name}-{noun}", "synthesizer": synthesizer}
 
     Fleet(app, **stack("fleet"), namespace=name)
-    storage = Storage(app, **stack("storage"))
+    storage = Storage(app, **stack("storage"), settings=settings)
     processing = Processing(app, **stack("processing"), settings=settings, storage=storage)
     ingest = Ingest(app, **stack("ingest"), settings=settings, storage=storage, processing=processing)
     Monitoring(

@@ -149,6 +149,9 @@ STATS = ("min", "mean", "max", "last")
 SAMPLES, BATCHES, MISSING_BATCHES = "n", "batches", "missing_batches"
 GAPS, NONFINITE = "gaps", "nonfinite"
 
+# The files' bucket: what robots upload, and query results too large for an answer, kept for a day.
+FILES_PREFIX, RESULTS_PREFIX = "robots/", "results/"
+
 METRIC_NAMESPACE = "iort"
 METRICS = {
     "live": ("LivePublished", "LiveStale", "LiveRefused", "PubNubFailed", "CarToLambdaMs"),

@@ -23,14 +23,16 @@ class Settings:
     """What may differ between two deployments of the same stacks.
 
     ``namespace`` prefixes topics, rules and stacks; ``retention_days`` is how long telemetry and
-    summaries are kept; ``live_concurrency`` bounds Lambda 1 (0 reserves nothing, for accounts whose
-    concurrency limit is too low to reserve from); ``live_fields`` maps stream to the fields that go
-    to the dashboard; ``layer`` is the folder of Lambda 1's third-party code; ``embedded`` is true for
-    the embedded cloud, which is deployed with the caller's own credentials.
+    summaries are kept; ``files_days`` is how long uploaded files are (0: for good);
+    ``live_concurrency`` bounds Lambda 1 (0 reserves nothing, for accounts whose concurrency limit is
+    too low to reserve from); ``live_fields`` maps stream to the fields that go to the dashboard;
+    ``layer`` is the folder of Lambda 1's third-party code; ``embedded`` is true for the embedded
+    cloud, which is deployed with the caller's own credentials.
     """
 
     namespace: str = DEFAULT_NAMESPACE
     retention_days: int = 90
+    files_days: int = 0
     live_concurrency: int = 5
     live_fields: Mapping[str, list[str]] = field(default_factory=lambda: {VESC_STREAM: list(VESC_FIELDS)})
     layer: Path = ROOT / "build" / "layer" / "lambda"
@@ -45,7 +47,8 @@ class Settings:
                 given["namespace"] = check_namespace(namespace)
             except ContractError as error:
                 raise SettingsError(f"context {error}") from error
-        for key, low, high in (("retention_days", 1, 3650), ("live_concurrency", 0, 1000)):
+        whole = (("retention_days", 1, 3650), ("files_days", 0, 3650), ("live_concurrency", 0, 1000))
+        for key, low, high in whole:
             if (value := app.node.try_get_context(key)) is not None:
                 given[key] = _integer(key, value, low, high)
         if (layer := app.node.try_get_context("layer")) is not None:

@@ -1,20 +1,27 @@
-"""What is kept: the telemetry, summary and robots tables."""
+"""What is kept: the telemetry, summary and robots tables, and the files' bucket."""
 
 from __future__ import annotations
 
 from typing import Any
 
-from aws_cdk import CfnOutput, RemovalPolicy, Stack
+from aws_cdk import CfnOutput, Duration, RemovalPolicy, Stack
 from aws_cdk import aws_dynamodb as dynamodb
+from aws_cdk import aws_s3 as s3
 from constructs import Construct
 
-from contract import EXPIRES_S, ROBOT, SECOND, T_US, TOPIC
+from contract import EXPIRES_S, FILES_PREFIX, RESULTS_PREFIX, ROBOT, SECOND, T_US, TOPIC
+from stacks.settings import Settings
+
+# Half the price to keep, a cent a gigabyte to read; S3 allows it from this day on, and leaves objects
+# below 128 KB, for which it would cost more, where they are.
+_RARE_AFTER_DAYS = 30
 
 
 class Storage(Stack):
-    """Three tables, paid by request. Every topic is a time series: partition key topic, sort key time."""
+    """Three tables, paid by request, and a bucket. Every topic is a time series: partition key topic,
+    sort key time."""
 
-    def __init__(self, scope: Construct, construct_id: str, **kwargs: Any) -> None:
+    def __init__(self, scope: Construct, construct_id: str, *, settings: Settings, **kwargs: Any) -> None:
         super().__init__(scope, construct_id, **kwargs)
         self.telemetry = self._table(
             "Telemetry",
@@ -25,6 +32,7 @@ class Storage(Stack):
         )
         self.summary = self._table("Summary", partition=TOPIC, sort=SECOND, expires=True)
         self.robots = self._table("Robots", partition=ROBOT)
+        self.files = self._files(settings)
 
     def _table(
         self,
@@ -48,3 +56,35 @@ class Storage(Stack):
         )
         CfnOutput(self, f"{name}Table", value=table.table_name)
         return table
+
+    def _files(self, settings: Settings) -> s3.Bucket:
+        """What is too large for a message. Not versioned: a key is written once and names its content,
+        and nothing of ours may delete, so that a second version can only be what somebody threw away."""
+        rules = [
+            s3.LifecycleRule(id="abandoned", abort_incomplete_multipart_upload_after=Duration.days(7)),
+            s3.LifecycleRule(id="results", prefix=RESULTS_PREFIX, expiration=Duration.days(1)),
+        ]
+        days = settings.files_days
+        if not 0 < days <= _RARE_AFTER_DAYS:
+            rare = s3.Transition(
+                storage_class=s3.StorageClass.INFREQUENT_ACCESS,
+                transition_after=Duration.days(_RARE_AFTER_DAYS),
+            )
+            rules.append(s3.LifecycleRule(id="rare", prefix=FILES_PREFIX, transitions=[rare]))
+        if days:
+            rules.append(s3.LifecycleRule(id="old", prefix=FILES_PREFIX, expiration=Duration.days(days)))
+        bucket = s3.Bucket(
+            self,
+            "Files",
+            encryption=s3.BucketEncryption.S3_MANAGED,
+            block_public_access=s3.BlockPublicAccess.BLOCK_ALL,
+            object_ownership=s3.ObjectOwnership.BUCKET_OWNER_ENFORCED,
+            enforce_ssl=True,
+            minimum_tls_version=1.2,
+            lifecycle_rules=rules,
+            # CloudFormation deletes an empty bucket only; `iort files empty` comes before, because the
+            # CDK's own way is a function that may delete every object, deployed for good.
+            removal_policy=RemovalPolicy.DESTROY,
+        )
+        CfnOutput(self, "FilesBucket", value=bucket.bucket_name)
+        return bucket

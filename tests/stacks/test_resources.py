@@ -161,3 +161,49 @@ def test_two_stages_share_an_account(tmp_path_factory, synthesized):
     assert not any(word in text for word in ("iort/", "/iort", "iort_", "iort-", "iort."))
     assert f"+ {7 * 86_400} AS expires_s" in text
     assert "ReservedConcurrentExecutions" not in text
+
+
+# --- files ------------------------------------------------------------------------------------------
+
+
+def test_the_files_bucket_is_private_encrypted_and_cleans_up_after_itself(synthesized, reader):
+    (bucket,) = synthesized.resources("AWS::S3::Bucket").values()
+    assert set(bucket["PublicAccessBlockConfiguration"].values()) == {True}
+    assert len(bucket["PublicAccessBlockConfiguration"]) == 4
+    (encryption,) = bucket["BucketEncryption"]["ServerSideEncryptionConfiguration"]
+    assert encryption["ServerSideEncryptionByDefault"]["SSEAlgorithm"] == "AES256"
+    (ownership,) = bucket["OwnershipControls"]["Rules"]
+    assert ownership["ObjectOwnership"] == "BucketOwnerEnforced"
+    rules = {rule["Id"]: rule for rule in bucket["LifecycleConfiguration"]["Rules"]}
+    assert rules.keys() == {"abandoned", "results", "rare"}
+    assert rules["abandoned"]["AbortIncompleteMultipartUpload"] == {"DaysAfterInitiation": 7}
+    assert "Prefix" not in rules["abandoned"]
+    assert (rules["results"]["Prefix"], rules["results"]["ExpirationInDays"]) == (contract.RESULTS_PREFIX, 1)
+    # Without a setting, what robots have uploaded is kept for good.
+    assert rules["rare"]["Prefix"] == contract.FILES_PREFIX
+    assert "ExpirationInDays" not in rules["rare"]
+    (policy,) = synthesized.resources("AWS::S3::BucketPolicy").values()
+    statements = policy["PolicyDocument"]["Statement"]
+    assert {statement["Effect"] for statement in statements} == {"Deny"}
+    conditions = [statement["Condition"] for statement in statements]
+    assert {"Bool": {"aws:SecureTransport": "false"}} in conditions
+    assert {"NumericLessThan": {"s3:TlsVersion": 1.2}} in conditions
+    for statement in statements:
+        assert set(reader.texts(statement["Resource"])) == {"Files.Arn", "Files.Arn/*"}
+
+
+@pytest.mark.parametrize(
+    ("days", "kept"), [(7, {"old": 7}), (30, {"old": 30}), (365, {"rare": None, "old": 365})]
+)
+def test_files_expire_when_the_setting_says_so(tmp_path, days, kept):
+    from aws_cdk import App
+
+    from stacks.settings import Settings
+    from stacks.storage import Storage
+
+    app = App(outdir=str(tmp_path))
+    Storage(app, "storage", settings=Settings(files_days=days))
+    (template,) = [stack.template for stack in app.synth().stacks]
+    (bucket,) = [r["Properties"] for r in template["Resources"].values() if r["Type"] == "AWS::S3::Bucket"]
+    rules = bucket["LifecycleConfiguration"]["Rules"]
+    assert {r["Id"]: r.get("ExpirationInDays") for r in rules if r["Id"] in {"rare", "old"}} == kept
