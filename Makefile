@@ -4,7 +4,7 @@ BIN := .venv/bin
 # cdk.json runs `python app.py`.
 bootstrap deploy destroy: export PATH := $(CURDIR)/$(BIN):$(PATH)
 
-.PHONY: help demo test check setup bench-agent layer bootstrap deploy destroy lock clean
+.PHONY: help demo test check setup bench-agent bench-fleet layer bootstrap deploy destroy lock clean
 
 help: ## show this
 	@grep -hE '^[a-z-]+:.*## ' Makefile | sed -E 's/^([a-z-]+):.*## /\1\t/' | expand -t 14
@@ -24,6 +24,10 @@ check: setup ## run the linters and the type checkers
 
 bench-agent: setup ## measure the agent on a real ROS 1 graph: DURATION=30 SOAK=600 REPORT=figures.json
 	@$(BIN)/python -m bench.agent $(if $(DURATION),--seconds $(DURATION)) $(if $(SOAK),--soak $(SOAK)) \
+		$(if $(REPORT),--json "$(REPORT)")
+
+bench-fleet: setup ## measure many robots on the embedded cloud: ROBOTS="10 200" SECONDS=300 REPORT=figures.json
+	@$(BIN)/python -m bench.fleet $(if $(ROBOTS),--robots $(ROBOTS)) $(if $(SECONDS),--seconds $(SECONDS)) \
 		$(if $(REPORT),--json "$(REPORT)")
 
 layer: ## build Lambda 1's layer for AWS
