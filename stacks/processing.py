@@ -5,23 +5,17 @@ from __future__ import annotations
 import json
 from typing import Any
 
-from aws_cdk import CfnOutput, Duration, IgnoreMode, RemovalPolicy, Stack
+from aws_cdk import Duration, Stack
 from aws_cdk import aws_iam as iam
 from aws_cdk import aws_lambda as lambda_
 from aws_cdk import aws_lambda_event_sources as sources
-from aws_cdk import aws_logs as logs
 from aws_cdk import aws_sqs as sqs
 from constructs import Construct
 
 from contract import LAMBDA, PONG, pubnub_parameter
-from stacks.settings import ROOT, Settings
+from stacks.function import RUNTIME, function
+from stacks.settings import Settings
 from stacks.storage import Storage
-
-RUNTIME = lambda_.Runtime.PYTHON_3_13
-# The emulator runs the functions on the machine it stands on, so the architecture means nothing there.
-ARCHITECTURE = lambda_.Architecture.ARM_64
-# Exactly what a function imports; see the wiring tests.
-CODE_EXCLUDES = ["/*", "!/contract.py", "!/functions", "__pycache__", ".mypy_cache", ".ruff_cache"]
 
 
 class Processing(Stack):
@@ -31,7 +25,6 @@ class Processing(Stack):
         self, scope: Construct, construct_id: str, *, settings: Settings, storage: Storage, **kwargs: Any
     ) -> None:
         super().__init__(scope, construct_id, **kwargs)
-        self._code = lambda_.Code.from_asset(str(ROOT), exclude=CODE_EXCLUDES, ignore_mode=IgnoreMode.GIT)
         self.undecodable = sqs.Queue(
             self,
             "Undecodable",
@@ -46,7 +39,8 @@ class Processing(Stack):
 
     def _live(self, settings: Settings) -> lambda_.Function:
         name = pubnub_parameter(settings.namespace)
-        live = self._function(
+        live = function(
+            self,
             "Live",
             module="live",
             memory_mb=256,
@@ -74,7 +68,8 @@ class Processing(Stack):
         return live
 
     def _summarize(self, storage: Storage) -> lambda_.Function:
-        summarize = self._function(
+        summarize = function(
+            self,
             "Summarize",
             module="summarize",
             memory_mb=512,
@@ -108,7 +103,7 @@ class Processing(Stack):
         return summarize
 
     def _echo(self, settings: Settings) -> lambda_.Function:
-        echo = self._function("Echo", module="echo", memory_mb=256)
+        echo = function(self, "Echo", module="echo", memory_mb=256)
         echo.configure_async_invoke(max_event_age=Duration.minutes(1), retry_attempts=0)
         topic = f"{PONG}/{settings.namespace}/*/{LAMBDA}"
         echo.add_to_role_policy(
@@ -118,41 +113,3 @@ class Processing(Stack):
             )
         )
         return echo
-
-    def _function(
-        self,
-        name: str,
-        *,
-        module: str,
-        memory_mb: int,
-        timeout_s: int = 10,
-        environment: dict[str, str] | None = None,
-        layers: list[lambda_.ILayerVersion] | None = None,
-        reserved_concurrency: int = 0,
-    ) -> lambda_.Function:
-        log = logs.LogGroup(
-            self,
-            f"{name}Log",
-            retention=logs.RetentionDays.ONE_MONTH,
-            removal_policy=RemovalPolicy.DESTROY,
-        )
-        # A role of its own instead of AWSLambdaBasicExecutionRole, which may write to every log.
-        role = iam.Role(self, f"{name}Role", assumed_by=iam.ServicePrincipal("lambda.amazonaws.com"))
-        log.grant_write(role)
-        function = lambda_.Function(
-            self,
-            name,
-            runtime=RUNTIME,
-            architecture=ARCHITECTURE,
-            code=self._code,
-            handler=f"functions.{module}.handler",
-            role=role,
-            log_group=log,
-            memory_size=memory_mb,
-            timeout=Duration.seconds(timeout_s),
-            environment=environment,
-            layers=layers,
-            reserved_concurrent_executions=reserved_concurrency or None,
-        )
-        CfnOutput(self, f"{name}Function", value=function.function_name)
-        return function

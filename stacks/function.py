@@ -1,0 +1,59 @@
+"""A Lambda function of ours: one asset of code for all, a role and a log of its own each."""
+
+from __future__ import annotations
+
+from aws_cdk import CfnOutput, Duration, IgnoreMode, RemovalPolicy, Stack
+from aws_cdk import aws_iam as iam
+from aws_cdk import aws_lambda as lambda_
+from aws_cdk import aws_logs as logs
+
+from stacks.settings import ROOT
+
+RUNTIME = lambda_.Runtime.PYTHON_3_13
+# The emulator runs the functions on the machine it stands on, so the architecture means nothing there.
+ARCHITECTURE = lambda_.Architecture.ARM_64
+# Exactly what a function imports; see the wiring tests.
+CODE_EXCLUDES = ["/*", "!/contract.py", "!/functions", "__pycache__", ".mypy_cache", ".ruff_cache"]
+
+
+def function(
+    stack: Stack,
+    name: str,
+    *,
+    module: str,
+    memory_mb: int,
+    timeout_s: int = 10,
+    environment: dict[str, str] | None = None,
+    layers: list[lambda_.ILayerVersion] | None = None,
+    reserved_concurrency: int = 0,
+) -> lambda_.Function:
+    """``functions/<module>.py``'s handler, which may write its own log and nothing else yet.
+
+    The stack puts its name out as ``<name>Function``. A ``reserved_concurrency`` of 0 reserves nothing.
+    """
+    log = logs.LogGroup(
+        stack,
+        f"{name}Log",
+        retention=logs.RetentionDays.ONE_MONTH,
+        removal_policy=RemovalPolicy.DESTROY,
+    )
+    # A role of its own instead of AWSLambdaBasicExecutionRole, which may write to every log.
+    role = iam.Role(stack, f"{name}Role", assumed_by=iam.ServicePrincipal("lambda.amazonaws.com"))
+    log.grant_write(role)
+    made = lambda_.Function(
+        stack,
+        name,
+        runtime=RUNTIME,
+        architecture=ARCHITECTURE,
+        code=lambda_.Code.from_asset(str(ROOT), exclude=CODE_EXCLUDES, ignore_mode=IgnoreMode.GIT),
+        handler=f"functions.{module}.handler",
+        role=role,
+        log_group=log,
+        memory_size=memory_mb,
+        timeout=Duration.seconds(timeout_s),
+        environment=environment,
+        layers=layers,
+        reserved_concurrent_executions=reserved_concurrency or None,
+    )
+    CfnOutput(stack, f"{name}Function", value=made.function_name)
+    return made
