@@ -1,0 +1,39 @@
+"""Writes the cost tables of station/cost.py into README.md and docs/cost.md: `python scripts/costs.py`."""
+
+from __future__ import annotations
+
+import re
+import sys
+from pathlib import Path
+
+ROOT = Path(__file__).resolve().parent.parent
+sys.path.insert(0, str(ROOT))
+
+from station import cost_tables, scale  # noqa: E402 the path comes first
+from station.cost import Usage  # noqa: E402
+from station.prices import AS_OF, REGION  # noqa: E402
+
+_BLOCK = re.compile(r"(<!-- cost (\w+):.*?-->\n).*?(\n<!-- /cost -->)", re.DOTALL)
+FILES = (ROOT / "README.md", ROOT / "docs" / "cost.md")
+
+
+def tables() -> dict[str, str]:
+    """Each table as Markdown, by the name in its comment."""
+    usage = Usage()
+    dated = f"List prices of {AS_OF}, {REGION}, in US dollars; one robot, {usage.rate_hz:g} Hz.\n\n"
+    return {
+        "hour": dated + cost_tables.robot_hour(usage).markdown(),
+        "whatif": dated + cost_tables.what_if(usage).markdown(),
+        "scale": cost_tables.fleets(scale.fleets(usage)).markdown(),
+    }
+
+
+def filled(text: str) -> str:
+    """The text with every table in its place."""
+    known = tables()
+    return _BLOCK.sub(lambda match: match[1] + known[match[2]] + match[3], text)
+
+
+if __name__ == "__main__":
+    for path in FILES:
+        path.write_text(filled(path.read_text()))

@@ -1,0 +1,334 @@
+"""What a fleet costs: every unit that is billed, from the configuration, times its list price. Pure.
+
+A `Usage` says how robots are driven, `bill` what that comes to item by item, and `thesis_bill` what the
+same driving cost in the layout that the project began from: a message, two items and a push a sample.
+"""
+
+from __future__ import annotations
+
+import io
+import json
+from collections.abc import Iterator
+from contextlib import redirect_stdout
+from dataclasses import dataclass, replace
+from math import ceil
+from typing import Any, NamedTuple
+
+from contract import METRICS
+from station.errors import StationError
+from station.prices import MONTH_DAYS, PRICES, PUBNUB_MAU_PLANS
+from station.sizes import Sizes, measure, own_item_bytes
+
+_METER, _WRITE, _READ, _PUBNUB_UNIT = 5 * 1024, 1024, 4 * 1024, 2048
+# "For most use cases, storage is the sum of item sizes, plus 100 bytes an item of indexing overhead."
+_ITEM_OVERHEAD = 100
+# Lambda polls each shard of a stream four times a second, and a shard is a partition of the table.
+_POLLS_PER_S, _PARTITION_WRITES = 4.0, 1000.0
+_RECORDS_A_CALL = 100
+# What Lambda itself writes to the log for every invocation.
+_REQUEST = "8f507cfc-xmpl-4697-b07a-ac58fc914c95"
+_PLATFORM_LINES = (
+    f"START RequestId: {_REQUEST} Version: $LATEST\n"
+    f"END RequestId: {_REQUEST}\n"
+    f"REPORT RequestId: {_REQUEST}\tDuration: 12.34 ms\tBilled Duration: 13 ms\t"
+    "Memory Size: 256 MB\tMax Memory Used: 81 MB\t\n"
+)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Usage:
+    """How the fleet is driven. The defaults are the agent's and the stacks' own.
+
+    ``rate_hz`` samples, ``live_hz`` live messages and ``ping_hz`` pings a path, all a second and robot;
+    a batch spans ``batch_s``; ``agent_every_s`` between the agent's own figures; robots drive
+    ``hours_per_day``; each of ``viewers`` watches the whole fleet all that time; items are kept
+    ``retention_days``.
+    What only AWS can say, the billed milliseconds of an invocation, are assumptions and named so.
+    """
+
+    robots: int = 1
+    rate_hz: float = 50.0
+    live_hz: float = 10.0
+    batch_s: float = 1.0
+    ping_hz: float = 0.0
+    agent_every_s: float = 5.0
+    hours_per_day: float = 2.0
+    viewers: int = 1
+    retention_days: int = 90
+    live_memory_mb: int = 256
+    live_ms: float = 20.0
+    live_concurrency: int = 5
+    summarize_memory_mb: int = 512
+    summarize_ms: float = 20.0
+    alarms: int = 10
+    dashboards: int = 2
+
+    def check(self) -> Usage:
+        """Itself; raises `StationError` for what no fleet can do."""
+        for name, value in vars(self).items():
+            if value < 0:
+                raise StationError(f"{name} {value}: allowed is 0 or more")
+        if self.robots < 1:
+            raise StationError(f"robots {self.robots}: allowed is 1 or more")
+        if not 0 < self.rate_hz <= 2000:
+            raise StationError(f"rate {self.rate_hz} Hz: allowed is more than 0 and up to 2000")
+        if self.batch_s > 1:
+            raise StationError(f"batch of {self.batch_s} s: allowed is 0 to 1, 0 sends each sample by itself")
+        if not 0 < self.hours_per_day <= 24:
+            raise StationError(f"{self.hours_per_day} hours a day: allowed is more than 0 and up to 24")
+        return self
+
+    @property
+    def batches_per_s(self) -> float:
+        """Batches of the source's stream, a robot."""
+        return min(self.rate_hz, max(1.0, 1 / self.batch_s)) if self.batch_s else self.rate_hz
+
+    @property
+    def own_batches_per_s(self) -> float:
+        """Batches of the agent's own streams: its figures, and round trips where it measures them."""
+        figures = 1 / self.agent_every_s if self.agent_every_s else 0.0
+        return figures + min(1.0, 3 * self.ping_hz)
+
+    @property
+    def robot_hours_per_month(self) -> float:
+        """Of the whole fleet."""
+        return self.robots * self.hours_per_day * MONTH_DAYS
+
+
+class Item(NamedTuple):
+    """One line of a bill: ``units`` a robot-hour of what `PRICES` calls ``price``, for a lane."""
+
+    service: str
+    lane: str
+    what: str
+    price: str
+    units: float
+
+    @property
+    def dollars(self) -> float:
+        """A robot-hour."""
+        return self.units * PRICES[self.price].each
+
+
+def bill(usage: Usage) -> list[Item]:
+    """What AWS bills a robot-hour, item by item; PubNub apart (`pubnub_bill`)."""
+    usage.check()
+    sizes = measure(usage.rate_hz, usage.batch_s)
+    hour = 3600.0
+    batches, own = usage.batches_per_s * hour, usage.own_batches_per_s * hour
+    own_item = own_item_bytes("agent", 1)
+    items = [Item("IoT Core", "all", "connection", "connection", 60)]
+    items += _rule_items("record", batches, sizes.record, messaging=False)
+    items += _rule_items("agent, rtt", own, own_item, messaging=False)
+    live = usage.live_hz * hour
+    items += _rule_items("live", live, sizes.live, messaging=True)
+    items += _ping_items(usage.ping_hz * hour, sizes)
+    writes = batches * _units(sizes.telemetry_item, _WRITE)
+    items += [
+        Item("DynamoDB", "record", "telemetry written", "write", writes),
+        Item("DynamoDB", "agent, rtt", "telemetry written", "write", own * _units(own_item, _WRITE)),
+        # A batch lies in one second; a second of several batches is written again by each.
+        Item("DynamoDB", "record", "summary written", "write", batches * _units(sizes.summary_item, _WRITE)),
+        Item("DynamoDB", "agent, rtt", "summary written", "write", own),
+        # The batches of the second and the one before, and whether there is a later one.
+        Item(
+            "DynamoDB",
+            "record",
+            "batches read by Lambda 2",
+            "read",
+            batches * (_units(2 * sizes.telemetry_item, _READ) + 1),
+        ),
+        Item("DynamoDB", "agent, rtt", "batches read by Lambda 2", "read", own * 2),
+    ]
+    seconds = min(batches, hour)
+    items += [
+        _storage("record", "telemetry kept", batches, sizes.telemetry_item, usage),
+        _storage("record", "summary kept", seconds, sizes.summary_item, usage),
+        _storage("agent, rtt", "kept", 2 * own, own_item, usage),
+    ]
+    calls = summarize_calls_per_s(usage) * hour / usage.robots
+    items += _lambda_items(
+        "record",
+        "Lambda 2",
+        calls,
+        memory_mb=usage.summarize_memory_mb,
+        billed_ms=usage.summarize_ms,
+        line=_log_line("summarize"),
+    )
+    items += _lambda_items(
+        "live",
+        "Lambda 1",
+        live,
+        memory_mb=usage.live_memory_mb,
+        billed_ms=usage.live_ms,
+        line=_log_line("live"),
+    )
+    return items
+
+
+def deployment_dollars_per_month(usage: Usage) -> dict[str, float]:
+    """What a deployment costs whoever drives: metrics that functions emit, alarms, dashboards above three."""
+    counts = {
+        "metric": sum(map(len, METRICS.values())),
+        "alarm": usage.alarms,
+        "dashboard": max(0, usage.dashboards - 3),
+    }
+    return {f"{name}s": count * PRICES[name].each for name, count in counts.items()}
+
+
+def thesis_bill(usage: Usage) -> list[Item]:
+    """The same driving in the thesis' layout: each sample a message through the broker, which triggers
+    two rules, one item in each of two tables, and one invocation of Lambda 1; functions of 128 MB on
+    x86. Prices, retention and the milliseconds of an invocation are the same as ours; there are no pings,
+    no figures of the agent's own, no alarms and no metrics."""
+    usage.check()
+    sizes = measure(usage.rate_hz, usage.batch_s)
+    samples = usage.rate_hz * 3600
+    per_s = usage.robots * usage.rate_hz
+    calls = min(per_s, max(_POLLS_PER_S * _shards(per_s), per_s / _RECORDS_A_CALL)) * 3600 / usage.robots
+    written = samples * _units(sizes.sample_item, _WRITE)
+    functions: dict[str, Any] = {"memory_mb": 128, "line": "", "compute": "compute_x86"}
+    live = _lambda_items("live", "Lambda 1", samples, billed_ms=usage.live_ms, **functions)
+    second = _lambda_items("record", "Lambda 2", calls, billed_ms=usage.summarize_ms, **functions)
+    return [
+        Item("IoT Core", "all", "connection", "connection", 60),
+        Item("IoT Core", "record", "messages", "message", samples * _units(sizes.sample, _METER)),
+        Item("IoT Core", "record", "rule to the table", "rule", samples),
+        Item("IoT Core", "record", "its action", "action", samples),
+        Item("IoT Core", "live", "rule to Lambda 1", "rule", samples),
+        Item("IoT Core", "live", "its action", "action", samples),
+        Item("DynamoDB", "record", "first table written", "write", written),
+        Item("DynamoDB", "record", "second table written", "write", written),
+        _storage("record", "both tables kept", 2 * samples, sizes.sample_item, usage),
+        *second,
+        *live,
+    ]
+
+
+def pubnub_bill(usage: Usage, *, thesis: bool = False) -> list[Item]:
+    """What PubNub bills a robot-hour on its plan by transactions: a publish each, a receipt a viewer."""
+    usage.check()
+    size = measure(usage.rate_hz, usage.batch_s).update
+    messages = (usage.rate_hz if thesis else usage.live_hz) * 3600 * _units(size, _PUBNUB_UNIT)
+    return [
+        Item("PubNub", "live", "published", "pubnub_publish", messages),
+        Item("PubNub", "live", "received by viewers", "pubnub_receive", messages * usage.viewers),
+    ]
+
+
+def pubnub_mau_dollars_per_month(usage: Usage) -> float | None:
+    """PubNub's plan by monthly active users: the viewers and Lambda 1; None above the listed plans."""
+    users = usage.viewers + 1
+    return next((dollars for most, dollars in PUBNUB_MAU_PLANS if users <= most), None)
+
+
+def total(items: list[Item]) -> float:
+    """Dollars a robot-hour."""
+    return sum(item.dollars for item in items)
+
+
+def by(items: list[Item], key: str) -> dict[str, float]:
+    """Dollars a robot-hour by ``service`` or ``lane``, the dearest first."""
+    sums: dict[str, float] = {}
+    for item in items:
+        name = str(getattr(item, key))
+        sums[name] = sums.get(name, 0.0) + item.dollars
+    return dict(sorted(sums.items(), key=lambda pair: -pair[1]))
+
+
+def summarize_calls_per_s(usage: Usage) -> float:
+    """Invocations of Lambda 2 a second, of the whole fleet: at most four a shard, or as many as
+    batches of a hundred records need."""
+    records = usage.robots * (usage.batches_per_s + usage.own_batches_per_s)
+    sizes = measure(usage.rate_hz, usage.batch_s)
+    writes = usage.robots * usage.batches_per_s * _units(sizes.telemetry_item, _WRITE)
+    return min(records, max(_POLLS_PER_S * _shards(writes), records / _RECORDS_A_CALL))
+
+
+def what_if(usage: Usage) -> Iterator[tuple[str, Usage]]:
+    """The settings that change the bill, one at a time."""
+    yield "as configured", usage
+    for live_hz in (5.0, 2.0, 1.0, 0.0):
+        if live_hz != usage.live_hz:
+            yield (
+                (f"live lane at {live_hz:g} Hz" if live_hz else "no live lane"),
+                replace(usage, live_hz=live_hz),
+            )
+    for batch_s in (0.2, 0.0):
+        name = f"batches of {batch_s:g} s" if batch_s else "one sample a batch"
+        yield name, replace(usage, batch_s=batch_s)
+    yield "round trips measured at 1 Hz", replace(usage, ping_hz=1.0)
+    yield "kept for 30 days", replace(usage, retention_days=30)
+    yield "a thousand robots", replace(usage, robots=1000)
+
+
+def _units(size: int, unit: int) -> int:
+    return max(1, ceil(size / unit))
+
+
+def _shards(writes_per_s: float) -> int:
+    return max(1, ceil(writes_per_s / _PARTITION_WRITES))
+
+
+def _rule_items(lane: str, messages: float, size: int, *, messaging: bool) -> list[Item]:
+    metered = messages * _units(size, _METER)
+    items = [
+        Item("IoT Core", lane, "rules triggered", "rule", metered),
+        Item("IoT Core", lane, "actions", "action", metered),
+    ]
+    return [Item("IoT Core", lane, "messages", "message", metered), *items] if messaging else items
+
+
+def _ping_items(pings: float, sizes: Sizes) -> list[Item]:
+    """Of each path: the ping in and the pong out; two of three pass a rule, one a function."""
+    if not pings:
+        return []
+    return [
+        Item("IoT Core", "ping", "pings and pongs", "message", 6 * pings * _units(sizes.ping, _METER)),
+        Item("IoT Core", "ping", "rules triggered", "rule", 2 * pings),
+        Item("IoT Core", "ping", "actions", "action", 2 * pings),
+        *_lambda_items("ping", "echo", pings, memory_mb=256, billed_ms=5.0, line=_log_line("echo")),
+    ]
+
+
+def _storage(lane: str, what: str, count: float, size: int, usage: Usage) -> Item:
+    gigabyte_months = count * (size + _ITEM_OVERHEAD) / 1e9 * usage.retention_days / MONTH_DAYS
+    return Item("DynamoDB", lane, what, "storage", gigabyte_months)
+
+
+def _lambda_items(
+    lane: str,
+    name: str,
+    calls: float,
+    *,
+    memory_mb: int,
+    billed_ms: float,
+    line: str,
+    compute: str = "compute_arm",
+) -> list[Item]:
+    logged = len(_PLATFORM_LINES) + len(line)
+    return [
+        Item("Lambda", lane, f"{name} invoked", "invocation", calls),
+        Item("Lambda", lane, f"{name} computing", compute, calls * memory_mb / 1024 * billed_ms / 1000),
+        Item("CloudWatch", lane, f"{name} logging", "logs", calls * logged / 1e9),
+    ]
+
+
+def _log_line(function: str) -> str:
+    """The metrics line that an invocation writes, as functions/metrics.py writes it."""
+    names = METRICS[function][:2]
+    directive = {
+        "Namespace": "iort",
+        "Dimensions": [["Function"]],
+        "Metrics": [{"Name": name, "Unit": "Milliseconds"} for name in names],
+    }
+    line = {"_aws": {"Timestamp": 1_750_000_000_000, "CloudWatchMetrics": [directive]}, "Function": function}
+    out = io.StringIO()
+    with redirect_stdout(out):
+        print(json.dumps({**line, **dict.fromkeys(names, 12.345)}, separators=(",", ":")))  # noqa: T201
+    return out.getvalue()
+
+
+def dollars_per_month(items: list[Item], usage: Usage) -> float:
+    """Of the whole fleet."""
+    return total(items) * usage.robot_hours_per_month

@@ -1,0 +1,135 @@
+"""The cost model's tables, as rows of text: the command prints them, the README and the bench keep them."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+from station import cost
+from station.cost import Usage
+from station.scale import Scale
+
+
+class Rows(NamedTuple):
+    """A table: its column names and its lines."""
+
+    head: tuple[str, ...]
+    body: list[tuple[str, ...]]
+
+    def markdown(self) -> str:
+        """As a Markdown table, numbers to the right."""
+        lines = [self.head, ("---", *("---:" for _ in self.head[1:])), *self.body]
+        return "\n".join(f"| {' | '.join(line)} |" for line in lines)
+
+
+def robot_hour(usage: Usage) -> Rows:
+    """Dollars a robot-hour by service and lane, thesis' layout beside ours, PubNub apart."""
+    ours, thesis = cost.bill(usage), cost.thesis_bill(usage)
+    pubnub = cost.pubnub_bill(usage), cost.pubnub_bill(usage, thesis=True)
+    body: list[tuple[str, ...]] = []
+    services = sorted({item.service for item in [*ours, *thesis]})
+    for service in services:
+        lanes: list[str] = []
+        for item in [*ours, *thesis]:
+            if item.service == service and item.lane not in lanes:
+                lanes.append(item.lane)
+        body.extend(
+            (f"{service}, {lane}", _sum(thesis, service, lane), _sum(ours, service, lane), "")
+            for lane in lanes
+        )
+    whole = cost.total(thesis), cost.total(ours)
+    body.append(("total AWS", _dollars(whole[0]), _dollars(whole[1]), f"1/{whole[0] / whole[1]:.1f}"))
+    both = cost.total(pubnub[1]), cost.total(pubnub[0])
+    body.append(("PubNub, plan by transactions", _dollars(both[0]), _dollars(both[1]), _ratio(both)))
+    return Rows(("dollars a robot-hour", "a message a sample", "iort", "ratio"), body)
+
+
+def month(usage: Usage) -> Rows:
+    """Dollars a month for the fleet, and what a deployment costs whoever drives."""
+    aws = cost.dollars_per_month(cost.bill(usage), usage)
+    thesis = cost.dollars_per_month(cost.thesis_bill(usage), usage)
+    transactions = cost.dollars_per_month(cost.pubnub_bill(usage), usage)
+    users = cost.pubnub_mau_dollars_per_month(usage)
+    body: list[tuple[str, ...]] = [
+        ("AWS, the driving", f"{aws:,.2f}"),
+        *((f"AWS, {name}", f"{dollars:,.2f}") for name, dollars in _deployment(usage)),
+        ("AWS, the same driving a message a sample", f"{thesis:,.2f}"),
+        ("PubNub, plan by transactions", f"{transactions:,.2f}"),
+        ("PubNub, plan by monthly active users", "ask PubNub" if users is None else f"{users:,.2f}"),
+    ]
+    return Rows((f"dollars a month, {usage.robots:,} robots", ""), body)
+
+
+def what_if(usage: Usage) -> Rows:
+    """One setting changed at a time: dollars a robot-hour, and the share of the thesis' layout."""
+    body: list[tuple[str, ...]] = []
+    for name, other in cost.what_if(usage):
+        ours, thesis = cost.total(cost.bill(other)), cost.total(cost.thesis_bill(other))
+        pubnub = cost.total(cost.pubnub_bill(other))
+        body.append((name, _dollars(ours), f"1/{thesis / ours:.1f}", _dollars(pubnub)))
+    return Rows(("dollars a robot-hour", "AWS", "of a message a sample", "PubNub by transactions"), body)
+
+
+def quotas(scale: Scale) -> Rows:
+    """What a fleet needs of each default quota, the one that breaks first on top."""
+    body: list[tuple[str, ...]] = []
+    for need in scale.needs:
+        at = "never" if need.robots_at_quota is None else f"{need.robots_at_quota:,.0f}"
+        fixed = "" if need.quota.adjustable else ", fixed"
+        quota = f"{need.quota.value:,.0f} {need.quota.unit}{fixed}"
+        body.append((need.name, f"{need.needed:,.1f}", quota, _times(need.times), at))
+    return Rows(
+        (
+            f"{scale.robots:,} robot{'s' * (scale.robots > 1)}",
+            "needed",
+            "quota",
+            "times",
+            "robots at the quota",
+        ),
+        body,
+    )
+
+
+def fleets(scales: list[Scale]) -> Rows:
+    """A column a fleet: the need of each quota as a multiple of it, and dollars a month."""
+    head = (
+        "needed, as a multiple of the default quota",
+        *(f"{scale.robots:,} robot{'s' * (scale.robots > 1)}" for scale in scales),
+    )
+    body: list[tuple[str, ...]] = []
+    for need in scales[-1].needs:
+        times = [next(n.times for n in scale.needs if n.name == need.name) for scale in scales]
+        body.append((need.name, *(f"**{_times(value)}**" if value > 1 else _times(value) for value in times)))
+    body.append(("breaks first", *(_first(scale) for scale in scales)))
+    body.append(("AWS, dollars a month", *(f"{scale.aws_dollars_per_month:,.0f}" for scale in scales)))
+    body.append(
+        ("PubNub by transactions, a month", *(f"{scale.pubnub_dollars_per_month:,.0f}" for scale in scales))
+    )
+    body.append(("PubNub, publishes/s", *(f"{scale.pubnub_publishes_per_s:,.0f}" for scale in scales)))
+    return Rows(head, body)
+
+
+def _times(value: float) -> str:
+    if value >= 10:
+        return f"{value:,.0f}"
+    return f"{value:.2g}" if value >= 0.001 else "< 0.001"
+
+
+def _first(scale: Scale) -> str:
+    return scale.breaks_first.name if scale.breaks_first.times > 1 else "none"
+
+
+def _deployment(usage: Usage) -> list[tuple[str, float]]:
+    return list(cost.deployment_dollars_per_month(usage).items())
+
+
+def _sum(items: list[cost.Item], service: str, lane: str) -> str:
+    found = [item.dollars for item in items if (item.service, item.lane) == (service, lane)]
+    return _dollars(sum(found)) if found else ""
+
+
+def _dollars(dollars: float) -> str:
+    return f"{dollars:.4f}" if dollars < 1 else f"{dollars:,.2f}"
+
+
+def _ratio(both: tuple[float, float]) -> str:
+    return f"1/{both[0] / both[1]:.1f}" if both[1] else ""

@@ -1,0 +1,89 @@
+"""List prices and default quotas, with the date they are of: the one table that the cost model reads.
+
+They are public list prices in US dollars for `REGION`, without tax, free tier, volume tiers or
+anybody's discount, copied by hand from the pages named below. A bill is made from AWS' page, not from
+this one: look there before a decision hangs on it.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+AS_OF = "2025-06-01"
+REGION = "eu-west-1"
+MONTH_HOURS = 730.0
+MONTH_DAYS = MONTH_HOURS / 24
+
+
+class Price(NamedTuple):
+    """``usd`` for every ``per`` of ``unit``, on the pricing page ``page``."""
+
+    usd: float
+    per: float
+    unit: str
+    page: str
+
+    @property
+    def each(self) -> float:
+        """Dollars for one of the unit."""
+        return self.usd / self.per
+
+
+_IOT = "https://aws.amazon.com/iot-core/pricing/"
+_DYNAMODB = "https://aws.amazon.com/dynamodb/pricing/on-demand/"
+_LAMBDA = "https://aws.amazon.com/lambda/pricing/"
+_CLOUDWATCH = "https://aws.amazon.com/cloudwatch/pricing/"
+_PUBNUB = "https://www.pubnub.com/docs/general/resources/pricing"
+
+PRICES = {
+    "connection": Price(0.08, 1e6, "minute connected", _IOT),
+    "message": Price(1.00, 1e6, "message of up to 5 KB", _IOT),
+    "rule": Price(0.15, 1e6, "rule triggered, up to 5 KB", _IOT),
+    "action": Price(0.15, 1e6, "action executed, up to 5 KB", _IOT),
+    "write": Price(0.705, 1e6, "write request unit, up to 1 KB", _DYNAMODB),
+    "read": Price(0.141, 1e6, "read request unit, up to 4 KB", _DYNAMODB),
+    "storage": Price(0.283, 1, "GB-month", _DYNAMODB),
+    "invocation": Price(0.20, 1e6, "invocation", _LAMBDA),
+    "compute_arm": Price(0.0000133334, 1, "GB-second, Arm", _LAMBDA),
+    "compute_x86": Price(0.0000166667, 1, "GB-second, x86", _LAMBDA),
+    "logs": Price(0.57, 1, "GB of log lines", _CLOUDWATCH),
+    "metric": Price(0.30, 1, "metric a month", _CLOUDWATCH),
+    "alarm": Price(0.10, 1, "alarm a month", _CLOUDWATCH),
+    "dashboard": Price(3.00, 1, "dashboard a month", _CLOUDWATCH),
+    "pubnub_publish": Price(0.000123, 1, "replicated transaction, up to 2 KB", _PUBNUB),
+    "pubnub_receive": Price(0.000033, 1, "edge transaction, up to 2 KB", _PUBNUB),
+}
+
+# PubNub's other kind of plan, by monthly active users: (users up to, dollars a month). Who connects is
+# a user: each viewer, and Lambda 1 as one; robots never connect to PubNub. Fair use bounds the messages,
+# and the free plan is for development only.
+PUBNUB_MAU_PLANS = ((1_000, 98.0), (5_000, 370.0), (10_000, 550.0), (25_000, 1_130.0))
+PUBNUB_MAU_PAGE = "https://www.pubnub.com/pricing/"
+
+
+class Quota(NamedTuple):
+    """A default quota of an account in `REGION`; ``adjustable`` ones grow on request."""
+
+    value: float
+    unit: str
+    adjustable: bool
+    page: str
+
+
+_IOT_QUOTAS = "https://docs.aws.amazon.com/general/latest/gr/iot-core.html"
+_DYNAMODB_QUOTAS = "https://docs.aws.amazon.com/amazondynamodb/latest/developerguide/ServiceQuotas.html"
+_PARTITIONS = "https://docs.aws.amazon.com/amazondynamodb/latest/developerguide/bp-partition-key-design.html"
+_LAMBDA_QUOTAS = "https://docs.aws.amazon.com/lambda/latest/dg/gettingstarted-limits.html"
+
+QUOTAS = {
+    "IoT Core: connections": Quota(500_000, "connections", True, _IOT_QUOTAS),
+    "IoT Core: connects in a minute after an outage": Quota(3_000 * 60, "connects", True, _IOT_QUOTAS),
+    "IoT Core: subscriptions": Quota(500_000, "subscriptions", True, _IOT_QUOTAS),
+    "IoT Core: publishes in": Quota(20_000, "1/s", True, _IOT_QUOTAS),
+    "IoT Core: rule evaluations": Quota(20_000, "1/s", True, _IOT_QUOTAS),
+    "IoT Core: publishes of one connection": Quota(100, "1/s", False, _IOT_QUOTAS),
+    "DynamoDB: writes to table telemetry": Quota(40_000, "units/s", True, _DYNAMODB_QUOTAS),
+    "DynamoDB: writes to table summary": Quota(40_000, "units/s", True, _DYNAMODB_QUOTAS),
+    "DynamoDB: writes to one partition": Quota(1_000, "units/s", False, _PARTITIONS),
+    "Lambda: concurrent executions": Quota(1_000, "executions", True, _LAMBDA_QUOTAS),
+}

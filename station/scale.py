@@ -1,0 +1,103 @@
+"""What a fleet needs of AWS, held against the default quotas: which of them breaks first. Pure."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import NamedTuple
+
+from station.cost import Usage, bill, deployment_dollars_per_month, dollars_per_month, pubnub_bill, total
+from station.prices import QUOTAS, Quota
+from station.sizes import measure
+
+# A robot listens to its shadow's four answers, the pong that sets its clock, and its commands.
+_SUBSCRIPTIONS = 6
+
+
+class Need(NamedTuple):
+    """What a fleet needs of one quota, and with how many robots the quota is used up (None: never)."""
+
+    name: str
+    needed: float
+    quota: Quota
+    robots_at_quota: float | None
+
+    @property
+    def times(self) -> float:
+        """The need as a multiple of the quota."""
+        return self.needed / self.quota.value
+
+
+class Scale(NamedTuple):
+    """A fleet on paper: needs in the order in which the quotas break, and dollars a month."""
+
+    robots: int
+    needs: list[Need]
+    aws_dollars_per_month: float
+    pubnub_dollars_per_month: float
+    pubnub_publishes_per_s: float
+
+    @property
+    def breaks_first(self) -> Need:
+        """The quota that the fewest robots use up."""
+        return self.needs[0]
+
+
+def on_paper(usage: Usage) -> Scale:
+    """What the fleet needs, all robots driving at once."""
+    one = _per_robot(usage)
+    quotas = dict(QUOTAS)
+    if usage.live_concurrency:
+        page = "live_concurrency, a parameter of the deployment"
+        quotas[_RESERVED] = Quota(usage.live_concurrency, "executions", adjustable=True, page=page)
+    needs = [
+        Need(
+            name,
+            one[name] * (1 if name in _ONE_ROBOTS else usage.robots),
+            quota,
+            None if name in _ONE_ROBOTS or not one[name] else quota.value / one[name],
+        )
+        for name, quota in quotas.items()
+    ]
+    needs.sort(key=lambda need: need.robots_at_quota or float("inf"))
+    fixed = sum(deployment_dollars_per_month(usage).values())
+    return Scale(
+        usage.robots,
+        needs,
+        dollars_per_month(bill(usage), usage) + fixed,
+        total(pubnub_bill(usage)) * usage.robot_hours_per_month,
+        usage.live_hz * usage.robots,
+    )
+
+
+def fleets(usage: Usage, sizes: tuple[int, ...] = (1, 100, 10_000, 1_000_000)) -> list[Scale]:
+    """The same driving with other numbers of robots."""
+    return [on_paper(replace(usage, robots=robots)) for robots in sizes]
+
+
+_RESERVED = "Lambda 1: concurrency reserved by this deployment"
+# What does not grow with the fleet: each robot has a connection and partition keys of its own.
+_ONE_ROBOTS = frozenset({"IoT Core: publishes of one connection", "DynamoDB: writes to one partition"})
+
+
+def _per_robot(usage: Usage) -> dict[str, float]:
+    sizes = measure(usage.rate_hz, usage.batch_s)
+    batches = usage.batches_per_s + usage.own_batches_per_s
+    publishes = batches + usage.live_hz + 3 * usage.ping_hz
+    telemetry = usage.batches_per_s * -(-sizes.telemetry_item // 1024) + usage.own_batches_per_s
+    summary = usage.batches_per_s * -(-sizes.summary_item // 1024) + usage.own_batches_per_s
+    # Lambda 2 is bounded by the stream's shards, Lambda 1 by what it waits for.
+    busy = usage.live_hz * usage.live_ms / 1000 + usage.ping_hz * 0.005
+    return {
+        _RESERVED: usage.live_hz * usage.live_ms / 1000,
+        "IoT Core: connections": 1,
+        "IoT Core: connects in a minute after an outage": 1,
+        "IoT Core: subscriptions": _SUBSCRIPTIONS,
+        # Basic Ingest is counted in: it passes the same gateway.
+        "IoT Core: publishes in": publishes,
+        "IoT Core: rule evaluations": batches + usage.live_hz + 2 * usage.ping_hz,
+        "IoT Core: publishes of one connection": publishes,
+        "DynamoDB: writes to table telemetry": telemetry,
+        "DynamoDB: writes to table summary": summary,
+        "DynamoDB: writes to one partition": telemetry,
+        "Lambda: concurrent executions": busy,
+    }

@@ -1,0 +1,149 @@
+"""The cost model against arithmetic done by hand, and its tables against the documents."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+
+import pytest
+from typer.testing import CliRunner
+
+from contract import STATS
+from device.sources.vehicle import Vehicle, VehicleConfig
+from functions.statistics import Vehicle as Gain
+from functions.statistics import summarize_second
+from scripts.costs import FILES, filled
+from station import cost, scale, sizes
+from station.cli import app
+from station.cost import Usage
+from station.errors import StationError
+from station.prices import PRICES
+
+_ONE = Usage()
+
+
+def _units(items, lane, price):
+    return sum(item.units for item in items if (item.lane, item.price) == (lane, price))
+
+
+def test_record_lane_is_a_rule_an_action_and_its_units_a_batch():
+    items = cost.bill(_ONE)
+    assert _units(items, "record", "message") == 0, "Basic Ingest has no messaging charge"
+    assert _units(items, "record", "rule") == _units(items, "record", "action") == 3600
+    # The telemetry and the summary item are each between one and two kilobytes.
+    assert _units(items, "record", "write") == 2 * 3600 * 2
+    assert next(i for i in items if i.what == "rules triggered").dollars == pytest.approx(3600 * 0.15e-6)
+
+
+def test_live_lane_is_a_message_a_rule_an_action_and_an_invocation_each():
+    items = cost.bill(replace(_ONE, live_hz=4.0))
+    for price in ("message", "rule", "action", "invocation"):
+        assert _units(items, "live", price) == 4 * 3600, price
+    assert _units(cost.bill(replace(_ONE, live_hz=0.0)), "live", "invocation") == 0
+
+
+def test_thesis_layout_pays_for_every_sample():
+    items = cost.thesis_bill(_ONE)
+    assert _units(items, "record", "message") == 50 * 3600
+    assert _units(items, "record", "write") == 2 * 50 * 3600
+    assert _units(items, "live", "invocation") == 50 * 3600
+    assert 0.6 < cost.total(items) < 0.8
+
+
+def test_without_a_live_lane_we_cost_less_than_a_twentieth():
+    ours = cost.total(cost.bill(replace(_ONE, live_hz=0.0)))
+    assert ours < cost.total(cost.thesis_bill(_ONE)) / 20
+
+
+def test_a_batch_of_one_sample_costs_as_much_as_the_thesis_record_lane():
+    single = cost.bill(replace(_ONE, batch_s=0.0, live_hz=0.0))
+    assert _units(single, "record", "rule") == 50 * 3600
+
+
+def test_lambda_2_is_shared_by_a_fleet():
+    calls = {robots: cost.summarize_calls_per_s(Usage(robots=robots)) / robots for robots in (1, 100, 10_000)}
+    assert calls[1] > calls[100] > calls[10_000]
+    assert calls[10_000] * 10_000 >= 10_000 * 1.2 / 100, "a call takes a hundred records at most"
+
+
+def test_pubnub_counts_publishes_and_receipts_or_users():
+    items = cost.pubnub_bill(replace(_ONE, viewers=3))
+    assert [item.units for item in items] == [36_000, 108_000]
+    assert items[0].dollars == pytest.approx(36_000 * 0.000123)
+    assert cost.pubnub_mau_dollars_per_month(_ONE) == 98.0
+    assert cost.pubnub_mau_dollars_per_month(replace(_ONE, viewers=10**6)) is None
+
+
+def test_every_item_has_a_price_and_every_price_names_its_page():
+    for items in (cost.bill(replace(_ONE, ping_hz=1.0)), cost.thesis_bill(_ONE), cost.pubnub_bill(_ONE)):
+        assert all(item.price in PRICES and item.units >= 0 for item in items)
+    assert all(price.page.startswith("https://") and price.usd > 0 for price in PRICES.values())
+
+
+@pytest.mark.parametrize(
+    "wrong", [{"robots": 0}, {"rate_hz": 0.0}, {"batch_s": 2.0}, {"live_hz": -1.0}, {"hours_per_day": 25.0}]
+)
+def test_refuses_what_no_fleet_can_do(wrong):
+    with pytest.raises(StationError):
+        cost.bill(replace(_ONE, **wrong))
+
+
+def test_summary_item_is_measured_in_the_shape_that_lambda_2_writes():
+    drive = sizes._drive(50, 50)
+    batch = sizes._batch(drive, 50)
+    second = batch.t_us // 1_000_000
+    gain = VehicleConfig().speed_to_erpm_gain
+    written = summarize_second(second, [batch], Gain(gain))
+    measured = sizes._summary(drive)
+    assert written is not None
+    assert set(written) <= set(measured)
+    assert {name.rsplit("_", 1)[1] for name in written if name.endswith(STATS)} == set(STATS)
+    kept = {name: measured[name] for name in written}
+    assert sizes.item_bytes(written) == pytest.approx(sizes.item_bytes(kept), rel=0.05)
+
+
+def test_a_drive_is_a_vesc_drive():
+    assert sizes._drive(50, 1)[0].keys() == Vehicle(VehicleConfig(), 1).sample().keys()
+
+
+@pytest.mark.parametrize(
+    ("item", "expected"),
+    [({"a": "bc"}, 3), ({"n": 0}, 3), ({"n": 12345}, 5), ({"n": -1.5}, 4), ({"b": True}, 2)],
+)
+def test_item_sizes_as_dynamodb_counts_them(item, expected):
+    assert sizes.item_bytes(item) == expected
+
+
+def test_quota_that_breaks_first_is_the_one_that_fewest_robots_use_up():
+    paper = scale.on_paper(Usage(robots=10_000))
+    at = [need.robots_at_quota for need in paper.needs if need.robots_at_quota]
+    assert at == sorted(at)
+    assert paper.breaks_first.robots_at_quota == 5 / (10 * 0.020)
+    unreserved = scale.on_paper(Usage(robots=10_000, live_concurrency=0))
+    assert unreserved.breaks_first.name.startswith("IoT Core")
+
+
+def test_documents_hold_the_tables_that_the_model_makes():
+    for path in FILES:
+        assert filled(path.read_text()) == path.read_text(), f"{path.name}: run python scripts/costs.py"
+
+
+def test_command_prints_json_that_adds_up():
+    done = CliRunner().invoke(app, ["cost", "--live-hz", "2", "--json"])
+    assert done.exit_code == 0, done.output
+    answer = json.loads(done.output)
+    assert answer["usage"]["live_hz"] == 2.0
+    summed = sum(item["dollars_per_robot_hour"] for item in answer["items"])
+    assert summed == pytest.approx(answer["dollars_per_robot_hour"])
+
+
+def test_command_reads_the_rates_of_a_car(tmp_path):
+    for name in ("certificate.pem", "private.key"):
+        (tmp_path / name).touch()
+    (tmp_path / "car.yaml").write_text(
+        "robot: car7\nendpoint: example.org\ncertificate: certificate.pem\nprivate_key: private.key\n"
+        "sources:\n- {type: sim, rate_hz: 20}\nlive: {rate_hz: 2}\nrecord: {batch_s: 0.5}\n"
+    )
+    done = CliRunner().invoke(app, ["cost", "--config", str(tmp_path / "car.yaml"), "--json"])
+    usage = json.loads(done.output)["usage"]
+    assert (usage["rate_hz"], usage["live_hz"], usage["batch_s"]) == (20.0, 2.0, 0.5)
