@@ -103,7 +103,7 @@ def _value_bytes(value: Any) -> int:
         return 1
     digits = len(Decimal(repr(value)).normalize().as_tuple().digits)
     # Two digits a byte, one for the exponent and one for a minus.
-    return (digits + 1) // 2 + 1 + (value < 0)
+    return (digits + 1) // 2 + 1 + int(value < 0)
 
 
 def _rule() -> dict[str, Value]:
