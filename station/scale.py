@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import replace
 from typing import NamedTuple
 
-from station.cost import Usage, bill, deployment_dollars_per_month, dollars_per_month, pubnub_bill, total
+from station.cost import Usage, bill, dollars_per_month, pubnub_bill, total
 from station.prices import QUOTAS, Quota
 from station.sizes import measure
 
@@ -59,11 +59,10 @@ def on_paper(usage: Usage) -> Scale:
         for name, quota in quotas.items()
     ]
     needs.sort(key=lambda need: need.robots_at_quota or float("inf"))
-    fixed = sum(deployment_dollars_per_month(usage).values())
     return Scale(
         usage.robots,
         needs,
-        dollars_per_month(bill(usage), usage) + fixed,
+        dollars_per_month(bill(usage), usage),
         total(pubnub_bill(usage)) * usage.robot_hours_per_month,
         usage.live_hz * usage.robots,
     )

@@ -10,6 +10,7 @@ from typer.testing import CliRunner
 
 from contract import STATS
 from device.sources.vehicle import Vehicle, VehicleConfig
+from functions.metrics import emit
 from functions.statistics import Vehicle as Gain
 from functions.statistics import summarize_second
 from scripts.costs import FILES, filled
@@ -100,6 +101,11 @@ def test_summary_item_is_measured_in_the_shape_that_lambda_2_writes():
     assert {name.rsplit("_", 1)[1] for name in written if name.endswith(STATS)} == set(STATS)
     kept = {name: measured[name] for name in written}
     assert sizes.item_bytes(written) == pytest.approx(sizes.item_bytes(kept), rel=0.05)
+
+
+def test_metrics_line_is_about_as_long_as_lambda_1_writes_it(capsys):
+    emit("live", LivePublished=1, CarToLambdaMs=12.345)
+    assert len(capsys.readouterr().out) == pytest.approx(cost._METRICS_LINE, rel=0.25)
 
 
 def test_a_drive_is_a_vesc_drive():
