@@ -2,9 +2,9 @@
 PYTHON ?= python3
 BIN := .venv/bin
 # cdk.json runs `python app.py`.
-bootstrap deploy destroy: export PATH := $(CURDIR)/$(BIN):$(PATH)
+bootstrap deploy diff destroy: export PATH := $(CURDIR)/$(BIN):$(PATH)
 
-.PHONY: help demo test check setup bench-agent bench-fleet layer bootstrap deploy destroy lock clean
+.PHONY: help demo test check setup bench-agent bench-fleet layer bootstrap deploy diff destroy lock clean
 
 help: ## show this
 	@grep -hE '^[a-z-]+:.*## ' Makefile | sed -E 's/^([a-z-]+):.*## /\1\t/' | expand -t 14
@@ -40,6 +40,9 @@ bootstrap: layer ## prepare an AWS account and region for the CDK, once
 
 deploy: layer ## deploy to the AWS account of your credentials; ARGS="-c key=value" sets parameters
 	@$(CDK) deploy --all $(ARGS)
+
+diff: layer ## what a deploy would change, resource by resource
+	@$(CDK) diff --all $(ARGS)
 
 destroy: layer ## remove everything from it again, the data included
 	@$(CDK) destroy --all $(ARGS)

@@ -28,7 +28,11 @@ def build(app: App, settings: Settings) -> None:
     def stack(noun: str) -> dict[str, Any]:
         # The embedded cloud knows one caller, not the roles that bootstrapping makes on AWS.
         synthesizer = CliCredentialsStackSynthesizer() if settings.embedded else None
-        return {"construct_id": f"{name}-{noun}", "synthesizer": synthesizer}
+        return {
+            "construct_id": f"{name}-{noun}",
+            "synthesizer": synthesizer,
+            "termination_protection": settings.protected,
+        }
 
     Fleet(app, **stack("fleet"), namespace=name)
     storage = Storage(app, **stack("storage"), settings=settings)
@@ -37,7 +41,8 @@ def build(app: App, settings: Settings) -> None:
     Monitoring(
         app, **stack("monitoring"), settings=settings, storage=storage, processing=processing, ingest=ingest
     )
-    Tags.of(app).add("project", name)
+    for key, value in {"project": name, "stage": settings.stage, **settings.tags}.items():
+        Tags.of(app).add(key, value)
     refuse_what_the_embedded_cloud_drops(app)
 
 

@@ -153,6 +153,8 @@ GAPS, NONFINITE = "gaps", "nonfinite"
 FILES_PREFIX, RESULTS_PREFIX = "robots/", "results/"
 
 METRIC_NAMESPACE = "iort"
+# The dimensions of every metric: the deployment's namespace and what emits it.
+METRIC_DEPLOYMENT, METRIC_FUNCTION = "Deployment", "Function"
 METRICS = {
     "live": ("LivePublished", "LiveStale", "LiveRefused", "PubNubFailed", "CarToLambdaMs"),
     "summarize": ("BatchesSummarized", "SamplesSummarized", "BatchesRefused", "BatchesMissing"),

@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 import json
+import os
 import time
 
-from contract import METRIC_NAMESPACE, METRICS
+from contract import METRIC_DEPLOYMENT, METRIC_FUNCTION, METRIC_NAMESPACE, METRICS
 
 
 def emit(function: str, **values: float) -> None:
@@ -13,6 +14,7 @@ def emit(function: str, **values: float) -> None:
 
     ``function`` and the metric names must be the contract's; a name it does not know is a KeyError,
     so that no dashboard can wait for a metric that nothing emits.
+    The deployment's ``NAMESPACE`` is a dimension: two stages in one account do not add up.
     Source of the format: CloudWatch, "Specification: Embedded metric format".
     """
     known = METRICS[function]
@@ -23,10 +25,11 @@ def emit(function: str, **values: float) -> None:
     if not shown:
         return
     metrics = [{"Name": name, "Unit": _unit(name)} for name in shown]
-    directive = {"Namespace": METRIC_NAMESPACE, "Dimensions": [["Function"]], "Metrics": metrics}
+    dimensions = {METRIC_DEPLOYMENT: os.environ["NAMESPACE"], METRIC_FUNCTION: function}
+    directive = {"Namespace": METRIC_NAMESPACE, "Dimensions": [list(dimensions)], "Metrics": metrics}
     line = {
         "_aws": {"Timestamp": int(time.time() * 1000), "CloudWatchMetrics": [directive]},
-        "Function": function,
+        **dimensions,
         **shown,
     }
     print(json.dumps(line, separators=(",", ":")))  # noqa: T201 the log line is the metric

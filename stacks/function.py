@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
-from aws_cdk import CfnOutput, Duration, IgnoreMode, RemovalPolicy, Stack
+from aws_cdk import CfnOutput, Duration, IgnoreMode, Stack
 from aws_cdk import aws_iam as iam
 from aws_cdk import aws_lambda as lambda_
 from aws_cdk import aws_logs as logs
 
-from stacks.settings import ROOT
+from stacks.encryption import Encryption
+from stacks.settings import ROOT, Settings
 
 RUNTIME = lambda_.Runtime.PYTHON_3_13
 # The emulator runs the functions on the machine it stands on, so the architecture means nothing there.
@@ -20,6 +21,8 @@ def function(
     stack: Stack,
     name: str,
     *,
+    settings: Settings,
+    encryption: Encryption,
     module: str,
     memory_mb: int,
     timeout_s: int = 10,
@@ -35,7 +38,8 @@ def function(
         stack,
         f"{name}Log",
         retention=logs.RetentionDays.ONE_MONTH,
-        removal_policy=RemovalPolicy.DESTROY,
+        removal_policy=settings.removal_policy,
+        **encryption.log,
     )
     # A role of its own instead of AWSLambdaBasicExecutionRole, which may write to every log.
     role = iam.Role(stack, f"{name}Role", assumed_by=iam.ServicePrincipal("lambda.amazonaws.com"))
@@ -51,7 +55,8 @@ def function(
         log_group=log,
         memory_size=memory_mb,
         timeout=Duration.seconds(timeout_s),
-        environment=environment,
+        # Under this namespace its metrics are counted: functions/metrics.py.
+        environment={"NAMESPACE": settings.namespace, **(environment or {})},
         layers=layers,
         reserved_concurrent_executions=reserved_concurrency or None,
     )

@@ -38,9 +38,10 @@ class Ingest(Stack):
         self.rejected = sqs.Queue(
             self,
             "Rejected",
-            encryption=sqs.QueueEncryption.SQS_MANAGED,
             enforce_ssl=True,
             retention_period=Duration.days(14),
+            removal_policy=settings.removal_policy,
+            **storage.encryption.queue,
         )
         CfnOutput(self, "RejectedQueue", value=self.rejected.queue_url)
         self.rules = [

@@ -5,11 +5,12 @@ from __future__ import annotations
 from typing import Any
 
 from aws_cdk import Duration, Stack
+from aws_cdk import aws_budgets as budgets
 from aws_cdk import aws_cloudwatch as cloudwatch
 from aws_cdk import aws_lambda as lambda_
 from constructs import Construct
 
-from contract import METRIC_NAMESPACE, METRICS, RULES, rule_name
+from contract import METRIC_DEPLOYMENT, METRIC_FUNCTION, METRIC_NAMESPACE, METRICS, RULES, rule_name
 from stacks.ingest import Ingest
 from stacks.processing import Processing
 from stacks.settings import Settings
@@ -46,6 +47,37 @@ class Monitoring(Stack):
         dashboard.add_widgets(*self._storage(storage))
         dashboard.add_widgets(*self._functions(processing))
         dashboard.add_widgets(*self._own(), self._queues(processing, ingest))
+        if settings.budget_usd:
+            self._budget(settings)
+
+    def _budget(self, settings: Settings) -> None:
+        """Of the whole account: a budget by tag counts nothing until somebody activates the tag."""
+
+        def told(kind: str, percent: float) -> budgets.CfnBudget.NotificationWithSubscribersProperty:
+            return budgets.CfnBudget.NotificationWithSubscribersProperty(
+                notification=budgets.CfnBudget.NotificationProperty(
+                    notification_type=kind,
+                    comparison_operator="GREATER_THAN",
+                    threshold=percent,
+                    threshold_type="PERCENTAGE",
+                ),
+                subscribers=[
+                    budgets.CfnBudget.SubscriberProperty(
+                        subscription_type="EMAIL", address=settings.alarm_email or ""
+                    )
+                ],
+            )
+
+        budgets.CfnBudget(
+            self,
+            "Budget",
+            budget=budgets.CfnBudget.BudgetDataProperty(
+                budget_type="COST",
+                time_unit="MONTHLY",
+                budget_limit=budgets.CfnBudget.SpendProperty(amount=settings.budget_usd, unit="USD"),
+            ),
+            notifications_with_subscribers=[told("ACTUAL", 80), told("FORECASTED", 100)],
+        )
 
     def _broker(self) -> list[cloudwatch.GraphWidget]:
         return [
@@ -110,8 +142,7 @@ class Monitoring(Stack):
             _graph("Stream: iterator age, ms", [age]),
         ]
 
-    @staticmethod
-    def _own() -> list[cloudwatch.GraphWidget]:
+    def _own(self) -> list[cloudwatch.GraphWidget]:
         return [
             _graph(
                 f"{function}: {METRIC_NAMESPACE} metrics",
@@ -120,7 +151,7 @@ class Monitoring(Stack):
                         METRIC_NAMESPACE,
                         name,
                         statistic="p95" if name.endswith("Ms") else "sum",
-                        Function=function,
+                        **{METRIC_DEPLOYMENT: self._namespace, METRIC_FUNCTION: function},
                     )
                     for name in names
                 ],

@@ -25,12 +25,14 @@ class Processing(Stack):
         self, scope: Construct, construct_id: str, *, settings: Settings, storage: Storage, **kwargs: Any
     ) -> None:
         super().__init__(scope, construct_id, **kwargs)
+        self._settings, self._encryption = settings, storage.encryption
         self.undecodable = sqs.Queue(
             self,
             "Undecodable",
-            encryption=sqs.QueueEncryption.SQS_MANAGED,
             enforce_ssl=True,
             retention_period=Duration.days(14),
+            removal_policy=settings.removal_policy,
+            **storage.encryption.queue,
         )
         self.live = self._live(settings)
         self.summarize = self._summarize(storage)
@@ -42,6 +44,8 @@ class Processing(Stack):
         live = function(
             self,
             "Live",
+            settings=settings,
+            encryption=self._encryption,
             module="live",
             memory_mb=256,
             environment={"PUBNUB_PARAMETER": name, "LIVE_FIELDS": json.dumps(settings.live_fields)},
@@ -71,6 +75,8 @@ class Processing(Stack):
         summarize = function(
             self,
             "Summarize",
+            settings=self._settings,
+            encryption=self._encryption,
             module="summarize",
             memory_mb=512,
             timeout_s=60,
@@ -103,7 +109,9 @@ class Processing(Stack):
         return summarize
 
     def _echo(self, settings: Settings) -> lambda_.Function:
-        echo = function(self, "Echo", module="echo", memory_mb=256)
+        echo = function(
+            self, "Echo", settings=settings, encryption=self._encryption, module="echo", memory_mb=256
+        )
         echo.configure_async_invoke(max_event_age=Duration.minutes(1), retry_attempts=0)
         topic = f"{PONG}/{settings.namespace}/*/{LAMBDA}"
         echo.add_to_role_policy(

@@ -2,16 +2,26 @@
 
 from __future__ import annotations
 
+import json
+import math
+import re
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, fields
 from pathlib import Path
 from typing import Any
 
-from aws_cdk import App
+from aws_cdk import App, RemovalPolicy
 
 from contract import DEFAULT_NAMESPACE, VESC_FIELDS, VESC_STREAM, ContractError, check_namespace
 
 ROOT = Path(__file__).resolve().parent.parent
+
+DEV, PROD = "dev", "prod"
+STAGES = (DEV, PROD)
+_EMAIL = re.compile(r"[^@\s,]+@[^@\s,]+\.[^@\s,]+")
+# "Tag naming limits and requirements": up to 128 and 256 characters, and aws: is AWS' own.
+_TAG_KEY = re.compile(r"(?!aws:)[\w .:/=+@-]{1,128}", re.IGNORECASE)
+_TAG_VALUE = re.compile(r"[\w .:/=+@-]{0,256}")
 
 
 class SettingsError(ValueError):
@@ -19,18 +29,41 @@ class SettingsError(ValueError):
 
 
 @dataclass(frozen=True, kw_only=True)
+class Thresholds:
+    """From where on a human should know; each is a context key of its name.
+
+    The voltage suits a battery of three lithium cells; the temperatures are those of the controller's
+    board and MOSFETs, which a VESC throttles from 85 degC on.
+    """
+
+    low_voltage_v: float = 10.5
+    high_temperature_degc: float = 80.0
+    stream_behind_s: float = 60.0
+    car_to_lambda_ms: float = 2_000.0
+
+
+@dataclass(frozen=True, kw_only=True)
 class Settings:
     """What may differ between two deployments of the same stacks.
 
-    ``namespace`` prefixes topics, rules and stacks; ``retention_days`` is how long telemetry and
-    summaries are kept; ``files_days`` is how long uploaded files are (0: for good);
-    ``live_concurrency`` bounds Lambda 1 (0 reserves nothing, for accounts whose concurrency limit is
-    too low to reserve from); ``live_fields`` maps stream to the fields that go to the dashboard;
-    ``layer`` is the folder of Lambda 1's third-party code; ``embedded`` is true for the embedded
-    cloud, which is deployed with the caller's own credentials.
+    ``namespace`` prefixes topics, rules and stacks; ``stage`` is dev, where everything goes with the
+    stack, or prod, where what holds data stays and is protected; ``tags`` are put on every resource;
+    ``customer_key`` encrypts what is kept with a key of the account's own; ``budget_usd`` is the
+    account's monthly budget (0: none), and ``alarm_email`` who hears of it and of every alarm.
+    ``retention_days`` is how long telemetry and summaries are kept; ``files_days`` is how long uploaded
+    files are (0: for good); ``live_concurrency`` bounds Lambda 1 (0 reserves nothing, for accounts whose
+    concurrency limit is too low to reserve from); ``live_fields`` maps stream to the fields that go to
+    the dashboard; ``layer`` is the folder of Lambda 1's third-party code; ``embedded`` is true for the
+    embedded cloud, which is deployed with the caller's own credentials.
     """
 
     namespace: str = DEFAULT_NAMESPACE
+    stage: str = DEV
+    tags: Mapping[str, str] = field(default_factory=dict)
+    customer_key: bool = False
+    budget_usd: int = 0
+    alarm_email: str | None = None
+    thresholds: Thresholds = field(default_factory=Thresholds)
     retention_days: int = 90
     files_days: int = 0
     live_concurrency: int = 5
@@ -38,24 +71,58 @@ class Settings:
     layer: Path = ROOT / "build" / "layer" / "lambda"
     embedded: bool = False
 
+    @property
+    def protected(self) -> bool:
+        """Whether data outlives its stack: retained, recoverable to a point in time, and protected
+        from deletion and termination."""
+        return self.stage == PROD
+
+    @property
+    def removal_policy(self) -> RemovalPolicy:
+        """What becomes of a resource that holds data when its stack goes."""
+        return RemovalPolicy.RETAIN if self.protected else RemovalPolicy.DESTROY
+
     @classmethod
     def from_context(cls, app: App) -> Settings:
         """Read ``-c key=value`` and cdk.json; raises `SettingsError` for a value that is not allowed."""
+        context = app.node.try_get_context
         given: dict[str, Any] = {}
-        if (namespace := app.node.try_get_context("namespace")) is not None:
+        if (namespace := context("namespace")) is not None:
             try:
                 given["namespace"] = check_namespace(namespace)
             except ContractError as error:
                 raise SettingsError(f"context {error}") from error
-        whole = (("retention_days", 1, 3650), ("files_days", 0, 3650), ("live_concurrency", 0, 1000))
-        for key, low, high in whole:
-            if (value := app.node.try_get_context(key)) is not None:
+        if (stage := context("stage")) is not None:
+            if stage not in STAGES:
+                raise SettingsError(f"context stage = {stage!r}: allowed is {' or '.join(STAGES)}")
+            given["stage"] = stage
+        for key, low, high in (
+            ("retention_days", 1, 3650),
+            ("files_days", 0, 3650),
+            ("live_concurrency", 0, 1000),
+            ("budget_usd", 0, 1_000_000),
+        ):
+            if (value := context(key)) is not None:
                 given[key] = _integer(key, value, low, high)
-        if (layer := app.node.try_get_context("layer")) is not None:
+        for key in ("embedded", "customer_key"):
+            if (value := context(key)) is not None:
+                given[key] = _boolean(key, value)
+        if (email := context("alarm_email")) is not None:
+            given["alarm_email"] = _email("alarm_email", email)
+        if (tags := context("tags")) is not None:
+            given["tags"] = _tags(tags)
+        given["thresholds"] = Thresholds(
+            **{
+                one.name: _positive(one.name, value)
+                for one in fields(Thresholds)
+                if (value := context(one.name)) is not None
+            }
+        )
+        if (layer := context("layer")) is not None:
             given["layer"] = ROOT / str(layer)
-        if (embedded := app.node.try_get_context("embedded")) is not None:
-            given["embedded"] = _boolean("embedded", embedded)
         settings = cls(**given)
+        if settings.budget_usd and not settings.alarm_email:
+            raise SettingsError("context budget_usd: a budget needs alarm_email, whom it tells")
         if not settings.layer.is_dir():
             raise SettingsError(f"layer {settings.layer} is not there: run `make layer`")
         return settings
@@ -69,7 +136,44 @@ def _integer(key: str, value: Any, low: int, high: int) -> int:
     return int(text)
 
 
+def _positive(key: str, value: Any) -> float:
+    try:
+        number = math.nan if isinstance(value, bool) else float(value)
+    except (TypeError, ValueError):
+        number = math.nan
+    if not 0 < number < math.inf:
+        raise SettingsError(f"context {key} = {value!r}: allowed is a number above 0")
+    return number
+
+
 def _boolean(key: str, value: Any) -> bool:
     if str(value).lower() not in ("true", "false"):
         raise SettingsError(f"context {key} = {value!r}: allowed is true or false")
     return str(value).lower() == "true"
+
+
+def _email(key: str, value: Any) -> str:
+    if not isinstance(value, str) or not _EMAIL.fullmatch(value):
+        raise SettingsError(f"context {key} = {value!r}: allowed is one e-mail address")
+    return value
+
+
+def _tags(value: Any) -> dict[str, str]:
+    """From cdk.json an object, from the command line ``team=lab,cost-centre=7``."""
+    tags: Mapping[Any, Any] | None = value if isinstance(value, Mapping) else None
+    if isinstance(value, str):
+        pairs = [pair.split("=", 1) for pair in value.split(",")]
+        tags = {pair[0]: pair[-1] for pair in pairs} if all(len(pair) == 2 for pair in pairs) else None
+    if tags is None or not all(
+        isinstance(key, str)
+        and _TAG_KEY.fullmatch(key)
+        and isinstance(text, str)
+        and _TAG_VALUE.fullmatch(text)
+        for key, text in tags.items()
+    ):
+        raise SettingsError(f"context tags = {_shown(value)}: allowed is key=value,key=value with AWS' tags")
+    return dict(tags)
+
+
+def _shown(value: Any) -> str:
+    return repr(value) if isinstance(value, str) else json.dumps(value, default=str)

@@ -4,12 +4,13 @@ from __future__ import annotations
 
 from typing import Any
 
-from aws_cdk import CfnOutput, Duration, RemovalPolicy, Stack
+from aws_cdk import CfnOutput, Duration, Stack
 from aws_cdk import aws_dynamodb as dynamodb
 from aws_cdk import aws_s3 as s3
 from constructs import Construct
 
 from contract import EXPIRES_S, FILES_PREFIX, RESULTS_PREFIX, ROBOT, SECOND, T_US, TOPIC
+from stacks.encryption import Encryption
 from stacks.settings import Settings
 
 # Half the price to keep, a cent a gigabyte to read; S3 allows it from this day on, and leaves objects
@@ -19,10 +20,15 @@ _RARE_AFTER_DAYS = 30
 
 class Storage(Stack):
     """Three tables, paid by request, and a bucket. Every topic is a time series: partition key topic,
-    sort key time."""
+    sort key time.
+
+    ``encryption`` is for whatever else the deployment keeps, in whichever stack.
+    """
 
     def __init__(self, scope: Construct, construct_id: str, *, settings: Settings, **kwargs: Any) -> None:
         super().__init__(scope, construct_id, **kwargs)
+        self._settings = settings
+        self.encryption = Encryption(self, settings=settings)
         self.telemetry = self._table(
             "Telemetry",
             partition=TOPIC,
@@ -52,7 +58,12 @@ class Storage(Stack):
             billing_mode=dynamodb.BillingMode.PAY_PER_REQUEST,
             time_to_live_attribute=EXPIRES_S if expires else None,
             stream=stream,
-            removal_policy=RemovalPolicy.DESTROY,
+            removal_policy=self._settings.removal_policy,
+            deletion_protection=self._settings.protected,
+            point_in_time_recovery_specification=dynamodb.PointInTimeRecoverySpecification(
+                point_in_time_recovery_enabled=self._settings.protected
+            ),
+            **self.encryption.table,
         )
         CfnOutput(self, f"{name}Table", value=table.table_name)
         return table
@@ -76,7 +87,6 @@ class Storage(Stack):
         bucket = s3.Bucket(
             self,
             "Files",
-            encryption=s3.BucketEncryption.S3_MANAGED,
             block_public_access=s3.BlockPublicAccess.BLOCK_ALL,
             object_ownership=s3.ObjectOwnership.BUCKET_OWNER_ENFORCED,
             enforce_ssl=True,
@@ -84,7 +94,8 @@ class Storage(Stack):
             lifecycle_rules=rules,
             # CloudFormation deletes an empty bucket only; `iort files empty` comes before, because the
             # CDK's own way is a function that may delete every object, deployed for good.
-            removal_policy=RemovalPolicy.DESTROY,
+            removal_policy=settings.removal_policy,
+            **self.encryption.bucket,
         )
         CfnOutput(self, "FilesBucket", value=bucket.bucket_name)
         return bucket

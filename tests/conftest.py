@@ -39,10 +39,12 @@ def failed_if_skipped(report: Any) -> Any:
 
 @dataclass(frozen=True)
 class Synthesized:
-    """The app as it is deployed: a template a stack, and the folder with the assets."""
+    """The app as it is deployed: a template a stack, the folder with the assets, and which stacks are
+    protected from termination."""
 
     folder: Path
     templates: Mapping[str, dict[str, Any]]
+    protected: set[str]
 
     def resources(self, kind: str, stack: str | None = None) -> dict[str, dict[str, Any]]:
         """Logical id to properties of every resource of a type."""
@@ -60,7 +62,25 @@ class Synthesized:
 
 @pytest.fixture(scope="session")
 def synthesized(tmp_path_factory: pytest.TempPathFactory) -> Synthesized:
-    """app.build with default settings; imported here, because CDK takes seconds to load."""
+    """app.build with default settings: stage dev."""
+    return _synthesize(tmp_path_factory)
+
+
+@pytest.fixture(scope="session")
+def production(tmp_path_factory: pytest.TempPathFactory) -> Synthesized:
+    """app.build with everything that a production stage can have."""
+    return _synthesize(
+        tmp_path_factory,
+        stage="prod",
+        customer_key=True,
+        budget_usd=50,
+        alarm_email="lab@example.org",
+        tags={"team": "lab"},
+    )
+
+
+def _synthesize(tmp_path_factory: pytest.TempPathFactory, **given: Any) -> Synthesized:
+    # Imported here, because CDK takes seconds to load.
     from aws_cdk import App
 
     from app import build
@@ -70,8 +90,13 @@ def synthesized(tmp_path_factory: pytest.TempPathFactory) -> Synthesized:
     (layer / "python").mkdir()
     (layer / "python" / "nothing.py").touch()
     app = App(outdir=str(folder))
-    settings = Settings(layer=layer)
+    settings = Settings(layer=layer, **given)
     build(app, settings)
     stacks = app.synth().stacks
     prefix = f"{settings.namespace}-"
-    return Synthesized(folder, {s.stack_name.removeprefix(prefix): s.template for s in stacks})
+    nouns = {s.stack_name.removeprefix(prefix): s for s in stacks}
+    return Synthesized(
+        folder,
+        {noun: s.template for noun, s in nouns.items()},
+        {noun for noun, s in nouns.items() if s.termination_protection},
+    )

@@ -88,6 +88,11 @@ def test_what_the_context_says(settings, tmp_path):
         True,
     )
     assert settings(embedded="false").embedded is False
+    asked = {"stage": "prod", "customer_key": "true", "budget_usd": "50", "alarm_email": "lab@example.org"}
+    given = settings(**asked, low_voltage_v="13.2", tags="team=lab,cost-centre=7")
+    assert (given.stage, given.customer_key, given.budget_usd) == ("prod", True, 50)
+    assert (given.alarm_email, given.thresholds.low_voltage_v) == ("lab@example.org", 13.2)
+    assert given.tags == {"team": "lab", "cost-centre": "7"} == settings(tags=dict(given.tags)).tags
     # cdk.json's numbers arrive as JavaScript's.
     assert settings(retention_days=7.0, embedded=True) == settings(retention_days="7", embedded="true")
 
@@ -108,6 +113,18 @@ def test_what_the_context_says(settings, tmp_path):
         ({"live_concurrency": "many"}, ["live_concurrency", "'many'"]),
         ({"live_concurrency": [5]}, ["live_concurrency", "[5]"]),
         ({"embedded": "maybe"}, ["embedded", "'maybe'", "true", "false"]),
+        ({"stage": "test"}, ["stage", "'test'", "dev or prod"]),
+        ({"alarm_email": "nobody"}, ["alarm_email", "'nobody'"]),
+        ({"alarm_email": "a@b.org,c@d.org"}, ["alarm_email"]),
+        ({"budget_usd": "50"}, ["budget_usd", "alarm_email"]),
+        ({"budget_usd": "ten", "alarm_email": "a@b.org"}, ["budget_usd", "'ten'"]),
+        ({"low_voltage_v": "low"}, ["low_voltage_v", "'low'", "above 0"]),
+        ({"low_voltage_v": "nan"}, ["low_voltage_v", "'nan'"]),
+        ({"high_temperature_degc": -1}, ["high_temperature_degc", "-1"]),
+        ({"stream_behind_s": True}, ["stream_behind_s", "True"]),
+        ({"tags": "lab"}, ["tags", "'lab'", "key=value"]),
+        ({"tags": "aws:x=1"}, ["tags", "'aws:x=1'"]),
+        ({"tags": {"team": 7}}, ["tags", "7"]),
         ({"layer": "build/nowhere"}, ["build/nowhere", "make layer"]),
     ],
 )

@@ -1,4 +1,4 @@
-"""One snapshot a stack: a change of what is deployed shows in the diff. Update: pytest --snapshot-update."""
+"""One snapshot a stack and stage: a change of what is deployed shows. Update: pytest --snapshot-update."""
 
 from __future__ import annotations
 
@@ -16,8 +16,10 @@ def test_the_stacks_are_these(synthesized):
 
 
 @pytest.mark.parametrize("stack", STACKS)
-def test_template(synthesized, snapshot, stack):
-    template = {k: v for k, v in synthesized.templates[stack].items() if k not in ("Parameters", "Rules")}
+@pytest.mark.parametrize("stage", ["synthesized", "production"])
+def test_template(request, snapshot, stack, stage):
+    templates = request.getfixturevalue(stage).templates
+    template = {k: v for k, v in templates[stack].items() if k not in ("Parameters", "Rules")}
     # What the code and the layer hold is other tests' business; so is which CDK numbered the layer.
     masked = _ASSET.sub("<asset>", json.dumps(template))
     assert json.loads(masked) == snapshot

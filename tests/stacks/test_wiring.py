@@ -158,8 +158,10 @@ def test_what_the_variables_say_is_what_the_functions_expect(functions, reader, 
     monkeypatch.setenv("LIVE_FIELDS", live["LIVE_FIELDS"])
     assert LiveSettings.from_environment().fields == {contract.VESC_STREAM: frozenset(contract.VESC_FIELDS)}
     assert live["PUBNUB_PARAMETER"] == contract.pubnub_parameter()
+    assert live["NAMESPACE"] == contract.DEFAULT_NAMESPACE
     tables = functions["Summarize"]["Environment"]["Variables"]
     assert {key: reader.text(value) for key, value in tables.items()} == {
+        "NAMESPACE": contract.DEFAULT_NAMESPACE,
         "TELEMETRY_TABLE": "Telemetry",
         "SUMMARY_TABLE": "Summary",
         "ROBOTS_TABLE": "Robots",
@@ -205,7 +207,8 @@ def test_the_dashboard_shows_what_the_functions_emit_and_nothing_else(shown):
     by_function = {}
     for namespace, metric, dimensions, options in shown:
         if namespace == contract.METRIC_NAMESPACE:
-            assert dimensions.keys() == {"Function"}
+            assert dimensions.keys() == {"Deployment", "Function"}
+            assert dimensions["Deployment"] == contract.DEFAULT_NAMESPACE
             by_function.setdefault(dimensions["Function"], set()).add(metric)
             assert options["stat"] == ("p95" if metric.endswith("Ms") else "Sum")
     assert by_function == {function: set(names) for function, names in contract.METRICS.items()}

@@ -20,6 +20,12 @@ def no_network():
     enable_socket()
 
 
+@pytest.fixture(autouse=True)
+def deployment(monkeypatch):
+    """What every function's environment says, and its metrics are counted under."""
+    monkeypatch.setenv("NAMESPACE", "iort")
+
+
 @pytest.fixture
 def aws(monkeypatch):
     """AWS in this process, with nothing in it; the machine's own settings and keys are out of reach."""

@@ -11,6 +11,11 @@ import contract
 from functions.metrics import emit
 
 
+@pytest.fixture(autouse=True)
+def deployment(monkeypatch):
+    monkeypatch.setenv("NAMESPACE", "lab2")
+
+
 def test_every_metric_of_the_contract_is_a_valid_line(capsys):
     for function, names in contract.METRICS.items():
         before_ms = time.time_ns() // 1_000_000
@@ -22,8 +27,8 @@ def test_every_metric_of_the_contract_is_a_valid_line(capsys):
         assert isinstance(metadata["Timestamp"], int)
         (directive,) = metadata["CloudWatchMetrics"]
         assert directive["Namespace"] == contract.METRIC_NAMESPACE
-        assert directive["Dimensions"] == [["Function"]]
-        assert line["Function"] == function
+        assert directive["Dimensions"] == [["Deployment", "Function"]]
+        assert (line["Deployment"], line["Function"]) == ("lab2", function)
         assert {metric["Name"] for metric in directive["Metrics"]} == set(names)
         for metric in directive["Metrics"]:
             assert metric["Unit"] == ("Milliseconds" if metric["Name"].endswith("Ms") else "Count")
