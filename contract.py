@@ -365,7 +365,7 @@ def decode(message: bytes | str | Mapping[str, Any]) -> Batch:
     boot = _check_header(envelope.get("boot"), seq, nonfinite)
     if not 1 <= n <= MAX_SAMPLES:
         raise ContractError(f"envelope says {n} samples: allowed is 1 to {MAX_SAMPLES}")
-    body = _json_object(_inflate(envelope.get("samples")), "samples")
+    body = _json_object(inflate(envelope.get("samples")), "samples")
     dt, fields = body.get("dt"), body.get("fields")
     if not isinstance(dt, list) or len(dt) != n or not isinstance(fields, dict):
         raise ContractError(f"samples: expected {n} dt and an object of fields")
@@ -727,7 +727,8 @@ def _integer(envelope: Mapping[str, Any], key: str) -> int:
     raise ContractError(f"{key} {_show(value)}: expected an integer")
 
 
-def _inflate(samples: Any) -> bytes:
+def inflate(samples: Any) -> bytes:
+    """The JSON of a batch's columns, as large as a batch may be and no larger; raises `ContractError`."""
     if not isinstance(samples, (str, bytes)):
         raise ContractError(f"samples {_show(samples)}: expected base64 text")
     try:

@@ -147,6 +147,14 @@ def listed(cloud: Cloud) -> Iterator[dict[str, Any]]:
             yield {name: deserialize(value) for name, value in item.items()}
 
 
+def row(cloud: Cloud, robot: str) -> dict[str, Any] | None:
+    """The robot's row of the registry, None where it has none."""
+    deserialize = TypeDeserializer().deserialize
+    table, key = cloud.output("storage", "RobotsTable"), {ROBOT: {"S": robot}}
+    item = cloud.client("dynamodb").get_item(TableName=table, Key=key).get("Item")
+    return None if item is None else {name: deserialize(value) for name, value in item.items()}
+
+
 def remove(cloud: Cloud, robot: str) -> None:
     """Take a robot away: its certificates are revoked and deleted, then its thing and its row.
 

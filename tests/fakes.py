@@ -38,16 +38,23 @@ class FakeDynamoDB:
         self.items[table][(first, *map(Decimal, rest))] = item
 
     def get_paginator(self, operation: str) -> FakeDynamoDB:
+        if operation == "scan":
+            return _Scans(self)  # type: ignore[return-value]  # it paginates as well
         assert operation == "query"
         return self
+
+    def query(self, **query: Any) -> dict[str, Any]:
+        page = next(iter(self.paginate(**query)))
+        return {**page, "Count": len(page["Items"])}
 
     def paginate(self, **query: Any) -> Iterator[dict[str, Any]]:
         assert query["ConsistentRead"]
         names, values = query["ExpressionAttributeNames"], query["ExpressionAttributeValues"]
-        assert names == {"#topic": TOPIC, "#t": T_US}
+        assert names["#topic"] == TOPIC
+        assert set(names.values()) >= set(KEYS[query["TableName"]])
         topic = values[":topic"]["S"]
         bounds = {name: Decimal(value["N"]) for name, value in values.items() if name != ":topic"}
-        match = re.fullmatch(r"#topic = :topic AND #t (.+)", query["KeyConditionExpression"])
+        match = re.fullmatch(r"#topic = :topic AND #(?:t|key) (.+)", query["KeyConditionExpression"])
         assert match
         inside = {
             "< :t": lambda t: t < bounds[":t"],
@@ -81,6 +88,17 @@ class FakeDynamoDB:
             self.put(table, item)
         left = requests[len(taken) :]
         return {"UnprocessedItems": {table: left} if left else {}}
+
+
+class _Scans:
+    """Everything in a table, in no order to rely on."""
+
+    def __init__(self, table: FakeDynamoDB) -> None:
+        self._table = table
+
+    def paginate(self, **scan: Any) -> Iterator[dict[str, Any]]:
+        self._table.calls["scan"] += 1
+        yield {"Items": list(self._table.items[scan["TableName"]].values())}
 
 
 def tables(client: Any) -> Tables:

@@ -1,0 +1,190 @@
+"""What the cars have recorded, as numpy's columns or a pandas frame.
+
+    from station import data
+    from station.cloud import Cloud
+
+    ride = data.query(Cloud(), "car7", "vesc", "-10m", "now", fields=["speed", "speed_mps"])
+    ride.times_us, ride.columns["speed_mps"], ride.frame()
+
+A range includes its start and not its end, to the microsecond.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from contract import (
+    AGENT_FIELDS,
+    AGENT_STREAM,
+    DERIVED_UNITS,
+    RTT_FIELDS,
+    RTT_STREAM,
+    STATS,
+    T_US,
+    VESC_FIELDS,
+    VESC_STREAM,
+)
+from functions.statistics import Vehicle
+from station import inventory, reading
+from station.blocks import ATTRIBUTES, Block, Refused, blocks, join
+from station.cloud import Cloud
+from station.conditions import Column, derive, holds
+from station.errors import StationError
+from station.reading import Progress
+from station.resample import resample
+from station.seconds import seconds
+from station.selection import MADE_OF, Selection, select
+from station.times import Time, duration_us
+
+
+@dataclass(frozen=True)
+class Result:
+    """Samples in order of time.
+
+    ``times_us`` are int64 microseconds since the epoch, strictly increasing; ``columns`` one array a
+    field: float64 with NaN for null, bool for flags, objects for texts. ``refused`` counts stored items
+    that are not batches, of which ``reason`` says what was wrong with the first.
+    """
+
+    robot: str
+    stream: str
+    times_us: NDArray[np.int64]
+    columns: Mapping[str, Column]
+    refused: int = 0
+    reason: str = ""
+
+    def __len__(self) -> int:
+        return len(self.times_us)
+
+    def unit(self, name: str) -> str:
+        """The unit of a column, empty where none is known."""
+        return unit(self.stream, name)
+
+    def frame(self) -> Any:
+        """The same as a pandas DataFrame, indexed by time in UTC."""
+        # Half a second of import that only those pay who ask for it.
+        import pandas as pd  # noqa: PLC0415
+
+        index = pd.to_datetime(self.times_us, unit="us", utc=True).rename("time")
+        return pd.DataFrame(dict(self.columns), index=index)
+
+
+def query(
+    cloud: Cloud,
+    robot: str,
+    stream: str,
+    start: Time | None = None,
+    end: Time | None = None,
+    *,
+    fields: Sequence[str] | None = None,
+    where: str | None = None,
+    every: str | None = None,
+    summary: bool = False,
+    scan: bool = False,
+    progress: Progress | None = None,
+) -> Result:
+    """The samples of a robot's stream from ``start`` (included) to ``end`` (not included).
+
+    Times are microseconds since the epoch, datetimes, or texts such as ``-10m`` and ISO 8601; None is
+    the beginning or the end of what is stored. ``fields`` may name ``speed_mps`` and ``power_w``, which
+    are derived with the robot's parameters, and so may ``where``, a condition in the language of
+    functions/expression.py. ``every`` (``"1s"``) puts samples together, see station/resample.py.
+    ``summary`` reads the seconds that Lambda 2 has written instead of samples; a field then stands for
+    its ``_min``, ``_mean``, ``_max`` and ``_last``. ``scan`` reads by Scan instead of by Query.
+
+    Raises `StationError` for a robot, stream or field that is not there, naming those that are, and for
+    a time or condition that cannot be read.
+    """
+    selection = select(robot, stream, start, end, fields=fields, where=where)
+    every_us = duration_us(every) if every is not None else None
+    refused = Refused()
+    if summary:
+        found = seconds(cloud, selection, scan=scan, progress=progress)
+    else:
+        found = samples(cloud, selection, refused=refused, scan=scan, progress=progress)
+    block = join(list(found)) if every_us is None else resample(found, every_us)
+    if not len(block.times_us):
+        inventory.check_there(cloud, robot, stream)
+    return Result(robot, stream, block.times_us, block.columns, refused.count, refused.reason)
+
+
+def samples(
+    cloud: Cloud,
+    selection: Selection,
+    *,
+    refused: Refused,
+    scan: bool = False,
+    progress: Progress | None = None,
+) -> Iterator[Block]:
+    """The selection's samples a block at a time, for what is too long to be held at once.
+
+    Raises `StationError` at the end where a field that was named was in none of the samples.
+    """
+    pages = reading.batches(cloud, selection, ATTRIBUTES, scan=scan)
+    found = blocks(reading.told(pages, progress, T_US), refused, selection.needs)
+    condition, fields, named = selection.condition, selection.fields, selection.named()
+    derived = sorted(named & DERIVED_UNITS.keys())
+    vehicle = inventory.vehicle_of(cloud, selection.robot) if derived else None
+    there: set[str] = set()
+    some = False
+    for whole in found:
+        block = _trimmed(whole, selection)
+        some = some or len(block.times_us) > 0
+        columns = dict(block.columns)
+        if derived:
+            made = derive(columns, vehicle)
+            columns |= {name: made[name] for name in derived if name in made}
+        there |= columns.keys()
+        chosen = Block(block.times_us, columns)
+        if condition is not None:
+            chosen = chosen.take(holds(condition, columns, len(block.times_us)))
+        names = block.columns if fields is None else fields
+        if len(chosen.times_us):
+            yield Block(chosen.times_us, {name: _column(chosen, name) for name in names})
+    if some and (unknown := sorted(named - there)):
+        raise StationError(_unknown(cloud, selection, unknown, vehicle))
+
+
+def unit(stream: str, name: str) -> str:
+    """The unit of a field, or of a statistic of it; empty where none is known."""
+    stem, _, statistic = name.rpartition("_")
+    for field in (name, stem) if statistic in STATS else (name,):
+        if field in DERIVED_UNITS:
+            return DERIVED_UNITS[field]
+        if stream == VESC_STREAM and field in VESC_FIELDS:
+            return VESC_FIELDS[field].unit
+        if stream == RTT_STREAM and field in RTT_FIELDS.values():
+            return "ms"
+        if stream == AGENT_STREAM and field in AGENT_FIELDS:
+            return AGENT_FIELDS[field].split()[0].rstrip(",")
+    return ""
+
+
+def _trimmed(block: Block, selection: Selection) -> Block:
+    times = block.times_us
+    first = 0 if selection.start_us is None else int(times.searchsorted(selection.start_us))
+    last = len(times) if selection.end_us is None else int(times.searchsorted(selection.end_us))
+    return block if (first, last) == (0, len(times)) else block.take(slice(first, last))
+
+
+def _column(block: Block, name: str) -> Column:
+    """A column; null where these samples have none."""
+    return block.columns[name] if name in block.columns else np.full(len(block.times_us), np.nan)
+
+
+def _unknown(cloud: Cloud, selection: Selection, unknown: Sequence[str], vehicle: Vehicle | None) -> str:
+    whole = replace(selection, fields=None, condition=None)
+    page = next(reading.batches(cloud, whole, ATTRIBUTES), ())
+    there = {name for block in blocks([page], Refused()) for name in block.columns}
+    possible = there | {name for name, parts in MADE_OF.items() if there.issuperset(parts)}
+    if vehicle is None and "speed_mps" in possible.intersection(unknown):
+        return f"speed_mps needs the speed_to_erpm_gain of {selection.robot}, which the registry lacks"
+    return (
+        f"{selection.robot} has no {', '.join(unknown)} in {selection.stream} in this range; "
+        f"it has {', '.join(sorted(possible))}"
+    )

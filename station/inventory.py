@@ -1,0 +1,37 @@
+"""What there is to ask for: robots, their parameters, their streams."""
+
+from __future__ import annotations
+
+from contract import OWN_STREAMS, ROBOT, VESC_STREAM
+from functions.statistics import Vehicle
+from station import reading, robots
+from station.cloud import Cloud
+from station.errors import StationError
+
+
+def vehicle_of(cloud: Cloud, robot: str) -> Vehicle | None:
+    """The robot's parameters in the registry; None where they are not there."""
+    row = robots.row(cloud, robot)
+    if row is None or not row.get("speed_to_erpm_gain"):
+        return None
+    return Vehicle(float(row["speed_to_erpm_gain"]), float(row.get("speed_to_erpm_offset", 0)))
+
+
+def check_there(cloud: Cloud, robot: str, stream: str) -> None:
+    """Raise `StationError` where a robot or its stream does not exist, naming those that do.
+
+    What a robot that is no longer registered has sent stays, and is there.
+    """
+    if reading.has_any(cloud, robot, stream):
+        return
+    has = ", ".join(streams_of(cloud, robot))
+    known = sorted(str(row[ROBOT]) for row in robots.listed(cloud))
+    if not has and robot not in known:
+        raise StationError(f"there is no robot {robot}; there is {', '.join(known) or 'none at all'}")
+    raise StationError(f"{robot} has no stream {stream}; it has {has or 'sent nothing yet'}")
+
+
+def streams_of(cloud: Cloud, robot: str) -> list[str]:
+    """The streams of a robot that are known by name and have something stored."""
+    known = sorted({VESC_STREAM, *OWN_STREAMS})
+    return [stream for stream in known if reading.has_any(cloud, robot, stream)]

@@ -1,0 +1,125 @@
+"""The language of conditions: what it says, what it refuses, and that both evaluators agree."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from functions import expression
+from functions.expression import ExpressionError, parse
+from station import conditions
+
+SAMPLES = {
+    "speed": [0, 1.5, -2, None],
+    "fault_code": [0, 1, 0, 2],
+    "name": ["a", "b", None, "a"],
+    "on": [True, False, True, None],
+    "pose.x": [1, 2, 3, 4],
+    "covariance.0": [5, 6, 7, 8],
+}
+
+
+def column(values):
+    plain = all(value is None or type(value) in (int, float) for value in values)
+    array = np.empty(len(values), dtype=object)
+    array[:] = values
+    return array.astype(float) if plain else array
+
+
+def both(text, samples=SAMPLES):
+    node, n = parse(text), len(next(iter(samples.values())))
+    lists = expression.holds(node, samples, n)
+    arrays = conditions.holds(node, {name: column(values) for name, values in samples.items()}, n)
+    assert arrays.tolist() == lists
+    return lists
+
+
+@pytest.mark.parametrize(
+    ("text", "expected"),
+    [
+        ("speed > 1.2", [0, 1, 0, 0]),
+        ("abs(speed) >= 1.5", [0, 1, 1, 0]),
+        ("-2 <= speed < 1", [1, 0, 1, 0]),
+        ("speed != 0", [0, 1, 1, 0]),
+        ("not speed > 1.2", [1, 0, 1, 1]),
+        ("speed is None", [0, 0, 0, 1]),
+        ("speed is not None and fault_code == 0", [1, 0, 1, 0]),
+        ("fault_code in (1, 2)", [0, 1, 0, 1]),
+        ("fault_code not in [1, 2]", [1, 0, 1, 0]),
+        ("speed", [0, 1, 1, 0]),
+        ("on", [1, 0, 1, 0]),
+        ("name == 'a'", [1, 0, 0, 1]),
+        ("name != 'a'", [0, 1, 0, 0]),
+        ("pose.x * 2 + 1 > 6", [0, 0, 1, 1]),
+        ("covariance[0] % 2 == 0", [0, 1, 0, 1]),
+        ("1 / speed > 0", [0, 1, 0, 0]),
+        ("speed / 0 is None", [1, 1, 1, 1]),
+        ("missing > 0 or missing is None", [1, 1, 1, 1]),
+        ("  speed > 0\n and fault_code == 1 ", [0, 1, 0, 0]),
+    ],
+)
+def test_says_where_it_holds(text, expected):
+    assert both(text) == list(map(bool, expected))
+
+
+@pytest.mark.parametrize(
+    ("text", "position"),
+    [
+        ("speed >", 7),
+        ("speed > 1 > {x}", 12),
+        ("__import__('os').system('x') > 0", 0),
+        ("speed > [1]", 8),
+        ("speed ** 2 > 1", 0),
+        ("speed > open('x')", 8),
+        ("speed is 3", 9),
+        ("speed in fault_code", 9),
+        ("speed[name] > 1", 0),
+        ("lambda: 1", 0),
+        ("1e999 > speed", 0),
+        ("", 0),
+        ("'é' == name and f'{x}'", 16),
+    ],
+)
+def test_refuses_everything_else_and_points_at_it(text, position):
+    with pytest.raises(ExpressionError) as refused:
+        parse(text)
+    assert refused.value.position == position
+    assert str(refused.value).splitlines()[-1].index("^") == position + 2
+
+
+@pytest.mark.parametrize("text", ["(" * 500 + "1" + ")" * 500, "not " * 200 + "x", "x" * 2000])
+def test_neither_depth_nor_length_breaks_it(text):
+    with pytest.raises(ExpressionError):
+        parse(text)
+
+
+numbers = st.one_of(st.none(), st.integers(-5, 5), st.floats(-1e308, 1e308))
+terms = st.recursive(
+    st.sampled_from(["a", "b", "flag", "0", "1.5", "None", "True"]),
+    lambda part: st.one_of(
+        st.tuples(part, st.sampled_from("+-*/%"), part).map(lambda t: f"({t[0]} {t[1]} {t[2]})"),
+        part.map("abs({})".format),
+        part.map("(-{})".format),
+    ),
+    max_leaves=6,
+)
+truths = st.recursive(
+    st.one_of(
+        terms,
+        st.tuples(terms, st.sampled_from(["<", "<=", "==", "!=", ">", ">="]), terms).map(" ".join),
+        terms.map("{} is None".format),
+    ),
+    lambda part: st.one_of(
+        st.tuples(part, st.sampled_from(["and", "or"]), part).map(lambda t: f"({t[0]}) {t[1]} ({t[2]})"),
+        part.map("not ({})".format),
+    ),
+    max_leaves=5,
+)
+
+
+@given(truths, st.lists(st.tuples(numbers, numbers, st.booleans()), min_size=1, max_size=5))
+def test_lists_and_arrays_agree(text, rows):
+    a, b, flag = (list(values) for values in zip(*rows, strict=True))
+    both(text, {"a": a, "b": b, "flag": flag})

@@ -1,0 +1,219 @@
+"""Queries, over a table in memory whose pages are as small as they can be."""
+
+from __future__ import annotations
+
+from decimal import Decimal
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from contract import MAX_BATCH_SPAN_US, Batch, build_topic
+from functions.statistics import Vehicle
+from functions.statistics import derive as derive_lists
+from functions.tables import attribute
+from station import conditions, data
+from station.data import select
+from station.errors import StationError
+from tests.fakes import ROBOTS, SUMMARY, TELEMETRY, FakeDynamoDB, item_of, serialize
+
+TOPIC = build_topic("dt", "car", "vesc")
+START = 1_700_000_000_000_000
+
+
+class FakeCloud:
+    """A `station.cloud.Cloud` whose only service is the table in memory."""
+
+    namespace = "iort"
+
+    def __init__(self, client):
+        self.table = client
+
+    def client(self, service):
+        assert service == "dynamodb"
+        return self.table
+
+    def output(self, _noun, name):
+        return {"TelemetryTable": TELEMETRY, "SummaryTable": SUMMARY, "RobotsTable": ROBOTS}[name]
+
+
+def cloud_of(*batches, page_items=2, robot="car", gain=None):
+    client = FakeDynamoDB(page_items=page_items)
+    for batch in batches:
+        client.put(TELEMETRY, item_of(batch))
+    row = {"robot": robot} | ({"speed_to_erpm_gain": Decimal(gain)} if gain else {})
+    client.put(ROBOTS, {name: serialize(value) for name, value in row.items()})
+    return FakeCloud(client)
+
+
+def ride(n=100, *, each=10, period_us=20_000, fields=("speed",)):
+    """Batches of n samples, whose values are their number."""
+    return [
+        Batch(
+            "0badcafe",
+            i // each,
+            [START + k * period_us for k in range(i, min(n, i + each))],
+            {name: list(range(i, min(n, i + each))) for name in fields},
+        )
+        for i in range(0, n, each)
+    ]
+
+
+def test_gives_every_sample_once_and_in_order():
+    found = data.query(cloud_of(*ride()), "car", "vesc")
+    assert found.times_us.tolist() == [START + 20_000 * i for i in range(100)]
+    assert found.times_us.dtype == np.int64
+    assert found.columns["speed"].tolist() == list(range(100))
+    assert found.unit("speed") == "erpm"
+    assert len(found) == 100
+
+
+@given(st.integers(-30_000, 2_030_000), st.integers(0, 2_060_000), st.integers(1, 4))
+def test_a_range_has_its_start_and_not_its_end(offset, length, page_items):
+    cloud = cloud_of(*ride(), page_items=page_items)
+    first, last = START + offset, START + offset + length
+    found = data.query(cloud, "car", "vesc", first, last)
+    every = [START + 20_000 * i for i in range(100)]
+    assert found.times_us.tolist() == [t for t in every if first <= t < last]
+
+
+def test_a_batch_that_starts_before_the_range_is_read():
+    long = Batch("0badcafe", 0, [START, START + MAX_BATCH_SPAN_US - 1], {"speed": [1, 2]})
+    found = data.query(cloud_of(long), "car", "vesc", START + MAX_BATCH_SPAN_US - 1, START + 9_000_000)
+    assert found.columns["speed"].tolist() == [2]
+
+
+@given(
+    st.lists(st.tuples(st.integers(0, 3_000_000), st.integers(1, 5)), min_size=1, max_size=8),
+    st.integers(1, 3),
+)
+def test_batches_that_reach_into_one_another_give_each_time_once(starts, page_items):
+    """A car whose clock was set back: the later batch counts where two claim one microsecond."""
+    batches, expected = {}, {}
+    for seq, (at, n) in enumerate(starts):
+        times = sorted({START + at, *(START + at + 100_000 * i for i in range(n))})
+        batches[times[0]] = Batch("0badcafe", seq, times, {"speed": [seq] * len(times)})
+    for t_us in sorted(batches):
+        expected.update(dict.fromkeys(batches[t_us].times_us, batches[t_us].seq))
+    found = data.query(cloud_of(*batches.values(), page_items=page_items), "car", "vesc")
+    assert dict(zip(found.times_us.tolist(), found.columns["speed"].tolist(), strict=True)) == expected
+    assert found.times_us.tolist() == sorted(expected)
+
+
+def test_null_is_nan_and_a_field_that_some_batches_lack_too():
+    cloud = cloud_of(
+        Batch("0badcafe", 0, [START, START + 1], {"speed": [None, 1.5]}),
+        Batch("0badcafe", 1, [START + 2], {"speed": [2], "duty_cycle": [0.1]}),
+    )
+    found = data.query(cloud, "car", "vesc")
+    np.testing.assert_array_equal(found.columns["speed"], [np.nan, 1.5, 2])
+    np.testing.assert_array_equal(found.columns["duty_cycle"], [np.nan, np.nan, 0.1])
+    frame = found.frame()
+    assert list(frame.columns) == ["speed", "duty_cycle"]
+    assert str(frame.index.tz) == "UTC"
+    assert frame.index[0].value == START * 1000
+
+
+def test_texts_flags_and_large_integers_stay_what_they_are():
+    large = 2**53 + 1
+    batch = Batch(
+        "0badcafe", 0, [START, START + 1], {"s": ["1", None], "b": [True, False], "i": [large, None]}
+    )
+    columns = data.query(cloud_of(batch), "car", "vesc").columns
+    assert columns["s"].tolist() == ["1", None]
+    assert columns["b"].tolist() == [True, False]
+    assert columns["i"].tolist() == [large, None]
+
+
+def test_items_that_are_no_batches_are_counted_and_the_rest_is_given():
+    cloud = cloud_of(*ride(20))
+    for at, change in enumerate(({"samples": "!"}, {"n": 7}, {"v": 9}, {"codec": "x"})):
+        item = item_of(Batch("0badcafe", 0, [START + 5_000_000 + at], {"speed": [1]}))
+        cloud.table.put(TELEMETRY, item | {name: serialize(value) for name, value in change.items()})
+    found = data.query(cloud, "car", "vesc")
+    assert len(found) == 20
+    assert found.refused == 4
+    assert "base64" in found.reason
+
+
+def test_where_and_fields_work_on_what_is_derived():
+    cloud = cloud_of(*ride(), gain="10")
+    found = data.query(cloud, "car", "vesc", fields=["speed_mps"], where="speed_mps >= 9.8")
+    assert list(found.columns) == ["speed_mps"]
+    assert found.columns["speed_mps"].tolist() == [9.8, 9.9]
+    assert found.unit("speed_mps") == "m/s"
+
+
+def test_what_is_derived_is_what_lambda_2_derives():
+    lists = {"speed": [1, None, 3.5], "voltage_input": [12, 11.5, None], "current_input": [1e300, 2, 3]}
+    vehicle = Vehicle(4614.0, 3.0)
+    arrays = {name: np.array(values, dtype=float) for name, values in lists.items()}
+    ours = conditions.derive(arrays, vehicle)
+    assert {name: conditions.values(column) for name, column in ours.items()} == derive_lists(lists, vehicle)
+
+
+def test_every_puts_samples_together_across_pages():
+    batches = ride(150, fields=("speed", "fault_code"))
+    found = data.query(cloud_of(*batches, page_items=1), "car", "vesc", every="1s")
+    assert found.times_us.tolist() == [START, START + 1_000_000, START + 2_000_000]
+    assert found.columns["speed"].tolist() == [24.5, 74.5, 124.5]
+    assert found.columns["fault_code"].tolist() == [49, 99, 149]
+
+
+def test_every_passes_over_null():
+    batch = Batch(
+        "0badcafe", 0, [START, START + 1, START + 500_000], {"speed": [None, 3, None], "s": ["a", "b", "c"]}
+    )
+    found = data.query(cloud_of(batch), "car", "vesc", every="500ms")
+    np.testing.assert_array_equal(found.columns["speed"], [3, np.nan])
+    assert found.columns["s"].tolist() == ["b", "c"]
+
+
+def test_summary_gives_the_seconds_that_begin_in_the_range():
+    cloud = cloud_of(*ride())
+    for second in range(3):
+        summary = {"n": 50, "speed_min": float(second), "speed_mean": 1.5, "speed_max": 2, "speed_last": 2}
+        item = {name: attribute(value) for name, value in summary.items()}
+        key = {"topic": {"S": TOPIC}, "second": {"N": str(START // 1_000_000 + second)}}
+        cloud.table.put(SUMMARY, item | key)
+    found = data.query(cloud, "car", "vesc", START + 1, START + 2_000_001, fields=["speed"], summary=True)
+    assert found.times_us.tolist() == [START + 1_000_000, START + 2_000_000]
+    assert list(found.columns) == ["speed_min", "speed_mean", "speed_max", "speed_last"]
+    assert found.columns["speed_min"].tolist() == [1, 2]
+    assert found.unit("speed_min") == "erpm"
+    with pytest.raises(StationError, match="has no volts; it has n, speed_last"):
+        data.query(cloud, "car", "vesc", fields=["volts"], summary=True)
+
+
+def test_an_empty_range_is_no_error():
+    found = data.query(cloud_of(*ride()), "car", "vesc", START - 10, START)
+    assert len(found) == 0
+
+
+@pytest.mark.parametrize(
+    ("question", "answer"),
+    [
+        ({"robot": "bus"}, "there is no robot bus; there is car"),
+        ({"stream": "imu"}, "car has no stream imu; it has vesc"),
+        ({"fields": ["volts"]}, "car has no volts in vesc in this range; it has speed, speed_mps"),
+        ({"where": "volts > 1"}, "car has no volts"),
+        ({"fields": ["speed_mps"]}, "speed_mps needs the speed_to_erpm_gain of car"),
+        ({"where": "speed >"}, "no expression"),
+        ({"start": "yesterday"}, "time 'yesterday': allowed is now, -10m"),
+        ({"start": 5, "end": 4}, "ends before it starts"),
+        ({"every": "1 fortnight"}, "duration '1 fortnight'"),
+        ({"robot": "a/b"}, "robot name 'a/b'"),
+    ],
+)
+def test_a_mistake_is_answered_with_what_there_is(question, answer):
+    arguments = {"robot": "car", "stream": "vesc", **question}
+    with pytest.raises(StationError) as refused:
+        data.query(cloud_of(*ride()), **arguments)
+    assert answer in str(refused.value)
+
+
+def test_a_selection_reads_only_what_it_needs():
+    selection = select("car", "vesc", fields=["speed_mps"], where="duty_cycle > 0")
+    names = ["speed", "duty_cycle", "voltage_input", "speed_mps"]
+    assert [name for name in names if selection.needs(name)] == ["speed", "duty_cycle", "speed_mps"]

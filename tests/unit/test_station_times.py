@@ -1,0 +1,57 @@
+"""Times as people write them."""
+
+from __future__ import annotations
+
+from datetime import datetime, timezone
+
+import pytest
+
+from station.errors import StationError
+from station.times import duration_us, has_zone, iso, time_us
+
+NOW = 1_700_000_000_123_456
+
+
+@pytest.mark.parametrize(
+    ("text", "expected"),
+    [
+        ("now", NOW),
+        ("-10m", NOW - 600_000_000),
+        ("-1.5h", NOW - 5_400_000_000),
+        ("2023-11-14T22:13:20Z", 1_700_000_000_000_000),
+        ("2023-11-14 23:13:20.5+01:00", 1_700_000_000_500_000),
+        ("2023-11-14T22:13:20.123456789Z", 1_700_000_000_123_456),
+        (17, 17),
+        (datetime(1970, 1, 1, 0, 0, 1, tzinfo=timezone.utc), 1_000_000),
+    ],
+)
+def test_reads(text, expected):
+    assert time_us(text, NOW) == expected
+
+
+def test_without_a_zone_it_is_this_machines():
+    assert time_us("2023-11-14T22:13:20", NOW) == datetime(2023, 11, 14, 22, 13, 20).timestamp() * 1e6  # noqa: DTZ001
+    assert not has_zone("2023-11-14T22:13:20")
+    assert not has_zone("2023-11-14")
+    assert has_zone("2023-11-14T22:13:20Z")
+    assert has_zone("2023-11-14 22:13+01:00")
+    assert has_zone("-10m")
+
+
+@pytest.mark.parametrize("text", ["", "soon", "-10", "2023-13-01", "10m"])
+def test_refuses(text):
+    with pytest.raises(StationError, match="allowed is"):
+        time_us(text, NOW)
+
+
+def test_lengths():
+    assert [duration_us(text) for text in ("100ms", "1s", "1 min", "0.5h", "7d")] == [
+        100_000, 1_000_000, 60_000_000, 1_800_000_000, 604_800_000_000,
+    ]  # fmt: skip
+    with pytest.raises(StationError):
+        duration_us("0s")
+
+
+def test_written_times_are_read_back():
+    assert iso(NOW) == "2023-11-14T22:13:20.123456Z"
+    assert time_us(iso(NOW), 0) == NOW
