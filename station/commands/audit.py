@@ -1,0 +1,153 @@
+"""`iort audit`: did everything arrive?"""
+
+from __future__ import annotations
+
+import json
+import time
+from dataclasses import asdict, replace
+from typing import Annotated, Any
+
+import typer
+from rich.console import Console
+from rich.table import Table
+
+from contract import OWN_STREAMS, VESC_STREAM, ContractError, check_robot, check_stream
+from station import audit
+from station.audit import Audit, Range
+from station.errors import StationError
+from station.times import duration_us, iso, time_us
+
+commands = typer.Typer()
+_out = Console(highlight=False)
+_errors = Console(stderr=True, highlight=False)
+# How many gaps of a run are listed one by one.
+_LISTED = 20
+
+
+@commands.command("audit")
+def audit_(
+    context: typer.Context,
+    robot: str,
+    streams: Annotated[
+        list[str] | None,
+        typer.Option("--stream", help="A stream; give it again for more. Default: all known."),
+    ] = None,
+    start: Annotated[
+        str | None, typer.Option("--from", help="Samples from here on: ISO 8601, now or -10m.")
+    ] = None,
+    end: Annotated[str | None, typer.Option("--to", help="Samples up to here.")] = None,
+    last: Annotated[str | None, typer.Option(help="The last so much: 5m, 2h, 7d.")] = None,
+    late: Annotated[str, typer.Option(help="What counts as late.")] = "5s",
+    from_start: Annotated[
+        bool, typer.Option("--from-start", help="Numbers before the first stored one are missing too.")
+    ] = False,
+    as_json: Annotated[bool, typer.Option("--json", help="As JSON.")] = False,
+) -> None:
+    """Prove delivery: batch numbers expected, stored, missing, twice, late, by run of the agent.
+
+    Exit status 0 if every stream is complete, 1 if something is missing or nothing is stored.
+    """
+    within = _range(start, end, last)
+    cloud = context.obj.cloud()
+    try:
+        check_robot(robot)
+        names = [check_stream(name) for name in streams or ()] or sorted({VESC_STREAM, *OWN_STREAMS})
+    except ContractError as error:
+        raise StationError(str(error)) from error
+    figures = audit.last_figures(cloud, robot)
+    found = []
+    with _errors.status("reading") as status:
+        for name in names:
+            counted = _counting(audit.headers(cloud, robot, name, within), name, status)
+            one = audit.audit(name, counted, late_ms=duration_us(late) // 1000, from_start=from_start)
+            if one.runs or one.refused or streams:
+                found.append(one)
+    in_car, dropped = (_count(figures.get(name)) for name in ("backlog_batches", "dropped_batches"))
+    found = [replace(one, in_car=in_car, dropped=dropped) for one in found]
+    if as_json:
+        _out.print_json(json.dumps([_as_json(one) for one in found]))
+    elif not found:
+        _errors.print(f"nothing of {robot} is stored in this range")
+    else:
+        for one in found:
+            _show(one)
+    raise typer.Exit(0 if found and all(one.complete for one in found) else 1)
+
+
+def _count(value: float | None) -> int | None:
+    return None if value is None else int(value)
+
+
+def _range(start: str | None, end: str | None, last: str | None) -> Range:
+    if last is not None and (start is not None or end is not None):
+        raise StationError("give --last, or --from and --to")
+    now_us = time.time_ns() // 1000
+    if last is not None:
+        return Range(now_us - duration_us(last), None)
+    first_us = None if start is None else time_us(start, now_us)
+    last_us = None if end is None else time_us(end, now_us)
+    if first_us is not None and last_us is not None and first_us > last_us:
+        raise StationError("the range ends before it starts")
+    return Range(first_us, last_us)
+
+
+def _counting(items: Any, name: str, status: Any) -> Any:
+    for count, item in enumerate(items, 1):
+        if not count % 1000:
+            status.update(f"{name}: {count:,} batches")
+        yield item
+
+
+def _show(one: Audit) -> None:
+    said = "[green]complete[/]" if one.complete else f"[bold red]{one.missing:,} batches missing[/]"
+    table = Table(title=f"{one.stream}: {said}", title_justify="left")
+    for i, name in enumerate(
+        ("run", "from", "to", "numbers", "expected", "stored", "missing", "twice", "late", "samples")
+    ):
+        table.add_column(name, justify="right" if i > 3 else "left")
+    for run in one.runs:
+        missing = sum(gap.batches for gap in run.missing)
+        table.add_row(
+            run.boot[:8],
+            iso(run.first_us)[:19] + "Z",
+            iso(run.last_us)[:19] + "Z",
+            f"{run.first_seq:,} to {run.last_seq:,}",
+            f"{run.expected:,}",
+            f"{run.batches:,}",
+            f"{missing:,}",
+            f"{run.duplicated:,}",
+            f"{run.late:,}" + (f" (up to {run.latest_ms / 1000:.1f} s)" if run.late else ""),
+            f"{run.samples:,}",
+            style="red" if missing else "",
+        )
+    _out.print(table)
+    for run in one.runs:
+        for gap in run.missing[:_LISTED]:
+            after = "the start" if gap.after_us is None else iso(gap.after_us)
+            before = "the end" if gap.before_us is None else iso(gap.before_us)
+            _out.print(f"  missing {gap.first:,} to {gap.last:,}: between {after} and {before}")
+        if len(run.missing) > _LISTED:
+            _out.print(f"  and {len(run.missing) - _LISTED} more gaps; --json has them all")
+    if one.before_first:
+        _out.print(
+            f"  the first stored number is {one.before_first:,}: before it is expired, out of range or lost"
+        )
+    if one.refused:
+        _out.print(f"  [red]{one.refused:,} items are not batches[/]")
+    if one.in_car:
+        _out.print(f"  the car's queue held {one.in_car:,} batches when it last said so")
+    if one.dropped:
+        _out.print(f"  [red]the car has dropped {one.dropped:,} batches, since its queue was full[/]")
+
+
+def _as_json(one: Audit) -> dict[str, Any]:
+    runs = [
+        {
+            **asdict(run),
+            "expected": run.expected,
+            "missing_batches": sum(gap.batches for gap in run.missing),
+            "missing": [gap._asdict() for gap in run.missing],
+        }
+        for run in one.runs
+    ]
+    return {**asdict(one), "runs": runs, "missing": one.missing, "complete": one.complete}

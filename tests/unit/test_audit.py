@@ -1,0 +1,97 @@
+"""What an audit says of batches that were lost, repeated, delayed or numbered anew."""
+
+from __future__ import annotations
+
+import random
+
+from hypothesis import given
+from hypothesis import strategies as st
+
+from station.audit import audit
+
+T_US = 1_750_000_000_000_000
+
+
+def _item(seq, *, boot="0badcafe", n=50, late_ms=0, at=None):
+    t_us = T_US + int((seq if at is None else at) * 1_000_000)
+    return {
+        "boot": boot,
+        "seq": str(seq),
+        "t": str(t_us),
+        "n": str(n),
+        "received_ms": t_us // 1000 + 1020 + late_ms,
+    }
+
+
+def test_a_whole_run_is_complete():
+    found = audit("vesc", [_item(seq) for seq in range(10)])
+    assert found.complete
+    assert (found.runs[0].expected, found.runs[0].batches, found.runs[0].samples) == (10, 10, 500)
+    assert (found.missing, found.before_first) == (0, 0)
+
+
+def test_a_gap_is_named_with_its_neighbours():
+    found = audit("vesc", [_item(seq) for seq in (0, 1, 4, 5)])
+    assert not found.complete
+    (gap,) = found.runs[0].missing
+    assert (gap.first, gap.last) == (2, 3)
+    assert (gap.after_us, gap.before_us) == (T_US + 1_000_000, T_US + 4_000_000)
+
+
+def test_nothing_stored_is_not_complete():
+    assert not audit("vesc", []).complete
+
+
+def test_numbers_before_the_first_are_missing_only_when_asked():
+    items = [_item(seq) for seq in (7, 8)]
+    assert audit("vesc", items).complete
+    assert audit("vesc", items).before_first == 7
+    found = audit("vesc", items, from_start=True)
+    assert (found.missing, found.before_first) == (7, 0)
+
+
+def test_runs_continue_each_others_numbers():
+    items = [_item(seq) for seq in range(3)] + [_item(seq, boot="deadbeef") for seq in range(3, 6)]
+    assert audit("vesc", items).complete
+    found = audit("vesc", [item for item in items if item["seq"] != "3"])
+    assert [len(run.missing) for run in found.runs] == [0, 1]
+    assert found.runs[1].expected == 3
+
+
+def test_a_queue_that_was_lost_starts_again_at_0():
+    items = [_item(seq) for seq in range(5)] + [_item(seq, boot="deadbeef", at=10 + seq) for seq in range(3)]
+    assert audit("vesc", items).complete
+    found = audit("vesc", [item for item in items if (item["boot"], item["seq"]) != ("deadbeef", "0")])
+    assert found.missing == 1
+
+
+def test_a_clock_set_back_between_runs_changes_nothing():
+    before = [_item(seq) for seq in range(3)]
+    after = [_item(seq, boot="deadbeef", at=seq - 1000, late_ms=2_000_000) for seq in range(3, 6)]
+    assert audit("vesc", after + before).complete
+
+
+def test_late_is_against_the_fastest_of_the_run_whatever_the_clock():
+    items = [_item(seq, late_ms=-3_600_000 + (20_000 if seq == 2 else 0)) for seq in range(5)]
+    (run,) = audit("vesc", items).runs
+    assert (run.late, run.latest_ms) == (1, 20_000)
+
+
+def test_a_number_stored_twice_is_counted_and_its_samples_are_not():
+    (run,) = audit("vesc", [_item(0), _item(1), _item(1, at=1.5)]).runs
+    assert (run.duplicated, run.batches, run.samples) == (1, 2, 100)
+
+
+def test_what_is_no_batch_is_counted():
+    found = audit("vesc", [_item(0), {"t": "5"}, {**_item(1), "seq": "x"}])
+    assert (found.refused, found.complete) == (2, False)
+
+
+@given(st.sets(st.integers(0, 300), min_size=1), st.integers(0, 2**32))
+def test_expected_is_stored_and_missing_in_any_order(seqs, seed):
+    items = [_item(seq) for seq in seqs]
+    random.Random(seed).shuffle(items)
+    (run,) = audit("vesc", items).runs
+    assert run.expected == run.last_seq - run.first_seq + 1
+    missing = {seq for gap in run.missing for seq in range(gap.first, gap.last + 1)}
+    assert missing == set(range(min(seqs), max(seqs) + 1)) - seqs
