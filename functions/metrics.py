@@ -36,4 +36,6 @@ def emit(function: str, **values: float) -> None:
 
 
 def _unit(name: str) -> str:
+    if name.endswith("Bytes"):
+        return "Bytes"
     return "Milliseconds" if name.endswith("Ms") else "Count"

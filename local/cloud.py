@@ -30,7 +30,7 @@ from typing import Any
 
 from typing_extensions import Self
 
-from contract import DEFAULT_NAMESPACE, LAMBDA, PING, TOPIC, build_topic, encode_ping
+from contract import DEFAULT_NAMESPACE, FILE, LAMBDA, PING, TOPIC, build_topic, encode_ping
 from local import gateway_certificate
 from local.deployment import ROOT, deploy
 from local.errors import LocalError
@@ -217,7 +217,12 @@ class EmbeddedCloud:
         message that waits for it is stale by then.
         """
         self._progress("functions")
-        warm_up: dict[str, dict[str, Any]] = {"Live": {}, "Summarize": {"Records": []}, "Echo": self._ping()}
+        warm_up: dict[str, dict[str, Any]] = {
+            "Live": {},
+            "Summarize": {"Records": []},
+            "Echo": self._ping(),
+            "Upload": {TOPIC: build_topic(PING, "warm-up", FILE, self.namespace)},
+        }
         client = self.cloud.client("lambda")
         for name, event in warm_up.items():
             function = self.cloud.output("processing", f"{name}Function")

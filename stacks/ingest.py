@@ -20,7 +20,7 @@ Action = iot.CfnTopicRule.ActionProperty
 
 
 class Ingest(Stack):
-    """The rules record, live, pong and echo. What an action cannot take goes to ``rejected``, with
+    """The rules record, live, pong, echo and upload. What an action cannot take goes to ``rejected``, with
     the message's own bytes (base64OriginalPayload) and the reason."""
 
     def __init__(
@@ -49,6 +49,7 @@ class Ingest(Stack):
             self._lambda_rule("live", processing.live),
             self._pong(),
             self._lambda_rule("echo", processing.echo),
+            self._lambda_rule("upload", processing.upload),
         ]
 
     def _record(self, storage: Storage) -> iot.CfnTopicRule:

@@ -17,7 +17,13 @@ from stacks.settings import Settings
 from stacks.storage import Storage
 
 # The action each rule runs, as IoT Core names it in the dimension ActionType of its metrics.
-_ACTION_TYPES = {"record": "DynamoDBv2", "live": "Lambda", "pong": "Republish", "echo": "Lambda"}
+_ACTION_TYPES = {
+    "record": "DynamoDBv2",
+    "live": "Lambda",
+    "pong": "Republish",
+    "echo": "Lambda",
+    "upload": "Lambda",
+}
 _PERIOD = Duration.minutes(1)
 
 
@@ -121,7 +127,7 @@ class Monitoring(Stack):
 
     @staticmethod
     def _functions(processing: Processing) -> list[cloudwatch.GraphWidget]:
-        named = dict(zip(("live", "summarize", "echo"), processing.functions, strict=True))
+        named = dict(zip(("live", "summarize", "echo", "upload"), processing.functions, strict=True))
 
         def each(
             title: str, metric: str, statistic: str, *also: cloudwatch.IMetric

@@ -1,4 +1,4 @@
-"""What is computed: Lambda 1 live, Lambda 2 summarize and echo, each with a role and a log of its own."""
+"""What is computed: Lambda 1 live, Lambda 2 summarize, echo and upload, each with its own role and log."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from aws_cdk import aws_lambda_event_sources as sources
 from aws_cdk import aws_sqs as sqs
 from constructs import Construct
 
-from contract import LAMBDA, PONG, pubnub_parameter
+from contract import FILE, FILES_PREFIX, LAMBDA, PONG, pubnub_parameter
 from stacks.function import RUNTIME, function
 from stacks.settings import Settings
 from stacks.storage import Storage
@@ -37,7 +37,8 @@ class Processing(Stack):
         self.live = self._live(settings)
         self.summarize = self._summarize(storage)
         self.echo = self._echo(settings)
-        self.functions = (self.live, self.summarize, self.echo)
+        self.upload = self._upload(settings, storage)
+        self.functions = (self.live, self.summarize, self.echo, self.upload)
 
     def _live(self, settings: Settings) -> lambda_.Function:
         name = pubnub_parameter(settings.namespace)
@@ -113,11 +114,43 @@ class Processing(Stack):
             self, "Echo", settings=settings, encryption=self._encryption, module="echo", memory_mb=256
         )
         echo.configure_async_invoke(max_event_age=Duration.minutes(1), retry_attempts=0)
-        topic = f"{PONG}/{settings.namespace}/*/{LAMBDA}"
-        echo.add_to_role_policy(
-            iam.PolicyStatement(
-                actions=["iot:Publish"],
-                resources=[self.format_arn(service="iot", resource="topic", resource_name=topic)],
-            )
-        )
+        self._may_answer(echo, f"{PONG}/{settings.namespace}/*/{LAMBDA}")
         return echo
+
+    def _upload(self, settings: Settings, storage: Storage) -> lambda_.Function:
+        upload = function(
+            self,
+            "Upload",
+            settings=settings,
+            encryption=self._encryption,
+            module="upload",
+            memory_mb=256,
+            environment={
+                "FILES_BUCKET": storage.files.bucket_name,
+                "ROBOTS_TABLE": storage.robots.table_name,
+                "UPLOAD_BYTES_A_DAY": str(settings.upload_gb_a_day * 10**9),
+            },
+        )
+        # The robot asks again where no answer comes.
+        upload.configure_async_invoke(max_event_age=Duration.minutes(1), retry_attempts=0)
+        # What it signs, it must be allowed itself. It may neither read a file nor delete one.
+        self._allow(
+            upload,
+            ["s3:AbortMultipartUpload", "s3:ListMultipartUploadParts", "s3:PutObject"],
+            storage.files.arn_for_objects(f"{FILES_PREFIX}*"),
+        )
+        self._allow(upload, ["s3:ListBucket", "s3:ListBucketMultipartUploads"], storage.files.bucket_arn)
+        storage.robots.grant(upload, "dynamodb:UpdateItem")
+        self._may_answer(upload, f"{PONG}/{settings.namespace}/*/{FILE}")
+        return upload
+
+    def _may_answer(self, one: lambda_.Function, topic: str) -> None:
+        self._allow(
+            one,
+            ["iot:Publish"],
+            self.format_arn(service="iot", resource="topic", resource_name=topic),
+        )
+
+    @staticmethod
+    def _allow(one: lambda_.Function, actions: list[str], resource: str) -> None:
+        one.add_to_role_policy(iam.PolicyStatement(actions=actions, resources=[resource]))

@@ -51,7 +51,8 @@ class Settings:
     ``customer_key`` encrypts what is kept with a key of the account's own; ``budget_usd`` is the
     account's monthly budget (0: none), and ``alarm_email`` who hears of it and of every alarm.
     ``retention_days`` is how long telemetry and summaries are kept; ``files_days`` is how long uploaded
-    files are (0: for good); ``live_concurrency`` bounds Lambda 1 (0 reserves nothing, for accounts whose
+    files are (0: for good), ``upload_gb_a_day`` what one robot may upload in a day, in 1e9 bytes;
+    ``live_concurrency`` bounds Lambda 1 (0 reserves nothing, for accounts whose
     concurrency limit is too low to reserve from); ``live_fields`` maps stream to the fields that go to
     the dashboard; ``layer`` is the folder of Lambda 1's third-party code; ``embedded`` is true for the
     embedded cloud, which is deployed with the caller's own credentials.
@@ -66,6 +67,7 @@ class Settings:
     thresholds: Thresholds = field(default_factory=Thresholds)
     retention_days: int = 90
     files_days: int = 0
+    upload_gb_a_day: int = 50
     live_concurrency: int = 5
     live_fields: Mapping[str, list[str]] = field(default_factory=lambda: {VESC_STREAM: list(VESC_FIELDS)})
     layer: Path = ROOT / "build" / "layer" / "lambda"
@@ -99,6 +101,7 @@ class Settings:
         for key, low, high in (
             ("retention_days", 1, 3650),
             ("files_days", 0, 3650),
+            ("upload_gb_a_day", 1, 10_000),
             ("live_concurrency", 0, 1000),
             ("budget_usd", 0, 1_000_000),
         ):

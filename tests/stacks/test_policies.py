@@ -98,11 +98,22 @@ ROLES = {
         "lambda.amazonaws.com",
         {(action, "EchoLog.Arn") for action in LOG} | {("iot:Publish", f"{IOT}:topic/pong/iort/*/lambda")},
     ),
+    "UploadRole": (
+        "lambda.amazonaws.com",
+        {(action, "UploadLog.Arn") for action in LOG}
+        | {
+            (f"s3:{action}", f"Files.Arn/{contract.FILES_PREFIX}*")
+            for action in ("AbortMultipartUpload", "ListMultipartUploadParts", "PutObject")
+        }
+        | {(f"s3:{action}", "Files.Arn") for action in ("ListBucket", "ListBucketMultipartUploads")}
+        | {("dynamodb:UpdateItem", "Robots.Arn"), ("iot:Publish", f"{IOT}:topic/pong/iort/*/file")},
+    ),
     "ProvisioningRole": ("iot.amazonaws.com", PROVISIONING),
     "ingest/RecordRole": ("iot.amazonaws.com", {REJECT, ("dynamodb:PutItem", "Telemetry.Arn")}),
     "ingest/LiveRole": ("iot.amazonaws.com", {REJECT}),
     "ingest/PongRole": ("iot.amazonaws.com", {REJECT, ("iot:Publish", f"{IOT}:topic/pong/iort/*/rule")}),
     "ingest/EchoRole": ("iot.amazonaws.com", {REJECT}),
+    "ingest/UploadRole": ("iot.amazonaws.com", {REJECT}),
 }
 # The only statements about every resource, each with why it cannot name one.
 EVERY_RESOURCE = {
@@ -178,7 +189,7 @@ def test_a_robot_may_publish_what_the_agent_builds_and_only_under_its_own_name(r
         record_topic("car", "vesc"),
         build_topic(LIVE, "car", "vesc"),
         build_topic(FLEET, "car", "pose"),
-        *(build_topic(PING, "car", path) for path in contract.PING_PATHS),
+        *(build_topic(PING, "car", path) for path in (*contract.PING_PATHS, contract.FILE)),
     ]
     for topic in own:
         assert allows(robot_policy, "Publish", "topic", topic), topic
@@ -284,9 +295,9 @@ def test_no_statement_is_about_every_resource_or_action(synthesized, reader):
             if resource == "*":
                 wild.add((role, action))
             else:
-                # A wildcard within an ARN stands for the robot's name alone.
+                # A wildcard within an ARN stands for the robot's name, and in the bucket for its files.
                 # Things and certificates have no names before they are provisioned.
-                named = resource.replace(":topic/pong/iort/*/", "")
+                named = resource.replace(":topic/pong/iort/*/", "").removesuffix("/robots/*")
                 assert "*" not in named or (role == "ProvisioningRole" and named in {THINGS, CERTIFICATES})
     assert wild == EVERY_RESOURCE
     # And nothing grants that is not a role's policy or a robot's, such as a policy of its own.
@@ -303,7 +314,7 @@ def test_only_its_rule_may_call_a_function(synthesized, reader):
         assert permission["Principal"] == "iot.amazonaws.com"
         assert permission["SourceAccount"] == {"Ref": "AWS::AccountId"}
         called[reader.text(permission["FunctionName"])] = reader.text(permission["SourceArn"])
-    assert called == {"Live.Arn": "Live.Arn", "Echo.Arn": "Echo.Arn"}
+    assert called == {"Live.Arn": "Live.Arn", "Echo.Arn": "Echo.Arn", "Upload.Arn": "Upload.Arn"}
     # Both are named Live; one is the function, the other the rule.
     for permission in permissions.values():
         rule = permission["SourceArn"]["Fn::GetAtt"][0]

@@ -14,7 +14,19 @@ from pathlib import Path
 import pytest
 
 import contract
-from contract import BROKER, LAMBDA, LIVE, PING, PONG, RECORD, RULE, build_topic, record_topic, rule_name
+from contract import (
+    BROKER,
+    FILE,
+    LAMBDA,
+    LIVE,
+    PING,
+    PONG,
+    RECORD,
+    RULE,
+    build_topic,
+    record_topic,
+    rule_name,
+)
 from stacks.settings import ROOT
 from tests.stacks.templates import name
 
@@ -55,7 +67,7 @@ def runtime(tmp_path_factory):
     return folder
 
 
-@pytest.mark.parametrize("function", ["Live", "Summarize", "Echo"])
+@pytest.mark.parametrize("function", ["Live", "Summarize", "Echo", "Upload"])
 def test_every_handler_imports_from_its_asset_alone(synthesized, functions, runtime, tmp_path, function):
     properties = functions[function]
     asset = synthesized.asset(properties["Code"])
@@ -144,7 +156,7 @@ def variables_read(module):
     return read
 
 
-@pytest.mark.parametrize("function", ["Live", "Summarize", "Echo"])
+@pytest.mark.parametrize("function", ["Live", "Summarize", "Echo", "Upload"])
 def test_a_function_reads_exactly_the_variables_that_it_is_given(functions, function):
     properties = functions[function]
     given = set(properties.get("Environment", {}).get("Variables", {}))
@@ -165,6 +177,12 @@ def test_what_the_variables_say_is_what_the_functions_expect(functions, reader, 
         "TELEMETRY_TABLE": "Telemetry",
         "SUMMARY_TABLE": "Summary",
         "ROBOTS_TABLE": "Robots",
+    }
+    upload = functions["Upload"]["Environment"]["Variables"]
+    assert {key: reader.text(value) for key, value in upload.items()} == {
+        "FILES_BUCKET": "Files",
+        "ROBOTS_TABLE": "Robots",
+        "UPLOAD_BYTES_A_DAY": str(50 * 10**9),
     }
 
 
@@ -267,9 +285,11 @@ def test_every_topic_of_the_agent_meets_exactly_the_rule_that_it_is_for(filters)
         build_topic(LIVE, "car", "vesc"): {"iort_live"},
         build_topic(PING, "car", RULE): {"iort_pong"},
         build_topic(PING, "car", LAMBDA): {"iort_echo"},
+        build_topic(PING, "car", FILE): {"iort_upload"},
         build_topic(PING, "car", BROKER): set(),
         build_topic(PONG, "car", RULE): set(),
         build_topic(PONG, "car", LAMBDA): set(),
+        build_topic(PONG, "car", FILE): set(),
         build_topic(contract.FLEET, "car", "pose"): set(),
         build_topic(contract.CMD, "car", "stop"): set(),
         build_topic(LIVE, "car", "vesc", "lab2"): set(),

@@ -1,0 +1,134 @@
+"""Upload: signed addresses for a robot's files, asked for over MQTT, so that no robot holds AWS keys."""
+
+from __future__ import annotations
+
+import logging
+import os
+import time
+from collections.abc import Iterator, Mapping
+from functools import cache
+from typing import Any
+
+import boto3
+from botocore.config import Config
+
+from contract import (
+    FILE,
+    PONG,
+    TOPIC,
+    ContractError,
+    FileAnswer,
+    FileRequest,
+    build_topic,
+    decode_file_request,
+    encode_file_answer,
+    file_key,
+    parse_topic,
+)
+from functions.allotment import Allotment
+from functions.bucket import Bucket, parts_sha256
+from functions.metrics import emit
+
+_log = logging.getLogger(__name__)
+_log.setLevel(logging.INFO)
+
+_AGAIN_S = 3600
+
+
+def answer(
+    robot: str, request: FileRequest, bucket: Bucket, allotment: Allotment, now_s: float
+) -> FileAnswer:
+    """What the bucket has of the file and where the robot may put the rest. The robot is the topic's;
+    the key follows from it and the file, so that no request can reach another's, or another file."""
+    file, key = request.file, file_key(robot, request.file)
+    if bucket.has(key):
+        return FileAnswer(request.id, key, stored=True)
+    upload_id = bucket.upload_of(key) if file.parts > 1 else None
+    # A file in one piece counts with each address for it, a larger one when its upload begins.
+    begins = upload_id is None and (file.parts > 1 or bool(request.parts))
+    if begins and not allotment.take(robot, file.size, now_s):
+        why = f"no more than {allotment.bytes_a_day} bytes a day, and only of registered robots"
+        return FileAnswer(request.id, refused=why, again_s=_AGAIN_S)
+    if file.parts == 1:
+        addresses = [bucket.address(key, file)] if request.parts else []
+        return FileAnswer(request.id, key, addresses=addresses)
+    if upload_id is None:
+        upload_id = bucket.begin(key, file)
+    there = bucket.parts(key, upload_id)
+    if request.parts_sha256 is not None and len(there) == file.parts:
+        if parts_sha256(there) != request.parts_sha256:
+            bucket.abort(key, upload_id)
+            return FileAnswer(request.id, refused="the parts stored are not this file's", again_s=0)
+        bucket.complete(key, upload_id, there, file.size)
+        return FileAnswer(request.id, key, stored=True)
+    addresses = [
+        bucket.part_address(key, file, upload_id, part, sha256)
+        for part, sha256 in sorted(request.parts.items())
+        if part not in there or there[part].sha256 != sha256
+    ]
+    return FileAnswer(request.id, key, have=tuple(ranges(there)), addresses=addresses)
+
+
+def ranges(numbers: Mapping[int, Any]) -> Iterator[tuple[int, int]]:
+    """The numbers as ranges, both ends included."""
+    first = last = None
+    for number in sorted(numbers):
+        if last is not None and number == last + 1:
+            last = number
+            continue
+        if first is not None and last is not None:
+            yield first, last
+        first = last = number
+    if first is not None and last is not None:
+        yield first, last
+
+
+@cache
+def _bucket() -> Bucket:
+    # Signature 4 with the region's own host: an address on S3's global one is redirected, which no
+    # signature survives.
+    config = Config(signature_version="s3v4", s3={"us_east_1_regional_endpoint": "regional"})
+    return Bucket(boto3.client("s3", config=config), os.environ["FILES_BUCKET"])
+
+
+@cache
+def _allotment() -> Allotment:
+    return Allotment(
+        boto3.client("dynamodb"),
+        table=os.environ["ROBOTS_TABLE"],
+        bytes_a_day=int(os.environ["UPLOAD_BYTES_A_DAY"]),
+    )
+
+
+@cache
+def _iot_data() -> Any:
+    return boto3.client("iot-data")
+
+
+def handler(event: dict[str, Any], _context: object) -> None:
+    """Entry point of the upload rule's Lambda action."""
+    topic = parse_topic(event[TOPIC])
+    try:
+        request = decode_file_request(event)
+    except ContractError as error:
+        _log.warning("refused a request of %s: %s", topic.robot, error)
+        emit("upload", FilesRefused=1)
+        request_id = event.get("id")
+        if isinstance(request_id, str):
+            _reply(topic.robot, topic.namespace, FileAnswer(request_id[:32], refused=str(error)))
+        return
+    given = answer(topic.robot, request, _bucket(), _allotment(), time.time())
+    done = given.stored and request.parts_sha256 is not None
+    emit(
+        "upload",
+        FilesAsked=1,
+        FilesRefused=int(given.refused is not None),
+        FilesStored=int(done),
+        StoredBytes=request.file.size if done else 0,
+    )
+    _reply(topic.robot, topic.namespace, given)
+
+
+def _reply(robot: str, namespace: str, given: FileAnswer) -> None:
+    topic = build_topic(PONG, robot, FILE, namespace)
+    _iot_data().publish(topic=topic, qos=1, payload=encode_file_answer(given))
