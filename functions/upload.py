@@ -85,9 +85,9 @@ def ranges(numbers: Mapping[int, Any]) -> Iterator[tuple[int, int]]:
 
 @cache
 def _bucket() -> Bucket:
-    # Signature 4 with the region's own host: an address on S3's global one is redirected, which no
+    # Virtual addressing is what gives the region's own host: the global one redirects, which no
     # signature survives.
-    config = Config(signature_version="s3v4", s3={"us_east_1_regional_endpoint": "regional"})
+    config = Config(signature_version="s3v4", s3={"addressing_style": "virtual"})
     return Bucket(boto3.client("s3", config=config), os.environ["FILES_BUCKET"])
 
 

@@ -52,10 +52,10 @@ class Settings:
     account's monthly budget (0: none), and ``alarm_email`` who hears of it and of every alarm.
     ``retention_days`` is how long telemetry and summaries are kept; ``files_days`` is how long uploaded
     files are (0: for good), ``upload_gb_a_day`` what one robot may upload in a day, in 1e9 bytes;
-    ``live_concurrency`` bounds Lambda 1 (0 reserves nothing, for accounts whose
-    concurrency limit is too low to reserve from); ``live_fields`` maps stream to the fields that go to
-    the dashboard; ``layer`` is the folder of Lambda 1's third-party code; ``embedded`` is true for the
-    embedded cloud, which is deployed with the caller's own credentials.
+    ``live_concurrency`` bounds Lambda 1 (0 reserves nothing, for accounts whose concurrency limit is
+    too low to reserve from); ``live_fields`` maps stream to the fields that go to the dashboard;
+    ``layer`` is the folder of Lambda 1's third-party code; ``embedded`` is true for the embedded
+    cloud, which is deployed with the caller's own credentials.
     """
 
     namespace: str = DEFAULT_NAMESPACE

@@ -180,6 +180,7 @@ def test_what_the_variables_say_is_what_the_functions_expect(functions, reader, 
     }
     upload = functions["Upload"]["Environment"]["Variables"]
     assert {key: reader.text(value) for key, value in upload.items()} == {
+        "NAMESPACE": contract.DEFAULT_NAMESPACE,
         "FILES_BUCKET": "Files",
         "ROBOTS_TABLE": "Robots",
         "UPLOAD_BYTES_A_DAY": str(50 * 10**9),

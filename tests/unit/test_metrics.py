@@ -31,7 +31,7 @@ def test_every_metric_of_the_contract_is_a_valid_line(capsys):
         assert (line["Deployment"], line["Function"]) == ("lab2", function)
         assert {metric["Name"] for metric in directive["Metrics"]} == set(names)
         for metric in directive["Metrics"]:
-            assert metric["Unit"] == ("Milliseconds" if metric["Name"].endswith("Ms") else "Count")
+            assert metric["Unit"] == {"Ms": "Milliseconds", "es": "Bytes"}.get(metric["Name"][-2:], "Count")
             assert line[metric["Name"]] == 2.5
 
 

@@ -1,0 +1,393 @@
+"""Upload: what a robot asks, what the function answers, and what its addresses allow."""
+
+from __future__ import annotations
+
+import base64
+import hashlib
+import json
+from dataclasses import replace
+from urllib.parse import parse_qs, urlsplit
+
+import boto3
+import pytest
+from botocore.config import Config
+
+import contract
+from contract import (
+    FILE,
+    FILES_BYTES,
+    MAX_FILE_BYTES,
+    PART_BYTES,
+    PING,
+    PONG,
+    TOPIC,
+    Address,
+    ContractError,
+    File,
+    FileAnswer,
+    FileRequest,
+    build_topic,
+)
+from functions import upload
+from functions.allotment import Allotment
+from functions.bucket import Bucket
+
+NAME, ROBOTS = "files", "robots"
+NOW_S = 1_700_000_000.0
+ID = "0123456789abcdef"
+
+
+def sha256(content: bytes) -> str:
+    return hashlib.sha256(content).hexdigest()
+
+
+def file_of(content: bytes, name: str = "drive.bag") -> File:
+    return File(
+        name, "recording", "application/octet-stream", len(content), sha256(content), 1_700_000_000_000_000
+    )
+
+
+def parts_of(content: bytes) -> dict[int, bytes]:
+    return {
+        i // PART_BYTES + 1: content[i : i + PART_BYTES] for i in range(0, max(1, len(content)), PART_BYTES)
+    }
+
+
+def asking(content: bytes, *parts: int, done: bool = False) -> FileRequest:
+    hashes = {n: sha256(part) for n, part in parts_of(content).items()}
+    whole = sha256(b"".join(bytes.fromhex(one) for one in hashes.values()))
+    return FileRequest(ID, file_of(content), {n: hashes[n] for n in parts}, whole if done else None)
+
+
+SMALL = asking(b"small", 1)
+
+
+# --- the contract -----------------------------------------------------------------------------------
+
+
+def test_a_request_survives_the_wire_and_the_rule():
+    for request in (SMALL, asking(bytes(PART_BYTES + 1), 1, 2, done=True)):
+        wire = contract.encode_file_request(request)
+        assert contract.decode_file_request(wire) == request
+        through_rule = {**json.loads(wire), TOPIC: "x", "received_ms": 1}
+        assert contract.decode_file_request(through_rule) == request
+
+
+@pytest.mark.parametrize(
+    "wrong",
+    [
+        {"name": "../etc/passwd"},
+        {"name": "/absolute"},
+        {"name": "a/../b"},
+        {"name": "a//b"},
+        {"name": ".hidden"},
+        {"name": "a/b/c/d/e"},
+        {"name": "with space"},
+        {"name": "x" * 101},
+        {"name": ""},
+        {"name": None},
+        {"kind": "virus"},
+        {"content_type": "text"},
+        {"content_type": "text/html\r\nx-evil: 1"},
+        {"size": -1},
+        {"size": MAX_FILE_BYTES + 1},
+        {"size": 1.5},
+        {"sha256": "ab"},
+        {"sha256": "A" * 64},
+        {"t": -1},
+    ],
+)
+def test_a_file_that_is_not_allowed_is_refused_on_both_sides(wrong):
+    envelope = json.loads(contract.encode_file_request(SMALL))
+    envelope["file"].update(wrong)
+    with pytest.raises(ContractError):
+        contract.decode_file_request(envelope)
+    if "t" not in wrong:
+        with pytest.raises(ContractError):
+            contract.encode_file_request(replace(SMALL, file=replace(SMALL.file, **wrong)))
+
+
+@pytest.mark.parametrize(
+    "wrong",
+    [
+        {"id": "short"},
+        {"id": 7},
+        {"v": 2},
+        {"file": []},
+        {"parts": {"2": "a" * 64}},
+        {"parts": {"0": "a" * 64}},
+        {"parts": {"one": "a" * 64}},
+        {"parts": {"1": "a"}},
+        {"parts": [1]},
+        {"parts_sha256": "x"},
+    ],
+)
+def test_a_request_that_is_not_allowed_is_refused(wrong):
+    with pytest.raises(ContractError):
+        contract.decode_file_request({**json.loads(contract.encode_file_request(SMALL)), **wrong})
+
+
+def test_no_more_addresses_are_asked_for_than_fit_a_message():
+    content = file_of(b"")
+    large = replace(content, size=PART_BYTES * 20)
+    with pytest.raises(ContractError, match="allowed is up to 16"):
+        contract.encode_file_request(FileRequest(ID, large, dict.fromkeys(range(1, 18), "a" * 64)))
+    longest = Address(10_000, "https://x/" + "u" * 3000, {"x-amz-checksum-sha256": "c" * 44})
+    answer = FileAnswer(ID, "k" * 500, addresses=[longest] * contract.MAX_ADDRESSES)
+    assert len(contract.encode_file_answer(answer)) < contract.MAX_MESSAGE_BYTES
+
+
+@pytest.mark.parametrize(
+    "answer",
+    [
+        FileAnswer(ID, "robots/car/x", stored=True),
+        FileAnswer(
+            ID, "robots/car/x", have=((1, 3), (5, 5)), addresses=(Address(4, "https://x", {"a": "b"}),)
+        ),
+        FileAnswer(ID, refused="no", again_s=60),
+        FileAnswer(ID, refused="never"),
+    ],
+)
+def test_an_answer_survives_the_wire(answer):
+    assert contract.decode_file_answer(contract.encode_file_answer(answer)) == answer
+
+
+@pytest.mark.parametrize(
+    "wrong",
+    [
+        {"key": None},
+        {"stored": "yes"},
+        {"have": [[1]]},
+        {"have": 3},
+        {"addresses": [{"part": 1}]},
+        {"addresses": [{"part": 1, "url": "x", "headers": []}]},
+        {"refused": "x", "again_s": -1},
+        {"id": None},
+    ],
+)
+def test_an_answer_that_is_not_one_is_refused(wrong):
+    envelope = {"v": 1, "id": ID, "key": "robots/car/x", "stored": False}
+    with pytest.raises(ContractError):
+        contract.decode_file_answer(json.dumps({**envelope, **wrong}))
+
+
+def test_the_key_is_the_robots_the_times_and_the_contents():
+    key = contract.file_key("car", SMALL.file)
+    assert key == f"robots/car/2023/11/14/221320-{sha256(b'small')[:12]}/drive.bag"
+    assert contract.file_key("car", file_of(b"other")) != key
+    with pytest.raises(ContractError):
+        contract.file_key("../car", SMALL.file)
+
+
+# --- the function -----------------------------------------------------------------------------------
+
+
+class ListsChecksums:
+    """moto's client, whose ListParts leaves out what S3 says of each part: its checksum."""
+
+    def __init__(self, client):
+        self._client = client
+        self.sha256 = {}
+
+    def __getattr__(self, name):
+        return getattr(self._client, name)
+
+    def upload_part(self, **arguments):
+        self.sha256[arguments["PartNumber"]] = arguments["ChecksumSHA256"]
+        return self._client.upload_part(**arguments)
+
+    def get_paginator(self, name):
+        return self if name == "list_parts" else self._client.get_paginator(name)
+
+    def paginate(self, **arguments):
+        for page in self._client.get_paginator("list_parts").paginate(**arguments):
+            for part in page.get("Parts", ()):
+                part["ChecksumSHA256"] = self.sha256[part["PartNumber"]]
+            yield page
+
+
+@pytest.fixture
+def s3(aws):
+    client = boto3.client("s3", config=Config(signature_version="s3v4", s3={"addressing_style": "virtual"}))
+    client.create_bucket(Bucket=NAME, CreateBucketConfiguration={"LocationConstraint": "eu-west-1"})
+    return ListsChecksums(client)
+
+
+@pytest.fixture
+def dynamodb(aws):
+    client = boto3.client("dynamodb")
+    client.create_table(
+        TableName=ROBOTS,
+        KeySchema=[{"AttributeName": contract.ROBOT, "KeyType": "HASH"}],
+        AttributeDefinitions=[{"AttributeName": contract.ROBOT, "AttributeType": "S"}],
+        BillingMode="PAY_PER_REQUEST",
+    )
+    client.put_item(TableName=ROBOTS, Item={contract.ROBOT: {"S": "car"}})
+    return client
+
+
+@pytest.fixture
+def ask(s3, dynamodb):
+    """Asks as `car`, unless another robot is named."""
+
+    def ask(request, robot="car", *, bytes_a_day=10**9, now_s=NOW_S):
+        allotment = Allotment(dynamodb, table=ROBOTS, bytes_a_day=bytes_a_day)
+        return upload.answer(robot, request, Bucket(s3, NAME), allotment, now_s)
+
+    return ask
+
+
+def test_a_small_files_address_allows_this_content_once_and_nothing_else(ask):
+    (address,) = ask(SMALL).addresses
+    url = urlsplit(address.url)
+    query = {name: value for name, (value,) in parse_qs(url.query).items()}
+    # The region's own host: an address on the global one would be redirected.
+    assert (url.scheme, url.netloc) == ("https", f"{NAME}.s3.eu-west-1.amazonaws.com")
+    assert url.path == "/" + contract.file_key("car", SMALL.file)
+    assert query["X-Amz-Expires"] == str(contract.UPLOAD_URL_S)
+    signed = set(query["X-Amz-SignedHeaders"].split(";"))
+    assert signed == {"host", *address.headers}
+    checksum = base64.b64encode(hashlib.sha256(b"small").digest()).decode()
+    assert address.headers["x-amz-checksum-sha256"] == checksum
+    assert (address.headers["content-length"], address.headers["if-none-match"]) == ("5", "*")
+    assert address.headers["x-amz-meta-sha256"] == SMALL.file.sha256
+
+
+def test_a_parts_address_allows_this_part_and_nothing_else(ask):
+    content = bytes(PART_BYTES) + b"rest"
+    first, second = ask(asking(content, 1, 2)).addresses
+    for address, size in ((first, PART_BYTES), (second, 4)):
+        query = {name: value for name, (value,) in parse_qs(urlsplit(address.url).query).items()}
+        assert query["partNumber"] == str(address.part)
+        assert set(query["X-Amz-SignedHeaders"].split(";")) == {"host", *address.headers}
+        assert address.headers["content-length"] == str(size)
+
+
+def test_what_is_stored_is_not_asked_for_again(ask, s3):
+    s3.put_object(Bucket=NAME, Key=contract.file_key("car", SMALL.file), Body=b"small")
+    answer = ask(SMALL)
+    assert (answer.stored, answer.addresses) == (True, ())
+    # A key that only begins the same is another.
+    assert not ask(replace(SMALL, file=replace(SMALL.file, name="drive.ba"))).stored
+    assert not ask(SMALL, "car-2", bytes_a_day=0).stored
+
+
+def put(s3, key, upload_id, part, content):
+    checksum = base64.b64encode(hashlib.sha256(content).digest()).decode()
+    s3.upload_part(
+        Bucket=NAME, Key=key, UploadId=upload_id, PartNumber=part, Body=content, ChecksumSHA256=checksum
+    )
+
+
+def test_a_large_file_goes_on_where_it_was_and_ends_as_one_object(ask, s3):
+    content = bytes(2 * PART_BYTES) + b"rest"
+    key, parts = contract.file_key("car", file_of(content)), parts_of(content)
+    assert [one.part for one in ask(asking(content, 1, 2, 3)).addresses] == [1, 2, 3]
+    (begun,) = s3.list_multipart_uploads(Bucket=NAME)["Uploads"]
+    for part in (1, 3):
+        put(s3, key, begun["UploadId"], part, parts[part])
+    answer = ask(asking(content, 1, 2, 3))
+    assert answer.have == ((1, 1), (3, 3))
+    assert [one.part for one in answer.addresses] == [2]
+    # Whoever says that it is done before it is, is told what it has.
+    assert not ask(asking(content, done=True)).stored
+    put(s3, key, begun["UploadId"], 2, parts[2])
+    assert ask(asking(content, done=True)).stored
+    stored = s3.get_object(Bucket=NAME, Key=key)
+    assert stored["Body"].read() == content
+    assert stored["Metadata"] == {"sha256": sha256(content), "kind": "recording", "t": "1700000000000000"}
+    assert ask(asking(content, 1)).stored
+    assert "Uploads" not in s3.list_multipart_uploads(Bucket=NAME)
+
+
+def test_parts_of_another_content_never_become_the_file(ask, s3):
+    content = bytes(PART_BYTES) + b"rest"
+    key = contract.file_key("car", file_of(content))
+    ask(asking(content, 1, 2))
+    (begun,) = s3.list_multipart_uploads(Bucket=NAME)["Uploads"]
+    put(s3, key, begun["UploadId"], 1, bytes(PART_BYTES))
+    put(s3, key, begun["UploadId"], 2, b"evil")
+    assert [one.part for one in ask(asking(content, 1, 2)).addresses] == [2]
+    answer = ask(asking(content, done=True))
+    assert (answer.refused, answer.again_s) == ("the parts stored are not this file's", 0)
+    assert "Contents" not in s3.list_objects_v2(Bucket=NAME)
+    assert "Uploads" not in s3.list_multipart_uploads(Bucket=NAME)
+
+
+def test_a_day_has_so_many_bytes_and_a_large_file_counts_once(ask, dynamodb):
+    content = bytes(PART_BYTES + 1)
+    limit = {"bytes_a_day": PART_BYTES + 7}
+    for _ in range(3):
+        assert ask(asking(content, 1), **limit).addresses
+    assert ask(SMALL, **limit).addresses
+    refused = ask(SMALL, **limit)
+    assert "bytes a day" in refused.refused
+    assert refused.again_s == 3600
+    assert ask(SMALL, **limit, now_s=NOW_S + 86_400).addresses
+    row = dynamodb.get_item(TableName=ROBOTS, Key={contract.ROBOT: {"S": "car"}})["Item"]
+    assert row[FILES_BYTES] == {"N": "5"}
+    # To ask whether it is there costs nothing.
+    assert ask(replace(SMALL, parts={}), **limit).refused is None
+
+
+def test_a_robot_that_is_not_registered_gets_no_address(ask, dynamodb):
+    assert ask(SMALL, "stranger").refused
+    assert "Item" not in dynamodb.get_item(TableName=ROBOTS, Key={contract.ROBOT: {"S": "stranger"}})
+
+
+@pytest.fixture
+def published(monkeypatch, s3, dynamodb):
+    sent = []
+
+    class Broker:
+        def publish(self, **arguments):
+            sent.append(arguments)
+
+    monkeypatch.setenv("NAMESPACE", "iort")
+    monkeypatch.setattr(upload, "_iot_data", Broker)
+    monkeypatch.setattr(upload, "_bucket", lambda: Bucket(s3, NAME))
+    monkeypatch.setattr(upload, "_allotment", lambda: Allotment(dynamodb, table=ROBOTS, bytes_a_day=10**9))
+    return sent
+
+
+def event(request, robot="car"):
+    return {**json.loads(contract.encode_file_request(request)), TOPIC: build_topic(PING, robot, FILE)}
+
+
+def test_the_handler_answers_the_robot_of_the_topic_and_counts(published, capsys, s3):
+    upload.handler(event(SMALL), None)
+    key = contract.file_key("car", SMALL.file)
+    s3.put_object(Bucket=NAME, Key=key, Body=b"small")
+    upload.handler(event(asking(b"small", done=True)), None)
+    asked, stored = (contract.decode_file_answer(one["payload"]) for one in published)
+    assert {(one["topic"], one["qos"]) for one in published} == {(build_topic(PONG, "car", FILE), 1)}
+    assert (asked.key, asked.stored, stored.stored) == (key, False, True)
+    first, second = map(json.loads, capsys.readouterr().out.splitlines())
+    assert (first["FilesAsked"], "FilesStored" in first) == (1, False)
+    assert (second["FilesStored"], second["StoredBytes"]) == (1, 5)
+    units = {m["Name"]: m["Unit"] for m in second["_aws"]["CloudWatchMetrics"][0]["Metrics"]}
+    assert units["StoredBytes"] == "Bytes"
+
+
+def test_the_handler_says_what_is_wrong_with_a_request(published, capsys):
+    upload.handler({**event(SMALL), "parts": {"9": "x"}}, None)
+    (answer,) = (contract.decode_file_answer(one["payload"]) for one in published)
+    assert answer.id == ID
+    assert answer.refused == "part 9: allowed is 1 to 1"
+    assert answer.again_s is None
+    assert json.loads(capsys.readouterr().out.splitlines()[-1])["FilesRefused"] == 1
+    # Nobody can be told who has not said which request it is.
+    upload.handler({TOPIC: build_topic(PING, "car", FILE)}, None)
+    assert len(published) == 1
+
+
+def test_the_clients_are_those_of_the_environment(aws, monkeypatch):
+    monkeypatch.setenv("FILES_BUCKET", NAME)
+    monkeypatch.setenv("AWS_ACCESS_KEY_ID", "k")
+    monkeypatch.setenv("AWS_SECRET_ACCESS_KEY", "s")
+    upload._bucket.cache_clear()
+    try:
+        address = upload._bucket().address("robots/car/x", SMALL.file)
+    finally:
+        upload._bucket.cache_clear()
+    assert urlsplit(address.url).netloc == f"{NAME}.s3.eu-west-1.amazonaws.com"
