@@ -35,7 +35,7 @@ from station.blocks import ATTRIBUTES, Block, Refused, blocks, join
 from station.cloud import Cloud
 from station.conditions import Column, derive, holds
 from station.errors import StationError
-from station.reading import Progress
+from station.progress import Told
 from station.resample import resample
 from station.seconds import seconds
 from station.selection import MADE_OF, Selection, select
@@ -86,7 +86,7 @@ def query(
     every: str | None = None,
     summary: bool = False,
     scan: bool = False,
-    progress: Progress | None = None,
+    progress: Told | None = None,
 ) -> Result:
     """The samples of a robot's stream from ``start`` (included) to ``end`` (not included).
 
@@ -119,7 +119,7 @@ def samples(
     *,
     refused: Refused,
     scan: bool = False,
-    progress: Progress | None = None,
+    progress: Told | None = None,
 ) -> Iterator[Block]:
     """The selection's samples a block at a time, for what is too long to be held at once.
 

@@ -7,6 +7,7 @@ from functions.statistics import Vehicle
 from station import reading, robots
 from station.cloud import Cloud
 from station.errors import StationError
+from station.times import iso
 
 
 def vehicle_of(cloud: Cloud, robot: str) -> Vehicle | None:
@@ -22,7 +23,7 @@ def check_there(cloud: Cloud, robot: str, stream: str) -> None:
 
     What a robot that is no longer registered has sent stays, and is there.
     """
-    if reading.has_any(cloud, robot, stream):
+    if reading.outermost(cloud, robot, stream, newest=False) is not None:
         return
     has = ", ".join(streams_of(cloud, robot))
     known = sorted(str(row[ROBOT]) for row in robots.listed(cloud))
@@ -34,4 +35,11 @@ def check_there(cloud: Cloud, robot: str, stream: str) -> None:
 def streams_of(cloud: Cloud, robot: str) -> list[str]:
     """The streams of a robot that are known by name and have something stored."""
     known = sorted({VESC_STREAM, *OWN_STREAMS})
-    return [stream for stream in known if reading.has_any(cloud, robot, stream)]
+    return [stream for stream in known if reading.outermost(cloud, robot, stream, newest=True) is not None]
+
+
+def extent(cloud: Cloud, robot: str, stream: str) -> tuple[str, str] | None:
+    """When a stream's oldest and newest batches start, as ISO 8601; None where there is none."""
+    first = reading.outermost(cloud, robot, stream, newest=False)
+    last = reading.outermost(cloud, robot, stream, newest=True)
+    return None if first is None or last is None else (iso(first), iso(last))

@@ -2,17 +2,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from typing import Any, TypeVar
 
 from contract import MAX_BATCH_SPAN_US, RECORD, SECOND, T_US, TOPIC, build_topic
 from station.cloud import Cloud
+from station.progress import Told
 from station.selection import Selection
 
 Item = Mapping[str, Any]
-# Hears how many items a page had, and the microseconds at which the last of them starts.
-Progress = Callable[[int, int], None]
 
 # No time reaches these, see contract.py.
 _FIRST, _LAST = -(2**53), 2**53
@@ -43,11 +42,13 @@ def seconds(cloud: Cloud, selection: Selection, *, scan: bool = False) -> Iterat
     return _pages(cloud, request, SECOND, scan=scan) if first <= last else iter(())
 
 
-def has_any(cloud: Cloud, robot: str, stream: str) -> bool:
-    """Whether anything of a stream is stored."""
+def outermost(cloud: Cloud, robot: str, stream: str, *, newest: bool) -> int | None:
+    """The time at which the oldest or newest stored batch of a stream starts; None where there is none."""
     whole = Selection(robot=robot, stream=stream)
     request = _request(cloud, whole, ("TelemetryTable", T_US), (_FIRST, _LAST), scan=False)
-    return bool(cloud.client("dynamodb").query(**request, Limit=1, Select="COUNT")["Count"])
+    request["ProjectionExpression"] = "#key"
+    found = cloud.client("dynamodb").query(**request, Limit=1, ScanIndexForward=not newest)["Items"]
+    return int(found[0][T_US]["N"]) if found else None
 
 
 def _request(
@@ -95,7 +96,7 @@ def ahead(items: Iterable[_T]) -> Iterator[_T]:
 
 
 def told(
-    pages: Iterable[Sequence[Item]], progress: Progress | None, key: str, unit_us: int = 1
+    pages: Iterable[Sequence[Item]], progress: Told | None, key: str, unit_us: int = 1
 ) -> Iterator[Sequence[Item]]:
     """The pages, telling ``progress`` of each."""
     for items in pages:

@@ -23,7 +23,8 @@ from station.blocks import Block, objects
 from station.cloud import Cloud
 from station.conditions import Column, holds
 from station.errors import StationError
-from station.reading import Item, Progress
+from station.progress import Told
+from station.reading import Item
 from station.selection import Selection
 
 # What a second says of its samples as a whole.
@@ -32,7 +33,7 @@ _deserialize = TypeDeserializer().deserialize
 
 
 def seconds(
-    cloud: Cloud, selection: Selection, *, scan: bool = False, progress: Progress | None = None
+    cloud: Cloud, selection: Selection, *, scan: bool = False, progress: Told | None = None
 ) -> Iterator[Block]:
     """The selection's seconds, a block a page; times are those at which they begin.
 

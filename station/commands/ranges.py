@@ -1,0 +1,54 @@
+"""The options that name a range of time, the same for every command."""
+
+from __future__ import annotations
+
+import time
+from dataclasses import dataclass
+from datetime import datetime
+from typing import Annotated
+
+import typer
+from typing_extensions import Self
+
+from station.errors import StationError
+from station.progress import say
+from station.times import duration_us, has_zone, time_us
+
+From = Annotated[
+    str | None,
+    typer.Option("--from", help="First time: -10m, 2026-05-04T10:00:00Z; the very first if only --to."),
+]
+To = Annotated[str | None, typer.Option("--to", help="First time no more included; now if only --from.")]
+Last = Annotated[str | None, typer.Option("--last", help="The time up to now: 5m, 2h, 7d; or all.")]
+
+_USUAL = "5m"
+
+
+@dataclass(frozen=True)
+class Range:
+    """From a time (included) to a time (not included), in microseconds; None is the very beginning or end."""
+
+    start_us: int | None
+    end_us: int | None
+
+    @classmethod
+    def of(cls, start: str | None, end: str | None, last: str | None) -> Self:
+        """The range that the options name; raises `StationError` where they contradict one another."""
+        if last is not None and (start is not None or end is not None):
+            raise StationError("give either --last or --from and --to")
+        now_us = time.time_ns() // 1000
+        if last == "all":
+            return cls(None, None)
+        if start is None and end is None:
+            if last is None:
+                say(f"no range is given: the last {_USUAL}; --last all is everything")
+            return cls(now_us - duration_us(last or _USUAL), now_us)
+        for text in (start, end):
+            if text is not None and not has_zone(text):
+                zone = datetime.now().astimezone()
+                say(f"{text} is taken as {zone.tzname()} (UTC{zone.strftime('%z')}), this machine's zone")
+        start_us = None if start is None else time_us(start, now_us)
+        end_us = now_us if end is None else time_us(end, now_us)
+        if start_us is not None and start_us > end_us:
+            raise StationError("the range ends before it starts")
+        return cls(start_us, end_us)

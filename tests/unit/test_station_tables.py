@@ -1,0 +1,102 @@
+"""Results as other programs read them, and the ranges that people ask for."""
+
+from __future__ import annotations
+
+import csv
+import io
+import json
+
+import numpy as np
+import pyarrow.parquet as pq
+import pytest
+from rich.console import Console
+
+from station import tables
+from station.commands.ranges import Range
+from station.data import Result
+from station.errors import StationError
+
+
+def result(n=3):
+    objects = np.empty(n, dtype=object)
+    objects[:] = (["a", None, "ü"] * n)[:n]
+    columns = {
+        "speed": np.arange(n) * 1.5,
+        "current_motor": np.full(n, np.nan),
+        "name": objects,
+        "on": np.arange(n) % 2 == 0,
+    }
+    times = np.arange(n, dtype=np.int64) * 20_000 + 1_700_000_000_123_456
+    return Result("car", "vesc", times, columns)
+
+
+def test_csv_is_what_spreadsheets_and_grafana_read():
+    file = io.StringIO()
+    tables.to_csv(result(), file)
+    rows = list(csv.DictReader(io.StringIO(file.getvalue())))
+    assert rows[1] == {
+        "time": "2023-11-14T22:13:20.143456Z",
+        "speed": "1.5",
+        "current_motor": "",
+        "name": "",
+        "on": "False",
+    }
+    assert len(rows) == 3
+
+
+def test_json_lines_keep_null_text_and_microseconds():
+    file = io.StringIO()
+    tables.to_json_lines(result(25_000), file)
+    lines = [json.loads(line) for line in file.getvalue().splitlines()]
+    assert len(lines) == 25_000
+    assert lines[2] == {
+        "time": "2023-11-14T22:13:20.163456Z",
+        "t_us": 1_700_000_000_163_456,
+        "speed": 3.0,
+        "current_motor": None,
+        "name": "ü",
+        "on": True,
+    }
+    assert lines[-1]["t_us"] == 1_700_000_000_123_456 + 24_999 * 20_000
+
+
+def test_parquet_keeps_times_types_null_and_units():
+    file = io.BytesIO()
+    tables.to_parquet(result(), file)
+    table = pq.read_table(io.BytesIO(file.getvalue()))
+    assert str(table.schema.field("time").type) == "timestamp[us, tz=UTC]"
+    assert table.schema.field("speed").metadata == {b"unit": b"erpm"}
+    assert table.schema.metadata[b"robot"] == b"car"
+    assert table.column("speed").to_pylist() == [0.0, 1.5, 3.0]
+    assert table.column("current_motor").null_count == 3
+    assert table.column("name").to_pylist() == ["a", None, "ü"]
+
+
+def test_a_terminal_shows_units_and_both_ends():
+    console = Console(width=120, file=io.StringIO())
+    console.print(tables.terminal(result(1000)))
+    text = console.file.getvalue()
+    assert "erpm" in text
+    assert "22:13:20.123456" in text
+    assert "22:13:40.103456" in text
+    assert "22:13:30" not in text
+
+
+def test_ranges(capsys):
+    assert Range.of(None, None, "all") == Range(None, None)
+    found = Range.of(None, None, "2s")
+    assert found.end_us - found.start_us == 2_000_000
+    found = Range.of("2023-11-14T22:13:20Z", "2023-11-14T22:13:21Z", None)
+    assert (found.start_us, found.end_us) == (1_700_000_000_000_000, 1_700_000_001_000_000)
+    assert capsys.readouterr().err == ""
+    Range.of("2023-11-14T22:13:20", None, None)
+    assert "this machine's zone" in capsys.readouterr().err
+    found = Range.of(None, None, None)
+    assert found.end_us - found.start_us == 300_000_000
+    assert "--last all" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("options", [("-1m", None, "1m"), ("now", "-1m", None), (None, None, "soon")])
+def test_ranges_that_make_no_sense(options):
+    with pytest.raises(StationError):
+        Range.of(*options)
