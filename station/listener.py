@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import threading
 import time
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from types import TracebackType
 from typing import Any, NamedTuple
 
@@ -33,8 +33,13 @@ class Heard(NamedTuple):
     hops: Mapping[str, int]
 
 
+# Takes an update, PubNub's time of taking it and this machine's of receiving it, in microseconds; in
+# the listener's own thread.
+OnUpdate = Callable[[dict[str, Any], int, int], None]
+
+
 class Listener:
-    """Subscribed from `__enter__` to `__exit__`; `heard` grows meanwhile.
+    """Subscribed from `__enter__` to `__exit__`; `heard` grows meanwhile, or ``on_update`` is called.
 
     The delay compares the car's clock with this machine's, so it is only as good as the two agree.
     Raises `StationError` where PubNub does not answer.
@@ -48,6 +53,7 @@ class Listener:
         namespace: str = DEFAULT_NAMESPACE,
         origin: str = "",
         tls: bool = True,
+        on_update: OnUpdate | None = None,
     ) -> None:
         config = PNConfiguration()
         config.subscribe_key, config.user_id = subscribe_key, "iort-station"
@@ -57,7 +63,7 @@ class Listener:
         config.disable_config_locking = False
         config.reconnect_policy = PNReconnectionPolicy.EXPONENTIAL
         self._channel = channel(robot, namespace)
-        self._callback = _Callback()
+        self._callback = _Callback(on_update)
         self._client = PubNub(config)
         self._client.add_listener(self._callback)
 
@@ -80,7 +86,8 @@ class Listener:
 
 
 class _Callback(SubscribeCallback):  # type: ignore[misc]  # the SDK's base class has no types
-    def __init__(self) -> None:
+    def __init__(self, on_update: OnUpdate | None) -> None:
+        self._on_update = on_update
         self.connected = threading.Event()
         self.heard: list[Heard] = []
 
@@ -94,6 +101,9 @@ class _Callback(SubscribeCallback):  # type: ignore[misc]  # the SDK's base clas
     def message(self, _pubnub: Any, message: Any) -> None:
         now_us = time.time_ns() // 1000
         update = message.message
+        if self._on_update is not None:
+            self._on_update(update, int(message.timetoken) // 10, now_us)
+            return
         hops = update["hops"]
         self.heard.append(
             Heard(

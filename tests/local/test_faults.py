@@ -18,10 +18,10 @@ from pathlib import Path
 import pytest
 
 from local.cloud import EmbeddedCloud
+from local.proxy import FREEZE, PASS, REFUSE, Proxy
 from station import delivery, robots
 from tests.local.conftest import until
 from tests.local.drives import RATE_HZ, Agent, counted, counter_log
-from tests.proxy import FREEZE, PASS, REFUSE, Proxy
 
 OUTAGE_S = 60
 DRIVE_S = 75

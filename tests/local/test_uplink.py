@@ -21,10 +21,10 @@ from device.dispatch import Dispatcher
 from device.iotcore import IotCore
 from device.reconnect import SLOW_SHORTEST_S
 from local.cloud import EmbeddedCloud
+from local.proxy import FREEZE, PASS, REFUSE, Proxy
 from station import robots
 from tests.local.conftest import until
 from tests.local.robot import Robot
-from tests.proxy import FREEZE, PASS, REFUSE, Proxy
 
 
 @pytest.fixture

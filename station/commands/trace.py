@@ -1,0 +1,113 @@
+"""`iort trace`: where the time goes."""
+
+from __future__ import annotations
+
+import json
+import threading
+import time
+from dataclasses import asdict
+from typing import Annotated, Any
+
+import typer
+from rich.console import Console
+from rich.table import Table
+
+from contract import RTT_STREAM, VESC_STREAM, ContractError, check_robot
+from station import audit, keys, trace
+from station.errors import StationError
+from station.listener import Listener
+from station.page import PUBNUB_ORIGIN
+
+commands = typer.Typer()
+_out = Console(highlight=False)
+_errors = Console(stderr=True, highlight=False)
+_BAR = 30
+
+
+@commands.command("trace")
+def trace_(
+    context: typer.Context,
+    robot: str,
+    stream: Annotated[str, typer.Option(help="Whose live updates.")] = VESC_STREAM,
+    updates: Annotated[int, typer.Option(min=1, help="How many updates to wait for.")] = 50,
+    seconds: Annotated[float, typer.Option(min=0.1, help="How long to wait for them at most.")] = 15.0,
+    as_json: Annotated[bool, typer.Option("--json", help="As JSON.")] = False,
+) -> None:
+    """Follow a robot's live updates from the sample in the car to here, hop by hop."""
+    cloud = context.obj.cloud()
+    try:
+        check_robot(robot)
+    except ContractError as error:
+        raise StationError(str(error)) from error
+    found: list[trace.Times] = []
+    enough = threading.Event()
+
+    def take(update: dict[str, Any], pubnub_us: int, here_us: int) -> None:
+        if update.get("stream") == stream and not enough.is_set():
+            found.append(trace.times(update, pubnub_us, here_us))
+            if len(found) >= updates:
+                enough.set()
+
+    pubnub = keys.load(cloud)
+    listener = Listener(
+        subscribe_key=pubnub.subscribe_key,
+        robot=robot,
+        namespace=cloud.namespace,
+        on_update=take,
+        **pubnub.server(),
+    )
+    with listener, _errors.status(f"listening to {robot}"):
+        with trace.pubnub_clock(pubnub.origin or PUBNUB_ORIGIN, tls=pubnub.tls) as ask:
+            here_to_pubnub = trace.clock_of(ask, lambda: time.time_ns() // 1000)
+        enough.wait(seconds)
+    if not found:
+        raise StationError(
+            f"nothing of {robot}'s stream {stream} was heard in {seconds:g} s: "
+            "is it driving, and its live lane on?"
+        )
+    figures = audit.last_figures(cloud, robot)
+    result = trace.trace(
+        found,
+        here_to_pubnub=here_to_pubnub,
+        car_uncertainty_ms=figures.get("clock_uncertainty_ms"),
+        newest_rtt=audit.last_batch(cloud, robot, RTT_STREAM),
+    )
+    if as_json:
+        _out.print_json(json.dumps(asdict(result)))
+    else:
+        _show(robot, result)
+
+
+def _show(robot: str, result: trace.Trace) -> None:
+    table = Table(title=f"{robot}: {result.updates} live updates", title_justify="left")
+    for name in ("hop", "median", "95 %", "clocks", ""):
+        table.add_column(name, justify="left" if name in {"hop", ""} else "right")
+    whole = max(result.whole.p50_ms, 1e-3)
+    begins = 0.0
+    for hop in result.hops:
+        table.add_row(*_cells(hop), bar(begins / whole, hop.p50_ms / whole))
+        begins += max(0.0, hop.p50_ms)
+    table.add_section()
+    table.add_row(*_cells(result.whole), bar(0, 1), style="bold")
+    _out.print(table)
+    _out.print("clocks: by how much a hop may be wrong; ? where two providers' clocks are taken as they are")
+    if result.round_trips_ms:
+        trips = ", ".join(f"{path} {value:.1f} ms" for path, value in result.round_trips_ms.items())
+        _out.print(f"round trips that the car measured last: {trips}")
+
+
+def bar(begins: float, share: float) -> str:
+    """A bar from one share of the whole on, in eighths of a character."""
+    begins = min(max(begins, 0.0), 1.0)
+    eighths = round(min(max(share, 0.0), 1.0 - begins) * _BAR * 8)
+    return " " * round(begins * _BAR) + "█" * (eighths // 8) + " ▏▎▍▌▋▊▉"[eighths % 8].strip()
+
+
+def _cells(hop: trace.Hop) -> tuple[str, ...]:
+    clocks = "?" if hop.uncertainty_ms is None else f"± {hop.uncertainty_ms:.1f} ms"
+    return (
+        hop.name,
+        f"{hop.p50_ms:.1f} ms",
+        f"{hop.p95_ms:.1f} ms",
+        "exact" if hop.uncertainty_ms == 0 else clocks,
+    )

@@ -1,0 +1,54 @@
+"""`iort trace` of a car that drives on the embedded cloud."""
+
+from __future__ import annotations
+
+import json
+import subprocess
+import sys
+from pathlib import Path
+
+from local.deployment import ROOT
+from tests.local.conftest import until
+from tests.local.drives import Agent
+
+
+def _trace(embedded, *arguments):
+    command = [Path(sys.executable).parent / "iort", "--local", "--embedded", embedded.folder / "cloud.json"]
+    return subprocess.run(
+        [*command, "trace", *arguments, "--json"],
+        check=False,
+        cwd=ROOT,
+        capture_output=True,
+        text=True,
+        timeout=120,
+    )
+
+
+def test_every_hop_of_a_driving_car(embedded, bundle):
+    car = bundle(
+        sources=[{"type": "sim", "stream": "vesc", "rate_hz": 20}],
+        ping={"rate_hz": 5},
+        metrics={"every_s": 1},
+    )
+    agent = Agent(car)
+    try:
+        until(agent.status, seconds=60)
+        done = _trace(embedded, car.robot, "--updates", "10", "--seconds", "60")
+    finally:
+        agent.process.terminate()
+        agent.process.wait(60)
+    assert done.returncode == 0, done.stderr
+    found = json.loads(done.stdout)
+    assert found["updates"] == 10
+    names = [hop["name"] for hop in found["hops"]]
+    assert len(names) == len(set(names)) == 5
+    # One machine, one clock: what goes from place to place cannot arrive before it has left.
+    for hop in found["hops"]:
+        assert hop["p50_ms"] >= -1.0 - (hop["uncertainty_ms"] or 0.0), hop
+    assert found["whole"]["p50_ms"] > 0
+
+
+def test_a_car_that_does_not_drive(embedded, bundle):
+    done = _trace(embedded, bundle().robot, "--seconds", "0.5")
+    assert done.returncode == 1
+    assert "is it driving" in done.stderr

@@ -1,0 +1,74 @@
+"""The hops of an update, with clocks that are off by as much as a car's may be."""
+
+from __future__ import annotations
+
+import itertools
+
+import pytest
+
+from contract import Batch, LiveSample, live_update
+from station.commands.trace import bar
+from station.trace import CAR, HERE, LAMBDA, PUBNUB, RULE, Clock, clock_of, round_trips_ms, times, trace
+
+T_US = 1_750_000_000_000_000
+# What each hop takes, in microseconds of true time.
+TRUE = {CAR: 700, RULE: 30_500, LAMBDA: 12_000, PUBNUB: 20_000, HERE: 15_000}
+
+
+def _times(car_off_us, here_off_us, offset_us):
+    """An update whose car and receiver are off by so much from the cloud's clock."""
+    sent = T_US + TRUE[CAR]
+    rule = sent + TRUE[RULE]
+    lambda_us, pubnub = rule + TRUE[LAMBDA], rule + TRUE[LAMBDA] + TRUE[PUBNUB]
+    live = LiveSample("0badcafe", 1, T_US - car_off_us, sent - car_off_us, {"speed": 1}, 0, offset_us)
+    update = live_update("car7", "vesc", live, rule // 1000, lambda_us)
+    return times(update, pubnub, pubnub + TRUE[HERE] - here_off_us)
+
+
+@pytest.mark.parametrize(
+    ("car_off_us", "here_off_us"), [(0, 0), (3_600_000_000, -250_000), (-90_000, 10_000)]
+)
+def test_hops_are_right_whatever_the_clocks(car_off_us, here_off_us):
+    found = trace(
+        [_times(car_off_us, here_off_us, car_off_us)] * 3,
+        here_to_pubnub=Clock(here_off_us, 400),
+        car_uncertainty_ms=1.5,
+    )
+    for hop in found.hops:
+        assert hop.p50_ms == pytest.approx(TRUE[hop.name] / 1000, abs=0.6), hop
+    assert found.whole.p50_ms == pytest.approx(sum(TRUE.values()) / 1000, abs=0.01)
+    uncertain = {hop.name: hop.uncertainty_ms for hop in found.hops}
+    assert uncertain == {CAR: 0.0, RULE: 1.5, LAMBDA: 0.5, PUBNUB: None, HERE: 0.4}
+    assert found.whole.uncertainty_ms == pytest.approx(1.9)
+
+
+def test_a_car_that_does_not_know_its_offset_says_so():
+    found = trace([_times(0, 0, None)], here_to_pubnub=Clock(0, 0), car_uncertainty_ms=1.5)
+    assert {hop.name: hop.uncertainty_ms for hop in found.hops}[RULE] is None
+    assert found.whole.uncertainty_ms is None
+
+
+def test_the_fastest_answer_tells_the_clock():
+    ours = itertools.chain([0, 1000], [2000, 2100], [3000, 3800], itertools.count(10_000, 5000))
+    clock = clock_of(lambda: 1_000_000, lambda: next(ours))
+    assert clock == Clock(1_000_000 - 2050, 50)
+
+
+def test_round_trips_are_the_medians_of_the_newest_batch():
+    columns = {
+        "broker_ms": [1.0, None, 3.0, 2.0],
+        "rule_ms": [None, 5.5, None, None],
+        "lambda_ms": [None] * 4,
+    }
+    batch = Batch("0badcafe", 0, [1, 2, 3, 4], columns)
+    assert round_trips_ms(batch) == {"broker": 2.0, "rule": 5.5}
+    assert round_trips_ms(None) == {}
+
+
+@pytest.mark.parametrize(("begins", "share"), [(0, 1), (0.5, 0.5), (0.9, 0.5), (-1, 2), (1, 0), (0.3, -1)])
+def test_bars_stay_inside_their_column(begins, share):
+    assert len(bar(begins, share)) <= 31
+
+
+def test_bars_begin_where_the_last_ended():
+    assert bar(0.5, 0.25).index("█") == 15
