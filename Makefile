@@ -19,8 +19,10 @@ demo: setup ## drive a car through the embedded cloud: DURATION=20 BAG=drive.bag
 test: setup ## run every test; REQUIRE_ALL=1 makes a skip a failure
 	@$(BIN)/python -m pytest
 
-check: setup ## run the linters and the type checkers
+check: setup ## run the linters, the type checkers, and cfn-lint, cdk-nag and checkov over the stacks
+	@$(PYTHON) scripts/setup.py --checkov
 	@$(BIN)/ruff check . && $(BIN)/ruff format --check . && $(BIN)/mypy app.py contract.py scripts device functions stacks station local bench && $(BIN)/npm run --silent check
+	@PATH="$(CURDIR)/$(BIN):$$PATH" $(BIN)/python scripts/check_stacks.py --checkov build/checkov/bin/checkov
 
 bench-agent: setup ## measure the agent on a real ROS 1 graph: DURATION=30 SOAK=600 REPORT=figures.json
 	@$(BIN)/python -m bench.agent $(if $(DURATION),--seconds $(DURATION)) $(if $(SOAK),--soak $(SOAK)) \
@@ -52,6 +54,10 @@ lock: setup ## compile requirements/*.in to the locked *.txt
 		requirements/dev.in -o requirements/dev.txt
 	@$(BIN)/uv pip compile --quiet --universal --generate-hashes --no-emit-index-url --python-version 3.10 \
 		-c requirements/dev.txt requirements/layer.in -o requirements/layer.txt
+	@$(BIN)/uv pip compile --quiet --universal --generate-hashes --no-emit-index-url --python-version 3.10 \
+		-c requirements/dev.txt requirements/build.in -o requirements/build.txt
+	@$(BIN)/uv pip compile --quiet --universal --generate-hashes --no-emit-index-url --python-version 3.10 \
+		requirements/checkov.in -o requirements/checkov.txt
 
 clean: ## remove what was made
 	find . -name __pycache__ -type d -prune -exec rm -rf {} +

@@ -31,7 +31,11 @@ LEAST_FREE_BYTES = 3 * 1024**3
 LAMBDA_PLATFORMS = ("manylinux_2_28_aarch64", "manylinux_2_17_aarch64", "manylinux2014_aarch64")
 LAMBDA_PYTHON = "3.13"
 # No compiler is needed: pubnub, which publishes no wheel, is Python alone.
-LOCKED = ("--require-hashes", "--no-deps", "--only-binary", ":all:", "--no-binary", "pubnub")
+# It is built with the locked setuptools of .venv, not with whatever is newest today.
+LOCKED = (
+    *("--require-hashes", "--no-deps", "--only-binary", ":all:"),
+    *("--no-binary", "pubnub", "--no-build-isolation"),
+)
 STARTED = time.monotonic()
 # npm's and pip's caches are theirs to keep elsewhere; nothing of ours goes outside the checkout.
 CACHES = {"npm_config_cache": str(BUILD / "npm-cache"), "npm_config_update_notifier": "false"}
@@ -45,11 +49,13 @@ def main() -> None:
     """Run the steps that are due."""
     parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
     parser.add_argument("--layer", choices=["lambda"], help="also build the layer that `cdk deploy` needs")
+    parser.add_argument("--checkov", action="store_true", help="also install what `make check` needs")
     asked = parser.parse_args()
     try:
         check_machine()
         step("virtual environment", [], make_venv, stamp="venv")
-        step("Python packages", [ROOT / "requirements" / "dev.txt"], install_python, stamp="python")
+        locked = [ROOT / "requirements" / name for name in ("build.txt", "dev.txt")]
+        step("Python packages", locked, install_python, stamp="python")
         installed = [ROOT / "pyproject.toml", ROOT / "station" / "pyproject.toml"]
         step("the project itself", installed, install_project, stamp="project")
         step("CDK and page packages", [ROOT / "package-lock.json"], install_node, stamp="node")
@@ -59,6 +65,9 @@ def main() -> None:
         step("Lambda layer, this machine", [layer], lambda: build_layer("local"), stamp="layer-local")
         if asked.layer:
             step("Lambda layer, AWS", [layer], lambda: build_layer("lambda"), stamp="layer-lambda")
+        if asked.checkov:
+            locked = [ROOT / "requirements" / "checkov.txt"]
+            step("checkov, in an environment of its own", locked, install_checkov, stamp="checkov")
     except SetupError as error:
         sys.exit(f"setup: {error}")
     except KeyboardInterrupt:
@@ -109,6 +118,7 @@ def make_venv() -> None:
 
 def install_python() -> None:
     """Install exactly what is locked; every file is checked against its hash."""
+    pip("install", *LOCKED, "-r", "requirements/build.txt")
     pip("install", *LOCKED, "-r", "requirements/dev.txt")
 
 
@@ -141,9 +151,15 @@ def build_layer(target: str) -> None:
     )  # fmt: skip
 
 
-def pip(*arguments: str) -> None:
-    """Run .venv's pip."""
-    run([PYTHON, "-m", "pip", "--disable-pip-version-check", "--quiet", *arguments])
+def install_checkov() -> None:
+    """Install checkov, whose requirements contradict ours, into build/checkov."""
+    run([BASE_PYTHON, "-m", "venv", "--clear", BUILD / "checkov"])
+    pip("install", *LOCKED, "-r", "requirements/checkov.txt", python=BUILD / "checkov" / "bin" / "python")
+
+
+def pip(*arguments: str, python: Path = PYTHON) -> None:
+    """Run an environment's pip, .venv's unless another is named."""
+    run([python, "-m", "pip", "--disable-pip-version-check", "--quiet", *arguments])
 
 
 def run(command: Sequence[str | Path]) -> None:

@@ -39,12 +39,13 @@ def failed_if_skipped(report: Any) -> Any:
 
 @dataclass(frozen=True)
 class Synthesized:
-    """The app as it is deployed: a template a stack, the folder with the assets, and which stacks are
-    protected from termination."""
+    """The app as it is deployed: a template a stack, the folder with the assets, which stacks are
+    protected from termination, and the paths of what the checkers' findings are acknowledged on."""
 
     folder: Path
     templates: Mapping[str, dict[str, Any]]
     protected: set[str]
+    acknowledged: set[str]
 
     def resources(self, kind: str, stack: str | None = None) -> dict[str, dict[str, Any]]:
         """Logical id to properties of every resource of a type."""
@@ -91,7 +92,7 @@ def _synthesize(tmp_path_factory: pytest.TempPathFactory, **given: Any) -> Synth
     (layer / "python" / "nothing.py").touch()
     app = App(outdir=str(folder))
     settings = Settings(layer=layer, **given)
-    build(app, settings)
+    acknowledged = build(app, settings)
     stacks = app.synth().stacks
     prefix = f"{settings.namespace}-"
     nouns = {s.stack_name.removeprefix(prefix): s for s in stacks}
@@ -99,4 +100,5 @@ def _synthesize(tmp_path_factory: pytest.TempPathFactory, **given: Any) -> Synth
         folder,
         {noun: s.template for noun, s in nouns.items()},
         {noun for noun, s in nouns.items() if s.termination_protection},
+        {one.path for one in acknowledged},
     )

@@ -1,0 +1,164 @@
+"""Runs the independent checkers over the stacks of both stages: cfn-lint, cdk-nag and checkov.
+
+    python scripts/check_stacks.py [--checkov build/checkov/bin/checkov] [--write]
+
+Needs no credentials and no network. What the stacks deliberately do otherwise is in
+stacks/acknowledged.py; --write makes docs/acknowledged.md from it.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import os
+import subprocess
+import sys
+import time
+from collections import defaultdict
+from collections.abc import Iterable, Iterator
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from typing import Any
+
+ROOT = Path(__file__).resolve().parent.parent
+sys.path.insert(0, str(ROOT))
+
+from aws_cdk import App, Validations  # noqa: E402 the checkout is not installed
+from cdk_nag import AwsSolutionsChecks, ServerlessChecks  # noqa: E402 as above
+
+from app import build  # noqa: E402 as above
+from stacks.acknowledged import Acknowledged  # noqa: E402 as above
+from stacks.settings import Settings  # noqa: E402 as above
+
+DOCUMENT = ROOT / "docs" / "acknowledged.md"
+STAGES: dict[str, dict[str, Any]] = {
+    "dev": {},
+    "prod": {
+        "stage": "prod",
+        "customer_key": True,
+        "budget_usd": 50,
+        "alarm_email": "lab@example.org",
+        "tags": {"team": "lab"},
+    },
+}
+
+
+def main() -> None:
+    """Print what is open, and exit with 1 if anything is."""
+    parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
+    parser.add_argument("--checkov", type=Path, help="checkov's command, in its own environment")
+    parser.add_argument("--write", action="store_true", help="write docs/acknowledged.md")
+    asked = parser.parse_args()
+    findings: list[str] = []
+    known: dict[str, list[Acknowledged]] = {}
+    with TemporaryDirectory() as folder:
+        layer = Path(folder) / "layer"
+        (layer / "python").mkdir(parents=True)
+        for stage, given in STAGES.items():
+            began = time.monotonic()
+            out = Path(folder) / stage
+            settings = Settings(layer=layer, **given)
+            known[stage] = synthesize(settings, out)
+            findings += [f"{stage}: {finding}" for finding in nag(out)]
+            print(f"check: stage {stage} synthesized, cdk-nag ({time.monotonic() - began:.0f} s)", flush=True)  # noqa: T201 a command prints
+        began = time.monotonic()
+        findings += lint(Path(folder))
+        print(f"check: cfn-lint ({time.monotonic() - began:.0f} s)", flush=True)  # noqa: T201 as above
+        if asked.checkov:
+            began = time.monotonic()
+            findings += checkov(asked.checkov, Path(folder))
+            print(f"check: checkov ({time.monotonic() - began:.0f} s)", flush=True)  # noqa: T201 as above
+    text = document(known)
+    if asked.write:
+        DOCUMENT.write_text(text)
+    elif DOCUMENT.read_text() != text:
+        findings.append(f"{DOCUMENT.relative_to(ROOT)} is not up to date: scripts/check_stacks.py --write")
+    if findings:
+        sys.exit(
+            "\n".join([*findings, f"{len(findings)} open: do it, or say why not in stacks/acknowledged.py"])
+        )
+
+
+def synthesize(settings: Settings, out: Path) -> list[Acknowledged]:
+    """The templates, and cdk-nag's report, into ``out``."""
+    app = App(outdir=str(out))
+    known = build(app, settings)
+    Validations.of(app).add_plugins(AwsSolutionsChecks(app), ServerlessChecks(app))
+    try:
+        app.synth()
+    except RuntimeError as error:
+        if "Validation failed" not in str(error):
+            raise
+    return known
+
+
+def nag(out: Path) -> Iterator[str]:
+    """What cdk-nag has against a synthesized app; raises if a pack did not run."""
+    report = json.loads((out / "validation-report.json").read_text())
+    packs = {plugin["pluginName"]: plugin for plugin in report["pluginReports"]}
+    for name in ("AwsSolutions", "Serverless"):
+        for violation in packs[name]["violations"]:
+            for construct in violation["violatingConstructs"]:
+                yield f"cdk-nag {violation['ruleName']} on {construct['constructPath']}"
+
+
+def lint(folder: Path) -> Iterator[str]:
+    """What cfn-lint has against the templates below ``folder``."""
+    templates = sorted(map(str, folder.rglob("*.template.json")))
+    command = [str(Path(sys.executable).with_name("cfn-lint")), "--format", "json", "--", *templates]
+    for match in json.loads(output(command, good=range(16)) or "[]"):
+        where = match["Location"]["Path"]
+        yield f"cfn-lint {match['Rule']['Id']} on {'/'.join(map(str, where or []))}: {match['Message']}"
+
+
+def checkov(command: Path, folder: Path) -> Iterator[str]:
+    """What checkov has against the templates below ``folder``."""
+    options = ["--framework", "cloudformation", "--compact", "--quiet", "--skip-download", "--output", "json"]
+    report = json.loads(output([str(command), "--directory", str(folder), *options], good=(0, 1)))
+    if report["summary"]["parsing_errors"] or not report["summary"]["passed"]:
+        yield f"checkov could not read the templates: {report['summary']}"
+    for check in report["results"]["failed_checks"]:
+        where = f"{check['file_path']} {check['resource']}"
+        yield f"checkov {check['check_id']} on {where}: {check['check_name']}"
+
+
+def output(command: list[str], *, good: Iterable[int]) -> str:
+    """A tool's standard output. Neither tool needs a network, and neither gets one."""
+    nowhere = "http://127.0.0.1:9"
+    environment = {**os.environ, "HTTPS_PROXY": nowhere, "HTTP_PROXY": nowhere, "LOG_LEVEL": "ERROR"}
+    done = subprocess.run(  # noqa: S603 the commands are the ones above
+        command, env=environment, capture_output=True, text=True, check=False
+    )
+    if done.returncode not in good:
+        sys.exit(f"{command[0]} failed:\n{done.stderr or done.stdout}")
+    return done.stdout
+
+
+def document(known: dict[str, list[Acknowledged]]) -> str:
+    """docs/acknowledged.md: rule and reason, and every resource that it is acknowledged for."""
+    where: dict[tuple[str, str], dict[str, set[str]]] = defaultdict(lambda: defaultdict(set))
+    for stage, acknowledged in known.items():
+        for one in acknowledged:
+            where[one.rule, one.reason][one.path].add(stage)
+    lines = [
+        "# What the checkers ask for and the stacks do not do",
+        "",
+        "Generated by `scripts/check_stacks.py --write` from",
+        "[stacks/acknowledged.py](../stacks/acknowledged.py). `make check` runs cfn-lint (W), cdk-nag",
+        "(AwsSolutions, Serverless) and checkov (CKV) over both stages, prod with a customer-managed key,",
+        "and fails on anything that is not here, and when this is not up to date.",
+        "",
+        "| rule | why not | resources |",
+        "|---|---|---|",
+    ]
+    for (rule, reason), paths in sorted(where.items()):
+        named = []
+        for path, stages in sorted(paths.items()):
+            named.append(path if stages == set(STAGES) else f"{path} ({', '.join(sorted(stages))})")
+        shown = rule.replace("|", "\\|").replace("<", "&lt;").replace("*", "\\*")
+        lines.append(f"| {shown} | {reason} | {', '.join(named)} |")
+    return "\n".join([*lines, ""])
+
+
+if __name__ == "__main__":
+    main()
