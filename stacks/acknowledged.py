@@ -146,6 +146,15 @@ def single(settings: Settings) -> dict[str, dict[str, str]]:
             "Serverless-LambdaAsyncFailureDestination": "a live sample that is late is worth nothing; every "
             "sample is in the record lane"
         },
+        "processing/UploadRole/DefaultPolicy": {
+            wide(f"{settings.namespace}-storage:ExportsOutputFnGetAttFiles8E6940B8ArnD8EE6C03/robots/*"): (
+                "the wildcard is the robot, and the function signs for the one that asked"
+            ),
+            wide(f"{iot}:topic/pong/{settings.namespace}/*/file"): a_robot,
+        },
+        "processing/Upload/EventInvokeConfig": {
+            "Serverless-LambdaAsyncFailureDestination": "the robot asks again until it is answered"
+        },
         "processing/SummarizeRole/DefaultPolicy": {
             wide("*"): "dynamodb:ListStreams knows no resources; the CDK grants it with the stream",
             "AwsSolutions-IAM5[Action::kms:GenerateDataKey*]": "the CDK's grant to a queue's sender, one key",
