@@ -30,9 +30,10 @@ from local.errors import LocalError
 from local.figures import Figures, Spread, round_trips
 from local.processes import Child
 from station import delivery, robots
+from station.answers import answers
 from station.errors import StationError
 from station.listener import Listener
-from station.page import PageServer
+from station.page_server import PageServer
 
 ROBOT = "car1"
 _SOURCE_RATE_HZ = 50
@@ -124,6 +125,7 @@ class _Demo:
                     origin=embedded.pubnub.origin,
                     tls=False,
                     vehicles=vehicles,
+                    answers=answers(embedded.cloud),
                     port=self._options.port,
                 )
             )
@@ -140,7 +142,7 @@ class _Demo:
             bundle = robots.add(
                 embedded.cloud, ROBOT, out=embedded.folder / "robots", settings=self._settings()
             )
-            self._console.print(f"\n[bold]Watch the car:[/bold] {page.url}\n", highlight=False)
+            self._console.print(f"\n[bold]Watch the car:[/bold] {page.url}#/car/{ROBOT}\n", highlight=False)
             report = self._drive(embedded, bundle, listener)
             figures = self._count(embedded, report, listener)
             self._console.print(figures.as_table())

@@ -10,6 +10,8 @@ from typing import Any
 
 import pytest
 
+from tests.browser import browser, open_page  # noqa: F401 (fixtures)
+
 
 def skips_fail() -> bool:
     return os.environ.get("REQUIRE_ALL", "").lower() in {"1", "true", "yes"}

@@ -10,7 +10,8 @@ from rich.console import Console
 
 from contract import ROBOT
 from station import keys, robots
-from station.page import PageServer
+from station.answers import answers
+from station.page_server import PageServer
 
 commands = typer.Typer()
 _out = Console(highlight=False)
@@ -21,8 +22,15 @@ def dashboard(
     context: typer.Context,
     port: Annotated[int, typer.Option(help="The page's port; 0 for a free one.")] = 8080,
     host: Annotated[str, typer.Option(help="The address to listen on.")] = "127.0.0.1",
+    token: Annotated[
+        str,
+        typer.Option(
+            envvar="PUBNUB_ACCESS_TOKEN",
+            help="PubNub's access token to read with, where Access Manager is on.",
+        ),
+    ] = "",
 ) -> None:
-    """Serve the live page until Ctrl-C."""
+    """Serve the live page until Ctrl-C: the fleet, each car, its past, and CloudWatch's dashboards."""
     cloud = context.obj.cloud()
     pubnub_keys = keys.load(cloud)
     vehicles = {
@@ -34,6 +42,8 @@ def dashboard(
         namespace=cloud.namespace,
         subscribe_key=pubnub_keys.subscribe_key,
         vehicles=vehicles,
+        token=token,
+        answers=answers(cloud),
         host=host,
         port=port,
         **pubnub_keys.server(),

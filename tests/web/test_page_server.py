@@ -6,6 +6,7 @@ import gzip
 import http.client
 import json
 import socket
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 from urllib.parse import urlsplit
@@ -14,7 +15,8 @@ import pytest
 
 import contract
 from station.errors import StationError
-from station.page import PageServer, config, field_table
+from station.page import BUILT, config, field_table
+from station.page_server import PageServer
 
 TOLD: dict[str, Any] = {
     "namespace": "iort",
@@ -31,7 +33,7 @@ def built(tmp_path: Path) -> Path:
     (folder / "index.html").write_text("<!doctype html><title>page</title>")
     (folder / "page.js").write_text("'use strict'")
     (folder / "style.css").write_text("body {}")
-    (folder / "page.js.LEGAL.txt").write_text("no type of its own: not served")
+    (folder / "page.bin").write_text("no type of its own: not served")
     (tmp_path / "secret.json").write_text("{}")
     return folder
 
@@ -87,7 +89,7 @@ def test_files_come_with_their_type_and_the_policy(built: Path, path: str, kind:
         "/%2e%2e/secret.json",
         "//etc/passwd",
         "/page.js/",
-        "/page.js.LEGAL.txt",
+        "/page.bin",
         "http://elsewhere/page.js",
     ],
 )
@@ -108,14 +110,14 @@ def test_the_page_is_told_where_to_listen_and_nothing_more(built: Path) -> None:
     vehicles = {"car-1": {"speed_to_erpm_gain": 4614.0}}
     with PageServer(**TOLD, vehicles=vehicles, built=built) as page:
         told = json.loads(ask(page, "/config.json")[1])
-    assert told == {**TOLD, "vehicles": vehicles}
+    assert told == {**TOLD, "vehicles": vehicles, "token": "", "answers": False}
 
 
 def test_the_page_reads_the_contracts_fields(built: Path) -> None:
     with PageServer(**TOLD, built=built) as page:
         table = json.loads(ask(page, "/fields.json")[1])
     assert table == field_table()
-    assert table["fields"].keys() == contract.VESC_FIELDS.keys()
+    assert table["fields"].keys() >= contract.VESC_FIELDS.keys() | contract.DERIVED_UNITS.keys()
     assert table["fields"]["speed"]["unit"] == "erpm"
     assert table["faults"]["5"] == contract.FAULTS[5]
 
@@ -127,6 +129,7 @@ def test_the_page_reads_the_contracts_fields(built: Path) -> None:
         ({"subscribe_key": "pub-c-1"}, "no page may see"),
         ({"subscribe_key": "sec-c-1"}, "no page may see"),
         ({"subscribe_key": ""}, "subscribe_key"),
+        ({"token": "a b"}, "access token"),
         ({"origin": "evil.example; script-src *"}, "origin"),
         ({"origin": "https://ps.pndsn.com"}, "origin"),
         ({"vehicles": {"a/b": {}}}, "robot name"),
@@ -184,3 +187,29 @@ def test_it_serves_ipv6(built: Path) -> None:
         assert ask(page, "/")[0].status == 200
     finally:
         page.stop()
+
+
+def test_answers_come_as_json_with_the_words_of_what_failed(built: Path) -> None:
+    def answer(asked: Mapping[str, str]) -> dict[str, Any]:
+        if "n" not in asked:
+            raise StationError("the request names no n")
+        return {"twice": 2 * int(asked["n"])}
+
+    with PageServer(**TOLD, built=built, answers={"double": answer}) as page:
+        good, body = ask(page, "/double.json?n=21")
+        bad, reason = ask(page, "/double.json")
+        elsewhere, _ = ask(page, "/double.json?n=1", headers={"Host": "evil.example"})
+        told = json.loads(ask(page, "/config.json")[1])
+    assert (good.status, json.loads(body)) == (200, {"twice": 42})
+    assert (bad.status, json.loads(reason)) == (400, {"error": "the request names no n"})
+    assert elsewhere.status == 403
+    assert told["answers"] is True
+
+
+def test_pubnubs_sdk_is_passed_on_unmodified_and_with_its_licence() -> None:
+    modules = BUILT.parent.parent / "node_modules" / "pubnub"
+    if not (BUILT / "index.html").is_file():
+        pytest.skip("the live page is not built: npm run build")
+    published = (modules / "dist" / "web" / "pubnub.min.js").read_bytes()
+    assert (BUILT / "pubnub.min.js").read_bytes() == published
+    assert (modules / "LICENSE").read_text().strip() in (BUILT / "licences.txt").read_text()

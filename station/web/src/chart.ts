@@ -2,12 +2,11 @@
 
 import uPlot from "uplot";
 import { WINDOW_S } from "./fleet";
+import { axis, calm, faint, fit, holes, labels, paint, PLAIN, rem, roundRange } from "./frame";
 import type { Ring } from "./ring";
 import { colour, onTheme } from "./theme";
 
 export interface Line {
-  /** The column of the history. */
-  readonly column: number;
   /** The custom property that holds its colour. */
   readonly colour: string;
   readonly dash?: readonly number[];
@@ -21,22 +20,27 @@ export interface ChartOptions {
   readonly span: number;
   /** The axis always holds zero. */
   readonly zero?: boolean;
-  /** Told what is under the pointer: seconds ago and a value a line, unscaled; undefined when it leaves. */
+  /** Told what is under the pointer: seconds ago and a value a line; undefined when it leaves. */
   readonly onPoint?: (point: { readonly ago: number; readonly values: readonly number[] } | undefined) => void;
+}
+
+/** What a chart shows: columns of a history, one a line; undefined where there is none yet. */
+export interface Shown {
+  readonly history: Ring;
+  readonly columns: readonly (number | undefined)[];
 }
 
 // A line is broken where nothing came for so long.
 const HOLE_S = 1;
-// Moving by less than this share of a pixel cannot be seen, nor can more than 60 pictures a second.
-const STEP_PX = 0.5;
-const FRAME_S = 0.014;
+// Moving by less than this many points of the screen is not worth a picture, nor are more than 25 a second.
+const STEP_PX = 0.75;
+const FRAME_S = 0.04;
 
-const calm = window.matchMedia("(prefers-reduced-motion: reduce)");
 const shared = uPlot.sync("charts");
 
 export class Chart {
   private readonly plot: uPlot;
-  private history: Ring | undefined;
+  private shown: Shown | undefined;
   private scale = 1;
   private dirty = true;
   private drawnAt = -Infinity;
@@ -46,22 +50,21 @@ export class Chart {
   private low = 0;
   private high = 1;
   private palette: string[] = [];
-  private paint = { text: "", grid: "" };
+  private paint = paint();
 
   constructor(
     host: HTMLElement,
     private readonly options: ChartOptions,
   ) {
     this.readColours();
-    const font = `${Math.round(rem(0.72))}px ${getComputedStyle(document.body).fontFamily}`;
+    const colours = () => this.paint;
     this.plot = new uPlot(
       {
+        ...PLAIN,
         width: Math.max(1, host.clientWidth),
         height: Math.max(1, host.clientHeight),
         pxAlign: 0,
         padding: [rem(0.5), rem(0.9), 0, 0],
-        legend: { show: false },
-        select: { show: false, left: 0, top: 0, width: 0, height: 0 },
         cursor: {
           y: false,
           drag: { x: false, y: false, setScale: false },
@@ -70,26 +73,11 @@ export class Chart {
         },
         scales: { x: { time: false, auto: false }, y: { auto: true, range: (_, low, high) => this.range(low, high) } },
         axes: [
-          {
-            font,
-            size: rem(1.5),
-            gap: rem(0.3),
-            stroke: () => this.paint.text,
-            grid: { stroke: () => this.paint.grid, width: 1 },
-            ticks: { show: false },
+          axis(colours, 1.5, 0.3, {
             splits: (_, __, low) => [0, 10, 20, 30].map((step) => low + step),
             values: () => ["\u221230 s", "\u221220", "\u221210", "now"],
-          },
-          {
-            font,
-            size: rem(3.1),
-            gap: rem(0.4),
-            stroke: () => this.paint.text,
-            grid: { stroke: () => this.paint.grid, width: 1 },
-            ticks: { show: false },
-            space: rem(2.2),
-            values: (_, splits) => labels(splits),
-          },
+          }),
+          axis(colours, 3.1, 0.4, { space: rem(2.2), values: (_, splits) => labels(splits) }),
         ],
         series: [
           {},
@@ -98,7 +86,7 @@ export class Chart {
             width: 1.75,
             pxAlign: 0,
             points: { show: false },
-            gaps: holes,
+            gaps: holes(() => HOLE_S),
             ...(line.dash ? { dash: [...line.dash] } : {}),
             ...(line.fill ? { fill: () => faint(this.palette[i]!), fillTo: 0 } : {}),
           })),
@@ -111,14 +99,10 @@ export class Chart {
       this.data(0),
       host,
     );
-    new ResizeObserver(() => {
-      if (host.clientWidth > 0) this.plot.setSize({ width: host.clientWidth, height: host.clientHeight });
+    fit(host, this.plot, (visible) => {
+      this.visible = visible;
       this.dirty = true;
-    }).observe(host);
-    new IntersectionObserver((entries) => {
-      this.visible = entries.at(-1)?.isIntersecting ?? true;
-      this.dirty = true;
-    }).observe(host);
+    });
     onTheme(() => {
       this.readColours();
       this.dirty = true;
@@ -126,15 +110,16 @@ export class Chart {
   }
 
   /** What to show from now on, undefined for nothing, and what to multiply it by. */
-  show(history: Ring | undefined, scale: number): void {
-    if (this.history === history && this.scale === scale) return;
-    [this.history, this.scale] = [history, scale];
+  show(shown: Shown | undefined, scale: number): void {
+    const same = this.shown?.history === shown?.history && String(this.shown?.columns) === String(shown?.columns);
+    if (same && this.scale === scale) return;
+    [this.shown, this.scale] = [shown, scale];
     this.dirty = true;
     this.drawnEmpty = false;
     this.low = this.high = NaN;
   }
 
-  /** Whether the picture would differ by half a pixel, or must be drawn for another reason. */
+  /** Whether the picture would differ by enough to be seen, or must be drawn for another reason. */
   due(now: number): boolean {
     if (!this.visible || now - this.drawnAt < FRAME_S) return false;
     if (this.dirty) return true;
@@ -146,7 +131,7 @@ export class Chart {
     const right = edge(now);
     const data = this.data(right - WINDOW_S);
     [this.right, this.drawnAt, this.dirty] = [right, now, false];
-    this.drawnEmpty = this.history === undefined || !(this.history.last(0) > right - WINDOW_S);
+    this.drawnEmpty = this.shown === undefined || !(this.shown.history.last(0) > right - WINDOW_S);
     this.plot.batch(() => {
       this.plot.setData(data, false);
       this.plot.setScale("x", { min: right - WINDOW_S, max: right });
@@ -159,27 +144,23 @@ export class Chart {
   }
 
   private data(from: number): uPlot.AlignedData {
-    const { history, scale } = this;
-    const { lines } = this.options;
-    if (!history) return [new Float64Array(0), ...lines.map(() => new Float64Array(0))];
-    const columns = lines.map(({ column }) => {
-      const values = history.column(column, from);
+    const { shown, scale } = this;
+    if (!shown) return [new Float64Array(0), ...this.options.lines.map(() => new Float64Array(0))];
+    const times = shown.history.column(0, from);
+    const columns = shown.columns.map((column) => {
+      if (column === undefined) return new Float64Array(times.length).fill(NaN);
+      const values = shown.history.column(column, from);
       return scale === 1 ? values : values.map((value) => value * scale);
     });
-    return [history.column(0, from), ...columns];
+    return [times, ...columns];
   }
 
   /** The axis: round numbers that hold the data, reached in a few frames rather than at once. */
   private range(low: number | null, high: number | null): [number, number] {
-    let [least, most] = low === null || high === null || !(low <= high) ? [0, 0] : [low, high];
-    if (this.options.zero) [least, most] = [Math.min(0, least), Math.max(0, most)];
-    const missing = this.options.span - (most - least);
-    if (missing > 0 && this.options.zero && least === 0) most += missing;
-    else if (missing > 0) [least, most] = [least - missing / 2, most + missing / 2];
-    const step = roundStep((most - least) / 8);
-    const [toLow, toHigh] = [Math.floor(least / step + 1e-9) * step, Math.ceil(most / step - 1e-9) * step];
+    const [least, most] = low === null || high === null || !(low <= high) ? [0, 0] : [low, high];
+    const [toLow, toHigh] = roundRange(least, most, this.options.span, this.options.zero ?? false);
     const ease = (from: number, to: number): number =>
-      calm.matches || Number.isNaN(from) || Math.abs(to - from) < (toHigh - toLow) * 0.004 ? to : from + (to - from) * 0.22;
+      calm.matches || Number.isNaN(from) || Math.abs(to - from) < (toHigh - toLow) * 0.004 ? to : from + (to - from) * 0.3;
     this.low = ease(this.low, toLow);
     this.high = ease(this.high, toHigh);
     return [this.low, this.high];
@@ -208,60 +189,17 @@ export class Chart {
     if (idx === null || idx === undefined || left === undefined || left < 0) this.options.onPoint(undefined);
     else {
       const ago = this.right - (plot.data[0][idx] ?? NaN);
-      this.options.onPoint({ ago, values: plot.data.slice(1).map((values) => (values[idx] ?? NaN) / this.scale) });
+      this.options.onPoint({ ago, values: plot.data.slice(1).map((values) => values[idx] ?? NaN) });
     }
   }
 
   private readColours(): void {
     this.palette = this.options.lines.map((line) => colour(line.colour));
-    this.paint = { text: colour("--muted"), grid: colour("--grid") };
+    this.paint = paint();
   }
 }
 
 /** The right edge: now, or the next full second for those who want less motion. */
 function edge(now: number): number {
   return calm.matches ? Math.ceil(now) : now;
-}
-
-/** Where a line must not run: over a value that is missing, and over a time without samples. */
-function holes(plot: uPlot, series: number, first: number, last: number, gaps: uPlot.Series.Gaps): uPlot.Series.Gaps {
-  const times = plot.data[0];
-  const values = plot.data[series]!;
-  let shown = -1;
-  for (let i = Math.max(0, first - 1); i <= last; i += 1) {
-    if (Number.isNaN(values[i])) continue;
-    if (shown >= 0 && (shown < i - 1 || times[i]! - times[shown]! > HOLE_S)) {
-      gaps.push([plot.valToPos(times[shown]!, "x", true), plot.valToPos(times[i]!, "x", true)]);
-    }
-    shown = i;
-  }
-  return gaps;
-}
-
-function labels(splits: readonly number[]): string[] {
-  const step = splits.length > 1 ? Math.abs(splits[1]! - splits[0]!) : 1;
-  const digits = Math.max(0, Math.min(3, Math.ceil(-Math.log10(step) - 1e-9)));
-  return splits.map((value) => {
-    if (Math.abs(value) >= 10_000) return `${signed(value / 1000, Math.abs(step) % 1000 ? 1 : 0)}k`;
-    return signed(value, digits);
-  });
-}
-
-function signed(value: number, digits: number): string {
-  const text = Math.abs(value).toFixed(digits);
-  return value < 0 && /[1-9]/.test(text) ? `\u2212${text}` : text;
-}
-
-function roundStep(step: number): number {
-  const power = 10 ** Math.floor(Math.log10(step));
-  const share = step / power;
-  return (share <= 1 ? 1 : share <= 2 ? 2 : share <= 5 ? 5 : 10) * power;
-}
-
-function faint(rgb: string): string {
-  return rgb.startsWith("rgb(") ? rgb.replace("rgb(", "rgba(").replace(")", ", 0.09)") : rgb;
-}
-
-function rem(times: number): number {
-  return times * parseFloat(getComputedStyle(document.documentElement).fontSize);
 }

@@ -5,6 +5,10 @@ export interface Config {
   readonly subscribe_key: string;
   readonly origin: string;
   readonly tls: boolean;
+  /** PubNub's access token, where its Access Manager is on; empty otherwise. */
+  readonly token: string;
+  /** Whether the server also answers questions about the past; a static site does not. */
+  readonly answers: boolean;
   readonly vehicles: Readonly<Record<string, { readonly speed_to_erpm_gain?: number }>>;
 }
 

@@ -1,34 +1,37 @@
-// What is known of every car: its streams' newest samples, the last 30 seconds, and the delays.
-// Nothing here touches the page; times are the page's own clock, in seconds since it was opened.
+// What is known of every car: its streams' newest samples, the last 30 seconds, the delays and the faults.
+// Nothing here touches the page; times are those of clock.ts.
 
 import type { Config, FieldTable } from "./config";
-import { parseUpdate, type Hops, type Update, type Value } from "./message";
+import type { Hops, Update, Value } from "./message";
 import { Ring } from "./ring";
+import type { Arrival } from "./wire";
 
 /** Older values are shown as stale, and a car unheard of for longer as gone. */
 export const STALE_S = 1.5;
-export const GONE_S = 5;
+export const GONE_S = 4.5;
 /** What the charts show, and what a median is taken over. */
 export const WINDOW_S = 30;
 export const MEDIAN_S = 10;
 
-/** The fields that have charts of their own; their columns in a stream's history follow the time. */
-export const CHARTED = ["speed", "voltage_input", "current_motor", "current_input", "duty_cycle"] as const;
-
-// Room for 30 s at 30 Hz; the live lane carries at most 10.
-const KEPT = 1024;
-// Names come from the network, so their number is bounded.
-const MAX_ROBOTS = 256;
-const MAX_STREAMS = 32;
-const KEPT_BOOTS = 8;
+// Names and fields come from the network, so whatever they make grow is bounded: 30 s at 16 Hz (the live
+// lane carries at most 10), and in all 12 MB of columns.
+export const BOUNDS = { rows: 512, delays: 2048, columns: 1536, robots: 256, streams: 32, boots: 8, faults: 100 } as const;
 
 export type Freshness = "live" | "stale" | "gone";
 
-export interface Delay {
-  total: number;
-  toCloud: number;
-  toLambda: number;
-  toPage: number;
+/** The legs of a message's way, in the order of `Robot.delays`' columns after arrival and total. */
+export const LEGS = ["car", "toCloud", "toLambda", "toPubNub", "toPage"] as const;
+export type Leg = (typeof LEGS)[number];
+/** In milliseconds. The total is from leaving the car to arriving here: without the car's own leg. */
+export type Delay = { readonly total: number } & Readonly<Record<Leg, number>>;
+
+export interface Fault {
+  /** When it was first and last heard of, in seconds since the epoch. */
+  readonly since: number;
+  until: number;
+  readonly name: string;
+  readonly stream: string;
+  over: boolean;
 }
 
 /**
@@ -57,7 +60,7 @@ export class Stream {
   boot = "";
   seq = -1;
   t_us = 0;
-  hops: Hops = { sent_us: 0, received_ms: 0, lambda_us: 0 };
+  hops: Hops = { sent_us: 0, received_ms: 0, lambda_us: 0, offset_us: 0, offset_known: false };
   sample: ReadonlyMap<string, Value> = new Map();
   /** When the newest sample was taken, on the page's clock, if it had come as fast as the fastest. */
   takenAt = -Infinity;
@@ -65,12 +68,18 @@ export class Stream {
   received = 0;
   /** Grows with every sample that becomes the newest. */
   version = 0;
-  readonly history = new Ring(1 + CHARTED.length, KEPT);
-  private readonly arrivals = new Ring(1, KEPT);
+  /** Column 0 is `takenAt`; a numeric field's column is in `columns`. */
+  readonly history = new Ring(1, BOUNDS.rows);
+  readonly columns = new Map<string, number>();
+  private readonly arrivals = new Ring(1, BOUNDS.rows);
   private readonly offset = new ClockOffset();
   private readonly oldBoots: string[] = [];
+  private readonly row: number[] = [];
 
-  constructor(readonly name: string) {}
+  constructor(
+    readonly name: string,
+    private readonly mayWiden: () => boolean,
+  ) {}
 
   /** Take a newer sample; false for one that comes after a newer one, or twice. */
   take(update: Update, now: number): boolean {
@@ -81,7 +90,7 @@ export class Stream {
     } else {
       if (this.oldBoots.includes(update.boot)) return false;
       if (this.boot !== "") this.oldBoots.push(this.boot);
-      if (this.oldBoots.length > KEPT_BOOTS) this.oldBoots.shift();
+      if (this.oldBoots.length > BOUNDS.boots) this.oldBoots.shift();
       this.offset.reset();
     }
     ({ boot: this.boot, seq: this.seq, t_us: this.t_us, hops: this.hops, sample: this.sample } = update);
@@ -90,11 +99,26 @@ export class Stream {
     this.heardAt = now;
     this.received += 1;
     this.version += 1;
-    this.arrivals.push(now);
-    if (!(this.takenAt <= this.history.last(0))) {
-      this.history.push(this.takenAt, ...CHARTED.map((field) => numeric(update.sample.get(field))));
-    }
+    this.arrivals.push([now]);
+    if (!(this.takenAt <= this.history.last(0))) this.keep(update.sample);
     return true;
+  }
+
+  private keep(sample: ReadonlyMap<string, Value>): void {
+    const { row } = this;
+    row.fill(NaN);
+    row[0] = this.takenAt;
+    for (const [field, value] of sample) {
+      if (typeof value !== "number") continue;
+      let column = this.columns.get(field);
+      if (column === undefined) {
+        if (!this.mayWiden()) continue;
+        column = this.history.widen();
+        this.columns.set(field, column);
+      }
+      row[column] = value;
+    }
+    this.history.push(row);
   }
 
   /** Messages a second over the last two seconds. */
@@ -108,8 +132,10 @@ export class Stream {
 
 export class Robot {
   readonly streams = new Map<string, Stream>();
-  /** Arrival, and in milliseconds: car to page, car to cloud, cloud to Lambda, Lambda to page. */
-  readonly delays = new Ring(5, KEPT);
+  /** Arrival, the total and the legs in milliseconds. */
+  readonly delays = new Ring(2 + LEGS.length, BOUNDS.delays);
+  /** The newest last. */
+  readonly faults: Fault[] = [];
   heardAt = -Infinity;
   takenAt = -Infinity;
   version = 0;
@@ -134,27 +160,48 @@ export class Robot {
   /** The name of the fault that a stream reports, if any does. */
   fault(table: FieldTable): string | undefined {
     for (const { sample } of this.streams.values()) {
-      const code = sample.get("fault_code");
-      if (typeof code === "number" && code !== 0) return `${table.faults[String(code)] ?? "unknown fault"} (${code})`;
+      const name = faultName(sample.get("fault_code"), table);
+      if (name !== undefined) return name;
     }
     return undefined;
   }
 
   newestDelay(): Delay | undefined {
-    if (this.delays.length === 0) return undefined;
-    const [total, toCloud, toLambda, toPage] = [1, 2, 3, 4].map((i) => this.delays.last(i)) as [number, number, number, number];
-    return { total, toCloud, toLambda, toPage };
+    return this.delays.length === 0 ? undefined : asDelay((column) => this.delays.last(column));
   }
 
   medianDelay(now: number): Delay | undefined {
-    const times = this.delays.column(0, now - MEDIAN_S);
-    const skip = times.length > 0 && times[0]! < now - MEDIAN_S ? 1 : 0;
+    const from = now - MEDIAN_S;
+    const times = this.delays.column(0, from);
+    const skip = times.length > 0 && times[0]! < from ? 1 : 0;
     if (times.length - skip === 0) return undefined;
-    const [total, toCloud, toLambda, toPage] = [1, 2, 3, 4].map((i) =>
-      median(this.delays.column(i, now - MEDIAN_S).subarray(skip)),
-    ) as [number, number, number, number];
-    return { total, toCloud, toLambda, toPage };
+    return asDelay((column) => median(this.delays.column(column, from).subarray(skip)));
   }
+
+  /** Keep the log of faults: one entry from the first sample that reports it to the last. */
+  logFault(stream: Stream, table: FieldTable, at: number): void {
+    const code = stream.sample.get("fault_code");
+    if (code === undefined) return;
+    const name = faultName(code, table);
+    const open = this.faults.findLast((fault) => fault.stream === stream.name && !fault.over);
+    if (open && open.name === name) open.until = at;
+    else {
+      if (open) open.over = true;
+      if (name === undefined) return;
+      this.faults.push({ since: at, until: at, name, stream: stream.name, over: false });
+      if (this.faults.length > BOUNDS.faults) this.faults.shift();
+    }
+  }
+}
+
+function faultName(code: Value | undefined, table: FieldTable): string | undefined {
+  if (typeof code !== "number" || code === 0) return undefined;
+  return `${table.faults[String(code)] ?? "unknown fault"} (${code})`;
+}
+
+function asDelay(column: (index: number) => number): Delay {
+  const legs = Object.fromEntries(LEGS.map((leg, i) => [leg, column(2 + i)])) as Record<Leg, number>;
+  return { total: column(1), ...legs };
 }
 
 export class Fleet {
@@ -166,48 +213,46 @@ export class Fleet {
   lastRefusal = "";
   /** Grows when a car or a stream is heard for the first time, or forgotten. */
   shape = 0;
+  private columns = 0;
 
   constructor(
     private readonly config: Config,
     private readonly table: FieldTable,
   ) {}
 
-  /** Take a message that arrived now; never throws. `wall_us` is the time of day, `now` the page's. */
-  take(channel: string, message: unknown, wall_us: number, now: number): void {
-    this.received += 1;
-    const update = parseUpdate(this.config.namespace, this.table.version, channel, message);
-    if (typeof update === "string") {
-      this.malformed += 1;
-      this.lastRefusal = update;
-      return;
-    }
+  /** Take what arrived, and how many messages were refused with it. */
+  take(arrivals: readonly Arrival[], refused: number, lastRefusal: string): void {
+    this.received += arrivals.length + refused;
+    this.malformed += refused;
+    if (refused > 0) this.lastRefusal = lastRefusal;
+    for (const arrival of arrivals) this.takeOne(arrival);
+  }
+
+  private takeOne({ update, at, wall_us, pubnub_us }: Arrival): void {
     const robot = this.robots.get(update.robot) ?? this.meet(update.robot);
     let stream = robot.streams.get(update.stream);
     if (!stream) {
-      if (robot.streams.size >= MAX_STREAMS) {
+      if (robot.streams.size >= BOUNDS.streams) {
         this.malformed += 1;
         this.lastRefusal = "too many streams";
         return;
       }
-      stream = new Stream(update.stream);
+      stream = new Stream(update.stream, () => this.columns < BOUNDS.columns && (this.columns += 1) > 0);
       robot.streams.set(stream.name, stream);
       this.shape += 1;
     }
-    if (!stream.take(update, now)) {
+    if (!stream.take(update, at)) {
       this.outOfOrder += 1;
       return;
     }
-    robot.heardAt = now;
+    robot.heardAt = at;
     robot.takenAt = Math.max(...[...robot.streams.values()].map((each) => each.takenAt));
     robot.version += 1;
-    const { sent_us, received_ms, lambda_us } = update.hops;
-    robot.delays.push(
-      now,
-      (wall_us - sent_us) / 1e3,
-      received_ms - sent_us / 1e3,
-      lambda_us / 1e3 - received_ms,
-      (wall_us - lambda_us) / 1e3,
-    );
+    robot.logFault(stream, this.table, at);
+    const { received_ms, lambda_us, offset_us } = update.hops;
+    const sent_us = update.hops.sent_us + offset_us;
+    const legs = [update.hops.sent_us - update.t_us, received_ms * 1e3 - sent_us, lambda_us - received_ms * 1e3, pubnub_us - lambda_us, wall_us - pubnub_us];
+    robot.delays.push([at, (wall_us - sent_us) / 1e3, ...legs.map((leg_us) => leg_us / 1e3)]);
   }
 
   /** Metres a second for an erpm, where the car's parameters are known. */
@@ -216,9 +261,10 @@ export class Fleet {
   }
 
   private meet(name: string): Robot {
-    if (this.robots.size >= MAX_ROBOTS) {
+    if (this.robots.size >= BOUNDS.robots) {
       const silent = [...this.robots.values()].reduce((a, b) => (a.heardAt <= b.heardAt ? a : b));
       this.robots.delete(silent.name);
+      for (const { columns } of silent.streams.values()) this.columns -= columns.size;
     }
     const robot = new Robot(name);
     this.robots.set(name, robot);

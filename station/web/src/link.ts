@@ -1,14 +1,12 @@
 // The connection to PubNub. The SDK gives up after a few failures and, when it comes back, delivers what
 // it missed; a live page must neither give up nor fall behind, so it starts a new subscription each time.
 
-import PubNub from "pubnub";
-import type { Config } from "./config";
+import type PubNubSdk from "pubnub";
+import type { LinkState, Listening } from "./wire";
 
-export type LinkState =
-  | { readonly kind: "connecting" }
-  | { readonly kind: "paused" }
-  | { readonly kind: "live"; readonly downFor: number | undefined }
-  | { readonly kind: "lost"; readonly since: number; readonly retryAt: number; readonly reason: string };
+// The SDK's licence lets unmodified copies be passed on, so it is not bundled: it comes as its own file.
+declare function importScripts(...urls: string[]): void;
+declare const PubNub: typeof PubNubSdk;
 
 const FIRST_RETRY_S = 0.5;
 const LAST_RETRY_S = 5;
@@ -29,28 +27,30 @@ const REASONS: Readonly<Record<string, string>> = {
 
 export class Link {
   state: LinkState = { kind: "connecting" };
-  private readonly pubnub: PubNub;
+  private readonly pubnub: PubNubSdk;
   private readonly channel: string;
   private attempt = 0;
   private retry: number | undefined;
   private pause: number | undefined;
   private heardAt = 0;
   private probing = false;
+  private visible = true;
   /** Statuses of a subscription that was given up may still arrive. */
   private subscribed = false;
 
   constructor(
-    config: Config,
+    listening: Listening,
     private readonly now: () => number,
-    onMessage: (channel: string, message: unknown) => void,
+    onMessage: (channel: string, message: unknown, timetoken: string) => void,
     private readonly onState: (state: LinkState) => void,
   ) {
-    this.channel = `${config.namespace}.*`;
+    importScripts("pubnub.min.js");
+    this.channel = `${listening.namespace}.*`;
     this.pubnub = new PubNub({
-      subscribeKey: config.subscribe_key,
-      userId: userId(),
-      origin: config.origin,
-      ssl: config.tls,
+      subscribeKey: listening.subscribe_key,
+      userId: listening.user,
+      origin: listening.origin,
+      ssl: listening.tls,
       restore: false,
       suppressLeaveEvents: true,
       listenToBrowserNetworkEvents: false,
@@ -58,32 +58,34 @@ export class Link {
       subscribeRequestTimeout: 310,
       retryConfiguration: PubNub.NoneRetryPolicy(),
     });
+    if (listening.token) this.pubnub.setToken(listening.token);
     this.pubnub.addListener({
       message: (event) => {
         this.heardAt = this.now();
-        onMessage(event.channel, event.message);
+        onMessage(event.channel, event.message, String(event.timetoken));
       },
       status: (event) => this.take(event.category, "error" in event ? event.error : undefined),
     });
-    window.addEventListener("online", () => this.state.kind === "lost" && this.connect());
-    window.addEventListener("offline", () => this.lose("this device is offline", LAST_RETRY_S));
-    document.addEventListener("visibilitychange", () => this.seen(!document.hidden));
-    window.setInterval(() => this.probe(), 1000);
+    self.addEventListener("online", () => this.state.kind === "lost" && this.connect());
+    self.addEventListener("offline", () => this.lose("this device is offline", LAST_RETRY_S));
+    self.setInterval(() => this.probe(), 1000);
   }
 
   connect(): void {
-    window.clearTimeout(this.retry);
+    self.clearTimeout(this.retry);
     this.subscribed = false;
     this.pubnub.unsubscribeAll();
     this.subscribed = true;
     this.heardAt = this.now();
     this.pubnub.subscribe({ channels: [this.channel] });
-    this.retry = window.setTimeout(() => this.lose("PubNub does not answer", FIRST_RETRY_S), ANSWER_S * 1000);
+    this.retry = self.setTimeout(() => this.lose("PubNub does not answer", FIRST_RETRY_S), ANSWER_S * 1000);
   }
 
-  private seen(visible: boolean): void {
-    window.clearTimeout(this.pause);
-    if (!visible) this.pause = window.setTimeout(() => this.stop(), HIDDEN_S * 1000);
+  /** Whether anybody looks at the page. */
+  seen(visible: boolean): void {
+    this.visible = visible;
+    self.clearTimeout(this.pause);
+    if (!visible) this.pause = self.setTimeout(() => this.stop(), HIDDEN_S * 1000);
     else if (this.state.kind === "paused") {
       this.change({ kind: "connecting" });
       this.connect();
@@ -91,7 +93,7 @@ export class Link {
   }
 
   private stop(): void {
-    window.clearTimeout(this.retry);
+    self.clearTimeout(this.retry);
     this.subscribed = false;
     this.pubnub.unsubscribeAll();
     this.change({ kind: "paused" });
@@ -101,7 +103,7 @@ export class Link {
     if (!this.subscribed) return;
     switch (category) {
       case PubNub.CATEGORIES.PNConnectedCategory:
-        window.clearTimeout(this.retry);
+        self.clearTimeout(this.retry);
         this.attempt = 0;
         this.heardAt = this.now();
         this.change({ kind: "live", downFor: this.state.kind === "lost" ? this.now() - this.state.since : undefined });
@@ -126,14 +128,14 @@ export class Link {
     if (this.state.kind === "paused") return;
     this.subscribed = false;
     this.attempt += 1;
-    window.clearTimeout(this.retry);
-    this.retry = window.setTimeout(() => this.connect(), wait * 1000);
+    self.clearTimeout(this.retry);
+    this.retry = self.setTimeout(() => this.connect(), wait * 1000);
     const since = this.state.kind === "lost" ? this.state.since : this.now();
     this.change({ kind: "lost", since, retryAt: this.now() + wait, reason });
   }
 
   private async probe(): Promise<void> {
-    if (this.state.kind !== "live" || this.probing || document.hidden || this.now() - this.heardAt < PROBE_S) return;
+    if (this.state.kind !== "live" || this.probing || !this.visible || this.now() - this.heardAt < PROBE_S) return;
     this.probing = true;
     const asked = this.now();
     try {
@@ -150,17 +152,4 @@ export class Link {
     this.state = state;
     this.onState(state);
   }
-}
-
-/** One id a browser: PubNub bills by users, and a reload is not a new one. */
-function userId(): string {
-  const fresh = `page-${Array.from(crypto.getRandomValues(new Uint8Array(8)), (b) => b.toString(16).padStart(2, "0")).join("")}`;
-  try {
-    const known = localStorage.getItem("iort.user");
-    if (known && /^page-[0-9a-f]{16}$/.test(known)) return known;
-    localStorage.setItem("iort.user", fresh);
-  } catch {
-    // A browser that stores nothing is a new user each time.
-  }
-  return fresh;
 }

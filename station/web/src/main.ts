@@ -1,160 +1,153 @@
-// The live page: listens to the whole fleet, shows one car in full, and costs nothing while hidden.
+// The page: listens to the whole fleet, shows one view of it, and costs nothing while hidden.
 
-import { CarView } from "./carview";
-import { load } from "./config";
-import { byId, setAttribute } from "./dom";
-import { Fleet, type Robot } from "./fleet";
-import { FleetStrip } from "./fleetstrip";
-import { age, number } from "./format";
-import { Link, type LinkState } from "./link";
+import { now } from "./clock";
+import { load, type Config, type FieldTable } from "./config";
+import { byId, byName, el, setAttribute } from "./dom";
+import { Feed } from "./feed";
+import { Fleet } from "./fleet";
+import { observer } from "./observer";
+import { readRoute, route, type Route } from "./route";
+import { StatusBar } from "./statusbar";
 import { startTheme } from "./theme";
+import { CarView } from "./views/car";
+import { CloudWatchView } from "./views/cloudwatch";
+import { FleetView } from "./views/fleet";
+import { HistoryView } from "./views/history";
 
-// Ages and states are written this often; values as they come.
+// Ages and states are written this often, values and charts at most as often as this.
 const CLOCK_S = 0.25;
-const ANNOUNCE_S = 8;
+const VALUES_S = 0.04;
 
-const now = (): number => performance.now() / 1000;
+class Page {
+  private readonly fleet: Fleet;
+  private readonly feed: Feed;
+  private readonly bar: StatusBar;
+  private readonly fleetView: FleetView;
+  private readonly carView: CarView;
+  private readonly historyView: HistoryView;
+  private readonly cloudWatchView: CloudWatchView;
+  private readonly stage = byId("stage");
+  private readonly tools = el("p", { class: "tools" });
+  private route: Route = { view: "fleet" };
+  private shape = -1;
+  private clockAt = -Infinity;
+  private valuesAt = -Infinity;
 
-async function main(): Promise<void> {
-  startTheme(byId("theme"));
-  const { config, table } = await load();
-  const fleet = new Fleet(config, table);
-  let selected: Robot | undefined;
-  let drawnShape = -1;
-  let clockAt = -Infinity;
-  let reconnected: { readonly at: number; readonly downFor: number } | undefined;
+  constructor(config: Config, table: FieldTable) {
+    this.fleet = new Fleet(config, table);
+    this.feed = new Feed(config, table, this.fleet, (state) => {
+      this.bar.linked(state);
+      this.clockAt = -Infinity;
+    });
+    this.bar = new StatusBar(config, this.fleet);
+    this.fleetView = new FleetView(this.fleet, table);
+    this.carView = new CarView(this.fleet, table, this.tools);
+    this.historyView = new HistoryView(config, table, this.fleet);
+    this.cloudWatchView = new CloudWatchView(config);
+    for (const [id, to] of [["to-fleet", "fleet"], ["to-cloudwatch", "cloudwatch"]] as const) byId(id).setAttribute("href", route({ view: to }));
+    window.addEventListener("hashchange", () => this.go());
+    window.addEventListener("keydown", (event) => this.key(event));
+    document.addEventListener("visibilitychange", () => !document.hidden && this.frame());
+    Object.defineProperty(window, "iort", { value: observer(this.fleet, this.feed, GONE_SHOWN_S), writable: false });
+    this.go();
+    this.frame();
+  }
 
-  const link = new Link(
-    config,
-    now,
-    (channel, message) => fleet.take(channel, message, Date.now() * 1000, now()),
-    (state) => {
-      if (state.kind === "live" && state.downFor !== undefined) reconnected = { at: now(), downFor: state.downFor };
-      clockAt = -Infinity;
-    },
-  );
-  const strip = new FleetStrip(byId("cars"), fleet, table, (name) => {
-    history.replaceState(null, "", `#${name}`);
-    wanted = name;
-    arrange();
-  });
-  const view = new CarView(byId("car"), fleet, table);
-  const text = (id: string, value: string): void => {
-    const node = byId(id);
-    if (node.textContent !== value) node.textContent = value;
-  };
-  text("empty-channel", `${config.namespace}.*`);
-  text("empty-origin", config.origin);
-
-  // The car that the viewer, or the address, asks for; the first one heard until then.
-  let wanted = location.hash.slice(1);
-  window.addEventListener("hashchange", () => {
-    wanted = location.hash.slice(1);
-    arrange();
-  });
-  const arrange = (): void => {
-    drawnShape = fleet.shape;
-    const known = selected && fleet.robots.get(selected.name);
-    selected = fleet.robots.get(wanted) ?? known ?? fleet.robots.values().next().value;
-    strip.arrange(selected?.name);
-    view.show(selected);
-    document.body.dataset["empty"] = String(fleet.robots.size === 0);
-    clockAt = -Infinity;
-  };
-
-  const clock = (at: number): void => {
-    const linked = link.state.kind === "live";
-    strip.update(at, linked);
-    view.clock(at, linked);
-    const count = { live: 0, stale: 0, gone: 0 };
-    for (const robot of fleet.robots.values()) count[robot.freshness(at)] += 1;
-    const counts = (["live", "stale", "gone"] as const).filter((state) => count[state] > 0);
-    text("count", counts.map((state) => `${count[state]} ${state}`).join(" · "));
-    showLink(link.state, at);
-    text("received", number(fleet.received));
-    text("malformed", number(fleet.malformed));
-    byId("malformed").title = fleet.lastRefusal ? `the last one: ${fleet.lastRefusal}` : "";
-    text("late", number(fleet.outOfOrder));
-  };
-  const showLink = (state: LinkState, at: number): void => {
-    setAttribute(byId("link"), "data-state", state.kind);
-    text("link-text", { connecting: "Connecting", paused: "Paused", live: "Connected", lost: "Connection lost" }[state.kind]);
-    const banner = byId("banner");
-    let words = "";
-    let detail = "";
-    if (state.kind === "lost") {
-      words = `Connection lost: ${state.reason}.`;
-      const wait = state.retryAt - at;
-      detail = `${age(at - state.since)} ago. ${wait > 0.5 ? `Trying again in ${Math.ceil(wait)} s` : "Trying again now"}.`;
-    } else if (reconnected && at - reconnected.at < ANNOUNCE_S) {
-      words = `Connected again after ${age(reconnected.downFor)}.`;
+  private go(): void {
+    this.route = readRoute(location.hash);
+    const { view } = this.route;
+    const robot = "robot" in this.route ? this.route.robot : undefined;
+    const shown = { fleet: this.fleetView, car: this.carView, history: this.historyView, cloudwatch: this.cloudWatchView }[view];
+    document.body.dataset["view"] = view;
+    document.title = robot ? `${robot} · iort` : view === "cloudwatch" ? "CloudWatch · iort" : "iort live";
+    if (this.stage.firstElementChild !== shown.node) {
+      this.stage.replaceChildren(shown.node);
+      window.scrollTo(0, 0);
     }
-    setAttribute(banner, "data-state", state.kind);
-    banner.hidden = words === "";
-    text("banner-text", words);
-    text("banner-detail", detail);
-  };
+    for (const [id, name] of [["to-fleet", "fleet"], ["to-cloudwatch", "cloudwatch"]] as const) {
+      if (view === name) byId(id).setAttribute("aria-current", "page");
+      else byId(id).removeAttribute("aria-current");
+    }
+    this.historyView.show(view === "history" ? robot : undefined);
+    this.cloudWatchView.show(view === "cloudwatch");
+    this.arrange();
+  }
 
-  const frame = (): void => {
+  /** After a car or a stream was heard for the first time, and on another view. */
+  private arrange(): void {
+    this.shape = this.fleet.shape;
+    const robot = "robot" in this.route ? this.route.robot : undefined;
+    this.fleetView.arrange();
+    if (this.route.view === "car" && robot) {
+      this.carView.show(this.fleet.robots.get(robot));
+      const link = (text: string, label: string, name: string): HTMLElement =>
+        el("a", { class: "tool", href: route({ view: "car", robot: name }), "aria-label": label }, text);
+      const [before, after] = this.neighbours(robot);
+      this.tools.replaceChildren(
+        el("a", { class: "tool", href: route({ view: "history", robot }) }, "History"),
+        ...(before && after ? [link("‹", `Previous car, ${before}`, before), link("›", `Next car, ${after}`, after)] : []),
+      );
+    }
+    // One car of its own view that is not there yet is waited for as the whole fleet is.
+    const waits = this.route.view === "fleet" ? this.fleet.robots.size === 0 : this.route.view === "car" && !this.fleet.robots.has(robot!);
+    document.body.dataset["empty"] = String(waits);
+    byId("empty-name").textContent = robot ?? "a car";
+    this.clockAt = -Infinity;
+  }
+
+  private neighbours(robot: string): [string | undefined, string | undefined] {
+    const names = [...this.fleet.robots.keys()].sort(byName);
+    const at = names.indexOf(robot);
+    if (names.length < 2 || at < 0) return [undefined, undefined];
+    return [names.at(at - 1), names[(at + 1) % names.length]];
+  }
+
+  /** Left and right change the car, Escape leaves it. */
+  private key(event: KeyboardEvent): void {
+    const inField = event.target instanceof HTMLElement && event.target.matches("input, select, textarea");
+    if (this.route.view === "fleet" || inField || event.ctrlKey || event.metaKey || event.altKey) return;
+    if (event.key === "Escape") location.hash = "robot" in this.route && this.route.view === "history" ? route({ view: "car", robot: this.route.robot }) : route({ view: "fleet" });
+    if (this.route.view !== "car") return;
+    const [before, after] = this.neighbours(this.route.robot);
+    const to = { ArrowLeft: before, ArrowRight: after }[event.key];
+    if (to !== undefined) location.hash = route({ view: "car", robot: to });
+  }
+
+  private readonly frame = (): void => {
     if (document.hidden) return;
-    requestAnimationFrame(frame);
+    requestAnimationFrame(this.frame);
     const at = now();
-    if (fleet.shape !== drawnShape) arrange();
-    view.values(at);
-    if (at - clockAt >= CLOCK_S) {
-      clockAt = at;
-      clock(at);
+    if (this.fleet.shape !== this.shape) this.arrange();
+    const { view } = this.route;
+    if (at - this.valuesAt >= VALUES_S) {
+      this.valuesAt = at;
+      if (view === "car") {
+        this.carView.values(at);
+        this.carView.draw(at);
+      }
     }
-    view.draw(at);
+    if (at - this.clockAt < CLOCK_S) return;
+    this.clockAt = at;
+    const linked = this.feed.state.kind === "live";
+    this.bar.clock(at, this.feed.state);
+    if (view === "fleet") this.fleetView.clock(at, linked);
+    if (view === "car") this.carView.clock(at, linked);
+    if (view === "history") this.historyView.clock(at);
   };
-  document.addEventListener("visibilitychange", () => !document.hidden && requestAnimationFrame(frame));
-
-  Object.defineProperty(window, "iort", { value: observer(fleet, link), writable: false });
-  link.connect();
-  requestAnimationFrame(frame);
 }
 
-/** What tests and the curious may read; every access makes a copy, so nothing can be changed through it. */
-function observer(fleet: Fleet, link: Link): object {
-  const robots = (): object =>
-    Object.fromEntries(
-      [...fleet.robots.values()].map((robot) => {
-        const at = now();
-        const streams = [...robot.streams.values()].map(({ name, boot, seq, t_us, hops, sample, received, takenAt }) => [
-          name,
-          { boot, seq, t: t_us, hops: { ...hops }, sample: Object.fromEntries(sample), received, age_s: at - takenAt },
-        ]);
-        const delay_ms = { newest: robot.newestDelay(), median: robot.medianDelay(at) };
-        return [robot.name, { state: robot.freshness(at), streams: Object.fromEntries(streams), delay_ms }];
-      }),
-    );
-  return Object.freeze({
-    get link() {
-      return link.state.kind;
-    },
-    get received() {
-      return fleet.received;
-    },
-    get malformed() {
-      return fleet.malformed;
-    },
-    get outOfOrder() {
-      return fleet.outOfOrder;
-    },
-    get robots() {
-      return robots();
-    },
-    /** The delays of a robot's last messages, car to page, in milliseconds, newest last. */
-    delays(robot: string): number[] {
-      return Array.from(fleet.robots.get(robot)?.delays.column(1) ?? []);
-    },
+/** How long after its last message a car is shown as gone, at the latest. */
+const GONE_SHOWN_S = CLOCK_S;
+
+load()
+  .then(({ config, table }) => {
+    startTheme(byId("theme"));
+    return new Page(config, table);
+  })
+  .catch((error: unknown) => {
+    setAttribute(byId("link"), "data-state", "lost");
+    byId("link-text").textContent = "Not started";
+    byId("banner").hidden = false;
+    byId("banner").dataset["state"] = "lost";
+    byId("banner-text").textContent = `The page could not start: ${error instanceof Error ? error.message : String(error)}`;
   });
-}
-
-main().catch((error: unknown) => {
-  setAttribute(byId("link"), "data-state", "lost");
-  byId("link-text").textContent = "Not started";
-  byId("banner").hidden = false;
-  byId("banner").dataset["state"] = "lost";
-  byId("banner-text").textContent = `The page could not start: ${error instanceof Error ? error.message : String(error)}`;
-});

@@ -7,6 +7,9 @@ export interface Hops {
   readonly sent_us: number;
   readonly received_ms: number;
   readonly lambda_us: number;
+  /** What to add to the car's times to have the cloud's; 0 where the car does not know. */
+  readonly offset_us: number;
+  readonly offset_known: boolean;
 }
 
 export interface Update {
@@ -37,8 +40,8 @@ export function parseUpdate(namespace: string, version: number, channel: string,
   if (!isInteger(seq) || seq < 0) return "no sequence number";
   if (!isInteger(t)) return "no sample time";
   if (!isObject(hops)) return "no hop times";
-  const { sent_us, received_ms, lambda_us } = hops;
-  if (!isInteger(sent_us) || !isInteger(received_ms) || !isInteger(lambda_us)) return "a hop without its time";
+  const { sent_us, received_ms, lambda_us, offset_us = 0 } = hops;
+  if (!isInteger(sent_us) || !isInteger(received_ms) || !isInteger(lambda_us) || !isInteger(offset_us)) return "a hop without its time";
   if (!isObject(sample)) return "no sample";
   const entries = Object.entries(sample);
   if (entries.length > MAX_FIELDS) return "too many fields";
@@ -48,7 +51,7 @@ export function parseUpdate(namespace: string, version: number, channel: string,
     if (!isValue(value)) return "a value that is neither number, text, true, false nor null";
     values.set(name, value);
   }
-  return { robot, stream, boot, seq, t_us: t, hops: { sent_us, received_ms, lambda_us }, sample: values };
+  return { robot, stream, boot, seq, t_us: t, hops: { sent_us, received_ms, lambda_us, offset_us, offset_known: Object.hasOwn(hops, "offset_us") }, sample: values };
 }
 
 function isObject(value: unknown): value is Record<string, unknown> {

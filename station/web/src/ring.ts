@@ -9,7 +9,7 @@ export class Ring {
 
   constructor(
     width: number,
-    private readonly capacity: number,
+    readonly capacity: number,
   ) {
     this.columns = Array.from({ length: width }, () => new Float64Array(2 * capacity));
   }
@@ -18,19 +18,25 @@ export class Ring {
     return this.end - this.first;
   }
 
-  push(...row: number[]): void {
+  get width(): number {
+    return this.columns.length;
+  }
+
+  /** Another column, without values so far; its index. */
+  widen(): number {
+    this.columns.push(new Float64Array(2 * this.capacity).fill(NaN));
+    return this.columns.length - 1;
+  }
+
+  push(row: readonly number[]): void {
     if (this.end === 2 * this.capacity) {
       for (const column of this.columns) column.copyWithin(0, this.first, this.end);
       this.end -= this.first;
       this.first = 0;
     }
-    this.columns.forEach((column, i) => (column[this.end] = row[i] ?? NaN));
+    for (let i = 0; i < this.columns.length; i += 1) this.columns[i]![this.end] = row[i] ?? NaN;
     this.end += 1;
     if (this.length > this.capacity) this.first += 1;
-  }
-
-  clear(): void {
-    this.first = this.end = 0;
   }
 
   /** The newest value of a column, NaN where there is none. */

@@ -1,0 +1,113 @@
+"""What the live page may ask the server that serves it: a car's past, and CloudWatch's dashboards.
+
+Each answer is a function of the request's parameters; station/web/src/answers.ts is the other end.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from typing import Any
+
+import numpy as np
+
+from contract import STATS, check_robot
+from station import cloudwatch, data, inventory
+from station.cloud import Cloud
+from station.conditions import Column
+from station.errors import StationError
+
+# A chart has no more points across.
+MAX_ROWS = 5_000
+# Of ranges longer than this the seconds are read that Lambda 2 has written, not the samples.
+_SAMPLES_US = 3_600_000_000
+
+
+def answers(cloud: Cloud) -> dict[str, Callable[[Mapping[str, str]], dict[str, Any]]]:
+    """Every answer by its name."""
+    return {
+        "streams": lambda asked: {"streams": inventory.streams_of(cloud, check_robot(_text(asked, "robot")))},
+        "history": lambda asked: history(cloud, asked),
+        "dashboards": lambda _asked: {"dashboards": cloudwatch.dashboards(cloud)},
+        "dashboard": lambda asked: cloudwatch.dashboard(
+            cloud, _text(asked, "name"), minutes=_whole(asked, "minutes", 1, 14 * 24 * 60)
+        ),
+    }
+
+
+def history(cloud: Cloud, asked: Mapping[str, str]) -> dict[str, Any]:
+    """The samples of ``robot`` and ``stream`` from ``from_us`` to ``to_us``, in at most ``rows`` rows.
+
+    A row that stands for several samples has the least, the mean and the most of every number, and the
+    last of everything else. Raises `StationError` for a request that cannot be answered.
+    """
+    start_us, end_us = (_whole(asked, name, 0, 2**53) for name in ("from_us", "to_us"))
+    rows = _whole(asked, "rows", 2, MAX_ROWS)
+    if start_us >= end_us:
+        raise StationError("the range ends before it starts")
+    summary = end_us - start_us > _SAMPLES_US
+    robot, stream = _text(asked, "robot"), _text(asked, "stream")
+    found = data.query(cloud, robot, stream, start_us, end_us, summary=summary)
+    columns = (
+        _by_statistic(found.columns) if summary else {name: (c, c, c) for name, c in found.columns.items()}
+    )
+    n = len(found)
+    row_us = 0
+    starts = np.arange(n)
+    if n > rows:
+        row_us = -(-(int(found.times_us[-1] - found.times_us[0]) + 1) // rows)
+        bins = (found.times_us - found.times_us[0]) // row_us
+        starts = np.flatnonzero(np.append(True, bins[1:] != bins[:-1]))
+    several = summary or row_us > 0
+    return {
+        "times_s": [t_us / 1e6 for t_us in found.times_us[starts].tolist()],
+        "fields": {name: _rows(each, starts, n, several=several) for name, each in columns.items()},
+        "samples": int(np.nansum(found.columns["n"])) if summary and "n" in found.columns else n,
+        "row_s": max(row_us / 1e6, 1.0 if summary else 0.0),
+    }
+
+
+def _by_statistic(columns: Mapping[str, Column]) -> dict[str, tuple[Column, Column, Column]]:
+    """The summary's columns, one entry a field: mean, least, most."""
+    names = [name.removesuffix("_mean") for name in columns if name.endswith(f"_{STATS[1]}")]
+    return {
+        name: (columns[f"{name}_mean"], columns[f"{name}_min"], columns[f"{name}_max"])
+        for name in names
+        if f"{name}_min" in columns and f"{name}_max" in columns
+    }
+
+
+def _rows(of: tuple[Column, Column, Column], starts: Any, n: int, *, several: bool) -> dict[str, list[Any]]:
+    mean, least, most = of
+    if mean.dtype.kind != "f":
+        ends = np.append(starts[1:], n) - 1 if n else starts
+        return {"mean": mean[ends].tolist()}
+    if not several or n == 0:
+        return {"mean": _numbers(mean)}
+    known = ~np.isnan(mean)
+    number = np.add.reduceat(known.astype(float), starts)
+    with np.errstate(invalid="ignore"):
+        average = np.add.reduceat(np.where(known, mean, 0.0), starts) / np.where(number == 0, np.nan, number)
+    return {
+        "mean": _numbers(average),
+        "least": _numbers(np.fmin.reduceat(least, starts)),
+        "most": _numbers(np.fmax.reduceat(most, starts)),
+    }
+
+
+def _numbers(column: Column) -> list[float | None]:
+    # NaN is no JSON.
+    return [None if value != value else value for value in column.tolist()]  # noqa: PLR0124
+
+
+def _text(asked: Mapping[str, str], name: str) -> str:
+    if not asked.get(name):
+        raise StationError(f"the request names no {name}")
+    return asked[name]
+
+
+def _whole(asked: Mapping[str, str], name: str, least: int, most: int) -> int:
+    text = _text(asked, name)
+    # Sixteen digits hold all that is allowed.
+    if not text.isdecimal() or len(text) > 16 or not least <= int(text) <= most:
+        raise StationError(f"{name} {text[:40]!r}: allowed is a whole number from {least} to {most}")
+    return int(text)

@@ -1,0 +1,106 @@
+// A heading with readings, and a chart below it. Under the pointer, the readings are of that time.
+
+import { Chart, type ChartOptions, type Shown } from "./chart";
+import { el, setAttribute, Text } from "./dom";
+import { age, number } from "./format";
+
+/** A value in a panel's heading, computed from those of the panel's lines as they are drawn. */
+export interface Reading {
+  readonly name: string;
+  readonly label?: string;
+  readonly unit: string;
+  readonly digits?: number;
+  /** The line whose key stands beside it. */
+  readonly line?: number;
+  readonly from: (values: readonly number[]) => number;
+}
+
+export interface PanelOptions {
+  readonly title: string;
+  readonly readings: readonly Reading[];
+  readonly chart: ChartOptions;
+  /** Present where the viewer may put it away. */
+  readonly onClose?: () => void;
+}
+
+export class Panel {
+  readonly node: HTMLElement;
+  private readonly texts: Text[];
+  private readonly note = new Text("note");
+  private readonly chart: Chart;
+  private readonly units: Text[];
+  private hovered = false;
+  private scale = 1;
+
+  constructor(
+    host: HTMLElement,
+    private readonly options: PanelOptions,
+  ) {
+    const { title, readings, chart, onClose } = options;
+    this.texts = readings.map(({ name }) => new Text("num", "span", { "data-reading": name }));
+    this.units = readings.map(({ unit }) => {
+      const text = new Text("unit");
+      text.set(unit);
+      return text;
+    });
+    const close = onClose && el("button", { type: "button", class: "close", "aria-label": `Close ${title}` }, "×");
+    close?.addEventListener("click", onClose!);
+    const heading = el(
+      "header",
+      {},
+      el("h3", {}, title),
+      this.note.node,
+      ...readings.map(({ label, line }, i) =>
+        el(
+          "p",
+          { class: "reading" },
+          ...(line === undefined ? [] : [el("span", { class: `key ${chart.lines[line]!.colour.slice(2)}` })]),
+          ...(label ? [el("span", { class: "label" }, label)] : []),
+          this.texts[i]!.node,
+          this.units[i]!.node,
+        ),
+      ),
+      ...(close ? [close] : []),
+    );
+    const plot = el("div", { class: "plot", "aria-hidden": "true" });
+    this.node = el("section", { class: "panel", "aria-label": title }, heading, plot);
+    host.append(this.node);
+    this.chart = new Chart(plot, {
+      ...chart,
+      onPoint: (point) => {
+        this.hovered = point !== undefined;
+        setAttribute(this.node, "data-hover", String(this.hovered));
+        if (point) {
+          this.read(point.values);
+          this.note.set(`${age(point.ago)} ago`);
+        }
+      },
+    });
+  }
+
+  /** What to show, what to multiply it by, and the unit that this gives, where it is not the usual one. */
+  show(shown: Shown | undefined, scale: number, unit?: string): void {
+    this.scale = scale;
+    this.chart.show(shown, scale);
+    this.options.readings.forEach((reading, i) => this.units[i]!.set(unit ?? reading.unit));
+  }
+
+  update(values: readonly number[]): void {
+    if (this.hovered) return;
+    this.read(values.map((value) => value * this.scale));
+    this.note.set("");
+    this.chart.wake();
+  }
+
+  due(now: number): boolean {
+    return this.chart.due(now);
+  }
+
+  draw(now: number): void {
+    this.chart.draw(now);
+  }
+
+  private read(values: readonly number[]): void {
+    this.options.readings.forEach(({ digits, from }, i) => this.texts[i]!.set(number(from(values), digits)));
+  }
+}

@@ -1,0 +1,229 @@
+// One car in full: gauges, charts, the delay by hop, planes, faults, and every field of every stream.
+
+import type { Shown } from "../chart";
+import type { FieldTable } from "../config";
+import { byName, el, setAttribute, Text } from "../dom";
+import { FaultLog } from "../faultlog";
+import { numeric, WINDOW_S, type Fleet, type Robot, type Stream } from "../fleet";
+import { age, spec } from "../format";
+import { Gauge } from "../gauge";
+import { Panel } from "../panel";
+import { Plane, type Track } from "../plane";
+import { fieldKey, StreamSection } from "../tiles";
+import { Waterfall } from "../waterfall";
+import { DELAY_PANEL, GAUGES, PLANES, VESC_PANELS, type PlaneSpec } from "./carspec";
+
+const MOST_CHOSEN = 6;
+
+interface ShownPlane {
+  readonly spec: PlaneSpec;
+  readonly node: HTMLElement;
+  readonly plane: Plane;
+  source: { readonly stream: Stream; readonly x: string; readonly y: string; readonly scale: number } | undefined;
+}
+
+export class CarView {
+  readonly node: HTMLElement;
+  private readonly title = new Text("car-name", "h2");
+  private readonly state = new Text("car-state");
+  private readonly fault = el("p", { class: "fault", role: "alert", hidden: "" });
+  private readonly gauges: readonly Gauge[];
+  private readonly gaugeRow = el("div", { class: "gauges" });
+  private readonly charts = el("div", { class: "charts" });
+  private readonly chosenCharts = el("div", { class: "charts" });
+  private readonly streams = el("div", { class: "streams" });
+  private readonly panels: readonly Panel[];
+  private readonly delay: Panel;
+  private readonly planes: readonly ShownPlane[];
+  private readonly waterfall = new Waterfall();
+  private readonly faults = new FaultLog();
+  private readonly sections = new Map<Stream, StreamSection>();
+  private readonly chosen = new Map<string, { readonly panel: Panel; readonly stream: Stream; readonly field: string }>();
+  private robot: Robot | undefined;
+  private drawn = -1;
+  private screen_ms = NaN;
+
+  constructor(
+    private readonly fleet: Fleet,
+    private readonly table: FieldTable,
+    tools: HTMLElement,
+  ) {
+    this.gauges = GAUGES.map((each) => new Gauge(each));
+    this.gaugeRow.append(...this.gauges.map(({ node }) => node));
+    const aside = el("aside", { class: "aside" });
+    this.panels = VESC_PANELS.map((options) => new Panel(this.charts, options));
+    aside.append(this.waterfall.node);
+    this.delay = new Panel(aside, DELAY_PANEL);
+    const planeRow = el("div", { class: "planes" });
+    this.planes = PLANES.map((spec) => {
+      const host = el("div", { class: "plot", "aria-hidden": "true" });
+      const node = el("section", { class: "panel", "aria-label": spec.title }, el("header", {}, el("h3", {}, spec.title), el("p", { class: "note" }, `last ${WINDOW_S} s`)), host);
+      planeRow.append(node);
+      return { spec, node, plane: new Plane(host, spec), source: undefined };
+    });
+    planeRow.append(this.faults.node);
+    this.node = el(
+      "article",
+      { class: "car", id: "car" },
+      el("header", { class: "car-head" }, this.title.node, this.state.node, this.fault, tools),
+      this.gaugeRow,
+      el("div", { class: "board" }, this.charts, aside),
+      planeRow,
+      this.chosenCharts,
+      this.streams,
+    );
+  }
+
+  show(robot: Robot | undefined): void {
+    if (this.robot !== robot) {
+      this.robot = robot;
+      this.sections.clear();
+      this.streams.replaceChildren();
+      for (const key of [...this.chosen.keys()]) this.close(key);
+      for (const gauge of this.gauges) gauge.reset();
+      this.drawn = -1;
+      this.screen_ms = NaN;
+      this.title.set(robot?.name ?? "");
+    }
+    this.arrange();
+  }
+
+  /** Sections for the streams there are; called when a stream is heard for the first time. */
+  private arrange(): void {
+    const { robot, table } = this;
+    if (!robot) return;
+    const vesc = robot.vesc(table);
+    const gauged = new Set(vesc ? GAUGES.flatMap(({ fields }) => fields) : []);
+    for (const each of [this.charts, this.gaugeRow]) each.hidden = vesc === undefined;
+    setAttribute(this.node, "data-vesc", String(vesc !== undefined));
+    this.delay.show({ history: robot.delays, columns: [1] }, 1);
+    const ordered = [...robot.streams.values()].sort((a, b) => Number(b === vesc) - Number(a === vesc) || byName(a.name, b.name));
+    for (const stream of ordered) {
+      let section = this.sections.get(stream);
+      if (!section) {
+        const except: ReadonlySet<string> = stream === vesc ? gauged : new Set();
+        section = new StreamSection(stream, table, except, (field) => this.choose(stream, field));
+        this.sections.set(stream, section);
+      }
+      this.streams.append(section.node);
+    }
+  }
+
+  /** Chart a field, or no longer. */
+  private choose(stream: Stream, field: string): void {
+    const key = fieldKey(stream.name, field);
+    if (this.chosen.has(key)) {
+      this.close(key);
+      return;
+    }
+    if (this.chosen.size >= MOST_CHOSEN) this.close(this.chosen.keys().next().value!);
+    const { label, unit, scale, digits } = spec(field, this.table);
+    const reading = { name: key, unit, from: ([value = NaN]: readonly number[]) => value, ...(digits === undefined ? {} : { digits }) };
+    const panel = new Panel(this.chosenCharts, {
+      title: label,
+      readings: [reading],
+      chart: { lines: [{ colour: "--accent" }], span: 1e-3 },
+      onClose: () => this.close(key),
+    });
+    panel.show({ history: stream.history, columns: [stream.columns.get(field)] }, scale);
+    this.chosen.set(key, { panel, stream, field });
+    panel.node.scrollIntoView({ block: "nearest" });
+  }
+
+  private close(key: string): void {
+    this.chosen.get(key)?.panel.node.remove();
+    this.chosen.delete(key);
+  }
+
+  /** What changes with every message. */
+  values(now: number): void {
+    const { robot, table } = this;
+    if (!robot || robot.version === this.drawn) return;
+    this.drawn = robot.version;
+    this.screen_ms = (now - robot.heardAt) * 1000;
+    const vesc = robot.vesc(table);
+    const gain = this.fleet.gain(robot.name);
+    const newest = (field: string): number => numeric(vesc?.sample.get(field));
+    GAUGES.forEach((each, i) => {
+      const show = each.show(newest, robot, gain);
+      const [least, most] = vesc && each.extent ? span(vesc, each.extent, now, show.scale ?? 1) : [NaN, NaN];
+      this.gauges[i]!.set(show.value, least, most, show.unit, show.digits);
+    });
+    this.panels.forEach((panel, i) => {
+      const { fields, scale } = VESC_PANELS[i]!;
+      panel.show(shown(vesc, fields), ...scale(gain));
+      panel.update(fields.map(newest));
+    });
+    this.delay.update([robot.newestDelay()?.total ?? NaN]);
+    for (const { panel, stream, field } of this.chosen.values()) panel.update([numeric(stream.sample.get(field))]);
+    for (const section of this.sections.values()) section.values();
+    this.findPlanes(robot, gain);
+    const fault = robot.fault(table);
+    const text = fault ? `Fault: ${fault}` : "";
+    if (this.fault.textContent !== text) this.fault.textContent = text;
+    this.fault.hidden = !fault;
+  }
+
+  private findPlanes(robot: Robot, gain: number | undefined): void {
+    for (const each of this.planes) {
+      each.source = undefined;
+      for (const stream of robot.streams.values()) {
+        const axes = each.spec.axes(stream.columns);
+        if (axes) {
+          each.source = { stream, x: axes[0], y: axes[1], scale: each.spec.scaled && gain ? 1 / gain : 1 };
+          break;
+        }
+      }
+      each.node.hidden = each.source === undefined;
+    }
+  }
+
+  /** What changes with time alone. */
+  clock(now: number, linked: boolean): void {
+    const { robot } = this;
+    if (!robot) return;
+    const charted = new Set(this.chosen.keys());
+    for (const section of this.sections.values()) section.clock(now, charted);
+    this.waterfall.refresh(robot, now, this.screen_ms);
+    this.faults.refresh(robot);
+    const fresh = robot.freshness(now);
+    setAttribute(this.node, "data-state", linked || fresh === "live" ? fresh : "unlinked");
+    const texts = {
+      live: "live",
+      stale: `stale: newest values are ${age(now - robot.takenAt)} old`,
+      gone: `gone: last heard ${age(now - robot.heardAt)} ago`,
+    };
+    this.state.set(linked || fresh === "live" ? texts[fresh] : `no connection: values are ${age(now - robot.heardAt)} old`);
+  }
+
+  draw(now: number): void {
+    if (!this.robot) return;
+    const panels = [...(this.charts.hidden ? [] : this.panels), this.delay, ...[...this.chosen.values()].map(({ panel }) => panel)];
+    // All in the same frame: a frame costs more than what is drawn in it.
+    if (!panels.some((panel) => panel.due(now))) return;
+    for (const panel of panels) panel.draw(now);
+    for (const { plane, source } of this.planes) if (source) plane.draw(now, () => track(source, now));
+  }
+}
+
+function shown(stream: Stream | undefined, fields: readonly string[]): Shown | undefined {
+  return stream && { history: stream.history, columns: fields.map((field) => stream.columns.get(field)) };
+}
+
+function track({ stream, x, y, scale }: NonNullable<ShownPlane["source"]>, now: number): Track {
+  const column = (field: string): Float64Array => stream.history.column(stream.columns.get(field) ?? 0, now - WINDOW_S);
+  const across = column(x);
+  return { x: scale === 1 ? across : across.map((value) => value * scale), y: column(y) };
+}
+
+/** The least and the most of a field in the last while. */
+function span(stream: Stream, field: string, now: number, scale: number): [number, number] {
+  const column = stream.columns.get(field);
+  if (column === undefined) return [NaN, NaN];
+  let [low, high] = [Infinity, -Infinity];
+  for (const value of stream.history.column(column, now - WINDOW_S)) {
+    if (value * scale < low) low = value * scale;
+    if (value * scale > high) high = value * scale;
+  }
+  return [low, high];
+}

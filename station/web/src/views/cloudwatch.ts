@@ -1,0 +1,148 @@
+// CloudWatch's dashboards as they are deployed, drawn from the metrics that the cloud has.
+
+import { ask, AnswerError, type Dashboard, type Series, type Widget } from "../answers";
+import type { Config } from "../config";
+import { el, Text } from "../dom";
+import { NOTHING, number } from "../format";
+import { TimeChart, type Curve } from "../timechart";
+
+const REFRESH_S = 30;
+const RANGES = [["15 min", 15], ["1 h", 60], ["3 h", 180], ["24 h", 1440]] as const;
+const COLOURS = ["--hue-1", "--hue-2", "--hue-3", "--hue-4", "--hue-5", "--hue-6"];
+const DASHES = [undefined, [6, 3], [2, 3]] as const;
+
+export class CloudWatchView {
+  readonly node: HTMLElement;
+  private readonly choice = el("select", { id: "dashboard", name: "dashboard" });
+  private readonly range = el("select", { id: "minutes", name: "minutes" });
+  private readonly note = new Text("history-note", "p", { role: "status" });
+  private readonly grid = el("div", { class: "widgets" });
+  private charts: TimeChart[] = [];
+  private timer: number | undefined;
+  private loading: AbortController | undefined;
+
+  constructor(private readonly config: Config) {
+    this.range.append(...RANGES.map(([label, minutes]) => el("option", { value: String(minutes) }, label)));
+    this.range.value = "60";
+    for (const each of [this.choice, this.range]) each.addEventListener("change", () => void this.load());
+    const form = el("p", { class: "range" }, el("label", {}, "dashboard ", this.choice), el("label", {}, "last ", this.range));
+    const told = el("p", { class: "unserved" }, "This page was put on the web as it is, and cannot read CloudWatch. Run ", el("code", {}, "iort dashboard"), ", or look at them in the AWS console.");
+    this.node = el(
+      "article",
+      { class: "cloudwatch" },
+      el("header", { class: "car-head" }, el("h2", { class: "car-name" }, "CloudWatch"), this.note.node),
+      ...(config.answers ? [form, this.grid] : [told]),
+    );
+  }
+
+  show(shown: boolean): void {
+    window.clearInterval(this.timer);
+    this.loading?.abort();
+    if (!shown || !this.config.answers) return;
+    void this.find();
+    this.timer = window.setInterval(() => !document.hidden && void this.load(), REFRESH_S * 1000);
+  }
+
+  private async find(): Promise<void> {
+    try {
+      const { dashboards } = await ask<{ dashboards: string[] }>("dashboards", {});
+      const before = this.choice.value;
+      this.choice.replaceChildren(...dashboards.map((name) => el("option", { value: name }, name)));
+      if (dashboards.includes(before)) this.choice.value = before;
+      if (dashboards.length === 0) this.note.set("No dashboard is deployed.");
+      else await this.load();
+    } catch (error) {
+      this.note.set(error instanceof AnswerError ? error.message : String(error));
+    }
+  }
+
+  private async load(): Promise<void> {
+    if (!this.choice.value) return;
+    this.loading?.abort();
+    const loading = new AbortController();
+    this.loading = loading;
+    try {
+      const dashboard = await ask<Dashboard>("dashboard", { name: this.choice.value, minutes: this.range.value }, loading.signal);
+      if (loading.signal.aborted) return;
+      this.draw(dashboard);
+      this.note.set(`as of ${new Date(dashboard.to_s * 1000).toLocaleTimeString("en-GB")}, again every ${REFRESH_S} s`);
+    } catch (error) {
+      if (!loading.signal.aborted) this.note.set(error instanceof AnswerError ? error.message : String(error));
+    }
+  }
+
+  private draw({ widgets, from_s, to_s }: Dashboard): void {
+    for (const chart of this.charts) chart.destroy();
+    this.charts = [];
+    const ordered = [...widgets].sort((a, b) => a.y - b.y || a.x - b.x);
+    this.grid.replaceChildren(
+      ...ordered.map((widget) => {
+        const [node, plot] = frame(widget);
+        node.style.setProperty("--across", String(widget.width));
+        node.style.setProperty("--down", String(widget.height));
+        return [node, plot, widget] as const;
+      }).map(([node, plot, widget]) => {
+        if (plot) queueMicrotask(() => this.charts.push(chart(plot, widget, [from_s, to_s])));
+        return node;
+      }),
+    );
+  }
+}
+
+function frame(widget: Widget): [HTMLElement, HTMLElement | undefined] {
+  if (widget.kind === "text") return [el("section", { class: "widget words" }, ...markdown(widget.text)), undefined];
+  const heading = el("header", {}, el("h3", {}, widget.title));
+  const node = el("section", { class: "panel widget", "aria-label": widget.title, "data-widget": widget.title }, heading);
+  if (widget.kind === "other") {
+    node.append(el("p", { class: "note" }, widget.text));
+    return [node, undefined];
+  }
+  const any = widget.series.some((series) => series.values.length > 0);
+  const legend = el(
+    "ul",
+    { class: "legend" },
+    ...widget.series.map((series, i) =>
+      el(
+        "li",
+        { "data-series": series.label },
+        el("span", { class: `key ${COLOURS[i % COLOURS.length]!.slice(2)}` }),
+        series.label,
+        " ",
+        el("b", { class: "num" }, series.values.length > 0 ? number(series.values.at(-1)!, digits(series.values.at(-1)!)) : NOTHING),
+      ),
+    ),
+  );
+  if (widget.kind === "number") {
+    node.append(legend);
+    return [node, undefined];
+  }
+  const plot = el("div", { class: "plot", "aria-hidden": "true", ...(any ? {} : { "data-empty": "no data in this range" }) });
+  node.append(plot, legend);
+  return [node, plot];
+}
+
+function chart(host: HTMLElement, { series, period_s }: Widget, range: readonly [number, number]): TimeChart {
+  const times = [...new Set(series.flatMap(({ times_s }) => times_s))].sort((a, b) => a - b);
+  const curves: Curve[] = series.map(({ label, right }, i) => {
+    const dash = DASHES[Math.floor(i / COLOURS.length) % DASHES.length];
+    return { label, right, colour: COLOURS[i % COLOURS.length]!, points: true, ...(dash ? { dash } : {}) };
+  });
+  return new TimeChart(host, { curves, zero: true, sync: "cloudwatch", hole_s: period_s * 1.5 }, [times, ...series.map((each) => aligned(each, times))], range);
+}
+
+function aligned({ times_s, values }: Series, times: readonly number[]): (number | null)[] {
+  const known = new Map(times_s.map((at, i) => [at, values[i]!]));
+  return times.map((at) => known.get(at) ?? null);
+}
+
+/** Headings, and the rest as it is written: text of a dashboard is no more HTML than a robot's. */
+function markdown(text: string): HTMLElement[] {
+  return text.split("\n").filter((line) => line.trim() !== "").map((line) => {
+    const heading = /^#+\s+(.*)$/.exec(line);
+    return heading ? el("h3", {}, heading[1]!) : el("p", {}, line);
+  });
+}
+
+function digits(value: number): number {
+  return Number.isInteger(value) ? 0 : Math.abs(value) < 10 ? 2 : 1;
+}

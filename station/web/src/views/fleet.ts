@@ -1,0 +1,112 @@
+// Every car: one card each, in the order of their names, so that a card stays where it is.
+
+import type { FieldTable } from "../config";
+import { byName, el, setAttribute, Text } from "../dom";
+import { numeric, type Fleet, type Robot } from "../fleet";
+import { age, milliseconds, NOTHING, number } from "../format";
+import { route } from "../route";
+import { Sparkline } from "../sparkline";
+import { hottest } from "./carspec";
+
+export class FleetView {
+  readonly node = el("nav", { class: "cars", id: "cars", "aria-label": "Cars" });
+  private readonly cards = new Map<string, Card>();
+
+  constructor(
+    private readonly fleet: Fleet,
+    private readonly table: FieldTable,
+  ) {
+    this.node.addEventListener("keydown", (event) => this.key(event));
+  }
+
+  /** Cards for the cars there are. */
+  arrange(): void {
+    for (const [name, card] of this.cards) {
+      if (!this.fleet.robots.has(name)) {
+        card.node.remove();
+        this.cards.delete(name);
+      }
+    }
+    [...this.fleet.robots.keys()].sort(byName).forEach((name, i) => {
+      let card = this.cards.get(name);
+      if (!card) {
+        card = new Card(name);
+        this.cards.set(name, card);
+      }
+      if (this.node.children[i] !== card.node) this.node.insertBefore(card.node, this.node.children[i] ?? null);
+    });
+  }
+
+  clock(now: number, linked: boolean): void {
+    for (const robot of this.fleet.robots.values()) {
+      this.cards.get(robot.name)?.update(robot, this.fleet, this.table, now, linked);
+    }
+  }
+
+  /** Arrow keys move between the cards, which are links: Enter opens one. */
+  private key(event: KeyboardEvent): void {
+    const cards = [...this.node.children] as HTMLElement[];
+    const at = cards.indexOf(document.activeElement as HTMLElement);
+    // As many cards as stand in the first row.
+    const columns = Math.max(1, cards.filter((card) => card.offsetTop === cards[0]!.offsetTop).length);
+    const to = { ArrowRight: at + 1, ArrowLeft: at - 1, ArrowDown: at + columns, ArrowUp: at - columns, Home: 0, End: cards.length - 1 }[event.key];
+    if (at < 0 || to === undefined) return;
+    event.preventDefault();
+    cards[to]?.focus();
+  }
+}
+
+class Card {
+  readonly node: HTMLElement;
+  private readonly state = new Text("card-state");
+  private readonly speed = new Text("num");
+  private readonly speedUnit = new Text("unit");
+  private readonly voltage = new Text("num");
+  private readonly temperature = new Text("num");
+  private readonly delay = new Text("num");
+  private readonly freshness = new Text("num");
+  private readonly fault = new Text("card-fault");
+  private readonly spark = new Sparkline();
+
+  constructor(name: string) {
+    const figure = (label: string, value: Text, unit: Node | string): HTMLElement =>
+      el("span", { class: "figure" }, el("span", { class: "figure-label" }, label), el("span", {}, value.node, unit));
+    const unit = (text: string): HTMLElement => el("span", { class: "unit" }, text);
+    this.node = el(
+      "a",
+      { class: "card", href: route({ view: "car", robot: name }), "data-robot": name },
+      el("span", { class: "card-head" }, el("span", { class: "dot", "aria-hidden": "true" }), el("span", { class: "card-name", title: name }, name), this.state.node),
+      el("span", { class: "card-main" }, el("span", { class: "card-speed" }, this.speed.node, this.speedUnit.node), this.spark.node),
+      el(
+        "span",
+        { class: "card-figures" },
+        figure("Battery", this.voltage, unit("V")),
+        figure("Temp.", this.temperature, unit("°C")),
+        figure("Delay", this.delay, unit("ms")),
+        figure("Age", this.freshness, ""),
+      ),
+      this.fault.node,
+    );
+  }
+
+  update(robot: Robot, fleet: Fleet, table: FieldTable, now: number, linked: boolean): void {
+    const fresh = robot.freshness(now);
+    const shown = linked || fresh === "live" ? fresh : "unlinked";
+    setAttribute(this.node, "data-state", shown);
+    this.state.set({ live: "online", stale: "stale", gone: "gone", unlinked: "no link" }[shown]);
+    this.freshness.set(age(now - (fresh === "gone" ? robot.heardAt : robot.takenAt)));
+    const fault = robot.fault(table);
+    this.fault.set(fault ?? "no fault");
+    setAttribute(this.node, "data-fault", String(fault !== undefined));
+    const vesc = robot.vesc(table);
+    const newest = (field: string): number => numeric(vesc?.sample.get(field));
+    const gain = fleet.gain(robot.name);
+    this.speed.set(gain ? number(newest("speed") / gain, 1) : number(newest("speed"), 0));
+    this.speedUnit.set(gain ? "m/s" : "erpm");
+    this.voltage.set(number(newest("voltage_input"), 1));
+    this.temperature.set(number(hottest(newest), 0));
+    const delay = robot.newestDelay();
+    this.delay.set(delay ? milliseconds(delay.total) : NOTHING);
+    if (vesc) this.spark.draw(vesc.history, vesc.columns.get("speed"), now);
+  }
+}

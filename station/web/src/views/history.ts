@@ -1,0 +1,262 @@
+// What a car did: a range from the cloud's table, to scrub through and to hold against what it does now.
+
+import { ask, AnswerError, type Drive } from "../answers";
+import type { Config, FieldTable } from "../config";
+import { el, setAttribute, Text } from "../dom";
+import type { Fleet } from "../fleet";
+import { age, number, spec } from "../format";
+import { route } from "../route";
+import { TimeChart } from "../timechart";
+import { Comparison } from "./comparison";
+
+const RANGES = [["1 min", 60], ["5 min", 300], ["15 min", 900], ["1 h", 3600]] as const;
+const FIRST_FIELDS = ["speed", "voltage_input", "current_motor", "current_input", "duty_cycle", "temperature_pcb"];
+const MOST_CHARTS = 12;
+// Rows asked for: about as many as a wide chart has points across.
+const ROWS = 1500;
+const STEP_MS = 100;
+
+export class HistoryView {
+  readonly node: HTMLElement;
+  private readonly title = new Text("car-name", "h2");
+  private readonly back = el("a", { class: "tool" }, "Live");
+  private readonly from = el("input", { type: "datetime-local", step: "1", id: "from", name: "from" });
+  private readonly to = el("input", { type: "datetime-local", step: "1", id: "to", name: "to" });
+  private readonly stream = el("select", { id: "stream", name: "stream" });
+  private readonly note = new Text("history-note", "p", { role: "status" });
+  private readonly result = el("div", { class: "result", hidden: "" });
+  private readonly scrub = el("input", { type: "range", min: "0", value: "0", class: "scrub", "aria-label": "Time within the range" });
+  private readonly at = new Text("num scrub-at");
+  private readonly play = el("button", { type: "button", class: "tool play" }, "Play");
+  private readonly chips = el("div", { class: "chips", role: "group", "aria-label": "Fields to chart" });
+  private readonly charts = el("div", { class: "charts three" });
+  private readonly comparison: Comparison;
+  private readonly shown = new Map<string, { readonly node: HTMLElement; readonly chart: TimeChart }>();
+  private robot: string | undefined;
+  private drive: Drive | undefined;
+  private loading: AbortController | undefined;
+  private playing: number | undefined;
+
+  constructor(
+    private readonly config: Config,
+    private readonly table: FieldTable,
+    private readonly fleet: Fleet,
+  ) {
+    this.comparison = new Comparison(table);
+    const form = el(
+      "form",
+      { class: "range" },
+      ...RANGES.map(([label, seconds]) => {
+        const button = el("button", { type: "button", class: "tool" }, `Last ${label}`);
+        button.addEventListener("click", () => this.last(seconds));
+        return button;
+      }),
+      el("label", {}, "from ", this.from),
+      el("label", {}, "to ", this.to),
+      el("label", {}, "stream ", this.stream),
+      el("button", { type: "submit", class: "tool primary" }, "Load"),
+    );
+    form.addEventListener("submit", (event) => {
+      event.preventDefault();
+      void this.load(seconds(this.from), seconds(this.to));
+    });
+    this.scrub.addEventListener("input", () => this.point(Number(this.scrub.value)));
+    this.play.addEventListener("click", () => (this.playing === undefined ? this.start() : this.stop()));
+    this.result.append(el("div", { class: "scrubber" }, this.play, this.scrub, this.at.node), this.chips, this.charts, this.comparison.node);
+    const served = [form, this.note.node, this.result];
+    const told = el("p", { class: "unserved" }, "This page was put on the web as it is, and cannot read the tables. To look into the past, run ", el("code", {}, "iort dashboard"), " on a machine with access to the cloud, or ", el("code", {}, "iort query"), ".");
+    this.node = el(
+      "article",
+      { class: "history" },
+      el("header", { class: "car-head" }, this.title.node, el("p", { class: "car-state" }, "history"), el("p", { class: "tools" }, this.back)),
+      ...(config.answers ? served : [told]),
+    );
+  }
+
+  /** Show a robot's past; undefined when the viewer leaves. */
+  show(robot: string | undefined): void {
+    if (robot === undefined || robot !== this.robot) {
+      this.stop();
+      this.loading?.abort();
+    }
+    if (robot === undefined || robot === this.robot) return;
+    this.robot = robot;
+    this.title.set(robot);
+    this.back.href = route({ view: "car", robot });
+    this.clear();
+    this.note.set("");
+    if (!this.config.answers) return;
+    void this.findStreams(robot);
+  }
+
+  clock(_now: number): void {
+    if (this.drive) this.comparison.now(this.fleet.robots.get(this.robot ?? "")?.streams.get(this.stream.value));
+  }
+
+  private async findStreams(robot: string): Promise<void> {
+    try {
+      const { streams } = await ask<{ streams: string[] }>("streams", { robot });
+      if (robot !== this.robot) return;
+      const chosen = streams.includes(this.table.stream) ? this.table.stream : streams[0];
+      this.stream.replaceChildren(...streams.map((name) => el("option", { value: name }, name)));
+      if (chosen === undefined) this.note.set("Nothing of this car is stored.");
+      else {
+        this.stream.value = chosen;
+        this.last(RANGES[1][1]);
+      }
+    } catch (error) {
+      this.note.set(words(error));
+    }
+  }
+
+  private last(range_s: number): void {
+    const to = Math.ceil(Date.now() / 1000);
+    this.from.value = local(to - range_s);
+    this.to.value = local(to);
+    void this.load(to - range_s, to);
+  }
+
+  private async load(from_s: number, to_s: number): Promise<void> {
+    if (!(from_s < to_s)) {
+      this.note.set("The range must begin before it ends.");
+      return;
+    }
+    this.loading?.abort();
+    const loading = new AbortController();
+    this.loading = loading;
+    this.note.set("Loading …");
+    const began = performance.now();
+    try {
+      const asked = { robot: this.robot!, stream: this.stream.value, from_us: String(from_s * 1e6), to_us: String(to_s * 1e6), rows: String(ROWS) };
+      const drive = await ask<Drive>("history", asked, loading.signal);
+      if (loading.signal.aborted) return;
+      this.set(drive, [from_s, to_s]);
+      const each = drive.row_s > 0 ? `, drawn as the mean of ${age(drive.row_s)} each within its least and most` : "";
+      this.note.set(drive.samples === 0 ? "Nothing was stored in this range." : `${number(drive.samples)} samples in ${age((performance.now() - began) / 1000)}${each}.`);
+    } catch (error) {
+      if (!loading.signal.aborted) this.note.set(words(error));
+    }
+  }
+
+  private clear(): void {
+    this.stop();
+    this.drive = undefined;
+    for (const { chart } of this.shown.values()) chart.destroy();
+    this.shown.clear();
+    this.charts.replaceChildren();
+    this.result.hidden = true;
+  }
+
+  private set(drive: Drive, asked: readonly [number, number]): void {
+    const before = new Set(this.shown.keys());
+    this.clear();
+    if (drive.samples === 0) return;
+    this.drive = drive;
+    this.result.hidden = false;
+    const charted = Object.keys(drive.fields).filter((field) => drive.fields[field]!.mean.some((value) => typeof value === "number"));
+    const wanted = charted.filter((field) => (before.size > 0 ? before.has(field) : FIRST_FIELDS.includes(field)));
+    const [first, last] = [drive.times_s[0]!, drive.times_s.at(-1)!];
+    // The range that was asked for may reach far beyond what there is.
+    const range: readonly [number, number] = [Math.max(asked[0], first - 0.5), Math.min(asked[1], last + 0.5)];
+    this.chips.replaceChildren(
+      ...charted.map((field) => {
+        const chip = el("button", { type: "button", class: "chip", "aria-pressed": "false", title: field }, spec(field, this.table).label);
+        const toggle = (): void => {
+          this.toggle(field, range);
+          setAttribute(chip, "aria-pressed", String(this.shown.has(field)));
+        };
+        chip.addEventListener("click", toggle);
+        if ((wanted.length > 0 ? wanted : charted.slice(0, 6)).includes(field)) toggle();
+        return chip;
+      }),
+    );
+    this.comparison.of(Object.keys(drive.fields));
+    this.scrub.max = String(drive.times_s.length - 1);
+    this.point(drive.times_s.length - 1);
+  }
+
+  private toggle(field: string, range: readonly [number, number]): void {
+    const old = this.shown.get(field);
+    if (old) {
+      old.chart.destroy();
+      old.node.remove();
+      this.shown.delete(field);
+      return;
+    }
+    const drive = this.drive!;
+    if (this.shown.size >= MOST_CHARTS) return;
+    const { label, unit, scale } = spec(field, this.table);
+    const { mean, least, most } = drive.fields[field]!;
+    const scaled = (values: Drive["fields"][string]["mean"]): (number | null)[] => values.map((value) => (typeof value === "number" ? value * scale : null));
+    const plot = el("div", { class: "plot", "aria-hidden": "true" });
+    const node = el("section", { class: "panel", "aria-label": label }, el("header", {}, el("h3", {}, label), el("p", { class: "reading" }, el("span", { class: "unit" }, unit))), plot);
+    this.charts.append(node);
+    const band = least !== undefined && most !== undefined;
+    const chart = new TimeChart(
+      plot,
+      {
+        curves: [{ label, colour: "--accent" }],
+        sync: "history",
+        hole_s: Math.max(1, drive.row_s * 2.5),
+        band,
+        onCursor: (index) => index !== null && this.read(index),
+      },
+      [[...drive.times_s], scaled(mean), ...(band ? [scaled(least), scaled(most)] : [])],
+      range,
+    );
+    this.shown.set(field, { node, chart });
+  }
+
+  /** Scrub to a row: in every chart, in the table and on the slider. */
+  private point(index: number): void {
+    this.scrub.value = String(index);
+    for (const { chart } of this.shown.values()) chart.point(index);
+    this.read(index);
+  }
+
+  private read(index: number): void {
+    const { drive } = this;
+    const at = drive?.times_s[index];
+    if (!drive || at === undefined) return;
+    this.scrub.value = String(index);
+    const text = new Date(at * 1000).toLocaleTimeString("en-GB", { hour: "2-digit", minute: "2-digit", second: "2-digit", fractionalSecondDigits: 1 });
+    this.at.set(text);
+    setAttribute(this.scrub, "aria-valuetext", text);
+    this.comparison.then(new Map(Object.entries(drive.fields).map(([field, { mean }]) => [field, mean[index] ?? null])));
+  }
+
+  /** Play the range as fast as it was driven. */
+  private start(): void {
+    const { drive } = this;
+    if (!drive) return;
+    let index = Number(this.scrub.value);
+    if (index >= drive.times_s.length - 1) index = 0;
+    const [began, first] = [performance.now() / 1000, drive.times_s[index]!];
+    this.play.textContent = "Pause";
+    this.playing = window.setInterval(() => {
+      const at = first + performance.now() / 1000 - began;
+      while (index < drive.times_s.length - 1 && drive.times_s[index + 1]! <= at) index += 1;
+      this.point(index);
+      if (index >= drive.times_s.length - 1) this.stop();
+    }, STEP_MS);
+  }
+
+  private stop(): void {
+    window.clearInterval(this.playing);
+    this.playing = undefined;
+    this.play.textContent = "Play";
+  }
+}
+
+function words(error: unknown): string {
+  return error instanceof AnswerError ? error.message : `The answer could not be read: ${String(error)}`;
+}
+
+/** A time as the input wants it, in this device's time zone. */
+function local(at: number): string {
+  return new Date((at - new Date(at * 1000).getTimezoneOffset() * 60) * 1000).toISOString().slice(0, 19);
+}
+
+function seconds(input: HTMLInputElement): number {
+  return new Date(input.value).getTime() / 1000;
+}

@@ -1,0 +1,92 @@
+"""One Chromium a module that looks at the page: playwright holds the thread's event loop meanwhile."""
+
+from __future__ import annotations
+
+import os
+import shutil
+import time
+from collections.abc import Callable, Iterator, Mapping
+from typing import TYPE_CHECKING, Any
+
+import pytest
+
+from station.page import BUILT
+
+if TYPE_CHECKING:
+    from playwright.sync_api import Browser, Page
+
+FLAGS = (
+    "--no-sandbox",
+    "--disable-gpu",
+    "--disable-quic",
+    "--no-first-run",
+    "--disable-background-networking",
+    "--disable-component-update",
+    "--disable-sync",
+)
+
+
+@pytest.fixture(scope="module")
+def browser() -> Iterator[Browser]:
+    playwright_api = pytest.importorskip("playwright.sync_api", reason="playwright is not installed")
+    chromium = os.environ.get("CHROMIUM") or shutil.which("chromium") or shutil.which("chromium-browser")
+    if not chromium:
+        pytest.skip("there is no chromium on this machine: apt-get install chromium, or name it in CHROMIUM")
+    if not (BUILT / "index.html").is_file():
+        pytest.skip("the live page is not built: npm run build")
+    with playwright_api.sync_playwright() as play:
+        browser = play.chromium.launch(executable_path=chromium, args=list(FLAGS))
+        yield browser
+        browser.close()
+
+
+@pytest.fixture
+def open_page(browser: Browser) -> Iterator[Callable[..., Page]]:
+    """Opens an address in a window of its own and waits until it listens; no script may fail there."""
+    contexts, errors = [], []
+
+    def open_(url: str, *, listening: bool = True, **options: Any) -> Page:
+        context = browser.new_context(**{"viewport": {"width": 1280, "height": 900}, **options})
+        contexts.append(context)
+        page = context.new_page()
+        page.on("pageerror", lambda error: errors.append(str(error)))
+        page.goto(url)
+        if listening:
+            until(lambda: page.evaluate("window.iort?.link") == "live", "the page to connect")
+        return page
+
+    yield open_
+    for context in contexts:
+        context.close()
+    assert not errors
+
+
+def until(true: Callable[[], Any], what: str, seconds: float = 60) -> None:
+    end = time.monotonic() + seconds
+    while not true():
+        assert time.monotonic() < end, f"waited {seconds} s for {what}"
+        time.sleep(0.02)
+
+
+def plain(text: str) -> str:
+    """A text with minus sign and thin spaces as a computer writes them."""
+    return text.replace("\u2212", "-").replace("\u202f", "")
+
+
+def shown(page: Page, name: str) -> str:
+    """The text of a value on the page."""
+    return plain(page.locator(f"[data-value='{name}']").inner_text())
+
+
+def show(page: Page, update: Mapping[str, Any]) -> None:
+    """Wait until the page has drawn the update."""
+    robot, stream, seq = update["robot"], update["stream"], update["seq"]
+    script = "([robot, stream]) => iort.robots[robot]?.streams[stream]?.seq"
+    until(lambda: page.evaluate(script, [robot, stream]) == seq, f"message {seq} to arrive")
+    drawn(page)
+
+
+def drawn(page: Page) -> None:
+    """Wait until the page has written its values once more: it does so at most 25 times a second."""
+    frames = "requestAnimationFrame(() => requestAnimationFrame(done))"
+    page.evaluate(f"() => new Promise((done) => setTimeout(() => {frames}, 50))")
