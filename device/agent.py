@@ -29,6 +29,8 @@ from device.sources import Source
 from device.spool import Spool
 from device.tuning import Tuning, from_config
 from device.uplink import Uplink
+from device.upload import make_uploader
+from device.upload_folder import Folder, Uploads
 
 _log = logging.getLogger(__name__)
 
@@ -78,6 +80,7 @@ class Agent:
         self._downlink = make_downlink(
             config.downlink, config.share, sources=config.sources, boot=self.boot, **shared
         )
+        self._uploads = _make_uploads(config, **shared)
         self._lock = threading.Lock()
         self._batchers: dict[str, Batcher] = {}
         self._counts: dict[str, StreamCounts] = {}
@@ -146,6 +149,8 @@ class Agent:
         ]
         watcher = self._thread("watcher", lambda: self._end_with(sources))
         pinger = self._thread("pings", lambda: self._pings.run(self._stop))
+        uploads_stop = threading.Event()
+        uploader = self._thread("uploads", lambda: self._uploads.run(uploads_stop)) if self._uploads else None
         self._stop.wait()
         if self._downlink is not None:
             self._downlink.halt()
@@ -156,6 +161,9 @@ class Agent:
         delivered = self._drain(drain_s)
         if self._downlink is not None:
             self._downlink.close()
+        uploads_stop.set()
+        if uploader is not None:
+            uploader.join()
         record_stop.set()
         self._record.wake()
         lane.join()
@@ -182,6 +190,7 @@ class Agent:
             "failed_sources": list(self._failed),
             "sources": [{"source": what, **source.report()} for what, source in self._sources],
             **({"downlink": self._downlink.report()} if self._downlink is not None else {}),
+            **({"files": self._uploads.status()} if self._uploads is not None else {}),
         }
 
     def status(self) -> dict[str, Any]:
@@ -226,6 +235,7 @@ class Agent:
                 "dropped_batches": dropped.batches,
                 "dropped_samples": dropped.samples,
             },
+            "files": self._uploads.status() if self._uploads is not None else None,
             "clock": offset._asdict() if offset is not None else None,
             "pings": {path: report._asdict() for path, report in self._pings.report().items()},
             "alarms": alarms,
@@ -323,3 +333,12 @@ class Agent:
         thread = threading.Thread(target=target, name=name, daemon=True)
         thread.start()
         return thread
+
+
+def _make_uploads(config: Config, **shared: Any) -> Uploads | None:
+    files, clock = config.files, shared["clock"]
+    if files.folder is None:
+        return None
+    folder = Folder(files.folder, clock=clock, settle_s=files.settle_s, remove_after_s=files.remove_after_s)
+    uploader = make_uploader(root_ca=config.root_ca, rate_kb_s=files.rate_kb_s, **shared)
+    return Uploads(folders=[folder], uploader=uploader, clock=clock)

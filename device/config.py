@@ -33,6 +33,7 @@ from device.sources.rosbridge import RosbridgeConfig
 from device.sources.sim import SimConfig
 from device.sources.vesc_serial import VescConfig
 from device.spool import FULL, OVERWRITE_OLDEST, PROCESS, REJECT_NEW
+from device.upload_folder import FilesConfig
 
 LOG_LEVELS = ("debug", "info", "warning", "error")
 
@@ -138,6 +139,7 @@ class Config:
     live: LiveConfig = setting(section(LiveConfig), LiveConfig())
     ping: PingConfig = setting(section(PingConfig), PingConfig())
     queue: QueueConfig = setting(section(QueueConfig), QueueConfig())
+    files: FilesConfig = setting(section(FilesConfig), FilesConfig())
     metrics: MetricsConfig = setting(section(MetricsConfig), MetricsConfig())
     downlink: DownlinkConfig = setting(section(DownlinkConfig), DownlinkConfig())
     share: tuple[tuple[str, ShareConfig], ...] = setting(share_rule(), ())

@@ -5,6 +5,7 @@ ConfigError    the configuration file says something it may not
 SourceError    a source cannot give samples (a bag unreadable, a type unknown)
 UplinkError    the broker cannot be reached, or refused a message
 IdentityError  certificate or key cannot be read, do not belong together, or cannot be had
+UploadError    a file cannot be uploaded
 MessageError   a ROS message, or its definition, is not what it should be
 """
 
@@ -33,3 +34,14 @@ class MessageError(AgentError):
 
 class IdentityError(AgentError):
     """Certificate or key cannot be used or obtained; the text says which file, or who refused."""
+
+
+class UploadError(AgentError):
+    """A file cannot be uploaded; the text says which, and what the cloud or the file system said.
+
+    ``again_s`` is after how many seconds it is worth another try; None: never, as it is.
+    """
+
+    def __init__(self, text: str, *, again_s: float | None) -> None:
+        super().__init__(text)
+        self.again_s = again_s

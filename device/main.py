@@ -76,6 +76,9 @@ def _parse(arguments: list[str]) -> argparse.Namespace:
     running.add_argument("--log-level", choices=LOG_LEVELS, help="instead of the file's log_level")
     checking = command("check", check, "say what would not work, and what to do about it")
     checking.add_argument("--json", action="store_true", help="as JSON")
+    uploading = command("upload", upload, "upload files, and say under which keys they are kept")
+    uploading.add_argument("files", type=Path, nargs="+", metavar="FILE", help="what to upload")
+    uploading.add_argument("--json", action="store_true", help="as JSON")
     status = command("status", show_status, "show what the running agent does")
     status.add_argument("--json", action="store_true", help="as JSON")
     claiming = command("provision", provision, "exchange a claim for a certificate of the robot's own")
@@ -158,6 +161,26 @@ def show_status(options: argparse.Namespace) -> int:
     state = fetch(_socket(options, load_config(options.config)))
     print(json.dumps(state, indent=2) if options.json else render_status(state))
     return 0
+
+
+def upload(options: argparse.Namespace) -> int:
+    """`iort-agent upload`: status 1 if a file is not in the bucket now."""
+    from device.upload_command import upload_files  # noqa: PLC0415
+
+    config = load_config(options.config)
+    results = upload_files(config, options.files, status_socket=_socket(options, config))
+    failed = False
+    found = []
+    for result in results:
+        failed |= result.error is not None
+        found.append({**result._asdict(), "path": str(result.path)})
+        if result.error is not None:
+            print(f"iort-agent: {result.error}", file=sys.stderr)
+        elif not options.json:
+            print(result.key, flush=True)
+    if options.json:
+        print(json.dumps(found, indent=2))
+    return 1 if failed else 0
 
 
 def provision(options: argparse.Namespace) -> int:

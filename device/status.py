@@ -158,6 +158,15 @@ def render(state: Mapping[str, Any]) -> str:
             f"stream    {name}: {stream['per_s']:g}/s, {stream['samples']} samples, "
             f"{stream['refused']} refused{silent}{fields}"
         )
+    files = state.get("files")
+    if files is not None:
+        current = f", now {files['current']} ({files['current_bytes']:,} bytes)" if files["current"] else ""
+        lines.append(
+            f"files     {files['waiting']} waiting, {files['uploaded']} uploaded, "
+            f"{files['sent_bytes']:,} bytes sent{current}"
+        )
+        if files["last_error"]:
+            lines.append(f"          last error: {files['last_error']}")
     clock = state["clock"]
     if clock is not None:
         offset, uncertainty = clock["offset_ms"], clock["uncertainty_ms"]

@@ -1,0 +1,333 @@
+"""The device's side of an upload, against a store that breaks, refuses and forgets."""
+
+from __future__ import annotations
+
+import hashlib
+import os
+import threading
+
+import pytest
+
+import contract
+from contract import PART_BYTES
+from device.allowance import Allowance
+from device.clock import ManualClock
+from device.dispatch import Dispatcher
+from device.errors import UploadError
+from device.loopback import Loopback
+from device.upload import make_uploader
+from device.upload_file import kind_of, read, wire_name
+from device.upload_folder import STATE, Folder, Uploads
+from device.upload_http import Outcome, Pace, Sender, trusting
+from tests.store_standin import store
+
+
+class Rig:
+    """A device with a loopback uplink and the store at its other end."""
+
+    def __init__(self, there, certificate, uplink, clock):
+        self.store, self.certificate, self.uplink, self.clock = there, certificate, uplink, clock
+        self.stop = threading.Event()
+        self.uploader = self.make()
+
+    def make(self):
+        return make_uploader(
+            robot="car",
+            namespace="iort",
+            uplink=self.uplink,
+            clock=self.clock,
+            allowance=Allowance(self.clock),
+            root_ca=self.certificate,
+            rate_kb_s=0,
+        )
+
+    def upload(self, path):
+        return self.uploader.upload(read(path, path.relative_to(path.parent), stop=self.stop), self.stop)
+
+    def folder(self, path, *, settle_s=10.0, remove_after_s=None):
+        watched = Folder(path, clock=self.clock, settle_s=settle_s, remove_after_s=remove_after_s)
+        return Uploads(folders=[watched], uploader=self.uploader, clock=self.clock)
+
+
+class WaitingClock(ManualClock):
+    """No time passes before what was sent has been answered, if it ever will be."""
+
+    def __init__(self, dispatcher):
+        super().__init__()
+        self._dispatcher = dispatcher
+
+    def wait(self, event, seconds):
+        # A request, the answer to it and what that sets are calls that follow one another.
+        for _ in range(4):
+            called = threading.Event()
+            self._dispatcher.post(called.set)
+            assert called.wait(60)
+        return super().wait(event, seconds)
+
+
+@pytest.fixture
+def rig(tmp_path):
+    dispatcher = Dispatcher()
+    clock = WaitingClock(dispatcher)
+    uplink = Loopback(clock, dispatcher)
+    folder = tmp_path / "tls"
+    folder.mkdir()
+    with store(uplink, folder) as (there, certificate):
+        made = Rig(there, certificate, uplink, clock)
+        uplink.start()
+        while not made.uploader.ready():
+            made.stop.wait(0.01)
+        yield made
+        uplink.stop(5)
+
+
+@pytest.fixture
+def large(tmp_path):
+    path = tmp_path / "large.bag"
+    path.write_bytes(os.urandom(2 * PART_BYTES + 1000))
+    return path
+
+
+@pytest.fixture
+def small(tmp_path):
+    path = tmp_path / "notes.txt"
+    path.write_bytes(b"driven well")
+    return path
+
+
+# --- what a file is ---------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("size", [0, 1, PART_BYTES - 1, PART_BYTES, PART_BYTES + 1, 2 * PART_BYTES])
+def test_a_file_is_hashed_whole_and_by_part(tmp_path, size):
+    content = os.urandom(size)
+    path = tmp_path / "f.bag"
+    path.write_bytes(content)
+    local = read(path, path.relative_to(tmp_path), stop=threading.Event())
+    assert (local.file.size, local.file.sha256) == (size, hashlib.sha256(content).hexdigest())
+    pieces = [content[i : i + PART_BYTES] for i in range(0, max(1, size), PART_BYTES)]
+    assert list(local.parts) == [hashlib.sha256(piece).hexdigest() for piece in pieces]
+    assert local.file.parts == len(local.parts)
+    assert contract.file_key("car", local.file).endswith("/f.bag")
+
+
+@pytest.mark.parametrize(
+    ("path", "name"),
+    [
+        ("drive.bag", "drive.bag"),
+        ("rosbag2_1/metadata.yaml", "rosbag2_1/metadata.yaml"),
+        ("Fahrt über Mittag (2).bag", "Fahrt__ber_Mittag__2_.bag"),
+        ("_hidden", "x_hidden"),
+        ("a/b/c/d/e.txt", "a/b/c/d_e.txt"),
+        ("x" * 150 + ".bag", "x" * 96 + ".bag"),
+    ],
+)
+def test_every_name_becomes_one_that_is_allowed(path, name, tmp_path):
+    from pathlib import PurePath
+
+    assert wire_name(PurePath(path)) == name
+    assert kind_of(PurePath("a.MCAP")) == ("recording", "application/x-mcap")
+
+
+# --- one file ---------------------------------------------------------------------------------------
+
+
+def test_small_and_large_files_arrive(rig, small, large):
+    for path in (small, large):
+        assert rig.store.objects[rig.upload(path)] == path.read_bytes()
+    assert rig.store.puts == [1, 1, 2, 3]
+    assert rig.uploader.sent_bytes == small.stat().st_size + large.stat().st_size
+    # To upload it again costs a question.
+    rig.upload(large)
+    assert rig.store.puts == [1, 1, 2, 3]
+
+
+@pytest.mark.parametrize("fault", ["reset", "mute", 500, 503, 403, 404, 412])
+def test_a_part_that_fails_is_sent_again_and_no_other(rig, large, fault):
+    first = rig.store.put
+
+    def put(part, content):
+        status = first(part, content)
+        if part == 1:
+            rig.store.faults = [fault]
+        return status
+
+    rig.store.put = put
+    assert rig.store.objects[rig.upload(large)] == large.read_bytes()
+    assert rig.store.puts == [1, 2, 2, 3]
+
+
+def test_a_break_in_the_middle_goes_on_with_what_is_missing(rig, large):
+    rig.store.put, put = lambda part, content: rig.stop.set() or put(part, content), rig.store.put
+    with pytest.raises(UploadError, match="stopped"):
+        rig.upload(large)
+    rig.store.put = put
+    assert list(rig.store.parts) == [1]
+    rig.stop.clear()
+    # Another process: it knows nothing but the file.
+    rig.uploader = rig.make()
+    assert rig.store.objects[rig.upload(large)] == large.read_bytes()
+    assert rig.store.puts == [1, 2, 3]
+
+
+def test_no_answer_is_asked_for_again_and_a_lost_one_costs_nothing(rig, small):
+    rig.store.silent = 2
+    assert rig.store.objects[rig.upload(small)] == b"driven well"
+    assert len(rig.store.requests) == 4
+    assert len({request.id for request in rig.store.requests}) == 4
+
+
+def test_what_the_cloud_refuses_is_said_with_its_reason(rig, small):
+    rig.store.refusals = [("no more than 5 bytes a day", 3600)]
+    with pytest.raises(UploadError, match=r"notes.txt: refused: no more than 5 bytes a day") as caught:
+        rig.upload(small)
+    assert caught.value.again_s == 3600
+
+
+def test_a_server_that_always_fails_is_given_up_for_now(rig, small):
+    rig.store.faults = [500] * 100
+    with pytest.raises(UploadError, match="the server says 500") as caught:
+        rig.upload(small)
+    assert caught.value.again_s == 300
+    assert len(rig.store.puts) == 6
+
+
+def test_a_file_that_changes_meanwhile_is_not_mixed(rig, large):
+    local = read(large, large.relative_to(large.parent), stop=rig.stop)
+    with large.open("r+b") as file:
+        file.write(b"changed")
+    with pytest.raises(UploadError, match="changes while") as caught:
+        rig.uploader.upload(local, rig.stop)
+    assert caught.value.again_s is not None
+    assert rig.store.puts == []
+    # The same by size and time, and yet another: what S3 computes tells.
+    os.utime(large, ns=(local.look.mtime_ns, local.look.mtime_ns))
+    with pytest.raises(UploadError, match="changes while"):
+        rig.uploader.upload(local, rig.stop)
+    assert not rig.store.objects
+
+
+def test_nothing_is_sent_in_the_clear_or_to_whom_we_do_not_trust(rig, small):
+    sender = Sender(trust=trusting(None), pace=Pace(rig.clock, 0))
+    url = rig.store._url
+    address = contract.Address(1, f"{url}/1", {"content-length": "11"})
+    put = sender.put(address, small, 0, 11, rig.stop)
+    assert put.outcome is Outcome.FAILED
+    assert "CERTIFICATE_VERIFY_FAILED" in put.text
+    with pytest.raises(UploadError, match="not https"):
+        sender.put(address._replace(url=url.replace("https", "http")), small, 0, 11, rig.stop)
+    assert rig.store.puts == []
+
+
+def test_no_faster_than_it_may(tmp_path):
+    clock, stop = ManualClock(), threading.Event()
+    pace, began = Pace(clock, 1000), clock.monotonic()
+    for _ in range(11):
+        pace.spend(500, stop)
+    assert clock.monotonic() - began == pytest.approx(5.0)
+
+
+# --- a folder ---------------------------------------------------------------------------------------
+
+
+@pytest.fixture
+def bags(tmp_path):
+    folder = tmp_path / "bags"
+    folder.mkdir()
+    return folder
+
+
+def test_only_finished_files_are_uploaded(rig, bags):
+    growing, link = bags / "a.bag", bags / "link.bag"
+    growing.write_bytes(b"1")
+    (bags / "b.bag.active").write_bytes(b"1")
+    (bags / ".hidden").write_bytes(b"1")
+    link.symlink_to(growing)
+    uploads = rig.folder(bags)
+    assert not uploads.step(rig.stop)
+    assert uploads.waiting() == 1
+    rig.clock.advance(9)
+    growing.write_bytes(b"12")
+    assert not uploads.step(rig.stop)
+    rig.clock.advance(9)
+    assert not uploads.step(rig.stop)
+    rig.clock.advance(2)
+    assert uploads.step(rig.stop)
+    assert list(rig.store.objects.values()) == [b"12"]
+    assert not uploads.step(rig.stop)
+    assert uploads.status() == {
+        "waiting": 0, "uploaded": 1, "sent_bytes": 2,
+        "current": None, "current_bytes": 0, "last_error": None,
+    }  # fmt: skip
+
+
+def test_a_new_process_neither_uploads_again_nor_reads_again(rig, bags, monkeypatch):
+    (bags / "drive").mkdir()
+    (bags / "drive" / "large.db3").write_bytes(os.urandom(PART_BYTES + 1))
+    (bags / "old.bag").write_bytes(b"old")
+    os.utime(bags / "old.bag", (1, 1))
+    uploads = rig.folder(bags, settle_s=0)
+    assert uploads.step(rig.stop)
+    # The end comes in the middle of the second.
+    rig.store.put, put = lambda part, content: rig.stop.set() or put(part, content), rig.store.put
+    uploads.step(rig.stop)
+    rig.store.put = put
+    assert list(rig.store.parts) == [1]
+    rig.stop.clear()
+    monkeypatch.setattr("device.upload_folder.read", None)
+    again = rig.folder(bags, settle_s=0)
+    assert again.step(rig.stop)
+    assert not again.step(rig.stop)
+    assert rig.store.puts == [1, 1, 2]
+    assert [key.rsplit("/", 2)[-2:] for key in rig.store.objects][1] == ["drive", "large.db3"]
+
+
+@pytest.mark.parametrize("damage", [b"", b"{", b"[]", b'{"read": {}}', b"\xff"])
+def test_a_damaged_state_costs_time_and_nothing_else(rig, bags, damage):
+    (bags / "a.bag").write_bytes(b"1")
+    assert rig.folder(bags, settle_s=0).step(rig.stop)
+    (bags / STATE).write_bytes(damage)
+    assert rig.folder(bags, settle_s=0).step(rig.stop)
+    assert rig.store.puts == [1]
+
+
+def test_a_file_that_was_uploaded_is_removed_when_it_is_time_and_only_then(rig, bags):
+    path = bags / "a.bag"
+    path.write_bytes(b"1")
+    uploads = rig.folder(bags, settle_s=0, remove_after_s=3600)
+    assert uploads.step(rig.stop)
+    rig.clock.advance(3599)
+    uploads.step(rig.stop)
+    assert path.exists()
+    rig.clock.advance(2)
+    uploads.step(rig.stop)
+    assert not path.exists()
+
+
+def test_a_file_that_changed_since_is_uploaded_again_and_not_removed(rig, bags):
+    path = bags / "a.bag"
+    path.write_bytes(b"1")
+    uploads = rig.folder(bags, settle_s=0, remove_after_s=3600)
+    assert uploads.step(rig.stop)
+    path.write_bytes(b"12")
+    rig.clock.advance(4000)
+    assert uploads.step(rig.stop)
+    assert path.exists()
+    assert sorted(rig.store.objects.values()) == [b"1", b"12"]
+
+
+def test_one_refused_file_holds_up_no_other(rig, bags):
+    for name, age in (("first.bag", 100), ("second.bag", 200)):
+        (bags / name).write_bytes(name.encode())
+        os.utime(bags / name, (age, age))
+    uploads = rig.folder(bags, settle_s=0)
+    rig.store.refusals = [("not today", 60)]
+    assert uploads.step(rig.stop)
+    assert "first.bag: refused: not today" in uploads.status()["last_error"]
+    assert uploads.step(rig.stop)
+    assert list(rig.store.objects.values()) == [b"second.bag"]
+    assert not uploads.step(rig.stop)
+    assert uploads.waiting() == 1
+    rig.clock.advance(61)
+    assert uploads.step(rig.stop)
+    assert b"first.bag" in rig.store.objects.values()

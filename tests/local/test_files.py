@@ -1,0 +1,275 @@
+"""Files from a robot into the bucket, on the embedded cloud with enforcement on."""
+
+from __future__ import annotations
+
+import hashlib
+import http.client
+import json
+import os
+import ssl
+import subprocess
+import sys
+import threading
+import uuid
+from pathlib import Path
+from typing import Any
+from urllib.parse import urlsplit
+
+import boto3
+import pytest
+from botocore.config import Config
+
+from contract import (
+    FILE,
+    FILES_PREFIX,
+    PART_BYTES,
+    PING,
+    PONG,
+    Address,
+    File,
+    FileAnswer,
+    FileRequest,
+    build_topic,
+    decode_file_answer,
+    encode_file_request,
+    file_key,
+)
+from device.clock import SystemClock
+from device.upload_http import Outcome, Pace, Sender, trusting
+from local.deployment import ROOT
+from tests.local.conftest import until
+from tests.local.drives import Agent
+from tests.local.robot import Robot
+
+CONTENT = b"a small file"
+T_US = 1_700_000_000_000_000
+
+
+class Bucket:
+    """The files' bucket as the operator sees it."""
+
+    def __init__(self, embedded: Any) -> None:
+        self.client = embedded.cloud.client("s3")
+        self.name = embedded.cloud.output("storage", "FilesBucket")
+
+    def keys(self, robot: str) -> list[str]:
+        found = self.client.list_objects_v2(Bucket=self.name, Prefix=f"{FILES_PREFIX}{robot}/")
+        return [one["Key"] for one in found.get("Contents", ())]
+
+    def content(self, key: str) -> bytes:
+        body: bytes = self.client.get_object(Bucket=self.name, Key=key)["Body"].read()
+        return body
+
+    def parts(self, robot: str) -> list[int]:
+        """The parts of the one upload that the robot has begun."""
+        listed = self.client.list_multipart_uploads(Bucket=self.name, Prefix=f"{FILES_PREFIX}{robot}/")
+        for begun in listed.get("Uploads", ()):
+            there = self.client.list_parts(Bucket=self.name, Key=begun["Key"], UploadId=begun["UploadId"])
+            return [part["PartNumber"] for part in there.get("Parts", ())]
+        return []
+
+
+@pytest.fixture
+def bucket(embedded):
+    return Bucket(embedded)
+
+
+def upload(car, *files, env=None):
+    """The robot's own command."""
+    command = [Path(sys.executable).parent / "iort-agent", "upload", "--config", car.config, "--json", *files]
+    done = subprocess.run(
+        command, cwd=ROOT, capture_output=True, text=True, check=False, timeout=180, env=env
+    )
+    return done.returncode, json.loads(done.stdout or "[]"), done.stderr
+
+
+def test_the_robots_command_uploads_small_and_large_files(bundle, bucket, tmp_path):
+    car = bundle()
+    small, large = tmp_path / "notes.txt", tmp_path / "drive.bag"
+    small.write_bytes(CONTENT)
+    large.write_bytes(os.urandom(2 * PART_BYTES + 12_345))
+    status, results, err = upload(car, small, large, tmp_path / "missing.bag")
+    assert status == 1
+    assert "missing.bag: No such file" in err
+    assert [one["error"] is None for one in results] == [True, True, False]
+    for path, result in zip((small, large), results, strict=False):
+        assert bucket.content(result["key"]) == path.read_bytes()
+        head = bucket.client.head_object(Bucket=bucket.name, Key=result["key"])
+        assert head["Metadata"]["sha256"] == hashlib.sha256(path.read_bytes()).hexdigest()
+    # The same again is found there.
+    assert upload(car, small)[1][0]["key"] == results[0]["key"]
+
+
+def test_a_large_file_in_a_watched_folder_survives_the_agents_end(bundle, bucket, tmp_path):
+    folder = tmp_path / "bags"
+    folder.mkdir()
+    large = folder / "drive.bag"
+    content = os.urandom(20 * 1024 * 1024)
+    large.write_bytes(content)
+    files = {"folder": str(folder), "settle_s": 1, "remove_after_s": 0}
+    source = {"type": "sim", "stream": "vesc", "rate_hz": 10}
+    car = bundle(sources=[source], files={**files, "rate_kb_s": 4000})
+    agent = Agent(car)
+    until(lambda: bucket.parts(car.robot), seconds=120)
+    agent.kill()
+    there = bucket.parts(car.robot)
+    assert not bucket.keys(car.robot)
+    assert large.exists()
+
+    from station import robots
+
+    robots.configure(car, {"files": {**files, "rate_kb_s": 0}})
+    agent = Agent(car)
+    (key,) = until(lambda: bucket.keys(car.robot), seconds=120)
+    assert bucket.content(key) == content
+    until(lambda: not large.exists(), seconds=60)
+    status = agent.status()["files"]
+    agent.process.terminate()
+    agent.report()
+    # What was there when it was killed was not sent again.
+    sizes = {1: PART_BYTES, 2: PART_BYTES, 3: len(content) - 2 * PART_BYTES}
+    assert there
+    assert status["sent_bytes"] == sum(size for part, size in sizes.items() if part not in there)
+    assert (status["waiting"], status["uploaded"], status["last_error"]) == (0, 1, None)
+
+
+# --- what a robot may not, with its own certificate and its own hands -------------------------------
+
+
+class Asking(Robot):
+    """A robot that asks about files by hand."""
+
+    def ask(self, request: FileRequest) -> FileAnswer:
+        assert self.publish(build_topic(PING, self.name, FILE), encode_file_request(request)) == "SUCCESS"
+        while True:
+            answer = decode_file_answer(self.next_message()[1])
+            if answer.id == request.id:
+                return answer
+
+
+@pytest.fixture
+def robot(bundle):
+    with Asking(bundle().folder) as asking:
+        asking.online()
+        assert asking.subscribe(build_topic(PONG, asking.name, FILE)) == "GRANTED_QOS_1"
+        yield asking
+
+
+def request_for(content: bytes, name: str = "notes.txt") -> FileRequest:
+    sha256 = hashlib.sha256(content).hexdigest()
+    file = File(name, "log", "text/plain", len(content), sha256, T_US)
+    return FileRequest(uuid.uuid4().hex, file, {1: sha256})
+
+
+@pytest.fixture
+def put(embedded):
+    """Send a body to an address as it is; the status, and the code of S3's error."""
+    context = ssl.create_default_context(cafile=embedded.cloud.ca_bundle)
+
+    def send(address: Address, body: bytes) -> tuple[int, str]:
+        url = urlsplit(address.url)
+        connection = http.client.HTTPSConnection(url.hostname or "", url.port, context=context, timeout=60)
+        connection.request("PUT", f"{url.path}?{url.query}", body, dict(address.headers))
+        answer = connection.getresponse()
+        text = answer.read().decode()
+        connection.close()
+        return answer.status, text.partition("<Code>")[2].partition("</Code>")[0]
+
+    return send
+
+
+def test_an_address_is_good_for_one_content_under_one_key_once(robot, put, bucket):
+    (address,) = robot.ask(request_for(CONTENT)).addresses
+    key = file_key(robot.name, request_for(CONTENT).file)
+    more = {**address.headers, "content-length": str(len(CONTENT) + 1)}
+    unconditional = {n: v for n, v in address.headers.items() if n != "if-none-match"}
+    other = address.url.replace(f"/{robot.name}/", "/another/")
+    assert other != address.url
+    assert put(address, CONTENT[::-1]) == (400, "BadDigest")
+    for changed, body in (
+        (address._replace(headers=more), CONTENT + b"x"),
+        (address._replace(headers=unconditional), CONTENT),
+        (address._replace(url=other), CONTENT),
+        (address._replace(url=address.url.replace("notes.txt", "other.txt")), CONTENT),
+    ):
+        assert put(changed, body) == (403, "SignatureDoesNotMatch")
+    assert bucket.keys(robot.name) == bucket.keys("another") == []
+    assert put(address, CONTENT) == (200, "")
+    assert put(address, CONTENT) == (412, "PreconditionFailed")
+    assert bucket.keys(robot.name) == [key]
+    assert robot.ask(request_for(CONTENT)).stored
+
+
+def test_a_part_is_good_for_its_content(robot, put):
+    content = bytes(PART_BYTES) + b"rest"
+    sha256 = hashlib.sha256(content).hexdigest()
+    file = File("drive.bag", "recording", "application/x-rosbag", len(content), sha256, T_US)
+    rest = hashlib.sha256(b"rest").hexdigest()
+    (address,) = robot.ask(FileRequest(uuid.uuid4().hex, file, {2: rest})).addresses
+    assert put(address, b"evil") == (400, "BadDigest")
+    elsewhere = address._replace(url=address.url.replace("partNumber=2", "partNumber=1"))
+    assert put(elsewhere, b"rest") == (403, "SignatureDoesNotMatch")
+    assert put(address, b"rest") == (200, "")
+    assert robot.ask(FileRequest(uuid.uuid4().hex, file, {2: rest})).have == ((2, 2),)
+
+
+@pytest.mark.parametrize("name", ["../other/x", "/etc/passwd", "a//b", ".ssh"])
+def test_a_name_that_leads_elsewhere_is_refused(robot, name):
+    envelope = json.loads(encode_file_request(request_for(CONTENT)))
+    envelope["file"]["name"] = name
+    # Nor does it help to name another robot.
+    envelope["robot"] = "another"
+    robot.publish(build_topic(PING, robot.name, FILE), json.dumps(envelope).encode())
+    answer = decode_file_answer(robot.next_message()[1])
+    assert answer.refused is not None
+    assert "file name" in answer.refused
+
+
+def test_a_robot_neither_asks_nor_hears_for_another(robot):
+    request = encode_file_request(request_for(CONTENT))
+    assert robot.publish(build_topic(PING, "another", FILE), request) == "NOT_AUTHORIZED"
+    assert robot.subscribe(build_topic(PONG, "another", FILE)) == "NOT_AUTHORIZED"
+    assert robot.subscribe(f"{PONG}/iort/+/{FILE}") == "NOT_AUTHORIZED"
+    assert robot.publish(build_topic(PONG, robot.name, FILE), b"{}") == "NOT_AUTHORIZED"
+
+
+def test_a_day_has_so_many_bytes(robot, embedded):
+    table = embedded.cloud.output("storage", "RobotsTable")
+    assert robot.ask(request_for(CONTENT)).addresses
+    embedded.cloud.client("dynamodb").update_item(
+        TableName=table,
+        Key={"robot": {"S": robot.name}},
+        UpdateExpression="SET files_bytes = :most",
+        ExpressionAttributeValues={":most": {"N": str(50 * 10**9)}},
+    )
+    answer = robot.ask(request_for(b"another"))
+    assert answer.refused is not None
+    assert "bytes a day" in answer.refused
+
+
+def test_an_address_that_has_expired_is_one_to_ask_for_again(embedded, bucket, robot, tmp_path):
+    """Addresses live for 15 minutes; this one is signed for a second, by the operator's own key."""
+    cloud = embedded.cloud
+    signer = boto3.client(
+        "s3",
+        region_name=cloud.region,
+        endpoint_url=cloud.endpoint_url,
+        aws_access_key_id=cloud.access_key_id,
+        aws_secret_access_key=cloud.secret_access_key,
+        config=Config(signature_version="s3v4"),
+    )
+    url = signer.generate_presigned_url(
+        "put_object", Params={"Bucket": bucket.name, "Key": "results/expired"}, ExpiresIn=1
+    )
+    path = tmp_path / "notes.txt"
+    path.write_bytes(CONTENT)
+    clock = SystemClock()
+    sender = Sender(trust=trusting(Path(cloud.ca_bundle)), pace=Pace(clock, 0))
+    address = Address(1, url, {"content-length": str(len(CONTENT))})
+
+    def sent():
+        return sender.put(address, path, 0, len(CONTENT), threading.Event())
+
+    put = until(lambda: (one := sent()).outcome is not Outcome.STORED and one, seconds=60)
+    assert put.outcome is Outcome.STALE
+    assert "403" in put.text
