@@ -792,6 +792,7 @@ RULE_TOPICS = {
     "live": ("live", "vesc"),
     "pong": ("ping", "rule"),
     "echo": ("ping", "lambda"),
+    "upload": ("ping", "file"),
 }
 
 
@@ -801,7 +802,9 @@ def test_rule_listens_to_its_own_topics_of_the_contract(rule, namespace):
     sql = contract.rule_sql(rule, namespace)
     [pattern] = re.findall(r"FROM '([^']*)'", sql)
     assert pattern.split("/")[:2] == [RULE_TOPICS[rule][0], namespace]
-    every = [(lane, name) for lane in contract.LANES for name in ("vesc", *contract.PING_PATHS)]
+    every = [
+        (lane, name) for lane in contract.LANES for name in ("vesc", contract.FILE, *contract.PING_PATHS)
+    ]
     heard = {
         pair for pair in every if matches(pattern, contract.build_topic(pair[0], "car", pair[1], namespace))
     }
