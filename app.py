@@ -35,12 +35,20 @@ def build(app: App, settings: Settings) -> list[Acknowledged]:
             "termination_protection": settings.protected,
         }
 
-    Fleet(app, **stack("fleet"), namespace=name)
     storage = Storage(app, **stack("storage"), settings=settings)
+    fleet = Fleet(app, **stack("fleet"), settings=settings, storage=storage)
     processing = Processing(app, **stack("processing"), settings=settings, storage=storage)
-    ingest = Ingest(app, **stack("ingest"), settings=settings, storage=storage, processing=processing)
+    ingest = Ingest(
+        app, **stack("ingest"), settings=settings, storage=storage, processing=processing, fleet=fleet
+    )
     Monitoring(
-        app, **stack("monitoring"), settings=settings, storage=storage, processing=processing, ingest=ingest
+        app,
+        **stack("monitoring"),
+        settings=settings,
+        storage=storage,
+        processing=processing,
+        ingest=ingest,
+        fleet=fleet,
     )
     for key, value in {"project": name, "stage": settings.stage, **settings.tags}.items():
         Tags.of(app).add(key, value)

@@ -140,7 +140,9 @@ def record_topic(robot: str, stream: str, namespace: str = DEFAULT_NAMESPACE) ->
 
 # --- rules, tables, metrics, PubNub --------------------------------------------------------------
 
-RULES = ("record", "live", "pong", "echo", "upload")
+# Where the broker says who came and went.
+_PRESENCE = "$aws/events/presence"
+RULES = ("record", "live", "pong", "echo", "upload", "presence", "version")
 # The files' bucket: what robots upload, and query results too large for an answer, kept for a day.
 FILES_PREFIX, RESULTS_PREFIX = "robots/", "results/"
 
@@ -156,6 +158,31 @@ STATS = ("min", "mean", "max", "last")
 SAMPLES, BATCHES, MISSING_BATCHES = "n", "batches", "missing_batches"
 GAPS, NONFINITE = "gaps", "nonfinite"
 
+# The registry's row of a robot, beside its vehicle parameters. Of its connection, by the broker's
+# lifecycle events: times are the broker's, and the certificate is the one that it connected with.
+ONLINE, LAST_SEEN_MS = "online", "last_seen_ms"
+CONNECTED_MS, DISCONNECTED_MS = "connected_ms", "disconnected_ms"
+DISCONNECT_REASON, CERTIFICATE_ID, AGENT_VERSION = "disconnect_reason", "certificate_id", "agent_version"
+# Grows by connection, and orders the events, which may overtake each other.
+SESSION_VERSION = "session_version"
+PRESENCE = (
+    ONLINE,
+    CONNECTED_MS,
+    DISCONNECTED_MS,
+    LAST_SEEN_MS,
+    DISCONNECT_REASON,
+    CERTIFICATE_ID,
+    AGENT_VERSION,
+    SESSION_VERSION,
+)
+# Of its provisioning: the machine that has the name, until when a certificate may be issued for it and
+# for which claim alone, and the certificate that was issued last.
+SERIAL, ADMIT_UNTIL_S, ADMIT_CLAIM = "serial", "admit_until_s", "admit_claim"
+ADMITTED_CERTIFICATE, ADMITTED_MS = "admitted_certificate", "admitted_ms"
+ADMISSION = (SERIAL, ADMIT_UNTIL_S, ADMIT_CLAIM, ADMITTED_CERTIFICATE, ADMITTED_MS)
+# The provisioning template's parameters.
+ROBOT_PARAMETER, SERIAL_PARAMETER = "Robot", "Serial"
+
 METRIC_NAMESPACE = "iort"
 # The dimensions of every metric: the deployment's namespace and what emits it.
 METRIC_DEPLOYMENT, METRIC_FUNCTION = "Deployment", "Function"
@@ -164,6 +191,8 @@ METRICS = {
     "summarize": ("BatchesSummarized", "SamplesSummarized", "BatchesRefused", "BatchesMissing"),
     "echo": ("PongsSent",),
     "upload": ("FilesAsked", "FilesStored", "FilesRefused", "StoredBytes"),
+    "admit": ("RobotsAdmitted", "RobotsRefused"),
+    "presence": ("RobotsConnected", "RobotsDisconnected", "PresenceIgnored"),
 }
 
 
@@ -190,6 +219,14 @@ def rule_sql(rule: str, namespace: str = DEFAULT_NAMESPACE, retention_s: int = 9
         return f"SELECT *, topic() AS {TOPIC}, {received} FROM '{PING}/{name}/+/{LAMBDA}'"
     if rule == "upload":
         return f"SELECT *, topic() AS {TOPIC}, {received} FROM '{PING}/{name}/+/{FILE}'"
+    if rule == "presence":
+        return f"SELECT * FROM '{_PRESENCE}/+/+' WHERE eventType <> 'connect_failed'"
+    if rule == "version":
+        reported = f"state.reported.{AGENT_VERSION}"
+        return (
+            f"SELECT {reported} AS {AGENT_VERSION}, topic(3) AS {ROBOT} "
+            f"FROM '$aws/things/+/shadow/name/{SHADOW}/update/accepted' WHERE {reported} <> ''"
+        )
     raise ContractError(f"rule {_show(rule)}: allowed is one of {', '.join(RULES)}")
 
 

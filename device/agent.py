@@ -7,6 +7,7 @@ import logging
 import os
 import threading
 import uuid
+from importlib.metadata import version
 from typing import Any, Mapping
 
 import contract
@@ -96,6 +97,7 @@ class Agent:
             base=self._tuning,
             apply=self.tune,
             known_fields=lambda: dict(self._fields),
+            version=version("iort"),
             uplink=uplink,
             clock=clock,
             allowance=allowance,

@@ -125,7 +125,7 @@ def _register(claim: Claim, robot: str) -> tuple[str, str]:
     key, request = make_key(robot)
     with _Exchange(claim) as exchange:
         certificate, token = exchange.certify(request)
-        thing = exchange.register(token, {"Robot": robot, "Serial": serial})
+        thing = exchange.register(token, {contract.ROBOT_PARAMETER: robot, contract.SERIAL_PARAMETER: serial})
     if thing != robot:
         raise IdentityError(f"the cloud registered {thing}, not {robot}: its template is not ours")
     return key, certificate

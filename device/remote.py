@@ -12,7 +12,7 @@ import json
 import logging
 from typing import Any, Callable, Mapping
 
-from contract import SHADOW
+from contract import AGENT_VERSION, SHADOW
 from device.allowance import Allowance
 from device.clock import Clock
 from device.errors import UplinkError
@@ -28,7 +28,8 @@ _NOT_FOUND = 404
 
 
 class Remote:
-    """Follows the shadow. `tick` is called now and then, the rest by the uplink."""
+    """Follows the shadow, and says there which version of the agent does so. `tick` is called now and
+    then, the rest by the uplink."""
 
     def __init__(
         self,
@@ -37,6 +38,7 @@ class Remote:
         base: Tuning,
         apply: Callable[[Tuning], None],
         known_fields: Callable[[], Mapping[str, Any]],
+        version: str,
         uplink: Uplink,
         clock: Clock,
         allowance: Allowance,
@@ -44,6 +46,7 @@ class Remote:
         self._base = self.tuning = base
         self._apply = apply
         self._known_fields = known_fields
+        self._agent_version = version
         self._uplink = uplink
         self._clock = clock
         self._allowance = allowance
@@ -149,7 +152,7 @@ class Remote:
         rejected = {
             name: {**refusal, "value": _quoted(refusal["value"])} for name, refusal in self._rejected.items()
         }
-        return {**self.tuning.as_document(), "rejected": rejected}
+        return {**self.tuning.as_document(), "rejected": rejected, AGENT_VERSION: self._agent_version}
 
     def _publish(self, topic: str, payload: bytes) -> None:
         self._allowance.spend(topic, payload)

@@ -218,15 +218,17 @@ class EmbeddedCloud:
         message that waits for it is stale by then.
         """
         self._progress("functions")
-        warm_up: dict[str, dict[str, Any]] = {
-            "Live": {},
-            "Summarize": {"Records": []},
-            "Echo": self._ping(),
-            "Upload": {TOPIC: build_topic(PING, "warm-up", FILE, self.namespace)},
+        warm_up: dict[tuple[str, str], dict[str, Any]] = {
+            ("processing", "Live"): {},
+            ("processing", "Summarize"): {"Records": []},
+            ("processing", "Echo"): self._ping(),
+            ("processing", "Upload"): {TOPIC: build_topic(PING, "warm-up", FILE, self.namespace)},
+            ("fleet", "Admit"): {},
+            ("fleet", "Presence"): {},
         }
         client = self.cloud.client("lambda")
-        for name, event in warm_up.items():
-            function = self.cloud.output("processing", f"{name}Function")
+        for (stack, name), event in warm_up.items():
+            function = self.cloud.output(stack, f"{name}Function")
             answer = client.invoke(FunctionName=function, Payload=json.dumps(event).encode())
             if "FunctionError" in answer:
                 reason = answer["Payload"].read().decode(errors="replace")

@@ -1,7 +1,8 @@
 """What the embedded cloud lacks of AWS and this project relies on.
 
 ministack is pinned, and each gap is one wrapper around one of its functions; tests/local/test_gaps.py
-fails when a release changes what is wrapped or closes the gap itself. In order:
+fails when a release changes what is wrapped or closes the gap itself. Sessions that AWS would end are in
+local/cut_sessions.py; here, in order:
 
 - a republish action's topic is not expanded: ``${topic(3)}`` stays literal;
 - the SQL function floor() gives nothing;
@@ -31,6 +32,8 @@ from typing import Any
 from ministack.core import iam_evaluator
 from ministack.services import iot, lambda_svc
 
+from local import cut_sessions
+
 # "Message size" in AWS IoT Core's service quotas.
 AWS_MESSAGE_BYTES = 128 * 1024
 _CSR = "create-from-csr"
@@ -43,6 +46,7 @@ class MessageTooLargeError(ConnectionError):
 
 def install() -> None:
     """Close the gaps in this process, before the emulator starts."""
+    cut_sessions.install()
     iot._run_rule_actions = _expanding_republish(iot._run_rule_actions)  # noqa: SLF001
     iot._eval_select_function = _with_floor(iot._eval_select_function)  # noqa: SLF001
     iot._IMPLEMENTED_SQL_FUNCS |= {"floor"}  # noqa: SLF001

@@ -6,9 +6,10 @@ from __future__ import annotations
 import json
 from typing import Any
 
-from aws_cdk import Stack
+from aws_cdk import Duration, Stack
 from aws_cdk import aws_iam as iam
 from aws_cdk import aws_iot as iot
+from aws_cdk import aws_lambda as lambda_
 from constructs import Construct
 
 from contract import (
@@ -19,11 +20,16 @@ from contract import (
     PING,
     PONG,
     RECORD,
+    ROBOT_PARAMETER,
+    SERIAL_PARAMETER,
     SHADOW,
     claim_name,
     fleet_name,
     rule_name,
 )
+from stacks.function import function
+from stacks.settings import Settings
+from stacks.storage import Storage
 
 # A robot's name is its thing name and its client id; the certificate is attached to the thing.
 _ME = "${iot:Connection.Thing.ThingName}"
@@ -33,8 +39,7 @@ class Fleet(Stack):
     """What every robot is registered with. One policy serves all: its variables bind each
     certificate to the topics of the thing that it is attached to.
 
-    ``hook`` is the ARN of a function that decides whether a claim may have the name it asks for;
-    without one, only the serial number keeps a second robot from a name that is taken.
+    ``admit`` decides whether a claim may have the name it asks for, ``presence`` keeps the robots' rows.
     """
 
     def __init__(
@@ -42,11 +47,16 @@ class Fleet(Stack):
         scope: Construct,
         construct_id: str,
         *,
-        namespace: str,
-        hook: str | None = None,
+        settings: Settings,
+        storage: Storage,
         **kwargs: Any,
     ) -> None:
         super().__init__(scope, construct_id, **kwargs)
+        self._settings = settings
+        namespace = settings.namespace
+        self.admit = self._admit(storage)
+        self.presence = self._presence(storage)
+        self.functions = (self.admit, self.presence)
         name = fleet_name(namespace)
         robot_type = iot.CfnThingType(
             self,
@@ -75,16 +85,53 @@ class Fleet(Stack):
             description="Registers a robot that made its own key",
             enabled=True,
             provisioning_role_arn=role.role_arn,
-            pre_provisioning_hook=None
-            if hook is None
-            else iot.CfnProvisioningTemplate.ProvisioningHookProperty(
-                payload_version="2020-04-01", target_arn=hook
+            pre_provisioning_hook=iot.CfnProvisioningTemplate.ProvisioningHookProperty(
+                payload_version="2020-04-01", target_arn=self.admit.function_arn
             ),
             template_body=json.dumps(provisioning_template(namespace)),
         )
-        # RegisterThing names them, and the role's policy must be there before the role is tried.
-        for needed in (robot_type, robots, policy, role):
+        asking = lambda_.CfnPermission(
+            self,
+            "AdmitPermission",
+            action="lambda:InvokeFunction",
+            function_name=self.admit.function_arn,
+            principal="iot.amazonaws.com",
+            source_account=self.account,
+            source_arn=self.format_arn(service="iot", resource="provisioningtemplate", resource_name=name),
+        )
+        # RegisterThing names them, and role and hook are tried when the template is made.
+        for needed in (robot_type, robots, policy, role, asking):
             template.node.add_dependency(needed)
+
+    def _admit(self, storage: Storage) -> lambda_.Function:
+        # AWS IoT waits 5 s for the answer; processor time comes with memory, and a cold start needs it.
+        admit = function(
+            self,
+            "Admit",
+            settings=self._settings,
+            encryption=storage.encryption,
+            module="admit",
+            memory_mb=512,
+            timeout_s=4,
+            environment={"ROBOTS_TABLE": storage.robots.table_name},
+        )
+        storage.robots.grant(admit, "dynamodb:UpdateItem")
+        return admit
+
+    def _presence(self, storage: Storage) -> lambda_.Function:
+        presence = function(
+            self,
+            "Presence",
+            settings=self._settings,
+            encryption=storage.encryption,
+            module="presence",
+            memory_mb=256,
+            environment={"ROBOTS_TABLE": storage.robots.table_name},
+        )
+        # An event that comes late is put in its place or ignored, so it may be tried again for long.
+        presence.configure_async_invoke(max_event_age=Duration.hours(6), retry_attempts=2)
+        storage.robots.grant(presence, "dynamodb:UpdateItem")
+        return presence
 
     def _provisioning_role(self, name: str) -> iam.Role:
         """What AWS IoT does in the template's name: this fleet's things, and certificates."""
@@ -121,7 +168,7 @@ def provisioning_template(namespace: str) -> dict[str, Any]:
     number is refused: two robots do not share a name."""
     name = fleet_name(namespace)
     return {
-        "Parameters": {"Robot": {"Type": "String"}, "Serial": {"Type": "String"}},
+        "Parameters": {ROBOT_PARAMETER: {"Type": "String"}, SERIAL_PARAMETER: {"Type": "String"}},
         "Resources": {
             "certificate": {
                 "Type": "AWS::IoT::Certificate",
@@ -131,10 +178,10 @@ def provisioning_template(namespace: str) -> dict[str, Any]:
             "thing": {
                 "Type": "AWS::IoT::Thing",
                 "Properties": {
-                    "ThingName": {"Ref": "Robot"},
+                    "ThingName": {"Ref": ROBOT_PARAMETER},
                     "ThingTypeName": name,
                     "ThingGroups": [name],
-                    "AttributePayload": {"vehicle": "vesc", "serial": {"Ref": "Serial"}},
+                    "AttributePayload": {"vehicle": "vesc", "serial": {"Ref": SERIAL_PARAMETER}},
                 },
                 "OverrideSettings": {
                     "AttributePayload": "FAIL",

@@ -12,6 +12,7 @@ from aws_cdk import aws_sqs as sqs
 from constructs import Construct
 
 from contract import PONG, RULE, pong_template, rule_name, rule_sql
+from stacks.fleet import Fleet
 from stacks.processing import Processing
 from stacks.settings import Settings
 from stacks.storage import Storage
@@ -20,7 +21,7 @@ Action = iot.CfnTopicRule.ActionProperty
 
 
 class Ingest(Stack):
-    """The rules record, live, pong, echo and upload. What an action cannot take goes to ``rejected``, with
+    """The rules, by which messages leave the broker. What an action cannot take goes to ``rejected``, with
     the message's own bytes (base64OriginalPayload) and the reason."""
 
     def __init__(
@@ -31,6 +32,7 @@ class Ingest(Stack):
         settings: Settings,
         storage: Storage,
         processing: Processing,
+        fleet: Fleet,
         **kwargs: Any,
     ) -> None:
         super().__init__(scope, construct_id, **kwargs)
@@ -50,6 +52,8 @@ class Ingest(Stack):
             self._pong(),
             self._lambda_rule("echo", processing.echo),
             self._lambda_rule("upload", processing.upload),
+            self._lambda_rule("presence", fleet.presence),
+            self._lambda_rule("version", fleet.presence),
         ]
 
     def _record(self, storage: Storage) -> iot.CfnTopicRule:

@@ -11,19 +11,14 @@ from aws_cdk import aws_lambda as lambda_
 from constructs import Construct
 
 from contract import METRIC_DEPLOYMENT, METRIC_FUNCTION, METRIC_NAMESPACE, METRICS, RULES, rule_name
+from stacks.fleet import Fleet
 from stacks.ingest import Ingest
 from stacks.processing import Processing
 from stacks.settings import Settings
 from stacks.storage import Storage
 
 # The action each rule runs, as IoT Core names it in the dimension ActionType of its metrics.
-_ACTION_TYPES = {
-    "record": "DynamoDBv2",
-    "live": "Lambda",
-    "pong": "Republish",
-    "echo": "Lambda",
-    "upload": "Lambda",
-}
+_ACTION_TYPES = dict.fromkeys(RULES, "Lambda") | {"record": "DynamoDBv2", "pong": "Republish"}
 _PERIOD = Duration.minutes(1)
 
 
@@ -39,6 +34,7 @@ class Monitoring(Stack):
         storage: Storage,
         processing: Processing,
         ingest: Ingest,
+        fleet: Fleet,
         **kwargs: Any,
     ) -> None:
         super().__init__(scope, construct_id, **kwargs)
@@ -51,7 +47,7 @@ class Monitoring(Stack):
         )
         dashboard.add_widgets(*self._broker(), *self._rules())
         dashboard.add_widgets(*self._storage(storage))
-        dashboard.add_widgets(*self._functions(processing))
+        dashboard.add_widgets(*self._functions(processing, fleet))
         dashboard.add_widgets(*self._own(), self._queues(processing, ingest))
         if settings.budget_usd:
             self._budget(settings)
@@ -126,8 +122,9 @@ class Monitoring(Stack):
         return [_graph("Tables: capacity units", units), _graph("Tables: throttled", throttled)]
 
     @staticmethod
-    def _functions(processing: Processing) -> list[cloudwatch.GraphWidget]:
+    def _functions(processing: Processing, fleet: Fleet) -> list[cloudwatch.GraphWidget]:
         named = dict(zip(("live", "summarize", "echo", "upload"), processing.functions, strict=True))
+        named |= {"admit": fleet.admit, "presence": fleet.presence}
 
         def each(
             title: str, metric: str, statistic: str, *also: cloudwatch.IMetric

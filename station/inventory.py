@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from contract import OWN_STREAMS, ROBOT, VESC_STREAM
 from functions.statistics import Vehicle
-from station import reading, robots
+from station import reading, registry, robots
 from station.cloud import Cloud
 from station.errors import StationError
 from station.times import iso
@@ -12,7 +12,7 @@ from station.times import iso
 
 def vehicle_of(cloud: Cloud, robot: str) -> Vehicle | None:
     """The robot's parameters in the registry; None where they are not there."""
-    row = robots.row(cloud, robot)
+    row = registry.find(cloud, robot)
     if row is None or not row.get("speed_to_erpm_gain"):
         return None
     return Vehicle(float(row["speed_to_erpm_gain"]), float(row.get("speed_to_erpm_offset", 0)))

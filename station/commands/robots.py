@@ -3,18 +3,35 @@
 from __future__ import annotations
 
 import json
+import time
+from collections.abc import Mapping
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import typer
 from rich.console import Console
+from rich.table import Table
 
-from contract import ROBOT
-from station import robots
+from contract import (
+    ADMISSION,
+    ADMIT_UNTIL_S,
+    AGENT_VERSION,
+    CONNECTED_MS,
+    DISCONNECT_REASON,
+    DISCONNECTED_MS,
+    ONLINE,
+    PRESENCE,
+    ROBOT,
+)
+from station import certificates, claims, registry, robots, rotation
 from station.errors import StationError
+from station.times import iso
 
 commands = typer.Typer(no_args_is_help=True, help="The robots that may connect.")
-_out = Console(highlight=False)
+_out, _errors = Console(highlight=False), Console(stderr=True, highlight=False)
+
+_GAIN = typer.Option(help="erpm per m/s (vesc.yaml).")
+_CLAIM_FOLDER = typer.Option(help="The folder to write the claim into.")
 
 
 @commands.command("add")
@@ -24,46 +41,181 @@ def add(
     out: Annotated[
         Path, typer.Option(help="Where the robot's folder of configuration and keys goes.")
     ] = Path(),
-    speed_to_erpm_gain: Annotated[float, typer.Option(help="erpm per m/s (vesc.yaml).")] = 4614.0,
+    speed_to_erpm_gain: Annotated[float, _GAIN] = 4614.0,
 ) -> None:
     """Register a robot and write the folder that it needs: car.yaml, certificate and key."""
-    vehicle = {**robots.F1TENTH, "speed_to_erpm_gain": speed_to_erpm_gain}
-    bundle = robots.add(context.obj.cloud(), name, out=out, vehicle=vehicle)
+    bundle = robots.add(context.obj.cloud(), name, out=out, vehicle=_vehicle(speed_to_erpm_gain))
     _out.print(f"{name} is registered. Copy {bundle.folder} to it, then run there:\n")
     _out.print(f"  iort-agent --config {bundle.folder.name}/car.yaml")
+
+
+@commands.command("register")
+def register(
+    context: typer.Context,
+    names: Annotated[list[str], typer.Argument(help="The robots' names.")],
+    serial: Annotated[
+        str | None, typer.Option(help="The one machine that may have the name, by its serial number.")
+    ] = None,
+    days: Annotated[float, typer.Option(help="How long it is expected.", min=0)] = claims.DAYS,
+    speed_to_erpm_gain: Annotated[float, _GAIN] = 4614.0,
+) -> None:
+    """Expect robots: each name may be had once, by any robot with one of the fleet's lasting claims."""
+    if serial is not None and len(names) != 1:
+        raise StationError("--serial is of one machine: give one name with it")
+    cloud, vehicle = context.obj.cloud(), _vehicle(speed_to_erpm_gain)
+    for name in names:
+        claims.register(cloud, name, serial=serial, days=days, vehicle=vehicle)
+        _out.print(f"{name} is expected for {days:g} days")
 
 
 @commands.command("claim")
 def claim(
     context: typer.Context,
     name: Annotated[str | None, typer.Argument(help="The robot's name; none for --lasting ones.")] = None,
-    out: Annotated[Path, typer.Option(help="The folder to write the claim into.")] = Path("claim"),
+    out: Annotated[Path, _CLAIM_FOLDER] = Path("claim"),
     lasting: Annotated[bool, typer.Option(help="Good until revoked, not for five minutes.")] = False,
 ) -> None:
-    """Write a claim, which the robot exchanges for a certificate of its own key's."""
+    """Write a claim, which the robot exchanges for a certificate of its own key's.
+
+    It is for NAME alone, registered here or opened again. Without a name, a lasting claim is for the
+    names that were registered (`iort robots register`), each of them once.
+    """
     if name is None and not lasting:
         raise StationError("give the robot's name, or --lasting for a claim of many robots")
-    path = robots.claim(context.obj.cloud(), name, out=out, lasting=lasting)
+    path = claims.claim(context.obj.cloud(), name, out=out, lasting=lasting)
     _out.print(f"Copy {out} to the robot, then run there:\n")
     _out.print(f"  iort-agent provision --config {out.name}/{path.name}")
+
+
+@commands.command("rotate")
+def rotate(
+    context: typer.Context,
+    name: str,
+    out: Annotated[Path, _CLAIM_FOLDER] = Path("claim"),
+    finish: Annotated[
+        bool, typer.Option("--finish", help="The robot has its new certificate: wait, and revoke.")
+    ] = False,
+    wait: Annotated[bool, typer.Option(help="Wait for the robot, and revoke what is old then.")] = True,
+    settled_s: Annotated[
+        float, typer.Option(help="How long it must be connected with the new one, seconds.", min=0)
+    ] = rotation.SETTLED_S,
+) -> None:
+    """Give a robot a new key and certificate; the old one is revoked once the new one is in use.
+
+    The robot stays able to connect at every moment, and the command may be stopped at any: `--finish`
+    goes on with what is left to do.
+    """
+    cloud = context.obj.cloud()
+    if not finish:
+        registry.get(cloud, name)
+        path = claims.claim(cloud, name, out=out)
+        _out.print(f"Copy {out} to {name} within five minutes, then run there:\n")
+        _out.print(f"  iort-agent renew --config car.yaml --claim {out.name}/{path.name}\n")
+    if finish or wait:
+        with _errors.status("waiting") as status:
+            old = rotation.finish(cloud, name, settled_s=settled_s, progress=status.update)
+        _out.print(f"{name} has settled with its new certificate; revoked: {len(old)}")
 
 
 @commands.command("list")
 def list_(
     context: typer.Context, as_json: Annotated[bool, typer.Option("--json", help="As JSON.")] = False
 ) -> None:
-    """List the registered robots and their parameters."""
+    """List the registered robots: who is online, and their parameters."""
     rows = sorted(robots.listed(context.obj.cloud()), key=lambda row: str(row[ROBOT]))
     if as_json:
         _out.print_json(json.dumps(rows, default=float))
         return
+    table = Table("robot", "connection", "agent", "parameters", box=None, pad_edge=False)
     for row in rows:
-        parameters = ", ".join(f"{key} {value}" for key, value in sorted(row.items()) if key != ROBOT)
-        _out.print(f"{row[ROBOT]}  {parameters}")
+        table.add_row(row[ROBOT], _connection(row), row.get(AGENT_VERSION, ""), _parameters(row))
+    _out.print(table)
+
+
+@commands.command("show")
+def show(
+    context: typer.Context,
+    name: str,
+    as_json: Annotated[bool, typer.Option("--json", help="As JSON.")] = False,
+) -> None:
+    """Show what is known of a robot: its connection, its provisioning, its certificates."""
+    cloud = context.obj.cloud()
+    row, held = registry.get(cloud, name), certificates.attached(cloud, name)
+    if as_json:
+        described = [
+            {**one._asdict(), "created": _time(one.created), "expires": _time(one.expires)} for one in held
+        ]
+        _out.print_json(json.dumps({**row, "certificates": described}, default=float))
+        return
+    table = Table(show_header=False, box=None, pad_edge=False)
+    table.add_row("connection", _connection(row))
+    for key, value in sorted(row.items()):
+        if key != ROBOT:
+            table.add_row(key, _value(key, value))
+    for one in held:
+        until = f", expires {_time(one.expires)}" if one.expires else ""
+        table.add_row("certificate", f"{one.id} {one.status}, made {_time(one.created)}{until}")
+    _out.print(table)
 
 
 @commands.command("remove")
-def remove(context: typer.Context, name: str) -> None:
-    """Revoke a robot's certificates and forget it. What it has sent stays."""
-    robots.remove(context.obj.cloud(), name)
-    _out.print(f"{name} is removed")
+def remove(
+    context: typer.Context,
+    name: Annotated[str | None, typer.Argument(help="The robot; none with --all.")] = None,
+    everything: Annotated[
+        bool, typer.Option("--all", help="Every robot and lasting claim, before `make destroy`.")
+    ] = False,
+    yes: Annotated[bool, typer.Option("--yes", help="Do not ask.")] = False,
+) -> None:
+    """Revoke a robot's certificates, cut its session and forget it. What it has sent stays."""
+    if everything == (name is not None):
+        raise StationError("give a robot's name, or --all")
+    cloud = context.obj.cloud()
+    if name is not None:
+        robots.remove(cloud, name)
+        _out.print(f"{name} is removed")
+        return
+    names = sorted(str(row[ROBOT]) for row in robots.listed(cloud))
+    if not yes and not typer.confirm(f"Remove {len(names)} robots and every lasting claim?"):
+        raise typer.Exit(1)
+    for one in names:
+        robots.remove(cloud, one)
+        _out.print(f"{one} is removed")
+    _out.print(f"lasting claims revoked: {claims.revoke_all(cloud)}")
+
+
+@commands.command("revoke-claims")
+def revoke_claims(context: typer.Context) -> None:
+    """Revoke every lasting claim. Robots that were provisioned with one keep their own certificate."""
+    _out.print(f"lasting claims revoked: {claims.revoke_all(context.obj.cloud())}")
+
+
+def _vehicle(speed_to_erpm_gain: float) -> dict[str, float]:
+    return {**robots.F1TENTH, "speed_to_erpm_gain": speed_to_erpm_gain}
+
+
+def _connection(row: Mapping[str, Any]) -> str:
+    if row.get(ONLINE):
+        return f"online since {_value(CONNECTED_MS, row[CONNECTED_MS])}"
+    if DISCONNECTED_MS in row:
+        reason = row.get(DISCONNECT_REASON, "")
+        return f"offline since {_value(DISCONNECTED_MS, row[DISCONNECTED_MS])} {reason}".rstrip()
+    if ADMIT_UNTIL_S in row:
+        late = float(row[ADMIT_UNTIL_S]) < time.time()
+        return f"{'was expected' if late else 'expected'} until {_value(ADMIT_UNTIL_S, row[ADMIT_UNTIL_S])}"
+    return "never connected"
+
+
+def _parameters(row: Mapping[str, Any]) -> str:
+    known = {ROBOT, *PRESENCE, *ADMISSION}
+    return ", ".join(f"{key} {value}" for key, value in sorted(row.items()) if key not in known)
+
+
+def _value(key: str, value: Any) -> str:
+    if key.endswith("_ms"):
+        return iso(int(value) * 1000)
+    return iso(int(value) * 1_000_000) if key == ADMIT_UNTIL_S else str(value)
+
+
+def _time(when: Any) -> str | None:
+    return None if when is None else when.isoformat(timespec="seconds")

@@ -14,7 +14,7 @@ import yaml
 
 from contract import ROBOT, claim_name
 from local.cloud import ROOT
-from station import delivery, robots
+from station import claims, delivery, robots
 from tests.local.conftest import run_agent, until
 from tests.local.robot import Robot
 
@@ -35,7 +35,7 @@ def certificates(embedded: Any, robot: str) -> list[str]:
 
 
 def test_a_claim_becomes_a_robot_that_drives(embedded, tmp_path):
-    claim = robots.claim(embedded.cloud, "claimed", out=tmp_path / "claim")
+    claim = claims.claim(embedded.cloud, "claimed", out=tmp_path / "claim")
     command("provision", "--config", claim)
     bundle = robots.Bundle("claimed", tmp_path / "claim")
     for name in ("private.key", "certificate.pem", "car.yaml", "claim-private.key", "claim.yaml"):
@@ -50,21 +50,26 @@ def test_a_claim_becomes_a_robot_that_drives(embedded, tmp_path):
 
 
 def test_a_second_robot_cannot_take_a_name(embedded, tmp_path):
-    first = robots.claim(embedded.cloud, "taken", out=tmp_path / "first")
+    first = claims.claim(embedded.cloud, "taken", out=tmp_path / "first")
     command("provision", "--config", first)
-    second = robots.claim(embedded.cloud, None, out=tmp_path / "second", lasting=True)
+    second = claims.claim(embedded.cloud, None, out=tmp_path / "second", lasting=True)
     settings = yaml.safe_load(second.read_text())
-    second.write_text(yaml.safe_dump({**settings, "serial": "another-machine"}))
-    done = command("provision", "--config", second, "--robot", "taken", status=1)
-    assert "RegisterThing was refused" in done.stderr
-    assert "another-machine" in done.stderr
-    assert "Traceback" not in done.stderr
+    owner = embedded.cloud.client("iot").describe_thing(thingName="taken")["attributes"]["serial"]
+    for serial in ("another-machine", owner):
+        second.write_text(yaml.safe_dump({**settings, "serial": serial}))
+        done = command("provision", "--config", second, "--robot", "taken", status=1)
+        assert "RegisterThing was refused: AccessDenied" in done.stderr
+        assert "Traceback" not in done.stderr
     assert not (tmp_path / "second" / "car.yaml").exists()
+    assert len(certificates(embedded, "taken")) == 1
 
 
 def test_a_lasting_claim_is_good_for_provisioning_only(embedded, tmp_path):
-    claim = robots.claim(embedded.cloud, None, out=tmp_path, lasting=True)
+    claim = claims.claim(embedded.cloud, None, out=tmp_path, lasting=True)
     command("provision", "--config", claim, status=2)  # no name
+    refused = command("provision", "--config", claim, "--robot", "lasting", status=1)
+    assert "AccessDenied" in refused.stderr  # nobody expects it
+    claims.register(embedded.cloud, "lasting")
     command("provision", "--config", claim, "--robot", "lasting")
     # As a robot the claim may do nothing at all.
     for name in ("certificate.pem", "private.key"):
@@ -79,7 +84,7 @@ def test_a_lasting_claim_is_good_for_provisioning_only(embedded, tmp_path):
 
 
 def test_a_used_up_claim_is_told(embedded, tmp_path):
-    claim = robots.claim(embedded.cloud, None, out=tmp_path, lasting=True)
+    claim = claims.claim(embedded.cloud, None, out=tmp_path, lasting=True)
     iot = embedded.cloud.client("iot")
     for certificate in iot.list_targets_for_policy(policyName=claim_name())["targets"]:
         iot.update_certificate(certificateId=certificate.rsplit("/", 1)[-1], newStatus="REVOKED")
@@ -89,7 +94,7 @@ def test_a_used_up_claim_is_told(embedded, tmp_path):
 
 
 def test_an_existing_configuration_is_updated_and_keeps_its_comments(embedded, tmp_path):
-    claim = robots.claim(embedded.cloud, "updated", out=tmp_path)
+    claim = claims.claim(embedded.cloud, "updated", out=tmp_path)
     car = tmp_path / "car.yaml"
     car.write_text("# my car\nrobot: other\nport: 1  # wrong\nsources:\n  - type: sim # a comment\n")
     command("provision", "--config", claim)
@@ -103,7 +108,7 @@ def test_an_existing_configuration_is_updated_and_keeps_its_comments(embedded, t
 def test_renewal_without_an_agent(embedded, bundle, tmp_path):
     car = bundle()
     before = (car.folder / "certificate.pem").read_text()
-    claim = robots.claim(embedded.cloud, car.robot, out=tmp_path / "claim")
+    claim = claims.claim(embedded.cloud, car.robot, out=tmp_path / "claim")
     command("renew", "--config", car.config, "--claim", claim)
     assert (car.folder / "certificate.pem").read_text() != before
     assert not list(car.folder.glob("*.previous"))
@@ -118,7 +123,7 @@ def test_renewal_that_does_not_connect_leaves_the_old_certificate(embedded, bund
 
     car = bundle()
     before = (car.folder / "certificate.pem").read_text(), (car.folder / "private.key").read_text()
-    claim = robots.claim(embedded.cloud, car.robot, out=tmp_path / "claim")
+    claim = claims.claim(embedded.cloud, car.robot, out=tmp_path / "claim")
 
     def fails(*_: object) -> None:
         raise IdentityError("no")
@@ -134,7 +139,7 @@ def test_renewal_that_does_not_connect_leaves_the_old_certificate(embedded, bund
 
 def test_renewal_while_the_agent_runs(embedded, bundle, tmp_path):
     car = bundle(sources=[{"type": "sim", "stream": "vesc", "rate_hz": 50}])
-    claim = robots.claim(embedded.cloud, car.robot, out=tmp_path / "claim")
+    claim = claims.claim(embedded.cloud, car.robot, out=tmp_path / "claim")
     report = tmp_path / "report.json"
     with subprocess.Popen([AGENT, "--config", car.config, "--report", report], cwd=ROOT) as agent:
         try:

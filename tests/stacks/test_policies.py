@@ -108,12 +108,22 @@ ROLES = {
         | {(f"s3:{action}", "Files.Arn") for action in ("ListBucket", "ListBucketMultipartUploads")}
         | {("dynamodb:UpdateItem", "Robots.Arn"), ("iot:Publish", f"{IOT}:topic/pong/iort/*/file")},
     ),
+    "AdmitRole": (
+        "lambda.amazonaws.com",
+        {(action, "AdmitLog.Arn") for action in LOG} | {("dynamodb:UpdateItem", "Robots.Arn")},
+    ),
+    "PresenceRole": (
+        "lambda.amazonaws.com",
+        {(action, "PresenceLog.Arn") for action in LOG} | {("dynamodb:UpdateItem", "Robots.Arn")},
+    ),
     "ProvisioningRole": ("iot.amazonaws.com", PROVISIONING),
     "ingest/RecordRole": ("iot.amazonaws.com", {REJECT, ("dynamodb:PutItem", "Telemetry.Arn")}),
     "ingest/LiveRole": ("iot.amazonaws.com", {REJECT}),
     "ingest/PongRole": ("iot.amazonaws.com", {REJECT, ("iot:Publish", f"{IOT}:topic/pong/iort/*/rule")}),
     "ingest/EchoRole": ("iot.amazonaws.com", {REJECT}),
     "ingest/UploadRole": ("iot.amazonaws.com", {REJECT}),
+    "ingest/PresenceRole": ("iot.amazonaws.com", {REJECT}),
+    "ingest/VersionRole": ("iot.amazonaws.com", {REJECT}),
 }
 # The only statements about every resource, each with why it cannot name one.
 EVERY_RESOURCE = {
@@ -306,19 +316,27 @@ def test_no_statement_is_about_every_resource_or_action(synthesized, reader):
     assert {k for k in kinds if k.endswith("Permission")} == {"AWS::Lambda::Permission"}
 
 
-def test_only_its_rule_may_call_a_function(synthesized, reader):
-    permissions = synthesized.resources("AWS::Lambda::Permission")
-    called = {}
-    for permission in permissions.values():
-        assert permission["Action"] == "lambda:InvokeFunction"
-        assert permission["Principal"] == "iot.amazonaws.com"
-        assert permission["SourceAccount"] == {"Ref": "AWS::AccountId"}
-        called[reader.text(permission["FunctionName"])] = reader.text(permission["SourceArn"])
-    assert called == {"Live.Arn": "Live.Arn", "Echo.Arn": "Echo.Arn", "Upload.Arn": "Upload.Arn"}
-    # Both are named Live; one is the function, the other the rule.
-    for permission in permissions.values():
-        rule = permission["SourceArn"]["Fn::GetAtt"][0]
-        assert synthesized.templates["ingest"]["Resources"][rule]["Type"] == "AWS::IoT::TopicRule"
+def test_only_its_rule_or_template_may_call_a_function(synthesized, reader):
+    called = set()
+    for stack in synthesized.templates:
+        for permission in synthesized.resources("AWS::Lambda::Permission", stack).values():
+            assert permission["Action"] == "lambda:InvokeFunction"
+            assert permission["Principal"] == "iot.amazonaws.com"
+            assert permission["SourceAccount"] == {"Ref": "AWS::AccountId"}
+            source, function = permission["SourceArn"], reader.text(permission["FunctionName"])
+            if "Fn::GetAtt" in source:
+                # Rule and function may have one name; this is the rule.
+                rule = synthesized.templates[stack]["Resources"][source["Fn::GetAtt"][0]]
+                assert rule["Type"] == "AWS::IoT::TopicRule"
+            called.add((reader.text(source), function))
+    assert called == {
+        ("Live.Arn", "Live.Arn"),
+        ("Echo.Arn", "Echo.Arn"),
+        ("Upload.Arn", "Upload.Arn"),
+        ("Presence.Arn", "Presence.Arn"),
+        ("Version.Arn", "Presence.Arn"),
+        (f"{IOT}:provisioningtemplate/iort-robot", "Admit.Arn"),
+    }
 
 
 def test_queues_are_encrypted_and_refuse_what_is_not_tls(synthesized, reader):

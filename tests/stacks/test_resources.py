@@ -37,13 +37,15 @@ def test_the_rules_are_the_contracts(rules):
 def test_every_rule_has_one_action_and_it_is_this(rules, reader):
     actions = {rule.removeprefix("iort_"): payload["Actions"] for rule, payload in rules.items()}
     assert all(len(each) == 1 for each in actions.values())
-    (record,), (live,), (pong,), (echo,), (upload,) = (actions[rule] for rule in RULES)
+    record, live, pong, echo, upload, presence, version = (actions[rule][0] for rule in RULES)
     assert reader.text(record["DynamoDBv2"]["PutItem"]["TableName"]) == "Telemetry"
     assert reader.text(live["Lambda"]["FunctionArn"]) == "Live.Arn"
     assert reader.text(echo["Lambda"]["FunctionArn"]) == "Echo.Arn"
     assert reader.text(upload["Lambda"]["FunctionArn"]) == "Upload.Arn"
+    for kept in (presence, version):
+        assert reader.text(kept["Lambda"]["FunctionArn"]) == "Presence.Arn"
     assert (pong["Republish"]["Topic"], pong["Republish"]["Qos"]) == (pong_template(), 0)
-    assert [len(each[0]) for each in actions.values()] == [1] * 5
+    assert {len(each[0]) for each in actions.values()} == {1}
 
 
 @pytest.mark.parametrize("rule", RULES)
@@ -101,12 +103,12 @@ def test_the_tables_keys_are_the_contracts(synthesized):
 
 def test_concurrency_is_reserved_where_a_burst_would_start_workers(functions):
     reserved = {k: v.get("ReservedConcurrentExecutions") for k, v in functions.items()}
-    assert reserved == {"Live": 5, "Summarize": None, "Echo": None, "Upload": None}
+    assert {name: count for name, count in reserved.items() if count is not None} == {"Live": 5}
 
 
 def test_functions_run_on_one_runtime_with_a_log_each_that_ends(synthesized, functions, reader):
     logs = {name(k): v for k, v in synthesized.resources("AWS::Logs::LogGroup").items()}
-    assert logs.keys() == {"LiveLog", "SummarizeLog", "EchoLog", "UploadLog"}
+    assert logs.keys() == {f"{noun}Log" for noun in functions}
     assert {v["RetentionInDays"] for v in logs.values()} == {30}
     for noun, function in functions.items():
         assert reader.text(function["LoggingConfig"]["LogGroup"]) == f"{noun}Log"
@@ -121,8 +123,10 @@ def test_a_live_message_or_a_ping_is_not_tried_again(synthesized, reader):
         "Live": 0,
         "Echo": 0,
         "Upload": 0,
+        "Presence": 2,
     }
-    assert {c["MaximumEventAgeInSeconds"] for c in configs} == {60}
+    ages_s = {reader.text(c["FunctionName"]): c["MaximumEventAgeInSeconds"] for c in configs}
+    assert ages_s == {"Live": 60, "Echo": 60, "Upload": 60, "Presence": 6 * 3600}
 
 
 def test_the_stream_never_blocks_for_good(synthesized, reader):

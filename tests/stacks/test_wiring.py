@@ -30,6 +30,7 @@ from contract import (
 from stacks.settings import ROOT
 from tests.stacks.templates import name
 
+HANDLERS = ("Live", "Summarize", "Echo", "Upload", "Admit", "Presence")
 FUNCTIONS = sorted((ROOT / "functions").glob("*.py"))
 # Lambda's Python has boto3 and what boto3 needs.
 RUNTIME_PACKAGES = ("boto3", "botocore", "dateutil", "jmespath", "s3transfer", "six", "urllib3")
@@ -67,7 +68,7 @@ def runtime(tmp_path_factory):
     return folder
 
 
-@pytest.mark.parametrize("function", ["Live", "Summarize", "Echo", "Upload"])
+@pytest.mark.parametrize("function", HANDLERS)
 def test_every_handler_imports_from_its_asset_alone(synthesized, functions, runtime, tmp_path, function):
     properties = functions[function]
     asset = synthesized.asset(properties["Code"])
@@ -156,7 +157,7 @@ def variables_read(module):
     return read
 
 
-@pytest.mark.parametrize("function", ["Live", "Summarize", "Echo", "Upload"])
+@pytest.mark.parametrize("function", HANDLERS)
 def test_a_function_reads_exactly_the_variables_that_it_is_given(functions, function):
     properties = functions[function]
     given = set(properties.get("Environment", {}).get("Variables", {}))
@@ -294,6 +295,11 @@ def test_every_topic_of_the_agent_meets_exactly_the_rule_that_it_is_for(filters)
         build_topic(contract.FLEET, "car", "pose"): set(),
         build_topic(contract.CMD, "car", "stop"): set(),
         build_topic(LIVE, "car", "vesc", "lab2"): set(),
+        "$aws/events/presence/connected/car": {"iort_presence"},
+        "$aws/events/presence/disconnected/car": {"iort_presence"},
+        f"$aws/things/car/shadow/name/{contract.SHADOW}/update/accepted": {"iort_version"},
+        f"$aws/things/car/shadow/name/{contract.SHADOW}/update/documents": set(),
+        "$aws/things/car/shadow/update/accepted": set(),
     }
     for one, rules in expected.items():
         assert {rule for rule, topic_filter in filters.items() if matches(topic_filter, one)} == rules, one

@@ -35,6 +35,7 @@ class Rig:
             base=BASE,
             apply=self.applied.append,
             known_fields=lambda: {"vesc": {"speed", "voltage_input"}},
+            version="1.2.3",
             uplink=self.uplink,
             clock=self.clock,
             allowance=Allowance(self.clock),
@@ -80,7 +81,8 @@ class Rig:
 
 def test_without_a_shadow_it_makes_one() -> None:
     rig = Rig()
-    assert rig.reported == {key: value for key, value in DOCUMENT.items() if value != {}}
+    said = {key: value for key, value in DOCUMENT.items() if value != {}}
+    assert rig.reported == {**said, "agent_version": "1.2.3"}
     assert rig.applied == []
 
 

@@ -1,0 +1,123 @@
+"""Admit: says which claims become robots. The provisioning template's hook, which AWS IoT asks before it
+registers a thing, and which must answer within 5 s.
+
+The operator opens a name, for one certificate and for a time (`iort robots claim`, `register`); what
+was not opened is refused, and so is everything when something goes wrong here.
+"""
+
+from __future__ import annotations
+
+import logging
+import os
+import time
+from collections.abc import Mapping
+from functools import cache
+from typing import Any
+
+import boto3
+from botocore.config import Config
+
+from contract import (
+    ADMIT_CLAIM,
+    ADMIT_UNTIL_S,
+    ADMITTED_CERTIFICATE,
+    ADMITTED_MS,
+    ROBOT,
+    ROBOT_PARAMETER,
+    SERIAL,
+    SERIAL_PARAMETER,
+    ContractError,
+    check_robot,
+)
+from functions.metrics import emit
+
+_log = logging.getLogger(__name__)
+
+# Both attempts fit, at their slowest, into the function's own time-out, and that into AWS' 5 s.
+_CONFIG = Config(connect_timeout=1, read_timeout=1, retries={"mode": "standard", "total_max_attempts": 2})
+_MAX_TEXT = 800
+
+
+def admission(event: Mapping[str, Any], now_ms: int) -> dict[str, Any]:
+    """Take the admission that is open for the robot: UpdateItem's arguments but for the table.
+
+    The update does it in one step, so that of two claims for one name one is refused. The same
+    certificate may ask again, because an answer may be lost. Raises `ContractError` for a request
+    that is not complete.
+    """
+    parameters = event.get("parameters")
+    if not isinstance(parameters, Mapping):
+        raise ContractError("a request without parameters")
+    robot, serial = check_robot(parameters.get(ROBOT_PARAMETER, "")), _text(parameters, SERIAL_PARAMETER)
+    certificate, claim = _text(event, "certificateId"), _text(event, "claimCertificateId")
+    opened = f"{ADMIT_UNTIL_S} >= :now_s AND (attribute_not_exists({ADMIT_CLAIM}) OR {ADMIT_CLAIM} = :claim)"
+    machine = f"(attribute_not_exists({SERIAL}) OR {SERIAL} = :serial)"
+    return {
+        "Key": {ROBOT: {"S": robot}},
+        "UpdateExpression": (
+            f"SET {SERIAL} = :serial, {ADMITTED_CERTIFICATE} = :certificate, {ADMITTED_MS} = :now_ms "
+            f"REMOVE {ADMIT_UNTIL_S}, {ADMIT_CLAIM}"
+        ),
+        "ConditionExpression": (
+            f"attribute_exists({ROBOT}) AND {machine}"
+            f" AND ({ADMITTED_CERTIFICATE} = :certificate OR ({opened}))"
+        ),
+        "ExpressionAttributeValues": {
+            ":serial": {"S": serial},
+            ":certificate": {"S": certificate},
+            ":claim": {"S": claim},
+            ":now_s": {"N": str(now_ms // 1000)},
+            ":now_ms": {"N": str(now_ms)},
+        },
+        "ReturnValuesOnConditionCheckFailure": "ALL_OLD",
+    }
+
+
+def reason(row: Mapping[str, Any], event: Mapping[str, Any], now_ms: int) -> str:
+    """Why a row's robot was not admitted, for the log; the row as DynamoDB returns it, empty for none."""
+    if not row:
+        return "it is not registered"
+    if row.get(SERIAL, {}).get("S") not in (None, event["parameters"][SERIAL_PARAMETER]):
+        return "another machine has the name"
+    if ADMIT_UNTIL_S not in row:
+        return "no certificate may be issued for it: `iort robots claim` opens it"
+    if float(row[ADMIT_UNTIL_S]["N"]) < now_ms // 1000:
+        return "the time in which a certificate could be issued for it is over"
+    return "it is open for another claim"
+
+
+def _text(values: Mapping[str, Any], name: str) -> str:
+    value = values.get(name)
+    if not isinstance(value, str) or not 1 <= len(value) <= _MAX_TEXT:
+        raise ContractError(f"{name}: expected a text of up to {_MAX_TEXT} characters")
+    return value
+
+
+@cache
+def _dynamodb() -> Any:
+    return boto3.client("dynamodb", config=_CONFIG)
+
+
+def handler(event: dict[str, Any], _context: object) -> dict[str, bool]:
+    """Entry point of the template's pre-provisioning hook."""
+    try:
+        allowed = _admit(event)
+    except Exception:  # noqa: BLE001 - whatever went wrong, nobody was found to be expected
+        _log.exception("refused, because it could not be decided")
+        allowed = False
+    emit("admit", RobotsAdmitted=allowed, RobotsRefused=not allowed)
+    return {"allowProvisioning": allowed}
+
+
+def _admit(event: Mapping[str, Any]) -> bool:
+    now_ms, dynamodb = time.time_ns() // 1_000_000, _dynamodb()
+    try:
+        dynamodb.update_item(TableName=os.environ["ROBOTS_TABLE"], **admission(event, now_ms))
+    except ContractError as error:
+        _log.warning("refused: %s", error)
+        return False
+    except dynamodb.exceptions.ConditionalCheckFailedException as error:
+        robot = event["parameters"][ROBOT_PARAMETER]
+        _log.warning("%s refused: %s", robot, reason(error.response.get("Item", {}), event, now_ms))
+        return False
+    return True

@@ -1,0 +1,111 @@
+"""The registry: a row a robot, in the robots table. Who may have a name is decided by its row."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Iterator, Mapping
+from decimal import Decimal
+from typing import Any
+
+from boto3.dynamodb.types import TypeDeserializer, TypeSerializer
+
+from contract import ADMIT_CLAIM, ADMIT_UNTIL_S, ROBOT, ContractError, check_robot
+from station.cloud import Cloud
+from station.errors import StationError
+
+_serialize, _deserialize = TypeSerializer().serialize, TypeDeserializer().deserialize
+
+
+def checked(robot: str) -> str:
+    """The name, if it may name a robot; raises `StationError` otherwise."""
+    try:
+        return check_robot(robot)
+    except ContractError as error:
+        raise StationError(str(error)) from error
+
+
+def listed(cloud: Cloud) -> Iterator[dict[str, Any]]:
+    """Every row of the registry, in no order."""
+    for page in cloud.client("dynamodb").get_paginator("scan").paginate(TableName=_table(cloud)):
+        for item in page["Items"]:
+            yield _plain(item)
+
+
+def find(cloud: Cloud, robot: str) -> dict[str, Any] | None:
+    """A robot's row as it is now; None where it is not registered."""
+    answer = cloud.client("dynamodb").get_item(
+        TableName=_table(cloud), Key=_key(checked(robot)), ConsistentRead=True
+    )
+    return _plain(answer["Item"]) if "Item" in answer else None
+
+
+def get(cloud: Cloud, robot: str) -> dict[str, Any]:
+    """A robot's row as it is now; raises `StationError` where it is not registered."""
+    row = find(cloud, robot)
+    if row is None:
+        raise StationError(f"robot {robot} is not registered")
+    return row
+
+
+def enter(cloud: Cloud, robot: str, row: Mapping[str, Any]) -> None:
+    """Write a new row, which is what makes a name taken: making a thing twice is no error.
+
+    Raises `StationError` where the robot is registered already.
+    """
+    item = {ROBOT: checked(robot), **row}
+    numbers = {name: Decimal(repr(value)) for name, value in item.items() if isinstance(value, int | float)}
+    dynamodb = cloud.client("dynamodb")
+    try:
+        dynamodb.put_item(
+            TableName=_table(cloud),
+            Item={name: _serialize(value) for name, value in {**item, **numbers}.items()},
+            ConditionExpression="attribute_not_exists(#robot)",
+            ExpressionAttributeNames={"#robot": ROBOT},
+        )
+    except dynamodb.exceptions.ConditionalCheckFailedException as error:
+        raise StationError(f"robot {robot} is already registered; remove it first") from error
+
+
+def open_name(cloud: Cloud, robot: str, *, for_s: float, claim: str | None) -> None:
+    """Let one certificate be issued for a name: within the time, for the claim with this id or for any."""
+    values = {":until": {"N": str(int(time.time() + for_s))}}
+    update = f"SET {ADMIT_UNTIL_S} = :until"
+    if claim is None:
+        update += f" REMOVE {ADMIT_CLAIM}"
+    else:
+        update += f", {ADMIT_CLAIM} = :claim"
+        values[":claim"] = {"S": claim}
+    cloud.client("dynamodb").update_item(
+        TableName=_table(cloud),
+        Key=_key(robot),
+        UpdateExpression=update,
+        ConditionExpression=f"attribute_exists({ROBOT})",
+        ExpressionAttributeValues=values,
+    )
+
+
+def close_name(cloud: Cloud, robot: str) -> None:
+    """Let no certificate be issued for a name any more."""
+    cloud.client("dynamodb").update_item(
+        TableName=_table(cloud),
+        Key=_key(robot),
+        UpdateExpression=f"REMOVE {ADMIT_UNTIL_S}, {ADMIT_CLAIM}",
+        ConditionExpression=f"attribute_exists({ROBOT})",
+    )
+
+
+def forget(cloud: Cloud, robot: str) -> None:
+    """Delete a robot's row."""
+    cloud.client("dynamodb").delete_item(TableName=_table(cloud), Key=_key(robot))
+
+
+def _table(cloud: Cloud) -> str:
+    return cloud.output("storage", "RobotsTable")
+
+
+def _key(robot: str) -> dict[str, Any]:
+    return {ROBOT: {"S": robot}}
+
+
+def _plain(item: Mapping[str, Any]) -> dict[str, Any]:
+    return {name: _deserialize(value) for name, value in item.items()}

@@ -1,0 +1,203 @@
+"""A robot's life as the registry tells it: expected, provisioned, connected, rotated, removed."""
+
+from __future__ import annotations
+
+import json
+import subprocess
+import sys
+import threading
+from importlib.metadata import version
+from pathlib import Path
+
+import pytest
+from typer.testing import CliRunner
+
+from contract import (
+    ADMIT_UNTIL_S,
+    ADMITTED_CERTIFICATE,
+    AGENT_VERSION,
+    CERTIFICATE_ID,
+    CONNECTED_MS,
+    DISCONNECT_REASON,
+    LAST_SEEN_MS,
+    ONLINE,
+    SERIAL,
+)
+from local.cloud import ROOT
+from station import certificates, claims, registry, robots, rotation
+from station.cli import app
+from station.cloud import EMBEDDED
+from station.errors import StationError
+from tests.local.conftest import until
+from tests.local.robot import Robot
+
+AGENT = Path(sys.executable).parent / "iort-agent"
+WAIT_S = 60
+
+
+def row(embedded, name):
+    return registry.get(embedded.cloud, name)
+
+
+def command(*arguments, status=0):
+    done = subprocess.run(
+        [AGENT, *map(str, arguments)], cwd=ROOT, capture_output=True, text=True, timeout=120, check=False
+    )
+    assert done.returncode == status, done.stdout + done.stderr
+    return done
+
+
+@pytest.fixture
+def iort(embedded):
+    def run(*arguments):
+        description = embedded.folder / EMBEDDED.name
+        return CliRunner().invoke(app, ["--local", "--embedded", str(description), *arguments])
+
+    return run
+
+
+def test_a_registered_machine_gets_its_name_and_no_other_does(embedded, tmp_path, iort):
+    assert iort("robots", "register", "expected", "--serial", "s1").exit_code == 0
+    assert "expected until" in iort("robots", "list").output
+    lasting = claims.claim(embedded.cloud, None, out=tmp_path, lasting=True)
+    text = lasting.read_text()
+    lasting.write_text(f"{text}serial: s2\n")
+    assert "AccessDenied" in command("provision", "--config", lasting, "--robot", "expected", status=1).stderr
+    lasting.write_text(f"{text}serial: s1\n")
+    command("provision", "--config", lasting, "--robot", "expected")
+    after = row(embedded, "expected")
+    assert (after[SERIAL], ADMIT_UNTIL_S in after) == ("s1", False)
+    (held,) = certificates.attached(embedded.cloud, "expected")
+    assert (held.id, held.status) == (after[ADMITTED_CERTIFICATE], "ACTIVE")
+    # Once: the same machine and the same claim, but nobody has opened the name again.
+    command("provision", "--config", lasting, "--robot", "expected", status=1)
+    shown = json.loads(iort("robots", "show", "expected", "--json").output)
+    assert [one["id"] for one in shown["certificates"]] == [held.id]
+
+
+def test_a_claim_for_one_name_has_no_other(embedded, tmp_path):
+    claims.register(embedded.cloud, "other-name")
+    claim = claims.claim(embedded.cloud, "one-name", out=tmp_path)
+    refused = command("provision", "--config", claim, "--robot", "nobodys-name", status=1)
+    assert "AccessDenied" in refused.stderr
+    # And another claim does not have the name that was opened for this one.
+    lasting = claims.claim(embedded.cloud, None, out=tmp_path / "lasting", lasting=True)
+    refused = command("provision", "--config", lasting, "--robot", "one-name", status=1)
+    assert "AccessDenied" in refused.stderr
+    command("provision", "--config", claim)
+
+
+def test_the_registry_follows_a_robot(embedded, bundle, iort):
+    car = bundle(sources=[{"type": "sim", "stream": "vesc", "rate_hz": 50, "duration_s": 1}])
+    command("--config", car.config)
+    after = until(
+        lambda: (now := row(embedded, car.robot)).get(ONLINE) is False and AGENT_VERSION in now and now,
+        seconds=WAIT_S,
+    )
+    assert after[DISCONNECT_REASON] == "CLIENT_INITIATED_DISCONNECT"
+    assert after[LAST_SEEN_MS] >= after[CONNECTED_MS] > 0
+    assert after[AGENT_VERSION] == version("iort")
+    (held,) = certificates.attached(embedded.cloud, car.robot)
+    assert after[CERTIFICATE_ID] == held.id
+    assert "offline since" in iort("robots", "list").output
+    with Robot(car.folder) as robot:
+        robot.online()
+        until(lambda: row(embedded, car.robot)[ONLINE], seconds=WAIT_S)
+        assert "online since" in iort("robots", "show", car.robot).output
+
+
+def test_removing_a_robot_cuts_its_session_for_good(embedded, bundle):
+    car = bundle()
+    embedded.cloud.client("iot-data").update_thing_shadow(
+        thingName=car.robot, shadowName="agent", payload=b'{"state": {"desired": {"log_level": "debug"}}}'
+    )
+    with Robot(car.folder) as robot:
+        robot.online()
+        robots.remove(embedded.cloud, car.robot)
+        assert robot.lost.wait(WAIT_S)
+    with Robot(car.folder) as again:
+        assert again.refused.wait(WAIT_S)
+        assert not again.connected.is_set()
+    with pytest.raises(StationError, match="not registered"):
+        registry.get(embedded.cloud, car.robot)
+    # Whoever gets the name next inherits nothing.
+    data = embedded.cloud.client("iot-data")
+    with pytest.raises(data.exceptions.ResourceNotFoundException):
+        data.get_thing_shadow(thingName=car.robot, shadowName="agent")
+
+
+def test_a_session_ends_with_its_certificate(embedded, bundle):
+    """AWS does so within minutes; the embedded cloud's gap is closed in local/cut_sessions.py."""
+    car = bundle()
+    with Robot(car.folder) as robot:
+        robot.online()
+        (held,) = certificates.attached(embedded.cloud, car.robot)
+        embedded.cloud.client("iot").update_certificate(certificateId=held.id, newStatus="INACTIVE")
+        assert robot.lost.wait(WAIT_S)
+    until(
+        lambda: row(embedded, car.robot).get(DISCONNECT_REASON) == "AUTH_ERROR",
+        seconds=WAIT_S,
+    )
+
+
+def test_delete_connection_cuts_one_client_alone(embedded, bundle):
+    first, second = bundle("-1"), bundle("-2")
+    with Robot(first.folder) as one, Robot(second.folder) as two:
+        one.online()
+        two.online()
+        assert certificates.cut(embedded.cloud, first.robot) is True
+        assert one.lost.wait(WAIT_S)
+        assert two.publish(f"live/iort/{second.robot}/vesc", b"{}") == "SUCCESS"
+    until(
+        lambda: row(embedded, first.robot).get(DISCONNECT_REASON) == "API_INITIATED_DISCONNECT",
+        seconds=WAIT_S,
+    )
+    assert certificates.cut(embedded.cloud, first.robot) is False
+
+
+def test_rotation_waits_for_the_new_certificate(embedded, bundle, tmp_path):
+    car = bundle()
+    (old,) = certificates.attached(embedded.cloud, car.robot)
+    heard, done = [], threading.Event()
+
+    def finish():
+        heard.append(rotation.finish(embedded.cloud, car.robot, settled_s=0, progress=heard.append))
+        done.set()
+
+    with Robot(car.folder) as robot:
+        robot.online()
+        claim = claims.claim(embedded.cloud, car.robot, out=tmp_path / "claim")
+        (tmp_path / "new").mkdir()
+        (tmp_path / "new" / "car.yaml").write_text(car.config.read_text())
+        for file in ("private.key", "certificate.pem", "root-ca.pem"):
+            (tmp_path / "new" / file).write_bytes((car.folder / file).read_bytes())
+        command("provision", "--config", _writing_to(claim, tmp_path / "new" / "car.yaml"))
+        assert len(certificates.attached(embedded.cloud, car.robot)) == 2
+        waiting = threading.Thread(target=finish)
+        waiting.start()
+        until(lambda: heard, seconds=WAIT_S)
+        # The old one is connected and stays so.
+        assert "older certificate" in heard[0]
+        assert robot.publish(f"live/iort/{car.robot}/vesc", b"{}") == "SUCCESS"
+        assert not done.is_set()
+    with Robot(tmp_path / "new") as robot:
+        robot.online()
+        assert done.wait(WAIT_S)
+        waiting.join()
+        assert [one.id for one in heard[-1]] == [old.id]
+        assert not robot.lost.is_set()
+    with Robot(car.folder) as robot:
+        assert robot.refused.wait(WAIT_S)
+
+
+def _writing_to(claim, config):
+    claim.write_text(f"{claim.read_text()}config: {config}\n")
+    return claim
+
+
+def test_rotation_changes_nothing_for_a_robot_that_does_not_come(embedded, bundle):
+    car = bundle()
+    with pytest.raises(StationError, match="not connected; its old certificate stays"):
+        rotation.finish(embedded.cloud, car.robot, wait_s=0)
+    (held,) = certificates.attached(embedded.cloud, car.robot)
+    assert held.status == "ACTIVE"

@@ -1,0 +1,166 @@
+"""Admit: only what the operator opened, once, for whom it was opened; and nothing when in doubt."""
+
+from __future__ import annotations
+
+import json
+import time
+
+import pytest
+from botocore.stub import Stubber
+
+from contract import ADMIT_CLAIM, ADMIT_UNTIL_S, ADMITTED_CERTIFICATE, SERIAL
+from functions import admit
+from functions.tables import plain
+from tests.fakes import ROBOTS
+
+LATER_S = int(time.time()) + 3600
+
+
+def request(robot="car", serial="s1", certificate="new", claim="claim"):
+    """What AWS IoT asks; "Pre-provisioning hook input"."""
+    return {
+        "claimCertificateId": claim,
+        "certificateId": certificate,
+        "certificatePem": "-----BEGIN CERTIFICATE-----",
+        "templateArn": "arn:aws:iot:eu-west-1:123456789012:provisioningtemplate/iort-robot",
+        "clientId": "iort-claim-1",
+        "parameters": {"Robot": robot, "Serial": serial},
+    }
+
+
+@pytest.fixture
+def robots(dynamodb, monkeypatch):
+    """moto's robots table: `put` a row, `ask` the handler, `row` again."""
+    monkeypatch.setenv("ROBOTS_TABLE", ROBOTS)
+    monkeypatch.setenv("NAMESPACE", "iort")
+    admit._dynamodb.cache_clear()
+
+    class Robots:
+        @staticmethod
+        def put(robot="car", until_s=LATER_S, **row):
+            item = {"robot": {"S": robot}, **{name: {"S": value} for name, value in row.items()}}
+            if until_s is not None:
+                item[ADMIT_UNTIL_S] = {"N": str(until_s)}
+            dynamodb.put_item(TableName=ROBOTS, Item=item)
+
+        @staticmethod
+        def clear():
+            for item in dynamodb.scan(TableName=ROBOTS)["Items"]:
+                dynamodb.delete_item(TableName=ROBOTS, Key={"robot": item["robot"]})
+
+        @staticmethod
+        def ask(event):
+            answer = admit.handler(event, None)
+            assert answer.keys() == {"allowProvisioning"}
+            return answer["allowProvisioning"]
+
+        @staticmethod
+        def row(robot="car"):
+            return plain(dynamodb.get_item(TableName=ROBOTS, Key={"robot": {"S": robot}}).get("Item", {}))
+
+    yield Robots
+    admit._dynamodb.cache_clear()
+
+
+def test_an_opened_name_is_admitted_once(robots, capsys):
+    robots.put()
+    assert robots.ask(request()) is True
+    row = robots.row()
+    assert (row[SERIAL], row[ADMITTED_CERTIFICATE]) == ("s1", "new")
+    assert ADMIT_UNTIL_S not in row
+    # The answer may have been lost; another certificate is another robot's.
+    assert robots.ask(request()) is True
+    assert robots.ask(request(certificate="second")) is False
+    assert robots.row() == {**row, "admitted_ms": robots.row()["admitted_ms"]}
+    lines = [json.loads(line) for line in capsys.readouterr().out.splitlines()]
+    assert [("RobotsAdmitted" in line, "RobotsRefused" in line) for line in lines] == [
+        (True, False),
+        (True, False),
+        (False, True),
+    ]
+
+
+REFUSED = [
+    (None, {}, "is not registered"),
+    ({"until_s": None}, {}, "no certificate may be issued"),
+    # A robot that drives, and whose name was not opened again, keeps it.
+    ({"until_s": None, SERIAL: "s1", ADMITTED_CERTIFICATE: "old"}, {}, "no certificate may be issued"),
+    ({"until_s": 1}, {}, "is over"),
+    ({SERIAL: "another"}, {}, "another machine has the name"),
+    ({ADMIT_CLAIM: "another"}, {}, "open for another claim"),
+    ({"robot": "other"}, {}, "is not registered"),
+    ({SERIAL: "s1", ADMITTED_CERTIFICATE: "new"}, {"serial": "s2"}, "another machine has the name"),
+]
+
+
+def test_everything_else_is_refused_and_changes_nothing(robots, caplog):
+    for row, asked, why in REFUSED:
+        robots.clear()
+        caplog.clear()
+        if row is not None:
+            robots.put(**row)
+        before = robots.row()
+        assert robots.ask(request(**asked)) is False
+        assert why in caplog.text
+        assert robots.row() == before
+
+
+def test_what_it_was_opened_for_is_admitted(robots):
+    for row in [{ADMIT_CLAIM: "claim"}, {SERIAL: "s1"}, {SERIAL: "s1", ADMIT_CLAIM: "claim"}]:
+        robots.put(**row)
+        assert robots.ask(request()) is True
+        assert ADMIT_CLAIM not in robots.row()
+
+
+INCOMPLETE = [
+    {},
+    {"parameters": None},
+    {**request(), "parameters": {}},
+    {**request(), "parameters": {"Robot": "car"}},
+    {**request(), "parameters": {"Robot": "car", "Serial": ""}},
+    {**request(), "parameters": {"Robot": "car", "Serial": ["s1"]}},
+    request(robot="a/b"),
+    request(robot=None),
+    request(serial="x" * 801),
+    {**request(), "certificateId": None},
+    # Without its claim's number a request cannot be told from another claim's.
+    {name: value for name, value in request().items() if name != "claimCertificateId"},
+]
+
+
+def test_a_request_that_is_not_complete_is_refused(robots, capsys):
+    robots.put()
+    before = robots.row()
+    for event in INCOMPLETE:
+        assert robots.ask(event) is False, event
+        assert robots.row() == before
+        assert json.loads(capsys.readouterr().out)["RobotsRefused"] == 1
+
+
+def test_what_cannot_be_decided_is_refused(robots, caplog):
+    for code in ["ThrottlingException", "AccessDeniedException", "InternalServerError"]:
+        caplog.clear()
+        with Stubber(admit._dynamodb()) as stub:
+            for _ in range(2):
+                stub.add_client_error("update_item", code)
+            assert robots.ask(request()) is False
+        assert "could not be decided" in caplog.text
+
+
+def test_a_deployment_without_its_table_refuses(robots, monkeypatch):
+    robots.put()
+    monkeypatch.delenv("ROBOTS_TABLE")
+    assert robots.ask(request()) is False
+
+
+def test_its_slowest_answer_is_in_time(synthesized):
+    (timeout_s,) = (
+        function["Timeout"]
+        for function in synthesized.resources("AWS::Lambda::Function").values()
+        if function["Handler"] == "functions.admit.handler"
+    )
+    config = admit._CONFIG
+    attempts = config.retries["total_max_attempts"]
+    # botocore waits up to a second, at random, before a second attempt.
+    slowest_s = attempts * max(config.connect_timeout, config.read_timeout) + (attempts - 1)
+    assert slowest_s < timeout_s < 5

@@ -1,0 +1,194 @@
+"""Presence: the row is right whatever the order in which the broker's events come, and however often."""
+
+from __future__ import annotations
+
+import itertools
+import json
+from decimal import Decimal
+
+import boto3
+import pytest
+
+import contract
+from contract import ContractError
+from functions import presence
+from functions.tables import plain
+from tests.fakes import ROBOTS
+
+MINUTE_MS = 60_000
+T0 = 1_700_000_000_000
+
+
+def connected(version=0, at_ms=T0, client="car", certificate="c" * 64):
+    return {
+        "clientId": client,
+        "timestamp": at_ms,
+        "eventType": "connected",
+        "sessionIdentifier": "00000000-0000-0000-0000-000000000000",
+        "principalIdentifier": certificate,
+        "ipAddress": "192.0.2.0",
+        "versionNumber": version,
+    }
+
+
+def disconnected(version=0, at_ms=T0, reason="CONNECTION_LOST", client="car"):
+    return {
+        "clientId": client,
+        "timestamp": at_ms,
+        "eventType": "disconnected",
+        "sessionIdentifier": "00000000-0000-0000-0000-000000000000",
+        "principalIdentifier": "c" * 64,
+        "clientInitiatedDisconnect": False,
+        "disconnectReason": reason,
+        "versionNumber": version,
+    }
+
+
+@pytest.fixture
+def table(dynamodb, monkeypatch):
+    """moto's robots table with one robot; called with events, it gives the row that they make."""
+    monkeypatch.setenv("ROBOTS_TABLE", ROBOTS)
+    monkeypatch.setenv("NAMESPACE", "iort")
+    presence._dynamodb.cache_clear()
+
+    def row_after(*events):
+        dynamodb.put_item(TableName=ROBOTS, Item={"robot": {"S": "car"}, "speed_to_erpm_gain": {"N": "4614"}})
+        for event in events:
+            presence.handler(event, None)
+        row = plain(dynamodb.get_item(TableName=ROBOTS, Key={"robot": {"S": "car"}})["Item"])
+        assert row.pop("speed_to_erpm_gain") == 4614
+        return row
+
+    yield row_after
+    presence._dynamodb.cache_clear()
+
+
+def test_a_connection_and_its_end(table):
+    assert table(connected()) == {
+        "robot": "car",
+        "online": True,
+        "connected_ms": T0,
+        "last_seen_ms": T0,
+        "session_version": 0,
+        "certificate_id": "c" * 64,
+    }
+    row = table(connected(), disconnected(at_ms=T0 + 5, reason="MQTT_KEEP_ALIVE_TIMEOUT"))
+    assert (row["online"], row["disconnected_ms"], row["last_seen_ms"]) == (False, T0 + 5, T0 + 5)
+    assert row["disconnect_reason"] == "MQTT_KEEP_ALIVE_TIMEOUT"
+    assert row["connected_ms"] == T0
+
+
+STORIES = {
+    "a day": [connected(3, T0), disconnected(3, T0 + 10 * MINUTE_MS)],
+    # The broker's clocks are up to two minutes apart.
+    "clocks apart": [connected(3, T0 + MINUTE_MS), disconnected(3, T0)],
+    "takeover": [connected(3, T0), connected(4, T0 + 1000), disconnected(3, T0 + 1001, "DUPLICATE_CLIENTID")],
+    "back again": [
+        connected(3, T0),
+        disconnected(3, T0 + 1000),
+        connected(4, T0 + 2000, certificate="d" * 64),
+    ],
+    "flapping": [
+        connected(0, T0),
+        disconnected(0, T0 + 10),
+        connected(7, T0 + 20),
+        disconnected(7, T0 + 30),
+    ],
+}
+
+
+def test_any_order_and_any_repetition_end_alike(table):
+    for events in STORIES.values():
+        _any_order(table, events)
+
+
+def _any_order(table, events):
+    last = max(events, key=lambda event: (event["versionNumber"], event["eventType"] == "disconnected"))
+    for order in itertools.permutations(events):
+        row = table(*order, order[0], order[-1])
+        assert row["online"] == (last["eventType"] == "connected"), order
+        assert row["session_version"] == last["versionNumber"]
+        assert row["last_seen_ms"] == last["timestamp"]
+        if row["online"]:
+            assert row["certificate_id"] == last["principalIdentifier"]
+            assert "disconnect_reason" not in row
+
+
+def test_numbers_that_start_again_after_an_hour_are_newer(table):
+    away = disconnected(9, T0)
+    back = connected(0, T0 + 61 * MINUTE_MS)
+    for order in itertools.permutations([connected(9, T0 - MINUTE_MS), away, back]):
+        row = table(*order)
+        assert (row["online"], row["session_version"]) == (True, 0), order
+
+
+def test_a_connection_of_hours_ends(table):
+    assert table(connected(2), disconnected(2, T0 + 300 * MINUTE_MS))["online"] is False
+    # And a copy of its beginning, hours late, does not bring it back.
+    assert table(connected(2), disconnected(2, T0 + 300 * MINUTE_MS), connected(2))["online"] is False
+
+
+def test_the_agents_version(table, capsys):
+    assert table({"robot": "car", "agent_version": "0.1.0"}) == {"robot": "car", "agent_version": "0.1.0"}
+    row = table({"robot": "car", "agent_version": "0.1.0"}, connected())
+    assert (row["agent_version"], row["online"]) == ("0.1.0", True)
+
+
+def test_a_client_without_a_row_makes_none(table, dynamodb, capsys):
+    for event in (
+        connected(client="iort-claim-1"),
+        disconnected(client="x"),
+        {"robot": "x", "agent_version": "1"},
+    ):
+        presence.handler(event, None)
+    table()
+    assert dynamodb.scan(TableName=ROBOTS)["Count"] == 1
+    counted = [json.loads(line) for line in capsys.readouterr().out.splitlines()]
+    assert [line["PresenceIgnored"] for line in counted] == [1, 1, 1]
+
+
+NO_EVENTS = [
+    {},
+    {"eventType": "connected"},
+    {**connected(), "timestamp": "1"},
+    {**connected(), "timestamp": True},
+    {**connected(), "versionNumber": -1},
+    {**connected(), "versionNumber": 1.5},
+    {**connected(), "clientId": "a/b"},
+    {**connected(), "principalIdentifier": None},
+    {**connected(), "principalIdentifier": "x" * 200},
+    {**disconnected(), "disconnectReason": ["x"]},
+    {**connected(), "eventType": "connect_failed"},
+    {"robot": "car", "agent_version": ""},
+    {"robot": "car", "agent_version": {"deep": 1}},
+    {"robot": "#", "agent_version": "1"},
+]
+
+
+def test_what_is_no_event_of_ours_changes_nothing(table, capsys):
+    for event in NO_EVENTS:
+        _changes_nothing(table, event, capsys)
+
+
+def _changes_nothing(table, event, capsys):
+    with pytest.raises(ContractError):
+        presence.change(event)
+    assert table(event) == {"robot": "car"}
+    assert json.loads(capsys.readouterr().out)["PresenceIgnored"] == 1
+
+
+def test_what_dynamodb_refuses_is_tried_again_by_lambda(table, monkeypatch):
+    monkeypatch.setenv("ROBOTS_TABLE", "gone")
+    with pytest.raises(boto3.client("dynamodb").exceptions.ResourceNotFoundException):
+        presence.handler(connected(), None)
+
+
+def test_counts(table, capsys):
+    table(connected(), disconnected(), disconnected())
+    lines = [json.loads(line) for line in capsys.readouterr().out.splitlines()]
+    counted = [{name: line[name] for name in contract.METRICS["presence"] if name in line} for line in lines]
+    assert counted == [{"RobotsConnected": 1}, {"RobotsDisconnected": 1}, {"PresenceIgnored": 1}]
+
+
+def test_times_are_whole_numbers(table):
+    assert table(connected())["last_seen_ms"] == Decimal(T0)
