@@ -135,6 +135,10 @@ def single(settings: Settings) -> dict[str, dict[str, str]]:
             wide("*"): "RegisterThing and two lists know no resources",
         },
         "fleet/Provisioning": {"W3005": "RegisterThing tries role and policy, which must be there first"},
+        "fleet/Presence/EventInvokeConfig": {
+            "Serverless-LambdaAsyncFailureDestination": "tried again for hours, and a robot's next event says "
+            "more than the one that was lost"
+        },
         "ingest/PongRole/DefaultPolicy": {wide(f"{iot}:topic/pong/{settings.namespace}/*/rule"): a_robot},
         "processing/EchoRole/DefaultPolicy": {
             wide(f"{iot}:topic/pong/{settings.namespace}/*/lambda"): a_robot
