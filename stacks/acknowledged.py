@@ -136,8 +136,8 @@ def single(settings: Settings) -> dict[str, dict[str, str]]:
         },
         "fleet/Provisioning": {"W3005": "RegisterThing tries role and policy, which must be there first"},
         "fleet/Presence/EventInvokeConfig": {
-            "Serverless-LambdaAsyncFailureDestination": "tried again for hours, and a robot's next event says "
-            "more than the one that was lost"
+            "Serverless-LambdaAsyncFailureDestination": "tried again for hours, and a robot's next event "
+            "says more than the one that was lost"
         },
         "ingest/PongRole/DefaultPolicy": {wide(f"{iot}:topic/pong/{settings.namespace}/*/rule"): a_robot},
         "processing/EchoRole/DefaultPolicy": {
