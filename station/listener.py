@@ -14,7 +14,7 @@ from pubnub.pnconfiguration import PNConfiguration
 from pubnub.pubnub import PubNub
 from typing_extensions import Self
 
-from contract import DEFAULT_NAMESPACE, ROBOT, T_US, channel
+from contract import DEFAULT_NAMESPACE, ROBOT, T_US, channel, check_namespace
 from station.errors import StationError
 
 _CONNECT_S = 15.0
@@ -41,6 +41,8 @@ OnUpdate = Callable[[dict[str, Any], int, int], None]
 class Listener:
     """Subscribed from `__enter__` to `__exit__`; `heard` grows meanwhile, or ``on_update`` is called.
 
+    ``robot`` None is the whole fleet; ``token`` is PubNub's access token, where Access Manager is on.
+
     The delay compares the car's clock with this machine's, so it is only as good as the two agree.
     Raises `StationError` where PubNub does not answer.
     """
@@ -49,11 +51,12 @@ class Listener:
         self,
         *,
         subscribe_key: str,
-        robot: str,
+        robot: str | None,
         namespace: str = DEFAULT_NAMESPACE,
         origin: str = "",
         tls: bool = True,
         on_update: OnUpdate | None = None,
+        token: str = "",
     ) -> None:
         config = PNConfiguration()
         config.subscribe_key, config.user_id = subscribe_key, "iort-station"
@@ -62,9 +65,11 @@ class Listener:
         config.ssl, config.daemon = tls, True
         config.disable_config_locking = False
         config.reconnect_policy = PNReconnectionPolicy.EXPONENTIAL
-        self._channel = channel(robot, namespace)
+        self._channel = f"{check_namespace(namespace)}.*" if robot is None else channel(robot, namespace)
         self._callback = _Callback(on_update)
         self._client = PubNub(config)
+        if token:
+            self._client.set_token(token)
         self._client.add_listener(self._callback)
 
     @property

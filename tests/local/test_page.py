@@ -1,0 +1,164 @@
+"""The page, in a real browser, on the embedded cloud: what the car sent is what is shown, live and later."""
+
+from __future__ import annotations
+
+import json
+import subprocess
+import sys
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from datetime import datetime, timezone
+from pathlib import Path
+
+from contract import VESC_STREAM
+from local.cloud import EmbeddedCloud
+from local.deployment import ROOT
+from station.answers import answers
+from station.cloud import EMBEDDED
+from station.listener import Listener
+from station.page_server import PageServer
+from tests.browser import plain, shown, until
+from tests.local.conftest import run_agent
+
+RATE_HZ, DRIVE_S = 50, 4
+
+
+@contextmanager
+def watching(embedded: EmbeddedCloud) -> Iterator[subprocess.Popen[str]]:
+    """`iort watch --json`, once it listens."""
+    command = [Path(sys.executable).parent / "iort", "--local", "--embedded", embedded.folder / EMBEDDED.name]
+    process = subprocess.Popen(
+        [*command, "watch", "--json"], cwd=ROOT, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
+    )
+    with process:
+        try:
+            assert "listening to iort.*" in process.stderr.readline()
+            yield process
+        finally:
+            process.kill()
+
+
+def served(embedded: EmbeddedCloud) -> PageServer:
+    return PageServer(
+        namespace=embedded.namespace,
+        subscribe_key=embedded.subscribe_key,
+        origin=embedded.pubnub.origin,
+        tls=False,
+        answers=answers(embedded.cloud),
+    )
+
+
+def test_what_the_car_sent_is_what_is_shown_live_and_later(embedded, bundle, open_page):
+    source = {"type": "sim", "stream": VESC_STREAM, "rate_hz": RATE_HZ, "duration_s": DRIVE_S}
+    car = bundle(sources=[source])
+    listener = Listener(
+        subscribe_key=embedded.subscribe_key,
+        robot=car.robot,
+        namespace=embedded.namespace,
+        origin=embedded.pubnub.origin,
+        tls=False,
+    )
+    with served(embedded) as server, watching(embedded) as watched, listener:
+        page = open_page(f"{server.url}#/car/{car.robot}")
+        report = run_agent(car)
+        until(lambda: listener.heard, "a live message outside")
+        heard = _settled(listener, report["live_published"])
+        newest = max((each for each in heard if each.stream == VESC_STREAM), key=lambda each: each.seq)
+        script = f"iort.robots['{car.robot}']?.streams.{VESC_STREAM}.seq"
+        until(lambda: page.evaluate(script) == newest.seq, "the last message on the page")
+        sample = page.evaluate(f"iort.robots['{car.robot}'].streams.{VESC_STREAM}.sample")
+
+        # The terminal has read the same.
+        line = next(line for line in map(json.loads, watched.stdout) if line["t"] == newest.t_us)
+        assert (line["robot"], line["sample"]) == (car.robot, sample)
+        until(lambda: shown(page, "voltage_input") == f"{sample['voltage_input']:.2f}", "the voltage")
+
+        # Both ends of the comparison wait for a processor; where both had one at once they must agree.
+        delays = page.evaluate(f"iort.delays('{car.robot}')")
+        assert len(delays) == len(heard)
+        outside = [each.delay_ms - each.hops.get("offset_us", 0) / 1000 for each in heard]
+        assert min(abs(a - b) for a, b in zip(delays, outside, strict=True)) <= 20
+
+        _look_back(page, server.url, car.robot, report["streams"][VESC_STREAM]["samples"], sample)
+
+
+def _settled(listener, published):
+    """What was heard, once no more comes: the live lane may lose messages, so their number is no end."""
+    end = time.monotonic() + 60
+    while len(listener.heard) < published and time.monotonic() < end:
+        count = len(listener.heard)
+        time.sleep(1)
+        if len(listener.heard) == count:
+            break
+    return list(listener.heard)
+
+
+def _look_back(page, url, robot, samples, newest):
+    page.goto(f"{url}#/history/{robot}")
+    note = page.locator(".history-note")
+
+    def loaded():
+        if f"{samples} samples" in plain(note.inner_text()):
+            return True
+        if "Loading" not in note.inner_text():
+            page.get_by_role("button", name="Last 5 min").click()
+        return False
+
+    until(loaded, "the samples in the table")
+    assert page.locator("section.panel[aria-label='Voltage input'] .plot canvas").count() == 1
+    row = page.locator("tr[data-field=voltage_input] td")
+    until(lambda: plain(row.nth(1).inner_text()) == f"{newest['voltage_input']:.2f}", "the value now")
+    counted = page.locator("tr[data-field=displacement] td")
+    page.locator(".scrub").focus()
+    page.keyboard.press("Home")
+    until(lambda: plain(counted.nth(0).inner_text()) == "0", "the value at the start")
+    assert plain(counted.nth(1).inner_text()) == f"{newest['displacement']:.0f}"
+    assert plain(counted.nth(2).inner_text()) == f"+{newest['displacement']:.0f}"
+
+
+def test_cloudwatchs_dashboards_are_drawn_from_its_metrics(embedded, open_page):
+    cloudwatch = embedded.cloud.client("cloudwatch")
+    rows = [
+        ["Test/Page", "Laps", "Car", "a", {"stat": "Sum", "period": 60, "label": "laps of a"}],
+        ["...", "b"],
+    ]
+    widgets = [
+        {
+            "type": "text",
+            "x": 0,
+            "y": 0,
+            "width": 24,
+            "height": 1,
+            "properties": {"markdown": "# <b>Laps</b>"},
+        },
+        {
+            "type": "metric",
+            "x": 0,
+            "y": 1,
+            "width": 12,
+            "height": 6,
+            "properties": {
+                "title": "Laps driven",
+                "metrics": rows,
+                "region": "eu-west-1",
+                "view": "timeSeries",
+            },
+        },
+    ]
+    cloudwatch.put_dashboard(DashboardName="page-test", DashboardBody=json.dumps({"widgets": widgets}))
+    now = datetime.now(timezone.utc)
+    for value in (2, 3):
+        datum = {"MetricName": "Laps", "Dimensions": [{"Name": "Car", "Value": "a"}], "Timestamp": now}
+        cloudwatch.put_metric_data(Namespace="Test/Page", MetricData=[{**datum, "Value": value}])
+    with served(embedded) as server:
+        page = open_page(f"{server.url}#/cloudwatch")
+        names = page.locator("#dashboard option")
+        until(lambda: "page-test" in names.all_inner_texts(), "the dashboards")
+        # Our own deployment's stands first, and is drawn.
+        assert names.first.inner_text().lower().startswith(embedded.namespace)
+        page.select_option("#dashboard", "page-test")
+        widget = page.locator("[data-widget='Laps driven']")
+        until(lambda: "laps of a 5" in plain(widget.inner_text()), "the metric's value")
+        assert widget.locator(".plot canvas").count() == 1
+        assert page.locator(".words h3").inner_text() == "<b>Laps</b>"
