@@ -4,7 +4,7 @@ BIN := .venv/bin
 # cdk.json runs `python app.py`.
 bootstrap deploy diff destroy: export PATH := $(CURDIR)/$(BIN):$(PATH)
 
-.PHONY: help demo test check setup bench-agent bench-fleet layer bootstrap deploy diff destroy lock clean
+.PHONY: help demo test check setup bench-agent bench-page screenshots bench-fleet layer bootstrap deploy diff destroy lock clean
 
 help: ## show this
 	@grep -hE '^[a-z-]+:.*## ' Makefile | sed -E 's/^([a-z-]+):.*## /\1\t/' | expand -t 14
@@ -31,6 +31,12 @@ bench-agent: setup ## measure the agent on a real ROS 1 graph: DURATION=30 SOAK=
 bench-fleet: setup ## measure many robots on the embedded cloud: ROBOTS="10 200" SECONDS=300 REPORT=figures.json
 	@$(BIN)/python -m bench.fleet $(if $(ROBOTS),--robots $(ROBOTS)) $(if $(SECONDS),--seconds $(SECONDS)) \
 		$(if $(REPORT),--json "$(REPORT)")
+
+bench-page: setup ## measure what the page costs its browser, 20 cars at 10 Hz: SOAK=300 REPORT=figures.json
+	@$(BIN)/python -m bench.page $(if $(SOAK),--soak $(SOAK)) $(if $(REPORT),--json "$(REPORT)")
+
+screenshots: setup ## take the pictures of docs/images anew
+	@$(BIN)/python -m bench.screenshots
 
 layer: ## build Lambda 1's layer for AWS
 	@$(PYTHON) scripts/setup.py --layer lambda

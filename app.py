@@ -19,6 +19,7 @@ from stacks.monitoring import Monitoring
 from stacks.portable import refuse_what_the_embedded_cloud_drops
 from stacks.processing import Processing
 from stacks.settings import Settings, SettingsError
+from stacks.site import Site
 from stacks.storage import Storage
 
 
@@ -50,6 +51,8 @@ def build(app: App, settings: Settings) -> list[Acknowledged]:
         ingest=ingest,
         fleet=fleet,
     )
+    if settings.site:
+        Site(app, **stack("site"), settings=settings)
     for key, value in {"project": name, "stage": settings.stage, **settings.tags}.items():
         Tags.of(app).add(key, value)
     refuse_what_the_embedded_cloud_drops(app)

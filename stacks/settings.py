@@ -54,8 +54,9 @@ class Settings:
     files are (0: for good), ``upload_gb_a_day`` what one robot may upload in a day, in 1e9 bytes;
     ``live_concurrency`` bounds Lambda 1 (0 reserves nothing, for accounts whose concurrency limit is
     too low to reserve from); ``live_fields`` maps stream to the fields that go to the dashboard;
-    ``layer`` is the folder of Lambda 1's third-party code; ``embedded`` is true for the embedded
-    cloud, which is deployed with the caller's own credentials.
+    ``site`` adds the stack that puts the page on the web; ``layer`` is the folder of Lambda 1's
+    third-party code; ``embedded`` is true for the embedded cloud, which is deployed with the caller's
+    own credentials.
     """
 
     namespace: str = DEFAULT_NAMESPACE
@@ -71,6 +72,7 @@ class Settings:
     live_concurrency: int = 5
     live_fields: Mapping[str, list[str]] = field(default_factory=lambda: {VESC_STREAM: list(VESC_FIELDS)})
     layer: Path = ROOT / "build" / "layer" / "lambda"
+    site: bool = False
     embedded: bool = False
 
     @property
@@ -107,7 +109,7 @@ class Settings:
         ):
             if (value := context(key)) is not None:
                 given[key] = _integer(key, value, low, high)
-        for key in ("embedded", "customer_key"):
+        for key in ("embedded", "customer_key", "site"):
             if (value := context(key)) is not None:
                 given[key] = _boolean(key, value)
         if (email := context("alarm_email")) is not None:
@@ -126,6 +128,10 @@ class Settings:
         settings = cls(**given)
         if settings.budget_usd and not settings.alarm_email:
             raise SettingsError("context budget_usd: a budget needs alarm_email, whom it tells")
+        if settings.site and settings.embedded:
+            raise SettingsError(
+                "context site: the embedded cloud has no CloudFront; `make demo` serves the page"
+            )
         if not settings.layer.is_dir():
             raise SettingsError(f"layer {settings.layer} is not there: run `make layer`")
         return settings

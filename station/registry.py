@@ -31,6 +31,12 @@ def listed(cloud: Cloud) -> Iterator[dict[str, Any]]:
             yield _plain(item)
 
 
+def vehicles(cloud: Cloud) -> dict[str, dict[str, float]]:
+    """What is known of the cars whose speed can be told in m/s, by their names."""
+    gain = "speed_to_erpm_gain"
+    return {str(row[ROBOT]): {gain: float(row[gain])} for row in listed(cloud) if row.get(gain)}
+
+
 def find(cloud: Cloud, robot: str) -> dict[str, Any] | None:
     """A robot's row as it is now; None where it is not registered."""
     answer = cloud.client("dynamodb").get_item(

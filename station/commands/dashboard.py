@@ -8,8 +8,7 @@ from typing import Annotated
 import typer
 from rich.console import Console
 
-from contract import ROBOT
-from station import keys, robots
+from station import keys, registry
 from station.answers import answers
 from station.page_server import PageServer
 
@@ -33,15 +32,10 @@ def dashboard(
     """Serve the live page until Ctrl-C: the fleet, each car, its past, and CloudWatch's dashboards."""
     cloud = context.obj.cloud()
     pubnub_keys = keys.load(cloud)
-    vehicles = {
-        str(row[ROBOT]): {"speed_to_erpm_gain": float(row["speed_to_erpm_gain"])}
-        for row in robots.listed(cloud)
-        if row.get("speed_to_erpm_gain")
-    }
     with PageServer(
         namespace=cloud.namespace,
         subscribe_key=pubnub_keys.subscribe_key,
-        vehicles=vehicles,
+        vehicles=registry.vehicles(cloud),
         token=token,
         answers=answers(cloud),
         host=host,

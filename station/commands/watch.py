@@ -15,7 +15,7 @@ from rich.live import Live
 from rich.text import Text
 
 from contract import ROBOT, T_US, ContractError
-from station import keys, robots
+from station import keys, registry
 from station.listener import Listener
 from station.watch import FleetWatch, read
 
@@ -35,11 +35,7 @@ def watch(
     """Show every car in the terminal, live, until Ctrl-C."""
     cloud = context.obj.cloud()
     pubnub_keys = keys.load(cloud)
-    gains = {
-        str(row[ROBOT]): float(row["speed_to_erpm_gain"])
-        for row in robots.listed(cloud)
-        if row.get("speed_to_erpm_gain")
-    }
+    gains = {robot: car["speed_to_erpm_gain"] for robot, car in registry.vehicles(cloud).items()}
     fleet, done = FleetWatch(gains), threading.Event()
     listener = Listener(
         subscribe_key=pubnub_keys.subscribe_key,

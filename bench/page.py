@@ -1,0 +1,146 @@
+"""`make bench-page`: what the page costs its browser, with 20 cars at 10 Hz.
+
+    python -m bench.page [--cars 20] [--seconds 30] [--soak 300] [--json FILE]
+
+Processor time of the page's main thread and of its worker, as shares of a processor, on the fleet's view
+and on that of one car, by Chromium's own counters; and the JavaScript heap after a collection, every half
+minute of the soak. Processor time, because on a machine that is shared the wall clock measures the others.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import os
+import platform
+import shutil
+import subprocess
+import sys
+import time
+from collections.abc import Iterator
+from contextlib import ExitStack, contextmanager
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+from rich.console import Console
+from rich.table import Table
+
+from local.pubnub_standin import PubNubStandIn
+from station.page_server import PageServer
+
+# Of issue 5.
+MAX_BUSY = 0.30
+_WARM_UP_S = 35.0  # until the charts' 30 s are full
+_STEP_S = 30.0
+_KEY = "bench"
+_FLAGS = ("--no-sandbox", "--disable-gpu", "--disable-background-networking", "--no-first-run")
+
+
+@dataclass(frozen=True)
+class View:
+    """Shares of a processor, over so many seconds, and the messages a second that came meanwhile."""
+
+    name: str
+    seconds: float
+    main_thread: float
+    messages_per_s: float
+
+
+def main() -> None:
+    """Measure and print; exit status 1 where the main thread is busier than it may be."""
+    options = _options()
+    console = Console()
+    try:
+        from playwright.sync_api import sync_playwright  # noqa: PLC0415 (only this command needs it)
+    except ImportError:
+        sys.exit("bench-page: playwright is not installed")
+    chromium = os.environ.get("CHROMIUM") or shutil.which("chromium")
+    if not chromium:
+        sys.exit("bench-page: there is no chromium here: apt-get install chromium, or name it in CHROMIUM")
+    with ExitStack() as stack:
+        pubnub = stack.enter_context(PubNubStandIn(publish_key=_KEY, subscribe_key=_KEY))
+        vehicles = {f"car{i + 1}": {"speed_to_erpm_gain": 4614.0} for i in range(options.cars)}
+        server = PageServer(
+            namespace="iort", subscribe_key=_KEY, origin=pubnub.origin, tls=False, vehicles=vehicles
+        )
+        url = stack.enter_context(server).url
+        stack.enter_context(_cars(pubnub.origin, options.cars))
+        play = stack.enter_context(sync_playwright())
+        browser = play.chromium.launch(executable_path=chromium, args=list(_FLAGS))
+        page = browser.new_page(viewport={"width": 1440, "height": 900})
+        page.goto(url)
+        probe = page.context.new_cdp_session(page)
+        probe.send("Performance.enable", {"timeDomain": "threadTicks"})
+        views = []
+        for name, address in (("fleet", "#/"), ("one car", "#/car/car1")):
+            page.goto(url + address)
+            with console.status(f"{name}: filling the charts"):
+                page.wait_for_timeout(_WARM_UP_S * 1000)
+            with console.status(f"{name}: measuring for {options.seconds:.0f} s"):
+                views.append(_measure(page, probe, name, options.seconds))
+        heap = []
+        for _ in range(int(options.soak / _STEP_S) + 1):
+            heap.append(_heap_mb(probe))
+            with console.status(f"memory: {heap[-1]:.1f} MB after {len(heap) * _STEP_S - _STEP_S:.0f} s"):
+                page.wait_for_timeout(_STEP_S * 1000)
+        bounds = page.evaluate("iort.bounds")
+        browser.close()
+    _print(console, views, heap, options.cars)
+    if options.json:
+        machine = {"python": platform.python_version(), "cpus": os.cpu_count()}
+        figures = {"views": [asdict(view) for view in views], "heap_mb": heap, "bounds": bounds, **machine}
+        options.json.write_text(json.dumps(figures, indent=2) + "\n")
+    sys.exit(1 if any(view.main_thread > MAX_BUSY for view in views) else 0)
+
+
+def _options() -> argparse.Namespace:
+    parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
+    parser.add_argument("--cars", type=int, default=20)
+    parser.add_argument("--seconds", type=float, default=30.0, help="of each view")
+    parser.add_argument("--soak", type=float, default=300.0, help="seconds of watching the memory")
+    parser.add_argument("--json", type=Path, help="write the figures as JSON")
+    return parser.parse_args()
+
+
+@contextmanager
+def _cars(origin: str, count: int) -> Iterator[None]:
+    """The cars, in a process of their own; it ends when its input does."""
+    keys = ["--publish-key", _KEY, "--subscribe-key", _KEY]
+    command = [sys.executable, "-m", "bench.cars", "--origin", origin, *keys, "--cars", str(count)]
+    with subprocess.Popen(command, stdin=subprocess.PIPE):
+        yield
+
+
+def _measure(page: Any, probe: Any, name: str, seconds: float) -> View:
+    before, messages = _metrics(probe), page.evaluate("iort.received")
+    began = time.monotonic()
+    page.wait_for_timeout(seconds * 1000)
+    took = time.monotonic() - began
+    busy = _metrics(probe)["TaskDuration"] - before["TaskDuration"]
+    received = page.evaluate("iort.received") - messages
+    return View(name, took, busy / took, received / took)
+
+
+def _metrics(probe: Any) -> dict[str, float]:
+    return {each["name"]: each["value"] for each in probe.send("Performance.getMetrics")["metrics"]}
+
+
+def _heap_mb(probe: Any) -> float:
+    probe.send("HeapProfiler.collectGarbage")
+    return float(_metrics(probe)["JSHeapUsedSize"]) / 1e6
+
+
+def _print(console: Console, views: list[View], heap: list[float], cars: int) -> None:
+    table = Table(title=f"The page with {cars} cars at 10 Hz", title_justify="left")
+    for name in ("view", "main thread busy", "messages/s"):
+        table.add_column(name, justify="left" if name == "view" else "right")
+    for view in views:
+        table.add_row(view.name, f"{view.main_thread:.1%} of a processor", f"{view.messages_per_s:.0f}")
+    console.print(table)
+    told = ", ".join(f"{mb:.1f}" for mb in heap)
+    console.print(f"JavaScript heap after a collection, MB, every {_STEP_S:.0f} s: {told}", highlight=False)
+
+
+if __name__ == "__main__":
+    main()

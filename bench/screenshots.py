@@ -1,0 +1,159 @@
+"""Takes the pictures in docs/images: `make screenshots`, or with --out and --only for a look.
+
+On the embedded cloud: one real agent drives a simulated car through everything, and other cars are
+published to PubNub's stand-in as Lambda 1 would, so that there is a fleet to see, with a fault, a car that
+is gone, poses and accelerations.
+"""
+
+from __future__ import annotations
+
+import argparse
+import os
+import shutil
+import subprocess
+import sys
+import tempfile
+import threading
+import time
+from collections.abc import Iterator
+from contextlib import ExitStack, contextmanager
+from pathlib import Path
+from typing import Any, Literal
+
+from bench.cars import Publisher, SimulatedCar, drive
+from local.cloud import EmbeddedCloud
+from local.deployment import ROOT
+from station import keys, robots
+from station.answers import answers
+from station.page_server import PageServer
+
+OUT = ROOT / "docs" / "images"
+DRIVE_S = 100
+_REAL = "car1"
+_FLEET = 11
+_FAULTY, _STOPS, _SENSES = 4, 7, 1
+LAPTOP, PHONE = (1280, 800), (390, 844)
+VIEWS = {
+    "fleet": "#/",
+    "car": "#/car/car2",
+    "history": f"#/history/{_REAL}",
+    "cloudwatch": "#/cloudwatch",
+}
+_COLOURS = 128
+
+Theme = Literal["dark", "light"]
+
+
+def main() -> None:
+    """Drive, look, and write one PNG a view, theme and width."""
+    parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
+    parser.add_argument("--out", type=Path, default=OUT)
+    parser.add_argument("--only", choices=[*VIEWS], nargs="*", default=[*VIEWS])
+    options = parser.parse_args()
+    from playwright.sync_api import sync_playwright  # noqa: PLC0415 (only this command needs it)
+
+    chromium = os.environ.get("CHROMIUM") or shutil.which("chromium")
+    if not chromium:
+        sys.exit("screenshots: there is no chromium here: apt-get install chromium, or name it in CHROMIUM")
+    with ExitStack() as stack:
+        folder = Path(stack.enter_context(tempfile.TemporaryDirectory()))
+        cloud = stack.enter_context(EmbeddedCloud(folder / "local"))
+        stack.enter_context(_driving(cloud, folder))
+        vehicles = {f"car{i + 1}": {"speed_to_erpm_gain": 4614.0} for i in range(_FLEET + 1)}
+        server = PageServer(
+            namespace=cloud.namespace,
+            subscribe_key=cloud.subscribe_key,
+            origin=cloud.pubnub.origin,
+            tls=False,
+            vehicles=vehicles,
+            answers=answers(cloud.cloud),
+        )
+        url = stack.enter_context(server).url
+        play = stack.enter_context(sync_playwright())
+        browser = play.chromium.launch(executable_path=chromium, args=["--no-sandbox", "--disable-gpu"])
+        pages = {}
+        for view in options.only:
+            on_phone: Theme = "light" if view in {"car", "cloudwatch"} else "dark"
+            looks: list[tuple[str, tuple[int, int], Theme]] = [
+                ("dark", LAPTOP, "dark"),
+                ("light", LAPTOP, "light"),
+                ("phone", PHONE, on_phone),
+            ]
+            for name, size, theme in looks:
+                page = browser.new_page(
+                    viewport={"width": size[0], "height": size[1]},
+                    color_scheme=theme,
+                    device_scale_factor=2 if size is PHONE else 1,
+                    has_touch=size is PHONE,
+                )
+                page.goto(url + VIEWS[view])
+                pages[f"{view}-{name}"] = page
+        # Until the charts are full, and a minute's metrics have been counted.
+        next(iter(pages.values())).wait_for_timeout(75_000)
+        for name, page in pages.items():
+            page.bring_to_front()
+            if name.startswith("history"):
+                _scrub(page)
+            page.wait_for_timeout(6_000 if name.startswith("car") else 1_500)
+            page.screenshot(path=options.out / f"{name}.png", full_page=False)
+            _shrink(options.out / f"{name}.png")
+        browser.close()
+
+
+def _scrub(page: Any) -> None:
+    page.get_by_role("button", name="Last 1 min").click()
+    page.wait_for_selector(".scrub")
+    page.wait_for_timeout(2_000)
+    slider = page.locator(".scrub")
+    half = int(slider.get_attribute("max") or 0) * 6 // 10
+    slider.evaluate(f"(node) => {{ node.value = {half}; node.dispatchEvent(new Event('input')) }}")
+
+
+@contextmanager
+def _driving(cloud: EmbeddedCloud, folder: Path) -> Iterator[None]:
+    """The real agent, and the other cars, until the block ends."""
+    source = {"type": "sim", "rate_hz": 50, "duration_s": DRIVE_S * 3}
+    settings = {"sources": [source], "ping": {"rate_hz": 2}}
+    bundle = robots.add(cloud.cloud, _REAL, out=folder, settings=settings)
+    agent = [str(Path(sys.executable).parent / "iort-agent"), "run", "--config", str(bundle.config)]
+    publish_key = keys.load(cloud.cloud).publish_key
+    publisher = Publisher(
+        origin=cloud.pubnub.origin, publish_key=publish_key, subscribe_key=cloud.subscribe_key
+    )
+    cars = [SimulatedCar(f"car{i + 2}", i + 2, senses=i + 1 == _SENSES) for i in range(_FLEET)]
+    stop = threading.Event()
+    driving = threading.Thread(target=drive, args=(cars, publisher, stop))
+    events = [
+        threading.Timer(30, lambda: setattr(cars[0], "fault_code", 4)),
+        threading.Timer(32, lambda: setattr(cars[0], "fault_code", 0)),
+        threading.Timer(50, lambda: setattr(cars[_FAULTY], "fault_code", 5)),
+        threading.Timer(55, lambda: cars.pop(_STOPS)),
+    ]
+    with (folder / "agent.log").open("w") as log, subprocess.Popen(agent, cwd=ROOT, stderr=log) as process:
+        driving.start()
+        for event in events:
+            event.start()
+        try:
+            yield
+        finally:
+            for event in events:
+                event.cancel()
+            stop.set()
+            driving.join()
+            publisher.close()
+            process.terminate()
+
+
+def _shrink(path: Path) -> None:
+    """A palette instead of millions of colours: a third of the bytes, and nobody sees it."""
+    from PIL import Image  # noqa: PLC0415
+
+    with Image.open(path) as image:
+        small = image.convert("RGB").quantize(_COLOURS, dither=Image.Dither.NONE)
+    small.save(path, optimize=True)
+
+
+if __name__ == "__main__":
+    began = time.monotonic()
+    main()
+    print(f"done in {time.monotonic() - began:.0f} s")

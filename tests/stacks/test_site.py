@@ -1,0 +1,72 @@
+"""The page on the web: nobody reads the bucket but CloudFront, and the browser is told what to allow."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import pytest
+
+from stacks.settings import Settings
+from station.page import HEADERS, PUBNUB_ORIGIN, security_policy
+
+
+@pytest.fixture(scope="module")
+def site() -> dict[str, Any]:
+    from aws_cdk import App
+
+    from stacks.site import Site
+
+    app = App()
+    Site(app, "iort-site", settings=Settings())
+    template: dict[str, Any] = app.synth().get_stack_by_name("iort-site").template
+    return template
+
+
+def of(site: dict[str, Any], kind: str) -> list[dict[str, Any]]:
+    return [each["Properties"] for each in site["Resources"].values() if each["Type"] == kind]
+
+
+def test_it_needs_neither_an_asset_nor_a_function(site):
+    assert {each["Type"] for each in site["Resources"].values()} == {
+        "AWS::S3::Bucket",
+        "AWS::S3::BucketPolicy",
+        "AWS::CloudFront::Distribution",
+        "AWS::CloudFront::OriginAccessControl",
+        "AWS::CloudFront::ResponseHeadersPolicy",
+    }
+
+
+def test_the_bucket_is_private_and_read_by_this_distribution_alone(site):
+    (bucket,) = of(site, "AWS::S3::Bucket")
+    assert all(bucket["PublicAccessBlockConfiguration"].values())
+    (policy,) = of(site, "AWS::S3::BucketPolicy")
+    allowed = [each for each in policy["PolicyDocument"]["Statement"] if each["Effect"] == "Allow"]
+    assert [(each["Action"], each["Principal"]) for each in allowed] == [
+        ("s3:GetObject", {"Service": "cloudfront.amazonaws.com"})
+    ]
+    (distribution,) = (
+        n for n, r in site["Resources"].items() if r["Type"] == "AWS::CloudFront::Distribution"
+    )
+    assert {"Ref": distribution} in allowed[0]["Condition"]["StringEquals"]["AWS:SourceArn"]["Fn::Join"][1]
+
+
+def test_it_speaks_tls_and_sends_what_the_pages_own_server_sends(site):
+    (distribution,) = of(site, "AWS::CloudFront::Distribution")
+    behaviour = distribution["DistributionConfig"]["DefaultCacheBehavior"]
+    assert behaviour["ViewerProtocolPolicy"] == "redirect-to-https"
+    assert behaviour["AllowedMethods"] == ["GET", "HEAD"]
+    (headers,) = of(site, "AWS::CloudFront::ResponseHeadersPolicy")
+    security = headers["ResponseHeadersPolicyConfig"]["SecurityHeadersConfig"]
+    policy = security["ContentSecurityPolicy"]["ContentSecurityPolicy"]
+    assert policy == security_policy(origin=PUBNUB_ORIGIN, tls=True)
+    assert security["ReferrerPolicy"]["ReferrerPolicy"] == HEADERS["Referrer-Policy"]
+    assert security["ContentTypeOptions"]["Override"] is True
+    assert security["StrictTransportSecurity"]["AccessControlMaxAgeSec"] == 365 * 86_400
+    custom = headers["ResponseHeadersPolicyConfig"]["CustomHeadersConfig"]["Items"]
+    assert {each["Header"]: each["Value"] for each in custom} == {
+        "Cross-Origin-Resource-Policy": HEADERS["Cross-Origin-Resource-Policy"]
+    }
+
+
+def test_it_is_left_out_unless_asked_for(synthesized):
+    assert "site" not in synthesized.templates
