@@ -108,6 +108,6 @@ def _text(asked: Mapping[str, str], name: str) -> str:
 def _whole(asked: Mapping[str, str], name: str, least: int, most: int) -> int:
     text = _text(asked, name)
     # Sixteen digits hold all that is allowed.
-    if not text.isdecimal() or len(text) > 16 or not least <= int(text) <= most:
+    if not (text.isascii() and text.isdecimal()) or len(text) > 16 or not least <= int(text) <= most:
         raise StationError(f"{name} {text[:40]!r}: allowed is a whole number from {least} to {most}")
     return int(text)

@@ -1,0 +1,84 @@
+"""What the page is answered about a car's past."""
+
+from __future__ import annotations
+
+import json
+
+import numpy as np
+import pytest
+
+from contract import Batch
+from station.answers import MAX_ROWS, answers, history
+from station.errors import StationError
+from tests.unit.test_station_data import START, cloud_of, ride
+
+ASKED = {
+    "robot": "car",
+    "stream": "vesc",
+    "from_us": str(START),
+    "to_us": str(START + 10_000_000),
+    "rows": "50",
+}
+
+
+def test_few_samples_come_as_they_are():
+    found = history(cloud_of(*ride(40)), ASKED)
+    assert found["samples"] == 40
+    assert found["row_s"] == 0
+    assert found["times_s"] == [(START + 20_000 * i) / 1e6 for i in range(40)]
+    assert found["fields"] == {"speed": {"mean": list(range(40))}}
+
+
+def test_many_samples_come_as_mean_within_least_and_most():
+    found = history(cloud_of(*ride(500)), ASKED)
+    speed = found["fields"]["speed"]
+    assert found["samples"] == 500
+    assert len(found["times_s"]) <= 50
+    assert found["row_s"] == pytest.approx(0.2, abs=0.001)
+    # Every sample is in one row: a row's numbers follow those of the row before.
+    assert speed["least"][0] == 0
+    assert speed["most"][-1] == 499
+    assert [a - b for a, b in zip(speed["least"][1:], speed["most"], strict=False)] == [1] * (
+        len(speed["most"]) - 1
+    )
+    assert speed["mean"] == pytest.approx((np.array(speed["least"]) + np.array(speed["most"])) / 2)
+
+
+def test_what_is_no_number_is_the_last_of_its_row_and_null_stays_null():
+    times = [START + 20_000 * i for i in range(4)]
+    columns = {"frame": ["a", "b", "c", "d"], "on": [True, False, True, True], "x": [None, None, 3.5, None]}
+    found = history(cloud_of(Batch("0badcafe", 0, times, columns)), {**ASKED, "rows": "2"})
+    assert found["fields"]["frame"]["mean"] == ["b", "d"]
+    assert found["fields"]["on"]["mean"] == [False, True]
+    assert found["fields"]["x"] == {"mean": [None, 3.5], "least": [None, 3.5], "most": [None, 3.5]}
+    json.dumps(found, allow_nan=False)
+
+
+def test_an_empty_range_is_no_error():
+    late = {**ASKED, "from_us": str(START + 60_000_000), "to_us": str(START + 61_000_000)}
+    found = history(cloud_of(*ride(10)), late)
+    assert (found["samples"], found["times_s"]) == (0, [])
+
+
+@pytest.mark.parametrize(
+    ("change", "says"),
+    [
+        ({"robot": ""}, "names no robot"),
+        ({"robot": "../x"}, "robot name"),
+        ({"robot": "nobody"}, "there is no robot nobody"),
+        ({"stream": "odom"}, "has no stream odom"),
+        ({"from_us": "-1"}, "from_us"),
+        ({"from_us": "9" * 400}, "from_us"),
+        ({"from_us": "\u0661"}, "from_us"),
+        ({"to_us": str(START)}, "ends before it starts"),
+        ({"rows": "1"}, "rows"),
+        ({"rows": str(MAX_ROWS + 1)}, "rows"),
+    ],
+)
+def test_what_cannot_be_answered_says_why(change, says):
+    with pytest.raises(StationError, match=says):
+        history(cloud_of(*ride(10)), {**ASKED, **change})
+
+
+def test_streams_are_those_stored():
+    assert answers(cloud_of(*ride(10)))["streams"]({"robot": "car"}) == {"streams": ["vesc"]}

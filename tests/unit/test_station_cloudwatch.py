@@ -1,0 +1,102 @@
+"""CloudWatch's dashboards as the page draws them."""
+
+from __future__ import annotations
+
+import json
+from datetime import datetime, timezone
+
+import boto3
+import pytest
+
+from station import cloudwatch
+from station.errors import StationError
+
+NOW_S = 1_700_000_000
+
+
+class FakeCloud:
+    """A `station.cloud.Cloud` with CloudWatch alone."""
+
+    namespace = "iort"
+
+    def client(self, service):
+        assert service == "cloudwatch"
+        return boto3.client(service)
+
+
+@pytest.fixture
+def cloud(aws):
+    return FakeCloud()
+
+
+def put(cloud, name, *widgets):
+    cloud.client("cloudwatch").put_dashboard(
+        DashboardName=name, DashboardBody=json.dumps({"widgets": list(widgets)})
+    )
+
+
+def metric(*rows, **properties):
+    return {
+        "type": "metric",
+        "x": 8,
+        "y": 1,
+        "properties": {"metrics": list(rows), "title": "T", **properties},
+    }
+
+
+def test_our_dashboards_come_first(cloud):
+    for name in ("another", "iort-monitoring", "Zebra"):
+        put(cloud, name)
+    assert cloudwatch.dashboards(cloud) == ["iort-monitoring", "Zebra", "another"]
+
+
+def test_a_widget_has_its_place_and_its_metrics_values(cloud):
+    rows = [
+        ["My/Cars", "Laps", "Car", "a", {"stat": "Sum", "period": 60, "label": "laps"}],
+        [".", "Speed", ".", "a", {"stat": "Maximum", "period": 60, "yAxis": "right"}],
+    ]
+    put(cloud, "d", metric(*rows, view="timeSeries"), {"type": "text", "properties": {"markdown": "# Hello"}})
+    client = cloud.client("cloudwatch")
+    for name, value in (("Laps", 2), ("Laps", 3), ("Speed", 4.5)):
+        datum = {"MetricName": name, "Dimensions": [{"Name": "Car", "Value": "a"}], "Value": value}
+        stamp = datetime.fromtimestamp(NOW_S - 120, timezone.utc)
+        client.put_metric_data(Namespace="My/Cars", MetricData=[{**datum, "Timestamp": stamp}])
+    found = cloudwatch.dashboard(cloud, "d", minutes=30, now_s=NOW_S)
+    drawn, words = found["widgets"]
+    assert found["to_s"] - found["from_s"] == 30 * 60
+    assert (drawn["x"], drawn["y"], drawn["width"], drawn["height"]) == (8, 1, 6, 6)
+    assert (drawn["kind"], drawn["title"], drawn["period_s"]) == ("series", "T", 60)
+    laps, speed = drawn["series"]
+    assert (laps["label"], laps["right"], laps["values"]) == ("laps", False, [5])
+    assert (speed["label"], speed["right"], speed["values"]) == ("Speed", True, [4.5])
+    assert found["from_s"] <= laps["times_s"][0] <= found["to_s"]
+    assert (words["kind"], words["text"]) == ("text", "# Hello")
+
+
+def test_shorthand_of_a_row_is_what_the_row_before_has():
+    rows = [
+        ["AWS/IoT", "Success", "RuleName", "a", "ActionType", "Lambda", {"label": "x"}],
+        [".", "Failure", ".", "b", ".", "."],
+        ["...", "Republish"],
+        [{"expression": "m1 + m2", "id": "e1"}],
+    ]
+    assert [parts for parts, _ in cloudwatch.metrics(rows)] == [
+        ["AWS/IoT", "Success", "RuleName", "a", "ActionType", "Lambda"],
+        ["AWS/IoT", "Failure", "RuleName", "b", "ActionType", "Lambda"],
+        ["AWS/IoT", "Failure", "RuleName", "b", "ActionType", "Republish"],
+        [],
+    ]
+
+
+def test_what_it_does_not_draw_it_names(cloud):
+    put(cloud, "d", {"type": "log", "properties": {"query": "x"}}, {"type": "alarm", "properties": {}})
+    found = cloudwatch.dashboard(cloud, "d", minutes=5, now_s=NOW_S)
+    assert [(each["kind"], each["text"].split(":")[0]) for each in found["widgets"]] == [
+        ("other", "a widget of type log"),
+        ("other", "a widget of type alarm"),
+    ]
+
+
+def test_a_dashboard_that_is_not_there_says_so(cloud):
+    with pytest.raises(StationError, match="no dashboard 'nobody'"):
+        cloudwatch.dashboard(cloud, "nobody", minutes=5, now_s=NOW_S)
