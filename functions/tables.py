@@ -88,6 +88,20 @@ class Tables:
         for page in pages:
             yield from map(plain, page["Items"])
 
+    def page(
+        self, condition: Mapping[str, Any], after: Mapping[str, Any] | None, *, scan: bool
+    ) -> dict[str, Any]:
+        """One page of the telemetry table, as DynamoDB gives it: 1 MB read, before any filter.
+
+        ``condition`` are the expressions of a Query or a Scan; ``after`` is the key that the page before
+        ended with.
+        """
+        request = {"TableName": self._telemetry, "ConsistentRead": True, **condition}
+        if after is not None:
+            request["ExclusiveStartKey"] = after
+        page: dict[str, Any] = (self._client.scan if scan else self._client.query)(**request)
+        return page
+
     def vehicle(self, robot: str) -> Vehicle | None:
         """The robot's parameters, read at most once a minute; None where none are registered."""
         now = time.monotonic()

@@ -225,6 +225,7 @@ class EmbeddedCloud:
             ("processing", "Upload"): {TOPIC: build_topic(PING, "warm-up", FILE, self.namespace)},
             ("fleet", "Admit"): {},
             ("fleet", "Presence"): {},
+            ("processing", "Query"): {},
         }
         client = self.cloud.client("lambda")
         for (stack, name), event in warm_up.items():

@@ -123,7 +123,7 @@ class Monitoring(Stack):
 
     @staticmethod
     def _functions(processing: Processing, fleet: Fleet) -> list[cloudwatch.GraphWidget]:
-        named = dict(zip(("live", "summarize", "echo", "upload"), processing.functions, strict=True))
+        named = dict(zip(("live", "summarize", "echo", "upload", "query"), processing.functions, strict=True))
         named |= {"admit": fleet.admit, "presence": fleet.presence}
 
         def each(

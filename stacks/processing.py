@@ -12,7 +12,7 @@ from aws_cdk import aws_lambda_event_sources as sources
 from aws_cdk import aws_sqs as sqs
 from constructs import Construct
 
-from contract import FILE, FILES_PREFIX, LAMBDA, PONG, pubnub_parameter
+from contract import FILE, FILES_PREFIX, LAMBDA, PONG, RESULTS_PREFIX, pubnub_parameter
 from stacks.function import RUNTIME, function
 from stacks.settings import Settings
 from stacks.storage import Storage
@@ -38,7 +38,8 @@ class Processing(Stack):
         self.summarize = self._summarize(storage)
         self.echo = self._echo(settings)
         self.upload = self._upload(settings, storage)
-        self.functions = (self.live, self.summarize, self.echo, self.upload)
+        self.query = self._query(storage)
+        self.functions = (self.live, self.summarize, self.echo, self.upload, self.query)
 
     def _live(self, settings: Settings) -> lambda_.Function:
         name = pubnub_parameter(settings.namespace)
@@ -108,6 +109,34 @@ class Processing(Stack):
             )
         )
         return summarize
+
+    def _query(self, storage: Storage) -> lambda_.Function:
+        query = function(
+            self,
+            "Query",
+            settings=self._settings,
+            encryption=self._encryption,
+            module="query",
+            # AWS gives a whole core at 1769 MB, and decoding is all that it does.
+            memory_mb=1769,
+            # Short enough for the caller's connection; what takes longer goes on in another invocation.
+            timeout_s=18,
+            environment={
+                "TELEMETRY_TABLE": storage.telemetry.table_name,
+                "ROBOTS_TABLE": storage.robots.table_name,
+                "FILES_BUCKET": storage.files.bucket_name,
+            },
+        )
+        storage.telemetry.grant(query, "dynamodb:Query", "dynamodb:Scan")
+        storage.robots.grant(query, "dynamodb:GetItem")
+        # The pre-signed address is good for what the function itself may read.
+        query.add_to_role_policy(
+            iam.PolicyStatement(
+                actions=["s3:GetObject", "s3:PutObject"],
+                resources=[storage.files.arn_for_objects(f"{RESULTS_PREFIX}*")],
+            )
+        )
+        return query
 
     def _echo(self, settings: Settings) -> lambda_.Function:
         echo = function(

@@ -137,7 +137,7 @@ def _decoded(items: Iterable[Mapping[str, Any]], refused: Refused, wanted: Calla
 
     def close() -> None:
         if times:
-            columns = {name: _column(column, numeric=numeric) for name, column in lists.items()}
+            columns = {name: column_of(column, numeric=numeric) for name, column in lists.items()}
             parts.append(Block(np.array(times, dtype=np.int64), columns))
 
     for item in items:
@@ -224,7 +224,8 @@ def _plain(value: Mapping[str, Any]) -> Any:
     return content
 
 
-def _column(column: list[Value], *, numeric: bool) -> Column:
+def column_of(column: list[Value], *, numeric: bool = False) -> Column:
+    """A list of values as a column; ``numeric`` where all are known to be numbers or null."""
     if not numeric:
         kinds = set(map(type, column))
         if kinds == {bool}:

@@ -12,7 +12,7 @@ A range includes its start and not its end, to the microsecond.
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -29,8 +29,7 @@ from contract import (
     VESC_FIELDS,
     VESC_STREAM,
 )
-from functions.statistics import Vehicle
-from station import inventory, reading
+from station import inventory, reading, remote
 from station.blocks import ATTRIBUTES, Block, Refused, blocks, join
 from station.cloud import Cloud
 from station.conditions import Column, derive, holds
@@ -38,8 +37,11 @@ from station.errors import StationError
 from station.progress import Told
 from station.resample import resample
 from station.seconds import seconds
-from station.selection import MADE_OF, Selection, select
+from station.selection import Selection, select
 from station.times import Time, duration_us
+
+# Where samples are chosen: on this machine, or by the query function in the cloud.
+CLIENT, LAMBDA = "client", "lambda"
 
 
 @dataclass(frozen=True)
@@ -85,6 +87,7 @@ def query(
     where: str | None = None,
     every: str | None = None,
     summary: bool = False,
+    on: str = CLIENT,
     scan: bool = False,
     progress: Told | None = None,
 ) -> Result:
@@ -95,7 +98,8 @@ def query(
     are derived with the robot's parameters, and so may ``where``, a condition in the language of
     functions/expression.py. ``every`` (``"1s"``) puts samples together, see station/resample.py.
     ``summary`` reads the seconds that Lambda 2 has written instead of samples; a field then stands for
-    its ``_min``, ``_mean``, ``_max`` and ``_last``. ``scan`` reads by Scan instead of by Query.
+    its ``_min``, ``_mean``, ``_max`` and ``_last``. ``on="lambda"`` has the query function choose the
+    samples in the cloud. ``scan`` reads by Scan instead of by Query.
 
     Raises `StationError` for a robot, stream or field that is not there, naming those that are, and for
     a time or condition that cannot be read.
@@ -103,7 +107,11 @@ def query(
     selection = select(robot, stream, start, end, fields=fields, where=where)
     every_us = duration_us(every) if every is not None else None
     refused = Refused()
-    if summary:
+    if on == LAMBDA:
+        if summary:
+            raise StationError("the query function reads samples; the summary is read from here")
+        found = remote.samples(cloud, selection, refused=refused, scan=scan, progress=progress)
+    elif summary:
         found = seconds(cloud, selection, scan=scan, progress=progress)
     else:
         found = samples(cloud, selection, refused=refused, scan=scan, progress=progress)
@@ -146,8 +154,8 @@ def samples(
         names = block.columns if fields is None else fields
         if len(chosen.times_us):
             yield Block(chosen.times_us, {name: _column(chosen, name) for name in names})
-    if some and (unknown := sorted(named - there)):
-        raise StationError(_unknown(cloud, selection, unknown, vehicle))
+    if some:
+        inventory.check_fields(cloud, selection, there)
 
 
 def unit(stream: str, name: str) -> str:
@@ -175,16 +183,3 @@ def _trimmed(block: Block, selection: Selection) -> Block:
 def _column(block: Block, name: str) -> Column:
     """A column; null where these samples have none."""
     return block.columns[name] if name in block.columns else np.full(len(block.times_us), np.nan)
-
-
-def _unknown(cloud: Cloud, selection: Selection, unknown: Sequence[str], vehicle: Vehicle | None) -> str:
-    whole = replace(selection, fields=None, condition=None)
-    page = next(reading.batches(cloud, whole, ATTRIBUTES), ())
-    there = {name for block in blocks([page], Refused()) for name in block.columns}
-    possible = there | {name for name, parts in MADE_OF.items() if there.issuperset(parts)}
-    if vehicle is None and "speed_mps" in possible.intersection(unknown):
-        return f"speed_mps needs the speed_to_erpm_gain of {selection.robot}, which the registry lacks"
-    return (
-        f"{selection.robot} has no {', '.join(unknown)} in {selection.stream} in this range; "
-        f"it has {', '.join(sorted(possible))}"
-    )

@@ -2,11 +2,16 @@
 
 from __future__ import annotations
 
+from collections.abc import Set as AbstractSet
+from dataclasses import replace
+
 from contract import OWN_STREAMS, ROBOT, VESC_STREAM
 from functions.statistics import Vehicle
 from station import reading, registry, robots
+from station.blocks import ATTRIBUTES, Refused, blocks
 from station.cloud import Cloud
 from station.errors import StationError
+from station.selection import MADE_OF, Selection
 from station.times import iso
 
 
@@ -30,6 +35,25 @@ def check_there(cloud: Cloud, robot: str, stream: str) -> None:
     if not has and robot not in known:
         raise StationError(f"there is no robot {robot}; there is {', '.join(known) or 'none at all'}")
     raise StationError(f"{robot} has no stream {stream}; it has {has or 'sent nothing yet'}")
+
+
+def check_fields(cloud: Cloud, selection: Selection, there: AbstractSet[str]) -> None:
+    """Raise `StationError` where the selection names a field that is not ``there``, naming those that are."""
+    unknown = sorted(selection.named() - there)
+    if not unknown:
+        return
+    whole = replace(selection, fields=None, condition=None)
+    page = next(reading.batches(cloud, whole, ATTRIBUTES), ())
+    stored = {name for block in blocks([page], Refused()) for name in block.columns}
+    possible = stored | {name for name, parts in MADE_OF.items() if stored.issuperset(parts)}
+    if "speed_mps" in possible.intersection(unknown):
+        raise StationError(
+            f"speed_mps needs the speed_to_erpm_gain of {selection.robot}, which the registry lacks"
+        )
+    raise StationError(
+        f"{selection.robot} has no {', '.join(unknown)} in {selection.stream} in this range; "
+        f"it has {', '.join(sorted(possible))}"
+    )
 
 
 def streams_of(cloud: Cloud, robot: str) -> list[str]:

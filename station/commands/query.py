@@ -31,6 +31,13 @@ class Format(str, Enum):
     parquet = "parquet"
 
 
+class On(str, Enum):
+    """Where the samples are chosen."""
+
+    client = "client"
+    lambda_ = "lambda"
+
+
 @commands.command("query")
 def query(
     context: typer.Context,
@@ -53,6 +60,9 @@ def query(
     output: Annotated[
         Path | None, typer.Option("--output", "-o", help="A file; otherwise standard output.")
     ] = None,
+    on: Annotated[
+        On, typer.Option(help="Choose samples on this machine, or in the cloud's query function.")
+    ] = On.client,
     scan: Annotated[
         bool,
         typer.Option("--scan", help="Scan the whole table instead: slow, to compare with."),
@@ -80,6 +90,7 @@ def query(
             where=where,
             every=every,
             summary=summary,
+            on=on.value,
             scan=scan,
             progress=progress,
         )

@@ -98,6 +98,15 @@ ROLES = {
         "lambda.amazonaws.com",
         {(action, "EchoLog.Arn") for action in LOG} | {("iot:Publish", f"{IOT}:topic/pong/iort/*/lambda")},
     ),
+    "QueryRole": (
+        "lambda.amazonaws.com",
+        {(action, "QueryLog.Arn") for action in LOG}
+        | {("dynamodb:Query", "Telemetry.Arn"), ("dynamodb:Scan", "Telemetry.Arn")}
+        | {("dynamodb:GetItem", "Robots.Arn")}
+        | {
+            (f"s3:{action}", f"Files.Arn/{contract.RESULTS_PREFIX}*") for action in ("GetObject", "PutObject")
+        },
+    ),
     "UploadRole": (
         "lambda.amazonaws.com",
         {(action, "UploadLog.Arn") for action in LOG}
@@ -305,9 +314,9 @@ def test_no_statement_is_about_every_resource_or_action(synthesized, reader):
             if resource == "*":
                 wild.add((role, action))
             else:
-                # A wildcard within an ARN stands for the robot's name, and in the bucket for its files.
+                # A wildcard within an ARN stands for the robot's name, in the bucket for its keys.
                 # Things and certificates have no names before they are provisioned.
-                named = resource.replace(":topic/pong/iort/*/", "").removesuffix("/robots/*")
+                named = re.sub(r":topic/pong/iort/\*/|/(robots|results)/\*$", "", resource)
                 assert "*" not in named or (role == "ProvisioningRole" and named in {THINGS, CERTIFICATES})
     assert wild == EVERY_RESOURCE
     # And nothing grants that is not a role's policy or a robot's, such as a policy of its own.

@@ -30,7 +30,7 @@ from contract import (
 from stacks.settings import ROOT
 from tests.stacks.templates import name
 
-HANDLERS = ("Live", "Summarize", "Echo", "Upload", "Admit", "Presence")
+HANDLERS = ("Live", "Summarize", "Echo", "Upload", "Query", "Admit", "Presence")
 FUNCTIONS = sorted((ROOT / "functions").glob("*.py"))
 # Lambda's Python has boto3 and what boto3 needs.
 RUNTIME_PACKAGES = ("boto3", "botocore", "dateutil", "jmespath", "s3transfer", "six", "urllib3")
@@ -178,6 +178,13 @@ def test_what_the_variables_say_is_what_the_functions_expect(functions, reader, 
         "TELEMETRY_TABLE": "Telemetry",
         "SUMMARY_TABLE": "Summary",
         "ROBOTS_TABLE": "Robots",
+    }
+    query = functions["Query"]["Environment"]["Variables"]
+    assert {key: reader.text(value) for key, value in query.items()} == {
+        "NAMESPACE": contract.DEFAULT_NAMESPACE,
+        "TELEMETRY_TABLE": "Telemetry",
+        "ROBOTS_TABLE": "Robots",
+        "FILES_BUCKET": "Files",
     }
     upload = functions["Upload"]["Environment"]["Variables"]
     assert {key: reader.text(value) for key, value in upload.items()} == {

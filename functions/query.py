@@ -1,0 +1,269 @@
+"""Queries in the cloud: the samples of a range that meet a condition, without the rest leaving AWS.
+
+Invoked by the operator's `iort query --on lambda`. The answer is packed as a batch is; what Lambda's
+response cannot hold goes through the files' bucket by a pre-signed address. An invocation ends before its
+time or its memory does, with a token from which the next one goes on.
+"""
+
+from __future__ import annotations
+
+import base64
+import json
+import os
+import uuid
+import zlib
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from functools import cache
+from itertools import pairwise
+from typing import Any
+
+import boto3
+from botocore.config import Config
+
+from contract import (
+    CODEC,
+    DERIVED_UNITS,
+    MAX_BATCH_SPAN_US,
+    RECORD,
+    RESULTS_PREFIX,
+    T_US,
+    TOPIC,
+    ContractError,
+    Value,
+    build_topic,
+    decode,
+    parse_topic,
+)
+from functions import expression
+from functions.expression import ExpressionError, Node
+from functions.statistics import derive
+from functions.tables import Tables, plain
+
+# Lambda's synchronous answer holds 6 MB; the envelope around the samples is some hundred bytes.
+MAX_INLINE_BYTES = 5_500_000
+# Python takes some 30 bytes a value, and the packing as much again.
+MAX_VALUES = 6_000_000
+# What is left of the time when the last page is asked for: packing and storing take no longer.
+MARGIN_MS = 8_000
+_URL_S = 900
+_FIRST, _LAST = -(2**53), 2**53
+
+Store = Callable[[bytes], str]
+Left = Callable[[], int]
+
+
+class RequestError(ValueError):
+    """A request that cannot be answered; the text says why."""
+
+
+@dataclass(frozen=True)
+class Request:
+    """What is asked: a topic's samples from ``start_us`` (included) to ``end_us`` (not).
+
+    ``fields`` None is all. ``token`` is the last answer's, to go on where it ended.
+    """
+
+    topic: str
+    start_us: int
+    end_us: int
+    fields: tuple[str, ...] | None
+    condition: Node | None
+    scan: bool
+    token: Mapping[str, Any] | None
+
+    @classmethod
+    def read(cls, event: Mapping[str, Any], namespace: str) -> Request:
+        """The request in an event; raises `RequestError`."""
+        try:
+            where, fields = event.get("where"), event.get("fields")
+            if fields is not None and not all(isinstance(name, str) for name in fields):
+                raise RequestError(f"fields {fields!r}: allowed is a list of names")
+            return cls(
+                topic=build_topic(RECORD, event["robot"], event["stream"], namespace),
+                start_us=_time(event, "start_us", _FIRST),
+                end_us=_time(event, "end_us", _LAST),
+                fields=None if fields is None else tuple(fields),
+                condition=None if where is None else expression.parse(where),
+                scan=bool(event.get("scan")),
+                token=event.get("token"),
+            )
+        except KeyError as error:
+            raise RequestError(f"the request has no {error.args[0]}") from error
+        except (ContractError, ExpressionError, TypeError, AttributeError) as error:
+            raise RequestError(str(error)) from error
+
+
+def _time(event: Mapping[str, Any], key: str, otherwise: int) -> int:
+    value = event.get(key)
+    if value is None:
+        return otherwise
+    if type(value) is not int:
+        raise RequestError(f"{key} {value!r}: allowed is an integer of microseconds")
+    return max(_FIRST, min(_LAST, value))
+
+
+class Found:
+    """The samples that meet the condition, as lists that grow."""
+
+    def __init__(self, request: Request, tables: Tables) -> None:
+        self._request = request
+        named = set(request.fields or ())
+        if request.condition is not None:
+            named |= expression.names(request.condition)
+        self._derived = sorted(named & DERIVED_UNITS.keys())
+        self._vehicle = tables.vehicle(parse_topic(request.topic).robot) if self._derived else None
+        self.times_us: list[int] = []
+        self.columns: dict[str, list[Value]] = {}
+        self.there: dict[str, None] = {}
+        self.refused = 0
+        self.reason = ""
+
+    @property
+    def values(self) -> int:
+        """How many values are held."""
+        return len(self.times_us) * (1 + len(self.columns))
+
+    def add(self, item: Mapping[str, Any]) -> None:
+        """Take what meets the condition out of a stored item."""
+        request = self._request
+        try:
+            batch = decode(item)
+        except ContractError as error:
+            self.refused += 1
+            self.reason = self.reason or str(error)
+            return
+        times, columns = batch.times_us, dict(batch.columns)
+        inside = [request.start_us <= t_us < request.end_us for t_us in times]
+        if not any(inside):
+            return
+        if self._derived:
+            made = derive(columns, self._vehicle)
+            columns |= {name: made[name] for name in self._derived if name in made}
+        self.there |= dict.fromkeys(columns)
+        if request.condition is not None:
+            holds = expression.holds(request.condition, columns, len(times))
+            inside = [a and b for a, b in zip(inside, holds, strict=True)]
+        chosen = [i for i, is_in in enumerate(inside) if is_in]
+        if not chosen:
+            return
+        names = batch.columns if request.fields is None else request.fields
+        before = len(self.times_us)
+        self.times_us += [times[i] for i in chosen]
+        for name in names:
+            self.columns.setdefault(name, [None] * before)
+        for name, column in self.columns.items():
+            source = columns.get(name) if name in names else None
+            column.extend([None] * len(chosen) if source is None else [source[i] for i in chosen])
+
+
+def answer(
+    event: Mapping[str, Any],
+    tables: Tables,
+    store: Store,
+    left_ms: Left,
+    *,
+    namespace: str,
+    max_values: int = MAX_VALUES,
+    max_inline_bytes: int = MAX_INLINE_BYTES,
+) -> dict[str, Any]:
+    """Answer one request. ``store`` keeps bytes and gives the address to get them from; ``left_ms``
+    says how much of the invocation's time is left."""
+    try:
+        request = Request.read(event, namespace)
+    except RequestError as error:
+        return {"error": str(error)}
+    found = Found(request, tables)
+    items = pages = 0
+    token: Mapping[str, Any] | None = None
+    for page, after in _pages(request, tables):
+        pages, items = pages + 1, items + len(page)
+        for item in page:
+            found.add(plain(item))
+        token = after
+        if token is not None and (left_ms() < MARGIN_MS or found.values > max_values):
+            break
+    samples = _packed(found)
+    reply: dict[str, Any] = {
+        "codec": CODEC,
+        "n": len(found.times_us),
+        "fields": list(found.there),
+        "items": items,
+        "pages": pages,
+        "refused": found.refused,
+        "reason": found.reason,
+        "token": token,
+    }
+    if len(samples) * 4 // 3 <= max_inline_bytes:
+        return {**reply, "samples": base64.b64encode(samples).decode()}
+    return {**reply, "url": store(samples)}
+
+
+def _pages(
+    request: Request, tables: Tables
+) -> Iterator[tuple[Sequence[Mapping[str, Any]], Mapping[str, Any] | None]]:
+    """Pages of items, each with the key after which the next one begins; None behind the last."""
+    first, last = request.start_us - MAX_BATCH_SPAN_US + 1, request.end_us - 1
+    if first > last:
+        return
+    condition = {
+        ("FilterExpression" if request.scan else "KeyConditionExpression"): (
+            "#topic = :topic AND #t BETWEEN :first AND :last"
+        ),
+        "ExpressionAttributeNames": {"#topic": TOPIC, "#t": T_US},
+        "ExpressionAttributeValues": {
+            ":topic": {"S": request.topic},
+            ":first": {"N": str(first)},
+            ":last": {"N": str(last)},
+        },
+    }
+    token = request.token
+    while True:
+        page = tables.page(condition, token, scan=request.scan)
+        token = page.get("LastEvaluatedKey")
+        yield page["Items"], token
+        if token is None:
+            return
+
+
+def _packed(found: Found) -> bytes:
+    """Times and columns as a batch has them, but for the first time, which stands in ``dt``."""
+    times = found.times_us
+    dt = times[:1] + [b - a for a, b in pairwise(times)]
+    text = json.dumps({"dt": dt, "fields": found.columns}, separators=(",", ":"))
+    return zlib.compress(text.encode(), 1)
+
+
+@cache
+def _tables() -> Tables:
+    return Tables(
+        boto3.client("dynamodb"),
+        telemetry=os.environ["TELEMETRY_TABLE"],
+        summary="",  # which it may not read
+        robots=os.environ["ROBOTS_TABLE"],
+    )
+
+
+@cache
+def _s3() -> Any:
+    # As in functions/upload.py: the global host redirects, which no signature survives.
+    config = Config(signature_version="s3v4", s3={"addressing_style": "virtual"})
+    return boto3.client("s3", config=config)
+
+
+def _store(samples: bytes) -> str:
+    place = {"Bucket": os.environ["FILES_BUCKET"], "Key": f"{RESULTS_PREFIX}{uuid.uuid4().hex}.json.zlib"}
+    _s3().put_object(**place, Body=samples, ContentType="application/zlib")
+    url: str = _s3().generate_presigned_url("get_object", Params=place, ExpiresIn=_URL_S)
+    return url
+
+
+def handler(event: dict[str, Any], context: Any) -> dict[str, Any]:
+    """Entry point of an invocation by the operator."""
+    return answer(
+        event,
+        _tables(),
+        _store,
+        context.get_remaining_time_in_millis,
+        namespace=os.environ["NAMESPACE"],
+    )

@@ -1,0 +1,115 @@
+"""The thesis' four ways to ask, over several pages, with the function's own role enforced."""
+
+from __future__ import annotations
+
+import json
+import random
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+from boto3.dynamodb.types import TypeSerializer
+
+from contract import RESULTS_PREFIX, Batch, build_topic, encode
+from local.cloud import EmbeddedCloud
+from local.deployment import ROOT
+from station import data
+
+START = 1_700_000_000_000_000
+BATCHES, EACH, FIELDS = 80, 150, 50
+N = BATCHES * EACH
+ROBOT, STREAM = "asked", "noise"
+
+
+def store(embedded, robot, stream, batches):
+    """Put batches into the table as the record rule does."""
+    serialize = TypeSerializer().serialize
+    table, client = embedded.cloud.output("storage", "TelemetryTable"), embedded.cloud.client("dynamodb")
+    for batch in batches:
+        item = {**json.loads(encode(batch)), "topic": build_topic("dt", robot, stream)}
+        client.put_item(TableName=table, Item={name: serialize(value) for name, value in item.items()})
+
+
+@pytest.fixture(scope="module")
+def noise(embedded: EmbeddedCloud) -> dict[str, list[float]]:
+    """Some 6 MB that cannot be compressed, which neither a page of DynamoDB nor an
+    answer of Lambda holds."""
+    chance = random.Random(1)
+    columns = {f"f{i}": [chance.random() for _ in range(N)] for i in range(FIELDS)}
+    batches = [
+        Batch(
+            "0badcafe",
+            i,
+            [START + 5_000 * k for k in range(i * EACH, (i + 1) * EACH)],
+            {name: column[i * EACH : (i + 1) * EACH] for name, column in columns.items()},
+        )
+        for i in range(BATCHES)
+    ]
+    store(embedded, ROBOT, STREAM, batches)
+    return columns
+
+
+@pytest.mark.parametrize("on", ["client", "lambda"])
+@pytest.mark.parametrize("scan", [False, True])
+def test_all_four_ways_give_the_same(embedded, noise, on, scan):
+    first, last = START + 1_000_001, START + 31_000_000
+    found = data.query(
+        embedded.cloud, ROBOT, STREAM, first, last, fields=["f0", "f7"], where="f7 > 0.5", on=on, scan=scan
+    )
+    expected = [k for k in range(N) if first <= START + 5_000 * k < last and noise["f7"][k] > 0.5]
+    assert found.times_us.tolist() == [START + 5_000 * k for k in expected]
+    assert found.columns["f0"].tolist() == [noise["f0"][k] for k in expected]
+
+
+@pytest.mark.parametrize("on", ["client", "lambda"])
+def test_what_takes_many_pages_comes_whole(embedded, noise, on):
+    pages = []
+    found = data.query(embedded.cloud, ROBOT, STREAM, on=on, progress=lambda items, _: pages.append(items))
+    assert len(found) == N
+    assert sum(pages) == BATCHES
+    if on == "client":
+        assert len(pages) > 3
+    else:
+        bucket = embedded.cloud.output("storage", "FilesBucket")
+        kept = embedded.cloud.client("s3").list_objects_v2(Bucket=bucket, Prefix=RESULTS_PREFIX)
+        assert kept["KeyCount"] >= 1
+    for name, column in noise.items():
+        np.testing.assert_array_equal(found.columns[name], column)
+
+
+def iort(*arguments: str, embedded: EmbeddedCloud, **how):
+    command = [Path(sys.executable).parent / "iort", "--embedded", embedded.folder / "cloud.json", "--local"]
+    return subprocess.run(
+        [*command, *arguments], cwd=ROOT, capture_output=True, text=True, check=False, timeout=120, **how
+    )
+
+
+def test_the_command_writes_what_it_finds_and_says_how_much(embedded, noise, tmp_path):
+    asked = ["query", ROBOT, STREAM, "--last", "all", "--fields", "f1"]
+    done = iort(*asked, "--every", "10s", "--json", embedded=embedded)
+    assert done.returncode == 0, done.stderr
+    rows = [json.loads(line) for line in done.stdout.splitlines()]
+    assert len(rows) == 6
+    assert rows[0]["f1"] == pytest.approx(np.mean(noise["f1"][:2000]))
+    assert "6 samples" in done.stderr
+    done = iort(*asked, "--format", "csv", "--output", str(tmp_path / "f1.csv"), embedded=embedded)
+    assert done.returncode == 0, done.stderr
+    assert len((tmp_path / "f1.csv").read_text().splitlines()) == N + 1
+    done = iort("query", ROBOT, "imu", "--last", "all", embedded=embedded)
+    assert done.returncode == 1
+    assert "no robot asked" in done.stderr
+
+
+@pytest.mark.usefixtures("noise")
+def test_a_reader_that_has_seen_enough_is_no_error(embedded):
+    iort_ = Path(sys.executable).parent / "iort"
+    done = subprocess.run(
+        f"'{iort_}' --local --embedded '{embedded.folder}/cloud.json' "
+        f"query {ROBOT} {STREAM} --last all --json | head -c 10",
+        shell=True, cwd=ROOT, capture_output=True, text=True, check=False, timeout=120,
+    )  # fmt: skip
+    assert done.stdout == '{"time": "'
+    assert "Traceback" not in done.stderr
+    assert "Error" not in done.stderr

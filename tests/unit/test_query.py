@@ -1,0 +1,188 @@
+"""The query function: what it chooses, how it ends in time, and how the station reads its answer."""
+
+from __future__ import annotations
+
+import base64
+import io
+import json
+import zlib
+
+import pytest
+
+from contract import Batch
+from functions.query import answer
+from station import data
+from station.errors import StationError
+from tests.fakes import ROBOTS, TELEMETRY, FakeDynamoDB, item_of, serialize, tables
+
+START = 1_700_000_000_000_000
+ENOUGH_MS = 60_000
+
+
+class Paged(FakeDynamoDB):
+    """The client's own pages, each with the key that it ended with."""
+
+    def query(self, *, after=None, **query):
+        after = query.pop("ExclusiveStartKey", None)
+        pages = [page["Items"] for page in self.paginate(**query)]
+        at = (
+            0 if after is None else 1 + next(i for i, p in enumerate(pages) if p and p[-1]["t"] == after["t"])
+        )
+        more = at + 1 < len(pages)
+        return {"Items": pages[at]} | ({"LastEvaluatedKey": {"t": pages[at][-1]["t"]}} if more else {})
+
+    def scan(self, **scan):
+        topic = scan["ExpressionAttributeValues"][":topic"]
+        assert "FilterExpression" in scan
+        return {"Items": [item for item in self.items[TELEMETRY].values() if item["topic"] == topic][::-1]}
+
+
+def table(*batches, page_items=2):
+    client = Paged(page_items=page_items)
+    for batch in batches:
+        client.put(TELEMETRY, item_of(batch))
+    row = {"robot": "car", "speed_to_erpm_gain": 10}
+    client.put(ROBOTS, {name: serialize(value) for name, value in row.items()})
+    return client
+
+
+def ride(n=100):
+    return [
+        Batch(
+            "0badcafe",
+            i // 10,
+            [START + k * 20_000 for k in range(i, i + 10)],
+            {"speed": list(range(i, i + 10)), "name": ["x"] * 10},
+        )
+        for i in range(0, n, 10)
+    ]
+
+
+def asked(client, *, left_ms=lambda: ENOUGH_MS, store=None, limits=None, **request):
+    event = {"robot": "car", "stream": "vesc", **request}
+    reply = answer(event, tables(client), store, left_ms, namespace="iort", **(limits or {}))
+    return json.loads(json.dumps(reply))
+
+
+def unpacked(reply):
+    return json.loads(zlib.decompress(base64.b64decode(reply["samples"])))
+
+
+def test_gives_the_range_the_fields_and_what_meets_the_condition():
+    reply = asked(
+        table(*ride()),
+        start_us=START + 200_000,
+        end_us=START + 1_000_000,
+        fields=["speed_mps", "name"],
+        where="speed_mps >= 4.7 and name == 'x'",
+    )
+    assert unpacked(reply) == {
+        "dt": [START + 47 * 20_000, 20_000, 20_000],
+        "fields": {"speed_mps": [4.7, 4.8, 4.9], "name": ["x"] * 3},
+    }
+    assert reply["n"] == 3
+    assert reply["token"] is None
+    assert set(reply["fields"]) == {"speed", "name", "speed_mps"}
+
+
+def test_ends_in_time_and_goes_on_from_the_token():
+    client, seen, token = table(*ride()), [], None
+    for _ in range(10):
+        reply = asked(client, left_ms=lambda: 0, token=token, fields=["speed"])
+        seen += unpacked(reply)["fields"]["speed"]
+        assert reply["pages"] == 1
+        token = reply["token"]
+        if token is None:
+            break
+    assert seen == list(range(100))
+
+
+def test_ends_before_it_runs_out_of_memory():
+    assert asked(table(*ride()), limits={"max_values": 50})["token"] is not None
+
+
+def test_what_is_large_goes_through_the_bucket():
+    kept = []
+    reply = asked(
+        table(*ride()),
+        store=lambda samples: kept.append(samples) or "https://there",
+        limits={"max_inline_bytes": 10},
+    )
+    assert reply["url"] == "https://there"
+    assert "samples" not in reply
+    assert json.loads(zlib.decompress(kept[0]))["fields"]["speed"] == list(range(100))
+
+
+def test_counts_what_is_no_batch():
+    client = table(*ride(20))
+    broken = item_of(Batch("0badcafe", 9, [START + 9_000_000], {"speed": [1]}))
+    client.put(TELEMETRY, broken | {"samples": serialize("!")})
+    reply = asked(client)
+    assert (reply["n"], reply["refused"]) == (20, 1)
+    assert "base64" in reply["reason"]
+
+
+@pytest.mark.parametrize(
+    ("request_", "reason"),
+    [
+        ({"robot": "a/b"}, "robot name"),
+        ({"where": "speed >"}, "no expression"),
+        ({"start_us": "now"}, "integer of microseconds"),
+        ({"fields": [1]}, "list of names"),
+        ({"where": 7}, ""),
+    ],
+)
+def test_refuses_with_the_reason(request_, reason):
+    assert reason in asked(table(*ride()), **request_)["error"]
+
+
+class Cloud:
+    """A `station.cloud.Cloud` whose functions run here."""
+
+    namespace, ca_bundle = "iort", None
+
+    def __init__(self, client, *, left_ms=lambda: ENOUGH_MS):
+        self._client, self._left_ms = client, left_ms
+
+    def output(self, _noun, name):
+        return {"TelemetryTable": TELEMETRY, "RobotsTable": ROBOTS}.get(name, name)
+
+    def client(self, service):
+        return {"dynamodb": self._client, "lambda": self}[service]
+
+    def invoke(self, *, FunctionName, Payload):  # noqa: N803
+        assert FunctionName == "QueryFunction"
+        reply = asked(self._client, left_ms=self._left_ms, **json.loads(Payload))
+        return {"Payload": io.BytesIO(json.dumps(reply).encode())}
+
+
+@pytest.mark.parametrize("left_ms", [0, ENOUGH_MS])
+@pytest.mark.parametrize("scan", [False, True])
+@pytest.mark.parametrize(
+    "question",
+    [
+        {},
+        {"fields": ["speed_mps"]},
+        {"where": "speed % 7 == 0", "start": START + 1, "end": START + 1_500_000},
+    ],
+)
+def test_all_four_ways_give_the_same(question, scan, left_ms):
+    cloud = Cloud(table(*ride()), left_ms=lambda: left_ms)
+    here = data.query(cloud, "car", "vesc", **question)
+    there = data.query(cloud, "car", "vesc", on="lambda", scan=scan, **question)
+    assert there.times_us.tolist() == here.times_us.tolist()
+    assert {k: v.tolist() for k, v in there.columns.items()} == {
+        k: v.tolist() for k, v in here.columns.items()
+    }
+    assert len(here) > 0
+
+
+def test_a_mistake_is_answered_from_there_as_from_here():
+    cloud = Cloud(table(*ride()))
+    for question, reason in (
+        ({"fields": ["volts"]}, "car has no volts in vesc in this range; it has name, speed"),
+        ({"summary": True}, "the summary is read from here"),
+        ({"stream": "imu"}, "car has no stream imu"),
+    ):
+        with pytest.raises(StationError, match=reason):
+            data.query(cloud, **{"robot": "car", "stream": "vesc", "on": "lambda", **question})
