@@ -7,7 +7,7 @@ from dataclasses import replace
 
 from contract import OWN_STREAMS, ROBOT, VESC_STREAM
 from functions.statistics import Vehicle
-from station import reading, registry, robots
+from station import reading, registry
 from station.blocks import ATTRIBUTES, Refused, blocks
 from station.cloud import Cloud
 from station.errors import StationError
@@ -31,7 +31,7 @@ def check_there(cloud: Cloud, robot: str, stream: str) -> None:
     if reading.outermost(cloud, robot, stream, newest=False) is not None:
         return
     has = ", ".join(streams_of(cloud, robot))
-    known = sorted(str(row[ROBOT]) for row in robots.listed(cloud))
+    known = sorted(str(row[ROBOT]) for row in registry.listed(cloud))
     if not has and robot not in known:
         raise StationError(f"there is no robot {robot}; there is {', '.join(known) or 'none at all'}")
     raise StationError(f"{robot} has no stream {stream}; it has {has or 'sent nothing yet'}")
