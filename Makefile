@@ -4,7 +4,7 @@ BIN := .venv/bin
 # cdk.json runs `python app.py`.
 bootstrap deploy diff destroy: export PATH := $(CURDIR)/$(BIN):$(PATH)
 
-.PHONY: help demo test check setup bench-agent bench-page screenshots bench-fleet layer bootstrap deploy diff destroy lock clean
+.PHONY: help demo test check setup bench bench-guard bench-agent bench-page screenshots bench-fleet layer bootstrap deploy diff destroy lock clean
 
 help: ## show this
 	@grep -hE '^[a-z-]+:.*## ' Makefile | sed -E 's/^([a-z-]+):.*## /\1\t/' | expand -t 14
@@ -23,6 +23,13 @@ check: setup ## run the linters, the type checkers, and cfn-lint, cdk-nag and ch
 	@$(PYTHON) scripts/setup.py --checkov
 	@$(BIN)/ruff check . && $(BIN)/ruff format --check . && $(BIN)/mypy app.py contract.py scripts device functions stacks station local bench && $(BIN)/npm run --silent check
 	@PATH="$(CURDIR)/$(BIN):$$PATH" $(BIN)/python scripts/check_stacks.py --checkov build/checkov/bin/checkov
+
+bench: setup ## measure every table of the thesis: ONLY=query,outage TARGET=aws OUT=docs/bench
+	@$(BIN)/python -m bench.run $(if $(ONLY),--only $(ONLY)) $(if $(TARGET),--target $(TARGET)) \
+		$(if $(OUT),--out $(OUT)) $(if $(NAMESPACE),--namespace $(NAMESPACE))
+
+bench-guard: setup ## hold the ratios of the last `make bench` against the report in docs/bench
+	@$(BIN)/python -m bench.guard
 
 bench-agent: setup ## measure the agent on a real ROS 1 graph: DURATION=30 SOAK=600 REPORT=figures.json
 	@$(BIN)/python -m bench.agent $(if $(DURATION),--seconds $(DURATION)) $(if $(SOAK),--soak $(SOAK)) \

@@ -900,6 +900,11 @@ def _wire_column(name: str, column: Sequence[Any]) -> tuple[list[Value], int]:
         raise ContractError(f"field {name}: {_show(odd)} is neither number, text, true, false nor null")
     nulled = 0
     out: list[Value] = list(column)
+    # Whole columns are looked at in C where they hold one kind; a car and Lambda 2 do this for every batch.
+    if kinds == {int} and min(column) >= _MIN_INT and max(column) <= _MAX_INT:
+        return out, 0
+    if kinds == {float} and all(map(math.isfinite, column)) and not any(map(float.is_integer, column)):
+        return out, 0
     if float in kinds:
         for i, value in enumerate(out):
             if type(value) is float:

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Mapping, Sequence
+from bisect import bisect_left
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from itertools import pairwise
 from statistics import mean, median
@@ -15,6 +16,7 @@ from contract import BATCHES, GAPS, MISSING_BATCHES, NONFINITE, SAMPLES, Batch, 
 # Jetson was seen to reach 2.5 on a recorded drive at 50 Hz.
 _HOLE = 3.0
 _SECOND_US = 1_000_000
+_NUMBERS = {int, float}
 
 
 @dataclass(frozen=True)
@@ -36,24 +38,26 @@ def summarize_second(
     ``_max``, ``_last`` for every field, with ``speed_mps`` and ``power_w`` derived where the fields
     and the vehicle's parameters allow.
     """
+    start_us, end_us = second * _SECOND_US, (second + 1) * _SECOND_US
     times: list[int] = []
     columns: dict[str, list[Value]] = {}
     missing = nonfinite = touching = 0
     before: list[int] = []
     previous: Batch | None = None
     for batch in batches:
-        inside = [i for i, t_us in enumerate(batch.times_us) if t_us // _SECOND_US == second]
-        if inside:
+        first, end = bisect_left(batch.times_us, start_us), bisect_left(batch.times_us, end_us)
+        if first < end:
             touching += 1
             for name, column in batch.columns.items():
-                columns.setdefault(name, [None] * len(times)).extend(column[i] for i in inside)
-            times.extend(batch.times_us[i] for i in inside)
+                columns.setdefault(name, [None] * len(times)).extend(column[first:end])
+            times.extend(batch.times_us[first:end])
             for column in columns.values():
                 column.extend([None] * (len(times) - len(column)))
-        if batch.t_us // _SECOND_US == second:
+        if start_us <= batch.t_us < end_us:
             missing += missing_before(previous, batch)
             nonfinite += batch.nonfinite
-        before.extend(t_us for t_us in batch.times_us if t_us // _SECOND_US < second)
+        if first:
+            before = [batch.times_us[first - 1]]
         previous = batch
     if not times:
         return None
@@ -61,7 +65,7 @@ def summarize_second(
         SAMPLES: len(times),
         BATCHES: touching,
         MISSING_BATCHES: missing,
-        GAPS: count_holes([*before[-1:], *times]),
+        GAPS: count_holes([*before, *times]),
         NONFINITE: nonfinite,
     }
     for name, column in {**columns, **derive(columns, vehicle)}.items():
@@ -108,13 +112,16 @@ def derive(columns: Mapping[str, Sequence[Value]], vehicle: Vehicle | None) -> d
     return derived
 
 
-def _field_statistics(name: str, column: Iterable[Value]) -> dict[str, Value]:
-    values = [value for value in column if value is not None]
-    if not values:
-        return {}
-    numbers = [value for value in values if _is_number(value)]
-    if len(numbers) < len(values):
-        return {f"{name}_last": values[-1]}
+def _field_statistics(name: str, column: Sequence[Value]) -> dict[str, Value]:
+    if _are_numbers(column):
+        numbers = column
+    else:
+        values = [value for value in column if value is not None]
+        numbers = [value for value in values if _is_number(value)]
+        if not values:
+            return {}
+        if len(numbers) < len(values):
+            return {f"{name}_last": values[-1]}
     low, high = min(numbers), max(numbers)
     # A mean is good to nine digits; the full seventeen would double what the table stores.
     rounded = float(f"{_mean(numbers):.9g}")
@@ -135,6 +142,11 @@ def _mean(numbers: Sequence[int | float]) -> float:
 
 def _finite(value: float) -> float | None:
     return value if math.isfinite(value) else None
+
+
+def _are_numbers(column: Sequence[Value]) -> TypeGuard[Sequence[int | float]]:
+    """Whether all are numbers, which nearly every column's are: one look at their types tells."""
+    return set(map(type, column)) <= _NUMBERS
 
 
 def _is_number(value: Value) -> TypeGuard[int | float]:

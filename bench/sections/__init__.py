@@ -1,0 +1,31 @@
+"""The sections of the report, a file each, in the order in which they run."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+from bench.result import Section
+from bench.sections import (
+    abilities,
+    cost,
+    dashboard,
+    outage,
+    query,
+    round_trips,
+    scale,
+    utilisation,
+)
+from bench.target import Say, Target
+
+Run = Callable[[Target, Say], Section]
+
+SECTIONS: dict[str, Run] = {
+    "round_trips": round_trips.run,
+    "dashboard": dashboard.run,
+    "utilisation": utilisation.run,
+    "query": query.run,
+    "abilities": abilities.run,
+    "cost": cost.run,
+    "outage": outage.run,
+    "scale": scale.run,
+}

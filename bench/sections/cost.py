@@ -1,0 +1,47 @@
+"""Cost a robot-hour, and on paper the fleets that no laptop can carry; computed by the station's model."""
+
+from __future__ import annotations
+
+from dataclasses import asdict, replace
+
+from bench import plots
+from bench.result import Plot, Ratio, Section, Table
+from bench.target import Say, Target
+from station import cost, cost_tables, scale
+from station.cost import Usage
+from station.prices import AS_OF, REGION
+
+
+def run(target: Target, say: Say) -> Section:
+    """The memory of the functions as they are deployed, the rates of the agent's defaults."""
+    say("computing")
+    client = target.cloud.client("lambda")
+    memory = {
+        name: client.get_function_configuration(
+            FunctionName=target.cloud.output("processing", f"{name}Function")
+        )["MemorySize"]
+        for name in ("Live", "Summarize")
+    }
+    usage = Usage(live_memory_mb=memory["Live"], summarize_memory_mb=memory["Summarize"])
+    section = Section("cost", "Cost a robot-hour, and scale on paper")
+    for title, rows in (
+        (f"Dollars a robot-hour, list prices of {AS_OF} in {REGION}", cost_tables.robot_hour(usage)),
+        ("What each setting does", cost_tables.what_if(usage)),
+        ("On paper: needs of AWS' default quotas", cost_tables.fleets(scale.fleets(usage))),
+    ):
+        section.tables.append(Table(title, list(rows.head), [list(row) for row in rows.body]))
+    thesis = cost.total(cost.thesis_bill(usage))
+    rates = (10.0, 5.0, 2.0, 1.0, 0.0)
+    ours = {rate: cost.total(cost.bill(replace(usage, live_hz=rate))) for rate in rates}
+    # The thesis pays for its live view with every sample; ours is given for both ends of the live rate.
+    section.ratios += [
+        Ratio("cost with the live lane at 10 Hz / a message a sample", round(ours[10.0] / thesis, 4), 0.05),
+        Ratio("cost with the live lane at 1 Hz / a message a sample", round(ours[1.0] / thesis, 4), 0.05),
+        Ratio("cost of the record lane alone / a message a sample", round(ours[0.0] / thesis, 4), 0.05),
+    ]
+    title = "Dollars a robot-hour on AWS"
+    shown = {"a message a sample": thesis, **{f"iort, live at {rate:g} Hz": ours[rate] for rate in rates}}
+    section.plots.append(Plot("cost", title, plots.bars(title, shown, unit="dollars")))
+    section.notes.append("PubNub is apart, since its plans differ by far more than everything else here.")
+    section.raw = {"usage": asdict(usage), "thesis": thesis, "ours": {str(k): v for k, v in ours.items()}}
+    return section

@@ -1,0 +1,186 @@
+"""From the car to the dashboard: to a PubNub subscriber hop by hop, and to a painted frame in Chromium."""
+
+from __future__ import annotations
+
+import os
+import shutil
+import threading
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import asdict
+from typing import Any
+
+from bench import plots
+from bench.driving import Driving
+from bench.result import Plot, Ratio, Section, Table
+from bench.spread import spread
+from bench.target import Say, Target
+from contract import VESC_STREAM
+from local.figures import THESIS
+from station import audit, keys, trace
+from station.listener import Listener
+from station.page import BUILT, PUBNUB_ORIGIN
+from station.page_server import PageServer
+
+ROBOT = "bench-dashboard"
+SECONDS = 24
+_CHUNKS = 3
+_WARM_UP_S = 3.0
+_FLAGS = ("--no-sandbox", "--disable-gpu", "--disable-quic", "--no-first-run", "--disable-sync")
+# After the frame that shows an update has been handed over, in the page's own clock, which is the
+# machine's: [time of the sample, in microseconds; time of the frame, in milliseconds].
+_WATCH = """robot => {
+  const seen = window.__painted = [];
+  let last = -1;
+  const now = () => performance.timeOrigin + performance.now();
+  const look = () => {
+    const received = window.iort.received;
+    if (received !== last) {
+      last = received;
+      const update = window.iort.robots[robot]?.streams?.vesc;
+      if (update) requestAnimationFrame(() => {
+        const after = new MessageChannel();
+        after.port1.onmessage = () => seen.push([update.t, now()]);
+        after.port2.postMessage(0);
+      });
+    }
+    requestAnimationFrame(look);
+  };
+  requestAnimationFrame(look);
+}"""
+
+
+def run(target: Target, say: Say) -> Section:
+    """Drive one car at 50 Hz, its live lane at 10 Hz, and watch it as an operator does."""
+    section = Section("dashboard", "To the dashboard")
+    bundle = target.robot(
+        ROBOT,
+        sources=[{"type": "sim", "stream": VESC_STREAM, "rate_hz": 50}],
+        metrics={"every_s": 1},
+        ping={"rate_hz": 1},
+    )
+    pubnub = keys.load(target.cloud)
+    found: list[trace.Times] = []
+    listener = Listener(
+        subscribe_key=pubnub.subscribe_key,
+        robot=ROBOT,
+        namespace=target.cloud.namespace,
+        on_update=lambda update, at, here: found.append(trace.times(update, at, here)),
+        **pubnub.server(),
+    )
+    painted: list[tuple[float, float]] = []
+    with listener, trace.pubnub_clock(pubnub.origin or PUBNUB_ORIGIN, tls=pubnub.tls) as ask:
+        here = trace.clock_of(ask, lambda: time.time_ns() // 1000)
+        with Driving(bundle) as driving, _chromium(target, say) as page:
+            threading.Event().wait(_WARM_UP_S)
+            found.clear()
+            say(f"driving for {SECONDS} s")
+            if page is not None:
+                page.evaluate(_WATCH, ROBOT)
+                page.wait_for_timeout(SECONDS * 1000)
+                painted = [(float(t), float(at)) for t, at in page.evaluate("window.__painted")]
+            else:
+                threading.Event().wait(SECONDS)
+            if driving.process.poll() is not None:
+                raise RuntimeError("the agent stopped while it was watched")
+            updates = list(found)
+        figures = audit.last_figures(target.cloud, ROBOT)
+    if not updates:
+        raise RuntimeError("no live update was heard")
+    hops = trace.trace(updates, here_to_pubnub=here, car_uncertainty_ms=figures.get("clock_uncertainty_ms"))
+    heard = [(one.here_us - one.sample_us) / 1000 for one in updates]
+    shown = [at - t / 1000 for t, at in painted]
+    _report(section, hops, heard, shown)
+    return section
+
+
+def _report(section: Section, hops: trace.Trace, heard: list[float], shown: list[float]) -> None:
+    to_subscriber = spread(_chunks(heard))
+    to_pixel = spread(_chunks(shown))
+    rows = [
+        [
+            "car to PubNub subscriber",
+            to_subscriber.text() if to_subscriber else "-",
+            f"{THESIS['dashboard']} ms",
+        ]
+    ]
+    rows.append(
+        [
+            "car to painted frame in Chromium",
+            to_pixel.text() if to_pixel else "no Chromium here",
+            f"{THESIS['dashboard']} ms",
+        ]
+    )
+    section.tables.append(
+        Table(
+            "From the sample in the car, by this machine's one clock where the car is simulated on it",
+            ["way", "median (p95, p99; range of the medians of three stretches)", "thesis, 2018"],
+            rows,
+        )
+    )
+    section.tables.append(
+        Table(
+            "Hop by hop",
+            ["hop", "median", "p95", "clocks may falsify it by"],
+            [
+                [
+                    hop.name,
+                    f"{hop.p50_ms:.2f} ms",
+                    f"{hop.p95_ms:.2f} ms",
+                    "not known" if hop.uncertainty_ms is None else f"{hop.uncertainty_ms:.2f} ms",
+                ]
+                for hop in [*hops.hops, hops.whole]
+            ],
+        )
+    )
+    curves = {"PubNub subscriber": heard, "painted frame": shown}
+    title = "From the sample in the car"
+    section.plots.append(Plot("dashboard", title, plots.cdf(title, curves)))
+    if to_subscriber:
+        section.ratios.append(
+            Ratio("car to subscriber / thesis' 300 ms", round(to_subscriber.p50 / 300, 4), 1.0)
+        )
+    if to_pixel:
+        section.ratios.append(Ratio("car to pixel / thesis' 300 ms", round(to_pixel.p50 / 300, 4), 1.0))
+    section.notes.append(
+        "A painted frame is the first one after the update's that the browser has handed over; Chromium "
+        "draws 60 a second without a display, so half a frame of the delay is waiting for the next."
+    )
+    section.raw = {
+        "hops": asdict(hops),
+        "subscriber_ms": asdict(to_subscriber) if to_subscriber else None,
+        "painted_ms": asdict(to_pixel) if to_pixel else None,
+    }
+
+
+def _chunks(values: list[float]) -> list[list[float]]:
+    size = max(1, -(-len(values) // _CHUNKS))
+    return [values[i : i + size] for i in range(0, len(values), size)]
+
+
+@contextmanager
+def _chromium(target: Target, say: Say) -> Iterator[Any]:
+    """The live page in a real browser; None where there is no browser or no built page."""
+    chromium = os.environ.get("CHROMIUM") or shutil.which("chromium") or shutil.which("chromium-browser")
+    if not chromium or not (BUILT / "index.html").is_file():
+        say("no Chromium, or the page is not built: measured to the subscriber only")
+        yield None
+        return
+    from playwright.sync_api import sync_playwright  # noqa: PLC0415 - only where there is a browser
+
+    pubnub = keys.load(target.cloud)
+    server = PageServer(
+        namespace=target.cloud.namespace, subscribe_key=pubnub.subscribe_key, **pubnub.server()
+    )
+    with server as page_server, sync_playwright() as play:
+        browser = play.chromium.launch(executable_path=chromium, args=list(_FLAGS))
+        try:
+            page = browser.new_page(viewport={"width": 1280, "height": 900})
+            page.goto(page_server.url)
+            page.wait_for_function(
+                "robot => window.iort?.robots[robot]?.streams?.vesc", arg=ROBOT, timeout=60_000
+            )
+            yield page
+        finally:
+            browser.close()

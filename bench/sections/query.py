@@ -1,0 +1,217 @@
+"""Table 6.6: 14,368 points by query and by scan, on the operator's machine and in Lambda, beside the thesis'
+layout of one item a sample read through boto3's Table, in the same run."""
+
+from __future__ import annotations
+
+import json
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import asdict, dataclass, field
+from decimal import Decimal
+from statistics import median
+from typing import Any
+
+import boto3
+from boto3.dynamodb.conditions import Attr, Key
+from boto3.dynamodb.types import TypeSerializer
+
+from bench import cpu, plots
+from bench.result import NOT_MEASURED, Plot, Ratio, Section, Table
+from bench.spread import ratio, spread
+from bench.target import Say, Target
+from contract import EXPIRES_S, RECEIVED_MS, RECORD, TOPIC, VESC_STREAM, Batch, Value, build_topic, encode
+from device.sources.vehicle import Vehicle, VehicleConfig
+from station import data
+
+POINTS = 14_368
+ROBOT = "bench-query"
+REPEATS = 3
+_RATE_HZ = 50
+THESIS_QUERY, THESIS_SCAN = "thesis' layout, query through Table", "thesis' layout, scan through Table"
+OURS_QUERY, OURS_SCAN = "iort, query", "iort, scan"
+THESIS_S = {THESIS_QUERY: "5.5 s"}
+
+
+@dataclass
+class Way:
+    """One way to read the points: seconds, a value a repeat. ``server_cpu_s`` on the embedded cloud only."""
+
+    wall_s: list[float] = field(default_factory=list)
+    client_cpu_s: list[float] = field(default_factory=list)
+    server_cpu_s: list[float] = field(default_factory=list)
+    read: int = 0
+
+
+def run(target: Target, say: Say) -> Section:
+    """Store the same drive in both layouts, then read it back in turns."""
+    section = Section("query", "Query and scan (table 6.6)")
+    samples = _drive()
+    say(f"storing {POINTS:,} points in both layouts")
+    _store(target, samples)
+    with _thesis_table(target, samples) as table:
+        topic = build_topic(RECORD, ROBOT, VESC_STREAM, target.cloud.namespace)
+        ways: dict[str, Callable[[], int]] = {
+            THESIS_QUERY: lambda: _pages(table.query, KeyConditionExpression=Key(TOPIC).eq(topic)),
+            OURS_QUERY: lambda: len(data.query(target.cloud, ROBOT, VESC_STREAM)),
+            THESIS_SCAN: lambda: _pages(table.scan, FilterExpression=Attr(TOPIC).eq(topic)),
+            OURS_SCAN: lambda: len(data.query(target.cloud, ROBOT, VESC_STREAM, scan=True)),
+        }
+        found = {name: Way() for name in ways}
+        for turn in range(REPEATS + 1):
+            for name, read in ways.items():
+                say(f"{name}, {turn} of {REPEATS}" if turn else f"{name}, to warm up")
+                one = _timed(target, read)
+                if turn:
+                    _add(found[name], one)
+    for name, way in found.items():
+        if way.read != POINTS:
+            raise RuntimeError(f"{name}: {way.read} of {POINTS} points")
+    _report(section, found)
+    return section
+
+
+def _report(section: Section, found: dict[str, Way]) -> None:
+    rows = []
+    for name, way in found.items():
+        wall, client = spread([[v] for v in way.wall_s]), spread([[v] for v in way.client_cpu_s])
+        rows.append(
+            [
+                name,
+                _text(wall),
+                _text(client),
+                f"{median(way.wall_s) - median(way.client_cpu_s):.3f} s",
+                f"{median(way.server_cpu_s):.3f} s" if way.server_cpu_s else NOT_MEASURED,
+                THESIS_S.get(name, NOT_MEASURED),
+            ]
+        )
+    section.tables.append(
+        Table(
+            f"{POINTS:,} points: median (range of {REPEATS} repeats, in turns)",
+            [
+                "way",
+                "wall",
+                "client's processor",
+                "waiting for the server",
+                "server's processor",
+                "thesis, 2018",
+            ],
+            rows,
+        )
+    )
+    faster = ratio(
+        [[v] for v in found[THESIS_QUERY].client_cpu_s], [[v] for v in found[OURS_QUERY].client_cpu_s]
+    )
+    sooner = ratio([[v] for v in found[THESIS_QUERY].wall_s], [[v] for v in found[OURS_QUERY].wall_s])
+    if faster is not None and sooner is not None:
+        section.ratios.append(
+            Ratio("query, client's processor: thesis' layout / ours", round(faster, 1), 20.0, at_least=True)
+        )
+        section.ratios.append(
+            Ratio("query, wall: thesis' layout / ours", round(sooner, 1), None, at_least=True)
+        )
+    title = f"{POINTS:,} points, client's processor"
+    values = {name: median(way.client_cpu_s) for name, way in found.items()}
+    section.plots.append(Plot("query", title, plots.bars(title, values, unit="s", log=True)))
+    section.notes.append(
+        "The thesis' layout is measured as its programs read it: boto3's Table, which makes a Decimal of "
+        "every number. A scan reads the whole table, so it also pays for what other sections have stored."
+    )
+    section.raw = {name: asdict(way) for name, way in found.items()}
+
+
+def _text(one: Any) -> str:
+    return NOT_MEASURED if one is None else f"{one.p50:.3f} s ({one.low:.3f} to {one.high:.3f})"
+
+
+def _timed(target: Target, read: Callable[[], int]) -> tuple[int, float, float, float | None]:
+    server = None if target.embedded is None else target.embedded.emulator.pid
+    before = _server(server)
+    cpu_s, wall_s = time.process_time(), time.perf_counter()
+    count = read()
+    wall_s, cpu_s = time.perf_counter() - wall_s, time.process_time() - cpu_s
+    after = _server(server)
+    spent = None if before is None or after is None else cpu.spent_ms(before, after) / 1000
+    return count, wall_s, cpu_s, spent
+
+
+def _server(pid: int | None) -> dict[int, int] | None:
+    return None if pid is None else cpu.of_process(pid)
+
+
+def _add(way: Way, one: tuple[int, float, float, float | None]) -> None:
+    way.read, wall_s, client_s, server_s = one
+    way.wall_s.append(round(wall_s, 4))
+    way.client_cpu_s.append(round(client_s, 4))
+    if server_s is not None:
+        way.server_cpu_s.append(round(server_s, 4))
+
+
+def _pages(read: Callable[..., dict[str, Any]], **arguments: Any) -> int:
+    """Every page, as the thesis' programs did, keeping the items."""
+    items: list[dict[str, Any]] = []
+    while True:
+        page = read(**arguments)
+        items += page["Items"]
+        if "LastEvaluatedKey" not in page:
+            return len(items)
+        arguments["ExclusiveStartKey"] = page["LastEvaluatedKey"]
+
+
+def _drive() -> list[tuple[int, dict[str, Value]]]:
+    vehicle = Vehicle(VehicleConfig(), seed=1)
+    first_us = (int(time.time()) - POINTS // _RATE_HZ - 60) * 1_000_000
+    samples = []
+    for i in range(POINTS):
+        vehicle.step(1 / _RATE_HZ)
+        samples.append((first_us + i * 1_000_000 // _RATE_HZ, vehicle.sample()))
+    return samples
+
+
+def _store(target: Target, samples: list[tuple[int, dict[str, Value]]]) -> None:
+    serialize = TypeSerializer().serialize
+    client, table = target.cloud.client("dynamodb"), target.cloud.output("storage", "TelemetryTable")
+    topic, expires_s = (
+        build_topic(RECORD, ROBOT, VESC_STREAM, target.cloud.namespace),
+        int(time.time()) + 86_400,
+    )
+    for seq, at in enumerate(range(0, POINTS, _RATE_HZ)):
+        part = samples[at : at + _RATE_HZ]
+        columns = {name: [sample[name] for _, sample in part] for name in part[0][1]}
+        item = json.loads(encode(Batch("0badcafe", seq, [t for t, _ in part], columns)))
+        item |= {TOPIC: topic, RECEIVED_MS: part[-1][0] // 1000, EXPIRES_S: expires_s}
+        client.put_item(TableName=table, Item={name: serialize(value) for name, value in item.items()})
+
+
+@contextmanager
+def _thesis_table(target: Target, samples: list[tuple[int, dict[str, Value]]]) -> Iterator[Any]:
+    """A table of one item a sample, as the thesis' rule wrote it; gone afterwards."""
+    name = f"{target.cloud.namespace}-bench-thesis"
+    cloud = target.cloud
+    resource = boto3.resource(
+        "dynamodb",
+        region_name=cloud.region,
+        endpoint_url=cloud.endpoint_url,
+        verify=cloud.ca_bundle,
+        aws_access_key_id=cloud.access_key_id,
+        aws_secret_access_key=cloud.secret_access_key,
+    )
+    table = resource.create_table(
+        TableName=name,
+        KeySchema=[{"AttributeName": TOPIC, "KeyType": "HASH"}, {"AttributeName": "t", "KeyType": "RANGE"}],
+        AttributeDefinitions=[
+            {"AttributeName": TOPIC, "AttributeType": "S"},
+            {"AttributeName": "t", "AttributeType": "N"},
+        ],
+        BillingMode="PAY_PER_REQUEST",
+    )
+    try:
+        table.wait_until_exists()
+        topic = build_topic(RECORD, ROBOT, VESC_STREAM, cloud.namespace)
+        with table.batch_writer() as batch:
+            for t_us, sample in samples:
+                numbers = {key: Decimal(repr(value)) for key, value in sample.items()}
+                batch.put_item(Item={TOPIC: topic, "t": t_us, **numbers})
+        yield table
+    finally:
+        table.delete()

@@ -1,0 +1,139 @@
+"""The pure parts of the bench: spreads, ratios, the report's rendering and the guard."""
+
+from __future__ import annotations
+
+import json
+import xml.etree.ElementTree as ET
+
+import pytest
+
+from bench import guard, plots, report
+from bench.result import Plot, Ratio, Section, Table
+from bench.spread import ratio, spread
+
+MACHINE = {
+    "date": "2026-01-02T03:04:05+00:00",
+    "cores": 2,
+    "cpu": "A processor",
+    "memory": "8 GB",
+    "kernel": "Linux 6",
+    "python": "3.11",
+    "packages": {"boto3": "1"},
+    "commit": "abc",
+    "load_1min": 0.5,
+}
+
+
+def _section(*ratios):
+    svg = plots.bars("Bars & <co>", {"a": 1.0, "b": 2.0}, unit="s")
+    return Section(
+        "query",
+        "Query <b>",
+        tables=[Table("T|x", ["name", "value"], [["a|b", "<script>"]])],
+        plots=[Plot("bars", "Bars & <co>", svg)],
+        ratios=list(ratios),
+        notes=["a note"],
+        raw={"values": [1, 2]},
+    )
+
+
+def test_spread_of_repeats():
+    found = spread([[1.0, 2.0, 3.0], [5.0, 6.0, 7.0]])
+    assert found is not None
+    assert (found.n, found.p50, found.low, found.high) == (6, 4.0, 2.0, 6.0)
+    assert found.p95 <= found.p99 <= 7.0
+    assert found.text() == "4.00 ms (p95 6.75, p99 6.95; 2.00 to 6.00)"
+    assert spread([[], []]) is None
+    assert spread([[3.0]]) == spread([[3.0], []])
+
+
+def test_ratio_is_of_pairs_so_a_slow_minute_falls_out():
+    assert ratio([[2.0], [20.0], [2.0]], [[1.0], [10.0], [1.0]]) == 2.0
+    assert ratio([[2.0], []], [[1.0], [1.0]]) == 2.0
+    assert ratio([[]], [[1.0]]) is None
+    assert ratio([[1.0]], [[0.0]]) is None
+
+
+@pytest.mark.parametrize(
+    ("value", "target", "at_least", "reached"),
+    [
+        (1.5, 1.5, False, True),
+        (1.6, 1.5, False, False),
+        (25, 20, True, True),
+        (19, 20, True, False),
+        (9, None, False, None),
+    ],
+)
+def test_targets(value, target, at_least, reached):
+    assert Ratio("r", value, target, at_least=at_least).reached is reached
+
+
+def test_markdown_has_tables_pictures_and_the_machine():
+    text = report.markdown([_section(Ratio("r", 1.6, 1.5))], MACHINE, "embedded")
+    assert "| r | 1.6 | at most 1.5 | **no** |" in text
+    assert "| a\\|b | <script> |" in text
+    assert "![Bars & <co>](report-bars.svg)" in text
+    assert "2026-01-02" in text
+    assert "A processor" in text
+
+
+def test_page_takes_no_text_for_markup():
+    text = report.page([_section(Ratio("r", 1, 2))], MACHINE, "embedded")
+    assert "<script>" not in text
+    assert "&lt;script&gt;" in text
+    assert text.count("<svg") == 1
+    assert "<td class=good>yes</td>" in text
+
+
+def test_written_report_is_whole_and_old_pictures_go(tmp_path):
+    (tmp_path / "report-old.svg").write_text("<svg/>")
+    report.write(tmp_path, [_section(Ratio("r", 1, 2))], MACHINE, "embedded")
+    assert sorted(path.name for path in tmp_path.iterdir()) == [
+        "report-bars.svg",
+        "report.html",
+        "report.json",
+        "report.md",
+    ]
+    kept = json.loads((tmp_path / "report.json").read_text())
+    assert kept["sections"][0]["raw"] == {"values": [1, 2]}
+    assert guard.ratios(kept)["r"]["value"] == 1
+
+
+def _report(**values):
+    ratios = [Ratio(name, value, target, at_least=least) for name, (value, target, least) in values.items()]
+    return json.loads(json.dumps({"sections": [_section(*ratios).as_json()]}))
+
+
+@pytest.mark.parametrize(
+    ("was", "now", "target", "at_least", "worse"),
+    [
+        (2.0, 2.9, None, False, 0),
+        (2.0, 3.1, None, False, 1),
+        (1.0, 1.6, 2.0, False, 0),
+        (1.0, 2.1, 2.0, False, 1),
+        (30.0, 19.0, 20.0, True, 1),
+        (90.0, 21.0, 20.0, True, 0),
+        (0.0, 1.0, 0.0, False, 1),
+        (0.0, 0.0, 0.0, False, 0),
+    ],
+)
+def test_guard_compares_ratios_and_forgives_noise(was, now, target, at_least, worse):
+    old, new = _report(r=(was, target, at_least)), _report(r=(now, target, at_least))
+    assert len(guard.regressions(new, old)) == worse
+
+
+def test_guard_compares_only_what_both_have():
+    assert guard.regressions(_report(a=(9, None, False)), _report(b=(1, None, False))) == []
+
+
+def test_plots_are_small_xml_and_the_same_every_time():
+    curves = {"a": [1.0, 2.0, 3.0] * 500, "b": [2.0], "none": []}
+    first, second = (plots.cdf("A & B", curves) for _ in range(2))
+    assert first == second
+    assert len(first) < 60_000
+    for svg in (
+        first,
+        plots.lines("L", [1, 10], {"a": [1, 2]}, x_label="x", y_label="y", log=True),
+        plots.points("P", {"a": ([1, 2], [3, 4])}, x_label="x", y_label="y", shaded=(1, 2)),
+    ):
+        assert ET.fromstring(svg).tag.endswith("svg")
