@@ -1,5 +1,6 @@
-"""A gap of its own: the emulator lets a session live on whose certificate is no longer active, and does
-not know DeleteConnection (AWS ends both, the first within minutes).
+"""A gap of its own: sessions that AWS would not let live. The emulator keeps one whose certificate is no
+longer active (AWS ends it within minutes), does not know DeleteConnection, and serves a client that
+shows no certificate at all, as its own account and without policies.
 """
 
 from __future__ import annotations
@@ -21,6 +22,7 @@ def install() -> None:
     """Close the gap in this process, before the emulator starts."""
     iot.handle_request = _ending_with_the_certificate(iot.handle_request)
     iot_data.handle_request = _with_delete_connection(iot_data.handle_request)
+    iot._mtls_serve_conn = _for_a_certificate(iot._mtls_serve_conn)  # noqa: SLF001
 
 
 def _ending_with_the_certificate(handle: Callable[..., Any]) -> Callable[..., Any]:
@@ -57,6 +59,18 @@ def _with_delete_connection(handle: Callable[..., Any]) -> Callable[..., Any]:
         return 200, {"Content-Type": "application/json"}, b""
 
     return handle_request
+
+
+def _for_a_certificate(serve: Callable[..., Any]) -> Callable[..., Any]:
+    @wraps(serve)
+    async def serve_connection(reader: Any, writer: Any) -> None:
+        tls = writer.get_extra_info("ssl_object")
+        if tls is None or not tls.getpeercert(binary_form=True):
+            await iot._mtls_close(writer)  # noqa: SLF001
+        else:
+            await serve(reader, writer)
+
+    return serve_connection
 
 
 def _says(query: Any, name: str) -> bool:

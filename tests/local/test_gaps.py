@@ -6,7 +6,7 @@ import asyncio
 import inspect
 
 import pytest
-from ministack.services import iot, lambda_svc
+from ministack.services import iot, iot_data, lambda_svc
 
 from local import gaps
 
@@ -38,6 +38,12 @@ def test_wrapped_functions_take_what_the_wrappers_pass():
     assert list(inspect.signature(iot._fleet_provisioning_reply).parameters) == [
         "account_id", "region", "operation", "template_name", "payload", "connection",
     ]  # fmt: skip
+    for handle in (iot.handle_request, iot_data.handle_request):
+        assert list(inspect.signature(handle).parameters) == [
+            "method", "path", "headers", "body", "query_params",
+        ]  # fmt: skip
+    assert list(inspect.signature(iot._mtls_serve_conn).parameters) == ["reader", "writer"]
+    assert {"cleanup", "disconnect_reason", "send_bytes"} <= set(dir(iot._WSSession))
     for name in (
         "_get_func_record_for_ref_in_scope",
         "_execution_record_for_config",
@@ -52,6 +58,10 @@ def test_gaps_are_still_gaps():
     assert "128 * 1024" not in inspect.getsource(iot.broker_publish)
     assert iot._parse_fleet_provisioning_topic("$aws/certificates/create-from-csr/json") is None
     assert "secure" not in inspect.getsource(iot._dispatch_rule_sqs)
+    # local/cut_sessions.py
+    assert "_connected_clients" not in inspect.getsource(iot._handle_certificate)
+    assert "/connections/" not in inspect.getsource(iot_data)
+    assert iot._mtls_resolve_identity(None) is not None
 
 
 def test_floor():

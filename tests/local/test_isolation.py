@@ -1,34 +1,39 @@
-"""Least privilege, tried on the broker with enforcement on: (what robot A does, what it is told)."""
+"""Least privilege, tried on the broker with enforcement on: every row of the isolation table, and who may
+not connect at all."""
 
 from __future__ import annotations
+
+import socket
+import ssl
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
 
 import pytest
 from botocore.exceptions import ClientError
 
-from contract import (
-    BROKER,
-    CMD,
-    FLEET,
-    LIVE,
-    MAX_MESSAGE_BYTES,
-    PING,
-    PONG,
-    RULE,
-    build_topic,
-    encode_ping,
-    record_topic,
-)
+from contract import CMD, FLEET, MAX_MESSAGE_BYTES, PING, PONG, RULE, build_topic, encode_ping
 from local.gaps import AWS_MESSAGE_BYTES
-from station import robots
+from station import claims, robots
+from tests.isolation import CLAIM, CONNECT, PUBLISH, RECEIVE, ROBOT, ROWS, SUBSCRIBE, A, B, Row
 from tests.local.robot import Robot
 
-A, B = "isolated-a", "isolated-b"
+WAIT_S = 60
+# What a broker answers to what it lets pass.
+ALLOWED = {"SUCCESS", "NO_MATCHING_SUBSCRIBERS", "GRANTED_QOS_0", "GRANTED_QOS_1"}
 
 
 @pytest.fixture(scope="module")
 def folders(embedded, tmp_path_factory):
     out = tmp_path_factory.mktemp("robots")
-    return {name: robots.add(embedded.cloud, name, out=out).folder for name in (A, B)}
+    folders = {name: robots.add(embedded.cloud, name, out=out).folder for name in (A, B)}
+    folders[CLAIM] = out / "claim"
+    claims.claim(embedded.cloud, None, out=folders[CLAIM], lasting=True)
+    # As a robot has them.
+    for name in ("certificate.pem", "private.key"):
+        (folders[CLAIM] / f"claim-{name}").rename(folders[CLAIM] / name)
+    (folders[CLAIM] / "car.yaml").write_text((folders[A] / "car.yaml").read_text())
+    return folders
 
 
 @pytest.fixture(scope="module")
@@ -37,53 +42,145 @@ def robot_a(folders):
         yield robot.online()
 
 
-@pytest.mark.parametrize(
-    ("topic", "answer"),
-    [
-        (record_topic(A, "vesc"), "SUCCESS"),
-        (build_topic(LIVE, A, "vesc"), "SUCCESS"),
-        (build_topic(FLEET, A, "pose"), "SUCCESS"),
-        (build_topic(PING, A, BROKER), "SUCCESS"),
-        (record_topic(B, "vesc"), "NOT_AUTHORIZED"),
-        (build_topic("dt", A, "vesc"), "NOT_AUTHORIZED"),
-        (build_topic(LIVE, B, "vesc"), "NOT_AUTHORIZED"),
-        (build_topic(FLEET, B, "pose"), "NOT_AUTHORIZED"),
-        (build_topic(PING, B, RULE), "NOT_AUTHORIZED"),
-        (build_topic(CMD, A, "drive"), "NOT_AUTHORIZED"),
-        (build_topic(CMD, B, "drive"), "NOT_AUTHORIZED"),
-        (build_topic(PONG, A, RULE), "NOT_AUTHORIZED"),
-        (f"$aws/rules/iort_live/live/iort/{A}/vesc", "NOT_AUTHORIZED"),
-        ("anything/else", "NOT_AUTHORIZED"),
-    ],
-)
-def test_publish(robot_a, topic, answer):
-    assert robot_a.publish(topic, b"{}") == answer
+class Session:
+    """A client that connects again when the broker has cut it off for what it tried."""
+
+    def __init__(self, folder: Path, client_id: str) -> None:
+        self._new: Callable[[], Robot] = lambda: Robot(folder, client_id=client_id)
+        self._robot: Robot | None = None
+
+    def attempt(self, row: Row) -> bool:
+        """Whether the broker let it pass; a session that ends over it was refused it."""
+        if self._robot is None:
+            self._robot = self._new()
+            self._robot.__enter__()
+            self._robot.online()
+        try:
+            said = (
+                self._robot.publish(row.what, b"{}")
+                if row.does == PUBLISH
+                else self._robot.subscribe(row.what)
+            )
+        except Exception:  # noqa: BLE001 - AwsCrtError, CancelledError, TimeoutError and others
+            # The library's error says no more than that there is no answer; the loss does.
+            assert self._robot.lost.wait(WAIT_S), row
+            said = "LOST"
+        if self._robot.lost.is_set():
+            self.close()
+        return said in ALLOWED
+
+    def close(self) -> None:
+        if self._robot is not None:
+            self._robot.__exit__()
+            self._robot = None
 
 
-@pytest.mark.parametrize(
-    ("topic_filter", "answer"),
-    [
-        (build_topic(CMD, A, "drive"), "GRANTED_QOS_1"),
-        (f"{CMD}/iort/{A}/+", "GRANTED_QOS_1"),
-        (f"{PONG}/iort/{A}/+", "GRANTED_QOS_1"),
-        (f"{FLEET}/iort/+/#", "GRANTED_QOS_1"),
-        (f"{FLEET}/iort/{B}/pose", "GRANTED_QOS_1"),
-        (build_topic(CMD, B, "drive"), "NOT_AUTHORIZED"),
-        (f"{CMD}/iort/+/drive", "NOT_AUTHORIZED"),
-        (f"{PONG}/iort/{B}/{RULE}", "NOT_AUTHORIZED"),
-        (f"{LIVE}/iort/{A}/vesc", "NOT_AUTHORIZED"),
-        ("#", "NOT_AUTHORIZED"),
-        ("+/iort/#", "NOT_AUTHORIZED"),
-    ],
-)
-def test_subscribe(robot_a, topic_filter, answer):
-    assert robot_a.subscribe(topic_filter) == answer
+@contextmanager
+def session(folder: Path, client_id: str) -> Iterator[Session]:
+    opened = Session(folder, client_id)
+    try:
+        yield opened
+    finally:
+        opened.close()
 
 
-def test_connect_as_another_robot_is_refused(folders):
-    with Robot(folders[A], client_id=B) as impostor:
-        assert impostor.refused.wait(15)
-        assert not impostor.connected.is_set()
+def rows(who: str, does: str) -> list[Row]:
+    return [row for row in ROWS if (row.who, row.does) == (who, does)]
+
+
+@pytest.mark.parametrize("does", [PUBLISH, SUBSCRIBE])
+@pytest.mark.parametrize(("who", "client"), [(ROBOT, A), (CLAIM, "iort-claim-1")])
+def test_the_broker_does_what_the_table_says(folders, who, client, does):
+    with session(folders[A if who == ROBOT else CLAIM], client) as tried:
+        told = [(row.what, tried.attempt(row), row.allowed) for row in rows(who, does)]
+    assert [one for one in told if one[1] != one[2]] == []
+
+
+@pytest.mark.parametrize("who", [ROBOT, CLAIM])
+def test_who_may_connect_as_whom(folders, who):
+    for row in rows(who, CONNECT):
+        with Robot(folders[A if who == ROBOT else CLAIM], client_id=row.what) as robot:
+            if row.allowed:
+                robot.online()
+            else:
+                assert robot.refused.wait(WAIT_S), row
+                assert not robot.connected.is_set(), row
+
+
+def test_a_robot_receives_what_the_table_says_and_nothing_else(embedded, folders):
+    """Whatever it manages to subscribe to: words to others do not reach it."""
+    said = [row for row in rows(ROBOT, RECEIVE) if not row.what.startswith("$")]
+    data, last = embedded.cloud.client("iot-data"), build_topic(CMD, A, "last")
+    with Robot(folders[A]) as robot:
+        robot.online()
+        for row in rows(ROBOT, SUBSCRIBE):
+            if row.allowed:
+                robot.subscribe(row.what)
+        for row in said:
+            data.publish(topic=row.what, qos=1, payload=b"{}")
+        data.publish(topic=last, qos=1, payload=b"{}")
+        heard = set()
+        while last not in heard:
+            heard.add(robot.next_message()[0])
+    assert heard == {row.what for row in said if row.allowed} | {last}
+
+
+# --- who may not connect at all ---------------------------------------------------------------------
+
+
+def test_without_a_certificate_nobody_connects(embedded):
+    context = ssl.create_default_context(cadata=embedded.cloud.root_ca_pem)
+    context.check_hostname = False
+    connect = b"\x10\x11\x00\x04MQTT\x04\x02\x00\x3c\x00\x05thief"
+    address = (embedded.cloud.mqtt_host, embedded.cloud.mqtt_port)
+    with socket.create_connection(address, timeout=WAIT_S) as raw:
+        try:
+            with context.wrap_socket(raw) as client:
+                client.sendall(connect)
+                answer = client.recv(16)
+        except OSError:
+            answer = b""
+    assert answer == b"", "AWS ends the handshake"
+
+
+@pytest.mark.parametrize("status", ["REVOKED", "INACTIVE"])
+def test_a_certificate_that_is_not_active_does_not_connect(embedded, bundle, status):
+    car = bundle()
+    iot = embedded.cloud.client("iot")
+    (arn,) = iot.list_thing_principals(thingName=car.robot)["principals"]
+    iot.update_certificate(certificateId=arn.rsplit("/", 1)[-1], newStatus=status)
+    refused(car.folder)
+
+
+def test_a_certificate_of_no_thing_does_not_connect(embedded, bundle):
+    car = bundle()
+    iot = embedded.cloud.client("iot")
+    (arn,) = iot.list_thing_principals(thingName=car.robot)["principals"]
+    iot.detach_thing_principal(thingName=car.robot, principal=arn)
+    refused(car.folder)
+
+
+def test_a_certificate_without_a_policy_does_not_connect(embedded, bundle):
+    car = bundle()
+    iot = embedded.cloud.client("iot")
+    (arn,) = iot.list_thing_principals(thingName=car.robot)["principals"]
+    iot.detach_policy(policyName="iort-robot", target=arn)
+    refused(car.folder)
+
+
+def test_a_removed_robot_does_not_connect(embedded, tmp_path):
+    bundle = robots.add(embedded.cloud, "isolated-removed", out=tmp_path)
+    robots.remove(embedded.cloud, bundle.robot)
+    refused(bundle.folder)
+
+
+def refused(folder: Path) -> None:
+    with Robot(folder) as robot:
+        assert robot.refused.wait(WAIT_S)
+        assert not robot.connected.is_set()
+
+
+# --- robots among themselves ------------------------------------------------------------------------
 
 
 def test_robots_talk_to_each_other_over_the_broker(folders, robot_a):
@@ -115,11 +212,3 @@ def test_message_above_128_kb_is_refused(embedded):
     data.publish(topic=topic, payload=b"x" * AWS_MESSAGE_BYTES)
     with pytest.raises(ClientError):
         data.publish(topic=topic, payload=b"x" * (AWS_MESSAGE_BYTES + 1))
-
-
-def test_removed_robot_is_refused(embedded, tmp_path):
-    bundle = robots.add(embedded.cloud, "isolated-removed", out=tmp_path)
-    robots.remove(embedded.cloud, bundle.robot)
-    with Robot(bundle.folder) as robot:
-        assert robot.refused.wait(15)
-        assert not robot.connected.is_set()

@@ -1,0 +1,255 @@
+"""Who may do what, in one table: (who, does, what, allowed). tests/local/test_isolation.py tries every row
+on the embedded cloud with enforcement on, tests/stacks/test_isolation.py asks the synthesized policies.
+
+What each role of the stacks may do is declared in tests/stacks/test_policies.py; here is what is asked of
+all of them, so that a function that is new and not declared fails.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+from contract import (
+    BROKER,
+    CMD,
+    FLEET,
+    LAMBDA,
+    LIVE,
+    PING,
+    PONG,
+    RECORD,
+    RULE,
+    RULES,
+    SHADOW,
+    build_topic,
+    claim_name,
+    fleet_name,
+    record_topic,
+    rule_name,
+)
+
+# Robot A is the one that tries; B is its neighbour.
+A, B = "isolated-a", "isolated-b"
+ROBOT, CLAIM = "robot A", "claim"
+CONNECT, PUBLISH, SUBSCRIBE, RECEIVE = "Connect", "Publish", "Subscribe", "Receive"
+
+
+class Row(NamedTuple):
+    """``what`` is a client id, a topic or a topic filter."""
+
+    who: str
+    does: str
+    what: str
+    allowed: bool
+
+
+def _rows(who: str, does: str, *, may: tuple[str, ...], may_not: tuple[str, ...]) -> list[Row]:
+    return [
+        Row(who, does, what, allowed) for group, allowed in ((may, True), (may_not, False)) for what in group
+    ]
+
+
+def _shadow(robot: str, name: str = f"/name/{SHADOW}") -> str:
+    return f"$aws/things/{robot}/shadow{name}"
+
+
+_PROVISION = f"$aws/provisioning-templates/{fleet_name()}/provision/json"
+_CSR = "$aws/certificates/create-from-csr/json"
+
+ROWS = [
+    *_rows(
+        ROBOT,
+        CONNECT,
+        may=(A,),
+        may_not=(B, f"{A}-2", A.upper(), A[:-1], "iort-claim-1", "anything"),
+    ),
+    *_rows(
+        ROBOT,
+        PUBLISH,
+        may=(
+            record_topic(A, "vesc"),
+            build_topic(LIVE, A, "vesc"),
+            build_topic(FLEET, A, "pose"),
+            build_topic(PING, A, BROKER),
+            build_topic(PING, A, RULE),
+            build_topic(PING, A, LAMBDA),
+            f"{_shadow(A)}/get",
+            f"{_shadow(A)}/update",
+        ),
+        may_not=(
+            # Another robot's.
+            record_topic(B, "vesc"),
+            build_topic(LIVE, B, "vesc"),
+            build_topic(FLEET, B, "pose"),
+            build_topic(PING, B, RULE),
+            build_topic(CMD, B, "drive"),
+            build_topic(PONG, B, RULE),
+            f"{_shadow(B)}/update",
+            f"{_shadow(B)}/get",
+            f"{_shadow(B)}/delete",
+            f"$aws/things/{B}/jobs/start-next",
+            f"$aws/things/{B}/jobs/1/update",
+            # What the operator and the cloud say.
+            build_topic(CMD, A, "drive"),
+            build_topic(PONG, A, RULE),
+            f"$aws/events/presence/connected/{A}",
+            f"$aws/events/presence/disconnected/{B}",
+            # Past Basic Ingest, and by it to other rules than its own, or with another's topic.
+            build_topic(RECORD, A, "vesc"),
+            *(f"$aws/rules/{rule_name(rule)}/{RECORD}/iort/{A}/vesc" for rule in RULES if rule != "record"),
+            f"$aws/rules/{rule_name('record')}/{LIVE}/iort/{A}/vesc",
+            f"$aws/rules/{rule_name('presence')}/$aws/events/presence/connected/{B}",
+            # Reserved topics that no agent needs.
+            f"{_shadow(A, '')}/update",
+            f"{_shadow(A, '/name/other')}/update",
+            f"$aws/things/{A}/jobs/start-next",
+            f"$aws/things/{A}/defender/metrics/json",
+            "$aws/certificates/create/json",
+            _CSR,
+            _PROVISION,
+            # Other deployments, other levels.
+            build_topic(LIVE, A, "vesc", "lab2"),
+            f"{LIVE}/iort",
+            f"{LIVE}/iort/{A}",
+            f"{LIVE}/iort/x/{A}/vesc",
+            "anything/else",
+        ),
+    ),
+    *_rows(
+        ROBOT,
+        SUBSCRIBE,
+        may=(
+            build_topic(CMD, A, "drive"),
+            f"{CMD}/iort/{A}/+",
+            f"{CMD}/iort/{A}/#",
+            f"{PONG}/iort/{A}/+",
+            build_topic(PING, A, BROKER),
+            f"{FLEET}/iort/+/#",
+            f"{FLEET}/iort/{B}/pose",
+            f"{_shadow(A)}/update/accepted",
+        ),
+        may_not=(
+            build_topic(CMD, B, "drive"),
+            f"{CMD}/iort/{B}/#",
+            f"{CMD}/iort/+/drive",
+            f"{CMD}/iort/#",
+            f"{CMD}/#",
+            f"{PONG}/iort/{B}/{RULE}",
+            f"{PONG}/iort/+/{RULE}",
+            f"{PING}/iort/+/{BROKER}",
+            f"{LIVE}/iort/{A}/vesc",
+            f"{LIVE}/iort/{B}/vesc",
+            f"{RECORD}/#",
+            f"{RECORD}/iort/{B}/vesc",
+            f"{FLEET}/#",
+            f"{FLEET}/lab2/+/#",
+            "#",
+            "+/#",
+            "+/iort/#",
+            "+/+/+/+",
+            f"+/iort/{A}/+",
+            f"$share/group/{CMD}/iort/{B}/#",
+            "$aws/#",
+            "$aws/events/#",
+            "$aws/events/presence/connected/+",
+            "$aws/things/#",
+            "$aws/things/+/shadow/#",
+            f"{_shadow(B)}/update/accepted",
+            f"{_shadow('+')}/update/accepted",
+            f"{_shadow(A, '')}/update/accepted",
+            f"{_shadow(A, '/name/+')}/update/accepted",
+            f"$aws/things/{A}/jobs/notify-next",
+            f"$aws/things/{B}/jobs/notify-next",
+            f"{_CSR}/accepted",
+        ),
+    ),
+    *_rows(
+        ROBOT,
+        RECEIVE,
+        may=(
+            build_topic(CMD, A, "drive"),
+            build_topic(PONG, A, RULE),
+            build_topic(FLEET, B, "pose"),
+            f"{_shadow(A)}/update/accepted",
+        ),
+        may_not=(
+            build_topic(CMD, B, "drive"),
+            build_topic(PONG, B, RULE),
+            build_topic(LIVE, B, "vesc"),
+            build_topic(PING, B, BROKER),
+            f"{_shadow(B)}/update/accepted",
+            f"$aws/things/{A}/jobs/notify-next",
+            f"$aws/events/presence/connected/{B}",
+        ),
+    ),
+    *_rows(
+        CLAIM,
+        CONNECT,
+        may=(f"{claim_name()}-1",),
+        may_not=(A, B, claim_name(), "lab2-claim-1", "anything"),
+    ),
+    *_rows(
+        CLAIM,
+        PUBLISH,
+        may=(_CSR, _PROVISION),
+        may_not=(
+            # A key that was made in the cloud has left it.
+            "$aws/certificates/create/json",
+            "$aws/provisioning-templates/other/provision/json",
+            record_topic(A, "vesc"),
+            build_topic(RECORD, A, "vesc"),
+            build_topic(LIVE, A, "vesc"),
+            build_topic(CMD, A, "drive"),
+            build_topic(FLEET, A, "pose"),
+            f"{_shadow(A)}/update",
+            f"$aws/things/{A}/jobs/start-next",
+            "anything/else",
+        ),
+    ),
+    *_rows(
+        CLAIM,
+        SUBSCRIBE,
+        may=(f"{_CSR}/accepted", f"{_CSR}/rejected", f"{_PROVISION}/accepted", f"{_PROVISION}/rejected"),
+        may_not=(
+            "#",
+            "$aws/#",
+            "$aws/certificates/#",
+            "$aws/certificates/create/json/accepted",
+            "$aws/certificates/+/json/accepted",
+            "$aws/provisioning-templates/+/provision/json/accepted",
+            f"{FLEET}/iort/+/#",
+            build_topic(CMD, A, "drive"),
+            f"{_shadow(A)}/update/accepted",
+        ),
+    ),
+]
+
+# What every role of the stacks is asked to do to every resource of a kind; its own role may what is
+# declared for it, and nothing else.
+TABLE_ACTIONS = (
+    "GetItem",
+    "PutItem",
+    "UpdateItem",
+    "DeleteItem",
+    "Query",
+    "Scan",
+    "BatchWriteItem",
+    "DeleteTable",
+)
+QUEUE_ACTIONS = ("SendMessage", "ReceiveMessage", "DeleteMessage", "PurgeQueue", "GetQueueAttributes")
+BUCKET_ACTIONS = ("ListBucket", "DeleteBucket")
+OBJECT_ACTIONS = ("GetObject", "PutObject", "DeleteObject")
+OBJECTS = ("robots/isolated-b/x", "results/x", "x")
+PARAMETER_ACTIONS = ("GetParameter", "PutParameter", "DeleteParameter")
+FUNCTION_ACTIONS = ("InvokeFunction", "UpdateFunctionConfiguration")
+LOG_ACTIONS = ("CreateLogStream", "PutLogEvents", "GetLogEvents")
+TOPICS = (
+    build_topic(CMD, B, "drive"),
+    build_topic(LIVE, B, "vesc"),
+    build_topic(RECORD, B, "vesc"),
+    build_topic(FLEET, B, "pose"),
+    build_topic(PONG, B, RULE),
+    build_topic(PONG, B, LAMBDA),
+    build_topic(PONG, B, "file"),
+    build_topic(PONG, B, LAMBDA, "lab2"),
+)

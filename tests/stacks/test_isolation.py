@@ -1,0 +1,116 @@
+"""The isolation table against the synthesized policies, by an evaluator of our own."""
+
+from __future__ import annotations
+
+import fnmatch
+from typing import Any
+
+import pytest
+
+import contract
+from tests import isolation
+from tests.isolation import CLAIM, CONNECT, ROWS, SUBSCRIBE, A, Row
+from tests.policy import allows
+from tests.stacks.test_policies import IOT, ROLES, qualified
+
+ACCOUNT = "arn:aws:iot:eu-west-1:123456789012"
+
+
+@pytest.fixture(scope="module")
+def policies(synthesized: Any, reader: Any) -> dict[str, list[dict[str, Any]]]:
+    """The IoT policies' statements, with ARNs of one account."""
+    return {
+        policy["PolicyName"]: [
+            {**s, "Resource": [arn.replace(IOT, ACCOUNT) for arn in reader.texts(s["Resource"])]}
+            for s in policy["PolicyDocument"]["Statement"]
+        ]
+        for policy in synthesized.resources("AWS::IoT::Policy").values()
+    }
+
+
+def test_the_table_is_large_and_says_nothing_twice():
+    assert len(ROWS) == len({row[:3] for row in ROWS}) >= 60
+    assert {row.who for row in ROWS if row.allowed} == {row.who for row in ROWS if not row.allowed}
+
+
+@pytest.mark.parametrize("row", ROWS, ids=lambda row: f"{row.who}-{row.does}-{row.what}")
+def test_the_policies_say_what_the_table_says(policies, row):
+    kind = {CONNECT: "client", SUBSCRIBE: "topicfilter"}.get(row.does, "topic")
+    variables = {}
+    if row.who != CLAIM and (row.does != CONNECT or row.what == A):
+        # Attached is a certificate to the thing that has the client's id, or else to none.
+        variables = {
+            "iot:Connection.Thing.ThingName": A,
+            "iot:Connection.Thing.IsAttached": "true",
+            "iot:ClientId": A,
+        }
+    policy = contract.claim_name() if row.who == CLAIM else contract.fleet_name()
+    arn = f"{ACCOUNT}:{kind}/{row.what}"
+    assert allows(policies[policy], f"iot:{row.does}", arn, variables) == row.allowed
+    # Of a certificate that is attached to no thing, and of another account's or region's topics: never.
+    if row.who != CLAIM:
+        assert not allows(policies[policy], f"iot:{row.does}", arn, {}) or not _is_of_a_thing(row)
+    assert not allows(policies[policy], f"iot:{row.does}", arn.replace("eu-west-1", "eu-west-2"), variables)
+
+
+def _is_of_a_thing(row: Row) -> bool:
+    """Every word to the fleet is heard by every robot; who is none cannot connect."""
+    return not row.what.startswith(f"{contract.FLEET}/")
+
+
+@pytest.mark.parametrize(
+    "action", ["RetainPublish", "UpdateThingShadow", "GetThingShadow", "StartNextPendingJobExecution"]
+)
+def test_a_robot_may_do_nothing_else(policies, action):
+    for statements in policies.values():
+        for kind in ("topic", "thing", "client"):
+            variables = {"iot:Connection.Thing.ThingName": A, "iot:Connection.Thing.IsAttached": "true"}
+            assert not allows(statements, f"iot:{action}", f"{ACCOUNT}:{kind}/{A}", variables)
+
+
+# --- roles ------------------------------------------------------------------------------------------
+
+ASKED = {
+    "AWS::DynamoDB::Table": [(f"dynamodb:{a}", "{}.Arn") for a in isolation.TABLE_ACTIONS],
+    "AWS::SQS::Queue": [(f"sqs:{a}", "{}.Arn") for a in isolation.QUEUE_ACTIONS],
+    "AWS::S3::Bucket": [(f"s3:{a}", "{}.Arn") for a in isolation.BUCKET_ACTIONS]
+    + [(f"s3:{a}", "{}.Arn/" + key) for a in isolation.OBJECT_ACTIONS for key in isolation.OBJECTS],
+    "AWS::Lambda::Function": [(f"lambda:{a}", "{}.Arn") for a in isolation.FUNCTION_ACTIONS],
+    "AWS::Logs::LogGroup": [(f"logs:{a}", "{}.Arn") for a in isolation.LOG_ACTIONS],
+}
+
+
+def test_every_role_on_every_resource_is_declared_or_refused(synthesized, reader):
+    statements: dict[str, list[dict[str, Any]]] = {
+        role: [] for role, *_ in qualified(synthesized, "AWS::IAM::Role")
+    }
+    for _, stack, _, policy in qualified(synthesized, "AWS::IAM::Policy"):
+        role = ("ingest/" if stack == "ingest" else "") + reader.text(policy["Roles"][0])
+        statements[role] += [
+            {**s, "Resource": reader.texts(s["Resource"])} for s in policy["PolicyDocument"]["Statement"]
+        ]
+    assert statements.keys() == ROLES.keys(), (
+        "declare what a new role may do in tests/stacks/test_policies.py"
+    )
+    wanted = [
+        (f"ssm:{a}", f"{IOT.replace(':iot:', ':ssm:')}:parameter/iort/pubnub")
+        for a in isolation.PARAMETER_ACTIONS
+    ]
+    wanted += [("iot:Publish", f"{IOT}:topic/{topic}") for topic in isolation.TOPICS]
+    for kind, asked in ASKED.items():
+        for name, *_ in qualified(synthesized, kind):
+            wanted += [(action, arn.format(name.removeprefix("ingest/"))) for action, arn in asked]
+    wrong, refused = [], 0
+    for role, granted in statements.items():
+        for action, arn in wanted:
+            declared = any(action == a and fnmatch.fnmatchcase(arn, r) for a, r in ROLES[role][1])
+            refused += not declared
+            # Nothing in these policies is a variable of the request's.
+            if allows(_plain(granted), action, arn.replace("${", "{")) != declared:
+                wrong.append((role, action, arn, declared))
+    assert not wrong
+    assert refused > 1000
+
+
+def _plain(statements: list[dict[str, Any]]) -> list[dict[str, Any]]:
+    return [{**s, "Resource": [arn.replace("${", "{") for arn in s["Resource"]]} for s in statements]
