@@ -18,6 +18,7 @@ from stacks.ingest import Ingest
 from stacks.monitoring import Monitoring
 from stacks.portable import refuse_what_the_embedded_cloud_drops
 from stacks.processing import Processing
+from stacks.quarantine import Quarantine
 from stacks.settings import Settings, SettingsError
 from stacks.site import Site
 from stacks.storage import Storage
@@ -37,18 +38,27 @@ def build(app: App, settings: Settings) -> list[Acknowledged]:
         }
 
     storage = Storage(app, **stack("storage"), settings=settings)
-    fleet = Fleet(app, **stack("fleet"), settings=settings, storage=storage)
-    processing = Processing(app, **stack("processing"), settings=settings, storage=storage)
-    ingest = Ingest(
-        app, **stack("ingest"), settings=settings, storage=storage, processing=processing, fleet=fleet
+    quarantine = Quarantine(app, **stack("quarantine"), settings=settings, storage=storage)
+    fleet = Fleet(app, **stack("fleet"), settings=settings, storage=storage, quarantine=quarantine)
+    processing = Processing(
+        app, **stack("processing"), settings=settings, storage=storage, quarantine=quarantine
+    )
+    Ingest(
+        app,
+        **stack("ingest"),
+        settings=settings,
+        storage=storage,
+        quarantine=quarantine,
+        processing=processing,
+        fleet=fleet,
     )
     Monitoring(
         app,
         **stack("monitoring"),
         settings=settings,
         storage=storage,
+        quarantine=quarantine,
         processing=processing,
-        ingest=ingest,
         fleet=fleet,
     )
     if settings.site:

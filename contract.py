@@ -37,6 +37,9 @@ LIVE_MAX_RATE_HZ = 10.0
 
 # Bounds that keep a hostile or broken message from costing more than a good one.
 MAX_SAMPLES = 50_000
+# A clock that is off by more than this has no date at all: of a dead battery, or of an overflow. Lambda 2
+# then refuses the batch; a car that believes in 1970 is let through, replayed drives are as old.
+MAX_AHEAD_US = 366 * 86_400 * 1_000_000
 # A batch closes after a second, so a range read starts one second early and misses nothing.
 MAX_BATCH_SPAN_US = 1_000_000
 MAX_FIELDS = 512
@@ -157,6 +160,20 @@ STATS = ("min", "mean", "max", "last")
 # between samples, values that were not finite.
 SAMPLES, BATCHES, MISSING_BATCHES = "n", "batches", "missing_batches"
 GAPS, NONFINITE = "gaps", "nonfinite"
+# Of a second that would be larger than DynamoDB's 400 KB: attributes left out, the largest first.
+OMITTED = "omitted"
+
+# The quarantine table: every message that was refused or could not be processed, by robot (`NO_ROBOT`
+# where nobody can tell) and an id that follows from its content, so that the same one again is no other.
+ENTRY, SOURCE, REASON, PAYLOAD = "id", "source", "reason", "payload"
+FIRST_MS, LAST_MS, SEEN, REPLAYS = "first_ms", "last_ms", "seen", "replays"
+NO_ROBOT = "-"
+# Where it was refused: by a rule's action, by Lambda 2 or on the way to it, by another function.
+BY_RULE, BY_STREAM, BY_FUNCTION = "rule", "stream", "function"
+# In an event for Lambda 2: a replay, whose records are answered for and not put into quarantine again.
+REPLAY = "replay"
+# What a queue's message of Lambda 2's carries: the stored item as DynamoDB JSON, in base64.
+ITEM_BASE64 = "base64Item"
 
 # The registry's row of a robot, beside its vehicle parameters. Of its connection, by the broker's
 # lifecycle events: times are the broker's, and the certificate is the one that it connected with.
@@ -193,6 +210,7 @@ METRICS = {
     "upload": ("FilesAsked", "FilesStored", "FilesRefused", "StoredBytes"),
     "admit": ("RobotsAdmitted", "RobotsRefused"),
     "presence": ("RobotsConnected", "RobotsDisconnected", "PresenceIgnored"),
+    "quarantine": ("Quarantined",),
 }
 
 
@@ -426,6 +444,25 @@ def decode(message: bytes | str | Mapping[str, Any]) -> Batch:
     times = list(accumulate(dt, initial=first_us))[1:]
     _check_times(times)
     return Batch(boot, seq, times, fields, nonfinite)
+
+
+def decode_item(item: Mapping[str, Any]) -> tuple[Topic, Batch]:
+    """Whose a stored item is, and its batch.
+
+    Raises `ContractError` for one that is no batch, that is not of the record lane, whose body names
+    another robot than its topic, or whose time is before 1970 or `MAX_AHEAD_US` after its receipt.
+    """
+    topic = parse_topic(item[TOPIC]) if TOPIC in item else None
+    if topic is None or topic.lane != RECORD:
+        raise ContractError(f"topic {_show(item.get(TOPIC))}: expected {RECORD}/<namespace>/<robot>/<stream>")
+    if item.get(ROBOT, topic.robot) != topic.robot:
+        raise ContractError(f"sent by {topic.robot} in the name of {_show(item[ROBOT])}")
+    batch = decode(item)
+    if batch.t_us < 0:
+        raise ContractError(f"time {batch.t_us} us: before 1970")
+    if RECEIVED_MS in item and batch.t_us > _integer(item, RECEIVED_MS) * 1000 + MAX_AHEAD_US:
+        raise ContractError(f"time {batch.t_us} us: over a year after its receipt; the car's clock is wrong")
+    return topic, batch
 
 
 def split(batch: Batch) -> tuple[Batch, Batch]:

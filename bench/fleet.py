@@ -41,7 +41,8 @@ from local.figures import Spread
 from station import robots
 from station.cloud import Cloud
 
-_CATCH_UP_S = 300.0
+# So long without any news, and no more comes.
+_CATCH_UP_S = 120.0
 _deserialize = TypeDeserializer().deserialize
 
 
@@ -207,17 +208,17 @@ def _summary_age(cloud: Cloud, robot: str) -> Iterator[list[float]]:
 
 def _summarized(cloud: Cloud, names: list[str], expected: int, tell: Tell) -> int:
     """The samples in the summary of all robots, once they are all there or no more come."""
-    before, since = -1, time.monotonic()
+    each, counted = expected // len(names), dict.fromkeys(names, -1)
+    since = time.monotonic()
     while True:
-        now = 0
-        for name in names:
-            for item in _items(cloud, "SummaryTable", name, SAMPLES):
-                now += int(item[SAMPLES])
-        tell(now / expected, "waiting for the summaries")
-        if now != before:
-            before, since = now, time.monotonic()
-        if now >= expected or time.monotonic() - since > _CATCH_UP_S:
-            return now
+        for name in [name for name in names if counted[name] < each]:
+            now = sum(int(item[SAMPLES]) for item in _items(cloud, "SummaryTable", name, SAMPLES))
+            if now != counted[name]:
+                counted[name], since = now, time.monotonic()
+        total = sum(counted.values())
+        tell(total / expected, "waiting for the summaries")
+        if total >= expected or time.monotonic() - since > _CATCH_UP_S:
+            return total
         threading.Event().wait(0.5)
 
 

@@ -60,18 +60,24 @@ def age_ms(live: LiveSample, received_ms: int, now_us: int, legs: Legs) -> float
     return (in_car_us + excess_us + in_cloud_us) / 1000
 
 
+class RefusedError(Exception):
+    """A live message that no robot of ours sends; as a failed invocation it goes to the quarantine."""
+
+
 def process(
     event: Mapping[str, Any], settings: LiveSettings, publish: Publish, legs: Legs, now_us: int
 ) -> None:
-    """Publish one live message, or count why not. A live message is never worth a retry."""
+    """Publish one live message, or count why not. A live message is never worth a retry.
+
+    Raises `RefusedError` for one that is malformed.
+    """
     try:
         topic = parse_topic(event[TOPIC])
         live = decode_live(event)
         received_ms = int(event[RECEIVED_MS])
     except (ContractError, KeyError, TypeError, ValueError, OverflowError) as error:
-        _log.warning("refused a live message: %s: %.500r", error, event)
         emit("live", LiveRefused=1)
-        return
+        raise RefusedError(f"{type(error).__name__}: {error}") from error
     if age_ms(live, received_ms, now_us, legs) > LIVE_MAX_AGE_MS:
         emit("live", LiveStale=1)
         return

@@ -9,7 +9,7 @@ from __future__ import annotations
 import logging
 import os
 from collections import defaultdict
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cache
 from itertools import islice
@@ -20,15 +20,16 @@ import boto3
 from contract import (
     EXPIRES_S,
     MAX_BATCH_SPAN_US,
+    REPLAY,
     T_US,
-    TOPIC,
     Batch,
     ContractError,
     Value,
-    decode,
+    decode_item,
     parse_topic,
 )
 from functions.metrics import emit
+from functions.refusals import Refusals, Refused
 from functions.statistics import missing_before, summarize_second
 from functions.tables import Tables, plain
 
@@ -45,10 +46,10 @@ BatchKey = tuple[int, str, int]
 
 @dataclass
 class Decoded:
-    """The good batches of some stream records by topic, and the sequence numbers of the bad ones."""
+    """The good batches of some stream records by topic, and what is wrong with the others."""
 
     batches: dict[str, list[Batch]] = field(default_factory=lambda: defaultdict(list))
-    refused: list[str] = field(default_factory=list)
+    refused: list[Refused] = field(default_factory=list)
 
 
 def decode_records(records: Iterable[Mapping[str, Any]]) -> Decoded:
@@ -59,14 +60,12 @@ def decode_records(records: Iterable[Mapping[str, Any]]) -> Decoded:
         if image is None:
             continue
         try:
-            item = plain(image)
-            batch = decode(item)
-            topic = str(parse_topic(item[TOPIC]))
+            topic, batch = decode_item(plain(image))
         except ContractError as error:
             _log.warning("refused %s of %s: %s", record["dynamodb"]["Keys"], record["eventID"], error)
-            decoded.refused.append(record["dynamodb"]["SequenceNumber"])
+            decoded.refused.append(Refused(record["dynamodb"]["SequenceNumber"], str(error), image))
         else:
-            decoded.batches[topic].append(batch)
+            decoded.batches[str(topic)].append(batch)
     return decoded
 
 
@@ -156,7 +155,7 @@ def _stored(items: Iterable[Mapping[str, Any]], known: Mapping[BatchKey, Batch])
     here it only must not stop its neighbours."""
     for item in items:
         try:
-            batch = known.get((int(item[T_US]), item["boot"], int(item["seq"]))) or decode(item)
+            batch = known.get((int(item[T_US]), item["boot"], int(item["seq"]))) or decode_item(item)[1]
             expires_s = int(item[EXPIRES_S]) if EXPIRES_S in item else None
         except (ContractError, KeyError, TypeError, ValueError, OverflowError):
             continue
@@ -167,11 +166,16 @@ def _key(batch: Batch) -> BatchKey:
     return batch.t_us, batch.boot, batch.seq
 
 
-def process(event: Mapping[str, Any], tables: Tables) -> dict[str, Any]:
-    """Summarise the event's records; the answer names those that cannot be decoded.
+Refuse = Callable[[Sequence[Refused]], Sequence[Refused]]
 
-    The good records behind a bad one are kept as well: the service sends them again, which changes
-    nothing, and a second need not wait for the bad one's retries to run out.
+
+def process(event: Mapping[str, Any], tables: Tables, refuse: Refuse) -> dict[str, Any]:
+    """Summarise the event's records. Those that cannot be decoded go to ``refuse``, since trying again
+    would not change them; the answer names the ones that it could not take.
+
+    The good records behind such a one are kept as well: the service sends them again, which changes
+    nothing, and a second need not wait for retries to run out. Of a replay the answer names all that
+    cannot be decoded: they are in quarantine already.
     """
     decoded = decode_records(event["Records"])
     topics = {topic: summarize_topic(tables, topic, batches) for topic, batches in decoded.batches.items()}
@@ -182,6 +186,7 @@ def process(event: Mapping[str, Any], tables: Tables) -> dict[str, Any]:
             for second, summary in summaries.seconds.items()
         }
     )
+    left = decoded.refused if event.get(REPLAY) else refuse(decoded.refused)
     good = [batch for batches in decoded.batches.values() for batch in batches]
     emit(
         "summarize",
@@ -190,7 +195,7 @@ def process(event: Mapping[str, Any], tables: Tables) -> dict[str, Any]:
         BatchesRefused=len(decoded.refused),
         BatchesMissing=sum(summaries.missing for summaries in topics.values()),
     )
-    return {"batchItemFailures": [{"itemIdentifier": number} for number in decoded.refused]}
+    return {"batchItemFailures": [{"itemIdentifier": refused.number} for refused in left]}
 
 
 @cache
@@ -203,6 +208,11 @@ def _tables() -> Tables:
     )
 
 
+@cache
+def _refusals() -> Refusals:
+    return Refusals(boto3.client("sqs"), queue_url=os.environ["REJECTED_QUEUE"])
+
+
 def handler(event: dict[str, Any], _context: object) -> dict[str, Any]:
     """Entry point of the telemetry table's stream mapping."""
-    return process(event, _tables())
+    return process(event, _tables(), _refusals().refuse)

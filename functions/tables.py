@@ -11,7 +11,7 @@ from typing import Any
 
 from boto3.dynamodb.types import TypeDeserializer
 
-from contract import ROBOT, SECOND, T_US, TOPIC, Value
+from contract import OMITTED, ROBOT, SECOND, T_US, TOPIC, Value
 from functions.statistics import Vehicle
 
 _log = logging.getLogger(__name__)
@@ -20,6 +20,8 @@ _deserialize = TypeDeserializer().deserialize
 _WRITE_SIZE = 25
 _WRITE_ATTEMPTS = 8
 _VEHICLE_CACHE_S = 60.0
+# "Limits", items: 400 KB with the names counted in; a little is left to how numbers are counted.
+_MAX_ITEM_BYTES, _MAX_NAME_BYTES = 380 * 1024, 65_535
 # What a DynamoDB number can hold, "Supported data types": 38 digits, 1e-130 to 9.99e125.
 _LARGEST, _SMALLEST = 9.99e125, 1e-130
 
@@ -121,7 +123,7 @@ class Tables:
             self._write(chunk)
 
     def _second_item(self, topic: str, second: int, summary: Mapping[str, Value]) -> dict[str, Any]:
-        item = {name: attribute(value) for name, value in summary.items()}
+        item = fitting({name: attribute(value) for name, value in summary.items()})
         return {**item, TOPIC: {"S": topic}, SECOND: {"N": str(second)}}
 
     def _write(self, requests: Sequence[Mapping[str, Any]]) -> None:
@@ -133,6 +135,31 @@ class Tables:
             # DynamoDB asks for exponential backoff before unprocessed items are sent again.
             time.sleep(0.02 * 2**attempt)
         raise TableError(f"{len(requests)} summaries not written after {_WRITE_ATTEMPTS} attempts")
+
+
+def fitting(item: dict[str, Any]) -> dict[str, Any]:
+    """The item without the largest attributes that keep it from fitting in DynamoDB's 400 KB.
+
+    A stream may have 512 fields of texts of 4096 characters, of which the summary keeps the last; the
+    samples themselves are in the telemetry table.
+    """
+    sizes = {name: _size(name, value) for name, value in item.items()}
+    total, dropped = sum(sizes.values()), set()
+    for name, size in sorted(sizes.items(), key=lambda pair: -pair[1]):
+        if len(name.encode()) > _MAX_NAME_BYTES or total > _MAX_ITEM_BYTES:
+            dropped.add(name)
+            total -= size
+    if not dropped:
+        return item
+    _log.warning("a summary of %d attributes is too large: %d left out", len(item), len(dropped))
+    kept = {name: value for name, value in item.items() if name not in dropped}
+    return {**kept, OMITTED: {"N": str(len(dropped))}}
+
+
+def _size(name: str, value: Mapping[str, Any]) -> int:
+    """About what DynamoDB counts: names and texts in UTF-8, and no number more than its digits."""
+    ((_, content),) = value.items()
+    return len(name.encode()) + len(str(content).encode("utf-8", "surrogatepass")) + 3
 
 
 def _vehicle(row: Mapping[str, Any]) -> Vehicle | None:

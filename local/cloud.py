@@ -30,7 +30,19 @@ from typing import Any
 
 from typing_extensions import Self
 
-from contract import DEFAULT_NAMESPACE, FILE, LAMBDA, PING, TOPIC, build_topic, encode_ping
+from contract import (
+    DEFAULT_NAMESPACE,
+    FILE,
+    LAMBDA,
+    LIVE,
+    PING,
+    RECEIVED_MS,
+    TOPIC,
+    LiveSample,
+    build_topic,
+    encode_live,
+    encode_ping,
+)
 from local import gateway_certificate
 from local.deployment import ROOT, deploy
 from local.errors import LocalError
@@ -219,7 +231,7 @@ class EmbeddedCloud:
         """
         self._progress("functions")
         warm_up: dict[tuple[str, str], dict[str, Any]] = {
-            ("processing", "Live"): {},
+            ("processing", "Live"): self._live(),
             ("processing", "Summarize"): {"Records": []},
             ("processing", "Echo"): self._ping(),
             ("processing", "Upload"): {TOPIC: build_topic(PING, "warm-up", FILE, self.namespace)},
@@ -237,3 +249,9 @@ class EmbeddedCloud:
 
     def _ping(self) -> dict[str, Any]:
         return {TOPIC: build_topic(PING, "warm-up", LAMBDA, self.namespace), **json.loads(encode_ping(0, 0))}
+
+    def _live(self) -> dict[str, Any]:
+        """Stale since 1970, and dropped."""
+        sample = LiveSample(boot="00000000", seq=0, t_us=0, sent_us=0, sample={}, offset_us=0)
+        topic = build_topic(LIVE, "warm-up", "warm-up", self.namespace)
+        return {TOPIC: topic, RECEIVED_MS: 0, **json.loads(encode_live(sample))}

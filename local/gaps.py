@@ -11,7 +11,9 @@ local/cut_sessions.py; here, in order:
 - a rule's SQS action counts as plain HTTP, which the queues' policies refuse (AWS calls itself by TLS);
 - fleet provisioning has no CreateCertificateFromCsr over MQTT, only keys made in the cloud;
 - a rule invokes Lambda at once, in a thread a message, and a throttled message is lost (AWS queues
-  asynchronous events, and a burst waits for free concurrency).
+  asynchronous events, a burst waits for free concurrency, and what fails goes to a destination);
+- a stream's mapping tries a failed batch again until it succeeds, and a role's grant on a stream's ARN is
+  not seen (local/stream_gap.py).
 """
 
 from __future__ import annotations
@@ -32,7 +34,7 @@ from typing import Any
 from ministack.core import iam_evaluator
 from ministack.services import iot, lambda_svc
 
-from local import cut_sessions
+from local import cut_sessions, stream_gap
 
 # "Message size" in AWS IoT Core's service quotas.
 AWS_MESSAGE_BYTES = 128 * 1024
@@ -56,6 +58,7 @@ def install() -> None:
     iot._parse_fleet_provisioning_topic = _with_csr(iot._parse_fleet_provisioning_topic)  # noqa: SLF001
     iot._fleet_provisioning_reply = _certifying(iot._fleet_provisioning_reply)  # noqa: SLF001
     iot._dispatch_rule_to_lambda = AsyncInvocations().dispatch  # noqa: SLF001
+    stream_gap.install()
 
 
 def expand_topic(template: str, topic: str) -> str:
@@ -191,11 +194,25 @@ class AsyncInvocations:
             cores = os.cpu_count() or 1
             pool = ThreadPoolExecutor(cores if reserved is None else max(1, min(cores, reserved)))
             self._pools[function_arn] = pool
-        retries = (function.get("event_invoke_config") or {}).get("MaximumRetryAttempts", 2)
-        pool.submit(_invoke, record, event, 1 + int(retries))
+        pool.submit(_invoke, account, region, record, event, time.monotonic())
 
 
-def _invoke(record: dict[str, Any], event: Any, attempts: int) -> None:
-    for _ in range(attempts):
-        if not lambda_svc._execute_function_with_config_scope(record, event).get("error"):  # noqa: SLF001
+def _invoke(account: str, region: str, record: dict[str, Any], event: Any, queued_s: float) -> None:
+    """Try as often, and for as long, as the function's settings say; then tell its destination."""
+    # The CDK gives them to the version $LATEST, which is what a rule calls.
+    settings: dict[str, Any] = {}
+    for qualifier in ("$LATEST", None):
+        settings = settings or lambda_svc._event_invoke_config(record, qualifier) or {}  # noqa: SLF001
+    retries, age_s = settings.get("MaximumRetryAttempts"), settings.get("MaximumEventAgeInSeconds")
+    result: dict[str, Any] = {"body": {"errorMessage": "the event was too old"}}
+    for _ in range(1 + (2 if retries is None else int(retries))):
+        if time.monotonic() - queued_s > (21_600 if age_s is None else int(age_s)):
+            break
+        result = lambda_svc._execute_function_with_config_scope(record, event)  # noqa: SLF001
+        if not result.get("error"):
             return
+    destination = ((settings.get("DestinationConfig") or {}).get("OnFailure") or {}).get("Destination")
+    if destination:
+        name = record["config"]["FunctionName"]
+        with iot.request_scope(account, region):
+            lambda_svc._route_async_failure(destination, name, event, result)  # noqa: SLF001

@@ -54,9 +54,8 @@ Found = tuple[CfnResource, Acknowledged]
 _FUNCTION = {
     "CKV_AWS_117": "no function needs anything in a VPC, and a way out of one costs more than all the rest",
     "CKV_AWS_173": "the environment holds names and no secret; Lambda encrypts it with its own key",
-    "CKV_AWS_116": "a stream's failures go to the mapping's queue, a rule's to the rule's; what is live "
-    "is worth nothing later",
-    "Serverless-LambdaDLQ": "as CKV_AWS_116: destinations, which also say why, where a retry has a point",
+    "CKV_AWS_116": "what fails goes to the quarantine, by the destination of its mapping or invocation",
+    "Serverless-LambdaDLQ": "as CKV_AWS_116: a destination also says why",
     "Serverless-LambdaTracing": "every message carries the time of each hop, and `iort trace` shows them; "
     "X-Ray would see one invocation in twenty",
     "AwsSolutions-L1": "PubNub's SDK names Python 3.13 as the newest that it supports",
@@ -89,7 +88,7 @@ def _decisions(resource: CfnResource, settings: Settings) -> Mapping[str, str]:
             decisions[rule] = _OWN_KEY
     if kind == "AWS::DynamoDB::Table" and not settings.protected:
         decisions |= {"CKV_AWS_28": _DEV, "AwsSolutions-DDB3": _DEV}
-    if kind == "AWS::SQS::Queue":
+    if kind == "AWS::SQS::Queue" and getattr(resource, "redrive_policy", None) is None:
         end = "where messages end that failed elsewhere; an alarm tells a human, who sends them back"
         decisions |= {"AwsSolutions-SQS3": end, "Serverless-SQSRedrivePolicy": end}
     if kind == "AWS::IoT::TopicRule":
@@ -128,6 +127,10 @@ def single(settings: Settings) -> dict[str, dict[str, str]]:
         return f"AwsSolutions-IAM5[Resource::{resource}]"
 
     a_robot = "the wildcard is the robot, which is known when the message comes"
+    to_a_queue = {
+        "AwsSolutions-IAM5[Action::kms:GenerateDataKey*]": "the CDK's grant to a queue's sender, one key",
+        "AwsSolutions-IAM5[Action::kms:ReEncrypt*]": "as kms:GenerateDataKey*",
+    }
     return {
         "fleet/ProvisioningRole/DefaultPolicy": {
             wide(f"{iot}:thing/*"): "a thing is named by the robot that asks to be provisioned",
@@ -135,39 +138,32 @@ def single(settings: Settings) -> dict[str, dict[str, str]]:
             wide("*"): "RegisterThing and two lists know no resources",
         },
         "fleet/Provisioning": {"W3005": "RegisterThing tries role and policy, which must be there first"},
-        "fleet/Presence/EventInvokeConfig": {
-            "Serverless-LambdaAsyncFailureDestination": "tried again for hours, and a robot's next event "
-            "says more than the one that was lost"
-        },
+        "fleet/PresenceRole/DefaultPolicy": {**to_a_queue},
         "ingest/PongRole/DefaultPolicy": {wide(f"{iot}:topic/pong/{settings.namespace}/*/rule"): a_robot},
         "processing/EchoRole/DefaultPolicy": {
-            wide(f"{iot}:topic/pong/{settings.namespace}/*/lambda"): a_robot
+            wide(f"{iot}:topic/pong/{settings.namespace}/*/lambda"): a_robot,
+            **to_a_queue,
         },
-        "processing/Echo/EventInvokeConfig": {
-            "Serverless-LambdaAsyncFailureDestination": "a pong that is late is worth nothing"
-        },
-        "processing/Live/EventInvokeConfig": {
-            "Serverless-LambdaAsyncFailureDestination": "a live sample that is late is worth nothing; every "
-            "sample is in the record lane"
-        },
+        "processing/LiveRole/DefaultPolicy": {**to_a_queue},
         "processing/UploadRole/DefaultPolicy": {
             wide(f"{settings.namespace}-storage:ExportsOutputFnGetAttFiles8E6940B8ArnD8EE6C03/robots/*"): (
                 "the wildcard is the robot, and the function signs for the one that asked"
             ),
             wide(f"{iot}:topic/pong/{settings.namespace}/*/file"): a_robot,
+            **to_a_queue,
         },
         "processing/QueryRole/DefaultPolicy": {
             wide(f"{settings.namespace}-storage:ExportsOutputFnGetAttFiles8E6940B8ArnD8EE6C03/results/*"): (
                 "the wildcard is the result, which the function names by chance"
             ),
         },
-        "processing/Upload/EventInvokeConfig": {
-            "Serverless-LambdaAsyncFailureDestination": "the robot asks again until it is answered"
-        },
         "processing/SummarizeRole/DefaultPolicy": {
             wide("*"): "dynamodb:ListStreams knows no resources; the CDK grants it with the stream",
-            "AwsSolutions-IAM5[Action::kms:GenerateDataKey*]": "the CDK's grant to a queue's sender, one key",
-            "AwsSolutions-IAM5[Action::kms:ReEncrypt*]": "as kms:GenerateDataKey*",
+            **to_a_queue,
+        },
+        "quarantine/Rejections": {
+            "Serverless-LambdaEventSourceMappingDestination": "a queue's mapping knows none; what fails five "
+            "times goes to the queue's own dead-letter queue"
         },
         "storage/Files": {
             "AwsSolutions-S1": "only robots with pre-signed requests and the operator reach it; CloudTrail's "

@@ -10,6 +10,7 @@ from aws_cdk import Duration, Stack
 from aws_cdk import aws_iam as iam
 from aws_cdk import aws_iot as iot
 from aws_cdk import aws_lambda as lambda_
+from aws_cdk import aws_lambda_destinations as destinations
 from constructs import Construct
 
 from contract import (
@@ -28,6 +29,7 @@ from contract import (
     rule_name,
 )
 from stacks.function import function
+from stacks.quarantine import Quarantine
 from stacks.settings import Settings
 from stacks.storage import Storage
 
@@ -49,13 +51,14 @@ class Fleet(Stack):
         *,
         settings: Settings,
         storage: Storage,
+        quarantine: Quarantine,
         **kwargs: Any,
     ) -> None:
         super().__init__(scope, construct_id, **kwargs)
         self._settings = settings
         namespace = settings.namespace
         self.admit = self._admit(storage)
-        self.presence = self._presence(storage)
+        self.presence = self._presence(storage, quarantine)
         self.functions = (self.admit, self.presence)
         name = fleet_name(namespace)
         robot_type = iot.CfnThingType(
@@ -118,7 +121,7 @@ class Fleet(Stack):
         storage.robots.grant(admit, "dynamodb:UpdateItem")
         return admit
 
-    def _presence(self, storage: Storage) -> lambda_.Function:
+    def _presence(self, storage: Storage, quarantine: Quarantine) -> lambda_.Function:
         presence = function(
             self,
             "Presence",
@@ -129,7 +132,11 @@ class Fleet(Stack):
             environment={"ROBOTS_TABLE": storage.robots.table_name},
         )
         # An event that comes late is put in its place or ignored, so it may be tried again for long.
-        presence.configure_async_invoke(max_event_age=Duration.hours(6), retry_attempts=2)
+        presence.configure_async_invoke(
+            max_event_age=Duration.hours(6),
+            retry_attempts=2,
+            on_failure=destinations.SqsDestination(quarantine.rejected),
+        )
         storage.robots.grant(presence, "dynamodb:UpdateItem")
         return presence
 

@@ -1,19 +1,19 @@
-"""What comes in: the topic rules, each with a role of its own and a queue for what fails."""
+"""What comes in: the topic rules, each with a role of its own and the quarantine for what fails."""
 
 from __future__ import annotations
 
 from typing import Any
 
-from aws_cdk import CfnOutput, Duration, Stack
+from aws_cdk import Stack
 from aws_cdk import aws_iam as iam
 from aws_cdk import aws_iot as iot
 from aws_cdk import aws_lambda as lambda_
-from aws_cdk import aws_sqs as sqs
 from constructs import Construct
 
 from contract import PONG, RULE, pong_template, rule_name, rule_sql
 from stacks.fleet import Fleet
 from stacks.processing import Processing
+from stacks.quarantine import Quarantine
 from stacks.settings import Settings
 from stacks.storage import Storage
 
@@ -21,8 +21,8 @@ Action = iot.CfnTopicRule.ActionProperty
 
 
 class Ingest(Stack):
-    """The rules, by which messages leave the broker. What an action cannot take goes to ``rejected``, with
-    the message's own bytes (base64OriginalPayload) and the reason."""
+    """The rules, by which messages leave the broker. What an action cannot take goes to the quarantine's
+    queue, with the message's own bytes (base64OriginalPayload) and the reason."""
 
     def __init__(
         self,
@@ -31,21 +31,14 @@ class Ingest(Stack):
         *,
         settings: Settings,
         storage: Storage,
+        quarantine: Quarantine,
         processing: Processing,
         fleet: Fleet,
         **kwargs: Any,
     ) -> None:
         super().__init__(scope, construct_id, **kwargs)
         self._settings = settings
-        self.rejected = sqs.Queue(
-            self,
-            "Rejected",
-            enforce_ssl=True,
-            retention_period=Duration.days(14),
-            removal_policy=settings.removal_policy,
-            **storage.encryption.queue,
-        )
-        CfnOutput(self, "RejectedQueue", value=self.rejected.queue_url)
+        self._rejected = quarantine.rejected
         self.rules = [
             self._record(storage),
             self._lambda_rule("live", processing.live),
@@ -99,13 +92,13 @@ class Ingest(Stack):
             "iot.amazonaws.com", conditions={"StringEquals": {"aws:SourceAccount": self.account}}
         )
         role = iam.Role(self, f"{name.capitalize()}Role", assumed_by=principal)
-        self.rejected.grant(role, "sqs:SendMessage")
+        self._rejected.grant(role, "sqs:SendMessage")
         return role
 
     def _rule(self, name: str, role: iam.Role, action: iot.CfnTopicRule.ActionProperty) -> iot.CfnTopicRule:
         retention_s = self._settings.retention_days * 86_400
         rejected = iot.CfnTopicRule.SqsActionProperty(
-            queue_url=self.rejected.queue_url, role_arn=role.role_arn, use_base64=False
+            queue_url=self._rejected.queue_url, role_arn=role.role_arn, use_base64=False
         )
         rule = iot.CfnTopicRule(
             self,

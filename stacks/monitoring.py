@@ -12,8 +12,8 @@ from constructs import Construct
 
 from contract import METRIC_DEPLOYMENT, METRIC_FUNCTION, METRIC_NAMESPACE, METRICS, RULES, rule_name
 from stacks.fleet import Fleet
-from stacks.ingest import Ingest
 from stacks.processing import Processing
+from stacks.quarantine import Quarantine
 from stacks.settings import Settings
 from stacks.storage import Storage
 
@@ -32,8 +32,8 @@ class Monitoring(Stack):
         *,
         settings: Settings,
         storage: Storage,
+        quarantine: Quarantine,
         processing: Processing,
-        ingest: Ingest,
         fleet: Fleet,
         **kwargs: Any,
     ) -> None:
@@ -48,7 +48,7 @@ class Monitoring(Stack):
         dashboard.add_widgets(*self._broker(), *self._rules())
         dashboard.add_widgets(*self._storage(storage))
         dashboard.add_widgets(*self._functions(processing, fleet))
-        dashboard.add_widgets(*self._own(), self._queues(processing, ingest))
+        dashboard.add_widgets(*self._own(), self._queues(quarantine))
         if settings.budget_usd:
             self._budget(settings)
 
@@ -163,15 +163,13 @@ class Monitoring(Stack):
         ]
 
     @staticmethod
-    def _queues(processing: Processing, ingest: Ingest) -> cloudwatch.GraphWidget:
-        queues = {"rejected by a rule": ingest.rejected, "undecodable batches": processing.undecodable}
-        return _graph(
-            "Quarantine: messages waiting",
-            [
-                queue.metric_approximate_number_of_messages_visible(period=_PERIOD, label=label)
-                for label, queue in queues.items()
-            ],
-        )
+    def _queues(quarantine: Quarantine) -> cloudwatch.GraphWidget:
+        queues = {"on the way in": quarantine.rejected, "not kept": quarantine.last}
+        waiting = [
+            queue.metric_approximate_number_of_messages_visible(period=_PERIOD, label=label)
+            for label, queue in queues.items()
+        ]
+        return _graph("Quarantine: messages waiting", waiting)
 
 
 def _metric(

@@ -8,12 +8,13 @@ from typing import Any
 from aws_cdk import Duration, Stack
 from aws_cdk import aws_iam as iam
 from aws_cdk import aws_lambda as lambda_
+from aws_cdk import aws_lambda_destinations as destinations
 from aws_cdk import aws_lambda_event_sources as sources
-from aws_cdk import aws_sqs as sqs
 from constructs import Construct
 
 from contract import FILE, FILES_PREFIX, LAMBDA, PONG, RESULTS_PREFIX, pubnub_parameter
 from stacks.function import RUNTIME, function
+from stacks.quarantine import Quarantine
 from stacks.settings import Settings
 from stacks.storage import Storage
 
@@ -22,18 +23,18 @@ class Processing(Stack):
     """The functions, and the grants that each of them needs and no more."""
 
     def __init__(
-        self, scope: Construct, construct_id: str, *, settings: Settings, storage: Storage, **kwargs: Any
+        self,
+        scope: Construct,
+        construct_id: str,
+        *,
+        settings: Settings,
+        storage: Storage,
+        quarantine: Quarantine,
+        **kwargs: Any,
     ) -> None:
         super().__init__(scope, construct_id, **kwargs)
         self._settings, self._encryption = settings, storage.encryption
-        self.undecodable = sqs.Queue(
-            self,
-            "Undecodable",
-            enforce_ssl=True,
-            retention_period=Duration.days(14),
-            removal_policy=settings.removal_policy,
-            **storage.encryption.queue,
-        )
+        self._rejected = quarantine.rejected
         self.live = self._live(settings)
         self.summarize = self._summarize(storage)
         self.echo = self._echo(settings)
@@ -61,8 +62,7 @@ class Processing(Stack):
             ],
             reserved_concurrency=settings.live_concurrency,
         )
-        # A live message is late after 2 s; the shortest age that Lambda allows is a minute.
-        live.configure_async_invoke(max_event_age=Duration.minutes(1), retry_attempts=0)
+        self._invoked_once(live)
         live.add_to_role_policy(
             iam.PolicyStatement(
                 actions=["ssm:GetParameter"],
@@ -86,6 +86,7 @@ class Processing(Stack):
                 "TELEMETRY_TABLE": storage.telemetry.table_name,
                 "SUMMARY_TABLE": storage.summary.table_name,
                 "ROBOTS_TABLE": storage.robots.table_name,
+                "REJECTED_QUEUE": self._rejected.queue_url,
             },
         )
         storage.telemetry.grant(summarize, "dynamodb:Query")
@@ -96,11 +97,14 @@ class Processing(Stack):
                 storage.telemetry,
                 starting_position=lambda_.StartingPosition.TRIM_HORIZON,
                 batch_size=100,
+                # With more, two batches of a robot could be summarised at once, and the one that read
+                # the table first could write last: docs/processing.md.
+                parallelization_factor=1,
                 bisect_batch_on_error=True,
                 report_batch_item_failures=True,
                 retry_attempts=5,
                 max_record_age=Duration.hours(6),
-                on_failure=sources.SqsDlq(self.undecodable),
+                on_failure=sources.SqsDlq(self._rejected),
                 # What expires leaves the stream too, and is nothing to summarise.
                 filters=[
                     lambda_.FilterCriteria.filter({"eventName": lambda_.FilterRule.is_equal("INSERT")}),
@@ -142,7 +146,7 @@ class Processing(Stack):
         echo = function(
             self, "Echo", settings=settings, encryption=self._encryption, module="echo", memory_mb=256
         )
-        echo.configure_async_invoke(max_event_age=Duration.minutes(1), retry_attempts=0)
+        self._invoked_once(echo)
         self._may_answer(echo, f"{PONG}/{settings.namespace}/*/{LAMBDA}")
         return echo
 
@@ -161,7 +165,7 @@ class Processing(Stack):
             },
         )
         # The robot asks again where no answer comes.
-        upload.configure_async_invoke(max_event_age=Duration.minutes(1), retry_attempts=0)
+        self._invoked_once(upload)
         # What it signs, it must be allowed itself. It may neither read a file nor delete one.
         self._allow(
             upload,
@@ -183,3 +187,12 @@ class Processing(Stack):
     @staticmethod
     def _allow(one: lambda_.Function, actions: list[str], resource: str) -> None:
         one.add_to_role_policy(iam.PolicyStatement(actions=actions, resources=[resource]))
+
+    def _invoked_once(self, called: lambda_.Function) -> None:
+        """A rule calls it and does not wait. What it answers is about now: late after 2 s (the shortest
+        age that Lambda allows is a minute), and never worth a second attempt."""
+        called.configure_async_invoke(
+            max_event_age=Duration.minutes(1),
+            retry_attempts=0,
+            on_failure=destinations.SqsDestination(self._rejected),
+        )

@@ -1,4 +1,4 @@
-"""What is kept: the telemetry, summary and robots tables, and the files' bucket."""
+"""What is kept: the telemetry, summary, robots and quarantine tables, and the files' bucket."""
 
 from __future__ import annotations
 
@@ -9,18 +9,19 @@ from aws_cdk import aws_dynamodb as dynamodb
 from aws_cdk import aws_s3 as s3
 from constructs import Construct
 
-from contract import EXPIRES_S, FILES_PREFIX, RESULTS_PREFIX, ROBOT, SECOND, T_US, TOPIC
+from contract import ENTRY, EXPIRES_S, FILES_PREFIX, RESULTS_PREFIX, ROBOT, SECOND, T_US, TOPIC
 from stacks.encryption import Encryption
 from stacks.settings import Settings
 
 # Half the price to keep, a cent a gigabyte to read; S3 allows it from this day on, and leaves objects
 # below 128 KB, for which it would cost more, where they are.
 _RARE_AFTER_DAYS = 30
+_TEXT = dynamodb.AttributeType.STRING
 
 
 class Storage(Stack):
-    """Three tables, paid by request, and a bucket. Every topic is a time series: partition key topic,
-    sort key time.
+    """Four tables, paid by request, and a bucket. Every topic is a time series: partition key topic,
+    sort key time. The quarantine has a message an item, by robot.
 
     ``encryption`` is for whatever else the deployment keeps, in whichever stack.
     """
@@ -38,6 +39,9 @@ class Storage(Stack):
         )
         self.summary = self._table("Summary", partition=TOPIC, sort=SECOND, expires=True)
         self.robots = self._table("Robots", partition=ROBOT)
+        self.quarantine = self._table(
+            "Quarantine", partition=ROBOT, sort=ENTRY, sort_type=_TEXT, expires=True
+        )
         self.files = self._files(settings)
 
     def _table(
@@ -46,15 +50,15 @@ class Storage(Stack):
         *,
         partition: str,
         sort: str | None = None,
+        sort_type: dynamodb.AttributeType = dynamodb.AttributeType.NUMBER,
         expires: bool = False,
         stream: dynamodb.StreamViewType | None = None,
     ) -> dynamodb.Table:
-        number, text = dynamodb.AttributeType.NUMBER, dynamodb.AttributeType.STRING
         table = dynamodb.Table(
             self,
             name,
-            partition_key=dynamodb.Attribute(name=partition, type=text),
-            sort_key=dynamodb.Attribute(name=sort, type=number) if sort else None,
+            partition_key=dynamodb.Attribute(name=partition, type=_TEXT),
+            sort_key=dynamodb.Attribute(name=sort, type=sort_type) if sort else None,
             billing_mode=dynamodb.BillingMode.PAY_PER_REQUEST,
             time_to_live_attribute=EXPIRES_S if expires else None,
             stream=stream,

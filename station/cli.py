@@ -11,7 +11,7 @@ from botocore.exceptions import BotoCoreError, ClientError
 
 from contract import DEFAULT_NAMESPACE
 from station.cloud import EMBEDDED
-from station.commands import audit, cost, dashboard, pubnub, query, robots, site, trace, watch
+from station.commands import audit, cost, dashboard, errors, pubnub, query, robots, site, trace, watch
 from station.errors import StationError
 from station.where import Where
 
@@ -25,6 +25,7 @@ app.add_typer(query.commands)
 app.add_typer(trace.commands)
 app.add_typer(watch.commands)
 app.add_typer(site.commands)
+app.add_typer(errors.commands)
 
 
 @app.callback()

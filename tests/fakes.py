@@ -16,7 +16,8 @@ from functions.tables import Tables, plain
 
 serialize = TypeSerializer().serialize
 
-TELEMETRY, SUMMARY, ROBOTS = "telemetry", "summary", "robots"
+TELEMETRY, SUMMARY, ROBOTS, QUARANTINE = "telemetry", "summary", "robots", "quarantine"
+# What Lambda 2 is given, as the arguments of Tables.
 NAMES = {"telemetry": TELEMETRY, "summary": SUMMARY, "robots": ROBOTS}
 KEYS = {TELEMETRY: (TOPIC, T_US), SUMMARY: (TOPIC, SECOND), ROBOTS: (ROBOT,)}
 TOPIC_OF_CAR = contract.build_topic(contract.RECORD, "car", contract.VESC_STREAM)

@@ -44,7 +44,7 @@ from contract import (
     encode_ping,
     record_topic,
 )
-from station import delivery
+from station import delivery, quarantine
 
 _WAIT_S = 30.0
 _CLIENTS, _WRITERS, _LISTENERS, _INSTANCES = 20, 8, 4, 4
@@ -343,23 +343,19 @@ class _Bench:
         return f"{len(names)} dashboards of {widgets} widgets"
 
     def _rejected(self) -> str:
-        queue, sqs = self._cloud.output("ingest", "RejectedQueue"), self._cloud.client("sqs")
         mark = uuid.uuid4().hex
+        message = json.dumps({"bench": mark}).encode()
         with self._client(0) as client:
-            message = json.dumps({"bench": mark}).encode()
             client.publish(record_topic(self._a, VESC_STREAM, self._namespace), message)
             client.ping()
 
         def there() -> bool:
-            got = sqs.receive_message(QueueUrl=queue, MaxNumberOfMessages=10, WaitTimeSeconds=1)
-            for message in got.get("Messages", []):
-                if "base64OriginalPayload" in message["Body"]:
-                    sqs.delete_message(QueueUrl=queue, ReceiptHandle=message["ReceiptHandle"])
-                    return True
-            return False
+            listed = quarantine.entries(self._cloud, robot=self._a)
+            kept = (quarantine.load(self._cloud, entry) for entry in listed)
+            return any(entry is not None and entry.payload == message for entry in kept)
 
-        _until(there, "the message in the queue")
-        return "a message that is no batch is in the queue, with its own bytes"
+        _until(there, "the message in quarantine")
+        return "a message that is no batch is in quarantine, with its own bytes"
 
     def _connections(self) -> str:
         bundles = [self._target.robot(f"bench-many-{i}") for i in range(_CLIENTS)]

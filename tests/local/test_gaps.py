@@ -4,11 +4,13 @@ from __future__ import annotations
 
 import asyncio
 import inspect
+import json
 
 import pytest
+from ministack.core import iam_actions
 from ministack.services import iot, iot_data, lambda_svc
 
-from local import gaps
+from local import gaps, stream_gap
 
 
 @pytest.mark.parametrize(
@@ -62,6 +64,11 @@ def test_gaps_are_still_gaps():
     assert "_connected_clients" not in inspect.getsource(iot._handle_certificate)
     assert "/connections/" not in inspect.getsource(iot_data)
     assert iot._mtls_resolve_identity(None) is not None
+    assert "Bisect" not in inspect.getsource(lambda_svc._poll_dynamodb_streams)
+    asked = json.dumps({"StreamArn": "arn:stream"}).encode()
+    request = ("dynamodbstreams", "POST", "/", {}, asked, {}, "r", "0")
+    assert iam_actions.extract_resource_arn(*request) == "*"
+    assert stream_gap._knowing_streams(iam_actions.extract_resource_arn)(*request) == "arn:stream"
 
 
 def test_floor():

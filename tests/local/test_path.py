@@ -2,15 +2,11 @@
 
 from __future__ import annotations
 
-import base64
-import json
 import math
 import os
 import signal
 import threading
 import time
-
-import pytest
 
 import contract
 from local.cloud import EmbeddedCloud
@@ -88,46 +84,6 @@ def test_seconds_are_summarised_with_speed_in_mps(embedded, bundle):
             abs_tol=1e-12,
         )
         assert int(item["expires_s"]["N"]) > int(item["second"]["N"])
-
-
-@pytest.mark.parametrize(
-    "payload",
-    [b"not json", b"\xff\xfe\x00", b'{"v": 1}', b"[]", b'{"t": "text"}'],
-    ids=["text", "not-utf8", "no-key", "array", "key-of-another-type"],
-)
-def test_malformed_record_is_quarantined_with_its_bytes(embedded, bundle, payload):
-    car = bundle()
-    sqs, url = embedded.cloud.client("sqs"), embedded.cloud.output("ingest", "RejectedQueue")
-    with Robot(car.folder) as robot:
-        answer = robot.online().publish(contract.record_topic(car.robot, "vesc", embedded.namespace), payload)
-        assert answer == "SUCCESS"
-
-    def mine():
-        for message in sqs.receive_message(QueueUrl=url, MaxNumberOfMessages=10).get("Messages", []):
-            body = json.loads(message["Body"])
-            if car.robot in body["topic"]:
-                return body
-        return None
-
-    body = until(mine)
-    assert base64.b64decode(body["base64OriginalPayload"]) == payload
-    assert body["failures"][0]["failedAction"] == "DynamoDBv2Action"
-
-
-def test_undecodable_batch_is_kept_and_its_neighbours_summarised(embedded, bundle):
-    car = bundle()
-    now_us = int(time.time()) * 1_000_000
-    good = [contract.Batch("0badcafe", seq, [now_us + seq * 1_000_000], {"speed": [1.5]}) for seq in (0, 2)]
-    bad = json.loads(contract.encode(contract.Batch("0badcafe", 1, [now_us + 1_000_000], {"speed": [1.0]})))
-    bad["samples"] = "AAAA"
-    topic = contract.record_topic(car.robot, "vesc", embedded.namespace)
-    with Robot(car.folder) as robot:
-        robot.online()
-        for payload in (contract.encode(good[0]), json.dumps(bad).encode(), contract.encode(good[1])):
-            assert robot.publish(topic, payload) == "SUCCESS"
-    until(lambda: delivery.samples_summarized(embedded.cloud, car.robot, "vesc") == 2)
-    stored = delivery.items(embedded.cloud, car.robot, "vesc")
-    assert [item["samples"] for item in stored][1] == "AAAA"
 
 
 def test_live_message_without_our_envelope_never_reaches_the_dashboard(embedded, bundle):

@@ -66,11 +66,14 @@ PROVISIONING = (
 
 LOG = {"logs:CreateLogStream", "logs:PutLogEvents"}
 REJECT = ("sqs:SendMessage", "Rejected.Arn")
+# What the CDK gives whoever may send to a queue as a destination.
+DESTINATION = {REJECT, ("sqs:GetQueueAttributes", "Rejected.Arn"), ("sqs:GetQueueUrl", "Rejected.Arn")}
 # Of every role, each action on each resource, and who may take the role.
 ROLES = {
     "LiveRole": (
         "lambda.amazonaws.com",
         {(action, "LiveLog.Arn") for action in LOG}
+        | DESTINATION
         | {
             (
                 "ssm:GetParameter",
@@ -89,14 +92,28 @@ ROLES = {
             ("dynamodb:GetRecords", "Telemetry.StreamArn"),
             ("dynamodb:GetShardIterator", "Telemetry.StreamArn"),
             ("dynamodb:ListStreams", "*"),
-            ("sqs:SendMessage", "Undecodable.Arn"),
-            ("sqs:GetQueueAttributes", "Undecodable.Arn"),
-            ("sqs:GetQueueUrl", "Undecodable.Arn"),
-        },
+        }
+        | DESTINATION,
     ),
     "EchoRole": (
         "lambda.amazonaws.com",
-        {(action, "EchoLog.Arn") for action in LOG} | {("iot:Publish", f"{IOT}:topic/pong/iort/*/lambda")},
+        {(action, "EchoLog.Arn") for action in LOG}
+        | DESTINATION
+        | {("iot:Publish", f"{IOT}:topic/pong/iort/*/lambda")},
+    ),
+    "QuarantineRole": (
+        "lambda.amazonaws.com",
+        {(action, "QuarantineLog.Arn") for action in LOG}
+        | {
+            ("dynamodb:UpdateItem", "Quarantine.Arn"),
+            ("dynamodb:GetRecords", "Telemetry.StreamArn"),
+            ("dynamodb:GetShardIterator", "Telemetry.StreamArn"),
+            ("sqs:ReceiveMessage", "Rejected.Arn"),
+            ("sqs:DeleteMessage", "Rejected.Arn"),
+            ("sqs:ChangeMessageVisibility", "Rejected.Arn"),
+            ("sqs:GetQueueAttributes", "Rejected.Arn"),
+            ("sqs:GetQueueUrl", "Rejected.Arn"),
+        },
     ),
     "QueryRole": (
         "lambda.amazonaws.com",
@@ -110,6 +127,7 @@ ROLES = {
     "UploadRole": (
         "lambda.amazonaws.com",
         {(action, "UploadLog.Arn") for action in LOG}
+        | DESTINATION
         | {
             (f"s3:{action}", f"Files.Arn/{contract.FILES_PREFIX}*")
             for action in ("AbortMultipartUpload", "ListMultipartUploadParts", "PutObject")
@@ -123,7 +141,9 @@ ROLES = {
     ),
     "PresenceRole": (
         "lambda.amazonaws.com",
-        {(action, "PresenceLog.Arn") for action in LOG} | {("dynamodb:UpdateItem", "Robots.Arn")},
+        {(action, "PresenceLog.Arn") for action in LOG}
+        | DESTINATION
+        | {("dynamodb:UpdateItem", "Robots.Arn")},
     ),
     "ProvisioningRole": ("iot.amazonaws.com", PROVISIONING),
     "ingest/RecordRole": ("iot.amazonaws.com", {REJECT, ("dynamodb:PutItem", "Telemetry.Arn")}),
@@ -350,7 +370,7 @@ def test_only_its_rule_or_template_may_call_a_function(synthesized, reader):
 
 def test_queues_are_encrypted_and_refuse_what_is_not_tls(synthesized, reader):
     queues = {name: properties for name, _, _, properties in qualified(synthesized, "AWS::SQS::Queue")}
-    assert queues.keys() == {"ingest/Rejected", "Undecodable"}
+    assert queues.keys() == {"Rejected", "Last"}
     for properties in queues.values():
         assert properties["SqsManagedSseEnabled"] is True
         assert properties["MessageRetentionPeriod"] == 14 * 86_400
@@ -361,7 +381,7 @@ def test_queues_are_encrypted_and_refuse_what_is_not_tls(synthesized, reader):
         assert statement["Condition"] == {"Bool": {"aws:SecureTransport": "false"}}
         assert statement["Principal"] == {"AWS": "*"}
         closed |= {reader.text(statement["Resource"])}
-    assert closed == {"Rejected.Arn", "Undecodable.Arn"}
+    assert closed == {"Rejected.Arn", "Last.Arn"}
 
 
 # --- secrets ----------------------------------------------------------------------------------------

@@ -48,19 +48,23 @@ def test_every_rule_has_one_action_and_it_is_this(rules, reader):
     assert {len(each[0]) for each in actions.values()} == {1}
 
 
-@pytest.mark.parametrize("rule", RULES)
-def test_every_rule_has_an_error_action_that_keeps_the_message(rules, reader, rule):
-    payload = rules[rule_name(rule)]
-    assert payload["ErrorAction"].keys() == {"Sqs"}
-    sqs = payload["ErrorAction"]["Sqs"]
-    assert sqs["QueueUrl"]["Ref"].startswith("Rejected")
-    # The error message holds the payload in base64 already: base64OriginalPayload.
-    assert sqs["UseBase64"] is False
-    # A rule's actions have one role, its own.
-    assert reader.text(sqs["RoleArn"]) == f"{rule.capitalize()}Role.Arn"
-    for action in payload["Actions"]:
-        for settings in action.values():
-            assert reader.text(settings.get("RoleArn", sqs["RoleArn"])) == f"{rule.capitalize()}Role.Arn"
+def test_every_rule_has_an_error_action_that_keeps_the_message(synthesized, reader):
+    """Every rule there is, of whichever stack: whoever adds one adds its error action."""
+    payloads = {}
+    for logical_id, rule in synthesized.resources("AWS::IoT::TopicRule").items():
+        payloads[name(logical_id)] = rule["TopicRulePayload"]
+    assert len(payloads) >= len(RULES)
+    for rule, payload in payloads.items():
+        assert payload["ErrorAction"].keys() == {"Sqs"}, rule
+        sqs = payload["ErrorAction"]["Sqs"]
+        assert reader.text(sqs["QueueUrl"]) == "Rejected"
+        # The error message holds the payload in base64 already: base64OriginalPayload.
+        assert sqs["UseBase64"] is False
+        # A rule's actions have one role, its own.
+        assert reader.text(sqs["RoleArn"]) == f"{rule}Role.Arn"
+        for action in payload["Actions"]:
+            for settings in action.values():
+                assert reader.text(settings.get("RoleArn", sqs["RoleArn"])) == f"{rule}Role.Arn"
 
 
 def test_a_rule_is_made_after_its_roles_policy(synthesized):
@@ -87,14 +91,18 @@ def test_the_tables_keys_are_the_contracts(synthesized):
     assert keys("Telemetry") == [(contract.TOPIC, "HASH", "S"), (contract.T_US, "RANGE", "N")]
     assert keys("Summary") == [(contract.TOPIC, "HASH", "S"), (contract.SECOND, "RANGE", "N")]
     assert keys("Robots") == [(contract.ROBOT, "HASH", "S")]
+    assert keys("Quarantine") == [(contract.ROBOT, "HASH", "S"), (contract.ENTRY, "RANGE", "S")]
     expires = {"AttributeName": contract.EXPIRES_S, "Enabled": True}
     assert {t: v.get("TimeToLiveSpecification") for t, v in tables.items()} == {
         "Telemetry": expires,
         "Summary": expires,
         "Robots": None,
+        "Quarantine": expires,
     }
     streams = {t: v.get("StreamSpecification") for t, v in tables.items()}
-    assert streams == {"Telemetry": {"StreamViewType": "NEW_IMAGE"}, "Summary": None, "Robots": None}
+    assert {t: stream for t, stream in streams.items() if stream} == {
+        "Telemetry": {"StreamViewType": "NEW_IMAGE"}
+    }
     assert {v["BillingMode"] for v in tables.values()} == {"PAY_PER_REQUEST"}
 
 
@@ -127,17 +135,42 @@ def test_a_live_message_or_a_ping_is_not_tried_again(synthesized, reader):
     }
     ages_s = {reader.text(c["FunctionName"]): c["MaximumEventAgeInSeconds"] for c in configs}
     assert ages_s == {"Live": 60, "Echo": 60, "Upload": 60, "Presence": 6 * 3600}
+    for config in configs:
+        assert reader.text(config["DestinationConfig"]["OnFailure"]["Destination"]) == "Rejected.Arn"
+
+
+def mappings(synthesized, reader):
+    found = synthesized.resources("AWS::Lambda::EventSourceMapping").values()
+    return {reader.text(mapping["EventSourceArn"]): mapping for mapping in found}
+
+
+def test_the_chain_of_what_fails_ends(synthesized, reader):
+    """rejected -> the quarantine's function -> after five attempts the last queue, which feeds nothing."""
+    mapping = mappings(synthesized, reader)["Rejected.Arn"]
+    assert reader.text(mapping["FunctionName"]) == "Quarantine"
+    assert mapping["FunctionResponseTypes"] == ["ReportBatchItemFailures"]
+    assert mapping["ScalingConfig"] == {"MaximumConcurrency": 2}
+    queues = {name(k): v for k, v in synthesized.resources("AWS::SQS::Queue").items()}
+    redrive = queues["Rejected"]["RedrivePolicy"]
+    assert (reader.text(redrive["deadLetterTargetArn"]), redrive["maxReceiveCount"]) == ("Last.Arn", 5)
+    assert "RedrivePolicy" not in queues["Last"]
+    assert "Last.Arn" not in mappings(synthesized, reader)
+    # What fails in the quarantine's own function goes nowhere but back into its queue.
+    configs = synthesized.resources("AWS::Lambda::EventInvokeConfig").values()
+    assert "Quarantine" not in {reader.text(config["FunctionName"]) for config in configs}
+    assert queues["Rejected"]["VisibilityTimeout"] >= 6 * 10
 
 
 def test_the_stream_never_blocks_for_good(synthesized, reader):
-    (mapping,) = synthesized.resources("AWS::Lambda::EventSourceMapping").values()
-    assert reader.text(mapping["EventSourceArn"]) == "Telemetry.StreamArn"
+    mapping = mappings(synthesized, reader)["Telemetry.StreamArn"]
     assert reader.text(mapping["FunctionName"]) == "Summarize"
     assert mapping["FunctionResponseTypes"] == ["ReportBatchItemFailures"]
     assert mapping["BisectBatchOnFunctionError"] is True
     assert mapping["MaximumRetryAttempts"] == 5
+    # More, and two batches of one robot could be summarised at once: docs/processing.md.
+    assert mapping["ParallelizationFactor"] == 1
     assert mapping["MaximumRecordAgeInSeconds"] == 6 * 3600
-    assert reader.text(mapping["DestinationConfig"]["OnFailure"]["Destination"]) == "Undecodable.Arn"
+    assert reader.text(mapping["DestinationConfig"]["OnFailure"]["Destination"]) == "Rejected.Arn"
     # From the beginning: what was stored before the first deployment of the mapping is summarised too.
     assert mapping["StartingPosition"] == "TRIM_HORIZON"
 

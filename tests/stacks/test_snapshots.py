@@ -7,7 +7,7 @@ import re
 
 import pytest
 
-STACKS = ("fleet", "storage", "processing", "ingest", "monitoring")
+STACKS = ("fleet", "storage", "quarantine", "processing", "ingest", "monitoring")
 _ASSET = re.compile(r"[0-9a-f]{64}")
 
 

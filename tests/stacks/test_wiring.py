@@ -30,7 +30,7 @@ from contract import (
 from stacks.settings import ROOT
 from tests.stacks.templates import name
 
-HANDLERS = ("Live", "Summarize", "Echo", "Upload", "Query", "Admit", "Presence")
+HANDLERS = ("Live", "Summarize", "Echo", "Upload", "Query", "Admit", "Presence", "Quarantine")
 FUNCTIONS = sorted((ROOT / "functions").glob("*.py"))
 # Lambda's Python has boto3 and what boto3 needs.
 RUNTIME_PACKAGES = ("boto3", "botocore", "dateutil", "jmespath", "s3transfer", "six", "urllib3")
@@ -178,6 +178,7 @@ def test_what_the_variables_say_is_what_the_functions_expect(functions, reader, 
         "TELEMETRY_TABLE": "Telemetry",
         "SUMMARY_TABLE": "Summary",
         "ROBOTS_TABLE": "Robots",
+        "REJECTED_QUEUE": "Rejected",
     }
     query = functions["Query"]["Environment"]["Variables"]
     assert {key: reader.text(value) for key, value in query.items()} == {

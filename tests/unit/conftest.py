@@ -9,7 +9,7 @@ import pytest
 from moto import mock_aws
 from pytest_socket import disable_socket, enable_socket
 
-from tests.fakes import NAMES
+from tests.fakes import NAMES, QUARANTINE
 
 
 @pytest.fixture(autouse=True)
@@ -38,11 +38,15 @@ def aws(monkeypatch):
 
 @pytest.fixture
 def dynamodb(aws, synthesized):
-    """moto's DynamoDB with the three tables as the template declares them."""
+    """moto's DynamoDB with the tables as the template declares them."""
     client = boto3.client("dynamodb")
     for logical, properties in synthesized.resources("AWS::DynamoDB::Table").items():
         client.create_table(
-            TableName=next(name for noun, name in NAMES.items() if logical.lower().startswith(noun)),
+            TableName=next(
+                name
+                for noun, name in {**NAMES, QUARANTINE: QUARANTINE}.items()
+                if logical.lower().startswith(noun)
+            ),
             KeySchema=properties["KeySchema"],
             AttributeDefinitions=properties["AttributeDefinitions"],
             BillingMode=properties["BillingMode"],

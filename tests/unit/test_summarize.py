@@ -56,6 +56,7 @@ class Stream:
         self.client = client if client is not None else FakeDynamoDB()
         self.tables = tables(self.client)
         self.records = 0
+        self.refused, self.jammed = [], set()
 
     def store(self, *batches, topic=TOPIC_OF_CAR):
         return [self.store_item(item_of(batch, topic)) for batch in batches]
@@ -69,7 +70,12 @@ class Stream:
         return record_of(item, self.records)
 
     def summarize(self, records):
-        return process({"Records": records}, self.tables)
+        return process({"Records": records}, self.tables, self.refuse)
+
+    def refuse(self, refused):
+        """The queue before the quarantine, which takes all but what ``jammed`` says."""
+        self.refused += [one for one in refused if one.number not in self.jammed]
+        return [one for one in refused if one.number in self.jammed]
 
     def deliver(self, *batches, topic=TOPIC_OF_CAR):
         return self.summarize(self.store(*batches, topic=topic))
@@ -407,6 +413,10 @@ POISON = {
     "map for boot": {**poison(), "boot": {"M": {}}},
     "other topic": {**poison(), "topic": {"S": "dt/iort/car"}},
     "topic of no robot": {**poison(), "topic": {"S": "dt/iort/c r/vesc"}},
+    "topic of the live lane": {**poison(), "topic": {"S": "live/iort/car/vesc"}},
+    "in the name of another": {**poison(), "robot": {"S": "other"}},
+    "before 1970": {**poison(), "t": {"N": "-1"}},
+    "years ahead": {**poison(), "t": {"N": str(T0 + 2 * contract.MAX_AHEAD_US)}},
 }
 
 
@@ -418,16 +428,27 @@ def test_a_poison_record_is_reported_and_the_others_are_kept(stream, name, capsy
     (third,) = stream.store(good[2])
     with caplog.at_level(logging.WARNING):
         answer = stream.summarize([first, second, bad, third])
-    assert answer == {"batchItemFailures": [{"itemIdentifier": bad["dynamodb"]["SequenceNumber"]}]}
+    assert answer == {"batchItemFailures": []}
+    number = bad["dynamodb"]["SequenceNumber"]
+    assert [(one.number, one.image) for one in stream.refused] == [(number, POISON[name])]
     assert stream.column("n") == {0: 50, 10: 1, 11: 50}
     assert stream.column("missing_batches") == {0: 0, 10: 0, 11: 0}
     assert counted(capsys) == {"BatchesSummarized": 3, "SamplesSummarized": 101, "BatchesRefused": 1}
     assert [record.message[:7] for record in caplog.records] == ["refused"]
-    # The service sends again from the first that failed, in the end without it.
+    # The queue before the quarantine does not take it: it stays in the stream, and comes again.
     before = clean(stream.summary())
-    assert stream.summarize([bad, third])["batchItemFailures"]
-    assert stream.summarize([third]) == {"batchItemFailures": []}
+    stream.jammed = {number}
+    assert stream.summarize([bad, third]) == {"batchItemFailures": [{"itemIdentifier": number}]}
     assert clean(stream.summary()) == before
+
+
+def test_a_replay_says_what_is_refused_and_puts_nothing_into_quarantine_again(stream):
+    good, bad = stream.store(batch(T0, 5)), stream.store_item(POISON["other version"])
+    event = {"replay": True, "Records": [*good, bad]}
+    answer = process(event, stream.tables, stream.refuse)
+    assert answer == {"batchItemFailures": [{"itemIdentifier": bad["dynamodb"]["SequenceNumber"]}]}
+    assert stream.refused == []
+    assert stream.column("n") == {0: 5}
 
 
 def test_a_poison_neighbour_hides_no_batch_from_the_count(stream):
@@ -483,6 +504,7 @@ def test_a_vehicle_whose_parameters_are_wrong_stops_nothing(stream, caplog):
 def test_the_handler_against_the_tables_of_the_template(dynamodb, monkeypatch, capsys):
     for name, table in NAMES.items():
         monkeypatch.setenv(f"{name.upper()}_TABLE", table)
+    monkeypatch.setenv("REJECTED_QUEUE", "https://sqs.example/rejected")
     dynamodb.put_item(TableName=ROBOTS, Item={"robot": {"S": "car"}, "speed_to_erpm_gain": {"N": "4614"}})
     stream = Stream(dynamodb)
     drive = [
@@ -491,12 +513,14 @@ def test_the_handler_against_the_tables_of_the_template(dynamodb, monkeypatch, c
     order = list(drive)
     random.Random(1).shuffle(order)
     summarize._tables.cache_clear()
+    summarize._refusals.cache_clear()
     try:
         for start in range(0, len(order), 13):
             records = stream.store(*order[start : start + 13])
             assert summarize.handler({"Records": records}, None) == {"batchItemFailures": []}
     finally:
         summarize._tables.cache_clear()
+        summarize._refusals.cache_clear()
     items = [plain(item) for item in dynamodb.scan(TableName=SUMMARY)["Items"]]
     assert sum(item["n"] for item in items) == 39 * 50
     by_second = {int(item["second"]) - SECOND: item for item in items}

@@ -172,6 +172,28 @@ def test_what_dynamodb_never_processes_is_an_error_in_the_time_there_is(slept):
     assert sum(slept) < 10
 
 
+def test_a_summary_too_large_for_an_item_goes_without_its_largest_values(dynamodb):
+    """As many fields as a batch may have, each with the longest text there may be."""
+    summary = {f"note_{i:03}_last": "ä" * (4096 - i) for i in range(512)} | {"n": 50, "a_mean": 1.5}
+    tables(dynamodb).put_seconds({(TOPIC_OF_CAR, 1): summary})
+    item = plain(dynamodb.scan(TableName=SUMMARY)["Items"][0])
+    kept = [name for name in summary if name in item]
+    assert item["omitted"] == len(summary) - len(kept) > 0
+    assert (item["n"], item["a_mean"]) == (50, Decimal("1.5"))
+    # The shortest ones stayed, and nearly all the room there is was used.
+    assert sorted(kept)[:1] == ["a_mean"]
+    assert "note_511_last" in item
+    assert sum(len(str(value).encode()) for value in item.values()) > 350_000
+
+
+def test_an_attribute_whose_name_dynamodb_does_not_take_is_left_out():
+    client = FakeDynamoDB()
+    tables(client).put_seconds({(TOPIC_OF_CAR, 1): {"n": 1, "x" * 65_536: 1}})
+    (item,) = summary_of(client).values()
+    assert (item["n"], item["omitted"]) == (1, 1)
+    assert len(item) == 4
+
+
 # --- values -----------------------------------------------------------------------------------------
 
 

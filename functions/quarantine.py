@@ -1,0 +1,240 @@
+"""Quarantine: what rules, streams and functions could not process, from a queue into a table.
+
+A queue cannot be listed and forgets after 14 days; the table keeps every message with its bytes, the
+reason and how often it came, for `iort errors` and `iort replay-errors`.
+"""
+
+from __future__ import annotations
+
+import base64
+import binascii
+import hashlib
+import json
+import logging
+import os
+import time
+from collections.abc import Callable, Iterable, Mapping
+from dataclasses import dataclass
+from functools import cache
+from typing import Any
+
+import boto3
+from botocore.exceptions import BotoCoreError, ClientError
+
+from contract import (
+    BY_FUNCTION,
+    BY_RULE,
+    BY_STREAM,
+    ENTRY,
+    EXPIRES_S,
+    FIRST_MS,
+    ITEM_BASE64,
+    LANES,
+    LAST_MS,
+    NO_ROBOT,
+    PAYLOAD,
+    REASON,
+    ROBOT,
+    SEEN,
+    SOURCE,
+    TOPIC,
+)
+from functions.metrics import emit
+
+_log = logging.getLogger(__name__)
+_log.setLevel(logging.INFO)
+_REASON_CHARACTERS = 2_000
+
+Records = Callable[[Mapping[str, Any]], Iterable[Mapping[str, Any]]]
+
+
+@dataclass(frozen=True)
+class Entry:
+    """A message to keep: where it was refused, its topic ("" where it had none), why, and its bytes."""
+
+    source: str
+    topic: str
+    reason: str
+    payload: bytes
+
+    @property
+    def robot(self) -> str:
+        """The robot that the topic names; `contract.NO_ROBOT` where it names none."""
+        levels = self.topic.split("/")
+        return levels[2] if len(levels) >= 3 and levels[0] in LANES and levels[2] else NO_ROBOT
+
+    @property
+    def id(self) -> str:
+        """The same for the same message from the same source, however often it comes."""
+        head = f"{self.source}\0{self.topic}\0".encode("utf-8", "surrogatepass")
+        return hashlib.sha256(head + self.payload).hexdigest()[:16]
+
+
+def entries(body: str, records: Records) -> list[Entry]:
+    """The messages in one message of the queue, which is one of these: a rule's error document, a record
+    that Lambda 2 refused, an asynchronous invocation that failed, a batch of the stream that failed
+    (whose records must be fetched with ``records``). Whatever else comes is kept as it is."""
+    try:
+        document = json.loads(body)
+        if "base64OriginalPayload" in document:
+            return [_of_rule(document)]
+        if ITEM_BASE64 in document:
+            item = base64.b64decode(document[ITEM_BASE64], validate=True)
+            return [_of_item(document[REASON], item)]
+        if "DDBStreamBatchInfo" in document:
+            condition = str(document["requestContext"]["condition"])
+            found = [
+                _of_item(f"Lambda 2 failed: {condition}", _json(record["dynamodb"]["NewImage"]))
+                for record in records(document["DDBStreamBatchInfo"])
+                if "NewImage" in record["dynamodb"]
+            ]
+            return found or [
+                Entry(BY_STREAM, "", f"{condition}; the records have left the stream", body.encode())
+            ]
+        if "requestPayload" in document:
+            return [_of_invocation(document)]
+    except (KeyError, TypeError, ValueError, AttributeError, binascii.Error) as error:
+        reason = f"a message that the quarantine does not know: {type(error).__name__}: {error}"
+    else:
+        reason = "a message that the quarantine does not know"
+    return [Entry(BY_FUNCTION, "", reason, body.encode("utf-8", "surrogatepass"))]
+
+
+def _of_rule(document: Mapping[str, Any]) -> Entry:
+    failures = document.get("failures") or []
+    reason = "; ".join(f"{f.get('failedAction')}: {f.get('errorMessage')}" for f in failures)
+    return Entry(
+        source=f"{BY_RULE} {document['ruleName']}",
+        topic=str(document.get("topic", "")),
+        reason=reason or "no reason given",
+        payload=base64.b64decode(document["base64OriginalPayload"], validate=True),
+    )
+
+
+def _of_item(reason: str, item: bytes) -> Entry:
+    topic = json.loads(item).get(TOPIC, {}).get("S", "")
+    return Entry(BY_STREAM, topic, reason, item)
+
+
+def _of_invocation(document: Mapping[str, Any]) -> Entry:
+    context, event = document["requestContext"], document["requestPayload"]
+    name = str(context.get("functionArn", "")).split(":function:")[-1].split(":")[0]
+    said = document.get("responsePayload")
+    error = said.get("errorMessage") if isinstance(said, dict) else said
+    topic = event.get(TOPIC) if isinstance(event, dict) else None
+    return Entry(
+        source=f"{BY_FUNCTION} {name}",
+        topic=topic if isinstance(topic, str) else "",
+        reason=f"{context.get('condition')}: {error}",
+        payload=_json(event),
+    )
+
+
+def _json(value: Any) -> bytes:
+    text = json.dumps(value, separators=(",", ":"), ensure_ascii=False, default=_binary)
+    return text.encode("utf-8", "surrogatepass")
+
+
+def _binary(value: Any) -> str:
+    if isinstance(value, bytes):
+        return base64.b64encode(value).decode()
+    raise TypeError(type(value).__name__)
+
+
+class Store:
+    """The quarantine table; ``client`` is a boto3 DynamoDB client."""
+
+    def __init__(self, client: Any, *, table: str, retention_s: int) -> None:
+        self._client, self._table, self._retention_s = client, table, retention_s
+
+    def put(self, entry: Entry, sent_ms: int) -> None:
+        """Keep the message; one that is there already counts once more."""
+        names = (SOURCE, TOPIC, REASON, PAYLOAD, FIRST_MS, LAST_MS, EXPIRES_S, SEEN)
+        expires_s = sent_ms // 1000 + self._retention_s
+        self._client.update_item(
+            TableName=self._table,
+            Key={ROBOT: {"S": entry.robot}, ENTRY: {"S": entry.id}},
+            UpdateExpression=(
+                f"SET #{SOURCE} = :source, #{TOPIC} = :topic, #{REASON} = :reason, #{PAYLOAD} = :payload,"
+                f" #{FIRST_MS} = if_not_exists(#{FIRST_MS}, :sent), #{LAST_MS} = :sent,"
+                f" #{EXPIRES_S} = :expires"
+                f" ADD #{SEEN} :one"
+            ),
+            ExpressionAttributeNames={f"#{name}": name for name in names},
+            ExpressionAttributeValues={
+                ":source": {"S": entry.source},
+                ":topic": {"S": entry.topic},
+                ":reason": {"S": entry.reason[:_REASON_CHARACTERS]},
+                ":payload": {"B": entry.payload},
+                ":sent": {"N": str(sent_ms)},
+                ":expires": {"N": str(expires_s)},
+                ":one": {"N": "1"},
+            },
+        )
+
+
+class Stream:
+    """Reads records off the telemetry table's stream; ``client`` is a boto3 DynamoDB Streams client."""
+
+    def __init__(self, client: Any) -> None:
+        self._client = client
+
+    def records(self, info: Mapping[str, Any]) -> list[Mapping[str, Any]]:
+        """The records of a failed batch (``DDBStreamBatchInfo``); none where they have left the stream."""
+        last = str(info["endSequenceNumber"])
+        found: list[Mapping[str, Any]] = []
+        try:
+            answer = self._client.get_shard_iterator(
+                StreamArn=info["streamArn"],
+                ShardId=info["shardId"],
+                ShardIteratorType="AT_SEQUENCE_NUMBER",
+                SequenceNumber=str(info["startSequenceNumber"]),
+            )
+            iterator = answer["ShardIterator"]
+            while iterator:
+                answer = self._client.get_records(ShardIterator=iterator)
+                for record in answer["Records"]:
+                    if int(record["dynamodb"]["SequenceNumber"]) > int(last):
+                        return found
+                    found.append(record)
+                if not answer["Records"] or found[-1]["dynamodb"]["SequenceNumber"] == last:
+                    break
+                iterator = answer.get("NextShardIterator")
+        except self._client.exceptions.TrimmedDataAccessException:
+            _log.warning("the records of a failed batch have left the stream: %s", info)
+        return found
+
+
+def process(event: Mapping[str, Any], store: Store, records: Records) -> dict[str, Any]:
+    """Keep what the queue's messages hold; the answer names the messages that are to come again."""
+    failed, kept = [], 0
+    for message in event["Records"]:
+        sent_ms = int(message.get("attributes", {}).get("SentTimestamp") or time.time() * 1000)
+        try:
+            for entry in entries(message["body"], records):
+                store.put(entry, sent_ms)
+                kept += 1
+        except (BotoCoreError, ClientError) as error:
+            _log.warning("message %s comes again: %s", message["messageId"], error)
+            failed.append(message["messageId"])
+    emit("quarantine", Quarantined=kept)
+    return {"batchItemFailures": [{"itemIdentifier": number} for number in failed]}
+
+
+@cache
+def _store() -> Store:
+    return Store(
+        boto3.client("dynamodb"),
+        table=os.environ["QUARANTINE_TABLE"],
+        retention_s=int(os.environ["RETENTION_S"]),
+    )
+
+
+@cache
+def _stream() -> Stream:
+    return Stream(boto3.client("dynamodbstreams"))
+
+
+def handler(event: dict[str, Any], _context: object) -> dict[str, Any]:
+    """Entry point of the rejected queue's mapping."""
+    return process(event, _store(), _stream().records)

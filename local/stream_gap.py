@@ -1,0 +1,177 @@
+"""The embedded cloud's mappings of DynamoDB streams, as AWS' are: `local.stream_mapping` in its process.
+
+ministack invokes a function with a batch until it succeeds, in the thread that also serves the queues.
+Here every mapping has a thread for each of its concurrent batches, splits, retries, gives up and tells
+the destination. Records of a deployment that was restarted are read from the beginning again, which AWS
+does too after a lost acknowledgement.
+"""
+
+from __future__ import annotations
+
+import json
+import logging
+import threading
+import time
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from functools import wraps
+from typing import Any
+
+from ministack.core import iam_actions
+from ministack.core.responses import request_scope
+from ministack.services import dynamodb, dynamodb_streams, lambda_svc
+
+from local.stream_mapping import Answer, Settings, Shard
+
+_log = logging.getLogger(__name__)
+# AWS waits longer between attempts; a test has less patience.
+_FIRST_PAUSE_S, _LONGEST_PAUSE_S = 0.1, 5.0
+# Records read ahead of the function.
+_AHEAD = 1_000
+
+
+def install() -> None:
+    """Close the gap in this process, before the emulator starts."""
+    lambda_svc._poll_dynamodb_streams = StreamMappings().poll  # noqa: SLF001
+    iam_actions.extract_resource_arn = _knowing_streams(iam_actions.extract_resource_arn)
+
+
+def _knowing_streams(resource_arn: Callable[..., str]) -> Callable[..., str]:
+    """The stream that a request is about, which ministack takes for a request about everything."""
+
+    @wraps(resource_arn)
+    def extract(service: str, *request: Any) -> str:
+        if service != "dynamodbstreams":
+            return resource_arn(service, *request)
+        try:
+            asked = json.loads(request[3] or b"{}")
+        except ValueError:
+            asked = {}
+        iterator = dynamodb_streams._decode_iterator(asked.get("ShardIterator") or "") or {}  # noqa: SLF001
+        return str(asked.get("StreamArn") or iterator.get("arn") or "*")
+
+    return extract
+
+
+@dataclass
+class _Running:
+    """A mapping at work: how far it has read, and which lanes wait for their function."""
+
+    account: str
+    region: str
+    mapping: dict[str, Any]
+    shard: Shard
+    position: int
+    busy: set[int] = field(default_factory=set)
+    pauses: dict[int, tuple[float, float]] = field(default_factory=dict)
+
+
+class StreamMappings:
+    """All mappings of streams; `poll` takes the place of ministack's own poller."""
+
+    def __init__(self) -> None:
+        self._running: dict[str, _Running] = {}
+        self._lock = threading.Lock()
+
+    def poll(self) -> bool:
+        """Start what there is to start; whether anything was."""
+        started = False
+        for account, region, mapping in lambda_svc._iter_all_esms():  # noqa: SLF001
+            if mapping.get("Enabled", True) and ":dynamodb:" in mapping.get("EventSourceArn", ""):
+                with request_scope(account, region):
+                    started = self._serve(account, region, mapping) or started
+        return started
+
+    def _serve(self, account: str, region: str, mapping: dict[str, Any]) -> bool:
+        table = mapping["EventSourceArn"].split("/stream/")[0].rsplit("/", 1)[-1]
+        function, _ = lambda_svc._get_func_record_for_qualifier(  # noqa: SLF001
+            mapping["FunctionName"], mapping.get("Qualifier")
+        )
+        if function is None or table not in dynamodb._tables:  # noqa: SLF001
+            return False
+        running = self._of(account, region, mapping, table)
+        self._read(running, table)
+        started = False
+        for number, lane in enumerate(running.shard.lanes):
+            with self._lock:
+                pause_until, _ = running.pauses.get(number, (0.0, 0.0))
+                if number in running.busy or time.monotonic() < pause_until:
+                    continue
+                batch = lane.batch(time.time())
+                if batch:
+                    running.busy.add(number)
+            self._tell(running, function)
+            if batch:
+                started = True
+                arguments = (running, function, number, batch)
+                threading.Thread(target=self._invoke, args=arguments, daemon=True).start()
+        return started
+
+    def _of(self, account: str, region: str, mapping: dict[str, Any], table: str) -> _Running:
+        running = self._running.get(mapping["UUID"])
+        settings = Settings.of(mapping)
+        if running is None:
+            latest = mapping.get("StartingPosition") == "LATEST"
+            position = (dynamodb.stream_end_position if latest else dynamodb.stream_start_position)(table)
+            # ministack notes where a mapping began when it was made.
+            position = lambda_svc._dynamodb_stream_positions.get(mapping["UUID"], position)  # noqa: SLF001
+            running = self._running[mapping["UUID"]] = _Running(
+                account, region, mapping, Shard(settings), position
+            )
+        elif running.shard.settings != settings and not running.shard.size and not running.busy:
+            running.shard = Shard(settings)
+        return running
+
+    @staticmethod
+    def _read(running: _Running, table: str) -> None:
+        ahead = running.shard.size
+        if ahead >= _AHEAD:
+            return
+        running.position = max(running.position, dynamodb.stream_start_position(table))
+        records = dynamodb.stream_records_since(table, running.position, _AHEAD - ahead)
+        running.position += len(records)
+        running.shard.put(lambda_svc._apply_filter_criteria(records, running.mapping))  # noqa: SLF001
+
+    def _invoke(self, running: _Running, function: dict[str, Any], number: int, batch: list[Any]) -> None:
+        with request_scope(running.account, running.region):
+            answer = _answer(lambda_svc._execute_function(function, {"Records": batch}))  # noqa: SLF001
+            failed = answer.error or answer.throttled
+            with self._lock:
+                running.shard.lanes[number].answered(answer)
+                _, last_s = running.pauses.get(number, (0.0, _FIRST_PAUSE_S / 2))
+                pause_s = min(2 * last_s, _LONGEST_PAUSE_S)
+                if failed:
+                    running.pauses[number] = (time.monotonic() + pause_s, pause_s)
+                else:
+                    running.pauses.pop(number, None)
+                running.busy.discard(number)
+            running.mapping["LastProcessingResult"] = "FAILED" if failed else f"OK - {len(batch)} records"
+            self._tell(running, function)
+        if failed:
+            # The poller sleeps up to a second when nothing is to do.
+            threading.Timer(pause_s, lambda_svc._esm_wake.set).start()  # noqa: SLF001
+        else:
+            lambda_svc._esm_wake.set()  # noqa: SLF001
+
+    def _tell(self, running: _Running, function: dict[str, Any]) -> None:
+        """Send what was given up to the mapping's destination."""
+        with self._lock:
+            discarded = running.shard.discarded()
+        mapping = running.mapping
+        for one in discarded:
+            _log.warning("gave up %d records of %s", len(one.records), mapping["EventSourceArn"])
+            lambda_svc._send_ddb_stream_failure_record(  # noqa: SLF001
+                mapping, function, list(one.records), mapping["EventSourceArn"], {}, one.condition.value
+            )
+
+
+def _answer(result: dict[str, Any]) -> Answer:
+    if result.get("throttle"):
+        return Answer(throttled=True)
+    body = result.get("body")
+    if isinstance(body, (str, bytes)):
+        try:
+            body = json.loads(body or "null")
+        except ValueError:
+            body = None
+    return Answer(payload=body, error=bool(result.get("error")))

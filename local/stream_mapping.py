@@ -1,0 +1,218 @@
+"""Lambda's mapping of a DynamoDB stream, as AWS documents it: what is tried again, split, given up.
+
+Pure: what time it is and what the function answered come in, what to invoke and what was given up go
+out. The embedded cloud drives it (local/stream_gap.py), and so do the tests of Lambda 2.
+
+Sources, AWS Lambda's developer guide: "Using AWS Lambda with Amazon DynamoDB", "Configuring partial batch
+response with DynamoDB and Lambda", "Retain discarded records from DynamoDB"; `CreateEventSourceMapping`.
+"""
+
+from __future__ import annotations
+
+import json
+import zlib
+from collections import deque
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, field
+from enum import Enum
+from typing import Any
+
+Record = Mapping[str, Any]
+# "Lambda ... batch size ... payload limit": a synchronous invocation carries at most 6 MB.
+MAX_EVENT_BYTES = 6 * 1024 * 1024
+_FOREVER = -1
+_WHOLE = -1
+
+
+@dataclass(frozen=True)
+class Settings:
+    """A mapping's settings; -1 is without end, as in the API.
+
+    ``halve_at_checkpoint`` is what the documentation leaves open: whether a partial answer that names
+    the first record of the batch, and so checkpoints nothing, is also split in two.
+    """
+
+    batch_size: int = 100
+    bisect: bool = False
+    max_retries: int = _FOREVER
+    max_age_s: int = _FOREVER
+    report_failures: bool = False
+    parallel: int = 1
+    halve_at_checkpoint: bool = False
+
+    @classmethod
+    def of(cls, mapping: Mapping[str, Any]) -> Settings:
+        """The settings of an event source mapping as the API describes it."""
+
+        def number(key: str, default: int) -> int:
+            value = mapping.get(key)
+            return default if value is None else int(value)
+
+        return cls(
+            batch_size=number("BatchSize", 100),
+            bisect=bool(mapping.get("BisectBatchOnFunctionError")),
+            max_retries=number("MaximumRetryAttempts", _FOREVER),
+            max_age_s=number("MaximumRecordAgeInSeconds", _FOREVER),
+            report_failures="ReportBatchItemFailures" in (mapping.get("FunctionResponseTypes") or []),
+            parallel=number("ParallelizationFactor", 1),
+        )
+
+
+class Condition(str, Enum):
+    """Why records were given up, in the words of the destination's message."""
+
+    AGE = "MaxRecordAgeExceeded"
+    RETRIES = "RetryAttemptsExhausted"
+
+
+@dataclass(frozen=True)
+class Discarded:
+    """Records that the destination hears of."""
+
+    condition: Condition
+    records: Sequence[Record]
+    attempts: int
+
+
+@dataclass(frozen=True)
+class Answer:
+    """What an invocation came to: the function's answer, an error of its own (a time-out is one), or a
+    throttle, which never reached it."""
+
+    payload: Any = None
+    error: bool = False
+    throttled: bool = False
+
+
+@dataclass
+class _Part:
+    """Records that are invoked together; ``failures`` counts towards the retries."""
+
+    records: list[Record]
+    failures: int = 0
+
+
+@dataclass
+class Lane:
+    """One of the shard's concurrent batches: its records strictly one batch after the other."""
+
+    settings: Settings
+    _waiting: deque[Record] = field(default_factory=deque)
+    _parts: deque[_Part] = field(default_factory=deque)
+    discarded: list[Discarded] = field(default_factory=list)
+
+    def put(self, record: Record) -> None:
+        """A record read off the stream."""
+        self._waiting.append(record)
+
+    @property
+    def size(self) -> int:
+        """Records that are neither done nor given up."""
+        return len(self._waiting) + sum(len(part.records) for part in self._parts)
+
+    def batch(self, now_s: float) -> list[Record]:
+        """What to invoke the function with next; nothing where there is nothing."""
+        self._expire(now_s)
+        if not self._parts and self._waiting:
+            records: list[Record] = []
+            size = 0
+            while self._waiting and len(records) < self.settings.batch_size:
+                size += len(json.dumps(self._waiting[0], default=str))
+                if records and size > MAX_EVENT_BYTES:
+                    break
+                records.append(self._waiting.popleft())
+            self._parts.append(_Part(records))
+        return list(self._parts[0].records) if self._parts else []
+
+    def answered(self, answer: Answer) -> None:
+        """The function's answer to the last `batch`."""
+        if answer.throttled:
+            # "This doesn't apply to service errors or throttles where the batch didn't reach the function."
+            return
+        part = self._parts.popleft()
+        done = _WHOLE if answer.error else self._checkpoint(part, answer.payload)
+        if done is None:
+            return
+        halves = done == _WHOLE or self.settings.halve_at_checkpoint
+        if done > 0:
+            # Split at the number that the function returned: only the rest is tried again.
+            self._again(_Part(part.records[done:], part.failures), counts=not self.settings.bisect)
+        elif self.settings.bisect and len(part.records) > 1 and halves:
+            # "Splitting a batch does not count towards the retry quota."
+            middle = len(part.records) // 2
+            self._parts.appendleft(_Part(part.records[middle:], part.failures))
+            self._parts.appendleft(_Part(part.records[:middle], part.failures))
+        else:
+            self._again(part, counts=True)
+
+    def _again(self, part: _Part, *, counts: bool) -> None:
+        part.failures += counts
+        if part.failures > self.settings.max_retries != _FOREVER:
+            self.discarded.append(Discarded(Condition.RETRIES, part.records, part.failures))
+        else:
+            self._parts.appendleft(part)
+
+    def _checkpoint(self, part: _Part, payload: Any) -> int | None:
+        """How many records of the part are done; None for all, `_WHOLE` where the answer is none."""
+        if not self.settings.report_failures or not payload:
+            return None
+        failures = payload.get("batchItemFailures") if isinstance(payload, Mapping) else None
+        if not failures:
+            return None
+        numbers = [record["dynamodb"]["SequenceNumber"] for record in part.records]
+        named = [failure.get("itemIdentifier") for failure in failures]
+        # An identifier that is empty, null, misspelt or of no record fails the whole batch.
+        if not set(named) <= set(numbers):
+            return _WHOLE
+        # "Lambda uses the record with the lowest sequence number as the checkpoint."
+        return min(numbers.index(number) for number in named)
+
+    def _expire(self, now_s: float) -> None:
+        limit_s = self.settings.max_age_s
+        if limit_s == _FOREVER:
+            return
+        for part in list(self._parts):
+            old = [record for record in part.records if _age_s(record, now_s) > limit_s]
+            if old:
+                self.discarded.append(Discarded(Condition.AGE, old, part.failures))
+                part.records = [record for record in part.records if record not in old]
+                if not part.records:
+                    self._parts.remove(part)
+        old = []
+        while self._waiting and _age_s(self._waiting[0], now_s) > limit_s:
+            old.append(self._waiting.popleft())
+        if old:
+            self.discarded.append(Discarded(Condition.AGE, old, 0))
+
+
+def _age_s(record: Record, now_s: float) -> float:
+    return now_s - float(record["dynamodb"].get("ApproximateCreationDateTime", now_s))
+
+
+class Shard:
+    """A shard of the stream under a mapping: its records in lanes by the hash of the item's key.
+
+    "Lambda still ensures in-order processing at the item (partition and sort key) level."
+    """
+
+    def __init__(self, settings: Settings) -> None:
+        self.settings = settings
+        self.lanes = [Lane(settings) for _ in range(settings.parallel)]
+
+    def put(self, records: Iterable[Record]) -> None:
+        """Records in the order of the stream."""
+        for record in records:
+            keys = json.dumps(record["dynamodb"]["Keys"], sort_keys=True)
+            self.lanes[zlib.crc32(keys.encode()) % len(self.lanes)].put(record)
+
+    @property
+    def size(self) -> int:
+        """Records that are neither done nor given up."""
+        return sum(lane.size for lane in self.lanes)
+
+    def discarded(self) -> list[Discarded]:
+        """What was given up since the last call."""
+        found = [one for lane in self.lanes for one in lane.discarded]
+        for lane in self.lanes:
+            lane.discarded.clear()
+        return found

@@ -1,0 +1,82 @@
+"""What cannot be processed: one queue that everything fails into, and a table that keeps it.
+
+A rule's error action, a batch of the stream that Lambda 2 gave up, an asynchronous invocation that failed
+and a record that Lambda 2 refused all go to ``rejected``; the function moves them into the quarantine
+table. What it cannot move after five attempts waits in ``last``, which nothing reads but the operator:
+the chain ends there, and nothing that fails in it comes back to its beginning.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+from aws_cdk import CfnOutput, Duration, Stack
+from aws_cdk import aws_lambda as lambda_
+from aws_cdk import aws_sqs as sqs
+from constructs import Construct
+
+from stacks.function import function
+from stacks.settings import Settings
+from stacks.storage import Storage
+
+_TIMEOUT_S = 10
+_ATTEMPTS = 5
+# At once, ten messages each: a flood of refusals waits in the queue, which is cheap, not in the table.
+_CONCURRENCY = 2
+
+
+class Quarantine(Stack):
+    """The queues ``rejected`` and ``last``, and the ``function`` between queue and table."""
+
+    def __init__(
+        self, scope: Construct, construct_id: str, *, settings: Settings, storage: Storage, **kwargs: Any
+    ) -> None:
+        super().__init__(scope, construct_id, **kwargs)
+        self._settings, self._storage = settings, storage
+        self.last = self._queue("Last")
+        self.rejected = self._queue(
+            "Rejected",
+            # AWS advises six times the function's time.
+            visibility_timeout=Duration.seconds(6 * _TIMEOUT_S),
+            dead_letter_queue=sqs.DeadLetterQueue(max_receive_count=_ATTEMPTS, queue=self.last),
+        )
+        self.function = function(
+            self,
+            "Quarantine",
+            settings=settings,
+            encryption=storage.encryption,
+            module="quarantine",
+            memory_mb=256,
+            timeout_s=_TIMEOUT_S,
+            environment={
+                "QUARANTINE_TABLE": storage.quarantine.table_name,
+                "RETENTION_S": str(settings.retention_days * 86_400),
+            },
+        )
+        storage.quarantine.grant(self.function, "dynamodb:UpdateItem")
+        # Of a batch that failed only the place in the stream is told, so that its records are read again.
+        storage.telemetry.grant_stream(self.function, "dynamodb:GetRecords", "dynamodb:GetShardIterator")
+        self.rejected.grant_consume_messages(self.function)
+        lambda_.EventSourceMapping(
+            self,
+            "Rejections",
+            target=self.function,
+            event_source_arn=self.rejected.queue_arn,
+            batch_size=10,
+            max_concurrency=_CONCURRENCY,
+            report_batch_item_failures=True,
+        )
+
+    def _queue(self, name: str, **properties: Any) -> sqs.Queue:
+        queue = sqs.Queue(
+            self,
+            name,
+            enforce_ssl=True,
+            # The longest there is.
+            retention_period=Duration.days(14),
+            removal_policy=self._settings.removal_policy,
+            **properties,
+            **self._storage.encryption.queue,
+        )
+        CfnOutput(self, f"{name}Queue", value=queue.queue_url)
+        return queue

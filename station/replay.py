@@ -1,0 +1,199 @@
+"""Puts messages from quarantine back, once the cause is gone, and deletes what has arrived."""
+
+from __future__ import annotations
+
+import json
+import threading
+import time
+from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from enum import Enum
+from typing import Any, NamedTuple
+
+from boto3.dynamodb.types import TypeDeserializer
+from botocore.exceptions import BotoCoreError, ClientError
+
+from contract import (
+    BY_RULE,
+    BY_STREAM,
+    ENTRY,
+    LAST_MS,
+    RECEIVED_MS,
+    RECORD,
+    REPLAY,
+    REPLAYS,
+    T_US,
+    TOPIC,
+    Batch,
+    ContractError,
+    decode_item,
+    parse_topic,
+)
+from station.cloud import Cloud
+from station.quarantine import Entry, key, load
+
+_deserialize = TypeDeserializer().deserialize
+# One that failed so often is for a person to look at.
+MAX_REPLAYS = 3
+_AT_ONCE = 8
+_CONFIRM_S = 30.0
+_POLL_S = 0.2
+
+
+class Fate(str, Enum):
+    """What became of an entry."""
+
+    REPLAYED = "replayed"
+    WOULD = "would be replayed"
+    FAILED = "failed again"
+    REFUSED = "still refused"
+    GIVEN_UP = "replayed too often"
+    GONE = "gone meanwhile"
+    NOT_FOR_REPLAY = "not for replay"
+
+
+class Outcome(NamedTuple):
+    """An entry's fate, and what there is to say of it."""
+
+    entry: Entry
+    fate: Fate
+    detail: str = ""
+
+
+class _NotForReplayError(Exception):
+    pass
+
+
+def replay(
+    cloud: Cloud, entries: Sequence[Entry], *, dry_run: bool = False, again: bool = False
+) -> Iterator[Outcome]:
+    """Put each entry back, eight at a time; what became of them, in the order in which they end.
+
+    A message of the record lane that a rule's action failed on is published to that rule again, and has
+    arrived when the table holds its batch. One that Lambda 2 failed on or refused is given to Lambda 2
+    again, which answers. Only then is the entry deleted. Every attempt is counted first, and after
+    `MAX_REPLAYS` (unless ``again``) there are no more. Live messages, pings and events are of their
+    moment and are not replayed.
+    """
+    one: Callable[[Entry], Outcome] = lambda entry: _outcome(cloud, entry, dry_run=dry_run, again=again)  # noqa: E731
+    with ThreadPoolExecutor(_AT_ONCE) as pool:
+        yield from pool.map(one, entries)
+
+
+def _outcome(cloud: Cloud, listed: Entry, *, dry_run: bool, again: bool) -> Outcome:
+    entry = load(cloud, listed)
+    if entry is None:
+        return Outcome(listed, Fate.GONE)
+    try:
+        batch = _batch(entry)
+    except _NotForReplayError as error:
+        return Outcome(listed, Fate.NOT_FOR_REPLAY, str(error))
+    except ContractError as error:
+        return Outcome(listed, Fate.REFUSED, str(error))
+    if entry.replays >= MAX_REPLAYS and not again:
+        return Outcome(entry, Fate.GIVEN_UP, f"{entry.replays} times")
+    if dry_run:
+        return Outcome(entry, Fate.WOULD)
+    try:
+        _count(cloud, entry)
+        problem = _publish(cloud, entry, batch) if _is_rules(entry) else _summarize(cloud, entry)
+        if problem:
+            return Outcome(entry, Fate.FAILED, problem)
+        _delete(cloud, entry)
+    except (BotoCoreError, ClientError) as error:
+        return Outcome(entry, Fate.FAILED, str(error))
+    return Outcome(entry, Fate.REPLAYED)
+
+
+def _is_rules(entry: Entry) -> bool:
+    return entry.source.startswith(f"{BY_RULE} ")
+
+
+def _batch(entry: Entry) -> Batch:
+    """The batch in an entry that can be replayed; raises `ContractError` where it is none."""
+    payload = entry.payload or b""
+    if entry.source == BY_STREAM and entry.topic:
+        return decode_item({name: _deserialize(value) for name, value in json.loads(payload).items()})[1]
+    if not _is_rules(entry) or not entry.topic.startswith(f"{RECORD}/"):
+        raise _NotForReplayError("of its moment, or without a batch: only the record lane is replayed")
+    parse_topic(entry.topic)
+    try:
+        envelope = json.loads(payload)
+    except (ValueError, RecursionError) as error:
+        raise ContractError(f"not JSON: {error}") from error
+    if not isinstance(envelope, dict):
+        raise ContractError("not a JSON object")
+    return decode_item({**envelope, TOPIC: entry.topic, RECEIVED_MS: entry.first_ms})[1]
+
+
+def _count(cloud: Cloud, entry: Entry) -> None:
+    cloud.client("dynamodb").update_item(
+        TableName=cloud.output("storage", "QuarantineTable"),
+        Key=key(entry),
+        UpdateExpression="ADD #replays :one",
+        ConditionExpression="attribute_exists(#id)",
+        ExpressionAttributeNames={"#replays": REPLAYS, "#id": ENTRY},
+        ExpressionAttributeValues={":one": {"N": "1"}},
+    )
+
+
+def _publish(cloud: Cloud, entry: Entry, batch: Batch) -> str:
+    """Publish to the rule and wait for the item; what went wrong, or nothing."""
+    if _stored(cloud, entry.topic, batch):
+        return ""
+    rule = entry.source.removeprefix(f"{BY_RULE} ")
+    cloud.client("iot-data").publish(topic=f"$aws/rules/{rule}/{entry.topic}", qos=1, payload=entry.payload)
+    deadline = time.monotonic() + _CONFIRM_S
+    while time.monotonic() < deadline:
+        if _stored(cloud, entry.topic, batch):
+            return ""
+        now = load(cloud, entry)
+        if now and now.seen > entry.seen:
+            return now.reason
+        threading.Event().wait(_POLL_S)
+    return f"not in the telemetry table after {_CONFIRM_S:.0f} s"
+
+
+def _stored(cloud: Cloud, topic: str, batch: Batch) -> bool:
+    answer = cloud.client("dynamodb").get_item(
+        TableName=cloud.output("storage", "TelemetryTable"),
+        Key={TOPIC: {"S": topic}, T_US: {"N": str(batch.t_us)}},
+        ConsistentRead=True,
+    )
+    item = {name: _deserialize(value) for name, value in answer.get("Item", {}).items()}
+    return (item.get("boot"), item.get("seq")) == (batch.boot, batch.seq)
+
+
+def _summarize(cloud: Cloud, entry: Entry) -> str:
+    """Give the item to Lambda 2; what went wrong, or nothing."""
+    image: dict[str, Any] = json.loads(entry.payload or b"{}")
+    keys = {name: image[name] for name in (TOPIC, T_US)}
+    change = {"Keys": keys, "NewImage": image, "SequenceNumber": "0"}
+    event = {
+        REPLAY: True,
+        "Records": [{"eventID": f"replay-{entry.id}", "eventName": "INSERT", "dynamodb": change}],
+    }
+    answer = cloud.client("lambda").invoke(
+        FunctionName=cloud.output("processing", "SummarizeFunction"), Payload=json.dumps(event).encode()
+    )
+    said = json.loads(answer["Payload"].read() or b"null")
+    if "FunctionError" in answer:
+        return f"Lambda 2 failed: {said.get('errorMessage', said)}"
+    if said.get("batchItemFailures"):
+        return "Lambda 2 refuses it; is the current version deployed?"
+    return ""
+
+
+def _delete(cloud: Cloud, entry: Entry) -> None:
+    """Delete the entry, unless the same message was refused once more meanwhile."""
+    dynamodb = cloud.client("dynamodb")
+    try:
+        dynamodb.delete_item(
+            TableName=cloud.output("storage", "QuarantineTable"),
+            Key=key(entry),
+            ConditionExpression="#last = :last",
+            ExpressionAttributeNames={"#last": LAST_MS},
+            ExpressionAttributeValues={":last": {"N": str(entry.last_ms)}},
+        )
+    except dynamodb.exceptions.ConditionalCheckFailedException:
+        return

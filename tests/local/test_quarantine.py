@@ -1,0 +1,209 @@
+"""Whatever cannot be processed is found in quarantine with its bytes, and put back once the cause is gone."""
+
+from __future__ import annotations
+
+import base64
+import json
+import time
+
+import pytest
+from typer.testing import CliRunner
+
+import contract
+from contract import ENTRY, LIVE, VESC_STREAM, Batch, build_topic, record_topic
+from station import delivery, quarantine
+from station.cli import app
+from station.cloud import EMBEDDED
+from tests.local.conftest import until
+from tests.local.robot import Robot
+
+RUN = "0badcafe"
+
+
+@pytest.fixture
+def iort(embedded):
+    def run(*arguments: str):
+        description = embedded.folder / EMBEDDED.name
+        return CliRunner().invoke(app, ["--local", "--embedded", str(description), *arguments])
+
+    return run
+
+
+@pytest.fixture
+def entry_of(embedded):
+    """The one entry of a robot, as soon as it is there, with its bytes."""
+
+    def wait(robot):
+        (listed,) = until(lambda: list(quarantine.entries(embedded.cloud, robot=robot)), seconds=60)
+        return quarantine.load(embedded.cloud, listed)
+
+    return wait
+
+
+def send(car, *messages, stream=VESC_STREAM, namespace="iort"):
+    topic = record_topic(car.robot, VESC_STREAM, namespace)
+    topic = topic.removesuffix(VESC_STREAM) + stream
+    with Robot(car.folder) as robot:
+        robot.online()
+        for message in messages:
+            assert robot.publish(topic, message) == "SUCCESS"
+
+
+def batch(seq=0, **changes):
+    """A batch of now as its message, with some of the envelope changed."""
+    t_us = (int(time.time()) + seq) * 1_000_000
+    envelope = json.loads(contract.encode(Batch(RUN, seq, [t_us], {"speed": [1.5]})))
+    return json.dumps({**envelope, **changes}).encode()
+
+
+# --- what ends in quarantine, and by whom -------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    "payload",
+    [b"not json", b"\xff\xfe\x00", b'{"v": 1}', b"[]", b'{"t": "text"}', b""],
+    ids=["text", "not-utf8", "no-key", "array", "key-of-another-type", "empty"],
+)
+def test_what_the_rule_cannot_store_is_kept_byte_by_byte(bundle, entry_of, payload):
+    car = bundle()
+    send(car, payload)
+    entry = entry_of(car.robot)
+    assert entry.payload == payload
+    assert entry.source == "rule iort_record"
+    assert entry.topic == f"dt/iort/{car.robot}/{VESC_STREAM}"
+    assert "DynamoDBv2Action" in entry.reason
+
+
+@pytest.mark.parametrize(
+    ("changes", "stream", "reason"),
+    [
+        ({"v": 2}, "vesc", "schema version 2"),
+        ({"samples": "AAAA"}, "vesc", "samples are not base64 of zlib"),
+        ({"robot": "somebody-else"}, "vesc", "in the name of 'somebody-else'"),
+        ({"t": -1}, "vesc", "before 1970"),
+        ({"t": 4_000_000_000_000_000}, "vesc", "clock is wrong"),
+        ({}, "b ad", "stream name 'b ad'"),
+        ({}, "a/b", "expected <lane>/<namespace>/<robot>/<name>"),
+    ],
+    ids=["version", "samples", "body-of-another", "before-1970", "years-ahead", "stream", "levels"],
+)
+def test_what_the_table_takes_and_lambda_2_cannot_is_kept(bundle, entry_of, changes, stream, reason):
+    car = bundle()
+    message = batch(**changes)
+    send(car, message, stream=stream)
+    entry = entry_of(car.robot)
+    assert entry.source == contract.BY_STREAM
+    assert reason in entry.reason
+    kept = json.loads(entry.payload)
+    for name, value in json.loads(message).items():
+        assert kept[name] in ({"S": value}, {"N": str(value)})
+
+
+def test_an_undecodable_batch_holds_up_no_neighbour(embedded, bundle, entry_of):
+    car = bundle()
+    send(car, batch(0), batch(1, samples="AAAA"), batch(2))
+    until(lambda: delivery.samples_summarized(embedded.cloud, car.robot, VESC_STREAM) == 2, seconds=60)
+    assert json.loads(entry_of(car.robot).payload)["seq"] == {"N": "1"}
+
+
+def test_a_live_message_that_no_robot_of_ours_sends_is_kept_as_lambda_1_got_it(bundle, entry_of):
+    car = bundle()
+    with Robot(car.folder) as robot:
+        robot.online().publish(build_topic(LIVE, car.robot, VESC_STREAM), b'{"speed": 99}')
+    entry = entry_of(car.robot)
+    assert json.loads(entry.payload)["speed"] == 99
+    assert entry.source.startswith(f"{contract.BY_FUNCTION} iort-processing-Live")
+    assert "schema" in entry.reason or "expected an integer" in entry.reason
+
+
+# --- the operator's commands ---------------------------------------------------------------------------
+
+
+def rejected(embedded, robot, message):
+    """What the record rule's error action sends when the table is throttled."""
+    document = {
+        "ruleName": contract.rule_name("record"),
+        "topic": f"dt/iort/{robot}/{VESC_STREAM}",
+        "base64OriginalPayload": base64.b64encode(message).decode(),
+        "failures": [{"failedAction": "DynamoDBv2Action", "errorMessage": "throttled"}],
+    }
+    queue = embedded.cloud.output("quarantine", "RejectedQueue")
+    embedded.cloud.client("sqs").send_message(QueueUrl=queue, MessageBody=json.dumps(document))
+
+
+def test_errors_are_listed_and_shown(bundle, iort, entry_of):
+    car = bundle()
+    send(car, b"\xff\x00" + b"[bold]no markup[/bold]\x1b[2J")
+    entry = entry_of(car.robot)
+    listed = json.loads(iort("errors", "--robot", car.robot, "--since", "10m", "--json").stdout)
+    assert [(one[ENTRY], one["seen"]) for one in listed["entries"]] == [(entry.id, 1)]
+    assert json.loads(iort("errors", "--since", "2200-01-01", "--json").stdout)["entries"] == []
+    assert car.robot in iort("errors").stdout
+    shown = iort("errors", entry.id)
+    assert shown.exit_code == 0
+    assert "000000  ff 00 5b 62" in shown.stdout
+    assert "\x1b[2J" not in shown.stdout
+    as_json = json.loads(iort("errors", entry.id, "--json").stdout)
+    assert base64.b64decode(as_json["payload_base64"]) == entry.payload
+    assert "nothing in quarantine has the id" in str(iort("errors", "0" * 16).exception)
+
+
+def test_a_throttled_batch_is_put_back_once_and_only_then_deleted(embedded, bundle, iort, entry_of):
+    car = bundle()
+    rejected(embedded, car.robot, batch(0))
+    entry_of(car.robot)
+    dry = iort("replay-errors", "--robot", car.robot, "--dry-run")
+    assert "1 would be replayed" in dry.stdout
+    assert delivery.samples_summarized(embedded.cloud, car.robot, VESC_STREAM) == 0
+    done = iort("replay-errors", "--robot", car.robot)
+    assert (done.exit_code, "1 replayed" in done.stdout) == (0, True), done.output
+    until(lambda: delivery.samples_summarized(embedded.cloud, car.robot, VESC_STREAM) == 1, seconds=60)
+    assert list(quarantine.entries(embedded.cloud, robot=car.robot)) == []
+    assert "nothing in quarantine" in iort("replay-errors", "--robot", car.robot).stdout
+
+
+def test_what_is_still_wrong_stays_where_it_is(embedded, bundle, iort, entry_of):
+    car = bundle()
+    send(car, b"not json")
+    before = entry_of(car.robot)
+    done = iort("replay-errors", "--robot", car.robot)
+    assert "1 still refused" in done.stdout
+    assert entry_of(car.robot) == before
+
+
+def test_a_batch_on_which_lambda_2_fails_is_given_up_and_put_back(embedded, bundle, iort, entry_of):
+    """The summary table's name is wrong for a while: every attempt fails, and the stream goes on."""
+    cloud, car = embedded.cloud, bundle()
+    client, name = cloud.client("lambda"), cloud.output("processing", "SummarizeFunction")
+    right = client.get_function_configuration(FunctionName=name)["Environment"]["Variables"]
+    wrong = {**right, "SUMMARY_TABLE": "no-such-table"}
+    client.update_function_configuration(FunctionName=name, Environment={"Variables": wrong})
+    try:
+        send(car, batch(0))
+        entry = entry_of(car.robot)
+        assert "RetryAttemptsExhausted" in entry.reason
+        failed = iort("replay-errors", "--robot", car.robot)
+        assert failed.exit_code == 1
+        assert "failed again: Lambda 2 failed" in failed.stdout
+        assert entry_of(car.robot).replays == 1
+    finally:
+        client.update_function_configuration(FunctionName=name, Environment={"Variables": right})
+    assert delivery.samples_summarized(cloud, car.robot, VESC_STREAM) == 0
+    done = iort("replay-errors", "--robot", car.robot)
+    assert "1 replayed" in done.stdout, done.output
+    assert delivery.samples_summarized(cloud, car.robot, VESC_STREAM) == 1
+    assert list(quarantine.entries(cloud, robot=car.robot)) == []
+
+
+def test_what_the_quarantine_cannot_keep_ends_in_the_last_queue_and_comes_back(embedded, bundle, iort):
+    """Its function is broken: after five attempts the message waits where nothing takes it."""
+    cloud, car = embedded.cloud, bundle()
+    sqs, last = cloud.client("sqs"), cloud.output("quarantine", "LastQueue")
+    document = {"ruleName": "iort_record", "topic": f"dt/iort/{car.robot}/vesc", "failures": []}
+    document["base64OriginalPayload"] = base64.b64encode(b"never kept so far").decode()
+    sqs.send_message(QueueUrl=last, MessageBody=json.dumps(document))
+    assert "did not take" in iort("errors").stderr
+    assert "on the way to it again" in iort("replay-errors", "--robot", car.robot).stderr
+    (entry,) = until(lambda: list(quarantine.entries(cloud, robot=car.robot)), seconds=60)
+    assert quarantine.load(cloud, entry).payload == b"never kept so far"
+    assert quarantine.waiting(cloud).last == 0

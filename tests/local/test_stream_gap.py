@@ -1,0 +1,140 @@
+"""The embedded cloud's stream mappings, in this process: ministack's tables and queues, and our function."""
+
+from __future__ import annotations
+
+import json
+import threading
+import time
+
+import pytest
+from ministack.core.responses import request_scope
+from ministack.services import dynamodb, lambda_svc, sqs
+
+from local.stream_gap import StreamMappings
+
+ACCOUNT, REGION = "000000000000", "eu-west-1"
+QUEUE_ARN = f"arn:aws:sqs:{REGION}:{ACCOUNT}:gap-destination"
+
+
+@pytest.fixture
+def cloud(monkeypatch):
+    """A table with a stream, a queue, and a function that answers what the test says."""
+    with request_scope(ACCOUNT, REGION):
+        definition = {
+            "TableName": "gap",
+            "KeySchema": [
+                {"AttributeName": "topic", "KeyType": "HASH"},
+                {"AttributeName": "t", "KeyType": "RANGE"},
+            ],
+            "AttributeDefinitions": [
+                {"AttributeName": "topic", "AttributeType": "S"},
+                {"AttributeName": "t", "AttributeType": "N"},
+            ],
+            "BillingMode": "PAY_PER_REQUEST",
+            "StreamSpecification": {"StreamEnabled": True, "StreamViewType": "NEW_IMAGE"},
+        }
+        created = dynamodb._create_table(definition)
+        assert created[0] == 200, created
+        sqs._act_create_queue({"QueueName": "gap-destination"}, "")
+        mapping = {
+            "UUID": "gap-mapping",
+            "EventSourceArn": dynamodb._tables["gap"]["LatestStreamArn"],
+            "FunctionName": "gap",
+            "StartingPosition": "TRIM_HORIZON",
+            "BatchSize": 4,
+            "BisectBatchOnFunctionError": True,
+            "MaximumRetryAttempts": 1,
+            "FunctionResponseTypes": ["ReportBatchItemFailures"],
+            "DestinationConfig": {"OnFailure": {"Destination": QUEUE_ARN}},
+        }
+        lambda_svc._esms["gap-mapping"] = mapping
+        function = {"config": {"FunctionArn": "arn:gap", "FunctionName": "gap"}}
+        monkeypatch.setattr(
+            lambda_svc, "_get_func_record_for_qualifier", lambda *_: (function, function["config"])
+        )
+        yield Cloud(monkeypatch)
+        del lambda_svc._esms["gap-mapping"]
+        dynamodb._delete_table({"TableName": "gap"})
+        sqs._queues.clear()
+
+
+class Cloud:
+    def __init__(self, monkeypatch):
+        self.mappings, self.seen = StreamMappings(), []
+        self.answer = lambda _numbers: {"body": None}
+        self.running = self.most = 0
+        self._lock = threading.Lock()
+        monkeypatch.setattr(lambda_svc, "_execute_function", self._execute)
+
+    def _execute(self, _function, event):
+        numbers = [int(record["dynamodb"]["Keys"]["t"]["N"]) for record in event["Records"]]
+        with self._lock:
+            self.running += 1
+            self.most = max(self.most, self.running)
+            self.seen.append(numbers)
+        answer = self.answer(numbers)
+        with self._lock:
+            self.running -= 1
+        return answer
+
+    def put(self, *numbers):
+        for n in numbers:
+            item = {"topic": {"S": "a"}, "t": {"N": str(n)}, "at": {"N": str(time.monotonic_ns())}}
+            assert dynamodb._put_item({"TableName": "gap", "Item": item})[0] == 200
+
+    def poll_until(self, condition):
+        deadline = time.monotonic() + 60
+        while not condition():
+            assert time.monotonic() < deadline, self.seen
+            if not self.mappings.poll():
+                # As the poller's own thread waits: for a finished invocation, or for a pause to end.
+                lambda_svc._esm_wake.wait(0.05)
+
+    @property
+    def told(self):
+        queue = sqs._queue_by_arn(QUEUE_ARN)
+        return [json.loads(message["body"]) for message in queue["messages"]]
+
+
+def test_records_come_in_order_and_in_batches(cloud):
+    cloud.put(*range(10))
+    cloud.poll_until(lambda: sum(map(len, cloud.seen)) == 10)
+    assert cloud.seen == [[0, 1, 2, 3], [4, 5, 6, 7], [8, 9]]
+    assert cloud.most == 1
+    cloud.put(10)
+    cloud.poll_until(lambda: cloud.seen[-1] == [10])
+    assert cloud.told == []
+
+
+def test_the_record_that_fails_is_given_up_alone_and_the_destination_hears_of_it(cloud):
+    cloud.answer = lambda numbers: {"error": 2 in numbers, "body": None}
+    cloud.put(*range(5))
+    cloud.poll_until(lambda: [4] in cloud.seen)
+    assert cloud.seen == [[0, 1, 2, 3], [0, 1], [2, 3], [2], [2], [3], [4]]
+    (message,) = cloud.told
+    assert message["requestContext"]["condition"] == "RetryAttemptsExhausted"
+    info = message["DDBStreamBatchInfo"]
+    assert (info["batchSize"], info["startSequenceNumber"]) == (1, info["endSequenceNumber"])
+
+
+def test_a_partial_answer_is_tried_from_its_lowest_number(cloud):
+    numbers = {}
+
+    def answer(seen):
+        for record in dynamodb.stream_live_records("gap", account_id=ACCOUNT, region=REGION):
+            numbers[int(record["dynamodb"]["Keys"]["t"]["N"])] = record["dynamodb"]["SequenceNumber"]
+        failures = [{"itemIdentifier": numbers[2]}] if len(cloud.seen) == 1 else []
+        return {"body": {"batchItemFailures": failures}}
+
+    cloud.answer = answer
+    cloud.put(*range(4))
+    cloud.poll_until(lambda: len(cloud.seen) == 2)
+    assert cloud.seen == [[0, 1, 2, 3], [2, 3]]
+
+
+def test_a_throttle_is_waited_out(cloud):
+    answers = iter([{"throttle": True, "error": True}] * 3)
+    cloud.answer = lambda _: next(answers, {"body": None})
+    cloud.put(1)
+    cloud.poll_until(lambda: len(cloud.seen) == 4)
+    assert cloud.told == []

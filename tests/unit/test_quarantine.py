@@ -1,0 +1,295 @@
+"""Whatever comes out of the rejected queue is kept with its bytes, once, whoever refused it and however."""
+
+from __future__ import annotations
+
+import base64
+import json
+
+import pytest
+from botocore.exceptions import ClientError
+from hypothesis import given
+from hypothesis import strategies as st
+
+from contract import BY_FUNCTION, BY_RULE, BY_STREAM, NO_ROBOT, build_topic
+from functions.quarantine import Entry, Store, Stream, entries, process
+from functions.refusals import Refusals, Refused, message
+from tests.fakes import QUARANTINE, TOPIC_OF_CAR
+
+RAW = b"\xff\x00not JSON, not even text"
+ARN = "arn:aws:lambda:eu-west-1:000000000000:function:iort-processing-Live-1"
+STREAM_ARN = "arn:aws:dynamodb:eu-west-1:0:table/telemetry/stream/1"
+INFO = {
+    "streamArn": STREAM_ARN,
+    "shardId": "shard-1",
+    "startSequenceNumber": "2",
+    "endSequenceNumber": "3",
+    "batchSize": 2,
+}
+
+
+def rule_error(payload=RAW, topic=TOPIC_OF_CAR, **changes):
+    """As IoT Core's "Rule error handling" shows it."""
+    return json.dumps(
+        {
+            "ruleName": "iort_record",
+            "topic": topic,
+            "cloudwatchTraceId": "7e146a2c",
+            "clientId": "car",
+            "base64OriginalPayload": base64.b64encode(payload).decode(),
+            "failures": [
+                {
+                    "failedAction": "DynamoDBv2Action",
+                    "failedResource": "telemetry",
+                    "errorMessage": "The provided key element does not match the schema",
+                }
+            ],
+            **changes,
+        }
+    )
+
+
+def image(n):
+    return {"topic": {"S": TOPIC_OF_CAR}, "t": {"N": str(n)}, "v": {"N": "9"}}
+
+
+def failed_batch(condition="RetryAttemptsExhausted"):
+    """As "Using Lambda with DynamoDB" shows an on-failure record."""
+    return json.dumps({"requestContext": {"condition": condition}, "DDBStreamBatchInfo": INFO})
+
+
+def invocation(event, error="boom"):
+    return json.dumps(
+        {
+            "version": "1.0",
+            "requestContext": {"functionArn": f"{ARN}:$LATEST", "condition": "RetriesExhausted"},
+            "requestPayload": event,
+            "responsePayload": {"errorMessage": error, "errorType": "RefusedError"},
+        }
+    )
+
+
+def records(info):
+    assert info == INFO
+    return [{"dynamodb": {"SequenceNumber": str(n), "NewImage": image(n)}} for n in (2, 3)]
+
+
+def none(_info):
+    return []
+
+
+# --- what a message of the queue holds --------------------------------------------------------------
+
+
+def test_a_rules_error_document():
+    (entry,) = entries(rule_error(), none)
+    assert (entry.source, entry.topic, entry.robot) == (f"{BY_RULE} iort_record", TOPIC_OF_CAR, "car")
+    assert entry.payload == RAW
+    assert "DynamoDBv2Action: The provided key element" in entry.reason
+
+
+def test_a_record_that_lambda_2_refused():
+    odd = {**image(7), "boot": {"S": "\x00\udfff and \ufffe, which SQS does not carry"}}
+    body = message(Refused("5", "schema version 9", odd))
+    body.encode("ascii")
+    (entry,) = entries(body, none)
+    assert (entry.source, entry.topic, entry.reason) == (BY_STREAM, TOPIC_OF_CAR, "schema version 9")
+    assert json.loads(entry.payload.decode("utf-8", "surrogatepass")) == odd
+
+
+def test_a_batch_of_the_stream_that_was_given_up():
+    found = entries(failed_batch(), records)
+    assert [json.loads(entry.payload) for entry in found] == [image(2), image(3)]
+    assert {(entry.source, entry.robot) for entry in found} == {(BY_STREAM, "car")}
+    assert all("RetryAttemptsExhausted" in entry.reason for entry in found)
+
+
+def test_a_batch_whose_records_have_left_the_stream_is_kept_as_far_as_it_is_known():
+    (entry,) = entries(failed_batch(), none)
+    assert json.loads(entry.payload)["DDBStreamBatchInfo"] == INFO
+    assert "left the stream" in entry.reason
+
+
+def test_an_asynchronous_invocation_that_failed():
+    event = {"topic": build_topic("live", "car", "vesc"), "v": 9}
+    (entry,) = entries(invocation(event), none)
+    assert entry.source == f"{BY_FUNCTION} iort-processing-Live-1"
+    assert (entry.robot, json.loads(entry.payload)) == ("car", event)
+    assert entry.reason == "RetriesExhausted: boom"
+
+
+@pytest.mark.parametrize(
+    "topic", ["", "dt", "dt/iort", "dt/iort//vesc", "$aws/events/presence/connected/car", "other/iort/car/a"]
+)
+def test_a_topic_that_names_no_robot(topic):
+    (entry,) = entries(rule_error(topic=topic), none)
+    assert (entry.robot, entry.topic, entry.payload) == (NO_ROBOT, topic, RAW)
+
+
+def test_a_robot_is_named_by_a_topic_that_is_otherwise_wrong():
+    for topic in ("dt/iort/car/a/b", "dt/iort/c r/vesc", "dt/iort/car"):
+        (entry,) = entries(rule_error(topic=topic), none)
+        assert entry.robot == topic.split("/")[2]
+
+
+documents = st.recursive(
+    st.none() | st.booleans() | st.integers() | st.text(max_size=10),
+    lambda inner: (
+        st.lists(inner, max_size=3)
+        | st.dictionaries(
+            st.sampled_from(
+                [
+                    "base64OriginalPayload",
+                    "base64Item",
+                    "reason",
+                    "ruleName",
+                    "failures",
+                    "requestPayload",
+                    "requestContext",
+                    "DDBStreamBatchInfo",
+                ]
+            ),
+            inner,
+            max_size=4,
+        )
+    ),
+    max_leaves=10,
+)
+
+
+@given(documents.map(json.dumps) | st.text())
+def test_whatever_else_is_in_the_queue_is_kept_as_it_is(body):
+    found = entries(body, none)
+    assert found
+    for entry in found:
+        assert entry.reason
+        assert entry.robot
+    if all("does not know" in entry.reason for entry in found):
+        assert [entry.payload for entry in found] == [body.encode("utf-8", "surrogatepass")]
+
+
+def test_the_same_message_is_the_same_entry_and_another_is_not():
+    ids = {
+        Entry(source, topic, reason, payload).id
+        for source in ("rule a", "rule b")
+        for topic in ("dt/iort/car/vesc", "dt/iort/car/rtt")
+        for payload in (b"1", b"2", b"")
+        for reason in ("because", "because of something else")
+    }
+    assert len(ids) == 12
+
+
+# --- into the table ---------------------------------------------------------------------------------
+
+
+def sqs_event(*bodies, sent_ms=1_700_000_000_000):
+    return {
+        "Records": [
+            {"messageId": f"m{i}", "body": body, "attributes": {"SentTimestamp": str(sent_ms + i)}}
+            for i, body in enumerate(bodies)
+        ]
+    }
+
+
+@pytest.fixture
+def store(dynamodb):
+    return Store(dynamodb, table=QUARANTINE, retention_s=3600)
+
+
+def kept(dynamodb):
+    return dynamodb.scan(TableName=QUARANTINE)["Items"]
+
+
+def test_every_kind_is_kept_with_its_bytes_and_counted(dynamodb, store, capsys):
+    event = sqs_event(rule_error(), failed_batch(), invocation({"v": 1}), "nonsense")
+    assert process(event, store, records) == {"batchItemFailures": []}
+    items = kept(dynamodb)
+    assert len(items) == 5
+    assert RAW in [item["payload"]["B"] for item in items]
+    assert json.loads(capsys.readouterr().out)["Quarantined"] == 5
+
+
+def test_a_message_that_comes_again_is_one_entry_that_says_how_often(dynamodb, store):
+    process(sqs_event(rule_error()), store, none)
+    process(sqs_event(rule_error(cloudwatchTraceId="another"), sent_ms=1_700_000_900_000), store, none)
+    (item,) = kept(dynamodb)
+    assert item["seen"] == {"N": "2"}
+    assert (item["first_ms"], item["last_ms"]) == ({"N": "1700000000000"}, {"N": "1700000900000"})
+    assert item["expires_s"] == {"N": "1700004500"}
+
+
+class Broken:
+    """A table that takes everything but the second item."""
+
+    def __init__(self):
+        self.calls = 0
+
+    def update_item(self, **_):
+        self.calls += 1
+        if self.calls == 2:
+            error = {"Error": {"Code": "ProvisionedThroughputExceededException", "Message": "slow down"}}
+            raise ClientError(error, "UpdateItem")
+
+
+def test_only_the_message_that_the_table_did_not_take_comes_again():
+    event = sqs_event(rule_error(b"1"), rule_error(b"2"), rule_error(b"3"))
+    answer = process(event, Store(Broken(), table=QUARANTINE, retention_s=1), none)
+    assert answer == {"batchItemFailures": [{"itemIdentifier": "m1"}]}
+
+
+# --- the stream, and the queue before ----------------------------------------------------------------
+
+
+class FakeStreams:
+    """Two records a call, as AWS' pages; the second and third of them are wanted."""
+
+    class exceptions:  # noqa: N801 boto3 calls it that
+        class TrimmedDataAccessException(Exception):  # noqa: N818
+            pass
+
+    def __init__(self, *, trimmed=False):
+        self.trimmed = trimmed
+
+    def get_shard_iterator(self, **request):
+        assert request == {
+            "StreamArn": STREAM_ARN,
+            "ShardId": "shard-1",
+            "ShardIteratorType": "AT_SEQUENCE_NUMBER",
+            "SequenceNumber": "2",
+        }
+        if self.trimmed:
+            raise self.exceptions.TrimmedDataAccessException
+        return {"ShardIterator": "2"}
+
+    def get_records(self, *, ShardIterator):  # noqa: N803
+        n = int(ShardIterator)
+        return {
+            "Records": [{"dynamodb": {"SequenceNumber": str(n)}}] if n < 9 else [],
+            "NextShardIterator": str(n + 1),
+        }
+
+
+def test_the_records_of_a_failed_batch_are_read_page_by_page():
+    found = Stream(FakeStreams()).records(INFO)
+    assert [record["dynamodb"]["SequenceNumber"] for record in found] == ["2", "3"]
+
+
+def test_records_that_have_left_the_stream_are_none():
+    assert Stream(FakeStreams(trimmed=True)).records(INFO) == []
+
+
+class FakeQueue:
+    def __init__(self, refuses=()):
+        self.refuses, self.bodies = refuses, []
+
+    def send_message(self, *, QueueUrl, MessageBody):  # noqa: N803
+        assert QueueUrl == "queue"
+        if json.loads(MessageBody)["reason"] in self.refuses:
+            raise ClientError({"Error": {"Code": "Throttling", "Message": ""}}, "SendMessage")
+        self.bodies.append(MessageBody)
+
+
+def test_what_the_queue_does_not_take_comes_back():
+    refused = [Refused(str(n), f"reason {n}", image(n)) for n in range(3)]
+    queue = FakeQueue(refuses={"reason 1"})
+    assert Refusals(queue, queue_url="queue").refuse(refused) == [refused[1]]
+    assert [json.loads(body)["reason"] for body in queue.bodies] == ["reason 0", "reason 2"]

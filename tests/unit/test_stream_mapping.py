@@ -1,0 +1,342 @@
+"""Lambda 2 under the stream's mapping: whatever goes wrong, the summary is right and nothing is lost.
+
+`local.stream_mapping` is how AWS documents the mapping; here hypothesis makes it histories of poison,
+throttled tables, time-outs, lost acknowledgements and repeated batches, and the real handler runs in it.
+"""
+
+from __future__ import annotations
+
+from collections import Counter
+
+import pytest
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+
+from contract import Batch
+from functions import tables as tables_module
+from functions.summarize import process
+from functions.tables import TableError
+from local.stream_mapping import Answer, Condition, Settings, Shard
+from tests.fakes import TELEMETRY, FakeDynamoDB, item_of, record_of, summary_of, tables
+
+S = 1_000_000
+T0 = 1_700_000_000 * S
+DEPLOYED = Settings(
+    batch_size=100, bisect=True, max_retries=5, max_age_s=6 * 3600, report_failures=True, parallel=1
+)
+
+
+def record(n, *, at_s=0.0):
+    keys = {"topic": {"S": "dt/iort/car/vesc"}, "t": {"N": str(n)}}
+    return {
+        "dynamodb": {"Keys": keys, "SequenceNumber": f"{n:06}", "ApproximateCreationDateTime": at_s},
+        "n": n,
+    }
+
+
+def numbers(records):
+    return [one["n"] for one in records]
+
+
+def failed(*which):
+    return Answer({"batchItemFailures": [{"itemIdentifier": n} for n in which]})
+
+
+class Run:
+    """A shard with records, a function that answers by the numbers of its records, and what it saw."""
+
+    def __init__(self, given, count=8, **changes):
+        self.shard = Shard(Settings(**{"batch_size": 8, **changes}))
+        self.shard.put(record(n) for n in range(count))
+        self.given, self.seen = given, []
+
+    def all(self, now_s=0.0, limit=200):
+        for _ in range(limit):
+            for lane in self.shard.lanes:
+                if batch := lane.batch(now_s):
+                    self.seen.append(numbers(batch))
+                    lane.answered(self.given(numbers(batch)))
+            if not self.shard.size:
+                return self
+        raise AssertionError("the shard is blocked")
+
+    @property
+    def given_up(self):
+        return [(one.condition, numbers(one.records)) for one in self.shard.discarded()]
+
+
+# --- the mapping is as AWS documents it -----------------------------------------------------------------
+
+
+@pytest.mark.parametrize("payload", [None, {}, "", {"batchItemFailures": []}, {"batchItemFailures": None}])
+def test_an_empty_answer_is_complete_success(payload):
+    run = Run(lambda _: Answer(payload), report_failures=True).all()
+    assert run.seen == [list(range(8))]
+    assert run.given_up == []
+
+
+@pytest.mark.parametrize("identifier", ["", None, "unknown"])
+def test_a_wrong_identifier_fails_the_whole_batch(identifier):
+    run = Run(lambda _: failed(identifier), report_failures=True, max_retries=2).all()
+    assert run.seen == [list(range(8))] * 3
+    assert run.given_up == [(Condition.RETRIES, list(range(8)))]
+
+
+def test_a_misspelt_identifier_fails_the_whole_batch():
+    run = Run(
+        lambda _: Answer({"batchItemFailures": [{"id": "000003"}]}), report_failures=True, max_retries=0
+    ).all()
+    assert run.given_up == [(Condition.RETRIES, list(range(8)))]
+
+
+def test_the_lowest_number_is_the_checkpoint():
+    answers = iter([failed("000006", "000003", "000005"), Answer()])
+    run = Run(lambda _: next(answers), report_failures=True).all()
+    assert run.seen == [list(range(8)), [3, 4, 5, 6, 7]]
+
+
+def test_without_the_setting_partial_answers_are_successes():
+    run = Run(lambda _: failed("000003")).all()
+    assert run.seen == [list(range(8))]
+
+
+def test_an_error_is_tried_as_often_as_allowed_and_then_given_up():
+    run = Run(lambda _: Answer(error=True), max_retries=3).all()
+    assert run.seen == [list(range(8))] * 4
+    assert run.given_up == [(Condition.RETRIES, list(range(8)))]
+
+
+def test_bisecting_isolates_the_record_that_fails_in_order_and_does_not_count_as_a_retry():
+    run = Run(lambda seen: Answer(error=5 in seen), bisect=True, max_retries=0).all()
+    assert run.seen == [[*range(8)], [0, 1, 2, 3], [4, 5, 6, 7], [4, 5], [4], [5], [6, 7]]
+    assert run.given_up == [(Condition.RETRIES, [5])]
+
+
+def test_an_error_is_bisected_whatever_partial_answers_say():
+    run = Run(lambda seen: Answer(error=0 in seen), bisect=True, report_failures=True, max_retries=0).all()
+    assert run.given_up == [(Condition.RETRIES, [0])]
+
+
+def test_a_throttle_counts_for_nothing():
+    answers = iter([Answer(throttled=True)] * 50 + [Answer()])
+    run = Run(lambda _: next(answers), max_retries=0, bisect=True).all()
+    assert len(run.seen) == 51
+    assert run.given_up == []
+
+
+def test_what_is_too_old_is_given_up_before_it_is_tried():
+    shard = Shard(Settings(batch_size=8, max_age_s=60))
+    shard.put([record(0, at_s=0), record(1, at_s=50), record(2, at_s=100)])
+    (lane,) = shard.lanes
+    assert numbers(lane.batch(100)) == [1, 2]
+    (old,) = shard.discarded()
+    assert (old.condition, numbers(old.records)) == (Condition.AGE, [0])
+    # And while it is tried.
+    lane.answered(Answer(error=True))
+    assert numbers(lane.batch(111)) == [2]
+    assert [numbers(one.records) for one in shard.discarded()] == [[1]]
+
+
+def test_an_event_has_at_most_6_mb():
+    shard = Shard(Settings(batch_size=100))
+    shard.put([{**record(n), "padding": "x" * 2_000_000} for n in range(5)])
+    (lane,) = shard.lanes
+    seen = []
+    while batch := lane.batch(0):
+        seen.append(numbers(batch))
+        lane.answered(Answer())
+    assert seen == [[0, 1, 2], [3, 4]]
+
+
+def test_concurrent_batches_keep_the_order_of_an_item_only():
+    shard = Shard(Settings(batch_size=2, parallel=4))
+    shard.put(record(n % 3) for n in range(12))
+    for lane in shard.lanes:
+        seen = []
+        while batch := lane.batch(0):
+            seen += numbers(batch)
+            lane.answered(Answer())
+        assert Counter(seen) == dict.fromkeys(set(seen), 4)
+
+
+# --- Lambda 2 in it -------------------------------------------------------------------------------------
+
+
+class Crash(BaseException):
+    """The handler's process is gone: killed by a time-out, or by a fault that no code caught."""
+
+
+class Faulty(FakeDynamoDB):
+    """Throttles or ends the handler at calls of its choosing, before or after the write."""
+
+    def __init__(self, faults):
+        super().__init__(page_items=3)
+        self.faults = faults
+
+    def _fault(self):
+        return next(self.faults, None)
+
+    def batch_write_item(self, **request):
+        fault = self._fault()
+        if fault == "throttled":
+            raise TableError("throttled")
+        if fault == "killed before":
+            raise Crash
+        answer = super().batch_write_item(**request)
+        if fault == "killed after":
+            raise Crash
+        return answer
+
+
+POISON = ("undecodable", "fatal")
+
+
+@st.composite
+def histories(draw):
+    """Batches of two robots with numbers in order, some of them poison; and what goes wrong when."""
+    kinds = draw(
+        st.lists(
+            st.tuples(st.sampled_from(["car", "bus"]), st.sampled_from(["good"] * 5 + list(POISON))),
+            min_size=1,
+            max_size=12,
+        )
+    )
+    faults = draw(
+        st.lists(st.sampled_from([None, None, "throttled", "killed before", "killed after"]), max_size=12)
+    )
+    jams = draw(st.lists(st.booleans(), max_size=6))
+    return kinds, faults, jams
+
+
+@settings(max_examples=150, deadline=None, suppress_health_check=[HealthCheck.too_slow])
+@given(
+    histories(),
+    st.integers(1, 6),
+    st.booleans(),
+    st.sampled_from([1, 1, 3]),
+    st.randoms(use_true_random=False),
+)
+def test_the_summary_is_right_and_every_poison_record_is_kept(history, size, halve, parallel, rng):
+    kinds, faults, jams = history
+    client, expected = Faulty(iter(faults)), FakeDynamoDB()
+    shard = Shard(
+        Settings(
+            batch_size=size,
+            bisect=True,
+            # As many as faults, so that only poison is given up.
+            max_retries=len(faults) + len(jams) + 1,
+            report_failures=True,
+            parallel=parallel,
+            halve_at_checkpoint=halve,
+        )
+    )
+    poison, fatal, records = set(), set(), []
+    for n, (robot, kind) in enumerate(kinds):
+        # Two batches a second: every second is made of several records, often of different events.
+        topic, start_us = f"dt/iort/{robot}/vesc", T0 + n * 400_000
+        item = item_of(Batch("aaaaaaaa", n, [start_us, start_us + 20_000], {"speed": [n, n]}), topic)
+        if kind == "undecodable":
+            item = {**item, "samples": {"S": "AAAA"}}
+        client.put(TELEMETRY, item)
+        expected.put(TELEMETRY, item)
+        one = record_of(item, n)
+        records.append(one)
+        number = one["dynamodb"]["SequenceNumber"]
+        if kind == "undecodable":
+            poison.add(number)
+        elif kind == "fatal":
+            fatal.add(number)
+    quarantined, jam = set(), iter(jams)
+
+    def refuse(refused):
+        """The queue before the quarantine; now and then it takes nothing."""
+        if refused and next(jam, False):
+            return list(refused)
+        quarantined.update(one.number for one in refused)
+        return []
+
+    shard.put(records)
+    given_up = set()
+    for _ in range(2_000):
+        lanes = [lane for lane in shard.lanes if lane.batch(0)]
+        if not lanes:
+            break
+        lane = rng.choice(lanes)
+        batch = lane.batch(0)
+        lane.answered(invoke(batch, client, refuse, fatal))
+        if rng.random() < 0.2:
+            # An acknowledgement was lost: the same records once more, after what came later.
+            invoke(batch, client, refuse, fatal)
+        given_up |= {one["dynamodb"]["SequenceNumber"] for d in shard.discarded() for one in d.records}
+    assert not shard.size, "the shard is blocked"
+
+    assert quarantined == poison
+    # A record on which the handler dies ends in the failure destination, alone.
+    assert given_up == fatal
+    whole = tables(expected)
+    process({"Records": [r for r in records if r["dynamodb"]["SequenceNumber"] not in fatal]}, whole, list)
+    for robot in ("car", "bus"):
+        topic = f"dt/iort/{robot}/vesc"
+        got, want = summary_of(client, topic), summary_of(expected, topic)
+        # What Lambda 2 died on is stored, and so in the summary of any neighbour that shares its second.
+        assert got == want
+
+
+def invoke(batch, client, refuse, fatal):
+    if any(one["dynamodb"]["SequenceNumber"] in fatal for one in batch):
+        return Answer(error=True)
+    try:
+        return Answer(process({"Records": batch}, tables(client), refuse))
+    except (TableError, Crash):
+        return Answer(error=True)
+
+
+def test_a_table_throttled_for_long_gives_the_batches_up_with_their_place_in_the_stream(monkeypatch):
+    monkeypatch.setattr(tables_module.time, "sleep", lambda _: None)
+    client = FakeDynamoDB(unprocessed=10**9)
+    shard, topic = Shard(DEPLOYED), "dt/iort/car/vesc"
+    items = [item_of(Batch("aaaaaaaa", n, [T0 + n * S], {"a": [n]}), topic) for n in range(4)]
+    for item in items:
+        client.put(TELEMETRY, item)
+    shard.put(record_of(item, n) for n, item in enumerate(items))
+    (lane,) = shard.lanes
+    while batch := lane.batch(0):
+        lane.answered(invoke(batch, client, list, set()))
+    given_up = [one["dynamodb"]["SequenceNumber"] for d in shard.discarded() for one in d.records]
+    # One record by itself is written at last (the fake takes the first of every call).
+    assert set(given_up) <= {record_of(item, n)["dynamodb"]["SequenceNumber"] for n, item in enumerate(items)}
+    replayed = FakeDynamoDB()
+    replayed.items = client.items
+    process(
+        {"replay": True, "Records": [record_of(item, n) for n, item in enumerate(items)]},
+        tables(replayed),
+        list,
+    )
+    assert sorted(summary_of(replayed)) == [T0 // S + n for n in range(4)]
+
+
+def test_two_batches_of_a_robot_at_once_could_leave_an_old_summary_behind():
+    """Why ParallelizationFactor is 1: with more, order is kept for an item and not for a topic."""
+    client, topic = FakeDynamoDB(), "dt/iort/car/vesc"
+    first, second = (item_of(Batch("aaaaaaaa", n, [T0 + n * 400_000], {"a": [n]}), topic) for n in range(2))
+    client.put(TELEMETRY, first)
+
+    class Slow(FakeDynamoDB):
+        """The first invocation: between its reading and its writing, the second one runs as a whole."""
+
+        items = client.items
+
+        def __init__(self):
+            super().__init__()
+            self.items = client.items
+
+        def batch_write_item(self, **request):
+            client.put(TELEMETRY, second)
+            process({"Records": [record_of(second, 2)]}, tables(client), list)
+            return super().batch_write_item(**request)
+
+    process({"Records": [record_of(first, 1)]}, tables(Slow()), list)
+    assert [item["n"] for item in summary_of(client).values()] == [1]
+    # One after the other, as a mapping with one batch at a time does it:
+    process({"Records": [record_of(second, 2)]}, tables(client), list)
+    assert [item["n"] for item in summary_of(client).values()] == [2]
