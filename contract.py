@@ -11,6 +11,7 @@ from __future__ import annotations
 
 import base64
 import binascii
+import calendar
 import json
 import math
 import re
@@ -340,6 +341,8 @@ AGENT_FIELDS = {
     "connects": "connections made",
     "clock_offset_ms": "ms, cloud minus car",
     "clock_uncertainty_ms": "ms, either way",
+    "files_waiting": "files waiting to be uploaded",
+    "files_sent_bytes": "bytes of files sent",
 }
 # Derived in the summary from the vehicle's parameters (robots table) and the fields above.
 DERIVED_UNITS = {"speed_mps": "m/s", "power_w": "W"}
@@ -732,6 +735,16 @@ MAX_ADDRESSES = 16
 UPLOAD_URL_S = 900
 KINDS = ("recording", "image", "log", "message", "other")
 
+# What stands in a sample for a field that is too large for a message, as <field>.<one of these>: the
+# claim check. All are null where the content was not kept, and the thumbnail where there is none.
+CLAIM_FIELDS = {
+    "key": "where the content is, or will be, in the files' bucket",
+    "sha256": "of the content, in hex",
+    "size": "bytes of content",
+    "content_type": "of the content",
+    "thumbnail": "of an image: base64 of a small JPEG",
+}
+
 _FILE_LEVEL = r"[A-Za-z0-9][A-Za-z0-9._-]{0,99}"
 _FILE_NAME = re.compile(rf"{_FILE_LEVEL}(/{_FILE_LEVEL}){{0,3}}")
 _CONTENT_TYPE = re.compile(r"[a-z0-9.+-]{1,50}/[a-z0-9.+-]{1,50}")
@@ -801,6 +814,34 @@ def file_key(robot: str, file: File) -> str:
     moment = time.gmtime(_check_file(file).t_us // 1_000_000)
     day, second = time.strftime("%Y/%m/%d", moment), time.strftime("%H%M%S", moment)
     return f"{FILES_PREFIX}{check_robot(robot)}/{day}/{second}-{file.sha256[:12]}/{file.name}"
+
+
+class FileKey(NamedTuple):
+    """What a key says of its file: whose it is, the second it was last written (since the epoch), the
+    first 12 digits of its SHA-256, and its name."""
+
+    robot: str
+    second: int
+    digits: str
+    name: str
+
+
+_FILE_KEY = re.compile(
+    rf"{FILES_PREFIX}([^/]+)/(\d{{4}}/\d\d/\d\d/\d{{6}})-([0-9a-f]{{12}})/({_FILE_LEVEL}(?:/{_FILE_LEVEL}){{0,3}})"
+)
+
+
+def parse_file_key(key: str) -> FileKey:
+    """Take a key apart; raises `ContractError` for one that `file_key` cannot have built."""
+    match = _FILE_KEY.fullmatch(key)
+    if match is None:
+        raise ContractError(f"key {_show(key)}: expected {FILES_PREFIX}<robot>/<day>/<time>-<hash>/<name>")
+    robot, when, digits, name = match.groups()
+    try:
+        second = calendar.timegm(time.strptime(when, "%Y/%m/%d/%H%M%S"))
+    except ValueError as error:
+        raise ContractError(f"key {_show(key)}: {when} is no time") from error
+    return FileKey(check_robot(robot), second, digits, name)
 
 
 def part_range(file: File, part: int) -> tuple[int, int]:

@@ -14,6 +14,7 @@ import contract
 from contract import Value
 from device.allowance import Allowance
 from device.batch import Batcher, StreamCounts
+from device.claim_check import ClaimCheck
 from device.clock import Clock
 from device.config import Config
 from device.downlink import make_downlink
@@ -28,10 +29,10 @@ from device.record import RecordLane
 from device.remote import Remote
 from device.sources import Source
 from device.spool import Spool
+from device.thumbnail import thumbnail
 from device.tuning import Tuning, from_config
 from device.uplink import Uplink
-from device.upload import make_uploader
-from device.upload_folder import Folder, Uploads
+from device.upload_folder import make_uploads
 
 _log = logging.getLogger(__name__)
 
@@ -81,7 +82,8 @@ class Agent:
         self._downlink = make_downlink(
             config.downlink, config.share, sources=config.sources, boot=self.boot, **shared
         )
-        self._uploads = _make_uploads(config, **shared)
+        self._uploads = make_uploads(config.files, root_ca=config.root_ca, **shared)
+        self._claims = self._make_claims()
         self._lock = threading.Lock()
         self._batchers: dict[str, Batcher] = {}
         self._counts: dict[str, StreamCounts] = {}
@@ -90,7 +92,9 @@ class Agent:
         self._sources = [(source.describe(), source.build(clock)) for source in config.sources]
         self._stop = threading.Event()
         self._rates = Rates(clock)
-        self._metrics = AgentMetrics(clock=clock, spool=spool, uplink=uplink, offset=self._offset)
+        self._metrics = AgentMetrics(
+            clock=clock, spool=spool, uplink=uplink, offset=self._offset, uploads=self._uploads
+        )
         self._tuning = from_config(config)
         self._remote = Remote(
             robot=config.robot,
@@ -152,7 +156,7 @@ class Agent:
         watcher = self._thread("watcher", lambda: self._end_with(sources))
         pinger = self._thread("pings", lambda: self._pings.run(self._stop))
         uploads_stop = threading.Event()
-        uploader = self._thread("uploads", lambda: self._uploads.run(uploads_stop)) if self._uploads else None
+        uploader = self._thread("uploads", self._run_uploads(uploads_stop))
         self._stop.wait()
         if self._downlink is not None:
             self._downlink.halt()
@@ -163,9 +167,8 @@ class Agent:
         delivered = self._drain(drain_s)
         if self._downlink is not None:
             self._downlink.close()
-        uploads_stop.set()
-        if uploader is not None:
-            uploader.join()
+        self._end_uploads(uploads_stop, drain_s)
+        uploader.join()
         record_stop.set()
         self._record.wake()
         lane.join()
@@ -192,7 +195,7 @@ class Agent:
             "failed_sources": list(self._failed),
             "sources": [{"source": what, **source.report()} for what, source in self._sources],
             **({"downlink": self._downlink.report()} if self._downlink is not None else {}),
-            **({"files": self._uploads.status()} if self._uploads is not None else {}),
+            **({"files": self._files_status()} if self._uploads is not None else {}),
         }
 
     def status(self) -> dict[str, Any]:
@@ -237,7 +240,7 @@ class Agent:
                 "dropped_batches": dropped.batches,
                 "dropped_samples": dropped.samples,
             },
-            "files": self._uploads.status() if self._uploads is not None else None,
+            "files": self._files_status() if self._uploads is not None else None,
             "clock": offset._asdict() if offset is not None else None,
             "pings": {path: report._asdict() for path, report in self._pings.report().items()},
             "alarms": alarms,
@@ -266,7 +269,7 @@ class Agent:
         def run() -> None:
             _log.info("source started: %s", what)
             try:
-                source.run(self.emit, self._stop)
+                source.run(self.emit if self._claims is None else self._claims.around(self.emit), self._stop)
             except SourceError as error:
                 _log.error("source failed: %s: %s", what, error)
                 self._failed.append(what)
@@ -278,6 +281,36 @@ class Agent:
                 _log.info("source ended: %s", what)
 
         return run
+
+    def _make_claims(self) -> ClaimCheck | None:
+        files = self._config.files
+        if files.large_folder is None or self._uploads is None:
+            return None
+        return ClaimCheck(
+            robot=self._config.robot,
+            folder=files.large_folder,
+            every_s=files.large_every_s,
+            max_bytes=round(files.large_max_mb * 1e6),
+            clock=self._clock,
+            thumbnail=thumbnail,
+            stored=self._uploads.wake,
+        )
+
+    def _run_uploads(self, stop: threading.Event) -> Any:
+        uploads = self._uploads
+        return (lambda: uploads.run(stop)) if uploads is not None else (lambda: None)
+
+    def _end_uploads(self, stop: threading.Event, drain_s: float) -> None:
+        """Contents of samples are delivered like samples; a folder's files wait for the next run."""
+        if self._claims is not None and not self._claims.wait_empty(drain_s):
+            _log.warning("contents were not uploaded within %g s; the next run uploads them", drain_s)
+        stop.set()
+        if self._uploads is not None:
+            self._uploads.wake()
+
+    def _files_status(self) -> dict[str, Any]:
+        uploads = self._uploads.status() if self._uploads is not None else {}
+        return {**uploads, "large": self._claims.report() if self._claims is not None else None}
 
     def _end_with(self, sources: list[threading.Thread]) -> None:
         for thread in sources:
@@ -335,12 +368,3 @@ class Agent:
         thread = threading.Thread(target=target, name=name, daemon=True)
         thread.start()
         return thread
-
-
-def _make_uploads(config: Config, **shared: Any) -> Uploads | None:
-    files, clock = config.files, shared["clock"]
-    if files.folder is None:
-        return None
-    folder = Folder(files.folder, clock=clock, settle_s=files.settle_s, remove_after_s=files.remove_after_s)
-    uploader = make_uploader(root_ca=config.root_ca, rate_kb_s=files.rate_kb_s, **shared)
-    return Uploads(folders=[folder], uploader=uploader, clock=clock)

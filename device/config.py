@@ -26,7 +26,7 @@ from device.schema import (
     text,
     variant,
 )
-from device.sources import SourceConfig
+from device.sources import UPLOAD, SourceConfig
 from device.sources.bag import BagConfig
 from device.sources.ros1 import Ros1Config
 from device.sources.rosbridge import RosbridgeConfig
@@ -155,6 +155,12 @@ def load_config(file: Path) -> Config:
         raise ConfigError(f"{file}: is empty")
     config = load(Config, content, where)
     _check_streams(config, where.child("sources"))
+    if config.files.large_folder is None and any(_uploads_large(source) for source in config.sources):
+        raise (
+            where.child("files")
+            .child("large_folder")
+            .problem("required, and missing: a source says `large: upload`, and this is where its bytes wait")
+        )
     if "://" in config.endpoint or "/" in config.endpoint:
         raise where.child("endpoint").error(config.endpoint, "a host name, without scheme or path")
     return config
@@ -168,3 +174,9 @@ def _check_streams(config: Config, where: Where) -> None:
             if stream in taken:
                 raise where.item(i).problem(f"the stream {stream} is taken: {', '.join(taken)} are in use")
         taken += source.streams()
+
+
+def _uploads_large(source: SourceConfig) -> bool:
+    if isinstance(source, BagConfig):
+        return source.large == UPLOAD
+    return isinstance(source, Ros1Config) and any(topic.large == UPLOAD for _, topic in source.topics)

@@ -14,6 +14,7 @@ from device.clock import Clock
 from device.offset import ClockOffset
 from device.spool import Spool
 from device.uplink import Uplink
+from device.upload_folder import Uploads
 
 _STATM = Path("/proc/self/statm")
 
@@ -50,8 +51,17 @@ class Rates:
 class AgentMetrics:
     """Makes one sample after another."""
 
-    def __init__(self, *, clock: Clock, spool: Spool, uplink: Uplink, offset: ClockOffset) -> None:
+    def __init__(
+        self,
+        *,
+        clock: Clock,
+        spool: Spool,
+        uplink: Uplink,
+        offset: ClockOffset,
+        uploads: Uploads | None = None,
+    ) -> None:
         self._clock, self._spool, self._uplink, self._offset = clock, spool, uplink, offset
+        self._uploads = uploads
         self._at, self._cpu_s, self._samples = clock.monotonic(), time.process_time(), 0
 
     def sample(self, samples: int) -> dict[str, Value]:
@@ -59,6 +69,7 @@ class AgentMetrics:
         now, cpu_s = self._clock.monotonic(), time.process_time()
         passed = max(now - self._at, 1e-3)
         backlog, dropped, offset = self._spool.backlog(), self._spool.dropped(), self._offset.estimate()
+        files = self._uploads.counts() if self._uploads is not None else None
         values: dict[str, Value] = {
             "cpu_percent": round((cpu_s - self._cpu_s) / passed * 100, 2),
             "rss_mb": rss_mb(),
@@ -69,6 +80,8 @@ class AgentMetrics:
             "connects": self._uplink.status().connects,
             "clock_offset_ms": offset.offset_ms if offset is not None else None,
             "clock_uncertainty_ms": offset.uncertainty_ms if offset is not None else None,
+            "files_waiting": files.waiting if files is not None else 0,
+            "files_sent_bytes": files.sent_bytes if files is not None else 0,
         }
         self._at, self._cpu_s, self._samples = now, cpu_s, samples
         assert values.keys() == AGENT_FIELDS.keys()

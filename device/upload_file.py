@@ -18,6 +18,7 @@ _LEVELS, _LEVEL_CHARACTERS = 4, 100
 
 # What the robots' files are; anything else is "other", of no type in particular.
 _SUFFIXES = {
+    ".bin": ("message", "application/octet-stream"),
     ".bag": ("recording", "application/x-rosbag"),
     ".mcap": ("recording", "application/x-mcap"),
     ".db3": ("recording", "application/vnd.sqlite3"),

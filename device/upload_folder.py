@@ -16,10 +16,12 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Iterator, NamedTuple
 
+from device.allowance import Allowance
 from device.clock import Clock
 from device.errors import UploadError
 from device.schema import Where, any_path, number, setting
-from device.upload import Uploader
+from device.uplink import Uplink
+from device.upload import Uploader, make_uploader
 from device.upload_file import Local, Look, from_json, read, to_json
 
 _log = logging.getLogger(__name__)
@@ -47,12 +49,19 @@ def _folder(value: Any, where: Where) -> Path:
 class FilesConfig:
     """Files to upload. A file of ``folder`` is finished when it has not changed for ``settle_s``.
     ``remove_after_s`` after it was uploaded it is removed; without, it stays. ``rate_kb_s``: no more
-    kilobytes (1000) a second than this, for all files; 0 for no limit."""
+    kilobytes (1000) a second than this, for all files; 0 for no limit.
+
+    ``large_folder`` is where bytes wait that topics with ``large: upload`` give: at most one content
+    every ``large_every_s`` of each stream, and no more than ``large_max_mb`` (1e6 bytes) in all.
+    """
 
     folder: Path | None = setting(_folder, None)
     settle_s: float = setting(number(1, 86_400, unit="s"), 10.0)
     remove_after_s: float | None = setting(number(0, 365 * 86_400, unit="s"), None)
     rate_kb_s: float = setting(number(0, 1e6, unit="kB/s"), 1000.0)
+    large_folder: Path | None = setting(any_path(), None)
+    large_every_s: float = setting(number(0, 86_400, unit="s"), 1.0)
+    large_max_mb: float = setting(number(1, 1e6, unit="MB"), 1000.0)
 
 
 class Counts(NamedTuple):
@@ -200,16 +209,22 @@ class Uploads:
         self._current: str | None = None
         self._current_bytes = 0
         self._last_error: str | None = None
+        self._wake = threading.Event()
+
+    def wake(self) -> None:
+        """Look at the folders again: there is something, or nothing more to do."""
+        self._wake.set()
 
     def run(self, stop: threading.Event) -> None:
-        """Upload until ``stop`` is set."""
+        """Upload until ``stop`` is set; call `wake` after setting it."""
         try:
             os.setpriority(os.PRIO_PROCESS, threading.get_native_id(), _NICE)
         except (AttributeError, OSError):
             _log.debug("files: this system has no priority of a thread's own")
         while not stop.is_set():
+            self._wake.clear()
             if not self.step(stop):
-                self._clock.wait(stop, _SCAN_S)
+                self._clock.wait(self._wake, _SCAN_S)
 
     def step(self, stop: threading.Event) -> bool:
         """Upload the next file, if there is one; whether there was."""
@@ -256,3 +271,42 @@ class Uploads:
 
     def _progress(self, there: int) -> None:
         self._current_bytes = there
+
+
+def make_uploads(
+    files: FilesConfig,
+    *,
+    robot: str,
+    namespace: str,
+    uplink: Uplink,
+    clock: Clock,
+    allowance: Allowance,
+    root_ca: Path | None,
+) -> Uploads | None:
+    """The uploads that the configuration asks for; None where it asks for none.
+
+    Raises `UploadError` where ``large_folder`` cannot be made.
+    """
+    folders = []
+    if files.large_folder is not None:
+        try:
+            files.large_folder.mkdir(parents=True, exist_ok=True)
+        except OSError as error:
+            raise UploadError(f"{files.large_folder}: {error.strerror or error}", again_s=None) from error
+        folders.append(Folder(files.large_folder, clock=clock, settle_s=0.0, remove_after_s=0.0))
+    if files.folder is not None:
+        folders.append(
+            Folder(files.folder, clock=clock, settle_s=files.settle_s, remove_after_s=files.remove_after_s)
+        )
+    if not folders:
+        return None
+    uploader = make_uploader(
+        robot=robot,
+        namespace=namespace,
+        uplink=uplink,
+        clock=clock,
+        allowance=allowance,
+        root_ca=root_ca,
+        rate_kb_s=files.rate_kb_s,
+    )
+    return Uploads(folders=folders, uploader=uploader, clock=clock)

@@ -11,12 +11,13 @@ from botocore.exceptions import BotoCoreError, ClientError
 
 from contract import DEFAULT_NAMESPACE
 from station.cloud import EMBEDDED
-from station.commands import audit, cost, dashboard, errors, pubnub, query, robots, site, trace, watch
+from station.commands import audit, cost, dashboard, errors, files, pubnub, query, robots, site, trace, watch
 from station.errors import StationError
 from station.where import Where
 
 app = typer.Typer(no_args_is_help=True, add_completion=True, help="The operator's station of iort.")
 app.add_typer(robots.commands, name="robots")
+app.add_typer(files.commands, name="files")
 app.add_typer(pubnub.commands)
 app.add_typer(dashboard.commands)
 app.add_typer(cost.commands)

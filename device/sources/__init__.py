@@ -8,8 +8,12 @@ from typing import Any, Callable, Mapping, Protocol, Sequence
 from contract import Value
 from device.clock import Clock
 
+# What becomes of bytes in a message, such as an image: nothing, or a file with a claim in the sample.
+REFUSE, UPLOAD = "refuse", "upload"
+
 # Takes a sample: stream, microseconds since the epoch, field -> value. The mapping is handed over:
-# the source must not change it afterwards. Never blocks, never raises.
+# the source must not change it afterwards. A value may be bytes where the source's configuration says
+# `UPLOAD`. Never blocks, never raises.
 Emit = Callable[[str, int, Mapping[str, Value]], None]
 
 

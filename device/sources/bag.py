@@ -17,7 +17,7 @@ import contract
 from device.clock import Clock
 from device.errors import SourceError
 from device.schema import choice, existing_path, flag, number, pairs, setting, text
-from device.sources import Emit
+from device.sources import REFUSE, UPLOAD, Emit
 from device.sources.flatten import flatten
 from device.sources.player import NOW, ORIGINAL, Message, Open, Playback, play
 from device.sources.vesc_csv import VescLog
@@ -36,7 +36,7 @@ class BagConfig:
     ``topics`` maps ROS topics to streams; without it, every VescStateStamped becomes ``stream``, as does
     a log of VESC Tool, which has no topics. ``speed`` is a factor, 0 for as fast as possible. ``stamps``:
     ``now`` moves the recording to when it is played, ``original`` keeps its own times. ``duration_s`` is
-    counted in the recording's time.
+    counted in the recording's time. ``large: upload`` sends bytes (images, point clouds) as files.
     """
 
     path: Path = setting(existing_path(folder=True))
@@ -48,6 +48,7 @@ class BagConfig:
     loop: bool = setting(flag(), default=False)
     duration_s: float | None = setting(number(0.001, 1e9, unit="s"), None)
     stream: str = setting(text(contract.check_stream), contract.VESC_STREAM)
+    large: str = setting(choice(REFUSE, UPLOAD), REFUSE)
 
     def streams(self) -> Sequence[str]:
         """The streams named; several topics may share one."""
@@ -86,7 +87,8 @@ class BagSource:
     def _recording(self) -> Open:
         config = self._config
         if config.path.suffix.lower() != ".csv":
-            return lambda: Recording(config.path, config.topics, config.stream)
+            large = config.large == UPLOAD
+            return lambda: Recording(config.path, config.topics, config.stream, large=large)
         if config.topics is not None:
             raise SourceError(f"{config.path}: a log of VESC Tool has no topics; `stream` names its stream")
         return VescLog(config.path, config.stream, config.stamps).open
@@ -95,7 +97,9 @@ class BagSource:
 class Recording:
     """A bag, open for reading. What the library raises comes out as `SourceError`."""
 
-    def __init__(self, path: Path, topics: Sequence[tuple[str, str]] | None, stream: str) -> None:
+    def __init__(
+        self, path: Path, topics: Sequence[tuple[str, str]] | None, stream: str, *, large: bool = False
+    ) -> None:
         try:
             # Only a robot that plays recordings needs the library: pip install iort[bag].
             from rosbags.highlevel import AnyReader  # noqa: PLC0415
@@ -106,6 +110,7 @@ class Recording:
         self._path = path
         self._topics = topics
         self._stream = stream
+        self._large = large
         with self._wrapped("cannot be opened"):
             self._reader = AnyReader([path.parent if in_folder else path], default_typestore=_known_types())
 
@@ -158,7 +163,7 @@ class Recording:
                 connection, recorded_ns, raw = found
                 message = self._reader.deserialize(raw, connection.msgtype)
             try:
-                values = flatten(message, self._fields_of)
+                values = flatten(message, self._fields_of, large=self._large)
             except SourceError as error:
                 raise SourceError(f"{self._path}: topic {connection.topic}: {error}") from error
             stamp_ns = _stamp_ns(message, recorded_ns)

@@ -19,7 +19,7 @@ from device.ros1_node import ANY_TYPE, DEFAULT_NODE, definition_of, shared
 from device.ros1_types import Definition, parse
 from device.schema import Where, choice, items, pairs, section, setting, text
 from device.seldom import Seldom
-from device.sources import Emit
+from device.sources import REFUSE, UPLOAD, Emit
 from device.sources.ros1_decode import Decoder
 
 _log = logging.getLogger(__name__)
@@ -54,7 +54,8 @@ class TopicConfig:
 
     ``time`` must be said: ``header`` is when it was measured, by the clock of the computer that did;
     ``arrival`` is when the agent received it, by its own clock. ``fields`` are the paths wanted, or
-    what they begin with (``pose.position``); without it, all.
+    what they begin with (``pose.position``); without it, all. ``large: upload`` sends bytes (images,
+    point clouds) as files, otherwise they are left out.
     """
 
     stream: str = setting(text(contract.check_stream))
@@ -62,6 +63,7 @@ class TopicConfig:
     fields: tuple[str, ...] | None = setting(
         items(text(), at_least=1, what="a list of at least one field"), default=None
     )
+    large: str = setting(choice(REFUSE, UPLOAD), REFUSE)
 
 
 def _topics(value: Any, where: Where) -> Any:
@@ -218,7 +220,10 @@ class Intake:
         config = self._config
         try:
             decoder = Decoder(
-                _definition(kind, definition), select=config.fields, stamp=config.time == HEADER
+                _definition(kind, definition),
+                select=config.fields,
+                stamp=config.time == HEADER,
+                large=config.large == UPLOAD,
             )
         except (MessageError, SourceError) as error:
             _log.error("topic %s: its messages cannot be decoded: %s", self._topic, error)

@@ -5,7 +5,8 @@ A definition is compiled once to a list of steps: neighbouring fixed-size fields
 `device.sources.flatten`, and time and duration are ``sec`` and ``nanosec`` as in ROS 2, so that a
 topic gives the same fields live, from a bag and through rosbridge. Left out, and counted, is what is
 no telemetry: arrays of more than `MAX_ELEMENTS`, ``uint8[]`` of any length, texts that the contract
-would refuse. An element named in the selection (``ranges.540``) is taken from any array.
+would refuse. With ``large``, a ``uint8[]`` stays the bytes that it is, for `device.claim_check` to take. An
+element named in the selection (``ranges.540``) is taken from any array.
 """
 
 from __future__ import annotations
@@ -47,12 +48,17 @@ class Decoder:
     """
 
     def __init__(
-        self, definition: Definition, *, select: Sequence[str] | None = None, stamp: bool = False
+        self,
+        definition: Definition,
+        *,
+        select: Sequence[str] | None = None,
+        stamp: bool = False,
+        large: bool = False,
     ) -> None:
         self._kind = definition.kind
         self._stamp = stamp and definition.stamped()
         self.left_out: dict[str, int] = {}
-        compiler = _Compiler(definition, select, self.left_out)
+        compiler = _Compiler(definition, select, self.left_out, large=large)
         self._steps = compiler.message(stamp=self._stamp)
         self.unknown = sorted(set(select or ()) - compiler.used)
 
@@ -81,9 +87,15 @@ class _Compiler:
     """Turns types into steps. What is not kept is stepped over, in one step if its size is fixed."""
 
     def __init__(
-        self, definition: Definition, select: Sequence[str] | None, left_out: dict[str, int]
+        self,
+        definition: Definition,
+        select: Sequence[str] | None,
+        left_out: dict[str, int],
+        *,
+        large: bool,
     ) -> None:
         self._definition = definition
+        self._large = large
         self._select = select
         self._left_out = left_out
         self._sizes: dict[str, int | None] = {}
@@ -160,6 +172,8 @@ class _Compiler:
         left_out = self._left_out
         whole, few = self._wanted(path), self._indexes(path, None)
         blob = kind in _BLOBS
+        if blob and whole and self._large:
+            return _bytes(path)
         elements: dict[int, list[Step]] = {}
         structs: dict[int, tuple[struct.Struct, list[str]]] = {}
         skip = self._element(kind, None)
@@ -326,6 +340,18 @@ def _text(path: str, left_out: dict[str, int]) -> Step:
             left_out[path] = left_out.get(path, 0) + 1
         else:
             out[path] = text
+        return at + int(n)
+
+    return step
+
+
+def _bytes(path: str) -> Step:
+    def step(data: bytes, at: int, out: dict[str, Any]) -> int:
+        (n,) = _LENGTH.unpack_from(data, at)
+        at += 4
+        if at + n > len(data):
+            raise struct.error
+        out[path] = bytes(data[at : at + n])
         return at + int(n)
 
     return step

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import base64
 import hashlib
 import http.client
+import io
 import json
 import os
 import ssl
@@ -18,6 +20,7 @@ from urllib.parse import urlsplit
 import boto3
 import pytest
 from botocore.config import Config
+from PIL import Image
 
 from contract import (
     FILE,
@@ -37,6 +40,9 @@ from contract import (
 from device.clock import SystemClock
 from device.upload_http import Outcome, Pace, Sender, trusting
 from local.deployment import ROOT
+from local.gaps import AWS_MESSAGE_BYTES
+from station import delivery, robots
+from tests.images import TOPIC, jpeg, write_bag
 from tests.local.conftest import until
 from tests.local.drives import Agent
 from tests.local.robot import Robot
@@ -116,8 +122,6 @@ def test_a_large_file_in_a_watched_folder_survives_the_agents_end(bundle, bucket
     assert not bucket.keys(car.robot)
     assert large.exists()
 
-    from station import robots
-
     robots.configure(car, {"files": {**files, "rate_kb_s": 0}})
     agent = Agent(car)
     (key,) = until(lambda: bucket.keys(car.robot), seconds=120)
@@ -131,6 +135,34 @@ def test_a_large_file_in_a_watched_folder_survives_the_agents_end(bundle, bucket
     assert there
     assert status["sent_bytes"] == sum(size for part, size in sizes.items() if part not in there)
     assert (status["waiting"], status["uploaded"], status["last_error"]) == (0, 1, None)
+
+
+def test_pictures_of_a_recording_travel_as_claims(embedded, bundle, bucket, tmp_path):
+    pictures = [jpeg(seed) for seed in range(4)]
+    assert min(map(len, pictures)) > AWS_MESSAGE_BYTES
+    path = write_bag(tmp_path / "camera.bag", pictures, hz=2)
+    source = {"type": "bag", "path": str(path), "topics": {TOPIC: "camera"}, "large": "upload"}
+    files = {"large_folder": "large", "rate_kb_s": 0}
+    car = bundle(sources=[source], files=files)
+    agent = Agent(car)
+    report = agent.report()
+    columns: dict[str, list[Any]] = {}
+    for batch in delivery.batches(embedded.cloud, car.robot, "camera"):
+        for name, values in batch.columns.items():
+            columns.setdefault(name, []).extend(values)
+    assert columns["format"] == ["jpeg"] * 4
+    # A content a second, of two samples a second.
+    keys = columns["data.key"]
+    assert [key is not None for key in keys] == [True, False, True, False]
+    for i in (0, 2):
+        assert bucket.content(keys[i]) == pictures[i]
+        assert columns["data.sha256"][i] == hashlib.sha256(pictures[i]).hexdigest()
+        with Image.open(io.BytesIO(base64.b64decode(columns["data.thumbnail"][i]))) as small:
+            assert small.size == (96, 72)
+    assert sorted(bucket.keys(car.robot)) == sorted(filter(None, keys))
+    assert report["files"]["large"] == {"kept": 2, "left_out": 2}
+    assert report["streams"]["camera"]["refused"] == 0
+    assert not list((car.folder / "large").glob("*/*"))
 
 
 # --- what a robot may not, with its own certificate and its own hands -------------------------------

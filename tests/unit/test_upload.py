@@ -177,6 +177,26 @@ def test_the_key_is_the_robots_the_times_and_the_contents():
     assert contract.file_key("car", file_of(b"other")) != key
     with pytest.raises(ContractError):
         contract.file_key("../car", SMALL.file)
+    assert contract.parse_file_key(key) == ("car", 1_700_000_000, sha256(b"small")[:12], "drive.bag")
+    deep = replace(SMALL.file, name="rosbag2_1/metadata.yaml")
+    assert contract.parse_file_key(contract.file_key("car", deep)).name == deep.name
+
+
+@pytest.mark.parametrize(
+    "key",
+    [
+        "",
+        "results/x",
+        "robots/car/2023/11/14/221320-0123456789ab/",
+        "robots/car/2023/13/14/221320-0123456789ab/drive.bag",
+        "robots/car/2023/11/14/221320-0123456789ab/../drive.bag",
+        "robots/c r/2023/11/14/221320-0123456789ab/drive.bag",
+        "robots/car/2023/11/14/221320-0123456789AB/drive.bag",
+    ],
+)
+def test_a_key_that_is_not_ours_is_refused(key):
+    with pytest.raises(ContractError):
+        contract.parse_file_key(key)
 
 
 # --- the function -----------------------------------------------------------------------------------

@@ -1,0 +1,162 @@
+"""The claim check: what is too large for a message becomes a file, and the sample says which.
+
+A source hands such a field over as bytes. They are written into a folder that `device.upload_folder`
+empties into the bucket, under a key that is known before anything is sent, so that the sample need
+not wait for the upload.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import logging
+import os
+import threading
+from pathlib import Path
+from typing import Any, Callable, Mapping
+
+import contract
+from contract import CLAIM_FIELDS, File, Value
+from device.clock import Clock
+from device.seldom import Seldom
+from device.sources import Emit
+from device.upload_file import kind_of, wire_name
+
+_log = logging.getLogger(__name__)
+
+# How files begin that people want to open by themselves. Other bytes are for who knows the message.
+_BEGINNINGS = ((b"\xff\xd8\xff", ".jpg"), (b"\x89PNG\r\n\x1a\n", ".png"))
+_LOOK_S = 0.1
+
+Thumbnail = Callable[[bytes, str], "str | None"]
+
+
+class ClaimCheck:
+    """Takes bytes out of samples and puts claims in. Safe to use from several threads.
+
+    Of each stream, at most one content every ``every_s`` of the samples' own time is kept, and no more
+    than ``max_bytes`` wait in the folder; what is not kept is counted, and its claim is null.
+    """
+
+    def __init__(
+        self,
+        *,
+        robot: str,
+        folder: Path,
+        every_s: float,
+        max_bytes: int,
+        clock: Clock,
+        thumbnail: Thumbnail,
+        stored: Callable[[], None],
+    ) -> None:
+        self._robot, self._folder, self._max_bytes = robot, folder, max_bytes
+        self._every_us = round(every_s * 1_000_000)
+        self._clock, self._thumbnail, self._stored = clock, thumbnail, stored
+        self._seldom = Seldom(_log, clock)
+        self._lock = threading.Lock()
+        self._last_us: dict[str, int] = {}
+        self._bytes = self._measure()
+        self.kept = self.left_out = 0
+
+    def around(self, emit: Emit) -> Emit:
+        """An `Emit` that puts claims in before the sample goes on."""
+
+        def emit_claims(stream: str, t_us: int, values: Mapping[str, Any]) -> None:
+            if any(type(value) is bytes for value in values.values()):
+                values = self.claim(stream, t_us, values)
+            emit(stream, t_us, values)
+
+        return emit_claims
+
+    def claim(self, stream: str, t_us: int, values: Mapping[str, Any]) -> dict[str, Value]:
+        """The sample with a claim for each field of bytes; the other fields as they are."""
+        keep = self._is_due(stream, t_us)
+        sample: dict[str, Value] = {}
+        for field, value in values.items():
+            if type(value) is not bytes:
+                sample[field] = value
+                continue
+            claim = self._keep(stream, t_us, field, value) if keep else None
+            if claim is None:
+                self.left_out += 1
+                claim = dict.fromkeys(CLAIM_FIELDS)
+            sample.update((f"{field}.{name}", one) for name, one in claim.items())
+        return sample
+
+    def wait_empty(self, timeout_s: float) -> bool:
+        """Wait until the folder is uploaded; whether it is."""
+        until, never = self._clock.monotonic() + timeout_s, threading.Event()
+        while self._measure():
+            if self._clock.monotonic() >= until:
+                return False
+            # The folder is emptied file by file, and tells nobody.
+            self._clock.wait(never, _LOOK_S)
+        return True
+
+    def report(self) -> dict[str, Any]:
+        """What became of the contents."""
+        return {"kept": self.kept, "left_out": self.left_out, **self._seldom.counts()}
+
+    def _is_due(self, stream: str, t_us: int) -> bool:
+        with self._lock:
+            last = self._last_us.get(stream)
+            # A recording that begins anew steps back.
+            if last is not None and last <= t_us < last + self._every_us:
+                return False
+            self._last_us[stream] = t_us
+            return True
+
+    def _keep(self, stream: str, t_us: int, field: str, content: bytes) -> dict[str, Value] | None:
+        suffix = next((end for begin, end in _BEGINNINGS if content.startswith(begin)), ".bin")
+        name = Path(stream) / f"{t_us}-{field}{suffix}"
+        if not self._has_room(len(content)):
+            self._seldom.warn("full", f"{self._folder} is full: contents of {stream} are not kept")
+            return None
+        try:
+            written_us = self._write(name, content, t_us)
+        except OSError as error:
+            self._seldom.warn("disk", f"{self._folder}: {error.strerror or error}")
+            return None
+        kind, content_type = kind_of(name)
+        sha256 = hashlib.sha256(content).hexdigest()
+        file = File(wire_name(name), kind, content_type, len(content), sha256, written_us)
+        self.kept += 1
+        self._stored()
+        return {
+            "key": contract.file_key(self._robot, file),
+            "sha256": sha256,
+            "size": len(content),
+            "content_type": content_type,
+            "thumbnail": self._thumbnail(content, content_type),
+        }
+
+    def _write(self, name: Path, content: bytes, t_us: int) -> int:
+        """Write a file that is whole when it has its name; its time, as the file system keeps it."""
+        path = self._folder / name
+        path.parent.mkdir(parents=True, exist_ok=True)
+        beside = path.with_name(f".{path.name}")
+        beside.write_bytes(content)
+        os.utime(beside, ns=(max(0, t_us) * 1000, max(0, t_us) * 1000))
+        written_us = beside.stat().st_mtime_ns // 1000
+        beside.replace(path)
+        return written_us
+
+    def _has_room(self, size: int) -> bool:
+        with self._lock:
+            if self._bytes + size > self._max_bytes:
+                # Uploads make room, and do not say so.
+                self._bytes = self._measure()
+            if self._bytes + size > self._max_bytes:
+                return False
+            self._bytes += size
+            return True
+
+    def _measure(self) -> int:
+        """Bytes that wait in the folder."""
+        return sum(map(_size, self._folder.glob("*/[!.]*")))
+
+
+def _size(path: Path) -> int:
+    try:
+        return path.stat().st_size or 1
+    except OSError:
+        return 0  # just uploaded

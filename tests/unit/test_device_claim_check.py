@@ -1,0 +1,215 @@
+"""The claim check: bytes become files, and the sample says which."""
+
+from __future__ import annotations
+
+import base64
+import hashlib
+import io
+import struct
+import threading
+from pathlib import Path
+
+import pytest
+from PIL import Image
+
+import contract
+from contract import CLAIM_FIELDS
+from device.claim_check import ClaimCheck
+from device.clock import ManualClock
+from device.config import load_config
+from device.errors import ConfigError, MessageError, SourceError
+from device.ros1_types import parse
+from device.sources.bag import BagConfig
+from device.sources.ros1_decode import Decoder
+from device.thumbnail import thumbnail
+from device.upload_file import read
+from device.upload_folder import Folder
+from tests.images import TOPIC, jpeg, write_bag
+
+T_US = 1_700_000_000_123_456
+PICTURE = jpeg()
+
+
+def claims_in(folder, *, every_s=1.0, max_bytes=10**9, small=lambda _content, _kind: "small"):
+    return ClaimCheck(
+        robot="car",
+        folder=folder,
+        every_s=every_s,
+        max_bytes=max_bytes,
+        clock=ManualClock(),
+        thumbnail=small,
+        stored=lambda: None,
+    )
+
+
+def test_the_claim_says_where_the_upload_will_put_it(tmp_path):
+    claims = claims_in(tmp_path)
+    sample = claims.claim("camera", T_US, {"format": "jpeg", "data": PICTURE})
+    assert sample.keys() == {"format", *(f"data.{name}" for name in CLAIM_FIELDS)}
+    assert sample["data.sha256"] == hashlib.sha256(PICTURE).hexdigest()
+    assert (sample["data.size"], sample["data.content_type"]) == (len(PICTURE), "image/jpeg")
+    # The folder's own thread knows nothing of the claim, and comes to the same key.
+    folder = Folder(tmp_path, clock=ManualClock(), settle_s=0, remove_after_s=0)
+    name = folder.next()
+    assert name == Path(f"camera/{T_US}-data.jpg")
+    local = folder.local(name, threading.Event())
+    assert contract.file_key("car", local.file) == sample["data.key"]
+    assert local.file.kind == "image"
+    assert (tmp_path / name).read_bytes() == PICTURE
+
+
+def test_what_is_no_picture_is_kept_as_it_is(tmp_path):
+    sample = claims_in(tmp_path, small=thumbnail).claim("scan", T_US, {"points": b"\0\1\2", "width": 3})
+    assert sample["points.content_type"] == "application/octet-stream"
+    assert sample["points.thumbnail"] is None
+    assert sample["points.key"].endswith(f"/scan/{T_US}-points.bin")
+    assert sample["width"] == 3
+
+
+def test_at_most_one_content_in_so_long_and_the_fields_stay_the_same(tmp_path):
+    claims = claims_in(tmp_path, every_s=1.0)
+    samples = [claims.claim("camera", T_US + i * 250_000, {"data": PICTURE}) for i in range(9)]
+    assert [sample["data.key"] is not None for sample in samples] == [i % 4 == 0 for i in range(9)]
+    assert {tuple(sample) for sample in samples} == {tuple(f"data.{name}" for name in CLAIM_FIELDS)}
+    assert claims.report() == {"kept": 3, "left_out": 6}
+    # Another stream has its own turn, and a recording that begins anew does too.
+    assert claims.claim("rear", T_US, {"data": PICTURE})["data.key"]
+    assert claims.claim("camera", T_US, {"data": PICTURE})["data.key"]
+
+
+def test_a_full_folder_keeps_nothing_more_until_there_is_room(tmp_path):
+    claims = claims_in(tmp_path, every_s=0, max_bytes=int(2.5 * len(PICTURE)))
+    kept = [claims.claim("camera", T_US + i, {"data": PICTURE})["data.key"] for i in range(3)]
+    assert [key is not None for key in kept] == [True, True, False]
+    assert claims.report() == {"kept": 2, "left_out": 1, "full": 1}
+    # Another run finds what waits.
+    assert (
+        claims_in(tmp_path, max_bytes=int(2.5 * len(PICTURE))).claim("camera", T_US, {"data": PICTURE})[
+            "data.key"
+        ]
+        is None
+    )
+    next(tmp_path.glob("camera/*.jpg")).unlink()
+    assert claims.claim("camera", T_US + 9, {"data": PICTURE})["data.key"]
+
+
+def test_a_disk_that_fails_costs_the_content_and_not_the_sample(tmp_path):
+    (tmp_path / "camera").write_text("in the way")
+    claims = claims_in(tmp_path)
+    sample = claims.claim("camera", T_US, {"data": PICTURE, "format": "jpeg"})
+    assert sample["data.key"] is None
+    assert sample["format"] == "jpeg"
+    assert claims.report()["disk"] == 1
+
+
+def test_waiting_for_the_folder_to_be_uploaded(tmp_path):
+    claims = claims_in(tmp_path)
+    assert claims.wait_empty(0)
+    claims.claim("camera", T_US, {"data": PICTURE})
+    assert not claims.wait_empty(5)
+    next(tmp_path.glob("camera/*.jpg")).unlink()
+    assert claims.wait_empty(5)
+
+
+def test_only_bytes_are_claimed(tmp_path):
+    out = []
+    emit = claims_in(tmp_path).around(lambda *sample: out.append(sample))
+    values = {"speed": 1.0, "text": "b"}
+    emit("vesc", T_US, values)
+    assert out == [("vesc", T_US, values)]
+    assert not list(tmp_path.iterdir())
+
+
+def test_a_claim_fits_a_batch_and_the_live_lane(tmp_path):
+    sample = claims_in(tmp_path, small=thumbnail).claim("camera", T_US, {"data": PICTURE})
+    columns = {name: [value] for name, value in sample.items()}
+    batch = contract.Batch("0123456789abcdef", 0, [T_US], columns)
+    assert len(contract.encode(batch)) < 8000
+    live = contract.LiveSample("0123456789abcdef", 0, T_US, T_US, sample)
+    assert len(contract.encode_live(live)) < contract.MAX_PUBNUB_BYTES / 2
+
+
+# --- thumbnails -------------------------------------------------------------------------------------
+
+
+def test_a_thumbnail_is_a_small_picture_of_the_same_shape():
+    small = thumbnail(PICTURE, "image/jpeg")
+    assert small is not None
+    assert len(small) <= 4096
+    with Image.open(io.BytesIO(base64.b64decode(small))) as picture:
+        assert (picture.format, picture.size) == ("JPEG", (96, 72))
+
+
+@pytest.mark.parametrize(
+    ("content", "content_type"),
+    [
+        (b"", "image/jpeg"),
+        (PICTURE[:500], "image/jpeg"),
+        (b"\xff\xd8\xffnoise", "image/png"),
+        (PICTURE, "text/plain"),
+    ],
+)
+def test_what_cannot_be_shown_has_no_thumbnail(content, content_type):
+    assert thumbnail(content, content_type) is None
+
+
+# --- sources ----------------------------------------------------------------------------------------
+
+
+def play(path, **settings):
+    out = []
+    source = BagConfig(path=path, topics=((TOPIC, "camera"),), **settings).build(ManualClock())
+    source.run(lambda *sample: out.append(sample), threading.Event())
+    return out
+
+
+def test_a_recordings_pictures_are_handed_over_where_it_says_upload(tmp_path):
+    path = write_bag(tmp_path / "camera.bag", [PICTURE, jpeg(1)])
+    samples = play(path, large="upload")
+    assert [values["data"] for _, _, values in samples] == [PICTURE, jpeg(1)]
+    assert samples[0][2]["format"] == "jpeg"
+    with pytest.raises(SourceError, match="field data has"):
+        play(path)
+
+
+def test_a_live_topics_bytes_are_handed_over_where_it_says_upload():
+    definition = parse("sensor_msgs/CompressedImage", "string format\nuint8[] data\nuint8 last")
+    message = struct.pack("<I4sI", 4, b"jpeg", len(PICTURE)) + PICTURE + b"\x07"
+    values = Decoder(definition, large=True).decode(message).values
+    assert values == {"format": "jpeg", "data": PICTURE, "last": 7}
+    refusing = Decoder(definition)
+    assert refusing.decode(message).values == {"format": "jpeg", "last": 7}
+    assert refusing.left_out == {"data": 1}
+    assert Decoder(definition, select=["format"], large=True).decode(message).values == {"format": "jpeg"}
+    with pytest.raises(MessageError, match="cut short"):
+        Decoder(definition, large=True).decode(message[:100])
+
+
+CAR = """
+robot: car
+endpoint: localhost
+certificate: car.yaml
+private_key: car.yaml
+sources:
+- type: ros1
+  topics: {/camera/compressed: {stream: camera, time: header, large: upload}}
+"""
+
+
+def test_where_bytes_wait_must_be_said(tmp_path):
+    file = tmp_path / "car.yaml"
+    file.write_text(CAR)
+    with pytest.raises(ConfigError, match=r"files.large_folder: required, and missing"):
+        load_config(file)
+    file.write_text(f"{CAR}\nfiles: {{large_folder: large}}\n")
+    assert load_config(file).files.large_folder == tmp_path / "large"
+    file.write_text(CAR.replace("upload", "download"))
+    with pytest.raises(ConfigError, match="one of refuse, upload"):
+        load_config(file)
+
+
+def test_what_the_folder_has_read_is_what_the_claim_says(tmp_path):
+    claims_in(tmp_path).claim("camera", T_US, {"data": PICTURE})
+    (path,) = tmp_path.glob("camera/*.jpg")
+    local = read(path, path.relative_to(tmp_path), stop=threading.Event())
+    assert local.file.t_us == T_US
