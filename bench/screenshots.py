@@ -39,6 +39,9 @@ VIEWS = {
     "history": f"#/history/{_REAL}",
     "cloudwatch": "#/cloudwatch",
 }
+_LIVE = ("fleet", "car")
+_FILL_S = 65.0
+_SETTLE_MS = 1_500
 _COLOURS = 128
 
 Theme = Literal["dark", "light"]
@@ -71,33 +74,40 @@ def main() -> None:
         url = stack.enter_context(server).url
         play = stack.enter_context(sync_playwright())
         browser = play.chromium.launch(executable_path=chromium, args=["--no-sandbox", "--disable-gpu"])
-        pages = {}
-        for view in options.only:
-            on_phone: Theme = "light" if view in {"car", "cloudwatch"} else "dark"
-            looks: list[tuple[str, tuple[int, int], Theme]] = [
-                ("dark", LAPTOP, "dark"),
-                ("light", LAPTOP, "light"),
-                ("phone", PHONE, on_phone),
-            ]
-            for name, size, theme in looks:
-                page = browser.new_page(
-                    viewport={"width": size[0], "height": size[1]},
-                    color_scheme=theme,
-                    device_scale_factor=2 if size is PHONE else 1,
-                    has_touch=size is PHONE,
-                )
-                page.goto(url + VIEWS[view])
-                pages[f"{view}-{name}"] = page
+        live = [view for view in options.only if view in _LIVE]
         # Until the charts are full, and a minute's metrics have been counted.
-        next(iter(pages.values())).wait_for_timeout(75_000)
-        for name, page in pages.items():
-            page.bring_to_front()
+        pages = [look for view in live for look in _open(browser, url, view)]
+        threading.Event().wait(_FILL_S)
+        pages += [look for view in options.only if view not in _LIVE for look in _open(browser, url, view)]
+        for name, page in pages:
             if name.startswith("history"):
                 _scrub(page)
-            page.wait_for_timeout(6_000 if name.startswith("car") else 1_500)
-            page.screenshot(path=options.out / f"{name}.png", full_page=False)
+            page.wait_for_timeout(_SETTLE_MS)
+            page.screenshot(path=options.out / f"{name}.png")
             _shrink(options.out / f"{name}.png")
+            page.close()
         browser.close()
+
+
+def _open(browser: Any, url: str, view: str) -> list[tuple[str, Any]]:
+    """A view in every look: dark and light on a laptop, and on a phone."""
+    on_phone: Theme = "light" if view in {"car", "cloudwatch"} else "dark"
+    looks: list[tuple[str, tuple[int, int], Theme]] = [
+        ("dark", LAPTOP, "dark"),
+        ("light", LAPTOP, "light"),
+        ("phone", PHONE, on_phone),
+    ]
+    pages = []
+    for name, size, theme in looks:
+        page = browser.new_page(
+            viewport={"width": size[0], "height": size[1]},
+            color_scheme=theme,
+            device_scale_factor=2 if size is PHONE else 1,
+            has_touch=size is PHONE,
+        )
+        page.goto(url + VIEWS[view])
+        pages.append((f"{view}-{name}", page))
+    return pages
 
 
 def _scrub(page: Any) -> None:

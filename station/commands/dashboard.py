@@ -20,7 +20,9 @@ _out = Console(highlight=False)
 def dashboard(
     context: typer.Context,
     port: Annotated[int, typer.Option(help="The page's port; 0 for a free one.")] = 8080,
-    host: Annotated[str, typer.Option(help="The address to listen on.")] = "127.0.0.1",
+    host: Annotated[
+        str, typer.Option(help="The address to listen on. Whoever reaches it can read the cars' past.")
+    ] = "127.0.0.1",
     token: Annotated[
         str,
         typer.Option(

@@ -1,5 +1,6 @@
 // The page's end of its worker: starts it, and hands what it hears to the fleet.
 
+import { now } from "./clock";
 import type { Config, FieldTable } from "./config";
 import type { Fleet } from "./fleet";
 import type { FromWorker, LinkState, ToWorker } from "./wire";
@@ -10,14 +11,16 @@ export class Feed {
 
   constructor(config: Config, table: FieldTable, fleet: Fleet, onState: (state: LinkState) => void) {
     this.worker.addEventListener("message", ({ data }: MessageEvent<FromWorker>) => {
-      if (data.kind === "arrivals") fleet.take(data.arrivals, data.refused, data.lastRefusal);
-      else {
+      if (data.kind === "arrivals") {
+        fleet.take(data.arrivals, data.refused, data.lastRefusal);
+        this.tell({ kind: "taken" });
+      } else {
         this.state = data.state;
         onState(data.state);
       }
     });
     this.worker.addEventListener("error", (event) => {
-      this.state = { kind: "lost", since: 0, retryAt: 0, reason: `the page's worker failed: ${event.message}` };
+      this.state = { kind: "lost", since: now(), retryAt: now(), reason: `the page's worker failed: ${event.message}` };
       onState(this.state);
     });
     const { namespace, subscribe_key, origin, tls, token } = config;

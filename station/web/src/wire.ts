@@ -21,7 +21,9 @@ export interface Listening {
 
 export type ToWorker =
   | { readonly kind: "start"; readonly listening: Listening }
-  | { readonly kind: "visible"; readonly visible: boolean };
+  | { readonly kind: "visible"; readonly visible: boolean }
+  /** The page has taken what was handed over, and is ready for more. */
+  | { readonly kind: "taken" };
 
 /** An update, and when it came: on the page's clock in seconds, and by the time of day in microseconds. */
 export interface Arrival {

@@ -8,17 +8,22 @@ import type { Arrival, FromWorker, Listening, ToWorker } from "./wire";
 
 // What comes within this long is handed over together: each handing over wakes the page.
 const TOGETHER_MS = 25;
+// What waits for a page that is busy; the oldest goes when it is more.
+const MOST_WAITING = 2_000;
 
 let link: Link | undefined;
 let arrivals: Arrival[] = [];
 let refused = 0;
 let lastRefusal = "";
 let handing: number | undefined;
+let taking = false;
 
 const tell = (message: FromWorker): void => self.postMessage(message);
 
 function hand(): void {
   handing = undefined;
+  if (taking) return;
+  taking = true;
   tell({ kind: "arrivals", arrivals, refused, lastRefusal });
   arrivals = [];
   refused = 0;
@@ -38,6 +43,11 @@ function start(listening: Listening): void {
         // A timetoken counts 100 ns.
         arrivals.push({ update, at, wall_us, pubnub_us: Number(timetoken) / 10 });
       }
+      if (arrivals.length > MOST_WAITING) {
+        arrivals.shift();
+        refused += 1;
+        lastRefusal = "more than this device can show";
+      }
       handing ??= self.setTimeout(hand, TOGETHER_MS);
     },
     (state) => tell({ kind: "state", state }),
@@ -46,6 +56,11 @@ function start(listening: Listening): void {
 }
 
 self.addEventListener("message", (event: MessageEvent<ToWorker>) => {
-  if (event.data.kind === "start") start(event.data.listening);
-  else link?.seen(event.data.visible);
+  const { data } = event;
+  if (data.kind === "start") start(data.listening);
+  else if (data.kind === "visible") link?.seen(data.visible);
+  else {
+    taking = false;
+    if (arrivals.length > 0 || refused > 0) handing ??= self.setTimeout(hand, TOGETHER_MS);
+  }
 });
