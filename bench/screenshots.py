@@ -39,10 +39,9 @@ VIEWS = {
     "history": f"#/history/{_REAL}",
     "cloudwatch": "#/cloudwatch",
 }
-_LIVE = ("fleet", "car")
 _FILL_S = 65.0
-_SETTLE_MS = 1_500
-_COLOURS = 128
+_SETTLE_MS = 4_000
+_COLOURS = 256
 
 Theme = Literal["dark", "light"]
 
@@ -74,40 +73,46 @@ def main() -> None:
         url = stack.enter_context(server).url
         play = stack.enter_context(sync_playwright())
         browser = play.chromium.launch(executable_path=chromium, args=["--no-sandbox", "--disable-gpu"])
-        live = [view for view in options.only if view in _LIVE]
+        pages = {
+            "laptop": _page(browser, url, LAPTOP, ratio=1),
+            "phone": _page(browser, url, PHONE, ratio=2),
+        }
         # Until the charts are full, and a minute's metrics have been counted.
-        pages = [look for view in live for look in _open(browser, url, view)]
         threading.Event().wait(_FILL_S)
-        pages += [look for view in options.only if view not in _LIVE for look in _open(browser, url, view)]
-        for name, page in pages:
-            if name.startswith("history"):
-                _scrub(page)
-            page.wait_for_timeout(_SETTLE_MS)
-            page.screenshot(path=options.out / f"{name}.png")
-            _shrink(options.out / f"{name}.png")
-            page.close()
+        for view in options.only:
+            on_phone: Theme = "light" if view in {"car", "cloudwatch"} else "dark"
+            looks: list[tuple[str, str, Theme]] = [
+                ("dark", "laptop", "dark"),
+                ("light", "laptop", "light"),
+                ("phone", "phone", on_phone),
+            ]
+            for name, device, theme in looks:
+                path = options.out / f"{view}-{name}.png"
+                _look(pages[device], url + VIEWS[view], theme)
+                pages[device].screenshot(path=path)
+                _shrink(path)
         browser.close()
 
 
-def _open(browser: Any, url: str, view: str) -> list[tuple[str, Any]]:
-    """A view in every look: dark and light on a laptop, and on a phone."""
-    on_phone: Theme = "light" if view in {"car", "cloudwatch"} else "dark"
-    looks: list[tuple[str, tuple[int, int], Theme]] = [
-        ("dark", LAPTOP, "dark"),
-        ("light", LAPTOP, "light"),
-        ("phone", PHONE, on_phone),
-    ]
-    pages = []
-    for name, size, theme in looks:
-        page = browser.new_page(
-            viewport={"width": size[0], "height": size[1]},
-            color_scheme=theme,
-            device_scale_factor=2 if size is PHONE else 1,
-            has_touch=size is PHONE,
-        )
-        page.goto(url + VIEWS[view])
-        pages.append((f"{view}-{name}", page))
-    return pages
+def _page(browser: Any, url: str, size: tuple[int, int], *, ratio: int) -> Any:
+    width, height = size
+    page = browser.new_page(
+        viewport={"width": width, "height": height}, device_scale_factor=ratio, has_touch=ratio > 1
+    )
+    page.goto(url)
+    return page
+
+
+def _look(page: Any, address: str, theme: Theme) -> None:
+    """Another view of the same page, which keeps what it has heard."""
+    page.emulate_media(color_scheme=theme)
+    page.goto(address)
+    if "/history/" in address:
+        _scrub(page)
+    if address.endswith("/cloudwatch"):
+        page.wait_for_selector("#dashboard option", state="attached")
+        page.select_option("#minutes", "15")
+    page.wait_for_timeout(_SETTLE_MS)
 
 
 def _scrub(page: Any) -> None:
@@ -159,7 +164,9 @@ def _shrink(path: Path) -> None:
     from PIL import Image  # noqa: PLC0415
 
     with Image.open(path) as image:
-        small = image.convert("RGB").quantize(_COLOURS, dither=Image.Dither.NONE)
+        small = image.convert("RGB").quantize(
+            _COLOURS, method=Image.Quantize.MAXCOVERAGE, dither=Image.Dither.NONE
+        )
     small.save(path, optimize=True)
 
 

@@ -48,8 +48,8 @@ export class Gauge {
   set(value: number, least: number, most: number, unit = this.options.unit, digits = this.options.digits): void {
     this.value.set(number(value, digits));
     this.unit.set(unit);
-    if (least < this.from) this.from = roundedOut(least, Math.floor);
-    if (most > this.to) this.to = roundedOut(most, Math.ceil);
+    for (const each of [least, value]) if (each < this.from) this.from = roundedOut(each, Math.floor);
+    for (const each of [most, value]) if (each > this.to && each < Infinity) this.to = roundedOut(each, Math.ceil);
     this.low.set(number(this.from, 0));
     this.high.set(number(this.to, 0));
     const place = (at: number): string => `${(Math.max(0, Math.min(1, (at - this.from) / (this.to - this.from))) * 100).toFixed(1)}%`;

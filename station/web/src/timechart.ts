@@ -41,7 +41,7 @@ export class TimeChart {
     read();
     const colours = () => this.paint;
     const rounded = (_: uPlot, low: number | null, high: number | null): [number, number] =>
-      low === null || high === null ? [0, 1] : roundRange(low, high, Math.max(Math.abs(high) * 0.02, 1e-6), options.zero ?? false);
+      low === null || high === null ? [0, 1] : roundRange(low, high, Math.max(Math.abs(high) * 0.02, high === 0 && low === 0 ? 1 : 1e-6), options.zero ?? false);
     const right = options.curves.some((curve) => curve.right);
     const series: uPlot.Series[] = options.curves.map((curve, i) => ({
       scale: curve.right ? "right" : "y",

@@ -131,7 +131,7 @@ export class HistoryView {
       const drive = await ask<Drive>("history", asked, loading.signal);
       if (loading.signal.aborted) return;
       this.set(drive, [from_s, to_s]);
-      const each = drive.row_s > 0 ? `, drawn as the mean of ${age(drive.row_s)} each within its least and most` : "";
+      const each = drive.row_s > 0 ? `, drawn as the mean of ${drive.row_s < 1 ? `${number(drive.row_s * 1000, 0)} ms` : age(drive.row_s)} each within its least and most` : "";
       this.note.set(drive.samples === 0 ? "Nothing was stored in this range." : `${number(drive.samples)} samples in ${age((performance.now() - began) / 1000)}${each}.`);
     } catch (error) {
       if (!loading.signal.aborted) this.note.set(words(error));
