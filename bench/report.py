@@ -23,13 +23,14 @@ th:first-child,td:first-child{text-align:left}th{background:#f5f5f5}svg{max-widt
 
 def headline(sections: Sequence[Section]) -> Table:
     """Every figure that holds on any machine, beside what it may be."""
-    rows = [_ratio_row(ratio) for section in sections for ratio in section.ratios]
+    rows = [ratio_row(ratio) for section in sections for ratio in section.ratios]
     return Table(
         "Ratios, each measured side by side in this run", ["figure", "measured", "target", "reached"], rows
     )
 
 
-def _ratio_row(ratio: Ratio) -> list[str]:
+def ratio_row(ratio: Ratio) -> list[str]:
+    """Name, value, target and whether it is reached, as text."""
     unit = "" if ratio.unit == "x" else f" {ratio.unit}"
     sign = "at least" if ratio.at_least else "at most"
     target = "" if ratio.target is None else f"{sign} {ratio.target:g}{unit}"

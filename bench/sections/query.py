@@ -29,7 +29,8 @@ ROBOT = "bench-query"
 REPEATS = 3
 _RATE_HZ = 50
 THESIS_QUERY, THESIS_SCAN = "thesis' layout, query through Table", "thesis' layout, scan through Table"
-OURS_QUERY, OURS_SCAN = "iort, query", "iort, scan"
+OURS_QUERY, OURS_SCAN = "iort, query on premises", "iort, scan on premises"
+LAMBDA_QUERY, LAMBDA_SCAN = "iort, query in Lambda", "iort, scan in Lambda"
 THESIS_S = {THESIS_QUERY: "5.5 s"}
 
 
@@ -56,6 +57,8 @@ def run(target: Target, say: Say) -> Section:
             OURS_QUERY: lambda: len(data.query(target.cloud, ROBOT, VESC_STREAM)),
             THESIS_SCAN: lambda: _pages(table.scan, FilterExpression=Attr(TOPIC).eq(topic)),
             OURS_SCAN: lambda: len(data.query(target.cloud, ROBOT, VESC_STREAM, scan=True)),
+            LAMBDA_QUERY: lambda: len(data.query(target.cloud, ROBOT, VESC_STREAM, on=data.LAMBDA)),
+            LAMBDA_SCAN: lambda: len(data.query(target.cloud, ROBOT, VESC_STREAM, on=data.LAMBDA, scan=True)),
         }
         found = {name: Way() for name in ways}
         for turn in range(REPEATS + 1):
@@ -136,7 +139,8 @@ def _timed(target: Target, read: Callable[[], int]) -> tuple[int, float, float, 
 
 
 def _server(pid: int | None) -> dict[int, int] | None:
-    return None if pid is None else cpu.of_process(pid)
+    """The emulator and the functions' workers, which are its children."""
+    return None if pid is None else cpu.of_process(pid) | cpu.of_tree(pid)
 
 
 def _add(way: Way, one: tuple[int, float, float, float | None]) -> None:

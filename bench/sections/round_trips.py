@@ -38,6 +38,8 @@ RAW = "raw client"
 _ENVELOPE = 60
 _LEAST, _LEAST_S = 12, 3.0
 _CONNECT_S = 30.0
+# To subscribe anew and to be there when the first turn comes.
+_SET_UP_S = 0.3
 
 
 def run(target: Target, say: Say) -> Section:
@@ -91,8 +93,8 @@ class _Connected:
     def __exit__(self, *_: object) -> None:
         self.uplink.stop(5.0)
 
-    def measure(self, path: str, rate_hz: float, size: int, seconds: float) -> list[float]:
-        """Round trips over a path, in milliseconds, by the agent's own pings."""
+    def measure(self, path: str, rate_hz: float, size: int, begins: float, seconds: float) -> list[float]:
+        """Round trips over a path from then on, in milliseconds, by the agent's own pings."""
         trips: list[float] = []
         lost = 0
 
@@ -118,6 +120,7 @@ class _Connected:
         answers = build_topic(lane, self.config.robot, path, self.config.namespace)
         while not self.uplink.subscribed(answers):
             stop.wait(0.02)
+        stop.wait(max(0.0, begins - time.perf_counter()))
         runner = threading.Thread(target=pings.run, args=(stop,), daemon=True)
         runner.start()
         stop.wait(seconds)
@@ -138,16 +141,21 @@ def _cell(
     seconds = max(_LEAST_S, _LEAST / rate_hz / 3)
     found: dict[str, list[float]] = {}
 
+    # Each in its own part of the period, so that none waits for another's message.
+    names = (*uplinks, RAW)
+    starts_s = {name: i / len(names) / rate_hz for i, name in enumerate(names)}
+    began = time.perf_counter() + _SET_UP_S
+    pause = threading.Event()
+
     def ours(path: str) -> None:
-        found[path] = uplinks[path].measure(path, rate_hz, size, seconds)
+        found[path] = uplinks[path].measure(path, rate_hz, size, began + starts_s[path], seconds)
 
     def floor() -> None:
         payload = encode_ping(1, time.time_ns() // 1000, "x" * max(0, size - _ENVELOPE))
-        began, values = time.perf_counter(), []
-        pause = threading.Event()
+        values = []
         for turn in range(max(1, round(seconds * rate_hz))):
-            # Between the turns of the others, so that they do not wait for each other.
-            pause.wait(max(0.0, began + (turn + 0.5) / rate_hz - time.perf_counter()))
+            due = began + starts_s[RAW] + turn / rate_hz
+            pause.wait(max(0.0, due - time.perf_counter()))
             values.append(raw.round_trip(topic, payload) * 1000)
         found[RAW] = values
 
@@ -157,7 +165,7 @@ def _cell(
         thread.start()
     for thread in threads:
         thread.join()
-    missing = [name for name in (*uplinks, RAW) if not found.get(name)]
+    missing = [name for name in names if not found.get(name)]
     if missing:
         raise RuntimeError(f"nothing was measured over {', '.join(missing)}")
     return found

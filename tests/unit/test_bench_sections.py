@@ -1,0 +1,101 @@
+"""What the bench's sections make of what they measured."""
+
+from __future__ import annotations
+
+import pytest
+
+from bench.result import Section
+from bench.sections import SECTIONS, abilities, outage, query, utilisation
+from bench.sections.utilisation import BATCHES, Measured
+
+
+def test_report_lines_of_lambda_are_read():
+    line = "REPORT RequestId: 8f50\tDuration: 12.34 ms\tBilled Duration: 13 ms\tMemory Size: 256 MB\t"
+    match = utilisation._REPORT.match(line)
+    assert match is not None
+    assert float(match[1]) == 12.34
+    cold = utilisation._INIT.search(line + "Max Memory Used: 81 MB\tInit Duration: 250.5 ms\t")
+    assert cold is not None
+    assert float(cold[1]) == 250.5
+
+
+def test_projection_is_the_share_of_a_processor_that_memory_buys():
+    projected = utilisation._projected({"f": Measured([], [2.0, 2.0]), "none": Measured()})
+    assert list(projected) == ["f"]
+    assert projected["f"][-1] == 2.0, "at 1,769 MB there is one whole vCPU"
+    assert projected["f"][0] == pytest.approx(2.0 * 1769 / 128)
+
+
+def test_functions_are_held_to_what_they_cost_beyond_an_empty_one():
+    many = f"Lambda 2, an event of {BATCHES} batches"
+    found = {
+        "Lambda 1 (live)": Measured([[1.0]], [2.0, 2.2, 2.1]),
+        "Lambda 2, an event of 1 batch": Measured([[1.0]], [9.2] * 3),
+        many: Measured([[1.0]], [50.2] * 3),
+        "empty function": Measured([[1.0]], [0.2] * 3),
+    }
+    section = Section("utilisation", "")
+    utilisation._ratios(section, found, {"p50": 0.004})
+    values = {ratio.name: ratio.value for ratio in section.ratios}
+    assert values["Lambda 1 warm, processor time beyond an empty function"] == 1.9
+    assert values["Lambda 2, processor time a batch of 50 samples"] == 0.5
+    assert values["node's cycle / thesis' 2 ms"] == 0.002
+    assert all(ratio.reached for ratio in section.ratios if ratio.target is not None)
+
+
+def test_outage_tells_what_came_before_during_and_after():
+    second = 1_000_000
+    live = [(t * second, 5.0) for t in range(8)] + [(70 * second + i * 100_000, 7.0) for i in range(20)]
+    section = Section("outage", "")
+    outage._report(
+        section,
+        lost=0,
+        summarized=4000,
+        sent=4000,
+        duplicated=0,
+        missing=0,
+        drain_s=3.0,
+        live=live,
+        cut_us=8 * second,
+        mended_us=68 * second,
+    )
+    values = {ratio.name: ratio.value for ratio in section.ratios}
+    assert values["samples lost over an outage"] == 0
+    assert values["time to drain / outage"] == 0.05
+    assert values["live delay after / before"] == 1.4
+    assert ["from the way's return to the first live sample", "2.0 s"] in section.tables[0].rows
+    assert ["live samples of the outage that came late to the dashboard", "0"] in section.tables[0].rows
+
+
+def test_thesis_reader_follows_every_page():
+    pages = [{"Items": [1, 2], "LastEvaluatedKey": "k"}, {"Items": [3]}]
+    asked = []
+
+    def read(**arguments):
+        asked.append(arguments)
+        return pages[len(asked) - 1]
+
+    assert query._pages(read, Limit=2) == 3
+    assert asked == [{"Limit": 2}, {"Limit": 2, "ExclusiveStartKey": "k"}]
+
+
+def test_a_probe_that_raises_is_a_no_and_says_what_was_seen():
+    def refuses():
+        raise abilities.No("nothing came")
+
+    def breaks():
+        raise ValueError("odd")
+
+    for ask, answer in (
+        (refuses, ("no", "nothing came")),
+        (breaks, ("no", "ValueError: odd")),
+        (lambda: "it did", ("yes", "it did")),
+    ):
+        assert abilities._answer(abilities.Probe("t", "s", "a", "-", ask)) == answer
+
+
+def test_every_section_of_the_documentation_is_one_that_runs():
+    from bench.machine import ROOT
+
+    text = (ROOT / "docs" / "bench.md").read_text()
+    assert {key for key in SECTIONS if f"| `{key}` |" in text} == set(SECTIONS)
