@@ -134,19 +134,26 @@ def _read(tables: Tables, topic: str, first: int, last: int, known: Mapping[Batc
     """The stored batches with samples from the first second to the last, the one before them, and
     all of the second in which the one after them starts."""
     start_us, end_us = first * _SECOND_US, (last + 1) * _SECOND_US
-    stored = list(_stored(tables.batches(topic, start_us - MAX_BATCH_SPAN_US, end_us - 1), known))
+    stored: list[Stored] = []
+    after_s, passed = None, 0
+    # One query: nearly always the batches are the newest, and nothing comes after them.
+    for item in tables.batches_from(topic, start_us - MAX_BATCH_SPAN_US, at_once=len(known) + _NEIGHBOURS):
+        t_us = int(item[T_US])
+        if after_s is None and t_us >= end_us:
+            passed += 1
+        if passed > _NEIGHBOURS or (after_s is not None and t_us // _SECOND_US != after_s):
+            break
+        for entry in _stored([item], known):
+            stored.append(entry)
+            if t_us >= end_us:
+                after_s = t_us // _SECOND_US
     if stored and stored[0].batch.t_us >= start_us:
-        stored = [*_nearest(tables, topic, stored[0].batch.t_us, known, later=False), *stored]
-    for after in _nearest(tables, topic, end_us - 1, known, later=True):
-        second_us = after.batch.t_us // _SECOND_US * _SECOND_US
-        stored += _stored(tables.batches(topic, second_us, second_us + _SECOND_US - 1), known)
+        stored = [*_before(tables, topic, stored[0].batch.t_us, known), *stored]
     return stored
 
 
-def _nearest(
-    tables: Tables, topic: str, t_us: int, known: Mapping[BatchKey, Batch], *, later: bool
-) -> list[Stored]:
-    found = _stored(islice(tables.neighbours(topic, t_us, later=later), _NEIGHBOURS), known)
+def _before(tables: Tables, topic: str, t_us: int, known: Mapping[BatchKey, Batch]) -> list[Stored]:
+    found = _stored(islice(tables.before(topic, t_us), _NEIGHBOURS), known)
     return list(islice(found, 1))
 
 

@@ -22,6 +22,8 @@ _WRITE_ATTEMPTS = 8
 _VEHICLE_CACHE_S = 60.0
 # "Limits", items: 400 KB with the names counted in; a little is left to how numbers are counted.
 _MAX_ITEM_BYTES, _MAX_NAME_BYTES = 380 * 1024, 65_535
+# Later than any time that the contract allows.
+_LAST_US = 2**53
 # What a DynamoDB number can hold, "Supported data types": 38 digits, 1e-130 to 9.99e125.
 _LARGEST, _SMALLEST = 9.99e125, 1e-130
 
@@ -59,33 +61,30 @@ class Tables:
         self._telemetry, self._summary, self._robots = telemetry, summary, robots
         self._vehicles: dict[str, tuple[float, Vehicle | None]] = {}
 
-    def batches(self, topic: str, first_us: int, last_us: int) -> Iterator[dict[str, Any]]:
-        """The stored batches of a topic that start in the range, both ends included, in order of time."""
-        pages = self._client.get_paginator("query").paginate(
-            TableName=self._telemetry,
-            ConsistentRead=True,
-            KeyConditionExpression="#topic = :topic AND #t BETWEEN :first AND :last",
-            ExpressionAttributeNames={"#topic": TOPIC, "#t": T_US},
-            ExpressionAttributeValues={
-                ":topic": {"S": topic},
-                ":first": {"N": str(first_us)},
-                ":last": {"N": str(last_us)},
-            },
+    def batches_from(self, topic: str, first_us: int, *, at_once: int) -> Iterator[dict[str, Any]]:
+        """The stored batches of a topic that start then or later, in order of time. ``at_once`` are read
+        at a time, as they are asked for: nobody wants a whole drive."""
+        return self._query(
+            topic, "#t BETWEEN :first AND :last", {":first": first_us, ":last": _LAST_US}, at_once=at_once
         )
-        for page in pages:
-            yield from map(plain, page["Items"])
 
-    def neighbours(self, topic: str, t_us: int, *, later: bool) -> Iterator[dict[str, Any]]:
-        """The stored batches of a topic that start before or after the time, the nearest first. Each
-        is read when it is asked for, since the first is nearly always the one that is wanted."""
+    def before(self, topic: str, t_us: int) -> Iterator[dict[str, Any]]:
+        """The stored batches of a topic that start before the time, the nearest first. Each is read when
+        it is asked for, since the first is nearly always the one that is wanted."""
+        return self._query(topic, "#t < :t", {":t": t_us}, at_once=1, ScanIndexForward=False)
+
+    def _query(
+        self, topic: str, condition: str, values: Mapping[str, int], *, at_once: int, **how: Any
+    ) -> Iterator[dict[str, Any]]:
+        numbers = {name: {"N": str(value)} for name, value in values.items()}
         pages = self._client.get_paginator("query").paginate(
             TableName=self._telemetry,
             ConsistentRead=True,
-            KeyConditionExpression=f"#topic = :topic AND #t {'>' if later else '<'} :t",
+            KeyConditionExpression=f"#topic = :topic AND {condition}",
             ExpressionAttributeNames={"#topic": TOPIC, "#t": T_US},
-            ExpressionAttributeValues={":topic": {"S": topic}, ":t": {"N": str(t_us)}},
-            ScanIndexForward=later,
-            PaginationConfig={"PageSize": 1},
+            ExpressionAttributeValues={":topic": {"S": topic}, **numbers},
+            PaginationConfig={"PageSize": at_once},
+            **how,
         )
         for page in pages:
             yield from map(plain, page["Items"])

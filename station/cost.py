@@ -129,15 +129,15 @@ def bill(usage: Usage) -> list[Item]:
         # A batch lies in one second; a second of several batches is written again by each.
         Item("DynamoDB", "record", "summary written", "write", batches * _units(sizes.summary_item, _WRITE)),
         Item("DynamoDB", "agent, rtt", "summary written", "write", own),
-        # The batches of the second and the one before, and whether there is a later one.
+        # The batches of the second and the one before.
         Item(
             "DynamoDB",
             "record",
             "batches read by Lambda 2",
             "read",
-            batches * (_units(2 * sizes.telemetry_item, _READ) + 1),
+            batches * _units(2 * sizes.telemetry_item, _READ),
         ),
-        Item("DynamoDB", "agent, rtt", "batches read by Lambda 2", "read", own * 2),
+        Item("DynamoDB", "agent, rtt", "batches read by Lambda 2", "read", own),
     ]
     seconds = min(batches, hour)
     items += [

@@ -460,6 +460,14 @@ def test_a_poison_neighbour_hides_no_batch_from_the_count(stream):
     assert stream.column("missing_batches") == {0: 5, 40: 2}
 
 
+def test_the_newest_batch_of_a_driving_car_takes_one_query(stream):
+    stream.client.page_items = 100
+    stream.deliver(batch(T0, seq=0))
+    stream.client.calls.clear()
+    stream.deliver(batch(T0 + S, seq=1))
+    assert (stream.client.calls["query"], stream.client.calls["batch_write_item"]) == (1, 1)
+
+
 def test_a_hail_of_poison_bounds_what_is_read(stream):
     for i in range(200):
         stream.store_item({**poison(v=9), "t": {"N": str(T0 + i * S)}})

@@ -55,39 +55,44 @@ def store(client, *times_us, topic=TOPIC_OF_CAR):
 # --- telemetry --------------------------------------------------------------------------------------
 
 
-def test_the_range_has_both_its_ends_one_topic_and_the_order_of_time(client):
+def test_batches_come_from_the_time_on_of_one_topic_in_the_order_of_time(client):
     store(client, T0 + 5, T0 + 1, T0 + 2, T0, T0 + 4, T0 + 3)
     store(client, T0 + 2, topic="dt/iort/other/vesc")
-    found = list(tables(client).batches(TOPIC_OF_CAR, T0 + 1, T0 + 4))
-    assert [item[T_US] for item in found] == [T0 + 1, T0 + 2, T0 + 3, T0 + 4]
+    found = list(tables(client).batches_from(TOPIC_OF_CAR, T0 + 1, at_once=2))
+    assert [item[T_US] for item in found] == [T0 + 1, T0 + 2, T0 + 3, T0 + 4, T0 + 5]
     assert {item[TOPIC] for item in found} == {TOPIC_OF_CAR}
 
 
 def test_every_page_is_read():
-    client = FakeDynamoDB(page_items=2)
+    client = FakeDynamoDB()
     store(client, *range(T0, T0 + 7))
-    assert len(list(tables(client).batches(TOPIC_OF_CAR, T0, T0 + 10))) == 7
+    assert len(list(tables(client).batches_from(TOPIC_OF_CAR, T0, at_once=2))) == 7
     assert client.calls["query"] == 4
 
 
-@pytest.mark.parametrize(("later", "expected"), [(False, [T0 + 1, T0]), (True, [T0 + 3, T0 + 4])])
-def test_neighbours_come_nearest_first(client, later, expected):
+def test_those_before_come_nearest_first(client):
     store(client, T0, T0 + 1, T0 + 2, T0 + 3, T0 + 4)
-    store(client, T0 + 2, topic="dt/iort/other/vesc")
-    found = tables(client).neighbours(TOPIC_OF_CAR, T0 + 2, later=later)
-    assert [item[T_US] for item in found] == expected
+    store(client, T0 + 1, topic="dt/iort/other/vesc")
+    assert [item[T_US] for item in tables(client).before(TOPIC_OF_CAR, T0 + 2)] == [T0 + 1, T0]
 
 
-def test_only_the_neighbours_that_are_asked_for_are_read():
+@pytest.mark.parametrize(
+    "read",
+    [
+        lambda found: found.before(TOPIC_OF_CAR, T0 + 8),
+        lambda found: found.batches_from(TOPIC_OF_CAR, T0, at_once=1),
+    ],
+)
+def test_only_what_is_asked_for_is_read(read):
     client = FakeDynamoDB(page_items=100)
     store(client, *range(T0, T0 + 9))
-    next(tables(client).neighbours(TOPIC_OF_CAR, T0 + 8, later=False))
+    next(read(tables(client)))
     assert client.read == 1
 
 
 def test_a_topic_with_nothing_stored(client):
-    assert list(tables(client).batches(TOPIC_OF_CAR, T0, T0 + 1)) == []
-    assert list(tables(client).neighbours(TOPIC_OF_CAR, T0, later=True)) == []
+    assert list(tables(client).batches_from(TOPIC_OF_CAR, T0, at_once=10)) == []
+    assert list(tables(client).before(TOPIC_OF_CAR, T0)) == []
 
 
 # --- robots -----------------------------------------------------------------------------------------
