@@ -16,8 +16,8 @@ demo: setup ## drive a car through the embedded cloud: DURATION=20 BAG=drive.bag
 	@$(BIN)/python -m local.demo $(if $(DURATION),--duration $(DURATION)) $(if $(BAG),--bag "$(BAG)") \
 		$(if $(REPORT),--report "$(REPORT)") $(if $(PORT),--port $(PORT))
 
-test: setup ## run every test; REQUIRE_ALL=1 makes a skip a failure
-	@$(BIN)/python -m pytest
+test: setup ## run every test: REQUIRE_ALL=1 makes a skip a failure, WORKERS=4 run side by side
+	@$(BIN)/python -m pytest --numprocesses $(or $(WORKERS),4) --dist loadscope --no-loadscope-reorder
 
 check: setup ## run the linters, the type checkers, and cfn-lint, cdk-nag and checkov over the stacks
 	@$(PYTHON) scripts/setup.py --checkov

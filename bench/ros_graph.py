@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import fcntl
 import os
 import shutil
 import socket
@@ -32,11 +33,15 @@ def python_with_rospy() -> str:
         raise RosError(f"ROS 1 is not installed: apt install {PACKAGES}")
     folder = ROOT / "build" / "ros-venv"
     python, ready = folder / "bin" / "python", folder / "ready"
-    if not ready.exists():
-        shutil.rmtree(folder, ignore_errors=True)
-        subprocess.run([SYSTEM_PYTHON, "-m", "venv", "--system-site-packages", folder], check=True)
-        subprocess.run([python, "-m", "pip", "install", "-q", "awsiotsdk>=1.22,<2"], check=True)
-        ready.touch()
+    folder.parent.mkdir(exist_ok=True)
+    with folder.with_suffix(".lock").open("w") as lock:
+        # Tests side by side make it once.
+        fcntl.flock(lock, fcntl.LOCK_EX)
+        if not ready.exists():
+            shutil.rmtree(folder, ignore_errors=True)
+            subprocess.run([SYSTEM_PYTHON, "-m", "venv", "--system-site-packages", folder], check=True)
+            subprocess.run([python, "-m", "pip", "install", "-q", "awsiotsdk>=1.22,<2"], check=True)
+            ready.touch()
     return str(python)
 
 

@@ -55,7 +55,7 @@ FOLDER = EMBEDDED.parent
 
 _REGION = "eu-west-1"
 _LEAST_FREE_BYTES = 500 * 1024 * 1024
-_READY_S = 30.0
+_READY_S = 120.0
 _POLL_S = 0.05
 
 Progress = Callable[[str], None]
@@ -204,7 +204,7 @@ class EmbeddedCloud:
             # It has nothing to put in order, and its workers end with it.
             orphaned=signal.SIGKILL,
         )
-        self._exit.callback(self.emulator.stop)
+        self._exit.callback(self.emulator.kill)
         for _ in range(int(_READY_S / _POLL_S)):
             self.emulator.check()
             try:

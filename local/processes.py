@@ -86,6 +86,10 @@ class Child:
         if self.poll() is None:
             self._process.terminate()
             self.wait(_TERMINATE_S)
+        self.kill()
+
+    def kill(self) -> None:
+        """End it and whatever it started at once: it has nothing to put in order."""
         # Workers share the session; the group's id is the child's, so this reaches nobody else.
         with suppress(ProcessLookupError):
             os.killpg(self.pid, signal.SIGKILL)

@@ -75,7 +75,7 @@ class Proxy:
         return [after - before for before, after in zip(self.attempts, self.attempts[1:], strict=False)]
 
     def _run(self, coroutine: Any) -> Any:
-        return asyncio.run_coroutine_threadsafe(coroutine, self._loop).result(10)
+        return asyncio.run_coroutine_threadsafe(coroutine, self._loop).result(60)
 
     async def _start(self) -> None:
         self._flowing.set()

@@ -1,4 +1,4 @@
-"""What every test shares: the synthesized app, and what a skip means."""
+"""What every test shares: the synthesized app, what a skip means, and who runs beside whom."""
 
 from __future__ import annotations
 
@@ -9,6 +9,46 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from hypothesis import HealthCheck, settings
+
+# How long an example takes says something about the machine only.
+settings.register_profile("iort", deadline=None, suppress_health_check=[HealthCheck.too_slow])
+settings.load_profile("iort")
+
+# What shares something costly runs in one worker of `make test`: an embedded cloud, of which there are two
+# because the faults spend their time waiting; the demo, which starts its own; what synthesizes the app.
+# Paths or their beginnings, the first that fits.
+GROUPS = {
+    "tests/local/test_demo.py": "demo",
+    "tests/local/test_faults.py": "faults",
+    "tests/local/test_uplink.py": "faults",
+    "tests/local/test_pubnub": "pubnub",
+    "tests/local/": "cloud",
+    "tests/ros/test_two_robots.py": "cloud",
+    "tests/stacks/": "app",
+    "tests/unit/test_summarize.py": "app",
+    "tests/unit/test_tables.py": "app",
+}
+
+
+def group(nodeid: str) -> str:
+    """What runs in one worker, in order: a group, a test of a ROS graph of its own, or a file."""
+    for path, name in GROUPS.items():
+        if nodeid.startswith(path):
+            return name
+    return nodeid if nodeid.startswith("tests/ros/") else nodeid.split("::", 1)[0]
+
+
+def pytest_xdist_make_scheduler(config: pytest.Config, log: Any) -> Any:
+    """Under `make test`, groups are spread over the workers. (Marks cannot say it: of xdist 3.8, they
+    no longer reach the scheduler under pytest 9.)"""
+    from xdist.scheduler import LoadScopeScheduling
+
+    class Groups(LoadScopeScheduling):  # type: ignore[misc]  # xdist has no types for us
+        def _split_scope(self, nodeid: str) -> str:
+            return group(nodeid)
+
+    return Groups(config, log)
 
 from tests.browser import browser, open_page  # noqa: F401 (fixtures)
 

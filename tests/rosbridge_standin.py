@@ -8,19 +8,13 @@ from __future__ import annotations
 
 import asyncio
 import json
-import socket
 import threading
 from typing import Any
 
 from aiohttp import WSMsgType, web
 from typing_extensions import Self
 
-
-def free_port() -> int:
-    with socket.socket() as probe:
-        probe.bind(("127.0.0.1", 0))
-        port: int = probe.getsockname()[1]
-        return port
+from tests.ports import free_port
 
 
 class RosbridgeStandin:
@@ -43,12 +37,12 @@ class RosbridgeStandin:
         ready = threading.Event()
         self._thread = threading.Thread(target=self._run, args=(ready,), name="rosbridge", daemon=True)
         self._thread.start()
-        assert ready.wait(10)
+        assert ready.wait(60)
         return self
 
     def __exit__(self, *_: object) -> None:
         self._loop.call_soon_threadsafe(self._over.set)
-        self._thread.join(10)
+        self._thread.join(60)
         assert not self._thread.is_alive()
 
     def wait_for(self, operation: str, count: int = 1, **members: Any) -> dict[str, Any]:
@@ -59,7 +53,7 @@ class RosbridgeStandin:
             return [op for op in self.operations if wanted.items() <= op.items()]
 
         with self._changed:
-            assert self._changed.wait_for(lambda: len(matching()) >= count, 20), self.operations
+            assert self._changed.wait_for(lambda: len(matching()) >= count, 60), self.operations
             return matching()[count - 1]
 
     def publish(self, topic: str, message: Any) -> None:
@@ -73,7 +67,7 @@ class RosbridgeStandin:
                 if topic is None or topic in topics:
                     await client.send_str(text)
 
-        asyncio.run_coroutine_threadsafe(to_all(), self._loop).result(10)
+        asyncio.run_coroutine_threadsafe(to_all(), self._loop).result(60)
 
     def cut(self) -> None:
         """Drop the connections without a word, as a router that is switched off does."""
@@ -82,7 +76,7 @@ class RosbridgeStandin:
             while self._transports:
                 self._transports.pop().abort()
 
-        asyncio.run_coroutine_threadsafe(abort(), self._loop).result(10)
+        asyncio.run_coroutine_threadsafe(abort(), self._loop).result(60)
 
     def _run(self, ready: threading.Event) -> None:
         asyncio.run(self._serve(ready))

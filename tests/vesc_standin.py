@@ -73,7 +73,7 @@ class VescStandin:
     def __exit__(self, *_: object) -> None:
         self.unplug()
         self._do(lambda: setattr(self, "_done", True))
-        self._thread.join(10)
+        self._thread.join(60)
         os.close(self._wake_in)
         os.close(self._wake_out)
 
@@ -93,7 +93,7 @@ class VescStandin:
         done = threading.Event()
         self._commands.put((command, done))
         os.write(self._wake_in, b"x")
-        assert done.wait(10)
+        assert done.wait(60)
 
     def _plug(self) -> None:
         self._master, self._slave = os.openpty()

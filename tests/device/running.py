@@ -29,7 +29,7 @@ class Running:
 
     def __exit__(self, *_: object) -> None:
         self.stop.set()
-        self.thread.join(5)
+        self.thread.join(60)
         assert not self.thread.is_alive()
         assert self.failed is None
 
@@ -37,7 +37,7 @@ class Running:
         """Wait until there are so many samples, or so many more than now."""
         with self._more:
             wanted = count + (len(self.samples) if more else 0)
-            assert self._more.wait_for(lambda: len(self.samples) >= wanted, 20), len(self.samples)
+            assert self._more.wait_for(lambda: len(self.samples) >= wanted, 60), len(self.samples)
 
     def _run(self) -> None:
         try:
@@ -53,7 +53,7 @@ class Running:
 
 def eventually(condition: Callable[[], Any]) -> None:
     """For what nobody tells of."""
-    deadline = time.monotonic() + 20
+    deadline = time.monotonic() + 60
     while not condition():
         assert time.monotonic() < deadline
         time.sleep(0.01)

@@ -16,11 +16,13 @@ import pytest
 from local.cloud import EmbeddedCloud
 from local.deployment import ROOT
 from station import robots
+from tests.ports import free_port
 
 
 @pytest.fixture(scope="session")
 def embedded(tmp_path_factory: pytest.TempPathFactory) -> Iterator[EmbeddedCloud]:
-    with EmbeddedCloud(tmp_path_factory.mktemp("cloud") / "local") as cloud:
+    ports = {name: free_port() for name in ("gateway", "mqtt", "pubnub")}
+    with EmbeddedCloud(tmp_path_factory.mktemp("cloud") / "local", ports=ports) as cloud:
         yield cloud
 
 
@@ -38,7 +40,7 @@ def bundle(
     return register
 
 
-def run_agent(bundle: robots.Bundle, *, timeout_s: float = 120) -> dict[str, Any]:
+def run_agent(bundle: robots.Bundle, *, timeout_s: float = 300) -> dict[str, Any]:
     """Run the installed agent to the end of its sources; its own report."""
     report = bundle.folder / "report.json"
     command = [Path(sys.executable).parent / "iort-agent", "--config", bundle.config, "--report", report]

@@ -76,7 +76,7 @@ class Agent:
     def status(self) -> dict[str, Any]:
         """What `iort-agent status` says; empty while there is no agent to ask."""
         command = [*self._command, "status", *self._config, "--json"]
-        done = subprocess.run(command, capture_output=True, text=True, cwd=ROOT, check=False, timeout=30)
+        done = subprocess.run(command, capture_output=True, text=True, cwd=ROOT, check=False, timeout=120)
         answer: dict[str, Any] = json.loads(done.stdout) if done.returncode == 0 else {}
         return answer
 
@@ -90,7 +90,7 @@ class Agent:
         self.process.wait()
         self._reader.join()
 
-    def report(self, *, timeout_s: float = 180) -> dict[str, Any]:
+    def report(self, *, timeout_s: float = 300) -> dict[str, Any]:
         """Wait for its end, which must be a good one; its own report."""
         status = self.process.wait(timeout_s)
         self._reader.join()

@@ -12,7 +12,7 @@ from awscrt import mqtt5
 from awsiot import mqtt5_client_builder
 from typing_extensions import Self
 
-_WAIT_S = 15.0
+WAIT_S = 60.0
 
 
 class Robot:
@@ -31,7 +31,7 @@ class Robot:
             port=config["port"],
             ca_filepath=str(folder / "root-ca.pem"),
             client_id=client_id or self.name,
-            ack_timeout_sec=10,
+            ack_timeout_sec=60,
             min_reconnect_delay_ms=60_000,
             max_reconnect_delay_ms=60_000,
             on_publish_received=lambda data: self.messages.put(
@@ -49,25 +49,25 @@ class Robot:
 
     def __exit__(self, *_: object) -> None:
         self._client.stop()
-        assert self._stopped.wait(_WAIT_S)
+        assert self._stopped.wait(WAIT_S)
 
     def online(self) -> Robot:
         """Wait until the broker has accepted the connection."""
-        assert self.connected.wait(_WAIT_S), "the broker did not accept the connection"
+        assert self.connected.wait(WAIT_S), "the broker did not accept the connection"
         return self
 
     def publish(self, topic: str, payload: bytes) -> str:
         """Publish at QoS 1; the name of the broker's reason code."""
         packet = mqtt5.PublishPacket(topic=topic, payload=payload, qos=mqtt5.QoS.AT_LEAST_ONCE)
-        answer = self._client.publish(packet).result(_WAIT_S)
+        answer = self._client.publish(packet).result(WAIT_S)
         return str(answer.puback.reason_code.name)
 
     def subscribe(self, topic_filter: str) -> str:
         """Subscribe at QoS 1; the name of the broker's reason code."""
         subscription = mqtt5.Subscription(topic_filter=topic_filter, qos=mqtt5.QoS.AT_LEAST_ONCE)
-        answer = self._client.subscribe(mqtt5.SubscribePacket(subscriptions=[subscription])).result(_WAIT_S)
+        answer = self._client.subscribe(mqtt5.SubscribePacket(subscriptions=[subscription])).result(WAIT_S)
         return str(answer.reason_codes[0].name)
 
     def next_message(self) -> tuple[str, bytes]:
         """The next message that comes in."""
-        return self.messages.get(timeout=_WAIT_S)
+        return self.messages.get(timeout=WAIT_S)

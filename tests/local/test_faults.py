@@ -7,6 +7,7 @@ a car of its own.
 
 from __future__ import annotations
 
+import itertools
 import os
 import shutil
 import socket
@@ -17,6 +18,7 @@ from pathlib import Path
 
 import pytest
 
+import contract
 from local.cloud import EmbeddedCloud
 from local.proxy import FREEZE, PASS, REFUSE, Proxy
 from station import delivery, robots
@@ -91,7 +93,7 @@ def drives(embedded: EmbeddedCloud, tmp_path_factory):
             agent = Agent(car, drain_s=90)
             meddler = threading.Thread(target=fault, args=(proxy, over))
             meddler.start()
-            agent.process.wait(DRIVE_S + 120)
+            agent.process.wait(DRIVE_S + 300)
             over.set()
             meddler.join()
             finished[name] = (car.robot, agent, agent.report())
@@ -118,7 +120,7 @@ def test_fault_of_the_network_loses_nothing(embedded, drives, name):
 def test_live_lane_shows_now_while_the_backlog_drains(embedded, bundle, proxy, tmp_path):
     from station.listener import Listener
 
-    log = counter_log(tmp_path / "counter.csv", 50)
+    log = counter_log(tmp_path / "counter.csv", 600)
     car = bundle(**_settings(log, proxy.port))
     with Listener(
         subscribe_key=embedded.subscribe_key,
@@ -129,35 +131,38 @@ def test_live_lane_shows_now_while_the_backlog_drains(embedded, bundle, proxy, t
     ) as listener:
         proxy.mode = REFUSE
         agent = Agent(car)
-        until(lambda: len(proxy.attempts) >= 2, seconds=60)
-        threading.Event().wait(8)
+        until(lambda: agent.status().get("spool", {}).get("samples", 0) >= 6 * RATE_HZ)
+        passed_us = time.time_ns() // 1000
         proxy.mode = PASS
-        agent.report()
-    # What was heard was new when it left the car, and nothing of the outage was shown late.
-    assert listener.heard
-    assert max(heard.delay_ms for heard in listener.heard) < 2_500
-    assert counted(embedded, car.robot) == list(range(50 * RATE_HZ))
+        until(lambda: len(listener.heard) >= 10)
+        agent.stop()
+        driven = agent.report()["streams"]["vesc"]["samples"]
+    # What was heard was new when it left the car, and nothing of the outage was shown.
+    oldest_us = 1000 * contract.LIVE_MAX_AGE_MS
+    assert min(heard.hops["sent_us"] for heard in listener.heard) > passed_us
+    assert max(heard.hops["sent_us"] - heard.t_us for heard in listener.heard) < oldest_us
+    assert counted(embedded, car.robot) == list(range(driven))
 
 
 @pytest.mark.parametrize("broker", [PASS, REFUSE])
 def test_killed_agent_goes_on_where_it_was(embedded, bundle, proxy, tmp_path, broker):
     """What was in a closed batch survives; at most the open batch, a second, goes with the process."""
-    log = counter_log(tmp_path / "counter.csv", 12)
+    log = counter_log(tmp_path / "counter.csv", 10)
     car = bundle(**_settings(log, proxy.port))
     first = Agent(car)
     until(lambda: first.said("connected to"))
     proxy.mode = broker
-    began = time.monotonic()
-    threading.Event().wait(6)
+    taken = until(lambda: first.status().get("streams", {}).get("vesc", {}).get("samples", 0))
+    # The second's batch closes and is written meanwhile.
+    threading.Event().wait(3)
     first.kill()
-    driven = (time.monotonic() - began) * RATE_HZ
     proxy.mode = PASS
     Agent(car).report()
     found = counted(embedded, car.robot)
     restart = found.index(0, 1)
     assert found[:restart] == list(range(restart))
-    assert restart >= driven - 1.5 * RATE_HZ
-    assert found[restart:] == list(range(12 * RATE_HZ))
+    assert restart >= taken
+    assert found[restart:] == list(range(10 * RATE_HZ))
 
 
 @pytest.mark.skipif(FAKETIME is None, reason="libfaketime is not installed: apt install faketime")
@@ -182,6 +187,8 @@ def test_clock_set_back_an_hour(embedded, bundle, tmp_path):
     batches = list(delivery.batches(embedded.cloud, car.robot, "vesc"))
     values = [int(v) for batch in sorted(batches, key=lambda b: b.seq) for v in batch.columns["speed"]]
     assert values == list(range(10 * RATE_HZ))
+    times = [batch.t_us for batch in sorted(batches, key=lambda b: b.seq)]
+    assert any(later < earlier - 3_000_000_000 for earlier, later in itertools.pairwise(times))
     assert report["spool"]["left_samples"] == 0
 
 
@@ -200,7 +207,7 @@ def test_disk_full_and_free_again(embedded, bundle, proxy, tmp_path):
         filler = disk / "filler"
         with pytest.raises(OSError, match="No space left"):
             filler.write_bytes(bytes(4 * 1024 * 1024))
-        until(lambda: agent.status().get("alarms"), seconds=30)
+        until(lambda: agent.status().get("alarms"))
         filler.unlink()
         proxy.mode = PASS
         agent.report()
@@ -238,7 +245,7 @@ def test_name_that_does_not_resolve_at_boot(embedded, bundle, tmp_path):
     hosts.write_text("127.0.0.1 localhost\n")
     mount = f'mount --bind {hosts} /etc/hosts && exec "$@"'
     agent = Agent(car, before=["unshare", "--mount", "sh", "-c", mount, "sh"])
-    until(lambda: agent.said("does not resolve"), seconds=30)
+    until(lambda: agent.said("does not resolve"))
     with hosts.open("a") as file:
         file.write(f"127.0.0.1 {name}\n")
     agent.report()

@@ -16,14 +16,14 @@ from contract import ROBOT, claim_name
 from local.cloud import ROOT
 from station import claims, delivery, robots
 from tests.local.conftest import run_agent, until
-from tests.local.robot import Robot
+from tests.local.robot import WAIT_S, Robot
 
 AGENT = Path(sys.executable).parent / "iort-agent"
 
 
 def command(*arguments: object, status: int = 0) -> subprocess.CompletedProcess[str]:
     done = subprocess.run(
-        [AGENT, *map(str, arguments)], cwd=ROOT, capture_output=True, text=True, timeout=120, check=False
+        [AGENT, *map(str, arguments)], cwd=ROOT, capture_output=True, text=True, timeout=300, check=False
     )
     assert done.returncode == status, done.stdout + done.stderr
     return done
@@ -75,7 +75,7 @@ def test_a_lasting_claim_is_good_for_provisioning_only(embedded, tmp_path):
     for name in ("certificate.pem", "private.key"):
         (tmp_path / f"claim-{name}").replace(tmp_path / name)
     with Robot(tmp_path, client_id="lasting") as robot:
-        assert robot.refused.wait(15)
+        assert robot.refused.wait(WAIT_S)
     with Robot(tmp_path, client_id=f"{claim_name()}-x") as robot:
         assert robot.online().publish("dt/iort/lasting/vesc", b"{}") == "NOT_AUTHORIZED"
         assert robot.subscribe("#") == "NOT_AUTHORIZED"
@@ -157,7 +157,7 @@ def test_renewal_while_the_agent_runs(embedded, bundle, tmp_path):
             )
         finally:
             agent.terminate()
-            assert agent.wait(30) == 0
+            assert agent.wait(120) == 0
     sent = json.loads(report.read_text())["streams"]["vesc"]["samples"]
     until(lambda: delivery.delivery(embedded.cloud, car.robot, "vesc").samples_stored == sent)
 

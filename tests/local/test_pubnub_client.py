@@ -7,7 +7,6 @@ import json
 import logging
 import socket
 import threading
-import time
 from collections.abc import Iterator
 from contextlib import contextmanager
 
@@ -60,12 +59,11 @@ class Everything:
 
 
 def refused(publisher):
-    """The error of a publish, and how long it took."""
-    began = time.monotonic()
+    """The error of a publish. It waits a second for a connection and an answer each (test_live)."""
     with pytest.raises(PublishError) as caught:
         publisher.publish("iort.car", MESSAGE)
     assert "c-ours" not in str(caught.value)
-    return str(caught.value), time.monotonic() - began
+    return str(caught.value)
 
 
 def test_a_publish_arrives(standin, publisher):
@@ -101,30 +99,26 @@ def test_a_message_too_large_is_refused_here_or_there(standin, publisher):
 
 
 def test_keys_that_are_refused_are_not_shown(standin, publisher):
-    text, _ = refused(publisher(standin.origin, publish_key="other-c-ours"))
+    text = refused(publisher(standin.origin, publish_key="other-c-ours"))
     assert text == "PubNubException, status 400"
 
 
-def test_a_dead_server_costs_a_second_at_most_and_its_return_is_noticed(publisher):
+def test_a_dead_server_is_an_error_and_its_return_is_noticed(publisher):
     with PubNubStandIn(**KEYS) as standin:
         one = publisher(standin.origin)
         one.publish("iort.car", MESSAGE)
         port = standin.port
     for _ in range(2):
-        text, took_s = refused(one)
-        assert text.startswith("PubNubException")
-        assert took_s < 3
+        assert refused(one).startswith("PubNubException")
     with PubNubStandIn(port=port, **KEYS) as standin:
         one.publish("iort.car", MESSAGE)
         assert standin.published == 1
 
 
-def test_a_server_that_takes_and_never_answers_costs_a_second(publisher):
+def test_a_server_that_takes_and_never_answers_is_given_up(publisher):
     with socket.create_server(("127.0.0.1", 0)) as silent:
         one = publisher(f"127.0.0.1:{silent.getsockname()[1]}")
-        text, took_s = refused(one)
-        assert text.startswith("PubNubException")
-        assert 0.9 < took_s < 4
+        assert refused(one).startswith("PubNubException")
 
 
 @contextmanager

@@ -24,7 +24,7 @@ def driving(bundle: Any) -> Iterator[None]:
             yield
         finally:
             agent.terminate()
-            assert agent.wait(30) == 0
+            assert agent.wait(120) == 0
 
 
 class Shadow:

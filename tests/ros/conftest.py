@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import os
 import shutil
-import socket
 import subprocess
 import threading
 import time
@@ -20,10 +19,11 @@ from typing import Any
 import pytest
 
 from bench.ros_graph import ROOT, SYSTEM_PYTHON, python_with_rospy
+from tests.ports import free_port
 
 HERE = Path(__file__).resolve().parent
 PACKAGES = "python3-rospy python3-rosmaster python3-std-msgs python3-geometry-msgs"
-WAIT_S = 30.0
+WAIT_S = 120.0
 
 
 @pytest.fixture(scope="session")
@@ -38,12 +38,6 @@ def ros_python() -> str:
     if tried.returncode:
         pytest.skip(f"{python} cannot import ROS 1 (apt install {PACKAGES}): {tried.stderr.splitlines()[-1]}")
     return python_with_rospy()
-
-
-def free_port() -> int:
-    with socket.socket() as sock:
-        sock.bind(("127.0.0.1", 0))
-        return int(sock.getsockname()[1])
 
 
 class Process:

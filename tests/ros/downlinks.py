@@ -72,7 +72,9 @@ for seq, line in zip(itertools.count(), sys.stdin):
     else:
         lease, _, message = rest.partition(" ")
         now_us = clock.now_us()
-        command = contract.Command("feedbeef", started_us, seq, now_us, 500, json.loads(message), int(lease))
+        command = contract.Command(
+            "feedbeef", started_us, seq, now_us, 60_000, json.loads(message), int(lease)
+        )
         uplink.deliver("cmd/iort/car1/drive", contract.encode_command(command))
 downlink.halt()
 uplink.stop(1)

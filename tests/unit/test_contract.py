@@ -13,14 +13,11 @@ from dataclasses import fields, replace
 from decimal import Decimal
 
 import pytest
-from hypothesis import HealthCheck, assume, example, given, settings
+from hypothesis import assume, example, given, settings
 from hypothesis import strategies as st
 
 import contract
 from contract import Batch, ContractError, LiveSample
-
-settings.register_profile("contract", deadline=None, suppress_health_check=[HealthCheck.too_slow])
-settings.load_profile("contract")
 
 LIMIT_US = 2**53 - 1
 BOOT = "0123abcd"

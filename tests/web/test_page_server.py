@@ -42,7 +42,7 @@ def ask(
     page: PageServer, path: str, method: str = "GET", headers: dict[str, str] | None = None
 ) -> tuple[http.client.HTTPResponse, bytes]:
     address = urlsplit(page.url)
-    connection = http.client.HTTPConnection(address.hostname or "", address.port, timeout=5)
+    connection = http.client.HTTPConnection(address.hostname or "", address.port, timeout=60)
     connection.request(method, path, headers=headers or {})
     answer = connection.getresponse()
     body = answer.read()
