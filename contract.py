@@ -610,8 +610,9 @@ class Command:
 
     Commands are in the order of ``started_us``, ``session``, ``seq``: ``session`` names an operator's
     session, which began at ``started_us``, and ``seq`` numbers its commands; a later session takes
-    over. After ``valid_ms`` from ``sent_us`` the command is stale. ``lease_ms``, without which a motion
-    is refused, is how long it may go on until the next one. ``message`` is the ROS message.
+    over. After ``valid_ms`` from ``sent_us``, by the cloud's clock, the command is stale. ``lease_ms``,
+    without which a motion is refused, is how long it may go on until the next one. ``message`` is the
+    ROS message.
     """
 
     session: str
@@ -662,12 +663,14 @@ def decode_command(payload: bytes | str) -> Command:
 
 @dataclass(frozen=True)
 class FleetMessage:
-    """A robot's ROS message for other robots: the newest only, ``seq`` growing within a ``boot``."""
+    """A robot's ROS message for other robots: the newest only, ``seq`` growing within a ``boot``.
+    ``offset_us`` is what to add to ``sent_us`` to have the cloud's time, where the robot knows it."""
 
     boot: str
     seq: int
     sent_us: int
     message: Mapping[str, Any]
+    offset_us: int | None = None
 
 
 def encode_fleet(fleet: FleetMessage) -> bytes:
@@ -677,6 +680,7 @@ def encode_fleet(fleet: FleetMessage) -> bytes:
         "boot": _check_header(fleet.boot, fleet.seq, 0),
         "seq": fleet.seq,
         "sent_us": _check_time(fleet.sent_us, "sent_us"),
+        **_offset_us(fleet.offset_us),
     }
     return _message_json({**envelope, "message": fleet.message})
 
@@ -687,7 +691,9 @@ def decode_fleet(payload: bytes | str) -> FleetMessage:
     seq = _integer(envelope, "seq")
     boot = _check_header(envelope.get("boot"), seq, 0)
     sent_us = _check_time(_integer(envelope, "sent_us"), "sent_us")
-    return FleetMessage(boot, seq, sent_us, envelope["message"])
+    offset_us = _integer(envelope, "offset_us") if "offset_us" in envelope else None
+    _offset_us(offset_us)
+    return FleetMessage(boot, seq, sent_us, envelope["message"], offset_us)
 
 
 def _check_command(command: Command) -> None:

@@ -80,7 +80,12 @@ class Agent:
             **shared,
         )
         self._downlink = make_downlink(
-            config.downlink, config.share, sources=config.sources, boot=self.boot, **shared
+            config.downlink,
+            config.share,
+            sources=config.sources,
+            boot=self.boot,
+            offset=self._offset.known,
+            **shared,
         )
         self._uploads = make_uploads(config.files, root_ca=config.root_ca, **shared)
         self._claims = self._make_claims()

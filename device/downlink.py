@@ -30,6 +30,7 @@ from device.allowance import Allowance
 from device.clock import Clock
 from device.errors import ConfigError, MessageError, UplinkError
 from device.leases import Leases, Limits
+from device.offset import Offset
 from device.ros1_json import decode, encode
 from device.ros1_node import DEFAULT_NODE
 from device.ros1_publish import Graph, Ros1Graph
@@ -167,6 +168,7 @@ def make_downlink(
 
 class Downlink:
     """Made before the uplink starts; `start` begins, `halt` stops what moves, `close` ends it.
+    ``offset`` is the cloud's clock against ours, where it is known well enough (`ClockOffset.known`).
 
     Raises `SourceError` where a ROS type is not installed, `ConfigError` where a stop is not of its type.
     """
@@ -183,8 +185,10 @@ class Downlink:
         clock: Clock,
         allowance: Allowance,
         graph: Graph,
+        offset: Callable[[], Offset | None],
     ) -> None:
         self._robot = robot
+        self._offset = offset
         self._clock = clock
         self._graph = graph
         self._seldom = Seldom(_log, clock)
@@ -277,8 +281,15 @@ class Downlink:
         except (ContractError, MessageError) as error:
             self._refuse(message.topic, "malformed", str(error))
             return
+        offset = self._offset()
+        wrong_us = None
+        if offset is not None:
+            now_us += round(offset.offset_ms * 1000)
+            wrong_us = round(offset.uncertainty_ms * 1000)
         with self._lock:
-            refusal = command.leases.offer(offered, now_us=now_us, now=self._clock.monotonic())
+            refusal = command.leases.offer(
+                offered, now_us=now_us, wrong_us=wrong_us, now=self._clock.monotonic()
+            )
             if refusal is None:
                 if self._graph.publish(command.config.topic, data):
                     command.passed += 1
@@ -286,7 +297,8 @@ class Downlink:
                     refusal = "no_ros"
         if refusal is not None:
             ago_s = (now_us - offered.sent_us) / 1e6
-            self._refuse(message.topic, refusal, f"{refusal.replace('_', ' ')}, sent {ago_s:.3f} s ago")
+            by = f"to within {wrong_us / 1e6:.3f} s" if wrong_us is not None else "by its own clock"
+            self._refuse(message.topic, refusal, f"{refusal.replace('_', ' ')}, sent {ago_s:.3f} s ago, {by}")
         self._wake.set()
 
     def _on_connection(self, connected: bool) -> None:  # noqa: FBT001 - as the uplink calls it
@@ -322,6 +334,10 @@ class Downlink:
         except (ContractError, MessageError) as error:
             self._refuse(f"{FLEET} {topic.name}", "malformed", f"{topic.robot}: {error}")
             return
+        offset = self._offset()
+        if offset is not None and heard.offset_us is not None:
+            # Both clocks against the cloud's; otherwise they must do as they are.
+            now_us += round(offset.offset_ms * 1000) - heard.offset_us
         refusal = fleet.refusal(topic.robot, heard, now_us)
         if refusal is None:
             ros_topic = fleet.config.topic.replace(_ROBOT, topic.robot.replace("-", "_"))
@@ -356,7 +372,7 @@ class Downlink:
         if now - at > contract.FLEET_MAX_AGE_MS / 1000 or not self._uplink.connected():
             return
         try:
-            payload = shared.encode(header, data, self._clock.now_us())
+            payload = shared.encode(header, data, self._clock.now_us(), self._offset())
         except (ContractError, MessageError) as error:
             self._refuse(f"share {shared.ros_topic}", "cannot_be_sent", str(error))
             return
@@ -418,14 +434,15 @@ class _Share:
         self._boot = boot
         self._definitions: dict[tuple[str, str], Definition] = {}
 
-    def encode(self, header: Mapping[str, str], data: bytes, now_us: int) -> bytes:
+    def encode(self, header: Mapping[str, str], data: bytes, now_us: int, offset: Offset | None) -> bytes:
         key = (header.get("type", ""), header.get("message_definition", ""))
         if key not in self._definitions:
             if len(self._definitions) >= _MAX_DEFINITIONS:
                 self._definitions.clear()
             self._definitions[key] = parse(*key)
         message = decode(self._definitions[key], data)
-        return contract.encode_fleet(FleetMessage(self._boot, self.seq, now_us, message))
+        offset_us = round(offset.offset_ms * 1000) if offset is not None else None
+        return contract.encode_fleet(FleetMessage(self._boot, self.seq, now_us, message, offset_us))
 
 
 def _ignore(_: UplinkError | None) -> None:

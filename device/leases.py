@@ -5,8 +5,10 @@ robot takes his word for it: when it ends unrenewed, a stop is due, and is due a
 a single message may find a node that is just starting. Then there is silence, so that whoever drives
 the robot next (a joystick, a planner on board) is not held down for ever.
 
-Only what is later than everything that has passed may pass. Times of commands are compared with the
-robot's wall clock; leases run on the clock that never jumps.
+Only what is later than everything that has passed may pass. Commands are timed by the cloud's clock, and so
+is their age, which the robot knows to within the uncertainty of its measured offset (`device.offset`): the
+oldest that a command may be is what counts. A robot that does not know what time it is in the cloud lets
+nothing move it. Leases run on the clock that never jumps.
 """
 
 from __future__ import annotations
@@ -19,12 +21,13 @@ from contract import Command
 STOP_REPEATS = 4
 STOP_REPEAT_S = 0.25
 
-STALE, EARLY, REPEATED, SUPERSEDED, NO_LEASE, CLOSED = (
+STALE, EARLY, REPEATED, SUPERSEDED, NO_LEASE, CLOCK_UNKNOWN, CLOSED = (
     "stale",
     "from_the_future",
     "repeated_or_out_of_order",
     "from_an_earlier_session",
     "without_lease",
+    "clock_offset_unknown",
     "shutting_down",
 )
 
@@ -49,9 +52,12 @@ class Leases:
         self._stops = 0
         self._next_stop = 0.0
 
-    def offer(self, command: Command, *, now_us: int, now: float) -> str | None:
-        """None if the command may pass, which counts as having passed; otherwise why not."""
-        refusal = self._refusal(command, now_us)
+    def offer(self, command: Command, *, now_us: int, wrong_us: int | None, now: float) -> str | None:
+        """None if the command may pass, which counts as having passed; otherwise why not.
+
+        ``now_us`` is the cloud's time, to within ``wrong_us``, or the robot's own where that is None.
+        """
+        refusal = self._refusal(command, now_us, wrong_us)
         if refusal is not None:
             return refusal
         self._last = command
@@ -87,11 +93,13 @@ class Leases:
             return self._ends
         return self._next_stop if self._stops else None
 
-    def _refusal(self, command: Command, now_us: int) -> str | None:
+    def _refusal(self, command: Command, now_us: int, wrong_us: int | None) -> str | None:
         limits, last = self._limits, self._last
-        age_us = now_us - command.sent_us
+        age_us = now_us - command.sent_us + (wrong_us or 0)
         if self._closed:
             return CLOSED
+        if limits.lease_s is not None and wrong_us is None:
+            return CLOCK_UNKNOWN
         if age_us > min(command.valid_ms * 1000, limits.max_age_s * 1e6):
             return STALE
         if age_us < -limits.max_ahead_s * 1e6:

@@ -63,12 +63,15 @@ class ClockOffset:
             round(best.uncertainty_ms(now), 3),
         )
 
-    def known_us(self) -> int | None:
-        """The offset in microseconds, if it is known well enough to judge by."""
+    def known(self) -> Offset | None:
+        """The offset, if it is known well enough to judge by (`contract.CLOCK_MAX_UNCERTAINTY_MS`)."""
         found = self.estimate()
-        if found is None or found.uncertainty_ms > CLOCK_MAX_UNCERTAINTY_MS:
-            return None
-        return round(found.offset_ms * 1000)
+        return found if found is not None and found.uncertainty_ms <= CLOCK_MAX_UNCERTAINTY_MS else None
+
+    def known_us(self) -> int | None:
+        """The offset of `known` in microseconds."""
+        found = self.known()
+        return round(found.offset_ms * 1000) if found is not None else None
 
 
 def _replaces(new: _Seen, old: _Seen) -> bool:

@@ -69,6 +69,8 @@ class Process:
             with self._news:
                 lines.append(line.rstrip("\n"))
                 self._news.notify_all()
+        with self._news:
+            self._news.notify_all()  # it may have ended
 
     def until(self, condition: Callable[[], Any], what: str) -> Any:
         """Wait for output that makes the condition true."""

@@ -20,6 +20,7 @@ from device.clock import SystemClock
 from device.dispatch import Dispatcher
 from device.downlink import DownlinkConfig, make_downlink, share_rule
 from device.loopback import Loopback
+from device.offset import Offset
 from device.ros1_node import DEFAULT_NODE
 from device.ros1_publish import Ros1Graph
 from device.schema import Where, load
@@ -47,6 +48,7 @@ downlink = make_downlink(
     uplink=uplink,
     clock=clock,
     allowance=Allowance(clock),
+    offset=lambda: Offset(0.0, 0.0),
 )
 assert downlink is not None
 uplink.start()

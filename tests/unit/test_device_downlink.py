@@ -22,6 +22,7 @@ from device.dispatch import Dispatcher
 from device.downlink import Downlink, DownlinkConfig, share_rule
 from device.errors import ConfigError, MessageError, SourceError
 from device.loopback import Loopback
+from device.offset import Offset
 from device.ros1_json import decode, encode
 from device.ros1_types import Definition, parse
 from device.schema import Where, load
@@ -122,6 +123,7 @@ class Rig:
         self.dispatcher = Dispatcher()
         self.uplink = uplink or Loopback(self.clock, self.dispatcher)
         self.graph = FakeGraph()
+        self.offset: Offset | None = Offset(0.0, 0.0)
         where = Where(Path("car.yaml"))
         self.downlink = Downlink(
             load(DownlinkConfig, {**CONFIG, **config}, where),
@@ -133,6 +135,7 @@ class Rig:
             clock=self.clock,
             allowance=Allowance(self.clock),
             graph=self.graph,
+            offset=lambda: self.offset,
         )
         if uplink is None:
             self.uplink.connect()
@@ -210,6 +213,31 @@ def test_motion_is_refused_when_it_is_not_for_now(changes: Any, reason: str) -> 
     rig.send({"data": 1.0}, **changes)
     assert rig.graph.published == []
     assert rig.refused() == {f"cmd/iort/car1/speed {reason}": 1}
+
+
+def test_a_deadline_is_judged_by_the_clouds_clock_and_what_may_be_too_old_is() -> None:
+    rig = Rig()
+    for hour in (-1, 1):
+        # The car's clock is an hour off, and knows it to within a tenth of a second.
+        rig.offset = Offset(hour * 3_600_000.0, 100.0)
+        cloud_us = rig.clock.now_us() + hour * 3_600_000_000
+        for age_us in (0, 400_000, 400_001):
+            sent_us = cloud_us - age_us
+            rig.send({"data": 1.0}, started_us=T0 - 7_200_000_000, sent_us=sent_us, valid_ms=500)
+    assert len(rig.graph.published) == 4
+    assert rig.refused() == {"cmd/iort/car1/speed stale": 2}
+
+
+def test_a_car_that_does_not_know_the_clouds_time_does_not_move_but_speaks(
+    caplog: pytest.LogCaptureFixture,
+) -> None:
+    rig = Rig()
+    rig.offset = None
+    rig.send({"data": 1.0})
+    rig.send({"data": "hello"}, name="say", lease_ms=None)
+    assert [topic for topic, _ in rig.graph.published] == ["/say"]
+    assert rig.refused() == {"cmd/iort/car1/speed clock_offset_unknown": 1}
+    assert "clock offset unknown, sent 0.000 s ago, by its own clock" in caplog.text
 
 
 def test_a_repeated_delivery_passes_once() -> None:
@@ -356,10 +384,17 @@ def test_two_robots_share_their_poses() -> None:
 
 
 def fleet(
-    rig: Rig, robot: str, seq: int, *, boot: str = "0badcafe", age_us: int = 0, message: Any = None
+    rig: Rig,
+    robot: str,
+    seq: int,
+    *,
+    boot: str = "0badcafe",
+    age_us: int = 0,
+    message: Any = None,
+    offset_us: int | None = None,
 ) -> None:
     sent_us = rig.clock.now_us() - age_us
-    payload = contract.encode_fleet(FleetMessage(boot, seq, sent_us, message or POSE_MESSAGE))
+    payload = contract.encode_fleet(FleetMessage(boot, seq, sent_us, message or POSE_MESSAGE, offset_us))
     rig.uplink.deliver(f"fleet/iort/{robot}/pose", payload)
     rig.dispatcher.run_pending()
 
@@ -372,6 +407,16 @@ def test_of_another_robot_only_what_is_new_passes() -> None:
     assert len(rig.graph.published) == 3
     assert rig.refused() == {"fleet pose repeated_or_out_of_order": 1, "fleet pose stale": 1}
     assert rig.downlink.report()["fleet"] == {"pose": {"car2": 3}}
+
+
+def test_two_clocks_that_are_off_are_compared_by_the_clouds() -> None:
+    rig = Rig()
+    rig.offset = Offset(3_600_000.0, 1.0)
+    # Theirs is an hour ahead of ours, and both of them know.
+    for seq, age_us in enumerate((0, 2_000_000, 2_000_001)):
+        fleet(rig, "car2", seq, age_us=age_us - 3_600_000_000, offset_us=0)
+    assert rig.downlink.report()["fleet"] == {"pose": {"car2": 2}}
+    assert rig.refused() == {"fleet pose stale": 1}
 
 
 def test_two_robots_of_one_ros_name_and_too_many() -> None:
