@@ -11,6 +11,8 @@ from typing import Any
 import pytest
 from hypothesis import HealthCheck, settings
 
+from tests.browser import browser, open_page  # noqa: F401 (fixtures)
+
 # How long an example takes says something about the machine only.
 settings.register_profile("iort", deadline=None, suppress_health_check=[HealthCheck.too_slow])
 settings.load_profile("iort")
@@ -26,8 +28,11 @@ GROUPS = {
     "tests/local/": "cloud",
     "tests/ros/test_two_robots.py": "cloud",
     "tests/stacks/": "app",
+    "tests/unit/test_station_data.py": "app",
     "tests/unit/test_summarize.py": "app",
     "tests/unit/test_tables.py": "app",
+    "tests/unit/test_upload.py": "app",
+    "tests/web/": "page",
 }
 
 
@@ -39,6 +44,7 @@ def group(nodeid: str) -> str:
     return nodeid if nodeid.startswith("tests/ros/") else nodeid.split("::", 1)[0]
 
 
+@pytest.hookimpl(optionalhook=True)
 def pytest_xdist_make_scheduler(config: pytest.Config, log: Any) -> Any:
     """Under `make test`, groups are spread over the workers. (Marks cannot say it: of xdist 3.8, they
     no longer reach the scheduler under pytest 9.)"""
@@ -49,8 +55,6 @@ def pytest_xdist_make_scheduler(config: pytest.Config, log: Any) -> Any:
             return group(nodeid)
 
     return Groups(config, log)
-
-from tests.browser import browser, open_page  # noqa: F401 (fixtures)
 
 
 def skips_fail() -> bool:
