@@ -76,6 +76,8 @@ AGENT_STREAM = "agent"
 OWN_STREAMS = frozenset({RTT_STREAM, AGENT_STREAM})
 # The named shadow of a robot's thing that carries the agent's settings.
 SHADOW = "agent"
+# Where the shadow says what became of the commands that asked for an answer.
+COMMANDS, ACCEPTED = "commands", "accepted"
 
 
 class Topic(NamedTuple):
@@ -612,7 +614,8 @@ class Command:
     session, which began at ``started_us``, and ``seq`` numbers its commands; a later session takes
     over. After ``valid_ms`` from ``sent_us``, by the cloud's clock, the command is stale. ``lease_ms``,
     without which a motion is refused, is how long it may go on until the next one. ``message`` is the
-    ROS message.
+    ROS message. With ``answer`` the robot says in its shadow what became of it: `COMMANDS`, name,
+    ``session``, ``seq`` and ``outcome``, `ACCEPTED` or why not.
     """
 
     session: str
@@ -622,6 +625,7 @@ class Command:
     valid_ms: int
     message: Mapping[str, Any]
     lease_ms: int | None = None
+    answer: bool = False
 
     @property
     def order(self) -> tuple[int, str, int]:
@@ -642,6 +646,8 @@ def encode_command(command: Command) -> bytes:
     }
     if command.lease_ms is not None:
         envelope["lease_ms"] = command.lease_ms
+    if command.answer:
+        envelope["answer"] = True
     return _message_json({**envelope, "message": command.message})
 
 
@@ -656,6 +662,7 @@ def decode_command(payload: bytes | str) -> Command:
         valid_ms=_integer(envelope, "valid_ms"),
         message=envelope["message"],
         lease_ms=_integer(envelope, "lease_ms") if "lease_ms" in envelope else None,
+        answer=envelope.get("answer", False),
     )
     _check_command(command)
     return command
@@ -699,6 +706,8 @@ def decode_fleet(payload: bytes | str) -> FleetMessage:
 def _check_command(command: Command) -> None:
     _checked(_BOOT, command.session, "session", "8 to 32 of 0-9 a-f")
     _check_header(command.session, command.seq, 0)
+    if not isinstance(command.answer, bool):
+        raise ContractError(f"answer {_show(command.answer)}: allowed is true or false")
     if _check_time(command.started_us, "started_us") > _check_time(command.sent_us, "sent_us"):
         raise ContractError("the command was sent before its session started")
     for name, value, most in (

@@ -79,12 +79,24 @@ class Agent:
             on_stamp=self._offset.add,
             **shared,
         )
+        self._tuning = from_config(config)
+        self._remote = Remote(
+            robot=config.robot,
+            base=self._tuning,
+            apply=self.tune,
+            known_fields=lambda: dict(self._fields),
+            version=version("iort"),
+            uplink=uplink,
+            clock=clock,
+            allowance=allowance,
+        )
         self._downlink = make_downlink(
             config.downlink,
             config.share,
             sources=config.sources,
             boot=self.boot,
             offset=self._offset.known,
+            answer=self._remote.answer,
             **shared,
         )
         self._uploads = make_uploads(config.files, root_ca=config.root_ca, **shared)
@@ -99,17 +111,6 @@ class Agent:
         self._rates = Rates(clock)
         self._metrics = AgentMetrics(
             clock=clock, spool=spool, uplink=uplink, offset=self._offset, uploads=self._uploads
-        )
-        self._tuning = from_config(config)
-        self._remote = Remote(
-            robot=config.robot,
-            base=self._tuning,
-            apply=self.tune,
-            known_fields=lambda: dict(self._fields),
-            version=version("iort"),
-            uplink=uplink,
-            clock=clock,
-            allowance=allowance,
         )
         self.tune(self._tuning)
 

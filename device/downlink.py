@@ -22,10 +22,10 @@ import logging
 import re
 import threading
 from dataclasses import dataclass
-from typing import Any, Callable, Iterable, Mapping, Sequence
+from typing import Any, Callable, Iterable, Mapping, Optional, Sequence
 
 import contract
-from contract import CMD, FLEET, ContractError, FleetMessage
+from contract import CMD, FLEET, Command, ContractError, FleetMessage
 from device.allowance import Allowance
 from device.clock import Clock
 from device.errors import ConfigError, MessageError, UplinkError
@@ -47,6 +47,9 @@ _IDLE_S = 1.0
 _MAX_ROBOTS = 64
 _MAX_DEFINITIONS = 8
 _ROBOT = "{robot}"
+
+# Takes a command's name, the command and None or why it was refused.
+Answer = Callable[[str, Command, Optional[str]], None]
 
 
 def _ros_type(value: str) -> str:
@@ -168,7 +171,8 @@ def make_downlink(
 
 class Downlink:
     """Made before the uplink starts; `start` begins, `halt` stops what moves, `close` ends it.
-    ``offset`` is the cloud's clock against ours, where it is known well enough (`ClockOffset.known`).
+    ``offset`` is the cloud's clock against ours, where it is known well enough (`ClockOffset.known`);
+    ``answer`` is told what became of the commands that ask for it.
 
     Raises `SourceError` where a ROS type is not installed, `ConfigError` where a stop is not of its type.
     """
@@ -186,8 +190,10 @@ class Downlink:
         allowance: Allowance,
         graph: Graph,
         offset: Callable[[], Offset | None],
+        answer: Answer,
     ) -> None:
         self._robot = robot
+        self._answer = answer
         self._offset = offset
         self._clock = clock
         self._graph = graph
@@ -276,11 +282,23 @@ class Downlink:
         command = self._commands[message.topic]
         try:
             offered = contract.decode_command(message.payload)
-            now_us = self._clock.now_us()
-            data = encode(command.definition, offered.message, now_us=now_us, partial=command.config.partial)
-        except (ContractError, MessageError) as error:
+        except ContractError as error:
             self._refuse(message.topic, "malformed", str(error))
             return
+        refusal = self._offer(command, offered)
+        if refusal is not None:
+            self._refuse(message.topic, *refusal)
+        if offered.answer:
+            self._answer(command.name, offered, refusal[1] if refusal is not None else None)
+        self._wake.set()
+
+    def _offer(self, command: _Command, offered: Command) -> tuple[str, str] | None:
+        """Publish the command, or say why not: the reason in a word, and for a person."""
+        now_us = self._clock.now_us()
+        try:
+            data = encode(command.definition, offered.message, now_us=now_us, partial=command.config.partial)
+        except MessageError as error:
+            return "malformed", str(error)
         offset = self._offset()
         wrong_us = None
         if offset is not None:
@@ -293,13 +311,11 @@ class Downlink:
             if refusal is None:
                 if self._graph.publish(command.config.topic, data):
                     command.passed += 1
-                else:
-                    refusal = "no_ros"
-        if refusal is not None:
-            ago_s = (now_us - offered.sent_us) / 1e6
-            by = f"to within {wrong_us / 1e6:.3f} s" if wrong_us is not None else "by its own clock"
-            self._refuse(message.topic, refusal, f"{refusal.replace('_', ' ')}, sent {ago_s:.3f} s ago, {by}")
-        self._wake.set()
+                    return None
+                refusal = "no_ros"
+        ago_s = (now_us - offered.sent_us) / 1e6
+        by = f"to within {wrong_us / 1e6:.3f} s" if wrong_us is not None else "by its own clock"
+        return refusal, f"{refusal.replace('_', ' ')}, sent {ago_s:.3f} s ago, {by}"
 
     def _on_connection(self, connected: bool) -> None:  # noqa: FBT001 - as the uplink calls it
         if connected:

@@ -12,7 +12,7 @@ import json
 import logging
 from typing import Any, Callable, Mapping
 
-from contract import AGENT_VERSION, SHADOW
+from contract import ACCEPTED, AGENT_VERSION, COMMANDS, SHADOW, Command
 from device.allowance import Allowance
 from device.clock import Clock
 from device.errors import UplinkError
@@ -60,6 +60,7 @@ class Remote:
         }
         self._desired: dict[str, Any] = {}
         self._rejected: dict[str, dict[str, Any]] = {}
+        self._answers: dict[str, dict[str, Any]] = {}
         # What the shadow holds of ours, as far as known; None before it was fetched.
         self._reported: dict[str, Any] | None = None
         self._version = 0
@@ -83,6 +84,12 @@ class Remote:
                 self._publish(self._update, json.dumps({"state": {"reported": change}}).encode())
             else:
                 self._report_at = None
+
+    def answer(self, name: str, command: Command, refusal: str | None) -> None:
+        """Report what became of a command; the newest of each name counts."""
+        outcome = ACCEPTED if refusal is None else _quoted(refusal)
+        self._answers[name] = {"session": command.session, "seq": command.seq, "outcome": outcome}
+        self._report_at = self._clock.monotonic()
 
     def _on_connection(self, connected: bool) -> None:  # noqa: FBT001 - the uplink's signature
         self._fetch_at = self._clock.monotonic() if connected else None
@@ -152,7 +159,12 @@ class Remote:
         rejected = {
             name: {**refusal, "value": _quoted(refusal["value"])} for name, refusal in self._rejected.items()
         }
-        return {**self.tuning.as_document(), "rejected": rejected, AGENT_VERSION: self._agent_version}
+        return {
+            **self.tuning.as_document(),
+            "rejected": rejected,
+            COMMANDS: dict(self._answers),
+            AGENT_VERSION: self._agent_version,
+        }
 
     def _publish(self, topic: str, payload: bytes) -> None:
         self._allowance.spend(topic, payload)

@@ -11,7 +11,21 @@ from botocore.exceptions import BotoCoreError, ClientError
 
 from contract import DEFAULT_NAMESPACE
 from station.cloud import EMBEDDED
-from station.commands import audit, cost, dashboard, errors, files, pubnub, query, robots, site, trace, watch
+from station.commands import (
+    audit,
+    config,
+    cost,
+    dashboard,
+    errors,
+    files,
+    pubnub,
+    query,
+    robots,
+    send,
+    site,
+    trace,
+    watch,
+)
 from station.errors import StationError
 from station.where import Where
 
@@ -27,6 +41,8 @@ app.add_typer(trace.commands)
 app.add_typer(watch.commands)
 app.add_typer(site.commands)
 app.add_typer(errors.commands)
+app.add_typer(send.commands)
+app.add_typer(config.commands)
 
 
 @app.callback()

@@ -12,10 +12,14 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from click.testing import Result
+from typer.testing import CliRunner
 
 from local.cloud import EmbeddedCloud
 from local.deployment import ROOT
 from station import robots
+from station.cli import app
+from station.cloud import EMBEDDED
 from tests.ports import free_port
 
 
@@ -38,6 +42,17 @@ def bundle(
         return robots.add(embedded.cloud, name, out=tmp_path, settings=settings)
 
     return register
+
+
+@pytest.fixture
+def iort(embedded: EmbeddedCloud) -> Callable[..., Result]:
+    """The operator's command: `iort("robots", "list")`."""
+
+    def run(*arguments: str) -> Result:
+        where = ["--local", "--embedded", str(embedded.folder / EMBEDDED.name)]
+        return CliRunner().invoke(app, [*where, *arguments])
+
+    return run
 
 
 def run_agent(bundle: robots.Bundle, *, timeout_s: float = 300) -> dict[str, Any]:

@@ -6,19 +6,6 @@ import json
 import stat
 
 import pytest
-from typer.testing import CliRunner
-
-from station.cli import app
-from station.cloud import EMBEDDED
-
-
-@pytest.fixture
-def iort(embedded):
-    def run(*arguments: str):
-        description = embedded.folder / EMBEDDED.name
-        return CliRunner().invoke(app, ["--local", "--embedded", str(description), *arguments])
-
-    return run
 
 
 def test_robot_is_added_listed_and_removed(iort, tmp_path):

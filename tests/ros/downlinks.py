@@ -49,6 +49,7 @@ downlink = make_downlink(
     clock=clock,
     allowance=Allowance(clock),
     offset=lambda: Offset(0.0, 0.0),
+    answer=lambda *_: None,
 )
 assert downlink is not None
 uplink.start()

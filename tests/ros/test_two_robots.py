@@ -14,7 +14,7 @@ import pytest
 import contract
 from local.cloud import EmbeddedCloud
 from station import robots
-from tests.local.conftest import bundle, embedded  # noqa: F401 - fixtures
+from tests.local.conftest import bundle, embedded, iort  # noqa: F401 - fixtures
 from tests.ros.conftest import Graph, Process
 from tests.unit.test_device_downlink import POSE
 
@@ -22,6 +22,7 @@ POSE_TYPE = "geometry_msgs/PoseStamped"
 DRIVE = {
     "topic": "/speed",
     "type": "std_msgs/Float64",
+    "max_age_s": 60,
     "motion": {"lease_s": 0.5, "stop": {"data": 0.0}},
 }
 
@@ -52,6 +53,7 @@ def messages(listener: Process) -> list[Any]:
 def test_two_robots_see_each_others_poses_and_take_commands(
     embedded: EmbeddedCloud,  # noqa: F811
     bundle: Callable[..., robots.Bundle],  # noqa: F811
+    iort: Callable[..., Any],  # noqa: F811
     graphs: list[Graph],
 ) -> None:
     settings = {
@@ -99,6 +101,17 @@ def test_two_robots_see_each_others_poses_and_take_commands(
         assert seq < 1000, "\n".join(agents[0].errors)
         time.sleep(0.1)  # an operator's stick
     driver.until(lambda: messages(driver)[-1]["data"] == 0, "stop")
+
+    # And by `iort send`, which knows what became of it.
+    sent = iort("send", cars[0].robot, "drive", '{"data": 2.5}', "--lease-ms", "300", "--valid-ms", "60000",
+                "--seconds", "60")  # fmt: skip
+    assert sent.exit_code == 0, sent.output + str(sent.exception) + "\n".join(agents[0].errors)
+    assert "has accepted drive" in sent.output
+    driver.until(lambda: 2.5 in [m["data"] for m in messages(driver)], "command")
+    for message, said in (('{"data": "fast"}', "data: found 'fast'"), ('{"data": 1}', "without lease")):
+        refused = iort("send", cars[0].robot, "drive", message, "--valid-ms", "60000", "--seconds", "60")
+        assert refused.exit_code == 1
+        assert said in str(refused.exception)
 
     assert [agent.terminate() for agent in agents] == [0, 0]
     for agent in agents:

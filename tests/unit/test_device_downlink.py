@@ -123,6 +123,7 @@ class Rig:
         self.dispatcher = Dispatcher()
         self.uplink = uplink or Loopback(self.clock, self.dispatcher)
         self.graph = FakeGraph()
+        self.answers: list[tuple[str, int, str | None]] = []
         self.offset: Offset | None = Offset(0.0, 0.0)
         where = Where(Path("car.yaml"))
         self.downlink = Downlink(
@@ -136,6 +137,7 @@ class Rig:
             allowance=Allowance(self.clock),
             graph=self.graph,
             offset=lambda: self.offset,
+            answer=lambda name, command, refusal: self.answers.append((name, command.seq, refusal)),
         )
         if uplink is None:
             self.uplink.connect()
@@ -213,6 +215,21 @@ def test_motion_is_refused_when_it_is_not_for_now(changes: Any, reason: str) -> 
     rig.send({"data": 1.0}, **changes)
     assert rig.graph.published == []
     assert rig.refused() == {f"cmd/iort/car1/speed {reason}": 1}
+
+
+def test_who_asks_is_told_what_became_of_his_command() -> None:
+    rig = Rig()
+    rig.send({"data": 1.0})
+    rig.send({"data": 1.0}, answer=True)
+    rig.send({"data": 1.0}, answer=True, seq=1)
+    rig.send({"data": "fast"}, answer=True)
+    rig.send({"data": 1.0}, answer=True, sent_us=T0 - 600_000, started_us=T0 - 600_000)
+    assert rig.answers == [
+        ("speed", 1, None),
+        ("speed", 1, "repeated or out of order, sent 0.000 s ago, to within 0.000 s"),
+        ("speed", 3, "data: found 'fast'; allowed is a number"),
+        ("speed", 4, "stale, sent 0.600 s ago, to within 0.000 s"),
+    ]
 
 
 def test_a_deadline_is_judged_by_the_clouds_clock_and_what_may_be_too_old_is() -> None:

@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 from typing import Any
 
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from contract import Command
 from device.allowance import Allowance
 from device.clock import ManualClock
 from device.dispatch import Dispatcher
@@ -235,3 +237,19 @@ def test_no_wish_whatever_brings_it_down(wished: dict[str, Any]) -> None:
     tuning, rejected = overlay(BASE, wished, {})
     assert 0.01 <= tuning.live_rate_hz <= 10
     json.dumps(rejected)
+
+
+def test_what_became_of_commands_is_reported_and_a_new_run_forgets_it() -> None:
+    rig = Rig(live={"rate_hz": 2})
+    command = Command("feedbeef", 1, 7, 2, 500, {}, answer=True)
+    rig.remote.answer("drive", command, None)
+    rig.settle()
+    assert rig.reported["commands"]["drive"] == {"session": "feedbeef", "seq": 7, "outcome": "accepted"}
+    rig.remote.answer("drive", replace(command, seq=8), "stale" * 100)
+    rig.settle()
+    assert rig.reported["commands"]["drive"]["seq"] == 8
+    assert len(rig.reported["commands"]["drive"]["outcome"]) < 250
+    rig.remote._answers.clear()
+    rig.remote._follow()
+    rig.settle()
+    assert not rig.reported.get("commands")

@@ -1,0 +1,82 @@
+"""`iort config`: read and change the settings of a running agent."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping
+from typing import Annotated, Any
+
+import typer
+from rich.console import Console
+
+from station.errors import StationError
+from station.shadow import Shadow, State, answered
+
+commands = typer.Typer()
+_out = Console(highlight=False)
+_errors = Console(stderr=True, highlight=False)
+
+
+@commands.command("config")
+def config(
+    context: typer.Context,
+    robot: str,
+    changes: Annotated[
+        list[str] | None,
+        typer.Argument(
+            metavar="[NAME=VALUE]...", help="live.rate_hz=5, fields.vesc=speed,voltage_input, log_level=debug"
+        ),
+    ] = None,
+    unset: Annotated[
+        list[str] | None, typer.Option(help="A name to withdraw the wish of: car.yaml's value counts again.")
+    ] = None,
+    seconds: Annotated[float, typer.Option(min=0.1, help="How long to wait for the robot's answer.")] = 30.0,
+    as_json: Annotated[bool, typer.Option("--json", help="As JSON.")] = False,
+) -> None:
+    """Show what is in force on a robot, or change it and wait for its answer.
+
+    Ends with 1 where the robot refuses a change, or does not answer; the wish stands then, and comes into
+    force when the robot is back.
+    """
+    wishes = {**dict(map(_change, changes or [])), **dict.fromkeys(unset or [])}
+    shadow = Shadow(context.obj.cloud(), robot)
+    late = False
+    if wishes:
+        shadow.wish(wishes)
+        with _errors.status(f"waiting for {robot}"):
+            late = shadow.wait(lambda state: answered(wishes, state), seconds) is None
+    state = shadow.read()
+    refused = [refusal for refusal in state.refusals() if not wishes or refusal.name in wishes]
+    if as_json:
+        refusals = {one.name: {"value": one.value, "reason": one.reason} for one in refused}
+        _out.print_json(json.dumps({"settings": state.settings(), "refused": refusals, "answered": not late}))
+    else:
+        _show(robot, state, wishes)
+        for refusal in refused:
+            _errors.print(f"refused: {refusal.reason}", style="red", markup=False)
+    if late:
+        raise StationError(
+            f"{robot} has not answered within {seconds:g} s; the wish stands: is its agent running?"
+        )
+    if wishes and refused:
+        raise typer.Exit(1)
+
+
+def _change(text: str) -> tuple[str, Any]:
+    name, equals, value = text.partition("=")
+    if not name or not equals:
+        raise StationError(f"{text}: expected NAME=VALUE, such as live.rate_hz=5")
+    if name.startswith("fields."):
+        return name, [field for field in value.split(",") if field]
+    try:
+        return name, json.loads(value)
+    except ValueError:
+        return name, value
+
+
+def _show(robot: str, state: State, wishes: Mapping[str, Any]) -> None:
+    if not state.reported:
+        _out.print(f"{robot} has reported no settings yet")
+    for name, value in state.settings().items():
+        shown = ",".join(value) if isinstance(value, list) else json.dumps(value).strip('"')
+        _out.print(f"{name}={shown}{'  (asked for now)' if name in wishes else ''}", markup=False)

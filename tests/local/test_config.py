@@ -1,0 +1,78 @@
+"""`iort config` and `iort send` with a running agent on the embedded cloud."""
+
+from __future__ import annotations
+
+import json
+
+import pytest
+
+from station.errors import StationError
+from tests.local.test_shadow import driving
+
+
+def settings(outcome):
+    return json.loads(outcome.output)["settings"]
+
+
+def test_a_running_agent_is_changed_and_answers(iort, bundle):
+    car = bundle(sources=[{"type": "sim", "stream": "vesc", "rate_hz": 50}])
+    with driving(car):
+        changed = iort("config", car.robot, "live.rate_hz=2", "fields.vesc=speed,voltage_input",
+                       "log_level=debug", "--seconds", "120", "--json")  # fmt: skip
+        assert changed.exit_code == 0, changed.output + str(changed.exception)
+        assert settings(changed)["live.rate_hz"] == 2
+        assert settings(changed)["fields.vesc"] == ["speed", "voltage_input"]
+        refused = iort("config", car.robot, "live.rate_hz=50", "ping.rate_hz=1", "--seconds", "120", "--json")
+        assert refused.exit_code == 1
+        answer = json.loads(refused.output)
+        assert answer["answered"]
+        assert answer["refused"].keys() == {"live.rate_hz"}
+        assert answer["refused"]["live.rate_hz"]["value"] == 50
+        assert "from 0.01 to 10 (Hz)" in answer["refused"]["live.rate_hz"]["reason"]
+        assert answer["settings"]["ping.rate_hz"] == 1
+        # Asked without a change, it says what is refused still, and that is no failure of the question.
+        shown = iort("config", car.robot)
+        assert shown.exit_code == 0
+        assert "ping.rate_hz=1" in shown.output
+        withdrawn = iort("config", car.robot, "--unset", "live.rate_hz", "--unset", "fields.vesc",
+                         "--seconds", "120", "--json")  # fmt: skip
+        assert withdrawn.exit_code == 0, withdrawn.output
+        assert settings(withdrawn)["live.rate_hz"] == 10
+        # It takes commands of the names that its car.yaml has, which are none.
+        unheard = iort("send", car.robot, "drive", "{}", "--seconds", "0")
+        assert "downlink.cmd.drive" in str(unheard.exception)
+
+
+def test_a_robot_that_is_off_has_not_answered_and_the_wish_stands(iort, bundle):
+    car = bundle()
+    asked = iort("config", car.robot, "live.rate_hz=3", "--seconds", "0.1")
+    assert isinstance(asked.exception, StationError)
+    assert "the wish stands" in str(asked.exception)
+    assert "has reported no settings yet" in asked.output
+
+
+@pytest.mark.parametrize(
+    ("arguments", "said"),
+    [
+        (("config", "nobody"), "robot nobody is not registered"),
+        (("config", "car/1"), "robot name 'car/1'"),
+        (("send", "nobody", "drive", "{}"), "robot nobody is not registered"),
+    ],
+)
+def test_what_cannot_be_asked_is_said(iort, arguments, said):
+    assert said in str(iort(*arguments).exception)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "said"),
+    [
+        (("config", "CAR", "live.rate_hz"), "expected NAME=VALUE"),
+        (("send", "CAR", "drive", "{"), "is not JSON"),
+        (("send", "CAR", "drive", "7"), "expected a JSON object"),
+        (("send", "CAR", "a/b", "{}"), "stream name 'a/b'"),
+    ],
+)
+def test_what_cannot_be_sent_is_said(iort, bundle, arguments, said):
+    car = bundle()
+    named = [car.robot if part == "CAR" else part for part in arguments]
+    assert said in str(iort(*named).exception)

@@ -1,0 +1,69 @@
+"""What the operator makes of a robot's shadow."""
+
+from __future__ import annotations
+
+import pytest
+
+from station.errors import StationError
+from station.shadow import State, _check_clock, answered, outcome
+
+REPORTED = {
+    "live": {"enabled": True, "rate_hz": 10},
+    "fields": {"vesc": ["speed"]},
+    "log_level": "info",
+    "rejected": {"ping.rate_hz": {"value": 99, "reason": "ping.rate_hz: found 99"}},
+    "commands": {"drive": {"session": "feedbeef", "seq": 3, "outcome": "accepted"}},
+}
+STATE = State(5, {}, REPORTED)
+
+
+def test_what_is_in_force_and_what_is_refused():
+    assert STATE.settings() == {
+        "fields.vesc": ["speed"], "live.enabled": True, "live.rate_hz": 10, "log_level": "info",
+    }  # fmt: skip
+    assert STATE.refusals() == [("ping.rate_hz", 99, "ping.rate_hz: found 99")]
+    assert State(0, {}, {}).settings() == {}
+
+
+@pytest.mark.parametrize(
+    ("wishes", "said"),
+    [
+        ({"live.rate_hz": 10}, True),
+        ({"live.rate_hz": 10.0, "fields.vesc": ["speed"]}, True),
+        ({"live.rate_hz": 5}, None),
+        ({"live.rate_hz": 10, "log_level": "debug"}, None),
+        ({"fields.vesc": []}, True),
+        ({"ping.rate_hz": 99}, True),
+        # Refused is another value, of an older wish.
+        ({"ping.rate_hz": 98}, None),
+        # Withdrawn, and not seen by the robot yet.
+        ({"ping.rate_hz": None}, None),
+        ({"live.rate_hz": None}, True),
+    ],
+)
+def test_when_a_robot_has_answered(wishes, said):
+    assert answered(wishes, STATE) is said
+
+
+def test_a_long_value_is_refused_by_its_beginning():
+    long = ["x" * 300]
+    rejected = {"fields.vesc": {"value": ('["' + "x" * 300)[:200] + "...", "reason": "no"}}
+    assert answered({"fields.vesc": long}, State(1, {}, {"rejected": rejected}))
+    assert answered({"fields.vesc": ["y" * 300]}, State(1, {}, {"rejected": rejected})) is None
+
+
+def test_what_became_of_a_command():
+    assert outcome(STATE, "drive", "feedbeef", 3) == "accepted"
+    assert outcome(STATE, "drive", "feedbeef", 4) is None
+    assert outcome(STATE, "drive", "0badcafe", 3) is None
+    assert outcome(State(0, {}, {}), "drive", "feedbeef", 3) is None
+
+
+def test_a_clock_that_is_off_is_refused():
+    date, cloud_s = "Sat, 21 Nov 2026 10:00:00 GMT", 1_795_255_200
+    _check_clock(None, 0, 0)
+    for off_s in (-2.0, 0.0, 2.9):
+        _check_clock(date, cloud_s + off_s, cloud_s + off_s)
+    for off_s in (-3.0, 4.0, 86_400.0):
+        with pytest.raises(StationError, match="set it"):
+            _check_clock(date, cloud_s + off_s, cloud_s + off_s)
