@@ -46,12 +46,19 @@ _STATUS_S = 1.0
 def main() -> None:
     """Run the demo; exit status 0 if no sample was lost, 1 otherwise, 2 where it could not run."""
     options = _options()
-    # As Ctrl-C: whatever stops the demo stops what it started.
-    signal.signal(signal.SIGTERM, _interrupt)
-    signal.signal(signal.SIGHUP, _interrupt)
+    stopped = threading.Event()
+
+    def interrupt(_signal: int, _frame: object) -> NoReturn:
+        # Python drops an exception that is raised while it forks, so the wish is noted too.
+        stopped.set()
+        raise KeyboardInterrupt
+
+    # Whatever stops the demo stops what it started.
+    for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
+        signal.signal(number, interrupt)
     console = Console()
     try:
-        figures = _Demo(options, console).run()
+        figures = _Demo(options, console, stopped).run()
     except (LocalError, StationError) as error:
         console.print(f"demo: {error}", style="red", markup=False, highlight=False)
         sys.exit(2)
@@ -62,10 +69,6 @@ def main() -> None:
         console.print("stopped; nothing is left running")
         sys.exit(130)
     sys.exit(1 if figures.samples_lost else 0)
-
-
-def _interrupt(_signal: int, _frame: object) -> NoReturn:
-    raise KeyboardInterrupt
 
 
 def _options() -> argparse.Namespace:
@@ -110,8 +113,8 @@ def _positive(value: str) -> float:
 
 
 class _Demo:
-    def __init__(self, options: argparse.Namespace, console: Console) -> None:
-        self._options, self._console = options, console
+    def __init__(self, options: argparse.Namespace, console: Console, stopped: threading.Event) -> None:
+        self._options, self._console, self._stopped = options, console, stopped
         self._began = time.monotonic()
 
     def run(self) -> Figures:
@@ -173,7 +176,7 @@ class _Demo:
         with _agent(embedded, bundle, "--report", str(report)) as agent:
             began = time.monotonic()
             with self._console.status("starting the agent") as status:
-                while agent.wait(_STATUS_S) is None:
+                while self._running(agent):
                     embedded.emulator.check()
                     status.update(self._status_line(embedded, listener, time.monotonic() - began))
             if not report.exists():
@@ -184,6 +187,12 @@ class _Demo:
                 )
         written: dict[str, Any] = json.loads(report.read_text())
         return written
+
+    def _running(self, agent: Child) -> bool:
+        """Whether it still runs, after a moment; raises KeyboardInterrupt where that is not wanted."""
+        if self._stopped.is_set():
+            raise KeyboardInterrupt
+        return agent.wait(_STATUS_S) is None
 
     def _status_line(self, embedded: EmbeddedCloud, listener: Listener, seconds: float) -> str:
         stored = sum(len(b.times_us) for b in delivery.batches(embedded.cloud, ROBOT, VESC_STREAM))
@@ -225,7 +234,8 @@ class _Demo:
         robots.configure(bundle, settings)
         self._console.print(f"\nThe car drives on: {url}  Ctrl-C stops everything.", highlight=False)
         with _agent(embedded, bundle) as agent:
-            agent.wait()
+            while self._running(agent):
+                embedded.emulator.check()
             raise LocalError(f"the agent stopped with status {agent.poll()}:\n{agent.tail()}")
 
 

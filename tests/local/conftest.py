@@ -12,7 +12,6 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from click.testing import Result
 from typer.testing import CliRunner
 
 from local.cloud import EmbeddedCloud
@@ -45,10 +44,10 @@ def bundle(
 
 
 @pytest.fixture
-def iort(embedded: EmbeddedCloud) -> Callable[..., Result]:
+def iort(embedded: EmbeddedCloud) -> Callable[..., Any]:
     """The operator's command: `iort("robots", "list")`."""
 
-    def run(*arguments: str) -> Result:
+    def run(*arguments: str) -> Any:
         where = ["--local", "--embedded", str(embedded.folder / EMBEDDED.name)]
         return CliRunner().invoke(app, [*where, *arguments])
 
