@@ -7,7 +7,7 @@ import logging
 import os
 import threading
 import uuid
-from importlib.metadata import version
+from importlib.metadata import PackageNotFoundError, version
 from typing import Any, Mapping
 
 import contract
@@ -85,7 +85,7 @@ class Agent:
             base=self._tuning,
             apply=self.tune,
             known_fields=lambda: dict(self._fields),
-            version=version("iort"),
+            version=_version(),
             uplink=uplink,
             clock=clock,
             allowance=allowance,
@@ -374,3 +374,10 @@ class Agent:
         thread = threading.Thread(target=target, name=name, daemon=True)
         thread.start()
         return thread
+
+
+def _version() -> str:
+    try:
+        return version("iort")
+    except PackageNotFoundError:
+        return "run from a checkout"

@@ -28,10 +28,22 @@ GROUPS = {
     "tests/local/": "cloud",
     "tests/ros/test_two_robots.py": "cloud",
     "tests/stacks/": "app",
-    "tests/unit/test_station_data.py": "app",
-    "tests/unit/test_summarize.py": "app",
-    "tests/unit/test_tables.py": "app",
-    "tests/unit/test_upload.py": "app",
+    **dict.fromkeys(
+        [
+            f"tests/unit/test_{name}.py"
+            for name in (
+                "admit",
+                "presence",
+                "quarantine",
+                "query",
+                "station_data",
+                "summarize",
+                "tables",
+                "upload",
+            )
+        ],
+        "app",
+    ),
     "tests/web/": "page",
 }
 

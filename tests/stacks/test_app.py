@@ -17,6 +17,8 @@ def run(tmp_path, name, **context):
     env = {
         "PATH": os.environ["PATH"],
         "HOME": str(tmp_path),
+        # As `make deploy` keeps it, or every run would unpack the CDK once more.
+        "JSII_RUNTIME_PACKAGE_CACHE_ROOT": str(ROOT / "build" / "jsii-cache"),
         "CDK_OUTDIR": str(tmp_path / name),
         "CDK_CONTEXT_JSON": json.dumps({"layer": str(tmp_path / "layer"), **context}),
         # Every attempt to look anything up goes to a port where nobody is.
@@ -35,7 +37,7 @@ def run(tmp_path, name, **context):
 
 
 def finished(process):
-    out, err = process.communicate(timeout=240)
+    out, err = process.communicate(timeout=600)
     return process.returncode, out, err
 
 
