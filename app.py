@@ -56,10 +56,8 @@ def build(app: App, settings: Settings) -> list[Acknowledged]:
         app,
         **stack("monitoring"),
         settings=settings,
-        storage=storage,
-        quarantine=quarantine,
-        processing=processing,
-        fleet=fleet,
+        stacks=(storage, quarantine, fleet, processing),
+        topic=processing.alarms,
     )
     if settings.site:
         Site(app, **stack("site"), settings=settings)

@@ -148,7 +148,9 @@ def record_topic(robot: str, stream: str, namespace: str = DEFAULT_NAMESPACE) ->
 
 # Where the broker says who came and went.
 _PRESENCE = "$aws/events/presence"
-RULES = ("record", "live", "pong", "echo", "upload", "presence", "version")
+RULES = ("record", "live", "pong", "echo", "upload", "presence", "version", "alert")
+# A battery of three lithium cells below this is nearly empty; the deployment may say otherwise.
+LOW_VOLTAGE_V = 10.5
 # The files' bucket: what robots upload, and query results too large for an answer, kept for a day.
 FILES_PREFIX, RESULTS_PREFIX = "robots/", "results/"
 
@@ -206,9 +208,32 @@ ROBOT_PARAMETER, SERIAL_PARAMETER = "Robot", "Serial"
 METRIC_NAMESPACE = "iort"
 # The dimensions of every metric: the deployment's namespace and what emits it.
 METRIC_DEPLOYMENT, METRIC_FUNCTION = "Deployment", "Function"
+# The third of those that `robot_metrics` also counts a robot: each is billed a robot.
+METRIC_ROBOT = "Robot"
 METRICS = {
-    "live": ("LivePublished", "LiveStale", "LiveRefused", "PubNubFailed", "CarToLambdaMs"),
+    "live": (
+        "LivePublished",
+        "LiveStale",
+        "LiveRefused",
+        "PubNubFailed",
+        "InCarMs",
+        "UplinkMs",
+        "ToLambdaMs",
+        "CarToLambdaMs",
+    ),
     "summarize": ("BatchesSummarized", "SamplesSummarized", "BatchesRefused", "BatchesMissing"),
+    "health": (
+        "AgentReports",
+        "SampleGaps",
+        "FaultSamples",
+        "BatteryVolts",
+        "TemperatureDegC",
+        "BacklogBatches",
+        "RoundTripBrokerMs",
+        "RoundTripRuleMs",
+        "RoundTripLambdaMs",
+    ),
+    "alert": ("AlertsSent", "AlertsHeld"),
     "echo": ("PongsSent",),
     "upload": ("FilesAsked", "FilesStored", "FilesRefused", "StoredBytes"),
     "admit": ("RobotsAdmitted", "RobotsRefused"),
@@ -224,7 +249,12 @@ def rule_name(rule: str, namespace: str = DEFAULT_NAMESPACE) -> str:
     return f"{check_namespace(namespace)}_{rule}"
 
 
-def rule_sql(rule: str, namespace: str = DEFAULT_NAMESPACE, retention_s: int = 90 * 86_400) -> str:
+def rule_sql(
+    rule: str,
+    namespace: str = DEFAULT_NAMESPACE,
+    retention_s: int = 90 * 86_400,
+    low_voltage_v: float = LOW_VOLTAGE_V,
+) -> str:
     """The SELECT of a topic rule. What only the cloud may say (whose message, when received, when
     it expires) comes last, so that it overrides what the message claims."""
     name = check_namespace(namespace)
@@ -247,6 +277,14 @@ def rule_sql(rule: str, namespace: str = DEFAULT_NAMESPACE, retention_s: int = 9
         return (
             f"SELECT {reported} AS {AGENT_VERSION}, topic(3) AS {ROBOT} "
             f"FROM '$aws/things/+/shadow/name/{SHADOW}/update/accepted' WHERE {reported} <> ''"
+        )
+    if rule == "alert":
+        # A controller that does not measure its voltage says 0.
+        low = f"sample.voltage_input > 0 AND sample.voltage_input < {low_voltage_v:g}"
+        return (
+            f"SELECT t, sample.fault_code AS fault_code, sample.voltage_input AS voltage_input, "
+            f"topic() AS {TOPIC}, {received} FROM '{LIVE}/{name}/+/+' "
+            f"WHERE sample.fault_code > 0 OR ({low})"
         )
     raise ContractError(f"rule {_show(rule)}: allowed is one of {', '.join(RULES)}")
 

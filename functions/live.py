@@ -93,7 +93,16 @@ def process(
         emit("live", PubNubFailed=1)
         return
     took_us = now_us - live.sent_us - (live.offset_us or 0)
-    emit("live", LivePublished=1, CarToLambdaMs=max(0.0, took_us / 1000))
+    uplink_us = received_ms * 1000 - live.sent_us - live.offset_us if live.offset_us is not None else 0
+    emit(
+        "live",
+        LivePublished=1,
+        # Of a car that has not measured its clock's offset the leg between is not known.
+        InCarMs=max(0.0, (live.sent_us - live.t_us) / 1000),
+        UplinkMs=max(0.0, uplink_us / 1000),
+        ToLambdaMs=max(0.0, now_us / 1000 - received_ms),
+        CarToLambdaMs=max(0.0, took_us / 1000),
+    )
 
 
 @cache

@@ -28,6 +28,7 @@ from contract import (
     decode_item,
     parse_topic,
 )
+from functions.health import measure
 from functions.metrics import emit
 from functions.refusals import Refusals, Refused
 from functions.statistics import missing_before, summarize_second
@@ -176,7 +177,9 @@ def _key(batch: Batch) -> BatchKey:
 Refuse = Callable[[Sequence[Refused]], Sequence[Refused]]
 
 
-def process(event: Mapping[str, Any], tables: Tables, refuse: Refuse) -> dict[str, Any]:
+def process(
+    event: Mapping[str, Any], tables: Tables, refuse: Refuse, *, robot_metrics: bool = False
+) -> dict[str, Any]:
     """Summarise the event's records. Those that cannot be decoded go to ``refuse``, since trying again
     would not change them; the answer names the ones that it could not take.
 
@@ -202,6 +205,9 @@ def process(event: Mapping[str, Any], tables: Tables, refuse: Refuse) -> dict[st
         BatchesRefused=len(decoded.refused),
         BatchesMissing=sum(summaries.missing for summaries in topics.values()),
     )
+    for topic, batches in decoded.batches.items():
+        _, _, robot, stream = parse_topic(topic)
+        emit("health", robot=robot if robot_metrics else None, **measure(stream, batches))
     return {"batchItemFailures": [{"itemIdentifier": refused.number} for refused in left]}
 
 
@@ -222,4 +228,5 @@ def _refusals() -> Refusals:
 
 def handler(event: dict[str, Any], _context: object) -> dict[str, Any]:
     """Entry point of the telemetry table's stream mapping."""
-    return process(event, _tables(), _refusals().refuse)
+    by_robot = os.environ["ROBOT_METRICS"] == "true"
+    return process(event, _tables(), _refusals().refuse, robot_metrics=by_robot)

@@ -145,6 +145,11 @@ def single(settings: Settings) -> dict[str, dict[str, str]]:
             **to_a_queue,
         },
         "processing/LiveRole/DefaultPolicy": {**to_a_queue},
+        "processing/AlertRole/DefaultPolicy": {**to_a_queue},
+        f"processing/Alarms/{settings.alarm_email}": {
+            "Serverless-SNSRedrivePolicy": "a mail that is not delivered has nobody to read it from a queue; "
+            "the alarm's state stays"
+        },
         "processing/UploadRole/DefaultPolicy": {
             wide(f"{settings.namespace}-storage:ExportsOutputFnGetAttFiles8E6940B8ArnD8EE6C03/robots/*"): (
                 "the wildcard is the robot, and the function signs for the one that asked"

@@ -47,6 +47,7 @@ class Ingest(Stack):
             self._lambda_rule("upload", processing.upload),
             self._lambda_rule("presence", fleet.presence),
             self._lambda_rule("version", fleet.presence),
+            self._lambda_rule("alert", processing.alert),
         ]
 
     def _record(self, storage: Storage) -> iot.CfnTopicRule:
@@ -105,7 +106,9 @@ class Ingest(Stack):
             name.capitalize(),
             rule_name=rule_name(name, self._settings.namespace),
             topic_rule_payload=iot.CfnTopicRule.TopicRulePayloadProperty(
-                sql=rule_sql(name, self._settings.namespace, retention_s),
+                sql=rule_sql(
+                    name, self._settings.namespace, retention_s, self._settings.thresholds.low_voltage_v
+                ),
                 aws_iot_sql_version="2016-03-23",
                 actions=[action],
                 error_action=Action(sqs=rejected),

@@ -5,11 +5,13 @@ from __future__ import annotations
 import json
 from typing import Any
 
-from aws_cdk import Duration, Stack
+from aws_cdk import CfnOutput, Duration, Stack
 from aws_cdk import aws_iam as iam
 from aws_cdk import aws_lambda as lambda_
 from aws_cdk import aws_lambda_destinations as destinations
 from aws_cdk import aws_lambda_event_sources as sources
+from aws_cdk import aws_sns as sns
+from aws_cdk import aws_sns_subscriptions as subscriptions
 from constructs import Construct
 
 from contract import FILE, FILES_PREFIX, LAMBDA, PONG, RESULTS_PREFIX, pubnub_parameter
@@ -40,7 +42,8 @@ class Processing(Stack):
         self.echo = self._echo(settings)
         self.upload = self._upload(settings, storage)
         self.query = self._query(storage)
-        self.functions = (self.live, self.summarize, self.echo, self.upload, self.query)
+        self.alarms = self._alarms(settings)
+        self.alert = self._alert(settings, storage)
 
     def _live(self, settings: Settings) -> lambda_.Function:
         name = pubnub_parameter(settings.namespace)
@@ -87,6 +90,7 @@ class Processing(Stack):
                 "SUMMARY_TABLE": storage.summary.table_name,
                 "ROBOTS_TABLE": storage.robots.table_name,
                 "REJECTED_QUEUE": self._rejected.queue_url,
+                "ROBOT_METRICS": str(self._settings.robot_metrics).lower(),
             },
         )
         storage.telemetry.grant(summarize, "dynamodb:Query")
@@ -141,6 +145,49 @@ class Processing(Stack):
             )
         )
         return query
+
+    def _alarms(self, settings: Settings) -> sns.Topic:
+        """Where every alarm and every car's alert goes."""
+        topic = sns.Topic(self, "Alarms", enforce_ssl=True, **self._encryption.topic)
+        # A topic with a policy of its own has lost the one that lets its account's alarms in.
+        topic.add_to_resource_policy(
+            iam.PolicyStatement(
+                principals=[iam.ServicePrincipal("cloudwatch.amazonaws.com")],
+                actions=["sns:Publish"],
+                resources=[topic.topic_arn],
+                conditions={"StringEquals": {"aws:SourceAccount": self.account}},
+            )
+        )
+        if settings.alarm_email:
+            topic.add_subscription(subscriptions.EmailSubscription(settings.alarm_email))
+        CfnOutput(self, "AlarmTopic", value=topic.topic_arn)
+        return topic
+
+    def _alert(self, settings: Settings, storage: Storage) -> lambda_.Function:
+        alert = function(
+            self,
+            "Alert",
+            settings=settings,
+            encryption=self._encryption,
+            module="alert",
+            memory_mb=256,
+            environment={
+                "ROBOTS_TABLE": storage.robots.table_name,
+                "ALARM_TOPIC": self.alarms.topic_arn,
+                "LOW_VOLTAGE_V": f"{settings.thresholds.low_voltage_v:g}",
+            },
+        )
+        storage.robots.grant(alert, "dynamodb:UpdateItem")
+        alert.add_to_role_policy(
+            iam.PolicyStatement(actions=["sns:Publish"], resources=[self.alarms.topic_arn])
+        )
+        # The same message comes again a tenth of a second later.
+        alert.configure_async_invoke(
+            max_event_age=Duration.minutes(5),
+            retry_attempts=1,
+            on_failure=destinations.SqsDestination(self._rejected),
+        )
+        return alert
 
     def _echo(self, settings: Settings) -> lambda_.Function:
         echo = function(

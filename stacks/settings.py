@@ -12,7 +12,14 @@ from typing import Any
 
 from aws_cdk import App, RemovalPolicy
 
-from contract import DEFAULT_NAMESPACE, VESC_FIELDS, VESC_STREAM, ContractError, check_namespace
+from contract import (
+    DEFAULT_NAMESPACE,
+    LOW_VOLTAGE_V,
+    VESC_FIELDS,
+    VESC_STREAM,
+    ContractError,
+    check_namespace,
+)
 
 ROOT = Path(__file__).resolve().parent.parent
 
@@ -36,7 +43,7 @@ class Thresholds:
     board and MOSFETs, which a VESC throttles from 85 degC on.
     """
 
-    low_voltage_v: float = 10.5
+    low_voltage_v: float = LOW_VOLTAGE_V
     high_temperature_degc: float = 80.0
     stream_behind_s: float = 60.0
     car_to_lambda_ms: float = 2_000.0
@@ -50,6 +57,7 @@ class Settings:
     stack, or prod, where what holds data stays and is protected; ``tags`` are put on every resource;
     ``customer_key`` encrypts what is kept with a key of the account's own; ``budget_usd`` is the
     account's monthly budget (0: none), and ``alarm_email`` who hears of it and of every alarm.
+    ``robot_metrics`` counts every robot's health by itself as well, which costs by the robot.
     ``retention_days`` is how long telemetry and summaries are kept; ``files_days`` is how long uploaded
     files are (0: for good), ``upload_gb_a_day`` what one robot may upload in a day, in 1e9 bytes;
     ``live_concurrency`` bounds Lambda 1 (0 reserves nothing, for accounts whose concurrency limit is
@@ -63,6 +71,7 @@ class Settings:
     stage: str = DEV
     tags: Mapping[str, str] = field(default_factory=dict)
     customer_key: bool = False
+    robot_metrics: bool = False
     budget_usd: int = 0
     alarm_email: str | None = None
     thresholds: Thresholds = field(default_factory=Thresholds)
@@ -109,7 +118,7 @@ class Settings:
         ):
             if (value := context(key)) is not None:
                 given[key] = _integer(key, value, low, high)
-        for key in ("embedded", "customer_key", "site"):
+        for key in ("embedded", "customer_key", "robot_metrics", "site"):
             if (value := context(key)) is not None:
                 given[key] = _boolean(key, value)
         if (email := context("alarm_email")) is not None:

@@ -145,12 +145,19 @@ ROLES = {
         | DESTINATION
         | {("dynamodb:UpdateItem", "Robots.Arn")},
     ),
+    "AlertRole": (
+        "lambda.amazonaws.com",
+        {(action, "AlertLog.Arn") for action in LOG}
+        | DESTINATION
+        | {("dynamodb:UpdateItem", "Robots.Arn"), ("sns:Publish", "Alarms")},
+    ),
     "ProvisioningRole": ("iot.amazonaws.com", PROVISIONING),
     "ingest/RecordRole": ("iot.amazonaws.com", {REJECT, ("dynamodb:PutItem", "Telemetry.Arn")}),
     "ingest/LiveRole": ("iot.amazonaws.com", {REJECT}),
     "ingest/PongRole": ("iot.amazonaws.com", {REJECT, ("iot:Publish", f"{IOT}:topic/pong/iort/*/rule")}),
     "ingest/EchoRole": ("iot.amazonaws.com", {REJECT}),
     "ingest/UploadRole": ("iot.amazonaws.com", {REJECT}),
+    "ingest/AlertRole": ("iot.amazonaws.com", {REJECT}),
     "ingest/PresenceRole": ("iot.amazonaws.com", {REJECT}),
     "ingest/VersionRole": ("iot.amazonaws.com", {REJECT}),
 }
@@ -364,6 +371,7 @@ def test_only_its_rule_or_template_may_call_a_function(synthesized, reader):
         ("Upload.Arn", "Upload.Arn"),
         ("Presence.Arn", "Presence.Arn"),
         ("Version.Arn", "Presence.Arn"),
+        ("Alert.Arn", "Alert.Arn"),
         (f"{IOT}:provisioningtemplate/iort-robot", "Admit.Arn"),
     }
 

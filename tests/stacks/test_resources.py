@@ -37,11 +37,12 @@ def test_the_rules_are_the_contracts(rules):
 def test_every_rule_has_one_action_and_it_is_this(rules, reader):
     actions = {rule.removeprefix("iort_"): payload["Actions"] for rule, payload in rules.items()}
     assert all(len(each) == 1 for each in actions.values())
-    record, live, pong, echo, upload, presence, version = (actions[rule][0] for rule in RULES)
+    record, live, pong, echo, upload, presence, version, alert = (actions[rule][0] for rule in RULES)
     assert reader.text(record["DynamoDBv2"]["PutItem"]["TableName"]) == "Telemetry"
     assert reader.text(live["Lambda"]["FunctionArn"]) == "Live.Arn"
     assert reader.text(echo["Lambda"]["FunctionArn"]) == "Echo.Arn"
     assert reader.text(upload["Lambda"]["FunctionArn"]) == "Upload.Arn"
+    assert reader.text(alert["Lambda"]["FunctionArn"]) == "Alert.Arn"
     for kept in (presence, version):
         assert reader.text(kept["Lambda"]["FunctionArn"]) == "Presence.Arn"
     assert (pong["Republish"]["Topic"], pong["Republish"]["Qos"]) == (pong_template(), 0)
@@ -132,9 +133,10 @@ def test_a_live_message_or_a_ping_is_not_tried_again(synthesized, reader):
         "Echo": 0,
         "Upload": 0,
         "Presence": 2,
+        "Alert": 1,
     }
     ages_s = {reader.text(c["FunctionName"]): c["MaximumEventAgeInSeconds"] for c in configs}
-    assert ages_s == {"Live": 60, "Echo": 60, "Upload": 60, "Presence": 6 * 3600}
+    assert ages_s == {"Live": 60, "Echo": 60, "Upload": 60, "Presence": 6 * 3600, "Alert": 300}
     for config in configs:
         assert reader.text(config["DestinationConfig"]["OnFailure"]["Destination"]) == "Rejected.Arn"
 

@@ -27,10 +27,12 @@ from contract import (
     record_topic,
     rule_name,
 )
-from stacks.settings import ROOT
+from functions.health import measure
+from stacks.metrics import statistic
+from stacks.settings import ROOT, Settings
 from tests.stacks.templates import name
 
-HANDLERS = ("Live", "Summarize", "Echo", "Upload", "Query", "Admit", "Presence", "Quarantine")
+HANDLERS = ("Live", "Summarize", "Echo", "Upload", "Query", "Admit", "Presence", "Quarantine", "Alert")
 FUNCTIONS = sorted((ROOT / "functions").glob("*.py"))
 # Lambda's Python has boto3 and what boto3 needs.
 RUNTIME_PACKAGES = ("boto3", "botocore", "dateutil", "jmespath", "s3transfer", "six", "urllib3")
@@ -179,6 +181,7 @@ def test_what_the_variables_say_is_what_the_functions_expect(functions, reader, 
         "SUMMARY_TABLE": "Summary",
         "ROBOTS_TABLE": "Robots",
         "REJECTED_QUEUE": "Rejected",
+        "ROBOT_METRICS": "false",
     }
     query = functions["Query"]["Environment"]["Variables"]
     assert {key: reader.text(value) for key, value in query.items()} == {
@@ -201,23 +204,43 @@ def test_what_the_variables_say_is_what_the_functions_expect(functions, reader, 
 
 @pytest.fixture(scope="module")
 def shown(synthesized):
-    """Every metric on the dashboard: namespace, name, dimensions, options."""
-    (dashboard,) = synthesized.resources("AWS::CloudWatch::Dashboard").values()
-    separator, parts = dashboard["DashboardBody"]["Fn::Join"]
-    assert separator == ""
-    # What is only known when it is deployed stands for itself; none of it needs escaping.
-    body = json.loads(
-        "".join(
+    """Every metric on the dashboards: namespace, name, dimensions, options."""
+    metrics = []
+    for body in dashboards(synthesized).values():
+        for widget in body["widgets"]:
+            rows = widget["properties"]["metrics"]
+            metrics += [of_expression(row[0]) if isinstance(row[0], dict) else of_row(row) for row in rows]
+    return metrics
+
+
+def dashboards(app):
+    """The bodies by name; what is only known when it is deployed stands for itself."""
+    found = {}
+    for dashboard in app.resources("AWS::CloudWatch::Dashboard").values():
+        separator, parts = dashboard["DashboardBody"]["Fn::Join"]
+        assert separator == ""
+        text = "".join(
             part if isinstance(part, str) else f"<{json.dumps(part)}>".replace('"', "'") for part in parts
         )
-    )
-    metrics = []
-    for widget in body["widgets"]:
-        for row in widget["properties"]["metrics"]:
-            namespace, metric, *rest = row
-            options = rest.pop() if isinstance(rest[-1], dict) else {}
-            metrics.append((namespace, metric, dict(zip(rest[::2], rest[1::2], strict=True)), options))
-    return metrics
+        found[dashboard["DashboardName"]] = json.loads(text)
+    return found
+
+
+def of_row(row):
+    namespace, metric, *rest = row
+    options = rest.pop() if isinstance(rest[-1], dict) else {}
+    return namespace, metric, dict(zip(rest[::2], rest[1::2], strict=True)), options
+
+
+def of_expression(options):
+    """What `SEARCH('{namespace,dimension,...} MetricName="..." dimension="..."', 'Sum', 60)` searches."""
+    schema, wanted, stat = re.search(
+        r"SEARCH\('\{([^}]+)\} ([^']+)', '(\w+)', 60\)", options["expression"]
+    ).groups()
+    namespace, *dimensions = schema.split(",")
+    values = dict(re.findall(r'(\w+)="([^"]+)"', wanted))
+    metric = values.pop("MetricName")
+    return namespace, metric, {name: values.get(name, "*") for name in dimensions}, {"stat": stat}
 
 
 def emitted():
@@ -227,23 +250,28 @@ def emitted():
         for node in ast.walk(ast.parse(path.read_text())):
             if isinstance(node, ast.Call) and getattr(node.func, "id", "") == "emit":
                 function = ast.literal_eval(node.args[0])
-                found.setdefault(function, set()).update(keyword.arg for keyword in node.keywords)
+                named = {keyword.arg for keyword in node.keywords} - {"robot", None}
+                found.setdefault(function, set()).update(named)
+    # These have their names computed.
+    batch = contract.Batch("0" * 8, 0, [1], {"voltage_input": [12.0]})
+    for stream in ("vesc", contract.RTT_STREAM, contract.AGENT_STREAM):
+        found["health"] |= measure(stream, [batch]).keys()
     return found
 
 
-def test_the_dashboard_shows_what_the_functions_emit_and_nothing_else(shown):
+def test_the_dashboards_show_what_the_functions_emit_and_nothing_else(shown):
     by_function = {}
     for namespace, metric, dimensions, options in shown:
         if namespace == contract.METRIC_NAMESPACE:
             assert dimensions.keys() == {"Deployment", "Function"}
             assert dimensions["Deployment"] == contract.DEFAULT_NAMESPACE
             by_function.setdefault(dimensions["Function"], set()).add(metric)
-            assert options["stat"] == ("p95" if metric.endswith("Ms") else "Sum")
+            assert options["stat"] == statistic(metric)
     assert by_function == {function: set(names) for function, names in contract.METRICS.items()}
     assert emitted() == by_function
 
 
-def test_the_dashboard_covers_every_service_of_the_path(shown):
+def test_the_dashboards_cover_every_service_of_the_path(shown):
     assert {namespace for namespace, *_ in shown} == {
         "AWS/IoT",
         "AWS/DynamoDB",
@@ -255,11 +283,91 @@ def test_the_dashboard_covers_every_service_of_the_path(shown):
     assert rules == {rule_name(rule) for rule in contract.RULES}
 
 
-def test_the_dashboards_action_types_are_those_of_the_rules(shown, synthesized):
-    shown_types = {d["RuleName"]: d["ActionType"] for _, _, d, _ in shown if "ActionType" in d}
-    for rule in synthesized.resources("AWS::IoT::TopicRule").values():
-        (action,) = rule["TopicRulePayload"]["Actions"]
-        assert shown_types[rule["RuleName"]] == next(iter(action))
+# Dimensions of each metric. AWS IoT Developer Guide, "AWS IoT metrics and dimensions"; Lambda Developer
+# Guide, "Types of metrics for Lambda functions"; DynamoDB Developer Guide, "DynamoDB metrics and
+# dimensions"; SQS Developer Guide, "Available CloudWatch metrics for Amazon SQS".
+AWS_METRICS = {
+    ("AWS/IoT", "Protocol"): {
+        f"{what}.{how}"
+        for what in ("Connect", "PublishIn", "PublishOut", "Subscribe")
+        for how in ("Success", "AuthError", "Throttle")
+    },
+    ("AWS/IoT", "RuleName"): {"TopicMatch", "ParseError", "RuleMessageThrottled"},
+    ("AWS/IoT", "ActionType", "RuleName"): {"Failure", "Success", "ErrorActionFailure"},
+    ("AWS/Lambda", "FunctionName"): {
+        "Duration",
+        "ConcurrentExecutions",
+        "Errors",
+        "Throttles",
+        "IteratorAge",
+    },
+    ("AWS/DynamoDB", "TableName"): {
+        "ConsumedReadCapacityUnits",
+        "ConsumedWriteCapacityUnits",
+        "ReadThrottleEvents",
+        "WriteThrottleEvents",
+    },
+    ("AWS/SQS", "QueueName"): {"ApproximateNumberOfMessagesVisible"},
+}
+
+
+def test_every_metric_of_aws_is_one_that_aws_has(shown, alarms):
+    of_alarms = [
+        (a["Namespace"], a["MetricName"], {d["Name"]: d["Value"] for d in a["Dimensions"]})
+        for a in alarms.values()
+    ]
+    for namespace, metric, dimensions in [*(one[:3] for one in shown), *of_alarms]:
+        if namespace != contract.METRIC_NAMESPACE:
+            assert metric in AWS_METRICS[(namespace, *sorted(dimensions))]
+        elif metric not in contract.METRICS[dimensions["Function"]]:
+            raise AssertionError(f"nothing emits {metric}")
+
+
+# --- alarms -----------------------------------------------------------------------------------------
+
+
+@pytest.fixture(scope="module")
+def alarms(synthesized):
+    found = synthesized.resources("AWS::CloudWatch::Alarm").values()
+    return {alarm["AlarmName"].removeprefix("iort-"): alarm for alarm in found}
+
+
+def test_every_queue_function_and_table_has_an_alarm(synthesized, alarms):
+    for kind, ending in (
+        ("AWS::SQS::Queue", "Waiting"),
+        ("AWS::Lambda::Function", "Errors"),
+        ("AWS::DynamoDB::Table", "Throttled"),
+    ):
+        for logical_id in synthesized.resources(kind):
+            assert f"{name(logical_id)}{ending}" in alarms
+
+
+def test_every_alarm_tells_the_topic_and_is_explained(alarms, reader):
+    text = (ROOT / "docs" / "cloud.md").read_text()
+    for alarm, properties in alarms.items():
+        assert reader.texts(properties["AlarmActions"]) == ["Alarms"]
+        assert properties["TreatMissingData"] == "notBreaching"
+        generic = re.sub(r"^.*(Waiting|Errors|Throttled|Behind)$", r"\1", alarm)
+        assert f"`{generic}`" in text or f"`...{generic}`" in text, f"docs/cloud.md says nothing of {alarm}"
+
+
+def test_the_thresholds_are_the_settings(production, synthesized):
+    alarms = {
+        a["AlarmName"]: a["Threshold"] for a in synthesized.resources("AWS::CloudWatch::Alarm").values()
+    }
+    limits = Settings().thresholds
+    assert alarms["iort-BatteryVolts"] == limits.low_voltage_v == contract.LOW_VOLTAGE_V
+    assert alarms["iort-TemperatureDegC"] == limits.high_temperature_degc
+    assert alarms["iort-CarToLambdaMs"] == limits.car_to_lambda_ms
+    assert alarms["iort-SummarizeBehind"] == limits.stream_behind_s * 1000
+    (alert,) = (f for k, f in synthesized.resources("AWS::Lambda::Function").items() if k.startswith("Alert"))
+    assert float(alert["Environment"]["Variables"]["LOW_VOLTAGE_V"]) == limits.low_voltage_v
+
+
+def test_the_address_subscribes_to_the_topic(production, synthesized):
+    (subscription,) = production.resources("AWS::SNS::Subscription").values()
+    assert (subscription["Protocol"], subscription["Endpoint"]) == ("email", "lab@example.org")
+    assert not synthesized.resources("AWS::SNS::Subscription")
 
 
 # --- rules and topics -------------------------------------------------------------------------------
@@ -292,7 +400,7 @@ def test_every_topic_of_the_agent_meets_exactly_the_rule_that_it_is_for(filters)
     assert topic == build_topic(RECORD, "car", "vesc")
     expected = {
         topic: {"iort_record"},
-        build_topic(LIVE, "car", "vesc"): {"iort_live"},
+        build_topic(LIVE, "car", "vesc"): {"iort_live", "iort_alert"},
         build_topic(PING, "car", RULE): {"iort_pong"},
         build_topic(PING, "car", LAMBDA): {"iort_echo"},
         build_topic(PING, "car", FILE): {"iort_upload"},

@@ -78,7 +78,8 @@ def test_the_chosen_fields_go_to_the_cars_channel_with_every_hops_time(counted):
         "hops": {"sent_us": SENT_US, "received_ms": RECEIVED, "lambda_us": NOW_US},
         "sample": {"speed": 1200, "voltage_input": 15.8},
     }
-    assert counted() == {"LivePublished": 1, "CarToLambdaMs": 35}
+    hops = {"InCarMs": 4, "ToLambdaMs": 5, "CarToLambdaMs": 35}
+    assert counted() == {"LivePublished": 1, **hops}
 
 
 def test_a_stream_that_is_not_configured_sends_every_field():

@@ -31,8 +31,22 @@ def test_every_metric_of_the_contract_is_a_valid_line(capsys):
         assert (line["Deployment"], line["Function"]) == ("lab2", function)
         assert {metric["Name"] for metric in directive["Metrics"]} == set(names)
         for metric in directive["Metrics"]:
-            assert metric["Unit"] == {"Ms": "Milliseconds", "es": "Bytes"}.get(metric["Name"][-2:], "Count")
+            endings = {"Ms": "Milliseconds", "Bytes": "Bytes", "Volts": "None", "DegC": "None"}
+            units = [unit for ending, unit in endings.items() if metric["Name"].endswith(ending)]
+            assert metric["Unit"] == (units or ["Count"])[0]
             assert line[metric["Name"]] == 2.5
+
+
+def test_a_list_is_values_and_a_robot_a_metric_of_its_own(capsys):
+    emit("health", robot="car7", BatteryVolts=[11.5, 11.25], TemperatureDegC=[])
+    line = json.loads(capsys.readouterr().out)
+    (directive,) = line["_aws"]["CloudWatchMetrics"]
+    assert directive["Dimensions"] == [["Deployment", "Function"], ["Deployment", "Function", "Robot"]]
+    assert (line["Robot"], line["BatteryVolts"]) == ("car7", [11.5, 11.25])
+    assert directive["Metrics"] == [{"Name": "BatteryVolts", "Unit": "None"}]
+    # "Specification: Embedded metric format": an array of up to 100 members.
+    emit("health", BatteryVolts=[float(i) for i in range(150)])
+    assert json.loads(capsys.readouterr().out)["BatteryVolts"] == [float(i) for i in range(50, 150)]
 
 
 def test_a_zero_is_not_written_and_a_line_of_zeros_neither(capsys):

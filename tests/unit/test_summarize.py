@@ -513,6 +513,7 @@ def test_the_handler_against_the_tables_of_the_template(dynamodb, monkeypatch, c
     for name, table in NAMES.items():
         monkeypatch.setenv(f"{name.upper()}_TABLE", table)
     monkeypatch.setenv("REJECTED_QUEUE", "https://sqs.example/rejected")
+    monkeypatch.setenv("ROBOT_METRICS", "false")
     dynamodb.put_item(TableName=ROBOTS, Item={"robot": {"S": "car"}, "speed_to_erpm_gain": {"N": "4614"}})
     stream = Stream(dynamodb)
     drive = [

@@ -1,0 +1,144 @@
+"""Alert: a car's fault or low battery, from the alert rule to the humans who asked to be told.
+
+The rule fires as often as the car says so, ten times a second; a human is told once a car and cause, and
+again when it has lasted for `QUIET_S`.
+"""
+
+from __future__ import annotations
+
+import os
+import time
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from datetime import datetime, timezone
+from functools import cache
+from typing import Any, TypeGuard
+
+import boto3
+from botocore.exceptions import ClientError
+
+from contract import FAULTS, RECEIVED_MS, ROBOT, TOPIC, parse_topic
+from functions.metrics import emit
+
+QUIET_S = 900
+
+Notify = Callable[[str, str], None]
+
+
+@dataclass(frozen=True)
+class Cause:
+    """Why somebody should know: ``key`` tells causes of one car apart, ``text`` is for the reader."""
+
+    key: str
+    text: str
+
+
+def causes(event: Mapping[str, Any], low_voltage_v: float) -> list[Cause]:
+    """What of a message that the alert rule selected is alarming; nothing of values that are no numbers."""
+    found = []
+    code, volts = event.get("fault_code"), event.get("voltage_input")
+    if _is_number(code) and code > 0:
+        meaning = FAULTS.get(int(code), "a code that the contract does not know")
+        found.append(Cause(f"alert_fault_{int(code)}", f"fault {int(code)}, {meaning}"))
+    if _is_number(volts) and 0 < volts < low_voltage_v:
+        found.append(Cause("alert_low_voltage", f"battery at {volts:.1f} V, below {low_voltage_v:g} V"))
+    return found
+
+
+class Notices:
+    """When a human was last told of a car's cause, in the car's row of the registry; what this
+    environment remembers saves a request."""
+
+    def __init__(self, client: Any, table: str) -> None:
+        self._client, self._table = client, table
+        self._until_s: dict[tuple[str, str], float] = {}
+
+    def take(self, robot: str, key: str, now_s: int) -> bool:
+        """Whether it is time to tell; of all who ask within `QUIET_S`, one is told so."""
+        if now_s < self._until_s.get((robot, key), 0):
+            return False
+        try:
+            self._update(
+                robot,
+                "SET #key = :now",
+                key,
+                ConditionExpression="attribute_not_exists(#key) OR #key <= :then",
+                ExpressionAttributeValues={
+                    ":now": {"N": str(now_s)},
+                    ":then": {"N": str(now_s - QUIET_S)},
+                },
+            )
+        except ClientError as error:
+            if error.response["Error"]["Code"] != "ConditionalCheckFailedException":
+                raise
+            # Another environment told, some time within the quiet; to look again later costs a request.
+            self._until_s[robot, key] = now_s + QUIET_S / 10
+            return False
+        self._until_s[robot, key] = now_s + QUIET_S
+        return True
+
+    def give_back(self, robot: str, key: str) -> None:
+        """Nobody could be told: the next one tries again."""
+        self._until_s.pop((robot, key), None)
+        self._update(robot, "REMOVE #key", key)
+
+    def _update(self, robot: str, expression: str, key: str, **rest: Any) -> None:
+        self._client.update_item(
+            TableName=self._table,
+            Key={ROBOT: {"S": robot}},
+            UpdateExpression=expression,
+            ExpressionAttributeNames={"#key": key},
+            **rest,
+        )
+
+
+def process(
+    event: Mapping[str, Any], low_voltage_v: float, notices: Notices, notify: Notify, now_s: int
+) -> None:
+    """Tell of each cause that it is time for. Raises what ``notify`` raises, and leaves no trace of it.
+
+    Raises `contract.ContractError` for a topic that is not one of ours.
+    """
+    topic = parse_topic(event[TOPIC])
+    when = datetime.fromtimestamp(int(event[RECEIVED_MS]) / 1000, timezone.utc)
+    for cause in causes(event, low_voltage_v):
+        if not notices.take(topic.robot, cause.key, now_s):
+            emit("alert", AlertsHeld=1)
+            continue
+        text = (
+            f"{topic.robot}: {cause.text}\n\n"
+            f"when     {when:%Y-%m-%d %H:%M:%S} UTC\n"
+            f"stream   {topic}\n\n"
+            f"The next mail about this comes in {QUIET_S // 60} minutes if it lasts.\n"
+            f"What happened: iort query {topic.robot} {topic.name}\n"
+        )
+        try:
+            notify(f"{topic.namespace}: {topic.robot}, {cause.text}", text)
+        except Exception:
+            notices.give_back(topic.robot, cause.key)
+            raise
+        emit("alert", AlertsSent=1)
+
+
+def _is_number(value: object) -> TypeGuard[int | float]:
+    return isinstance(value, (int, float)) and not isinstance(value, bool)
+
+
+@cache
+def _notices() -> Notices:
+    return Notices(boto3.client("dynamodb"), os.environ["ROBOTS_TABLE"])
+
+
+@cache
+def _sns() -> Any:
+    return boto3.client("sns")
+
+
+def _notify(subject: str, text: str) -> None:
+    # "Publish", SNS API: a subject is up to 100 ASCII characters.
+    _sns().publish(TopicArn=os.environ["ALARM_TOPIC"], Subject=subject[:100], Message=text)
+
+
+def handler(event: dict[str, Any], _context: object) -> None:
+    """Entry point of the alert rule's Lambda action."""
+    process(event, float(os.environ["LOW_VOLTAGE_V"]), _notices(), _notify, int(time.time()))

@@ -1,0 +1,87 @@
+"""What a human should know: every alarm, its threshold and what to do, which docs/cloud.md says at length."""
+
+from __future__ import annotations
+
+from aws_cdk import Duration
+from aws_cdk import aws_cloudwatch as cloudwatch
+from aws_cdk import aws_cloudwatch_actions as actions
+from aws_cdk import aws_sns as sns
+from constructs import Construct
+
+from stacks import metrics
+from stacks.settings import Settings
+from stacks.watched import Watched
+
+_FIVE_MINUTES = Duration.minutes(5)
+
+
+class Alarms(Construct):
+    """An alarm tells the topic when it goes off, not when it ends. No data is no alarm: a fleet that is
+    switched off sends none."""
+
+    def __init__(
+        self, scope: Construct, construct_id: str, *, settings: Settings, watched: Watched, topic: sns.ITopic
+    ) -> None:
+        super().__init__(scope, construct_id)
+        self._namespace = settings.namespace
+        self._tell = actions.SnsAction(topic)
+        self._lost_or_late(settings, watched)
+        self._cars(settings)
+
+    def _lost_or_late(self, settings: Settings, watched: Watched) -> None:
+        for name, queue in watched.queues.items():
+            self._alarm(f"{name}Waiting", metrics.waiting(queue), 0, "messages are in quarantine")
+        for name, function in watched.functions.items():
+            failed = metrics.function("Errors", function).with_(period=_FIVE_MINUTES)
+            self._alarm(f"{name}Errors", failed, 0, "the function failed")
+        for name, table in watched.tables.items():
+            throttled = metrics.table("WriteThrottleEvents", table).with_(period=_FIVE_MINUTES)
+            self._alarm(f"{name}Throttled", throttled, 0, "the table refused writes")
+        limits = settings.thresholds
+        for name, function in watched.readers.items():
+            age = metrics.function("IteratorAge", function)
+            behind_ms = limits.stream_behind_s * 1000
+            self._alarm(f"{name}Behind", age, behind_ms, "the stream is read late", periods=3)
+        self._ours("Quarantined", "quarantine", 0, "messages that could not be processed are in quarantine")
+        self._ours("PubNubFailed", "live", 0, "live samples did not reach PubNub", periods=3)
+        self._ours("CarToLambdaMs", "live", limits.car_to_lambda_ms, "live samples are late", periods=3)
+        self._ours("BatchesMissing", "summarize", 0, "batches of a car are missing")
+        self._ours("BatchesRefused", "summarize", 0, "batches cannot be decoded")
+
+    def _cars(self, settings: Settings) -> None:
+        """From the record lane, which nothing is lost of; the rule alert is faster and says which car."""
+        limits = settings.thresholds
+        self._ours("FaultSamples", "health", 0, "a car reports a fault")
+        self._ours("TemperatureDegC", "health", limits.high_temperature_degc, "a car's controller is hot")
+        self._ours("BatteryVolts", "health", limits.low_voltage_v, "a car's battery is low", below=True)
+
+    def _ours(
+        self, name: str, function: str, limit: float, what: str, *, periods: int = 1, below: bool = False
+    ) -> None:
+        metric = metrics.ours(function, name, namespace=self._namespace)
+        self._alarm(name, metric, limit, what, periods=periods, below=below)
+
+    def _alarm(
+        self,
+        name: str,
+        metric: cloudwatch.Metric,
+        limit: float,
+        what: str,
+        *,
+        periods: int = 1,
+        below: bool = False,
+    ) -> None:
+        operator = cloudwatch.ComparisonOperator
+        alarm = cloudwatch.Alarm(
+            self,
+            name,
+            alarm_name=f"{self._namespace}-{name}",
+            alarm_description=f"{what}. What to do: docs/cloud.md",
+            metric=metric,
+            threshold=limit,
+            comparison_operator=operator.LESS_THAN_THRESHOLD if below else operator.GREATER_THAN_THRESHOLD,
+            evaluation_periods=periods,
+            datapoints_to_alarm=periods,
+            treat_missing_data=cloudwatch.TreatMissingData.NOT_BREACHING,
+        )
+        alarm.add_alarm_action(self._tell)

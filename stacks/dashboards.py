@@ -1,0 +1,179 @@
+"""The two dashboards: the platform, a row a service in the order of a message's path, and the robots."""
+
+from __future__ import annotations
+
+from aws_cdk import Duration
+from aws_cdk import aws_cloudwatch as cloudwatch
+from constructs import Construct
+
+from contract import METRICS, RULES, rule_name
+from stacks import metrics
+from stacks.settings import Settings
+from stacks.watched import Watched
+
+# Shown on the robots' dashboard; the platform's shows the rest of what the functions emit.
+_OF_ROBOTS = ("health", "summarize")
+_HOPS = ("InCarMs", "UplinkMs", "ToLambdaMs", "CarToLambdaMs")
+_ROUND_TRIPS = ("RoundTripBrokerMs", "RoundTripRuleMs", "RoundTripLambdaMs")
+
+
+class Dashboards(Construct):
+    """``<namespace>-platform`` and ``<namespace>-robots``."""
+
+    def __init__(self, scope: Construct, construct_id: str, *, settings: Settings, watched: Watched) -> None:
+        super().__init__(scope, construct_id)
+        self._namespace = settings.namespace
+        platform = self._dashboard("Platform")
+        platform.add_widgets(*self._iot())
+        platform.add_widgets(*self._tables(watched))
+        platform.add_widgets(*self._functions(watched))
+        platform.add_widgets(*self._streams_and_queues(watched))
+        platform.add_widgets(*self._live(), *self._rest())
+        robots = self._dashboard("Robots")
+        robots.add_widgets(*self._seen())
+        robots.add_widgets(*self._delays())
+        robots.add_widgets(*self._health())
+        if settings.robot_metrics:
+            robots.add_widgets(*self._one_by_one())
+
+    def _dashboard(self, name: str) -> cloudwatch.Dashboard:
+        return cloudwatch.Dashboard(
+            self,
+            name,
+            dashboard_name=f"{self._namespace}-{name.lower()}",
+            default_interval=Duration.hours(3),
+            period_override=cloudwatch.PeriodOverride.INHERIT,
+        )
+
+    def _ours(self, function: str, *names: str) -> list[cloudwatch.IMetric]:
+        return [metrics.ours(function, name, namespace=self._namespace) for name in names]
+
+    # --- platform ----------------------------------------------------------------------------------
+
+    def _iot(self) -> list[cloudwatch.GraphWidget]:
+        rules = {rule: rule_name(rule, self._namespace) for rule in RULES}
+        matched = [metrics.rule("TopicMatch", name, label=rule) for rule, name in rules.items()]
+        failed: list[cloudwatch.IMetric] = []
+        for rule, name in rules.items():
+            failed.append(metrics.rule_actions("Failure", name, label=f"{rule}: action failed"))
+            failed.append(metrics.rule("ParseError", name, label=f"{rule}: no JSON"))
+            failed.append(metrics.rule("RuleMessageThrottled", name, label=f"{rule}: throttled"))
+            failed.append(metrics.rule_actions("ErrorActionFailure", name, label=f"{rule}: lost"))
+        refused = [metrics.broker(f"{what}.AuthError") for what in ("Connect", "PublishIn", "Subscribe")]
+        return [
+            _graph(
+                "Broker: connections and messages, all of the account",
+                [metrics.broker(f"{what}.Success") for what in ("Connect", "PublishIn", "PublishOut")],
+                right=[*refused, metrics.broker("PublishIn.Throttle")],
+            ),
+            _graph("Rules: messages matched", matched),
+            _graph("Rules: failures", failed),
+        ]
+
+    @staticmethod
+    def _tables(watched: Watched) -> list[cloudwatch.GraphWidget]:
+        def each(name: str, what: str) -> list[cloudwatch.IMetric]:
+            return [metrics.table(name, table, label=f"{t} {what}") for t, table in watched.tables.items()]
+
+        return [
+            _graph(
+                "Tables: capacity units",
+                [*each("ConsumedWriteCapacityUnits", "written"), *each("ConsumedReadCapacityUnits", "read")],
+            ),
+            _graph(
+                "Tables: throttled",
+                [*each("WriteThrottleEvents", "writes"), *each("ReadThrottleEvents", "reads")],
+            ),
+        ]
+
+    @staticmethod
+    def _functions(watched: Watched) -> list[cloudwatch.GraphWidget]:
+        def each(title: str, name: str) -> cloudwatch.GraphWidget:
+            lines = [metrics.function(name, of, label=label) for label, of in watched.functions.items()]
+            return _graph(title, lines)
+
+        return [
+            each("Functions: duration p95, ms", "Duration"),
+            each("Functions: concurrency", "ConcurrentExecutions"),
+            each("Functions: errors", "Errors"),
+            each("Functions: throttles", "Throttles"),
+        ]
+
+    @staticmethod
+    def _streams_and_queues(watched: Watched) -> list[cloudwatch.GraphWidget]:
+        return [
+            _graph(
+                "Streams: iterator age, ms",
+                [metrics.function("IteratorAge", of, label=label) for label, of in watched.readers.items()],
+            ),
+            _graph(
+                "Quarantine: messages waiting",
+                [metrics.waiting(queue, label=label) for label, queue in watched.queues.items()],
+            ),
+        ]
+
+    def _live(self) -> list[cloudwatch.GraphWidget]:
+        return [
+            _graph(
+                "PubNub: live samples published",
+                self._ours("live", "LivePublished"),
+                right=self._ours("live", "PubNubFailed", "LiveStale", "LiveRefused"),
+            )
+        ]
+
+    def _rest(self) -> list[cloudwatch.GraphWidget]:
+        return [
+            _graph(f"Function {function}", self._ours(function, *names))
+            for function, names in METRICS.items()
+            if function not in (*_OF_ROBOTS, "live")
+        ]
+
+    # --- robots ------------------------------------------------------------------------------------
+
+    def _seen(self) -> list[cloudwatch.GraphWidget]:
+        return [
+            _graph("Agents: reports a minute, twelve from each", self._ours("health", "AgentReports")),
+            _graph(
+                "Samples and batches a minute",
+                self._ours("summarize", "SamplesSummarized", "BatchesSummarized"),
+            ),
+            _graph(
+                "Gaps: holes between samples, missing and refused batches",
+                [
+                    *self._ours("health", "SampleGaps"),
+                    *self._ours("summarize", "BatchesMissing", "BatchesRefused"),
+                ],
+            ),
+            _graph("Backlog: batches waiting in the fullest car", self._ours("health", "BacklogBatches")),
+        ]
+
+    def _delays(self) -> list[cloudwatch.GraphWidget]:
+        return [
+            _graph("Delay of live samples by hop, p95 ms", self._ours("live", *_HOPS)),
+            _graph("Round trips of the cars' pings, p95 ms", self._ours("health", *_ROUND_TRIPS)),
+        ]
+
+    def _health(self) -> list[cloudwatch.GraphWidget]:
+        return [
+            _graph("Battery of the weakest car, V", self._ours("health", "BatteryVolts")),
+            _graph("Temperature of the hottest controller, degC", self._ours("health", "TemperatureDegC")),
+            _graph(
+                "Samples with a fault code, and alerts sent",
+                self._ours("health", "FaultSamples"),
+                right=self._ours("alert", "AlertsSent"),
+            ),
+        ]
+
+    def _one_by_one(self) -> list[cloudwatch.GraphWidget]:
+        return [
+            _graph(f"{name}, each robot", [metrics.each_robot("health", name, namespace=self._namespace)])
+            for name in ("BatteryVolts", "TemperatureDegC", "FaultSamples", "BacklogBatches")
+        ]
+
+
+def _graph(
+    title: str, left: list[cloudwatch.IMetric], right: list[cloudwatch.IMetric] | None = None
+) -> cloudwatch.GraphWidget:
+    return cloudwatch.GraphWidget(
+        title=title, left=left, right=right or [], width=8, height=6, period=metrics.PERIOD
+    )

@@ -1,0 +1,118 @@
+"""The metrics that dashboards and alarms are made of: AWS' own and ours, each with its statistic.
+
+AWS' names and dimensions are from each service's page "metrics and dimensions"; the tests hold every one that
+is shown to a table of those pages.
+"""
+
+from __future__ import annotations
+
+from aws_cdk import Duration
+from aws_cdk import aws_cloudwatch as cloudwatch
+from aws_cdk import aws_dynamodb as dynamodb
+from aws_cdk import aws_lambda as lambda_
+from aws_cdk import aws_sqs as sqs
+
+from contract import METRIC_DEPLOYMENT, METRIC_FUNCTION, METRIC_NAMESPACE, METRIC_ROBOT, METRICS
+
+PERIOD = Duration.minutes(1)
+# Of the worst car, where the mean of all would hide it.
+_STATISTICS = {"BatteryVolts": "Minimum", "TemperatureDegC": "Maximum", "BacklogBatches": "Maximum"}
+
+
+def ours(function: str, name: str, *, namespace: str, label: str | None = None) -> cloudwatch.Metric:
+    """A metric that functions/ emits; a KeyError for one that the contract does not know."""
+    if name not in METRICS[function]:
+        raise KeyError(name)
+    return _metric(
+        METRIC_NAMESPACE,
+        name,
+        label=label,
+        statistic=statistic(name),
+        dimensions={METRIC_DEPLOYMENT: namespace, METRIC_FUNCTION: function},
+    )
+
+
+def each_robot(function: str, name: str, *, namespace: str) -> cloudwatch.MathExpression:
+    """A metric of ours of every robot by itself, whichever there are: needs ``robot_metrics``."""
+    if name not in METRICS[function]:
+        raise KeyError(name)
+    schema = f"{METRIC_NAMESPACE},{METRIC_DEPLOYMENT},{METRIC_FUNCTION},{METRIC_ROBOT}"
+    wanted = f'MetricName="{name}" {METRIC_DEPLOYMENT}="{namespace}" {METRIC_FUNCTION}="{function}"'
+    return _search(schema, wanted, statistic(name), label="")
+
+
+def statistic(name: str) -> str:
+    """What a minute of a metric of ours is read as."""
+    return _STATISTICS.get(name, "p95" if name.endswith("Ms") else "Sum")
+
+
+def rule(name: str, rule_name: str, *, label: str) -> cloudwatch.Metric:
+    """A metric of a topic rule, by its physical name."""
+    return _metric("AWS/IoT", name, label=label, dimensions={"RuleName": rule_name})
+
+
+def rule_actions(name: str, rule_name: str, *, label: str) -> cloudwatch.MathExpression:
+    """A metric of a rule's actions, all together. The values of their dimension ActionType are documented
+    nowhere, so that none is named here."""
+    expression = _search("AWS/IoT,ActionType,RuleName", f'MetricName="{name}" RuleName="{rule_name}"', "Sum")
+    return cloudwatch.MathExpression(
+        expression=f"SUM({expression.expression})", using_metrics={}, period=PERIOD, label=label
+    )
+
+
+def broker(name: str) -> cloudwatch.Metric:
+    """A metric of the account's message broker."""
+    return _metric("AWS/IoT", name, dimensions={"Protocol": "MQTT"})
+
+
+def function(name: str, of: lambda_.IFunction, *, label: str | None = None) -> cloudwatch.Metric:
+    """A metric of a Lambda function."""
+    how = {"Duration": "p95", "ConcurrentExecutions": "Maximum", "IteratorAge": "Maximum"}.get(name, "Sum")
+    return _metric(
+        "AWS/Lambda", name, label=label, statistic=how, dimensions={"FunctionName": of.function_name}
+    )
+
+
+def table(name: str, of: dynamodb.ITable, *, label: str | None = None) -> cloudwatch.Metric:
+    """A metric of a DynamoDB table."""
+    return _metric("AWS/DynamoDB", name, label=label, dimensions={"TableName": of.table_name})
+
+
+def waiting(of: sqs.IQueue, *, label: str | None = None) -> cloudwatch.Metric:
+    """How many messages wait in a queue."""
+    return _metric(
+        "AWS/SQS",
+        "ApproximateNumberOfMessagesVisible",
+        label=label,
+        statistic="Maximum",
+        dimensions={"QueueName": of.queue_name},
+    )
+
+
+def _metric(
+    namespace: str,
+    name: str,
+    *,
+    dimensions: dict[str, str],
+    label: str | None = None,
+    statistic: str = "Sum",
+) -> cloudwatch.Metric:
+    return cloudwatch.Metric(
+        namespace=namespace,
+        metric_name=name,
+        dimensions_map=dimensions,
+        statistic=statistic,
+        period=PERIOD,
+        label=label,
+    )
+
+
+def _search(
+    schema: str, wanted: str, statistic: str, *, label: str | None = None
+) -> cloudwatch.MathExpression:
+    return cloudwatch.MathExpression(
+        expression=f"SEARCH('{{{schema}}} {wanted}', '{statistic}', {PERIOD.to_seconds():.0f})",
+        using_metrics={},
+        period=PERIOD,
+        label=label,
+    )

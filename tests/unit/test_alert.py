@@ -1,0 +1,112 @@
+"""Alerts: what a human is told, and how often."""
+
+from __future__ import annotations
+
+import json
+
+import boto3
+import pytest
+
+from contract import ContractError
+from functions.alert import QUIET_S, Notices, causes, process
+from tests.fakes import NAMES
+
+NOW_S = 1_700_000_000
+
+
+def event(**sample):
+    return {"topic": "live/iort/car7/vesc", "t": 1, "received_ms": NOW_S * 1000, **sample}
+
+
+class Mailbox:
+    def __init__(self):
+        self.mails = []
+
+    def __call__(self, subject, text):
+        self.mails.append((subject, text))
+
+
+@pytest.fixture
+def notices(dynamodb):
+    return Notices(dynamodb, NAMES["robots"])
+
+
+def emitted(capsys):
+    lines = [json.loads(line) for line in capsys.readouterr().out.splitlines()]
+    return [sum(line.get(name, 0) for line in lines) for name in ("AlertsSent", "AlertsHeld")]
+
+
+def test_a_fault_is_told_with_robot_code_and_time(notices):
+    mailbox = Mailbox()
+    process(event(fault_code=5, voltage_input=12.0), 10.5, notices, mailbox, NOW_S)
+    ((subject, text),) = mailbox.mails
+    assert subject == "iort: car7, fault 5, MOSFET over-temperature"
+    assert "2023-11-14 22:13:20 UTC" in text
+    assert "live/iort/car7/vesc" in text
+
+
+@pytest.mark.parametrize(
+    ("sample", "keys"),
+    [
+        ({"fault_code": 2, "voltage_input": 9.0}, ["alert_fault_2", "alert_low_voltage"]),
+        ({"fault_code": 0, "voltage_input": 9.0}, ["alert_low_voltage"]),
+        ({"fault_code": 99}, ["alert_fault_99"]),
+        # A controller that does not measure its voltage says 0.
+        ({"fault_code": 0, "voltage_input": 0}, []),
+        ({"fault_code": "3", "voltage_input": None}, []),
+        ({"fault_code": True}, []),
+        ({}, []),
+    ],
+)
+def test_causes(sample, keys):
+    assert [cause.key for cause in causes(sample, 10.5)] == keys
+
+
+def test_a_fault_that_lasts_is_told_once_in_a_while(notices, capsys):
+    mailbox = Mailbox()
+    for tenth in range(50):
+        process(event(fault_code=1), 10.5, notices, mailbox, NOW_S + tenth // 10)
+    assert len(mailbox.mails) == 1
+    assert emitted(capsys) == [1, 49]
+    process(event(fault_code=1), 10.5, notices, mailbox, NOW_S + QUIET_S)
+    assert len(mailbox.mails) == 2
+    # Another cause and another car are told at once.
+    process(event(fault_code=4), 10.5, notices, mailbox, NOW_S + QUIET_S)
+    process({**event(fault_code=1), "topic": "live/iort/car8/vesc"}, 10.5, notices, mailbox, NOW_S + QUIET_S)
+    assert [subject.split(",")[0] for subject, _ in mailbox.mails[2:]] == ["iort: car7", "iort: car8"]
+
+
+def test_of_two_environments_one_tells(dynamodb):
+    mailbox = Mailbox()
+    for notices in (Notices(dynamodb, NAMES["robots"]), Notices(dynamodb, NAMES["robots"])):
+        process(event(fault_code=1), 10.5, notices, mailbox, NOW_S)
+    assert len(mailbox.mails) == 1
+
+
+def test_what_could_not_be_sent_is_told_by_the_next(notices):
+    def refused(_subject, _text):
+        raise ConnectionError("no SNS")
+
+    with pytest.raises(ConnectionError):
+        process(event(fault_code=1), 10.5, notices, refused, NOW_S)
+    mailbox = Mailbox()
+    process(event(fault_code=1), 10.5, notices, mailbox, NOW_S)
+    assert len(mailbox.mails) == 1
+
+
+def test_the_registrys_row_is_kept(dynamodb, notices):
+    dynamodb.put_item(TableName=NAMES["robots"], Item={"robot": {"S": "car7"}, "vehicle": {"S": "f1tenth"}})
+    process(event(fault_code=1), 10.5, notices, Mailbox(), NOW_S)
+    row = dynamodb.get_item(TableName=NAMES["robots"], Key={"robot": {"S": "car7"}})["Item"]
+    assert row["vehicle"] == {"S": "f1tenth"}
+    assert row["alert_fault_1"] == {"N": str(NOW_S)}
+
+
+def test_another_error_of_the_table_is_not_taken_for_a_repetition(aws):
+    with pytest.raises(boto3.client("dynamodb").exceptions.ResourceNotFoundException):
+        process(event(fault_code=1), 10.5, Notices(boto3.client("dynamodb"), "none"), Mailbox(), NOW_S)
+
+
+def test_a_topic_that_is_not_ours_is_refused(notices):
+    with pytest.raises(ContractError):
+        process({**event(fault_code=1), "topic": "x"}, 10.5, notices, Mailbox(), NOW_S)

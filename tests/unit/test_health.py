@@ -1,0 +1,52 @@
+"""Health: what the batches of a car say about it."""
+
+from __future__ import annotations
+
+import pytest
+
+from contract import AGENT_STREAM, METRICS, RTT_STREAM, Batch
+from functions.health import measure
+
+
+def batch(columns, *, times_us=None):
+    length = len(next(iter(columns.values())))
+    return Batch("0" * 8, 0, times_us or [1_000_000 + 20_000 * i for i in range(length)], columns)
+
+
+def test_the_worst_of_a_drive_counts():
+    first = batch({"voltage_input": [12.1, 11.9], "temp_fet": [40.0, 41.5], "fault_code": [0, 5]})
+    second = batch({"voltage_input": [11.2, 11.6], "temp_fet": [0.0, 39.0], "temp_motor": [55.5, None]})
+    measured = measure("vesc", [first, second])
+    assert measured == {
+        "SampleGaps": 0,
+        "FaultSamples": 1,
+        "BatteryVolts": [11.2],
+        "TemperatureDegC": [55.5],
+    }
+
+
+def test_what_is_not_measured_is_not_counted():
+    nothing = {"SampleGaps": 0, "FaultSamples": 0, "BatteryVolts": [], "TemperatureDegC": []}
+    assert measure("vesc", [batch({"voltage_input": [0.0, None], "temp_fet": [0, 0]})]) == nothing
+    assert measure("imu", [batch({"x": [1.0], "fault_code": ["odd"], "voltage_input": [True]})]) == nothing
+
+
+def test_a_hole_is_a_gap():
+    times_us = [0, 20_000, 40_000, 60_000, 200_000, 220_000]
+    assert measure("vesc", [batch({"x": [0.0] * 6}, times_us=times_us)])["SampleGaps"] == 1
+
+
+def test_round_trips_and_the_agents_own():
+    rtt = batch({"broker_ms": [12.0, None], "rule_ms": [None, 31.5], "lambda_ms": [None, None]})
+    assert measure(RTT_STREAM, [rtt]) == {
+        "RoundTripBrokerMs": [12.0],
+        "RoundTripRuleMs": [31.5],
+        "RoundTripLambdaMs": [],
+    }
+    agent = batch({"backlog_batches": [0, 7]})
+    assert measure(AGENT_STREAM, [agent]) == {"AgentReports": 2, "BacklogBatches": [7.0]}
+
+
+@pytest.mark.parametrize("stream", ["vesc", RTT_STREAM, AGENT_STREAM])
+def test_the_names_are_the_contracts(stream):
+    assert measure(stream, [batch({"x": [1.0]})]).keys() <= set(METRICS["health"])
