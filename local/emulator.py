@@ -2,14 +2,18 @@
 
 from __future__ import annotations
 
+import os
+
 from ministack import app
 
-from local import gaps
+from local import gaps, metrics
 
 
 def main() -> None:
     """Serve until SIGTERM or SIGINT."""
     gaps.install()
+    metrics.install()
+    metrics.start(os.environ["MINISTACK_REGION"])
     # Under USE_SSL it would also take port 443 of the machine, where it may.
     app._port_is_bindable = lambda _host, _port: False  # noqa: SLF001
     app.main()
