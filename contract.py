@@ -72,8 +72,10 @@ RTT_STREAM = "rtt"
 RTT_FIELDS = {path: f"{path}_ms" for path in PING_PATHS}
 # What the agent says of itself; the fields are AGENT_FIELDS.
 AGENT_STREAM = "agent"
-# The streams that every robot has and no source gives.
-OWN_STREAMS = frozenset({RTT_STREAM, AGENT_STREAM})
+# What the messages were that a stream's samples are made of: `MessageType`.
+TYPES_STREAM = "types"
+# The streams that every robot may have and no source's configuration names.
+OWN_STREAMS = frozenset({RTT_STREAM, AGENT_STREAM, TYPES_STREAM})
 # The named shadow of a robot's thing that carries the agent's settings.
 SHADOW = "agent"
 # Where the shadow says what became of the commands that asked for an answer.
@@ -522,6 +524,48 @@ def split(batch: Batch) -> tuple[Batch, Batch]:
         Batch(batch.boot, batch.seq, batch.times_us[:half], first, batch.nonfinite),
         Batch(batch.boot, batch.seq + 1, batch.times_us[half:], second, 0),
     )
+
+
+# --- message types ---------------------------------------------------------------------------------
+
+# A definition is a text of its own, in pieces that a field may hold.
+_PIECE, _MAX_PIECES = 4000, 64
+
+
+class MessageType(NamedTuple):
+    """The ROS 1 type of the messages that a stream's samples are made of.
+
+    A source says it once a run, as a sample of the stream `TYPES_STREAM`: from then on downstream knows
+    how to make the messages again. ``kind`` is as ROS 1 writes it, ``package/Type``; ``definition`` is the
+    text that a publisher sends and a bag keeps, with every type within.
+    """
+
+    stream: str
+    topic: str
+    kind: str
+    md5sum: str
+    definition: str
+
+    def sample(self) -> dict[str, Value]:
+        """The type as a sample. Raises `ContractError` for a definition that is too long."""
+        pieces = [self.definition[i : i + _PIECE] for i in range(0, len(self.definition), _PIECE)]
+        if len(pieces) > _MAX_PIECES:
+            raise ContractError(f"the definition of {self.kind} has over {_PIECE * _MAX_PIECES} characters")
+        sample: dict[str, Value] = dict(self._asdict())
+        del sample["definition"]
+        sample.update({f"definition.{i}": piece for i, piece in enumerate(pieces)})
+        return sample
+
+
+def message_type(sample: Mapping[str, Value]) -> MessageType:
+    """The type in a sample; raises `ContractError` for what `MessageType.sample` cannot have written."""
+    texts = {name: value for name, value in sample.items() if isinstance(value, str)}
+    try:
+        stream, topic, kind, md5sum = (texts[name] for name in ("stream", "topic", "kind", "md5sum"))
+        pieces = [texts[f"definition.{i}"] for i in range(sum("definition." in name for name in texts))]
+    except KeyError as error:
+        raise ContractError(f"a message type without {error}") from error
+    return MessageType(stream, topic, kind, md5sum, "".join(pieces))
 
 
 # --- live lane, pings ------------------------------------------------------------------------------

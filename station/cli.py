@@ -17,7 +17,9 @@ from station.commands import (
     cost,
     dashboard,
     errors,
+    export,
     files,
+    plot,
     pubnub,
     query,
     robots,
@@ -37,6 +39,8 @@ app.add_typer(dashboard.commands)
 app.add_typer(cost.commands)
 app.add_typer(audit.commands)
 app.add_typer(query.commands)
+app.add_typer(export.commands)
+app.add_typer(plot.commands)
 app.add_typer(trace.commands)
 app.add_typer(watch.commands)
 app.add_typer(site.commands)

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Set as AbstractSet
 from dataclasses import replace
 
-from contract import OWN_STREAMS, ROBOT, VESC_STREAM
+from contract import OWN_STREAMS, ROBOT, TYPES_STREAM, VESC_STREAM
 from functions.statistics import Vehicle
 from station import reading, registry
 from station.blocks import ATTRIBUTES, Refused, blocks
@@ -57,8 +57,16 @@ def check_fields(cloud: Cloud, selection: Selection, there: AbstractSet[str]) ->
 
 
 def streams_of(cloud: Cloud, robot: str) -> list[str]:
-    """The streams of a robot that are known by name and have something stored."""
-    known = sorted({VESC_STREAM, *OWN_STREAMS})
+    """The streams of a robot that have something stored, as far as they are known by name: those that
+    every robot has, and those whose message types its sources have said."""
+    types = reading.batches(cloud, Selection(robot=robot, stream=TYPES_STREAM), ATTRIBUTES)
+    said = {
+        name
+        for block in blocks(types, Refused())
+        for name in block.columns.get("stream", ())
+        if isinstance(name, str)
+    }
+    known = sorted({VESC_STREAM, *OWN_STREAMS, *said})
     return [stream for stream in known if reading.outermost(cloud, robot, stream, newest=True) is not None]
 
 

@@ -72,7 +72,7 @@ class FakeDynamoDB:
             self.read += len(page)
             yield {"Items": page}
 
-    def get_item(self, *, TableName: str, Key: dict[str, Any]) -> dict[str, Any]:  # noqa: N803
+    def get_item(self, *, TableName: str, Key: dict[str, Any], **_: Any) -> dict[str, Any]:  # noqa: N803
         self.calls["get_item"] += 1
         item = self.items[TableName].get((Key[ROBOT]["S"],))
         return {"Item": item} if item else {}

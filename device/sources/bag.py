@@ -155,6 +155,7 @@ class Recording:
         connections = [c for c in self._reader.connections if c.topic in streams]
         start_ns = int(self._reader.start_time)
         iterator = iter(self._reader.messages(connections=connections))
+        said: set[str] = set()
         while True:
             with self._wrapped("is damaged"):
                 found = next(iterator, None)
@@ -167,7 +168,23 @@ class Recording:
             except SourceError as error:
                 raise SourceError(f"{self._path}: topic {connection.topic}: {error}") from error
             stamp_ns = _stamp_ns(message, recorded_ns)
+            if connection.topic not in said:
+                said.add(connection.topic)
+                kind = self._type(streams[connection.topic], connection)
+                if kind is not None:
+                    yield Message(contract.TYPES_STREAM, recorded_ns - start_ns, stamp_ns, kind)
             yield Message(streams[connection.topic], recorded_ns - start_ns, stamp_ns, values)
+
+    def _type(self, stream: str, connection: Any) -> Mapping[str, contract.Value] | None:
+        """What the messages of a topic are, as ROS 1 has it; None where it cannot be told."""
+        kind = connection.msgtype.replace("/msg/", "/")
+        try:
+            definition, md5sum = self._reader.typestore.generate_msgdef(connection.msgtype, ros_version=1)
+            return contract.MessageType(stream, connection.topic, kind, md5sum, definition).sample()
+        except Exception as error:  # noqa: BLE001 - whatever a bag library raises
+            # The samples are worth more than knowing how to make a bag of them again.
+            _log.warning("%s: topic %s: its type cannot be told: %s", self._path, connection.topic, error)
+            return None
 
     def _fields_of(self, value: Any) -> list[str] | None:
         # The object's own attributes would include the constants of its type.

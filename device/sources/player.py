@@ -58,7 +58,8 @@ def play(recording: Open, how: Playback, clock: Clock, emit: Emit, stop: threadi
                 else:
                     t_us = clock.now_us()
                 emit(message.stream, t_us, message.values)
-                played += 1
+                # A type comes with the first message of it, and is none.
+                played += message.stream != contract.TYPES_STREAM
         if not how.loop or not played:
             return
         # One mean gap on, so that a loop does not put two samples on one time.

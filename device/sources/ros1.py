@@ -154,6 +154,7 @@ class Intake:
             if header is not self._header:
                 self._decoder = self._decoder_for(header)
                 self._header = header
+                self._say_type(header, arrival_us)
             decoder = self._decoder
         if decoder is None:
             self._seldom.warn("undecodable", f"topic {self._topic}: its messages cannot be decoded")
@@ -171,6 +172,18 @@ class Intake:
             self._seldom.warn("empty", f"topic {self._topic}: there is no field in its messages to send")
             return
         self._emit(self._config.stream, t_us, values)
+
+    def _say_type(self, header: Mapping[str, str], t_us: int) -> None:
+        """Say what the messages are, whenever a publisher connects."""
+        config, definition = self._config, header.get("message_definition", "")
+        if self._decoder is None or not definition.strip():
+            return
+        kind, md5sum = header.get("type", ""), header.get("md5sum", "")
+        said = contract.MessageType(config.stream, self._topic, kind, md5sum, definition)
+        try:
+            self._emit(contract.TYPES_STREAM, t_us, said.sample())
+        except contract.ContractError as error:
+            _log.warning("topic %s: its type is not recorded: %s", self._topic, error)
 
     def look(self, connections: int) -> None:
         """Say it when the topic falls silent, and when it is heard again."""

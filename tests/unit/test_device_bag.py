@@ -28,10 +28,25 @@ Sample = tuple[str, int, Any]
 
 
 def play(path: Path, clock: ManualClock | None = None, **settings: Any) -> list[Sample]:
+    """The samples, without what says what they are made of."""
+    return [s for s in play_all(path, clock, **settings) if s[0] != contract.TYPES_STREAM]
+
+
+def play_all(path: Path, clock: ManualClock | None = None, **settings: Any) -> list[Sample]:
     out: list[Sample] = []
     source = BagConfig(path=path, **settings).build(clock or ManualClock(now_us=NOW))
     source.run(lambda *sample: out.append(sample), threading.Event())
     return out
+
+
+def test_the_first_message_of_a_topic_brings_its_type(tmp_path: Path) -> None:
+    first, second, *rest = play_all(write_ros1(tmp_path / "a.bag"))
+    kind = contract.message_type(first[2])
+    assert (first[0], first[1]) == (contract.TYPES_STREAM, second[1])
+    assert (kind.stream, kind.kind) == (second[0], "vesc_msgs/VescStateStamped")
+    assert "float64 speed" in kind.definition
+    assert len(kind.md5sum) == 32
+    assert contract.TYPES_STREAM not in {sample[0] for sample in rest}
 
 
 STATE_ROS1 = "int32 FAULT_CODE_NONE=0\nfloat64 speed\nint32 fault_code\n"

@@ -14,6 +14,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+import contract
 from device.clock import ManualClock
 from device.errors import MessageError, SourceError
 from device.ros1_types import VARIABLE, parse
@@ -340,14 +341,27 @@ class Desk:
     def __init__(self, **settings: Any) -> None:
         self.clock = ManualClock(now_us=T0)
         self.samples: list[tuple[str, int, dict[str, Any]]] = []
+        self.types: list[contract.MessageType] = []
         config = TopicConfig(**{"stream": "s", "time": "header", **settings})
         self.intake = Intake("/t", config, emit=self._emit, clock=self.clock)
 
     def _emit(self, stream: str, t_us: int, values: Any) -> None:
-        self.samples.append((stream, t_us, values))
+        if stream == contract.TYPES_STREAM:
+            self.types.append(contract.message_type(values))
+        else:
+            self.samples.append((stream, t_us, values))
 
     def take(self, data: bytes, **header: str) -> None:
         self.intake.take({**CONNECTION, **header}, data)
+
+
+def test_a_publishers_type_is_said_when_it_connects() -> None:
+    desk = Desk()
+    header = {**CONNECTION}
+    for _ in range(3):
+        desk.intake.take(header, b"")
+    said = contract.MessageType("s", "/t", "a_msgs/A", "1", CONNECTION["message_definition"])
+    assert desk.types == [said]
 
 
 def test_a_believable_stamp_is_the_samples_time() -> None:

@@ -1,0 +1,168 @@
+"""Samples made into ROS 1 messages again, of the type that they came from."""
+
+from __future__ import annotations
+
+import math
+import re
+from collections.abc import Iterator, Mapping, Sequence
+from typing import Any
+
+import numpy as np
+from rosbags.typesys import Stores, get_types_from_msg, get_typestore
+
+from contract import TYPES_STREAM, ContractError, MessageType, Value, message_type
+from station import data
+from station.blocks import Block, Refused
+from station.cloud import Cloud
+from station.conditions import values
+from station.errors import StationError
+from station.selection import Selection
+
+# What rosbags' typestore calls the kinds of a field's type: a basic one, another message, arrays.
+_BASE, _NAME, _ARRAY = 1, 2, 3
+_HEADER = "std_msgs/msg/Header"
+_TIMES = {"builtin_interfaces/msg/Time", "builtin_interfaces/msg/Duration"}
+_HEADER_TEXT = "=" * 80 + "\nMSG: std_msgs/Header\nuint32 seq\ntime stamp\nstring frame_id\n"
+
+
+def type_of(cloud: Cloud, selection: Selection) -> MessageType | None:
+    """The type that a robot has said a stream's messages have: the last before the range ends, or else
+    the first after; None where it has said none."""
+    whole = Selection(robot=selection.robot, stream=TYPES_STREAM)
+    said: list[tuple[int, MessageType]] = []
+    for block in data.samples(cloud, whole, refused=Refused()):
+        columns = {name: values(column) for name, column in block.columns.items()}
+        for i, t_us in enumerate(block.times_us.tolist()):
+            try:
+                kind = message_type({name: column[i] for name, column in columns.items()})
+            except ContractError:
+                continue
+            if kind.stream == selection.stream:
+                said.append((t_us, kind))
+    before = [kind for t_us, kind in said if selection.end_us is None or t_us < selection.end_us]
+    if before:
+        return before[-1]
+    return said[0][1] if said else None
+
+
+def made_of(stream: str, columns: Mapping[str, Any]) -> MessageType:
+    """A type for samples that no ROS message was made into: a header and a field a column."""
+    lines = ["std_msgs/Header header"]
+    for name, column in columns.items():
+        kind = {"b": "bool", "f": "float64"}.get(column.dtype.kind, "string")
+        lines.append(f"{kind} {_plain(name)}")
+    name = re.sub(r"\W", "_", stream)
+    kind = f"iort_msgs/{name[:1].upper()}{name[1:]}" if name[:1].isalpha() else f"iort_msgs/S{name}"
+    text = "\n".join(lines) + "\n" + _HEADER_TEXT
+    return MessageType(stream, f"/{name}", kind, "", text)
+
+
+def _plain(path: str) -> str:
+    return path.replace(".", "_").lower()
+
+
+class Maker:
+    """Makes messages of one type out of samples.
+
+    ``definition`` and ``md5sum`` are the type's as ROS 1 knows them. ``lacking`` are fields of the type
+    that the samples do not have, which are zero or empty in the messages; ``foreign`` are fields of the
+    samples that the type does not have. ``own`` is for a type of `made_of`.
+
+    Raises `StationError` for a type that ROS 1 cannot have.
+    """
+
+    def __init__(self, kind: MessageType, fields: Sequence[str], *, own: bool = False) -> None:
+        self.kind = kind
+        self._field = _plain if own else str
+        fields = [self._field(name) for name in fields]
+        self._name = kind.kind.replace("/", "/msg/") if "/msg/" not in kind.kind else kind.kind
+        self._store = get_typestore(Stores.EMPTY)
+        try:
+            self._store.register(get_types_from_msg(kind.definition, self._name))
+            self.definition, self.md5sum = kind.definition, self._store.generate_msgdef(self._name)[1]
+            paths, self._build = self._compile(fields)
+        except Exception as error:  # whatever a library raises on a text
+            raise StationError(f"the type {kind.kind} cannot be made again: {error}") from error
+        if kind.md5sum not in {"", self.md5sum}:
+            raise StationError(f"the definition of {kind.kind} is not that of its checksum {kind.md5sum}")
+        self.lacking = sorted(path for path in paths if path not in fields)
+        self.foreign = sorted(set(fields) - paths)
+
+    def messages(self, block: Block) -> Iterator[tuple[int, bytes]]:
+        """Time in nanoseconds since the epoch, and the message as ROS 1 sends it, of each sample.
+
+        A header's stamp is the sample's time, to the microsecond; its seq counts.
+        """
+        columns = {self._field(name): values(column) for name, column in block.columns.items()}
+        for i, t_us in enumerate(block.times_us.tolist()):
+            sample = {name: column[i] for name, column in columns.items()}
+            message = self._build(sample, t_us)
+            yield t_us * 1000, bytes(self._store.serialize_ros1(message, self._name))
+
+    def _compile(self, fields: Sequence[str]) -> tuple[set[str], Any]:
+        """The paths that the type has, and what makes a message of a sample."""
+        store, seq = self._store, iter(range(2**32))
+        definitions = store.fielddefs
+        paths: set[str] = set()
+
+        def builder(name: str, prefix: str) -> Any:
+            made = store.types[name]
+            parts = {field: part(kind, f"{prefix}{field}") for field, kind in definitions[name][1] if field}
+            return lambda sample, t_us: made(**{field: of(sample, t_us) for field, of in parts.items()})
+
+        def header(sample: Mapping[str, Value], t_us: int) -> Any:
+            del sample
+            stamp = store.types["builtin_interfaces/msg/Time"](
+                sec=t_us // 1_000_000, nanosec=t_us % 1_000_000 * 1000
+            )
+            return store.types[_HEADER](seq=next(seq), stamp=stamp, frame_id="")
+
+        def part(kind: Any, path: str) -> Any:
+            node, detail = int(kind[0]), kind[1]
+            if node == _NAME:
+                return header if detail == _HEADER else builder(detail, f"{path}.")
+            if node == _BASE:
+                base = detail[0]
+                paths.add(path)
+                return lambda sample, _t_us: _value(sample.get(path), base)
+            element, length = detail
+            count = length if node == _ARRAY else _elements(fields, path)
+            items = [part(element, f"{path}.{i}") for i in range(count)]
+            basic = element[1][0] if int(element[0]) == _BASE and element[1][0] != "string" else None
+
+            def several(sample: Mapping[str, Value], t_us: int) -> Any:
+                listed = [item(sample, t_us) for item in items]
+                return listed if basic is None else np.array(listed, dtype=_DTYPES.get(basic, basic))
+
+            return several
+
+        lone = [(field, kind) for field, kind in definitions[self._name][1] if field != "header"]
+        names = [field for field, _ in definitions[self._name][1]]
+        if len(lone) == 1 and len(names) == 2 and int(lone[0][1][0]) == _NAME and lone[0][1][1] not in _TIMES:
+            # A header and one thing: the sample's fields are the thing's, see device/sources/flatten.py.
+            inner = builder(lone[0][1][1], "")
+            whole = store.types[self._name]
+            return paths, lambda sample, t_us: whole(
+                **{"header": header(sample, t_us), lone[0][0]: inner(sample, t_us)}
+            )
+        return paths, builder(self._name, "")
+
+
+_DTYPES = {"bool": "bool", "byte": "uint8", "char": "uint8", "octet": "uint8"}
+
+
+def _elements(fields: Sequence[str], path: str) -> int:
+    """How many elements of an array the samples have."""
+    indexes = [name[len(path) + 1 :].partition(".")[0] for name in fields if name.startswith(f"{path}.")]
+    return max((int(index) + 1 for index in indexes if index.isdecimal()), default=0)
+
+
+def _value(value: Value, base: str) -> Any:
+    """A value as the field's own type; null is what the wire could not carry, not a number."""
+    if base == "string":
+        return "" if value is None else str(value)
+    if base.startswith("float"):
+        return math.nan if value is None else float(value)
+    if base == "bool":
+        return bool(value)
+    return 0 if value is None else int(value)
