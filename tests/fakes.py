@@ -74,7 +74,8 @@ class FakeDynamoDB:
 
     def get_item(self, *, TableName: str, Key: dict[str, Any], **_: Any) -> dict[str, Any]:  # noqa: N803
         self.calls["get_item"] += 1
-        item = self.items[TableName].get((Key[ROBOT]["S"],))
+        first, *rest = (next(iter(Key[name].values())) for name in KEYS[TableName])
+        item = self.items[TableName].get((first, *map(Decimal, rest)))
         return {"Item": item} if item else {}
 
     def batch_write_item(self, *, RequestItems: dict[str, Any]) -> dict[str, Any]:  # noqa: N803

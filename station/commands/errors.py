@@ -96,7 +96,8 @@ def replay_errors(
         for outcome in outcomes:
             if outcome.fate not in (Fate.REPLAYED, Fate.NOT_FOR_REPLAY):
                 detail = f": {outcome.detail}" if outcome.detail else ""
-                _out.print(escape(f"{outcome.entry.id}  {outcome.entry.robot}  {outcome.fate.value}{detail}"))
+                line = f"{outcome.entry.id}  {outcome.entry.robot}  {outcome.fate.value}{detail}"
+                _out.print(escape(_one_line(line)), soft_wrap=True)
         counts = Counter(outcome.fate for outcome in outcomes)
         _out.print(", ".join(f"{n} {fate.value}" for fate, n in counts.items()) or "nothing in quarantine")
     if any(outcome.fate is Fate.FAILED for outcome in outcomes):
