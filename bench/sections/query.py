@@ -23,6 +23,7 @@ from bench.target import Say, Target
 from contract import EXPIRES_S, RECEIVED_MS, RECORD, TOPIC, VESC_STREAM, Batch, Value, build_topic, encode
 from device.sources.vehicle import Vehicle, VehicleConfig
 from station import data
+from station.sizes import item_bytes
 
 POINTS = 14_368
 ROBOT = "bench-query"
@@ -61,6 +62,17 @@ def run(target: Target, say: Say) -> Section:
             LAMBDA_SCAN: lambda: len(data.query(target.cloud, ROBOT, VESC_STREAM, on=data.LAMBDA, scan=True)),
         }
         found = {name: Way() for name in ways}
+        stored_mb = (
+            POINTS
+            * item_bytes(
+                {TOPIC: topic, "t": samples[-1][0], **_header(POINTS, samples[-1][0]), **samples[-1][1]}
+            )
+            / 1e6
+        )
+        section.notes.append(
+            f"An item of the thesis' layout holds the ROS message with its header: {stored_mb:.2f} MB in all, "
+            "where the thesis' were 4.95 MB."
+        )
         for turn in range(REPEATS + 1):
             for name, read in ways.items():
                 say(f"{name}, {turn} of {REPEATS}" if turn else f"{name}, to warm up")
@@ -187,6 +199,18 @@ def _store(target: Target, samples: list[tuple[int, dict[str, Value]]]) -> None:
         client.put_item(TableName=table, Item={name: serialize(value) for name, value in item.items()})
 
 
+def _header(seq: int, t_us: int) -> dict[str, Any]:
+    """What a ROS message carries besides its fields, and when it was received: with them an item is
+    nearly as large as the thesis' were, 4.95 MB / 14,368."""
+    return {
+        "seq": seq,
+        "secs": t_us // 1_000_000,
+        "nsecs": t_us % 1_000_000 * 1000,
+        "frame_id": "base_link",
+        RECEIVED_MS: t_us // 1000,
+    }
+
+
 @contextmanager
 def _thesis_table(target: Target, samples: list[tuple[int, dict[str, Value]]]) -> Iterator[Any]:
     """A table of one item a sample, as the thesis' rule wrote it; gone afterwards."""
@@ -213,9 +237,9 @@ def _thesis_table(target: Target, samples: list[tuple[int, dict[str, Value]]]) -
         table.wait_until_exists()
         topic = build_topic(RECORD, ROBOT, VESC_STREAM, cloud.namespace)
         with table.batch_writer() as batch:
-            for t_us, sample in samples:
+            for seq, (t_us, sample) in enumerate(samples):
                 numbers = {key: Decimal(repr(value)) for key, value in sample.items()}
-                batch.put_item(Item={TOPIC: topic, "t": t_us, **numbers})
+                batch.put_item(Item={TOPIC: topic, "t": t_us, **_header(seq, t_us), **numbers})
         yield table
     finally:
         table.delete()
