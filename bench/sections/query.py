@@ -70,7 +70,7 @@ def run(target: Target, say: Say) -> Section:
             / 1e6
         )
         section.notes.append(
-            f"An item of the thesis' layout holds the ROS message with its header: {stored_mb:.2f} MB in all, "
+            f"An item of the thesis' layout holds the ROS message with its header: {stored_mb:.2f} MB, "
             "where the thesis' were 4.95 MB."
         )
         for turn in range(REPEATS + 1):
