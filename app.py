@@ -12,6 +12,7 @@ from typing import Any
 
 from aws_cdk import App, CliCredentialsStackSynthesizer, Tags
 
+from stacks.account import Account
 from stacks.acknowledged import Acknowledged, acknowledge
 from stacks.fleet import Fleet
 from stacks.ingest import Ingest
@@ -59,6 +60,8 @@ def build(app: App, settings: Settings) -> list[Acknowledged]:
         stacks=(storage, quarantine, fleet, processing),
         topic=processing.alarms,
     )
+    if settings.account_wide:
+        Account(app, **stack("account"), settings=settings)
     if settings.site:
         Site(app, **stack("site"), settings=settings)
     for key, value in {"project": name, "stage": settings.stage, **settings.tags}.items():

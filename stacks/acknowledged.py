@@ -122,6 +122,7 @@ def _one_by_one(app: App, settings: Settings) -> Iterator[Found]:
 def single(settings: Settings) -> dict[str, dict[str, str]]:
     """Stack and construct path to rules and reasons."""
     iot = "arn:<AWS::Partition>:iot:<AWS::Region>:<AWS::AccountId>"
+    logs = "arn:<AWS::Partition>:logs:<AWS::Region>:<AWS::AccountId>"
 
     def wide(resource: str) -> str:
         return f"AwsSolutions-IAM5[Resource::{resource}]"
@@ -132,6 +133,12 @@ def single(settings: Settings) -> dict[str, dict[str, str]]:
         "AwsSolutions-IAM5[Action::kms:ReEncrypt*]": "as kms:GenerateDataKey*",
     }
     return {
+        "account/AuditRole/DefaultPolicy": {wide("*"): "an audit reads every certificate and policy"},
+        "account/LogRole/DefaultPolicy": {
+            wide(f"{logs}:log-group:AWSIotLogsV2:*"): "the wildcard is the log's streams"
+        },
+        "account/Audit": {"W3005": "the role's policy must be there before the role is tried"},
+        "account/Log": {"W3005": "as account/Audit"},
         "fleet/ProvisioningRole/DefaultPolicy": {
             wide(f"{iot}:thing/*"): "a thing is named by the robot that asks to be provisioned",
             wide(f"{iot}:cert/*"): "a certificate's id is made when it is",

@@ -25,6 +25,7 @@ ROOT = Path(__file__).resolve().parent.parent
 
 DEV, PROD = "dev", "prod"
 STAGES = (DEV, PROD)
+IOT_LOG_LEVELS = ("off", "error", "warn", "info", "debug")
 _EMAIL = re.compile(r"[^@\s,]+@[^@\s,]+\.[^@\s,]+")
 # "Tag naming limits and requirements": up to 128 and 256 characters, and aws: is AWS' own.
 _TAG_KEY = re.compile(r"(?!aws:)[\w .:/=+@-]{1,128}", re.IGNORECASE)
@@ -62,6 +63,7 @@ class Settings:
     files are (0: for good), ``upload_gb_a_day`` what one robot may upload in a day, in 1e9 bytes;
     ``live_concurrency`` bounds Lambda 1 (0 reserves nothing, for accounts whose concurrency limit is
     too low to reserve from); ``live_fields`` maps stream to the fields that go to the dashboard;
+    ``device_defender`` and ``iot_log_level`` ("" for none) are for the account as a whole;
     ``site`` adds the stack that puts the page on the web; ``layer`` is the folder of Lambda 1's
     third-party code; ``embedded`` is true for the embedded cloud, which is deployed with the caller's
     own credentials.
@@ -81,6 +83,8 @@ class Settings:
     live_concurrency: int = 5
     live_fields: Mapping[str, list[str]] = field(default_factory=lambda: {VESC_STREAM: list(VESC_FIELDS)})
     layer: Path = ROOT / "build" / "layer" / "lambda"
+    device_defender: bool = True
+    iot_log_level: str = "error"
     site: bool = False
     embedded: bool = False
 
@@ -89,6 +93,11 @@ class Settings:
         """Whether data outlives its stack: retained, recoverable to a point in time, and protected
         from deletion and termination."""
         return self.stage == PROD
+
+    @property
+    def account_wide(self) -> bool:
+        """Whether anything is set for the account as a whole."""
+        return not self.embedded and (self.device_defender or bool(self.iot_log_level))
 
     @property
     def removal_policy(self) -> RemovalPolicy:
@@ -118,9 +127,15 @@ class Settings:
         ):
             if (value := context(key)) is not None:
                 given[key] = _integer(key, value, low, high)
-        for key in ("embedded", "customer_key", "robot_metrics", "site"):
+        for key in ("embedded", "customer_key", "device_defender", "robot_metrics", "site"):
             if (value := context(key)) is not None:
                 given[key] = _boolean(key, value)
+        if (level := context("iot_log_level")) is not None:
+            if level not in IOT_LOG_LEVELS:
+                raise SettingsError(
+                    f"context iot_log_level = {level!r}: allowed is one of {', '.join(IOT_LOG_LEVELS)}"
+                )
+            given["iot_log_level"] = "" if level == "off" else level
         if (email := context("alarm_email")) is not None:
             given["alarm_email"] = _email("alarm_email", email)
         if (tags := context("tags")) is not None:

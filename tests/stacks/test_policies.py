@@ -64,6 +64,19 @@ PROVISIONING = (
     | {(f"iot:{action}", "*") for action in ("ListAttachedPolicies", "ListPrincipalThings", "RegisterThing")}
 )
 
+# What the checks of the audit read: certificates and policies, whoever's they are.
+AUDIT_READS = (
+    *(
+        "DescribeCACertificate",
+        "DescribeCertificate",
+        "GetEffectivePolicies",
+        "GetLoggingOptions",
+        "GetPolicy",
+    ),
+    *("GetV2LoggingOptions", "ListCACertificates", "ListCertificates", "ListPolicies"),
+)
+LOG_OF_IOT = "arn:${AWS::Partition}:logs:${AWS::Region}:${AWS::AccountId}:log-group:AWSIotLogsV2:*"
+
 LOG = {"logs:CreateLogStream", "logs:PutLogEvents"}
 REJECT = ("sqs:SendMessage", "Rejected.Arn")
 # What the CDK gives whoever may send to a queue as a destination.
@@ -152,6 +165,11 @@ ROLES = {
         | {("dynamodb:UpdateItem", "Robots.Arn"), ("sns:Publish", "Alarms")},
     ),
     "ProvisioningRole": ("iot.amazonaws.com", PROVISIONING),
+    "AuditRole": ("iot.amazonaws.com", {(f"iot:{action}", "*") for action in AUDIT_READS}),
+    "LogRole": (
+        "iot.amazonaws.com",
+        {(f"logs:{action}", LOG_OF_IOT) for action in ("CreateLogGroup", "CreateLogStream", "PutLogEvents")},
+    ),
     "ingest/RecordRole": ("iot.amazonaws.com", {REJECT, ("dynamodb:PutItem", "Telemetry.Arn")}),
     "ingest/LiveRole": ("iot.amazonaws.com", {REJECT}),
     "ingest/PongRole": ("iot.amazonaws.com", {REJECT, ("iot:Publish", f"{IOT}:topic/pong/iort/*/rule")}),
@@ -170,6 +188,8 @@ EVERY_RESOURCE = {
         ("ProvisioningRole", f"iot:{a}")
         for a in ("ListAttachedPolicies", "ListPrincipalThings", "RegisterThing")
     ),
+    # An audit is of everything.
+    *(("AuditRole", f"iot:{a}") for a in AUDIT_READS),
 }
 
 
@@ -341,9 +361,10 @@ def test_no_statement_is_about_every_resource_or_action(synthesized, reader):
             if resource == "*":
                 wild.add((role, action))
             else:
-                # A wildcard within an ARN stands for the robot's name, in the bucket for its keys.
+                # A wildcard within an ARN stands for the robot's name, in the bucket for its keys, in a log
+                # for its streams.
                 # Things and certificates have no names before they are provisioned.
-                named = re.sub(r":topic/pong/iort/\*/|/(robots|results)/\*$", "", resource)
+                named = re.sub(r":topic/pong/iort/\*/|/(robots|results)/\*$|:AWSIotLogsV2:\*$", "", resource)
                 assert "*" not in named or (role == "ProvisioningRole" and named in {THINGS, CERTIFICATES})
     assert wild == EVERY_RESOURCE
     # And nothing grants that is not a role's policy or a robot's, such as a policy of its own.

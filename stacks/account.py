@@ -1,0 +1,104 @@
+"""What holds for the whole account: Device Defender's audit, and what AWS IoT logs.
+
+An account has one of each, so a second deployment in it, or one that brings its own, leaves them out
+(`device_defender`, `iot_log_level`). The embedded cloud has neither.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+from aws_cdk import Stack
+from aws_cdk import aws_iam as iam
+from aws_cdk import aws_iot as iot
+from constructs import Construct
+
+from stacks.settings import Settings
+
+# "Audit checks" that are about certificates, policies and clients; the others are about role aliases,
+# Cognito and intermediate authorities, of which there is nothing here.
+_CHECKS = (
+    "CA_CERTIFICATE_EXPIRING_CHECK",
+    "CA_CERTIFICATE_KEY_QUALITY_CHECK",
+    "CONFLICTING_CLIENT_IDS_CHECK",
+    "DEVICE_CERTIFICATE_EXPIRING_CHECK",
+    "DEVICE_CERTIFICATE_KEY_QUALITY_CHECK",
+    "DEVICE_CERTIFICATE_SHARED_CHECK",
+    "IOT_POLICY_OVERLY_PERMISSIVE_CHECK",
+    "LOGGING_DISABLED_CHECK",
+    "REVOKED_CA_CERTIFICATE_STILL_ACTIVE_CHECK",
+    "REVOKED_DEVICE_CERTIFICATE_STILL_ACTIVE_CHECK",
+)
+# What these checks read. Source: the managed policy AWSIoTDeviceDefenderAudit, which reads IAM and
+# Cognito besides, for the checks that are off.
+_AUDIT_READS = (
+    "DescribeCACertificate",
+    "DescribeCertificate",
+    "GetEffectivePolicies",
+    "GetLoggingOptions",
+    "GetPolicy",
+    "GetV2LoggingOptions",
+    "ListCACertificates",
+    "ListCertificates",
+    "ListPolicies",
+)
+_LOG_GROUP = "AWSIotLogsV2"
+
+
+class Account(Stack):
+    """The audit, once a day, and the log, as far as the settings want them."""
+
+    def __init__(self, scope: Construct, construct_id: str, *, settings: Settings, **kwargs: Any) -> None:
+        super().__init__(scope, construct_id, **kwargs)
+        if settings.device_defender:
+            self._audit()
+        if settings.iot_log_level:
+            self._log(settings.iot_log_level)
+
+    def _audit(self) -> None:
+        role = self._role("AuditRole")
+        role.add_to_policy(
+            iam.PolicyStatement(actions=[f"iot:{action}" for action in _AUDIT_READS], resources=["*"])
+        )
+        on = iot.CfnAccountAuditConfiguration.AuditCheckConfigurationProperty(enabled=True)
+        audit = iot.CfnAccountAuditConfiguration(
+            self,
+            "Audit",
+            account_id=self.account,
+            role_arn=role.role_arn,
+            audit_check_configurations=iot.CfnAccountAuditConfiguration.AuditCheckConfigurationsProperty(
+                **{name.lower(): on for name in _CHECKS}
+            ),
+        )
+        daily = iot.CfnScheduledAudit(
+            self,
+            "Daily",
+            frequency="DAILY",
+            target_check_names=list(_CHECKS),
+        )
+        audit.node.add_dependency(role)
+        daily.node.add_dependency(audit)
+
+    def _log(self, level: str) -> None:
+        role = self._role("LogRole")
+        group = self.format_arn(service="logs", resource="log-group", resource_name=_LOG_GROUP)
+        role.add_to_policy(
+            iam.PolicyStatement(
+                actions=["logs:CreateLogGroup", "logs:CreateLogStream", "logs:PutLogEvents"],
+                resources=[group.replace(f"/{_LOG_GROUP}", f":{_LOG_GROUP}:*")],
+            )
+        )
+        log = iot.CfnLogging(
+            self,
+            "Log",
+            account_id=self.account,
+            default_log_level=level.upper(),
+            role_arn=role.role_arn,
+        )
+        log.node.add_dependency(role)
+
+    def _role(self, name: str) -> iam.Role:
+        principal = iam.ServicePrincipal(
+            "iot.amazonaws.com", conditions={"StringEquals": {"aws:SourceAccount": self.account}}
+        )
+        return iam.Role(self, name, assumed_by=principal)

@@ -1,0 +1,247 @@
+"""Least privilege of the stacks' own roles, tried with each role's credentials: every role on every table,
+queue, bucket, parameter, function, log and topic. What is not declared for it is refused."""
+
+from __future__ import annotations
+
+import fnmatch
+import json
+from collections.abc import Iterator
+from typing import Any, NamedTuple
+
+import boto3
+import pytest
+from botocore.config import Config
+from botocore.exceptions import ClientError
+
+from contract import pubnub_parameter
+from tests import isolation
+from tests.stacks.templates import name
+from tests.stacks.test_policies import IOT, ROLES
+
+ACCOUNT = "000000000000"
+DENIED = {"AccessDenied", "AccessDeniedException", "ForbiddenException", "UnauthorizedOperation", "403"}
+SERVICES = ("dynamodb", "sqs", "s3", "ssm", "lambda", "logs", "iot-data", "iam", "sts", "iot")
+
+
+class Resource(NamedTuple):
+    """``arn`` is how it is declared, ``physical`` how it is called."""
+
+    kind: str
+    arn: str
+    physical: str
+
+
+@pytest.fixture(scope="module")
+def deployed(embedded):
+    """Every resource of the stacks, as CloudFormation lists them."""
+    found = []
+    cloudformation = embedded.cloud.client("cloudformation")
+    for page in cloudformation.get_paginator("describe_stacks").paginate():
+        for stack in page["Stacks"]:
+            noun = stack["StackName"].removeprefix("iort-")
+            if noun == stack["StackName"]:
+                continue  # the CDK's own
+            pages = cloudformation.get_paginator("list_stack_resources")
+            for resources in pages.paginate(StackName=stack["StackName"]):
+                for one in resources["StackResourceSummaries"]:
+                    logical = name(one["LogicalResourceId"])
+                    if one["ResourceType"] == "AWS::IAM::Role" and noun == "ingest":
+                        logical = f"ingest/{logical}"
+                    found.append(Resource(one["ResourceType"], logical, one["PhysicalResourceId"]))
+    return found
+
+
+def of(deployed: list[Resource], kind: str) -> list[Resource]:
+    return [one for one in deployed if one.kind == kind]
+
+
+def as_role(embedded: Any, role: str) -> dict[str, Any]:
+    """Clients with the role's credentials. The role trusts its service alone, which
+    tests/stacks/test_policies.py holds it to; the operator, who may change that, lets the account take
+    it for the moment of taking it."""
+    cloud = embedded.cloud
+    iam = cloud.client("iam")
+    described = iam.get_role(RoleName=role)["Role"]
+    account = {"AWS": f"arn:aws:iam::{ACCOUNT}:root"}
+    trust = [{"Effect": "Allow", "Action": "sts:AssumeRole", "Principal": account}]
+    _trust(iam, role, {"Version": "2012-10-17", "Statement": trust})
+    try:
+        taken = cloud.client("sts").assume_role(RoleArn=described["Arn"], RoleSessionName="test")
+    finally:
+        _trust(iam, role, described["AssumeRolePolicyDocument"])
+    session = boto3.Session(
+        aws_access_key_id=taken["Credentials"]["AccessKeyId"],
+        aws_secret_access_key=taken["Credentials"]["SecretAccessKey"],
+        aws_session_token=taken["Credentials"]["SessionToken"],
+        region_name=cloud.region,
+    )
+    config = Config(retries={"total_max_attempts": 1}, s3={"addressing_style": "path"})
+    at = {"endpoint_url": cloud.endpoint_url, "verify": cloud.ca_bundle, "config": config}
+    return {service: session.client(service, **at) for service in SERVICES}
+
+
+def _trust(iam: Any, role: str, document: Any) -> None:
+    iam.update_assume_role_policy(RoleName=role, PolicyDocument=json.dumps(document))
+
+
+class Probe(NamedTuple):
+    """One call: what is asked, by its action and declared ARN, and how."""
+
+    action: str
+    arn: str
+    service: str
+    call: str
+    arguments: dict[str, Any]
+
+
+def probes(deployed: list[Resource]) -> Iterator[Probe]:
+    yield from _tables(deployed)
+    for queue in of(deployed, "AWS::SQS::Queue"):
+        at: dict[str, Any] = {"QueueUrl": queue.physical}
+        each: dict[str, tuple[str, dict[str, Any]]] = {
+            "SendMessage": ("send_message", {**at, "MessageBody": "x"}),
+            "ReceiveMessage": ("receive_message", {**at, "VisibilityTimeout": 0}),
+            "DeleteMessage": ("delete_message", {**at, "ReceiptHandle": "x"}),
+            "PurgeQueue": ("purge_queue", at),
+            "GetQueueAttributes": ("get_queue_attributes", {**at, "AttributeNames": ["All"]}),
+        }
+        for action in isolation.QUEUE_ACTIONS:
+            yield Probe(f"sqs:{action}", f"{queue.arn}.Arn", "sqs", *each[action])
+    for bucket in of(deployed, "AWS::S3::Bucket"):
+        at = {"Bucket": bucket.physical}
+        each = {"ListBucket": ("list_objects_v2", at), "DeleteBucket": ("delete_bucket", at)}
+        for action in isolation.BUCKET_ACTIONS:
+            yield Probe(f"s3:{action}", f"{bucket.arn}.Arn", "s3", *each[action])
+        for action in isolation.OBJECT_ACTIONS:
+            for key in isolation.OBJECTS:
+                call = {"GetObject": "get_object", "PutObject": "put_object", "DeleteObject": "delete_object"}
+                yield Probe(f"s3:{action}", f"{bucket.arn}.Arn/{key}", "s3", call[action], {**at, "Key": key})
+    parameter = {"Name": pubnub_parameter()}
+    each = {
+        "GetParameter": ("get_parameter", parameter),
+        "PutParameter": ("put_parameter", {**parameter, "Value": "x", "Overwrite": True}),
+        "DeleteParameter": ("delete_parameter", parameter),
+    }
+    for action in isolation.PARAMETER_ACTIONS:
+        arn = f"{IOT.replace(':iot:', ':ssm:')}:parameter{pubnub_parameter()}"
+        yield Probe(f"ssm:{action}", arn, "ssm", *each[action])
+    for function in of(deployed, "AWS::Lambda::Function"):
+        at = {"FunctionName": function.physical}
+        each = {
+            "InvokeFunction": ("invoke", at),
+            "UpdateFunctionConfiguration": ("update_function_configuration", {**at, "Timeout": 3}),
+        }
+        for action in isolation.FUNCTION_ACTIONS:
+            yield Probe(f"lambda:{action}", f"{function.arn}.Arn", "lambda", *each[action])
+    for log in of(deployed, "AWS::Logs::LogGroup"):
+        at = {"logGroupName": log.physical, "logStreamName": "isolation"}
+        each = {
+            "CreateLogStream": ("create_log_stream", at),
+            "PutLogEvents": ("put_log_events", {**at, "logEvents": [{"timestamp": 1, "message": "x"}]}),
+            "GetLogEvents": ("get_log_events", at),
+        }
+        for action in isolation.LOG_ACTIONS:
+            yield Probe(f"logs:{action}", f"{log.arn}.Arn", "logs", *each[action])
+    for topic in isolation.TOPICS:
+        yield Probe("iot:Publish", f"{IOT}:topic/{topic}", "iot-data", "publish", {"topic": topic})
+    # What no role of ours has to do with anything of.
+    yield Probe("iam:ListRoles", "none", "iam", "list_roles", {})
+    yield Probe("iot:ListCertificates", "none", "iot", "list_certificates", {})
+    yield Probe(
+        "iot:CreateKeysAndCertificate", "none", "iot", "create_keys_and_certificate", {"setAsActive": False}
+    )
+    for role in of(deployed, "AWS::IAM::Role"):
+        arn = f"arn:aws:iam::{ACCOUNT}:role/{role.physical}"
+        taken = {"RoleArn": arn, "RoleSessionName": "probe"}
+        yield Probe("sts:AssumeRole", role.arn, "sts", "assume_role", taken)
+
+
+def _tables(deployed: list[Resource]) -> Iterator[Probe]:
+    for table in of(deployed, "AWS::DynamoDB::Table"):
+        at: dict[str, Any] = {"TableName": table.physical}
+        key: dict[str, Any] = {"robot": {"S": "none"}} if table.arn == "Robots" else {"topic": {"S": "none"}}
+        sort = {"Telemetry": "t", "Summary": "second"}.get(table.arn)
+        if sort:
+            key[sort] = {"N": "0"}
+        query = {"KeyConditionExpression": "#k = :k", "ExpressionAttributeValues": {":k": {"S": "none"}}}
+        names = {"ExpressionAttributeNames": {"#k": next(iter(key))}}
+        # What is allowed may happen, to an item that is not there and stays so.
+        there = {"ConditionExpression": "attribute_exists(#k)", **names}
+        each = {
+            "GetItem": ("get_item", {**at, "Key": key}),
+            "PutItem": ("put_item", {**at, "Item": key, **there}),
+            "UpdateItem": ("update_item", {**at, "Key": key, "UpdateExpression": "REMOVE x", **there}),
+            "DeleteItem": ("delete_item", {**at, "Key": key}),
+            "Query": ("query", {**at, **query, **names}),
+            "Scan": ("scan", {**at, "Limit": 1}),
+            "BatchWriteItem": (
+                "batch_write_item",
+                {"RequestItems": {table.physical: [{"DeleteRequest": {"Key": key}}]}},
+            ),
+            "DeleteTable": ("delete_table", at),
+        }
+        for action in isolation.TABLE_ACTIONS:
+            yield Probe(f"dynamodb:{action}", f"{table.arn}.Arn", "dynamodb", *each[action])
+
+
+def declared(role: str, probe: Probe) -> bool:
+    return any(
+        probe.action == action and fnmatch.fnmatchcase(probe.arn, arn) for action, arn in ROLES[role][1]
+    )
+
+
+def refused(clients: dict[str, Any], probe: Probe) -> bool:
+    try:
+        getattr(clients[probe.service], probe.call)(**probe.arguments)
+    except ClientError as error:
+        code = error.response["Error"]["Code"]
+        return code in DENIED
+    return False
+
+
+def test_every_role_is_declared(deployed):
+    roles = {one.arn for one in of(deployed, "AWS::IAM::Role")}
+    # Others, such as those of account-wide settings, are left out on the embedded cloud.
+    assert roles <= ROLES.keys(), "declare what a new role may do in tests/stacks/test_policies.py"
+
+
+def test_every_role_is_refused_what_is_not_declared_for_it(embedded, deployed):
+    asked = list(probes(deployed))
+    through, tried = [], 0
+    for role in of(deployed, "AWS::IAM::Role"):
+        clients = as_role(embedded, role.physical)
+        for probe in asked:
+            if declared(role.arn, probe):
+                continue
+            tried += 1
+            if not refused(clients, probe):
+                through.append((role.arn, probe.action, probe.arn))
+    assert through == []
+    assert tried > 1000
+
+
+def test_what_is_declared_is_not_refused(embedded, deployed):
+    """The same calls, of those that leave nothing behind: so a refusal above is one for its reason."""
+    harmless = {
+        "dynamodb:GetItem",
+        "dynamodb:PutItem",
+        "dynamodb:UpdateItem",
+        "dynamodb:Query",
+        "dynamodb:BatchWriteItem",
+        "ssm:GetParameter",
+        "s3:ListBucket",
+        "iot:Publish",
+        "sqs:GetQueueAttributes",
+    }
+    asked = [probe for probe in probes(deployed) if probe.action in harmless]
+    wrong, tried = [], set()
+    for role in of(deployed, "AWS::IAM::Role"):
+        mine = [probe for probe in asked if declared(role.arn, probe)]
+        if mine:
+            clients = as_role(embedded, role.physical)
+            for probe in mine:
+                tried.add(probe.action)
+                if refused(clients, probe):
+                    wrong.append((role.arn, probe.action, probe.arn))
+    assert wrong == []
+    assert tried >= harmless
