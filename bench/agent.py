@@ -4,7 +4,8 @@
 
 At 50 Hz and at 1000 Hz: processor time a sample of the agent (both lanes and the spool on, TLS to the
 embedded cloud's broker) and of a bare subscriber of the same topic in the same run; the delay from ROS
-publish to an MQTT subscriber over the live lane; memory at the start and at the end; samples lost.
+publish to an MQTT subscriber over the live lane, there and, where it is installed, over mosquitto, beside a
+bare MQTT client's (`bench.live_lane`); memory at the start and at the end; samples lost.
 """
 
 from __future__ import annotations
@@ -25,6 +26,7 @@ from typing import Any
 from rich.console import Console
 from rich.table import Table
 
+from bench import live_lane, mosquitto
 from bench.ros_graph import RosError, RosGraph, python_with_rospy
 from bench.watcher import delays_ms
 from local.cloud import EmbeddedCloud
@@ -74,11 +76,18 @@ def main() -> None:
                 seconds = options.soak or options.seconds
                 console.print(f"{rate_hz} Hz for {seconds} s ...")
                 runs.append(_measure(embedded.cloud, python, rate_hz, seconds))
+        lean = []
+        program = mosquitto.found()
+        if program is None:
+            console.print("mosquitto is not installed (apt install mosquitto): left out", style="yellow")
+        for rate_hz in RATES_HZ if program is not None and not options.soak else ():
+            console.print(f"mosquitto, {rate_hz} Hz for {options.seconds} s ...")
+            lean.append(live_lane.measure(str(program), python, rate_hz, options.seconds))
     except (LocalError, RosError) as error:
         sys.exit(f"bench-agent: {error}")
-    console.print(_table(runs, cycle))
+    console.print(_table(runs, cycle, lean))
     if options.json:
-        options.json.write_text(json.dumps(_report(runs, cycle), indent=2) + "\n")
+        options.json.write_text(json.dumps(_report(runs, cycle, lean), indent=2) + "\n")
     sys.exit(1 if any(run.lost for run in runs) else 0)
 
 
@@ -170,7 +179,7 @@ def _output(command: list[str]) -> str:
     return done.stdout
 
 
-def _table(runs: list[Run], cycle: dict[str, float]) -> Table:
+def _table(runs: list[Run], cycle: dict[str, float], lean: list[live_lane.Lane]) -> Table:
     table = Table(title="The agent", title_justify="left", title_style="bold")
     for column in ("figure", "measured", "target", "floor, same run"):
         table.add_column(column, justify="left" if column == "figure" else "right")
@@ -188,12 +197,19 @@ def _table(runs: list[Run], cycle: dict[str, float]) -> Table:
         rss = f"{run.rss_mb_first:.1f} to {run.rss_mb_last:.1f} MB"
         table.add_row(f"memory {rate}, first to last", rss, f"{TARGETS['rss_mb']:.0f} MB", "")
         table.add_row(f"samples lost {rate}", f"{run.lost} of {run.samples:,}", "0", "")
+    for lane in lean:
+        table.add_row(
+            f"ROS publish to MQTT subscriber at {lane.rate_hz} Hz, mosquitto",
+            lane.shown(lane.agent_ms),
+            f"{TARGETS['live_ms_p50']} ms",
+            lane.shown(lane.floor_ms),
+        )
     p50 = f"{cycle['p50']:.4f} ms (p95 {cycle['p95']:.4f})"
     table.add_row("node's cycle, callback to spool", p50, f"{TARGETS['cycle_ms_p50']} ms", "thesis: 2 ms")
     return table
 
 
-def _report(runs: list[Run], cycle: dict[str, float]) -> dict[str, Any]:
+def _report(runs: list[Run], cycle: dict[str, float], lean: list[live_lane.Lane]) -> dict[str, Any]:
     return {
         "date": datetime.now(timezone.utc).isoformat(timespec="seconds"),
         "machine": f"{platform.machine()}, {os.cpu_count()} cores, {platform.platform()}",
@@ -202,6 +218,7 @@ def _report(runs: list[Run], cycle: dict[str, float]) -> dict[str, Any]:
         "targets": {**TARGETS, "cpu_us": CPU_US},
         "cycle_ms": cycle,
         "runs": [asdict(run) for run in runs],
+        "mosquitto": [asdict(lane) for lane in lean],
     }
 
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import threading
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
 
@@ -13,10 +13,12 @@ from awscrt import mqtt5
 from awsiot import mqtt5_client_builder
 
 from contract import LIVE, decode_live
+from device.uplink import matches
 from station.cloud import Cloud
 
 NAME = "bench-watcher"
 _WAIT_S = 20.0
+TimeOf = Callable[[bytes], int]
 
 
 @contextmanager
@@ -37,19 +39,51 @@ def delays_ms(cloud: Cloud, folder: Path, robot: str) -> Iterator[list[float]]:
     }
     for name, text in files.items():
         (folder / name).write_text(text or "")
-    heard: list[float] = []
+    try:
+        with listening(
+            endpoint=cloud.mqtt_endpoint,
+            port=cloud.mqtt_port,
+            certificate=folder / "certificate",
+            key=folder / "key",
+            ca=folder / "ca",
+            took_us={f"{LIVE}/{cloud.namespace}/{robot}/+": live_us},
+        ) as heard:
+            yield heard[f"{LIVE}/{cloud.namespace}/{robot}/+"]
+    finally:
+        certificate = created["certificateId"]
+        iot.detach_policy(policyName=NAME, target=created["certificateArn"])
+        iot.update_certificate(certificateId=certificate, newStatus="INACTIVE")
+        iot.delete_certificate(certificateId=certificate, forceDelete=True)
+        iot.delete_policy(policyName=NAME)
+
+
+def live_us(payload: bytes) -> int:
+    """The time of a live message's sample, in microseconds."""
+    return decode_live(payload).t_us
+
+
+@contextmanager
+def listening(
+    *, endpoint: str, port: int, certificate: Path, key: Path, ca: Path, took_us: Mapping[str, TimeOf]
+) -> Iterator[dict[str, list[float]]]:
+    """The delays in ms of every message meanwhile by topic filter, each of which says how to read the
+    time at which a message's way began."""
+    heard: dict[str, list[float]] = {topic_filter: [] for topic_filter in took_us}
     connected, stopped = threading.Event(), threading.Event()
 
     def take(data: mqtt5.PublishReceivedData) -> None:
         now_us = time.time_ns() // 1000
-        heard.append((now_us - decode_live(data.publish_packet.payload).t_us) / 1000)
+        packet = data.publish_packet
+        for topic_filter, began_us in took_us.items():
+            if matches(topic_filter, packet.topic):
+                heard[topic_filter].append((now_us - began_us(packet.payload)) / 1000)
 
     client = mqtt5_client_builder.mtls_from_path(
-        str(folder / "certificate"),
-        str(folder / "key"),
-        endpoint=cloud.mqtt_endpoint,
-        port=cloud.mqtt_port,
-        ca_filepath=str(folder / "ca"),
+        str(certificate),
+        str(key),
+        endpoint=endpoint,
+        port=port,
+        ca_filepath=str(ca),
         client_id=NAME,
         on_publish_received=take,
         on_lifecycle_connection_success=lambda _: connected.set(),
@@ -58,17 +92,12 @@ def delays_ms(cloud: Cloud, folder: Path, robot: str) -> Iterator[list[float]]:
     client.start()
     if not connected.wait(_WAIT_S):
         raise TimeoutError(f"{NAME} was not connected within {_WAIT_S:.0f} s")
-    wanted = mqtt5.Subscription(
-        topic_filter=f"{LIVE}/{cloud.namespace}/{robot}/+", qos=mqtt5.QoS.AT_MOST_ONCE
-    )
-    client.subscribe(mqtt5.SubscribePacket(subscriptions=[wanted])).result(_WAIT_S)
+    wanted = [
+        mqtt5.Subscription(topic_filter=topic_filter, qos=mqtt5.QoS.AT_MOST_ONCE) for topic_filter in took_us
+    ]
+    client.subscribe(mqtt5.SubscribePacket(subscriptions=wanted)).result(_WAIT_S)
     try:
         yield heard
     finally:
         client.stop()
         stopped.wait(_WAIT_S)
-        certificate = created["certificateId"]
-        iot.detach_policy(policyName=NAME, target=created["certificateArn"])
-        iot.update_certificate(certificateId=certificate, newStatus="INACTIVE")
-        iot.delete_certificate(certificateId=certificate, forceDelete=True)
-        iot.delete_policy(policyName=NAME)

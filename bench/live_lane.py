@@ -1,0 +1,102 @@
+"""From ROS publish to an MQTT subscriber over the live lane, through mosquitto, beside the floor.
+
+The floor is a bare rospy subscriber that hands the same messages, as many a second, to a bare MQTT client:
+the same topic, broker, TLS and subscriber at the same time.
+"""
+
+from __future__ import annotations
+
+import struct
+import subprocess
+import tempfile
+from dataclasses import dataclass
+from pathlib import Path
+
+import yaml
+
+from bench.mosquitto import HOST, Mosquitto
+from bench.ros_graph import RosError, RosGraph
+from bench.watcher import listening, live_us
+from contract import LIVE, LIVE_MAX_RATE_HZ
+from local.figures import Spread
+
+TOPIC = "/sensors/core"
+_AGENT, _FLOOR = f"{LIVE}/iort/bench/+", "bench/floor"
+_WARM_UP_S = 3
+
+
+@dataclass(frozen=True)
+class Lane:
+    """The delays at one rate, of the agent and of the floor."""
+
+    rate_hz: int
+    agent_ms: Spread
+    floor_ms: Spread
+
+    @staticmethod
+    def shown(spread: Spread) -> str:
+        """To a hundredth of a millisecond, for that is what the two differ by."""
+        return "-" if spread.p50 is None else f"{spread.p50:.2f} ms (p95 {spread.p95:.2f})"
+
+
+def measure(program: str, python: str, rate_hz: int, seconds: int) -> Lane:
+    """Run both side by side; raises `RosError` where one of the processes stops."""
+    with (
+        tempfile.TemporaryDirectory() as name,
+        Mosquitto(program, Path(name)) as broker,
+        RosGraph(python, Path(name)) as graph,
+    ):
+        certificate, key = broker.identity("watcher")
+        with listening(
+            endpoint=HOST,
+            port=broker.port,
+            certificate=certificate,
+            key=key,
+            ca=broker.ca,
+            took_us={_AGENT: live_us, _FLOOR: _stamp_us},
+        ) as heard:
+            graph.start("device.main", "run", "--config", _car(broker, Path(name)))
+            every = max(1, round(rate_hz / LIVE_MAX_RATE_HZ))
+            graph.start("bench.mqtt_floor", TOPIC, every, broker.port, *broker.identity("floor"), broker.ca,
+                        _FLOOR)  # fmt: skip
+            publisher = graph.start("bench.ros_publisher", TOPIC, rate_hz, rate_hz * (seconds + _WARM_UP_S))
+            assert publisher.stdout is not None
+            assert publisher.stdin is not None
+            publisher.stdout.readline()
+            publisher.stdin.write("\n")
+            publisher.stdin.flush()
+            try:
+                publisher.wait(_WARM_UP_S)
+            except subprocess.TimeoutExpired:
+                before = {topic: len(delays) for topic, delays in heard.items()}
+            else:
+                raise RosError(f"the publisher stopped with status {publisher.returncode}")
+            if not publisher.stdout.readline():
+                raise RosError(f"the publisher stopped with status {publisher.wait()}")
+            agent, floor = (Spread.of(heard[topic][before[topic] :]) for topic in (_AGENT, _FLOOR))
+    return Lane(rate_hz, agent, floor)
+
+
+def _car(broker: Mosquitto, folder: Path) -> Path:
+    certificate, key = broker.identity("bench")
+    config = folder / "car.yaml"
+    config.write_text(
+        yaml.safe_dump(
+            {
+                "robot": "bench",
+                "endpoint": HOST,
+                "port": broker.port,
+                "certificate": str(certificate),
+                "private_key": str(key),
+                "root_ca": str(broker.ca),
+                "sources": [{"type": "ros1", "topics": {TOPIC: {"stream": "vesc", "time": "header"}}}],
+                "queue": {"path": "spool.db"},
+            }
+        )
+    )
+    return config
+
+
+def _stamp_us(message: bytes) -> int:
+    _, sec, nanosec = struct.unpack_from("<III", message)
+    return int(sec * 1_000_000 + nanosec // 1000)
