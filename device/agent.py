@@ -14,7 +14,7 @@ import contract
 from contract import Value
 from device.allowance import Allowance
 from device.batch import Batcher, StreamCounts
-from device.claim_check import ClaimCheck
+from device.claim_check import make_claims
 from device.clock import Clock
 from device.config import Config
 from device.downlink import make_downlink
@@ -29,7 +29,6 @@ from device.record import RecordLane
 from device.remote import Remote
 from device.sources import Source
 from device.spool import Spool
-from device.thumbnail import thumbnail
 from device.tuning import Tuning, from_config
 from device.uplink import Uplink
 from device.upload_folder import make_uploads
@@ -100,7 +99,7 @@ class Agent:
             **shared,
         )
         self._uploads = make_uploads(config.files, root_ca=config.root_ca, **shared)
-        self._claims = self._make_claims()
+        self._claims = make_claims(config.files, robot=config.robot, clock=clock, uploads=self._uploads)
         self._lock = threading.Lock()
         self._batchers: dict[str, Batcher] = {}
         self._counts: dict[str, StreamCounts] = {}
@@ -291,20 +290,6 @@ class Agent:
                 _log.info("source ended: %s", what)
 
         return run
-
-    def _make_claims(self) -> ClaimCheck | None:
-        files = self._config.files
-        if files.large_folder is None or self._uploads is None:
-            return None
-        return ClaimCheck(
-            robot=self._config.robot,
-            folder=files.large_folder,
-            every_s=files.large_every_s,
-            max_bytes=round(files.large_max_mb * 1e6),
-            clock=self._clock,
-            thumbnail=thumbnail,
-            stored=self._uploads.wake,
-        )
 
     def _run_uploads(self, stop: threading.Event) -> Any:
         uploads = self._uploads

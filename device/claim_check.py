@@ -19,7 +19,9 @@ from contract import CLAIM_FIELDS, File, Value
 from device.clock import Clock
 from device.seldom import Seldom
 from device.sources import Emit
+from device.thumbnail import thumbnail
 from device.upload_file import kind_of, wire_name
+from device.upload_folder import FilesConfig, Uploads
 
 _log = logging.getLogger(__name__)
 
@@ -153,6 +155,23 @@ class ClaimCheck:
     def _measure(self) -> int:
         """Bytes that wait in the folder."""
         return sum(map(_size, self._folder.glob("*/[!.]*")))
+
+
+def make_claims(
+    files: FilesConfig, *, robot: str, clock: Clock, uploads: Uploads | None
+) -> ClaimCheck | None:
+    """The claim check that the configuration asks for; None where it asks for none."""
+    if files.large_folder is None or uploads is None:
+        return None
+    return ClaimCheck(
+        robot=robot,
+        folder=files.large_folder,
+        every_s=files.large_every_s,
+        max_bytes=round(files.large_max_mb * 1e6),
+        clock=clock,
+        thumbnail=thumbnail,
+        stored=uploads.wake,
+    )
 
 
 def _size(path: Path) -> int:

@@ -223,7 +223,13 @@ class Uploads:
             _log.debug("files: this system has no priority of a thread's own")
         while not stop.is_set():
             self._wake.clear()
-            if not self.step(stop):
+            try:
+                more = self.step(stop)
+            except Exception:  # noqa: BLE001 - whatever a file system raises
+                # One file that nobody thought of must not end the upload of all others.
+                _log.exception("files: going on after an error")
+                more = False
+            if not more:
                 self._clock.wait(self._wake, _SCAN_S)
 
     def step(self, stop: threading.Event) -> bool:

@@ -12,10 +12,13 @@ import contract
 from contract import PART_BYTES
 from device.allowance import Allowance
 from device.clock import ManualClock
+from device.config import load_config
 from device.dispatch import Dispatcher
 from device.errors import UploadError
 from device.loopback import Loopback
+from device.status import SOCKET, StatusServer
 from device.upload import make_uploader
+from device.upload_command import upload_files
 from device.upload_file import kind_of, read, wire_name
 from device.upload_folder import STATE, Folder, Uploads
 from device.upload_http import Outcome, Pace, Sender, trusting
@@ -331,3 +334,39 @@ def test_one_refused_file_holds_up_no_other(rig, bags):
     rig.clock.advance(61)
     assert uploads.step(rig.stop)
     assert b"first.bag" in rig.store.objects.values()
+
+
+def test_an_error_that_nobody_thought_of_does_not_end_it(rig, bags, caplog):
+    (bags / "a.bag").write_bytes(b"1")
+    uploads = rig.folder(bags, settle_s=0)
+    step, calls = uploads.step, []
+
+    def odd(stop):
+        calls.append(1)
+        if len(calls) == 1:
+            raise RuntimeError("odd")
+        step(stop)
+        rig.stop.set()
+        return True
+
+    uploads.step = odd
+    uploads.run(rig.stop)
+    assert "going on after an error" in caplog.text
+    assert list(rig.store.objects.values()) == [b"1"]
+
+
+def test_beside_a_running_agent_the_command_says_what_to_do_instead(tmp_path, bags):
+    file = tmp_path / "car.yaml"
+    for name in ("certificate.pem", "private.key"):
+        (tmp_path / name).write_text("")
+    file.write_text(
+        "robot: car\nendpoint: localhost\ncertificate: certificate.pem\nprivate_key: private.key\n"
+        f"sources: [{{type: sim, stream: vesc, rate_hz: 1}}]\nfiles: {{folder: {bags}}}\n"
+    )
+    server = StatusServer(tmp_path / SOCKET, lambda: {"pid": 7})
+    server.start()
+    try:
+        with pytest.raises(UploadError, match=rf"process 7.*copy the files into {bags}"):
+            list(upload_files(load_config(file), [file], status_socket=tmp_path / SOCKET))
+    finally:
+        server.stop()

@@ -41,7 +41,7 @@ from device.clock import SystemClock
 from device.upload_http import Outcome, Pace, Sender, trusting
 from local.deployment import ROOT
 from local.gaps import AWS_MESSAGE_BYTES
-from station import delivery, robots
+from station import delivery, files, robots
 from tests.images import TOPIC, jpeg, write_bag
 from tests.local.conftest import until
 from tests.local.drives import Agent
@@ -89,7 +89,7 @@ def upload(car, *files, env=None):
     return done.returncode, json.loads(done.stdout or "[]"), done.stderr
 
 
-def test_the_robots_command_uploads_small_and_large_files(bundle, bucket, tmp_path):
+def test_the_robots_command_uploads_small_and_large_files(embedded, bundle, bucket, tmp_path):
     car = bundle()
     small, large = tmp_path / "notes.txt", tmp_path / "drive.bag"
     small.write_bytes(CONTENT)
@@ -104,6 +104,13 @@ def test_the_robots_command_uploads_small_and_large_files(bundle, bucket, tmp_pa
         assert head["Metadata"]["sha256"] == hashlib.sha256(path.read_bytes()).hexdigest()
     # The same again is found there.
     assert upload(car, small)[1][0]["key"] == results[0]["key"]
+    # The operator's side.
+    stored = {one.name: one for one in files.listed(embedded.cloud, car.robot)}
+    assert {name: one.size for name, one in stored.items()} == {
+        path.name: path.stat().st_size for path in (small, large)
+    }
+    got = files.download(embedded.cloud, stored["drive.bag"], tmp_path / "got")
+    assert got.read_bytes() == large.read_bytes()
 
 
 def test_a_large_file_in_a_watched_folder_survives_the_agents_end(bundle, bucket, tmp_path):
@@ -112,9 +119,9 @@ def test_a_large_file_in_a_watched_folder_survives_the_agents_end(bundle, bucket
     large = folder / "drive.bag"
     content = os.urandom(20 * 1024 * 1024)
     large.write_bytes(content)
-    files = {"folder": str(folder), "settle_s": 1, "remove_after_s": 0}
+    watched = {"folder": str(folder), "settle_s": 1, "remove_after_s": 0}
     source = {"type": "sim", "stream": "vesc", "rate_hz": 10}
-    car = bundle(sources=[source], files={**files, "rate_kb_s": 4000})
+    car = bundle(sources=[source], files={**watched, "rate_kb_s": 4000})
     agent = Agent(car)
     until(lambda: bucket.parts(car.robot), seconds=120)
     agent.kill()
@@ -122,7 +129,7 @@ def test_a_large_file_in_a_watched_folder_survives_the_agents_end(bundle, bucket
     assert not bucket.keys(car.robot)
     assert large.exists()
 
-    robots.configure(car, {"files": {**files, "rate_kb_s": 0}})
+    robots.configure(car, {"files": {**watched, "rate_kb_s": 0}})
     agent = Agent(car)
     (key,) = until(lambda: bucket.keys(car.robot), seconds=120)
     assert bucket.content(key) == content
@@ -142,8 +149,7 @@ def test_pictures_of_a_recording_travel_as_claims(embedded, bundle, bucket, tmp_
     assert min(map(len, pictures)) > AWS_MESSAGE_BYTES
     path = write_bag(tmp_path / "camera.bag", pictures, hz=2)
     source = {"type": "bag", "path": str(path), "topics": {TOPIC: "camera"}, "large": "upload"}
-    files = {"large_folder": "large", "rate_kb_s": 0}
-    car = bundle(sources=[source], files=files)
+    car = bundle(sources=[source], files={"large_folder": "large", "rate_kb_s": 0})
     agent = Agent(car)
     report = agent.report()
     columns: dict[str, list[Any]] = {}

@@ -10,6 +10,7 @@ import json
 import logging
 import sys
 import threading
+from hashlib import sha256
 from pathlib import Path
 
 from device.clock import SystemClock
@@ -35,8 +36,12 @@ def listen() -> None:
     stop.set()
 
 
+def digest(content):
+    return f"sha256 {sha256(content).hexdigest()}"
+
+
 def emit(stream, t_us, values):
-    say(json.dumps([stream, t_us, dict(values)]))
+    say(json.dumps([stream, t_us, dict(values)], default=digest))
 
 
 threading.Thread(target=listen, daemon=True).start()

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 import json
 import time
 from typing import Any
@@ -88,6 +89,27 @@ def test_only_the_selected_fields(cars: Cars) -> None:
     cars.publisher("pub")
     until_turns(collector, 5)
     assert samples(collector)[-1][1].keys() == {"turns", "load.1"}
+
+
+def test_bytes_are_handed_over_where_the_topic_says_upload(cars: Cars) -> None:
+    definition = f"# A picture.\nHeader header\nuint32 turns\nuint8[] data\n{HEADER}"
+    topics = {
+        f"/{large}": {"stream": large, "time": "header", "large": large} for large in ("upload", "refuse")
+    }
+    file = cars.graph.folder / "source.json"
+    file.write_text(json.dumps({"topics": topics}))
+    collector = cars.graph.run("collector.py", file)
+    for topic in topics:
+        message = cars.graph.folder / f"{topic[1:]}.msg"
+        message.write_text(definition)
+        arguments = ["--field", "turns", "--bytes", 300_000, "--count", 5]
+        cars.graph.run("publisher.py", topic[1:], topic, "strange_msgs/Picture", message, *arguments)
+        until_turns(collector, 4, topic[1:])
+    content = bytes(i % 251 for i in range(300_000))
+    expected = f"sha256 {hashlib.sha256(content).hexdigest()}"
+    assert [values["data"] for _, values in samples(collector, "upload")] == [expected] * 5
+    assert {tuple(values) for _, values in samples(collector, "refuse")} == {("turns",)}
+    assert json.loads(collector.quit()[-1])["/refuse"]["left_out"] == {"data": 5}
 
 
 def test_started_before_the_master_and_the_master_started_again(cars: Cars) -> None:

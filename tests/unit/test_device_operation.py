@@ -262,3 +262,12 @@ def test_status_of_an_agent_for_a_person() -> None:
     assert "stream    vesc: " in text
     assert "500 samples" in text
     assert "NOT connected" in text
+    assert "files " not in text
+    state["files"] = {
+        "waiting": 2, "uploaded": 1, "sent_bytes": 1_234_567, "current": "drive.bag",
+        "current_bytes": 8_388_608, "last_error": "drive.bag: refused: not today", "large": None,
+    }  # fmt: skip
+    text = render(state)
+    line = "files     2 waiting, 1 uploaded, 1,234,567 bytes sent, now drive.bag (8,388,608 bytes)"
+    assert line in text
+    assert "last error: drive.bag: refused: not today" in text
