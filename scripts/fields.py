@@ -19,7 +19,8 @@ def table() -> str:
     rows = ["| field | unit | meaning | ROS |", "|---|---|---|---|"]
     for field in VESC_FIELDS.values():
         versions = ", ".join(map(str, field.ros))
-        rows.append(f"| `{field.name}` | {field.unit} | {field.meaning} | {versions} |")
+        unit = f"{field.unit} (ROS 2: {field.ros2_unit})" if field.ros2_unit else field.unit
+        rows.append(f"| `{field.name}` | {unit} | {field.meaning} | {versions} |")
     return "\n".join(rows)
 
 

@@ -14,10 +14,10 @@ import re
 from pathlib import Path
 from typing import TYPE_CHECKING, Callable, Iterator, Mapping, NamedTuple, Sequence
 
-from contract import Value
+from contract import FAULT_CODES, Value
 from device.errors import SourceError
 from device.sources.player import ORIGINAL, Message
-from device.sources.vesc_protocol import FAULT_CODES, without_sensor
+from device.sources.vesc_protocol import without_sensor
 
 if TYPE_CHECKING:
     from typing_extensions import Self

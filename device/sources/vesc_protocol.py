@@ -30,50 +30,6 @@ _MAX_BUFFER = 4 * _MAX_FRAME
 # A motor without a temperature sensor reads as colder than this, down to -273.
 NO_SENSOR_DEGC = -50.0
 
-# mc_fault_code, in its order; FAULTS in the contract has the meaning of the first ones.
-FAULT_CODES = {
-    name: code
-    for code, name in enumerate(
-        (
-            "NONE",
-            "OVER_VOLTAGE",
-            "UNDER_VOLTAGE",
-            "DRV",
-            "ABS_OVER_CURRENT",
-            "OVER_TEMP_FET",
-            "OVER_TEMP_MOTOR",
-            "GATE_DRIVER_OVER_VOLTAGE",
-            "GATE_DRIVER_UNDER_VOLTAGE",
-            "MCU_UNDER_VOLTAGE",
-            "BOOTING_FROM_WATCHDOG_RESET",
-            "ENCODER_SPI",
-            "ENCODER_SINCOS_BELOW_MIN_AMPLITUDE",
-            "ENCODER_SINCOS_ABOVE_MAX_AMPLITUDE",
-            "FLASH_CORRUPTION",
-            "HIGH_OFFSET_CURRENT_SENSOR_1",
-            "HIGH_OFFSET_CURRENT_SENSOR_2",
-            "HIGH_OFFSET_CURRENT_SENSOR_3",
-            "UNBALANCED_CURRENTS",
-            "BRK",
-            "RESOLVER_LOT",
-            "RESOLVER_DOS",
-            "RESOLVER_LOS",
-            "FLASH_CORRUPTION_APP_CFG",
-            "FLASH_CORRUPTION_MC_CFG",
-            "ENCODER_NO_MAGNET",
-            "ENCODER_MAGNET_TOO_STRONG",
-            "PHASE_FILTER",
-            "ENCODER_FAULT",
-            "LV_OUTPUT_FAULT",
-            "ENCODER_SLIP",
-            "OVERSPEED",
-            "UNDERSPEED",
-            "ABS_OVERSPEED",
-        )
-    )
-}
-FAULT_CODES["DRV8302"] = FAULT_CODES["DRV"]
-
 
 class ProtocolError(ValueError):
     """A payload that is not what it should be; the text says what it is."""

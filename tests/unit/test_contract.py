@@ -902,7 +902,16 @@ def test_field(field):
     assert field.unit in UNITS
     assert field.meaning.strip() == field.meaning != ""
     assert set(field.ros) <= {1, 2}
+    assert (field.ros2_unit in {"Ah", "Wh"}) == field.unit.startswith("1e-4")
     assert field.ros
+
+
+def test_faults_are_the_firmwares_whole_list():
+    assert list(contract.FAULTS) == list(range(34))
+    assert contract.FAULT_CODES["OVER_TEMP_FET"] == contract.FAULT_CODES["OVER_TEMP_MOTOR"] - 1 == 5
+    assert contract.FAULT_CODES["ABS_OVERSPEED"] == 33
+    assert len(set(contract.FAULTS.values())) == 34
+    assert set(contract.FAULT_CODES.values()) == contract.FAULTS.keys()
 
 
 def test_live_update_carries_every_hop():
