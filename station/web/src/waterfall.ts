@@ -42,7 +42,7 @@ export class Waterfall {
         "header",
         {},
         el("h3", {}, "Delay by hop"),
-        el("p", { class: "reading" }, el("span", { class: "label" }, "car to page"), this.median.node, el("span", { class: "unit" }, "ms")),
+        el("p", { class: "reading" }, el("span", { class: "label", title: "from the car to the page" }, "total"), this.median.node, el("span", { class: "unit" }, "ms")),
       ),
       list,
       this.warning.node,

@@ -91,7 +91,7 @@ export class CloudWatchView {
 
 function frame(widget: Widget): [HTMLElement, HTMLElement | undefined] {
   if (widget.kind === "text") return [el("section", { class: "widget words" }, ...markdown(widget.text)), undefined];
-  const heading = el("header", {}, el("h3", {}, widget.title));
+  const heading = el("header", {}, el("h3", { title: widget.title }, widget.title));
   const node = el("section", { class: "panel widget", "aria-label": widget.title, "data-widget": widget.title }, heading);
   if (widget.kind === "other") {
     node.append(el("p", { class: "note" }, widget.text));
