@@ -39,6 +39,7 @@ STAGES: dict[str, dict[str, Any]] = {
         "budget_usd": 50,
         "alarm_email": "lab@example.org",
         "tags": {"team": "lab"},
+        "site": True,
     },
 }
 

@@ -177,6 +177,21 @@ def single(settings: Settings) -> dict[str, dict[str, str]]:
             "Serverless-LambdaEventSourceMappingDestination": "a queue's mapping knows none; what fails five "
             "times goes to the queue's own dead-letter queue"
         },
+        "site/Page": {
+            "AwsSolutions-S1": "CloudFront alone reads it, and what is in it is public by its purpose",
+            "CKV_AWS_18": "as AwsSolutions-S1",
+            "CKV_AWS_21": "built files, which `iort site` writes again from the repository",
+        },
+        "site/Distribution": {
+            "AwsSolutions-CFR1": "robots are watched from wherever their people are",
+            "AwsSolutions-CFR2": "static files without a back end: a firewall has nothing to keep",
+            "CKV_AWS_68": "as AwsSolutions-CFR2",
+            "AwsSolutions-CFR3": "who reads a public page is nobody's business; CloudWatch counts requests",
+            "CKV_AWS_86": "as AwsSolutions-CFR3",
+            "AwsSolutions-CFR4": "CloudFront's own certificate decides; with a domain of one's own "
+            "TLS 1.2 is the least, as the stack says",
+            "CKV_AWS_174": "as AwsSolutions-CFR4",
+        },
         "storage/Files": {
             "AwsSolutions-S1": "only robots with pre-signed requests and the operator reach it; CloudTrail's "
             "data events tell who, at $0.10 per 100,000, without a second bucket",

@@ -21,6 +21,8 @@ def check_stacks():
 def test_what_is_acknowledged_of_one_resource_is_there_in_some_stage(synthesized, production):
     there = synthesized.acknowledged | production.acknowledged
     for path in single(Settings(alarm_email="lab@example.org")):
+        if path.startswith("site/"):
+            continue  # an option that only `make check` synthesizes
         assert any(one.startswith(path) for one in there), f"stacks/acknowledged.py: {path} is not there"
 
 
