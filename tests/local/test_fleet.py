@@ -201,3 +201,38 @@ def test_rotation_changes_nothing_for_a_robot_that_does_not_come(embedded, bundl
         rotation.finish(embedded.cloud, car.robot, wait_s=0)
     (held,) = certificates.attached(embedded.cloud, car.robot)
     assert held.status == "ACTIVE"
+
+
+def test_revoked_claims_provision_nothing_more(embedded, tmp_path, iort):
+    claims.register(embedded.cloud, "too-late")
+    lasting = claims.claim(embedded.cloud, None, out=tmp_path, lasting=True)
+    assert "lasting claims revoked: " in iort("robots", "revoke-claims").output
+    assert (
+        "the claim does not connect"
+        in command("provision", "--config", lasting, "--robot", "too-late", status=1).stderr
+    )
+    assert claims.revoke_all(embedded.cloud) == 0
+
+
+@pytest.mark.parametrize(
+    ("arguments", "said"),
+    [
+        (("remove",), "give a robot's name, or --all"),
+        (("remove", "x", "--all"), "give a robot's name, or --all"),
+        (("claim",), "give the robot's name, or --lasting"),
+        (("register", "a", "b", "--serial", "s"), "--serial is of one machine"),
+        (("show", "nobody"), "robot nobody is not registered"),
+        (("rotate", "nobody"), "robot nobody is not registered"),
+        (("register", "a/b"), "robot name 'a/b'"),
+    ],
+)
+def test_what_the_command_refuses(iort, arguments, said):
+    outcome = iort("robots", *arguments)
+    assert outcome.exit_code != 0
+    assert said in str(outcome.exception)
+
+
+def test_removing_all_asks_first(embedded, bundle, iort):
+    car = bundle()
+    assert iort("robots", "remove", "--all").exit_code == 1
+    assert registry.get(embedded.cloud, car.robot)

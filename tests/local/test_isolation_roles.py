@@ -9,6 +9,8 @@ from collections.abc import Iterator
 from typing import Any, NamedTuple
 
 import boto3
+import botocore.loaders
+import botocore.session
 import pytest
 from botocore.config import Config
 from botocore.exceptions import ClientError
@@ -51,8 +53,18 @@ def deployed(embedded):
     return found
 
 
+@pytest.fixture(scope="module")
+def taken(embedded, deployed):
+    """Each role's clients."""
+    return {role.arn: as_role(embedded, role.physical) for role in of(deployed, "AWS::IAM::Role")}
+
+
 def of(deployed: list[Resource], kind: str) -> list[Resource]:
     return [one for one in deployed if one.kind == kind]
+
+
+# The services' descriptions, which would take longer to read for each role than all its calls.
+_LOADER = botocore.loaders.create_loader()
 
 
 def as_role(embedded: Any, role: str) -> dict[str, Any]:
@@ -69,7 +81,10 @@ def as_role(embedded: Any, role: str) -> dict[str, Any]:
         taken = cloud.client("sts").assume_role(RoleArn=described["Arn"], RoleSessionName="test")
     finally:
         _trust(iam, role, described["AssumeRolePolicyDocument"])
+    core = botocore.session.Session()
+    core.register_component("data_loader", _LOADER)
     session = boto3.Session(
+        botocore_session=core,
         aws_access_key_id=taken["Credentials"]["AccessKeyId"],
         aws_secret_access_key=taken["Credentials"]["SecretAccessKey"],
         aws_session_token=taken["Credentials"]["SessionToken"],
@@ -205,22 +220,21 @@ def test_every_role_is_declared(deployed):
     assert roles <= ROLES.keys(), "declare what a new role may do in tests/stacks/test_policies.py"
 
 
-def test_every_role_is_refused_what_is_not_declared_for_it(embedded, deployed):
+def test_every_role_is_refused_what_is_not_declared_for_it(deployed, taken):
     asked = list(probes(deployed))
     through, tried = [], 0
-    for role in of(deployed, "AWS::IAM::Role"):
-        clients = as_role(embedded, role.physical)
+    for role, clients in taken.items():
         for probe in asked:
-            if declared(role.arn, probe):
+            if declared(role, probe):
                 continue
             tried += 1
             if not refused(clients, probe):
-                through.append((role.arn, probe.action, probe.arn))
+                through.append((role, probe.action, probe.arn))
     assert through == []
     assert tried > 1000
 
 
-def test_what_is_declared_is_not_refused(embedded, deployed):
+def test_what_is_declared_is_not_refused(deployed, taken):
     """The same calls, of those that leave nothing behind: so a refusal above is one for its reason."""
     harmless = {
         "dynamodb:GetItem",
@@ -235,13 +249,11 @@ def test_what_is_declared_is_not_refused(embedded, deployed):
     }
     asked = [probe for probe in probes(deployed) if probe.action in harmless]
     wrong, tried = [], set()
-    for role in of(deployed, "AWS::IAM::Role"):
-        mine = [probe for probe in asked if declared(role.arn, probe)]
-        if mine:
-            clients = as_role(embedded, role.physical)
-            for probe in mine:
+    for role, clients in taken.items():
+        for probe in asked:
+            if declared(role, probe):
                 tried.add(probe.action)
                 if refused(clients, probe):
-                    wrong.append((role.arn, probe.action, probe.arn))
+                    wrong.append((role, probe.action, probe.arn))
     assert wrong == []
     assert tried >= harmless
