@@ -113,3 +113,15 @@ def test_a_reader_that_has_seen_enough_is_no_error(embedded):
     assert done.stdout == '{"time": "'
     assert "Traceback" not in done.stderr
     assert "Error" not in done.stderr
+
+
+def test_a_picture_of_it(embedded, noise, tmp_path):
+    picture = tmp_path / "noise.svg"
+    asked = ["plot", ROBOT, STREAM, "--last", "all", "--fields", "f0,f1", "--output", str(picture)]
+    done = iort(*asked, "--kind", "distribution", embedded=embedded)
+    assert done.returncode == 0, done.stderr
+    assert f"{N:,} samples" in done.stderr
+    assert picture.read_text().startswith("<?xml")
+    done = iort(*asked[:-1], str(tmp_path / "where.svg"), "--kind", "trajectory", embedded=embedded)
+    assert done.returncode == 1
+    assert "no position" in done.stderr
