@@ -33,6 +33,7 @@ GROUPS = {
             f"tests/unit/test_{name}.py"
             for name in (
                 "admit",
+                "alert",
                 "presence",
                 "quarantine",
                 "query",
