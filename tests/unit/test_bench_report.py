@@ -10,6 +10,7 @@ import pytest
 from bench import guard, plots, report
 from bench.result import Plot, Ratio, Section, Table
 from bench.spread import ratio, spread
+from scripts.headline import REPORT, ROOT, filled
 
 MACHINE = {
     "date": "2026-01-02T03:04:05+00:00",
@@ -124,6 +125,19 @@ def test_guard_compares_ratios_and_forgives_noise(was, now, target, at_least, wo
 
 def test_guard_compares_only_what_both_have():
     assert guard.regressions(_report(a=(9, None, False)), _report(b=(1, None, False))) == []
+
+
+def test_readme_has_the_headline_of_the_report_that_is_kept():
+    kept, readme = json.loads(REPORT.read_text()), (ROOT / "README.md").read_text()
+    assert filled(readme, kept) == readme, "run python scripts/headline.py"
+
+
+def test_report_that_is_kept_names_no_host_and_no_folder():
+    for path in REPORT.parent.iterdir():
+        text = path.read_text()
+        assert "/tmp/" not in text, path.name
+        assert "/home/" not in text, path.name
+        assert "/work/" not in text, path.name
 
 
 def test_plots_are_small_xml_and_the_same_every_time():
