@@ -231,13 +231,13 @@ def test_topic_filters(topic_filter: str, topic: str, expected: bool) -> None:
     assert matches(topic_filter, topic) is expected
 
 
-def config_file(folder: Path, source: str) -> Path:
+def config_file(folder: Path, source: str, more: str = "") -> Path:
     for name in ("cert.pem", "key.pem", "ca.pem"):
         (folder / name).write_text("not a certificate")
     file = folder / "car.yaml"
     file.write_text(
         "robot: car1\nendpoint: localhost\ncertificate: cert.pem\nprivate_key: key.pem\nroot_ca: ca.pem\n"
-        f"sources: [{source}]\n"
+        f"sources: [{source}]\n{more}\n"
     )
     return file
 

@@ -76,6 +76,22 @@ def test_a_section_left_empty_has_its_defaults(folder: Path) -> None:
     assert load_config(write(folder, GOOD + "live:\n")).live.rate_hz == 10
 
 
+def test_the_queues_path_is_relative_to_the_file(
+    folder: Path, tmp_path_factory: pytest.TempPathFactory, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    elsewhere = tmp_path_factory.mktemp("elsewhere")
+    monkeypatch.chdir(elsewhere)
+    monkeypatch.setenv("HOME", str(elsewhere))
+    for said, meant in (
+        ("pki/queue.db", folder / "pki" / "queue.db"),
+        (str(elsewhere / "queue.db"), elsewhere / "queue.db"),
+        ("~/queue.db", elsewhere / "queue.db"),
+    ):
+        config = load_config(write(folder, f"{GOOD}queue: {{path: {said}}}\n"))
+        assert config.queue.path == meant
+        assert not meant.exists(), "reading a configuration makes nothing"
+
+
 SIM = "  - type: sim\n"
 
 
@@ -125,6 +141,13 @@ SIM = "  - type: sim\n"
         ((SIM, SIM + "ping: {paths: [brokr]}\n"), ["ping.paths[0]: found 'brokr'", "did you mean broker?"]),
         ((SIM, SIM + "ping: {paths: broker}\n"), ["ping.paths: found 'broker'", "a list"]),
         ((SIM, SIM + "queue: {policy: Drop}\n"), ["queue.policy: found 'Drop'", "RejectNewData"]),
+        (
+            (SIM, SIM + "queue: {path: away/queue.db}\n"),
+            ["queue.path: found 'away/queue.db'", "a folder that exists", "there is no ", "/away"],
+        ),
+        ((SIM, SIM + "queue: {path: pki}\n"), ["queue.path: found 'pki'", "nothing else already"]),
+        ((SIM, SIM + "queue: {path: car.yaml}\n"), ["queue.path: ", "nothing else already"]),
+        ((SIM, SIM + "queue: {path: 7}\n"), ["queue.path: found 7 (a number)", "the path of a file"]),
         ((SIM, SIM + "port: 88830\n"), ["port: found 88830", "1 to 65535"]),
         ((SIM, SIM + "namespace: Iort\n"), ["namespace: ", "'Iort'", "lower-case"]),
         ((SIM, "  - type: sim\n   x: 1\n"), ["is not YAML", "line 8"]),

@@ -152,6 +152,24 @@ def test_a_bad_sample_is_refused_and_counted() -> None:
     assert rig.speeds() == [1]
 
 
+def test_what_is_too_large_for_a_message_never_reaches_the_broker() -> None:
+    rig = Rig()
+    texts = {f"f{i:02}": "x" * 4096 for i in range(31)}
+    rig.lane.offer("vesc", T0, {**texts, "last": ""})
+    rig.dispatcher.run_pending()
+    room = contract.MAX_MESSAGE_BYTES - len(rig.uplink.published.pop().payload)
+    rig.clock.advance(1)
+    rig.lane.offer("vesc", T0, {**texts, "last": "x" * (room + 1)})
+    rig.dispatcher.run_pending()
+    assert (rig.uplink.published, rig.lane.refused) == ([], 1)
+    rig.clock.advance(1)
+    rig.lane.offer("vesc", T0, {**texts, "last": "x" * room})
+    (message,) = rig.uplink.published
+    assert len(message.payload) == contract.MAX_MESSAGE_BYTES, "one byte more is one too many"
+    rig.dispatcher.run_pending()
+    assert (rig.lane.refused, rig.lane.published) == (1, 2)
+
+
 def test_only_written_messages_count_as_published() -> None:
     rig = Rig()
     rig.offer(1)

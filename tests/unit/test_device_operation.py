@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import contextlib
 import json
 import logging
 import os
 import random
 import stat
 import sys
+from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
@@ -16,7 +18,9 @@ from hypothesis import strategies as st
 
 import contract
 from device.batch import StreamCounts
-from device.clock import ManualClock
+from device.check import FAIL, check
+from device.clock import ManualClock, SystemClock
+from device.config import load_config
 from device.dispatch import Dispatcher
 from device.errors import AgentError
 from device.logs import JournalFormatter, Troubles, is_journal
@@ -25,6 +29,7 @@ from device.main import main
 from device.metrics import AgentMetrics, Rates, rss_mb
 from device.offset import ClockOffset
 from device.spool import MemorySpool
+from device.sqlite_spool import make_spool
 from device.status import StatusServer, fetch, render
 
 
@@ -249,6 +254,52 @@ def test_status_and_check_by_command(
     assert findings["key's mode"]["todo"].startswith("chmod 600 ")
     assert findings["queue"]["level"] == "warn"
     assert findings["endpoint"]["level"] == "fail"
+
+
+@contextlib.contextmanager
+def unprivileged() -> Iterator[None]:
+    """This process as one that may not write everywhere, if root runs the tests."""
+    if os.geteuid() != 0:
+        yield
+        return
+    nobody = 65534
+    os.setresuid(nobody, nobody, 0)
+    try:
+        yield
+    finally:
+        os.setresuid(0, 0, 0)
+
+
+def test_a_queue_that_may_not_be_written_is_found_and_leaves_the_agent_running(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    import socket
+
+    from tests.unit.test_device_agent import config_file
+
+    def unknown(*_: object, **__: object) -> None:
+        raise socket.gaierror("Name or service not known")
+
+    monkeypatch.setattr(socket, "getaddrinfo", unknown)
+    # By a relative path, since the folders above are their owner's alone.
+    monkeypatch.chdir(tmp_path)
+    folder = tmp_path / "kept"
+    folder.mkdir()
+    file = config_file(tmp_path, "{type: sim}", "queue: {path: kept/queue.db}")
+    config = load_config(Path(file.name))
+    assert FAIL not in {one.level for one in check(config, Path("agent.sock")) if one.what == "queue"}
+    tmp_path.chmod(0o755)
+    folder.chmod(0o555)
+    with unprivileged():
+        findings = {one.what: one for one in check(config, Path("agent.sock"))}
+        spool = make_spool(config, SystemClock())
+        spool.put("vesc", spool.next_seq("vesc"), b"x", samples=1)
+        (kept, alarm) = spool.next(0), spool.alarm
+        spool.close()
+    assert findings["queue"].level == FAIL
+    assert findings["queue"].text == "kept may not be written"
+    assert kept is not None
+    assert "kept in memory only" in (alarm or "")
 
 
 def test_status_of_an_agent_for_a_person() -> None:

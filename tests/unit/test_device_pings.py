@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import threading
+from pathlib import Path
 from typing import Any
 
 import pytest
@@ -13,9 +14,12 @@ from hypothesis import strategies as st
 import contract
 from device.allowance import Allowance
 from device.clock import ManualClock
+from device.config import PingConfig
 from device.dispatch import Dispatcher
+from device.errors import ConfigError
 from device.loopback import Loopback
 from device.pings import CLOCK_EVERY_S, CLOCK_FIRST_EVERY_S, TIMEOUT_S, Pings, percentile
+from device.schema import Where, load
 
 T0 = 1_700_000_000_000_000
 
@@ -126,6 +130,22 @@ def test_paths_take_turns_at_the_rate() -> None:
     assert [path for path, _ in times[:3]] == ["broker", "rule", "lambda"]
     assert [at for path, at in times if path == "rule"] == [round(1 / 30 + i / 10, 6) for i in range(10)]
     assert 480 < len(rig.uplink.published[0].payload) < 560
+
+
+def test_the_largest_ping_that_may_be_asked_for_fits_into_a_message_and_so_does_its_answer(
+    tmp_path: Path,
+) -> None:
+    where = Where(tmp_path / "car.yaml")
+    largest = 100_000
+    assert load(PingConfig, {"padding_bytes": largest}, where).padding_bytes == largest
+    with pytest.raises(ConfigError, match=f"0 to {largest}"):
+        load(PingConfig, {"padding_bytes": largest + 1}, where)
+    rig = Rig(padding_bytes=largest)
+    rig.pings.send("rule")
+    (ping,) = rig.uplink.published
+    assert len(ping.payload) > largest
+    pong = {**json.loads(ping.payload), contract.RECEIVED_MS: rig.clock.now_us() // 1000}
+    assert len(json.dumps(pong)) <= contract.MAX_MESSAGE_BYTES
 
 
 def test_the_end_waits_for_answers_but_not_for_ever() -> None:
