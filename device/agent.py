@@ -343,7 +343,7 @@ class Agent:
         if self._record.wait_empty(drain_s):
             dropped = self._spool.dropped()
             if dropped.batches:
-                _log.error("%d samples were dropped because the queue was full", dropped.samples)
+                _log.error("%d samples were dropped: the queue was full, or damaged", dropped.samples)
             return dropped.batches == 0
         left = self._spool.backlog()
         if self._spool.durable:

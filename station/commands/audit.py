@@ -137,7 +137,7 @@ def _show(one: Audit) -> None:
     if one.in_car:
         _out.print(f"  the car's queue held {one.in_car:,} batches when it last said so")
     if one.dropped:
-        _out.print(f"  [red]the car has dropped {one.dropped:,} batches, since its queue was full[/]")
+        _out.print(f"  [red]the car has dropped {one.dropped:,} batches: its queue was full, or damaged[/]")
 
 
 def _as_json(one: Audit) -> dict[str, Any]:

@@ -10,9 +10,11 @@ from __future__ import annotations
 import os
 import shutil
 import socket
+import sqlite3
 import subprocess
 import threading
 import time
+from contextlib import closing
 from pathlib import Path
 
 import pytest
@@ -20,7 +22,7 @@ import pytest
 import contract
 from local.cloud import EmbeddedCloud
 from local.proxy import FREEZE, PASS, REFUSE, Proxy
-from station import delivery, robots
+from station import audit, delivery, robots
 from tests.local.conftest import until
 from tests.local.drives import RATE_HZ, Agent, counted, counter_log
 
@@ -219,22 +221,62 @@ def test_disk_full_and_free_again(embedded, bundle, proxy, tmp_path):
     assert counted(embedded, car.robot) == list(range(12 * RATE_HZ))
 
 
-def test_corrupt_spool_is_set_aside(embedded, bundle, proxy, tmp_path):
-    log = counter_log(tmp_path / "counter.csv", 12)
-    car = bundle(**_settings(log, proxy.port))
-    agent = Agent(car)
-    until(lambda: agent.said("connected to"))
+@pytest.mark.parametrize("damage", ["payloads", "header"])
+def test_corrupt_spool_is_set_aside(embedded, bundle, proxy, tmp_path, damage):
+    """What was lost with the file is known by the car's count, or by the numbers alone if nothing of the
+    file can be read; what came afterwards is all there."""
+    log = counter_log(tmp_path / "counter.csv", 600)
+    car = bundle(**_settings(log, proxy.port), metrics={"every_s": 1})
     proxy.mode = REFUSE
-    threading.Event().wait(3)
+    first = Agent(car)
+    until(lambda: first.status().get("spool", {}).get("samples", 0) >= 4 * RATE_HZ)
+    first.kill()
     spool = car.folder / "spool.db"
-    with spool.open("r+b") as file:
-        file.write(os.urandom(min(8192, spool.stat().st_size)))
-    threading.Event().wait(3)
+    with closing(sqlite3.connect(spool)) as database:
+        database.execute("PRAGMA wal_checkpoint(TRUNCATE)").fetchall()
+        query = "SELECT seq, samples, payload FROM batches WHERE stream = 'vesc' ORDER BY seq"
+        written = database.execute(query).fetchall()
+    bad, noise = spool.read_bytes(), os.urandom(8192)
+    if damage == "header":
+        bad, lost, known = noise + bad[8192:], written, 0
+    else:
+        lost, known = written[1:3], 2
+        for _, _, payload in lost:
+            assert payload in bad
+            bad = bad.replace(payload, noise[: len(payload)])
+        noise = noise[: min(len(payload) for _, _, payload in lost)]
+    spool.write_bytes(bad)
+    kept = [row for row in written if row not in lost]
+
     proxy.mode = PASS
-    agent.report()
-    found = counted(embedded, car.robot)
-    assert found == sorted(set(found))
-    assert found[-1] == 12 * RATE_HZ - 1
+    second = Agent(car)
+    alarms = until(lambda: second.status().get("alarms"))
+    (aside,) = car.folder.glob("spool.db.corrupt-*Z")
+    assert aside.read_bytes() == bad if damage == "header" else noise in aside.read_bytes()
+    for told in (f"set aside as {aside.name}", f"at least {known} lost"):
+        assert [told in alarm for alarm in alarms] == [True]
+        assert second.said(told)
+    until(lambda: audit.last_figures(embedded.cloud, car.robot).get("dropped_batches") == known)
+    second.stop()
+    report = second.report(status=1 if known else 0)
+    assert report["spool"]["dropped_batches"] == known
+    assert report["spool"]["dropped_samples"] == sum(samples for _, samples, _ in lost[:known])
+
+    # In the table is everything else, in order, and each number that is not there is one that was lost,
+    # or, where nothing could be read, was left out because it may have been used.
+    batches = list(delivery.batches(embedded.cloud, car.robot, "vesc"))
+    stored = [(batch.seq, len(batch.times_us)) for batch in batches]
+    assert stored[: len(kept)] == [(seq, samples) for seq, samples, _ in kept]
+    found = counted(embedded, car.robot)[sum(samples for _, samples, _ in kept) :]
+    assert found == list(range(report["streams"]["vesc"]["samples"]))
+    items = audit.headers(embedded.cloud, car.robot, "vesc", audit.Range())
+    runs = audit.audit("vesc", items, from_start=True).runs
+    missing = [seq for run in runs for gap in run.missing for seq in range(gap.first, gap.last + 1)]
+    if known:
+        assert missing == [seq for seq, _, _ in lost]
+    else:
+        assert missing == list(range(stored[0][0]))
+        assert {seq for seq, _, _ in lost} <= set(missing)
 
 
 @as_root

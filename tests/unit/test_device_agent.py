@@ -116,7 +116,7 @@ def test_dropped_samples_are_not_a_success(caplog: pytest.LogCaptureFixture) -> 
 
     rig = Rig(late, connected=False, max_bytes=1000)
     assert rig.agent.run(drain_s=10) == 1
-    assert "were dropped because the queue was full" in caplog.text
+    assert "were dropped: the queue was full" in caplog.text
     dropped = rig.agent.report()["spool"]["dropped_samples"]
     assert dropped > 0
     assert len(rig.recorded()) == 500 - dropped
