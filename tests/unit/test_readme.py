@@ -47,3 +47,17 @@ def test_every_make_target_it_names_is_there():
 def test_every_file_it_links_to_is_there():
     for link in re.findall(r"\]\(([^)h][^)]*)\)", README):
         assert (ROOT / link).exists(), link
+
+
+def test_every_decision_has_a_number_of_its_own():
+    records = sorted((ROOT / "docs" / "decisions").glob("*.md"))
+    numbers = [int(path.name[:4]) for path in records]
+    assert numbers == sorted(set(numbers))
+    for path, number in zip(records, numbers, strict=True):
+        assert path.read_text().startswith(f"# {number}. "), path.name
+
+
+def test_every_file_that_the_documentation_links_to_is_there():
+    for page in (ROOT / "docs").rglob("*.md"):
+        for link in re.findall(r"\]\(([^)#:]+)(?:#[^)]*)?\)", page.read_text()):
+            assert (page.parent / link).exists(), f"{page.name}: {link}"
