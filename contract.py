@@ -163,6 +163,8 @@ RECEIVED_MS, EXPIRES_S = "received_ms", "expires_s"
 ROBOT = "robot"
 # Of a robot in the registry: on which day (UTC) it has asked to upload how many bytes.
 FILES_DAY, FILES_BYTES = "files_day", "files_bytes"
+# And when a human was last told of what: a name for each cause, after this.
+ALERT_PREFIX = "alert_"
 STATS = ("min", "mean", "max", "last")
 # Of a second in the summary: samples, batches they came in, batches missing before those, holes
 # between samples, values that were not finite.

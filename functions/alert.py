@@ -9,15 +9,15 @@ from __future__ import annotations
 import os
 import time
 from collections.abc import Callable, Mapping
+from contextlib import suppress
 from dataclasses import dataclass
 from datetime import datetime, timezone
 from functools import cache
 from typing import Any, TypeGuard
 
 import boto3
-from botocore.exceptions import ClientError
 
-from contract import FAULTS, RECEIVED_MS, ROBOT, TOPIC, parse_topic
+from contract import ALERT_PREFIX, FAULTS, RECEIVED_MS, ROBOT, TOPIC, parse_topic
 from functions.metrics import emit
 
 QUIET_S = 900
@@ -38,10 +38,15 @@ def causes(event: Mapping[str, Any], low_voltage_v: float) -> list[Cause]:
     found = []
     code, volts = event.get("fault_code"), event.get("voltage_input")
     if _is_number(code) and code > 0:
-        meaning = FAULTS.get(int(code), "a code that the contract does not know")
-        found.append(Cause(f"alert_fault_{int(code)}", f"fault {int(code)}, {meaning}"))
+        # All unknown codes are one cause: a car that makes them up may neither send a mail for each nor
+        # fill its row of the registry.
+        meaning = FAULTS[int(code)] if code in FAULTS else None
+        key = f"{ALERT_PREFIX}fault_{'unknown' if meaning is None else int(code)}"
+        found.append(Cause(key, f"fault {code:g}, {meaning or 'a code that the contract does not know'}"))
     if _is_number(volts) and 0 < volts < low_voltage_v:
-        found.append(Cause("alert_low_voltage", f"battery at {volts:.1f} V, below {low_voltage_v:g} V"))
+        found.append(
+            Cause(f"{ALERT_PREFIX}low_voltage", f"battery at {volts:.1f} V, below {low_voltage_v:g} V")
+        )
     return found
 
 
@@ -54,7 +59,8 @@ class Notices:
         self._until_s: dict[tuple[str, str], float] = {}
 
     def take(self, robot: str, key: str, now_s: int) -> bool:
-        """Whether it is time to tell; of all who ask within `QUIET_S`, one is told so."""
+        """Whether it is time to tell; of all who ask within `QUIET_S`, one is told so. Never of a robot
+        that has no row: it was removed, and what it still sent must not make it one again."""
         if now_s < self._until_s.get((robot, key), 0):
             return False
         try:
@@ -62,15 +68,13 @@ class Notices:
                 robot,
                 "SET #key = :now",
                 key,
-                ConditionExpression="attribute_not_exists(#key) OR #key <= :then",
+                "attribute_not_exists(#key) OR #key <= :then",
                 ExpressionAttributeValues={
                     ":now": {"N": str(now_s)},
                     ":then": {"N": str(now_s - QUIET_S)},
                 },
             )
-        except ClientError as error:
-            if error.response["Error"]["Code"] != "ConditionalCheckFailedException":
-                raise
+        except self._client.exceptions.ConditionalCheckFailedException:
             # Another environment told, some time within the quiet; to look again later costs a request.
             self._until_s[robot, key] = now_s + QUIET_S / 10
             return False
@@ -80,14 +84,16 @@ class Notices:
     def give_back(self, robot: str, key: str) -> None:
         """Nobody could be told: the next one tries again."""
         self._until_s.pop((robot, key), None)
-        self._update(robot, "REMOVE #key", key)
+        with suppress(self._client.exceptions.ConditionalCheckFailedException):
+            self._update(robot, "REMOVE #key", key, "attribute_exists(#key)")
 
-    def _update(self, robot: str, expression: str, key: str, **rest: Any) -> None:
+    def _update(self, robot: str, expression: str, key: str, condition: str, **rest: Any) -> None:
         self._client.update_item(
             TableName=self._table,
             Key={ROBOT: {"S": robot}},
             UpdateExpression=expression,
-            ExpressionAttributeNames={"#key": key},
+            ConditionExpression=f"attribute_exists(#robot) AND ({condition})",
+            ExpressionAttributeNames={"#key": key, "#robot": ROBOT},
             **rest,
         )
 

@@ -44,6 +44,10 @@ from functions.metrics import emit
 _log = logging.getLogger(__name__)
 _log.setLevel(logging.INFO)
 _REASON_CHARACTERS = 2_000
+# An item holds 400 KB, and one of the telemetry table can be larger as JSON than it is there.
+_MAX_PAYLOAD_BYTES = 360 * 1024
+# "GetRecords": an empty answer does not say that nothing follows. So many of them are looked behind.
+_EMPTY_ANSWERS = 50
 
 Records = Callable[[Mapping[str, Any]], Iterable[Mapping[str, Any]]]
 
@@ -148,7 +152,12 @@ class Store:
         self._client, self._table, self._retention_s = client, table, retention_s
 
     def put(self, entry: Entry, sent_ms: int) -> None:
-        """Keep the message; one that is there already counts once more."""
+        """Keep the message; one that is there already counts once more. Of one that does not fit into
+        an item, the beginning: the item that it is made of stands in the telemetry table."""
+        payload, reason = entry.payload, entry.reason[:_REASON_CHARACTERS]
+        if len(payload) > _MAX_PAYLOAD_BYTES:
+            payload = payload[:_MAX_PAYLOAD_BYTES]
+            reason = f"cut from {len(entry.payload)} bytes; {reason}"
         names = (SOURCE, TOPIC, REASON, PAYLOAD, FIRST_MS, LAST_MS, EXPIRES_S, SEEN)
         expires_s = sent_ms // 1000 + self._retention_s
         self._client.update_item(
@@ -164,13 +173,17 @@ class Store:
             ExpressionAttributeValues={
                 ":source": {"S": entry.source},
                 ":topic": {"S": entry.topic},
-                ":reason": {"S": entry.reason[:_REASON_CHARACTERS]},
-                ":payload": {"B": entry.payload},
+                ":reason": {"S": reason},
+                ":payload": {"B": payload},
                 ":sent": {"N": str(sent_ms)},
                 ":expires": {"N": str(expires_s)},
                 ":one": {"N": "1"},
             },
         )
+
+
+class StreamError(Exception):
+    """The stream did not give a failed batch's records in the calls that there were; worth another try."""
 
 
 class Stream:
@@ -180,9 +193,14 @@ class Stream:
         self._client = client
 
     def records(self, info: Mapping[str, Any]) -> list[Mapping[str, Any]]:
-        """The records of a failed batch (``DDBStreamBatchInfo``); none where they have left the stream."""
-        last = str(info["endSequenceNumber"])
+        """The records of a failed batch (``DDBStreamBatchInfo``); none where they have left the stream.
+
+        Raises `StreamError` where the last of them was not reached: a part of a batch would be taken for
+        all of it.
+        """
+        last = int(info["endSequenceNumber"])
         found: list[Mapping[str, Any]] = []
+        empty = 0
         try:
             answer = self._client.get_shard_iterator(
                 StreamArn=info["streamArn"],
@@ -191,18 +209,20 @@ class Stream:
                 SequenceNumber=str(info["startSequenceNumber"]),
             )
             iterator = answer["ShardIterator"]
-            while iterator:
+            while iterator and empty < _EMPTY_ANSWERS:
                 answer = self._client.get_records(ShardIterator=iterator)
                 for record in answer["Records"]:
-                    if int(record["dynamodb"]["SequenceNumber"]) > int(last):
+                    number = int(record["dynamodb"]["SequenceNumber"])
+                    if number <= last:
+                        found.append(record)
+                    if number >= last:
                         return found
-                    found.append(record)
-                if not answer["Records"] or found[-1]["dynamodb"]["SequenceNumber"] == last:
-                    break
+                empty += not answer["Records"]
                 iterator = answer.get("NextShardIterator")
         except self._client.exceptions.TrimmedDataAccessException:
             _log.warning("the records of a failed batch have left the stream: %s", info)
-        return found
+            return []
+        raise StreamError(f"{len(found)} records, and not the last, of {info}")
 
 
 def process(event: Mapping[str, Any], store: Store, records: Records) -> dict[str, Any]:
@@ -214,7 +234,7 @@ def process(event: Mapping[str, Any], store: Store, records: Records) -> dict[st
             for entry in entries(message["body"], records):
                 store.put(entry, sent_ms)
                 kept += 1
-        except (BotoCoreError, ClientError) as error:
+        except (BotoCoreError, ClientError, StreamError) as error:
             _log.warning("message %s comes again: %s", message["messageId"], error)
             failed.append(message["messageId"])
     emit("quarantine", Quarantined=kept)

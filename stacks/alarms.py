@@ -27,6 +27,8 @@ class Alarms(Construct):
         self._tell = actions.SnsAction(topic)
         self._lost_or_late(settings, watched)
         self._cars(settings)
+        if not settings.embedded:
+            self._never_kept()
 
     def _lost_or_late(self, settings: Settings, watched: Watched) -> None:
         for name, queue in watched.queues.items():
@@ -48,6 +50,17 @@ class Alarms(Construct):
         self._ours("BatchesMissing", "summarize", 0, "batches of a car are missing")
         self._ours("BatchesRefused", "summarize", 0, "batches cannot be decoded")
 
+    def _never_kept(self) -> None:
+        """Where a message can end without being in quarantine. Of the whole account, since AWS documents
+        no values for some of the dimensions; the embedded cloud has no Metrics Insights."""
+        for name, namespace, what in (
+            ("ParseError", "AWS/IoT", "messages are no JSON, and some rule could not read them"),
+            ("ErrorActionFailure", "AWS/IoT", "messages that a rule failed on did not reach the quarantine"),
+            ("RuleMessageThrottled", "AWS/IoT", "messages were not given to a rule"),
+            ("DestinationDeliveryFailures", "AWS/Lambda", "what a function failed on is not in quarantine"),
+        ):
+            self._alarm(name, metrics.of_the_account(namespace, name), 0, what)
+
     def _cars(self, settings: Settings) -> None:
         """From the record lane, which nothing is lost of; the rule alert is faster and says which car."""
         limits = settings.thresholds
@@ -64,7 +77,7 @@ class Alarms(Construct):
     def _alarm(
         self,
         name: str,
-        metric: cloudwatch.Metric,
+        metric: cloudwatch.IMetric,
         limit: float,
         what: str,
         *,

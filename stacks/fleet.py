@@ -20,6 +20,7 @@ from contract import (
     LIVE,
     PING,
     PONG,
+    PRESENCE,
     RECORD,
     ROBOT_PARAMETER,
     SERIAL_PARAMETER,
@@ -137,7 +138,7 @@ class Fleet(Stack):
             retry_attempts=2,
             on_failure=destinations.SqsDestination(quarantine.rejected),
         )
-        storage.robots.grant(presence, "dynamodb:UpdateItem")
+        storage.may_keep(presence, *PRESENCE)
         return presence
 
     def _provisioning_role(self, name: str) -> iam.Role:

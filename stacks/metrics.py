@@ -78,6 +78,16 @@ def table(name: str, of: dynamodb.ITable, *, label: str | None = None) -> cloudw
     return _metric("AWS/DynamoDB", name, label=label, dimensions={"TableName": of.table_name})
 
 
+def of_the_account(namespace: str, name: str) -> cloudwatch.MathExpression:
+    """The sum of a metric whatever its dimensions, by Metrics Insights: an alarm may ask that, and none
+    may search."""
+    return cloudwatch.MathExpression(
+        expression=f'SELECT SUM({name}) FROM "{namespace}"',  # noqa: S608 no database is asked
+        using_metrics={},
+        period=PERIOD,
+    )
+
+
 def waiting(of: sqs.IQueue, *, label: str | None = None) -> cloudwatch.Metric:
     """How many messages wait in a queue."""
     return _metric(

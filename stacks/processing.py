@@ -14,7 +14,17 @@ from aws_cdk import aws_sns as sns
 from aws_cdk import aws_sns_subscriptions as subscriptions
 from constructs import Construct
 
-from contract import FILE, FILES_PREFIX, LAMBDA, PONG, RESULTS_PREFIX, pubnub_parameter
+from contract import (
+    ALERT_PREFIX,
+    FILE,
+    FILES_BYTES,
+    FILES_DAY,
+    FILES_PREFIX,
+    LAMBDA,
+    PONG,
+    RESULTS_PREFIX,
+    pubnub_parameter,
+)
 from stacks.function import RUNTIME, function
 from stacks.quarantine import Quarantine
 from stacks.settings import Settings
@@ -177,7 +187,7 @@ class Processing(Stack):
                 "LOW_VOLTAGE_V": f"{settings.thresholds.low_voltage_v:g}",
             },
         )
-        storage.robots.grant(alert, "dynamodb:UpdateItem")
+        storage.may_keep(alert, f"{ALERT_PREFIX}*")
         alert.add_to_role_policy(
             iam.PolicyStatement(actions=["sns:Publish"], resources=[self.alarms.topic_arn])
         )
@@ -220,7 +230,7 @@ class Processing(Stack):
             storage.files.arn_for_objects(f"{FILES_PREFIX}*"),
         )
         self._allow(upload, ["s3:ListBucket", "s3:ListBucketMultipartUploads"], storage.files.bucket_arn)
-        storage.robots.grant(upload, "dynamodb:UpdateItem")
+        storage.may_keep(upload, FILES_DAY, FILES_BYTES)
         self._may_answer(upload, f"{PONG}/{settings.namespace}/*/{FILE}")
         return upload
 

@@ -6,6 +6,7 @@ from typing import Any
 
 from aws_cdk import CfnOutput, Duration, Stack
 from aws_cdk import aws_dynamodb as dynamodb
+from aws_cdk import aws_iam as iam
 from aws_cdk import aws_s3 as s3
 from constructs import Construct
 
@@ -71,6 +72,23 @@ class Storage(Stack):
         )
         CfnOutput(self, f"{name}Table", value=table.table_name)
         return table
+
+    def may_keep(self, role: iam.IGrantable, *attributes: str) -> None:
+        """Let a role change these attributes of a robot's row, and no other: a name's admission and its
+        vehicle stand in the same row. A ``*`` stands for the rest of a name.
+
+        Source: DynamoDB, "Using IAM policy conditions for fine-grained access control", by which the
+        condition is only as good as what the answer may hold.
+        """
+        statement = iam.PolicyStatement(
+            actions=["dynamodb:UpdateItem"],
+            resources=[self.robots.table_arn],
+            conditions={
+                "ForAllValues:StringLike": {"dynamodb:Attributes": sorted({ROBOT, *attributes})},
+                "StringEqualsIfExists": {"dynamodb:ReturnValues": ["NONE", "UPDATED_NEW", "UPDATED_OLD"]},
+            },
+        )
+        role.grant_principal.add_to_principal_policy(statement)
 
     def _files(self, settings: Settings) -> s3.Bucket:
         """What is too large for a message. Not versioned: a key is written once and names its content,

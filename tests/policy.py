@@ -48,6 +48,11 @@ def _holds(operator: str, key: str, wanted: Any, variables: Mapping[str, str]) -
         return variables.get(key) in [str(one).lower() for one in _list(wanted)]
     if operator == "StringEquals":
         return variables.get(key) in _list(wanted)
+    # A key that the request does not have passes both.
+    if operator == "StringEqualsIfExists":
+        return key not in variables or variables[key] in _list(wanted)
+    if operator == "ForAllValues:StringLike":
+        return all(any(_like(one, value) for one in _list(wanted)) for value in _list(variables.get(key, [])))
     raise NotImplementedError(operator)
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import fnmatch
 import json
 import re
 
@@ -9,6 +10,9 @@ import pytest
 
 import contract
 from contract import BROKER, CMD, FLEET, LIVE, PING, PONG, RULES, build_topic, record_topic, rule_name
+from functions.alert import Notices, causes
+from functions.allotment import Allotment
+from functions.presence import change
 
 ME = "${iot:Connection.Thing.ThingName}"
 IOT = "arn:${AWS::Partition}:iot:${AWS::Region}:${AWS::AccountId}"
@@ -179,6 +183,12 @@ ROLES = {
     "ingest/PresenceRole": ("iot.amazonaws.com", {REJECT}),
     "ingest/VersionRole": ("iot.amazonaws.com", {REJECT}),
 }
+# Of the functions that keep something in a robot's row: which attributes.
+KEEPS = {
+    "AlertRole": ("alert_*",),
+    "PresenceRole": contract.PRESENCE,
+    "UploadRole": ("files_bytes", "files_day"),
+}
 # The only statements about every resource, each with why it cannot name one.
 EVERY_RESOURCE = {
     # "Actions, resources, and condition keys for Amazon DynamoDB": ListStreams has no resource type.
@@ -329,15 +339,66 @@ def test_a_robot_connects_as_its_thing_and_nobody_else(robot_policy):
 
 def test_every_role_may_do_exactly_this(synthesized, reader):
     granted = {role: set() for role, *_ in qualified(synthesized, "AWS::IAM::Role")}
+    conditional = set()
     for _, stack, _, policy in qualified(synthesized, "AWS::IAM::Policy"):
         (ref,) = policy["Roles"]
         role = ("ingest/" if stack == "ingest" else "") + reader.text(ref)
         for statement in policy["PolicyDocument"]["Statement"]:
-            assert statement.keys() <= {"Action", "Effect", "Resource"}
+            assert statement.keys() <= {"Action", "Effect", "Resource", "Condition"}
             assert statement["Effect"] == "Allow"
+            if "Condition" in statement:
+                assert statement["Action"] == "dynamodb:UpdateItem"
+                assert statement["Condition"] == {
+                    "ForAllValues:StringLike": {"dynamodb:Attributes": sorted({"robot", *KEEPS[role]})},
+                    "StringEqualsIfExists": {"dynamodb:ReturnValues": ["NONE", "UPDATED_NEW", "UPDATED_OLD"]},
+                }
+                conditional.add(role)
             for action in reader.texts(statement["Action"]):
                 granted[role] |= {(action, resource) for resource in reader.texts(statement["Resource"])}
     assert granted == {role: actions for role, (_, actions) in ROLES.items()}
+    # Whoever else changes a row of the registry decides who may join.
+    others = {role for role, actions in granted.items() if ("dynamodb:UpdateItem", "Robots.Arn") in actions}
+    assert conditional == KEEPS.keys() == others - {"AdmitRole"}
+
+
+def test_no_function_that_keeps_a_robots_row_can_open_its_name():
+    for names in KEEPS.values():
+        for name in (*contract.ADMISSION, "speed_to_erpm_gain", "vehicle"):
+            assert not any(fnmatch.fnmatchcase(name, pattern) for pattern in names), name
+
+
+class Recorder:
+    """A DynamoDB client that only notes which attributes it was asked for."""
+
+    class exceptions:  # noqa: N801 boto3 calls it that
+        class ConditionalCheckFailedException(Exception):  # noqa: N818
+            pass
+
+    def __init__(self):
+        self.attributes = set()
+
+    def update_item(self, **asked):
+        names = asked.get("ExpressionAttributeNames", {})
+        text = f"{asked['UpdateExpression']} {asked.get('ConditionExpression', '')}"
+        words = re.findall(r"(?<![:\w])#?[a-z]\w*(?!\w*\()", text)
+        self.attributes |= asked["Key"].keys() | {names.get(word, word) for word in words}
+
+
+def test_each_function_changes_what_it_may_and_may_change_what_it_does():
+    upload, alert, presence = Recorder(), Recorder(), Recorder()
+    Allotment(upload, table="robots", bytes_a_day=9).take("car", 1, 0)
+    notices = Notices(alert, "robots")
+    for cause in causes({"fault_code": 1, "voltage_input": 1.0}, 10.5) + causes({"fault_code": 99}, 10.5):
+        notices.take("car", cause.key, 0)
+        notices.give_back("car", cause.key)
+    event = {"clientId": "car", "timestamp": 1, "versionNumber": 1, "principalIdentifier": "a"}
+    for kind in ("connected", "disconnected"):
+        presence.update_item(**change({**event, "eventType": kind}))
+    presence.update_item(**change({"agent_version": "1", "robot": "car"}))
+    assert upload.attributes == {"robot", *KEEPS["UploadRole"]}
+    assert presence.attributes == {"robot", *KEEPS["PresenceRole"]}
+    assert alert.attributes - {"robot"} == {"alert_fault_1", "alert_fault_unknown", "alert_low_voltage"}
+    assert all(fnmatch.fnmatchcase(name, "alert_*") for name in alert.attributes - {"robot"})
 
 
 def test_every_role_is_for_one_service_of_this_account(synthesized, reader):

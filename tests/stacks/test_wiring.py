@@ -300,6 +300,7 @@ AWS_METRICS = {
         "Errors",
         "Throttles",
         "IteratorAge",
+        "DestinationDeliveryFailures",
     },
     ("AWS/DynamoDB", "TableName"): {
         "ConsumedReadCapacityUnits",
@@ -315,6 +316,7 @@ def test_every_metric_of_aws_is_one_that_aws_has(shown, alarms):
     of_alarms = [
         (a["Namespace"], a["MetricName"], {d["Name"]: d["Value"] for d in a["Dimensions"]})
         for a in alarms.values()
+        if "Metrics" not in a
     ]
     for namespace, metric, dimensions in [*(one[:3] for one in shown), *of_alarms]:
         if namespace != contract.METRIC_NAMESPACE:
@@ -340,6 +342,26 @@ def test_every_queue_function_and_table_has_an_alarm(synthesized, alarms):
     ):
         for logical_id in synthesized.resources(kind):
             assert f"{name(logical_id)}{ending}" in alarms
+
+
+def test_what_can_be_lost_beside_the_quarantine_has_an_alarm(alarms):
+    asked = {}
+    for alarm, properties in alarms.items():
+        if "Metrics" in properties:
+            (query,) = properties["Metrics"]
+            assert query["ReturnData"] is not False
+            metric, namespace = re.fullmatch(
+                r'SELECT SUM\((\w+)\) FROM "([\w/]+)"', query["Expression"]
+            ).groups()
+            asked[alarm] = (namespace, metric)
+    known = {(key[0], metric) for key, names in AWS_METRICS.items() for metric in names}
+    assert set(asked.values()) <= known
+    assert asked == {
+        "ParseError": ("AWS/IoT", "ParseError"),
+        "ErrorActionFailure": ("AWS/IoT", "ErrorActionFailure"),
+        "RuleMessageThrottled": ("AWS/IoT", "RuleMessageThrottled"),
+        "DestinationDeliveryFailures": ("AWS/Lambda", "DestinationDeliveryFailures"),
+    }
 
 
 def test_every_alarm_tells_the_topic_and_is_explained(alarms, reader):

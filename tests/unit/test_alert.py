@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 
 import boto3
 import pytest
@@ -28,6 +29,8 @@ class Mailbox:
 
 @pytest.fixture
 def notices(dynamodb):
+    for robot in ("car7", "car8"):
+        dynamodb.put_item(TableName=NAMES["robots"], Item={"robot": {"S": robot}})
     return Notices(dynamodb, NAMES["robots"])
 
 
@@ -50,7 +53,8 @@ def test_a_fault_is_told_with_robot_code_and_time(notices):
     [
         ({"fault_code": 2, "voltage_input": 9.0}, ["alert_fault_2", "alert_low_voltage"]),
         ({"fault_code": 0, "voltage_input": 9.0}, ["alert_low_voltage"]),
-        ({"fault_code": 99}, ["alert_fault_99"]),
+        # However many codes a car makes up, they are one cause.
+        *(({"fault_code": code}, ["alert_fault_unknown"]) for code in (99, 100, 0.5, 1e300, math.inf)),
         # A controller that does not measure its voltage says 0.
         ({"fault_code": 0, "voltage_input": 0}, []),
         ({"fault_code": "3", "voltage_input": None}, []),
@@ -76,10 +80,10 @@ def test_a_fault_that_lasts_is_told_once_in_a_while(notices, capsys):
     assert [subject.split(",")[0] for subject, _ in mailbox.mails[2:]] == ["iort: car7", "iort: car8"]
 
 
-def test_of_two_environments_one_tells(dynamodb):
+def test_of_two_environments_one_tells(dynamodb, notices):
     mailbox = Mailbox()
-    for notices in (Notices(dynamodb, NAMES["robots"]), Notices(dynamodb, NAMES["robots"])):
-        process(event(fault_code=1), 10.5, notices, mailbox, NOW_S)
+    for one in (notices, Notices(dynamodb, NAMES["robots"])):
+        process(event(fault_code=1), 10.5, one, mailbox, NOW_S)
     assert len(mailbox.mails) == 1
 
 
@@ -100,6 +104,20 @@ def test_the_registrys_row_is_kept(dynamodb, notices):
     row = dynamodb.get_item(TableName=NAMES["robots"], Key={"robot": {"S": "car7"}})["Item"]
     assert row["vehicle"] == {"S": "f1tenth"}
     assert row["alert_fault_1"] == {"N": str(NOW_S)}
+
+
+def test_a_robot_that_was_removed_gets_no_row_by_what_it_still_sends(dynamodb, notices):
+    mailbox = Mailbox()
+
+    def removed_meanwhile(_subject, _text):
+        dynamodb.delete_item(TableName=NAMES["robots"], Key={"robot": {"S": "car7"}})
+        raise ConnectionError("no SNS")
+
+    with pytest.raises(ConnectionError):
+        process(event(fault_code=1), 10.5, notices, removed_meanwhile, NOW_S)
+    process(event(fault_code=1), 10.5, notices, mailbox, NOW_S)
+    assert mailbox.mails == []
+    assert "Item" not in dynamodb.get_item(TableName=NAMES["robots"], Key={"robot": {"S": "car7"}})
 
 
 def test_another_error_of_the_table_is_not_taken_for_a_repetition(aws):

@@ -15,6 +15,28 @@ def statement(effect="Allow", action="iot:Publish", resource=f"{TOPIC}a/*", **mo
 
 
 @pytest.mark.parametrize(
+    ("names", "returned", "allowed"),
+    [
+        (["robot", "alert_1"], "NONE", True),
+        (["robot", "alert_1", "admit_until_s"], "NONE", False),
+        ("alert_2", "NONE", True),
+        ("admit_until_s", "NONE", False),
+        (["robot"], "ALL_OLD", False),
+        (["robot"], None, True),
+        (None, None, True),
+    ],
+)
+def test_conditions_on_attributes(names, returned, allowed):
+    condition = {
+        "ForAllValues:StringLike": {"dynamodb:Attributes": ["alert_*", "robot"]},
+        "StringEqualsIfExists": {"dynamodb:ReturnValues": ["NONE"]},
+    }
+    asked = {"dynamodb:Attributes": names, "dynamodb:ReturnValues": returned}
+    known = {key: value for key, value in asked.items() if value is not None}
+    assert allows([statement(Condition=condition)], "iot:Publish", f"{TOPIC}a/b", known) is allowed
+
+
+@pytest.mark.parametrize(
     ("resource", "topic", "allowed"),
     [
         ("a/b", "a/b", True),

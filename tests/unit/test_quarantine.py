@@ -240,14 +240,15 @@ def test_only_the_message_that_the_table_did_not_take_comes_again():
 
 
 class FakeStreams:
-    """Two records a call, as AWS' pages; the second and third of them are wanted."""
+    """A record a call, as AWS' pages, behind so many empty ones; the second and third are wanted."""
 
     class exceptions:  # noqa: N801 boto3 calls it that
         class TrimmedDataAccessException(Exception):  # noqa: N818
             pass
 
-    def __init__(self, *, trimmed=False):
-        self.trimmed = trimmed
+    def __init__(self, *, trimmed=False, empty=0, ends_at=9):
+        self.trimmed, self.empty, self.ends_at = trimmed, empty, ends_at
+        self.left = empty
 
     def get_shard_iterator(self, **request):
         assert request == {
@@ -262,15 +263,33 @@ class FakeStreams:
 
     def get_records(self, *, ShardIterator):  # noqa: N803
         n = int(ShardIterator)
-        return {
-            "Records": [{"dynamodb": {"SequenceNumber": str(n)}}] if n < 9 else [],
-            "NextShardIterator": str(n + 1),
-        }
+        if self.left or n >= self.ends_at:
+            self.left -= 1
+            return {"Records": [], "NextShardIterator": str(n)}
+        self.left = self.empty
+        return {"Records": [{"dynamodb": {"SequenceNumber": str(n)}}], "NextShardIterator": str(n + 1)}
 
 
-def test_the_records_of_a_failed_batch_are_read_page_by_page():
-    found = Stream(FakeStreams()).records(INFO)
+@pytest.mark.parametrize("empty", [0, 1, 20])
+def test_the_records_of_a_failed_batch_are_read_page_by_page_behind_empty_ones(empty):
+    found = Stream(FakeStreams(empty=empty)).records(INFO)
     assert [record["dynamodb"]["SequenceNumber"] for record in found] == ["2", "3"]
+
+
+def test_a_part_of_a_batch_is_not_taken_for_all_of_it(dynamodb, store):
+    answer = process(sqs_event(failed_batch()), store, Stream(FakeStreams(ends_at=3)).records)
+    assert answer == {"batchItemFailures": [{"itemIdentifier": "m0"}]}
+    assert kept(dynamodb) == []
+
+
+def test_what_is_larger_than_an_item_is_kept_as_far_as_it_fits(dynamodb, store):
+    big = {**image(7), "x": {"L": [{"N": "1"}] * 60_000}}
+    body = message(Refused("5", "no batch", big))
+    assert process(sqs_event(body), store, none) == {"batchItemFailures": []}
+    (item,) = kept(dynamodb)
+    assert item["payload"]["B"].startswith(b'{"topic":{"S":"dt/iort/car/vesc"}')
+    assert item["reason"]["S"].startswith("cut from ")
+    assert item["reason"]["S"].endswith("no batch")
 
 
 def test_records_that_have_left_the_stream_are_none():
