@@ -337,7 +337,7 @@ class Field(NamedTuple):
 # Sources: vesc_msgs/VescState.msg of the ROS 1 and the ROS 2 driver and COMM_GET_VALUES of the
 # firmware. Charge and energy are in the unit the ROS 1 driver really sends, whatever its comments
 # say: the integer of 1e-4 Ah and Wh straight off the wire. The ROS 2 driver divides by 1e4 first; nothing
-# on the way to the tables converts either.
+# on the way to the tables converts either. Values that are not whole are therefore the ROS 2 driver's.
 VESC_STREAM = "vesc"
 VESC_FIELDS: dict[str, Field] = {
     f.name: f

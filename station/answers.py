@@ -62,6 +62,7 @@ def history(cloud: Cloud, asked: Mapping[str, str]) -> dict[str, Any]:
         "times_s": [t_us / 1e6 for t_us in found.times_us[starts].tolist()],
         "fields": {name: _rows(each, starts, n, several=several) for name, each in columns.items()},
         "samples": int(np.nansum(found.columns["n"])) if summary and "n" in found.columns else n,
+        "ros2": found.ros2,
         "row_s": max(row_us / 1e6, 1.0 if summary else 0.0),
     }
 

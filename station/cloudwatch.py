@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import json
 import time
+from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
 from datetime import datetime, timezone
 from typing import Any
@@ -140,7 +141,11 @@ def _queries(
         queries.append(query)
         if visible:
             label = options.get("label", parts[1] if parts else key)
-            shown[key] = {"label": label, "right": options.get("yAxis") == "right"}
+            shown[key] = {
+                "label": label,
+                "right": options.get("yAxis") == "right",
+                "searched": str(options.get("expression", "")).startswith("SEARCH("),
+            }
     return queries[:_MAX_QUERIES], shown
 
 
@@ -151,7 +156,9 @@ def _series(
     from_s: int,
     to_s: int,
 ) -> list[dict[str, Any]]:
-    found: dict[str, dict[float, float]] = {key: {} for key in shown}
+    # A SEARCH answers with a result a metric found: all with the query's id, told apart by their labels,
+    # and those of one label by their place.
+    found: dict[tuple[str, str, int], dict[float, float]] = {}
     pages = client.get_paginator("get_metric_data").paginate(
         MetricDataQueries=list(queries),
         StartTime=datetime.fromtimestamp(from_s, timezone.utc),
@@ -159,16 +166,24 @@ def _series(
         ScanBy="TimestampAscending",
     )
     for page in pages:
+        seen: Counter[tuple[str, str]] = Counter()
         for result in page["MetricDataResults"]:
-            if result["Id"] in found:
+            if result["Id"] in shown:
                 stamps = (stamp.timestamp() for stamp in result["Timestamps"])
-                found[result["Id"]].update(zip(stamps, result["Values"], strict=True))
-    return [
-        {
-            "label": str(shown[key]["label"]),
-            "right": bool(shown[key]["right"]),
-            "times_s": sorted(values),
-            "values": [values[at] for at in sorted(values)],
-        }
-        for key, values in found.items()
-    ]
+                key = result["Id"], result.get("Label", "")
+                values = found.setdefault((*key, seen[key]), {})
+                values.update(zip(stamps, result["Values"], strict=True))
+                seen[key] += 1
+    series = []
+    for query_id, options in shown.items():
+        several = [(label, values) for (id_, label, _), values in found.items() if id_ == query_id]
+        for label, values in several or [("", {})]:
+            series.append(
+                {
+                    "label": (options["searched"] and label) or str(options["label"]),
+                    "right": bool(options["right"]),
+                    "times_s": sorted(values),
+                    "values": [values[at] for at in sorted(values)],
+                }
+            )
+    return series

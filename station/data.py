@@ -18,17 +18,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from contract import (
-    AGENT_FIELDS,
-    AGENT_STREAM,
-    DERIVED_UNITS,
-    RTT_FIELDS,
-    RTT_STREAM,
-    STATS,
-    T_US,
-    VESC_FIELDS,
-    VESC_STREAM,
-)
+from contract import DERIVED_UNITS, T_US
 from station import inventory, reading, remote
 from station.blocks import ATTRIBUTES, Block, Refused, blocks, join
 from station.cloud import Cloud
@@ -39,6 +29,7 @@ from station.resample import resample
 from station.seconds import seconds
 from station.selection import Selection, select
 from station.times import Time, duration_us
+from station.units import Driver, unit
 
 # Where samples are chosen: on this machine, or by the query function in the cloud.
 CLIENT, LAMBDA = "client", "lambda"
@@ -50,7 +41,8 @@ class Result:
 
     ``times_us`` are int64 microseconds since the epoch, strictly increasing; ``columns`` one array a
     field: float64 with NaN for null, bool for flags, objects for texts. ``refused`` counts stored items
-    that are not batches, of which ``reason`` says what was wrong with the first.
+    that are not batches, of which ``reason`` says what was wrong with the first. ``ros2`` where charge and
+    energy have the ROS 2 driver's units.
     """
 
     robot: str
@@ -59,13 +51,14 @@ class Result:
     columns: Mapping[str, Column]
     refused: int = 0
     reason: str = ""
+    ros2: bool = False
 
     def __len__(self) -> int:
         return len(self.times_us)
 
     def unit(self, name: str) -> str:
         """The unit of a column, empty where none is known."""
-        return unit(self.stream, name)
+        return unit(self.stream, name, ros2=self.ros2)
 
     def frame(self) -> Any:
         """The same as a pandas DataFrame, indexed by time in UTC."""
@@ -115,10 +108,12 @@ def query(
         found = seconds(cloud, selection, scan=scan, progress=progress)
     else:
         found = samples(cloud, selection, refused=refused, scan=scan, progress=progress)
+    driver = Driver()
+    found = driver.told(found)
     block = join(list(found)) if every_us is None else resample(found, every_us)
     if not len(block.times_us):
         inventory.check_there(cloud, robot, stream)
-    return Result(robot, stream, block.times_us, block.columns, refused.count, refused.reason)
+    return Result(robot, stream, block.times_us, block.columns, refused.count, refused.reason, driver.ros2)
 
 
 def samples(
@@ -156,21 +151,6 @@ def samples(
             yield Block(chosen.times_us, {name: _column(chosen, name) for name in names})
     if some:
         inventory.check_fields(cloud, selection, there)
-
-
-def unit(stream: str, name: str) -> str:
-    """The unit of a field, or of a statistic of it; empty where none is known."""
-    stem, _, statistic = name.rpartition("_")
-    for field in (name, stem) if statistic in STATS else (name,):
-        if field in DERIVED_UNITS:
-            return DERIVED_UNITS[field]
-        if stream == VESC_STREAM and field in VESC_FIELDS:
-            return VESC_FIELDS[field].unit
-        if stream == RTT_STREAM and field in RTT_FIELDS.values():
-            return "ms"
-        if stream == AGENT_STREAM and field in AGENT_FIELDS:
-            return AGENT_FIELDS[field].split()[0].rstrip(",")
-    return ""
 
 
 def _trimmed(block: Block, selection: Selection) -> Block:

@@ -87,7 +87,10 @@ def config(
 
 def field_table() -> dict[str, Any]:
     """The contract's field table as the page reads it, ``/fields.json``."""
-    fields = {f.name: {"unit": f.unit, "meaning": f.meaning} for f in contract.VESC_FIELDS.values()}
+    fields = {
+        f.name: {"unit": f.unit, "meaning": f.meaning} | ({"ros2_unit": f.ros2_unit} if f.ros2_unit else {})
+        for f in contract.VESC_FIELDS.values()
+    }
     fields |= {name: {"unit": unit, "meaning": ""} for name, unit in contract.DERIVED_UNITS.items()}
     fields |= {
         name: {"unit": "ms", "meaning": f"round trip over the path {path}"}

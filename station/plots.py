@@ -174,7 +174,7 @@ def _style(i: int) -> dict[str, Any]:
 
 
 def _labelled(runs: Sequence[Run], field: str) -> str:
-    unit = runs[0].result.unit(field)
+    unit = " or ".join(dict.fromkeys(run.result.unit(field) for run in runs))
     return f"{field}\n({unit})" if unit and unit != "1" else field
 
 

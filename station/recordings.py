@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
@@ -61,26 +62,32 @@ class _Mcap:
 
 @contextmanager
 def bag(path: Path) -> Iterator[Recording]:
-    """A new ROS 1 bag; raises `StationError` where the file exists."""
-    _must_be_new(path)
-    with BagWriter(path) as writer:
+    """A new ROS 1 bag, there once it is whole; raises `StationError` where the file exists."""
+    with _new(path) as part, BagWriter(part) as writer:
         yield _Bag(writer)
 
 
 @contextmanager
 def mcap(path: Path) -> Iterator[Recording]:
-    """A new MCAP file; raises `StationError` where the file exists."""
-    _must_be_new(path)
-    with path.open("wb") as file:
+    """A new MCAP file, there once it is whole; raises `StationError` where the file exists."""
+    with _new(path) as part, part.open("wb") as file:
         writer = McapWriter(file)
         writer.start(profile="ros1", library="iort")
         yield _Mcap(writer)
         writer.finish()
 
 
-def _must_be_new(path: Path) -> None:
+@contextmanager
+def _new(path: Path) -> Iterator[Path]:
+    """Where to write what becomes ``path``, so that what broke off is never taken for a recording."""
     if path.exists():
         raise StationError(f"{path} exists")
+    part = path.with_name(f".{path.name}.{os.getpid()}.part")
+    try:
+        yield part
+        part.rename(path)
+    finally:
+        part.unlink(missing_ok=True)
 
 
 KINDS = {".bag": bag, ".mcap": mcap}

@@ -18,6 +18,7 @@ from contract import (
     STATS,
     TOPIC,
 )
+from functions import expression
 from station import reading
 from station.blocks import Block, objects
 from station.cloud import Cloud
@@ -53,7 +54,11 @@ def seconds(
             block = Block(block.times_us, {name: block.columns[name] for name in chosen})
         if len(block.times_us):
             yield block
-    unknown = sorted(name for name in selection.named() if not _stands_for(name, there))
+    # A condition compares one number a second, so it says which.
+    compared = expression.names(selection.condition) if selection.condition is not None else set()
+    unknown = sorted(
+        {name for name in selection.named() if not _stands_for(name, there)} | (compared - there.keys())
+    )
     if there and unknown:
         raise StationError(
             f"the summary of {selection.robot} {selection.stream} has no {', '.join(unknown)}; "

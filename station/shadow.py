@@ -41,6 +41,10 @@ class State(NamedTuple):
         own = {k: v for k, v in self.reported.items() if k not in {"rejected", COMMANDS, AGENT_VERSION}}
         return dict(sorted(_flat(own)))
 
+    def wished(self) -> dict[str, Any]:
+        """What is desired: dotted name to value."""
+        return dict(_flat(self.desired))
+
     def refusals(self) -> list[Refusal]:
         """The wishes that the robot refuses."""
         found = self.reported.get("rejected", {})

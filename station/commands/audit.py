@@ -99,28 +99,11 @@ def _counting(items: Any, name: str, status: Any) -> Any:
 
 
 def _show(one: Audit) -> None:
-    said = "[green]complete[/]" if one.complete else f"[bold red]{one.missing:,} batches missing[/]"
-    table = Table(title=f"{one.stream}: {said}", title_justify="left")
-    for i, name in enumerate(
-        ("run", "from", "to", "numbers", "expected", "stored", "missing", "twice", "late", "samples")
-    ):
-        table.add_column(name, justify="right" if i > 3 else "left")
-    for run in one.runs:
-        missing = sum(gap.batches for gap in run.missing)
-        table.add_row(
-            run.boot[:8],
-            iso(run.first_us)[:19] + "Z",
-            iso(run.last_us)[:19] + "Z",
-            f"{run.first_seq:,} to {run.last_seq:,}",
-            f"{run.expected:,}",
-            f"{run.batches:,}",
-            f"{missing:,}",
-            f"{run.duplicated:,}",
-            f"{run.late:,}" + (f" (up to {run.latest_ms / 1000:.1f} s)" if run.late else ""),
-            f"{run.samples:,}",
-            style="red" if missing else "",
-        )
-    _out.print(table)
+    if not one.runs:
+        _out.print(f"{one.stream}: [bold red]nothing stored in this range[/]")
+    else:
+        _out.print(f"{one.stream}: {_said(one)}")
+        _out.print(_table(one))
     for run in one.runs:
         for gap in run.missing[:_LISTED]:
             after = "the start" if gap.after_us is None else iso(gap.after_us)
@@ -138,6 +121,35 @@ def _show(one: Audit) -> None:
         _out.print(f"  the car's queue held {one.in_car:,} batches when it last said so")
     if one.dropped:
         _out.print(f"  [red]the car has dropped {one.dropped:,} batches: its queue was full, or damaged[/]")
+
+
+def _said(one: Audit) -> str:
+    return "[green]complete[/]" if one.complete else f"[bold red]{one.missing:,} batches missing[/]"
+
+
+def _table(one: Audit) -> Table:
+    """A row a run, in 80 columns: its first and last time and number one above the other; below the
+    number of late batches, how late the latest was."""
+    table = Table(box=None, padding=(0, 1, 0, 0), pad_edge=False)
+    for i, name in enumerate(
+        ("run", "from, to", "numbers", "expected", "stored", "missing", "twice", "late", "samples")
+    ):
+        table.add_column(name, justify="right" if i > 1 else "left")
+    for run in one.runs:
+        missing = sum(gap.batches for gap in run.missing)
+        table.add_row(
+            run.boot[:8],
+            f"{iso(run.first_us)[:19]}Z\n{iso(run.last_us)[:19]}Z",
+            f"{run.first_seq:,}\n{run.last_seq:,}",
+            f"{run.expected:,}",
+            f"{run.batches:,}",
+            f"{missing:,}",
+            f"{run.duplicated:,}",
+            f"{run.late:,}" + (f"\n{run.latest_ms / 1000:.1f} s" if run.late else ""),
+            f"{run.samples:,}",
+            style="red" if missing else "",
+        )
+    return table
 
 
 def _as_json(one: Audit) -> dict[str, Any]:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Annotated, Any
 
 import typer
@@ -15,6 +15,8 @@ from station.shadow import Shadow, State, answered
 commands = typer.Typer()
 _out = Console(highlight=False)
 _errors = Console(stderr=True, highlight=False)
+# How long a robot that is there may take to have the file's value in force again.
+_WITHDRAWN_S = 3.0
 
 
 @commands.command("config")
@@ -42,9 +44,15 @@ def config(
     shadow = Shadow(context.obj.cloud(), robot)
     late = False
     if wishes:
+        before = shadow.read()
         shadow.wish(wishes)
         with _errors.status(f"waiting for {robot}"):
             late = shadow.wait(lambda state: answered(wishes, state), seconds) is None
+            old, wished = before.settings(), before.wished()
+            withdrawn = [n for n, value in wishes.items() if value is None and wished.get(n) == old.get(n)]
+            if withdrawn and not late:
+                # The file's value may be the same, which a robot does not report again.
+                shadow.wait(lambda state: _all_changed(withdrawn, old, state), min(seconds, _WITHDRAWN_S))
     state = shadow.read()
     refused = [refusal for refusal in state.refusals() if not wishes or refusal.name in wishes]
     if as_json:
@@ -62,6 +70,11 @@ def config(
         raise typer.Exit(1)
 
 
+def _all_changed(names: Sequence[str], old: Mapping[str, Any], state: State) -> bool | None:
+    now = state.settings()
+    return all(now.get(name) != old.get(name) for name in names) or None
+
+
 def _change(text: str) -> tuple[str, Any]:
     name, equals, value = text.partition("=")
     if not name or not equals:
@@ -77,6 +90,10 @@ def _change(text: str) -> tuple[str, Any]:
 def _show(robot: str, state: State, wishes: Mapping[str, Any]) -> None:
     if not state.reported:
         _out.print(f"{robot} has reported no settings yet")
+    said = {
+        name: "  (asked for now)" if value is not None else "  (wish withdrawn)"
+        for name, value in wishes.items()
+    }
     for name, value in state.settings().items():
         shown = ",".join(value) if isinstance(value, list) else json.dumps(value).strip('"')
-        _out.print(f"{name}={shown}{'  (asked for now)' if name in wishes else ''}", markup=False)
+        _out.print(f"{name}={shown}{said.get(name, '')}", markup=False)

@@ -45,11 +45,16 @@ def export(
         raise StationError(f"{output}: allowed is a file ending in {' or '.join(recordings.KINDS)}")
     cloud, when = context.obj.cloud(), Range.of(start, end, last)
     with kind(output) as file:
-        for stream in dict.fromkeys(streams):
+        written = [
             _write(cloud, select(robot, stream, when.start_us, when.end_us), file)
+            for stream in dict.fromkeys(streams)
+        ]
+        if not any(written):
+            raise StationError(f"there is nothing to export; {output} is not written")
 
 
-def _write(cloud: Cloud, selection: Selection, file: Recording) -> None:
+def _write(cloud: Cloud, selection: Selection, file: Recording) -> int:
+    """How many messages were written."""
     from station import data, inventory, messages  # noqa: PLC0415 - as above
     from station.blocks import Refused  # noqa: PLC0415
 
@@ -61,7 +66,7 @@ def _write(cloud: Cloud, selection: Selection, file: Recording) -> None:
         if first is None:
             inventory.check_there(cloud, robot, stream)
             say(f"{robot} {stream}: no samples in this range")
-            return
+            return 0
         kind = messages.type_of(cloud, selection)
         made = kind or messages.made_of(stream, first.columns)
         maker = messages.Maker(made, list(first.columns), own=kind is None)
@@ -75,6 +80,7 @@ def _write(cloud: Cloud, selection: Selection, file: Recording) -> None:
         say(f"not in the samples, so zero or empty: {', '.join(maker.lacking)}")
     if maker.foreign:
         say(f"not in the type, so left out: {', '.join(maker.foreign)}")
+    return written
 
 
 def _all(first: Block, rest: Iterator[Block]) -> Iterator[Block]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from enum import Enum
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
@@ -125,7 +126,7 @@ def _read(
     columns = dict(result.columns)
     if fields is None and "speed" in columns:
         columns |= derive(columns, inventory.vehicle_of(cloud, robot))
-    return Run(robot, data.Result(robot, stream, result.times_us, columns))
+    return Run(robot, replace(result, columns=columns))
 
 
 def _chosen(run: Run, stream: str) -> list[str]:

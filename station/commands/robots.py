@@ -148,6 +148,9 @@ def show(
         _out.print_json(json.dumps({**row, "certificates": described}, default=float))
         return
     table = Table(show_header=False, box=None, pad_edge=False)
+    table.add_column(no_wrap=True)
+    # Half an identifier is of no use to who copies it.
+    table.add_column(overflow="fold")
     table.add_row("connection", _connection(row))
     for key, value in sorted(row.items()):
         if key != ROBOT:

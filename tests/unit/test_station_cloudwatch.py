@@ -100,3 +100,39 @@ def test_what_it_does_not_draw_it_names(cloud):
 def test_a_dashboard_that_is_not_there_says_so(cloud):
     with pytest.raises(StationError, match="no dashboard 'nobody'"):
         cloudwatch.dashboard(cloud, "nobody", minutes=5, now_s=NOW_S)
+
+
+class Searched:
+    """CloudWatch with one dashboard, whose one widget searches, and with the results of that."""
+
+    namespace = "iort"
+
+    def __init__(self, *labels):
+        stamp = datetime.fromtimestamp(NOW_S, timezone.utc)
+        self.results = [
+            {"Id": "iort0", "Label": label, "Timestamps": [stamp], "Values": [float(i)]}
+            for i, label in enumerate(labels)
+        ]
+
+    def client(self, _service):
+        return self
+
+    def get_dashboard(self, **_name):
+        expression = "SEARCH('{iort,Robot} MetricName=\"Samples\"', 'Sum', 60)"
+        row = [{"expression": expression, "label": "samples"}]
+        return {"DashboardBody": json.dumps({"widgets": [metric(row)]})}
+
+    def get_paginator(self, _name):
+        return self
+
+    def paginate(self, **_asked):
+        return [{"MetricDataResults": self.results}]
+
+
+def test_a_search_is_a_line_for_each_metric_found():
+    (widget,) = cloudwatch.dashboard(Searched("car1", "car2"), "d", minutes=5, now_s=NOW_S)["widgets"]
+    assert [(one["label"], one["values"]) for one in widget["series"]] == [("car1", [0]), ("car2", [1])]
+    (widget,) = cloudwatch.dashboard(Searched("cars", "cars"), "d", minutes=5, now_s=NOW_S)["widgets"]
+    assert [(one["label"], one["values"]) for one in widget["series"]] == [("cars", [0]), ("cars", [1])]
+    (widget,) = cloudwatch.dashboard(Searched(), "d", minutes=5, now_s=NOW_S)["widgets"]
+    assert [(one["label"], one["values"]) for one in widget["series"]] == [("samples", [])]

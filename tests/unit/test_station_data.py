@@ -184,6 +184,26 @@ def test_summary_gives_the_seconds_that_begin_in_the_range():
     assert found.unit("speed_min") == "erpm"
     with pytest.raises(StationError, match="has no volts; it has n, speed_last"):
         data.query(cloud, "car", "vesc", fields=["volts"], summary=True)
+    with pytest.raises(StationError, match="has no speed; it has n, speed_last"):
+        data.query(cloud, "car", "vesc", where="speed > 1", summary=True)
+    assert len(data.query(cloud, "car", "vesc", where="speed_min > 1", summary=True)) == 1
+
+
+@pytest.mark.parametrize(("drawn", "unit"), [([1, 2, None, 4], "1e-4 Ah"), ([1e-4, 2e-4, None, 4e-4], "Ah")])
+def test_charge_has_the_unit_of_the_driver_that_counted_it(drawn, unit):
+    times = [START + 20_000 * i for i in range(4)]
+    cloud = cloud_of(Batch("0badcafe", 0, times, {"charge_drawn": drawn, "charge_regen": [0, 0, 0, 0]}))
+    for found in (data.query(cloud, "car", "vesc"), data.query(cloud, "car", "vesc", every="1s")):
+        assert [found.unit(name) for name in ("charge_drawn", "charge_regen")] == [unit, unit]
+
+
+@pytest.mark.parametrize(("drawn", "unit"), [(4, "1e-4 Ah"), (4e-4, "Ah")])
+def test_charge_in_a_summary_has_its_unit_too(drawn, unit):
+    cloud = cloud_of(*ride())
+    summary = {"n": 50, "charge_drawn_mean": drawn * 0.7, "charge_drawn_max": drawn}
+    key = {"topic": {"S": TOPIC}, "second": {"N": str(START // 1_000_000)}}
+    cloud.table.put(SUMMARY, {name: attribute(value) for name, value in summary.items()} | key)
+    assert data.query(cloud, "car", "vesc", summary=True).unit("charge_drawn_mean") == unit
 
 
 def test_an_empty_range_is_no_error():

@@ -23,6 +23,9 @@ def test_what_is_in_force_and_what_is_refused():
     }  # fmt: skip
     assert STATE.refusals() == [("ping.rate_hz", 99, "ping.rate_hz: found 99")]
     assert State(0, {}, {}).settings() == {}
+    assert State(1, {"live": {"rate_hz": 5}, "log_level": "debug"}, {}).wished() == {
+        "live.rate_hz": 5, "log_level": "debug",
+    }  # fmt: skip
 
 
 @pytest.mark.parametrize(

@@ -126,6 +126,15 @@ def test_values_shown_are_values_sent(page: Page, car: Car) -> None:
         assert plain(page.inner_text(f"[data-reading='{name}']")) == text
 
 
+def test_charge_and_energy_have_the_unit_of_the_driver_that_sent_them(page: Page, car: Car) -> None:
+    show(page, car.send({**SAMPLE, "charge_drawn": 0, "energy_drawn": 0}))
+    page.click("[data-stream='vesc'] .tile:has([data-value='charge_drawn'])")
+    show(page, car.send({**SAMPLE, "charge_drawn": 0.0019, "energy_drawn": 1}))
+    texts = {"charge_drawn": "0.0019", "energy_drawn": "1.000"}
+    assert {name: shown(page, name) for name in texts} == texts
+    assert plain(page.inner_text("[data-reading='vesc/charge_drawn']")) == "0.0019"
+
+
 def test_every_newer_message_is_shown(page: Page, car: Car) -> None:
     for i in range(30):
         update = car.send({**SAMPLE, "voltage_input": 10 + i / 20})

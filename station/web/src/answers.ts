@@ -5,6 +5,8 @@ export interface Drive {
   /** For each field its values; least and most too where one row stands for many samples. */
   readonly fields: Readonly<Record<string, { readonly mean: Values; readonly least?: Values; readonly most?: Values }>>;
   readonly samples: number;
+  /** Whether charge and energy have the ROS 2 driver's units. */
+  readonly ros2: boolean;
   /** What one row covers, in seconds; 0 where each row is a sample. */
   readonly row_s: number;
 }

@@ -17,7 +17,8 @@ export interface FieldTable {
   readonly version: number;
   /** The stream that carries the VESC's fields. */
   readonly stream: string;
-  readonly fields: Readonly<Record<string, { readonly unit: string; readonly meaning: string }>>;
+  /** With `ros2_unit` where the ROS 2 driver has another unit. */
+  readonly fields: Readonly<Record<string, { readonly unit: string; readonly ros2_unit?: string; readonly meaning: string }>>;
   readonly faults: Readonly<Record<string, string>>;
 }
 

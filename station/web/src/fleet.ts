@@ -71,6 +71,8 @@ export class Stream {
   /** Column 0 is `takenAt`; a numeric field's column is in `columns`. */
   readonly history = new Ring(1, BOUNDS.rows);
   readonly columns = new Map<string, number>();
+  /** Whether charge and energy have the ROS 2 driver's units: counts of 1e-4 Ah are whole. */
+  ros2 = false;
   private readonly arrivals = new Ring(1, BOUNDS.rows);
   private readonly offset = new ClockOffset();
   private readonly oldBoots: string[] = [];
@@ -78,6 +80,7 @@ export class Stream {
 
   constructor(
     readonly name: string,
+    private readonly table: FieldTable,
     private readonly mayWiden: () => boolean,
   ) {}
 
@@ -92,6 +95,7 @@ export class Stream {
       if (this.boot !== "") this.oldBoots.push(this.boot);
       if (this.oldBoots.length > BOUNDS.boots) this.oldBoots.shift();
       this.offset.reset();
+      this.ros2 = false;
     }
     ({ boot: this.boot, seq: this.seq, t_us: this.t_us, hops: this.hops, sample: this.sample } = update);
     const t = update.t_us / 1e6;
@@ -100,6 +104,9 @@ export class Stream {
     this.received += 1;
     this.version += 1;
     this.arrivals.push([now]);
+    for (const [field, value] of update.sample) {
+      if (typeof value === "number" && !Number.isInteger(value) && this.table.fields[field]?.ros2_unit !== undefined) this.ros2 = true;
+    }
     if (!(this.takenAt <= this.history.last(0))) this.keep(update.sample);
     return true;
   }
@@ -237,7 +244,7 @@ export class Fleet {
         this.lastRefusal = "too many streams";
         return;
       }
-      stream = new Stream(update.stream, () => this.columns < BOUNDS.columns && (this.columns += 1) > 0);
+      stream = new Stream(update.stream, this.table, () => this.columns < BOUNDS.columns && (this.columns += 1) > 0);
       robot.streams.set(stream.name, stream);
       this.shape += 1;
     }

@@ -22,11 +22,13 @@ const DIGITS: Readonly<Record<string, number>> = {
 const UNITS: Readonly<Record<string, string>> = { degC: "°C", deg: "°", enum: "", id: "" };
 const CAPITALS = new Set(["pcb", "fet", "ntc", "pid", "id", "iq", "vd", "vq", "imu", "gps", "cpu", "mos1", "mos2", "mos3"]);
 
-export function spec(field: string, table: FieldTable): Spec {
+/** How to write a field; `ros2` for the ROS 2 driver's units. */
+export function spec(field: string, table: FieldTable, ros2 = false): Spec {
   const known = Object.hasOwn(table.fields, field) ? table.fields[field] : undefined;
   const label = humanise(field);
   if (!known) return { label, meaning: "", unit: "", scale: 1, digits: undefined };
-  const { unit, meaning } = known;
+  const { meaning } = known;
+  const unit = (ros2 ? known.ros2_unit : undefined) ?? known.unit;
   if (field === "fault_code") return { label, meaning: "", unit: "", scale: 1, digits: 0, texts: table.faults };
   // A share is read best in percent, and 1e-4 Ah in Ah.
   if (unit === "1") return { label, meaning, unit: "%", scale: 100, digits: 1 };

@@ -12,18 +12,20 @@ export const fieldKey = (stream: string, field: string): string => `${stream}/${
 class Tile {
   readonly node: HTMLElement;
   private readonly value: Text;
+  private readonly unit = new Text("unit");
   private readonly spark = new Sparkline();
 
   constructor(
     private readonly field: string,
-    private readonly spec: Spec,
+    private spec: Spec,
     choose: (() => void) | undefined,
   ) {
     this.value = new Text("num", "span", { "data-value": field });
     const { label, unit, meaning } = spec;
+    this.unit.set(unit);
     const parts = [
       el("span", { class: "tile-label" }, label),
-      el("span", { class: "tile-value" }, this.value.node, ...(unit ? [el("span", { class: "unit" }, unit)] : [])),
+      el("span", { class: "tile-value" }, this.value.node, ...(unit ? [this.unit.node] : [])),
       this.spark.node,
     ];
     const title = meaning ? `${field}: ${meaning}` : field;
@@ -31,6 +33,12 @@ class Tile {
       ? el("button", { type: "button", class: "tile", title: `${title}. Press to chart it.`, "aria-pressed": "false" }, ...parts)
       : el("div", { class: "tile", title }, ...parts);
     if (choose) this.node.addEventListener("click", choose);
+  }
+
+  /** Write from now on as this says. */
+  write(spec: Spec): void {
+    this.spec = spec;
+    this.unit.set(spec.unit);
   }
 
   set(value: Parameters<typeof write>[0]): void {
@@ -53,6 +61,7 @@ export class StreamSection {
   private readonly list = el("div", { class: "tiles" });
   private readonly tiles = new Map<string, Tile>();
   private drawn = -1;
+  private ros2 = false;
 
   constructor(
     private readonly stream: Stream,
@@ -74,6 +83,10 @@ export class StreamSection {
     const { stream } = this;
     if (stream.version === this.drawn) return;
     this.drawn = stream.version;
+    if (stream.ros2 !== this.ros2) {
+      this.ros2 = stream.ros2;
+      for (const [field, tile] of this.tiles) tile.write(spec(field, this.table, this.ros2));
+    }
     this.arrange();
     for (const [field, tile] of this.tiles) tile.set(stream.sample.get(field));
   }
@@ -97,7 +110,7 @@ export class StreamSection {
     if (fresh.length === 0) return;
     for (const field of fresh) {
       const charts = !Number.isNaN(numeric(this.stream.sample.get(field)));
-      this.tiles.set(field, new Tile(field, spec(field, this.table), charts ? () => this.choose(field) : undefined));
+      this.tiles.set(field, new Tile(field, spec(field, this.table, this.ros2), charts ? () => this.choose(field) : undefined));
     }
     const known = Object.keys(this.table.fields);
     const place = (field: string): number => (known.includes(field) ? known.indexOf(field) : known.length);

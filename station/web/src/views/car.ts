@@ -38,7 +38,7 @@ export class CarView {
   private readonly waterfall = new Waterfall();
   private readonly faults = new FaultLog();
   private readonly sections = new Map<Stream, StreamSection>();
-  private readonly chosen = new Map<string, { readonly panel: Panel; readonly stream: Stream; readonly field: string }>();
+  private readonly chosen = new Map<string, { readonly panel: Panel; readonly stream: Stream; readonly field: string; ros2: boolean }>();
   private robot: Robot | undefined;
   private drawn = -1;
   private screen_ms = NaN;
@@ -117,7 +117,7 @@ export class CarView {
       return;
     }
     if (this.chosen.size >= MOST_CHOSEN) this.close(this.chosen.keys().next().value!);
-    const { label, unit, scale, digits } = spec(field, this.table);
+    const { label, unit, scale, digits } = spec(field, this.table, stream.ros2);
     const reading = { name: key, unit, from: ([value = NaN]: readonly number[]) => value, ...(digits === undefined ? {} : { digits }) };
     const panel = new Panel(this.chosenCharts, {
       title: label,
@@ -126,7 +126,7 @@ export class CarView {
       onClose: () => this.close(key),
     });
     panel.show({ history: stream.history, columns: [stream.columns.get(field)] }, scale);
-    this.chosen.set(key, { panel, stream, field });
+    this.chosen.set(key, { panel, stream, field, ros2: stream.ros2 });
     panel.node.scrollIntoView({ block: "nearest" });
   }
 
@@ -155,7 +155,15 @@ export class CarView {
       panel.update(fields.map(newest));
     });
     this.delay.update([robot.newestDelay()?.total ?? NaN]);
-    for (const { panel, stream, field } of this.chosen.values()) panel.update([numeric(stream.sample.get(field))]);
+    for (const each of this.chosen.values()) {
+      const { panel, stream, field } = each;
+      if (each.ros2 !== stream.ros2) {
+        const { unit, scale } = spec(field, table, stream.ros2);
+        panel.show({ history: stream.history, columns: [stream.columns.get(field)] }, scale, unit);
+        each.ros2 = stream.ros2;
+      }
+      panel.update([numeric(stream.sample.get(field))]);
+    }
     for (const section of this.sections.values()) section.values();
     this.findPlanes(robot, gain);
     const fault = robot.fault(table);

@@ -25,11 +25,11 @@ export class Comparison {
     this.node = el("section", { class: "panel compare", "aria-label": "Then and now" }, el("table", {}, el("thead", {}, head), this.body));
   }
 
-  of(fields: readonly string[]): void {
+  of(fields: readonly string[], ros2: boolean): void {
     this.rows.clear();
     this.body.replaceChildren();
     for (const field of fields) {
-      const row = { spec: spec(field, this.table), then: new Text("num"), now: new Text("num"), change: new Text("num"), value: null };
+      const row = { spec: spec(field, this.table, ros2), then: new Text("num"), now: new Text("num"), change: new Text("num"), value: null };
       this.rows.set(field, row);
       this.body.append(
         el(

@@ -170,7 +170,7 @@ export class HistoryView {
         return chip;
       }),
     );
-    this.comparison.of(Object.keys(drive.fields));
+    this.comparison.of(Object.keys(drive.fields), drive.ros2);
     this.scrub.max = String(drive.times_s.length - 1);
     this.point(drive.times_s.length - 1);
   }
@@ -185,7 +185,7 @@ export class HistoryView {
     }
     const drive = this.drive!;
     if (this.shown.size >= MOST_CHARTS) return;
-    const { label, unit, scale } = spec(field, this.table);
+    const { label, unit, scale } = spec(field, this.table, drive.ros2);
     const { mean, least, most } = drive.fields[field]!;
     const scaled = (values: Drive["fields"][string]["mean"]): (number | null)[] => values.map((value) => (typeof value === "number" ? value * scale : null));
     const plot = el("div", { class: "plot", "aria-hidden": "true" });

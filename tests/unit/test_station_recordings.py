@@ -1,0 +1,21 @@
+"""Recordings are there once they are whole."""
+
+from __future__ import annotations
+
+import pytest
+
+from station import recordings
+from station.errors import StationError
+
+
+@pytest.mark.parametrize("ending", recordings.KINDS)
+def test_what_broke_off_leaves_nothing_behind(tmp_path, ending):
+    path = tmp_path / f"ride{ending}"
+    with pytest.raises(StationError, match="broke off"), recordings.KINDS[ending](path):
+        raise StationError("broke off")
+    assert list(tmp_path.iterdir()) == []
+    with recordings.KINDS[ending](path):
+        pass
+    assert list(tmp_path.iterdir()) == [path]
+    with pytest.raises(StationError, match="exists"), recordings.KINDS[ending](path):
+        pass
