@@ -78,8 +78,14 @@ def process(
     except (ContractError, KeyError, TypeError, ValueError, OverflowError) as error:
         emit("live", LiveRefused=1)
         raise RefusedError(f"{type(error).__name__}: {error}") from error
+    # Of a car that has not measured its clock's offset neither the leg between nor the whole way is known.
+    uplink_ms = way_ms = 0.0
+    if live.offset_us is not None:
+        uplink_ms = max(0.0, received_ms - (live.sent_us + live.offset_us) / 1000)
+        way_ms = max(0.0, (now_us - live.sent_us - live.offset_us) / 1000)
     if age_ms(live, received_ms, now_us, legs) > LIVE_MAX_AGE_MS:
-        emit("live", LiveStale=1)
+        # The stale ones are the late ones: an alarm that does not hear of them never goes off.
+        emit("live", LiveStale=1, CarToLambdaMs=way_ms)
         return
     chosen = settings.fields.get(topic.name)
     if chosen is not None:
@@ -92,16 +98,13 @@ def process(
         _log.warning("not published for %s: %s", topic.robot, error)
         emit("live", PubNubFailed=1)
         return
-    took_us = now_us - live.sent_us - (live.offset_us or 0)
-    uplink_us = received_ms * 1000 - live.sent_us - live.offset_us if live.offset_us is not None else 0
     emit(
         "live",
         LivePublished=1,
-        # Of a car that has not measured its clock's offset the leg between is not known.
         InCarMs=max(0.0, (live.sent_us - live.t_us) / 1000),
-        UplinkMs=max(0.0, uplink_us / 1000),
+        UplinkMs=uplink_ms,
         ToLambdaMs=max(0.0, now_us / 1000 - received_ms),
-        CarToLambdaMs=max(0.0, took_us / 1000),
+        CarToLambdaMs=way_ms,
     )
 
 
