@@ -31,6 +31,7 @@ _SILENT_S = 5.0
 _LOOK_S = 1.0
 # A topic changes its definition when somebody rebuilds a package, not all the time.
 _MAX_DECODERS = 32
+_MAX_LATCHED = 32
 
 _ROS_NAME = re.compile(r"(/[A-Za-z]\w*)(/\w+)*", re.ASCII)
 
@@ -53,9 +54,10 @@ class TopicConfig:
     """What becomes of a topic.
 
     ``time`` must be said: ``header`` is when it was measured, by the clock of the computer that did;
-    ``arrival`` is when the agent received it, by its own clock. ``fields`` are the paths wanted, or
-    what they begin with (``pose.position``); without it, all. ``large: upload`` sends bytes (images,
-    point clouds) as files, otherwise they are left out.
+    ``arrival`` is when the agent received it, by its own clock. What a latching publisher repeats to a
+    new connection is left out with either, and counted as ``latched_again``. ``fields`` are the paths
+    wanted, or what they begin with (``pose.position``); without it, all. ``large: upload`` sends bytes
+    (images, point clouds) as files, otherwise they are left out.
     """
 
     stream: str = setting(text(contract.check_stream))
@@ -140,6 +142,8 @@ class Intake:
         self._header: Mapping[str, str] | None = None
         self._decoder: Decoder | None = None
         self._decoders: dict[tuple[str, str], Decoder | None] = {}
+        # Publisher -> its connection, and the last message that came by it.
+        self._latched: dict[str, tuple[Mapping[str, str], bytes]] = {}
         self._lock = threading.Lock()
         self._messages = self._seen = 0
         self._heard = clock.monotonic()
@@ -148,6 +152,9 @@ class Intake:
     def take(self, header: Mapping[str, str], data: bytes) -> None:
         """Take a message with the header of the connection that it came by. Never raises."""
         arrival_us = self._clock.now_us()
+        if header.get("latching") == "1" and self._came_before(header, data):
+            self._seldom.warn("latched_again", f"topic {self._topic}: a latched message came again; not sent")
+            return
         self._messages += 1
         # Two publishers of one topic are two threads; almost always there is one.
         with self._lock:
@@ -172,6 +179,17 @@ class Intake:
             self._seldom.warn("empty", f"topic {self._topic}: there is no field in its messages to send")
             return
         self._emit(self._config.stream, t_us, values)
+
+    def _came_before(self, header: Mapping[str, str], data: bytes) -> bool:
+        """Whether it is what a latching publisher sends with every connection, and is known from the
+        connection before: old data, whatever its time."""
+        publisher = header.get("callerid", "")
+        with self._lock:
+            connection, last = self._latched.get(publisher, (header, b""))
+            if publisher not in self._latched and len(self._latched) >= _MAX_LATCHED:
+                self._latched.clear()
+            self._latched[publisher] = header, data
+        return connection is not header and last == data
 
     def _say_type(self, header: Mapping[str, str], t_us: int) -> None:
         """Say what the messages are, whenever a publisher connects."""

@@ -80,6 +80,10 @@ class Process:
         assert found, f"no {what}; {self.lines[-3:]}\n" + "\n".join(self.errors[-25:])
         return found
 
+    def alive(self) -> bool:
+        """Whether it still runs."""
+        return self._process.poll() is None
+
     def until_said(self, text: str) -> None:
         """Wait for a text in the log."""
         self.until(lambda: any(text in line for line in self.errors), f"{text!r} in its log")

@@ -24,6 +24,7 @@ parser.add_argument("--rate", type=float, default=50)
 parser.add_argument("--start", type=int, default=0, help="the first value of the counter")
 parser.add_argument("--count", type=int, default=0, help="stop counting after so many")
 parser.add_argument("--stamp", default="now", help="now, or seconds since the epoch")
+parser.add_argument("--latch", action="store_true", help="repeat the last message to who connects")
 parser.add_argument("--field", required=True, help="dotted path of the field that counts")
 parser.add_argument("--bytes", type=int, default=0, help="so many in a field data of uint8[]")
 options = parser.parse_args()
@@ -31,7 +32,7 @@ options = parser.parse_args()
 text = Path(options.definition).read_text()
 Class = genpy.dynamic.generate_dynamic(options.type, text)[options.type]
 rospy.init_node(options.name, disable_signals=True)
-publisher = rospy.Publisher(options.topic, Class, queue_size=1000, tcp_nodelay=True)
+publisher = rospy.Publisher(options.topic, Class, queue_size=1000, tcp_nodelay=True, latch=options.latch)
 stop = threading.Event()
 
 

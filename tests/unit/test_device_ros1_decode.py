@@ -394,6 +394,35 @@ def test_no_stamp_is_believed_in_a_simulation(caplog: pytest.LogCaptureFixture) 
     assert "/use_sim_time" in caplog.text
 
 
+@pytest.mark.parametrize("time", ["header", "arrival"])
+def test_a_latched_message_that_comes_again_is_no_new_data(time: str) -> None:
+    desk = Desk(time=time)
+    old, new = (header(T0 // 1_000_000 + second) + b"\x01" for second in (0, 1))
+    first, second = ({**CONNECTION, "latching": "1", "callerid": "/map"} for _ in range(2))
+    desk.intake.take(first, old)
+    desk.intake.look(1)
+    desk.clock.advance(6)
+    desk.intake.look(1)
+    desk.intake.take(second, old)
+    desk.intake.look(1)
+    assert len(desk.samples) == 1
+    assert desk.intake.report() == {"messages": 1, "silent": True, "left_out": {}, "latched_again": 1}
+    # The same twice by one connection was published twice; another publisher's is its own.
+    desk.intake.take(second, old)
+    desk.intake.take({**first, "callerid": "/other"}, old)
+    desk.intake.take({**first}, new)
+    desk.intake.look(1)
+    assert len(desk.samples) == 4
+    assert desk.intake.report() == {"messages": 4, "silent": False, "left_out": {}, "latched_again": 1}
+
+
+def test_what_does_not_latch_is_new_with_every_connection() -> None:
+    desk = Desk()
+    for _ in range(2):
+        desk.take(header(T0 // 1_000_000) + b"\x01", latching="0", callerid="/pub")
+    assert len(desk.samples) == 2
+
+
 def test_arrival_time_asks_no_stamp(caplog: pytest.LogCaptureFixture) -> None:
     desk = Desk(time="arrival")
     desk.take(header(0) + b"\x01")
