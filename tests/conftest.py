@@ -23,6 +23,7 @@ settings.load_profile("iort")
 GROUPS = {
     "tests/local/test_demo.py": "demo",
     "tests/local/test_faults.py": "faults",
+    "tests/local/test_faults_ros.py": "faults",
     "tests/local/test_uplink.py": "faults",
     "tests/local/test_pubnub": "pubnub",
     "tests/local/": "cloud",

@@ -1,0 +1,58 @@
+"""A ROS master that is started again under a driving car: every sample is in the table once all the same."""
+
+from __future__ import annotations
+
+import functools
+import json
+from collections.abc import Callable
+
+from device.status import SOCKET, fetch
+from local.cloud import EmbeddedCloud
+from station import delivery, robots
+from tests.local.conftest import until
+from tests.ros.conftest import Graph, graph, ros_python  # noqa: F401 - fixtures
+from tests.ros.test_source import WHEEL
+
+LATER, COUNT = 1000, 100
+
+
+def test_ros_master_restarted(
+    embedded: EmbeddedCloud,
+    bundle: Callable[..., robots.Bundle],
+    graph: Graph,  # noqa: F811
+) -> None:
+    topics = {
+        f"/{name}": {"stream": name, "time": "header", "fields": ["turns"]} for name in ("wheel", "other")
+    }
+    car = bundle(queue={"path": "spool.db"}, sources=[{"type": "ros1", "topics": topics}])
+    definition, written = graph.folder / "wheel.msg", car.folder / "report.json"
+    definition.write_text(WHEEL)
+    agent = graph.module("device.main", "run", "--config", car.config, "--report", written, "--drain-s", 60)
+    publisher = functools.partial(graph.run, "publisher.py")
+    of_type = ["strange_msgs/Wheel", definition, "--field", "state.turns"]
+    publisher("first", "/wheel", *of_type)
+    agent.until_said("connected to 127.0.0.1")
+
+    def taken(stream: str) -> int:
+        return int(fetch(car.folder / SOCKET)["streams"].get(stream, {}).get("samples", 0))
+
+    before = until(lambda: taken("wheel"))
+    graph.master.kill()
+    agent.until_said("does not answer")
+    graph.start_master()
+    agent.until_said("had forgotten /wheel, /other: registered again")
+    again = taken("wheel")
+    assert again > before, "who is connected needs no master"
+    # Who comes after the restart is found, and heard from its first sample on.
+    publisher("second", "/other", *of_type, "--start", LATER, "--count", COUNT)
+    until(lambda: taken("other") >= COUNT)
+    assert agent.terminate() == 0, "\n".join(agent.errors)
+
+    streams = json.loads(written.read_text())["streams"]
+    for stream, start in (("wheel", 0), ("other", LATER)):
+        batches = list(delivery.batches(embedded.cloud, car.robot, stream))
+        assert [batch.seq for batch in batches] == list(range(len(batches)))
+        found = [value for batch in batches for value in batch.columns["turns"]]
+        assert found == list(range(start, start + streams[stream]["samples"]))
+    assert streams["wheel"]["samples"] > again
+    assert streams["other"]["samples"] == COUNT
