@@ -59,7 +59,7 @@ class Usage:
     live_concurrency: int = 5
     summarize_memory_mb: int = 512
     summarize_ms: float = 20.0
-    alarms: int = 10
+    alarms: int = 28
     dashboards: int = 2
 
     def check(self) -> Usage:

@@ -30,6 +30,7 @@ from contract import (
 from functions.health import measure
 from stacks.metrics import statistic
 from stacks.settings import ROOT, Settings
+from station.cost import Usage
 from tests.stacks.templates import name
 
 HANDLERS = ("Live", "Summarize", "Echo", "Upload", "Query", "Admit", "Presence", "Quarantine", "Alert")
@@ -362,6 +363,10 @@ def test_what_can_be_lost_beside_the_quarantine_has_an_alarm(alarms):
         "RuleMessageThrottled": ("AWS/IoT", "RuleMessageThrottled"),
         "DestinationDeliveryFailures": ("AWS/Lambda", "DestinationDeliveryFailures"),
     }
+
+
+def test_the_cost_model_counts_every_alarm(alarms):
+    assert Usage().alarms == len(alarms)
 
 
 def test_every_alarm_tells_the_topic_and_is_explained(alarms, reader):
