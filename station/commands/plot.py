@@ -74,7 +74,7 @@ def plot(
     if runs and (start, end, last) != (None, None, None):
         raise StationError("give either --run or --from, --to and --last")
     ranges = [_run(run) for run in runs] if runs else [Range.of(start, end, last)]
-    asked = [name.strip() for name in fields.split(",")] if fields else None
+    asked = [name.strip() for name in (fields or "").split(",") if name.strip()] or None
     drawn: list[Run] = []
     for name in dict.fromkeys([robot, *(also or ())]):
         for within in ranges:

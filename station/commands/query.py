@@ -86,7 +86,7 @@ def query(
             stream,
             when.start_us,
             when.end_us,
-            fields=[name.strip() for name in fields.split(",")] if fields else None,
+            fields=[name.strip() for name in (fields or "").split(",") if name.strip()] or None,
             where=where,
             every=every,
             summary=summary,

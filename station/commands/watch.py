@@ -27,7 +27,7 @@ _REFRESH_S = 0.25
 def watch(
     context: typer.Context,
     as_json: Annotated[bool, typer.Option("--json", help="A line of JSON for every update.")] = False,
-    seconds: Annotated[float | None, typer.Option(help="Stop after so long; never otherwise.")] = None,
+    seconds: Annotated[float | None, typer.Option(min=0, help="Stop after so long; never otherwise.")] = None,
     token: Annotated[
         str, typer.Option(envvar="PUBNUB_ACCESS_TOKEN", help="PubNub's access token to read with.")
     ] = "",
@@ -86,7 +86,7 @@ def _show(fleet: FleetWatch, seconds: float | None, namespace: str) -> None:
         while end is None or time.monotonic() < end:
             cars = fleet.cars()
             words = (
-                f"{len(cars)} cars. Ctrl-C stops."
+                f"{len(cars)} {'car' if len(cars) == 1 else 'cars'}. Ctrl-C stops."
                 if cars
                 else f"waiting for a car on {namespace}.* (Ctrl-C stops)"
             )
