@@ -25,6 +25,7 @@ from local.proxy import FREEZE, PASS, REFUSE, Proxy
 from station import audit, delivery, robots
 from tests.local.conftest import until
 from tests.local.drives import RATE_HZ, Agent, counted, counter_log
+from tests.local.test_uplink import set_status
 
 OUTAGE_S = 60
 DRIVE_S = 75
@@ -277,6 +278,37 @@ def test_corrupt_spool_is_set_aside(embedded, bundle, proxy, tmp_path, damage):
     else:
         assert missing == list(range(stored[0][0]))
         assert {seq for seq, _, _ in lost} <= set(missing)
+
+
+def test_certificate_revoked_on_the_way_and_replaced(embedded, bundle, proxy, tmp_path):
+    log = counter_log(tmp_path / "counter.csv", 600)
+    car = bundle(**_settings(log, proxy.port))
+    agent = Agent(car)
+    until(lambda: delivery.samples_summarized(embedded.cloud, car.robot, "vesc"))
+    # Which ends the session, too; on AWS within minutes.
+    set_status(embedded, car.robot, "REVOKED")
+    until(lambda: agent.said("inactive or revoked"), seconds=120)
+    waiting = until(agent.status)["spool"]["samples"]
+    until(lambda: agent.status().get("spool", {}).get("samples", 0) >= waiting + 2 * RATE_HZ)
+    status = until(agent.status)
+    assert status["connection"]["connected"] is False
+    assert any("inactive or revoked" in trouble["text"] for trouble in status["troubles"])
+
+    iot = embedded.cloud.client("iot")
+    (revoked,) = iot.list_thing_principals(thingName=car.robot)["principals"]
+    (policy,) = iot.list_attached_policies(target=revoked)["policies"]
+    fresh = iot.create_keys_and_certificate(setAsActive=True)
+    iot.attach_policy(policyName=policy["policyName"], target=fresh["certificateArn"])
+    iot.attach_thing_principal(thingName=car.robot, principal=fresh["certificateArn"])
+    contents = {"private.key": fresh["keyPair"]["PrivateKey"], "certificate.pem": fresh["certificatePem"]}
+    for name, content in contents.items():
+        (car.folder / "new").write_text(content)
+        (car.folder / "new").replace(car.folder / name)
+    until(lambda: agent.status().get("connection", {}).get("connected"), seconds=120)
+    agent.stop()
+    report = agent.report()
+    assert report["spool"]["dropped_samples"] == report["spool"]["left_samples"] == 0
+    assert counted(embedded, car.robot) == list(range(report["streams"]["vesc"]["samples"]))
 
 
 @as_root

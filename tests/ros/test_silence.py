@@ -38,11 +38,15 @@ class Car:
         self.process = graph.module("device.main", "run", "--config", config, "--drain-s", 0)
 
     def status(self) -> dict[str, Any]:
+        found: dict[str, Any] = until(self._answer, seconds=WAIT_S)
+        return found
+
+    def _answer(self) -> dict[str, Any]:
         assert self.process.alive(), "\n".join(self.process.errors)
         try:
             return fetch(self._folder / SOCKET)
         except AgentError:
-            return {}  # not yet
+            return {}  # not yet, or too busy to say
 
     def samples(self) -> dict[str, int]:
         streams = self.status().get("streams", {})
