@@ -44,6 +44,7 @@ export class CloudWatchView {
   }
 
   private async find(): Promise<void> {
+    this.note.set("Loading …");
     try {
       const { dashboards } = await ask<{ dashboards: string[] }>("dashboards", {});
       const before = this.choice.value;
