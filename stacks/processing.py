@@ -73,7 +73,7 @@ class Processing(Stack):
                     compatible_runtimes=[RUNTIME],
                 )
             ],
-            reserved_concurrency=settings.live_concurrency,
+            reserved_concurrency=settings.reserved_for_live,
         )
         self._invoked_once(live)
         live.add_to_role_policy(

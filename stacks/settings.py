@@ -25,6 +25,7 @@ ROOT = Path(__file__).resolve().parent.parent
 
 DEV, PROD = "dev", "prod"
 STAGES = (DEV, PROD)
+_RESERVED_FOR_LIVE = 5
 IOT_LOG_LEVELS = ("off", "error", "warn", "info", "debug")
 _EMAIL = re.compile(r"[^@\s,]+@[^@\s,]+\.[^@\s,]+")
 # "Tag naming limits and requirements": up to 128 and 256 characters, and aws: is AWS' own.
@@ -61,8 +62,8 @@ class Settings:
     ``robot_metrics`` counts every robot's health by itself as well, which costs by the robot.
     ``retention_days`` is how long telemetry and summaries are kept; ``files_days`` is how long uploaded
     files are (0: for good), ``upload_gb_a_day`` what one robot may upload in a day, in 1e9 bytes;
-    ``live_concurrency`` bounds Lambda 1 (0 reserves nothing, for accounts whose concurrency limit is
-    too low to reserve from); ``live_fields`` maps stream to the fields that go to the dashboard;
+    ``live_concurrency`` is what is reserved for Lambda 1, which also bounds it (0: nothing; None: as
+    `reserved_for_live` says); ``live_fields`` maps stream to the fields that go to the dashboard;
     ``device_defender`` and ``iot_log_level`` ("" for none) are for the account as a whole;
     ``site`` adds the stack that puts the page on the web; ``layer`` is the folder of Lambda 1's
     third-party code; ``embedded`` is true for the embedded cloud, which is deployed with the caller's
@@ -80,7 +81,7 @@ class Settings:
     retention_days: int = 90
     files_days: int = 0
     upload_gb_a_day: int = 50
-    live_concurrency: int = 5
+    live_concurrency: int | None = None
     live_fields: Mapping[str, list[str]] = field(default_factory=lambda: {VESC_STREAM: list(VESC_FIELDS)})
     layer: Path = ROOT / "build" / "layer" / "lambda"
     device_defender: bool = True
@@ -93,6 +94,18 @@ class Settings:
         """Whether data outlives its stack: retained, recoverable to a point in time, and protected
         from deletion and termination."""
         return self.stage == PROD
+
+    @property
+    def reserved_for_live(self) -> int:
+        """Executions reserved for Lambda 1, 0 for none.
+
+        Lambda refuses a reservation that leaves an account fewer than 100 unreserved
+        (PutFunctionConcurrency), and new accounts have 10 in all: the first deployment of a lab would fail.
+        On the embedded cloud an execution is a process, of which one machine should not run many.
+        """
+        if self.live_concurrency is None:
+            return _RESERVED_FOR_LIVE if self.protected or self.embedded else 0
+        return self.live_concurrency
 
     @property
     def account_wide(self) -> bool:

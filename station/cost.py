@@ -56,7 +56,7 @@ class Usage:
     retention_days: int = 90
     live_memory_mb: int = 256
     live_ms: float = 20.0
-    live_concurrency: int = 5
+    live_concurrency: int = 0
     summarize_memory_mb: int = 512
     summarize_ms: float = 20.0
     alarms: int = 28

@@ -10,6 +10,7 @@ import sys
 import pytest
 
 from stacks.settings import ROOT, Settings, SettingsError
+from station.cost import Usage
 
 
 def run(tmp_path, name, **context):
@@ -90,6 +91,10 @@ def test_what_the_context_says(settings, tmp_path):
         True,
     )
     assert settings(embedded="false").embedded is False
+    assert given.reserved_for_live == 0
+    assert settings().reserved_for_live == 0 == Usage().live_concurrency
+    assert settings(stage="prod").reserved_for_live == settings(embedded="true").reserved_for_live == 5
+    assert settings(stage="prod", live_concurrency="0").reserved_for_live == 0
     asked = {"stage": "prod", "customer_key": "true", "budget_usd": "50", "alarm_email": "lab@example.org"}
     given = settings(**asked, low_voltage_v="13.2", tags="team=lab,cost-centre=7")
     assert (given.stage, given.customer_key, given.budget_usd) == ("prod", True, 50)

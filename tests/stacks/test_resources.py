@@ -110,9 +110,14 @@ def test_the_tables_keys_are_the_contracts(synthesized):
 # --- functions --------------------------------------------------------------------------------------
 
 
-def test_concurrency_is_reserved_where_a_burst_would_start_workers(functions):
-    reserved = {k: v.get("ReservedConcurrentExecutions") for k, v in functions.items()}
-    assert {name: count for name, count in reserved.items() if count is not None} == {"Live": 5}
+def test_lambda_1_is_reserved_for_where_the_account_may_have_it(synthesized, production):
+    def reserved(app):
+        functions = app.resources("AWS::Lambda::Function", "processing").values()
+        found = {f["Handler"]: f.get("ReservedConcurrentExecutions") for f in functions}
+        return {handler: number for handler, number in found.items() if number is not None}
+
+    assert reserved(synthesized) == {}, "a new account has too few to reserve from"
+    assert reserved(production) == {"functions.live.handler": 5}
 
 
 def test_functions_run_on_one_runtime_with_a_log_each_that_ends(synthesized, functions, reader):
@@ -195,13 +200,12 @@ def test_two_stages_share_an_account(tmp_path_factory, synthesized):
     layer = tmp_path_factory.mktemp("layer")
     (layer / "nothing.py").touch()
     app = App(outdir=str(tmp_path_factory.mktemp("cdk.out")))
-    build(app, Settings(namespace="lab2", layer=layer, live_concurrency=0, retention_days=7))
+    build(app, Settings(namespace="lab2", layer=layer, retention_days=7))
     stacks = app.synth().stacks
     assert {stack.stack_name for stack in stacks} == {f"lab2-{noun}" for noun in synthesized.templates}
     text = json.dumps([stack.template for stack in stacks])
     assert not any(word in text for word in ("iort/", "/iort", "iort_", "iort-", "iort."))
     assert f"+ {7 * 86_400} AS expires_s" in text
-    assert "ReservedConcurrentExecutions" not in text
 
 
 # --- files ------------------------------------------------------------------------------------------
