@@ -21,7 +21,7 @@ test: setup ## run every test: REQUIRE_ALL=1 makes a skip a failure, WORKERS=4 r
 
 check: setup ## run the linters, the type checkers, and cfn-lint, cdk-nag and checkov over the stacks
 	@$(PYTHON) scripts/setup.py --checkov
-	@$(BIN)/ruff check . && $(BIN)/ruff format --check . && $(BIN)/mypy app.py contract.py scripts device functions stacks station local bench && $(BIN)/npm run --silent check
+	@$(BIN)/ruff check . && $(BIN)/ruff format --check . && $(BIN)/mypy app.py contract scripts device functions stacks station local bench && $(BIN)/npm run --silent check
 	@PATH="$(CURDIR)/$(BIN):$$PATH" $(BIN)/python scripts/check_stacks.py --checkov build/checkov/bin/checkov
 
 bench: setup ## measure every table of the thesis: ONLY=query,outage TARGET=aws OUT=docs/bench

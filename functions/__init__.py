@@ -1,1 +1,1 @@
-"""What runs in Lambda, one effect a file. The asset holds this package and contract.py, nothing else."""
+"""What runs in Lambda, one effect a file. The asset holds this package and contract/, nothing else."""

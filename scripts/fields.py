@@ -1,4 +1,4 @@
-"""Writes the field table of contract.py into README.md: `python scripts/fields.py`."""
+"""Writes the field table of contract/ into README.md: `python scripts/fields.py`."""
 
 from __future__ import annotations
 

@@ -14,7 +14,7 @@ RUNTIME = lambda_.Runtime.PYTHON_3_13
 # The emulator runs the functions on the machine it stands on, so the architecture means nothing there.
 ARCHITECTURE = lambda_.Architecture.ARM_64
 # Exactly what a function imports; see the wiring tests.
-CODE_EXCLUDES = ["/*", "!/contract.py", "!/functions", "__pycache__", ".mypy_cache", ".ruff_cache"]
+CODE_EXCLUDES = ["/*", "!/contract", "!/functions", "__pycache__", ".mypy_cache", ".ruff_cache"]
 
 
 def function(

@@ -13,7 +13,7 @@ from station.selection import Selection
 
 Item = Mapping[str, Any]
 
-# No time reaches these, see contract.py.
+# No time reaches these, see contract/.
 _FIRST, _LAST = -(2**53), 2**53
 _T = TypeVar("_T")
 

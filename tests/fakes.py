@@ -12,6 +12,7 @@ from boto3.dynamodb.types import TypeSerializer
 
 import contract
 from contract import EXPIRES_S, RECEIVED_MS, ROBOT, SECOND, T_US, TOPIC, Batch
+from contract.checks import json_object
 from functions.tables import Tables, plain
 
 serialize = TypeSerializer().serialize
@@ -113,7 +114,7 @@ def item_of(batch: Batch, topic: str = TOPIC_OF_CAR, expires_s: int = EXPIRES) -
 
 
 def item_of_message(message: bytes, topic: str = TOPIC_OF_CAR, expires_s: int = EXPIRES) -> dict[str, Any]:
-    envelope = contract._json_object(message, "envelope")
+    envelope = json_object(message, "envelope")
     envelope.update({TOPIC: topic, RECEIVED_MS: 1_700_000_000_000, EXPIRES_S: expires_s})
     return {name: serialize(value) for name, value in envelope.items()}
 

@@ -40,7 +40,7 @@ def test_same_again_is_not_synthesized_again(assembly):
 
 
 @pytest.mark.parametrize(
-    "changed", ["app.py", "contract.py", "cdk.json", "stacks/one.py", "functions/one.py"]
+    "changed", ["app.py", "contract/one.py", "cdk.json", "stacks/one.py", "functions/one.py"]
 )
 def test_any_change_is_synthesized(assembly, checkout, changed):
     assembly()

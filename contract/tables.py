@@ -1,0 +1,56 @@
+"""The attributes of the tables' items, which the messages share: telemetry, summary, quarantine, registry."""
+
+from __future__ import annotations
+
+# Attributes of the telemetry and summary tables that are not the robot's own.
+TOPIC, T_US, SECOND = "topic", "t", "second"
+RECEIVED_MS, EXPIRES_S = "received_ms", "expires_s"
+ROBOT = "robot"
+# Of a robot in the registry: on which day (UTC) it has asked to upload how many bytes.
+FILES_DAY, FILES_BYTES = "files_day", "files_bytes"
+# And when a human was last told of what: a name for each cause, after this.
+ALERT_PREFIX = "alert_"
+STATS = ("min", "mean", "max", "last")
+# Of a second in the summary: samples, batches they came in, batches missing before those, holes
+# between samples, values that were not finite.
+SAMPLES, BATCHES, MISSING_BATCHES = "n", "batches", "missing_batches"
+GAPS, NONFINITE = "gaps", "nonfinite"
+# Of a second that would be larger than DynamoDB's 400 KB: attributes left out, the largest first.
+OMITTED = "omitted"
+
+# The quarantine table: every message that was refused or could not be processed, by robot (`NO_ROBOT`
+# where nobody can tell) and an id that follows from its content, so that the same one again is no other.
+ENTRY, SOURCE, REASON, PAYLOAD = "id", "source", "reason", "payload"
+FIRST_MS, LAST_MS, SEEN, REPLAYS = "first_ms", "last_ms", "seen", "replays"
+NO_ROBOT = "-"
+# Where it was refused: by a rule's action, by Lambda 2 or on the way to it, by another function.
+BY_RULE, BY_STREAM, BY_FUNCTION = "rule", "stream", "function"
+# In an event for Lambda 2: a replay, whose records are answered for and not put into quarantine again.
+REPLAY = "replay"
+# What a queue's message of Lambda 2's carries: the stored item as DynamoDB JSON, in base64.
+ITEM_BASE64 = "base64Item"
+
+# The registry's row of a robot, beside its vehicle parameters. Of its connection, by the broker's
+# lifecycle events: times are the broker's, and the certificate is the one that it connected with.
+ONLINE, LAST_SEEN_MS = "online", "last_seen_ms"
+CONNECTED_MS, DISCONNECTED_MS = "connected_ms", "disconnected_ms"
+DISCONNECT_REASON, CERTIFICATE_ID, AGENT_VERSION = "disconnect_reason", "certificate_id", "agent_version"
+# Grows by connection, and orders the events, which may overtake each other.
+SESSION_VERSION = "session_version"
+PRESENCE = (
+    ONLINE,
+    CONNECTED_MS,
+    DISCONNECTED_MS,
+    LAST_SEEN_MS,
+    DISCONNECT_REASON,
+    CERTIFICATE_ID,
+    AGENT_VERSION,
+    SESSION_VERSION,
+)
+# Of its provisioning: the machine that has the name, until when a certificate may be issued for it and
+# for which claim alone, and the certificate that was issued last.
+SERIAL, ADMIT_UNTIL_S, ADMIT_CLAIM = "serial", "admit_until_s", "admit_claim"
+ADMITTED_CERTIFICATE, ADMITTED_MS = "admitted_certificate", "admitted_ms"
+ADMISSION = (SERIAL, ADMIT_UNTIL_S, ADMIT_CLAIM, ADMITTED_CERTIFICATE, ADMITTED_MS)
+# The provisioning template's parameters.
+ROBOT_PARAMETER, SERIAL_PARAMETER = "Robot", "Serial"
