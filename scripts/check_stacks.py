@@ -3,7 +3,8 @@
     python scripts/check_stacks.py [--checkov build/checkov/bin/checkov] [--write]
 
 Needs no credentials and no network. What the stacks deliberately do otherwise is in
-stacks/acknowledged.py; --write makes docs/acknowledged.md from it.
+stacks/acknowledged.py, where what no checker finds any more is a finding too; --write makes
+docs/acknowledged.md from it.
 """
 
 from __future__ import annotations
@@ -16,9 +17,10 @@ import sys
 import time
 from collections import defaultdict
 from collections.abc import Iterable, Iterator
+from functools import cache
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from typing import Any
+from typing import Any, NamedTuple
 
 ROOT = Path(__file__).resolve().parent.parent
 sys.path.insert(0, str(ROOT))
@@ -27,7 +29,8 @@ from aws_cdk import App, Validations  # noqa: E402 the checkout is not installed
 from cdk_nag import AwsSolutionsChecks, ServerlessChecks  # noqa: E402 as above
 
 from app import build  # noqa: E402 as above
-from stacks.acknowledged import Acknowledged  # noqa: E402 as above
+from contract import DEFAULT_NAMESPACE  # noqa: E402 as above
+from stacks.acknowledged import Acknowledged, short  # noqa: E402 as above
 from stacks.settings import Settings  # noqa: E402 as above
 
 DOCUMENT = ROOT / "docs" / "acknowledged.md"
@@ -44,13 +47,23 @@ STAGES: dict[str, dict[str, Any]] = {
 }
 
 
+class Finding(NamedTuple):
+    """What a checker has against a construct, by its path; of one that is acknowledged, that it still
+    would have it."""
+
+    rule: str
+    path: str
+    text: str
+    acknowledged: bool
+
+
 def main() -> None:
     """Print what is open, and exit with 1 if anything is."""
     parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
     parser.add_argument("--checkov", type=Path, help="checkov's command, in its own environment")
     parser.add_argument("--write", action="store_true", help="write docs/acknowledged.md")
     asked = parser.parse_args()
-    findings: list[str] = []
+    found: list[Finding] = []
     known: dict[str, list[Acknowledged]] = {}
     with TemporaryDirectory() as folder:
         layer = Path(folder) / "layer"
@@ -60,15 +73,17 @@ def main() -> None:
             out = Path(folder) / stage
             settings = Settings(layer=layer, **given)
             known[stage] = synthesize(settings, out)
-            findings += [f"{stage}: {finding}" for finding in nag(out)]
+            found += nag(out)
             print(f"check: stage {stage} synthesized, cdk-nag ({time.monotonic() - began:.0f} s)", flush=True)  # noqa: T201 a command prints
         began = time.monotonic()
-        findings += lint(Path(folder))
+        found += lint(Path(folder))
         print(f"check: cfn-lint ({time.monotonic() - began:.0f} s)", flush=True)  # noqa: T201 as above
         if asked.checkov:
             began = time.monotonic()
-            findings += checkov(asked.checkov, Path(folder))
+            found += checkov(asked.checkov, Path(folder))
             print(f"check: checkov ({time.monotonic() - began:.0f} s)", flush=True)  # noqa: T201 as above
+    findings = [finding.text for finding in found if not finding.acknowledged]
+    findings += stale(known, found, unjudged=() if asked.checkov else ("CKV",))
     text = document(known)
     if asked.write:
         DOCUMENT.write_text(text)
@@ -93,34 +108,83 @@ def synthesize(settings: Settings, out: Path) -> list[Acknowledged]:
     return known
 
 
-def nag(out: Path) -> Iterator[str]:
+def nag(out: Path) -> Iterator[Finding]:
     """What cdk-nag has against a synthesized app; raises if a pack did not run."""
     report = json.loads((out / "validation-report.json").read_text())
     packs = {plugin["pluginName"]: plugin for plugin in report["pluginReports"]}
     for name in ("AwsSolutions", "Serverless"):
         for violation in packs[name]["violations"]:
             for construct in violation["violatingConstructs"]:
-                yield f"cdk-nag {violation['ruleName']} on {construct['constructPath']}"
+                rule, path = violation["ruleName"], construct["constructPath"]
+                text = f"{out.name}: cdk-nag {rule} on {path}"
+                yield Finding(rule, path, text, acknowledged=False)
+        for violation in packs[name].get("suppressedViolations", []):
+            rule = violation["acknowledgedId"].removeprefix(f"{name}::")
+            yield Finding(rule, violation["acknowledgedAt"], "", acknowledged=True)
 
 
-def lint(folder: Path) -> Iterator[str]:
-    """What cfn-lint has against the templates below ``folder``."""
-    templates = sorted(map(str, folder.rglob("*.template.json")))
-    command = [str(Path(sys.executable).with_name("cfn-lint")), "--format", "json", "--", *templates]
-    for match in json.loads(output(command, good=range(16)) or "[]"):
-        where = match["Location"]["Path"]
-        yield f"cfn-lint {match['Rule']['Id']} on {'/'.join(map(str, where or []))}: {match['Message']}"
+def lint(folder: Path) -> Iterator[Finding]:
+    """What cfn-lint has against the templates below ``folder``.
+
+    It does not report what a resource's metadata tells it to ignore, so it reads the templates a second
+    time without that.
+    """
+    templates = sorted(folder.rglob("*.template.json"))
+    with TemporaryDirectory() as elsewhere:
+        bare = {}
+        for i, template in enumerate(templates):
+            content = json.loads(template.read_text())
+            ignored = [one.get("Metadata", {}).pop("cfn-lint", None) for one in content["Resources"].values()]
+            if any(ignored):
+                copy = Path(elsewhere) / f"{i}.template.json"
+                copy.write_text(json.dumps(content))
+                bare[str(copy)] = template
+        command = [str(Path(sys.executable).with_name("cfn-lint")), "--format", "json", "--"]
+        matches = json.loads(output([*command, *map(str, templates), *bare], good=range(16)) or "[]")
+    for match in matches:
+        rule, where = match["Rule"]["Id"], match["Location"]["Path"] or []
+        template = bare.get(match["Filename"], Path(match["Filename"]))
+        text = f"cfn-lint {rule} on {'/'.join(map(str, where))}: {match['Message']}"
+        path = _paths(template)[where[1]] if where[:1] == ["Resources"] and len(where) > 1 else ""
+        yield Finding(rule, path, text, acknowledged=match["Filename"] in bare)
 
 
-def checkov(command: Path, folder: Path) -> Iterator[str]:
+def checkov(command: Path, folder: Path) -> Iterator[Finding]:
     """What checkov has against the templates below ``folder``."""
-    options = ["--framework", "cloudformation", "--compact", "--quiet", "--skip-download", "--output", "json"]
+    options = ["--framework", "cloudformation", "--compact", "--skip-download", "--output", "json"]
     report = json.loads(output([str(command), "--directory", str(folder), *options], good=(0, 1)))
     if report["summary"]["parsing_errors"] or not report["summary"]["passed"]:
-        yield f"checkov could not read the templates: {report['summary']}"
-    for check in report["results"]["failed_checks"]:
-        where = f"{check['file_path']} {check['resource']}"
-        yield f"checkov {check['check_id']} on {where}: {check['check_name']}"
+        sys.exit(f"checkov could not read the templates: {report['summary']}")
+    for outcome in ("failed_checks", "skipped_checks"):
+        for check in report["results"][outcome]:
+            rule, template = check["check_id"], folder / check["file_path"].lstrip("/")
+            path = _paths(template)[check["resource"].split(".", 1)[-1]]
+            text = f"checkov {rule} on {check['file_path']} {path}: {check['check_name']}"
+            yield Finding(rule, path, text, acknowledged=outcome == "skipped_checks")
+
+
+@cache
+def _paths(template: Path) -> dict[str, str]:
+    """Logical id to construct path, as the CDK notes it beside a template."""
+    beside = template.with_name(template.name.replace(".template.", ".metadata."))
+    return {
+        entry["data"]: path.lstrip("/")
+        for path, entries in json.loads(beside.read_text()).items()
+        for entry in entries
+        if entry["type"] == "aws:cdk:logicalId"
+    }
+
+
+def stale(
+    known: dict[str, list[Acknowledged]], found: list[Finding], *, unjudged: tuple[str, ...] = ()
+) -> Iterator[str]:
+    """What is acknowledged and no checker finds any more, in any stage; ``unjudged`` are the beginnings of
+    rules whose checker did not run."""
+    still = {(one.rule, short(one.path, DEFAULT_NAMESPACE)) for one in found}
+    everywhere = {(one.rule, one.path): one for acknowledged in known.values() for one in acknowledged}
+    for rule, path in sorted(everywhere.keys() - still):
+        if not rule.startswith(unjudged):
+            yield f"{rule} on {path}: no checker finds what stacks/acknowledged.py acknowledges; remove it"
 
 
 def output(command: list[str], *, good: Iterable[int]) -> str:

@@ -90,7 +90,7 @@ def _decisions(resource: CfnResource, settings: Settings) -> Mapping[str, str]:
         decisions |= {"CKV_AWS_28": _DEV, "AwsSolutions-DDB3": _DEV}
     if kind == "AWS::SQS::Queue" and getattr(resource, "redrive_policy", None) is None:
         end = "where messages end that failed elsewhere; an alarm tells a human, who sends them back"
-        decisions |= {"AwsSolutions-SQS3": end, "Serverless-SQSRedrivePolicy": end}
+        decisions["Serverless-SQSRedrivePolicy"] = end
     if kind == "AWS::IoT::TopicRule":
         decisions["W3005"] = "IoT Core tries the role when the rule is made, so role and policy come first"
     return decisions
@@ -212,5 +212,9 @@ def _resources(app: App) -> Iterator[CfnResource]:
 
 
 def _path(resource: Any, settings: Settings) -> str:
-    path: str = resource.node.path.removeprefix(f"{settings.namespace}-")
-    return path.removesuffix("/Resource")
+    return short(resource.node.path, settings.namespace)
+
+
+def short(path: str, namespace: str) -> str:
+    """A construct's path as `Acknowledged` has it: stack and construct ids, the resource's own left out."""
+    return path.removeprefix(f"{namespace}-").removesuffix("/Resource")

@@ -6,7 +6,7 @@ import importlib.util
 
 import pytest
 
-from stacks.acknowledged import single
+from stacks.acknowledged import Acknowledged, single
 from stacks.settings import ROOT, Settings
 
 
@@ -37,5 +37,47 @@ def test_nag_and_lint_find_what_nobody_acknowledged(check_stacks, tmp_path):
     Validations.of(app).add_plugins(AwsSolutionsChecks(app), ServerlessChecks(app))
     with pytest.raises(RuntimeError, match="ValidationFailed"):
         app.synth()
-    assert any("AwsSolutions-SQS3 on Bad/Queue" in finding for finding in check_stacks.nag(tmp_path))
-    assert any("DelaySeconds" in finding for finding in check_stacks.lint(tmp_path))
+    found = [*check_stacks.nag(tmp_path), *check_stacks.lint(tmp_path)]
+    assert any("AwsSolutions-SQS3 on Bad/Queue" in one.text for one in found)
+    assert any("DelaySeconds" in one.text for one in found)
+    assert not any(one.acknowledged for one in found)
+
+
+def test_what_nobody_finds_any_more_is_stale_by_name(check_stacks, tmp_path):
+    """One acknowledgement of each checker is needed, another of the same rule is not."""
+    from aws_cdk import Acknowledgment, App, Stack, Validations
+    from aws_cdk import aws_iam as iam
+    from aws_cdk import aws_sqs as sqs
+    from cdk_nag import AwsSolutionsChecks, ServerlessChecks
+
+    app = App(outdir=str(tmp_path))
+    stack = Stack(app, "iort-bad")
+    lone, end = sqs.CfnQueue(stack, "Lone"), sqs.CfnQueue(stack, "End")
+    redrive = {"deadLetterTargetArn": end.attr_arn, "maxReceiveCount": 1}
+    sqs.CfnQueue(stack, "Backed", redrive_policy=redrive)
+    for queue in (lone, end):
+        Validations.of(queue).acknowledge(Acknowledgment(id="AwsSolutions::AwsSolutions-SQS3", reason="a"))
+    early, late = iam.CfnGroup(stack, "Early"), iam.CfnGroup(stack, "Late")
+    late.add_resource_dependency(early)
+    late.add_property_override("GroupName", early.ref)
+    for group in (early, late):
+        group.add_metadata("cfn-lint", {"config": {"ignore_checks": ["W3005"]}})
+    Validations.of(app).add_plugins(AwsSolutionsChecks(app), ServerlessChecks(app))
+    with pytest.raises(RuntimeError, match="ValidationFailed"):
+        app.synth()
+    found = [*check_stacks.nag(tmp_path), *check_stacks.lint(tmp_path)]
+    known = [
+        Acknowledged(f"bad/{name}", rule, "a")
+        for name, rule in (
+            *((name, "AwsSolutions-SQS3") for name in ("Lone", "End")),
+            *((name, "W3005") for name in ("Early", "Late")),
+            ("Lone", "CKV_AWS_27"),
+        )
+    ]
+    assert not any("W3005" in one.text for one in found if not one.acknowledged)
+
+    def gone(**options):
+        return [finding.split(":")[0] for finding in check_stacks.stale({"dev": known}, found, **options)]
+
+    assert gone(unjudged=("CKV",)) == ["AwsSolutions-SQS3 on bad/End", "W3005 on bad/Early"]
+    assert "CKV_AWS_27 on bad/Lone" in gone()
