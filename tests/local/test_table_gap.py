@@ -1,0 +1,179 @@
+"""What the emulator's tables answer with the gap closed is what they answer without it."""
+
+from __future__ import annotations
+
+import copy
+import json
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from ministack.core.responses import request_scope
+from ministack.services import dynamodb
+
+from local import table_gap
+
+ACCOUNT, REGION = "000000000000", "eu-west-1"
+TABLE = "ordered-gap"
+NUMBERS = st.integers(-3, 12)
+RANGES = st.one_of(
+    st.tuples(st.sampled_from(["=", "<", "<=", ">", ">="]), NUMBERS),
+    st.tuples(NUMBERS, NUMBERS).map(lambda pair: ("BETWEEN", *sorted(pair))),
+    st.just(()),
+)
+
+
+@pytest.fixture(scope="module")
+def query():
+    """Asks both ways, and gives the answer if it is one."""
+    plain, evaluate = dynamodb._query, dynamodb._evaluate_condition
+    narrowed = table_gap.narrowing(plain)
+    dynamodb._evaluate_condition = table_gap._evaluating(evaluate)
+
+    def ask(**data):
+        with request_scope(ACCOUNT, REGION):
+            answers = [one(copy.deepcopy(data)) for one in (plain, narrowed)]
+        assert answers[0] == answers[1]
+        return json.loads(answers[1][2]) if answers[1][0] == 200 else None
+
+    yield ask
+    dynamodb._evaluate_condition = evaluate
+
+
+@pytest.fixture(scope="module")
+def table():
+    """Holds numbers, whatever the order they came in."""
+    definition = {
+        "TableName": TABLE,
+        "KeySchema": [
+            {"AttributeName": "topic", "KeyType": "HASH"},
+            {"AttributeName": "t", "KeyType": "RANGE"},
+        ],
+        "AttributeDefinitions": [
+            {"AttributeName": "topic", "AttributeType": "S"},
+            {"AttributeName": "t", "AttributeType": "N"},
+        ],
+        "BillingMode": "PAY_PER_REQUEST",
+    }
+    keep = table_gap._ordering(dynamodb._set_item)
+
+    def hold(numbers):
+        with request_scope(ACCOUNT, REGION):
+            held = dynamodb._tables[TABLE]
+            held["items"].clear()
+            for n in numbers:
+                item = {"topic": {"S": "a"}, "t": {"N": str(n)}, "odd": {"BOOL": bool(n % 2)}}
+                keep(held, "a", str(n), item)
+            return held
+
+    with request_scope(ACCOUNT, REGION):
+        created = dynamodb._create_table(definition)
+        assert created[0] == 200, created
+    yield hold
+    with request_scope(ACCOUNT, REGION):
+        dynamodb._delete_table({"TableName": TABLE})
+
+
+def asked(condition, *, partition="a"):
+    text, values = "#topic = :topic", {":topic": {"S": partition}}
+    names = {"#topic": "topic"}
+    if condition:
+        operator, *bounds = condition
+        names["#t"] = "t"
+        refs = [f":v{i}" for i in range(len(bounds))]
+        values |= {ref: {"N": str(bound)} for ref, bound in zip(refs, bounds, strict=True)}
+        text += f" AND #t {operator} {' AND '.join(refs)}"
+    return {
+        "TableName": TABLE,
+        "KeyConditionExpression": text,
+        "ExpressionAttributeNames": names,
+        "ExpressionAttributeValues": values,
+    }
+
+
+QUERIES = st.fixed_dictionaries(
+    {
+        "condition": RANGES,
+        "limit": st.one_of(st.none(), st.integers(1, 5)),
+        "forward": st.booleans(),
+        "cursor": st.one_of(st.none(), NUMBERS),
+        "odd": st.booleans(),
+    }
+)
+
+
+@given(st.lists(NUMBERS, unique=True), st.sets(NUMBERS, max_size=2), QUERIES)
+def test_a_query_answers_as_without(query, table, numbers, removed, wanted):
+    held = table(numbers)
+    for n in removed:
+        with request_scope(ACCOUNT, REGION):
+            dynamodb._remove_item(held, "a", str(n))
+    data = asked(wanted["condition"]) | {"ScanIndexForward": wanted["forward"]}
+    if wanted["limit"] is not None:
+        data["Limit"] = wanted["limit"]
+    if wanted["cursor"] is not None:
+        data["ExclusiveStartKey"] = {"topic": {"S": "a"}, "t": {"N": str(wanted["cursor"])}}
+    if wanted["odd"]:
+        data["FilterExpression"] = "odd = :odd"
+        data["ExpressionAttributeValues"][":odd"] = {"BOOL": True}
+    query(**data)
+
+
+def test_pages_hold_every_item_once(query, table):
+    table(range(10))
+    data, seen = asked((">=", 2)) | {"Limit": 3}, []
+    while True:
+        answer = query(**data)
+        seen += [int(item["t"]["N"]) for item in answer["Items"]]
+        if "LastEvaluatedKey" not in answer:
+            break
+        data["ExclusiveStartKey"] = answer["LastEvaluatedKey"]
+    assert seen == list(range(2, 10))
+
+
+def test_only_what_is_asked_for_is_looked_at(query, table):
+    partition = table(range(100))["items"]["a"]
+    with request_scope(ACCOUNT, REGION):
+        found, wanted = table_gap._asked(asked((">", 90)) | {"Limit": 2})
+    assert found is partition
+    assert [item["t"]["N"] for item in partition.between(wanted)] == ["91", "92", "93"]
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        {"KeyConditionExpression": "#topic = :nothing"},
+        {"KeyConditionExpression": "#topic > :topic"},
+        {"KeyConditionExpression": "#topic = :topic AND begins_with(#topic, :topic)"},
+        {"ExpressionAttributeValues": {":topic": {"N": "1"}}},
+        {"ExclusiveStartKey": {"topic": {"S": "a"}}},
+        {"Limit": 0},
+        {"TableName": "no-such-table"},
+    ],
+)
+def test_what_is_wrong_is_refused_as_without(query, table, change):
+    table(range(3))
+    assert query(**{**asked(()), **change}) is None
+
+
+def test_a_copy_of_a_partition_is_one(table):
+    held = table([3, 1, 2])["items"]
+    copied = copy.deepcopy(held)["a"]
+    everything = table_gap.Wanted(None, None, forward=True, most=None)
+    assert copied.between(everything) == held["a"].between(everything)
+
+
+@given(
+    st.one_of(
+        st.from_regex(r"-?[0-9]{0,40}(\.[0-9]{0,40})?([eE][+-]?[0-9]{1,3})?", fullmatch=True),
+        st.floats().map(repr),
+        st.text(max_size=4),
+        st.none(),
+    )
+)
+def test_numbers_are_read_as_without(text):
+    for look, answer in (
+        (dynamodb._ddb_canonicalize_number, lambda plain: plain),
+        (dynamodb._number_error, lambda _: None),
+    ):
+        assert table_gap._plainly(look, answer)(text) == look(text)
