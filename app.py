@@ -10,7 +10,12 @@ import os
 import sys
 from typing import Any
 
-from aws_cdk import App, CliCredentialsStackSynthesizer, Tags
+try:
+    from aws_cdk import App, CliCredentialsStackSynthesizer, Tags
+except ModuleNotFoundError as missing:
+    sys.exit(
+        f"app.py: {missing.name} is not there for {sys.executable}: `make layer` sets up .venv/bin/python"
+    )
 
 from stacks.account import Account
 from stacks.acknowledged import Acknowledged, acknowledge

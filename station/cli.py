@@ -74,8 +74,10 @@ def main() -> None:
         app()
     except StationError as error:
         sys.exit(f"iort: {error}")
-    except (BotoCoreError, ClientError) as error:
+    except ClientError as error:
         sys.exit(f"iort: AWS refused a call: {error}")
+    except BotoCoreError as error:
+        sys.exit(f"iort: AWS could not be asked: {error}")
     except OSError as error:
         sys.exit(f"iort: {error}")
     except KeyboardInterrupt:

@@ -7,6 +7,7 @@ put out, and the address where robots connect.
 from __future__ import annotations
 
 import json
+import os
 from dataclasses import asdict, dataclass, field
 from functools import cache, cached_property
 from pathlib import Path
@@ -58,10 +59,26 @@ class Cloud:
     def _session(self) -> boto3.Session:
         return boto3.Session(
             profile_name=self.profile,
-            region_name=self.region,
+            # Of AWS' tools boto3 alone reads AWS_DEFAULT_REGION only.
+            region_name=self.region or os.environ.get("AWS_REGION"),
             aws_access_key_id=self.access_key_id,
             aws_secret_access_key=self.secret_access_key,
         )
+
+    def check(self) -> Cloud:
+        """Itself; raises `StationError` where profile, region or credentials are missing."""
+        try:
+            region, credentials = self._session.region_name, self._session.get_credentials()
+        except BotoCoreError as error:
+            raise StationError(f"AWS: {error}") from error
+        if not region:
+            raise StationError("no AWS region: give --region, or set AWS_REGION")
+        if credentials is None:
+            raise StationError(
+                "no AWS credentials: give --profile, or set AWS_PROFILE, or AWS_ACCESS_KEY_ID and "
+                "AWS_SECRET_ACCESS_KEY; `aws configure` writes a profile"
+            )
+        return self
 
     @cached_property
     def _clients(self) -> dict[str, Any]:
@@ -94,8 +111,13 @@ class Cloud:
         stack = f"{self.namespace}-{noun}"
         try:
             outputs = _outputs(self.client("cloudformation"), stack)
-        except (BotoCoreError, ClientError) as error:
-            raise StationError(f"stack {stack} cannot be read; is it deployed? {error}") from error
+        except ClientError as error:
+            if error.response["Error"]["Code"] != "ValidationError":
+                raise StationError(f"stack {stack} cannot be read: {error}") from error
+            where = f"{self._session.region_name}: `make deploy`, or --region and --namespace"
+            raise StationError(f"stack {stack} is not deployed in {where} of where it is") from error
+        except BotoCoreError as error:
+            raise StationError(f"stack {stack} cannot be read: {error}") from error
         if name not in outputs:
             raise StationError(f"stack {stack} has no output {name}; deploy the current stacks")
         return outputs[name]

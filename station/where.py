@@ -8,6 +8,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from station.cloud import Cloud
+from station.errors import StationError
 
 # Whoever has set one of these means an AWS account.
 _AWS_NAMED = ("AWS_PROFILE", "AWS_REGION", "AWS_DEFAULT_REGION", "AWS_ACCESS_KEY_ID")
@@ -24,10 +25,21 @@ class Where:
     embedded: Path
 
     def cloud(self) -> Cloud:
-        """The cloud that they name: an embedded one that runs here, unless something says AWS."""
+        """The cloud that they name: an embedded one that runs here, unless something says AWS.
+
+        Raises `StationError` where there is neither one nor what AWS asks for.
+        """
         said = self.profile or self.region or any(os.environ.get(name) for name in _AWS_NAMED)
         if self.local or (not said and self.embedded.exists()):
             if not self.local:
                 print("iort: on the embedded cloud that runs in this checkout", file=sys.stderr)  # noqa: T201
             return Cloud.load(self.embedded)
-        return Cloud(namespace=self.namespace, profile=self.profile, region=self.region)
+        cloud = Cloud(namespace=self.namespace, profile=self.profile, region=self.region)
+        try:
+            return cloud.check()
+        except StationError as error:
+            if said:
+                raise
+            raise StationError(
+                f"{error}. No embedded cloud runs here either; `make demo` starts one"
+            ) from error

@@ -16,9 +16,17 @@ _out = Console(highlight=False)
 @commands.command("pubnub")
 def pubnub(
     context: typer.Context,
-    publish_key: Annotated[str, typer.Option(prompt=True, hide_input=True, envvar="PUBNUB_PUBLISH_KEY")],
-    subscribe_key: Annotated[str, typer.Option(prompt=True, hide_input=True, envvar="PUBNUB_SUBSCRIBE_KEY")],
+    publish_key: Annotated[
+        str | None, typer.Option(envvar="PUBNUB_PUBLISH_KEY", help="Asked for where it is not given.")
+    ] = None,
+    subscribe_key: Annotated[
+        str | None, typer.Option(envvar="PUBNUB_SUBSCRIBE_KEY", help="Asked for where it is not given.")
+    ] = None,
 ) -> None:
     """Store PubNub's keys, encrypted, where Lambda 1 reads them."""
-    keys.store(context.obj.cloud(), keys.PubNubKeys(publish_key=publish_key, subscribe_key=subscribe_key))
+    # Before anybody types a key for a cloud that is not there.
+    cloud = context.obj.cloud()
+    publish_key = publish_key or typer.prompt("Publish key", hide_input=True)
+    subscribe_key = subscribe_key or typer.prompt("Subscribe key", hide_input=True)
+    keys.store(cloud, keys.PubNubKeys(publish_key=publish_key, subscribe_key=subscribe_key))
     _out.print("stored; Lambda 1 uses them from its next cold start on")

@@ -70,6 +70,16 @@ def test_a_wrong_value_is_one_line(tmp_path, layer):
     assert not list((tmp_path / "out").glob("*.template.json"))
 
 
+def test_a_python_without_the_cdk_is_one_line(tmp_path):
+    # -S: without any package that is installed.
+    command = [sys.executable, "-S", "-E", "-s", str(ROOT / "app.py")]
+    done = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, check=False)
+    assert done.returncode == 1
+    assert done.stderr.startswith("app.py: aws_cdk is not there for ")
+    assert done.stderr.count("\n") == 1
+    assert "make layer" in done.stderr
+
+
 @pytest.fixture
 def settings(tmp_path, layer):
     def read(**context):

@@ -1,0 +1,70 @@
+"""What a newcomer reads who has no account at hand, no region, or nothing deployed in it."""
+
+from __future__ import annotations
+
+import os
+
+import pytest
+from typer.testing import CliRunner
+
+from station.cli import app
+from station.cloud import Cloud
+from station.errors import StationError
+from station.where import Where
+
+
+@pytest.fixture(autouse=True)
+def newcomer(monkeypatch, tmp_path):
+    """Nobody's machine: no settings of AWS, in the environment or at home."""
+    for name in [name for name in os.environ if name.startswith("AWS_")]:
+        monkeypatch.delenv(name)
+    monkeypatch.setenv("AWS_EC2_METADATA_DISABLED", "true")
+    for name in ("AWS_CONFIG_FILE", "AWS_SHARED_CREDENTIALS_FILE"):
+        monkeypatch.setenv(name, str(tmp_path / "nowhere"))
+
+
+@pytest.fixture
+def found(tmp_path):
+    def cloud(**options):
+        given = {"namespace": "iort", "profile": None, "region": None, "local": False, **options}
+        return Where(**given, embedded=tmp_path / "cloud.json").cloud()
+
+    return cloud
+
+
+def test_neither_account_nor_embedded_cloud_says_how_to_get_either(found):
+    with pytest.raises(StationError, match=r"no AWS region.*AWS_REGION.*`make demo`"):
+        found()
+
+
+def test_a_region_without_credentials_says_how_to_give_them(found, monkeypatch):
+    with pytest.raises(StationError, match="no AWS credentials: give --profile") as raised:
+        found(region="eu-west-1")
+    assert "make demo" not in str(raised.value), "who names a region means AWS"
+    monkeypatch.setenv("AWS_REGION", "eu-west-1")
+    with pytest.raises(StationError, match="no AWS credentials"):
+        found()
+
+
+def test_a_profile_that_is_not_there_is_named(found):
+    with pytest.raises(StationError, match="nobody"):
+        found(profile="nobody")
+
+
+def test_the_region_of_the_cdks_own_variable_is_taken(found, monkeypatch):
+    monkeypatch.setenv("AWS_REGION", "eu-central-1")
+    monkeypatch.setenv("AWS_ACCESS_KEY_ID", "a")
+    monkeypatch.setenv("AWS_SECRET_ACCESS_KEY", "b")
+    assert found().client("iot").meta.region_name == "eu-central-1"
+    assert found(region="eu-west-1").client("iot").meta.region_name == "eu-west-1"
+
+
+def test_no_key_is_asked_for_before_there_is_a_cloud(tmp_path):
+    done = CliRunner().invoke(app, ["--embedded", str(tmp_path / "cloud.json"), "pubnub"], input="a\nb\n")
+    assert isinstance(done.exception, StationError)
+    assert "key" not in done.output
+
+
+def test_a_stack_that_is_not_deployed_is_named_with_its_region(aws):
+    with pytest.raises(StationError, match=r"iort-storage is not deployed in eu-west-1: `make deploy`"):
+        Cloud().output("storage", "TelemetryTable")
