@@ -42,6 +42,7 @@ _AUDIT_READS = (
     "ListCertificates",
     "ListPolicies",
 )
+# AWS IoT makes it and keeps it for ever; why its end is set by hand: docs/cloud.md, "AWS IoT's own log".
 _LOG_GROUP = "AWSIotLogsV2"
 
 
