@@ -17,12 +17,13 @@ _FIVE_MINUTES = Duration.minutes(5)
 
 class Alarms(Construct):
     """An alarm tells the topic when it goes off, not when it ends. No data is no alarm: a fleet that is
-    switched off sends none."""
+    switched off sends none. ``every`` is all of them, in the order of what to look at first."""
 
     def __init__(
         self, scope: Construct, construct_id: str, *, settings: Settings, watched: Watched, topic: sns.ITopic
     ) -> None:
         super().__init__(scope, construct_id)
+        self.every: list[cloudwatch.IAlarm] = []
         self._namespace = settings.namespace
         self._tell = actions.SnsAction(topic)
         self._lost_or_late(settings, watched)
@@ -98,3 +99,4 @@ class Alarms(Construct):
             treat_missing_data=cloudwatch.TreatMissingData.NOT_BREACHING,
         )
         alarm.add_alarm_action(self._tell)
+        self.every.append(alarm)

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 from aws_cdk import Duration
 from aws_cdk import aws_cloudwatch as cloudwatch
 from constructs import Construct
@@ -18,12 +20,22 @@ _ROUND_TRIPS = ("RoundTripBrokerMs", "RoundTripRuleMs", "RoundTripLambdaMs")
 
 
 class Dashboards(Construct):
-    """``<namespace>-platform`` and ``<namespace>-robots``."""
+    """``<namespace>-platform``, the state of every alarm first, and ``<namespace>-robots``."""
 
-    def __init__(self, scope: Construct, construct_id: str, *, settings: Settings, watched: Watched) -> None:
+    def __init__(
+        self,
+        scope: Construct,
+        construct_id: str,
+        *,
+        settings: Settings,
+        watched: Watched,
+        alarms: Sequence[cloudwatch.IAlarm],
+    ) -> None:
         super().__init__(scope, construct_id)
         self._namespace = settings.namespace
         platform = self._dashboard("Platform")
+        status = cloudwatch.AlarmStatusWidget(title="Alarms", alarms=list(alarms), width=24, height=4)
+        platform.add_widgets(status)
         platform.add_widgets(*self._iot())
         platform.add_widgets(*self._tables(watched))
         platform.add_widgets(*self._functions(watched))

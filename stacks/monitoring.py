@@ -31,8 +31,8 @@ class Monitoring(Stack):
     ) -> None:
         super().__init__(scope, construct_id, **kwargs)
         watched = Watched.of(stacks)
-        Dashboards(self, "Dashboards", settings=settings, watched=watched)
-        Alarms(self, "Alarms", settings=settings, watched=watched, topic=topic)
+        alarms = Alarms(self, "Alarms", settings=settings, watched=watched, topic=topic)
+        Dashboards(self, "Dashboards", settings=settings, watched=watched, alarms=alarms.every)
         if settings.budget_usd:
             self._budget(settings)
 

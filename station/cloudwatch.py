@@ -1,4 +1,5 @@
-"""CloudWatch's dashboards as they are deployed: the widgets of GetDashboard with the data of GetMetricData.
+"""CloudWatch's dashboards as they are deployed: the widgets of GetDashboard with the data of GetMetricData
+and the states of DescribeAlarms.
 
 What CloudWatch's console draws, on any cloud that answers these calls, the embedded one included.
 """
@@ -20,6 +21,8 @@ from station.errors import StationError
 _PERIOD_S = 300
 # GetMetricData's own limit of queries a call.
 _MAX_QUERIES = 500
+# And DescribeAlarms' of names.
+_MAX_NAMES = 100
 
 
 def dashboards(cloud: Cloud) -> list[str]:
@@ -84,10 +87,13 @@ def _widget(client: Any, widget: Mapping[str, Any], from_s: int, to_s: int) -> d
         "title": str(properties.get("title", "")),
         "text": "",
         "series": [],
+        "alarms": [],
         "period_s": period_s,
     }
     if widget.get("type") == "text":
         return {**drawn, "kind": "text", "text": str(properties.get("markdown", ""))}
+    if widget.get("type") == "alarm":
+        return _with_alarms(client, drawn, properties)
     if widget.get("type") != "metric" or "metrics" not in properties:
         return {
             **drawn,
@@ -102,9 +108,39 @@ def _widget(client: Any, widget: Mapping[str, Any], from_s: int, to_s: int) -> d
     try:
         series = _series(client, queries, shown, from_s, to_s)
     except ClientError as error:
-        reason = error.response.get("Error", {}).get("Message", str(error))
-        return {**drawn, "kind": "other", "text": f"CloudWatch refuses this widget's metrics: {reason}"}
+        text = f"CloudWatch refuses this widget's metrics: {_reason(error)}"
+        return {**drawn, "kind": "other", "text": text}
     return {**drawn, "kind": kind, "series": series, "period_s": period_s}
+
+
+def _with_alarms(client: Any, drawn: dict[str, Any], properties: Mapping[str, Any]) -> dict[str, Any]:
+    """The widget with the state of its alarms, in its own order; one that is gone is left out."""
+    names = [str(arn).partition(":alarm:")[2] for arn in properties.get("alarms", [])]
+    try:
+        found = [
+            alarm
+            for i in range(0, len(names), _MAX_NAMES)
+            for alarm in client.describe_alarms(
+                AlarmNames=names[i : i + _MAX_NAMES], AlarmTypes=["MetricAlarm"], MaxRecords=_MAX_NAMES
+            )["MetricAlarms"]
+        ]
+    except ClientError as error:
+        return {**drawn, "kind": "other", "text": f"CloudWatch does not tell its alarms: {_reason(error)}"}
+    alarms = [
+        {
+            "name": alarm["AlarmName"],
+            "about": alarm.get("AlarmDescription", ""),
+            "state": alarm["StateValue"],
+            "reason": alarm.get("StateReason", ""),
+            "since_s": alarm["StateUpdatedTimestamp"].timestamp(),
+        }
+        for alarm in sorted(found, key=lambda alarm: names.index(alarm["AlarmName"]))
+    ]
+    return {**drawn, "kind": "alarms", "alarms": alarms}
+
+
+def _reason(error: ClientError) -> str:
+    return str(error.response.get("Error", {}).get("Message", error))
 
 
 _PLACE = {"x": 0, "y": 0, "width": 6, "height": 6}

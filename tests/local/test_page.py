@@ -168,6 +168,9 @@ def test_cloudwatchs_dashboards_are_drawn_from_its_metrics(embedded, open_page):
         until(lambda: "page-test" in names.all_inner_texts(), "the dashboards")
         # Our own deployment's stands first, and is drawn.
         assert names.first.inner_text().lower().startswith(embedded.namespace)
+        alarms = page.locator("[data-widget='Alarms'] li")
+        deployed = cloudwatch.describe_alarms(AlarmNamePrefix=embedded.namespace)["MetricAlarms"]
+        until(lambda: alarms.count() == len(deployed) > 0, "the alarms")
         page.select_option("#dashboard", "page-test")
         widget = page.locator("[data-widget='Laps driven']")
         until(lambda: "laps of a 5" in plain(widget.inner_text()), "the metric's value")

@@ -210,9 +210,18 @@ def shown(synthesized):
     metrics = []
     for body in dashboards(synthesized).values():
         for widget in body["widgets"]:
-            rows = widget["properties"]["metrics"]
+            rows = widget["properties"].get("metrics", [])
             metrics += [of_expression(row[0]) if isinstance(row[0], dict) else of_row(row) for row in rows]
     return metrics
+
+
+def test_the_platform_shows_the_state_of_every_alarm(synthesized):
+    first = dashboards(synthesized)["iort-platform"]["widgets"][0]
+    assert first["type"] == "alarm"
+    told = " ".join(first["properties"]["alarms"])
+    alarms = synthesized.resources("AWS::CloudWatch::Alarm")
+    assert len(alarms) == len(first["properties"]["alarms"])
+    assert all(f"'{logical_id}'" in told for logical_id in alarms)
 
 
 def dashboards(app):

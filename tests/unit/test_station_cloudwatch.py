@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import time
 from datetime import datetime, timezone
 
 import boto3
@@ -89,12 +90,41 @@ def test_shorthand_of_a_row_is_what_the_row_before_has():
 
 
 def test_what_it_does_not_draw_it_names(cloud):
-    put(cloud, "d", {"type": "log", "properties": {"query": "x"}}, {"type": "alarm", "properties": {}})
+    put(cloud, "d", {"type": "log", "properties": {"query": "x"}}, {"type": "explorer", "properties": {}})
     found = cloudwatch.dashboard(cloud, "d", minutes=5, now_s=NOW_S)
     assert [(each["kind"], each["text"].split(":")[0]) for each in found["widgets"]] == [
         ("other", "a widget of type log"),
-        ("other", "a widget of type alarm"),
+        ("other", "a widget of type explorer"),
     ]
+
+
+def test_alarms_are_shown_in_the_widgets_order_with_state_and_reason(cloud):
+    client = cloud.client("cloudwatch")
+    for name in ("first", "second"):
+        client.put_metric_alarm(
+            AlarmName=name,
+            AlarmDescription=f"the {name}",
+            Namespace="My/Cars",
+            MetricName="Laps",
+            Statistic="Sum",
+            Period=60,
+            EvaluationPeriods=1,
+            Threshold=1,
+            ComparisonOperator="GreaterThanThreshold",
+        )
+    client.set_alarm_state(AlarmName="first", StateValue="ALARM", StateReason="too many laps")
+    client.set_alarm_state(AlarmName="second", StateValue="OK", StateReason="few laps")
+    arns = {alarm["AlarmName"]: alarm["AlarmArn"] for alarm in client.describe_alarms()["MetricAlarms"]}
+    gone = arns["first"].replace("first", "gone")
+    put(cloud, "d", {"type": "alarm", "properties": {"alarms": [arns["second"], gone, arns["first"]]}})
+    (drawn,) = cloudwatch.dashboard(cloud, "d", minutes=5)["widgets"]
+    assert drawn["kind"] == "alarms"
+    assert [(one["name"], one["state"], one["about"]) for one in drawn["alarms"]] == [
+        ("second", "OK", "the second"),
+        ("first", "ALARM", "the first"),
+    ]
+    assert drawn["alarms"][1]["reason"] == "too many laps"
+    assert abs(drawn["alarms"][1]["since_s"] - time.time()) < 3600
 
 
 def test_a_dashboard_that_is_not_there_says_so(cloud):

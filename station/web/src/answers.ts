@@ -20,16 +20,25 @@ export interface Series {
   readonly values: readonly number[];
 }
 
+export interface Alarm {
+  readonly name: string;
+  readonly about: string;
+  readonly state: "OK" | "ALARM" | "INSUFFICIENT_DATA";
+  readonly reason: string;
+  readonly since_s: number;
+}
+
 export interface Widget {
   readonly x: number;
   readonly y: number;
   readonly width: number;
   readonly height: number;
   readonly title: string;
-  readonly kind: "series" | "number" | "text" | "other";
+  readonly kind: "series" | "number" | "alarms" | "text" | "other";
   readonly text: string;
   readonly period_s: number;
   readonly series: readonly Series[];
+  readonly alarms: readonly Alarm[];
 }
 
 export interface Dashboard {

@@ -1,6 +1,6 @@
 // CloudWatch's dashboards as they are deployed, drawn from the metrics that the cloud has.
 
-import { ask, AnswerError, type Dashboard, type Series, type Widget } from "../answers";
+import { ask, AnswerError, type Alarm, type Dashboard, type Series, type Widget } from "../answers";
 import type { Config } from "../config";
 import { el, Text } from "../dom";
 import { NOTHING, number } from "../format";
@@ -98,6 +98,12 @@ function frame(widget: Widget): [HTMLElement, HTMLElement | undefined] {
     node.append(el("p", { class: "note" }, widget.text));
     return [node, undefined];
   }
+  if (widget.kind === "alarms") {
+    const raised = widget.alarms.filter(({ state }) => state === "ALARM").length;
+    heading.append(el("span", { class: "note" }, raised === 0 ? `none of ${widget.alarms.length} raised` : `${raised} of ${widget.alarms.length} raised`));
+    node.append(el("ul", { class: "alarms" }, ...[...widget.alarms].sort(byUrgency).map(alarm)));
+    return [node, undefined];
+  }
   const any = widget.series.some((series) => series.values.length > 0);
   const legend = el(
     "ul",
@@ -120,6 +126,23 @@ function frame(widget: Widget): [HTMLElement, HTMLElement | undefined] {
   const plot = el("div", { class: "plot", "aria-hidden": "true", ...(any ? {} : { "data-empty": "no data in this range" }) });
   node.append(plot, legend);
   return [node, plot];
+}
+
+const STATES = { ALARM: "raised", INSUFFICIENT_DATA: "no data yet", OK: "quiet" } as const;
+
+function byUrgency(a: Alarm, b: Alarm): number {
+  const order = Object.keys(STATES);
+  return order.indexOf(a.state) - order.indexOf(b.state);
+}
+
+function alarm({ name, about, state, reason, since_s }: Alarm): HTMLElement {
+  const since = `${STATES[state]} since ${new Date(since_s * 1000).toLocaleString("en-GB")}`;
+  return el(
+    "li",
+    { "data-alarm": name, "data-state": state, title: [about, since, reason].filter(Boolean).join("\n") },
+    name,
+    ...(state === "OK" ? [] : [" ", el("b", {}, STATES[state])]),
+  );
 }
 
 function chart(host: HTMLElement, { series, period_s }: Widget, range: readonly [number, number]): TimeChart {
