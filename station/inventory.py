@@ -31,10 +31,16 @@ def check_there(cloud: Cloud, robot: str, stream: str) -> None:
     if reading.outermost(cloud, robot, stream, newest=False) is not None:
         return
     has = ", ".join(streams_of(cloud, robot))
-    known = sorted(str(row[ROBOT]) for row in registry.listed(cloud))
-    if not has and robot not in known:
-        raise StationError(f"there is no robot {robot}; there is {', '.join(known) or 'none at all'}")
+    if not has:
+        check_registered(cloud, robot)
     raise StationError(f"{robot} has no stream {stream}; it has {has or 'sent nothing yet'}")
+
+
+def check_registered(cloud: Cloud, robot: str) -> None:
+    """Raise `StationError` where a robot is not registered, naming those that are."""
+    if registry.find(cloud, robot) is None:
+        known = sorted(str(row[ROBOT]) for row in registry.listed(cloud))
+        raise StationError(f"there is no robot {robot}; there is {', '.join(known) or 'none at all'}")
 
 
 def check_fields(cloud: Cloud, selection: Selection, there: AbstractSet[str]) -> None:

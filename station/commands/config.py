@@ -38,7 +38,7 @@ def config(
     """Show what is in force on a robot, or change it and wait for its answer.
 
     Ends with 1 where the robot refuses a change, or does not answer; the wish stands then, and comes into
-    force when the robot is back.
+    force when the robot is back. A wish that is refused stands too, until --unset withdraws it.
     """
     wishes = {**dict(map(_change, changes or [])), **dict.fromkeys(unset or [])}
     shadow = Shadow(context.obj.cloud(), robot)
@@ -62,9 +62,17 @@ def config(
         _show(robot, state, wishes)
         for refusal in refused:
             _errors.print(f"refused: {refusal.reason}", style="red", markup=False)
+        if refused:
+            options = " ".join(f"--unset {refusal.name}" for refusal in refused)
+            _errors.print(
+                f"what is refused stays wished for; `iort config {robot} {options}` withdraws it",
+                markup=False,
+                soft_wrap=True,
+            )
     if late:
         raise StationError(
-            f"{robot} has not answered within {seconds:g} s; the wish stands: is its agent running?"
+            f"{robot} has not answered within {seconds:g} s: is its agent running? "
+            "The wish stands; --unset withdraws one"
         )
     if wishes and refused:
         raise typer.Exit(1)

@@ -19,6 +19,7 @@ from station import files
 from station.cloud import Cloud
 from station.errors import StationError
 from station.files import StoredFile, Told
+from station.inventory import check_registered
 from station.times import duration_us, iso, time_us
 
 commands = typer.Typer(no_args_is_help=True, help="Bags, images and what else robots have uploaded.")
@@ -41,7 +42,10 @@ def list_(
     last: _Last = None,
     as_json: _Json = False,
 ) -> None:
-    """List a robot's files in the order of their time; one line of JSON a file with --json."""
+    """List a robot's files in the order of their time; one line of JSON a file with --json.
+
+    What a robot that is no longer registered has uploaded stays, and is listed.
+    """
     for one in _chosen(context.obj.cloud(), robot, name, start, end, last):
         if as_json:
             _out.print(json.dumps(asdict(one)), markup=False)
@@ -111,9 +115,13 @@ def _chosen(
     now_us = time.time_ns() // 1000
     start_us = now_us - duration_us(last) if last else None if start is None else time_us(start, now_us)
     end_us = None if end is None else time_us(end, now_us)
+    none = True
     for one in files.listed(cloud, robot, start_us=start_us, end_us=end_us):
+        none = False
         if fnmatch.fnmatch(one.name, name):
             yield one
+    if none and next(files.listed(cloud, robot), None) is None:
+        check_registered(cloud, robot)
 
 
 def _newest(found: list[StoredFile], robot: str, which: str) -> StoredFile:

@@ -7,6 +7,8 @@ import stat
 
 import pytest
 
+from contract import File, file_key
+
 
 def test_robot_is_added_listed_and_removed(iort, tmp_path):
     added = iort("robots", "add", "cli-car", "--out", str(tmp_path), "--speed-to-erpm-gain", "3000")
@@ -25,12 +27,27 @@ def test_robot_is_added_listed_and_removed(iort, tmp_path):
     [
         (("robots", "add", "car/1"), "robot name 'car/1'"),
         (("robots", "remove", "nobody"), "robot nobody is not registered"),
+        (("files", "list", "nobody"), "there is no robot nobody; there is "),
+        (("files", "list", "nobody", "--last", "1h", "--json"), "there is no robot nobody"),
+        (("files", "get", "nobody"), "there is no robot nobody"),
     ],
 )
 def test_error_says_what_is_wrong(iort, tmp_path, arguments, said):
     outcome = iort(*arguments)
     assert outcome.exit_code != 0
     assert said in str(outcome.exception)
+
+
+def test_a_robot_without_files_has_none_and_one_that_is_gone_keeps_them(embedded, iort, bundle):
+    robot = bundle().robot
+    assert (iort("files", "list", robot).exit_code, iort("files", "list", robot).output) == (0, "")
+    bucket = embedded.cloud.output("storage", "FilesBucket")
+    file = File("a.bag", "recording", "application/octet-stream", 5, "0" * 64, 1_700_000_000_000_000)
+    key = file_key("gone", file)
+    embedded.cloud.client("s3").put_object(Bucket=bucket, Key=key, Body=b"drive")
+    assert "a.bag" in iort("files", "list", "gone").output
+    later = iort("files", "list", "gone", "--last", "1h")
+    assert (later.exit_code, later.output) == (0, "")
 
 
 def test_robot_is_not_added_twice(iort, tmp_path):

@@ -34,6 +34,7 @@ def test_a_running_agent_is_changed_and_answers(iort, bundle):
         shown = iort("config", car.robot)
         assert shown.exit_code == 0
         assert "ping.rate_hz=1" in shown.output
+        assert f"`iort config {car.robot} --unset live.rate_hz` withdraws it" in shown.stderr
         withdrawn = iort("config", car.robot, "--unset", "live.rate_hz", "--unset", "fields.vesc",
                          "--seconds", "120", "--json")  # fmt: skip
         assert withdrawn.exit_code == 0, withdrawn.output
@@ -47,7 +48,7 @@ def test_a_robot_that_is_off_has_not_answered_and_the_wish_stands(iort, bundle):
     car = bundle()
     asked = iort("config", car.robot, "live.rate_hz=3", "--seconds", "0.1")
     assert isinstance(asked.exception, StationError)
-    assert "the wish stands" in str(asked.exception)
+    assert "The wish stands; --unset" in str(asked.exception)
     assert "has reported no settings yet" in asked.output
 
 

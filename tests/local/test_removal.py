@@ -1,0 +1,89 @@
+"""Taking a deployment down as the README says, beside another one in the same account."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import pytest
+from botocore.exceptions import ClientError
+from typer.testing import CliRunner
+
+from contract import FILES_PREFIX
+from local.deployment import deploy
+from station import certificates, claims, registry, robots
+from station.cli import app
+from tests.local.conftest import until
+
+
+@pytest.fixture(scope="module")
+def lab(embedded, tmp_path_factory):
+    """A second deployment in the embedded account, which is the test's to remove."""
+    folder = tmp_path_factory.mktemp("lab")
+    cloud = replace(embedded.cloud, namespace="lab")
+    deploy(cloud, folder, lambda _step: None)
+    cloud.save(folder / "cloud.json")
+    return cloud, folder / "cloud.json"
+
+
+def destroyed(cloud, noun):
+    """Delete a stack: whether it is gone, and what stood in the way."""
+    formation, name = cloud.client("cloudformation"), f"{cloud.namespace}-{noun}"
+    formation.delete_stack(StackName=name)
+
+    def status():
+        try:
+            said = formation.describe_stacks(StackName=name)["Stacks"][0]["StackStatus"]
+        except ClientError:
+            return "GONE"
+        return said if said != "DELETE_IN_PROGRESS" else ""
+
+    if until(status) == "GONE":
+        return True, ""
+    events = formation.describe_stack_events(StackName=name)["StackEvents"]
+    failed = [event for event in events if event["ResourceStatus"] == "DELETE_FAILED"]
+    return False, " ".join(event.get("ResourceStatusReason", "") for event in failed)
+
+
+def test_a_deployment_is_taken_down_and_the_one_beside_it_stays(embedded, bundle, lab, tmp_path):
+    cloud, description = lab
+    kept = bundle()
+    for name in ("lab-car1", "lab-car2"):
+        robots.add(cloud, name, out=tmp_path)
+    claims.register(cloud, "lab-expected")
+    claims.claim(cloud, None, out=tmp_path / "claim", lasting=True)
+    bucket = cloud.output("storage", "FilesBucket")
+    cloud.client("s3").put_object(Bucket=bucket, Key=f"{FILES_PREFIX}lab-car1/drive.bag", Body=b"drive")
+
+    def iort(*arguments, typed=None):
+        return CliRunner().invoke(app, ["--local", "--embedded", str(description), *arguments], input=typed)
+
+    # Who uses another stack's outputs goes before it.
+    for noun in ("monitoring", "ingest"):
+        assert destroyed(cloud, noun) == (True, ""), noun
+    gone, why = destroyed(cloud, "fleet")
+    assert not gone, "robots hold the policy, and the stack goes all the same: what is the command for?"
+    assert "lab-robot" in why
+    assert "lab-claim" in why
+
+    asked = iort("robots", "remove", "--all", typed="n\n")
+    assert asked.exit_code == 1
+    assert "Remove 3 robots and every lasting claim?" in asked.output
+    assert {row["robot"] for row in registry.listed(cloud)} == {"lab-car1", "lab-car2", "lab-expected"}
+
+    done = iort("robots", "remove", "--all", "--yes")
+    assert done.exit_code == 0, done.output
+    assert done.output.splitlines() == [
+        *(f"{name} is removed" for name in ("lab-car1", "lab-car2", "lab-expected")),
+        "lasting claims revoked: 1",
+    ]
+    assert list(registry.listed(cloud)) == []
+    again = iort("robots", "remove", "--all", "--yes")
+    assert (again.exit_code, again.output) == (0, "lasting claims revoked: 0\n")
+
+    assert iort("files", "empty", "--yes").exit_code == 0
+    for noun in ("fleet", "processing", "quarantine", "storage"):
+        assert destroyed(cloud, noun) == (True, ""), noun
+
+    assert registry.get(embedded.cloud, kept.robot)
+    (certificate,) = certificates.attached(embedded.cloud, kept.robot)
+    assert certificate.status == "ACTIVE"
