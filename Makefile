@@ -4,7 +4,7 @@ BIN := .venv/bin
 # cdk.json runs `python app.py`.
 bootstrap deploy diff destroy: export PATH := $(CURDIR)/$(BIN):$(PATH)
 
-.PHONY: help demo test check setup bench bench-guard bench-agent bench-page screenshots bench-fleet layer bootstrap deploy diff destroy lock clean
+.PHONY: help demo test test-oldest check setup bench bench-guard bench-agent bench-page screenshots bench-fleet layer bootstrap deploy diff destroy lock clean
 
 help: ## show this
 	@grep -hE '^[a-z-]+:.*## ' Makefile | sed -E 's/^([a-z-]+):.*## /\1\t/' | expand -t 14
@@ -18,6 +18,11 @@ demo: setup ## drive a car through the embedded cloud: DURATION=20 BAG=drive.bag
 
 test: setup ## run every test: REQUIRE_ALL=1 makes a skip a failure, WORKERS=4 run side by side
 	@$(BIN)/python -m pytest --numprocesses $(or $(WORKERS),4) --dist loadscope --no-loadscope-reorder
+
+test-oldest: setup ## run the robot's tests on its oldest Python, 3.8, which ROS Noetic has: OLDEST=/path/to/python3.8
+	@$(PYTHON) scripts/setup.py --oldest $(or $(OLDEST),any)
+	@build/oldest/bin/python -m pytest -W "ignore:Python 3.8 is no longer supported" \
+		tests/device tests/unit/test_contract*.py tests/unit/test_device_*.py
 
 check: setup ## run the linters, the type checkers, and cfn-lint, cdk-nag and checkov over the stacks
 	@$(PYTHON) scripts/setup.py --checkov
@@ -71,6 +76,8 @@ lock: setup ## compile requirements/*.in to the locked *.txt
 		-c requirements/dev.txt requirements/build.in -o requirements/build.txt
 	@$(BIN)/uv pip compile --quiet --universal --generate-hashes --no-emit-index-url --python-version 3.10 \
 		requirements/checkov.in -o requirements/checkov.txt
+	@$(BIN)/uv pip compile --quiet --generate-hashes --no-emit-index-url --python-version 3.8.10 \
+		requirements/oldest.in -o requirements/oldest.txt
 
 clean: ## remove what was made
 	find . -name __pycache__ -type d -prune -exec rm -rf {} +

@@ -1,6 +1,6 @@
 """Sets the checkout up: .venv, node_modules, the built page and Lambda 1's layer. Nothing outside it.
 
-    python3 scripts/setup.py [--layer lambda]
+    python3 scripts/setup.py [--layer lambda] [--checkov] [--oldest any|/path/to/python3.8]
 
 Needs only a Python from 3.10 on with the venv module. A step whose inputs have not changed since it
 last succeeded is passed over, so running it again costs nothing.
@@ -25,6 +25,8 @@ PYTHON = VENV / "bin" / "python"
 # The interpreter itself, also when this runs in a virtual environment, even in the one made here.
 BASE_PYTHON = Path(getattr(sys, "_base_executable", sys.executable)).resolve()
 OLDEST = (3, 10)
+# The robot's: ROS Noetic's.
+OLDEST_OF_ROBOT = "3.8"
 LEAST_FREE_BYTES = 3 * 1024**3
 # Where `cdk deploy` sends it: stacks/processing.py names the same runtime and architecture.
 # Amazon Linux 2023 has glibc 2.34; the newest platform that a package was built for is taken.
@@ -50,6 +52,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
     parser.add_argument("--layer", choices=["lambda"], help="also build the layer that `cdk deploy` needs")
     parser.add_argument("--checkov", action="store_true", help="also install what `make check` needs")
+    parser.add_argument("--oldest", metavar="PYTHON", help="also install the robot's tests for Python 3.8")
     asked = parser.parse_args()
     try:
         check_machine()
@@ -68,6 +71,11 @@ def main() -> None:
         if asked.checkov:
             locked = [ROOT / "requirements" / "checkov.txt"]
             step("checkov, in an environment of its own", locked, install_checkov, stamp="checkov")
+        if asked.oldest:
+            locked = [ROOT / "requirements" / "oldest.txt", ROOT / "pyproject.toml"]
+            given = None if asked.oldest == "any" else asked.oldest
+            title = f"the robot's tests, for Python {OLDEST_OF_ROBOT}"
+            step(title, locked, lambda: install_oldest(given), stamp="oldest")
     except SetupError as error:
         sys.exit(f"setup: {error}")
     except KeyboardInterrupt:
@@ -155,6 +163,47 @@ def install_checkov() -> None:
     """Install checkov, whose requirements contradict ours, into build/checkov."""
     run([BASE_PYTHON, "-m", "venv", "--clear", BUILD / "checkov"])
     pip("install", *LOCKED, "-r", "requirements/checkov.txt", python=BUILD / "checkov" / "bin" / "python")
+
+
+def install_oldest(given: str | None) -> None:
+    """Install the agent and what its tests need for the oldest Python that a robot has, into build/oldest."""
+    run([oldest_python(given), "-m", "venv", "--clear", BUILD / "oldest"])
+    python = BUILD / "oldest" / "bin" / "python"
+    pip("install", *LOCKED[:2], "--only-binary", ":all:", "-r", "requirements/oldest.txt", python=python)
+
+
+def oldest_python(given: str | None) -> str:
+    """The interpreter: the one given, one that this machine has, or one that uv fetches into build/."""
+    installed = (Path(os.environ.get("PYENV_ROOT") or Path.home() / ".pyenv") / "versions").glob(
+        f"{OLDEST_OF_ROBOT}.*/bin/python"
+    )
+    found = shutil.which(f"python{OLDEST_OF_ROBOT}")
+    candidates = [given] if given else [*([found] if found else []), *map(str, sorted(installed))]
+    for candidate in candidates:
+        if is_oldest(candidate):
+            return candidate
+    if given:
+        raise SetupError(f"{given} is not Python {OLDEST_OF_ROBOT} with the venv module")
+    os.environ["UV_PYTHON_INSTALL_DIR"] = str(BUILD / "python")
+    try:
+        run([VENV / "bin" / "uv", "python", "install", "--no-bin", OLDEST_OF_ROBOT])
+    except SetupError as error:
+        raise SetupError(
+            f"there is no Python {OLDEST_OF_ROBOT} here, and uv could not fetch one: install it, or name it "
+            f"with `make test-oldest OLDEST=/path/to/python{OLDEST_OF_ROBOT}`\n{error}"
+        ) from error
+    fetched = (BUILD / "python").glob(f"cpython-{OLDEST_OF_ROBOT}.*/bin/python{OLDEST_OF_ROBOT}")
+    return str(next(fetched))
+
+
+def is_oldest(python: str) -> bool:
+    """Whether the file is what it is called, and can make a virtual environment."""
+    ask = "import ensurepip, sys, venv; print('%d.%d' % sys.version_info[:2])"
+    try:
+        done = subprocess.run([python, "-c", ask], capture_output=True, text=True, check=False)  # noqa: S603
+    except OSError:
+        return False
+    return done.stdout.strip() == OLDEST_OF_ROBOT
 
 
 def pip(*arguments: str, python: Path = PYTHON) -> None:

@@ -9,7 +9,7 @@ import socket
 # Below those that Linux gives to connections (32768 on), and a range for each worker of pytest-xdist, so
 # that nobody takes one between here and its server's start.
 _FIRST, _EACH = 12_000, 1_000
-_WORKER = int(os.environ.get("PYTEST_XDIST_WORKER", "gw0").removeprefix("gw"))
+_WORKER = int(os.environ.get("PYTEST_XDIST_WORKER", "gw0")[len("gw") :])
 _offsets = itertools.count(os.getpid())
 
 

@@ -13,8 +13,8 @@ import select
 import struct
 import threading
 import tty
-from collections.abc import Callable
 from pathlib import Path
+from typing import Callable, List
 
 from typing_extensions import Self
 
@@ -44,7 +44,7 @@ def values(n: int = 0, *, length: int = 74, controller: int = 1) -> bytes:
     return payload[:length]
 
 
-Answer = Callable[[bytes, int], "list[bytes]"]
+Answer = Callable[[bytes, int], List[bytes]]
 
 
 class VescStandin:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import socket
+from contextlib import ExitStack
 
 from device.nodelay import send_at_once
 
@@ -15,11 +16,10 @@ def nodelay(sock: socket.socket) -> bool:
 def test_only_the_sockets_to_that_port_are_set():
     with socket.create_server(("127.0.0.1", 0)) as broker, socket.create_server(("127.0.0.1", 0)) as other:
         port = broker.getsockname()[1]
-        with (
-            socket.create_connection(("127.0.0.1", port)) as uplink,
-            socket.create_connection(("127.0.0.1", other.getsockname()[1])) as stranger,
-            socket.socket() as unconnected,
-        ):
+        with ExitStack() as stack:
+            uplink = stack.enter_context(socket.create_connection(("127.0.0.1", port)))
+            stranger = stack.enter_context(socket.create_connection(("127.0.0.1", other.getsockname()[1])))
+            unconnected = stack.enter_context(socket.socket())
             assert not nodelay(uplink)
             assert send_at_once(port) == 1
             assert nodelay(uplink)

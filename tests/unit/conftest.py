@@ -1,15 +1,15 @@
-"""Unit tests touch no network: a socket is an error."""
+"""Unit tests touch no network: a socket is an error.
+
+What the cloud's tests need is imported by their fixtures: the robot's run on the oldest Python, where
+neither boto3 nor moto is installed.
+"""
 
 from __future__ import annotations
 
 import os
 
-import boto3
 import pytest
-from moto import mock_aws
 from pytest_socket import disable_socket, enable_socket
-
-from tests.fakes import NAMES, QUARANTINE
 
 
 @pytest.fixture(autouse=True)
@@ -29,6 +29,8 @@ def deployment(monkeypatch):
 @pytest.fixture
 def aws(monkeypatch):
     """AWS in this process, with nothing in it; the machine's own settings and keys are out of reach."""
+    from moto import mock_aws
+
     for name in [name for name in os.environ if name.startswith("AWS_")]:
         monkeypatch.delenv(name)
     monkeypatch.setenv("AWS_DEFAULT_REGION", "eu-west-1")
@@ -39,6 +41,10 @@ def aws(monkeypatch):
 @pytest.fixture
 def dynamodb(aws, synthesized):
     """moto's DynamoDB with the tables as the template declares them."""
+    import boto3
+
+    from tests.fakes import NAMES, QUARANTINE
+
     client = boto3.client("dynamodb")
     for logical, properties in synthesized.resources("AWS::DynamoDB::Table").items():
         client.create_table(

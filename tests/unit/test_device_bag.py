@@ -5,13 +5,12 @@ from __future__ import annotations
 import threading
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any
+from typing import Any, Tuple
 
 import numpy as np
 import pytest
+from rosbags import rosbag2
 from rosbags.rosbag1 import Writer as Writer1
-from rosbags.rosbag2 import StoragePlugin
-from rosbags.rosbag2 import Writer as Writer2
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
 import contract
@@ -24,7 +23,10 @@ NOW = 1_700_000_000_000_000
 # When the written recordings start, in nanoseconds.
 START = 1_600_000_000_000_000_000
 
-Sample = tuple[str, int, Any]
+# The newest rosbags for Python 3.8 writes ROS 2 recordings in one format only.
+STORAGES = ["mcap", "sqlite3"] if hasattr(rosbag2, "StoragePlugin") else ["sqlite3"]
+
+Sample = Tuple[str, int, Any]
 
 
 def play(path: Path, clock: ManualClock | None = None, **settings: Any) -> list[Sample]:
@@ -86,12 +88,18 @@ def ros2_store() -> Any:
     return store
 
 
-def write_ros2(path: Path, plugin: StoragePlugin, *, count: int = 10) -> Path:
+def ros2_writer(path: Path, storage: str) -> rosbag2.Writer:
+    if len(STORAGES) == 1:
+        return rosbag2.Writer(path)
+    return rosbag2.Writer(path, version=8, storage_plugin=rosbag2.StoragePlugin[storage.upper()])
+
+
+def write_ros2(path: Path, storage: str, *, count: int = 10) -> Path:
     store = ros2_store()
     types = store.types
     names = [name for name, field in contract.VESC_FIELDS.items() if 2 in field.ros]
     whole = {"displacement", "distance_traveled", "fault_code", "controller_id"}
-    with Writer2(path, version=8, storage_plugin=plugin) as writer:
+    with ros2_writer(path, storage) as writer:
         core = writer.add_connection("/sensors/core", VESC_TYPE, typestore=store)
         odd = writer.add_connection("/odd", "lab_msgs/msg/Odd", typestore=store)
         for i in range(count):
@@ -180,10 +188,10 @@ def test_stops_when_asked(tmp_path: Path) -> None:
     assert len(seen) == 1
 
 
-@pytest.mark.parametrize("plugin", [StoragePlugin.MCAP, StoragePlugin.SQLITE3])
+@pytest.mark.parametrize("storage", STORAGES)
 @pytest.mark.parametrize("by_file", [False, True])
-def test_ros_2(tmp_path: Path, plugin: StoragePlugin, by_file: bool) -> None:
-    folder = write_ros2(tmp_path / "drive", plugin)
+def test_ros_2(tmp_path: Path, storage: str, by_file: bool) -> None:
+    folder = write_ros2(tmp_path / "drive", storage)
     path = next(p for p in folder.iterdir() if p.suffix in (".mcap", ".db3")) if by_file else folder
     samples = play(path)
     assert len(samples) == 10
@@ -192,7 +200,7 @@ def test_ros_2(tmp_path: Path, plugin: StoragePlugin, by_file: bool) -> None:
     assert sorted(values) == sorted(expected)
     assert values["voltage_input"] == expected.index("voltage_input") + 3.5
     assert values["fault_code"] == expected.index("fault_code") + 3
-    arrays = play(path, topics=(("/odd", "odd"),))[2][2] if plugin is StoragePlugin.MCAP else None
+    arrays = play(path, topics=(("/odd", "odd"),))[2][2] if storage == "mcap" else None
     if arrays is not None:
         assert arrays == {"xs.0": 1.0, "xs.1": 2.0, "xs.2": 3.0, "ys.0": 2.0, "ys.1": 0.5}
 
@@ -207,7 +215,7 @@ def strip_definitions(folder: Path) -> None:
 
 
 def test_ros_2_without_definitions_knows_the_vesc_but_not_the_labs_types(tmp_path: Path) -> None:
-    folder = write_ros2(tmp_path / "drive", StoragePlugin.SQLITE3)
+    folder = write_ros2(tmp_path / "drive", "sqlite3")
     strip_definitions(folder)
     assert len(play(folder)) == 10
     with pytest.raises(SourceError, match=r"/odd is of type lab_msgs/msg/Odd, whose definition"):

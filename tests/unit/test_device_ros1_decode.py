@@ -5,6 +5,7 @@ rosbags, which is independent of it, serialises the messages and says what must 
 
 from __future__ import annotations
 
+import dataclasses
 import struct
 import sys
 import threading
@@ -215,11 +216,10 @@ def test_a_real_recording_is_what_rosbags_reads() -> None:
     from rosbags.highlevel import AnyReader
 
     with AnyReader([recording("f1tenth-motor-servo.bag")]) as reader:
-        fields = reader.typestore.fielddefs
 
         def fields_of(value: Any) -> list[str] | None:
-            known = fields.get(getattr(value, "__msgtype__", ""))
-            return None if known is None else [name for name, _ in known[1]]
+            is_message = hasattr(value, "__msgtype__")
+            return [field.name for field in dataclasses.fields(value)] if is_message else None
 
         counts: dict[str, int] = {}
         for connection in reader.connections:
@@ -263,9 +263,7 @@ def messages(draw: st.DrawFn) -> tuple[str, list[Any], list[Any]]:
     array = draw(st.sampled_from(["", "[]", "[2]"]))
 
     def lines(fields: list[tuple[str, str]]) -> str:
-        return "".join(
-            f"{kind}{length} {name}\n" for (kind, length), name in zip(fields, NAMES, strict=False)
-        )
+        return "".join(f"{kind}{length} {name}\n" for (kind, length), name in zip(fields, NAMES))
 
     def content(fields: list[tuple[str, str]]) -> list[Any]:
         out = []
@@ -295,7 +293,7 @@ def test_any_message_is_what_rosbags_wrote(case: tuple[str, list[Any], list[Any]
     def arrays(kind: str, values: list[Any]) -> list[Any]:
         return [
             np.array(value, dtype=field.kind) if isinstance(value, list) and field.kind != "string" else value
-            for field, value in zip(parsed.fields(kind), values, strict=False)
+            for field, value in zip(parsed.fields(kind), values)
         ]
 
     nested = [types["B"](*arrays("a_msgs/B", values)) for values in b_values]

@@ -6,7 +6,7 @@ import logging
 import threading
 import time
 from pathlib import Path
-from typing import Any
+from typing import Any, Tuple
 
 import pytest
 from hypothesis import HealthCheck, given, settings
@@ -21,7 +21,7 @@ from tests.recordings import recording
 NOW = 1_700_000_000_000_000
 HEADER = "ms_today;input_voltage;temp_motor;erpm;amp_hours_used;fault_code;roll"
 
-Sample = tuple[str, int, Any]
+Sample = Tuple[str, int, Any]
 
 
 @pytest.fixture
