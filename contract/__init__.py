@@ -9,8 +9,7 @@ Everything here that refuses its input raises `ContractError`, and nothing else.
 
 from __future__ import annotations
 
-from contract.batch import CODEC, Batch, decode, decode_item, encode, split
-from contract.checks import inflate
+from contract.batch import Batch, decode, decode_item, encode, split
 from contract.cloud import (
     FILES_PREFIX,
     LOW_VOLTAGE_V,
@@ -27,6 +26,7 @@ from contract.cloud import (
     pubnub_parameter,
     rule_sql,
 )
+from contract.columns import CODEC, DICTIONARY, EXACT, PLAIN_CODEC, SCALES, inflate
 from contract.commands import (
     FLEET_MAX_AGE_MS,
     MAX_LEASE_MS,
@@ -184,9 +184,11 @@ __all__ = [
     "CONNECTED_MS",
     "DEFAULT_NAMESPACE",
     "DERIVED_UNITS",
+    "DICTIONARY",
     "DISCONNECTED_MS",
     "DISCONNECT_REASON",
     "ENTRY",
+    "EXACT",
     "EXPIRES_S",
     "FAULTS",
     "FAULT_CODES",
@@ -234,6 +236,7 @@ __all__ = [
     "PAYLOAD",
     "PING",
     "PING_PATHS",
+    "PLAIN_CODEC",
     "PONG",
     "PRESENCE",
     "REASON",
@@ -249,6 +252,7 @@ __all__ = [
     "RULE",
     "RULES",
     "SAMPLES",
+    "SCALES",
     "SCHEMA_VERSION",
     "SECOND",
     "SEEN",

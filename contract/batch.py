@@ -2,28 +2,25 @@
 
 from __future__ import annotations
 
-import base64
-import json
-import zlib
 from dataclasses import dataclass
 from itertools import accumulate
 from typing import Any, Mapping, Sequence
 
 from contract.checks import (
+    COMPACT,
     FIELD_NAME,
     check_header,
     check_times,
     check_version,
     checked,
-    inflate,
     integer,
     json_object,
     shown,
     wire_column,
 )
+from contract.columns import CODEC, PLAIN_CODEC, inflate, packed_samples, unpacked
 from contract.limits import (
     MAX_AHEAD_US,
-    MAX_COLUMNS_BYTES,
     MAX_FIELDS,
     MAX_SAMPLES,
     SCHEMA_VERSION,
@@ -32,8 +29,6 @@ from contract.limits import (
 )
 from contract.tables import NONFINITE, RECEIVED_MS, ROBOT, SAMPLES, T_US, TOPIC
 from contract.topics import RECORD, Topic, parse_topic
-
-CODEC = "columns+zlib+base64"
 
 
 @dataclass(frozen=True)
@@ -81,10 +76,6 @@ def encode(batch: Batch) -> bytes:
     check_header(batch.boot, batch.seq, nonfinite)
     check_times(times)
     dt = [0] + [b - a for a, b in zip(times, times[1:])]
-    text = json.dumps({"dt": dt, "fields": fields}, separators=(",", ":"), allow_nan=False)
-    if len(text) > MAX_COLUMNS_BYTES:
-        raise ContractError(f"batch of {len(text)} bytes of columns: allowed is up to {MAX_COLUMNS_BYTES}")
-    samples = base64.b64encode(zlib.compress(text.encode(), 6)).decode()
     envelope = {
         "v": SCHEMA_VERSION,
         "boot": batch.boot,
@@ -93,9 +84,9 @@ def encode(batch: Batch) -> bytes:
         SAMPLES: n,
         NONFINITE: nonfinite,
         "codec": CODEC,
-        "samples": samples,
+        "samples": packed_samples(dt, fields),
     }
-    return json.dumps(envelope, separators=(",", ":")).encode()
+    return COMPACT.encode(envelope).encode()
 
 
 def decode(message: bytes | str | Mapping[str, Any]) -> Batch:
@@ -105,15 +96,16 @@ def decode(message: bytes | str | Mapping[str, Any]) -> Batch:
     """
     envelope = message if isinstance(message, Mapping) else json_object(message, "envelope")
     check_version(envelope)
-    if envelope.get("codec") != CODEC:
-        raise ContractError(f"codec {shown(envelope.get('codec'))}: this side knows {CODEC}")
+    codec = envelope.get("codec")
+    if codec not in (CODEC, PLAIN_CODEC):
+        raise ContractError(f"codec {shown(codec)}: this side knows {CODEC} and {PLAIN_CODEC}")
     seq = integer(envelope, "seq")
     first_us, n = integer(envelope, T_US), integer(envelope, SAMPLES)
     nonfinite = integer(envelope, NONFINITE)
     boot = check_header(envelope.get("boot"), seq, nonfinite)
     if not 1 <= n <= MAX_SAMPLES:
         raise ContractError(f"envelope says {n} samples: allowed is 1 to {MAX_SAMPLES}")
-    body = json_object(inflate(envelope.get("samples")), "samples")
+    body = json_object(inflate(envelope.get("samples"), codec), "samples")
     dt, fields = body.get("dt"), body.get("fields")
     if not isinstance(dt, list) or len(dt) != n or not isinstance(fields, dict):
         raise ContractError(f"samples: expected {n} dt and an object of fields")
@@ -121,15 +113,13 @@ def decode(message: bytes | str | Mapping[str, Any]) -> Batch:
         raise ContractError(f"samples of {len(fields)} fields: allowed is up to {MAX_FIELDS}")
     if dt[0] != 0 or not set(map(type, dt)) <= {int}:
         raise ContractError("samples: dt must be integers, the first 0")
+    columns = {}
     for name, column in fields.items():
         checked(FIELD_NAME, name, "field name", "a ROS field name or a dotted path of them")
-        if not isinstance(column, list) or len(column) != n:
-            raise ContractError(f"field {name}: expected {n} values")
-        if wire_column(name, column)[1]:
-            raise ContractError(f"field {name}: a number is not finite")
+        columns[name] = unpacked(codec, name, column, n)
     times = list(accumulate(dt, initial=first_us))[1:]
     check_times(times)
-    return Batch(boot, seq, times, fields, nonfinite)
+    return Batch(boot, seq, times, columns, nonfinite)
 
 
 def decode_item(item: Mapping[str, Any]) -> tuple[Topic, Batch]:

@@ -2,18 +2,14 @@
 
 from __future__ import annotations
 
-import base64
-import binascii
 import json
 import math
 import re
-import zlib
 from functools import lru_cache
 from typing import Any, Mapping, Sequence
 
 from contract.limits import (
     MAX_BATCH_SPAN_US,
-    MAX_COLUMNS_BYTES,
     MAX_FIELDS,
     MAX_SAMPLES,
     SCHEMA_VERSION,
@@ -148,23 +144,6 @@ def integer(envelope: Mapping[str, Any], key: str) -> int:
     except (TypeError, ValueError, ArithmeticError) as error:
         raise ContractError(f"{key} {shown(value)}: expected an integer") from error
     raise ContractError(f"{key} {shown(value)}: expected an integer")
-
-
-def inflate(samples: Any) -> bytes:
-    """The JSON of a batch's columns, as large as a batch may be and no larger; raises `ContractError`."""
-    if not isinstance(samples, (str, bytes)):
-        raise ContractError(f"samples {shown(samples)}: expected base64 text")
-    try:
-        packed = base64.b64decode(samples, validate=True)
-        inflater = zlib.decompressobj()
-        body = inflater.decompress(packed, MAX_COLUMNS_BYTES + 1)
-    except (binascii.Error, ValueError, zlib.error) as error:
-        raise ContractError(f"samples are not base64 of zlib: {error}") from error
-    if len(body) > MAX_COLUMNS_BYTES:
-        raise ContractError(f"samples inflate to over {MAX_COLUMNS_BYTES} bytes")
-    if not inflater.eof or inflater.unused_data:
-        raise ContractError("samples are cut short, or more follows them")
-    return body
 
 
 def json_object(text: Any, what: str) -> dict[str, Any]:

@@ -22,9 +22,9 @@ import boto3
 from botocore.config import Config
 
 from contract import (
-    CODEC,
     DERIVED_UNITS,
     MAX_BATCH_SPAN_US,
+    PLAIN_CODEC,
     RECORD,
     RESULTS_PREFIX,
     T_US,
@@ -185,7 +185,7 @@ def answer(
             break
     samples = _packed(found)
     reply: dict[str, Any] = {
-        "codec": CODEC,
+        "codec": PLAIN_CODEC,
         "n": len(found.times_us),
         "fields": list(found.there),
         "items": items,

@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 
 from contract import DERIVED_UNITS, T_US
 from station import inventory, reading, remote
-from station.blocks import ATTRIBUTES, Block, Refused, blocks, join
+from station.blocks import Block, join
 from station.cloud import Cloud
 from station.conditions import Column, derive, holds
 from station.errors import StationError
@@ -28,6 +28,7 @@ from station.progress import Told
 from station.resample import resample
 from station.seconds import seconds
 from station.selection import Selection, select
+from station.stored import ATTRIBUTES, Refused, blocks
 from station.times import Time, duration_us
 from station.units import Driver, unit
 

@@ -8,10 +8,10 @@ from dataclasses import replace
 from contract import OWN_STREAMS, ROBOT, TYPES_STREAM, VESC_STREAM
 from functions.statistics import Vehicle
 from station import reading, registry
-from station.blocks import ATTRIBUTES, Refused, blocks
 from station.cloud import Cloud
 from station.errors import StationError
 from station.selection import MADE_OF, Selection
+from station.stored import ATTRIBUTES, Refused, blocks
 from station.times import iso
 
 

@@ -12,11 +12,12 @@ from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
 from contract import TYPES_STREAM, ContractError, MessageType, Value, message_type
 from station import data
-from station.blocks import Block, Refused
+from station.blocks import Block
 from station.cloud import Cloud
 from station.conditions import values
 from station.errors import StationError
 from station.selection import Selection
+from station.stored import Refused
 
 # What rosbags' typestore calls the kinds of a field's type: a basic one, another message, arrays.
 _BASE, _NAME, _ARRAY = 1, 2, 3

@@ -12,13 +12,14 @@ from typing import Any
 
 import numpy as np
 
-from contract import CODEC
+from contract import PLAIN_CODEC
 from station import inventory
-from station.blocks import Block, Refused, column_of, join, ordered
+from station.blocks import Block, column_of, join, ordered
 from station.cloud import Cloud
 from station.errors import StationError
 from station.progress import Told
 from station.selection import Selection
+from station.stored import Refused
 
 _DOWNLOAD_S = 60
 
@@ -77,7 +78,7 @@ def _invoke(cloud: Cloud, function: str, request: Mapping[str, Any]) -> dict[str
         raise StationError(f"the query function failed: {reply.get('errorMessage', text[:500])}")
     if "error" in reply:
         raise StationError(f"the query function refused: {reply['error']}")
-    if reply["codec"] != CODEC:
+    if reply["codec"] != PLAIN_CODEC:
         raise StationError(f"the query function answers in {reply['codec']}: deploy the current stacks")
     return reply
 

@@ -56,7 +56,7 @@ def export(
 def _write(cloud: Cloud, selection: Selection, file: Recording) -> int:
     """How many messages were written."""
     from station import data, inventory, messages  # noqa: PLC0415 - as above
-    from station.blocks import Refused  # noqa: PLC0415
+    from station.stored import Refused  # noqa: PLC0415
 
     refused = Refused()
     robot, stream = selection.robot, selection.stream

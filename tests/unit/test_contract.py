@@ -72,7 +72,7 @@ def strict(text):
 
 
 def body_of(envelope):
-    return zlib.decompress(base64.b64decode(envelope["samples"]))
+    return contract.inflate(envelope["samples"], envelope["codec"])
 
 
 def stored(message):
@@ -132,11 +132,16 @@ def test_batch_of_a_drive(n):
 
 def test_whole_floats_become_integers_on_the_wire():
     batch = Batch(BOOT, 0, [0], {"a": [3.0], "b": [-0.0], "c": [1e300], "d": [True], "e": [0.5]})
-    body = body_of(json.loads(contract.encode(batch)))
-    assert body == b'{"dt":[0],"fields":{"a":[3],"b":[0],"c":[1e+300],"d":[true],"e":[0.5]}}'
+    message = contract.encode(batch)
+    assert body_of(json.loads(message)) == (
+        b'{"dt":[0],"fields":{"a":[0,3],"b":[0,0],"c":[null,1e+300],"d":[null,true],"e":[1,5]}}'
+    )
+    assert list(map(type, (c[0] for c in contract.decode(message).columns.values()))) == [
+        int, int, float, bool, float,
+    ]  # fmt: skip
 
 
-def test_any_language_decodes_it_in_three_lines():
+def test_the_envelope_names_what_it_holds():
     batch = Batch(BOOT, 3, [1_000, 1_250, 1_900], {"speed": [1, 2.5, None]})
     envelope = json.loads(contract.encode(batch))
     assert {key: envelope[key] for key in envelope if key != "samples"} == {
@@ -146,9 +151,9 @@ def test_any_language_decodes_it_in_three_lines():
         "t": 1_000,
         "n": 3,
         "nonfinite": 0,
-        "codec": "columns+zlib+base64",
+        "codec": "steps",
     }
-    assert json.loads(body_of(envelope)) == {"dt": [0, 250, 650], "fields": {"speed": [1, 2.5, None]}}
+    assert json.loads(body_of(envelope)) == {"dt": [0, 250, 650], "fields": {"speed": [None, 1, 2.5, None]}}
 
 
 def nulled(value):
@@ -420,9 +425,10 @@ def test_one_key_removed(good):
 
 
 def enveloped(body, **changed):
-    """A good envelope of two samples around any body."""
+    """A good envelope of two samples around any body, in the codec whose columns are their values alone;
+    tests/unit/test_columns.py has the other."""
     packed = base64.b64encode(zlib.compress(body)).decode()
-    return dict(json.loads(contract.encode(GOOD)), samples=packed, **changed)
+    return dict(json.loads(contract.encode(GOOD)), codec=contract.PLAIN_CODEC, samples=packed, **changed)
 
 
 @given(st.binary(max_size=100) | json_values.map(lambda value: json.dumps(value).encode()))

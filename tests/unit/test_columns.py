@@ -1,0 +1,246 @@
+"""The codec of the columns: what is written comes back to the bit, what cannot have been is refused."""
+
+from __future__ import annotations
+
+import base64
+import hashlib
+import itertools
+import json
+import re
+import struct
+import zlib
+
+import pytest
+from hypothesis import example, given, settings
+from hypothesis import strategies as st
+
+import contract
+from contract import Batch, ContractError
+from contract.checks import wire_column
+from contract.columns import packed, unpacked
+from station.sizes import stored_bytes
+from station.stored import Refused, blocks
+from tests.fakes import item_of_message
+from tests.recordings import recording
+
+BOOT = "0123abcd"
+EDGE = 2**53
+
+finite = st.floats(allow_nan=False, allow_infinity=False)
+integers = st.integers(-(2**63), 2**64 - 1)
+decimals = st.builds(lambda whole, places: whole / 10**places, st.integers(-EDGE, EDGE), st.integers(0, 25))
+singles = st.floats(width=32, allow_nan=False, allow_infinity=False)
+near_the_edge = st.integers(EDGE - 3, EDGE + 3) | st.integers(-EDGE - 3, 3 - EDGE)
+odd = st.none() | st.booleans() | st.text(max_size=3)
+
+
+@st.composite
+def columns(draw):
+    """Of one kind, of two, and of any mixture."""
+    n = draw(st.integers(1, 30))
+    places = draw(st.integers(0, 6))
+    reading = st.integers(-(10**6), 10**6).map(lambda whole: whole / 10**places)
+    kinds = st.sampled_from([finite, integers, decimals, singles, near_the_edge, odd, reading])
+    kind = st.one_of(draw(st.lists(kinds, min_size=1, max_size=2)))
+    return draw(st.lists(kind, min_size=n, max_size=n))
+
+
+def bits(values):
+    """What tells any two values apart: kind and content, of a float all 64 bits."""
+    return [(type(v), struct.pack("<d", v) if type(v) is float else v) for v in values]
+
+
+@settings(max_examples=300)
+@given(columns())
+@example([0.1, 0.2, 0.30000000000000004])
+@example([1e300, 1, -1e300])
+@example([5e-324, 1e-22, 1.5e-22])
+@example([2.5, 3, -0.5, 2.0**53 - 1])
+@example([float(EDGE), 0.5])
+@example([EDGE - 1, 1 - EDGE])
+@example([0.1] * 9 + [0.125] + [0.1] * 9)
+def test_a_column_comes_back_to_the_bit(column):
+    values, _ = wire_column("a", column)
+    written = json.loads(json.dumps(packed(values)))
+    assert bits(unpacked(contract.CODEC, "a", written, len(values))) == bits(values)
+    assert bits(unpacked(contract.PLAIN_CODEC, "a", values, len(values))) == bits(values)
+
+
+@settings(max_examples=50)
+@given(columns(), st.integers(0, 2**40))
+def test_a_batch_comes_back_the_same_as_by_the_codec_before(column, seq):
+    n = len(column)
+    batch = Batch(BOOT, seq, list(range(0, 20 * n, 20)), {"speed": column, "flag": [True] * n})
+    envelope = json.loads(contract.encode(batch))
+    fields = {name: wire_column(name, values)[0] for name, values in batch.columns.items()}
+    before = plain_message(envelope, {"dt": [0] + [20] * (n - 1), "fields": fields})
+    now, then = contract.decode(envelope), contract.decode(before)
+    assert now == then
+    for name in batch.columns:
+        assert bits(now.columns[name]) == bits(then.columns[name])
+
+
+def plain_message(envelope, body):
+    """The message that an agent before this codec sent."""
+    samples = base64.b64encode(zlib.compress(json.dumps(body, separators=(",", ":")).encode())).decode()
+    return {**envelope, "codec": "columns+zlib+base64", "samples": samples}
+
+
+# Written by the agent as it was before this codec.
+STORED = (
+    b'{"v":1,"boot":"0123abcd","seq":7,"t":1000,"n":3,"nonfinite":0,"codec":"columns+zlib+base64",'
+    b'"samples":"eJyrVkopUbKKNtAxAiJT01gdpbTM1JyUYiWraqVEoIShjoGekU5eaU4OUCoJKKCUr6RTUlSaqpOWmFOcGltbCwBm'
+    b'dxOr"}'
+)
+FROZEN = "71f73f6da111bb52e14b827789e70220e1689946c9378dbab0ed3390b2cf0b95"
+
+
+def test_what_was_stored_before_this_codec_is_read_for_ever():
+    assert contract.decode(STORED) == Batch(
+        BOOT, 7, [1000, 1020, 1275], {"a": [1, 0.2, None], "b": ["o", True, False]}
+    )
+
+
+def test_the_dictionary_is_that_with_which_stored_batches_were_compressed():
+    assert hashlib.sha256(contract.DICTIONARY).hexdigest() == FROZEN
+    names = set(re.findall(r'"(\w+)":', contract.DICTIONARY.decode()))
+    assert {*contract.VESC_FIELDS, *contract.AGENT_FIELDS, *contract.RTT_FIELDS.values()} <= names
+
+
+@pytest.mark.parametrize(
+    ("column", "expected"),
+    [
+        ([5, 7, 4], [0, 5, 2, -3]),
+        ([2.5, 3, 2.25], [2, 250, 50, -75]),
+        ([12.1] * 3, [1, 121, 0, 0]),
+        ([1e-05, 2e-05], [5, 1, 1]),
+        ([0.5, None], [None, 0.5, None]),
+        ([True, False], [None, True, False]),
+        ([EDGE, 1], [None, EDGE, 1]),
+        ([5 / 3, 0.5], [None, 5 / 3, 0.5]),
+    ],
+)
+def test_what_a_column_looks_like(column, expected):
+    assert bits(packed(column)) == bits(expected)
+
+
+def message_of(*fields, n=2):
+    """A message of this codec around columns as they are."""
+    body = {"dt": [0] + [5] * (n - 1), "fields": {f"f{i}": column for i, column in enumerate(fields)}}
+    deflater = zlib.compressobj(zdict=contract.DICTIONARY)
+    deflated = deflater.compress(json.dumps(body).encode()) + deflater.flush()
+    good = json.loads(contract.encode(Batch(BOOT, 0, [5 * i for i in range(n)], {"a": [1] * n})))
+    return {**good, "samples": base64.b64encode(deflated).decode()}
+
+
+@pytest.mark.parametrize(
+    ("column", "named"),
+    [
+        ([], "expected 2 values"),
+        ([0, 1], "expected 2 values"),
+        ([0, 1, 2, 3], "expected 2 values"),
+        ({"0": 1}, "expected 2 values"),
+        ("012", "expected 2 values"),
+        ([-1, 1, 2], "-1 decimals"),
+        ([23, 1, 2], "23 decimals"),
+        ([1.0, 1, 2], "1.0 decimals"),
+        ([True, 1, 2], "True decimals"),
+        (["1", 1, 2], "'1' decimals"),
+        ([[], 1, 2], "decimals"),
+        ([10**400, 1, 2], "decimals"),
+        ([1, 1.0, 2], "must be integers"),
+        ([1, True, 2], "must be integers"),
+        ([1, None, 2], "must be integers"),
+        ([1, "1", 2], "must be integers"),
+        ([0, EDGE, 0], "beyond 53 bits"),
+        ([0, -EDGE, 0], "beyond 53 bits"),
+        ([0, 1, EDGE - 1], "beyond 53 bits"),
+        ([0, 1, 2**64], "beyond 53 bits"),
+        ([0, 2**63, 2**63], "beyond 53 bits"),
+        ([0, 1, 10**4000], "beyond 53 bits"),
+        ([None, 1, [2]], "neither number"),
+        ([None, 1, float("1e999")], "Infinity"),
+    ],
+)
+def test_columns_that_nobody_writes_are_refused(column, named):
+    message = message_of(column)
+    with pytest.raises(ContractError, match=re.escape(named)):
+        contract.decode(message)
+    read, refused = read_by_the_station(message)
+    assert (len(read), refused.count) == (0, 1)
+
+
+def test_a_sum_that_comes_back_through_64_bits_is_refused():
+    steps = [0, 1, *[2**62] * 4, 1]
+    message = message_of(steps, n=6)
+    with pytest.raises(ContractError, match="beyond 53 bits"):
+        contract.decode(message)
+    assert read_by_the_station(message)[1].count == 1
+
+
+def read_by_the_station(*messages):
+    """The blocks that the operator's side makes of messages, in one page."""
+    refused = Refused()
+    items = [item_of_message(json.dumps(message).encode()) for message in messages]
+    return list(blocks([items], refused)), refused
+
+
+def test_the_dictionary_is_needed():
+    envelope = json.loads(contract.encode(Batch(BOOT, 0, [0], {"a": [1]})))
+    with pytest.raises(ContractError, match="not base64 of zlib"):
+        contract.decode({**envelope, "codec": contract.PLAIN_CODEC})
+
+
+@settings(max_examples=100)
+@given(st.lists(columns(), min_size=1, max_size=4), st.data())
+def test_the_station_reads_what_the_contract_reads(parts, data):
+    """A page of batches of both codecs, good and bad, of columns that change their kind."""
+    messages, expected, refused = [], [], 0
+    for seq, column in enumerate(parts):
+        times = [seq * 1_000_000 + 20 * i for i in range(len(column))]
+        message = json.loads(contract.encode(Batch(BOOT, seq, times, {"a": column})))
+        kind = data.draw(st.sampled_from(["new", "old", "bad"]))
+        if kind == "old":
+            body = {"dt": [0] + [20] * (len(times) - 1), "fields": {"a": wire_column("a", column)[0]}}
+            message = plain_message(message, body)
+        if kind == "bad":
+            damaged = message_of(
+                [data.draw(st.integers(-1, 30)), 2**62, *[2**62] * (len(times) - 1)], n=len(times)
+            )
+            message = {**message, "samples": damaged["samples"]}
+            refused += 1
+        else:
+            expected += contract.decode(message).columns["a"]
+        messages.append(message)
+    read, told = read_by_the_station(*messages)
+    got = [value for block in read for value in block.columns["a"].tolist()]
+    assert told.count == refused
+    assert list(map(as_read, got)) == list(map(as_read, expected))
+
+
+def as_read(value):
+    """As the station has it: null is NaN and numbers are floats, unless the column holds more than those."""
+    if value is None or value != value:  # noqa: PLR0124 - NaN
+        return None
+    return (
+        value if isinstance(value, (str, bool)) else (float(value), int(value) if abs(value) < 2**63 else 0)
+    )
+
+
+def test_a_real_drive_fits_in_a_write_unit_and_comes_back():
+    from tests.unit.test_summarize import drive_of
+
+    samples = list(drive_of(recording("f1tenth-motor-servo.bag")))
+    sizes = []
+    for _, group in itertools.groupby(samples, key=lambda sample: sample[0] // 1_000_000):
+        second = list(group)
+        names = list(second[0][1])
+        batch = Batch(BOOT, 0, [t for t, _ in second], {n: [s[n] for _, s in second] for n in names})
+        message = contract.encode(batch)
+        decoded = contract.decode(message)
+        assert {n: list(map(float, c)) for n, c in decoded.columns.items()} == {
+            n: list(map(float, c)) for n, c in batch.columns.items()
+        }
+        sizes.append(stored_bytes(message))
+    assert len(sizes) > 40
+    assert max(sizes) <= 1024
