@@ -17,11 +17,13 @@ import yaml
 from bench.mosquitto import HOST, Mosquitto
 from bench.ros_graph import RosError, RosGraph
 from bench.watcher import listening, live_us
-from contract import LIVE, LIVE_MAX_RATE_HZ
+from contract import LIVE, LIVE_MAX_RATE_HZ, VESC_STREAM, build_topic, live_topic
 from local.figures import Spread
 
 TOPIC = "/sensors/core"
-_AGENT, _FLOOR = f"{LIVE}/iort/bench/+", "bench/floor"
+_ROBOT, _FLOOR = "bench", "bench/floor"
+# A live message goes one way or the other; unlike AWS IoT, mosquitto delivers both.
+_AGENT = (build_topic(LIVE, _ROBOT, VESC_STREAM), live_topic(_ROBOT, VESC_STREAM))
 _WARM_UP_S = 3
 
 
@@ -53,7 +55,7 @@ def measure(program: str, python: str, rate_hz: int, seconds: int) -> Lane:
             certificate=certificate,
             key=key,
             ca=broker.ca,
-            took_us={_AGENT: live_us, _FLOOR: _stamp_us},
+            took_us={**dict.fromkeys(_AGENT, live_us), _FLOOR: _stamp_us},
         ) as heard:
             graph.start("device.main", "run", "--config", _car(broker, Path(name)))
             every = max(1, round(rate_hz / LIVE_MAX_RATE_HZ))
@@ -73,23 +75,24 @@ def measure(program: str, python: str, rate_hz: int, seconds: int) -> Lane:
                 raise RosError(f"the publisher stopped with status {publisher.returncode}")
             if not publisher.stdout.readline():
                 raise RosError(f"the publisher stopped with status {publisher.wait()}")
-            agent, floor = (Spread.of(heard[topic][before[topic] :]) for topic in (_AGENT, _FLOOR))
-    return Lane(rate_hz, agent, floor)
+            measured = {topic: delays[before[topic] :] for topic, delays in heard.items()}
+            agent = [delay for topic in _AGENT for delay in measured[topic]]
+    return Lane(rate_hz, Spread.of(agent), Spread.of(measured[_FLOOR]))
 
 
 def _car(broker: Mosquitto, folder: Path) -> Path:
-    certificate, key = broker.identity("bench")
+    certificate, key = broker.identity(_ROBOT)
     config = folder / "car.yaml"
     config.write_text(
         yaml.safe_dump(
             {
-                "robot": "bench",
+                "robot": _ROBOT,
                 "endpoint": HOST,
                 "port": broker.port,
                 "certificate": str(certificate),
                 "private_key": str(key),
                 "root_ca": str(broker.ca),
-                "sources": [{"type": "ros1", "topics": {TOPIC: {"stream": "vesc", "time": "header"}}}],
+                "sources": [{"type": "ros1", "topics": {TOPIC: {"stream": VESC_STREAM, "time": "header"}}}],
                 "queue": {"path": "spool.db"},
             }
         )

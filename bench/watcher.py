@@ -1,8 +1,7 @@
-"""Listens to a robot's live topic at the broker, with a certificate made for it."""
+"""Listens at a broker and says how long messages took."""
 
 from __future__ import annotations
 
-import json
 import threading
 import time
 from collections.abc import Callable, Iterator, Mapping
@@ -12,49 +11,12 @@ from pathlib import Path
 from awscrt import mqtt5
 from awsiot import mqtt5_client_builder
 
-from contract import LIVE, decode_live
+from contract import decode_live
 from device.uplink import matches
-from station.cloud import Cloud
 
 NAME = "bench-watcher"
 _WAIT_S = 20.0
 TimeOf = Callable[[bytes], int]
-
-
-@contextmanager
-def delays_ms(cloud: Cloud, folder: Path, robot: str) -> Iterator[list[float]]:
-    """From a sample's own time to its arrival at an MQTT subscriber, of every live message meanwhile."""
-    iot = cloud.client("iot")
-    document = {
-        "Statement": [{"Effect": "Allow", "Action": "iot:*", "Resource": "*"}],
-        "Version": "2012-10-17",
-    }
-    iot.create_policy(policyName=NAME, policyDocument=json.dumps(document))
-    created = iot.create_keys_and_certificate(setAsActive=True)
-    iot.attach_policy(policyName=NAME, target=created["certificateArn"])
-    files = {
-        "certificate": created["certificatePem"],
-        "key": created["keyPair"]["PrivateKey"],
-        "ca": cloud.root_ca_pem,
-    }
-    for name, text in files.items():
-        (folder / name).write_text(text or "")
-    try:
-        with listening(
-            endpoint=cloud.mqtt_endpoint,
-            port=cloud.mqtt_port,
-            certificate=folder / "certificate",
-            key=folder / "key",
-            ca=folder / "ca",
-            took_us={f"{LIVE}/{cloud.namespace}/{robot}/+": live_us},
-        ) as heard:
-            yield heard[f"{LIVE}/{cloud.namespace}/{robot}/+"]
-    finally:
-        certificate = created["certificateId"]
-        iot.detach_policy(policyName=NAME, target=created["certificateArn"])
-        iot.update_certificate(certificateId=certificate, newStatus="INACTIVE")
-        iot.delete_certificate(certificateId=certificate, forceDelete=True)
-        iot.delete_policy(policyName=NAME)
 
 
 def live_us(payload: bytes) -> int:

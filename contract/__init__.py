@@ -61,6 +61,7 @@ from contract.files import (
 from contract.limits import (
     CLOCK_MAX_UNCERTAINTY_MS,
     DEFAULT_NAMESPACE,
+    LIVE_BROKER_EVERY_S,
     LIVE_MAX_AGE_MS,
     LIVE_MAX_RATE_HZ,
     MAX_AHEAD_US,
@@ -153,11 +154,22 @@ from contract.topics import (
     check_namespace,
     check_robot,
     check_stream,
+    live_topic,
     parse_topic,
     record_topic,
     rule_name,
 )
-from contract.vesc import AGENT_FIELDS, DERIVED_UNITS, FAULT_CODES, FAULTS, VESC_FIELDS, VESC_STREAM, Field
+from contract.vesc import (
+    AGENT_FIELDS,
+    DERIVED_UNITS,
+    FAULT_CODES,
+    FAULT_FIELD,
+    FAULTS,
+    VESC_FIELDS,
+    VESC_STREAM,
+    VOLTAGE_FIELD,
+    Field,
+)
 
 __all__ = [
     "ACCEPTED",
@@ -192,6 +204,7 @@ __all__ = [
     "EXPIRES_S",
     "FAULTS",
     "FAULT_CODES",
+    "FAULT_FIELD",
     "FILE",
     "FILES_BYTES",
     "FILES_DAY",
@@ -207,6 +220,7 @@ __all__ = [
     "LAST_MS",
     "LAST_SEEN_MS",
     "LIVE",
+    "LIVE_BROKER_EVERY_S",
     "LIVE_MAX_AGE_MS",
     "LIVE_MAX_RATE_HZ",
     "LOW_VOLTAGE_V",
@@ -268,6 +282,7 @@ __all__ = [
     "UPLOAD_URL_S",
     "VESC_FIELDS",
     "VESC_STREAM",
+    "VOLTAGE_FIELD",
     "Address",
     "Batch",
     "Command",
@@ -308,6 +323,7 @@ __all__ = [
     "file_key",
     "fleet_name",
     "inflate",
+    "live_topic",
     "live_update",
     "message_type",
     "parse_file_key",

@@ -18,6 +18,7 @@ from contract.topics import (
     check_namespace,
     check_robot,
 )
+from contract.vesc import FAULT_FIELD, VOLTAGE_FIELD
 
 # Where the broker says who came and went.
 _PRESENCE = "$aws/events/presence"
@@ -92,15 +93,21 @@ def rule_sql(
             f"SELECT {reported} AS {AGENT_VERSION}, topic(3) AS {ROBOT} "
             f"FROM '$aws/things/+/shadow/name/{SHADOW}/update/accepted' WHERE {reported} <> ''"
         )
-    if rule == "alert":
+    # Two rules and not one with OR, which AWS IoT calls Undefined where either side compares with null.
+    if rule == "fault":
+        return _alert_sql(FAULT_FIELD, name, f"sample.{FAULT_FIELD} > 0")
+    if rule == "battery":
         # A controller that does not measure its voltage says 0.
-        low = f"sample.voltage_input > 0 AND sample.voltage_input < {low_voltage_v:g}"
-        return (
-            f"SELECT t, sample.fault_code AS fault_code, sample.voltage_input AS voltage_input, "
-            f"topic() AS {TOPIC}, {received} FROM '{LIVE}/{name}/+/+' "
-            f"WHERE sample.fault_code > 0 OR ({low})"
-        )
+        low = f"sample.{VOLTAGE_FIELD} > 0 AND sample.{VOLTAGE_FIELD} < {low_voltage_v:g}"
+        return _alert_sql(VOLTAGE_FIELD, name, low)
     raise ContractError(f"rule {shown(rule)}: allowed is one of {', '.join(RULES)}")
+
+
+def _alert_sql(field: str, namespace: str, condition: str) -> str:
+    return (
+        f"SELECT t, sample.{field} AS {field}, topic() AS {TOPIC}, timestamp() AS {RECEIVED_MS} "
+        f"FROM '{LIVE}/{namespace}/+/+' WHERE {condition}"
+    )
 
 
 def pong_template(namespace: str = DEFAULT_NAMESPACE) -> str:

@@ -18,6 +18,9 @@ LIVE_MAX_AGE_MS = 2_000
 # by: wrong by a quarter of the age above at most.
 CLOCK_MAX_UNCERTAINTY_MS = 500
 LIVE_MAX_RATE_HZ = 10.0
+# Most live messages go straight to their rule, which costs no messaging; one as often as this, at least,
+# passes the broker, where other rules and subscribers see it.
+LIVE_BROKER_EVERY_S = 10.0
 
 # Bounds that keep a hostile or broken message from costing more than a good one.
 MAX_SAMPLES = 50_000

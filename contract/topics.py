@@ -87,15 +87,24 @@ def parse_topic(topic: str) -> Topic:
 def record_topic(robot: str, stream: str, namespace: str = DEFAULT_NAMESPACE) -> str:
     """Where a robot publishes its batches: straight to the rule, by Basic Ingest, which costs no
     messaging. The rule's ``topic()`` sees ``dt/<namespace>/<robot>/<stream>``."""
-    topic = build_topic(RECORD, robot, stream, namespace)
-    return f"$aws/rules/{rule_name('record', namespace)}/{topic}"
+    return _straight_to("record", build_topic(RECORD, robot, stream, namespace), namespace)
 
 
-RULES = ("record", "live", "pong", "echo", "upload", "presence", "version", "alert")
+def live_topic(robot: str, stream: str, namespace: str = DEFAULT_NAMESPACE) -> str:
+    """Where a robot publishes a live message that only the live rule shall see: by Basic Ingest, as
+    `record_topic`. Every other one goes to ``live/<namespace>/<robot>/<stream>``."""
+    return _straight_to("live", build_topic(LIVE, robot, stream, namespace), namespace)
+
+
+def _straight_to(rule: str, topic: str, namespace: str) -> str:
+    return f"$aws/rules/{rule_name(rule, namespace)}/{topic}"
+
+
+RULES = ("record", "live", "pong", "echo", "upload", "presence", "version", "fault", "battery")
 
 
 def rule_name(rule: str, namespace: str = DEFAULT_NAMESPACE) -> str:
-    """The physical name of a topic rule; robots need the record rule's for Basic Ingest."""
+    """The physical name of a topic rule; robots need two of them for Basic Ingest."""
     if rule not in RULES:
         raise ContractError(f"rule {shown(rule)}: allowed is one of {', '.join(RULES)}")
     return f"{check_namespace(namespace)}_{rule}"

@@ -21,10 +21,12 @@ class Field(NamedTuple):
 # say: the integer of 1e-4 Ah and Wh straight off the wire. The ROS 2 driver divides by 1e4 first; nothing
 # on the way to the tables converts either. Values that are not whole are therefore the ROS 2 driver's.
 VESC_STREAM = "vesc"
+# What a human is told of, straight from a rule.
+FAULT_FIELD, VOLTAGE_FIELD = "fault_code", "voltage_input"
 VESC_FIELDS: dict[str, Field] = {
     f.name: f
     for f in (
-        Field("voltage_input", "V", "battery voltage at the controller", (1, 2)),
+        Field(VOLTAGE_FIELD, "V", "battery voltage at the controller", (1, 2)),
         Field("temperature_pcb", "degC", "temperature of the controller's board", (1,)),
         Field("temp_fet", "degC", "temperature of the MOSFETs (driver may leave 0)", (2,)),
         Field("temp_motor", "degC", "temperature of the motor (driver may leave 0)", (2,)),
@@ -40,7 +42,7 @@ VESC_FIELDS: dict[str, Field] = {
         Field("energy_regen", "1e-4 Wh", "energy recovered since power-on", (1, 2), "Wh"),
         Field("displacement", "counts", "tachometer, net", (1, 2)),
         Field("distance_traveled", "counts", "tachometer, absolute", (1, 2)),
-        Field("fault_code", "enum", "0 none, otherwise see FAULTS", (1, 2)),
+        Field(FAULT_FIELD, "enum", "0 none, otherwise see FAULTS", (1, 2)),
         Field("pid_pos_now", "deg", "rotor position of the position controller", (2,)),
         Field("controller_id", "id", "CAN id of the controller", (2,)),
         Field("ntc_temp_mos1", "degC", "temperature of MOSFET 1", (2,)),

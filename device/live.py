@@ -4,6 +4,11 @@ The first sample of a burst goes at once, from the thread that brought it. What 
 one is due replaces what waits; it goes with the first sample that is due, or, if the stream falls
 silent, half a period later. While a message is not written yet, or there is no connection, nothing
 is sent at all, so that the first one afterwards is the newest.
+
+Messages go straight to the live rule, by Basic Ingest, which costs no messaging and which nothing else
+sees. The first of a run, one with another fault code than the one before and one in ten seconds pass the
+broker instead, for the rules that alert a human and whoever else listens there; the live rule hears those
+as well, so each message comes to the dashboard once.
 """
 
 from __future__ import annotations
@@ -32,8 +37,11 @@ class _Newest(NamedTuple):
 class _Slot:
     """What the lane knows of one stream."""
 
-    def __init__(self, topic: str) -> None:
+    def __init__(self, topic: str, broker_topic: str) -> None:
         self.topic = topic
+        self.broker_topic = broker_topic
+        self.broker_due = 0.0
+        self.fault: Value = None
         self.newest: _Newest | None = None
         self.due = 0.0
         self.seq = 0
@@ -87,8 +95,10 @@ class LiveLane:
         with self._lock:
             slot = self._slots.get(stream)
             if slot is None:
-                topic = contract.build_topic(contract.LIVE, self._robot, stream, self._namespace)
-                slot = self._slots[stream] = _Slot(topic)
+                slot = self._slots[stream] = _Slot(
+                    contract.live_topic(self._robot, stream, self._namespace),
+                    contract.build_topic(contract.LIVE, self._robot, stream, self._namespace),
+                )
             slot.newest = _Newest(t_us, values, now)
             if now >= slot.due:
                 self._send(slot, now)
@@ -121,21 +131,33 @@ class LiveLane:
             payload = _encode(sample)
         except ContractError as error:
             level = logging.DEBUG if self.refused else logging.WARNING
-            _log.log(level, "live: a sample cannot be sent on %s: %s", slot.topic, error)
+            _log.log(level, "live: a sample cannot be sent on %s: %s", slot.broker_topic, error)
             self.refused += 1
             return
         slot.seq += 1
         # On a grid, so that a sample a little late does not slow the rate down, but never twice as fast.
         slot.due = max(slot.due, now - self._period_s / 2) + self._period_s
         slot.writing = True
-        self._allowance.spend(slot.topic, payload)
-        self._uplink.publish(slot.topic, payload, qos=0, done=functools.partial(self._done, slot))
+        topic = _topic(slot, newest.values.get(contract.FAULT_FIELD), now)
+        self._allowance.spend(topic, payload)
+        self._uplink.publish(topic, payload, qos=0, done=functools.partial(self._done, slot))
 
     def _done(self, slot: _Slot, error: UplinkError | None) -> None:
         with self._lock:
             slot.writing = False
             if error is None:
                 self.published += 1
+            else:
+                # It may have been one for the broker.
+                slot.broker_due = 0.0
+
+
+def _topic(slot: _Slot, fault: Value, now: float) -> str:
+    """Which way the next message of a stream goes."""
+    if now < slot.broker_due and fault == slot.fault:
+        return slot.topic
+    slot.broker_due, slot.fault = now + contract.LIVE_BROKER_EVERY_S, fault
+    return slot.broker_topic
 
 
 def _encode(sample: LiveSample) -> bytes:

@@ -1,6 +1,6 @@
-"""Alert: a car's fault or low battery, from the alert rule to the humans who asked to be told.
+"""Alert: a car's fault or low battery, from a rule each to the humans who asked to be told.
 
-The rule fires as often as the car says so, ten times a second; a human is told once a car and cause, and
+A rule fires as often as it sees the car say so; a human is told once a car and cause, and
 again when it has lasted for `QUIET_S`.
 """
 
@@ -17,7 +17,16 @@ from typing import Any, TypeGuard
 
 import boto3
 
-from contract import ALERT_PREFIX, FAULTS, RECEIVED_MS, ROBOT, TOPIC, parse_topic
+from contract import (
+    ALERT_PREFIX,
+    FAULT_FIELD,
+    FAULTS,
+    RECEIVED_MS,
+    ROBOT,
+    TOPIC,
+    VOLTAGE_FIELD,
+    parse_topic,
+)
 from functions.metrics import emit
 
 QUIET_S = 900
@@ -34,9 +43,9 @@ class Cause:
 
 
 def causes(event: Mapping[str, Any], low_voltage_v: float) -> list[Cause]:
-    """What of a message that the alert rule selected is alarming; nothing of values that are no numbers."""
+    """What of a message that a rule selected is alarming; nothing of values that are no numbers."""
     found = []
-    code, volts = event.get("fault_code"), event.get("voltage_input")
+    code, volts = event.get(FAULT_FIELD), event.get(VOLTAGE_FIELD)
     if _is_number(code) and code > 0:
         # All unknown codes are one cause: a car that makes them up may neither send a mail for each nor
         # fill its row of the registry.
@@ -146,5 +155,5 @@ def _notify(subject: str, text: str) -> None:
 
 
 def handler(event: dict[str, Any], _context: object) -> None:
-    """Entry point of the alert rule's Lambda action."""
+    """Entry point of the Lambda action of the rules fault and battery."""
     process(event, float(os.environ["LOW_VOLTAGE_V"]), _notices(), _notify, int(time.time()))

@@ -5,7 +5,16 @@ from __future__ import annotations
 from collections.abc import Iterable, Sequence
 from typing import TypeGuard
 
-from contract import AGENT_STREAM, PING_PATHS, RTT_FIELDS, RTT_STREAM, Batch, Value
+from contract import (
+    AGENT_STREAM,
+    FAULT_FIELD,
+    PING_PATHS,
+    RTT_FIELDS,
+    RTT_STREAM,
+    VOLTAGE_FIELD,
+    Batch,
+    Value,
+)
 from functions.statistics import count_holes
 
 # The controllers' own temperatures; a driver that does not measure one leaves it at 0.
@@ -33,11 +42,11 @@ def measure(stream: str, batches: Sequence[Batch]) -> dict[str, float | list[flo
     if stream == AGENT_STREAM:
         backlog = list(_numbers(batches, "backlog_batches"))
         return {"AgentReports": sum(len(batch.times_us) for batch in batches), "BacklogBatches": backlog[-1:]}
-    volts = [value for value in _numbers(batches, "voltage_input") if value > 0]
+    volts = [value for value in _numbers(batches, VOLTAGE_FIELD) if value > 0]
     hot = [value for name in _TEMPERATURES for value in _numbers(batches, name) if value]
     return {
         "SampleGaps": sum(count_holes(batch.times_us) for batch in batches),
-        "FaultSamples": sum(value != 0 for value in _numbers(batches, "fault_code")),
+        "FaultSamples": sum(value != 0 for value in _numbers(batches, FAULT_FIELD)),
         "BatteryVolts": [min(volts)] if volts else [],
         "TemperatureDegC": [max(hot)] if hot else [],
     }

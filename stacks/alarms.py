@@ -63,7 +63,8 @@ class Alarms(Construct):
             self._alarm(name, metrics.of_the_account(namespace, name), 0, what)
 
     def _cars(self, settings: Settings) -> None:
-        """From the record lane, which nothing is lost of; the rule alert is faster and says which car."""
+        """From the record lane, which nothing is lost of; the rules fault and battery are faster and name
+        the car."""
         limits = settings.thresholds
         self._ours("FaultSamples", "health", 0, "a car reports a fault")
         self._ours("TemperatureDegC", "health", limits.high_temperature_degc, "a car's controller is hot")

@@ -47,7 +47,8 @@ class Ingest(Stack):
             self._lambda_rule("upload", processing.upload),
             self._lambda_rule("presence", fleet.presence),
             self._lambda_rule("version", fleet.presence),
-            self._lambda_rule("alert", processing.alert),
+            self._lambda_rule("fault", processing.alert),
+            self._lambda_rule("battery", processing.alert),
         ]
 
     def _record(self, storage: Storage) -> iot.CfnTopicRule:

@@ -191,7 +191,7 @@ class Processing(Stack):
         alert.add_to_role_policy(
             iam.PolicyStatement(actions=["sns:Publish"], resources=[self.alarms.topic_arn])
         )
-        # The same message comes again a tenth of a second later.
+        # The car says the same again within 10 s.
         alert.configure_async_invoke(
             max_event_age=Duration.minutes(5),
             retry_attempts=1,

@@ -24,6 +24,7 @@ from contract import (
     build_topic,
     claim_name,
     fleet_name,
+    live_topic,
     record_topic,
     rule_name,
 )
@@ -68,6 +69,7 @@ ROWS = [
         PUBLISH,
         may=(
             record_topic(A, "vesc"),
+            live_topic(A, "vesc"),
             build_topic(LIVE, A, "vesc"),
             build_topic(FLEET, A, "pose"),
             build_topic(PING, A, BROKER),
@@ -79,6 +81,7 @@ ROWS = [
         may_not=(
             # Another robot's.
             record_topic(B, "vesc"),
+            live_topic(B, "vesc"),
             build_topic(LIVE, B, "vesc"),
             build_topic(FLEET, B, "pose"),
             build_topic(PING, B, RULE),
@@ -97,7 +100,9 @@ ROWS = [
             # Past Basic Ingest, and by it to other rules than its own, or with another's topic.
             build_topic(RECORD, A, "vesc"),
             *(f"$aws/rules/{rule_name(rule)}/{RECORD}/iort/{A}/vesc" for rule in RULES if rule != "record"),
-            f"$aws/rules/{rule_name('record')}/{LIVE}/iort/{A}/vesc",
+            *(f"$aws/rules/{rule_name(rule)}/{LIVE}/iort/{A}/vesc" for rule in RULES if rule != "live"),
+            f"$aws/rules/{rule_name('live')}/{LIVE}/iort",
+            live_topic(A, "vesc", "lab2"),
             f"$aws/rules/{rule_name('presence')}/$aws/events/presence/connected/{B}",
             # Reserved topics that no agent needs.
             f"{_shadow(A, '')}/update",
@@ -124,6 +129,7 @@ ROWS = [
             f"{CMD}/iort/{A}/#",
             f"{PONG}/iort/{A}/+",
             build_topic(PING, A, BROKER),
+            f"{PING}/iort/{A}/+",
             f"{FLEET}/iort/+/#",
             f"{FLEET}/iort/{B}/pose",
             f"{_shadow(A)}/update/accepted",
@@ -137,7 +143,10 @@ ROWS = [
             f"{PONG}/iort/{B}/{RULE}",
             f"{PONG}/iort/+/{RULE}",
             f"{PING}/iort/+/{BROKER}",
+            f"{PING}/iort/{B}/{BROKER}",
             f"{LIVE}/iort/{A}/vesc",
+            live_topic(A, "vesc"),
+            live_topic(B, "vesc"),
             f"{LIVE}/iort/{B}/vesc",
             f"{RECORD}/#",
             f"{RECORD}/iort/{B}/vesc",
@@ -197,6 +206,7 @@ ROWS = [
             "$aws/certificates/create/json",
             "$aws/provisioning-templates/other/provision/json",
             record_topic(A, "vesc"),
+            live_topic(A, "vesc"),
             build_topic(RECORD, A, "vesc"),
             build_topic(LIVE, A, "vesc"),
             build_topic(CMD, A, "drive"),

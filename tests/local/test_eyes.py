@@ -10,7 +10,7 @@ import pytest
 import contract
 from contract import Batch, LiveSample, build_topic, encode, encode_live, record_topic
 from station import cloudwatch
-from tests.local.conftest import until
+from tests.local.conftest import run_agent, until
 from tests.local.robot import Robot
 
 FAULT, LOW_V = 5, 9.5
@@ -97,5 +97,36 @@ def test_a_fault_reaches_a_human_and_the_dashboards(embedded, bundle, inbox):
     assert max(drawn["FaultSamples"]) >= 10
     assert min(drawn["BatteryVolts"]) == LOW_V
     # The emulator's own, and nothing that would stay empty in a healthy run.
-    wanted = {"record", "alert", "Connect.Success", "PublishIn.Success", "Summarize", "Telemetry written"}
+    wanted = {
+        "record",
+        "fault",
+        "battery",
+        "Connect.Success",
+        "PublishIn.Success",
+        "Summarize",
+        "Telemetry written",
+    }
     assert wanted - {"Telemetry written"} <= drawn.keys()
+
+
+# After the test above, which awaits the moment that the alarm goes off.
+@pytest.mark.parametrize(
+    ("voltage_v", "fault_code", "told"),
+    [
+        ("nan", lambda i: FAULT if i >= 25 else 0, "fault 5, MOSFET over-temperature"),
+        (LOW_V, lambda _: "nan", "battery at 9.5 V, below 10.5 V"),
+    ],
+    ids=["fault, voltage unknown", "voltage low, fault unknown"],
+)
+def test_a_human_hears_of_one_though_the_other_is_null(bundle, inbox, tmp_path, voltage_v, fault_code, told):
+    """By the real agent, which sends most of its live messages where no alert can hear them."""
+    log = tmp_path / "drive.csv"
+    rows = (f"{1000 + 20 * i};{voltage_v};{fault_code(i)}" for i in range(100))
+    log.write_text("\n".join(["ms_today;input_voltage;fault_code", *rows]) + "\n")
+    car = bundle(sources=[{"type": "bag", "path": str(log)}])
+    run_agent(car)
+
+    def lines():
+        return [line for mail in inbox() if (line := mail["Message"].splitlines()[0]).startswith(car.robot)]
+
+    assert until(lines) == [f"{car.robot}: {told}"]

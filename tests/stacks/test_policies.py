@@ -7,17 +7,32 @@ import json
 import re
 
 import pytest
+from aws_cdk import Stack
 
 import contract
-from contract import BROKER, CMD, FLEET, LIVE, PING, PONG, RULES, build_topic, record_topic, rule_name
+from contract import (
+    BROKER,
+    CMD,
+    FLEET,
+    LIVE,
+    PING,
+    PONG,
+    RULES,
+    build_topic,
+    live_topic,
+    record_topic,
+    rule_name,
+)
 from functions.alert import Notices, causes
 from functions.allotment import Allotment
 from functions.presence import change
+from stacks.fleet import claim_policy
+from stacks.fleet import robot_policy as robots_policy
 
 ME = "${iot:Connection.Thing.ThingName}"
 IOT = "arn:${AWS::Partition}:iot:${AWS::Region}:${AWS::AccountId}"
 SHADOW = f"$aws/things/{ME}/shadow/name/agent/*"
-LISTEN = (f"cmd/iort/{ME}/*", f"pong/iort/{ME}/*", f"ping/iort/{ME}/broker", "fleet/iort/*", SHADOW)
+LISTEN = (f"cmd/iort/{ME}/*", f"p?ng/iort/{ME}/*", "fleet/iort/*", SHADOW)
 ROBOT_POLICY = [
     {
         "Effect": "Allow",
@@ -30,6 +45,7 @@ ROBOT_POLICY = [
         "Action": "iot:Publish",
         "Resource": [
             f"{IOT}:topic/$aws/rules/iort_record/dt/iort/{ME}/*",
+            f"{IOT}:topic/$aws/rules/iort_live/live/iort/{ME}/*",
             f"{IOT}:topic/live/iort/{ME}/*",
             f"{IOT}:topic/fleet/iort/{ME}/*",
             f"{IOT}:topic/ping/iort/{ME}/*",
@@ -179,7 +195,8 @@ ROLES = {
     "ingest/PongRole": ("iot.amazonaws.com", {REJECT, ("iot:Publish", f"{IOT}:topic/pong/iort/*/rule")}),
     "ingest/EchoRole": ("iot.amazonaws.com", {REJECT}),
     "ingest/UploadRole": ("iot.amazonaws.com", {REJECT}),
-    "ingest/AlertRole": ("iot.amazonaws.com", {REJECT}),
+    "ingest/FaultRole": ("iot.amazonaws.com", {REJECT}),
+    "ingest/BatteryRole": ("iot.amazonaws.com", {REJECT}),
     "ingest/PresenceRole": ("iot.amazonaws.com", {REJECT}),
     "ingest/VersionRole": ("iot.amazonaws.com", {REJECT}),
 }
@@ -235,6 +252,30 @@ def test_the_iot_policies_statement_by_statement(iot_policies):
     assert iot_policies == {contract.fleet_name(): ROBOT_POLICY, contract.claim_name(): CLAIM_POLICY}
 
 
+def test_the_policies_fit_whatever_the_namespace_and_the_region():
+    """ "Policy document size" of AWS IoT Core's quotas: 2048 characters, white space not counted."""
+    stack, longest = Stack(), "n" * 16
+    real = {"AWS::Partition": "aws-us-gov", "AWS::Region": "ap-southeast-2", "AWS::AccountId": "0" * 12}
+    for policy in (robots_policy, claim_policy):
+        text = json.dumps(stack.resolve(policy(stack, namespace=contract.check_namespace(longest))))
+        joined = json.dumps(_joined(json.loads(text), real), separators=(",", ":"))
+        assert longest in joined
+        assert len(joined) <= 2048
+
+
+def _joined(value, real):
+    if isinstance(value, list):
+        return [_joined(one, real) for one in value]
+    if not isinstance(value, dict):
+        return value
+    if "Ref" in value:
+        return real[value["Ref"]]
+    if "Fn::Join" in value:
+        separator, parts = value["Fn::Join"]
+        return separator.join(_joined(parts, real))
+    return {key: _joined(one, real) for key, one in value.items()}
+
+
 def test_every_resource_of_the_robots_policy_is_bound_to_its_thing(robot_policy):
     for statement in robot_policy:
         assert statement["Effect"] == "Allow"
@@ -263,6 +304,7 @@ def allows(policy, action, kind, topic, thing="car"):
 def test_a_robot_may_publish_what_the_agent_builds_and_only_under_its_own_name(robot_policy):
     own = [
         record_topic("car", "vesc"),
+        live_topic("car", "vesc"),
         build_topic(LIVE, "car", "vesc"),
         build_topic(FLEET, "car", "pose"),
         *(build_topic(PING, "car", path) for path in (*contract.PING_PATHS, contract.FILE)),
@@ -285,7 +327,7 @@ def test_a_robot_may_not_publish_what_is_for_others_to_say(robot_policy):
         "$aws/things/car/shadow/name/other/update",
         "$aws/things/car2/shadow/name/agent/update",
         *(f"$aws/rules/{rule_name(rule)}/dt/iort/car/vesc" for rule in RULES if rule != "record"),
-        f"$aws/rules/{rule_name('record')}/live/iort/car/vesc",
+        *(f"$aws/rules/{rule_name(rule)}/live/iort/car/vesc" for rule in RULES if rule != "live"),
     ):
         assert not allows(robot_policy, "Publish", "topic", topic), topic
 
@@ -453,7 +495,8 @@ def test_only_its_rule_or_template_may_call_a_function(synthesized, reader):
         ("Upload.Arn", "Upload.Arn"),
         ("Presence.Arn", "Presence.Arn"),
         ("Version.Arn", "Presence.Arn"),
-        ("Alert.Arn", "Alert.Arn"),
+        ("Fault.Arn", "Alert.Arn"),
+        ("Battery.Arn", "Alert.Arn"),
         (f"{IOT}:provisioningtemplate/iort-robot", "Admit.Arn"),
     }
 

@@ -24,6 +24,7 @@ from contract import (
     RECORD,
     RULE,
     build_topic,
+    live_topic,
     record_topic,
     rule_name,
 )
@@ -430,14 +431,17 @@ def filters(synthesized):
 
 
 def test_every_topic_of_the_agent_meets_exactly_the_rule_that_it_is_for(filters):
-    basic_ingest = record_topic("car", "vesc")
-    rule, topic = re.fullmatch(r"\$aws/rules/([^/]+)/(.+)", basic_ingest).groups()
-    # Basic Ingest leaves the rest of the topic to the rule it names, which filters it like any other.
-    assert rule == rule_name("record")
-    assert topic == build_topic(RECORD, "car", "vesc")
+    for ruled, lane, straight in (
+        ("record", RECORD, record_topic("car", "vesc")),
+        ("live", LIVE, live_topic("car", "vesc")),
+    ):
+        rule, topic = re.fullmatch(r"\$aws/rules/([^/]+)/(.+)", straight).groups()
+        # Basic Ingest leaves the rest of the topic to the rule it names, which filters it like any other.
+        assert rule == rule_name(ruled)
+        assert topic == build_topic(lane, "car", "vesc")
     expected = {
-        topic: {"iort_record"},
-        build_topic(LIVE, "car", "vesc"): {"iort_live", "iort_alert"},
+        build_topic(RECORD, "car", "vesc"): {"iort_record"},
+        build_topic(LIVE, "car", "vesc"): {"iort_live", "iort_fault", "iort_battery"},
         build_topic(PING, "car", RULE): {"iort_pong"},
         build_topic(PING, "car", LAMBDA): {"iort_echo"},
         build_topic(PING, "car", FILE): {"iort_upload"},

@@ -44,7 +44,7 @@ class Rig:
 
     def sent(self, stream: str = "vesc") -> list[contract.LiveSample]:
         topic = f"live/iort/car1/{stream}"
-        return [contract.decode_live(m.payload) for m in self.uplink.published if m.topic == topic]
+        return [contract.decode_live(m.payload) for m in self.uplink.published if m.topic.endswith(topic)]
 
     def speeds(self) -> list[object]:
         return [live.sample["speed"] for live in self.sent()]
@@ -203,3 +203,38 @@ def test_a_message_says_how_far_the_cloud_s_clock_is_where_that_is_known() -> No
     rig.clock.advance(1)
     rig.offer(2)
     assert [live.offset_us for live in rig.sent()] == [None, -3_600_000_000]
+
+
+BROKER, DIRECT = "live/iort/car1/vesc", "$aws/rules/iort_live/live/iort/car1/vesc"
+
+
+def _drive(rig: Rig, seconds: float, **values: object) -> list[str]:
+    """Topics of what a stream at 10 Hz is sent on."""
+    before = len(rig.uplink.published)
+    for _ in range(round(seconds * 10)):
+        rig.lane.offer("vesc", rig.clock.now_us(), values)  # type: ignore[arg-type]
+        rig.dispatcher.run_pending()
+        rig.clock.advance(0.1)
+    return [message.topic for message in rig.uplink.published[before:]]
+
+
+def test_one_message_in_ten_seconds_passes_the_broker_the_first_of_a_run_among_them() -> None:
+    topics = _drive(Rig(), 30, speed=1)
+    assert [i for i, topic in enumerate(topics) if topic == BROKER] == [0, 100, 200]
+    assert set(topics) == {BROKER, DIRECT}
+
+
+def test_a_fault_passes_the_broker_the_moment_that_it_comes_changes_and_goes() -> None:
+    rig = Rig()
+    topics = [_drive(rig, 1, fault_code=code) for code in (0, 5, 6, 0)]
+    assert [[topic == BROKER for topic in each] for each in topics] == 4 * [[True] + 9 * [False]]
+    assert _drive(rig, 10.1, fault_code=5).count(BROKER) == 2, "and again while it lasts"
+
+
+def test_what_was_not_written_is_said_again_at_the_broker() -> None:
+    rig = Rig()
+    _drive(rig, 1, fault_code=0)
+    rig.uplink.verdict = lambda _: "full"
+    _drive(rig, 0.1, fault_code=5)
+    rig.uplink.verdict = lambda _: None
+    assert _drive(rig, 0.2, fault_code=5) == [BROKER, DIRECT]
