@@ -11,7 +11,7 @@ from dataclasses import dataclass, replace
 from math import ceil
 from typing import Any, NamedTuple
 
-from contract import METRICS
+from contract import LIVE_BROKER_EVERY_S, METRICS
 from station.errors import StationError
 from station.prices import MONTH_DAYS, PRICES, PUBNUB_MAU_PLANS
 from station.sizes import Sizes, measure, own_item_bytes
@@ -89,6 +89,11 @@ class Usage:
         return figures + min(1.0, 3 * self.ping_hz)
 
     @property
+    def live_at_broker_per_s(self) -> float:
+        """Live messages that pass the broker, a robot, while its fault code stays what it is."""
+        return min(self.live_hz, 1 / LIVE_BROKER_EVERY_S)
+
+    @property
     def robot_hours_per_month(self) -> float:
         """Of the whole fleet."""
         return self.robots * self.hours_per_day * MONTH_DAYS
@@ -117,10 +122,17 @@ def bill(usage: Usage) -> list[Item]:
     batches, own = usage.batches_per_s * hour, usage.own_batches_per_s * hour
     own_item = own_item_bytes("agent", 1)
     items = [Item("IoT Core", "all", "connection", "connection", 60)]
-    items += _rule_items("record", batches, sizes.record, messaging=False)
-    items += _rule_items("agent, rtt", own, own_item, messaging=False)
+    items += _rule_items("record", batches, sizes.record)
+    items += _rule_items("agent, rtt", own, own_item)
     live = usage.live_hz * hour
-    items += _rule_items("live", live, sizes.live, messaging=True)
+    items += _rule_items("live", live, sizes.live)
+    # Some pass the broker, where two more rules look at them.
+    passing = usage.live_at_broker_per_s * hour * _units(sizes.live, _METER)
+    items += [
+        Item("IoT Core", "live", "messages", "message", passing),
+        Item("IoT Core", "live", "rules fault and battery", "rule", 2 * passing),
+        Item("IoT Core", "live", "their actions, or the least billed", "action", 2 * passing),
+    ]
     items += _ping_items(usage.ping_hz * hour, sizes)
     writes = batches * _units(sizes.telemetry_item, _WRITE)
     items += [
@@ -269,13 +281,13 @@ def _shards(writes_per_s: float) -> int:
     return max(1, ceil(writes_per_s / _PARTITION_WRITES))
 
 
-def _rule_items(lane: str, messages: float, size: int, *, messaging: bool) -> list[Item]:
+def _rule_items(lane: str, messages: float, size: int) -> list[Item]:
+    """Of Basic Ingest, which has no messaging charge."""
     metered = messages * _units(size, _METER)
-    items = [
+    return [
         Item("IoT Core", lane, "rules triggered", "rule", metered),
         Item("IoT Core", lane, "actions", "action", metered),
     ]
-    return [Item("IoT Core", lane, "messages", "message", metered), *items] if messaging else items
 
 
 def _ping_items(pings: float, sizes: Sizes) -> list[Item]:

@@ -86,6 +86,8 @@ def _per_robot(usage: Usage) -> dict[str, float]:
     summary = usage.batches_per_s * -(-sizes.summary_item // 1024) + usage.own_batches_per_s
     # Lambda 2 is bounded by the stream's shards, Lambda 1 by what it waits for.
     busy = usage.live_hz * usage.live_ms / 1000 + usage.ping_hz * 0.005
+    # What passes the broker is looked at by three rules.
+    live_rules = usage.live_hz + 2 * usage.live_at_broker_per_s
     return {
         _RESERVED: usage.live_hz * usage.live_ms / 1000,
         "IoT Core: connections": 1,
@@ -93,7 +95,7 @@ def _per_robot(usage: Usage) -> dict[str, float]:
         "IoT Core: subscriptions": _SUBSCRIPTIONS,
         # Basic Ingest is counted in: it passes the same gateway.
         "IoT Core: publishes in": publishes,
-        "IoT Core: rule evaluations": batches + usage.live_hz + 2 * usage.ping_hz,
+        "IoT Core: rule evaluations": batches + live_rules + 2 * usage.ping_hz,
         "IoT Core: publishes of one connection": publishes,
         "DynamoDB: writes to table telemetry": telemetry,
         "DynamoDB: writes to table summary": summary,

@@ -111,17 +111,17 @@ def test_a_fault_reaches_a_human_and_the_dashboards(embedded, bundle, inbox):
 
 # After the test above, which awaits the moment that the alarm goes off.
 @pytest.mark.parametrize(
-    ("voltage_v", "fault_code", "told"),
+    ("drive", "told"),
     [
-        ("nan", lambda i: FAULT if i >= 25 else 0, "fault 5, MOSFET over-temperature"),
-        (LOW_V, lambda _: "nan", "battery at 9.5 V, below 10.5 V"),
+        (lambda i: ("nan", FAULT if i >= 25 else 0), "fault 5, MOSFET over-temperature"),
+        (lambda _: (LOW_V, "nan"), "battery at 9.5 V, below 10.5 V"),
     ],
     ids=["fault, voltage unknown", "voltage low, fault unknown"],
 )
-def test_a_human_hears_of_one_though_the_other_is_null(bundle, inbox, tmp_path, voltage_v, fault_code, told):
+def test_a_human_hears_of_one_though_the_other_is_null(bundle, inbox, tmp_path, drive, told):
     """By the real agent, which sends most of its live messages where no alert can hear them."""
     log = tmp_path / "drive.csv"
-    rows = (f"{1000 + 20 * i};{voltage_v};{fault_code(i)}" for i in range(100))
+    rows = (";".join(str(value) for value in (1000 + 20 * i, *drive(i))) for i in range(100))
     log.write_text("\n".join(["ms_today;input_voltage;fault_code", *rows]) + "\n")
     car = bundle(sources=[{"type": "bag", "path": str(log)}])
     run_agent(car)

@@ -36,10 +36,14 @@ def test_record_lane_is_a_rule_an_action_and_its_units_a_batch():
     assert next(i for i in items if i.what == "rules triggered").dollars == pytest.approx(3600 * 0.15e-6)
 
 
-def test_live_lane_is_a_message_a_rule_an_action_and_an_invocation_each():
+def test_live_lane_is_a_rule_an_action_and_an_invocation_each_and_a_message_in_ten_seconds():
     items = cost.bill(replace(_ONE, live_hz=4.0))
-    for price in ("message", "rule", "action", "invocation"):
-        assert _units(items, "live", price) == 4 * 3600, price
+    assert _units(items, "live", "invocation") == 4 * 3600
+    assert _units(items, "live", "message") == 360
+    # At the broker two more rules look at it.
+    assert _units(items, "live", "rule") == _units(items, "live", "action") == 4 * 3600 + 2 * 360
+    seldom = cost.bill(replace(_ONE, live_hz=0.05))
+    assert _units(seldom, "live", "message") == _units(seldom, "live", "invocation") == 180
     assert _units(cost.bill(replace(_ONE, live_hz=0.0)), "live", "invocation") == 0
 
 
