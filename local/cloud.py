@@ -234,6 +234,8 @@ class EmbeddedCloud:
             ("processing", "Live"): self._live(),
             ("processing", "Summarize"): {"Records": []},
             ("processing", "Echo"): self._ping(),
+            # No fault and no low voltage.
+            ("processing", "Alert"): {**self._ping(), RECEIVED_MS: 0},
             ("processing", "Upload"): {TOPIC: build_topic(PING, "warm-up", FILE, self.namespace)},
             ("fleet", "Admit"): {},
             ("fleet", "Presence"): {},
