@@ -44,6 +44,8 @@ from station.cloud import Cloud
 
 # So long without any news, and no more comes.
 _CATCH_UP_S = 120.0
+# How often progress is a line, where it cannot be a bar.
+_SAY_S = 5.0
 _deserialize = TypeDeserializer().deserialize
 
 
@@ -124,11 +126,15 @@ def measure(embedded: EmbeddedCloud, count: int, seconds: int, tell: Tell, *, pr
                     tell(said["second"] / seconds, "driving")
                 after, took_s = _usage(pid, emulator), time.monotonic() - began
         sent = said["sent"]
-    expected = sum(sent["batches"].values()) * BATCH_SAMPLES
+    batches = sent["batches"]
+    expected = sum(batches.values()) * BATCH_SAMPLES
     began = time.monotonic()
-    summarized = _summarized(cloud, names, expected, tell)
+    summarized = _summarized(cloud, {name: batches[name] * BATCH_SAMPLES for name in names}, tell)
     catch_up_s = time.monotonic() - began
-    stored = [_stored(cloud, name, sent["sent_ms"][name]) for name in names]
+    stored = []
+    for i, name in enumerate(names):
+        stored.append(_stored(cloud, name, sent["sent_ms"][name]))
+        tell((i + 1) / count, "counting the batches")
     return Fleet(
         robots=count,
         seconds=seconds,
@@ -211,20 +217,25 @@ def _summary_age(cloud: Cloud, robot: str) -> Iterator[list[float]]:
         watcher.join()
 
 
-def _summarized(cloud: Cloud, names: list[str], expected: int, tell: Tell) -> int:
-    """The samples in the summary of all robots, once they are all there or no more come."""
-    each, counted = expected // len(names), dict.fromkeys(names, -1)
-    since = time.monotonic()
-    while True:
-        for name in [name for name in names if counted[name] < each]:
+def _summarized(cloud: Cloud, expected: dict[str, int], tell: Tell) -> int:
+    """The samples in the summary of all robots, once they are all there or no more come.
+
+    One robot is asked for after the other: while the first is behind, it tells how far they all are.
+    """
+    total, since = 0, time.monotonic()
+    for name, samples in expected.items():
+        counted = None
+        while True:
             now = sum(int(item[SAMPLES]) for item in _items(cloud, "SummaryTable", name, SAMPLES))
-            if now != counted[name]:
-                counted[name], since = now, time.monotonic()
-        total = sum(counted.values())
-        tell(total / expected, "waiting for the summaries")
-        if total >= expected or time.monotonic() - since > _CATCH_UP_S:
-            return total
-        threading.Event().wait(0.5)
+            if counted is not None and now > counted:
+                since = time.monotonic()
+            counted = now
+            tell((total + now) / sum(expected.values()), "waiting for the summaries")
+            if now >= samples or time.monotonic() - since > _CATCH_UP_S:
+                break
+            threading.Event().wait(0.5)
+        total += counted
+    return total
 
 
 @dataclass(frozen=True)
@@ -292,7 +303,10 @@ def as_table(fleet: Fleet) -> Table:
 
 @contextmanager
 def progress(console: Console) -> Iterator[Tell]:
-    """A bar for each thing that `measure` tells of."""
+    """A bar for each thing that `measure` tells of; without a terminal, a line every few seconds."""
+    if not console.is_terminal:
+        yield _lines(console)
+        return
     with Progress(console=console, transient=True) as bars:
         tasks: dict[str, Any] = {}
 
@@ -302,6 +316,18 @@ def progress(console: Console) -> Iterator[Tell]:
             bars.update(tasks[what], completed=share)
 
         yield tell
+
+
+def _lines(console: Console) -> Tell:
+    last = ("", 0.0)
+
+    def tell(share: float, what: str) -> None:
+        nonlocal last
+        if what != last[0] or time.monotonic() - last[1] >= _SAY_S:
+            last = (what, time.monotonic())
+            console.print(f"  {what}: {share:.0%}", style="dim")
+
+    return tell
 
 
 def main() -> None:

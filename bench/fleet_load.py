@@ -103,7 +103,8 @@ class Robot:
     def send(self) -> None:
         """The batch of the last second."""
         seq = len(self.sent_ms)
-        self._first_us = self._first_us or time.time_ns() // 1000 - SAMPLES * _STEP_US
+        # As the agent's, a batch lies within one second of wall time.
+        self._first_us = self._first_us or (time.time_ns() // 1_000_000_000 - 1) * SAMPLES * _STEP_US
         first_us = self._first_us + seq * SAMPLES * _STEP_US
         times = range(first_us, first_us + SAMPLES * _STEP_US, _STEP_US)
         batch = Batch(self._boot, seq, times, self._columns[seq % len(self._columns)])

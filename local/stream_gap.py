@@ -26,8 +26,10 @@ from local.stream_mapping import Answer, Settings, Shard
 _log = logging.getLogger(__name__)
 # AWS waits longer between attempts; a test has less patience.
 _FIRST_PAUSE_S, _LONGEST_PAUSE_S = 0.1, 5.0
-# Records read ahead of the function.
-_AHEAD = 1_000
+# Two clocks differ by less.
+_SLACK_S = 0.005
+# Records read ahead of the function, at least as many as one event may hold.
+_AHEAD = 2_000
 
 
 def install() -> None:
@@ -64,12 +66,14 @@ class _Running:
     position: int
     busy: set[int] = field(default_factory=set)
     pauses: dict[int, tuple[float, float]] = field(default_factory=dict)
+    windows: dict[int, float] = field(default_factory=dict)
 
 
 class StreamMappings:
     """All mappings of streams; `poll` takes the place of ministack's own poller."""
 
-    def __init__(self) -> None:
+    def __init__(self, clock: Callable[[], float] = time.time) -> None:
+        self._clock = clock
         self._running: dict[str, _Running] = {}
         self._lock = threading.Lock()
 
@@ -97,9 +101,12 @@ class StreamMappings:
                 pause_until, _ = running.pauses.get(number, (0.0, 0.0))
                 if number in running.busy or time.monotonic() < pause_until:
                     continue
-                batch = lane.batch(time.time())
+                now_s = self._clock()
+                batch = lane.batch(now_s)
                 if batch:
                     running.busy.add(number)
+                else:
+                    _wake_at(lane.due_s, now_s, running.windows, number)
             self._tell(running, function)
             if batch:
                 started = True
@@ -163,6 +170,15 @@ class StreamMappings:
             lambda_svc._send_ddb_stream_failure_record(  # noqa: SLF001
                 mapping, function, list(one.records), mapping["EventSourceArn"], {}, one.condition.value
             )
+
+
+def _wake_at(due_s: float | None, now_s: float, windows: dict[int, float], number: int) -> None:
+    """Have the poller look when a lane's batching window is over; it would sleep up to a second longer."""
+    if due_s is not None and windows.get(number) != due_s:
+        windows[number] = due_s
+        timer = threading.Timer(max(0.0, due_s - now_s) + _SLACK_S, lambda_svc._esm_wake.set)  # noqa: SLF001
+        timer.daemon = True
+        timer.start()
 
 
 def _answer(result: dict[str, Any]) -> Answer:

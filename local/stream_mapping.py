@@ -33,6 +33,7 @@ class Settings:
     """
 
     batch_size: int = 100
+    window_s: float = 0.0
     bisect: bool = False
     max_retries: int = _FOREVER
     max_age_s: int = _FOREVER
@@ -50,6 +51,7 @@ class Settings:
 
         return cls(
             batch_size=number("BatchSize", 100),
+            window_s=number("MaximumBatchingWindowInSeconds", 0),
             bisect=bool(mapping.get("BisectBatchOnFunctionError")),
             max_retries=number("MaximumRetryAttempts", _FOREVER),
             max_age_s=number("MaximumRecordAgeInSeconds", _FOREVER),
@@ -97,13 +99,17 @@ class Lane:
     """One of the shard's concurrent batches: its records strictly one batch after the other."""
 
     settings: Settings
-    _waiting: deque[Record] = field(default_factory=deque)
+    _waiting: deque[tuple[Record, int]] = field(default_factory=deque)
+    _waiting_bytes: int = 0
+    _since_s: float | None = None
     _parts: deque[_Part] = field(default_factory=deque)
     discarded: list[Discarded] = field(default_factory=list)
 
     def put(self, record: Record) -> None:
         """A record read off the stream."""
-        self._waiting.append(record)
+        size = len(json.dumps(record, default=str))
+        self._waiting.append((record, size))
+        self._waiting_bytes += size
 
     @property
     def size(self) -> int:
@@ -111,18 +117,41 @@ class Lane:
         return len(self._waiting) + sum(len(part.records) for part in self._parts)
 
     def batch(self, now_s: float) -> list[Record]:
-        """What to invoke the function with next; nothing where there is nothing."""
+        """What to invoke the function with next; nothing where there is nothing, or it is `due` later."""
         self._expire(now_s)
-        if not self._parts and self._waiting:
+        if not self._parts and self._gathered(now_s):
             records: list[Record] = []
             size = 0
             while self._waiting and len(records) < self.settings.batch_size:
-                size += len(json.dumps(self._waiting[0], default=str))
+                size += self._waiting[0][1]
                 if records and size > MAX_EVENT_BYTES:
                     break
-                records.append(self._waiting.popleft())
+                records.append(self._taken())
             self._parts.append(_Part(records))
+            self._since_s = None
         return list(self._parts[0].records) if self._parts else []
+
+    @property
+    def due_s(self) -> float | None:
+        """When the batching window of what waits is over; None where nothing waits, or for its turn."""
+        return None if self._since_s is None else self._since_s + self.settings.window_s
+
+    def _gathered(self, now_s: float) -> bool:
+        """Whether what waits is invoked now: "until it has gathered a full batch, the batching window
+        expires, or the batch reaches the payload limit of 6 MB". The window begins with the first record
+        after the batch before; one that is tried again waits for no other."""
+        if not self._waiting:
+            self._since_s = None
+            return False
+        if self._since_s is None:
+            self._since_s = now_s
+        full = len(self._waiting) >= self.settings.batch_size or self._waiting_bytes >= MAX_EVENT_BYTES
+        return full or now_s >= self._since_s + self.settings.window_s
+
+    def _taken(self) -> Record:
+        record, size = self._waiting.popleft()
+        self._waiting_bytes -= size
+        return record
 
     def answered(self, answer: Answer) -> None:
         """The function's answer to the last `batch`."""
@@ -175,12 +204,12 @@ class Lane:
             old = [record for record in part.records if _age_s(record, now_s) > limit_s]
             if old:
                 self.discarded.append(Discarded(Condition.AGE, old, part.failures))
-                part.records = [record for record in part.records if record not in old]
+                part.records = [record for record in part.records if _age_s(record, now_s) <= limit_s]
                 if not part.records:
                     self._parts.remove(part)
         old = []
-        while self._waiting and _age_s(self._waiting[0], now_s) > limit_s:
-            old.append(self._waiting.popleft())
+        while self._waiting and _age_s(self._waiting[0][0], now_s) > limit_s:
+            old.append(self._taken())
         if old:
             self.discarded.append(Discarded(Condition.AGE, old, 0))
 

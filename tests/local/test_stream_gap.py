@@ -138,3 +138,28 @@ def test_a_throttle_is_waited_out(cloud):
     cloud.put(1)
     cloud.poll_until(lambda: len(cloud.seen) == 4)
     assert cloud.told == []
+
+
+def test_a_window_gathers_what_comes_in_it(cloud):
+    lambda_svc._esms["gap-mapping"]["MaximumBatchingWindowInSeconds"] = 2
+    now = 1_000.0
+    cloud.mappings = StreamMappings(lambda: now)
+    cloud.put(0)
+    assert not cloud.mappings.poll()
+    now += 1.5
+    cloud.put(1)
+    assert not cloud.mappings.poll()
+    assert cloud.seen == []
+    now += 0.5
+    cloud.poll_until(lambda: cloud.seen)
+    assert cloud.seen == [[0, 1]]
+
+
+def test_the_poller_is_woken_when_the_window_is_over(cloud):
+    lambda_svc._esms["gap-mapping"]["MaximumBatchingWindowInSeconds"] = 1
+    cloud.put(0)
+    lambda_svc._esm_wake.clear()
+    assert not cloud.mappings.poll()
+    assert lambda_svc._esm_wake.wait(60)
+    cloud.poll_until(lambda: cloud.seen)
+    assert cloud.seen == [[0]]

@@ -8,6 +8,7 @@ import pytest
 
 import contract
 from contract import RULES, pong_template, rule_name, rule_sql
+from station.cost import RECORDS_A_CALL, WINDOW_S
 from tests.stacks.templates import name
 
 
@@ -178,6 +179,8 @@ def test_the_stream_never_blocks_for_good(synthesized, reader):
     assert mapping["MaximumRetryAttempts"] == 5
     # More, and two batches of one robot could be summarised at once: docs/processing.md.
     assert mapping["ParallelizationFactor"] == 1
+    # The cost model knows it.
+    assert (mapping["MaximumBatchingWindowInSeconds"], mapping["BatchSize"]) == (WINDOW_S, RECORDS_A_CALL)
     assert mapping["MaximumRecordAgeInSeconds"] == 6 * 3600
     assert reader.text(mapping["DestinationConfig"]["OnFailure"]["Destination"]) == "Rejected.Arn"
     # From the beginning: what was stored before the first deployment of the mapping is summarised too.

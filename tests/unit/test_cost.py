@@ -68,7 +68,8 @@ def test_a_batch_of_one_sample_costs_as_much_as_the_thesis_record_lane():
 def test_lambda_2_is_shared_by_a_fleet():
     calls = {robots: cost.summarize_calls_per_s(Usage(robots=robots)) / robots for robots in (1, 100, 10_000)}
     assert calls[1] > calls[100] > calls[10_000]
-    assert calls[10_000] * 10_000 >= 10_000 * 1.2 / 100, "a call takes a hundred records at most"
+    assert calls[1] == 1 / cost.WINDOW_S
+    assert calls[10_000] * 10_000 == pytest.approx(12), "a call takes a thousand records at most"
 
 
 def test_pubnub_counts_publishes_and_receipts_or_users():

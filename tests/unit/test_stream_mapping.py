@@ -22,7 +22,13 @@ from tests.fakes import TELEMETRY, FakeDynamoDB, item_of, record_of, summary_of,
 S = 1_000_000
 T0 = 1_700_000_000 * S
 DEPLOYED = Settings(
-    batch_size=100, bisect=True, max_retries=5, max_age_s=6 * 3600, report_failures=True, parallel=1
+    batch_size=1_000,
+    window_s=2,
+    bisect=True,
+    max_retries=5,
+    max_age_s=6 * 3600,
+    report_failures=True,
+    parallel=1,
 )
 
 
@@ -135,6 +141,59 @@ def test_what_is_too_old_is_given_up_before_it_is_tried():
     lane.answered(Answer(error=True))
     assert numbers(lane.batch(111)) == [2]
     assert [numbers(one.records) for one in shard.discarded()] == [[1]]
+
+
+def window(**changes):
+    shard = Shard(Settings(**{"batch_size": 3, "window_s": 2, **changes}))
+    return shard, shard.lanes[0]
+
+
+def test_records_are_gathered_until_the_window_is_over():
+    shard, lane = window()
+    assert lane.batch(9) == []
+    assert lane.due_s is None
+    shard.put([record(0)])
+    assert lane.batch(10) == []
+    assert lane.due_s == 12
+    shard.put([record(1)])
+    assert lane.batch(11.9) == []
+    assert numbers(lane.batch(12)) == [0, 1]
+    assert lane.due_s is None
+
+
+def test_a_full_batch_waits_for_no_window():
+    shard, lane = window()
+    shard.put(record(n) for n in range(4))
+    assert numbers(lane.batch(10)) == [0, 1, 2]
+    lane.answered(Answer())
+    # The rest begins a window of its own.
+    assert lane.batch(10) == []
+    assert numbers(lane.batch(12)) == [3]
+
+
+def test_the_payload_limit_ends_the_window():
+    shard, lane = window(batch_size=100)
+    shard.put({**record(n), "large": "x" * 2_500_000} for n in range(3))
+    assert numbers(lane.batch(10)) == [0, 1]
+
+
+def test_what_is_tried_again_waits_for_no_window():
+    shard, lane = window(bisect=True)
+    shard.put(record(n) for n in range(3))
+    assert numbers(lane.batch(10)) == [0, 1, 2]
+    lane.answered(Answer(error=True))
+    assert numbers(lane.batch(10)) == [0]
+
+
+def test_what_is_too_old_begins_no_window():
+    shard, lane = window(max_age_s=60)
+    shard.put([record(0, at_s=0)])
+    assert lane.batch(59) == []
+    assert lane.batch(61) == []
+    assert lane.due_s is None
+    shard.put([record(1, at_s=61)])
+    assert lane.batch(61.5) == []
+    assert numbers(lane.batch(63.5)) == [1]
 
 
 def test_an_event_has_at_most_6_mb():
@@ -300,9 +359,11 @@ def test_a_table_throttled_for_long_gives_the_batches_up_with_their_place_in_the
         client.put(TELEMETRY, item)
     shard.put(record_of(item, n) for n, item in enumerate(items))
     (lane,) = shard.lanes
-    while batch := lane.batch(0):
+    assert lane.batch(0) == []
+    while batch := lane.batch(DEPLOYED.window_s):
         lane.answered(invoke(batch, client, list, set()))
     given_up = [one["dynamodb"]["SequenceNumber"] for d in shard.discarded() for one in d.records]
+    assert not shard.size
     # One record by itself is written at last (the fake takes the first of every call).
     assert set(given_up) <= {record_of(item, n)["dynamodb"]["SequenceNumber"] for n, item in enumerate(items)}
     replayed = FakeDynamoDB()
