@@ -77,6 +77,7 @@ from contract.limits import (
 )
 from contract.live import LiveSample, Pong, decode_live, decode_pong, encode_live, encode_ping, live_update
 from contract.message_type import MessageType, message_type
+from contract.seconds import flat_second, packed_second
 from contract.tables import (
     ADMISSION,
     ADMIT_CLAIM,
@@ -321,11 +322,13 @@ __all__ = [
     "encode_live",
     "encode_ping",
     "file_key",
+    "flat_second",
     "fleet_name",
     "inflate",
     "live_topic",
     "live_update",
     "message_type",
+    "packed_second",
     "parse_file_key",
     "parse_topic",
     "part_range",

@@ -84,7 +84,7 @@ class MetricsConfig:
     """The agent's own figures, a sample every ``every_s`` of the stream `contract.AGENT_STREAM`."""
 
     enabled: bool = setting(flag(), default=True)
-    every_s: float = setting(number(1, 3600, unit="s"), 5.0)
+    every_s: float = setting(number(1, 3600, unit="s"), 10.0)
 
 
 def _queue_file(value: Any, where: Where) -> Path | None:

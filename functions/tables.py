@@ -11,7 +11,7 @@ from typing import Any
 
 from boto3.dynamodb.types import TypeDeserializer
 
-from contract import OMITTED, ROBOT, SECOND, T_US, TOPIC, Value
+from contract import OMITTED, ROBOT, SECOND, T_US, TOPIC, Value, packed_second
 from functions.statistics import Vehicle
 
 _log = logging.getLogger(__name__)
@@ -37,10 +37,15 @@ def plain(image: Mapping[str, Any]) -> dict[str, Any]:
     return {name: _deserialize(value) for name, value in image.items()}
 
 
-def attribute(value: Value) -> dict[str, Any]:
-    """A value as a DynamoDB attribute. A number too small becomes 0, one too large its own text."""
+def attribute(value: Value | list[Value]) -> dict[str, Any]:
+    """A value, or a list of some, as a DynamoDB attribute.
+
+    A number too small becomes 0, one too large its own text.
+    """
     if value is None:
         return {"NULL": True}
+    if isinstance(value, list):
+        return {"L": [attribute(each) for each in value]}
     if isinstance(value, bool):
         return {"BOOL": value}
     if isinstance(value, str):
@@ -122,7 +127,7 @@ class Tables:
             self._write(chunk)
 
     def _second_item(self, topic: str, second: int, summary: Mapping[str, Value]) -> dict[str, Any]:
-        item = fitting({name: attribute(value) for name, value in summary.items()})
+        item = fitting({name: attribute(value) for name, value in packed_second(summary).items()})
         return {**item, TOPIC: {"S": topic}, SECOND: {"N": str(second)}}
 
     def _write(self, requests: Sequence[Mapping[str, Any]]) -> None:

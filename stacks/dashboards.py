@@ -144,7 +144,7 @@ class Dashboards(Construct):
 
     def _seen(self) -> list[cloudwatch.GraphWidget]:
         return [
-            _graph("Agents: reports a minute, twelve from each", self._ours("health", "AgentReports")),
+            _graph("Agents: reports a minute, six from each", self._ours("health", "AgentReports")),
             _graph(
                 "Samples and batches a minute",
                 self._ours("summarize", "SamplesSummarized", "BatchesSummarized"),

@@ -53,7 +53,7 @@ class Usage:
     live_hz: float = 10.0
     batch_s: float = 1.0
     ping_hz: float = 0.0
-    agent_every_s: float = 5.0
+    agent_every_s: float = 10.0
     hours_per_day: float = 2.0
     viewers: int = 1
     retention_days: int = 90

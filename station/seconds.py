@@ -17,6 +17,7 @@ from contract import (
     SECOND,
     STATS,
     TOPIC,
+    flat_second,
 )
 from functions import expression
 from station import reading
@@ -73,7 +74,7 @@ def _stands_for(name: str, there: Mapping[str, Any]) -> list[str]:
 
 
 def _block(items: Sequence[Item]) -> Block:
-    rows = [{name: _value(value) for name, value in item.items()} for item in items]
+    rows = [flat_second({name: _value(value) for name, value in item.items()}) for item in items]
     names = dict.fromkeys(name for row in rows for name in row if name not in {TOPIC, SECOND, EXPIRES_S})
     whole = [name for name in _OF_ALL if name in names]
     ordered = [*whole, *sorted(name for name in names if name not in whole)]
@@ -82,6 +83,8 @@ def _block(items: Sequence[Item]) -> Block:
 
 
 def _value(value: Mapping[str, Any]) -> Any:
+    if "L" in value:
+        return [_value(each) for each in value["L"]]
     return float(value["N"]) if "N" in value else _deserialize(value)
 
 

@@ -4,24 +4,18 @@ from __future__ import annotations
 
 import json
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from decimal import Decimal
 from functools import cache
 from typing import Any
 
 from contract import (
     AGENT_FIELDS,
-    BATCHES,
     EXPIRES_S,
-    GAPS,
-    MISSING_BATCHES,
-    NONFINITE,
     RECEIVED_MS,
     RECORD,
     RTT_FIELDS,
-    SAMPLES,
     SECOND,
-    STATS,
     TOPIC,
     VESC_STREAM,
     Batch,
@@ -32,9 +26,12 @@ from contract import (
     encode_live,
     encode_ping,
     live_update,
+    packed_second,
     record_topic,
 )
 from device.sources.vehicle import Vehicle, VehicleConfig
+from functions.statistics import Vehicle as Gain
+from functions.statistics import summarize_second
 
 _BOOT, _ROBOT = "0badcafe0badcafe", "car-0001"
 _T_US, _MS = 1_750_000_000_000_000, 1_750_000_000_000
@@ -70,7 +67,7 @@ def measure(rate_hz: float, batch_s: float) -> Sizes:
         live=len(encode_live(live)) + len(build_topic("live", _ROBOT, VESC_STREAM)),
         ping=len(encode_ping(100_000, _T_US)) + len(build_topic("ping", _ROBOT, "lambda")),
         telemetry_item=stored_bytes(message),
-        summary_item=item_bytes(_summary(second)),
+        summary_item=item_bytes(_summary(_batch(second, rate_hz))),
         update=len(json.dumps(live_update(_ROBOT, VESC_STREAM, live, _MS, _T_US), separators=(",", ":"))),
         sample=len(json.dumps(flat, separators=(",", ":"))) + len(build_topic(RECORD, _ROBOT, VESC_STREAM)),
         sample_item=item_bytes({**flat, **_rule()}),
@@ -101,6 +98,8 @@ def _value_bytes(value: Any) -> int:
         return len(value.encode())
     if isinstance(value, (bool, type(None))):
         return 1
+    if isinstance(value, list):
+        return 3 + sum(1 + _value_bytes(each) for each in value)
     digits = len(Decimal(repr(value)).normalize().as_tuple().digits)
     # Two digits a byte, one for the exponent and one for a minus.
     return (digits + 1) // 2 + 1 + int(value < 0)
@@ -130,19 +129,8 @@ def _batch(samples: Sequence[Mapping[str, Value]], rate_hz: float) -> Batch:
     return Batch(_BOOT, 100_000, times, columns)
 
 
-def _summary(samples: Sequence[Mapping[str, Value]]) -> dict[str, Any]:
-    """An item of the shape that Lambda 2 writes; a test holds it to functions/statistics.py."""
-    item: dict[str, Any] = {SAMPLES: len(samples), BATCHES: 1, MISSING_BATCHES: 0, GAPS: 0, NONFINITE: 0}
-    columns: dict[str, list[float]] = {
-        name: [float(sample[name] or 0) for sample in samples] for name in samples[0]
-    }
-    gain = VehicleConfig().speed_to_erpm_gain
-    columns["speed_mps"] = [speed / gain for speed in columns["speed"]]
-    volts, amperes = columns["voltage_input"], columns["current_input"]
-    columns["power_w"] = [v * a for v, a in zip(volts, amperes, strict=True)]
-    for name, column in columns.items():
-        mean = float(f"{sum(column) / len(column):.9g}")
-        values = (min(column), mean, max(column), column[-1])
-        for stat, value in zip(STATS, values, strict=True):
-            item[f"{name}_{stat}"] = int(value) if value == int(value) else value
-    return {**item, TOPIC: _rule()[TOPIC], SECOND: _MS // 1000, EXPIRES_S: _MS // 1000}
+def _summary(batch: Batch) -> dict[str, Any]:
+    """The item that Lambda 2 makes of a second."""
+    second = batch.t_us // 1_000_000
+    summary = summarize_second(second, [replace(batch, seq=0)], Gain(VehicleConfig().speed_to_erpm_gain))
+    return {**packed_second(summary or {}), TOPIC: _rule()[TOPIC], SECOND: second, EXPIRES_S: _MS // 1000}

@@ -129,5 +129,6 @@ def record_of(item: dict[str, Any], number: int = 1, kind: str = "INSERT") -> di
 
 
 def summary_of(client: FakeDynamoDB, topic: str = TOPIC_OF_CAR) -> dict[int, dict[str, Any]]:
-    """What the summary table holds of a topic, by second."""
-    return {int(key[1]): plain(item) for key, item in client.items[SUMMARY].items() if key[0] == topic}
+    """What the summary table holds of a topic, by second, with the flat names that everybody reads."""
+    stored = client.items[SUMMARY].items()
+    return {int(key[1]): contract.flat_second(plain(item)) for key, item in stored if key[0] == topic}

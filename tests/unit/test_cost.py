@@ -8,11 +8,8 @@ from dataclasses import replace
 import pytest
 from typer.testing import CliRunner
 
-from contract import STATS
 from device.sources.vehicle import Vehicle, VehicleConfig
 from functions.metrics import emit
-from functions.statistics import Vehicle as Gain
-from functions.statistics import summarize_second
 from scripts.costs import FILES, filled
 from station import cost, scale, sizes
 from station.cli import app
@@ -31,8 +28,7 @@ def test_record_lane_is_a_rule_an_action_and_its_units_a_batch():
     items = cost.bill(_ONE)
     assert _units(items, "record", "message") == 0, "Basic Ingest has no messaging charge"
     assert _units(items, "record", "rule") == _units(items, "record", "action") == 3600
-    # The telemetry item is below a kilobyte, the summary item between one and two.
-    assert _units(items, "record", "write") == 3600 * (1 + 2)
+    assert _units(items, "record", "write") == 3600 * (1 + 1), "each item fits in a unit"
     assert next(i for i in items if i.what == "rules triggered").dollars == pytest.approx(3600 * 0.15e-6)
 
 
@@ -69,7 +65,8 @@ def test_lambda_2_is_shared_by_a_fleet():
     calls = {robots: cost.summarize_calls_per_s(Usage(robots=robots)) / robots for robots in (1, 100, 10_000)}
     assert calls[1] > calls[100] > calls[10_000]
     assert calls[1] == 1 / cost.WINDOW_S
-    assert calls[10_000] * 10_000 == pytest.approx(12), "a call takes a thousand records at most"
+    records = 10_000 * (_ONE.batches_per_s + _ONE.own_batches_per_s)
+    assert calls[10_000] * 10_000 == pytest.approx(records / 1000), "a call takes a thousand records at most"
 
 
 def test_pubnub_counts_publishes_and_receipts_or_users():
@@ -94,18 +91,13 @@ def test_refuses_what_no_fleet_can_do(wrong):
         cost.bill(replace(_ONE, **wrong))
 
 
-def test_summary_item_is_measured_in_the_shape_that_lambda_2_writes():
-    drive = sizes._drive(50, 50)
-    batch = sizes._batch(drive, 50)
-    second = batch.t_us // 1_000_000
-    gain = VehicleConfig().speed_to_erpm_gain
-    written = summarize_second(second, [batch], Gain(gain))
-    measured = sizes._summary(drive)
-    assert written is not None
-    assert set(written) <= set(measured)
-    assert {name.rsplit("_", 1)[1] for name in written if name.endswith(STATS)} == set(STATS)
-    kept = {name: measured[name] for name in written}
-    assert sizes.item_bytes(written) == pytest.approx(sizes.item_bytes(kept), rel=0.05)
+def test_a_second_s_items_fit_in_one_write_unit_each():
+    """The cost rests on it: a byte over a kilobyte is billed as two."""
+    for robot_hz in (10, 50):
+        measured = sizes.measure(robot_hz, 1.0)
+        assert measured.telemetry_item <= 1024
+        assert measured.summary_item <= 1024
+    assert sizes.own_item_bytes("agent", 1) <= 1024
 
 
 def test_metrics_line_is_about_as_long_as_lambda_1_writes_it(capsys):
@@ -119,7 +111,14 @@ def test_a_drive_is_a_vesc_drive():
 
 @pytest.mark.parametrize(
     ("item", "expected"),
-    [({"a": "bc"}, 3), ({"n": 0}, 3), ({"n": 12345}, 5), ({"n": -1.5}, 4), ({"b": True}, 2)],
+    [
+        ({"a": "bc"}, 3),
+        ({"n": 0}, 3),
+        ({"n": 12345}, 5),
+        ({"n": -1.5}, 4),
+        ({"b": True}, 2),
+        ({"l": [1, 12345]}, 1 + 3 + (1 + 2) + (1 + 4)),
+    ],
 )
 def test_item_sizes_as_dynamodb_counts_them(item, expected):
     assert sizes.item_bytes(item) == expected

@@ -530,7 +530,7 @@ def test_the_handler_against_the_tables_of_the_template(dynamodb, monkeypatch, c
     finally:
         summarize._tables.cache_clear()
         summarize._refusals.cache_clear()
-    items = [plain(item) for item in dynamodb.scan(TableName=SUMMARY)["Items"]]
+    items = [contract.flat_second(plain(item)) for item in dynamodb.scan(TableName=SUMMARY)["Items"]]
     assert sum(item["n"] for item in items) == 39 * 50
     by_second = {int(item["second"]) - SECOND: item for item in items}
     assert {s for s, item in by_second.items() if item["missing_batches"]} == {8}

@@ -1,0 +1,58 @@
+"""A second as it is stored: packed, and for everybody else as flat as it was."""
+
+from __future__ import annotations
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+import contract
+from contract import Batch, flat_second, packed_second
+from functions.statistics import summarize_second
+from functions.tables import attribute, plain
+
+# Fields that are called like what else a second holds, and like one another's statistics.
+COUNTS = ["n", "batches", "gaps", "topic", "second", "expires_s", "omitted"]
+AWKWARD = [*COUNTS, "a", "a_last", "a_min", "a_last_last"]
+names = st.sampled_from(AWKWARD) | st.from_regex(r"[a-z]{1,3}(_(min|mean|max|last)){0,2}", fullmatch=True)
+numbers = st.integers(-5, 5) | st.floats(-1e9, 1e9) | st.sampled_from([1e300, -1e-200])
+values = numbers | st.none() | st.booleans() | st.text(max_size=3)
+
+
+three = {"min_size": 3, "max_size": 3}
+
+
+@given(st.dictionaries(names, st.lists(numbers, **three) | st.lists(values, **three)))
+def test_a_second_is_read_as_it_was_made(columns):
+    made = summarize_second(0, [Batch("0badcafe", 0, [0, 10, 20], columns)], None)
+    assert made is not None
+    made[contract.EXPIRES_S] = 1_800_000_000
+    packed = packed_second(made)
+    assert flat_second(packed) == made
+    assert not packed.keys() & {contract.TOPIC, contract.SECOND, contract.OMITTED}
+    # And through the table, whose numbers are Decimals.
+    stored = plain({name: attribute(value) for name, value in packed.items()})
+    assert flat_second(stored) == plain({name: attribute(value) for name, value in made.items()})
+
+
+def test_a_second_that_was_stored_flat_is_read_as_it_is():
+    flat = {"n": 50, "speed_min": 1, "speed_mean": 1.5, "speed_max": 2, "speed_last": 2, "mode_last": "x"}
+    assert flat_second(flat) == flat
+
+
+@pytest.mark.parametrize(
+    ("columns", "expected"),
+    [
+        ({"a": [1, 2, 4.5]}, {"a": [1, 2.5, 4.5, 4.5]}),
+        ({"a": [7, 7, 7]}, {"a": [7]}),
+        ({"a": ["x", "y", None]}, {"a_last": "y"}),
+        ({"a": [1, 2, "y"]}, {"a_last": "y"}),
+        ({"gaps": [1, 1, 1]}, {f"gaps_{statistic}": 1 for statistic in contract.STATS}),
+    ],
+)
+def test_what_a_second_looks_like(columns, expected):
+    made = summarize_second(0, [Batch("0badcafe", 0, [0, 10, 20], columns)], None)
+    assert made is not None
+    packed = packed_second(made)
+    whole = {"n": 3, "batches": 1, "missing_batches": 0, "gaps": 0, "nonfinite": 0}
+    assert packed == {**whole, **expected}
