@@ -101,10 +101,9 @@ class Settings:
 
         Lambda refuses a reservation that leaves an account fewer than 100 unreserved
         (PutFunctionConcurrency), and new accounts have 10 in all: the first deployment of a lab would fail.
-        On the embedded cloud an execution is a process, of which one machine should not run many.
         """
         if self.live_concurrency is None:
-            return _RESERVED_FOR_LIVE if self.protected or self.embedded else 0
+            return _RESERVED_FOR_LIVE if self.protected else 0
         return self.live_concurrency
 
     @property

@@ -11,7 +11,7 @@ from dataclasses import dataclass, replace
 from math import ceil
 from typing import Any, NamedTuple
 
-from contract import LIVE_BROKER_EVERY_S, METRICS
+from contract import LIVE_BROKER_EVERY_S
 from station.errors import StationError
 from station.prices import MONTH_DAYS, PRICES, PUBNUB_MAU_PLANS
 from station.sizes import Sizes, measure, own_item_bytes
@@ -43,7 +43,7 @@ class Usage:
     ``rate_hz`` samples, ``live_hz`` live messages and ``ping_hz`` pings a path, all a second and robot;
     a batch spans ``batch_s``; ``agent_every_s`` between the agent's own figures; robots drive
     ``hours_per_day``; each of ``viewers`` watches the whole fleet all that time; items are kept
-    ``retention_days``.
+    ``retention_days``, ``recoverable`` to a point in time in stage prod.
     What only AWS can say, the billed milliseconds of an invocation, and of each batch that Lambda 2 finds
     in one, are assumptions and named so.
     """
@@ -65,6 +65,9 @@ class Usage:
     summarize_batch_ms: float = 5.0
     alarms: int = 28
     dashboards: int = 2
+    recoverable: bool = False
+    customer_key: bool = False
+    device_defender: bool = True
 
     def check(self) -> Usage:
         """Itself; raises `StationError` for what no fleet can do."""
@@ -154,11 +157,14 @@ def bill(usage: Usage) -> list[Item]:
         Item("DynamoDB", "agent, rtt", "batches read by Lambda 2", "read", own),
     ]
     seconds = min(batches, hour)
-    items += [
+    kept = [
         _storage("record", "telemetry kept", batches, sizes.telemetry_item, usage),
         _storage("record", "summary kept", seconds, sizes.summary_item, usage),
         _storage("agent, rtt", "kept", 2 * own, own_item, usage),
     ]
+    items += kept
+    if usage.recoverable:
+        items += [item._replace(what=f"{item.what}, recoverable", price="recovery") for item in kept]
     calls = summarize_calls_per_s(usage) * hour / usage.robots
     items += _lambda_items(
         "record",
@@ -177,16 +183,6 @@ def bill(usage: Usage) -> list[Item]:
         line_bytes=_METRICS_LINE,
     )
     return items
-
-
-def deployment_dollars_per_month(usage: Usage) -> dict[str, float]:
-    """What a deployment costs whoever drives: metrics that functions emit, alarms, dashboards above three."""
-    counts = {
-        "metric": sum(map(len, METRICS.values())),
-        "alarm": usage.alarms,
-        "dashboard": max(0, usage.dashboards - 3),
-    }
-    return {f"{name}s": count * PRICES[name].each for name, count in counts.items()}
 
 
 def thesis_bill(usage: Usage) -> list[Item]:
@@ -276,6 +272,7 @@ def what_if(usage: Usage) -> Iterator[tuple[str, Usage]]:
         yield name, replace(usage, batch_s=batch_s)
     yield "round trips measured at 1 Hz", replace(usage, ping_hz=1.0)
     yield "kept for 30 days", replace(usage, retention_days=30)
+    yield "tables recoverable to a point in time (`prod`)", replace(usage, recoverable=True)
     yield "a thousand robots", replace(usage, robots=1000)
 
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 from typing import NamedTuple
 
 from station import cost
+from station.at_rest import deployment_dollars_per_month
 from station.cost import Usage
 from station.scale import Scale
 
@@ -119,7 +120,7 @@ def _first(scale: Scale) -> str:
 
 
 def _deployment(usage: Usage) -> list[tuple[str, float]]:
-    return list(cost.deployment_dollars_per_month(usage).items())
+    return list(deployment_dollars_per_month(usage).items())
 
 
 def _sum(items: list[cost.Item], service: str, lane: str) -> str:

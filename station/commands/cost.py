@@ -14,6 +14,7 @@ from rich.table import Table
 from device.config import Config, load_config
 from device.errors import AgentError
 from station import cost, cost_tables, scale
+from station.at_rest import deployment_dollars_per_month
 from station.cloud import Cloud
 from station.cost import Usage
 from station.errors import StationError
@@ -47,7 +48,10 @@ def cost_(
         Path | None, typer.Option(help="A car.yaml: its rates, where no option says another.")
     ] = None,
     deployed: Annotated[
-        bool, typer.Option("--deployed", help="Memory and concurrency of the functions as deployed.")
+        bool,
+        typer.Option(
+            "--deployed", help="Memory, concurrency, alarms, recovery and key as they are deployed."
+        ),
     ] = False,
     as_json: Annotated[bool, typer.Option("--json", help="As JSON.")] = False,
 ) -> None:
@@ -114,6 +118,12 @@ def _as_deployed(usage: Usage, cloud: Cloud) -> Usage:
             found["live_concurrency"] = reserved.get("ReservedConcurrentExecutions", 0)
     pages = cloud.client("cloudwatch").get_paginator("describe_alarms").paginate()
     found["alarms"] = sum(len(page.get("MetricAlarms", [])) for page in pages)
+    table, dynamodb = cloud.output("storage", "TelemetryTable"), cloud.client("dynamodb")
+    encryption = dynamodb.describe_table(TableName=table)["Table"].get("SSEDescription", {})
+    found["customer_key"] = encryption.get("SSEType") == "KMS"
+    backups = dynamodb.describe_continuous_backups(TableName=table)["ContinuousBackupsDescription"]
+    recovery = backups.get("PointInTimeRecoveryDescription", {})
+    found["recoverable"] = recovery.get("PointInTimeRecoveryStatus") == "ENABLED"
     return replace(usage, **found)
 
 
@@ -132,7 +142,7 @@ def _as_json(usage: Usage) -> dict[str, Any]:
         "pubnub_items": items(cost.pubnub_bill(usage)),
         "dollars_per_robot_hour": cost.total(cost.bill(usage)),
         "thesis_dollars_per_robot_hour": cost.total(cost.thesis_bill(usage)),
-        "deployment_dollars_per_month": cost.deployment_dollars_per_month(usage),
+        "deployment_dollars_per_month": deployment_dollars_per_month(usage),
         "fleet_dollars_per_month": paper.aws_dollars_per_month,
         "pubnub_mau_dollars_per_month": cost.pubnub_mau_dollars_per_month(usage),
         "quotas": [

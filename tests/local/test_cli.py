@@ -50,6 +50,13 @@ def test_a_robot_without_files_has_none_and_one_that_is_gone_keeps_them(embedded
     assert (later.exit_code, later.output) == (0, "")
 
 
+def test_the_cost_of_what_is_deployed(iort):
+    usage = json.loads(iort("cost", "--deployed", "--json").output)["usage"]
+    assert (usage["live_concurrency"], usage["live_memory_mb"], usage["summarize_memory_mb"]) == (0, 256, 512)
+    assert (usage["recoverable"], usage["customer_key"]) == (False, False)
+    assert usage["alarms"] > 20
+
+
 def test_robot_is_not_added_twice(iort, tmp_path):
     assert iort("robots", "add", "twice", "--out", str(tmp_path / "a")).exit_code == 0
     assert "already registered" in str(iort("robots", "add", "twice", "--out", str(tmp_path / "b")).exception)

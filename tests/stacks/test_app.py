@@ -103,7 +103,7 @@ def test_what_the_context_says(settings, tmp_path):
     assert settings(embedded="false").embedded is False
     assert given.reserved_for_live == 0
     assert settings().reserved_for_live == 0 == Usage().live_concurrency
-    assert settings(stage="prod").reserved_for_live == settings(embedded="true").reserved_for_live == 5
+    assert settings(stage="prod").reserved_for_live == 5
     assert settings(stage="prod", live_concurrency="0").reserved_for_live == 0
     asked = {"stage": "prod", "customer_key": "true", "budget_usd": "50", "alarm_email": "lab@example.org"}
     given = settings(**asked, low_voltage_v="13.2", tags="team=lab,cost-centre=7")

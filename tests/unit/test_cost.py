@@ -12,6 +12,7 @@ from device.sources.vehicle import Vehicle, VehicleConfig
 from functions.metrics import emit
 from scripts.costs import FILES, filled
 from station import cost, scale, sizes
+from station.at_rest import deployment_dollars_per_month
 from station.cli import app
 from station.cost import Usage
 from station.errors import StationError
@@ -41,6 +42,27 @@ def test_live_lane_is_a_rule_an_action_and_an_invocation_each_and_a_message_in_t
     seldom = cost.bill(replace(_ONE, live_hz=0.05))
     assert _units(seldom, "live", "message") == _units(seldom, "live", "invocation") == 180
     assert _units(cost.bill(replace(_ONE, live_hz=0.0)), "live", "invocation") == 0
+
+
+def test_a_deployment_at_rest_pays_for_what_polls_watches_and_keeps():
+    rest = deployment_dollars_per_month(_ONE)
+    # Five long polls of 20 s around the clock.
+    assert rest["polling the quarantine's queue"] == pytest.approx(657_000 * 0.40e-6)
+    assert rest["alarms"] == pytest.approx(2.8)
+    assert rest["dashboards"] == 0, "three are free"
+    assert "key" not in rest
+    assert deployment_dollars_per_month(replace(_ONE, customer_key=True))["key"] == 1.0
+    fleet = deployment_dollars_per_month(replace(_ONE, robots=1000))
+    assert fleet["audit of the robots"] == pytest.approx(1.1)
+    assert "audit of the robots" not in deployment_dollars_per_month(replace(_ONE, device_defender=False))
+
+
+def test_recovery_to_a_point_in_time_is_billed_by_what_is_kept():
+    def kept(usage, price):
+        return sum(item.units for item in cost.bill(usage) if item.price == price)
+
+    assert kept(_ONE, "recovery") == 0
+    assert kept(replace(_ONE, recoverable=True), "recovery") == kept(_ONE, "storage") > 0
 
 
 def test_thesis_layout_pays_for_every_sample():
