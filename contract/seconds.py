@@ -12,6 +12,8 @@ from contract.limits import Value
 from contract.tables import EXPIRES_S, OMITTED, SECOND, STATS, TOPIC
 
 _TAKEN = frozenset({TOPIC, SECOND, EXPIRES_S, OMITTED})
+_SUFFIXES = tuple(f"_{statistic}" for statistic in STATS)
+_LEAST = _SUFFIXES[0]
 
 
 def packed_second(flat: Mapping[str, Value]) -> dict[str, Any]:
@@ -20,16 +22,17 @@ def packed_second(flat: Mapping[str, Value]) -> dict[str, Any]:
     A field of which only the last is known, such as a text, stays ``<field>_last``; one whose name the
     second has for something else stays as it is.
     """
-    packed: dict[str, Any] = {}
-    for name, value in flat.items():
-        field, _, statistic = name.rpartition("_")
-        names = [f"{field}_{each}" for each in STATS]
-        if field in flat or field in _TAKEN or statistic not in STATS or not flat.keys() >= set(names):
-            packed[name] = value
-        elif statistic == STATS[0]:
-            values = [flat[each] for each in names]
-            # The mean and the last lie between least and most.
-            packed[field] = values[:1] if flat[f"{field}_min"] == flat[f"{field}_max"] else values
+    packed: dict[str, Any] = dict(flat)
+    for name, least in flat.items():
+        if not name.endswith(_LEAST):
+            continue
+        field = name[: -len(_LEAST)]
+        names = [field + suffix for suffix in _SUFFIXES]
+        if field in flat or field in _TAKEN or not all(map(flat.__contains__, names)):
+            continue
+        values = [packed.pop(each) for each in names]
+        # The mean and the last lie between least and most.
+        packed[field] = values[:1] if least == values[2] else values
     return packed
 
 
@@ -39,7 +42,7 @@ def flat_second(packed: Mapping[str, Any]) -> dict[str, Any]:
     for name, value in packed.items():
         if isinstance(value, list):
             values = value * len(STATS) if len(value) == 1 else value
-            flat.update(zip([f"{name}_{statistic}" for statistic in STATS], values))
+            flat.update(zip([name + suffix for suffix in _SUFFIXES], values))
         else:
             flat[name] = value
     return flat

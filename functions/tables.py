@@ -22,6 +22,8 @@ _WRITE_ATTEMPTS = 8
 _VEHICLE_CACHE_S = 60.0
 # "Limits", items: 400 KB with the names counted in; a little is left to how numbers are counted.
 _MAX_ITEM_BYTES, _MAX_NAME_BYTES = 380 * 1024, 65_535
+# A float's longest text; as a number it is shorter.
+_MAX_NUMBER_BYTES = 25
 # Later than any time that the contract allows.
 _LAST_US = 2**53
 # What a DynamoDB number can hold, "Supported data types": 38 digits, 1e-130 to 9.99e125.
@@ -44,8 +46,6 @@ def attribute(value: Value | list[Value]) -> dict[str, Any]:
     """
     if value is None:
         return {"NULL": True}
-    if isinstance(value, list):
-        return {"L": [attribute(each) for each in value]}
     if isinstance(value, bool):
         return {"BOOL": value}
     if isinstance(value, str):
@@ -55,6 +55,8 @@ def attribute(value: Value | list[Value]) -> dict[str, Any]:
             return {"S": repr(value)}
         if abs(value) < _SMALLEST:
             return {"N": "0"}
+    if isinstance(value, list):
+        return {"L": list(map(attribute, value))}
     return {"N": repr(value)}
 
 
@@ -162,7 +164,9 @@ def fitting(item: dict[str, Any]) -> dict[str, Any]:
 
 def _size(name: str, value: Mapping[str, Any]) -> int:
     """About what DynamoDB counts: names and texts in UTF-8, and no number more than its digits."""
-    ((_, content),) = value.items()
+    ((kind, content),) = value.items()
+    if kind == "L":
+        return len(name.encode()) + 3 + _MAX_NUMBER_BYTES * len(content)
     return len(name.encode()) + len(str(content).encode("utf-8", "surrogatepass")) + 3
 
 
