@@ -1,0 +1,92 @@
+"""What the operator's side makes of stored batches, a page at once: what the contract makes of each."""
+
+from __future__ import annotations
+
+import itertools
+import json
+
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+import contract
+from contract import Batch
+from contract.checks import wire_column
+from station.sizes import stored_bytes
+from station.stored import Refused, blocks
+from tests.fakes import item_of_message
+from tests.recordings import recording
+from tests.unit.test_contract_columns import BOOT, WRONG, columns, message_of, plain_message
+
+
+def read(*messages):
+    """The blocks of messages in one page, and what was refused."""
+    refused = Refused()
+    items = [item_of_message(json.dumps(message).encode()) for message in messages]
+    return list(blocks([items], refused)), refused
+
+
+@pytest.mark.parametrize("column", [column for column, _ in WRONG])
+def test_columns_that_nobody_writes_are_refused(column):
+    found, refused = read(message_of(column))
+    assert (len(found), refused.count) == (0, 1)
+
+
+def test_a_sum_that_comes_back_through_64_bits_is_refused():
+    found, refused = read(message_of([0, 1, *[2**62] * 4, 1], n=6))
+    assert (len(found), refused.count) == (0, 1)
+
+
+@settings(max_examples=100)
+@given(st.lists(columns(), min_size=1, max_size=4), st.data())
+def test_the_station_reads_what_the_contract_reads(parts, data):
+    """A page of batches of both codecs, good and bad, of columns that change their kind."""
+    messages, expected, refused = [], [], 0
+    for seq, column in enumerate(parts):
+        times = [seq * 1_000_000 + 20 * i for i in range(len(column))]
+        message = json.loads(contract.encode(Batch(BOOT, seq, times, {"a": column})))
+        kind = data.draw(st.sampled_from(["new", "old", "bad"]))
+        if kind == "old":
+            body = {"dt": [0] + [20] * (len(times) - 1), "fields": {"a": wire_column("a", column)[0]}}
+            message = plain_message(message, body)
+        if kind == "bad":
+            damaged = message_of(
+                [data.draw(st.integers(-1, 30)), 2**62, *[2**62] * (len(times) - 1)], n=len(times)
+            )
+            message = {**message, "samples": damaged["samples"]}
+            refused += 1
+        else:
+            expected += contract.decode(message).columns["a"]
+        messages.append(message)
+    found, told = read(*messages)
+    got = [value for block in found for value in block.columns["a"].tolist()]
+    assert told.count == refused
+    assert list(map(as_read, got)) == list(map(as_read, expected))
+
+
+def as_read(value):
+    """As the station has it: null is NaN and numbers are floats, unless the column holds more than those."""
+    if value is None or value != value:  # noqa: PLR0124 - NaN
+        return None
+    return (
+        value if isinstance(value, (str, bool)) else (float(value), int(value) if abs(value) < 2**63 else 0)
+    )
+
+
+def test_a_real_drive_fits_in_a_write_unit_and_comes_back():
+    from tests.unit.test_summarize import drive_of
+
+    samples = list(drive_of(recording("f1tenth-motor-servo.bag")))
+    sizes = []
+    for _, group in itertools.groupby(samples, key=lambda sample: sample[0] // 1_000_000):
+        second = list(group)
+        names = list(second[0][1])
+        batch = Batch(BOOT, 0, [t for t, _ in second], {n: [s[n] for _, s in second] for n in names})
+        message = contract.encode(batch)
+        decoded = contract.decode(message)
+        assert {n: list(map(float, c)) for n, c in decoded.columns.items()} == {
+            n: list(map(float, c)) for n, c in batch.columns.items()
+        }
+        sizes.append(stored_bytes(message))
+    assert len(sizes) > 40
+    assert max(sizes) <= 1024
