@@ -23,7 +23,7 @@ from contract import (
     parse_topic,
 )
 from functions.legs import Legs
-from functions.metrics import emit
+from functions.metrics import Gathered, emit
 from functions.pubnub_client import PublishError, PubNubPublisher
 
 _log = logging.getLogger(__name__)
@@ -65,11 +65,18 @@ class RefusedError(Exception):
 
 
 def process(
-    event: Mapping[str, Any], settings: LiveSettings, publish: Publish, legs: Legs, now_us: int
+    event: Mapping[str, Any],
+    settings: LiveSettings,
+    publish: Publish,
+    *,
+    legs: Legs,
+    counted: Gathered,
+    now_us: int,
 ) -> None:
     """Publish one live message, or count why not. A live message is never worth a retry.
 
-    Raises `RefusedError` for one that is malformed.
+    Failures are written at once, everything else is ``counted`` and written now and then. Raises
+    `RefusedError` for one that is malformed.
     """
     try:
         topic = parse_topic(event[TOPIC])
@@ -85,7 +92,7 @@ def process(
         way_ms = max(0.0, (now_us - live.sent_us - live.offset_us) / 1000)
     if age_ms(live, received_ms, now_us, legs) > LIVE_MAX_AGE_MS:
         # The stale ones are the late ones: an alarm that does not hear of them never goes off.
-        emit("live", LiveStale=1, CarToLambdaMs=way_ms)
+        counted.add(now_us / 1e6, LiveStale=1, CarToLambdaMs=way_ms)
         return
     chosen = settings.fields.get(topic.name)
     if chosen is not None:
@@ -98,8 +105,8 @@ def process(
         _log.warning("not published for %s: %s", topic.robot, error)
         emit("live", PubNubFailed=1)
         return
-    emit(
-        "live",
+    counted.add(
+        now_us / 1e6,
         LivePublished=1,
         InCarMs=max(0.0, (live.sent_us - live.t_us) / 1000),
         UplinkMs=uplink_ms,
@@ -123,6 +130,18 @@ def _legs() -> Legs:
     return Legs()
 
 
+@cache
+def _counted() -> Gathered:
+    return Gathered("live")
+
+
 def handler(event: dict[str, Any], _context: object) -> None:
     """Entry point of the live rule's Lambda action."""
-    process(event, _settings(), _publisher().publish, _legs(), time.time_ns() // 1000)
+    process(
+        event,
+        _settings(),
+        _publisher().publish,
+        legs=_legs(),
+        counted=_counted(),
+        now_us=time.time_ns() // 1000,
+    )

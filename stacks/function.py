@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 from aws_cdk import CfnOutput, Duration, IgnoreMode, Stack
 from aws_cdk import aws_iam as iam
 from aws_cdk import aws_lambda as lambda_
 from aws_cdk import aws_logs as logs
 
 from stacks.encryption import Encryption
-from stacks.settings import ROOT, Settings
+from stacks.settings import ALL_LOGS, ROOT, Settings
 
 RUNTIME = lambda_.Runtime.PYTHON_3_13
 # The emulator runs the functions on the machine it stands on, so the architecture means nothing there.
@@ -53,6 +55,7 @@ def function(
         handler=f"functions.{module}.handler",
         role=role,
         log_group=log,
+        **_logged(settings),
         memory_size=memory_mb,
         timeout=Duration.seconds(timeout_s),
         # Under this namespace its metrics are counted: functions/metrics.py.
@@ -62,3 +65,17 @@ def function(
     )
     CfnOutput(stack, f"{name}Function", value=made.function_name)
     return made
+
+
+def _logged(settings: Settings) -> dict[str, Any]:
+    """Lambda's START, END and REPORT lines cost as much as what functions say themselves. Only logs in JSON
+    can leave them out; of an invocation that fails or times out there is still a report."""
+    if settings.function_logs == ALL_LOGS:
+        return {}
+    return {
+        "logging_format": lambda_.LoggingFormat.JSON,
+        "system_log_level_v2": lambda_.SystemLogLevel.WARN,
+        # Metrics are lines without a level, which counts as INFO ("Log-level filtering"): with WARN here they
+        # would be filtered out.
+        "application_log_level_v2": lambda_.ApplicationLogLevel.INFO,
+    }

@@ -27,6 +27,8 @@ DEV, PROD = "dev", "prod"
 STAGES = (DEV, PROD)
 _RESERVED_FOR_LIVE = 5
 IOT_LOG_LEVELS = ("off", "error", "warn", "info", "debug")
+OWN_LOGS, ALL_LOGS = "own", "all"
+FUNCTION_LOGS = (OWN_LOGS, ALL_LOGS)
 _EMAIL = re.compile(r"[^@\s,]+@[^@\s,]+\.[^@\s,]+")
 # "Tag naming limits and requirements": up to 128 and 256 characters, and aws: is AWS' own.
 _TAG_KEY = re.compile(r"(?!aws:)[\w .:/=+@-]{1,128}", re.IGNORECASE)
@@ -64,6 +66,8 @@ class Settings:
     files are (0: for good), ``upload_gb_a_day`` what one robot may upload in a day, in 1e9 bytes;
     ``live_concurrency`` is what is reserved for Lambda 1, which also bounds it (0: nothing; None: as
     `reserved_for_live` says); ``live_fields`` maps stream to the fields that go to the dashboard;
+    ``function_logs`` is "own" for what the functions themselves write, or "all" for Lambda's lines about
+    every invocation as well;
     ``device_defender`` and ``iot_log_level`` ("" for none) are for the account as a whole;
     ``site`` adds the stack that puts the page on the web; ``layer`` is the folder of Lambda 1's
     third-party code; ``embedded`` is true for the embedded cloud, which is deployed with the caller's
@@ -86,6 +90,7 @@ class Settings:
     layer: Path = ROOT / "build" / "layer" / "lambda"
     device_defender: bool = True
     iot_log_level: str = "error"
+    function_logs: str = OWN_LOGS
     site: bool = False
     embedded: bool = False
 
@@ -148,6 +153,12 @@ class Settings:
                     f"context iot_log_level = {level!r}: allowed is one of {', '.join(IOT_LOG_LEVELS)}"
                 )
             given["iot_log_level"] = "" if level == "off" else level
+        if (logs := context("function_logs")) is not None:
+            if logs not in FUNCTION_LOGS:
+                raise SettingsError(
+                    f"context function_logs = {logs!r}: allowed is {' or '.join(FUNCTION_LOGS)}"
+                )
+            given["function_logs"] = logs
         if (email := context("alarm_email")) is not None:
             given["alarm_email"] = _email("alarm_email", email)
         if (tags := context("tags")) is not None:

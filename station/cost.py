@@ -32,8 +32,11 @@ _PLATFORM_LINES = (
     f"REPORT RequestId: {_REQUEST}\tDuration: 12.34 ms\tBilled Duration: 13 ms\t"
     "Memory Size: 256 MB\tMax Memory Used: 81 MB\t\n"
 )
-# And ours: two metrics in embedded metric format; a test holds it to functions/metrics.py.
-_METRICS_LINE = 260
+# And ours in bytes, in embedded metric format; a test holds these to functions/. Lambda 1 gathers what it
+# counts: a line an environment in `_GATHER_S`, or sooner with a hundred values of one metric; four a message.
+_GATHER_S, _MOST_VALUES, _LIVE_LINE, _LIVE_VALUES = 10.0, 100.0, 480, 24
+# Lambda 2 writes one about itself, and one about each stream that it was given.
+_SUMMARIZE_LINE, _HEALTH_LINE, _PONG_LINE = 310, 300, 220
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -44,6 +47,7 @@ class Usage:
     a batch spans ``batch_s``; ``agent_every_s`` between the agent's own figures; robots drive
     ``hours_per_day``; each of ``viewers`` watches the whole fleet all that time; items are kept
     ``retention_days``, ``recoverable`` to a point in time in stage prod.
+    ``function_logs`` is the deployment's parameter: "all" adds Lambda's own lines about every invocation.
     What only AWS can say, the billed milliseconds of an invocation, and of each batch that Lambda 2 finds
     in one, are assumptions and named so.
     """
@@ -63,6 +67,7 @@ class Usage:
     summarize_memory_mb: int = 512
     summarize_ms: float = 20.0
     summarize_batch_ms: float = 5.0
+    function_logs: str = "own"
     alarms: int = 28
     dashboards: int = 2
     recoverable: bool = False
@@ -72,7 +77,7 @@ class Usage:
     def check(self) -> Usage:
         """Itself; raises `StationError` for what no fleet can do."""
         for name, value in vars(self).items():
-            if value < 0:
+            if not isinstance(value, str) and value < 0:
                 raise StationError(f"{name} {value}: allowed is 0 or more")
         if self.robots < 1:
             raise StationError(f"robots {self.robots}: allowed is 1 or more")
@@ -140,7 +145,7 @@ def bill(usage: Usage) -> list[Item]:
         Item("IoT Core", "live", "rules fault and battery", "rule", 2 * passing),
         Item("IoT Core", "live", "their actions, or the least billed", "action", 2 * passing),
     ]
-    items += _ping_items(usage.ping_hz * hour, sizes)
+    items += _ping_items(usage.ping_hz * hour, sizes, all_lines=usage.function_logs == "all")
     writes = batches * _units(sizes.telemetry_item, _WRITE)
     # Of one robot in an event: its batches, of which one query reads also the second before.
     found = max(1.0, usage.batches_per_s * _shards_of(usage) / summarize_calls_per_s(usage))
@@ -166,13 +171,15 @@ def bill(usage: Usage) -> list[Item]:
     if usage.recoverable:
         items += [item._replace(what=f"{item.what}, recoverable", price="recovery") for item in kept]
     calls = summarize_calls_per_s(usage) * hour / usage.robots
+    all_lines = usage.function_logs == "all"
     items += _lambda_items(
         "record",
         "Lambda 2",
         calls,
         memory_mb=usage.summarize_memory_mb,
         billed_ms=usage.summarize_ms + usage.summarize_batch_ms * (batches + own) / calls,
-        line_bytes=_METRICS_LINE,
+        logged=calls * _SUMMARIZE_LINE + (batches / found + own) * _HEALTH_LINE,
+        all_lines=all_lines,
     )
     items += _lambda_items(
         "live",
@@ -180,7 +187,8 @@ def bill(usage: Usage) -> list[Item]:
         live,
         memory_mb=usage.live_memory_mb,
         billed_ms=usage.live_ms,
-        line_bytes=_METRICS_LINE,
+        logged=_live_lines_per_s(usage) * hour / usage.robots * _LIVE_LINE + live * _LIVE_VALUES,
+        all_lines=all_lines,
     )
     return items
 
@@ -197,7 +205,7 @@ def thesis_bill(usage: Usage) -> list[Item]:
     polls = max(_THESIS_POLLS_PER_S * _shards(per_s), per_s / _THESIS_RECORDS_A_CALL)
     calls = min(per_s, polls) * 3600 / usage.robots
     written = samples * _units(sizes.sample_item, _WRITE)
-    functions: dict[str, Any] = {"memory_mb": 128, "line_bytes": 0, "compute": "compute_x86"}
+    functions: dict[str, Any] = {"memory_mb": 128, "logged": 0.0, "compute": "compute_x86"}
     live = _lambda_items("live", "Lambda 1", samples, billed_ms=usage.live_ms, **functions)
     second = _lambda_items("record", "Lambda 2", calls, billed_ms=usage.summarize_ms, **functions)
     return [
@@ -258,6 +266,13 @@ def _shards_of(usage: Usage) -> float:
     return _shards(usage.robots * usage.batches_per_s * _units(sizes.telemetry_item, _WRITE))
 
 
+def _live_lines_per_s(usage: Usage) -> float:
+    """Of the whole fleet: each environment of Lambda 1 gathers what it counts."""
+    messages = usage.robots * usage.live_hz
+    environments = max(1, ceil(messages * usage.live_ms / 1000))
+    return min(messages, max(environments / _GATHER_S, messages / _MOST_VALUES))
+
+
 def what_if(usage: Usage) -> Iterator[tuple[str, Usage]]:
     """The settings that change the bill, one at a time."""
     yield "as configured", usage
@@ -271,6 +286,7 @@ def what_if(usage: Usage) -> Iterator[tuple[str, Usage]]:
         name = f"batches of {batch_s:g} s" if batch_s else "one sample a batch"
         yield name, replace(usage, batch_s=batch_s)
     yield "round trips measured at 1 Hz", replace(usage, ping_hz=1.0)
+    yield "with Lambda's own log lines", replace(usage, function_logs="all")
     yield "kept for 30 days", replace(usage, retention_days=30)
     yield "tables recoverable to a point in time (`prod`)", replace(usage, recoverable=True)
     yield "a thousand robots", replace(usage, robots=1000)
@@ -293,7 +309,7 @@ def _rule_items(lane: str, messages: float, size: int) -> list[Item]:
     ]
 
 
-def _ping_items(pings: float, sizes: Sizes) -> list[Item]:
+def _ping_items(pings: float, sizes: Sizes, *, all_lines: bool) -> list[Item]:
     """Of each path: the ping in and the pong out; two of three pass a rule, one a function."""
     if not pings:
         return []
@@ -301,7 +317,15 @@ def _ping_items(pings: float, sizes: Sizes) -> list[Item]:
         Item("IoT Core", "ping", "pings and pongs", "message", 6 * pings * _units(sizes.ping, _METER)),
         Item("IoT Core", "ping", "rules triggered", "rule", 2 * pings),
         Item("IoT Core", "ping", "actions", "action", 2 * pings),
-        *_lambda_items("ping", "echo", pings, memory_mb=256, billed_ms=5.0, line_bytes=_METRICS_LINE),
+        *_lambda_items(
+            "ping",
+            "echo",
+            pings,
+            memory_mb=256,
+            billed_ms=5.0,
+            logged=pings * _PONG_LINE,
+            all_lines=all_lines,
+        ),
     ]
 
 
@@ -317,14 +341,17 @@ def _lambda_items(
     *,
     memory_mb: int,
     billed_ms: float,
-    line_bytes: int,
+    logged: float,
+    all_lines: bool = True,
     compute: str = "compute_arm",
 ) -> list[Item]:
-    logged = len(_PLATFORM_LINES) + line_bytes
+    """``logged`` are the bytes of the function's own lines in an hour."""
+    if all_lines:
+        logged += calls * len(_PLATFORM_LINES)
     return [
         Item("Lambda", lane, f"{name} invoked", "invocation", calls),
         Item("Lambda", lane, f"{name} computing", compute, calls * memory_mb / 1024 * billed_ms / 1000),
-        Item("CloudWatch", lane, f"{name} logging", "logs", calls * logged / 1e9),
+        Item("CloudWatch", lane, f"{name} logging", "logs", logged / 1e9),
     ]
 
 

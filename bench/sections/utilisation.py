@@ -16,7 +16,7 @@ import threading
 import time
 import zipfile
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager
 from dataclasses import asdict, dataclass, field
 from statistics import median
 from typing import Any
@@ -80,9 +80,11 @@ def run(target: Target, say: Say) -> Section:
     }
     live = target.cloud.output("processing", "LiveFunction")
     summarize = target.cloud.output("processing", "SummarizeFunction")
-    with _empty_function(target) as empty:
+    with _empty_function(target) as empty, ExitStack() as reports:
         names = dict(zip(events, (live, summarize, summarize), strict=True))
         events["empty function"], names["empty function"] = (lambda _: {}), empty
+        for name in sorted(set(names.values())):
+            reports.enter_context(_reporting(target, name))
         found = {name: Measured() for name in events}
         for name, event in events.items():
             _invoke(target, names[name], event(0))
@@ -245,6 +247,10 @@ def _reported(
             for event in page["events"]
         ]
         reports = [line for line in lines if _REPORT.match(line)]
+        if not reports and time.monotonic() > deadline:
+            raise RuntimeError(
+                f"{group} has no REPORT line after {_LOGS_S:.0f} s: deploy with function_logs=all"
+            )
         if len(reports) >= len(requests) or time.monotonic() > deadline:
             durations = [float(match[1]) for line in reports if (match := _REPORT.match(line))]
             return durations, [float(match[1]) for line in reports if (match := _INIT.search(line))]
@@ -291,6 +297,21 @@ def _cold(target: Target, function: str, event: Callable[[int], dict[str, Any]],
 def _configure(client: Any, function: str, **change: Any) -> None:
     client.update_function_configuration(FunctionName=function, **change)
     client.get_waiter("function_updated_v2").wait(FunctionName=function)
+
+
+@contextmanager
+def _reporting(target: Target, function: str) -> Iterator[None]:
+    """Have Lambda write its REPORT lines meanwhile, which the stacks leave out (`function_logs`)."""
+    client = target.cloud.client("lambda")
+    was = client.get_function_configuration(FunctionName=function).get("LoggingConfig", {})
+    if was.get("LogFormat") != "JSON":
+        yield
+        return
+    _configure(client, function, LoggingConfig={"LogFormat": "Text", "LogGroup": was["LogGroup"]})
+    try:
+        yield
+    finally:
+        _configure(client, function, LoggingConfig=was)
 
 
 @contextmanager

@@ -50,7 +50,7 @@ def cost_(
     deployed: Annotated[
         bool,
         typer.Option(
-            "--deployed", help="Memory, concurrency, alarms, recovery and key as they are deployed."
+            "--deployed", help="Memory, concurrency, logs, alarms, recovery and key as they are deployed."
         ),
     ] = False,
     as_json: Annotated[bool, typer.Option("--json", help="As JSON.")] = False,
@@ -112,9 +112,12 @@ def _as_deployed(usage: Usage, cloud: Cloud) -> Usage:
     client = cloud.client("lambda")
     for name, key in (("Live", "live_memory_mb"), ("Summarize", "summarize_memory_mb")):
         function = cloud.output("processing", f"{name}Function")
-        found[key] = client.get_function_configuration(FunctionName=function)["MemorySize"]
+        configured = client.get_function_configuration(FunctionName=function)
+        found[key] = configured["MemorySize"]
         if name == "Live":
             reserved = client.get_function_concurrency(FunctionName=function)
+            level = configured.get("LoggingConfig", {}).get("SystemLogLevel")
+            found["function_logs"] = "own" if level == "WARN" else "all"
             found["live_concurrency"] = reserved.get("ReservedConcurrentExecutions", 0)
     pages = cloud.client("cloudwatch").get_paginator("describe_alarms").paginate()
     found["alarms"] = sum(len(page.get("MetricAlarms", [])) for page in pages)

@@ -12,6 +12,7 @@ import sys
 from pathlib import Path
 
 import pytest
+from aws_cdk import App, Stack
 
 import contract
 from contract import (
@@ -29,8 +30,10 @@ from contract import (
     rule_name,
 )
 from functions.health import measure
+from stacks.encryption import Encryption
+from stacks.function import function
 from stacks.metrics import statistic
-from stacks.settings import ROOT, Settings
+from stacks.settings import ROOT, Settings, SettingsError
 from station.cost import Usage
 from tests.stacks.templates import name
 
@@ -264,6 +267,8 @@ def emitted():
                 function = ast.literal_eval(node.args[0])
                 named = {keyword.arg for keyword in node.keywords} - {"robot", None}
                 found.setdefault(function, set()).update(named)
+            if isinstance(node, ast.Call) and ast.unparse(node.func) == "counted.add":
+                found.setdefault(path.stem, set()).update(keyword.arg for keyword in node.keywords)
     # These have their names computed.
     batch = contract.Batch("0" * 8, 0, [1], {"voltage_input": [12.0]})
     for stream in ("vesc", contract.RTT_STREAM, contract.AGENT_STREAM):
@@ -281,6 +286,29 @@ def test_the_dashboards_show_what_the_functions_emit_and_nothing_else(shown):
             assert options["stat"] == statistic(metric)
     assert by_function == {function: set(names) for function, names in contract.METRICS.items()}
     assert emitted() == by_function
+
+
+def test_functions_log_what_they_say_and_of_lambda_what_went_wrong(synthesized, functions):
+    for made in functions.values():
+        logging = made["LoggingConfig"]
+        assert (logging["LogFormat"], logging["SystemLogLevel"]) == ("JSON", "WARN")
+        # A metric's line names no level and counts as INFO: "Log-level filtering", Lambda Developer Guide.
+        assert logging["ApplicationLogLevel"] == "INFO"
+
+
+def test_lambdas_own_lines_come_back_where_they_are_asked_for(tmp_path):
+    app = App(context={"function_logs": "all", "layer": str(tmp_path)})
+    stack, settings = Stack(app, "x"), Settings.from_context(app)
+    encryption = Encryption(stack, settings=settings)
+    function(stack, "Echo", settings=settings, encryption=encryption, module="echo", memory_mb=256)
+    (made,) = (
+        resource["Properties"]
+        for resource in app.synth().stacks[0].template["Resources"].values()
+        if resource["Type"] == "AWS::Lambda::Function"
+    )
+    assert made["LoggingConfig"].keys() == {"LogGroup"}
+    with pytest.raises(SettingsError, match="function_logs = 'none': allowed is own or all"):
+        Settings.from_context(App(context={"function_logs": "none", "layer": str(tmp_path)}))
 
 
 def test_the_dashboards_cover_every_service_of_the_path(shown):

@@ -9,7 +9,8 @@ import pytest
 from typer.testing import CliRunner
 
 from device.sources.vehicle import Vehicle, VehicleConfig
-from functions.metrics import emit
+from functions.health import measure
+from functions.metrics import Gathered, emit
 from scripts.costs import FILES, filled
 from station import cost, scale, sizes
 from station.at_rest import deployment_dollars_per_month
@@ -122,9 +123,32 @@ def test_a_second_s_items_fit_in_one_write_unit_each():
     assert sizes.own_item_bytes("agent", 1) <= 1024
 
 
-def test_metrics_line_is_about_as_long_as_lambda_1_writes_it(capsys):
-    emit("live", LivePublished=1, CarToLambdaMs=12.345)
-    assert len(capsys.readouterr().out) == pytest.approx(cost._METRICS_LINE, rel=0.25)
+def test_an_hour_of_lambda_1_logs_about_as_much_as_it_writes(capsys):
+    counted = Gathered("live")
+    for i in range(36_000):
+        delays = dict.fromkeys(("InCarMs", "UplinkMs", "ToLambdaMs", "CarToLambdaMs"), 2.34 + i % 97)
+        counted.add(1_700_000_000 + i / 10, LivePublished=1, **delays)
+    written = len(capsys.readouterr().out)
+    assert written == pytest.approx(_units(cost.bill(_ONE), "live", "logs") * 1e9, rel=0.1)
+    whole = _units(cost.bill(replace(_ONE, function_logs="all")), "live", "logs") * 1e9
+    assert whole - 36_000 * len(cost._PLATFORM_LINES) == pytest.approx(written, rel=0.1)
+
+
+def test_environments_gather_each_for_itself():
+    assert cost._live_lines_per_s(_ONE) == 0.1
+    # Twenty milliseconds each: two at a time, and more than a hundred in ten seconds.
+    assert cost._live_lines_per_s(replace(_ONE, robots=10)) == 1.0
+    assert cost._live_lines_per_s(replace(_ONE, live_hz=0.01)) == 0.01
+
+
+def test_the_other_lines_are_about_as_long_as_they_are_written(capsys):
+    batch = sizes._batch(sizes._drive(50, 50), 50)
+    emit("summarize", BatchesSummarized=2, SamplesSummarized=100)
+    emit("health", **measure("vesc", [batch]))
+    emit("echo", PongsSent=1)
+    lengths = [len(line) for line in capsys.readouterr().out.splitlines()]
+    model = [cost._SUMMARIZE_LINE, cost._HEALTH_LINE, cost._PONG_LINE]
+    assert lengths == pytest.approx(model, rel=0.1)
 
 
 def test_a_drive_is_a_vesc_drive():

@@ -17,6 +17,7 @@ from contract import LIVE, LIVE_MAX_AGE_MS, RECEIVED_MS, TOPIC, LiveSample, buil
 from functions import live
 from functions.legs import Legs
 from functions.live import LiveSettings, RefusedError, age_ms, process
+from functions.metrics import Gathered
 from functions.pubnub_client import PublishError, PubNubPublisher
 
 T_US = 1_700_000_000_000_000
@@ -46,6 +47,11 @@ class Channels:
         self.sent.append((channel, message))
 
 
+def show(message, publish, *, settings=SETTINGS, legs=None, now_us=NOW_US):
+    """What a new environment does with a message: it writes what it counts at once."""
+    process(message, settings, publish, legs=legs or Legs(), counted=Gathered("live"), now_us=now_us)
+
+
 @pytest.fixture
 def counted(capsys):
     """The metrics written since the last call, summed by name; every line is checked on the way."""
@@ -65,7 +71,7 @@ def counted(capsys):
 
 def test_the_chosen_fields_go_to_the_cars_channel_with_every_hops_time(counted):
     channels = Channels()
-    process(event(), SETTINGS, channels, Legs(), NOW_US)
+    show(event(), channels)
     ((channel, message),) = channels.sent
     assert channel == contract.channel("car")
     assert message == {
@@ -85,27 +91,27 @@ def test_the_chosen_fields_go_to_the_cars_channel_with_every_hops_time(counted):
 
 def test_a_stream_that_is_not_configured_sends_every_field():
     channels = Channels()
-    process(event("imu"), SETTINGS, channels, Legs(), NOW_US)
+    show(event("imu"), channels)
     assert channels.sent[0][1]["sample"] == SAMPLE
     assert channels.sent[0][1]["stream"] == "imu"
 
 
 def test_a_stream_configured_with_no_field_sends_none_and_fields_that_are_not_there_are_not_made_up():
     channels = Channels()
-    process(event(), LiveSettings({"vesc": frozenset()}), channels, Legs(), NOW_US)
-    process(event(), LiveSettings({"vesc": frozenset({"speed", "absent"})}), channels, Legs(), NOW_US)
+    show(event(), channels, settings=LiveSettings({"vesc": frozenset()}))
+    show(event(), channels, settings=LiveSettings({"vesc": frozenset({"speed", "absent"})}))
     assert [message["sample"] for _, message in channels.sent] == [{}, {"speed": 1200}]
 
 
 def test_another_deployment_has_channels_of_its_own():
     channels = Channels()
-    process(event(namespace="lab2"), SETTINGS, channels, Legs(), NOW_US)
+    show(event(namespace="lab2"), channels)
     assert channels.sent[0][0] == contract.channel("car", "lab2")
 
 
 def test_the_robot_is_the_topics_whatever_the_message_claims():
     channels = Channels()
-    process(event(robot="mine", channel="iort.other"), SETTINGS, channels, Legs(), NOW_US)
+    show(event(robot="mine", channel="iort.other"), channels)
     assert channels.sent[0][0] == contract.channel("mine")
     assert channels.sent[0][1]["robot"] == "mine"
 
@@ -131,7 +137,7 @@ def test_stale_by_its_time_in_the_car_and_in_the_cloud(
     t_us = sent_us - round(in_car_ms * 1000)
     now_us = RECEIVED * 1000 + round(in_cloud_ms * 1000)
     channels = Channels()
-    process(event(t=t_us, sent_us=sent_us), SETTINGS, channels, Legs(), now_us)
+    show(event(t=t_us, sent_us=sent_us), channels, now_us=now_us)
     age = age_ms(LiveSample("0123abcd", 0, t_us, sent_us, {}), RECEIVED, now_us, Legs())
     assert age == in_car_ms + in_cloud_ms
     assert len(channels.sent) == (not stale)
@@ -181,7 +187,7 @@ MALFORMED = [
 def test_a_malformed_event_is_counted_and_fails_the_invocation_so_that_it_is_kept(malformed, counted):
     channels = Channels()
     with pytest.raises(RefusedError) as raised:
-        process(malformed, SETTINGS, channels, Legs(), NOW_US)
+        show(malformed, channels)
     assert channels.sent == []
     assert counted() == {"LiveRefused": 1}
     assert len(str(raised.value)) < 1000
@@ -199,14 +205,14 @@ def test_nothing_in_an_event_raises_anything_else(changes, anything):
     channels = Channels()
     for one in ({**event(), **changes}, anything):
         with contextlib.suppress(RefusedError):
-            process(one, SETTINGS, channels, Legs(), NOW_US)
+            show(one, channels)
     for channel, message in channels.sent:
         assert channel.startswith("iort.")
         json.dumps(message, allow_nan=False)
 
 
 def test_what_pubnub_does_not_take_is_counted_and_not_raised(counted, caplog):
-    process(event(), SETTINGS, Channels(PublishError("status 403")), Legs(), NOW_US)
+    show(event(), Channels(PublishError("status 403")))
     assert counted() == {"PubNubFailed": 1}
     assert "car: status 403" in caplog.text
 
@@ -287,13 +293,8 @@ def test_the_loggers_that_would_show_the_keys_are_quiet():
 
 def late(sent_us, received_ms, legs, channels):
     """A live message that was received at once by Lambda, however long it took to get there."""
-    process(
-        {**event(t=sent_us, sent_us=sent_us), "received_ms": received_ms},
-        SETTINGS,
-        channels,
-        legs,
-        received_ms * 1000,
-    )
+    message = {**event(t=sent_us, sent_us=sent_us), "received_ms": received_ms}
+    show(message, channels, legs=legs, now_us=received_ms * 1000)
 
 
 @pytest.mark.parametrize("offset_us", [0, 3_600_000_000, -3_600_000_000])
@@ -321,7 +322,7 @@ def test_a_car_that_knows_its_clocks_offset_is_judged_by_it_in_an_environment_wi
     sent_us = SENT_US + clock_error_us
     message = event(t=sent_us, sent_us=sent_us, offset_us=-clock_error_us)
     channels = Channels()
-    process({**message, RECEIVED_MS: received_ms}, SETTINGS, channels, Legs(), received_ms * 1000)
+    show({**message, RECEIVED_MS: received_ms}, channels, now_us=received_ms * 1000)
     assert len(channels.sent) == (not stale)
     totals = counted()
     assert (totals.get("LiveStale", 0), totals.get("LivePublished", 0)) == (stale, not stale)

@@ -8,7 +8,7 @@ import time
 import pytest
 
 import contract
-from functions.metrics import emit
+from functions.metrics import Gathered, emit
 
 
 @pytest.fixture(autouse=True)
@@ -65,3 +65,71 @@ def test_an_unknown_name_is_refused_even_when_it_is_zero(value, capsys):
     with pytest.raises(KeyError, match="nothing"):
         emit("nothing", LivePublished=value)
     assert capsys.readouterr().out == ""
+
+
+class Lines:
+    """What would have been written: the time and the values of each line."""
+
+    def __init__(self):
+        self.written = []
+
+    def __call__(self, function, values, at_s):
+        assert function == "live"
+        self.written.append((at_s, values))
+
+
+def test_what_is_counted_first_is_written_at_once_and_then_once_in_ten_seconds():
+    lines = Lines()
+    gathered = Gathered("live", lines)
+    for i in range(26):
+        gathered.add(1000.0 + i, LivePublished=1, InCarMs=0.5 + i)
+    assert [at_s for at_s, _ in lines.written] == [1000, 1010, 1020]
+    first, second, third = (values for _, values in lines.written)
+    assert first == {"LivePublished": 1, "InCarMs": 0.5}
+    assert second == {"LivePublished": 10, "InCarMs": [i + 0.5 for i in range(1, 11)]}
+    assert third["LivePublished"] == 10
+
+
+def test_no_value_is_lost_and_no_line_has_more_than_cloudwatch_takes():
+    lines = Lines()
+    gathered = Gathered("live", lines)
+    delays = [round(1 + i / 7, 2) for i in range(5000)]
+    for i, delay in enumerate(delays):
+        gathered.add(1000 + i * 0.02, LivePublished=1, CarToLambdaMs=delay, UplinkMs=0.0)
+    gathered.add(2000, LiveStale=1)
+    values = [values for _, values in lines.written]
+    found = [each["CarToLambdaMs"] for each in values if "CarToLambdaMs" in each]
+    assert [ms for each in found for ms in (each if isinstance(each, list) else [each])] == delays
+    assert max(len(each) for each in found if isinstance(each, list)) == 100
+    assert sum(each.get("LivePublished", 0) for each in values) == 5000
+    assert not any("UplinkMs" in each for each in values), "a zero is a value that nobody knows"
+
+
+def test_what_is_left_when_calls_pause_is_of_its_own_minute():
+    lines = Lines()
+    gathered = Gathered("live", lines)
+    for at_s in (1000, 1001, 1002, 1400):
+        gathered.add(at_s, LivePublished=1)
+    assert lines.written == [
+        (1000, {"LivePublished": 1}),
+        (1002, {"LivePublished": 2}),
+        (1400, {"LivePublished": 1}),
+    ]
+
+
+def test_a_clock_set_back_holds_nothing_back_for_long():
+    lines = Lines()
+    gathered = Gathered("live", lines)
+    gathered.add(1000, InCarMs=1)
+    for i in range(100):
+        gathered.add(i, InCarMs=1)
+    assert len(lines.written) == 2
+
+
+def test_what_is_gathered_is_a_line_of_its_time(capsys):
+    gathered = Gathered("live")
+    for at_s in (1000.0, 1004.0, 1011.0):
+        gathered.add(at_s, LivePublished=1, InCarMs=1.2345)
+    _, line = map(json.loads, capsys.readouterr().out.splitlines())
+    assert (line["_aws"]["Timestamp"], line["LivePublished"]) == (1_011_000, 2)
+    assert line["InCarMs"] == [1.23, 1.23]
