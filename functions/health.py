@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
-from typing import TypeGuard
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 
 from contract import (
     AGENT_STREAM,
@@ -13,10 +12,11 @@ from contract import (
     RTT_STREAM,
     VOLTAGE_FIELD,
     Batch,
-    Value,
 )
-from functions.statistics import count_holes
+from functions.metrics import MOST_VALUES
+from functions.statistics import count_holes, numbers_of
 
+Measured = Mapping[str, float | list[float]]
 # The controllers' own temperatures; a driver that does not measure one leaves it at 0.
 _TEMPERATURES = (
     "temperature_pcb",
@@ -28,7 +28,7 @@ _TEMPERATURES = (
 )
 
 
-def measure(stream: str, batches: Sequence[Batch]) -> dict[str, float | list[float]]:
+def measure(stream: str, batches: Sequence[Batch]) -> Measured:
     """The metrics of one robot's batches of one stream; each batch counts once, whatever its seconds.
 
     Battery (V) and temperature (degC) are the worst of the batches; holes between samples are counted
@@ -52,10 +52,22 @@ def measure(stream: str, batches: Sequence[Batch]) -> dict[str, float | list[flo
     }
 
 
-def _numbers(batches: Iterable[Batch], name: str) -> Iterable[float]:
+def together(measured: Iterable[Measured]) -> Iterator[Measured]:
+    """The metrics of several robots in as few lines of log as hold them: counts are summed, values follow
+    each other."""
+    counts: dict[str, float] = {}
+    values: dict[str, list[float]] = {}
+    for one in measured:
+        for name, value in one.items():
+            if isinstance(value, list):
+                values.setdefault(name, []).extend(value)
+            else:
+                counts[name] = counts.get(name, 0) + value
+    yield {**counts, **{name: found[:MOST_VALUES] for name, found in values.items()}}
+    for start in range(MOST_VALUES, max(map(len, values.values()), default=0), MOST_VALUES):
+        yield {name: found[start : start + MOST_VALUES] for name, found in values.items()}
+
+
+def _numbers(batches: Iterable[Batch], name: str) -> Iterator[float]:
     for batch in batches:
-        yield from (float(value) for value in batch.columns.get(name, ()) if _is_number(value))
-
-
-def _is_number(value: Value) -> TypeGuard[int | float]:
-    return isinstance(value, (int, float)) and not isinstance(value, bool)
+        yield from numbers_of(batch.columns.get(name, ()))

@@ -11,7 +11,7 @@ from collections.abc import Callable, Mapping, Sequence
 from contract import METRIC_DEPLOYMENT, METRIC_FUNCTION, METRIC_NAMESPACE, METRIC_ROBOT, METRICS
 
 # "Specification: Embedded metric format": so many values may a metric have in one line.
-_MOST_VALUES = 100
+MOST_VALUES = 100
 # So long values are gathered: the frame of a line is 400 bytes, a value in it seven.
 GATHER_S = 10.0
 
@@ -36,7 +36,7 @@ def write(function: str, values: Values, at_s: float, robot: str | None = None) 
     """
     known = METRICS[function]
     shown = {
-        name: list(value)[-_MOST_VALUES:] if isinstance(value, Sequence) else value
+        name: list(value)[-MOST_VALUES:] if isinstance(value, Sequence) else value
         for name, value in values.items()
         if value
     }
@@ -89,7 +89,7 @@ class Gathered:
                 kept[0] += value
             else:
                 kept.append(value)
-        full = any(len(kept) == _MOST_VALUES for kept in self._values.values())
+        full = any(len(kept) == MOST_VALUES for kept in self._values.values())
         if full or now_s - self._written_s >= GATHER_S:
             self._flush(now_s)
 

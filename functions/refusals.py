@@ -5,7 +5,7 @@ from __future__ import annotations
 import base64
 import json
 import logging
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from typing import Any, NamedTuple
 
 from botocore.exceptions import BotoCoreError, ClientError
@@ -13,6 +13,8 @@ from botocore.exceptions import BotoCoreError, ClientError
 from contract import ITEM_BASE64, REASON
 
 _log = logging.getLogger(__name__)
+# SendMessageBatch: at most ten messages, of 256 KiB together.
+_MESSAGES, _BYTES = 10, 256 * 1024
 
 
 class Refused(NamedTuple):
@@ -30,16 +32,35 @@ class Refusals:
         self._client, self._queue_url = client, queue_url
 
     def refuse(self, refused: Sequence[Refused]) -> list[Refused]:
-        """Send each; those that the queue did not take come back."""
-        return [one for one in refused if not self._sent(one)]
+        """Send each, as many at a time as a call may carry; those that the queue did not take come back."""
+        return [one for several in _calls(refused) for one in self._left(several)]
 
-    def _sent(self, refused: Refused) -> bool:
+    def _left(self, several: Mapping[str, tuple[Refused, str]]) -> list[Refused]:
+        entries = [{"Id": name, "MessageBody": body} for name, (_, body) in several.items()]
         try:
-            self._client.send_message(QueueUrl=self._queue_url, MessageBody=message(refused))
+            answer = self._client.send_message_batch(QueueUrl=self._queue_url, Entries=entries)
         except (BotoCoreError, ClientError) as error:
-            _log.warning("record %s stays in the stream: %s", refused.number, error)
-            return False
-        return True
+            _log.warning("%d records stay in the stream: %s", len(several), error)
+            return [one for one, _ in several.values()]
+        failed = answer.get("Failed", [])
+        for entry in failed:
+            _log.warning("a record stays in the stream: %s", entry.get("Code"))
+        return [several[entry["Id"]][0] for entry in failed]
+
+
+def _calls(refused: Sequence[Refused]) -> Iterator[dict[str, tuple[Refused, str]]]:
+    """What one call carries each: the messages by an id of their own."""
+    several: dict[str, tuple[Refused, str]] = {}
+    size = 0
+    for number, one in enumerate(refused):
+        body = message(one)
+        if several and (len(several) == _MESSAGES or size + len(body) > _BYTES):
+            yield several
+            several, size = {}, 0
+        several[str(number)] = (one, body)
+        size += len(body)
+    if several:
+        yield several
 
 
 def message(refused: Refused) -> str:

@@ -113,11 +113,9 @@ def derive(columns: Mapping[str, Sequence[Value]], vehicle: Vehicle | None) -> d
 
 
 def _field_statistics(name: str, column: Sequence[Value]) -> dict[str, Value]:
-    if _are_numbers(column):
-        numbers = column
-    else:
+    numbers = numbers_of(column)
+    if len(numbers) < len(column):
         values = [value for value in column if value is not None]
-        numbers = [value for value in values if _is_number(value)]
         if not values:
             return {}
         if len(numbers) < len(values):
@@ -131,6 +129,11 @@ def _field_statistics(name: str, column: Sequence[Value]) -> dict[str, Value]:
         f"{name}_max": high,
         f"{name}_last": numbers[-1],
     }
+
+
+def numbers_of(column: Sequence[Value]) -> Sequence[int | float]:
+    """The numbers of a column that may hold other values."""
+    return column if _are_numbers(column) else [value for value in column if _is_number(value)]
 
 
 def _mean(numbers: Sequence[int | float]) -> float:

@@ -9,6 +9,7 @@ local/cut_sessions.py; here, in order:
 - a message above 128 KB is taken from an MQTT 3.1.1 client or by HTTP (AWS refuses it);
 - on Python 3.10 the MQTT listener pauses reading too early, loses the ClientHello and never answers;
 - a rule's SQS action counts as plain HTTP, which the queues' policies refuse (AWS calls itself by TLS);
+- SendMessageBatch asks for a permission of its own (AWS asks for sqs:SendMessage);
 - fleet provisioning has no CreateCertificateFromCsr over MQTT, only keys made in the cloud;
 - a rule invokes Lambda at once, in a thread a message, and a throttled message is lost (AWS queues
   asynchronous events, a burst waits for free concurrency, and what fails goes to a destination);
@@ -32,7 +33,7 @@ from concurrent.futures import ThreadPoolExecutor
 from functools import wraps
 from typing import Any
 
-from ministack.core import iam_evaluator
+from ministack.core import iam_actions, iam_evaluator
 from ministack.services import iot, lambda_svc
 
 from local import cut_sessions, stream_gap, table_gap
@@ -56,6 +57,7 @@ def install() -> None:
     iot.broker_publish = _refusing_large(iot.broker_publish)
     iot._MtlsAcceptor.connection_made = _once_reading(iot._MtlsAcceptor.connection_made)  # noqa: SLF001
     iot._dispatch_rule_sqs = _over_tls(iot._dispatch_rule_sqs)  # noqa: SLF001
+    iam_actions.extract_iam_action = _as_one_message(iam_actions.extract_iam_action)
     iot._parse_fleet_provisioning_topic = _with_csr(iot._parse_fleet_provisioning_topic)  # noqa: SLF001
     iot._fleet_provisioning_reply = _certifying(iot._fleet_provisioning_reply)  # noqa: SLF001
     iot._dispatch_rule_to_lambda = AsyncInvocations().dispatch  # noqa: SLF001
@@ -132,6 +134,15 @@ def _over_tls(dispatch: Callable[..., None]) -> Callable[..., None]:
         context.run(dispatch, *arguments)
 
     return dispatch_rule_sqs
+
+
+def _as_one_message(iam_action: Callable[..., str | None]) -> Callable[..., str | None]:
+    @wraps(iam_action)
+    def extract(*request: Any) -> str | None:
+        action = iam_action(*request)
+        return "sqs:SendMessage" if action == "sqs:SendMessageBatch" else action
+
+    return extract
 
 
 def _with_csr(parse: Callable[..., Any]) -> Callable[..., Any]:

@@ -28,21 +28,24 @@ class Bundle:
 
 
 def write_bundle(
-    cloud: Cloud, bundle: Bundle, created: Mapping[str, Any], settings: Mapping[str, Any]
+    cloud: Cloud, bundle: Bundle, certificate_pem: str, private_key_pem: str, settings: Mapping[str, Any]
 ) -> None:
-    """Write everything into the bundle's folder; ``created`` is what CreateKeysAndCertificate answers."""
-    config: dict[str, Any] = {"robot": bundle.robot, **connection(cloud, bundle.folder, created)}
+    """Write everything into the bundle's folder."""
+    written = connection(cloud, bundle.folder, certificate_pem, private_key_pem)
+    config: dict[str, Any] = {"robot": bundle.robot, **written}
     config["sources"] = [{"type": "sim", "stream": VESC_STREAM, "rate_hz": 50}]
     config["queue"] = {"path": "queue.db"}
     config.update(settings)
     write_private(bundle.config, yaml.safe_dump(config, sort_keys=False))
 
 
-def connection(cloud: Cloud, folder: Path, created: Mapping[str, Any], *, prefix: str = "") -> dict[str, Any]:
+def connection(
+    cloud: Cloud, folder: Path, certificate_pem: str, private_key_pem: str, *, prefix: str = ""
+) -> dict[str, Any]:
     """Write what the connection needs into the folder; the settings that name it."""
     files = {"certificate": f"{prefix}certificate.pem", "private_key": f"{prefix}private.key"}
-    write_private(folder / files["certificate"], created["certificatePem"])
-    write_private(folder / files["private_key"], created["keyPair"]["PrivateKey"])
+    write_private(folder / files["certificate"], certificate_pem)
+    write_private(folder / files["private_key"], private_key_pem)
     if cloud.root_ca_pem is not None:
         files["root_ca"] = "root-ca.pem"
         write_private(folder / files["root_ca"], cloud.root_ca_pem)

@@ -7,6 +7,11 @@ from collections.abc import Callable
 from datetime import datetime
 from typing import Any, NamedTuple
 
+from cryptography import x509
+from cryptography.hazmat.primitives import hashes, serialization
+from cryptography.hazmat.primitives.asymmetric import ec
+from cryptography.x509.oid import NameOID
+
 from contract import fleet_name
 from station.cloud import Cloud
 
@@ -19,6 +24,32 @@ class Certificate(NamedTuple):
     status: str
     created: datetime
     expires: datetime | None
+
+
+class Made(NamedTuple):
+    """A certificate that was just made, and its private key, which is kept nowhere else; both as PEM."""
+
+    id: str
+    arn: str
+    pem: str
+    private_key_pem: str
+
+
+def make(iot: Any, name: str) -> Made:
+    """An active certificate for a key that is made here, on the curve P-256, and never leaves this machine.
+
+    Raises botocore's `ClientError` where AWS refuses.
+    """
+    key = ec.generate_private_key(ec.SECP256R1())
+    request = x509.CertificateSigningRequestBuilder(
+        subject_name=x509.Name([x509.NameAttribute(NameOID.COMMON_NAME, name)])
+    ).sign(key, hashes.SHA256())
+    pem = request.public_bytes(serialization.Encoding.PEM).decode()
+    answer = iot.create_certificate_from_csr(certificateSigningRequest=pem, setAsActive=True)
+    private = key.private_bytes(
+        serialization.Encoding.PEM, serialization.PrivateFormat.PKCS8, serialization.NoEncryption()
+    )
+    return Made(answer["certificateId"], answer["certificateArn"], answer["certificatePem"], private.decode())
 
 
 def attached(cloud: Cloud, robot: str) -> list[Certificate]:

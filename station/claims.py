@@ -13,7 +13,7 @@ import yaml
 from botocore.exceptions import ClientError
 
 from contract import SERIAL, claim_name, fleet_name
-from station import registry
+from station import certificates, registry
 from station.bundle import connection, write_private
 from station.certificates import once_detached
 from station.cloud import Cloud
@@ -52,17 +52,20 @@ def claim(
         settings.update(_serial_of(iot, robot))
     try:
         if lasting:
-            created = iot.create_keys_and_certificate(setAsActive=True)
-            iot.attach_policy(policyName=claim_name(cloud.namespace), target=created["certificateArn"])
+            made = certificates.make(iot, claim_name(cloud.namespace))
+            iot.attach_policy(policyName=claim_name(cloud.namespace), target=made.arn)
+            number, certificate, key = made.id, made.pem, made.private_key_pem
         else:
             created = iot.create_provisioning_claim(templateName=fleet_name(cloud.namespace))
+            number, certificate = created["certificateId"], created["certificatePem"]
+            key = created["keyPair"]["PrivateKey"]
     except ClientError as error:
         raise StationError(f"no claim can be made; are the current stacks deployed? {error}") from error
     if robot is not None:
         for_s = DAYS * _DAY_S if lasting else _CLAIM_S
-        registry.open_name(cloud, robot, for_s=for_s, claim=created["certificateId"])
+        registry.open_name(cloud, robot, for_s=for_s, claim=number)
     out.mkdir(parents=True, exist_ok=True, mode=0o700)
-    settings.update(connection(cloud, out, created, prefix="claim-"))
+    settings.update(connection(cloud, out, certificate, key, prefix="claim-"))
     path = out / "claim.yaml"
     write_private(path, yaml.safe_dump(settings, sort_keys=False))
     return path

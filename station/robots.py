@@ -42,7 +42,7 @@ def add(
     folder = out / robot
     if folder.exists() and any(folder.iterdir()):
         raise StationError(f"{folder} is not empty; its keys would be lost")
-    # Before anything is registered: the private key that comes back is the only copy.
+    # Before anything is registered: it will hold the only copy of the private key.
     folder.mkdir(parents=True, exist_ok=True, mode=0o700)
     registry.enter(cloud, robot, vehicle)
     iot, fleet = cloud.client("iot"), fleet_name(cloud.namespace)
@@ -51,15 +51,15 @@ def add(
             thingName=robot, thingTypeName=fleet, attributePayload={"attributes": {"vehicle": "vesc"}}
         )
         iot.add_thing_to_thing_group(thingGroupName=fleet, thingName=robot)
-        created = iot.create_keys_and_certificate(setAsActive=True)
-        iot.attach_policy(policyName=fleet, target=created["certificateArn"])
-        iot.attach_thing_principal(thingName=robot, principal=created["certificateArn"])
+        made = certificates.make(iot, robot)
+        iot.attach_policy(policyName=fleet, target=made.arn)
+        iot.attach_thing_principal(thingName=robot, principal=made.arn)
     except ClientError as error:
         raise StationError(
             f"robot {robot} is registered in part; remove it and try again: {error}"
         ) from error
     bundle = Bundle(robot, folder)
-    write_bundle(cloud, bundle, created, settings or {})
+    write_bundle(cloud, bundle, made.pem, made.private_key_pem, settings or {})
     return bundle
 
 

@@ -60,6 +60,9 @@ def test_gaps_are_still_gaps():
     assert "128 * 1024" not in inspect.getsource(iot.broker_publish)
     assert iot._parse_fleet_provisioning_topic("$aws/certificates/create-from-csr/json") is None
     assert "secure" not in inspect.getsource(iot._dispatch_rule_sqs)
+    batch = ("sqs", "POST", "/", {"x-amz-target": "AmazonSQS.SendMessageBatch"}, b"{}", {})
+    assert iam_actions.extract_iam_action(*batch) == "sqs:SendMessageBatch"
+    assert gaps._as_one_message(iam_actions.extract_iam_action)(*batch) == "sqs:SendMessage"
     # local/cut_sessions.py
     assert "_connected_clients" not in inspect.getsource(iot._handle_certificate)
     assert "/connections/" not in inspect.getsource(iot_data)

@@ -5,7 +5,8 @@ from __future__ import annotations
 import pytest
 
 from contract import AGENT_STREAM, METRICS, RTT_STREAM, Batch
-from functions.health import measure
+from functions.health import measure, together
+from functions.metrics import MOST_VALUES
 
 
 def batch(columns, *, times_us=None):
@@ -50,3 +51,20 @@ def test_round_trips_and_the_agents_own():
 @pytest.mark.parametrize("stream", ["vesc", RTT_STREAM, AGENT_STREAM])
 def test_the_names_are_the_contracts(stream):
     assert measure(stream, [batch({"x": [1.0]})]).keys() <= set(METRICS["health"])
+
+
+def test_several_robots_are_one_line_of_log_and_none_of_their_values_is_cut_off():
+    one = {"SampleGaps": 1, "FaultSamples": 0, "BatteryVolts": [11.2], "TemperatureDegC": []}
+    rtt = {"RoundTripBrokerMs": [5.0] * 3}
+    (line,) = together([one, {**one, "BatteryVolts": [12.0]}, rtt])
+    assert line == {
+        "SampleGaps": 2,
+        "FaultSamples": 0,
+        "BatteryVolts": [11.2, 12.0],
+        "TemperatureDegC": [],
+        "RoundTripBrokerMs": [5.0] * 3,
+    }
+    many = list(together({**one, "BatteryVolts": [float(n)]} for n in range(MOST_VALUES + 1)))
+    assert [len(line["BatteryVolts"]) for line in many] == [MOST_VALUES, 1]
+    assert sum(line.get("SampleGaps", 0) for line in many) == MOST_VALUES + 1
+    assert list(together([])) == [{}]

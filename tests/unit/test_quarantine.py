@@ -297,14 +297,39 @@ def test_records_that_have_left_the_stream_are_none():
 
 
 class FakeQueue:
-    def __init__(self, refuses=()):
-        self.refuses, self.bodies = refuses, []
+    def __init__(self, refuses=(), *, throttled=False):
+        self.refuses, self.throttled, self.calls = refuses, throttled, []
 
-    def send_message(self, *, QueueUrl, MessageBody):  # noqa: N803
+    @property
+    def bodies(self):
+        return [body for call in self.calls for body in call]
+
+    def send_message_batch(self, *, QueueUrl, Entries):  # noqa: N803
         assert QueueUrl == "queue"
-        if json.loads(MessageBody)["reason"] in self.refuses:
-            raise ClientError({"Error": {"Code": "Throttling", "Message": ""}}, "SendMessage")
-        self.bodies.append(MessageBody)
+        if self.throttled:
+            raise ClientError({"Error": {"Code": "Throttling", "Message": ""}}, "SendMessageBatch")
+        assert 1 <= len(Entries) <= 10
+        assert sum(len(entry["MessageBody"]) for entry in Entries) <= 256 * 1024
+        refused = [e for e in Entries if json.loads(e["MessageBody"])["reason"] in self.refuses]
+        self.calls.append([e["MessageBody"] for e in Entries if e not in refused])
+        return {"Failed": [{"Id": entry["Id"], "Code": "InternalError"} for entry in refused]}
+
+
+def test_what_is_refused_is_sent_as_much_at_a_time_as_a_call_may_carry():
+    refused = [Refused(str(n), f"reason {n}", image(n)) for n in range(23)]
+    queue = FakeQueue()
+    assert Refusals(queue, queue_url="queue").refuse(refused) == []
+    assert [len(call) for call in queue.calls] == [10, 10, 3]
+    large = [Refused(str(n), "large", {**image(n), "x": {"S": "x" * 90_000}}) for n in range(5)]
+    queue = FakeQueue()
+    assert Refusals(queue, queue_url="queue").refuse(large) == []
+    assert [len(call) for call in queue.calls] == [2, 2, 1]
+    assert Refusals(queue, queue_url="queue").refuse([]) == []
+
+
+def test_what_a_throttled_queue_does_not_take_comes_back():
+    refused = [Refused(str(n), f"reason {n}", image(n)) for n in range(12)]
+    assert Refusals(FakeQueue(throttled=True), queue_url="queue").refuse(refused) == refused
 
 
 def test_what_the_queue_does_not_take_comes_back():

@@ -1,0 +1,117 @@
+"""What the telemetry table holds around the batches of an event, and no more of it than a second may hold."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator, Mapping
+from dataclasses import dataclass, field
+from itertools import islice
+from typing import Any, NamedTuple
+
+from contract import EXPIRES_S, MAX_BATCH_SPAN_US, MAX_COLUMNS_BYTES, T_US, Batch, ContractError, decode_item
+from functions.tables import Tables
+
+_SECOND_US = 1_000_000
+# A second is made of so many batches of a stream, and of about so much of their columns: one robot that puts
+# more in it must not hold up the others. AWS takes as many messages a second from a connection.
+SECOND_BATCHES, _SECOND_BYTES = 100, MAX_COLUMNS_BYTES
+# Beside those of the event: the one before and the one after.
+_BESIDE = 2
+# A neighbour that cannot be decoded is passed over for the next; so many of them end the search.
+_NEIGHBOURS = 10
+
+BatchKey = tuple[int, str, int]
+
+
+class Stored(NamedTuple):
+    """A batch as the telemetry table holds it; ``beyond`` what its second may hold, it only tells what the
+    next second begins after."""
+
+    batch: Batch
+    expires_s: int | None
+    beyond: bool = False
+
+
+def key_of(batch: Batch) -> BatchKey:
+    """What a batch is told by from others of its topic."""
+    return batch.t_us, batch.boot, batch.seq
+
+
+@dataclass
+class Reader:
+    """Reads one topic; what is ``known`` need not be decoded again. ``full`` are the seconds that it found to
+    hold more than they may."""
+
+    tables: Tables
+    topic: str
+    known: Mapping[BatchKey, Batch]
+    full: set[int] = field(default_factory=set)
+
+    def read(self, first: int, last: int) -> list[Stored]:
+        """The stored batches with samples from the first second to the last, the one before them, and all
+        of the second in which the one after them starts; in order of time."""
+        start_us, end_us = first * _SECOND_US, (last + 1) * _SECOND_US
+        stored: list[Stored] = []
+        after_s, passed = None, 0
+        # One query: nearly always the batches are the newest, and nothing comes after them.
+        at_once = sum(start_us <= t_us < end_us for t_us, _, _ in self.known) + _BESIDE
+        for t_us, entry in self._bounded(start_us - MAX_BATCH_SPAN_US, at_once):
+            if after_s is None and t_us >= end_us:
+                passed += 1
+            if passed > _NEIGHBOURS or (after_s is not None and t_us // _SECOND_US != after_s):
+                break
+            if entry is not None:
+                stored.append(entry)
+                if t_us >= end_us:
+                    after_s = t_us // _SECOND_US
+        if stored and stored[0].batch.t_us >= start_us:
+            stored = [*self._before(stored[0].batch.t_us), *stored]
+        return stored
+
+    def _bounded(self, first_us: int, at_once: int) -> Iterator[tuple[int, Stored | None]]:
+        """The batches from a time on and when they start, None for an item that is none. Of a second that
+        holds more than it may, the rest is passed over up to its last."""
+        from_us: int | None = first_us
+        while from_us is not None:
+            start_us, from_us = from_us, None
+            second, count, size, t_us = -1, 0, 0, -1
+            entry: Stored | None = None
+            for item in self.tables.batches_from(self.topic, start_us, at_once=at_once):
+                before_us, t_us = t_us, int(item[T_US])
+                if t_us // _SECOND_US != second:
+                    second, count, size = t_us // _SECOND_US, 0, 0
+                elif entry is not None:
+                    size += _bytes(entry.batch)
+                if count >= SECOND_BATCHES or size >= _SECOND_BYTES:
+                    self.full.add(second)
+                    from_us = (second + 1) * _SECOND_US
+                    for last in self._before(from_us):
+                        if last.batch.t_us > before_us:
+                            yield last.batch.t_us, last._replace(beyond=True)
+                    break
+                count += 1
+                entry = next(self._stored([item]), None)
+                yield t_us, entry
+
+    def _before(self, t_us: int) -> list[Stored]:
+        found = self._stored(islice(self.tables.before(self.topic, t_us), _NEIGHBOURS))
+        return list(islice(found, 1))
+
+    def _stored(self, items: Iterable[Mapping[str, Any]]) -> Iterator[Stored]:
+        """The items that are batches. Of one that is not, the own record has been or will be refused;
+        here it only must not stop its neighbours."""
+        for item in items:
+            try:
+                key = int(item[T_US]), item["boot"], int(item["seq"])
+                batch = self.known.get(key) or decode_item(item)[1]
+                expires_s = int(item[EXPIRES_S]) if EXPIRES_S in item else None
+            except (ContractError, KeyError, TypeError, ValueError, OverflowError):
+                continue
+            yield Stored(batch, expires_s)
+
+
+def _bytes(batch: Batch) -> int:
+    """About what the columns take in memory."""
+    return sum(
+        8 * len(column) + sum(len(value) for value in column if isinstance(value, str))
+        for column in batch.columns.values()
+    )
