@@ -65,9 +65,18 @@ def test_batches_come_from_the_time_on_of_one_topic_in_the_order_of_time(client)
 
 def test_every_page_is_read():
     client = FakeDynamoDB()
+    store(client, *range(T0, T0 + 103))
+    assert len(list(tables(client).batches_from(TOPIC_OF_CAR, T0, at_once=2))) == 103
+    # Few are wanted nearly always; whoever wants more wants many.
+    assert client.calls["query"] == 3
+
+
+def test_no_more_is_read_than_is_asked_for():
+    client = FakeDynamoDB()
     store(client, *range(T0, T0 + 7))
-    assert len(list(tables(client).batches_from(TOPIC_OF_CAR, T0, at_once=2))) == 7
-    assert client.calls["query"] == 4
+    found = tables(client).batches_from(TOPIC_OF_CAR, T0, at_once=2)
+    assert [next(found)[T_US], next(found)[T_US]] == [T0, T0 + 1]
+    assert (client.calls["query"], client.read) == (1, 2)
 
 
 def test_those_before_come_nearest_first(client):
