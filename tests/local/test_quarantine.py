@@ -78,6 +78,7 @@ def test_what_the_rule_cannot_store_is_kept_byte_by_byte(bundle, entry_of, paylo
     ("changes", "stream", "reason"),
     [
         ({"v": 2}, "vesc", "schema version 2"),
+        ({"codec": "later"}, "vesc", "codec 'later': this side knows steps"),
         ({"samples": "AAAA"}, "vesc", "samples are not base64 of zlib"),
         ({"robot": "somebody-else"}, "vesc", "in the name of 'somebody-else'"),
         ({"t": -1}, "vesc", "before 1970"),
@@ -85,7 +86,7 @@ def test_what_the_rule_cannot_store_is_kept_byte_by_byte(bundle, entry_of, paylo
         ({}, "b ad", "stream name 'b ad'"),
         ({}, "a/b", "expected <lane>/<namespace>/<robot>/<name>"),
     ],
-    ids=["version", "samples", "body-of-another", "before-1970", "years-ahead", "stream", "levels"],
+    ids=["version", "codec", "samples", "body-of-another", "before-1970", "years-ahead", "stream", "levels"],
 )
 def test_what_the_table_takes_and_lambda_2_cannot_is_kept(bundle, entry_of, changes, stream, reason):
     car = bundle()
