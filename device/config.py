@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any
 
 import contract
-from device.downlink import DownlinkConfig, ShareConfig, share_rule
+from device.downlink_config import DownlinkConfig, ShareConfig, share_rule
 from device.errors import ConfigError
 from device.schema import (
     Where,

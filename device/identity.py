@@ -247,7 +247,7 @@ class _Exchange:
         self._ended.set()
 
     def _on_failure(self, data: Any) -> None:
-        from device.iotcore import explain, said  # noqa: PLC0415
+        from device.failures import explain, said  # noqa: PLC0415
 
         packet = data.connack_packet
         self._failure = said(packet) if packet is not None else explain(data.exception)

@@ -13,7 +13,6 @@ from __future__ import annotations
 import functools
 import logging
 import threading
-import time
 from concurrent.futures import Future
 from pathlib import Path
 from typing import Any, Callable
@@ -25,8 +24,9 @@ from device.certificate import Certificate, read_certificate, stamp
 from device.clock import Clock
 from device.dispatch import Dispatcher
 from device.errors import IdentityError, UplinkError
+from device.failures import code_name, error_name, explain, said, why_not_connected
 from device.nodelay import send_at_once
-from device.reconnect import SETTLED_S, SHORTEST_S, Backoff, Cause, Causes
+from device.reconnect import SETTLED_S, SHORTEST_S, Backoff, Causes
 from device.uplink import Done, Message, OnConnection, OnMessage, UplinkStatus, matches
 
 _log = logging.getLogger(__name__)
@@ -41,39 +41,7 @@ _RESUBSCRIBE_S, _RESUBSCRIBE_SLOWLY_S = 10.0, 60.0
 # How often to look whether certificate, key or root_ca were replaced.
 _LOOK_S = 2.0
 _CLIENT_STOPS_S = 15.0
-
-_TLS_FAILED = "AWS_IO_TLS_ERROR_NEGOTIATION_FAILURE"
-_HUNG_UP = "AWS_ERROR_MQTT_UNEXPECTED_HANGUP"
-_CLOSED = "AWS_IO_SOCKET_CLOSED"
 _OUR_WISH = "AWS_ERROR_MQTT5_USER_REQUESTED_STOP"
-# CONNACK codes that nothing but a person changes.
-_REFUSALS = frozenset(
-    {
-        mqtt5.ConnectReasonCode.NOT_AUTHORIZED,
-        mqtt5.ConnectReasonCode.BAD_USERNAME_OR_PASSWORD,
-        mqtt5.ConnectReasonCode.BANNED,
-        mqtt5.ConnectReasonCode.CLIENT_IDENTIFIER_NOT_VALID,
-    }
-)
-
-# What the person in the lab should look at, by the client's name for what went wrong.
-_HINTS = {
-    "AWS_IO_DNS_INVALID_NAME": "the endpoint's name does not resolve",
-    "AWS_IO_DNS_QUERY_FAILED": "the endpoint's name does not resolve",
-    "AWS_IO_SOCKET_CONNECTION_REFUSED": "nothing listens at the endpoint's port",
-    "AWS_IO_SOCKET_TIMEOUT": "the endpoint does not answer",
-    "AWS_IO_SOCKET_NO_ROUTE_TO_HOST": "there is no network",
-    "AWS_IO_TLS_NEGOTIATION_TIMEOUT": "the endpoint accepts connections but does not answer",
-    _TLS_FAILED: "TLS failed",
-    "AWS_ERROR_MQTT5_PING_RESPONSE_TIMEOUT": "the broker no longer answers",
-    _HUNG_UP: "the broker or the network closed the connection",
-    _CLOSED: "the broker or the network closed the connection",
-}
-_ADVICE = (
-    "Nothing recorded is lost meanwhile, as far as the queue reaches. "
-    "`iort-agent check` says more; tried again within minutes, and at once when "
-    "certificate, private_key or root_ca is replaced"
-)
 
 
 class IotCore:
@@ -317,7 +285,13 @@ class IotCore:
 
     def _on_refused(self, data: Any) -> None:
         if not self._stop.is_set():
-            cause = self._cause(data)
+            cause = why_not_connected(
+                data,
+                client_id=self._client_id,
+                certificate=self._certificate,
+                now_us=self._clock.now_us(),
+                hung_up=self._causes.hung_up,
+            )
             self._slow = cause.slow
             self._last_error = cause.text
             level = logging.DEBUG
@@ -326,53 +300,13 @@ class IotCore:
             _log.log(level, "cannot connect to %s as %s: %s", self._endpoint, self._client_id, cause.text)
         self._down.set()
 
-    def _cause(self, data: Any) -> Cause:
-        """What to make of a connection that was not made."""
-        packet = data.connack_packet
-        code = packet.reason_code if packet is not None else None
-        name = _error_name(data.exception)
-        words = said(packet) if code is not None else explain(data.exception)
-        suspicious = code in _REFUSALS or name in (_TLS_FAILED, _HUNG_UP, _CLOSED)
-        if suspicious and (invalid := self._invalid_now()) is not None:
-            return Cause("validity", f"{invalid} ({words}). {_ADVICE}", slow=True)
-        if code in _REFUSALS:
-            text = (
-                f"{words}: the certificate is not active, not attached to a thing named {self._client_id}, "
-                f"or its policy does not let it connect. {_ADVICE}"
-            )
-            return Cause("refused", text, slow=True)
-        if suspicious and self._causes.hung_up():
-            if name == _TLS_FAILED:
-                text = f"{words}: the broker's certificate does not fit root_ca, or the broker refuses ours"
-            else:
-                text = (
-                    f"{words}, again and again: it may be restarting, or the robot's certificate is unknown, "
-                    "inactive or revoked"
-                )
-            # Where TLS was not even agreed on, the broker may just as well be down behind a proxy.
-            return Cause(f"hangup {name}", f"{text}. {_ADVICE}", slow=name != _CLOSED)
-        return Cause(words, words)
-
-    def _invalid_now(self) -> str | None:
-        """What the clock says against the robot's certificate."""
-        if self._certificate is None:
-            return None
-        now_s = self._clock.now_us() // 1_000_000
-        if now_s > self._certificate.not_after_s:
-            day = time.strftime("%Y-%m-%d", time.gmtime(self._certificate.not_after_s))
-            return f"the robot's certificate expired on {day}; get a new one with `iort-agent provision`"
-        if now_s < self._certificate.not_before_s:
-            today = time.strftime("%Y-%m-%d", time.gmtime(now_s))
-            return f"the robot's certificate is not valid yet: its clock says {today}; set the clock"
-        return None
-
     def _on_lost(self, data: Any) -> None:
         self._confirmed.clear()
         if self._clock.monotonic() - self._since > SETTLED_S:
             self._backoff.reset()
         self._switch(connected=False)
         packet = data.disconnect_packet
-        if self._stop.is_set() or _error_name(data.exception) == _OUR_WISH:
+        if self._stop.is_set() or error_name(data.exception) == _OUR_WISH:
             _log.info("disconnected from %s", self._endpoint)
         elif packet is not None and packet.reason_code == mqtt5.DisconnectReasonCode.SESSION_TAKEN_OVER:
             self._last_error = f"another client has connected as {self._client_id}"
@@ -419,7 +353,7 @@ class IotCore:
                     self._confirmed.add(topic_filter)
                     self._refused.discard(topic_filter)
                 return
-            why = f"the broker says {_name(code)}" + (
+            why = f"the broker says {code_name(code)}" + (
                 f", {packet.reason_string}" if packet.reason_string else ""
             )
         else:
@@ -450,24 +384,3 @@ def _publish_error(future: Future[Any]) -> UplinkError | None:
     if code is None or code < 128:
         return None
     return UplinkError(said(puback))
-
-
-def said(packet: Any) -> str:
-    """What the broker said in a CONNACK, DISCONNECT or PUBACK."""
-    reason = f", {packet.reason_string}" if packet.reason_string else ""
-    return f"the broker says {_name(packet.reason_code)}{reason}"
-
-
-def _name(code: Any) -> str:
-    return str(getattr(code, "name", code)).replace("_", " ").lower()
-
-
-def explain(error: Any) -> str:
-    """What the client says, and what to look at."""
-    name = _error_name(error)
-    hint = _HINTS.get(name)
-    return f"{hint} ({name})" if hint else f"{name}: {getattr(error, 'message', error)}"
-
-
-def _error_name(error: Any) -> str:
-    return str(getattr(error, "name", type(error).__name__))

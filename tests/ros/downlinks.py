@@ -18,7 +18,8 @@ import contract
 from device.allowance import Allowance
 from device.clock import SystemClock
 from device.dispatch import Dispatcher
-from device.downlink import DownlinkConfig, make_downlink, share_rule
+from device.downlink import make_downlink
+from device.downlink_config import DownlinkConfig, share_rule
 from device.loopback import Loopback
 from device.offset import Offset
 from device.ros1_node import DEFAULT_NODE

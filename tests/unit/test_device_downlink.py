@@ -19,7 +19,8 @@ from contract import Command, ContractError, FleetMessage
 from device.allowance import Allowance
 from device.clock import ManualClock, SystemClock
 from device.dispatch import Dispatcher
-from device.downlink import Downlink, DownlinkConfig, share_rule
+from device.downlink import Downlink
+from device.downlink_config import DownlinkConfig, share_rule
 from device.errors import ConfigError, MessageError, SourceError
 from device.loopback import Loopback
 from device.offset import Offset

@@ -1,0 +1,57 @@
+"""What a robot's log says of a connection that was not made."""
+
+from __future__ import annotations
+
+from types import SimpleNamespace
+from typing import Any
+
+import pytest
+from awscrt import mqtt5
+
+from device.certificate import Certificate
+from device.failures import why_not_connected
+
+NOW_S = 1_700_000_000
+GOOD = Certificate(id="c", not_before_s=NOW_S - 10, not_after_s=NOW_S + 10)
+REFUSED = mqtt5.ConnectReasonCode.NOT_AUTHORIZED
+HUNG_UP, CLOSED = "AWS_ERROR_MQTT_UNEXPECTED_HANGUP", "AWS_IO_SOCKET_CLOSED"
+DNS = "AWS_IO_DNS_INVALID_NAME"
+
+
+def failed(name: str = HUNG_UP, code: Any = None) -> Any:
+    packet = None if code is None else SimpleNamespace(reason_code=code, reason_string=None)
+    return SimpleNamespace(exception=SimpleNamespace(name=name, message="m"), connack_packet=packet)
+
+
+@pytest.mark.parametrize(
+    ("data", "certificate", "again", "expected", "words"),
+    [
+        (failed(DNS), GOOD, False, (f"the endpoint's name does not resolve ({DNS})", False), "resolve"),
+        (failed(HUNG_UP), GOOD, False, ("", False), "closed the connection"),
+        (failed(HUNG_UP), GOOD, True, (f"hangup {HUNG_UP}", True), "unknown, inactive or revoked"),
+        (failed(CLOSED), GOOD, True, (f"hangup {CLOSED}", False), "again and again"),
+        (failed(code=REFUSED), GOOD, False, ("refused", True), "not attached to a thing named car7"),
+        (failed(HUNG_UP), GOOD._replace(not_after_s=NOW_S - 1), False, ("validity", True), "expired on 2023"),
+        (
+            failed(code=REFUSED),
+            GOOD._replace(not_before_s=NOW_S + 1),
+            True,
+            "validity",
+            True,
+            "set the clock",
+        ),
+        # Nothing suspicious: whatever the certificate says, it was not the reason.
+        (failed(DNS), GOOD._replace(not_after_s=NOW_S - 1), True, ("", False), "resolve"),
+        (failed(code=REFUSED), None, False, ("refused", True), "iort-agent check"),
+    ],
+)
+def test_each_failure_has_its_cause(
+    data: Any, certificate: Certificate | None, again: bool, expected: tuple[str, bool], words: str
+) -> None:
+    cause = why_not_connected(
+        data, client_id="car7", certificate=certificate, now_us=NOW_S * 1_000_000, hung_up=lambda: again
+    )
+    assert words in cause.text
+    kind, slow = expected
+    assert cause.slow is slow
+    assert not kind or cause[0] == kind
