@@ -36,8 +36,7 @@ def failed(name: str = HUNG_UP, code: Any = None) -> Any:
             failed(code=REFUSED),
             GOOD._replace(not_before_s=NOW_S + 1),
             True,
-            "validity",
-            True,
+            ("validity", True),
             "set the clock",
         ),
         # Nothing suspicious: whatever the certificate says, it was not the reason.
