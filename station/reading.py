@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
+from decimal import Decimal
 from typing import Any, TypeVar
 
 from contract import MAX_BATCH_SPAN_US, RECORD, SECOND, T_US, TOPIC, build_topic
@@ -48,7 +49,7 @@ def outermost(cloud: Cloud, robot: str, stream: str, *, newest: bool) -> int | N
     request = _request(cloud, whole, ("TelemetryTable", T_US), (_FIRST, _LAST), scan=False)
     request["ProjectionExpression"] = "#key"
     found = cloud.client("dynamodb").query(**request, Limit=1, ScanIndexForward=not newest)["Items"]
-    return int(found[0][T_US]["N"]) if found else None
+    return whole_part(found[0][T_US]) if found else None
 
 
 def _request(
@@ -80,7 +81,7 @@ def _pages(cloud: Cloud, request: Mapping[str, Any], key: str, *, scan: bool) ->
     found = (page["Items"] for page in paginator.paginate(**request))
     if scan:
         # Nothing promises the order of a scan.
-        yield sorted((item for items in found for item in items), key=lambda item: int(item[key]["N"]))
+        yield sorted((item for items in found for item in items), key=lambda item: Decimal(item[key]["N"]))
     else:
         yield from ahead(found)
 
@@ -95,11 +96,17 @@ def ahead(items: Iterable[_T]) -> Iterator[_T]:
             yield item  # type: ignore[misc]  # told apart from the end
 
 
+def whole_part(value: Mapping[str, str]) -> int:
+    """The whole part of a number that a table holds: a robot may have sent fractions of a microsecond, which
+    its batch is refused for, but not its neighbours."""
+    return int(Decimal(value["N"]))
+
+
 def told(
     pages: Iterable[Sequence[Item]], progress: Told | None, key: str, unit_us: int = 1
 ) -> Iterator[Sequence[Item]]:
     """The pages, telling ``progress`` of each."""
     for items in pages:
         if progress is not None and items:
-            progress(len(items), int(items[-1][key]["N"]) * unit_us)
+            progress(len(items), whole_part(items[-1][key]) * unit_us)
         yield items

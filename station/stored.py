@@ -31,10 +31,12 @@ from contract import (
 )
 from station.blocks import EMPTY, Block, column_of, join, joined, ordered
 from station.conditions import Column
+from station.reading import whole_part
 
 # What of a stored item is needed to read its samples.
 ATTRIBUTES = ("v", "boot", "seq", T_US, SAMPLES, "nonfinite", "codec", "samples")
 _SCALES = np.array(SCALES)
+_OF_64_BITS = 2.0**63
 Item = Mapping[str, Any]
 Wanted = Callable[[str], bool]
 
@@ -68,7 +70,7 @@ def blocks(
             continue
         both = ordered(join([held, page]))
         # What starts later may still reach before these.
-        last_us = int(items[-1][T_US]["N"])
+        last_us = whole_part(items[-1][T_US])
         final = int(np.searchsorted(both.times_us, last_us, side="right"))
         held = both.take(slice(final, None))
         if final:
@@ -137,7 +139,7 @@ def _open(item: Item) -> _Open:
             if found is not None and abs(t_us) < EXACT - MAX_BATCH_SPAN_US:
                 dt, columns = found
                 return _Open(item, tuple(columns), list(accumulate(dt, initial=t_us))[1:], columns)
-    except (KeyError, TypeError, ValueError):
+    except (AttributeError, KeyError, RecursionError, TypeError, ValueError):
         # Including the contract's errors: its own decoder says it better.
         pass
     return _Open(item, None, (), {})
@@ -190,15 +192,22 @@ def _column(written: Sequence[list[Any]], lengths: NDArray[np.int64]) -> Column 
         several = list(group)
         its_lengths = lengths[at : at + len(several)]
         at += len(several)
-        values = (
-            column_of(list(chain.from_iterable(column[1:] for column in several)), numeric=True)
-            if is_plain
-            else _from_steps(several, its_lengths)
-        )
+        values = _from_values(several) if is_plain else _from_steps(several, its_lengths)
         if values is None:
             return None
         parts.append((values, len(values)))
     return parts[0][0] if len(parts) == 1 else joined(parts)
+
+
+def _from_values(written: Sequence[list[Any]]) -> Column | None:
+    """Columns of numbers and null as they are, behind one another; None where one is not within 64 bits,
+    which is more than a batch may hold, or a float that only the contract tells apart from that."""
+    try:
+        column = column_of(list(chain.from_iterable(values[1:] for values in written)), numeric=True)
+    except OverflowError:
+        return None
+    # NaN, which is null here, is on no side of a bound.
+    return None if column.dtype != np.float64 or (np.abs(column) >= _OF_64_BITS).any() else column
 
 
 def _from_steps(written: Sequence[list[Any]], lengths: NDArray[np.int64]) -> Column | None:

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import base64
 import itertools
 import json
+import zlib
 
 import pytest
 from hypothesis import given, settings
@@ -12,6 +14,7 @@ from hypothesis import strategies as st
 import contract
 from contract import Batch
 from contract.checks import wire_column
+from station import reading
 from station.sizes import stored_bytes
 from station.stored import Refused, blocks
 from tests.fakes import item_of_message
@@ -35,6 +38,41 @@ def test_columns_that_nobody_writes_are_refused(column):
 def test_a_sum_that_comes_back_through_64_bits_is_refused():
     found, refused = read(message_of([0, 1, *[2**62] * 4, 1], n=6))
     assert (len(found), refused.count) == (0, 1)
+
+
+# What a robot of somebody else's may have stored, as text, since no encoder of ours writes it.
+HOSTILE = {
+    "deep": "[" * 100_000,
+    "deep column": '{"dt":[0,5],"fields":{"f0":' + "[" * 100_000,
+    "fields of a list": '{"dt":[0,5],"fields":[]}',
+    "no fields": '{"dt":[0,5],"fields":null}',
+    "infinite": '{"dt":[0,5],"fields":{"f0":[1e999,1]}}',
+    "beyond 64 bits": '{"dt":[0,5],"fields":{"f0":[18446744073709551616,1]}}',
+    "beyond a float": '{"dt":[0,5],"fields":{"f0":[1' + 400 * "0" + ",1]}}",
+}
+
+
+@pytest.mark.parametrize("codec", [contract.CODEC, contract.PLAIN_CODEC])
+@pytest.mark.parametrize("body", HOSTILE.values(), ids=HOSTILE)
+def test_what_a_stranger_stored_is_refused_and_its_neighbours_are_read(body, codec):
+    if codec == contract.CODEC:
+        body = body.replace('"f0":[', '"f0":[null,')
+    deflater = zlib.compressobj(zdict=contract.DICTIONARY if codec == contract.CODEC else b"")
+    deflated = deflater.compress(body.encode()) + deflater.flush()
+    good = message_of([0, 1, 2])
+    strange = {**good, "codec": codec, "samples": base64.b64encode(deflated).decode()}
+    found, refused = read({**good, "t": -1_000_000}, strange, {**good, "t": 1_000_000})
+    assert refused.count == 1
+    assert [value for block in found for value in block.columns["f0"].tolist()] == [1, 3, 1, 3]
+
+
+def test_a_batch_at_a_fraction_of_a_microsecond_is_refused_and_its_neighbours_are_read():
+    items = [item_of_message(json.dumps(message_of([0, 1, 2])).encode()) for _ in range(2)]
+    items[1]["t"] = {"N": "5000.5"}
+    refused, told = Refused(), []
+    pages = reading.told([items], lambda *seen: told.append(seen), "t")
+    (block,) = blocks(pages, refused)
+    assert (block.columns["f0"].tolist(), refused.count, told) == ([1, 3], 1, [(2, 5000)])
 
 
 @settings(max_examples=100)
