@@ -26,7 +26,7 @@ def config(
     changes: Annotated[
         list[str] | None,
         typer.Argument(
-            metavar="[NAME=VALUE]...", help="live.rate_hz=5, fields.vesc=speed,voltage_input, log_level=debug"
+            metavar="[NAME=VALUE]...", help="live.rate_hz=5, fields.vesc=speed,fault_code, log_level=debug"
         ),
     ] = None,
     unset: Annotated[

@@ -238,3 +238,44 @@ def test_what_was_not_written_is_said_again_at_the_broker() -> None:
     _drive(rig, 0.1, fault_code=5)
     rig.uplink.verdict = lambda _: None
     assert _drive(rig, 0.2, fault_code=5) == [BROKER, DIRECT]
+
+
+def test_a_fault_shorter_than_a_slow_rate_s_interval_is_said_and_the_rate_stays() -> None:
+    rig = Rig(rate_hz=0.1)
+    topics = [_drive(rig, seconds, fault_code=code) for seconds, code in ((1, 0), (0.5, 5), (18.6, 0))]
+    assert topics[:2] == [[BROKER], [BROKER]]
+    assert [live.sample["fault_code"] for live in rig.sent()] == [0, 5, 0, 0, 0]
+    assert [round((live.sent_us - T0) / 1e6, 1) for live in rig.sent()] == [0, 1, 1.5, 5, 15]
+
+
+def test_the_last_word_of_a_stream_that_falls_silent_is_its_fault() -> None:
+    rig = Rig(rate_hz=0.1)
+    _drive(rig, 0.1, fault_code=0)
+    rig.clock.advance(-0.05)
+    _drive(rig, 0.1, fault_code=5)
+    rig.tick()
+    assert [live.sample["fault_code"] for live in rig.sent()] == [0, 5]
+    assert rig.uplink.published[-1].topic == BROKER
+
+
+def test_faults_that_come_and_go_are_never_more_than_the_fastest_rate() -> None:
+    rig = Rig(rate_hz=1)
+    for i in range(1000):
+        rig.lane.offer("vesc", rig.clock.now_us(), {"fault_code": i % 7})
+        rig.dispatcher.run_pending()
+        rig.clock.advance(0.01)
+    assert len(rig.sent()) <= 101
+
+
+def test_a_fault_that_was_not_written_is_said_again_before_a_slow_rate_s_turn() -> None:
+    rig = Rig(rate_hz=0.1)
+    _drive(rig, 1, fault_code=0)
+    rig.uplink.verdict = lambda _: "full"
+    _drive(rig, 0.1, fault_code=5)
+    rig.uplink.verdict = lambda _: None
+    assert _drive(rig, 1, fault_code=5) == [BROKER]
+
+
+def test_a_fault_that_nobody_knows_is_no_other_than_before() -> None:
+    topics = [topic for _ in range(3) for topic in _drive(Rig(), 1, fault_code=float("nan"))]
+    assert topics.count(BROKER) == 3
