@@ -19,6 +19,8 @@ from contract.limits import MAX_COLUMNS_BYTES, ContractError, Value
 
 # Of the batches that are written, and of those that were written before and are read for ever.
 CODEC, PLAIN_CODEC = "steps", "columns+zlib+base64"
+# A step has half the characters of the value that it stands for, which takes as much memory.
+_MOST_BYTES = {CODEC: MAX_COLUMNS_BYTES // 2, PLAIN_CODEC: MAX_COLUMNS_BYTES}
 # zlib's preset dictionary. Frozen with the codec's name, since it is needed to read what is stored; a
 # field that it does not know costs its name. What is nearest to the end is the cheapest to point to.
 DICTIONARY = (
@@ -45,8 +47,8 @@ def packed_samples(dt: Sequence[int], fields: Mapping[str, Sequence[Value]]) -> 
     """
     columns = {name: packed(column) for name, column in fields.items()}
     text = COMPACT.encode({"dt": dt, "fields": columns})
-    if len(text) > MAX_COLUMNS_BYTES:
-        raise ContractError(f"batch of {len(text)} bytes of columns: allowed is up to {MAX_COLUMNS_BYTES}")
+    if len(text) > _MOST_BYTES[CODEC]:
+        raise ContractError(f"batch of {len(text)} bytes of columns: allowed is up to {_MOST_BYTES[CODEC]}")
     deflater = zlib.compressobj(6, zdict=DICTIONARY)
     return base64.b64encode(deflater.compress(text.encode()) + deflater.flush()).decode()
 
@@ -55,14 +57,15 @@ def inflate(samples: Any, codec: str) -> bytes:
     """The JSON of a batch's columns, as large as a batch may be and no larger; raises `ContractError`."""
     if not isinstance(samples, (str, bytes)):
         raise ContractError(f"samples {shown(samples)}: expected base64 text")
+    most = _MOST_BYTES[codec]
     try:
         deflated = base64.b64decode(samples, validate=True)
         inflater = zlib.decompressobj(zdict=DICTIONARY if codec == CODEC else b"")
-        body = inflater.decompress(deflated, MAX_COLUMNS_BYTES + 1)
+        body = inflater.decompress(deflated, most + 1)
     except (binascii.Error, ValueError, zlib.error) as error:
         raise ContractError(f"samples are not base64 of zlib: {error}") from error
-    if len(body) > MAX_COLUMNS_BYTES:
-        raise ContractError(f"samples inflate to over {MAX_COLUMNS_BYTES} bytes")
+    if len(body) > most:
+        raise ContractError(f"samples inflate to over {most} bytes")
     if not inflater.eof or inflater.unused_data:
         raise ContractError("samples are cut short, or more follows them")
     return body

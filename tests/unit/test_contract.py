@@ -306,7 +306,7 @@ def test_live_refused(changed, named):
 
 
 def test_columns_too_large_to_be_read_are_not_written():
-    n = 2_100
+    n = 1_100
     batch = Batch(BOOT, 0, list(range(n)), {"text": ["x" * 4_000] * n})
     assert len(zlib.compress(b"x" * 4_000 * n)) < contract.MAX_MESSAGE_BYTES, "it would fit in a message"
     with pytest.raises(ContractError, match="columns"):

@@ -169,6 +169,15 @@ def test_a_sum_that_comes_back_through_64_bits_is_refused():
         contract.decode(message_of([0, 1, *[2**62] * 4, 1], n=6))
 
 
+def test_columns_take_no_more_memory_than_before():
+    """Steps of one character make a value each, so half the text is allowed."""
+    with pytest.raises(ContractError, match="inflate to over 4194304 bytes"):
+        contract.decode(message_of(*[[1] * 50_001] * 45, n=50_000))
+    batch = Batch(BOOT, 0, list(range(50_000)), {f"f{i}": [1] * 50_000 for i in range(45)})
+    with pytest.raises(ContractError, match="bytes of columns: allowed is up to 4194304"):
+        contract.encode(batch)
+
+
 def test_the_dictionary_is_needed():
     envelope = json.loads(contract.encode(Batch(BOOT, 0, [0], {"a": [1]})))
     with pytest.raises(ContractError, match="not base64 of zlib"):
