@@ -103,6 +103,10 @@ class Process:
             reader.join(WAIT_S)
         return self.lines
 
+    def wait(self) -> None:
+        """Wait for its own end."""
+        assert self._process.wait(WAIT_S) == 0, "\n".join(self.errors[-25:])
+
     def terminate(self) -> int:
         """End it as a supervisor does; its status."""
         self._process.terminate()
@@ -142,7 +146,7 @@ class Graph:
 
     def start_master(self) -> None:
         command = [SYSTEM_PYTHON, str(shutil.which("rosmaster")), "--core", "-p", str(self.port)]
-        self.master = self._start(command)
+        self.master = self.start(command)
         deadline = time.monotonic() + WAIT_S
         while not self._answers():
             assert time.monotonic() < deadline, "\n".join(self.master.errors)
@@ -157,10 +161,10 @@ class Graph:
         return True
 
     def run(self, script: str, *arguments: object) -> Process:
-        return self._start([self.python, str(HERE / script), *map(str, arguments)])
+        return self.start([self.python, str(HERE / script), *map(str, arguments)])
 
     def module(self, module: str, *arguments: object) -> Process:
-        return self._start([self.python, "-m", module, *map(str, arguments)])
+        return self.start([self.python, "-m", module, *map(str, arguments)])
 
     def parameter(self, name: str, value: Any) -> None:
         with xmlrpc.client.ServerProxy(self.environment["ROS_MASTER_URI"], allow_none=True) as proxy:
@@ -170,7 +174,7 @@ class Graph:
         for process in reversed(self._processes):
             process.kill()
 
-    def _start(self, command: list[str]) -> Process:
+    def start(self, command: list[str]) -> Process:
         process = Process(command, self.environment)
         self._processes.append(process)
         return process
