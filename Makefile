@@ -31,7 +31,7 @@ check: setup ## run the linters, the type checkers, and cfn-lint, cdk-nag and ch
 
 bench: setup ## measure every table of the thesis: ONLY=query,outage TARGET=aws OUT=docs/bench
 	@$(BIN)/python -m bench.run $(if $(ONLY),--only $(ONLY)) $(if $(TARGET),--target $(TARGET)) \
-		$(if $(OUT),--out $(OUT)) $(if $(NAMESPACE),--namespace $(NAMESPACE))
+		$(if $(YES),--yes) $(if $(OUT),--out $(OUT)) $(if $(NAMESPACE),--namespace $(NAMESPACE))
 
 bench-guard: setup ## hold the ratios of the last `make bench` against the report in docs/bench
 	@$(BIN)/python -m bench.guard

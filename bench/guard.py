@@ -1,9 +1,11 @@
-"""`make bench-guard`: holds the ratios of a new report against those of the one in the repository.
+"""`make bench-guard`: holds the figures of a new report against those of the one in the repository.
 
     python -m bench.guard [--new build/bench/report.json] [--old docs/bench/report.json]
 
-Ratios only, never times: a slower machine is slower for the floor as well. A ratio may be worse by half of
-what it was before it counts as a regression; what was nothing (samples lost) must stay nothing.
+A figure may be so many times worse as it says of itself (`bench.result.Ratio.tolerance`), whatever its
+target; what was nothing (samples lost) must stay nothing. A figure whose other half is a constant is a time
+in disguise: on a machine of another kind it is held to its target alone. A figure that a section no longer
+gives counts as worse. Exit status 1 where something is worse, 2 where nothing can be compared.
 """
 
 from __future__ import annotations
@@ -11,58 +13,78 @@ from __future__ import annotations
 import argparse
 import json
 import sys
+from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, NoReturn
 
 from bench.machine import ROOT
+from bench.result import Ratio
 
-TOLERANCE = 0.5
-
-
-def ratios(report: dict[str, Any]) -> dict[str, dict[str, Any]]:
-    """The ratios of a report by name."""
-    return {ratio["name"]: ratio for section in report["sections"] for ratio in section["ratios"]}
+Report = dict[str, Any]
+# Two reports with these alike were made on machines of a kind.
+_KIND = ("cpu", "cores")
 
 
-def regressions(new: dict[str, Any], old: dict[str, Any]) -> list[str]:
-    """What became worse, a line each; a ratio that only one report has is not compared."""
+def ratios(report: Report) -> dict[str, Ratio]:
+    """The ratios of a report by name; an older report's say less of themselves."""
+    return {ratio["name"]: Ratio(**ratio) for section in report["sections"] for ratio in section["ratios"]}
+
+
+def regressions(new: Report, old: Report) -> list[str]:
+    """What became worse, a line each. A section that only one report has is not compared."""
     found = []
-    before = ratios(old)
-    for name, now in ratios(new).items():
-        if name not in before:
-            continue
-        was, value = float(before[name]["value"]), float(now["value"])
-        worst = was / (1 + TOLERANCE) if now["at_least"] else was * (1 + TOLERANCE)
-        worse = value < worst if now["at_least"] else value > worst
-        # Within its target a ratio may move as it likes; without one it may not.
-        if worse and not _reached(now):
-            found.append(f"{name}: {value:g} {now['unit']}, was {was:g}")
+    now, before = ratios(new), ratios(old)
+    kind = all(new["machine"].get(key) == old["machine"].get(key) for key in _KIND)
+    for name, ratio in now.items():
+        if name in before and _worse(ratio, before[name].value, of_a_kind=kind):
+            found.append(f"{name}: {ratio.value:g} {ratio.unit}, was {before[name].value:g}")
+    measured = {section["key"] for section in new["sections"]}
+    for section in old["sections"]:
+        if section["key"] in measured:
+            gone = {ratio["name"] for ratio in section["ratios"]} - now.keys()
+            found += [f"{name}: no longer measured" for name in sorted(gone)]
     return found
 
 
-def _reached(ratio: dict[str, Any]) -> bool:
-    if ratio["target"] is None:
-        return False
-    value, target = float(ratio["value"]), float(ratio["target"])
-    return value >= target if ratio["at_least"] else value <= target
+def not_compared(new: Report, old: Report) -> list[str]:
+    """The sections that the new report does not have."""
+    measured = {section["key"] for section in new["sections"]}
+    return [section["key"] for section in old["sections"] if section["key"] not in measured]
 
 
-def main() -> None:
-    """Compare; exit status 1 where something became worse."""
+def _worse(now: Ratio, was: float, *, of_a_kind: bool) -> bool:
+    if now.by_machine and not of_a_kind:
+        return now.reached is False
+    return now.value < was / now.tolerance if now.at_least else now.value > was * now.tolerance
+
+
+def main(arguments: Sequence[str] | None = None) -> None:
+    """Compare, and say what is worse."""
     parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
     parser.add_argument("--new", type=Path, default=ROOT / "build" / "bench" / "report.json")
     parser.add_argument("--old", type=Path, default=ROOT / "docs" / "bench" / "report.json")
-    options = parser.parse_args()
+    options = parser.parse_args(arguments)
     try:
         new, old = (json.loads(path.read_text()) for path in (options.new, options.old))
     except (OSError, ValueError) as error:
-        sys.exit(f"bench-guard: {error}; `make bench` writes a report")
+        _cannot(f"{error}; `make bench` writes a report")
+    if new["target"] != old["target"]:
+        _cannot(f"a report of {new['target']} says nothing about one of {old['target']}")
     compared = ratios(new).keys() & ratios(old).keys()
+    if not compared:
+        _cannot(f"{options.new} has no figure of {options.old}")
     worse = regressions(new, old)
-    print(f"{len(compared)} ratios compared, {len(worse)} worse")
+    print(f"{len(compared)} figures compared, {len(worse)} worse")
     for line in worse:
         print(f"  {line}")
-    sys.exit(1 if worse or not compared else 0)
+    if left := not_compared(new, old):
+        print(f"not measured, so not compared: {', '.join(left)}")
+    sys.exit(1 if worse else 0)
+
+
+def _cannot(why: str) -> NoReturn:
+    print(f"bench-guard: {why}", file=sys.stderr)
+    sys.exit(2)
 
 
 if __name__ == "__main__":

@@ -28,9 +28,12 @@ class Plot:
 
 @dataclass(frozen=True)
 class Ratio:
-    """A figure that holds on any machine, and the most it may be; ``unit`` says ratio of what.
+    """A figure, and the most it may be; ``unit`` says ratio of what.
 
     Where ``at_least``, larger is better and ``target`` is the least. A target of None is not held.
+    ``tolerance`` is how many times worse than in the report that is kept the guard lets it be: above what
+    the same tree has shown on a machine with other work (docs/bench.md). ``by_machine`` says that the other
+    half of the ratio is a constant, so that a slower machine has a larger one.
     """
 
     name: str
@@ -38,6 +41,8 @@ class Ratio:
     target: float | None
     unit: str = "x"
     at_least: bool = False
+    tolerance: float = 1.5
+    by_machine: bool = False
 
     @property
     def reached(self) -> bool | None:

@@ -1,38 +1,55 @@
 """`make bench`: every table of the thesis, measured on one command.
 
-    python -m bench.run [--only query,outage] [--target embedded|aws] [--out build/bench]
+    python -m bench.run [--only query,outage] [--target embedded|aws] [--yes] [--out build/bench]
 
 Writes report.md, report.html, report.json and the pictures into the folder. Exit status 1 if a target is
 missed, 2 if a section could not be measured.
+
+With --target aws it says what that costs and asks first. Ctrl-C, or the end of its terminal, still puts back
+what was changed and removes what was made.
 """
 
 from __future__ import annotations
 
 import argparse
+import signal
 import sys
 import time
 import traceback
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 
 from botocore.exceptions import BotoCoreError, ClientError
 from rich.console import Console
 from rich.markup import escape
+from rich.prompt import Confirm
 from rich.table import Table
 
-from bench import machine, report
+from bench import machine, report, spending
 from bench.result import Section
 from bench.sections import SECTIONS
 from bench.target import AWS, EMBEDDED, Target, open_target
 from contract import DEFAULT_NAMESPACE
 from local.errors import LocalError
+from station.cloud import Cloud
 from station.errors import StationError
+from station.prices import AS_OF, REGION
 
+_INTERRUPTS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
 OUT = machine.ROOT / "build" / "bench"
 
 
 def main() -> None:
     """Measure, write and say."""
-    options = _options()
+    try:
+        run(_options())
+    except KeyboardInterrupt:
+        sys.exit(130)
+
+
+def run(options: argparse.Namespace, cloud: Cloud | None = None) -> None:
+    """The same, on ``cloud`` where it is not the one that the options and the environment lead to."""
     console = Console()
     began = time.monotonic()
     here = machine.describe()
@@ -43,7 +60,13 @@ def main() -> None:
     sections: list[Section] = []
     failed: list[str] = []
     try:
-        with open_target(options.target, namespace=options.namespace, say=say) as target:
+        with (
+            _wound_up(console),
+            open_target(options.target, namespace=options.namespace, cloud=cloud, say=say) as target,
+        ):
+            dollars = spending.estimate(target.cloud, options.only) if target.kind == AWS else {}
+            if dollars and not options.yes:
+                _confirm(console, dollars)
             for number, key in enumerate(options.only, 1):
                 console.print(
                     f"{time.monotonic() - began:6.1f} s  [bold]{key}[/]  ({number} of {len(options.only)})",
@@ -62,6 +85,42 @@ def main() -> None:
         console.print(f"not measured: {', '.join(failed)}", style="red")
         sys.exit(2)
     sys.exit(1 if any(r.reached is False for s in sections for r in s.ratios) else 0)
+
+
+@contextmanager
+def _wound_up(console: Console) -> Iterator[None]:
+    """An interrupt ends what runs now, in good order; another one does not end the putting in order."""
+    asked = False
+
+    def interrupt(_number: int, _frame: object) -> None:
+        nonlocal asked
+        if asked:
+            console.print("still putting back what was changed", style="yellow")
+            return
+        asked = True
+        raise KeyboardInterrupt
+
+    before = {number: signal.signal(number, interrupt) for number in _INTERRUPTS}
+    try:
+        yield
+    finally:
+        for number, handler in before.items():
+            signal.signal(number, handler)
+
+
+def _confirm(console: Console, dollars: dict[str, float]) -> None:
+    """Ask before money is spent. Raises `StationError` where nobody can be asked."""
+    parts = ", ".join(f"{key} {usd:.3f}" for key, usd in dollars.items())
+    console.print(
+        f"This costs about ${sum(dollars.values()):.2f} in your account ({parts}) at the list prices of "
+        f"{AS_OF} in {REGION}, and PubNub's transactions. Robots, certificates, functions and a table named "
+        "bench-... are made and removed again; utilisation changes Lambda 1's memory and puts it back.",
+        highlight=False,
+    )
+    if not sys.stdin.isatty():
+        raise StationError("nobody is here to agree: say so with --yes (make bench TARGET=aws YES=1)")
+    if not Confirm.ask("Go on?", console=console, default=False):
+        raise StationError("nothing was measured")
 
 
 def _measure(key: str, target: Target, console: Console, sections: list[Section], failed: list[str]) -> None:
@@ -96,6 +155,7 @@ def _options() -> argparse.Namespace:
     parser.add_argument("--only", type=_sections, default=list(SECTIONS), help=", ".join(SECTIONS))
     parser.add_argument("--target", choices=(EMBEDDED, AWS), default=EMBEDDED)
     parser.add_argument("--namespace", default=DEFAULT_NAMESPACE, help="the deployment's, with --target aws")
+    parser.add_argument("--yes", action="store_true", help="with --target aws: spend without asking")
     parser.add_argument("--out", type=Path, default=OUT, metavar="FOLDER")
     return parser.parse_args()
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import secrets
 import tempfile
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -9,10 +10,13 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
+from botocore.exceptions import BotoCoreError, ClientError
+
 from contract import DEFAULT_NAMESPACE
 from local.cloud import EmbeddedCloud
 from station import keys, robots
 from station.cloud import Cloud
+from station.errors import StationError
 from station.listener import Listener
 
 EMBEDDED, AWS = "embedded", "aws"
@@ -21,19 +25,28 @@ Say = Callable[[str], None]
 
 @dataclass
 class Target:
-    """A deployment, with robots that are registered for the bench and removed after it."""
+    """A deployment, with robots that are registered for the bench and removed after it.
+
+    In an account, ``run`` ends the names of all that this run makes: what an earlier one has stored, or
+    left behind where it was killed, is not taken for its own.
+    """
 
     kind: str
     cloud: Cloud
     folder: Path
     embedded: EmbeddedCloud | None = None
+    run: str = ""
     _robots: list[str] = field(default_factory=list)
 
-    def robot(self, name: str, **settings: Any) -> robots.Bundle:
-        """Register a robot; its agent's settings are ``settings``."""
-        bundle = robots.add(self.cloud, name, out=self.folder / "robots", settings=settings)
+    def name(self, base: str) -> str:
+        """The name of something that the bench makes."""
+        return f"{base}-{self.run}" if self.run else base
+
+    def robot(self, base: str, **settings: Any) -> robots.Bundle:
+        """Register a robot of that `name`; its agent's settings are ``settings``."""
+        name = self.name(base)
         self._robots.append(name)
-        return bundle
+        return robots.add(self.cloud, name, out=self.folder / "robots", settings=settings)
 
     def listener(self, robot: str) -> Listener:
         """A subscriber of the robot's channel."""
@@ -45,27 +58,36 @@ class Target:
             **pubnub.server(),
         )
 
-    def remove_robots(self) -> None:
-        """Take the robots away again; what they sent expires by itself."""
+    def remove_robots(self, say: Say) -> None:
+        """Take the robots away again, as many as can be; what they sent expires by itself."""
         while self._robots:
-            robots.remove(self.cloud, self._robots.pop())
+            name = self._robots.pop()
+            try:
+                robots.remove(self.cloud, name)
+            except (StationError, BotoCoreError, ClientError) as error:
+                say(f"{name} could not be removed; `iort robots remove {name}` tries again: {error}")
 
 
 @contextmanager
 def open_target(
-    kind: str, *, namespace: str = DEFAULT_NAMESPACE, say: Say = lambda _: None
+    kind: str,
+    *,
+    namespace: str = DEFAULT_NAMESPACE,
+    cloud: Cloud | None = None,
+    say: Say = lambda _: None,
 ) -> Iterator[Target]:
-    """The target from its start to its end. On AWS the stacks are deployed already, and the usual chain
-    of credentials and region is followed; robots get names of the bench's own."""
+    """The target from its start to its end. On AWS the stacks are deployed already: those of ``cloud``, or
+    those to which the usual chain of credentials and region leads."""
     with tempfile.TemporaryDirectory(prefix="iort-bench-") as name:
         folder = Path(name)
         if kind == AWS:
-            target = Target(AWS, Cloud(namespace=namespace), folder)
+            run = secrets.token_hex(3)
+            target = Target(AWS, cloud or Cloud(namespace=namespace), folder, run=run)
             try:
                 yield target
             finally:
                 say("removing the bench's robots")
-                target.remove_robots()
+                target.remove_robots(say)
             return
         with EmbeddedCloud(folder / "cloud", namespace=namespace, progress=say) as embedded:
             yield Target(EMBEDDED, embedded.cloud, folder, embedded)

@@ -11,6 +11,9 @@ from station import cost, cost_tables, scale
 from station.cost import Usage
 from station.prices import AS_OF, REGION
 
+# Nothing is measured here: the same settings have the same cost, to the last digit shown.
+_COMPUTED = 1.01
+
 
 def run(target: Target, say: Say) -> Section:
     """The memory of the functions as they are deployed, the rates of the agent's defaults."""
@@ -35,9 +38,12 @@ def run(target: Target, say: Say) -> Section:
     ours = {rate: cost.total(cost.bill(replace(usage, live_hz=rate))) for rate in rates}
     # The thesis pays for its live view with every sample; ours is given for both ends of the live rate.
     section.ratios += [
-        Ratio("cost with the live lane at 10 Hz / a message a sample", round(ours[10.0] / thesis, 4), 0.05),
-        Ratio("cost with the live lane at 1 Hz / a message a sample", round(ours[1.0] / thesis, 4), 0.05),
-        Ratio("cost of the record lane alone / a message a sample", round(ours[0.0] / thesis, 4), 0.05),
+        Ratio(f"cost {what} / a message a sample", round(ours[rate] / thesis, 4), 0.05, tolerance=_COMPUTED)
+        for what, rate in (
+            ("with the live lane at 10 Hz", 10.0),
+            ("with the live lane at 1 Hz", 1.0),
+            ("of the record lane alone", 0.0),
+        )
     ]
     title = "Dollars a robot-hour on AWS"
     shown = {"a message a sample": thesis, **{f"iort, live at {rate:g} Hz": ours[rate] for rate in rates}}

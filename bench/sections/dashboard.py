@@ -64,7 +64,7 @@ def run(target: Target, say: Say) -> Section:
     found: list[trace.Times] = []
     listener = Listener(
         subscribe_key=pubnub.subscribe_key,
-        robot=ROBOT,
+        robot=bundle.robot,
         namespace=target.cloud.namespace,
         on_update=lambda update, at, here: found.append(trace.times(update, at, here)),
         **pubnub.server(),
@@ -72,12 +72,12 @@ def run(target: Target, say: Say) -> Section:
     painted: list[tuple[float, float]] = []
     with listener, trace.pubnub_clock(pubnub.origin or PUBNUB_ORIGIN, tls=pubnub.tls) as ask:
         here = trace.clock_of(ask, lambda: time.time_ns() // 1000)
-        with Driving(bundle) as driving, _chromium(target, say) as page:
+        with Driving(bundle) as driving, _chromium(target, bundle.robot, say) as page:
             threading.Event().wait(_WARM_UP_S)
             found.clear()
             say(f"driving for {SECONDS} s")
             if page is not None:
-                page.evaluate(_WATCH, ROBOT)
+                page.evaluate(_WATCH, bundle.robot)
                 page.wait_for_timeout(SECONDS * 1000)
                 painted = [(float(t), float(at)) for t, at in page.evaluate("window.__painted")]
             else:
@@ -85,7 +85,7 @@ def run(target: Target, say: Say) -> Section:
             if driving.process.poll() is not None:
                 raise RuntimeError("the agent stopped while it was watched")
             updates = list(found)
-        figures = audit.last_figures(target.cloud, ROBOT)
+        figures = audit.last_figures(target.cloud, bundle.robot)
     if not updates:
         raise RuntimeError("no live update was heard")
     hops = trace.trace(updates, here_to_pubnub=here, car_uncertainty_ms=figures.get("clock_uncertainty_ms"))
@@ -139,10 +139,25 @@ def _report(section: Section, hops: trace.Trace, heard: list[float], shown: list
     section.plots.append(Plot("dashboard", title, plots.cdf(title, curves)))
     if to_subscriber:
         section.ratios.append(
-            Ratio("car to subscriber / thesis' 300 ms", round(to_subscriber.p50 / 300, 4), 1.0)
+            Ratio(
+                "car to subscriber / thesis' 300 ms",
+                round(to_subscriber.p50 / 300, 4),
+                1.0,
+                # A time of a few milliseconds, through five processes.
+                tolerance=8,
+                by_machine=True,
+            )
         )
     if to_pixel:
-        section.ratios.append(Ratio("car to pixel / thesis' 300 ms", round(to_pixel.p50 / 300, 4), 1.0))
+        section.ratios.append(
+            Ratio(
+                "car to pixel / thesis' 300 ms",
+                round(to_pixel.p50 / 300, 4),
+                1.0,
+                tolerance=2.5,
+                by_machine=True,
+            )
+        )
     section.notes.append(
         "A painted frame is the first one after the update's that the browser has handed over; Chromium "
         "draws 60 a second without a display, so half a frame of the delay is waiting for the next."
@@ -160,7 +175,7 @@ def _chunks(values: list[float]) -> list[list[float]]:
 
 
 @contextmanager
-def _chromium(target: Target, say: Say) -> Iterator[Any]:
+def _chromium(target: Target, robot: str, say: Say) -> Iterator[Any]:
     """The live page in a real browser; None where there is no browser or no built page."""
     chromium = os.environ.get("CHROMIUM") or shutil.which("chromium") or shutil.which("chromium-browser")
     if not chromium or not (BUILT / "index.html").is_file():
@@ -179,7 +194,7 @@ def _chromium(target: Target, say: Say) -> Iterator[Any]:
             page = browser.new_page(viewport={"width": 1280, "height": 900})
             page.goto(page_server.url)
             page.wait_for_function(
-                "robot => window.iort?.robots[robot]?.streams?.vesc", arg=ROBOT, timeout=60_000
+                "robot => window.iort?.robots[robot]?.streams?.vesc", arg=robot, timeout=60_000
             )
             yield page
         finally:

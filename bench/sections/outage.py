@@ -9,7 +9,7 @@ from __future__ import annotations
 import threading
 import time
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from statistics import median
 from typing import Any
 
@@ -19,6 +19,7 @@ from bench.result import Plot, Ratio, Section, Table
 from bench.spread import spread
 from bench.target import Say, Target
 from contract import OWN_STREAMS, VESC_STREAM
+from device.config import load_config
 from local.proxy import PASS, REFUSE, Proxy
 from station import audit, delivery, robots
 from station.robots import Bundle
@@ -36,7 +37,7 @@ def run(target: Target, say: Say) -> Section:
     seconds = BEFORE_S + CUT_S + AFTER_S
     source = {"type": "sim", "stream": VESC_STREAM, "rate_hz": RATE_HZ, "duration_s": seconds}
     bundle = target.robot(ROBOT, sources=[source], queue={"path": "queue.db"})
-    with _way(target, bundle) as way, target.listener(ROBOT) as listener, Driving(bundle) as driving:
+    with _way(target, bundle) as way, target.listener(bundle.robot) as listener, Driving(bundle) as driving:
         _wait_for(lambda: bool(listener.heard), "the first live update")
         say(f"driving for {BEFORE_S} s")
         threading.Event().wait(BEFORE_S)
@@ -51,10 +52,14 @@ def run(target: Target, say: Say) -> Section:
         report = driving.finished()
         heard = list(listener.heard)
     sent = sum(s["samples"] for name, s in report["streams"].items() if name not in OWN_STREAMS)
-    _wait_for(
-        lambda: delivery.samples_summarized(target.cloud, ROBOT, VESC_STREAM) >= sent, "Lambda 2", _SUMMARY_S
-    )
-    items = list(audit.headers(target.cloud, ROBOT, VESC_STREAM, audit.Range()))
+    # What is lost never comes; it is counted, not waited for.
+    with suppress(TimeoutError):
+        _wait_for(
+            lambda: delivery.samples_summarized(target.cloud, bundle.robot, VESC_STREAM) >= sent,
+            "Lambda 2",
+            _SUMMARY_S,
+        )
+    items = list(audit.headers(target.cloud, bundle.robot, VESC_STREAM, audit.Range()))
     found = audit.audit(VESC_STREAM, items, from_start=True)
     stored = sum(int(item["n"]) for item in items)
     delayed = [i for i in items if cut_us <= int(i["t"]) < mended_us]
@@ -63,7 +68,7 @@ def run(target: Target, say: Say) -> Section:
     _report(
         section,
         lost=sent - stored,
-        summarized=delivery.samples_summarized(target.cloud, ROBOT, VESC_STREAM),
+        summarized=delivery.samples_summarized(target.cloud, bundle.robot, VESC_STREAM),
         sent=sent,
         duplicated=sum(run.duplicated for run in found.runs),
         missing=found.missing,
@@ -118,11 +123,12 @@ def _report(
     section.ratios += [
         Ratio("samples lost over an outage", lost, 0, "samples"),
         Ratio("batches stored twice over an outage", duplicated, 0, "batches"),
-        Ratio("time to drain / outage", round(drain_s / CUT_S, 4), 0.5),
+        # Most of it is the wait for the agent's next attempt, which is drawn by lot.
+        Ratio("time to drain / outage", round(drain_s / CUT_S, 4), 0.5, tolerance=4),
     ]
     if after and before:
         section.ratios.append(
-            Ratio("live delay after / before", round(median(after) / median(before), 3), None)
+            Ratio("live delay after / before", round(median(after) / median(before), 3), None, tolerance=2)
         )
     title = "Live updates over an outage"
     start = cut_us - BEFORE_S * 1_000_000
@@ -162,11 +168,15 @@ class _Proxied:
 
 
 class _Certificate:
-    """AWS ends the sessions of a certificate that is deactivated, and refuses new ones."""
+    """AWS ends the sessions of a certificate that is deactivated, and refuses new ones.
 
-    def __init__(self, target: Target, robot: str) -> None:
-        self._iot = target.cloud.client("iot")
-        principals = self._iot.list_thing_principals(thingName=robot)["principals"]
+    An agent that is refused waits for minutes, until somebody gives it another certificate: the file is
+    written anew with what it holds.
+    """
+
+    def __init__(self, target: Target, bundle: Bundle) -> None:
+        self._iot, self._file = target.cloud.client("iot"), load_config(bundle.config).certificate
+        principals = self._iot.list_thing_principals(thingName=bundle.robot)["principals"]
         self._certificate = principals[0].rsplit("/", 1)[-1]
 
     def cut(self) -> None:
@@ -174,12 +184,13 @@ class _Certificate:
 
     def mend(self) -> None:
         self._iot.update_certificate(certificateId=self._certificate, newStatus="ACTIVE")
+        self._file.touch()
 
 
 @contextmanager
 def _way(target: Target, bundle: Bundle) -> Iterator[Any]:
     if target.embedded is None:
-        yield _Certificate(target, bundle.robot)
+        yield _Certificate(target, bundle)
         return
     with Proxy(target.cloud.mqtt_endpoint, target.cloud.mqtt_port) as proxy:
         robots.configure(bundle, {"endpoint": "127.0.0.1", "port": proxy.port})
@@ -190,5 +201,5 @@ def _wait_for(true: Any, what: str, seconds: float = 30.0) -> None:
     deadline = time.monotonic() + seconds
     while not true():
         if time.monotonic() > deadline:
-            raise RuntimeError(f"waited {seconds:.0f} s for {what}")
+            raise TimeoutError(f"waited {seconds:.0f} s for {what}")
         threading.Event().wait(0.1)

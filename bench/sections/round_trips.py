@@ -48,9 +48,10 @@ def run(target: Target, say: Say) -> Section:
     cells: dict[tuple[str, int], dict[str, list[list[float]]]] = {}
     with ExitStack() as stack:
         bundles = {path: target.robot(f"bench-rtt-{path}") for path in PING_PATHS}
-        raw = stack.enter_context(RawClient(target.robot("bench-rtt-raw").folder))
+        floor = target.robot("bench-rtt-raw")
+        raw = stack.enter_context(RawClient(floor.folder))
         uplinks = {path: stack.enter_context(_Connected(bundle)) for path, bundle in bundles.items()}
-        topic = build_topic(PING, "bench-rtt-raw", BROKER, target.cloud.namespace)
+        topic = build_topic(PING, floor.robot, BROKER, target.cloud.namespace)
         raw.subscribe(topic)
         floors = _floors(target, raw)
         for repeat, (size, rate_hz) in product(range(REPEATS), product(SIZES, RATES_HZ)):
@@ -134,11 +135,16 @@ class _Connected:
         return trips
 
 
+def seconds(rate_hz: float) -> float:
+    """How long a size is measured at a rate, once."""
+    return max(_LEAST_S, _LEAST / rate_hz / 3)
+
+
 def _cell(
     uplinks: dict[str, _Connected], raw: RawClient, topic: str, *, size: int, rate_hz: int
 ) -> dict[str, list[float]]:
     """Every path and the floor at the same time, each on its own connection."""
-    seconds = max(_LEAST_S, _LEAST / rate_hz / 3)
+    lasts_s = seconds(rate_hz)
     found: dict[str, list[float]] = {}
 
     # Each in its own part of the period, so that none waits for another's message.
@@ -148,12 +154,12 @@ def _cell(
     pause = threading.Event()
 
     def ours(path: str) -> None:
-        found[path] = uplinks[path].measure(path, rate_hz, size, began + starts_s[path], seconds)
+        found[path] = uplinks[path].measure(path, rate_hz, size, began + starts_s[path], lasts_s)
 
     def floor() -> None:
         payload = encode_ping(1, time.time_ns() // 1000, "x" * max(0, size - _ENVELOPE))
         values = []
-        for turn in range(max(1, round(seconds * rate_hz))):
+        for turn in range(max(1, round(lasts_s * rate_hz))):
             due = began + starts_s[RAW] + turn / rate_hz
             pause.wait(max(0.0, due - time.perf_counter()))
             values.append(raw.round_trip(topic, payload) * 1000)

@@ -7,6 +7,7 @@ system, and projected to each memory size; on AWS the sizes are set and measured
 
 from __future__ import annotations
 
+import base64
 import io
 import json
 import re
@@ -54,7 +55,7 @@ CALLS = 60
 BATCHES = 100
 _CATCH_UP_S = 60.0
 _LOGS_S = 60.0
-_REPORT = re.compile(r"^REPORT .*?\tDuration: ([\d.]+) ms")
+_REPORT = re.compile(r"^REPORT .*?\tDuration: ([\d.]+) ms.*", re.MULTILINE)
 _INIT = re.compile(r"Init Duration: ([\d.]+) ms")
 
 
@@ -172,15 +173,31 @@ def _ratios(section: Section, found: dict[str, Measured], cycle: dict[str, float
     if live.cpu_ms and empty.cpu_ms:
         beyond = median(a - b for a, b in zip(live.cpu_ms, empty.cpu_ms, strict=True))
         section.ratios.append(
-            Ratio("Lambda 1 warm, processor time beyond an empty function", round(beyond, 3), 3.0, "ms")
+            Ratio(
+                "Lambda 1 warm, processor time beyond an empty function",
+                round(beyond, 3),
+                3.0,
+                "ms",
+                tolerance=1.6,
+                by_machine=True,
+            )
         )
     many = found[f"Lambda 2, an event of {BATCHES} batches"]
     if many.cpu_ms:
         each = median(a - b for a, b in zip(many.cpu_ms, empty.cpu_ms, strict=True)) / BATCHES
         section.ratios.append(
-            Ratio("Lambda 2, processor time a batch of 50 samples", round(each, 3), 1.0, "ms")
+            Ratio(
+                "Lambda 2, processor time a batch of 50 samples",
+                round(each, 3),
+                1.0,
+                "ms",
+                tolerance=1.6,
+                by_machine=True,
+            )
         )
-    section.ratios.append(Ratio("node's cycle / thesis' 2 ms", round(cycle["p50"] / 2, 5), 0.05))
+    section.ratios.append(
+        Ratio("node's cycle / thesis' 2 ms", round(cycle["p50"] / 2, 5), 0.05, by_machine=True)
+    )
 
 
 def _projected(found: dict[str, Measured]) -> dict[str, list[float]]:
@@ -209,32 +226,41 @@ def _measure(
 ) -> None:
     began_ms = int(time.time() * 1000)
     before = _cpu(target)
-    requests = [_invoke(target, function, event(i)) for i in range(calls)]
+    told = [_invoke(target, function, event(i)) for i in range(calls)]
     after = _cpu(target)
     if before is not None and after is not None:
         found.cpu_ms.append(cpu.spent_ms(before, after) / calls)
-    durations, inits = _reported(target, function, began_ms, requests)
-    found.duration_ms.append(durations)
-    found.init_ms += inits
+    # AWS' answers end with the REPORT line; the embedded cloud's are in its log, where nobody else's are.
+    reports = [line for line in told if line is not None]
+    if len(reports) < calls:
+        reports = _logged(target, function, began_ms, calls)
+    found.duration_ms.append([float(match[1]) for line in reports if (match := _REPORT.match(line))])
+    found.init_ms += [float(match[1]) for line in reports if (match := _INIT.search(line))]
 
 
 def _cpu(target: Target) -> dict[int, int] | None:
     return None if target.embedded is None else cpu.of_tree(target.embedded.emulator.pid)
 
 
-def _invoke(target: Target, function: str, event: dict[str, Any]) -> str:
-    """Run the function once and wait; the request's id. Raises RuntimeError where it fails."""
-    answer = target.cloud.client("lambda").invoke(FunctionName=function, Payload=json.dumps(event).encode())
+def _invoke(target: Target, function: str, event: dict[str, Any]) -> str | None:
+    """Run the function once and wait; its REPORT line, if the answer has it. Raises RuntimeError where it
+    fails."""
+    answer = target.cloud.client("lambda").invoke(
+        FunctionName=function, Payload=json.dumps(event).encode(), LogType="Tail"
+    )
     if "FunctionError" in answer:
         raise RuntimeError(f"{function}: {answer['Payload'].read()[:400]!r}")
-    request: str = answer["ResponseMetadata"]["RequestId"]
-    return request
+    return report_line(base64.b64decode(answer.get("LogResult", "")).decode(errors="replace"))
 
 
-def _reported(
-    target: Target, function: str, began_ms: int, requests: list[str]
-) -> tuple[list[float], list[float]]:
-    """Durations and cold starts by the REPORT lines since then, once they are all in the log."""
+def report_line(tail: str) -> str | None:
+    """The REPORT line of an invocation's log, if it is there."""
+    match = _REPORT.search(tail)
+    return None if match is None else match[0]
+
+
+def _logged(target: Target, function: str, began_ms: int, calls: int) -> list[str]:
+    """The REPORT lines in the function's log since then, once they are all there."""
     client = target.cloud.client("lambda")
     logging = client.get_function_configuration(FunctionName=function).get("LoggingConfig", {})
     group = logging.get("LogGroup", f"/aws/lambda/{function}")
@@ -251,9 +277,8 @@ def _reported(
             raise RuntimeError(
                 f"{group} has no REPORT line after {_LOGS_S:.0f} s: deploy with function_logs=all"
             )
-        if len(reports) >= len(requests) or time.monotonic() > deadline:
-            durations = [float(match[1]) for line in reports if (match := _REPORT.match(line))]
-            return durations, [float(match[1]) for line in reports if (match := _INIT.search(line))]
+        if len(reports) >= calls or time.monotonic() > deadline:
+            return reports
         # A log tells nobody when it has the next line.
         threading.Event().wait(0.5)
 
@@ -317,7 +342,7 @@ def _reporting(target: Target, function: str) -> Iterator[None]:
 @contextmanager
 def _empty_function(target: Target) -> Iterator[str]:
     """A function that does nothing, with the role of echo: what an invocation costs by itself."""
-    client, name = target.cloud.client("lambda"), f"{target.cloud.namespace}-bench-empty"
+    client, name = target.cloud.client("lambda"), target.name(f"{target.cloud.namespace}-bench-empty")
     like = client.get_function_configuration(FunctionName=target.cloud.output("processing", "EchoFunction"))
     packed = io.BytesIO()
     with zipfile.ZipFile(packed, "w") as archive:
@@ -343,7 +368,7 @@ def _store(target: Target, say: Say) -> list[dict[str, Any]]:
     """The items of a drive of 100 s at 50 Hz in the telemetry table; waits until Lambda 2 has seen them."""
     say("storing a drive")
     serialize = TypeSerializer().serialize
-    topic = build_topic(RECORD, ROBOT, VESC_STREAM, target.cloud.namespace)
+    topic = build_topic(RECORD, target.name(ROBOT), VESC_STREAM, target.cloud.namespace)
     vehicle = Vehicle(VehicleConfig(), seed=1)
     first_s = int(time.time()) - BATCHES - 10
     items = []
@@ -361,7 +386,7 @@ def _store(target: Target, say: Say) -> list[dict[str, Any]]:
     for item in items:
         client.put_item(TableName=table, Item=item)
     deadline = time.monotonic() + _CATCH_UP_S
-    while delivery.samples_summarized(target.cloud, ROBOT, VESC_STREAM) < 50 * BATCHES:
+    while delivery.samples_summarized(target.cloud, target.name(ROBOT), VESC_STREAM) < 50 * BATCHES:
         if time.monotonic() > deadline:
             raise RuntimeError("Lambda 2 has not summarised what was stored")
         threading.Event().wait(0.2)
@@ -391,7 +416,7 @@ def _live_event(target: Target, i: int) -> dict[str, Any]:
     now_us = time.time_ns() // 1000
     sample = Vehicle(VehicleConfig(), seed=1).sample()
     message = json.loads(encode_live(LiveSample("0badcafe", i, now_us - 1000, now_us, sample)))
-    topic = build_topic(LIVE, ROBOT, VESC_STREAM, target.cloud.namespace)
+    topic = build_topic(LIVE, target.name(ROBOT), VESC_STREAM, target.cloud.namespace)
     return {**message, TOPIC: topic, RECEIVED_MS: now_us // 1000}
 
 

@@ -97,34 +97,73 @@ def test_written_report_is_whole_and_old_pictures_go(tmp_path):
     ]
     kept = json.loads((tmp_path / "report.json").read_text())
     assert kept["sections"][0]["raw"] == {"values": [1, 2]}
-    assert guard.ratios(kept)["r"]["value"] == 1
+    assert guard.ratios(kept)["r"].value == 1
 
 
-def _report(**values):
-    ratios = [Ratio(name, value, target, at_least=least) for name, (value, target, least) in values.items()]
-    return json.loads(json.dumps({"sections": [_section(*ratios).as_json()]}))
+def _report(*ratios, cpu="A processor", key="query"):
+    section = {**_section(*ratios).as_json(), "key": key}
+    machine = {**MACHINE, "cpu": cpu}
+    return json.loads(json.dumps({"target": "embedded", "machine": machine, "sections": [section]}))
 
 
 @pytest.mark.parametrize(
-    ("was", "now", "target", "at_least", "worse"),
+    ("was", "now", "target", "more", "worse"),
     [
-        (2.0, 2.9, None, False, 0),
-        (2.0, 3.1, None, False, 1),
-        (1.0, 1.6, 2.0, False, 0),
-        (1.0, 2.1, 2.0, False, 1),
-        (30.0, 19.0, 20.0, True, 1),
-        (90.0, 21.0, 20.0, True, 0),
-        (0.0, 1.0, 0.0, False, 1),
-        (0.0, 0.0, 0.0, False, 0),
+        (2.0, 2.9, None, {}, 0),
+        (2.0, 3.1, None, {}, 1),
+        # Also where the target is far away.
+        (1.0, 1.6, 9.0, {}, 1),
+        (1.0, 1.6, 9.0, {"tolerance": 2}, 0),
+        (30.0, 21.0, 20.0, {"at_least": True}, 0),
+        (90.0, 21.0, 20.0, {"at_least": True}, 1),
+        (0.0, 1.0, 0.0, {}, 1),
+        (0.0, 0.0, 0.0, {}, 0),
     ],
 )
-def test_guard_compares_ratios_and_forgives_noise(was, now, target, at_least, worse):
-    old, new = _report(r=(was, target, at_least)), _report(r=(now, target, at_least))
+def test_guard_lets_a_figure_be_as_much_worse_as_it_says(was, now, target, more, worse):
+    old, new = (_report(Ratio("r", value, target, **more)) for value in (was, now))
     assert len(guard.regressions(new, old)) == worse
 
 
-def test_guard_compares_only_what_both_have():
-    assert guard.regressions(_report(a=(9, None, False)), _report(b=(1, None, False))) == []
+@pytest.mark.parametrize(
+    ("cpu", "now", "worse"), [("A processor", 1.6, 1), ("Other", 1.6, 0), ("Other", 9, 1)]
+)
+def test_guard_holds_a_time_to_its_target_on_another_machine(cpu, now, worse):
+    old = _report(Ratio("r", 1.0, 5.0, by_machine=True))
+    new = _report(Ratio("r", now, 5.0, by_machine=True), cpu=cpu)
+    assert len(guard.regressions(new, old)) == worse
+
+
+def test_guard_names_what_a_section_no_longer_gives_and_which_were_not_run():
+    old, new = _report(Ratio("a", 1, 1), Ratio("b", 1, 1)), _report(Ratio("a", 1, 1))
+    assert guard.regressions(new, old) == ["b: no longer measured"]
+    other = _report(Ratio("c", 1, 1), key="outage")
+    assert guard.regressions(other, old) == []
+    assert guard.not_compared(other, old) == ["query"]
+
+
+@pytest.mark.parametrize(
+    ("change", "status", "said"),
+    [
+        ({}, 0, "1 figures compared, 0 worse"),
+        ({"target": "aws"}, 2, "a report of aws says nothing about one of embedded"),
+        ({"sections": []}, 2, "has no figure of"),
+    ],
+)
+def test_guard_says_what_it_did(tmp_path, capsys, change, status, said):
+    report = _report(Ratio("r", 1, 2))
+    for name, content in (("old", report), ("new", {**report, **change})):
+        (tmp_path / name).write_text(json.dumps(content))
+    with pytest.raises(SystemExit) as ended:
+        guard.main(["--new", str(tmp_path / "new"), "--old", str(tmp_path / "old")])
+    assert ended.value.code == status
+    assert said in "".join(capsys.readouterr())
+
+
+def test_guard_reads_the_report_that_is_kept():
+    kept = json.loads(REPORT.read_text())
+    assert len(guard.ratios(kept)) > 10
+    assert guard.regressions(kept, kept) == []
 
 
 def test_readme_has_the_headline_of_the_report_that_is_kept():

@@ -11,12 +11,15 @@ from bench.sections.utilisation import BATCHES, Measured
 
 def test_report_lines_of_lambda_are_read():
     line = "REPORT RequestId: 8f50\tDuration: 12.34 ms\tBilled Duration: 13 ms\tMemory Size: 256 MB\t"
-    match = utilisation._REPORT.match(line)
-    assert match is not None
-    assert float(match[1]) == 12.34
-    cold = utilisation._INIT.search(line + "Max Memory Used: 81 MB\tInit Duration: 250.5 ms\t")
-    assert cold is not None
-    assert float(cold[1]) == 250.5
+    cold = line + "Max Memory Used: 81 MB\tInit Duration: 250.5 ms\t"
+    tail = f"START RequestId: 8f50 Version: $LATEST\nREPORTED\nEND RequestId: 8f50\n{cold}\n"
+    assert utilisation.report_line(tail) == cold
+    assert utilisation.report_line("START RequestId: 8f50\n") is None
+    duration, init = utilisation._REPORT.match(cold), utilisation._INIT.search(cold)
+    assert duration is not None
+    assert init is not None
+    assert (float(duration[1]), float(init[1])) == (12.34, 250.5)
+    assert utilisation._INIT.search(line) is None
 
 
 def test_projection_is_the_share_of_a_processor_that_memory_buys():

@@ -1,0 +1,105 @@
+"""What `make bench TARGET=aws` will cost, at list prices: counted from what the sections do."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from itertools import product
+from math import ceil
+
+from bench.sections import dashboard, outage, query, round_trips, utilisation
+from contract import PING_PATHS
+from device.allowance import BYTES_PER_S
+from station import cost
+from station.cloud import Cloud
+from station.cost import Item, Usage
+
+# AWS' units: a message and an action are metered by 5 KB, writes by 1 KB, reads by 4 KB and by half where
+# they need not be consistent.
+_METER, _WRITE, _READ = 5 * 1024, 1024, 2 * 4096
+# Of a compressed batch of 50 samples with its keys, and of a second of its summary.
+_BATCH_WRITES, _SUMMARY_WRITES = 2, 3
+_BILLED_S = 0.02
+_MINUTES_CONNECTED = 30
+
+
+def estimate(cloud: Cloud, sections: Sequence[str]) -> dict[str, float]:
+    """Dollars a section, on the generous side; Amazon's alone, at the prices of the cost model."""
+    counted: dict[str, Callable[[], list[Item]]] = {
+        "round_trips": _round_trips,
+        "dashboard": lambda: _driven(dashboard.SECONDS * 2),
+        "utilisation": _utilisation,
+        "query": lambda: _query(_telemetry_bytes(cloud)),
+        "abilities": _abilities,
+        "outage": lambda: _driven(outage.BEFORE_S + outage.CUT_S + outage.AFTER_S),
+    }
+    return {key: cost.total(counted[key]()) for key in sections if key in counted}
+
+
+def _round_trips() -> list[Item]:
+    messages, rules, answers = 0, 0, 0
+    for size, rate_hz in product(round_trips.SIZES.values(), round_trips.RATES_HZ):
+        if size * rate_hz <= BYTES_PER_S:
+            pings = round_trips.REPEATS * ceil(rate_hz * round_trips.seconds(rate_hz))
+            metered = pings * ceil(size / _METER)
+            # There and back, of each path and of the floor.
+            messages += 2 * metered * (len(PING_PATHS) + 1)
+            rules += 2 * metered
+            answers += pings
+    return [
+        _item("message", messages),
+        _item("rule", rules),
+        _item("action", rules),
+        *_invoked(answers, 256),
+        _item("connection", 4 * _MINUTES_CONNECTED),
+    ]
+
+
+def _driven(seconds: float) -> list[Item]:
+    hours = seconds / 3600
+    items = cost.bill(Usage(ping_hz=1, agent_every_s=1))
+    return [item._replace(units=item.units * hours) for item in items]
+
+
+def _utilisation() -> list[Item]:
+    calls = utilisation.CALLS * utilisation.ROUNDS * 4
+    sized = [
+        item
+        for size in utilisation.SIZES_MB
+        for item in _invoked(utilisation.CALLS * utilisation.ROUNDS, size)
+    ]
+    written = utilisation.BATCHES * (_BATCH_WRITES + _SUMMARY_WRITES)
+    return [*_invoked(calls, 512), *sized, _item("write", written + calls * _SUMMARY_WRITES)]
+
+
+def _query(telemetry_bytes: int) -> list[Item]:
+    batches = ceil(query.POINTS / 50) + query.HOUR_POINTS // 50
+    reads = query.REPEATS + 1
+    stored = batches * _BATCH_WRITES * _WRITE
+    thesis = query.POINTS * 512
+    # Two ways scan the whole table, whatever else is in it, and the thesis' way twice its own.
+    scanned = 2 * (telemetry_bytes + stored) + 2 * thesis + 3 * stored
+    return [
+        _item("write", query.POINTS + batches * (_BATCH_WRITES + _SUMMARY_WRITES)),
+        _item("read", ceil(reads * scanned / _READ)),
+        *_invoked(batches + 2 * reads, 512),
+    ]
+
+
+def _abilities() -> list[Item]:
+    # A metric of its own, for the hour that AWS bills.
+    return [_item("metric", 1 / 730), _item("message", 500), _item("write", 500), *_invoked(100, 512)]
+
+
+def _invoked(calls: int, memory_mb: int) -> list[Item]:
+    return [_item("invocation", calls), _item("compute_x86", calls * memory_mb / 1024 * _BILLED_S * 5)]
+
+
+def _item(price: str, units: float) -> Item:
+    return Item("", "", "", price, units)
+
+
+def _telemetry_bytes(cloud: Cloud) -> int:
+    """How large the table is, as AWS counts it every six hours."""
+    table = cloud.output("storage", "TelemetryTable")
+    described = cloud.client("dynamodb").describe_table(TableName=table)["Table"]
+    return int(described.get("TableSizeBytes", 0))

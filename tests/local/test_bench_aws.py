@@ -1,0 +1,96 @@
+"""`make bench TARGET=aws`, as far as it can be tried without an account: on the embedded cloud's services."""
+
+from __future__ import annotations
+
+import argparse
+import io
+import json
+
+import pytest
+from botocore.exceptions import ClientError
+
+from bench import run, spending
+from bench.sections import SECTIONS, utilisation
+from bench.target import AWS, open_target
+from station import certificates, robots
+
+
+def memory_mb(cloud) -> int:
+    name = cloud.output("processing", "LiveFunction")
+    return cloud.client("lambda").get_function_configuration(FunctionName=name)["MemorySize"]
+
+
+def options(tmp_path, *only: str, yes: bool):
+    return argparse.Namespace(only=list(only), target=AWS, namespace="iort", yes=yes, out=tmp_path)
+
+
+def test_two_runs_have_robots_of_their_own_and_leave_none(embedded):
+    iot, made = embedded.cloud.client("iot"), []
+    for _ in range(2):
+        with open_target(AWS, cloud=embedded.cloud) as target:
+            made.append(target.robot("bench-car").robot)
+            assert iot.describe_thing(thingName=made[-1])["thingName"] == target.name("bench-car")
+            assert certificates.attached(embedded.cloud, made[-1])
+    assert len(set(made)) == 2
+    for name in made:
+        with pytest.raises(ClientError):
+            iot.describe_thing(thingName=name)
+
+
+def test_a_robot_that_cannot_be_removed_does_not_keep_the_others(embedded):
+    said = []
+    with open_target(AWS, cloud=embedded.cloud, say=said.append) as target:
+        kept, other = target.robot("bench-one").robot, target.robot("bench-other").robot
+        # As if somebody had been quicker.
+        robots.remove(embedded.cloud, other)
+    assert any(f"{other} could not be removed" in line for line in said)
+    with pytest.raises(ClientError):
+        embedded.cloud.client("iot").describe_thing(thingName=kept)
+
+
+def test_an_interrupt_puts_the_memory_back(embedded):
+    cloud, was = embedded.cloud, memory_mb(embedded.cloud)
+    seen = []
+
+    def say(text: str) -> None:
+        seen.append(memory_mb(cloud))
+        if "256 MB" in text:
+            raise KeyboardInterrupt
+
+    with open_target(AWS, cloud=cloud) as target:
+        live = cloud.output("processing", "LiveFunction")
+        with pytest.raises(KeyboardInterrupt):
+            utilisation._memory_sizes(target, live, lambda i: utilisation._live_event(target, i), say)
+    assert seen == [was, utilisation.SIZES_MB[0]]
+    assert memory_mb(cloud) == was
+
+
+def test_nobody_there_to_agree_means_that_nothing_is_spent(embedded, tmp_path, capsys, monkeypatch):
+    monkeypatch.setattr("sys.stdin", io.StringIO())
+    before = embedded.cloud.client("iot").list_things()["things"]
+    with pytest.raises(SystemExit) as ended:
+        run.run(options(tmp_path, "cost", "abilities", yes=False), embedded.cloud)
+    assert ended.value.code == 2
+    said = capsys.readouterr().out
+    assert "This costs about $0.0" in said
+    assert "--yes" in said
+    assert embedded.cloud.client("iot").list_things()["things"] == before
+    assert not list(tmp_path.iterdir())
+
+
+def test_every_section_that_sends_something_has_its_price(embedded):
+    dollars = spending.estimate(embedded.cloud, list(SECTIONS))
+    assert set(SECTIONS) - dollars.keys() == {"cost", "scale"}
+    assert all(0 < usd < 1 for usd in dollars.values())
+
+
+def test_the_report_says_where_it_was_made(embedded, tmp_path):
+    with pytest.raises(SystemExit) as ended:
+        run.run(options(tmp_path, "cost", "scale", yes=True), embedded.cloud)
+    # The cost at the full live rate misses its target.
+    assert ended.value.code in {0, 1}
+    report = json.loads((tmp_path / "report.json").read_text())
+    assert report["target"] == AWS
+    cost, scale = report["sections"]
+    assert cost["ratios"]
+    assert "Not run on AWS" in scale["notes"][0]
