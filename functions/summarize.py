@@ -95,16 +95,18 @@ def summarize_topic(tables: Tables, topic: str, batches: Sequence[Batch]) -> Sum
     reader = Reader(tables, topic, known)
     vehicle = tables.vehicle(parse_topic(topic).robot)
     summaries = Summaries()
+    within: set[BatchKey] = set()
     for touched in _runs({t_us // _SECOND_US for batch in batches for t_us in batch.times_us}):
         stored = reader.read(touched[0], touched[-1])
-        within = {key_of(entry.batch) for entry in stored if not entry.beyond}
-        summaries.beyond |= {key for key in known if key[0] // _SECOND_US in reader.full} - within
         seconds = set(touched)
         previous: Batch | None = None
         for batch, _, beyond in stored:
-            if previous is not None and key_of(previous) in known:
-                seconds.add(batch.t_us // _SECOND_US)
-            if key_of(batch) in known and not beyond:
+            second = batch.t_us // _SECOND_US
+            # What is read in front of a run is there in part, and belongs to another, as does what follows.
+            if previous is not None and key_of(previous) in known and second >= touched[0]:
+                seconds.add(second)
+            if key_of(batch) in known and not beyond and touched[0] <= second <= touched[-1]:
+                within.add(key_of(batch))
                 summaries.missing += missing_before(previous, batch)
             previous = batch
         for second in seconds:
@@ -117,6 +119,7 @@ def summarize_topic(tables: Tables, topic: str, batches: Sequence[Batch]) -> Sum
             if expires := [entry.expires_s for entry in near if entry.expires_s]:
                 summary[EXPIRES_S] = max(expires)
             summaries.seconds[second] = summary
+    summaries.beyond = {key for key in known if key[0] // _SECOND_US in reader.full} - within
     return summaries
 
 

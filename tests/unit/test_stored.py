@@ -108,3 +108,28 @@ def test_a_reader_says_which_seconds_are_full(stream):
     reader = Reader(stream.tables, TOPIC_OF_CAR, {})
     assert len(reader.read(SECOND, SECOND)) == SECOND_BATCHES + 1
     assert reader.full == {SECOND}
+
+
+def test_batches_within_a_full_second_are_kept_where_the_event_has_a_far_one_too(stream, capsys):
+    records = stream.store(*packed(MANY), batch(T0 + 100 * S, seq=MANY))
+    stream.summarize(records)
+    assert len(stream.refused) == MANY - SECOND_BATCHES
+    assert stream.column("batches") == {0: SECOND_BATCHES, 100: 1}
+    said = capsys.readouterr().out
+    assert f'"BatchesSummarized":{SECOND_BATCHES + 1}' in said
+    assert "BatchesMissing" not in said
+
+
+def test_a_long_drain_in_one_event_is_summarised_as_batch_by_batch(stream, capsys):
+    """More than is read together, two batches a second that reach into the next one, and one hole."""
+    batches = [
+        batch(T0 + n * S // 2 + 100_000, 20, step_us=25_000, seq=n + 5 * (n >= 100)) for n in range(300)
+    ]
+    records = stream.store(*batches)
+    stream.summarize(records)
+    assert '"BatchesMissing":5}' in capsys.readouterr().out
+    at_once = stream.summary()
+    for record in records:
+        stream.summarize([record])
+    assert at_once == stream.summary()
+    assert [second for second, missing in stream.column("missing_batches").items() if missing] == [50]
