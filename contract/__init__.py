@@ -75,7 +75,18 @@ from contract.limits import (
     ContractError,
     Value,
 )
-from contract.live import LiveSample, Pong, decode_live, decode_pong, encode_live, encode_ping, live_update
+from contract.live import (
+    MESSAGE_BASE64,
+    LiveSample,
+    Pong,
+    decode_live,
+    decode_pong,
+    encode_live,
+    encode_ping,
+    live_event,
+    live_message,
+    live_update,
+)
 from contract.message_type import MessageType, message_type
 from contract.seconds import flat_second, packed_second
 from contract.tables import (
@@ -236,6 +247,7 @@ __all__ = [
     "MAX_PUBNUB_BYTES",
     "MAX_SAMPLES",
     "MAX_VALID_MS",
+    "MESSAGE_BASE64",
     "METRICS",
     "METRIC_DEPLOYMENT",
     "METRIC_FUNCTION",
@@ -325,6 +337,8 @@ __all__ = [
     "flat_second",
     "fleet_name",
     "inflate",
+    "live_event",
+    "live_message",
     "live_topic",
     "live_update",
     "message_type",

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from contract.checks import shown
 from contract.limits import DEFAULT_NAMESPACE, ContractError
+from contract.live import MESSAGE_BASE64
 from contract.tables import AGENT_VERSION, EXPIRES_S, RECEIVED_MS, ROBOT, TOPIC
 from contract.topics import (
     FILE,
@@ -78,7 +79,10 @@ def rule_sql(
         expires = f"floor(timestamp() / 1000) + {retention_s} AS {EXPIRES_S}"
         return f"SELECT *, topic() AS {TOPIC}, {received}, {expires} FROM '{RECORD}/{name}/+/+'"
     if rule == "live":
-        return f"SELECT *, topic() AS {TOPIC}, {received} FROM '{LIVE}/{name}/+/+'"
+        # Byte by byte, whatever it is: a payload that is no JSON cannot go with others in SELECT *, and its
+        # bytes would be lost to the quarantine.
+        raw = f"encode(*, 'base64') AS {MESSAGE_BASE64}"
+        return f"SELECT {raw}, topic() AS {TOPIC}, {received} FROM '{LIVE}/{name}/+/+'"
     if rule == "pong":
         return f"SELECT *, {received} FROM '{PING}/{name}/+/{RULE}'"
     if rule == "echo":

@@ -19,6 +19,7 @@ from contract import (
     LiveSample,
     channel,
     decode_live,
+    live_message,
     live_update,
     parse_topic,
 )
@@ -80,9 +81,9 @@ def process(
     """
     try:
         topic = parse_topic(event[TOPIC])
-        live = decode_live(event)
+        live = decode_live(live_message(event))
         received_ms = int(event[RECEIVED_MS])
-    except (ContractError, KeyError, TypeError, ValueError, OverflowError) as error:
+    except (ContractError, AttributeError, KeyError, TypeError, ValueError, OverflowError) as error:
         emit("live", LiveRefused=1)
         raise RefusedError(f"{type(error).__name__}: {error}") from error
     # Of a car that has not measured its clock's offset neither the leg between nor the whole way is known.

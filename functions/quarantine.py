@@ -14,6 +14,7 @@ import logging
 import os
 import time
 from collections.abc import Callable, Iterable, Mapping
+from contextlib import suppress
 from dataclasses import dataclass
 from functools import cache
 from typing import Any
@@ -38,6 +39,8 @@ from contract import (
     SEEN,
     SOURCE,
     TOPIC,
+    ContractError,
+    live_message,
 )
 from functions.metrics import emit
 
@@ -130,8 +133,15 @@ def _of_invocation(document: Mapping[str, Any]) -> Entry:
         source=f"{BY_FUNCTION} {name}",
         topic=topic if isinstance(topic, str) else "",
         reason=f"{context.get('condition')}: {error}",
-        payload=_json(event),
+        payload=_message(event),
     )
+
+
+def _message(event: Any) -> bytes:
+    """What a function was called about: a live message's own bytes, or else the event."""
+    with suppress(ContractError, AttributeError):
+        return live_message(event)
+    return _json(event)
 
 
 def _json(value: Any) -> bytes:

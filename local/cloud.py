@@ -42,6 +42,7 @@ from contract import (
     build_topic,
     encode_live,
     encode_ping,
+    live_event,
 )
 from local import gateway_certificate
 from local.deployment import ROOT, deploy
@@ -255,5 +256,4 @@ class EmbeddedCloud:
     def _live(self) -> dict[str, Any]:
         """Stale since 1970, and dropped."""
         sample = LiveSample(boot="00000000", seq=0, t_us=0, sent_us=0, sample={}, offset_us=0)
-        topic = build_topic(LIVE, "warm-up", "warm-up", self.namespace)
-        return {TOPIC: topic, RECEIVED_MS: 0, **json.loads(encode_live(sample))}
+        return live_event(encode_live(sample), build_topic(LIVE, "warm-up", "warm-up", self.namespace), 0)

@@ -42,6 +42,7 @@ from contract import (
     build_topic,
     encode,
     encode_live,
+    live_event,
 )
 from device.sources.vehicle import Vehicle, VehicleConfig
 from station import delivery
@@ -415,9 +416,9 @@ def _live_event(target: Target, i: int) -> dict[str, Any]:
     """What the live rule gives to Lambda 1."""
     now_us = time.time_ns() // 1000
     sample = Vehicle(VehicleConfig(), seed=1).sample()
-    message = json.loads(encode_live(LiveSample("0badcafe", i, now_us - 1000, now_us, sample)))
+    message = encode_live(LiveSample("0badcafe", i, now_us - 1000, now_us, sample))
     topic = build_topic(LIVE, target.name(ROBOT), VESC_STREAM, target.cloud.namespace)
-    return {**message, TOPIC: topic, RECEIVED_MS: now_us // 1000}
+    return live_event(message, topic, now_us // 1000)
 
 
 def _cycle() -> dict[str, float]:

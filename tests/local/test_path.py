@@ -33,16 +33,18 @@ def _listener(embedded: EmbeddedCloud, robot: str) -> Listener:
 
 def test_simulated_drive_arrives_whole_on_both_lanes(embedded, bundle):
     car = bundle(
-        sources=[{"type": "sim", "stream": "vesc", "rate_hz": 50, "duration_s": 4}],
+        sources=[{"type": "sim", "stream": "vesc", "rate_hz": 50}],
         ping={"rate_hz": 5, "padding_bytes": 430},
     )
     with _listener(embedded, car.robot) as listener:
-        report = run_agent(car)
-        until(lambda: listener.heard)
-    assert report["streams"]["vesc"]["samples"] == 200
-    until(lambda: delivery.samples_summarized(embedded.cloud, car.robot, "vesc") == 200)
+        agent = Agent(car)
+        # Where the machine is slow, what is sent while Lambda 1 starts is stale by then.
+        until(lambda: listener.heard and agent.status().get("streams", {}).get("vesc", {}).get("samples"))
+        agent.stop()
+        driven = agent.report()["streams"]["vesc"]["samples"]
+    until(lambda: delivery.samples_summarized(embedded.cloud, car.robot, "vesc") == driven)
     found = delivery.delivery(embedded.cloud, car.robot, "vesc")
-    assert (found.samples_stored, found.batches_missing) == (200, 0)
+    assert (found.samples_stored, found.batches_missing) == (driven, 0)
     assert {heard.robot for heard in listener.heard} == {car.robot}
     trips = round_trips(delivery.batches(embedded.cloud, car.robot, contract.RTT_STREAM))
     assert all(spread.n >= 1 and spread.p50 is not None for spread in trips.values()), trips

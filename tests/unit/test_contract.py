@@ -112,15 +112,22 @@ def test_encoding_again_gives_the_same_message(batch):
 @given(lives)
 def test_live_round_trip(live):
     message = contract.encode_live(live)
-    for decoded in map(contract.decode_live, (message, message.decode(), stored_live(message))):
+    for decoded in map(contract.decode_live, (message, message.decode(), handed_over(message))):
         assert replace(decoded, sample={}) == replace(live, sample={})
         assert list(decoded.sample) == list(live.sample)
         assert all(same(live.sample[name], decoded.sample[name]) for name in live.sample)
 
 
-def stored_live(message):
-    """The event that the live rule gives to Lambda 1."""
-    return dict(json.loads(message), topic="live/iort/car/vesc", received_ms=1_700_000_000_000)
+def handed_over(message):
+    """As the live rule gives it to Lambda 1, and Lambda 1 takes it."""
+    event = contract.live_event(message, "live/iort/car/vesc", 1_700_000_000_000)
+    return contract.live_message(json.loads(json.dumps(event)))
+
+
+@pytest.mark.parametrize("event", [{}, {contract.MESSAGE_BASE64: 7}, {contract.MESSAGE_BASE64: "a%"}])
+def test_an_event_of_another_kind_holds_no_live_message(event):
+    with pytest.raises(ContractError, match=contract.MESSAGE_BASE64):
+        contract.live_message(event)
 
 
 @pytest.mark.parametrize("n", [1, 2, 50, 1000])
@@ -421,7 +428,7 @@ def test_one_key_removed(good):
         envelope = json.loads(good)
         del envelope[key]
         with pytest.raises(ContractError, match=key):
-            decoder(envelope)
+            decoder(json.dumps(envelope))
 
 
 def enveloped(body, **changed):
@@ -524,7 +531,9 @@ def test_too_many_fields_are_refused():
         contract.decode(enveloped(body.encode()))
     with pytest.raises(ContractError, match="sample"):
         contract.decode_live(
-            dict(json.loads(contract.encode_live(GOOD_LIVE)), sample={f"f{i}": 1 for i in range(513)})
+            json.dumps(
+                dict(json.loads(contract.encode_live(GOOD_LIVE)), sample={f"f{i}": 1 for i in range(513)})
+            )
         )
 
 
@@ -820,14 +829,16 @@ def test_rule_listens_to_its_own_topics_of_the_contract(rule, namespace):
 @pytest.mark.parametrize("rule", RULE_TOPICS)
 def test_what_the_cloud_says_overrides_the_message(rule):
     sql = contract.rule_sql(rule)
-    selected = sql[len("SELECT ") : sql.index(" FROM ")].split(", ")
-    assert selected[0] == "*"
+    # Lambda 1 alone is given the message as it came.
+    whole = f"encode(*, 'base64') AS {contract.MESSAGE_BASE64}" if rule == "live" else "*"
+    assert sql.startswith(f"SELECT {whole}, ")
+    selected = ["*", *sql[len(f"SELECT {whole}, ") : sql.index(" FROM ")].split(", ")]
     named = [part.rsplit(" AS ", 1)[1] for part in selected[1:]]
     assert contract.RECEIVED_MS in named
     assert (contract.TOPIC in named) == (rule != "pong")
     assert (contract.EXPIRES_S in named) == (rule == "record")
     functions = set(re.findall(r"([a-zA-Z_]+)\(", sql))
-    assert functions <= {"topic", "timestamp", "floor"}
+    assert functions <= {"topic", "timestamp", "floor", "encode"}
 
 
 def test_pong_goes_to_the_robot_that_asked():

@@ -31,8 +31,10 @@ SAMPLE = {"speed": 1200, "voltage_input": 15.8, "fault_code": 0}
 def event(stream="vesc", robot="car", namespace="iort", **changes):
     """What the live rule makes of a live message."""
     sample = changes.pop("sample", SAMPLE)
+    ours = {name: changes.pop(name) for name in (TOPIC, RECEIVED_MS) if name in changes}
     message = json.loads(contract.encode_live(LiveSample("0123abcd", 3, T_US, SENT_US, sample)))
-    return {**message, TOPIC: build_topic(LIVE, robot, stream, namespace), RECEIVED_MS: RECEIVED, **changes}
+    raw = json.dumps({**message, **changes}).encode()
+    return {**contract.live_event(raw, build_topic(LIVE, robot, stream, namespace), RECEIVED), **ours}
 
 
 class Channels:
@@ -148,28 +150,46 @@ def test_stale_by_its_time_in_the_car_and_in_the_cloud(
     assert "CarToLambdaMs" not in totals
 
 
-without = [
-    {key: value for key, value in event().items() if key != gone} for gone in event() if gone != "nonfinite"
-]
+MESSAGE = contract.encode_live(LiveSample("0123abcd", 3, T_US, SENT_US, SAMPLE))
+
+
+def handed(message):
+    """An event with any bytes in it."""
+    return contract.live_event(message, build_topic(LIVE, "car", "vesc"), RECEIVED)
+
+
+def saying(**changes):
+    """An event whose message says something else; nothing where that is `...`."""
+    said = {**json.loads(MESSAGE), **changes}
+    return handed(json.dumps({name: value for name, value in said.items() if value is not ...}).encode())
+
+
 MALFORMED = [
-    *without,
+    *({key: value for key, value in event().items() if key != gone} for gone in event()),
+    *(saying(**{gone: ...}) for gone in json.loads(MESSAGE) if gone != "nonfinite"),
     {},
     event(topic="live/iort/car"),
     event(topic=None),
     event(topic="live/iort/c r/vesc"),
-    event(v=2),
-    event(v="1"),
-    event(boot="XYZ"),
-    event(seq=-1),
-    {**event(), "sample": None},
-    {**event(), "sample": [1, 2]},
-    {**event(), "sample": {"speed": [1]}},
-    {**event(), "sample": {"": 1}},
-    {**event(), "sample": {"speed": math.nan}},
-    {**event(), "t": 1e300},
-    {**event(), "sent_us": "now"},
-    {**event(), "offset_us": "0"},
-    {**event(), "offset_us": None},
+    handed(b""),
+    handed(MESSAGE[:-1]),
+    handed(b"\xff\x00" + MESSAGE),
+    handed(b"[]"),
+    saying(v=2),
+    saying(v="1"),
+    saying(boot="XYZ"),
+    saying(seq=-1),
+    saying(sample=None),
+    saying(sample=[1, 2]),
+    saying(sample={"speed": [1]}),
+    saying(sample={"": 1}),
+    saying(sample={"speed": math.nan}),
+    saying(t=1e300),
+    saying(sent_us="now"),
+    saying(offset_us="0"),
+    saying(offset_us=None),
+    {**event(), contract.MESSAGE_BASE64: "%"},
+    {**event(), contract.MESSAGE_BASE64: {}},
     {**event(), RECEIVED_MS: None},
     {**event(), RECEIVED_MS: "soon"},
     {**event(), RECEIVED_MS: math.inf},
@@ -200,10 +220,14 @@ json_values = st.recursive(
 )
 
 
-@given(st.dictionaries(st.sampled_from(sorted(event())), json_values), json_values)
-def test_nothing_in_an_event_raises_anything_else(changes, anything):
+@given(
+    st.dictionaries(st.sampled_from(sorted(event())), json_values),
+    st.dictionaries(st.sampled_from(sorted(json.loads(MESSAGE))), json_values),
+    json_values,
+)
+def test_nothing_in_an_event_raises_anything_else(changes, said, anything):
     channels = Channels()
-    for one in ({**event(), **changes}, anything):
+    for one in ({**event(), **changes}, saying(**said), anything):
         with contextlib.suppress(RefusedError):
             show(one, channels)
     for channel, message in channels.sent:
