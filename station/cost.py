@@ -32,6 +32,8 @@ _PLATFORM_LINES = (
     f"REPORT RequestId: {_REQUEST}\tDuration: 12.34 ms\tBilled Duration: 13 ms\t"
     "Memory Size: 256 MB\tMax Memory Used: 81 MB\t\n"
 )
+# A car that measures no round trips still pings a rule for its clock's offset; a test holds it to the agent.
+CLOCK_PING_S = 30.0
 # And ours in bytes, in embedded metric format; a test holds these to functions/. Lambda 1 gathers what it
 # counts: a line an environment in `_GATHER_S`, or sooner with a hundred values of one metric; four a message.
 _GATHER_S, _MOST_VALUES, _LIVE_LINE, _LIVE_VALUES = 10.0, 100.0, 480, 24
@@ -106,6 +108,11 @@ class Usage:
         return min(self.live_hz, 1 / LIVE_BROKER_EVERY_S)
 
     @property
+    def clock_pings_per_s(self) -> float:
+        """Pings through a rule, a robot, by which it knows the cloud's clock."""
+        return 0.0 if self.ping_hz else 1 / CLOCK_PING_S
+
+    @property
     def robot_hours_per_month(self) -> float:
         """Of the whole fleet."""
         return self.robots * self.hours_per_day * MONTH_DAYS
@@ -144,6 +151,12 @@ def bill(usage: Usage) -> list[Item]:
         Item("IoT Core", "live", "messages", "message", passing),
         Item("IoT Core", "live", "rules fault and battery", "rule", 2 * passing),
         Item("IoT Core", "live", "their actions, or the least billed", "action", 2 * passing),
+    ]
+    clock = usage.clock_pings_per_s * hour
+    items += [
+        Item("IoT Core", "ping", "the clock's pings and pongs", "message", 2 * clock),
+        Item("IoT Core", "ping", "the clock's rule", "rule", clock),
+        Item("IoT Core", "ping", "its action", "action", clock),
     ]
     items += _ping_items(usage.ping_hz * hour, sizes, all_lines=usage.function_logs == "all")
     writes = batches * _units(sizes.telemetry_item, _WRITE)

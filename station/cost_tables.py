@@ -39,6 +39,8 @@ def robot_hour(usage: Usage) -> Rows:
         )
     whole = cost.total(thesis), cost.total(ours)
     body.append(("total AWS", _dollars(whole[0]), _dollars(whole[1]), f"1/{whole[0] / whole[1]:.1f}"))
+    unlogged = [sum(i.dollars for i in items if i.price != "logs") for items in (thesis, ours)]
+    body.append(("of it without log lines", *map(_dollars, unlogged), _ratio((unlogged[0], unlogged[1]))))
     both = cost.total(pubnub[1]), cost.total(pubnub[0])
     body.append(("PubNub, plan by transactions", _dollars(both[0]), _dollars(both[1]), _ratio(both)))
     return Rows(("dollars a robot-hour", "a message a sample", "iort", "ratio"), body)

@@ -81,7 +81,7 @@ _ONE_ROBOTS = frozenset({"IoT Core: publishes of one connection", "DynamoDB: wri
 def _per_robot(usage: Usage) -> dict[str, float]:
     sizes = measure(usage.rate_hz, usage.batch_s)
     batches = usage.batches_per_s + usage.own_batches_per_s
-    publishes = batches + usage.live_hz + 3 * usage.ping_hz
+    publishes = batches + usage.live_hz + 3 * usage.ping_hz + usage.clock_pings_per_s
     telemetry = usage.batches_per_s * -(-sizes.telemetry_item // 1024) + usage.own_batches_per_s
     summary = usage.batches_per_s * -(-sizes.summary_item // 1024) + usage.own_batches_per_s
     # Lambda 2 is bounded by the stream's shards, Lambda 1 by what it waits for.
@@ -95,7 +95,7 @@ def _per_robot(usage: Usage) -> dict[str, float]:
         "IoT Core: subscriptions": _SUBSCRIPTIONS,
         # Basic Ingest is counted in: it passes the same gateway.
         "IoT Core: publishes in": publishes,
-        "IoT Core: rule evaluations": batches + live_rules + 2 * usage.ping_hz,
+        "IoT Core: rule evaluations": batches + live_rules + 2 * usage.ping_hz + usage.clock_pings_per_s,
         "IoT Core: publishes of one connection": publishes,
         "DynamoDB: writes to table telemetry": telemetry,
         "DynamoDB: writes to table summary": summary,

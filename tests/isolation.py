@@ -103,6 +103,8 @@ ROWS = [
             *(f"$aws/rules/{rule_name(rule)}/{LIVE}/iort/{A}/vesc" for rule in RULES if rule != "live"),
             f"$aws/rules/{rule_name('live')}/{LIVE}/iort",
             live_topic(A, "vesc", "lab2"),
+            f"$aws/rules/{rule_name('live', 'lab2')}/{LIVE}/iort/{A}/vesc",
+            f"$aws/rules/{rule_name('live')}/{LIVE}/lab2/{A}/vesc",
             f"$aws/rules/{rule_name('presence')}/$aws/events/presence/connected/{B}",
             # Reserved topics that no agent needs.
             f"{_shadow(A, '')}/update",
@@ -144,6 +146,7 @@ ROWS = [
             f"{PONG}/iort/+/{RULE}",
             f"{PING}/iort/+/{BROKER}",
             f"{PING}/iort/{B}/{BROKER}",
+            f"{PING}/lab2/{A}/{BROKER}",
             f"{LIVE}/iort/{A}/vesc",
             live_topic(A, "vesc"),
             live_topic(B, "vesc"),

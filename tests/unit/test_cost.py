@@ -8,11 +8,12 @@ from dataclasses import replace
 import pytest
 from typer.testing import CliRunner
 
+from device.pings import CLOCK_EVERY_S
 from device.sources.vehicle import Vehicle, VehicleConfig
 from functions.health import measure
 from functions.metrics import Gathered, emit
 from scripts.costs import FILES, filled
-from station import cost, scale, sizes
+from station import cost, cost_tables, scale, sizes
 from station.at_rest import deployment_dollars_per_month
 from station.cli import app
 from station.cost import Usage
@@ -43,6 +44,25 @@ def test_live_lane_is_a_rule_an_action_and_an_invocation_each_and_a_message_in_t
     seldom = cost.bill(replace(_ONE, live_hz=0.05))
     assert _units(seldom, "live", "message") == _units(seldom, "live", "invocation") == 180
     assert _units(cost.bill(replace(_ONE, live_hz=0.0)), "live", "invocation") == 0
+
+
+def test_a_car_that_measures_nothing_still_pings_for_the_clock():
+    assert cost.CLOCK_PING_S == CLOCK_EVERY_S
+    items = cost.bill(_ONE)
+    assert _units(items, "ping", "message") == 2 * 120, "a ping and a pong"
+    assert _units(items, "ping", "rule") == _units(items, "ping", "action") == 120
+    measured = cost.bill(replace(_ONE, ping_hz=1.0))
+    assert _units(measured, "ping", "message") == 6 * 3600, "those of the path rule tell the clock, too"
+
+
+def test_the_ratio_is_given_without_log_lines_too():
+    """Lambda's own lines are in the thesis' column, which left them as they are, and not in ours."""
+    unlogged = [
+        sum(item.dollars for item in items if item.service != "CloudWatch")
+        for items in (cost.thesis_bill(_ONE), cost.bill(_ONE))
+    ]
+    (row,) = (row for row in cost_tables.robot_hour(_ONE).body if row[0] == "of it without log lines")
+    assert row[-1] == f"1/{unlogged[0] / unlogged[1]:.1f}"
 
 
 def test_a_deployment_at_rest_pays_for_what_polls_watches_and_keeps():
