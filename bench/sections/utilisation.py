@@ -321,8 +321,11 @@ def _cold(target: Target, function: str, event: Callable[[int], dict[str, Any]],
 
 
 def _configure(client: Any, function: str, **change: Any) -> None:
+    updated = client.get_waiter("function_updated_v2")
+    # An interrupt may have left the change before under way, and AWS refuses one meanwhile.
+    updated.wait(FunctionName=function)
     client.update_function_configuration(FunctionName=function, **change)
-    client.get_waiter("function_updated_v2").wait(FunctionName=function)
+    updated.wait(FunctionName=function)
 
 
 @contextmanager
@@ -333,8 +336,8 @@ def _reporting(target: Target, function: str) -> Iterator[None]:
     if was.get("LogFormat") != "JSON":
         yield
         return
-    _configure(client, function, LoggingConfig={"LogFormat": "Text", "LogGroup": was["LogGroup"]})
     try:
+        _configure(client, function, LoggingConfig={"LogFormat": "Text", "LogGroup": was["LogGroup"]})
         yield
     finally:
         _configure(client, function, LoggingConfig=was)
