@@ -220,7 +220,7 @@ def _summary_age(cloud: Cloud, robot: str) -> Iterator[list[float]]:
 def _summarized(cloud: Cloud, expected: dict[str, int], tell: Tell) -> int:
     """The samples in the summary of all robots, once they are all there or no more come.
 
-    One robot is asked for after the other: while the first is behind, it tells how far they all are.
+    One robot is asked for after the other: all are equally far behind, so the one that is waited for tells.
     """
     total, since = 0, time.monotonic()
     for name, samples in expected.items():
@@ -230,7 +230,7 @@ def _summarized(cloud: Cloud, expected: dict[str, int], tell: Tell) -> int:
             if counted is not None and now > counted:
                 since = time.monotonic()
             counted = now
-            tell((total + now) / sum(expected.values()), "waiting for the summaries")
+            tell(now / samples, "waiting for the summaries")
             if now >= samples or time.monotonic() - since > _CATCH_UP_S:
                 break
             threading.Event().wait(0.5)

@@ -12,8 +12,9 @@ from bisect import bisect_left
 from collections import defaultdict
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from collections.abc import Set as AbstractSet
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field
-from functools import cache
+from functools import cache, partial
 from typing import Any
 
 import boto3
@@ -36,6 +37,8 @@ from functions.statistics import missing_before, summarize_second
 from functions.stored import SECOND_BATCHES, BatchKey, Reader, Stored, key_of
 from functions.tables import Tables, plain
 
+# Topics that are read side by side; a client keeps ten connections.
+_AT_ONCE = 4
 _log = logging.getLogger(__name__)
 _log.setLevel(logging.INFO)
 _SECOND_US = 1_000_000
@@ -152,17 +155,23 @@ Refuse = Callable[[Sequence[Refused]], Sequence[Refused]]
 
 
 def process(
-    event: Mapping[str, Any], tables: Tables, refuse: Refuse, *, robot_metrics: bool = False
+    event: Mapping[str, Any],
+    tables: Tables,
+    refuse: Refuse,
+    *,
+    robot_metrics: bool = False,
+    at_once: int = 1,
 ) -> dict[str, Any]:
     """Summarise the event's records. Those that cannot be decoded go to ``refuse``, since trying again
     would not change them; the answer names the ones that it could not take.
 
     The good records behind such a one are kept as well: the service sends them again, which changes
     nothing, and a second need not wait for retries to run out. Of a replay the answer names all that
-    cannot be decoded: they are in quarantine already.
+    cannot be decoded: they are in quarantine already. ``at_once`` topics are read side by side, which have
+    nothing to do with each other and mostly wait for the table.
     """
     decoded = decode_records(event["Records"])
-    topics = {topic: summarize_topic(tables, topic, batches) for topic, batches in decoded.batches.items()}
+    topics = _summarized(tables, decoded.batches, at_once)
     tables.put_seconds(
         {
             (topic, second): summary
@@ -194,6 +203,14 @@ def process(
     return {"batchItemFailures": [{"itemIdentifier": refused.number} for refused in left]}
 
 
+def _summarized(tables: Tables, batches: Mapping[str, Sequence[Batch]], at_once: int) -> dict[str, Summaries]:
+    if at_once == 1 or len(batches) == 1:
+        return {topic: summarize_topic(tables, topic, several) for topic, several in batches.items()}
+    with ThreadPoolExecutor(min(at_once, max(1, len(batches)))) as pool:
+        found = pool.map(partial(summarize_topic, tables), batches, batches.values())
+        return dict(zip(batches, found, strict=True))
+
+
 @cache
 def _tables() -> Tables:
     return Tables(
@@ -213,4 +230,4 @@ def _refusals() -> Refusals:
 def handler(event: dict[str, Any], _context: object) -> dict[str, Any]:
     """Entry point of the telemetry table's stream mapping."""
     by_robot = os.environ["ROBOT_METRICS"] == "true"
-    return process(event, _tables(), _refusals().refuse, robot_metrics=by_robot)
+    return process(event, _tables(), _refusals().refuse, robot_metrics=by_robot, at_once=_AT_ONCE)

@@ -111,7 +111,7 @@ class Processing(Stack):
                 storage.telemetry,
                 starting_position=lambda_.StartingPosition.TRIM_HORIZON,
                 # What a robot sends in the window is read and written once.
-                batch_size=1_000,
+                batch_size=500,
                 max_batching_window=Duration.seconds(2),
                 # With more, two batches of a robot could be summarised at once, and the one that read
                 # the table first could write last: docs/processing.md.

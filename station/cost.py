@@ -22,7 +22,7 @@ _ITEM_OVERHEAD = 100
 # A shard of a stream is a partition of the table. Lambda 2 is called once a window, or by as many records;
 # a test holds both to the stack. The thesis had no window: Lambda polls a shard four times a second.
 _PARTITION_WRITES = 1000.0
-WINDOW_S, RECORDS_A_CALL = 2.0, 1_000
+WINDOW_S, RECORDS_A_CALL = 2.0, 500
 _THESIS_POLLS_PER_S, _THESIS_RECORDS_A_CALL = 4.0, 100
 # What Lambda itself writes to the log for every invocation.
 _REQUEST = "8f507cfc-xmpl-4697-b07a-ac58fc914c95"
@@ -269,7 +269,7 @@ def by(items: list[Item], key: str) -> dict[str, float]:
 
 def summarize_calls_per_s(usage: Usage) -> float:
     """Invocations of Lambda 2 a second, of the whole fleet: one a window and shard, or as many as events
-    of a thousand records need."""
+    of five hundred records need."""
     records = usage.robots * (usage.batches_per_s + usage.own_batches_per_s)
     return min(records, max(_shards_of(usage) / WINDOW_S, records / RECORDS_A_CALL))
 

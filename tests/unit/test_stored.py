@@ -6,6 +6,7 @@ import pytest
 
 from contract import Batch
 from functions.stored import SECOND_BATCHES, Reader
+from functions.summarize import process
 from tests.fakes import TOPIC_OF_CAR
 from tests.unit.test_summarize import SECOND, T0, S, Stream, batch
 
@@ -133,3 +134,15 @@ def test_a_long_drain_in_one_event_is_summarised_as_batch_by_batch(stream, capsy
         stream.summarize([record])
     assert at_once == stream.summary()
     assert [second for second, missing in stream.column("missing_batches").items() if missing] == [50]
+
+
+def test_topics_that_are_read_side_by_side_come_out_the_same():
+    seen = []
+    for at_once in (1, 4):
+        stream = Stream()
+        topics = [f"dt/iort/car{n}/vesc" for n in range(9)]
+        records = [record for topic in topics for record in stream.store(*packed(3), topic=topic)]
+        process({"Records": records}, stream.tables, stream.refuse, at_once=at_once)
+        seen.append({topic: stream.summary(topic) for topic in topics})
+    assert seen[0] == seen[1]
+    assert all(item["batches"] == 3 for items in seen[0].values() for item in items.values())

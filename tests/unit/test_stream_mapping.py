@@ -22,7 +22,7 @@ from tests.fakes import TELEMETRY, FakeDynamoDB, item_of, record_of, summary_of,
 S = 1_000_000
 T0 = 1_700_000_000 * S
 DEPLOYED = Settings(
-    batch_size=1_000,
+    batch_size=500,
     window_s=2,
     bisect=True,
     max_retries=5,
