@@ -15,7 +15,7 @@ import logging
 import threading
 from concurrent.futures import Future
 from pathlib import Path
-from typing import Any, Callable
+from typing import TYPE_CHECKING, Any, Callable
 
 from awscrt import io, mqtt5
 from awsiot import mqtt5_client_builder
@@ -28,6 +28,9 @@ from device.failures import code_name, error_name, explain, said, why_not_connec
 from device.nodelay import send_at_once
 from device.reconnect import SETTLED_S, SHORTEST_S, Backoff, Causes
 from device.uplink import Done, Message, OnConnection, OnMessage, UplinkStatus, matches
+
+if TYPE_CHECKING:
+    from device.config import Config
 
 _log = logging.getLogger(__name__)
 
@@ -372,6 +375,20 @@ class IotCore:
         timer = threading.Timer(delay_s, self._dispatcher.post, (self._resubscribe,))
         timer.daemon = True
         timer.start()
+
+
+def make_uplink(config: Config, clock: Clock) -> IotCore:
+    """The uplink of a robot's configuration."""
+    return IotCore(
+        endpoint=config.endpoint,
+        port=config.port,
+        client_id=config.robot,
+        certificate=config.certificate,
+        private_key=config.private_key,
+        root_ca=config.root_ca,
+        clock=clock,
+        dispatcher=Dispatcher(),
+    )
 
 
 def _publish_error(future: Future[Any]) -> UplinkError | None:

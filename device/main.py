@@ -16,7 +16,6 @@ from typing import Any, Callable, Sequence
 from device.agent import Agent
 from device.clock import SystemClock
 from device.config import LOG_LEVELS, Config, load_config
-from device.dispatch import Dispatcher
 from device.errors import AgentError, ConfigError
 from device.logs import set_up
 from device.sqlite_spool import make_spool
@@ -107,19 +106,10 @@ def run(options: argparse.Namespace) -> int:
         config = dataclasses.replace(config, log_level=options.log_level)
     troubles = set_up(config.log_level)
     # Reading a configuration must not need the network's library.
-    from device.iotcore import IotCore  # noqa: PLC0415
+    from device.iotcore import make_uplink  # noqa: PLC0415
 
     clock = SystemClock()
-    uplink = IotCore(
-        endpoint=config.endpoint,
-        port=config.port,
-        client_id=config.robot,
-        certificate=config.certificate,
-        private_key=config.private_key,
-        root_ca=config.root_ca,
-        clock=clock,
-        dispatcher=Dispatcher(),
-    )
+    uplink = make_uplink(config, clock)
     spool = make_spool(config, clock)
     try:
         agent = Agent(config, uplink=uplink, spool=spool, clock=clock, troubles=troubles)

@@ -11,7 +11,6 @@ from typing import Any, Iterator, NamedTuple, Sequence
 from device.allowance import Allowance
 from device.clock import SystemClock
 from device.config import Config
-from device.dispatch import Dispatcher
 from device.errors import AgentError, UploadError
 from device.logs import set_up
 from device.status import fetch
@@ -38,20 +37,11 @@ def upload_files(config: Config, paths: Sequence[Path], *, status_socket: Path) 
     """
     _refuse_beside_agent(config, status_socket)
     # Reading a configuration must not need the network's library.
-    from device.iotcore import IotCore  # noqa: PLC0415
+    from device.iotcore import make_uplink  # noqa: PLC0415
 
     set_up("warning")
     clock, stop = SystemClock(), threading.Event()
-    uplink = IotCore(
-        endpoint=config.endpoint,
-        port=config.port,
-        client_id=config.robot,
-        certificate=config.certificate,
-        private_key=config.private_key,
-        root_ca=config.root_ca,
-        clock=clock,
-        dispatcher=Dispatcher(),
-    )
+    uplink = make_uplink(config, clock)
     uploader = make_uploader(
         robot=config.robot,
         namespace=config.namespace,

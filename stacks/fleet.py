@@ -116,7 +116,6 @@ class Fleet(Stack):
             "Admit",
             settings=self._settings,
             encryption=storage.encryption,
-            module="admit",
             memory_mb=512,
             timeout_s=4,
             environment={"ROBOTS_TABLE": storage.robots.table_name},
@@ -130,7 +129,6 @@ class Fleet(Stack):
             "Presence",
             settings=self._settings,
             encryption=storage.encryption,
-            module="presence",
             memory_mb=256,
             environment={"ROBOTS_TABLE": storage.robots.table_name},
         )

@@ -25,14 +25,13 @@ def function(
     *,
     settings: Settings,
     encryption: Encryption,
-    module: str,
     memory_mb: int,
     timeout_s: int = 10,
     environment: dict[str, str] | None = None,
     layers: list[lambda_.ILayerVersion] | None = None,
     reserved_concurrency: int = 0,
 ) -> lambda_.Function:
-    """``functions/<module>.py``'s handler, which may write its own log and nothing else yet.
+    """``functions/<name, in lower case>.py``'s handler, which may write its own log and nothing else yet.
 
     The stack puts its name out as ``<name>Function``. A ``reserved_concurrency`` of 0 reserves nothing.
     """
@@ -52,7 +51,7 @@ def function(
         runtime=RUNTIME,
         architecture=ARCHITECTURE,
         code=lambda_.Code.from_asset(str(ROOT), exclude=CODE_EXCLUDES, ignore_mode=IgnoreMode.GIT),
-        handler=f"functions.{module}.handler",
+        handler=f"functions.{name.lower()}.handler",
         role=role,
         log_group=log,
         **_logged(settings),

@@ -62,7 +62,6 @@ class Processing(Stack):
             "Live",
             settings=settings,
             encryption=self._encryption,
-            module="live",
             memory_mb=256,
             environment={"PUBNUB_PARAMETER": name, "LIVE_FIELDS": json.dumps(settings.live_fields)},
             layers=[
@@ -76,14 +75,8 @@ class Processing(Stack):
             reserved_concurrency=settings.reserved_for_live,
         )
         self._invoked_once(live)
-        live.add_to_role_policy(
-            iam.PolicyStatement(
-                actions=["ssm:GetParameter"],
-                resources=[
-                    self.format_arn(service="ssm", resource="parameter", resource_name=name.lstrip("/"))
-                ],
-            )
-        )
+        parameter = self.format_arn(service="ssm", resource="parameter", resource_name=name.lstrip("/"))
+        self._allow(live, ["ssm:GetParameter"], parameter)
         return live
 
     def _summarize(self, storage: Storage) -> lambda_.Function:
@@ -92,7 +85,6 @@ class Processing(Stack):
             "Summarize",
             settings=self._settings,
             encryption=self._encryption,
-            module="summarize",
             memory_mb=512,
             timeout_s=60,
             environment={
@@ -136,7 +128,6 @@ class Processing(Stack):
             "Query",
             settings=self._settings,
             encryption=self._encryption,
-            module="query",
             # AWS gives a whole core at 1769 MB, and decoding is all that it does.
             memory_mb=1769,
             # Short enough for the caller's connection; what takes longer goes on in another invocation.
@@ -150,12 +141,8 @@ class Processing(Stack):
         storage.telemetry.grant(query, "dynamodb:Query", "dynamodb:Scan")
         storage.robots.grant(query, "dynamodb:GetItem")
         # The pre-signed address is good for what the function itself may read.
-        query.add_to_role_policy(
-            iam.PolicyStatement(
-                actions=["s3:GetObject", "s3:PutObject"],
-                resources=[storage.files.arn_for_objects(f"{RESULTS_PREFIX}*")],
-            )
-        )
+        results = storage.files.arn_for_objects(f"{RESULTS_PREFIX}*")
+        self._allow(query, ["s3:GetObject", "s3:PutObject"], results)
         return query
 
     def _alarms(self, settings: Settings) -> sns.Topic:
@@ -181,7 +168,6 @@ class Processing(Stack):
             "Alert",
             settings=settings,
             encryption=self._encryption,
-            module="alert",
             memory_mb=256,
             environment={
                 "ROBOTS_TABLE": storage.robots.table_name,
@@ -190,9 +176,7 @@ class Processing(Stack):
             },
         )
         storage.may_keep(alert, f"{ALERT_PREFIX}*")
-        alert.add_to_role_policy(
-            iam.PolicyStatement(actions=["sns:Publish"], resources=[self.alarms.topic_arn])
-        )
+        self._allow(alert, ["sns:Publish"], self.alarms.topic_arn)
         # The car says the same again within 10 s.
         alert.configure_async_invoke(
             max_event_age=Duration.minutes(5),
@@ -202,9 +186,7 @@ class Processing(Stack):
         return alert
 
     def _echo(self, settings: Settings) -> lambda_.Function:
-        echo = function(
-            self, "Echo", settings=settings, encryption=self._encryption, module="echo", memory_mb=256
-        )
+        echo = function(self, "Echo", settings=settings, encryption=self._encryption, memory_mb=256)
         self._invoked_once(echo)
         self._may_answer(echo, f"{PONG}/{settings.namespace}/*/{LAMBDA}")
         return echo
@@ -215,7 +197,6 @@ class Processing(Stack):
             "Upload",
             settings=settings,
             encryption=self._encryption,
-            module="upload",
             memory_mb=256,
             environment={
                 "FILES_BUCKET": storage.files.bucket_name,

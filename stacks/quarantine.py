@@ -45,7 +45,6 @@ class Quarantine(Stack):
             "Quarantine",
             settings=settings,
             encryption=storage.encryption,
-            module="quarantine",
             memory_mb=256,
             timeout_s=_TIMEOUT_S,
             environment={

@@ -6,21 +6,20 @@ stacks, and what it saw stands beside. *Used* says that the thesis' system reste
 
 from __future__ import annotations
 
-import io
 import json
 import threading
 import time
 import uuid
-import zipfile
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
-from contextlib import ExitStack, contextmanager
+from contextlib import ExitStack
 from dataclasses import dataclass
 from datetime import datetime, timedelta, timezone
 from typing import Any
 
 from typing_extensions import Self
 
+from bench import borrowed
 from bench.raw_mqtt import RawClient
 from bench.result import Ratio, Section, Table
 from bench.target import Say, Target
@@ -111,7 +110,9 @@ class _Bench:
     def __enter__(self) -> Self:
         self._bundles = [self._target.robot(f"bench-ability-{i}") for i in range(2)]
         self._a, self._b = (bundle.robot for bundle in self._bundles)
-        self._function = self._exit.enter_context(_who_am_i(self._target))
+        self._function = self._exit.enter_context(
+            borrowed.function(self._target, "who", _WHO, memory_mb=128, timeout_s=10)
+        )
         return self
 
     def __exit__(self, *_: object) -> None:
@@ -428,30 +429,6 @@ def handler(event, context):
     time.sleep(event["seconds"])
     return {"instance": INSTANCE, "memory_mb": os.environ.get("AWS_LAMBDA_FUNCTION_MEMORY_SIZE")}
 """
-
-
-@contextmanager
-def _who_am_i(target: Target) -> Iterator[str]:
-    client, name = target.cloud.client("lambda"), target.name(f"{target.cloud.namespace}-bench-who")
-    like = client.get_function_configuration(FunctionName=target.cloud.output("processing", "EchoFunction"))
-    packed = io.BytesIO()
-    with zipfile.ZipFile(packed, "w") as archive:
-        archive.writestr("who.py", _WHO)
-    client.create_function(
-        FunctionName=name,
-        Runtime=like["Runtime"],
-        Role=like["Role"],
-        Handler="who.handler",
-        Architectures=like.get("Architectures", ["arm64"]),
-        MemorySize=128,
-        Timeout=10,
-        Code={"ZipFile": packed.getvalue()},
-    )
-    try:
-        client.get_waiter("function_active_v2").wait(FunctionName=name)
-        yield name
-    finally:
-        client.delete_function(FunctionName=name)
 
 
 def _equal(found: Any, expected: Any) -> None:

@@ -8,14 +8,12 @@ system, and projected to each memory size; on AWS the sizes are set and measured
 from __future__ import annotations
 
 import base64
-import io
 import json
 import re
 import subprocess
 import sys
 import threading
 import time
-import zipfile
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager
 from dataclasses import asdict, dataclass, field
@@ -24,7 +22,7 @@ from typing import Any
 
 from boto3.dynamodb.types import TypeSerializer
 
-from bench import cpu, plots
+from bench import borrowed, cpu, plots
 from bench.machine import ROOT
 from bench.result import NOT_MEASURED, Plot, Ratio, Section, Table
 from bench.spread import spread
@@ -58,6 +56,8 @@ _CATCH_UP_S = 60.0
 _LOGS_S = 60.0
 _REPORT = re.compile(r"^REPORT .*?\tDuration: ([\d.]+) ms.*", re.MULTILINE)
 _INIT = re.compile(r"Init Duration: ([\d.]+) ms")
+# What an invocation costs by itself.
+_EMPTY = "def handler(event, context):\n    return None\n"
 
 
 @dataclass
@@ -82,7 +82,7 @@ def run(target: Target, say: Say) -> Section:
     }
     live = target.cloud.output("processing", "LiveFunction")
     summarize = target.cloud.output("processing", "SummarizeFunction")
-    with _empty_function(target) as empty, ExitStack() as reports:
+    with borrowed.function(target, "empty", _EMPTY, memory_mb=256) as empty, ExitStack() as reports:
         names = dict(zip(events, (live, summarize, summarize), strict=True))
         events["empty function"], names["empty function"] = (lambda _: {}), empty
         for name in sorted(set(names.values())):
@@ -341,31 +341,6 @@ def _reporting(target: Target, function: str) -> Iterator[None]:
         yield
     finally:
         _configure(client, function, LoggingConfig=was)
-
-
-@contextmanager
-def _empty_function(target: Target) -> Iterator[str]:
-    """A function that does nothing, with the role of echo: what an invocation costs by itself."""
-    client, name = target.cloud.client("lambda"), target.name(f"{target.cloud.namespace}-bench-empty")
-    like = client.get_function_configuration(FunctionName=target.cloud.output("processing", "EchoFunction"))
-    packed = io.BytesIO()
-    with zipfile.ZipFile(packed, "w") as archive:
-        archive.writestr("empty.py", "def handler(event, context):\n    return None\n")
-    client.create_function(
-        FunctionName=name,
-        Runtime=like["Runtime"],
-        Role=like["Role"],
-        Handler="empty.handler",
-        Architectures=like.get("Architectures", ["arm64"]),
-        MemorySize=256,
-        LoggingConfig={"LogGroup": like["LoggingConfig"]["LogGroup"]} if like.get("LoggingConfig") else {},
-        Code={"ZipFile": packed.getvalue()},
-    )
-    try:
-        client.get_waiter("function_active_v2").wait(FunctionName=name)
-        yield name
-    finally:
-        client.delete_function(FunctionName=name)
 
 
 def _store(target: Target, say: Say) -> list[dict[str, Any]]:

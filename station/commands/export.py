@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from station.commands.ranges import From, Last, Range, To
+from station.commands.options import From, Last, Range, Robot, To
 from station.errors import StationError
 from station.progress import reading, say
 
@@ -24,7 +24,7 @@ commands = typer.Typer()
 @commands.command("export")
 def export(
     context: typer.Context,
-    robot: Annotated[str, typer.Argument(help="The robot's name.")],
+    robot: Robot,
     streams: Annotated[list[str], typer.Argument(help="One stream or more, such as vesc.")],
     output: Annotated[Path, typer.Option("--output", "-o", help="The file to write: .mcap or .bag.")],
     start: From = None,

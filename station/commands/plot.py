@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from station.commands.ranges import From, Last, Range, To
+from station.commands.options import Every, From, Last, Range, Robot, Stream, To, names
 from station.errors import StationError
 from station.progress import reading, say
 
@@ -40,8 +40,8 @@ class Align(str, Enum):
 @commands.command("plot")
 def plot(
     context: typer.Context,
-    robot: Annotated[str, typer.Argument(help="The robot's name.")],
-    stream: Annotated[str, typer.Argument(help="The stream, such as vesc.")],
+    robot: Robot,
+    stream: Stream,
     output: Annotated[Path, typer.Option("--output", "-o", help="The picture: .png, .svg or .pdf.")],
     kind: Annotated[
         Kind, typer.Option(help="Fields over time, where it went, or how values are distributed.")
@@ -61,7 +61,7 @@ def plot(
         Align, typer.Option(help="Draw several runs by the clock, or from their start.")
     ] = Align.time,
     where: Annotated[str | None, typer.Option(help="Samples to draw, as in iort query.")] = None,
-    every: Annotated[str | None, typer.Option(help="Put samples together: 100ms, 1s, 1m.")] = None,
+    every: Every = None,
 ) -> None:
     """Draw fields over time, the trajectory or the distribution, of one robot or several.
 
@@ -74,7 +74,7 @@ def plot(
     if runs and (start, end, last) != (None, None, None):
         raise StationError("give either --run or --from, --to and --last")
     ranges = [_run(run) for run in runs] if runs else [Range.of(start, end, last)]
-    asked = [name.strip() for name in (fields or "").split(",") if name.strip()] or None
+    asked = names(fields)
     drawn: list[Run] = []
     for name in dict.fromkeys([robot, *(also or ())]):
         for within in ranges:

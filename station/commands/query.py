@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 from rich.console import Console
 
-from station.commands.ranges import From, Last, Range, To
+from station.commands.options import Every, From, Last, Range, Robot, Stream, To, names
 from station.errors import StationError
 from station.progress import reading, say
 
@@ -41,8 +41,8 @@ class On(str, Enum):
 @commands.command("query")
 def query(
     context: typer.Context,
-    robot: Annotated[str, typer.Argument(help="The robot's name.")],
-    stream: Annotated[str, typer.Argument(help="The stream, such as vesc.")],
+    robot: Robot,
+    stream: Stream,
     start: From = None,
     end: To = None,
     last: Last = None,
@@ -53,7 +53,7 @@ def query(
     where: Annotated[
         str | None, typer.Option(help="Samples to give, such as 'speed_mps > 1.2 and fault_code == 0'.")
     ] = None,
-    every: Annotated[str | None, typer.Option(help="Put samples together: 100ms, 1s, 1m.")] = None,
+    every: Every = None,
     summary: Annotated[bool, typer.Option("--summary", help="The summary's seconds, not samples.")] = False,
     form: Annotated[Format, typer.Option("--format", help="How to write them.")] = Format.table,
     as_json: Annotated[bool, typer.Option("--json", help="The same as --format jsonl.")] = False,
@@ -86,7 +86,7 @@ def query(
             stream,
             when.start_us,
             when.end_us,
-            fields=[name.strip() for name in (fields or "").split(",") if name.strip()] or None,
+            fields=names(fields),
             where=where,
             every=every,
             summary=summary,

@@ -300,7 +300,7 @@ def test_lambdas_own_lines_come_back_where_they_are_asked_for(tmp_path):
     app = App(context={"function_logs": "all", "layer": str(tmp_path)})
     stack, settings = Stack(app, "x"), Settings.from_context(app)
     encryption = Encryption(stack, settings=settings)
-    function(stack, "Echo", settings=settings, encryption=encryption, module="echo", memory_mb=256)
+    function(stack, "Echo", settings=settings, encryption=encryption, memory_mb=256)
     (made,) = (
         resource["Properties"]
         for resource in app.synth().stacks[0].template["Resources"].values()

@@ -12,7 +12,7 @@ import pytest
 from rich.console import Console
 
 from station import tables
-from station.commands.ranges import Range
+from station.commands.options import Range
 from station.data import Result
 from station.errors import StationError
 

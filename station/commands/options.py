@@ -1,4 +1,4 @@
-"""The options that name a range of time, the same for every command."""
+"""What commands that read samples are asked, the same for each: robot, stream, range of time, fields."""
 
 from __future__ import annotations
 
@@ -14,6 +14,9 @@ from station.errors import StationError
 from station.progress import say
 from station.times import duration_us, has_zone, time_us
 
+Robot = Annotated[str, typer.Argument(help="The robot's name.")]
+Stream = Annotated[str, typer.Argument(help="The stream, such as vesc.")]
+Every = Annotated[str | None, typer.Option(help="Put samples together: 100ms, 1s, 1m.")]
 From = Annotated[
     str | None,
     typer.Option("--from", help="First time: -10m, 2026-05-04T10:00:00Z; the very first if only --to."),
@@ -22,6 +25,11 @@ To = Annotated[str | None, typer.Option("--to", help="First time no more include
 Last = Annotated[str | None, typer.Option("--last", help="The time up to now: 5m, 2h, 7d; or all.")]
 
 _USUAL = "5m"
+
+
+def names(fields: str | None) -> list[str] | None:
+    """The names in a list with commas between; None where there is none."""
+    return [name.strip() for name in (fields or "").split(",") if name.strip()] or None
 
 
 @dataclass(frozen=True)

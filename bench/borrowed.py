@@ -1,0 +1,38 @@
+"""A function of the bench's own, for as long as it measures."""
+
+from __future__ import annotations
+
+import io
+import zipfile
+from collections.abc import Iterator
+from contextlib import contextmanager
+
+from bench.target import Target
+
+
+@contextmanager
+def function(target: Target, name: str, source: str, *, memory_mb: int, timeout_s: int = 3) -> Iterator[str]:
+    """The name of a deployed function whose ``source`` has a `handler`, with runtime, role, architecture
+    and log of the function echo; it is deleted in the end."""
+    client = target.cloud.client("lambda")
+    whole = target.name(f"{target.cloud.namespace}-bench-{name}")
+    like = client.get_function_configuration(FunctionName=target.cloud.output("processing", "EchoFunction"))
+    packed = io.BytesIO()
+    with zipfile.ZipFile(packed, "w") as archive:
+        archive.writestr(f"{name}.py", source)
+    client.create_function(
+        FunctionName=whole,
+        Runtime=like["Runtime"],
+        Role=like["Role"],
+        Handler=f"{name}.handler",
+        Architectures=like.get("Architectures", ["arm64"]),
+        MemorySize=memory_mb,
+        Timeout=timeout_s,
+        LoggingConfig={"LogGroup": like["LoggingConfig"]["LogGroup"]} if like.get("LoggingConfig") else {},
+        Code={"ZipFile": packed.getvalue()},
+    )
+    try:
+        client.get_waiter("function_active_v2").wait(FunctionName=whole)
+        yield whole
+    finally:
+        client.delete_function(FunctionName=whole)
