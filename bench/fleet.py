@@ -224,18 +224,36 @@ def _summarized(cloud: Cloud, expected: dict[str, int], tell: Tell) -> int:
     """
     total, since = 0, time.monotonic()
     for name, samples in expected.items():
-        counted = None
+        counted, looked_at = 0, None
         while True:
-            now = sum(int(item[SAMPLES]) for item in _items(cloud, "SummaryTable", name, SAMPLES))
-            if counted is not None and now > counted:
+            # To count is dear: not before its seconds go as far as what was sent.
+            spanned = _spanned(cloud, name)
+            if spanned * BATCH_SAMPLES >= samples:
+                counted = sum(int(item[SAMPLES]) for item in _items(cloud, "SummaryTable", name, SAMPLES))
+            if looked_at not in {None, (counted, spanned)}:
                 since = time.monotonic()
-            counted = now
-            tell(now / samples, "waiting for the summaries")
-            if now >= samples or time.monotonic() - since > _CATCH_UP_S:
+            looked_at = counted, spanned
+            tell(spanned * BATCH_SAMPLES / samples, "waiting for the summaries")
+            if counted >= samples:
+                break
+            if time.monotonic() - since > _CATCH_UP_S:
+                counted = sum(int(item[SAMPLES]) for item in _items(cloud, "SummaryTable", name, SAMPLES))
                 break
             threading.Event().wait(0.5)
         total += counted
     return total
+
+
+def _spanned(cloud: Cloud, robot: str) -> int:
+    """The seconds from a robot's first to its last summary."""
+    query = cloud.client("dynamodb").query
+    of_topic = _of_topic(cloud, "SummaryTable", robot, SECOND)
+    ends = [
+        int(item[SECOND]["N"])
+        for forward in (True, False)
+        for item in query(**of_topic, ScanIndexForward=forward, Limit=1)["Items"]
+    ]
+    return ends[1] - ends[0] + 1 if ends else 0
 
 
 @dataclass(frozen=True)
