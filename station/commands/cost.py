@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Annotated, Any
@@ -98,8 +99,13 @@ def _configured(usage: Usage, config: Path | None) -> Usage:
 
 def _rates(car: Config) -> dict[str, Any]:
     rates = [source.rate_hz for source in car.sources if hasattr(source, "rate_hz")]
+    # The rate is of each stream, which sends no more than its source brings.
+    live_hz = sum(
+        max(1, len(set(source.streams()))) * min(car.live.rate_hz, getattr(source, "rate_hz", math.inf))
+        for source in car.sources
+    )
     return {
-        "live_hz": car.live.rate_hz if car.live.enabled else 0.0,
+        "live_hz": live_hz if car.live.enabled else 0.0,
         "batch_s": car.record.batch_s,
         "ping_hz": car.ping.rate_hz,
         "agent_every_s": car.metrics.every_s if car.metrics.enabled else 0.0,

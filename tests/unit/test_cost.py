@@ -223,3 +223,17 @@ def test_command_reads_the_rates_of_a_car(tmp_path):
     done = CliRunner().invoke(app, ["cost", "--config", str(tmp_path / "car.yaml"), "--json"])
     usage = json.loads(done.output)["usage"]
     assert (usage["rate_hz"], usage["live_hz"], usage["batch_s"]) == (20.0, 2.0, 0.5)
+
+
+def test_command_counts_the_live_messages_of_every_stream(tmp_path):
+    for name in ("certificate.pem", "private.key"):
+        (tmp_path / name).touch()
+    (tmp_path / "car.yaml").write_text(
+        "robot: car7\nendpoint: example.org\ncertificate: certificate.pem\nprivate_key: private.key\n"
+        "live: {rate_hz: 4}\nsources:\n- {type: sim, rate_hz: 2}\n"
+        "- type: rosbridge\n  url: ws://localhost:9090\n"
+        "  topics: {/a: {stream: a, time: arrival}, /b: {stream: b, time: arrival}}\n"
+    )
+    done = CliRunner().invoke(app, ["cost", "--config", str(tmp_path / "car.yaml"), "--json"])
+    assert done.exit_code == 0, done.output
+    assert json.loads(done.output)["usage"]["live_hz"] == 2 + 2 * 4
