@@ -177,10 +177,15 @@ def answer(
     items = pages = 0
     token: Mapping[str, Any] | None = None
     for page, after in _pages(request, tables):
-        pages, items = pages + 1, items + len(page)
-        for item in page:
-            found.add(plain(item))
+        pages += 1
         token = after
+        # A page of a car that stands still may inflate to more than there is memory for: it may be parted.
+        for number, item in enumerate(page, 1):
+            items += 1
+            found.add(plain(item))
+            if found.values > max_values and number < len(page):
+                token = {name: item[name] for name in (TOPIC, T_US)}
+                break
         if token is not None and (left_ms() < MARGIN_MS or found.values > max_values):
             break
     samples = _packed(found)

@@ -7,7 +7,9 @@ import random
 from hypothesis import given
 from hypothesis import strategies as st
 
-from station.audit import audit
+from contract import Batch
+from station.audit import audit, last_figures
+from tests.fakes import item_of
 
 T_US = 1_750_000_000_000_000
 
@@ -95,3 +97,27 @@ def test_expected_is_stored_and_missing_in_any_order(seqs, seed):
     assert run.expected == run.last_seq - run.first_seq + 1
     missing = {seq for gap in run.missing for seq in range(gap.first, gap.last + 1)}
     assert missing == set(range(min(seqs), max(seqs) + 1)) - seqs
+
+
+class Newest:
+    """A `station.cloud.Cloud` and its table's client, which know one item."""
+
+    namespace = "iort"
+
+    def __init__(self, item):
+        self._item = item
+
+    def output(self, _noun, name):
+        return name
+
+    def client(self, _service):
+        return self
+
+    def query(self, **_):
+        return {"Items": [self._item]}
+
+
+def test_the_agents_figures_are_those_of_its_newest_batch_if_it_is_one():
+    item = item_of(Batch("0badcafe", 0, [T_US], {"backlog_batches": [3]}))
+    assert last_figures(Newest(item), "car") == {"backlog_batches": 3.0}
+    assert last_figures(Newest({**item, "t": {"N": "1.5"}}), "car") == {}

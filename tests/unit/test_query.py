@@ -24,17 +24,19 @@ class Paged(FakeDynamoDB):
 
     def query(self, *, after=None, **query):
         after = query.pop("ExclusiveStartKey", None)
-        pages = [page["Items"] for page in self.paginate(**query)]
-        at = (
-            0 if after is None else 1 + next(i for i, p in enumerate(pages) if p and p[-1]["t"] == after["t"])
-        )
-        more = at + 1 < len(pages)
-        return {"Items": pages[at]} | ({"LastEvaluatedKey": {"t": pages[at][-1]["t"]}} if more else {})
+        found = [item for page in self.paginate(**query) for item in page["Items"]]
+        at = 0 if after is None else 1 + next(i for i, item in enumerate(found) if item["t"] == after["t"])
+        page = found[at : at + self.page_items]
+        more = at + len(page) < len(found)
+        return {"Items": page} | ({"LastEvaluatedKey": {"t": page[-1]["t"]}} if more else {})
 
     def scan(self, **scan):
         topic = scan["ExpressionAttributeValues"][":topic"]
         assert "FilterExpression" in scan
-        return {"Items": [item for item in self.items[TELEMETRY].values() if item["topic"] == topic][::-1]}
+        found = [item for item in self.items[TELEMETRY].values() if item["topic"] == topic][::-1]
+        after = scan.get("ExclusiveStartKey")
+        at = 0 if after is None else 1 + next(i for i, item in enumerate(found) if item["t"] == after["t"])
+        return {"Items": found[at:]}
 
 
 def table(*batches, page_items=2):
@@ -99,6 +101,20 @@ def test_ends_in_time_and_goes_on_from_the_token():
 
 def test_ends_before_it_runs_out_of_memory():
     assert asked(table(*ride()), limits={"max_values": 50})["token"] is not None
+
+
+@pytest.mark.parametrize("scan", [False, True])
+@pytest.mark.parametrize("page_items", [1, 3, 10, 50])
+def test_a_page_that_is_more_than_memory_holds_is_answered_in_parts(page_items, scan):
+    client, seen, token = table(*ride(), page_items=page_items), [], None
+    for _ in range(11):
+        reply = asked(client, limits={"max_values": 50}, token=token, fields=["speed"], scan=scan)
+        assert reply["n"] <= 30
+        seen += unpacked(reply)["fields"]["speed"]
+        token = reply["token"]
+        if token is None:
+            break
+    assert sorted(seen) == list(range(100))
 
 
 def test_what_is_large_goes_through_the_bucket():
