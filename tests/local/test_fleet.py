@@ -29,7 +29,7 @@ from station.cli import app
 from station.cloud import EMBEDDED
 from station.errors import StationError
 from tests.local.conftest import until
-from tests.local.robot import Robot
+from tests.local.robot import STALE, Robot
 
 AGENT = Path(sys.executable).parent / "iort-agent"
 WAIT_S = 60
@@ -147,7 +147,7 @@ def test_delete_connection_cuts_one_client_alone(embedded, bundle):
         two.online()
         assert certificates.cut(embedded.cloud, first.robot) is True
         assert one.lost.wait(WAIT_S)
-        assert two.publish(f"live/iort/{second.robot}/vesc", b"{}") == "SUCCESS"
+        assert two.publish(f"live/iort/{second.robot}/vesc", STALE) == "SUCCESS"
     until(
         lambda: row(embedded, first.robot).get(DISCONNECT_REASON) == "API_INITIATED_DISCONNECT",
         seconds=WAIT_S,
@@ -178,7 +178,7 @@ def test_rotation_waits_for_the_new_certificate(embedded, bundle, tmp_path):
         until(lambda: heard, seconds=WAIT_S)
         # The old one is connected and stays so.
         assert "older certificate" in heard[0]
-        assert robot.publish(f"live/iort/{car.robot}/vesc", b"{}") == "SUCCESS"
+        assert robot.publish(f"live/iort/{car.robot}/vesc", STALE) == "SUCCESS"
         assert not done.is_set()
     with Robot(tmp_path / "new") as robot:
         robot.online()

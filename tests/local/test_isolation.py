@@ -16,7 +16,7 @@ from contract import CMD, FLEET, MAX_MESSAGE_BYTES, PING, PONG, RULE, build_topi
 from local.gaps import AWS_MESSAGE_BYTES
 from station import claims, robots
 from tests.isolation import CLAIM, CONNECT, PUBLISH, RECEIVE, ROBOT, ROWS, SUBSCRIBE, A, B, Row
-from tests.local.robot import Robot
+from tests.local.robot import Robot, payload_for
 
 WAIT_S = 60
 # What a broker answers to what it lets pass.
@@ -57,7 +57,7 @@ class Session:
             self._robot.online()
         try:
             said = (
-                self._robot.publish(row.what, b"{}")
+                self._robot.publish(row.what, payload_for(row.what))
                 if row.does == PUBLISH
                 else self._robot.subscribe(row.what)
             )
@@ -117,7 +117,7 @@ def test_a_robot_receives_what_the_table_says_and_nothing_else(embedded, folders
             if row.allowed:
                 robot.subscribe(row.what)
         for row in said:
-            data.publish(topic=row.what, qos=1, payload=b"{}")
+            data.publish(topic=row.what, qos=1, payload=payload_for(row.what))
         data.publish(topic=last, qos=1, payload=b"{}")
         heard = set()
         while last not in heard:
