@@ -120,11 +120,13 @@ def measure(embedded: EmbeddedCloud, count: int, seconds: int, tell: Tell, *, pr
             pid, began = said["pid"], time.monotonic()
             before = _usage(pid, emulator)
             with _summary_age(cloud, names[0]) as behind:
+                after, took_s = before, 1.0
                 for said in generator:
                     if "sent" in said:
                         break
+                    # The generator's memory is gone with the process, which ends when all is sent.
+                    after, took_s = _usage(pid, emulator), time.monotonic() - began
                     tell(said["second"] / seconds, "driving")
-                after, took_s = _usage(pid, emulator), time.monotonic() - began
         sent = said["sent"]
     batches = sent["batches"]
     expected = sum(batches.values()) * BATCH_SAMPLES

@@ -6,6 +6,7 @@ arrive in, the last record of a second leaves the same item behind.
 
 from __future__ import annotations
 
+import gc
 import logging
 import os
 from bisect import bisect_left
@@ -213,13 +214,17 @@ def _summarized(tables: Tables, batches: Mapping[str, Sequence[Batch]], at_once:
 
 @cache
 def _tables() -> Tables:
-    return Tables(
+    tables = Tables(
         # The requests are this code's own, and DynamoDB looks at them too: a third of the time went there.
         boto3.client("dynamodb", config=Config(parameter_validation=False)),
         telemetry=os.environ["TELEMETRY_TABLE"],
         summary=os.environ["SUMMARY_TABLE"],
         robots=os.environ["ROBOTS_TABLE"],
     )
+    # botocore's models are a hundred thousand objects that stay: no event's collection need pass them again.
+    gc.collect()
+    gc.freeze()
+    return tables
 
 
 @cache

@@ -15,7 +15,8 @@ local/cut_sessions.py; here, in order:
   asynchronous events, a burst waits for free concurrency, and what fails goes to a destination);
 - a stream's mapping tries a failed batch again until it succeeds, and a role's grant on a stream's ARN is
   not seen (local/stream_gap.py);
-- a Query takes time with every item of its partition (local/table_gap.py).
+- a Query takes time with every item of its partition (local/table_gap.py);
+- an invocation that logs nothing takes 50 ms more (local/log_gap.py).
 """
 
 from __future__ import annotations
@@ -36,7 +37,7 @@ from typing import Any
 from ministack.core import iam_actions, iam_evaluator
 from ministack.services import iot, lambda_svc
 
-from local import cut_sessions, stream_gap, table_gap
+from local import cut_sessions, log_gap, stream_gap, table_gap
 
 # "Message size" in AWS IoT Core's service quotas.
 AWS_MESSAGE_BYTES = 128 * 1024
@@ -63,6 +64,7 @@ def install() -> None:
     iot._dispatch_rule_to_lambda = AsyncInvocations().dispatch  # noqa: SLF001
     stream_gap.install()
     table_gap.install()
+    log_gap.install()
 
 
 def expand_topic(template: str, topic: str) -> str:

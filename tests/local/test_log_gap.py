@@ -1,0 +1,50 @@
+"""An invocation's log ends where the worker says so, not when a clock does."""
+
+from __future__ import annotations
+
+import json
+import queue
+import subprocess
+import sys
+from types import SimpleNamespace
+
+import pytest
+from ministack.core import lambda_runtime
+
+from local import log_gap
+
+
+@pytest.fixture(scope="module")
+def installed():
+    """The gap closed in this process, and opened again."""
+    kept = lambda_runtime._PYTHON_WORKER_SCRIPT, lambda_runtime.Worker._drain_stderr_bounded
+    log_gap.install()
+    yield
+    lambda_runtime._PYTHON_WORKER_SCRIPT, lambda_runtime.Worker._drain_stderr_bounded = kept
+
+
+def test_the_worker_says_where_each_invocations_log_ends(installed, tmp_path):
+    handler = "def handler(event, context):\n    if event:\n        print(event)\n    return event\n"
+    (tmp_path / "said.py").write_text(handler)
+    init = {"code_dir": str(tmp_path), "module": "said", "handler": "handler"}
+    asked = [init, *({"event": event} for event in ("one", "", "two"))]
+    done = subprocess.run(
+        [sys.executable, "-c", lambda_runtime._PYTHON_WORKER_SCRIPT],
+        input="".join(f"{json.dumps(each)}\n" for each in asked),
+        capture_output=True,
+        text=True,
+        check=True,
+        timeout=60,
+    )
+    answers = [json.loads(line) for line in done.stdout.splitlines()]
+    assert [answer.get("result") for answer in answers] == [None, "one", "", "two"]
+    assert done.stderr.splitlines() == ["one", log_gap._END, log_gap._END, "two", log_gap._END]
+
+
+def test_what_comes_after_the_end_is_the_next_invocations(installed):
+    lines = queue.Queue()
+    for line in ("one", "two", log_gap._END, "three", log_gap._END, log_gap._END):
+        lines.put(line)
+    worker = SimpleNamespace(config={"Runtime": "python3.13"}, _stderr_queue=lines)
+    log = lambda_runtime.Worker._drain_stderr_bounded
+    assert [log(worker) for _ in range(3)] == ["one\ntwo", "three", ""]
