@@ -16,7 +16,7 @@ from local.cloud import EmbeddedCloud
 from station import robots
 from tests.local.conftest import bundle, embedded, iort  # noqa: F401 - fixtures
 from tests.ros.conftest import Graph, Process
-from tests.unit.test_device_downlink import POSE
+from tests.unit.downlink_rig import POSE
 
 POSE_TYPE = "geometry_msgs/PoseStamped"
 DRIVE = {

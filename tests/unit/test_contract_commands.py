@@ -1,0 +1,69 @@
+"""Commands and fleet messages: what is written is read, and what is not allowed is not written."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+from typing import Any
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+import contract
+from contract import Command, ContractError, FleetMessage
+
+T0 = 1_700_000_000_000_000
+MESSAGES = st.dictionaries(
+    st.text(max_size=3),
+    st.integers()
+    | st.booleans()
+    | st.floats(allow_nan=False, allow_infinity=False)
+    | st.lists(st.none(), max_size=2),
+    max_size=4,
+)
+KEYS = ["v", "session", "started_us", "seq", "sent_us", "valid_ms", "lease_ms", "message", "boot"]
+TIMES = st.integers(0, 2**53 - 1)
+
+
+@given(
+    st.text("0123456789abcdef", min_size=8, max_size=32), st.tuples(TIMES, TIMES), st.integers(0, 2**53),
+    st.tuples(st.integers(1, 60_000), st.none() | st.integers(1, 10_000)), MESSAGES,
+)  # fmt: skip
+def test_a_command_there_and_back(
+    session: str, times: tuple[int, int], seq: int, holds: tuple[int, int | None], message: Any
+) -> None:
+    command = Command(session, min(times), seq, max(times), holds[0], message, holds[1])
+    assert contract.decode_command(contract.encode_command(command)) == command
+
+
+@given(st.integers(0, 2**53), TIMES, MESSAGES)
+def test_a_fleet_message_there_and_back(seq: int, sent: int, message: Any) -> None:
+    heard = FleetMessage("0badcafe", seq, sent, message)
+    assert contract.decode_fleet(contract.encode_fleet(heard)) == heard
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        {"session": "x"}, {"session": None}, {"seq": -1}, {"seq": True}, {"started_us": T0 + 1},
+        {"sent_us": 1.5}, {"sent_us": 2**60}, {"valid_ms": 0}, {"valid_ms": 60_001}, {"lease_ms": 0},
+        {"lease_ms": 10_001}, {"message": []}, {"message": None}, {"message": {"a": float("nan")}},
+        {"message": {"a": "x" * 200_000}}, {"message": {"a": {1, 2}}},
+    ],
+)  # fmt: skip
+def test_a_command_that_is_not_allowed(change: dict[str, Any]) -> None:
+    good = Command("feedbeef", T0, 0, T0, 500, {"data": 1}, 300)
+    with pytest.raises(ContractError):
+        contract.encode_command(replace(good, **change))
+
+
+ANYTHING = st.none() | st.booleans() | st.integers(-1, 2) | st.floats() | st.text(max_size=9) | st.just({})
+
+
+@given(st.dictionaries(st.sampled_from(KEYS), ANYTHING) | st.binary(max_size=40))
+def test_anything_else_is_refused_with_the_contracts_error(content: Any) -> None:
+    payload = content if isinstance(content, bytes) else json.dumps(content).encode()
+    for read in (contract.decode_command, contract.decode_fleet):
+        with pytest.raises(ContractError):
+            read(payload)
