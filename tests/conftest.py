@@ -39,7 +39,7 @@ GROUPS = {
                 "quarantine",
                 "query",
                 "station_data",
-                "summarize",
+                "summarize_drive",
                 "tables",
                 "upload",
             )

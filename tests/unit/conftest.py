@@ -58,3 +58,11 @@ def dynamodb(aws, synthesized):
             BillingMode=properties["BillingMode"],
         )
     return client
+
+
+@pytest.fixture
+def stream():
+    """An empty telemetry table and the stream that Lambda 2 reads."""
+    from tests.unit.summarizing import Stream
+
+    return Stream()

@@ -19,6 +19,7 @@ from station.sizes import stored_bytes
 from station.stored import Refused, blocks
 from tests.fakes import item_of_message
 from tests.recordings import recording
+from tests.unit.summarizing import drive_of
 from tests.unit.test_contract_columns import BOOT, WRONG, columns, message_of, plain_message
 
 
@@ -112,8 +113,6 @@ def as_read(value):
 
 
 def test_a_real_drive_fits_in_a_write_unit_and_comes_back():
-    from tests.unit.test_summarize import drive_of
-
     samples = list(drive_of(recording("f1tenth-motor-servo.bag")))
     sizes = []
     for _, group in itertools.groupby(samples, key=lambda sample: sample[0] // 1_000_000):

@@ -8,14 +8,9 @@ from contract import Batch
 from functions.stored import SECOND_BATCHES, Reader
 from functions.summarize import process
 from tests.fakes import TOPIC_OF_CAR
-from tests.unit.test_summarize import SECOND, T0, S, Stream, batch
+from tests.unit.summarizing import SECOND, T0, S, Stream, batch
 
 MANY = 3 * SECOND_BATCHES
-
-
-@pytest.fixture
-def stream():
-    return Stream()
 
 
 def packed(count, *, second=0, seq=0):
