@@ -1,0 +1,172 @@
+"""One ROS 1 topic's intake, from the connection header to the sample; no ROS is needed."""
+
+from __future__ import annotations
+
+import sys
+import threading
+from typing import Any
+
+import pytest
+
+import contract
+from device.clock import ManualClock
+from device.errors import SourceError
+from device.sources.ros1 import Intake, Ros1Config, TopicConfig
+from tests.unit.ros1_messages import STAMPED, header
+
+T0 = 1_700_000_000_000_000
+CONNECTION = {"type": "a_msgs/A", "md5sum": "1", "message_definition": STAMPED + "uint8 u"}
+
+
+class Desk:
+    def __init__(self, **settings: Any) -> None:
+        self.clock = ManualClock(now_us=T0)
+        self.samples: list[tuple[str, int, dict[str, Any]]] = []
+        self.types: list[contract.MessageType] = []
+        config = TopicConfig(**{"stream": "s", "time": "header", **settings})
+        self.intake = Intake("/t", config, emit=self._emit, clock=self.clock)
+
+    def _emit(self, stream: str, t_us: int, values: Any) -> None:
+        if stream == contract.TYPES_STREAM:
+            self.types.append(contract.message_type(values))
+        else:
+            self.samples.append((stream, t_us, values))
+
+    def take(self, data: bytes, **header: str) -> None:
+        self.intake.take({**CONNECTION, **header}, data)
+
+
+def test_a_publishers_type_is_said_when_it_connects() -> None:
+    desk = Desk()
+    header = {**CONNECTION}
+    for _ in range(3):
+        desk.intake.take(header, b"")
+    said = contract.MessageType("s", "/t", "a_msgs/A", "1", CONNECTION["message_definition"])
+    assert desk.types == [said]
+
+
+def test_a_believable_stamp_is_the_samples_time() -> None:
+    desk = Desk()
+    desk.take(header(T0 // 1_000_000 - 1) + b"\x01")
+    assert desk.samples == [("s", T0 - 999_993, {"u": 1})]
+    assert desk.intake.report() == {"messages": 1, "silent": False, "left_out": {}}
+
+
+@pytest.mark.parametrize("sec", [0, 12, 1_600_000_000, 1_700_003_700, 1_699_996_300])
+def test_a_stamp_that_cannot_be_is_flagged_and_not_believed(
+    sec: int, caplog: pytest.LogCaptureFixture
+) -> None:
+    desk = Desk()
+    for _ in range(3):
+        desk.take(header(sec, 0) + b"\x01")
+    assert [t_us for _, t_us, _ in desk.samples] == [T0] * 3
+    assert desk.intake.report()["unbelieved_stamps"] == 3
+    assert caplog.text.count("off the clock; using the time of arrival") == 1
+    desk.clock.advance(60)
+    desk.take(header(sec, 0) + b"\x01")
+    assert "(and 2 more like it)" in caplog.text
+
+
+def test_no_stamp_is_believed_in_a_simulation(caplog: pytest.LogCaptureFixture) -> None:
+    desk = Desk()
+    desk.intake.sim_time = True
+    desk.take(header(T0 // 1_000_000 - 1) + b"\x01")
+    assert desk.samples[0][1] == T0
+    assert "/use_sim_time" in caplog.text
+
+
+@pytest.mark.parametrize("time", ["header", "arrival"])
+def test_a_latched_message_that_comes_again_is_no_new_data(time: str) -> None:
+    desk = Desk(time=time)
+    old, new = (header(T0 // 1_000_000 + second) + b"\x01" for second in (0, 1))
+    first, second = ({**CONNECTION, "latching": "1", "callerid": "/map"} for _ in range(2))
+    desk.intake.take(first, old)
+    desk.intake.look(1)
+    desk.clock.advance(6)
+    desk.intake.look(1)
+    desk.intake.take(second, old)
+    desk.intake.look(1)
+    assert len(desk.samples) == 1
+    assert desk.intake.report() == {"messages": 1, "silent": True, "left_out": {}, "latched_again": 1}
+    # The same twice by one connection was published twice; another publisher's is its own.
+    desk.intake.take(second, old)
+    desk.intake.take({**first, "callerid": "/other"}, old)
+    desk.intake.take({**first}, new)
+    desk.intake.look(1)
+    assert len(desk.samples) == 4
+    assert desk.intake.report() == {"messages": 4, "silent": False, "left_out": {}, "latched_again": 1}
+
+
+def test_what_does_not_latch_is_new_with_every_connection() -> None:
+    desk = Desk()
+    for _ in range(2):
+        desk.take(header(T0 // 1_000_000) + b"\x01", latching="0", callerid="/pub")
+    assert len(desk.samples) == 2
+
+
+def test_arrival_time_asks_no_stamp(caplog: pytest.LogCaptureFixture) -> None:
+    desk = Desk(time="arrival")
+    desk.take(header(0) + b"\x01")
+    assert desk.samples[0][1] == T0
+    assert not caplog.records
+
+
+def test_header_time_without_a_header_is_flagged() -> None:
+    desk = Desk()
+    desk.take(b"\x01", message_definition="uint8 u")
+    assert desk.samples == [("s", T0, {"u": 1})]
+    assert desk.intake.report()["no_stamp"] == 1
+
+
+def test_a_changed_definition_is_another_decoder() -> None:
+    desk = Desk(time="arrival")
+    desk.take(b"\x01", message_definition="uint8 u")
+    desk.take(b"\x01\x02", md5sum="2", message_definition="uint8 u\nuint8 v")
+    desk.take(b"\x03", message_definition="uint8 u")
+    assert [values for _, _, values in desk.samples] == [{"u": 1}, {"u": 1, "v": 2}, {"u": 3}]
+
+
+@pytest.mark.parametrize("definition", ["Unknown u", "not a definition", "float64[64] a\n" * 9, ""])
+def test_what_cannot_be_decoded_is_counted(definition: str, caplog: pytest.LogCaptureFixture) -> None:
+    desk = Desk()
+    for _ in range(3):
+        desk.take(b"\x01", message_definition=definition)
+    assert desk.samples == []
+    assert desk.intake.report()["undecodable"] == 3
+    assert len(caplog.records) == 2, "why, and that"
+
+
+def test_malformed_messages_are_counted() -> None:
+    desk = Desk(time="arrival")
+    desk.take(b"\x01\x02", message_definition="uint8 u")
+    desk.take(b"\x01", message_definition="uint8 u")
+    assert (len(desk.samples), desk.intake.report()["malformed"]) == (1, 1)
+
+
+def test_fields_that_do_not_exist_are_told(caplog: pytest.LogCaptureFixture) -> None:
+    desk = Desk(time="arrival", fields=("w",))
+    desk.take(b"\x01", message_definition="uint8 u")
+    assert desk.samples == []
+    assert "a_msgs/A has no field w" in caplog.text
+    assert desk.intake.report()["empty"] == 1
+
+
+def test_silence_is_told_once_and_its_end_too(caplog: pytest.LogCaptureFixture) -> None:
+    caplog.set_level("INFO")
+    desk = Desk(time="arrival")
+    for _ in range(12):
+        desk.clock.advance(1)
+        desk.intake.look(0)
+    assert caplog.text.count("topic /t has been silent for 5 s: nobody publishes it") == 1
+    assert desk.intake.report()["silent"]
+    desk.take(b"\x01", message_definition="uint8 u")
+    desk.intake.look(1)
+    assert "is heard again" in caplog.text
+    assert desk.intake.report()["silent"] is False
+
+
+def test_without_rospy_the_source_says_how_to_get_it(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(sys.modules, "rospy", None)
+    source = Ros1Config(topics=(("/t", TopicConfig("s", "header")),)).build(ManualClock())
+    with pytest.raises(SourceError, match=r"cannot import rospy.*--system-site-packages"):
+        source.run(lambda *_: None, threading.Event())
