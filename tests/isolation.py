@@ -1,7 +1,7 @@
 """Who may do what, in one table: (who, does, what, allowed). tests/local/test_isolation.py tries every row
 on the embedded cloud with enforcement on, tests/stacks/test_isolation.py asks the synthesized policies.
 
-What each role of the stacks may do is declared in tests/stacks/test_policies.py; here is what is asked of
+What each role of the stacks may do is declared in tests/stacks/roles.py; here is what is asked of
 all of them, so that a function that is new and not declared fails.
 """
 

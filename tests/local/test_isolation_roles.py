@@ -17,8 +17,8 @@ from botocore.exceptions import ClientError
 
 from contract import pubnub_parameter
 from tests import isolation
+from tests.stacks.roles import IOT, ROLES
 from tests.stacks.templates import name
-from tests.stacks.test_policies import IOT, ROLES
 
 ACCOUNT = "000000000000"
 DENIED = {"AccessDenied", "AccessDeniedException", "ForbiddenException", "UnauthorizedOperation", "403"}
@@ -217,7 +217,7 @@ def refused(clients: dict[str, Any], probe: Probe) -> bool:
 def test_every_role_is_declared(deployed):
     roles = {one.arn for one in of(deployed, "AWS::IAM::Role")}
     # Others, such as those of account-wide settings, are left out on the embedded cloud.
-    assert roles <= ROLES.keys(), "declare what a new role may do in tests/stacks/test_policies.py"
+    assert roles <= ROLES.keys(), "declare what a new role may do in tests/stacks/roles.py"
 
 
 def test_every_role_is_refused_what_is_not_declared_for_it(deployed, taken):

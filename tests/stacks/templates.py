@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+from collections.abc import Iterator
 from typing import Any
 
 from tests.conftest import Synthesized
@@ -13,6 +14,14 @@ _HASH = re.compile(r"[0-9A-F]{8}$")
 def name(logical_id: str) -> str:
     """A logical id without the hash that CDK ends it with."""
     return _HASH.sub("", logical_id)
+
+
+def qualified(synthesized: Synthesized, kind: str) -> Iterator[tuple[str, str, str, dict[str, Any]]]:
+    """Name, stack, logical id and properties of every resource of a type; names of ingest have the stack's
+    before them, because two stacks have a LiveRole."""
+    for stack in synthesized.templates:
+        for logical_id, properties in synthesized.resources(kind, stack).items():
+            yield ("ingest/" if stack == "ingest" else "") + name(logical_id), stack, logical_id, properties
 
 
 class Reader:

@@ -11,7 +11,8 @@ import contract
 from tests import isolation
 from tests.isolation import CLAIM, CONNECT, ROWS, SUBSCRIBE, A, Row
 from tests.policy import allows
-from tests.stacks.test_policies import IOT, ROLES, qualified
+from tests.stacks.roles import IOT, ROLES
+from tests.stacks.templates import qualified
 
 ACCOUNT = "arn:aws:iot:eu-west-1:123456789012"
 
@@ -89,9 +90,7 @@ def test_every_role_on_every_resource_is_declared_or_refused(synthesized, reader
         statements[role] += [
             {**s, "Resource": reader.texts(s["Resource"])} for s in policy["PolicyDocument"]["Statement"]
         ]
-    assert statements.keys() == ROLES.keys(), (
-        "declare what a new role may do in tests/stacks/test_policies.py"
-    )
+    assert statements.keys() == ROLES.keys(), "declare what a new role may do in tests/stacks/roles.py"
     wanted = [
         (f"ssm:{a}", f"{IOT.replace(':iot:', ':ssm:')}:parameter/iort/pubnub")
         for a in isolation.PARAMETER_ACTIONS

@@ -1,4 +1,4 @@
-"""Both ends of every wire agree: handlers and assets, metrics and dashboard, rules and topics."""
+"""Both ends of every wire agree: handlers and assets, variables and their readers, rules and topics."""
 
 from __future__ import annotations
 
@@ -29,16 +29,13 @@ from contract import (
     record_topic,
     rule_name,
 )
-from functions.health import measure
 from stacks.encryption import Encryption
 from stacks.function import function
-from stacks.metrics import statistic
 from stacks.settings import ROOT, Settings, SettingsError
-from station.cost import Usage
 from tests.stacks.templates import name
+from tests.stacks.test_dashboards import FUNCTIONS
 
 HANDLERS = ("Live", "Summarize", "Echo", "Upload", "Query", "Admit", "Presence", "Quarantine", "Alert")
-FUNCTIONS = sorted((ROOT / "functions").glob("*.py"))
 CONTRACT = sorted((ROOT / "contract").glob("*.py"))
 # Lambda's Python has boto3 and what boto3 needs.
 RUNTIME_PACKAGES = ("boto3", "botocore", "dateutil", "jmespath", "s3transfer", "six", "urllib3")
@@ -47,9 +44,6 @@ RUNTIME_PACKAGES = ("boto3", "botocore", "dateutil", "jmespath", "s3transfer", "
 @pytest.fixture(scope="module")
 def functions(synthesized):
     return {name(k): v for k, v in synthesized.resources("AWS::Lambda::Function").items()}
-
-
-# --- assets -----------------------------------------------------------------------------------------
 
 
 def test_the_asset_holds_exactly_the_contract_and_the_functions(synthesized, functions):
@@ -127,9 +121,6 @@ def test_every_function_module_with_a_handler_is_deployed(functions):
     assert {function["Handler"] for function in functions.values()} == modules
 
 
-# --- environment variables --------------------------------------------------------------------------
-
-
 def imported(module):
     """The modules of functions/ that one of them loads, itself included."""
     found, todo = set(), [module]
@@ -205,89 +196,6 @@ def test_what_the_variables_say_is_what_the_functions_expect(functions, reader, 
     }
 
 
-# --- metrics ----------------------------------------------------------------------------------------
-
-
-@pytest.fixture(scope="module")
-def shown(synthesized):
-    """Every metric on the dashboards: namespace, name, dimensions, options."""
-    metrics = []
-    for body in dashboards(synthesized).values():
-        for widget in body["widgets"]:
-            rows = widget["properties"].get("metrics", [])
-            metrics += [of_expression(row[0]) if isinstance(row[0], dict) else of_row(row) for row in rows]
-    return metrics
-
-
-def test_the_platform_shows_the_state_of_every_alarm(synthesized):
-    first = dashboards(synthesized)["iort-platform"]["widgets"][0]
-    assert first["type"] == "alarm"
-    told = " ".join(first["properties"]["alarms"])
-    alarms = synthesized.resources("AWS::CloudWatch::Alarm")
-    assert len(alarms) == len(first["properties"]["alarms"])
-    assert all(f"'{logical_id}'" in told for logical_id in alarms)
-
-
-def dashboards(app):
-    """The bodies by name; what is only known when it is deployed stands for itself."""
-    found = {}
-    for dashboard in app.resources("AWS::CloudWatch::Dashboard").values():
-        separator, parts = dashboard["DashboardBody"]["Fn::Join"]
-        assert separator == ""
-        text = "".join(
-            part if isinstance(part, str) else f"<{json.dumps(part)}>".replace('"', "'") for part in parts
-        )
-        found[dashboard["DashboardName"]] = json.loads(text)
-    return found
-
-
-def of_row(row):
-    namespace, metric, *rest = row
-    options = rest.pop() if isinstance(rest[-1], dict) else {}
-    return namespace, metric, dict(zip(rest[::2], rest[1::2], strict=True)), options
-
-
-def of_expression(options):
-    """What `SEARCH('{namespace,dimension,...} MetricName="..." dimension="..."', 'Sum', 60)` searches."""
-    schema, wanted, stat = re.search(
-        r"SEARCH\('\{([^}]+)\} ([^']+)', '(\w+)', 60\)", options["expression"]
-    ).groups()
-    namespace, *dimensions = schema.split(",")
-    values = dict(re.findall(r'(\w+)="([^"]+)"', wanted))
-    metric = values.pop("MetricName")
-    return namespace, metric, {name: values.get(name, "*") for name in dimensions}, {"stat": stat}
-
-
-def emitted():
-    """Every metric that a function's code emits, by function."""
-    found = {}
-    for path in FUNCTIONS:
-        for node in ast.walk(ast.parse(path.read_text())):
-            if isinstance(node, ast.Call) and getattr(node.func, "id", "") == "emit":
-                function = ast.literal_eval(node.args[0])
-                named = {keyword.arg for keyword in node.keywords} - {"robot", None}
-                found.setdefault(function, set()).update(named)
-            if isinstance(node, ast.Call) and ast.unparse(node.func) == "counted.add":
-                found.setdefault(path.stem, set()).update(keyword.arg for keyword in node.keywords)
-    # These have their names computed.
-    batch = contract.Batch("0" * 8, 0, [1], {"voltage_input": [12.0]})
-    for stream in ("vesc", contract.RTT_STREAM, contract.AGENT_STREAM):
-        found["health"] |= measure(stream, [batch]).keys()
-    return found
-
-
-def test_the_dashboards_show_what_the_functions_emit_and_nothing_else(shown):
-    by_function = {}
-    for namespace, metric, dimensions, options in shown:
-        if namespace == contract.METRIC_NAMESPACE:
-            assert dimensions.keys() == {"Deployment", "Function"}
-            assert dimensions["Deployment"] == contract.DEFAULT_NAMESPACE
-            by_function.setdefault(dimensions["Function"], set()).add(metric)
-            assert options["stat"] == statistic(metric)
-    assert by_function == {function: set(names) for function, names in contract.METRICS.items()}
-    assert emitted() == by_function
-
-
 def test_functions_log_what_they_say_and_of_lambda_what_went_wrong(synthesized, functions):
     for made in functions.values():
         logging = made["LoggingConfig"]
@@ -309,134 +217,6 @@ def test_lambdas_own_lines_come_back_where_they_are_asked_for(tmp_path):
     assert made["LoggingConfig"].keys() == {"LogGroup"}
     with pytest.raises(SettingsError, match="function_logs = 'none': allowed is own or all"):
         Settings.from_context(App(context={"function_logs": "none", "layer": str(tmp_path)}))
-
-
-def test_the_dashboards_cover_every_service_of_the_path(shown):
-    assert {namespace for namespace, *_ in shown} == {
-        "AWS/IoT",
-        "AWS/DynamoDB",
-        "AWS/Lambda",
-        "AWS/SQS",
-        contract.METRIC_NAMESPACE,
-    }
-    rules = {dimensions["RuleName"] for _, _, dimensions, _ in shown if "RuleName" in dimensions}
-    assert rules == {rule_name(rule) for rule in contract.RULES}
-
-
-# Dimensions of each metric. AWS IoT Developer Guide, "AWS IoT metrics and dimensions"; Lambda Developer
-# Guide, "Types of metrics for Lambda functions"; DynamoDB Developer Guide, "DynamoDB metrics and
-# dimensions"; SQS Developer Guide, "Available CloudWatch metrics for Amazon SQS".
-AWS_METRICS = {
-    ("AWS/IoT", "Protocol"): {
-        f"{what}.{how}"
-        for what in ("Connect", "PublishIn", "PublishOut", "Subscribe")
-        for how in ("Success", "AuthError", "Throttle")
-    },
-    ("AWS/IoT", "RuleName"): {"TopicMatch", "ParseError", "RuleMessageThrottled"},
-    ("AWS/IoT", "ActionType", "RuleName"): {"Failure", "Success", "ErrorActionFailure"},
-    ("AWS/Lambda", "FunctionName"): {
-        "Duration",
-        "ConcurrentExecutions",
-        "Errors",
-        "Throttles",
-        "IteratorAge",
-        "DestinationDeliveryFailures",
-    },
-    ("AWS/DynamoDB", "TableName"): {
-        "ConsumedReadCapacityUnits",
-        "ConsumedWriteCapacityUnits",
-        "ReadThrottleEvents",
-        "WriteThrottleEvents",
-    },
-    ("AWS/SQS", "QueueName"): {"ApproximateNumberOfMessagesVisible"},
-}
-
-
-def test_every_metric_of_aws_is_one_that_aws_has(shown, alarms):
-    of_alarms = [
-        (a["Namespace"], a["MetricName"], {d["Name"]: d["Value"] for d in a["Dimensions"]})
-        for a in alarms.values()
-        if "Metrics" not in a
-    ]
-    for namespace, metric, dimensions in [*(one[:3] for one in shown), *of_alarms]:
-        if namespace != contract.METRIC_NAMESPACE:
-            assert metric in AWS_METRICS[(namespace, *sorted(dimensions))]
-        elif metric not in contract.METRICS[dimensions["Function"]]:
-            raise AssertionError(f"nothing emits {metric}")
-
-
-# --- alarms -----------------------------------------------------------------------------------------
-
-
-@pytest.fixture(scope="module")
-def alarms(synthesized):
-    found = synthesized.resources("AWS::CloudWatch::Alarm").values()
-    return {alarm["AlarmName"].removeprefix("iort-"): alarm for alarm in found}
-
-
-def test_every_queue_function_and_table_has_an_alarm(synthesized, alarms):
-    for kind, ending in (
-        ("AWS::SQS::Queue", "Waiting"),
-        ("AWS::Lambda::Function", "Errors"),
-        ("AWS::DynamoDB::Table", "Throttled"),
-    ):
-        for logical_id in synthesized.resources(kind):
-            assert f"{name(logical_id)}{ending}" in alarms
-
-
-def test_what_can_be_lost_beside_the_quarantine_has_an_alarm(alarms):
-    asked = {}
-    for alarm, properties in alarms.items():
-        if "Metrics" in properties:
-            (query,) = properties["Metrics"]
-            assert query["ReturnData"] is not False
-            metric, namespace = re.fullmatch(
-                r'SELECT SUM\((\w+)\) FROM "([\w/]+)"', query["Expression"]
-            ).groups()
-            asked[alarm] = (namespace, metric)
-    known = {(key[0], metric) for key, names in AWS_METRICS.items() for metric in names}
-    assert set(asked.values()) <= known
-    assert asked == {
-        "ParseError": ("AWS/IoT", "ParseError"),
-        "ErrorActionFailure": ("AWS/IoT", "ErrorActionFailure"),
-        "RuleMessageThrottled": ("AWS/IoT", "RuleMessageThrottled"),
-        "DestinationDeliveryFailures": ("AWS/Lambda", "DestinationDeliveryFailures"),
-    }
-
-
-def test_the_cost_model_counts_every_alarm(alarms):
-    assert Usage().alarms == len(alarms)
-
-
-def test_every_alarm_tells_the_topic_and_is_explained(alarms, reader):
-    text = (ROOT / "docs" / "cloud.md").read_text()
-    for alarm, properties in alarms.items():
-        assert reader.texts(properties["AlarmActions"]) == ["Alarms"]
-        assert properties["TreatMissingData"] == "notBreaching"
-        generic = re.sub(r"^.*(Waiting|Errors|Throttled|Behind)$", r"\1", alarm)
-        assert f"`{generic}`" in text or f"`...{generic}`" in text, f"docs/cloud.md says nothing of {alarm}"
-
-
-def test_the_thresholds_are_the_settings(production, synthesized):
-    alarms = {
-        a["AlarmName"]: a["Threshold"] for a in synthesized.resources("AWS::CloudWatch::Alarm").values()
-    }
-    limits = Settings().thresholds
-    assert alarms["iort-BatteryVolts"] == limits.low_voltage_v == contract.LOW_VOLTAGE_V
-    assert alarms["iort-TemperatureDegC"] == limits.high_temperature_degc
-    assert alarms["iort-CarToLambdaMs"] == limits.car_to_lambda_ms
-    assert alarms["iort-SummarizeBehind"] == limits.stream_behind_s * 1000
-    (alert,) = (f for k, f in synthesized.resources("AWS::Lambda::Function").items() if k.startswith("Alert"))
-    assert float(alert["Environment"]["Variables"]["LOW_VOLTAGE_V"]) == limits.low_voltage_v
-
-
-def test_the_address_subscribes_to_the_topic(production, synthesized):
-    (subscription,) = production.resources("AWS::SNS::Subscription").values()
-    assert (subscription["Protocol"], subscription["Endpoint"]) == ("email", "lab@example.org")
-    assert not synthesized.resources("AWS::SNS::Subscription")
-
-
-# --- rules and topics -------------------------------------------------------------------------------
 
 
 def matches(topic_filter, topic):

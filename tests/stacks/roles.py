@@ -1,0 +1,160 @@
+"""What every role of the stacks may do: each action on each resource, and who may take the role."""
+
+from __future__ import annotations
+
+import contract
+
+IOT = "arn:${AWS::Partition}:iot:${AWS::Region}:${AWS::AccountId}"
+THINGS, CERTIFICATES = f"{IOT}:thing/*", f"{IOT}:cert/*"
+GROUP, KIND = f"{IOT}:thinggroup/iort-robot", f"{IOT}:thingtype/iort-robot"
+PROVISIONING = (
+    {
+        (f"iot:{action}", resource)
+        for action in ("CreateThing", "DescribeThing", "ListThingGroupsForThing", "ListThingPrincipals")
+        for resource in (THINGS, KIND)
+    }
+    | {
+        (f"iot:{action}", CERTIFICATES)
+        for action in ("AttachPolicy", "DescribeCertificate", "UpdateCertificate")
+    }
+    | {("iot:AddThingToThingGroup", THINGS), ("iot:AddThingToThingGroup", GROUP)}
+    | {("iot:AttachThingPrincipal", THINGS), ("iot:AttachThingPrincipal", CERTIFICATES)}
+    | {("iot:DescribeThingType", KIND), ("iot:DescribeThingGroup", GROUP)}
+    | {("iot:GetPolicy", f"{IOT}:policy/iort-robot")}
+    | {(f"iot:{action}", "*") for action in ("ListAttachedPolicies", "ListPrincipalThings", "RegisterThing")}
+)
+
+# What the checks of the audit read: certificates and policies, whoever's they are.
+AUDIT_READS = (
+    *(
+        "DescribeCACertificate",
+        "DescribeCertificate",
+        "GetEffectivePolicies",
+        "GetLoggingOptions",
+        "GetPolicy",
+    ),
+    *("GetV2LoggingOptions", "ListCACertificates", "ListCertificates", "ListPolicies"),
+)
+LOG_OF_IOT = "arn:${AWS::Partition}:logs:${AWS::Region}:${AWS::AccountId}:log-group:AWSIotLogsV2:*"
+
+LOG = {"logs:CreateLogStream", "logs:PutLogEvents"}
+REJECT = ("sqs:SendMessage", "Rejected.Arn")
+# What the CDK gives whoever may send to a queue as a destination.
+DESTINATION = {REJECT, ("sqs:GetQueueAttributes", "Rejected.Arn"), ("sqs:GetQueueUrl", "Rejected.Arn")}
+# Of every role, each action on each resource, and who may take the role.
+ROLES = {
+    "LiveRole": (
+        "lambda.amazonaws.com",
+        {(action, "LiveLog.Arn") for action in LOG}
+        | DESTINATION
+        | {
+            (
+                "ssm:GetParameter",
+                "arn:${AWS::Partition}:ssm:${AWS::Region}:${AWS::AccountId}:parameter/iort/pubnub",
+            )
+        },
+    ),
+    "SummarizeRole": (
+        "lambda.amazonaws.com",
+        {(action, "SummarizeLog.Arn") for action in LOG}
+        | {
+            ("dynamodb:Query", "Telemetry.Arn"),
+            ("dynamodb:BatchWriteItem", "Summary.Arn"),
+            ("dynamodb:GetItem", "Robots.Arn"),
+            ("dynamodb:DescribeStream", "Telemetry.StreamArn"),
+            ("dynamodb:GetRecords", "Telemetry.StreamArn"),
+            ("dynamodb:GetShardIterator", "Telemetry.StreamArn"),
+            ("dynamodb:ListStreams", "*"),
+        }
+        | DESTINATION,
+    ),
+    "EchoRole": (
+        "lambda.amazonaws.com",
+        {(action, "EchoLog.Arn") for action in LOG}
+        | DESTINATION
+        | {("iot:Publish", f"{IOT}:topic/pong/iort/*/lambda")},
+    ),
+    "QuarantineRole": (
+        "lambda.amazonaws.com",
+        {(action, "QuarantineLog.Arn") for action in LOG}
+        | {
+            ("dynamodb:UpdateItem", "Quarantine.Arn"),
+            ("dynamodb:GetRecords", "Telemetry.StreamArn"),
+            ("dynamodb:GetShardIterator", "Telemetry.StreamArn"),
+            ("sqs:ReceiveMessage", "Rejected.Arn"),
+            ("sqs:DeleteMessage", "Rejected.Arn"),
+            ("sqs:ChangeMessageVisibility", "Rejected.Arn"),
+            ("sqs:GetQueueAttributes", "Rejected.Arn"),
+            ("sqs:GetQueueUrl", "Rejected.Arn"),
+        },
+    ),
+    "QueryRole": (
+        "lambda.amazonaws.com",
+        {(action, "QueryLog.Arn") for action in LOG}
+        | {("dynamodb:Query", "Telemetry.Arn"), ("dynamodb:Scan", "Telemetry.Arn")}
+        | {("dynamodb:GetItem", "Robots.Arn")}
+        | {
+            (f"s3:{action}", f"Files.Arn/{contract.RESULTS_PREFIX}*") for action in ("GetObject", "PutObject")
+        },
+    ),
+    "UploadRole": (
+        "lambda.amazonaws.com",
+        {(action, "UploadLog.Arn") for action in LOG}
+        | DESTINATION
+        | {
+            (f"s3:{action}", f"Files.Arn/{contract.FILES_PREFIX}*")
+            for action in ("AbortMultipartUpload", "ListMultipartUploadParts", "PutObject")
+        }
+        | {(f"s3:{action}", "Files.Arn") for action in ("ListBucket", "ListBucketMultipartUploads")}
+        | {("dynamodb:UpdateItem", "Robots.Arn"), ("iot:Publish", f"{IOT}:topic/pong/iort/*/file")},
+    ),
+    "AdmitRole": (
+        "lambda.amazonaws.com",
+        {(action, "AdmitLog.Arn") for action in LOG} | {("dynamodb:UpdateItem", "Robots.Arn")},
+    ),
+    "PresenceRole": (
+        "lambda.amazonaws.com",
+        {(action, "PresenceLog.Arn") for action in LOG}
+        | DESTINATION
+        | {("dynamodb:UpdateItem", "Robots.Arn")},
+    ),
+    "AlertRole": (
+        "lambda.amazonaws.com",
+        {(action, "AlertLog.Arn") for action in LOG}
+        | DESTINATION
+        | {("dynamodb:UpdateItem", "Robots.Arn"), ("sns:Publish", "Alarms")},
+    ),
+    "ProvisioningRole": ("iot.amazonaws.com", PROVISIONING),
+    "AuditRole": ("iot.amazonaws.com", {(f"iot:{action}", "*") for action in AUDIT_READS}),
+    "LogRole": (
+        "iot.amazonaws.com",
+        {(f"logs:{action}", LOG_OF_IOT) for action in ("CreateLogGroup", "CreateLogStream", "PutLogEvents")},
+    ),
+    "ingest/RecordRole": ("iot.amazonaws.com", {REJECT, ("dynamodb:PutItem", "Telemetry.Arn")}),
+    "ingest/LiveRole": ("iot.amazonaws.com", {REJECT}),
+    "ingest/PongRole": ("iot.amazonaws.com", {REJECT, ("iot:Publish", f"{IOT}:topic/pong/iort/*/rule")}),
+    "ingest/EchoRole": ("iot.amazonaws.com", {REJECT}),
+    "ingest/UploadRole": ("iot.amazonaws.com", {REJECT}),
+    "ingest/FaultRole": ("iot.amazonaws.com", {REJECT}),
+    "ingest/BatteryRole": ("iot.amazonaws.com", {REJECT}),
+    "ingest/PresenceRole": ("iot.amazonaws.com", {REJECT}),
+    "ingest/VersionRole": ("iot.amazonaws.com", {REJECT}),
+}
+# Of the functions that keep something in a robot's row: which attributes.
+KEEPS = {
+    "AlertRole": ("alert_*",),
+    "PresenceRole": contract.PRESENCE,
+    "UploadRole": ("files_bytes", "files_day"),
+}
+# The only statements about every resource, each with why it cannot name one.
+EVERY_RESOURCE = {
+    # "Actions, resources, and condition keys for Amazon DynamoDB": ListStreams has no resource type.
+    ("SummarizeRole", "dynamodb:ListStreams"),
+    # "Actions defined by AWS IoT": these have no resource type.
+    *(
+        ("ProvisioningRole", f"iot:{a}")
+        for a in ("ListAttachedPolicies", "ListPrincipalThings", "RegisterThing")
+    ),
+    # An audit is of everything.
+    *(("AuditRole", f"iot:{a}") for a in AUDIT_READS),
+}

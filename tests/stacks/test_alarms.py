@@ -1,0 +1,73 @@
+"""What must not go wrong unseen has an alarm, and every alarm is explained."""
+
+from __future__ import annotations
+
+import re
+
+import contract
+from stacks.settings import ROOT, Settings
+from station.cost import Usage
+from tests.stacks.aws_metrics import AWS_METRICS
+from tests.stacks.templates import name
+
+
+def test_every_queue_function_and_table_has_an_alarm(synthesized, alarms):
+    for kind, ending in (
+        ("AWS::SQS::Queue", "Waiting"),
+        ("AWS::Lambda::Function", "Errors"),
+        ("AWS::DynamoDB::Table", "Throttled"),
+    ):
+        for logical_id in synthesized.resources(kind):
+            assert f"{name(logical_id)}{ending}" in alarms
+
+
+def test_what_can_be_lost_beside_the_quarantine_has_an_alarm(alarms):
+    asked = {}
+    for alarm, properties in alarms.items():
+        if "Metrics" in properties:
+            (query,) = properties["Metrics"]
+            assert query["ReturnData"] is not False
+            metric, namespace = re.fullmatch(
+                r'SELECT SUM\((\w+)\) FROM "([\w/]+)"', query["Expression"]
+            ).groups()
+            asked[alarm] = (namespace, metric)
+    known = {(key[0], metric) for key, names in AWS_METRICS.items() for metric in names}
+    assert set(asked.values()) <= known
+    assert asked == {
+        "ParseError": ("AWS/IoT", "ParseError"),
+        "ErrorActionFailure": ("AWS/IoT", "ErrorActionFailure"),
+        "RuleMessageThrottled": ("AWS/IoT", "RuleMessageThrottled"),
+        "DestinationDeliveryFailures": ("AWS/Lambda", "DestinationDeliveryFailures"),
+    }
+
+
+def test_the_cost_model_counts_every_alarm(alarms):
+    assert Usage().alarms == len(alarms)
+
+
+def test_every_alarm_tells_the_topic_and_is_explained(alarms, reader):
+    text = (ROOT / "docs" / "cloud.md").read_text()
+    for alarm, properties in alarms.items():
+        assert reader.texts(properties["AlarmActions"]) == ["Alarms"]
+        assert properties["TreatMissingData"] == "notBreaching"
+        generic = re.sub(r"^.*(Waiting|Errors|Throttled|Behind)$", r"\1", alarm)
+        assert f"`{generic}`" in text or f"`...{generic}`" in text, f"docs/cloud.md says nothing of {alarm}"
+
+
+def test_the_thresholds_are_the_settings(production, synthesized):
+    alarms = {
+        a["AlarmName"]: a["Threshold"] for a in synthesized.resources("AWS::CloudWatch::Alarm").values()
+    }
+    limits = Settings().thresholds
+    assert alarms["iort-BatteryVolts"] == limits.low_voltage_v == contract.LOW_VOLTAGE_V
+    assert alarms["iort-TemperatureDegC"] == limits.high_temperature_degc
+    assert alarms["iort-CarToLambdaMs"] == limits.car_to_lambda_ms
+    assert alarms["iort-SummarizeBehind"] == limits.stream_behind_s * 1000
+    (alert,) = (f for k, f in synthesized.resources("AWS::Lambda::Function").items() if k.startswith("Alert"))
+    assert float(alert["Environment"]["Variables"]["LOW_VOLTAGE_V"]) == limits.low_voltage_v
+
+
+def test_the_address_subscribes_to_the_topic(production, synthesized):
+    (subscription,) = production.resources("AWS::SNS::Subscription").values()
+    assert (subscription["Protocol"], subscription["Endpoint"]) == ("email", "lab@example.org")
+    assert not synthesized.resources("AWS::SNS::Subscription")

@@ -1,0 +1,123 @@
+"""The dashboards show what the functions emit and what AWS has, and nothing else."""
+
+from __future__ import annotations
+
+import ast
+import json
+import re
+
+import pytest
+
+import contract
+from contract import rule_name
+from functions.health import measure
+from stacks.metrics import statistic
+from stacks.settings import ROOT
+from tests.stacks.aws_metrics import AWS_METRICS
+
+FUNCTIONS = sorted((ROOT / "functions").glob("*.py"))
+
+
+@pytest.fixture(scope="module")
+def shown(synthesized):
+    """Every metric on the dashboards: namespace, name, dimensions, options."""
+    metrics = []
+    for body in dashboards(synthesized).values():
+        for widget in body["widgets"]:
+            rows = widget["properties"].get("metrics", [])
+            metrics += [of_expression(row[0]) if isinstance(row[0], dict) else of_row(row) for row in rows]
+    return metrics
+
+
+def test_the_platform_shows_the_state_of_every_alarm(synthesized):
+    first = dashboards(synthesized)["iort-platform"]["widgets"][0]
+    assert first["type"] == "alarm"
+    told = " ".join(first["properties"]["alarms"])
+    alarms = synthesized.resources("AWS::CloudWatch::Alarm")
+    assert len(alarms) == len(first["properties"]["alarms"])
+    assert all(f"'{logical_id}'" in told for logical_id in alarms)
+
+
+def dashboards(app):
+    """The bodies by name; what is only known when it is deployed stands for itself."""
+    found = {}
+    for dashboard in app.resources("AWS::CloudWatch::Dashboard").values():
+        separator, parts = dashboard["DashboardBody"]["Fn::Join"]
+        assert separator == ""
+        text = "".join(
+            part if isinstance(part, str) else f"<{json.dumps(part)}>".replace('"', "'") for part in parts
+        )
+        found[dashboard["DashboardName"]] = json.loads(text)
+    return found
+
+
+def of_row(row):
+    namespace, metric, *rest = row
+    options = rest.pop() if isinstance(rest[-1], dict) else {}
+    return namespace, metric, dict(zip(rest[::2], rest[1::2], strict=True)), options
+
+
+def of_expression(options):
+    """What `SEARCH('{namespace,dimension,...} MetricName="..." dimension="..."', 'Sum', 60)` searches."""
+    schema, wanted, stat = re.search(
+        r"SEARCH\('\{([^}]+)\} ([^']+)', '(\w+)', 60\)", options["expression"]
+    ).groups()
+    namespace, *dimensions = schema.split(",")
+    values = dict(re.findall(r'(\w+)="([^"]+)"', wanted))
+    metric = values.pop("MetricName")
+    return namespace, metric, {name: values.get(name, "*") for name in dimensions}, {"stat": stat}
+
+
+def emitted():
+    """Every metric that a function's code emits, by function."""
+    found = {}
+    for path in FUNCTIONS:
+        for node in ast.walk(ast.parse(path.read_text())):
+            if isinstance(node, ast.Call) and getattr(node.func, "id", "") == "emit":
+                function = ast.literal_eval(node.args[0])
+                named = {keyword.arg for keyword in node.keywords} - {"robot", None}
+                found.setdefault(function, set()).update(named)
+            if isinstance(node, ast.Call) and ast.unparse(node.func) == "counted.add":
+                found.setdefault(path.stem, set()).update(keyword.arg for keyword in node.keywords)
+    # These have their names computed.
+    batch = contract.Batch("0" * 8, 0, [1], {"voltage_input": [12.0]})
+    for stream in ("vesc", contract.RTT_STREAM, contract.AGENT_STREAM):
+        found["health"] |= measure(stream, [batch]).keys()
+    return found
+
+
+def test_the_dashboards_show_what_the_functions_emit_and_nothing_else(shown):
+    by_function = {}
+    for namespace, metric, dimensions, options in shown:
+        if namespace == contract.METRIC_NAMESPACE:
+            assert dimensions.keys() == {"Deployment", "Function"}
+            assert dimensions["Deployment"] == contract.DEFAULT_NAMESPACE
+            by_function.setdefault(dimensions["Function"], set()).add(metric)
+            assert options["stat"] == statistic(metric)
+    assert by_function == {function: set(names) for function, names in contract.METRICS.items()}
+    assert emitted() == by_function
+
+
+def test_the_dashboards_cover_every_service_of_the_path(shown):
+    assert {namespace for namespace, *_ in shown} == {
+        "AWS/IoT",
+        "AWS/DynamoDB",
+        "AWS/Lambda",
+        "AWS/SQS",
+        contract.METRIC_NAMESPACE,
+    }
+    rules = {dimensions["RuleName"] for _, _, dimensions, _ in shown if "RuleName" in dimensions}
+    assert rules == {rule_name(rule) for rule in contract.RULES}
+
+
+def test_every_metric_of_aws_is_one_that_aws_has(shown, alarms):
+    of_alarms = [
+        (a["Namespace"], a["MetricName"], {d["Name"]: d["Value"] for d in a["Dimensions"]})
+        for a in alarms.values()
+        if "Metrics" not in a
+    ]
+    for namespace, metric, dimensions in [*(one[:3] for one in shown), *of_alarms]:
+        if namespace != contract.METRIC_NAMESPACE:
+            assert metric in AWS_METRICS[(namespace, *sorted(dimensions))]
+        elif metric not in contract.METRICS[dimensions["Function"]]:
+            raise AssertionError(f"nothing emits {metric}")
