@@ -15,14 +15,14 @@ import socket
 import threading
 import time
 import zlib
-from collections import OrderedDict, deque
 from concurrent.futures import Future
-from typing import TYPE_CHECKING, NamedTuple
+from typing import TYPE_CHECKING
 from urllib.parse import quote, unquote
 
 from aiohttp import web
 
 import contract
+from local.pubnub_history import History, Message, Subscription
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
@@ -34,11 +34,6 @@ if TYPE_CHECKING:
 POLL_S = 280.0
 # A subscriber that has not read its answer after this long is cut off; its SDK reconnects.
 WRITE_S = 10.0
-# What is kept for subscribers that are away, and what bounds the memory it takes.
-KEPT_A_CHANNEL = 100
-KEPT_CHANNELS = 1_000
-KEPT_BYTES = 64 * 1024 * 1024
-MESSAGES_AN_ANSWER = 100
 MAX_POLLS = 1_000
 # Above what the SDKs can send, so that a message too large is told so by us.
 MAX_LINE_BYTES = 4 * contract.MAX_PUBNUB_BYTES
@@ -47,7 +42,7 @@ MAX_LINE_BYTES = 4 * contract.MAX_PUBNUB_BYTES
 UNSUPPORTED = ("custom_message_type", "filter-expr", "meta", "norep")
 
 
-class Refusal(Exception):  # noqa: N818
+class Refusal(Exception):  # noqa: N818 - an answer, not a fault
     """A request that is answered with an error, in one of PubNub's two shapes."""
 
     def __init__(self, status: int, message: str, service: str | None = None) -> None:
@@ -61,62 +56,6 @@ class Refusal(Exception):  # noqa: N818
         return json.dumps(
             {"status": self.status, "service": self.service, "error": True, "message": self.message}
         )
-
-
-class Message(NamedTuple):
-    """One publish; the payload stays the JSON text that was sent."""
-
-    token: int
-    channel: str
-    publisher: str
-    payload: str
-
-
-class Subscription:
-    """The channels a request asks for: plain names, and wildcards by what they start with."""
-
-    def __init__(self, channels: list[str]) -> None:
-        self.names = {name for name in channels if not name.endswith(".*")}
-        self._prefixes = {name[:-1]: name for name in channels if name.endswith(".*")}
-
-    def match(self, channel: str) -> str | None:
-        """Which entry of the subscription the channel belongs to, the plain name first."""
-        if channel in self.names:
-            return channel
-        for prefix, wildcard in self._prefixes.items():
-            if channel.startswith(prefix):
-                return wildcard
-        return None
-
-
-class History:
-    """The newest messages of every channel, up to a number a channel and a size for all."""
-
-    def __init__(self) -> None:
-        self._channels: OrderedDict[str, deque[Message]] = OrderedDict()
-        self._bytes = 0
-
-    def add(self, message: Message) -> None:
-        """Keep the message; the channel silent for longest makes room when there is none."""
-        kept = self._channels.setdefault(message.channel, deque())
-        self._channels.move_to_end(message.channel)
-        kept.append(message)
-        self._bytes += len(message.payload)
-        if len(kept) > KEPT_A_CHANNEL:
-            self._bytes -= len(kept.popleft().payload)
-        while len(self._channels) > KEPT_CHANNELS or (self._bytes > KEPT_BYTES and len(self._channels) > 1):
-            _, dropped = self._channels.popitem(last=False)
-            self._bytes -= sum(len(old.payload) for old in dropped)
-
-    def after(self, cursor: int, wanted: Subscription) -> list[tuple[str, Message]]:
-        """The oldest messages after the cursor, as many as one answer holds, each with its match."""
-        found: list[tuple[str, Message]] = []
-        for channel, kept in self._channels.items():
-            match = wanted.match(channel)
-            if match is not None and kept[-1].token > cursor:
-                found.extend((match, message) for message in kept if message.token > cursor)
-        found.sort(key=lambda entry: entry[1].token)
-        return found[:MESSAGES_AN_ANSWER]
 
 
 class PubNubStandIn:

@@ -12,13 +12,16 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from pubnub.pubnub import PubNub
 from typer.testing import CliRunner
 
 from local.cloud import EmbeddedCloud
 from local.deployment import ROOT
+from local.pubnub_standin import PubNubStandIn
 from station import robots
 from station.cli import app
 from station.cloud import EMBEDDED
+from tests.local.pubnub_sdk import sdk
 from tests.ports import free_port
 
 
@@ -71,3 +74,24 @@ def until(condition: Callable[[], Any], *, seconds: float = 60.0) -> Any:
         assert time.monotonic() < deadline, f"not true within {seconds} s"
         time.sleep(0.05)
     return value
+
+
+@pytest.fixture
+def standin() -> Iterator[PubNubStandIn]:
+    """PubNub's stand-in, with keys."""
+    with PubNubStandIn(publish_key="pub", subscribe_key="sub") as standin:
+        yield standin
+
+
+@pytest.fixture
+def client() -> Iterator[Callable[..., PubNub]]:
+    """Makes clients of PubNub's SDK, `client(standin, uuid="page")`; all are stopped before the server is."""
+    made: list[PubNub] = []
+
+    def make(standin: PubNubStandIn, **given: Any) -> PubNub:
+        made.append(sdk(standin, **given))
+        return made[-1]
+
+    yield make
+    for pubnub in made:
+        pubnub.stop()

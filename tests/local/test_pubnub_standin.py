@@ -2,58 +2,21 @@
 
 from __future__ import annotations
 
-import gzip
 import http.client
 import itertools
 import json
-import os
 import queue
-import shutil
 import socket
-import subprocess
 import threading
 import time
-from pathlib import Path
 from urllib.parse import quote
 
 import pytest
-from pubnub.enums import PNReconnectionPolicy
-from pubnub.exceptions import PubNubException
-from pubnub.pnconfiguration import PNConfiguration
-from pubnub.pubnub import PubNub, SubscribeListener
+from pubnub.pubnub import SubscribeListener
 
-import contract
 from local import pubnub_standin
-from local.pubnub_standin import History, Message, PubNubStandIn, Subscription
-
-ROOT = Path(__file__).resolve().parents[2]
-WAIT_S = 60
-
-
-@pytest.fixture
-def standin():
-    with PubNubStandIn(publish_key="pub", subscribe_key="sub") as standin:
-        yield standin
-
-
-@pytest.fixture
-def client():
-    """Make clients of the real SDK, all closed at the end, before the server is."""
-    made = []
-
-    def make(standin, *, publish_key="pub", subscribe_key="sub", uuid="car"):
-        configuration = PNConfiguration()
-        configuration.publish_key, configuration.subscribe_key = publish_key, subscribe_key
-        configuration.uuid, configuration.origin, configuration.ssl = uuid, standin.origin, False
-        configuration.daemon, configuration.disable_config_locking = True, False
-        configuration.reconnect_policy = PNReconnectionPolicy.LINEAR
-        configuration.reconnection_interval = 0.1
-        made.append(PubNub(configuration))
-        return made[-1]
-
-    yield make
-    for pubnub in made:
-        pubnub.stop()
+from local.pubnub_standin import PubNubStandIn
+from tests.local.pubnub_sdk import PAYLOADS, WAIT_S, ask, poll, publish
 
 
 def subscribe(pubnub, *channels):
@@ -62,38 +25,6 @@ def subscribe(pubnub, *channels):
     pubnub.subscribe().channels(list(channels)).execute()
     assert listener.connected_event.wait(WAIT_S), "the SDK never connected"
     return listener.message_queue
-
-
-def publish(pubnub, channel, message, *, post=False):
-    return pubnub.publish().channel(channel).message(message).use_post(post).sync()
-
-
-def ask(standin, path, method="GET", body=None, headers=None):
-    connection = http.client.HTTPConnection(standin.host, standin.port, timeout=WAIT_S)
-    try:
-        connection.request(method, path, body, headers or {})
-        response = connection.getresponse()
-        return response, response.read().decode()
-    finally:
-        connection.close()
-
-
-def poll(standin, channels, token, **arguments):
-    response, body = ask(standin, f"/v2/subscribe/sub/{channels}/0?tt={token}&uuid=raw", **arguments)
-    assert response.status == 200, body
-    answer = json.loads(body)
-    return answer["t"]["t"], answer["m"]
-
-
-PAYLOADS = [
-    {"v": 1, "sample": {"speed": 1.5, "fault_code": 0, "note": None, "ok": True}},
-    {"text": "Grüße, 世界, 🚗 \u2028 \u0000"},
-    {"html": "<script>alert('&amp;')</script> \"quoted\" \\ / ?a=b&c=d#e %2F %"},
-    [1, [2.5, -0.1], 2**63, 1e308],
-    "text, with/slash",
-    0,
-    False,
-]
 
 
 @pytest.mark.parametrize("post", [False, True], ids=["GET", "POST"])
@@ -114,22 +45,6 @@ def test_compressed_post(standin, client):
     received = subscribe(client(standin), "iort.car")
     client(standin).publish().channel("iort.car").message({"a": 1}).use_post(True).use_compression().sync()
     assert received.get(timeout=WAIT_S).message == {"a": 1}
-
-
-@pytest.mark.parametrize(
-    ("body", "answer"),
-    [
-        (gzip.compress(b"1"), [1, "Sent"]),
-        (gzip.compress(b"1" * 5_000_000), [0, "Message Too Large"]),
-        (b"not gzip", [0, "Invalid Encoding"]),
-        (gzip.compress(b"1")[:-4], [0, "Invalid Encoding"]),
-        (gzip.compress(b"\xff"), [0, "Invalid Encoding"]),
-    ],
-    ids=["good", "bomb", "broken", "cut short", "not UTF-8"],
-)
-def test_gzip(standin, body, answer):
-    _, text = ask(standin, "/publish/pub/sub/0/c/0", "POST", body, {"Content-Encoding": "gzip"})
-    assert json.loads(text)[:2] == answer
 
 
 def test_wildcard_tells_the_channel_and_the_subscription(standin, client):
@@ -281,113 +196,6 @@ def test_subscriber_that_leaves_is_forgotten(standin):
     wait_for_polls(standin, 0)
 
 
-def test_too_many_polls_are_refused(standin, monkeypatch):
-    monkeypatch.setattr(pubnub_standin, "MAX_POLLS", 0)
-    response, _ = ask(standin, "/v2/subscribe/sub/iort.car/0?tt=1")
-    assert response.status == 429
-
-
-def test_subscriber_that_does_not_read_is_cut_off(monkeypatch):
-    monkeypatch.setattr(pubnub_standin, "WRITE_S", 0.2)
-    cut = threading.Event()
-
-    class Watched(PubNubStandIn):
-        def _cut(self, request):
-            super()._cut(request)
-            cut.set()
-
-    with Watched() as standin, socket.socket() as slow:
-        token, _ = poll(standin, "iort.car", 0)
-        publisher = http.client.HTTPConnection(standin.host, standin.port, timeout=WAIT_S)
-        for _ in range(100):
-            publisher.request("POST", "/publish/pub/sub/0/iort.car/0", json.dumps("x" * 32_000))
-            assert publisher.getresponse().read()
-        publisher.close()
-        slow.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 4096)
-        slow.settimeout(WAIT_S)
-        slow.connect((standin.host, standin.port))
-        slow.sendall(f"GET /v2/subscribe/sub/iort.car/0?tt={token} HTTP/1.1\r\nHost: x\r\n\r\n".encode())
-        assert cut.wait(WAIT_S)
-        received = sum(len(chunk) for chunk in iter(lambda: slow.recv(65536), b""))
-        assert received < 100 * 32_000
-
-
-@pytest.mark.parametrize("post", [False, True], ids=["GET", "POST"])
-def test_too_large(standin, client, post):
-    pubnub = client(standin)
-    room = contract.MAX_PUBNUB_BYTES - 100 - len("c") - 2 * len("%22")
-    assert publish(pubnub, "c", "x" * room, post=post).result.timetoken
-    with pytest.raises(PubNubException) as caught:
-        publish(pubnub, "c", "x" * (room + 1), post=post)
-    assert caught.value._status_code == 413
-    assert json.loads(caught.value._errormsg)[:2] == [0, "Message Too Large"]
-    assert (standin.published, standin.refused) == (1, 1)
-
-
-def test_post_of_megabytes_is_too_large(standin):
-    response, body = ask(standin, "/publish/pub/sub/0/c/0", "POST", json.dumps("x" * 3_000_000))
-    assert (response.status, json.loads(body)[:2]) == (413, [0, "Message Too Large"])
-
-
-@pytest.mark.parametrize(
-    "keys", [{"publish_key": "no"}, {"subscribe_key": "no"}], ids=["publish", "subscribe"]
-)
-def test_wrong_key(standin, client, keys):
-    with pytest.raises(PubNubException) as caught:
-        publish(client(standin, **keys), "iort.car", 1)
-    assert caught.value._status_code == 400
-    assert json.loads(caught.value._errormsg)[:2] == [0, "Invalid Key"]
-
-
-@pytest.mark.parametrize(
-    ("path", "service"),
-    [
-        ("/v2/subscribe/no/iort.car/0", "Access Manager"),
-        ("/v2/presence/sub-key/no/channel/iort.car/heartbeat", "Presence"),
-    ],
-)
-def test_wrong_key_of_a_subscriber(standin, path, service):
-    response, body = ask(standin, path)
-    assert response.status == 400
-    assert json.loads(body) == {"status": 400, "service": service, "error": True, "message": "Invalid Key"}
-
-
-def test_any_key_where_none_is_expected(client):
-    with PubNubStandIn() as standin:
-        assert publish(client(standin, publish_key="a", subscribe_key="b"), "iort.car", 1).result.timetoken
-
-
-@pytest.mark.parametrize(
-    ("path", "status", "message"),
-    [
-        ("/publish/pub/sub/0/iort.car/0/NaN", 400, "Invalid JSON"),
-        ("/publish/pub/sub/0/iort.car/0/%7B", 400, "Invalid JSON"),
-        ("/publish/pub/sub/0/iort.car/0/" + "[" * 5_000, 400, "Invalid JSON"),
-        ("/publish/pub/sub/0/iort.car/0/%FF", 400, "Invalid Encoding"),
-        ("/publish/pub/sub/0/iort.*/0/1", 400, "Invalid Channel"),
-        ("/publish/pub/sub/0/a%2Cb/0/1", 400, "Invalid Channel"),
-        ("/publish/pub/sub/0//0/1", 400, "Invalid Channel"),
-        ("/publish/pub/sub/0/iort.car/0/1?meta=%7B%7D", 400, "meta is not supported by the stand-in"),
-        ("/v2/subscribe/sub/iort.car/0?tt=x", 400, "Invalid Timetoken"),
-        ("/v2/history/sub-key/sub/channel/iort.car", 404, "Not Found"),
-        ("/", 404, "Not Found"),
-    ],
-)
-def test_refused(standin, path, status, message):
-    response, body = ask(standin, path)
-    answer = json.loads(body)
-    assert (response.status, answer["message"] if isinstance(answer, dict) else answer[1]) == (
-        status,
-        message,
-    )
-    assert (standin.published, standin.refused) == (0, 1)
-
-
-def test_sdk_sends_nan_and_is_refused(standin, client):
-    with pytest.raises(PubNubException, match="Invalid JSON"):
-        publish(client(standin), "iort.car", {"speed": float("nan")})
-
-
 @pytest.mark.parametrize("action", ["heartbeat", "leave"])
 def test_presence(standin, action):
     response, body = ask(standin, f"/v2/presence/sub-key/sub/channel/iort.*/{action}?uuid=page")
@@ -452,112 +260,6 @@ def test_stopping_twice_and_starting_again():
 def test_busy_port_is_an_error(standin):
     with pytest.raises(OSError, match="ddress already in use"):
         PubNubStandIn(port=standin.port).start()
-
-
-def message(token, channel, size=1):
-    return Message(token, channel, "", "x" * size)
-
-
-def test_history_keeps_the_newest_of_a_channel():
-    history = History()
-    for token in range(1, 251):
-        history.add(message(token, "a"))
-    tokens = [kept.token for _, kept in history.after(0, Subscription(["a"]))]
-    assert tokens == list(range(151, 251))
-
-
-def test_history_is_bounded(monkeypatch):
-    monkeypatch.setattr(pubnub_standin, "KEPT_CHANNELS", 3)
-    monkeypatch.setattr(pubnub_standin, "KEPT_BYTES", 10)
-    history, everything = History(), Subscription(["c.*"])
-    for token in range(1, 6):
-        history.add(message(token, f"c.{token}"))
-    assert [kept.token for _, kept in history.after(0, everything)] == [3, 4, 5]
-    history.add(message(6, "c.6", 9))
-    assert [kept.token for _, kept in history.after(0, everything)] == [5, 6]
-    history.add(message(7, "c.7", 1000))
-    assert [kept.token for _, kept in history.after(0, everything)] == [7]
-
-
-def test_what_a_channel_forgets_makes_room(monkeypatch):
-    monkeypatch.setattr(pubnub_standin, "KEPT_BYTES", 1_000)
-    history = History()
-    history.add(message(1, "quiet"))
-    for token in range(2, 500):
-        history.add(message(token, "busy", 5))
-    assert [kept.token for _, kept in history.after(0, Subscription(["quiet"]))] == [1]
-
-
-def test_an_answer_is_bounded_and_its_cursor_goes_on_from_there():
-    history, wanted = History(), Subscription(["c.*"])
-    for token in range(1, 301):
-        history.add(message(token, f"c.{token % 4}"))
-    first = [kept.token for _, kept in history.after(0, wanted)]
-    rest = [kept.token for _, kept in history.after(first[-1], wanted)]
-    assert first == list(range(1, 101))
-    assert rest == list(range(101, 201))
-
-
-@pytest.fixture
-def javascript():
-    """Start the JavaScript SDK's subscriber; skip where Node or the package is absent."""
-    node = shutil.which("node")
-    modules = Path(os.environ.get("IORT_NODE_MODULES") or ROOT / "node_modules")
-    if node is None or not (modules / "pubnub").is_dir():
-        pytest.skip("needs node and the npm package pubnub: run make setup")
-    processes = []
-
-    def start(standin, channel, count):
-        script = Path(__file__).with_name("pubnub_subscriber.cjs")
-        command = [node, script, modules / "pubnub", standin.origin, channel, str(count)]
-        process = subprocess.Popen(command, stdout=subprocess.PIPE, text=True)
-        watchdog = threading.Timer(WAIT_S, process.kill)
-        watchdog.start()
-        processes.append((process, watchdog))
-        return process
-
-    yield start
-    for process, watchdog in processes:
-        watchdog.cancel()
-        process.kill()
-        process.communicate()
-
-
-def lines(process):
-    for line in process.stdout:
-        yield json.loads(line)
-
-
-def test_javascript_sdk_receives_what_python_publishes(standin, client, javascript):
-    page = javascript(standin, "iort.*", len(PAYLOADS))
-    printed = lines(page)
-    assert next(printed) == {"status": "PNConnectedCategory"}
-    publisher = client(standin)
-    for payload in PAYLOADS:
-        publish(publisher, "iort.car", payload)
-    for payload in PAYLOADS:
-        event = next(printed)
-        assert (event["channel"], event["subscription"]) == ("iort.car", "iort.*")
-        if payload != [1, [2.5, -0.1], 2**63, 1e308]:  # JavaScript's numbers are doubles
-            assert event["message"] == payload
-    assert page.wait(WAIT_S) == 0
-
-
-def test_javascript_sdk_reconnects_to_a_restarted_server(client, javascript):
-    with PubNubStandIn() as standin:
-        page = javascript(standin, "iort.*", 2)
-        printed = lines(page)
-        assert next(printed) == {"status": "PNConnectedCategory"}
-        publish(client(standin), "iort.car", "before")
-        assert next(printed)["message"] == "before"
-        standin.stop()
-        with PubNubStandIn(port=standin.port) as restarted:
-            publish(client(restarted), "iort.car", "after")
-            seen = [next(printed)]
-            while "message" not in seen[-1]:
-                seen.append(next(printed, {"message": "nothing"}))
-            assert seen[-1]["message"] == "after", seen
-            assert page.wait(WAIT_S) == 0
 
 
 def test_channel_names_are_unquoted(standin):
