@@ -37,7 +37,7 @@ def main() -> None:
 
     def take(message: rospy.AnyMsg) -> None:
         if next(numbers) % int(every) == 0:
-            packet = mqtt5.PublishPacket(topic=to, payload=message._buff, qos=mqtt5.QoS.AT_MOST_ONCE)  # noqa: SLF001 rospy names it so
+            packet = mqtt5.PublishPacket(topic=to, payload=message._buff, qos=mqtt5.QoS.AT_MOST_ONCE)  # noqa: SLF001 - rospy names it so
             client.publish(packet)
 
     rospy.init_node("bench_mqtt_floor", disable_signals=True)

@@ -52,7 +52,7 @@ def main() -> None:
     options = _options()
     console = Console()
     try:
-        from playwright.sync_api import sync_playwright  # noqa: PLC0415 (only this command needs it)
+        from playwright.sync_api import sync_playwright  # noqa: PLC0415 - only this command needs it
     except ImportError:
         sys.exit("bench-page: playwright is not installed")
     chromium = os.environ.get("CHROMIUM") or shutil.which("chromium")

@@ -9,7 +9,7 @@ count = 0
 
 def take(_message: rospy.AnyMsg) -> None:
     """Count a message."""
-    global count  # noqa: PLW0603 as bare as it gets
+    global count  # noqa: PLW0603 - as bare as it gets
     count += 1
 
 

@@ -52,7 +52,7 @@ def main() -> None:
     parser.add_argument("--out", type=Path, default=OUT)
     parser.add_argument("--only", choices=[*VIEWS], nargs="*", default=[*VIEWS])
     options = parser.parse_args()
-    from playwright.sync_api import sync_playwright  # noqa: PLC0415 (only this command needs it)
+    from playwright.sync_api import sync_playwright  # noqa: PLC0415 - only this command needs it
 
     chromium = os.environ.get("CHROMIUM") or shutil.which("chromium")
     if not chromium:
@@ -160,7 +160,7 @@ def _driving(cloud: EmbeddedCloud, folder: Path) -> Iterator[None]:
 
 def _write(path: Path, png: bytes) -> None:
     """The same picture, to the pixel, in half the bytes."""
-    from PIL import Image  # noqa: PLC0415
+    from PIL import Image  # noqa: PLC0415 - only this command needs it
 
     with Image.open(io.BytesIO(png)) as image:
         image.save(path, lossless=True, method=6)

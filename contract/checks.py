@@ -22,7 +22,7 @@ from contract.tables import NONFINITE
 FIELD_NAME = re.compile(r"[A-Za-z][A-Za-z0-9_]*(\.[A-Za-z0-9_]+)*")
 
 
-def checked(pattern: re.Pattern[str], name: str, what: str, allowed: str) -> str:
+def checked(pattern: re.Pattern[str], name: object, what: str, allowed: str) -> str:
     """``name`` itself if it matches the whole pattern."""
     if not isinstance(name, str) or not pattern.fullmatch(name):
         raise ContractError(f"{what} {shown(name)}: allowed is {allowed}")
@@ -144,6 +144,14 @@ def integer(envelope: Mapping[str, Any], key: str) -> int:
     except (TypeError, ValueError, ArithmeticError) as error:
         raise ContractError(f"{key} {shown(value)}: expected an integer") from error
     raise ContractError(f"{key} {shown(value)}: expected an integer")
+
+
+def text(envelope: Mapping[str, Any], key: str) -> str:
+    """The text under a key."""
+    value = envelope.get(key)
+    if not isinstance(value, str):
+        raise ContractError(f"{key} {shown(value)}: expected a text")
+    return value
 
 
 def json_object(text: Any, what: str) -> dict[str, Any]:

@@ -16,6 +16,7 @@ from contract.checks import (
     json_object,
     offset_entry,
     shown,
+    text,
 )
 from contract.limits import MAX_MESSAGE_BYTES, SCHEMA_VERSION, ContractError
 
@@ -74,7 +75,7 @@ def decode_command(payload: bytes | str) -> Command:
     """Read a command; raises `ContractError` for what `encode_command` cannot have written."""
     envelope = _message_envelope(payload, "command")
     command = Command(
-        session=envelope.get("session"),  # type: ignore[arg-type]
+        session=text(envelope, "session"),
         started_us=integer(envelope, "started_us"),
         seq=integer(envelope, "seq"),
         sent_us=integer(envelope, "sent_us"),

@@ -9,7 +9,7 @@ import time
 from dataclasses import dataclass
 from typing import Any, Mapping, NamedTuple, Sequence
 
-from contract.checks import BOOT, check_time, check_version, checked, integer, json_object, shown
+from contract.checks import BOOT, check_time, check_version, checked, integer, json_object, shown, text
 from contract.cloud import FILES_PREFIX
 from contract.limits import SCHEMA_VERSION, ContractError
 from contract.tables import T_US
@@ -170,15 +170,15 @@ def decode_file_request(message: bytes | str | Mapping[str, Any]) -> FileRequest
     if not isinstance(given, Mapping) or not isinstance(parts, Mapping):
         raise ContractError("file and parts: expected an object each")
     file = File(
-        name=given.get("name"),  # type: ignore[arg-type]
-        kind=given.get("kind"),  # type: ignore[arg-type]
-        content_type=given.get("content_type"),  # type: ignore[arg-type]
+        name=text(given, "name"),
+        kind=text(given, "kind"),
+        content_type=text(given, "content_type"),
         size=integer(given, "size"),
-        sha256=given.get("sha256"),  # type: ignore[arg-type]
+        sha256=text(given, "sha256"),
         t_us=integer(given, T_US),
     )
     numbered = {int(n) if str(n).isdecimal() and len(str(n)) < 6 else -1: sha for n, sha in parts.items()}
-    request = FileRequest(envelope.get("id"), file, numbered, envelope.get("parts_sha256"))  # type: ignore[arg-type]
+    request = FileRequest(text(envelope, "id"), file, numbered, envelope.get("parts_sha256"))
     _check_file_request(request)
     return request
 
@@ -203,7 +203,7 @@ def decode_file_answer(message: bytes | str) -> FileAnswer:
     """Read an answer; raises `ContractError` for what `encode_file_answer` cannot have written."""
     envelope = json_object(message, "file answer")
     check_version(envelope)
-    given_id = checked(BOOT, envelope.get("id"), "id", "8 to 32 of 0-9 a-f")  # type: ignore[arg-type]
+    given_id = checked(BOOT, envelope.get("id"), "id", "8 to 32 of 0-9 a-f")
     if "refused" in envelope:
         again_s = integer(envelope, "again_s") if "again_s" in envelope else None
         if again_s is not None and not 0 <= again_s <= _MAX_WAIT_S:

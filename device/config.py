@@ -1,7 +1,5 @@
 """The agent's configuration: one YAML file, read once, into frozen dataclasses."""
 
-# ruff: noqa: RUF009 - `setting` makes a dataclass field, as `field` does
-
 from __future__ import annotations
 
 from dataclasses import dataclass

@@ -74,7 +74,7 @@ class CommandConfig:
     type: str = setting(text(_ros_type))
     partial: bool = setting(flag(), default=False)
     max_age_s: float = setting(number(0.05, contract.MAX_VALID_MS / 1000, unit="s"), 1.0)
-    motion: MotionConfig | None = setting(section(MotionConfig), default=None)  # noqa: RUF009 - a field
+    motion: MotionConfig | None = setting(section(MotionConfig), default=None)
 
 
 @dataclass(frozen=True)

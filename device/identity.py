@@ -4,8 +4,6 @@ A claim, a certificate good for this alone, is exchanged for the robot's own: Cr
 then RegisterThing with the fleet's template. The operator makes claims with `iort robots claim`.
 """
 
-# ruff: noqa: RUF009 - `setting` makes a dataclass field, as `field` does
-
 from __future__ import annotations
 
 import contextlib
@@ -168,8 +166,8 @@ class _Exchange:
 
     def __init__(self, claim: Claim) -> None:
         # Reading a configuration must not need the network's library.
-        from awscrt import mqtt5  # noqa: PLC0415
-        from awsiot import mqtt5_client_builder  # noqa: PLC0415
+        from awscrt import mqtt5  # noqa: PLC0415 - the network's library
+        from awsiot import mqtt5_client_builder  # noqa: PLC0415 - as above
 
         self._template = contract.fleet_name(claim.namespace)
         self._ended = threading.Event()
@@ -193,8 +191,8 @@ class _Exchange:
         self._requests: Any = None
 
     def __enter__(self) -> _Exchange:  # noqa: PYI034 - Self came with Python 3.11
-        from awscrt import mqtt_request_response  # noqa: PLC0415
-        from awsiot import iotidentity  # noqa: PLC0415
+        from awscrt import mqtt_request_response  # noqa: PLC0415 - the network's library
+        from awsiot import iotidentity  # noqa: PLC0415 - the network's library
 
         self._client.start()
         if not self._ended.wait(_WAIT_S) or not self._connected:
@@ -217,7 +215,7 @@ class _Exchange:
 
     def certify(self, request: str) -> tuple[str, str]:
         """The certificate for a request, and the token that says it is ours."""
-        from awsiot import iotidentity  # noqa: PLC0415
+        from awsiot import iotidentity  # noqa: PLC0415 - the network's library
 
         asked = iotidentity.CreateCertificateFromCsrRequest(certificate_signing_request=request)
         answer = self._result("CreateCertificateFromCsr", self._requests.create_certificate_from_csr(asked))
@@ -225,7 +223,7 @@ class _Exchange:
 
     def register(self, token: str, parameters: Mapping[str, str]) -> str:
         """Register the robot with its certificate; the thing's name."""
-        from awsiot import iotidentity  # noqa: PLC0415
+        from awsiot import iotidentity  # noqa: PLC0415 - the network's library
 
         asked = iotidentity.RegisterThingRequest(
             template_name=self._template,
@@ -247,7 +245,7 @@ class _Exchange:
         self._ended.set()
 
     def _on_failure(self, data: Any) -> None:
-        from device.failures import explain, said  # noqa: PLC0415
+        from device.failures import explain, said  # noqa: PLC0415 - it loads the network's library
 
         packet = data.connack_packet
         self._failure = said(packet) if packet is not None else explain(data.exception)
@@ -272,7 +270,7 @@ def _wait_connected(config: Config, certificate_id: str, status_socket: Path) ->
 
 
 def _try_alone(config: Config) -> None:
-    from device.check import FAIL, broker_findings  # noqa: PLC0415
+    from device.check import FAIL, broker_findings  # noqa: PLC0415 - as above
 
     for finding in broker_findings(config):
         if finding.level == FAIL:

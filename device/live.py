@@ -162,7 +162,7 @@ class LiveLane:
 def _fault(newest: _Newest) -> Value:
     """The fault code; None for NaN, which is another than itself each time."""
     code = newest.values.get(contract.FAULT_FIELD)
-    return code if code == code else None  # noqa: PLR0124 what NaN is not
+    return code if code == code else None  # noqa: PLR0124 - what NaN is not
 
 
 def _fault_due(slot: _Slot, now: float) -> bool:

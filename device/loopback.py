@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from functools import partial
 from typing import Callable, NamedTuple, Optional
 
 from device.clock import Clock
@@ -81,7 +82,7 @@ class Loopback:
         message = Message(topic, payload, self._clock.monotonic())
         for topic_filter, handler in self._subscriptions.items():
             if matches(topic_filter, topic):
-                self._dispatcher.post(lambda handler=handler: handler(message))  # type: ignore[misc]
+                self._dispatcher.post(partial(handler, message))
 
     def release(self, *, error: str | None = None, count: int | None = None) -> None:
         """Acknowledge what was held back, or fail it; the first ``count`` of it or all."""
@@ -116,7 +117,7 @@ class Loopback:
         self._connects += connected
         self._switched = self._clock.monotonic()
         for handler in self._handlers:
-            self._dispatcher.post(lambda handler=handler: handler(connected))  # type: ignore[misc]
+            self._dispatcher.post(partial(handler, connected))
 
     def _finish(self, done: Done, error: UplinkError | None) -> None:
         self._dispatcher.post(lambda: done(error))

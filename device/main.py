@@ -106,7 +106,7 @@ def run(options: argparse.Namespace) -> int:
         config = dataclasses.replace(config, log_level=options.log_level)
     troubles = set_up(config.log_level)
     # Reading a configuration must not need the network's library.
-    from device.iotcore import make_uplink  # noqa: PLC0415
+    from device.iotcore import make_uplink  # noqa: PLC0415 - it loads the library
 
     clock = SystemClock()
     uplink = make_uplink(config, clock)
@@ -132,8 +132,8 @@ def run(options: argparse.Namespace) -> int:
 
 def check(options: argparse.Namespace) -> int:
     """`iort-agent check`: status 1 if something would not work."""
-    from device.check import FAIL, render  # noqa: PLC0415
-    from device.check import check as findings_of  # noqa: PLC0415
+    from device.check import FAIL, render  # noqa: PLC0415 - it loads the network's library
+    from device.check import check as findings_of  # noqa: PLC0415 - as above
 
     config = load_config(options.config)
     findings = []
@@ -155,7 +155,7 @@ def show_status(options: argparse.Namespace) -> int:
 
 def upload(options: argparse.Namespace) -> int:
     """`iort-agent upload`: status 1 if a file is not in the bucket now."""
-    from device.upload_command import upload_files  # noqa: PLC0415
+    from device.upload_command import upload_files  # noqa: PLC0415 - as above
 
     config = load_config(options.config)
     results = upload_files(config, options.files, status_socket=_socket(options, config))
@@ -175,7 +175,7 @@ def upload(options: argparse.Namespace) -> int:
 
 def provision(options: argparse.Namespace) -> int:
     """`iort-agent provision`."""
-    from device import identity  # noqa: PLC0415
+    from device import identity  # noqa: PLC0415 - as above
 
     written = identity.provision(options.config, robot=options.robot)
     print(f"{written} and its certificate are ready: `iort-agent check --config {written}`")
@@ -184,7 +184,7 @@ def provision(options: argparse.Namespace) -> int:
 
 def renew(options: argparse.Namespace) -> int:
     """`iort-agent renew`."""
-    from device import identity  # noqa: PLC0415
+    from device import identity  # noqa: PLC0415 - as above
 
     config = load_config(options.config)
     identity.renew(options.config, options.claim, status_socket=_socket(options, config))

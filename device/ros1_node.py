@@ -298,7 +298,7 @@ class Node:
                 forgotten.append(topic)
         for topic in self._publishers:
             if me not in publishers.get(topic, ()):
-                self._ask("registerPublisher", topic, self._wanted[topic]._type, api)  # noqa: SLF001
+                self._ask("registerPublisher", topic, self._wanted[topic]._type, api)  # noqa: SLF001 - as below
                 forgotten.append(topic)
         return forgotten
 

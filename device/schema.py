@@ -190,7 +190,7 @@ def variant(key: str, classes: Mapping[str, type[Any]]) -> Rule:
 
 def load(cls: type[T], value: Any, where: Where) -> T:
     """The dataclass made of a mapping. Raises `ConfigError` for whatever a rule refuses."""
-    rules = {f.name: f for f in dataclasses.fields(cls)}  # type: ignore[arg-type]
+    rules = {f.name: f for f in dataclasses.fields(cls)}  # type: ignore[arg-type]  # T is any dataclass
     if not isinstance(value, dict):
         raise where.error(value, f"a mapping with some of the keys {', '.join(rules)}")
     for key in value:
@@ -210,7 +210,7 @@ def read_yaml(file: Path) -> Any:
     """The content of a YAML file. Raises `ConfigError` where it cannot be read or is no YAML."""
     try:
         # A subclass of SafeLoader: no Python objects are made.
-        return yaml.load(file.read_text(encoding="utf-8"), Loader=_UniqueKeyLoader)  # noqa: S506
+        return yaml.load(file.read_text(encoding="utf-8"), Loader=_UniqueKeyLoader)  # noqa: S506 - see above
     except OSError as error:
         raise ConfigError(f"{file}: cannot be read: {error.strerror}") from error
     except UnicodeDecodeError as error:
@@ -222,7 +222,7 @@ def read_yaml(file: Path) -> Any:
 class _UniqueKeyLoader(yaml.SafeLoader):
     """Refuses a key given twice, of which YAML would quietly keep the last."""
 
-    def construct_mapping(self, node: yaml.MappingNode, deep: bool = False) -> dict[Any, Any]:  # noqa: FBT001, FBT002
+    def construct_mapping(self, node: yaml.MappingNode, deep: bool = False) -> dict[Any, Any]:  # noqa: FBT001, FBT002 - as PyYAML has it
         keys = [self.construct_object(key, deep=True) for key, _ in node.value]
         for i, key in enumerate(keys):
             if key in keys[:i]:

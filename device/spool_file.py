@@ -245,14 +245,14 @@ def _known(db: sqlite3.Connection) -> dict[int, int]:
     for source in ("batches NOT INDEXED", "batches INDEXED BY ledger"):
         for order in ("ASC", "DESC"):
             with contextlib.suppress(sqlite3.Error):
-                known.update(db.execute(f"SELECT id, samples FROM {source} ORDER BY id {order}"))  # noqa: S608
+                known.update(db.execute(f"SELECT id, samples FROM {source} ORDER BY id {order}"))  # noqa: S608 - names of our own
     return {i: n for i, n in known.items() if type(i) is int and type(n) is int}
 
 
 def _read(db: sqlite3.Connection, where: str, first: int, max_bytes: int | None = None) -> list[Entry]:
     entries, total = [], 0
     rows = db.execute(
-        f"SELECT id, stream, seq, samples, crc, payload FROM batches WHERE {where} ORDER BY id",  # noqa: S608
+        f"SELECT id, stream, seq, samples, crc, payload FROM batches WHERE {where} ORDER BY id",  # noqa: S608 - conditions of our own
         (first,),
     )
     try:

@@ -245,7 +245,7 @@ class SqliteSpool:
                 continue
             try:
                 self._work(force=False)
-            except Exception as error:  # noqa: BLE001
+            except Exception as error:  # noqa: BLE001 - the thread has to live
                 # Whatever it is, batches must still go out.
                 _log.exception("queue: the thread failed, and goes on")
                 self._go_adrift(error)

@@ -48,7 +48,7 @@ class Tuning:
 
 def _rule(cls: type[Any], name: str) -> Rule:
     (rule,) = (f.metadata["rule"] for f in dataclasses.fields(cls) if f.name == name)
-    return rule  # type: ignore[no-any-return]
+    return rule  # type: ignore[no-any-return]  # metadata is of any type
 
 
 RULES: dict[str, Rule] = {

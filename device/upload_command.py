@@ -37,7 +37,7 @@ def upload_files(config: Config, paths: Sequence[Path], *, status_socket: Path) 
     """
     _refuse_beside_agent(config, status_socket)
     # Reading a configuration must not need the network's library.
-    from device.iotcore import make_uplink  # noqa: PLC0415
+    from device.iotcore import make_uplink  # noqa: PLC0415 - it loads the library
 
     set_up("warning")
     clock, stop = SystemClock(), threading.Event()

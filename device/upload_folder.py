@@ -4,8 +4,6 @@ What was uploaded, and what a file was found to hold, is kept in a small file in
 the end of the process costs no second upload and no second reading.
 """
 
-# ruff: noqa: RUF009 - `setting` makes a dataclass field, as `field` does
-
 from __future__ import annotations
 
 import json

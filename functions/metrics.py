@@ -57,7 +57,7 @@ def write(function: str, values: Values, at_s: float, robot: str | None = None) 
         **dimensions,
         **shown,
     }
-    print(json.dumps(line, separators=(",", ":")))  # noqa: T201 the log line is the metric
+    print(json.dumps(line, separators=(",", ":")))  # noqa: T201 - the log line is the metric
 
 
 class Gathered:

@@ -110,7 +110,7 @@ class EmbeddedCloud:
             endpoint_url=f"https://{self.host}:{ports['gateway']}",
             ca_bundle=str(certificate),
             access_key_id="test",
-            secret_access_key="test",  # noqa: S106 what the emulator takes for its root user
+            secret_access_key="test",  # noqa: S106 - what the emulator takes for its root user
             mqtt_host=self.host,
             mqtt_port=ports["mqtt"],
         )
@@ -219,7 +219,7 @@ class EmbeddedCloud:
 
     def _get(self, path: str) -> bytes:
         context = ssl.create_default_context(cafile=self.cloud.ca_bundle)
-        with urllib.request.urlopen(  # noqa: S310 always https
+        with urllib.request.urlopen(  # noqa: S310 - always https
             f"{self.cloud.endpoint_url}{path}", timeout=5, context=context
         ) as response:
             return bytes(response.read())

@@ -22,7 +22,7 @@ def install() -> None:
     """Close the gap in this process, before the emulator starts."""
     iot.handle_request = _ending_with_the_certificate(iot.handle_request)
     iot_data.handle_request = _with_delete_connection(iot_data.handle_request)
-    iot._mtls_serve_conn = _for_a_certificate(iot._mtls_serve_conn)  # noqa: SLF001
+    iot._mtls_serve_conn = _for_a_certificate(iot._mtls_serve_conn)
 
 
 def _ending_with_the_certificate(handle: Callable[..., Any]) -> Callable[..., Any]:
@@ -31,9 +31,9 @@ def _ending_with_the_certificate(handle: Callable[..., Any]) -> Callable[..., An
         answer = await handle(method, path, *rest)
         if method in {"PUT", "DELETE"} and path.startswith("/certificates/"):
             number = path.rsplit("/", 1)[-1]
-            record = iot._certificates.get(number)  # noqa: SLF001
+            record = iot._certificates.get(number)
             if record is None or record["status"] != "ACTIVE":
-                for session in list(iot._connected_clients.values()):  # noqa: SLF001
+                for session in list(iot._connected_clients.values()):
                     if session.certificate_id == number:
                         await _cut(session, "AUTH_ERROR", _NOT_AUTHORIZED)
         return answer
@@ -48,13 +48,13 @@ def _with_delete_connection(handle: Callable[..., Any]) -> Callable[..., Any]:
             return await handle(method, path, headers, body, query)
         client = unquote(path[len("/connections/") :])
         key = (get_account_id(), get_region(), client)
-        session = iot._connected_clients.get(key)  # noqa: SLF001
+        session = iot._connected_clients.get(key)
         if session is None:
             return error_response_json("ResourceNotFoundException", f"Client {client} is not connected", 404)
         if _says(query, "preventWillMessage"):
-            session._will_topic = None  # noqa: SLF001
+            session._will_topic = None
         if _says(query, "cleanSession"):
-            session._persist_session = False  # noqa: SLF001
+            session._persist_session = False
         await _cut(session, "API_INITIATED_DISCONNECT", _ADMINISTRATIVE_ACTION)
         return 200, {"Content-Type": "application/json"}, b""
 
@@ -66,7 +66,7 @@ def _for_a_certificate(serve: Callable[..., Any]) -> Callable[..., Any]:
     async def serve_connection(reader: Any, writer: Any) -> None:
         tls = writer.get_extra_info("ssl_object")
         if tls is None or not tls.getpeercert(binary_form=True):
-            await iot._mtls_close(writer)  # noqa: SLF001
+            await iot._mtls_close(writer)
         else:
             await serve(reader, writer)
 
@@ -80,10 +80,10 @@ def _says(query: Any, name: str) -> bool:
 
 async def _cut(session: Any, reason: str, code: int) -> None:
     """End a session as the broker does when it is taken over, for another reason."""
-    session._forced_disconnect_reason = reason  # noqa: SLF001
+    session._forced_disconnect_reason = reason
     # The client may be gone already.
     with contextlib.suppress(Exception):
         if session.protocol_version == iot.MQTT_5:
-            await session.send_bytes(iot._make_disconnect(code))  # noqa: SLF001
-        await session._send({"type": "websocket.close", "code": 1000})  # noqa: SLF001
+            await session.send_bytes(iot._make_disconnect(code))
+        await session._send({"type": "websocket.close", "code": 1000})
     await session.cleanup()

@@ -15,7 +15,7 @@ def main() -> None:
     metrics.install()
     metrics.start(os.environ["MINISTACK_REGION"])
     # Under USE_SSL it would also take port 443 of the machine, where it may.
-    app._port_is_bindable = lambda _host, _port: False  # noqa: SLF001
+    app._port_is_bindable = lambda _host, _port: False
     app.main()
 
 

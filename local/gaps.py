@@ -52,16 +52,16 @@ class MessageTooLargeError(ConnectionError):
 def install() -> None:
     """Close the gaps in this process, before the emulator starts."""
     cut_sessions.install()
-    iot._run_rule_actions = _expanding_republish(iot._run_rule_actions)  # noqa: SLF001
-    iot._eval_select_function = _with_floor(iot._eval_select_function)  # noqa: SLF001
-    iot._IMPLEMENTED_SQL_FUNCS |= {"floor"}  # noqa: SLF001
+    iot._run_rule_actions = _expanding_republish(iot._run_rule_actions)
+    iot._eval_select_function = _with_floor(iot._eval_select_function)
+    iot._IMPLEMENTED_SQL_FUNCS |= {"floor"}
     iot.broker_publish = _refusing_large(iot.broker_publish)
-    iot._MtlsAcceptor.connection_made = _once_reading(iot._MtlsAcceptor.connection_made)  # noqa: SLF001
-    iot._dispatch_rule_sqs = _over_tls(iot._dispatch_rule_sqs)  # noqa: SLF001
+    iot._MtlsAcceptor.connection_made = _once_reading(iot._MtlsAcceptor.connection_made)
+    iot._dispatch_rule_sqs = _over_tls(iot._dispatch_rule_sqs)
     iam_actions.extract_iam_action = _as_one_message(iam_actions.extract_iam_action)
-    iot._parse_fleet_provisioning_topic = _with_csr(iot._parse_fleet_provisioning_topic)  # noqa: SLF001
-    iot._fleet_provisioning_reply = _certifying(iot._fleet_provisioning_reply)  # noqa: SLF001
-    iot._dispatch_rule_to_lambda = AsyncInvocations().dispatch  # noqa: SLF001
+    iot._parse_fleet_provisioning_topic = _with_csr(iot._parse_fleet_provisioning_topic)
+    iot._fleet_provisioning_reply = _certifying(iot._fleet_provisioning_reply)
+    iot._dispatch_rule_to_lambda = AsyncInvocations().dispatch
     stream_gap.install()
     table_gap.install()
     log_gap.install()
@@ -103,8 +103,8 @@ def _with_floor(evaluate: Callable[..., Any]) -> Callable[..., Any]:
     def evaluate_function(name: str, args: list[str], *context: Any) -> Any:
         if name != "floor" or len(args) != 1:
             return evaluate(name, args, *context)
-        value = iot._sql_as_number(iot._eval_select_expr(args[0], *context))  # noqa: SLF001
-        return iot._MISSING if value is None else math.floor(value)  # noqa: SLF001
+        value = iot._sql_as_number(iot._eval_select_expr(args[0], *context))
+        return iot._MISSING if value is None else math.floor(value)
 
     return evaluate_function
 
@@ -162,15 +162,15 @@ def _certifying(reply: Callable[..., Any]) -> Callable[..., Any]:
             return await reply(account, region, operation, *rest)
         request = _json_object(rest[1]).get("certificateSigningRequest")
         try:
-            pem = iot.sign_certificate_request(*iot._ensure_ca(), request or "")  # noqa: SLF001
+            pem = iot.sign_certificate_request(*iot._ensure_ca(), request or "")
         except ValueError:
-            return iot._fleet_rejected("InvalidCsr", "CSR violates constraints")  # noqa: SLF001
+            return iot._fleet_rejected("InvalidCsr", "CSR violates constraints")
         number, token = iot.get_certificate_id(pem), secrets.token_urlsafe(48)
         with iot.request_scope(account, region):
-            record = iot._certificate_record(number, pem, "PENDING_ACTIVATION")  # noqa: SLF001
-            iot._certificates[number] = record  # noqa: SLF001
-            expires = time.time() + iot._OWNERSHIP_TOKEN_SECONDS  # noqa: SLF001
-            iot._ownership_tokens[token] = {"certificateId": number, "expiration": expires}  # noqa: SLF001
+            record = iot._certificate_record(number, pem, "PENDING_ACTIVATION")
+            iot._certificates[number] = record
+            expires = time.time() + iot._OWNERSHIP_TOKEN_SECONDS
+            iot._ownership_tokens[token] = {"certificateId": number, "expiration": expires}
         return "accepted", {
             "certificateId": number,
             "certificatePem": pem,
@@ -197,15 +197,15 @@ class AsyncInvocations:
 
     def dispatch(self, account: str, region: str, function_arn: str, event: Any) -> None:
         """Queue one event; raises `LookupError` for a function that is not there."""
-        function, config, _ = lambda_svc._get_func_record_for_ref_in_scope(  # noqa: SLF001
+        function, config, _ = lambda_svc._get_func_record_for_ref_in_scope(
             function_arn, account_id=account, region=region
         )
         if not function or not config:
             raise LookupError(f"function {function_arn} not found")
-        record = lambda_svc._execution_record_for_config(function, config)  # noqa: SLF001
+        record = lambda_svc._execution_record_for_config(function, config)
         pool = self._pools.get(function_arn)
         if pool is None:
-            reserved = lambda_svc._reserved_concurrency(function, config)  # noqa: SLF001
+            reserved = lambda_svc._reserved_concurrency(function, config)
             cores = os.cpu_count() or 1
             pool = ThreadPoolExecutor(cores if reserved is None else max(1, min(cores, reserved)))
             self._pools[function_arn] = pool
@@ -217,17 +217,17 @@ def _invoke(account: str, region: str, record: dict[str, Any], event: Any, queue
     # The CDK gives them to the version $LATEST, which is what a rule calls.
     settings: dict[str, Any] = {}
     for qualifier in ("$LATEST", None):
-        settings = settings or lambda_svc._event_invoke_config(record, qualifier) or {}  # noqa: SLF001
+        settings = settings or lambda_svc._event_invoke_config(record, qualifier) or {}
     retries, age_s = settings.get("MaximumRetryAttempts"), settings.get("MaximumEventAgeInSeconds")
     result: dict[str, Any] = {"body": {"errorMessage": "the event was too old"}}
     for _ in range(1 + (2 if retries is None else int(retries))):
         if time.monotonic() - queued_s > (21_600 if age_s is None else int(age_s)):
             break
-        result = lambda_svc._execute_function_with_config_scope(record, event)  # noqa: SLF001
+        result = lambda_svc._execute_function_with_config_scope(record, event)
         if not result.get("error"):
             return
     destination = ((settings.get("DestinationConfig") or {}).get("OnFailure") or {}).get("Destination")
     if destination:
         name = record["config"]["FunctionName"]
         with iot.request_scope(account, region):
-            lambda_svc._route_async_failure(destination, name, event, result)  # noqa: SLF001
+            lambda_svc._route_async_failure(destination, name, event, result)

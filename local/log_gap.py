@@ -23,13 +23,13 @@ _MOST_S = 1.0
 
 def install() -> None:
     """Close the gap in this process, before the emulator starts."""
-    worker = lambda_runtime._PYTHON_WORKER_SCRIPT  # noqa: SLF001
+    worker = lambda_runtime._PYTHON_WORKER_SCRIPT
     if worker.count(_ANSWERED) != 1:
         raise RuntimeError("ministack's Python worker is another than the one that local/log_gap.py knows")
     said = f"        print({_END!r}, file=sys.stderr, flush=True)\n"
-    lambda_runtime._PYTHON_WORKER_SCRIPT = worker.replace(_ANSWERED, said + _ANSWERED)  # noqa: SLF001
-    drain = lambda_runtime.Worker._drain_stderr_bounded  # noqa: SLF001
-    lambda_runtime.Worker._drain_stderr_bounded = _to_the_end(drain)  # noqa: SLF001
+    lambda_runtime._PYTHON_WORKER_SCRIPT = worker.replace(_ANSWERED, said + _ANSWERED)
+    drain = lambda_runtime.Worker._drain_stderr_bounded
+    lambda_runtime.Worker._drain_stderr_bounded = _to_the_end(drain)
 
 
 def _to_the_end(drain: Callable[..., str]) -> Callable[[Any], str]:
@@ -40,7 +40,7 @@ def _to_the_end(drain: Callable[..., str]) -> Callable[[Any], str]:
         deadline = time.monotonic() + _MOST_S
         while (left_s := deadline - time.monotonic()) > 0:
             try:
-                line = worker._stderr_queue.get(timeout=left_s)  # noqa: SLF001
+                line = worker._stderr_queue.get(timeout=left_s)
             except queue.Empty:
                 break
             if line == _END:

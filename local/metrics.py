@@ -39,14 +39,14 @@ _running: dict[str, int] = defaultdict(int)
 
 def install() -> None:
     """Close the gaps in this process, before the emulator starts."""
-    lambda_svc._execute_function_dispatch = _counting_invocations(lambda_svc._execute_function_dispatch)  # noqa: SLF001
+    lambda_svc._execute_function_dispatch = _counting_invocations(lambda_svc._execute_function_dispatch)
     # It counted synchronous invocations only; they are counted above.
-    lambda_svc._emit_lambda_metrics = _throttles  # noqa: SLF001
-    iot._run_rule_actions = _counting_matches(iot._run_rule_actions)  # noqa: SLF001
-    iot._dispatch_rule_action = _counting_actions(iot._dispatch_rule_action)  # noqa: SLF001
+    lambda_svc._emit_lambda_metrics = _throttles
+    iot._run_rule_actions = _counting_matches(iot._run_rule_actions)
+    iot._dispatch_rule_action = _counting_actions(iot._dispatch_rule_action)
     iot.broker_publish = _counting_messages(iot.broker_publish)
-    cloudwatch._get_metric_data = _searching(cloudwatch._get_metric_data)  # noqa: SLF001
-    cloudwatch._evaluate_alarm = evaluate  # noqa: SLF001
+    cloudwatch._get_metric_data = _searching(cloudwatch._get_metric_data)
+    cloudwatch._evaluate_alarm = evaluate
 
 
 def start(region: str) -> None:
@@ -61,7 +61,7 @@ def record(namespace: str, name: str, value: float, unit: str, **dimensions: str
     """Add a value to the minute that is running."""
     minute = int(time.time()) // _MINUTE_S * _MINUTE_S
     with _lock:
-        bucket = cloudwatch._metric_bucket((namespace, name, cloudwatch._dims_key(dimensions)))  # noqa: SLF001
+        bucket = cloudwatch._metric_bucket((namespace, name, cloudwatch._dims_key(dimensions)))
         running = [point for point in bucket[-_VALUES:] if point["Timestamp"] == minute]
         same = next((point for point in running if point["Value"] == value), None)
         if same is None and len(running) == _VALUES:
@@ -212,7 +212,7 @@ def expand(query: dict[str, Any]) -> Iterator[dict[str, Any]]:
     namespace, *names = found["schema"].split(",")
     wanted = dict(re.findall(r'(\w+)="([^"]*)"', found["wanted"]))
     metric = wanted.pop("MetricName")
-    for key_namespace, key_metric, key_dimensions in list(cloudwatch._metrics.keys()):  # noqa: SLF001
+    for key_namespace, key_metric, key_dimensions in list(cloudwatch._metrics.keys()):
         dimensions = dict(part.split("=", 1) for part in key_dimensions.split("|") if part)
         if (key_namespace, key_metric) != (namespace, metric) or dimensions.keys() != set(names):
             continue
@@ -245,18 +245,18 @@ def evaluate(alarm: dict[str, Any]) -> None:
         return
     reason = f"{alarm['MetricName']} {alarm['ComparisonOperator']} {alarm['Threshold']}: {after}"
     alarm |= {"StateValue": after, "StateReason": reason, "StateUpdatedTimestamp": int(time.time())}
-    cloudwatch._record_history(alarm["AlarmName"], before, after, reason)  # noqa: SLF001
-    cloudwatch._dispatch_alarm_actions(alarm, before, after, reason)  # noqa: SLF001
+    cloudwatch._record_history(alarm["AlarmName"], before, after, reason)
+    cloudwatch._dispatch_alarm_actions(alarm, before, after, reason)
 
 
 def _breaching(alarm: Mapping[str, Any], now_s: float) -> bool:
     """Whether all of the last periods are over the threshold, with or without the one that is running."""
     period, count = int(alarm.get("Period") or 60), int(alarm.get("EvaluationPeriods") or 1)
     dimensions = {d["Name"]: d["Value"] for d in alarm.get("Dimensions") or []}
-    key = (alarm.get("Namespace"), alarm.get("MetricName"), cloudwatch._dims_key(dimensions))  # noqa: SLF001
+    key = (alarm.get("Namespace"), alarm.get("MetricName"), cloudwatch._dims_key(dimensions))
     buckets: dict[int, list[Any]] = defaultdict(list)
     with _lock:
-        for point in cloudwatch._metrics.get(key) or []:  # noqa: SLF001
+        for point in cloudwatch._metrics.get(key) or []:
             buckets[int(point["Timestamp"] // period)].append(point)
     statistic = alarm.get("ExtendedStatistic") or alarm.get("Statistic") or "Average"
 
@@ -264,7 +264,7 @@ def _breaching(alarm: Mapping[str, Any], now_s: float) -> bool:
         points = buckets.get(index)
         if not points:
             return False
-        value = cloudwatch._stat_value(cloudwatch._calc_stats(points), statistic, points)  # noqa: SLF001
+        value = cloudwatch._stat_value(cloudwatch._calc_stats(points), statistic, points)
         limit, operator = float(alarm["Threshold"]), alarm["ComparisonOperator"]
         if operator in _BELOW:
             return bool(value < limit or (_BELOW[operator] and value == limit))
@@ -278,13 +278,13 @@ def _tick(region: str) -> None:
     set_request_region(region)
     while True:
         time.sleep(_TICK_S)
-        for queue in list(sqs._queues.values()):  # noqa: SLF001
-            sqs._refresh_counts(queue)  # noqa: SLF001
+        for queue in list(sqs._queues.values()):
+            sqs._refresh_counts(queue)
             waiting = float(queue["attributes"]["ApproximateNumberOfMessages"])
             name = queue["attributes"]["QueueArn"].rsplit(":", 1)[-1]
             record("AWS/SQS", "ApproximateNumberOfMessagesVisible", waiting, "Count", QueueName=name)
-        cloudwatch._evaluate_all_alarms()  # noqa: SLF001
+        cloudwatch._evaluate_all_alarms()
         oldest_s = time.time() - _KEPT_S
         with _lock:
-            for key, points in list(cloudwatch._metrics.items()):  # noqa: SLF001
-                cloudwatch._metrics[key] = [point for point in points if point["Timestamp"] >= oldest_s]  # noqa: SLF001
+            for key, points in list(cloudwatch._metrics.items()):
+                cloudwatch._metrics[key] = [point for point in points if point["Timestamp"] >= oldest_s]

@@ -37,7 +37,7 @@ class Child:
         self.name, self.log = name, log
         with log.open("wb") as output:
             try:
-                self._process = subprocess.Popen(  # noqa: S603 the command is ours
+                self._process = subprocess.Popen(  # noqa: S603 - the command is ours
                     list(command),
                     env=dict(environment),
                     cwd=cwd,
@@ -45,7 +45,7 @@ class Child:
                     stdout=output,
                     stderr=subprocess.STDOUT,
                     start_new_session=True,
-                    preexec_fn=_die_with(os.getpid(), orphaned),  # noqa: PLW1509 see there
+                    preexec_fn=_die_with(os.getpid(), orphaned),  # noqa: PLW1509 - see there
                 )
             except OSError as error:
                 raise LocalError(f"{name} cannot be started: {error}") from error

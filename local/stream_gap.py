@@ -34,7 +34,7 @@ _AHEAD = 2_000
 
 def install() -> None:
     """Close the gap in this process, before the emulator starts."""
-    lambda_svc._poll_dynamodb_streams = StreamMappings().poll  # noqa: SLF001
+    lambda_svc._poll_dynamodb_streams = StreamMappings().poll
     iam_actions.extract_resource_arn = _knowing_streams(iam_actions.extract_resource_arn)
 
 
@@ -49,7 +49,7 @@ def _knowing_streams(resource_arn: Callable[..., str]) -> Callable[..., str]:
             asked = json.loads(request[3] or b"{}")
         except ValueError:
             asked = {}
-        iterator = dynamodb_streams._decode_iterator(asked.get("ShardIterator") or "") or {}  # noqa: SLF001
+        iterator = dynamodb_streams._decode_iterator(asked.get("ShardIterator") or "") or {}
         return str(asked.get("StreamArn") or iterator.get("arn") or "*")
 
     return extract
@@ -80,7 +80,7 @@ class StreamMappings:
     def poll(self) -> bool:
         """Start what there is to start; whether anything was."""
         started = False
-        for account, region, mapping in lambda_svc._iter_all_esms():  # noqa: SLF001
+        for account, region, mapping in lambda_svc._iter_all_esms():
             if mapping.get("Enabled", True) and ":dynamodb:" in mapping.get("EventSourceArn", ""):
                 with request_scope(account, region):
                     started = self._serve(account, region, mapping) or started
@@ -88,10 +88,10 @@ class StreamMappings:
 
     def _serve(self, account: str, region: str, mapping: dict[str, Any]) -> bool:
         table = mapping["EventSourceArn"].split("/stream/")[0].rsplit("/", 1)[-1]
-        function, _ = lambda_svc._get_func_record_for_qualifier(  # noqa: SLF001
+        function, _ = lambda_svc._get_func_record_for_qualifier(
             mapping["FunctionName"], mapping.get("Qualifier")
         )
-        if function is None or table not in dynamodb._tables:  # noqa: SLF001
+        if function is None or table not in dynamodb._tables:
             return False
         running = self._of(account, region, mapping, table)
         self._read(running, table)
@@ -121,7 +121,7 @@ class StreamMappings:
             latest = mapping.get("StartingPosition") == "LATEST"
             position = (dynamodb.stream_end_position if latest else dynamodb.stream_start_position)(table)
             # ministack notes where a mapping began when it was made.
-            position = lambda_svc._dynamodb_stream_positions.get(mapping["UUID"], position)  # noqa: SLF001
+            position = lambda_svc._dynamodb_stream_positions.get(mapping["UUID"], position)
             running = self._running[mapping["UUID"]] = _Running(
                 account, region, mapping, Shard(settings), position
             )
@@ -137,11 +137,11 @@ class StreamMappings:
         running.position = max(running.position, dynamodb.stream_start_position(table))
         records = dynamodb.stream_records_since(table, running.position, _AHEAD - ahead)
         running.position += len(records)
-        running.shard.put(lambda_svc._apply_filter_criteria(records, running.mapping))  # noqa: SLF001
+        running.shard.put(lambda_svc._apply_filter_criteria(records, running.mapping))
 
     def _invoke(self, running: _Running, function: dict[str, Any], number: int, batch: list[Any]) -> None:
         with request_scope(running.account, running.region):
-            answer = _answer(lambda_svc._execute_function(function, {"Records": batch}))  # noqa: SLF001
+            answer = _answer(lambda_svc._execute_function(function, {"Records": batch}))
             failed = answer.error or answer.throttled
             with self._lock:
                 running.shard.lanes[number].answered(answer)
@@ -156,9 +156,9 @@ class StreamMappings:
             self._tell(running, function)
         if failed:
             # The poller sleeps up to a second when nothing is to do.
-            threading.Timer(pause_s, lambda_svc._esm_wake.set).start()  # noqa: SLF001
+            threading.Timer(pause_s, lambda_svc._esm_wake.set).start()
         else:
-            lambda_svc._esm_wake.set()  # noqa: SLF001
+            lambda_svc._esm_wake.set()
 
     def _tell(self, running: _Running, function: dict[str, Any]) -> None:
         """Send what was given up to the mapping's destination."""
@@ -167,7 +167,7 @@ class StreamMappings:
         mapping = running.mapping
         for one in discarded:
             _log.warning("gave up %d records of %s", len(one.records), mapping["EventSourceArn"])
-            lambda_svc._send_ddb_stream_failure_record(  # noqa: SLF001
+            lambda_svc._send_ddb_stream_failure_record(
                 mapping, function, list(one.records), mapping["EventSourceArn"], {}, one.condition.value
             )
 
@@ -176,7 +176,7 @@ def _wake_at(due_s: float | None, now_s: float, windows: dict[int, float], numbe
     """Have the poller look when a lane's batching window is over; it would sleep up to a second longer."""
     if due_s is not None and windows.get(number) != due_s:
         windows[number] = due_s
-        timer = threading.Timer(max(0.0, due_s - now_s) + _SLACK_S, lambda_svc._esm_wake.set)  # noqa: SLF001
+        timer = threading.Timer(max(0.0, due_s - now_s) + _SLACK_S, lambda_svc._esm_wake.set)
         timer.daemon = True
         timer.start()
 

@@ -30,13 +30,13 @@ _LOW, _HIGH = {"EQ", "GE", "GT"}, {"EQ", "LE", "LT"}
 
 def install() -> None:
     """Close the gap in this process, before the emulator starts."""
-    dynamodb._condition_syntax_error = lru_cache(_REMEMBERED)(dynamodb._condition_syntax_error)  # noqa: SLF001
-    dynamodb._number_size_bytes = lru_cache(_REMEMBERED)(dynamodb._number_size_bytes)  # noqa: SLF001
-    dynamodb._ddb_canonicalize_number = _plainly(dynamodb._ddb_canonicalize_number, lambda text: text)  # noqa: SLF001
-    dynamodb._number_error = _plainly(dynamodb._number_error, lambda _: None)  # noqa: SLF001
-    dynamodb._set_item = _ordering(dynamodb._set_item)  # noqa: SLF001
-    dynamodb._query = narrowing(dynamodb._query)  # noqa: SLF001
-    dynamodb._evaluate_condition = _evaluating(dynamodb._evaluate_condition)  # noqa: SLF001
+    dynamodb._condition_syntax_error = lru_cache(_REMEMBERED)(dynamodb._condition_syntax_error)
+    dynamodb._number_size_bytes = lru_cache(_REMEMBERED)(dynamodb._number_size_bytes)
+    dynamodb._ddb_canonicalize_number = _plainly(dynamodb._ddb_canonicalize_number, lambda text: text)
+    dynamodb._number_error = _plainly(dynamodb._number_error, lambda _: None)
+    dynamodb._set_item = _ordering(dynamodb._set_item)
+    dynamodb._query = narrowing(dynamodb._query)
+    dynamodb._evaluate_condition = _evaluating(dynamodb._evaluate_condition)
 
 
 class Bound(NamedTuple):
@@ -86,7 +86,7 @@ class Partition(dict[str, Item]):
         # The emulator copies tables to keep and to restore them.
         return Partition, (dict(self),)
 
-    def values(self) -> Iterable[Item]:  # type: ignore[override]
+    def values(self) -> Iterable[Item]:  # type: ignore[override]  # a list, where a dict has a view
         """All items, or those that the Query that is running asks for."""
         shown = _shown.get()
         return super().values() if shown is None or shown.partition is not self else shown.items
@@ -143,7 +143,7 @@ def _plainly(look: Callable[[Any], Any], answer: Callable[[str], Any]) -> Callab
 
 def _numbered(table: Mapping[str, Any]) -> bool:
     name = table.get("sk_name")
-    return bool(name) and dynamodb._get_attr_type(table, name) == "N"  # noqa: SLF001
+    return bool(name) and dynamodb._get_attr_type(table, name) == "N"
 
 
 def narrowing(query: Callable[..., Any]) -> Callable[..., Any]:
@@ -181,14 +181,14 @@ def _evaluating(evaluate: Callable[..., bool]) -> Callable[..., bool]:
 
 def _asked(data: Mapping[str, Any]) -> tuple[Partition, Wanted] | None:
     """The partition and range of a Query by key; None where ministack must look at it as a whole."""
-    table = dynamodb._tables.get(dynamodb._normalize_table_name(data.get("TableName")))  # noqa: SLF001
+    table = dynamodb._tables.get(dynamodb._normalize_table_name(data.get("TableName")))
     condition = data.get("KeyConditionExpression")
     if not table or not isinstance(condition, str) or data.get("IndexName") or data.get("KeyConditions"):
         return None
     try:
         conditions = _conditions(condition, data)
         compared, (value,) = conditions[table["pk_name"]]
-        partition = table["items"].get(dynamodb._extract_key_val(value))  # noqa: SLF001
+        partition = table["items"].get(dynamodb._extract_key_val(value))
         if compared != "EQ" or not isinstance(partition, Partition):
             return None
         low, high = _range(*conditions.get(table["sk_name"], ("", ())))
@@ -216,7 +216,7 @@ def _conditions(condition: str, data: Mapping[str, Any]) -> dict[str, tuple[str,
     """Operator and values by attribute; raises `ValueError` for conditions that are not of this form."""
     names, values = data.get("ExpressionAttributeNames") or {}, data["ExpressionAttributeValues"]
     found = {}
-    for clause in dynamodb._key_condition_clauses(dynamodb._tokenize(condition)):  # noqa: SLF001
+    for clause in dynamodb._key_condition_clauses(dynamodb._tokenize(condition)):
         kinds, texts = [kind for kind, _ in clause], [text for _, text in clause]
         name = names[texts[0]] if kinds[0] == "NAME_REF" else texts[0]
         if kinds[1:] == ["IDENT", "VALUE_REF", "IDENT", "VALUE_REF"] and texts[1].upper() == "BETWEEN":

@@ -25,13 +25,13 @@ from typing import Any, NamedTuple
 ROOT = Path(__file__).resolve().parent.parent
 sys.path.insert(0, str(ROOT))
 
-from aws_cdk import App, Validations  # noqa: E402 the checkout is not installed
-from cdk_nag import AwsSolutionsChecks, ServerlessChecks  # noqa: E402 as above
+from aws_cdk import App, Validations
+from cdk_nag import AwsSolutionsChecks, ServerlessChecks
 
-from app import build  # noqa: E402 as above
-from contract import DEFAULT_NAMESPACE  # noqa: E402 as above
-from stacks.acknowledged import Acknowledged, short  # noqa: E402 as above
-from stacks.settings import Settings  # noqa: E402 as above
+from app import build
+from contract import DEFAULT_NAMESPACE
+from stacks.acknowledged import Acknowledged, short
+from stacks.settings import Settings
 
 DOCUMENT = ROOT / "docs" / "acknowledged.md"
 STAGES: dict[str, dict[str, Any]] = {
@@ -74,14 +74,14 @@ def main() -> None:
             settings = Settings(layer=layer, **given)
             known[stage] = synthesize(settings, out)
             found += nag(out)
-            print(f"check: stage {stage} synthesized, cdk-nag ({time.monotonic() - began:.0f} s)", flush=True)  # noqa: T201 a command prints
+            print(f"check: stage {stage} synthesized, cdk-nag ({time.monotonic() - began:.0f} s)", flush=True)
         began = time.monotonic()
         found += lint(Path(folder))
-        print(f"check: cfn-lint ({time.monotonic() - began:.0f} s)", flush=True)  # noqa: T201 as above
+        print(f"check: cfn-lint ({time.monotonic() - began:.0f} s)", flush=True)
         if asked.checkov:
             began = time.monotonic()
             found += checkov(asked.checkov, Path(folder))
-            print(f"check: checkov ({time.monotonic() - began:.0f} s)", flush=True)  # noqa: T201 as above
+            print(f"check: checkov ({time.monotonic() - began:.0f} s)", flush=True)
     findings = [finding.text for finding in found if not finding.acknowledged]
     findings += stale(known, found, unjudged=() if asked.checkov else ("CKV",))
     text = document(known)
@@ -191,9 +191,7 @@ def output(command: list[str], *, good: Iterable[int]) -> str:
     """A tool's standard output. Neither tool needs a network, and neither gets one."""
     nowhere = "http://127.0.0.1:9"
     environment = {**os.environ, "HTTPS_PROXY": nowhere, "HTTP_PROXY": nowhere, "LOG_LEVEL": "ERROR"}
-    done = subprocess.run(  # noqa: S603 the commands are the ones above
-        command, env=environment, capture_output=True, text=True, check=False
-    )
+    done = subprocess.run(command, env=environment, capture_output=True, text=True, check=False)
     if done.returncode not in good:
         sys.exit(f"{command[0]} failed:\n{done.stderr or done.stdout}")
     return done.stdout

@@ -9,9 +9,9 @@ from pathlib import Path
 ROOT = Path(__file__).resolve().parent.parent
 sys.path.insert(0, str(ROOT))
 
-from station import cost_tables, scale  # noqa: E402 the path comes first
-from station.cost import Usage  # noqa: E402
-from station.prices import AS_OF, REGION  # noqa: E402
+from station import cost_tables, scale
+from station.cost import Usage
+from station.prices import AS_OF, REGION
 
 _BLOCK = re.compile(r"(<!-- cost (\w+):.*?-->\n).*?(\n<!-- /cost -->)", re.DOTALL)
 FILES = (ROOT / "README.md", ROOT / "docs" / "cost.md")

@@ -11,8 +11,8 @@ from typing import Any
 ROOT = Path(__file__).resolve().parent.parent
 sys.path.insert(0, str(ROOT))
 
-from bench.report import ratio_row  # noqa: E402 the path comes first
-from bench.result import Ratio  # noqa: E402
+from bench.report import ratio_row
+from bench.result import Ratio
 
 REPORT = ROOT / "docs" / "bench" / "report.json"
 _BLOCK = re.compile(r"(<!-- bench:.*?-->\n).*?(\n<!-- /bench -->)", re.DOTALL)

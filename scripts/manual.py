@@ -11,9 +11,9 @@ from typing import Any
 ROOT = Path(__file__).resolve().parent.parent
 sys.path.insert(0, str(ROOT))
 
-import typer  # noqa: E402 the path comes first
+import typer
 
-from station.cli import app  # noqa: E402 as above
+from station.cli import app
 
 PAGE = ROOT / "docs" / "iort.md"
 _INTRODUCTION = """# iort

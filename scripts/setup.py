@@ -109,12 +109,12 @@ def step(title: str, inputs: Iterable[Path], action: Callable[[], None], *, stam
     if mark.exists() and mark.read_text() == key.hexdigest() and PYTHON.exists():
         return
     mark.parent.mkdir(parents=True, exist_ok=True)
-    print(f"setup: {title} ...", end="", flush=True)  # noqa: T201 a command prints
+    print(f"setup: {title} ...", end="", flush=True)
     began = time.monotonic()
     action()
     mark.write_text(key.hexdigest())
     now = time.monotonic()
-    print(f" {now - began:.0f} s ({now - STARTED:.0f} s so far)", flush=True)  # noqa: T201
+    print(f" {now - began:.0f} s ({now - STARTED:.0f} s so far)", flush=True)
 
 
 def make_venv() -> None:
@@ -200,7 +200,7 @@ def is_oldest(python: str) -> bool:
     """Whether the file is what it is called, and can make a virtual environment."""
     ask = "import ensurepip, sys, venv; print('%d.%d' % sys.version_info[:2])"
     try:
-        done = subprocess.run([python, "-c", ask], capture_output=True, text=True, check=False)  # noqa: S603
+        done = subprocess.run([python, "-c", ask], capture_output=True, text=True, check=False)
     except OSError:
         return False
     return done.stdout.strip() == OLDEST_OF_ROBOT
@@ -218,7 +218,7 @@ def run(command: Sequence[str | Path]) -> None:
     # The venv's own node and npm come before any that the machine may have.
     path = f"{VENV / 'bin'}{os.pathsep}{os.environ.get('PATH', os.defpath)}"
     with log.open("wb") as output:
-        done = subprocess.run(  # noqa: S603 the commands are the ones above
+        done = subprocess.run(
             list(map(str, command)),
             cwd=ROOT,
             env={**os.environ, "PATH": path, **CACHES},

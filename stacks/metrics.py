@@ -82,7 +82,7 @@ def of_the_account(namespace: str, name: str) -> cloudwatch.MathExpression:
     """The sum of a metric whatever its dimensions, by Metrics Insights: an alarm may ask that, and none
     may search."""
     return cloudwatch.MathExpression(
-        expression=f'SELECT SUM({name}) FROM "{namespace}"',  # noqa: S608 no database is asked
+        expression=f'SELECT SUM({name}) FROM "{namespace}"',  # noqa: S608 - no database is asked
         using_metrics={},
         period=PERIOD,
     )

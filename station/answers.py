@@ -97,7 +97,7 @@ def _rows(of: tuple[Column, Column, Column], starts: Any, n: int, *, several: bo
 
 def _numbers(column: Column) -> list[float | None]:
     # NaN is no JSON.
-    return [None if value != value else value for value in column.tolist()]  # noqa: PLR0124
+    return [None if value != value else value for value in column.tolist()]  # noqa: PLR0124 - NaN is not itself
 
 
 def _text(asked: Mapping[str, str], name: str) -> str:

@@ -64,7 +64,7 @@ class Result:
     def frame(self) -> Any:
         """The same as a pandas DataFrame, indexed by time in UTC."""
         # Half a second of import that only those pay who ask for it.
-        import pandas as pd  # noqa: PLC0415
+        import pandas as pd  # noqa: PLC0415 - see above
 
         index = pd.to_datetime(self.times_us, unit="us", utc=True).rename("time")
         return pd.DataFrame(dict(self.columns), index=index)

@@ -5,9 +5,10 @@ from __future__ import annotations
 import json
 import threading
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from enum import Enum
+from functools import partial
 from typing import Any, NamedTuple
 
 from boto3.dynamodb.types import TypeDeserializer
@@ -75,7 +76,7 @@ def replay(
     `MAX_REPLAYS` (unless ``again``) there are no more. Live messages, pings and events are of their
     moment and are not replayed.
     """
-    one: Callable[[Entry], Outcome] = lambda entry: _outcome(cloud, entry, dry_run=dry_run, again=again)  # noqa: E731
+    one = partial(_outcome, cloud, dry_run=dry_run, again=again)
     with ThreadPoolExecutor(_AT_ONCE) as pool:
         yield from pool.map(one, entries)
 

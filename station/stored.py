@@ -249,4 +249,5 @@ def _plain(value: Mapping[str, Any]) -> Value:
     ((kind, content),) = value.items()
     if kind == "N":
         return int(content) if content.lstrip("-").isdecimal() else float(content)
-    return content  # type: ignore[no-any-return]
+    text: Value = content
+    return text

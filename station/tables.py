@@ -62,8 +62,8 @@ def to_json_lines(result: Result, file: IO[str]) -> None:
 def to_parquet(result: Result, file: IO[bytes]) -> None:
     """A column a field beside ``time`` (microseconds, UTC); units are in the fields' metadata."""
     # A third of a second of import.
-    import pyarrow as pa  # noqa: PLC0415
-    import pyarrow.parquet as pq  # noqa: PLC0415
+    import pyarrow as pa  # noqa: PLC0415 - see above
+    import pyarrow.parquet as pq  # noqa: PLC0415 - as above
 
     arrays = [pa.array(result.times_us, type=pa.timestamp("us", tz="UTC"))]
     fields = [pa.field("time", arrays[0].type, nullable=False)]

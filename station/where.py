@@ -32,7 +32,7 @@ class Where:
         said = self.profile or self.region or any(os.environ.get(name) for name in _AWS_NAMED)
         if self.local or (not said and self.embedded.exists()):
             if not self.local:
-                print("iort: on the embedded cloud that runs in this checkout", file=sys.stderr)  # noqa: T201
+                print("iort: on the embedded cloud that runs in this checkout", file=sys.stderr)
             return Cloud.load(self.embedded)
         cloud = Cloud(namespace=self.namespace, profile=self.profile, region=self.region)
         try:

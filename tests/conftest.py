@@ -11,7 +11,7 @@ from typing import Any
 import pytest
 from hypothesis import HealthCheck, settings
 
-from tests.browser import browser, open_page  # noqa: F401 (fixtures)
+from tests.browser import browser, open_page  # noqa: F401 - fixtures
 
 # How long an example takes says something about the machine only.
 settings.register_profile("iort", deadline=None, suppress_health_check=[HealthCheck.too_slow])

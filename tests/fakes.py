@@ -73,13 +73,13 @@ class FakeDynamoDB:
             self.read += len(page)
             yield {"Items": page}
 
-    def get_item(self, *, TableName: str, Key: dict[str, Any], **_: Any) -> dict[str, Any]:  # noqa: N803
+    def get_item(self, *, TableName: str, Key: dict[str, Any], **_: Any) -> dict[str, Any]:
         self.calls["get_item"] += 1
         first, *rest = (next(iter(Key[name].values())) for name in KEYS[TableName])
         item = self.items[TableName].get((first, *map(Decimal, rest)))
         return {"Item": item} if item else {}
 
-    def batch_write_item(self, *, RequestItems: dict[str, Any]) -> dict[str, Any]:  # noqa: N803
+    def batch_write_item(self, *, RequestItems: dict[str, Any]) -> dict[str, Any]:
         self.calls["batch_write_item"] += 1
         ((table, requests),) = RequestItems.items()
         items = [request["PutRequest"]["Item"] for request in requests]

@@ -80,7 +80,7 @@ class Store:
 
 class _Handler(http.server.BaseHTTPRequestHandler):
     def do_PUT(self) -> None:
-        store: Store = self.server.store  # type: ignore[attr-defined]
+        store: Store = self.server.store
         part = int(self.path.split("?")[0].strip("/"))
         store.puts.append(part)
         size = int(self.headers["content-length"])
@@ -119,11 +119,11 @@ def store(uplink: Loopback, folder: Path) -> Iterator[tuple[Store, Path]]:
     context.load_cert_chain(certificate, key)
     with _Server(("127.0.0.1", 0), _Handler) as server:
         server.socket = context.wrap_socket(server.socket, server_side=True)
-        server.store = Store(uplink, f"https://127.0.0.1:{server.server_port}")  # type: ignore[attr-defined]
+        server.store = Store(uplink, f"https://127.0.0.1:{server.server_port}")
         thread = threading.Thread(target=server.serve_forever, args=(0.05,))
         thread.start()
         try:
-            yield server.store, certificate  # type: ignore[attr-defined]
+            yield server.store, certificate
         finally:
             server.shutdown()
             thread.join()

@@ -3,8 +3,6 @@
 Needs no ROS.
 """
 
-# ruff: noqa: RUF009 - `setting` makes a dataclass field, as `field` does
-
 from __future__ import annotations
 
 import logging
@@ -102,7 +100,7 @@ class Recording:
     ) -> None:
         try:
             # Only a robot that plays recordings needs the library: pip install iort[bag].
-            from rosbags.highlevel import AnyReader  # noqa: PLC0415
+            from rosbags.highlevel import AnyReader  # noqa: PLC0415 - optional
         except ImportError as error:
             raise SourceError("playing a bag needs the package rosbags: pip install 'iort[bag]'") from error
         # rosbags opens the folder of a ROS 2 recording; people name the file in it.
@@ -248,7 +246,7 @@ float64 avg_vq
 
 def _known_types() -> Any:
     """The types of ROS 2 itself and the VESC driver's, for recordings without definitions."""
-    from rosbags.typesys import Stores, get_types_from_msg, get_typestore  # noqa: PLC0415
+    from rosbags.typesys import Stores, get_types_from_msg, get_typestore  # noqa: PLC0415 - optional
 
     store = get_typestore(Stores.ROS2_HUMBLE)
     state = "vesc_msgs/msg/VescState"

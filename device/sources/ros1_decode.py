@@ -77,7 +77,7 @@ class Decoder:
             stamp_us = None
         else:
             # Wholes and remainders apart, for a float of seconds would lose the last digits.
-            stamp_us = int(values.pop(_SEC)) * 1_000_000 + int(values.pop(_NANOSEC)) // 1000  # type: ignore[arg-type]
+            stamp_us = int(values.pop(_SEC)) * 1_000_000 + int(values.pop(_NANOSEC)) // 1000  # type: ignore[arg-type]  # whole numbers
         if len(values) > MAX_FIELDS:
             raise MessageError(f"{self._kind}: the message has over {MAX_FIELDS} fields; select some")
         return Decoded(values, stamp_us)

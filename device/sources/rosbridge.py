@@ -100,7 +100,7 @@ class RosbridgeConnection:
             if self._clock.monotonic() - began > _BACKOFF_S[1]:
                 backoff = _BACKOFF_S[0]
             # Full jitter: a fleet must not come back in step.
-            self._clock.wait(stop, random.uniform(0, backoff))  # noqa: S311
+            self._clock.wait(stop, random.uniform(0, backoff))  # noqa: S311 - jitter, not secrets
             backoff = min(_BACKOFF_S[1], backoff * 2)
 
     def publish(self, topic: str, kind: str, message: Mapping[str, Any]) -> None:
@@ -391,7 +391,7 @@ def _without_long(value: Any) -> Any:
 def _load_websocket() -> Any:
     try:
         # Only a robot with rosbridge needs it: pip install iort[rosbridge].
-        import websocket  # noqa: PLC0415
+        import websocket  # noqa: PLC0415 - optional
     except ImportError as error:
         raise SourceError(
             "rosbridge needs the package websocket-client: pip install 'iort[rosbridge]'"

@@ -1,7 +1,5 @@
 """A simulated car: the physics of `device.sources.vehicle`, sampled like a real VESC."""
 
-# ruff: noqa: RUF009 - `setting` makes a dataclass field, as `field` does
-
 from __future__ import annotations
 
 import math

@@ -126,7 +126,7 @@ class VescSource:
             if self.counts.samples > samples:
                 backoff = _BACKOFF_S[0]
             # Jitter, because nothing says that ours is the only program waiting for this port.
-            self._clock.wait(stop, backoff * random.uniform(0.5, 1.0))  # noqa: S311
+            self._clock.wait(stop, backoff * random.uniform(0.5, 1.0))  # noqa: S311 - jitter, not secrets
             backoff = min(_BACKOFF_S[1], backoff * 2)
         _log.info("%s: %s", self._config.port, ", ".join(f"{k} {v}" for k, v in vars(self.counts).items()))
 
@@ -297,9 +297,9 @@ class _Library:
     """pyserial, and whatever it raises when a port is not there, goes away or misbehaves."""
 
     def __init__(self) -> None:
-        import termios  # noqa: PLC0415
+        import termios  # noqa: PLC0415 - only where there is a port
 
-        import serial  # noqa: PLC0415
+        import serial  # noqa: PLC0415 - optional
 
         self.Serial = serial.Serial
         self.errors = (OSError, termios.error)

@@ -37,8 +37,8 @@ def export(
     of the fields. Stamps are the samples' times, to the microsecond. For CSV and Parquet: iort query.
     """
     # numpy takes longer to load than most commands to run.
-    from station import recordings  # noqa: PLC0415
-    from station.selection import select  # noqa: PLC0415
+    from station import recordings  # noqa: PLC0415 - see above
+    from station.selection import select  # noqa: PLC0415 - as above
 
     kind = recordings.KINDS.get(output.suffix)
     if kind is None:
@@ -56,7 +56,7 @@ def export(
 def _write(cloud: Cloud, selection: Selection, file: Recording) -> int:
     """How many messages were written."""
     from station import data, inventory, messages  # noqa: PLC0415 - as above
-    from station.stored import Refused  # noqa: PLC0415
+    from station.stored import Refused  # noqa: PLC0415 - as above
 
     refused = Refused()
     robot, stream = selection.robot, selection.stream

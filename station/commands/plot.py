@@ -68,7 +68,7 @@ def plot(
     A trajectory needs a stream with a position: none is made up from speeds.
     """
     # Together they take longer to load than most commands to run.
-    from station import plots  # noqa: PLC0415
+    from station import plots  # noqa: PLC0415 - see above
 
     cloud = context.obj.cloud()
     if runs and (start, end, last) != (None, None, None):
@@ -108,8 +108,8 @@ def _read(
     every: str | None,
 ) -> Run:
     from station import data, inventory  # noqa: PLC0415 - as above
-    from station.conditions import derive  # noqa: PLC0415
-    from station.plots import Run  # noqa: PLC0415
+    from station.conditions import derive  # noqa: PLC0415 - as above
+    from station.plots import Run  # noqa: PLC0415 - as above
 
     with reading(f"{robot} {stream}", within.start_us, within.end_us) as progress:
         result = data.query(

@@ -73,7 +73,7 @@ def query(
     A range includes its start and not its end. Without one it is the last five minutes.
     """
     # numpy takes longer to load than most commands to run.
-    from station import data, inventory  # noqa: PLC0415
+    from station import data, inventory  # noqa: PLC0415 - see above
 
     if form is Format.parquet and output is None and sys.stdout.isatty():
         raise StationError("Parquet is no text for a terminal: give --output FILE, or pipe it on")

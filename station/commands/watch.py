@@ -48,7 +48,7 @@ def watch(
     try:
         with listener:
             if as_json:
-                print(f"iort: listening to {cloud.namespace}.*", file=sys.stderr, flush=True)  # noqa: T201
+                print(f"iort: listening to {cloud.namespace}.*", file=sys.stderr, flush=True)
                 done.wait(seconds)
             else:
                 _show(fleet, seconds, cloud.namespace)
@@ -66,12 +66,12 @@ class _Lines:
         try:
             robot, sample, stamps = read(update)
         except ContractError as error:
-            print(f"iort: an update that is none: {error}", file=sys.stderr)  # noqa: T201
+            print(f"iort: an update that is none: {error}", file=sys.stderr)
             return
         delay_ms = (now_us - stamps["sent_us"] - stamps["offset_us"]) / 1000
         line = {ROBOT: robot, "stream": update["stream"], T_US: stamps["t_us"], "delay_ms": delay_ms}
         try:
-            print(json.dumps({**line, "sample": sample}), flush=True)  # noqa: T201
+            print(json.dumps({**line, "sample": sample}), flush=True)
         except BrokenPipeError:
             # Python would complain once more at its end, when it flushes.
             os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())

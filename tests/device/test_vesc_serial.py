@@ -154,7 +154,7 @@ def test_unplugged_and_plugged_again(vesc: VescStandin, log: pytest.LogCaptureFi
         for i in range(3):
             running.wait_for(10, more=True)
             vesc.unplug()
-            eventually(lambda: log.text.count("waiting for it to be plugged in") == i + 1)  # noqa: B023
+            eventually(lambda: log.text.count("waiting for it to be plugged in") == i + 1)  # noqa: B023 - it is called within the turn
             vesc.plug()
         running.wait_for(10, more=True)
         assert running.source.counts.opened == 4

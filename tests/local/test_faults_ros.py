@@ -20,7 +20,7 @@ LATER, COUNT = 1000, 100
 def test_ros_master_restarted(
     embedded: EmbeddedCloud,
     bundle: Callable[..., robots.Bundle],
-    graph: Graph,  # noqa: F811
+    graph: Graph,  # noqa: F811 - the fixture
 ) -> None:
     topics = {
         f"/{name}": {"stream": name, "time": "header", "fields": ["turns"]} for name in ("wheel", "other")

@@ -51,9 +51,9 @@ def messages(listener: Process) -> list[Any]:
 
 
 def test_two_robots_see_each_others_poses_and_take_commands(
-    embedded: EmbeddedCloud,  # noqa: F811
-    bundle: Callable[..., robots.Bundle],  # noqa: F811
-    iort: Callable[..., Any],  # noqa: F811
+    embedded: EmbeddedCloud,  # noqa: F811 - the fixture
+    bundle: Callable[..., robots.Bundle],  # noqa: F811 - the fixture
+    iort: Callable[..., Any],  # noqa: F811 - the fixture
     graphs: list[Graph],
 ) -> None:
     settings = {

@@ -47,8 +47,8 @@ def test_no_function_that_keeps_a_robots_row_can_open_its_name():
 class Recorder:
     """A DynamoDB client that only notes which attributes it was asked for."""
 
-    class exceptions:  # noqa: N801 boto3 calls it that
-        class ConditionalCheckFailedException(Exception):  # noqa: N818
+    class exceptions:
+        class ConditionalCheckFailedException(Exception):
             pass
 
     def __init__(self):

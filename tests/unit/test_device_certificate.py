@@ -51,7 +51,7 @@ def text(certificate: x509.Certificate) -> str:
     ],
 )
 def test_it_reads_what_the_library_reads(before: tuple[int, int, int], after: tuple[int, int, int]) -> None:
-    certificate, _ = made(dt.datetime(*before), dt.datetime(*after))  # noqa: DTZ001
+    certificate, _ = made(dt.datetime(*before), dt.datetime(*after))  # noqa: DTZ001 - the library takes UTC for granted
     found = parse_certificate("some text before\n" + text(certificate) + "and behind")
     assert found.not_before_s == certificate.not_valid_before_utc.timestamp()
     assert found.not_after_s == certificate.not_valid_after_utc.timestamp()
@@ -69,7 +69,7 @@ def test_what_is_no_certificate_is_refused(der: bytes) -> None:
 
 
 def test_pairs(tmp_path: Path) -> None:
-    year = (dt.datetime(2020, 1, 1), dt.datetime(2040, 1, 1))  # noqa: DTZ001
+    year = (dt.datetime(2020, 1, 1), dt.datetime(2040, 1, 1))  # noqa: DTZ001 - the library takes UTC for granted
     (one, one_key), (_, other_key) = made(*year), made(*year)
     for name, content in (("c", text(one)), ("k", one_key), ("o", other_key), ("x", "no key")):
         (tmp_path / name).write_text(content)

@@ -145,7 +145,7 @@ def test_a_message_not_yet_written_holds_back_the_next_ones() -> None:
 
 def test_a_bad_sample_is_refused_and_counted() -> None:
     rig = Rig()
-    rig.lane.offer("vesc", T0, {"speed": b"x"})  # type: ignore[dict-item]
+    rig.lane.offer("vesc", T0, {"speed": b"x"})
     rig.lane.offer("vesc", T0, {f"f{i}": "x" * 4096 for i in range(64)})
     rig.offer(1)
     assert rig.lane.refused == 2
@@ -212,7 +212,7 @@ def _drive(rig: Rig, seconds: float, **values: object) -> list[str]:
     """Topics of what a stream at 10 Hz is sent on."""
     before = len(rig.uplink.published)
     for _ in range(round(seconds * 10)):
-        rig.lane.offer("vesc", rig.clock.now_us(), values)  # type: ignore[arg-type]
+        rig.lane.offer("vesc", rig.clock.now_us(), values)
         rig.dispatcher.run_pending()
         rig.clock.advance(0.1)
     return [message.topic for message in rig.uplink.published[before:]]

@@ -220,7 +220,7 @@ NAMES = [f"f{i}" for i in range(6)]
 
 def values_of(kind: str) -> st.SearchStrategy[Any]:
     if kind in FLOATS:
-        return st.floats(width=FLOATS[kind], allow_nan=False)  # type: ignore[arg-type]
+        return st.floats(width=FLOATS[kind], allow_nan=False)
     if kind in INTS:
         bits, sign = INTS[kind]
         return st.integers(0, 2**bits - 1) if sign else st.integers(-(2 ** (bits - 1)), 2 ** (bits - 1) - 1)

@@ -238,11 +238,11 @@ def test_what_was_acknowledged_while_the_disk_was_full_does_not_come_again(path:
     def full(*_: Any, **__: Any) -> None:
         raise sqlite3.OperationalError("database or disk is full")
 
-    spool._disk.file.commit = full  # type: ignore[method-assign]
+    spool._disk.file.commit = full
     for entry in all_kept(spool)[:3]:
         spool.ack(entry.id)
     assert not spool.flush()
-    spool._disk.file.commit = commit  # type: ignore[method-assign]
+    spool._disk.file.commit = commit
     assert spool.flush()
     spool.close()
     with running(path) as again:

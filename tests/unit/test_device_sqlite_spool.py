@@ -148,7 +148,7 @@ def test_acknowledgements_and_puts_are_written_in_groups(path: Path) -> None:
         commits.append(len(entries))
         write(entries, **more)
 
-    spool._disk.file.commit = count  # type: ignore[method-assign]
+    spool._disk.file.commit = count
     stored = threading.Event()
     spool.on_stored(stored.set)
     spool.start()

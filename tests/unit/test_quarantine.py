@@ -242,8 +242,8 @@ def test_only_the_message_that_the_table_did_not_take_comes_again():
 class FakeStreams:
     """A record a call, as AWS' pages, behind so many empty ones; the second and third are wanted."""
 
-    class exceptions:  # noqa: N801 boto3 calls it that
-        class TrimmedDataAccessException(Exception):  # noqa: N818
+    class exceptions:
+        class TrimmedDataAccessException(Exception):
             pass
 
     def __init__(self, *, trimmed=False, empty=0, ends_at=9):
@@ -261,7 +261,7 @@ class FakeStreams:
             raise self.exceptions.TrimmedDataAccessException
         return {"ShardIterator": "2"}
 
-    def get_records(self, *, ShardIterator):  # noqa: N803
+    def get_records(self, *, ShardIterator):
         n = int(ShardIterator)
         if self.left or n >= self.ends_at:
             self.left -= 1
@@ -304,7 +304,7 @@ class FakeQueue:
     def bodies(self):
         return [body for call in self.calls for body in call]
 
-    def send_message_batch(self, *, QueueUrl, Entries):  # noqa: N803
+    def send_message_batch(self, *, QueueUrl, Entries):
         assert QueueUrl == "queue"
         if self.throttled:
             raise ClientError({"Error": {"Code": "Throttling", "Message": ""}}, "SendMessageBatch")

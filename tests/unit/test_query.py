@@ -166,7 +166,7 @@ class Cloud:
     def client(self, service):
         return {"dynamodb": self._client, "lambda": self}[service]
 
-    def invoke(self, *, FunctionName, Payload):  # noqa: N803
+    def invoke(self, *, FunctionName, Payload):
         assert FunctionName == "QueryFunction"
         reply = asked(self._client, left_ms=self._left_ms, **json.loads(Payload))
         return {"Payload": io.BytesIO(json.dumps(reply).encode())}

@@ -30,7 +30,7 @@ def test_reads(text, expected):
 
 
 def test_without_a_zone_it_is_this_machines():
-    assert time_us("2023-11-14T22:13:20", NOW) == datetime(2023, 11, 14, 22, 13, 20).timestamp() * 1e6  # noqa: DTZ001
+    assert time_us("2023-11-14T22:13:20", NOW) == datetime(2023, 11, 14, 22, 13, 20).timestamp() * 1e6  # noqa: DTZ001 - on purpose
     assert not has_zone("2023-11-14T22:13:20")
     assert not has_zone("2023-11-14")
     assert has_zone("2023-11-14T22:13:20Z")
