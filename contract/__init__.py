@@ -87,7 +87,7 @@ from contract.live import (
     live_message,
     live_update,
 )
-from contract.message_type import MessageType, message_type
+from contract.message_type import FrameId, MessageType, frame_id, message_type
 from contract.seconds import flat_second, packed_second
 from contract.tables import (
     ADMISSION,
@@ -306,6 +306,7 @@ __all__ = [
     "FileKey",
     "FileRequest",
     "FleetMessage",
+    "FrameId",
     "LiveSample",
     "MessageType",
     "Pong",
@@ -336,6 +337,7 @@ __all__ = [
     "file_key",
     "flat_second",
     "fleet_name",
+    "frame_id",
     "inflate",
     "live_event",
     "live_message",

@@ -166,12 +166,15 @@ class Recording:
             except SourceError as error:
                 raise SourceError(f"{self._path}: topic {connection.topic}: {error}") from error
             stamp_ns = _stamp_ns(message, recorded_ns)
+            stream, at_ns = streams[connection.topic], recorded_ns - start_ns
             if connection.topic not in said:
                 said.add(connection.topic)
-                kind = self._type(streams[connection.topic], connection)
+                kind = self._type(stream, connection)
                 if kind is not None:
-                    yield Message(contract.TYPES_STREAM, recorded_ns - start_ns, stamp_ns, kind)
-            yield Message(streams[connection.topic], recorded_ns - start_ns, stamp_ns, values)
+                    yield Message(contract.TYPES_STREAM, at_ns, stamp_ns, kind)
+            frame = getattr(getattr(message, "header", None), "frame_id", None)
+            in_frame = (connection.topic, frame) if isinstance(frame, str) else None
+            yield Message(stream, at_ns, stamp_ns, values, in_frame)
 
     def _type(self, stream: str, connection: Any) -> Mapping[str, contract.Value] | None:
         """What the messages of a topic are, as ROS 1 has it; None where it cannot be told."""

@@ -20,6 +20,7 @@ from device.ros1_types import Definition, parse
 from device.schema import Where, choice, items, pairs, section, setting, text
 from device.seldom import Seldom
 from device.sources import REFUSE, UPLOAD, Emit
+from device.sources.frames import Frames
 from device.sources.ros1_decode import Decoder
 
 _log = logging.getLogger(__name__)
@@ -144,6 +145,8 @@ class Intake:
         self._decoders: dict[tuple[str, str], Decoder | None] = {}
         # Publisher -> its connection, and the last message that came by it.
         self._latched: dict[str, tuple[Mapping[str, str], bytes]] = {}
+        self._frame: bytes | None = None
+        self._frames = Frames(config.stream, topic)
         self._lock = threading.Lock()
         self._messages = self._seen = 0
         self._heard = clock.monotonic()
@@ -167,7 +170,7 @@ class Intake:
             self._seldom.warn("undecodable", f"topic {self._topic}: its messages cannot be decoded")
             return
         try:
-            values, t_us = decoder.decode(data)
+            values, t_us, frame = decoder.decode(data)
         except MessageError as error:
             self._seldom.warn("malformed", f"topic {self._topic}: {error}")
             return
@@ -178,7 +181,18 @@ class Intake:
         if not values:
             self._seldom.warn("empty", f"topic {self._topic}: there is no field in its messages to send")
             return
+        if frame is not None and frame != self._frame:
+            self._say_frame(frame, t_us)
         self._emit(self._config.stream, t_us, values)
+
+    def _say_frame(self, frame: bytes, t_us: int) -> None:
+        """Say whose frame the messages are in from this one on."""
+        with self._lock:
+            self._frame = frame
+            # ROS 1 does not say how a text is encoded.
+            said = self._frames.sample(frame.decode("utf-8", "replace"), t_us)
+        if said is not None:
+            self._emit(contract.TYPES_STREAM, t_us, said)
 
     def _came_before(self, header: Mapping[str, str], data: bytes) -> bool:
         """Whether it is what a latching publisher sends with every connection, and is known from the

@@ -30,14 +30,17 @@ Wanted = Callable[[str], bool]
 _LENGTH = struct.Struct("<I")
 # The stamp travels in the sample under names that no field has, until `decode` takes it out.
 _SEC, _NANOSEC = "\0sec", "\0nanosec"
+_FRAME = "\0frame"
 _BLOBS = ("uint8", "char")
 
 
 class Decoded(NamedTuple):
-    """A sample, and the header's stamp if the message has one and it was asked for."""
+    """A sample; the header's stamp if the message has one and it was asked for; the header's frame_id,
+    as bytes, if the message begins with a header."""
 
     values: dict[str, Value]
     stamp_us: int | None
+    frame: bytes | None
 
 
 class Decoder:
@@ -56,7 +59,8 @@ class Decoder:
         large: bool = False,
     ) -> None:
         self._kind = definition.kind
-        self._stamp = stamp and definition.stamped()
+        self._stamped = definition.stamped()
+        self._stamp = stamp and self._stamped
         self.left_out: dict[str, int] = {}
         compiler = _Compiler(definition, select, self.left_out, large=large)
         self._steps = compiler.message(stamp=self._stamp)
@@ -78,9 +82,10 @@ class Decoder:
         else:
             # Wholes and remainders apart, for a float of seconds would lose the last digits.
             stamp_us = int(values.pop(_SEC)) * 1_000_000 + int(values.pop(_NANOSEC)) // 1000  # type: ignore[arg-type]  # whole numbers
+        frame: Any = values.pop(_FRAME) if self._stamped else None
         if len(values) > MAX_FIELDS:
             raise MessageError(f"{self._kind}: the message has over {MAX_FIELDS} fields; select some")
-        return Decoded(values, stamp_us)
+        return Decoded(values, stamp_us, frame)
 
 
 class _Compiler:
@@ -107,13 +112,14 @@ class _Compiler:
         run = _Run()
         names = [field.name for field in self._definition.fields()]
         lone = len(names) == 2 and HEADER in names
+        stamped = self._definition.stamped()
         for field in self._definition.fields():
             if field.name == HEADER:
-                if stamp:
+                if stamped:
                     run.fixed("I", None)
-                    run.fixed("I", _SEC)
-                    run.fixed("I", _NANOSEC)
-                    run.step(_skip_text)
+                    run.fixed("I", _SEC if stamp else None)
+                    run.fixed("I", _NANOSEC if stamp else None)
+                    run.step(_frame)
                 else:
                     self._skip(run, field)
             elif lone and field.length is None and field.kind in self._definition.types:
@@ -363,6 +369,13 @@ def _noted(path: str, left_out: dict[str, int]) -> Step:
         return at
 
     return step
+
+
+def _frame(data: bytes, at: int, out: dict[str, Any]) -> int:
+    end = at + 4 + int(_LENGTH.unpack_from(data, at)[0])
+    # Bytes, for it is nearly always the same, which is seen without decoding it.
+    out[_FRAME] = data[at + 4 : end]
+    return end
 
 
 def _skip_text(data: bytes, at: int, _out: dict[str, Value]) -> int:

@@ -34,7 +34,8 @@ def export(
     """Write a recording: MCAP, which Foxglove opens, or a ROS 1 bag, which rosbag plays.
 
     The messages have the type that the robot's source read them as, where it said so; otherwise one made
-    of the fields. Stamps are the samples' times, to the microsecond. For CSV and Parquet: iort query.
+    of the fields. Stamps are the samples' times, to the microsecond; headers have the frame_id that they
+    had, and are numbered anew. For CSV and Parquet: iort query.
     """
     # numpy takes longer to load than most commands to run.
     from station import recordings  # noqa: PLC0415 - see above
@@ -67,9 +68,9 @@ def _write(cloud: Cloud, selection: Selection, file: Recording) -> int:
             inventory.check_there(cloud, robot, stream)
             say(f"{robot} {stream}: no samples in this range")
             return 0
-        kind = messages.type_of(cloud, selection)
+        kind, frames = messages.said(cloud, selection)
         made = kind or messages.made_of(stream, first.columns)
-        maker = messages.Maker(made, list(first.columns), own=kind is None)
+        maker = messages.Maker(made, list(first.columns), own=kind is None, frames=frames)
         written = file.add(maker, _all(first, blocks))
     if refused.count:
         say(f"{refused.count} stored items are no batches and were left out; the first: {refused.reason}")

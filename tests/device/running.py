@@ -9,6 +9,7 @@ from typing import Any
 
 from typing_extensions import Self
 
+import contract
 from device.clock import SystemClock
 
 
@@ -18,6 +19,7 @@ class Running:
     def __init__(self, config: Any) -> None:
         self.source = config.build(SystemClock())
         self.samples: list[tuple[str, int, Any]] = []
+        self.said: list[Any] = []
         self.stop = threading.Event()
         self.failed: Exception | None = None
         self.thread = threading.Thread(target=self._run, daemon=True)
@@ -45,9 +47,12 @@ class Running:
         except Exception as error:  # noqa: BLE001 - the test's to see
             self.failed = error
 
-    def _emit(self, *sample: Any) -> None:
+    def _emit(self, stream: str, t_us: int, values: Any) -> None:
         with self._more:
-            self.samples.append(sample)
+            if stream == contract.TYPES_STREAM:
+                self.said.append(values)
+                return
+            self.samples.append((stream, t_us, values))
             self._more.notify_all()
 
 

@@ -15,6 +15,7 @@ import pytest
 pytest.importorskip("aiohttp")
 pytest.importorskip("websocket")
 
+import contract
 from device.clock import SystemClock
 from device.config import load_config
 from device.errors import ConfigError, SourceError
@@ -52,7 +53,7 @@ def config(server: RosbridgeStandin, topic: str = CORE, **settings: Any) -> Rosb
 
 def state(n: float = 0, **stamp: int) -> dict[str, Any]:
     """As rosbridge of ROS 1 or ROS 2 sends a VescStateStamped, by the parts of its stamp."""
-    return {"header": {"stamp": stamp, "frame_id": ""}, "state": {"speed": n, "fault_code": 0}}
+    return {"header": {"stamp": stamp, "frame_id": "base_link"}, "state": {"speed": n, "fault_code": 0}}
 
 
 def test_messages_become_samples(server: RosbridgeStandin, log: pytest.LogCaptureFixture) -> None:
@@ -68,6 +69,8 @@ def test_messages_become_samples(server: RosbridgeStandin, log: pytest.LogCaptur
     ], "in order, and without the wrapper"
     assert {stream for stream, _, _ in running.samples} == {"vesc"}
     times = [t_us for _, t_us, _ in running.samples]
+    frame = contract.FrameId("vesc", CORE, "base_link", times[0])
+    assert [contract.frame_id(sample) for sample in running.said] == [frame]
     assert before < times[0] <= times[-1] < time.time_ns() // 1000
     assert "WARNING" not in log.text
 

@@ -6,10 +6,16 @@ import dataclasses
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 from mcap.reader import make_reader
 from rosbags.highlevel import AnyReader
+from rosbags.rosbag1 import Writer
+from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
+from station import data
+from station.cloud import Cloud
+from tests.foxglove import flat, opened
 from tests.local.conftest import run_agent
 from tests.local.test_query import iort
 from tests.recordings import recording
@@ -28,9 +34,56 @@ def messages(path: Path, topic: str) -> tuple[Any, list[Any]]:
     return (connection.msgtype, connection.digest), found
 
 
+def data_of(cloud: Cloud, robot: str, stream: str) -> list[tuple[int, dict[str, Any]]]:
+    """What a query gives, as Foxglove's libraries give it: VescStateStamped has its fields in ``state``, and
+    an integer of 64 bits is a text."""
+    found = data.query(cloud, robot, stream)
+    within = "state." if stream == "vesc" else ""
+    columns = {f"{within}{name}": column.tolist() for name, column in found.columns.items()}
+    if "ticks" in columns:
+        columns["ticks"] = [str(ticks) for ticks in columns["ticks"]]
+    return [
+        (t_us * 1000, {name: column[i] for name, column in columns.items()})
+        for i, t_us in enumerate(found.times_us.tolist())
+    ]
+
+
+LAB = "/lab/wheels"
+LAB_TYPE = "lab_msgs/msg/Wheels"
+LAB_DEFINITION = (
+    "std_msgs/Header header\nstring surface\ntime at\nint64 ticks\nfloat32[4] slip\nWheel[2] driven\n"
+    + "=" * 80
+    + "\nMSG: lab_msgs/Wheel\nfloat64 rate\nbool locked\n"
+)
+LAB_COUNT = 200
+
+
+def lab_bag(path: Path) -> Path:
+    """A recording of a type that no library knows, whose frame changes half-way."""
+    store = get_typestore(Stores.ROS1_NOETIC)
+    store.register(get_types_from_msg(LAB_DEFINITION, LAB_TYPE))
+    made = store.types
+    with Writer(path) as writer:
+        connection = writer.add_connection(LAB, LAB_TYPE, typestore=store)
+        for i in range(LAB_COUNT):
+            t_ns = 1_600_000_000_000_000_000 + i * 20_000_000
+            stamp = made["builtin_interfaces/msg/Time"](*divmod(t_ns, 10**9))
+            frame = "base_link" if i < LAB_COUNT // 2 else "odom"
+            message = made[LAB_TYPE](
+                header=made["std_msgs/msg/Header"](seq=i, stamp=stamp, frame_id=frame),
+                surface=f"gr\u00fcn {i % 3}",
+                at=stamp,
+                ticks=2**60 + i,
+                slip=np.arange(4, dtype=np.float32) / (i + 1),
+                driven=[made["lab_msgs/msg/Wheel"](rate=i / 7, locked=bool(i % 2)) for _ in range(2)],
+            )
+            writer.write(connection, t_ns, store.serialize_ros1(message, LAB_TYPE))
+    return path
+
+
 @pytest.mark.timeout(300)
 def test_a_bag_comes_back_as_it_went_in(embedded, bundle, tmp_path):
-    original = recording("f1tenth-motor-servo.bag")
+    original, lab = recording("f1tenth-motor-servo.bag"), lab_bag(tmp_path / "lab.bag")
     robot = bundle(
         sources=[
             {
@@ -39,14 +92,22 @@ def test_a_bag_comes_back_as_it_went_in(embedded, bundle, tmp_path):
                 "topics": {VESC: "vesc", SERVO: "servo"},
                 "speed": 0,
                 "stamps": "original",
-            }
+            },
+            {
+                "type": "bag",
+                "path": str(lab),
+                "topics": {LAB: "lab"},
+                "speed": 0,
+                "stamps": "original",
+            },
         ],
         live={"enabled": False},
     )
     report = run_agent(robot)
-    assert report["streams"]["types"]["samples"] == 2
+    # Three types; the frames of the two that have headers, one of which changes.
+    assert report["streams"]["types"]["samples"] == 3 + 1 + 2
     exported = tmp_path / "again.bag"
-    asked = ["export", robot.robot, "vesc", "servo", "--last", "all", "--output"]
+    asked = ["export", robot.robot, "vesc", "servo", "lab", "--last", "all", "--output"]
     done = iort(*asked, str(exported), embedded=embedded)
     assert done.returncode == 0, done.stderr
     assert "2,244 messages of vesc_msgs/VescStateStamped on /sensors/core" in done.stderr
@@ -70,6 +131,12 @@ def test_a_bag_comes_back_as_it_went_in(embedded, bundle, tmp_path):
     came = messages(exported, SERVO)[1]
     assert [m.data for _, m in came] == [m.data for _, m in went]
 
+    kind, went = messages(lab, LAB)
+    assert kind == messages(exported, LAB)[0]
+    came = messages(exported, LAB)[1]
+    assert [repr(m) for _, m in came] == [repr(m) for _, m in went]
+    assert [m.header.frame_id for _, m in came] == ["base_link"] * 100 + ["odom"] * 100
+
     mcap = tmp_path / "again.mcap"
     done = iort(*asked, str(mcap), embedded=embedded)
     assert done.returncode == 0, done.stderr
@@ -80,11 +147,19 @@ def test_a_bag_comes_back_as_it_went_in(embedded, bundle, tmp_path):
         assert {(s.name, s.encoding) for s in summary.schemas.values()} == {
             ("vesc_msgs/VescStateStamped", "ros1msg"),
             ("std_msgs/Float64", "ros1msg"),
+            ("lab_msgs/Wheels", "ros1msg"),
         }
-        data = [message.data for _, _, message in reader.iter_messages(topics=[VESC])]
+        written = [message.data for _, _, message in reader.iter_messages(topics=[VESC])]
     with AnyReader([exported]) as bag:
         raw = [raw for c, _, raw in bag.messages() if c.topic == VESC]
-    assert data == raw
+    assert written == raw
+
+    for path in (mcap, exported):
+        foxglove = opened(path)
+        for topic, stream in ((VESC, "vesc"), (SERVO, "servo"), (LAB, "lab")):
+            asked_for = data_of(embedded.cloud, robot.robot, stream)
+            shown = [(t_ns, flat(message)) for t_ns, message in foxglove.messages[topic]]
+            assert shown == asked_for, (path, topic)
 
     done = iort(*asked, str(exported), embedded=embedded)
     assert done.returncode == 1

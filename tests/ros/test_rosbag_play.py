@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from contract import TYPES_STREAM, MessageType, message_type
+from contract import TYPES_STREAM, FrameId, MessageType, frame_id, message_type
 from device.clock import SystemClock
 from device.sources.bag import BagConfig
 from station import recordings
@@ -42,11 +42,11 @@ def driven(path: Path) -> tuple[dict[str, MessageType], dict[str, Samples]]:
     stop = threading.Event()
 
     def emit(stream: str, t_us: int, values: Any) -> None:
-        if stream == TYPES_STREAM:
+        if stream != TYPES_STREAM:
+            samples[stream].append((t_us, dict(values)))
+        elif "kind" in values:
             kind = message_type(values)
             kinds[kind.stream] = kind
-        else:
-            samples[stream].append((t_us, dict(values)))
 
     settings: Any = {"topics": tuple(STREAMS.items()), "speed": 0, "stamps": "original"}
     clock = SystemClock()
@@ -65,10 +65,13 @@ def block(samples: Samples) -> Block:
 
 def test_every_message_comes_back_from_rosbag_play(graph: Graph, player: list[str], tmp_path: Path) -> None:
     kinds, went = driven(recording("f1tenth-motor-servo.bag"))
+    # The car of the recording names no frame.
+    framed = {"base_link": went["vesc"][0][0], "odom": went["vesc"][COUNT // 2][0]}
     ride = tmp_path / "ride.bag"
     with recordings.bag(ride) as file:
         for stream, samples in went.items():
-            maker = Maker(kinds[stream], list(samples[0][1]))
+            frames = [FrameId(stream, VESC, name, t_us) for name, t_us in framed.items()]
+            maker = Maker(kinds[stream], list(samples[0][1]), frames=frames)
             assert not maker.lacking
             assert file.add(maker, iter([block(samples)])) == COUNT
 
@@ -90,3 +93,8 @@ def test_every_message_comes_back_from_rosbag_play(graph: Graph, player: list[st
     assert came("vesc") == went["vesc"]
     # A Float64 has no stamp of its own: its time is when it came.
     assert [values for _, values in came("servo")] == [values for _, values in went["servo"]]
+    # A Float64 has no header either, and the frames are told of the samples that they begin with.
+    told = [frame_id(sample) for _, sample in came(TYPES_STREAM) if "frame_id" in sample]
+    assert {(f.topic, f.frame_id): f.since_us for f in told} == {
+        (VESC, name): t_us for name, t_us in framed.items()
+    }

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import threading
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any, Tuple
 
@@ -42,20 +42,40 @@ def play_all(path: Path, clock: ManualClock | None = None, **settings: Any) -> l
 
 
 def test_the_first_message_of_a_topic_brings_its_type(tmp_path: Path) -> None:
-    first, second, *rest = play_all(write_ros1(tmp_path / "a.bag"))
+    first, frame, second, *rest = play_all(write_ros1(tmp_path / "a.bag"))
     kind = contract.message_type(first[2])
-    assert (first[0], first[1]) == (contract.TYPES_STREAM, second[1])
+    assert first[:2] == frame[:2] == (contract.TYPES_STREAM, second[1])
+    assert contract.frame_id(frame[2]) == contract.FrameId(second[0], "/sensors/core", "", second[1])
     assert (kind.stream, kind.kind) == (second[0], "vesc_msgs/VescStateStamped")
     assert "float64 speed" in kind.definition
     assert len(kind.md5sum) == 32
     assert contract.TYPES_STREAM not in {sample[0] for sample in rest}
 
 
+@pytest.mark.parametrize("stamps", ["now", "original"])
+def test_a_frame_is_said_from_the_sample_on_that_has_it(tmp_path: Path, stamps: str) -> None:
+    path = write_ros1(tmp_path / "a.bag", frames=["laser", "laser", "map"])
+    played = play_all(path, loop=True, duration_s=2.5, stamps=stamps)
+    times = [t_us for stream, t_us, _ in played if stream == contract.VESC_STREAM]
+    said = [contract.frame_id(v) for _, _, v in played if "frame_id" in v]
+    # Ten messages a round: nine in the frame map behind a laser, and so on.
+    assert [(f.frame_id, times.index(f.since_us)) for f in said[:4]] == [
+        ("laser", 0),
+        ("map", 2),
+        ("laser", 10),
+        ("map", 12),
+    ]
+
+
 STATE_ROS1 = "int32 FAULT_CODE_NONE=0\nfloat64 speed\nint32 fault_code\n"
 
 
 def write_ros1(
-    path: Path, *, count: int = 10, stamps: Callable[[int], int] = lambda t: t - 5_000_000
+    path: Path,
+    *,
+    count: int = 10,
+    stamps: Callable[[int], int] = lambda t: t - 5_000_000,
+    frames: Sequence[str] = ("",),
 ) -> Path:
     """Messages at 10 Hz, a stamp 5 ms before each is recorded, and a second topic."""
     store = get_typestore(Stores.ROS1_NOETIC)
@@ -69,7 +89,9 @@ def write_ros1(
             at = START + i * 100_000_000
             sec, nanosec = divmod(stamps(at), 1_000_000_000)
             stamp = types["builtin_interfaces/msg/Time"](sec=sec, nanosec=nanosec)
-            header = types["std_msgs/msg/Header"](seq=i, stamp=stamp, frame_id="")
+            header = types["std_msgs/msg/Header"](
+                seq=i, stamp=stamp, frame_id=frames[min(i, len(frames) - 1)]
+            )
             state = types["vesc_msgs/msg/VescState"](speed=float(i), fault_code=0)
             message = types[VESC_TYPE](header=header, state=state)
             writer.write(core, at, store.serialize_ros1(message, VESC_TYPE))

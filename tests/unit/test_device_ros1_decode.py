@@ -65,7 +65,11 @@ def test_decode(definition: str, data: bytes, values: dict[str, Any]) -> None:
 
 def test_the_stamp_is_exact_to_the_microsecond() -> None:
     decoder = Decoder(parse("a_msgs/A", STAMPED + "uint8 u"), stamp=True)
-    assert decoder.decode(header(1_700_000_000, 999_999_999) + b"\x01") == ({"u": 1}, 1_700_000_000_999_999)
+    assert decoder.decode(header(1_700_000_000, 999_999_999) + b"\x01") == (
+        {"u": 1},
+        1_700_000_000_999_999,
+        b"base_link",
+    )
     assert Decoder(parse("a_msgs/A", STAMPED + "uint8 u")).decode(header() + b"\x01").stamp_us is None
     assert Decoder(parse("a_msgs/A", "uint8 u"), stamp=True).decode(b"\x01").stamp_us is None
 

@@ -23,14 +23,17 @@ class Desk:
         self.clock = ManualClock(now_us=T0)
         self.samples: list[tuple[str, int, dict[str, Any]]] = []
         self.types: list[contract.MessageType] = []
+        self.frames: list[contract.FrameId] = []
         config = TopicConfig(**{"stream": "s", "time": "header", **settings})
         self.intake = Intake("/t", config, emit=self._emit, clock=self.clock)
 
     def _emit(self, stream: str, t_us: int, values: Any) -> None:
-        if stream == contract.TYPES_STREAM:
+        if stream != contract.TYPES_STREAM:
+            self.samples.append((stream, t_us, values))
+        elif "kind" in values:
             self.types.append(contract.message_type(values))
         else:
-            self.samples.append((stream, t_us, values))
+            self.frames.append(contract.frame_id(values))
 
     def take(self, data: bytes, **header: str) -> None:
         self.intake.take({**CONNECTION, **header}, data)
@@ -43,6 +46,21 @@ def test_a_publishers_type_is_said_when_it_connects() -> None:
         desk.intake.take(header, b"")
     said = contract.MessageType("s", "/t", "a_msgs/A", "1", CONNECTION["message_definition"])
     assert desk.types == [said]
+
+
+@pytest.mark.parametrize("time", ["header", "arrival"])
+def test_a_frame_is_said_once_and_when_it_is_another(time: str) -> None:
+    desk = Desk(time=time)
+    for second, frame in enumerate(["laser", "laser", "map", "gr\u00fcn"]):
+        desk.take(header(T0 // 1_000_000 + second, 0, frame) + b"\x01")
+    desk.take(b"\x01", message_definition="uint8 u")
+    at = [t_us for _, t_us, _ in desk.samples]
+    assert [(f.frame_id, f.since_us) for f in desk.frames] == [
+        ("laser", at[0]),
+        ("map", at[2]),
+        ("gr\u00fcn", at[3]),
+    ]
+    assert {(f.stream, f.topic) for f in desk.frames} == {("s", "/t")}
 
 
 def test_a_believable_stamp_is_the_samples_time() -> None:

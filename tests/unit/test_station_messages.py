@@ -6,11 +6,14 @@ import numpy as np
 import pytest
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
-from contract import ContractError, MessageType, message_type
+from contract import TYPES_STREAM, Batch, ContractError, FrameId, MessageType, build_topic, message_type
 from device.sources.flatten import flatten
 from station.blocks import Block, column_of
 from station.errors import StationError
-from station.messages import Maker, made_of
+from station.messages import Maker, made_of, said
+from station.selection import select
+from tests.fakes import TELEMETRY, item_of
+from tests.unit.test_station_data import cloud_of
 
 LINE = "=" * 80 + "\n"
 HEADER = LINE + "MSG: std_msgs/Header\nuint32 seq\ntime stamp\nstring frame_id\n"
@@ -39,6 +42,31 @@ def test_a_header_and_one_thing():
     assert maker.lacking == maker.foreign == []
 
 
+def test_headers_are_numbered_and_have_the_frame_of_their_time():
+    path = "Header header\nB[2] parts\n" + HEADER + LINE + "MSG: a_msgs/B\nHeader header\nfloat64 x\n"
+    frames = [FrameId("s", "/t", name, T_US + since) for name, since in (("laser", 1), ("map", 3))]
+    maker = Maker(MessageType("s", "/t", "a_msgs/A", "", path), ["parts.0.x", "parts.1.x"], frames=frames)
+    store = get_typestore(Stores.EMPTY)
+    store.register(get_types_from_msg(path, "a_msgs/msg/A"))
+    seen = []
+    for start in (T_US, T_US + 3):
+        block = Block(np.arange(start, start + 3), {"parts.0.x": column_of([1.0] * 3)})
+        for t_ns, raw in maker.messages(block):
+            message = store.deserialize_ros1(raw, "a_msgs/msg/A")
+            within = [part.header for part in message.parts]
+            seen.append((t_ns // 1000 - T_US, message.header.seq, message.header.frame_id))
+            # What is further within came with the same message; whose frame it was in is not kept.
+            assert [(header.seq, header.frame_id) for header in within] == [(message.header.seq, "")] * 2
+    assert seen == [
+        (0, 0, "laser"),
+        (1, 1, "laser"),
+        (2, 2, "laser"),
+        (3, 3, "map"),
+        (4, 4, "map"),
+        (5, 5, "map"),
+    ]
+
+
 def test_what_flattens_is_made_again():
     sample = {
         "on": True, "small": 7, "large": 2**60 + 1, "name": "ü", "at.sec": 5, "at.nanosec": 6,
@@ -56,6 +84,36 @@ def test_null_lacking_and_foreign_fields():
     assert np.isnan(message.b.x)
     assert message.b.code == 0
     assert (maker.lacking, maker.foreign) == (["code"], ["y"])
+
+
+def has_said(*samples):
+    """A cloud in which a robot has said these, a millisecond apart."""
+    cloud, topic = cloud_of(), build_topic("dt", "car", TYPES_STREAM)
+    for i, one in enumerate(samples):
+        columns = {name: [value] for name, value in one.sample().items()}
+        cloud.table.put(TELEMETRY, item_of(Batch("0badcafe", i, [1000 * (i + 1)], columns), topic))
+    return cloud
+
+
+def test_what_a_robot_has_said_of_its_messages():
+    first = MessageType("s", "/t", "a_msgs/A", "1" * 32, STAMPED)
+    second, other = first._replace(md5sum="2" * 32), first._replace(stream="o", topic="/o")
+    frames = [FrameId("s", "/t", name, t) for name, t in (("laser", 10), ("map", 30), ("odom", 20))]
+    elsewhere = [FrameId("s", "/u", "wrong", 15), FrameId("o", "/o", "wrong", 15)]
+    cloud = has_said(first, other, *frames, second, *elsewhere)
+    ordered = [frames[0], frames[2], frames[1]]
+    assert said(cloud, select("car", "s", None, None)) == (second, ordered)
+    # A range that ends before the change has the type before it, and one before the first has the first.
+    assert said(cloud, select("car", "s", None, 5000)) == (first, ordered)
+    assert said(cloud, select("car", "s", None, 10)) == (first, ordered)
+    assert said(cloud, select("car", "nothing", None, None)) == (None, [])
+
+
+def test_a_source_without_types_has_frames_all_the_same():
+    frame, all_of_it = FrameId("s", "/t", "laser", 10), select("car", "s", None, None)
+    assert said(has_said(frame), all_of_it) == (None, [frame])
+    # Two topics in one stream, and nothing to tell which of them a sample is of.
+    assert said(has_said(frame, frame._replace(topic="/u")), all_of_it) == (None, ())
 
 
 def test_samples_without_a_type_get_one():

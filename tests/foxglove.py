@@ -1,0 +1,59 @@
+"""Recordings as Foxglove sees them: read by the JavaScript libraries that it is made of."""
+
+from __future__ import annotations
+
+import json
+import os
+import shutil
+import subprocess
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import pytest
+
+ROOT = Path(__file__).resolve().parent.parent
+
+
+class Opened(NamedTuple):
+    """A recording: topic to type and checksum, and topic to time in nanoseconds and message."""
+
+    types: dict[str, tuple[str, str]]
+    messages: dict[str, list[tuple[int, dict[str, Any]]]]
+
+
+def opened(path: Path) -> Opened:
+    """The recording, every message of it decoded; skips the test where Node or the libraries are missing."""
+    node = shutil.which("node")
+    modules = Path(os.environ.get("IORT_NODE_MODULES") or ROOT / "node_modules")
+    if node is None or not (modules / "@mcap" / "core").is_dir():
+        pytest.skip("needs node and Foxglove's libraries: run make setup")
+    command = [node, Path(__file__).with_name("foxglove_reader.cjs"), modules, path]
+    done = subprocess.run(command, capture_output=True, text=True, check=False, timeout=300)
+    assert done.returncode == 0, done.stderr
+    found = Opened({}, {})
+    for line in map(json.loads, done.stdout.splitlines()):
+        if "message" in line:
+            found.messages.setdefault(line["topic"], []).append((int(line["t_ns"]), line["message"]))
+        else:
+            found.types[line["topic"]] = line["type"], line["md5sum"]
+    return found
+
+
+def flat(message: dict[str, Any]) -> dict[str, Any]:
+    """The fields of a message by the paths that samples have, without what headers hold."""
+    return dict(_flat("", message))
+
+
+def _flat(path: str, value: Any) -> Iterator[tuple[str, Any]]:
+    if isinstance(value, dict):
+        for name, member in value.items():
+            # ROS 1's name in JavaScript; samples have ROS 2's.
+            part = "nanosec" if name == "nsec" else name
+            if name != "header":
+                yield from _flat(f"{path}.{part}" if path else part, member)
+    elif isinstance(value, list):
+        for i, member in enumerate(value):
+            yield from _flat(f"{path}.{i}", member)
+    else:
+        yield path, value
