@@ -51,14 +51,14 @@ def test_a_publishers_type_is_said_when_it_connects() -> None:
 @pytest.mark.parametrize("time", ["header", "arrival"])
 def test_a_frame_is_said_once_and_when_it_is_another(time: str) -> None:
     desk = Desk(time=time)
-    for second, frame in enumerate(["laser", "laser", "map", "gr\u00fcn"]):
+    for second, frame in enumerate(["laser", "laser", "map", "grün"]):
         desk.take(header(T0 // 1_000_000 + second, 0, frame) + b"\x01")
     desk.take(b"\x01", message_definition="uint8 u")
     at = [t_us for _, t_us, _ in desk.samples]
     assert [(f.frame_id, f.since_us) for f in desk.frames] == [
         ("laser", at[0]),
         ("map", at[2]),
-        ("gr\u00fcn", at[3]),
+        ("grün", at[3]),
     ]
     assert {(f.stream, f.topic) for f in desk.frames} == {("s", "/t")}
 
