@@ -88,7 +88,7 @@ from contract.live import (
     live_update,
 )
 from contract.message_type import FrameId, MessageType, frame_id, message_type
-from contract.seconds import flat_second, packed_second
+from contract.seconds import Statistics, flat_second, packed_second
 from contract.tables import (
     ADMISSION,
     ADMIT_CLAIM,
@@ -310,6 +310,7 @@ __all__ = [
     "LiveSample",
     "MessageType",
     "Pong",
+    "Statistics",
     "Topic",
     "Value",
     "build_topic",

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Mapping, Sequence
+from itertools import chain
 
 from contract import (
     AGENT_STREAM,
@@ -35,18 +36,15 @@ def measure(stream: str, batches: Sequence[Batch]) -> Measured:
     within each batch.
     """
     if stream == RTT_STREAM:
-        return {
-            f"RoundTrip{path.capitalize()}Ms": list(_numbers(batches, RTT_FIELDS[path]))
-            for path in PING_PATHS
-        }
+        return {f"RoundTrip{path.capitalize()}Ms": _numbers(batches, RTT_FIELDS[path]) for path in PING_PATHS}
     if stream == AGENT_STREAM:
-        backlog = list(_numbers(batches, "backlog_batches"))
+        backlog = _numbers(batches, "backlog_batches")
         return {"AgentReports": sum(len(batch.times_us) for batch in batches), "BacklogBatches": backlog[-1:]}
     volts = [value for value in _numbers(batches, VOLTAGE_FIELD) if value > 0]
     hot = [value for name in _TEMPERATURES for value in _numbers(batches, name) if value]
     return {
         "SampleGaps": sum(count_holes(batch.times_us) for batch in batches),
-        "FaultSamples": sum(value != 0 for value in _numbers(batches, FAULT_FIELD)),
+        "FaultSamples": sum(map(bool, _numbers(batches, FAULT_FIELD))),
         "BatteryVolts": [min(volts)] if volts else [],
         "TemperatureDegC": [max(hot)] if hot else [],
     }
@@ -68,6 +66,6 @@ def together(measured: Iterable[Measured]) -> Iterator[Measured]:
         yield {name: found[start : start + MOST_VALUES] for name, found in values.items()}
 
 
-def _numbers(batches: Iterable[Batch], name: str) -> Iterator[float]:
-    for batch in batches:
-        yield from numbers_of(batch.columns.get(name, ()))
+def _numbers(batches: Iterable[Batch], name: str) -> list[int | float]:
+    columns = (batch.columns.get(name, ()) for batch in batches)
+    return list(chain.from_iterable(map(numbers_of, columns)))

@@ -19,7 +19,6 @@ from functools import cache, partial
 from typing import Any
 
 import boto3
-from botocore.config import Config
 
 from contract import (
     EXPIRES_S,
@@ -27,10 +26,11 @@ from contract import (
     REPLAY,
     Batch,
     ContractError,
-    Value,
+    Statistics,
     decode_item,
     parse_topic,
 )
+from functions import quick_dynamodb
 from functions.health import measure, together
 from functions.metrics import emit
 from functions.refusals import Refusals, Refused
@@ -87,7 +87,7 @@ class Summaries:
     """Of one topic: a summary a second, the batches missing just before those of the event, and those of
     the event that are beyond what their second may hold."""
 
-    seconds: dict[int, dict[str, Value]] = field(default_factory=dict)
+    seconds: dict[int, dict[str, Statistics]] = field(default_factory=dict)
     missing: int = 0
     beyond: set[BatchKey] = field(default_factory=set)
 
@@ -215,8 +215,7 @@ def _summarized(tables: Tables, batches: Mapping[str, Sequence[Batch]], at_once:
 @cache
 def _tables() -> Tables:
     tables = Tables(
-        # The requests are this code's own, and DynamoDB looks at them too: a third of the time went there.
-        boto3.client("dynamodb", config=Config(parameter_validation=False)),
+        quick_dynamodb.client(),
         telemetry=os.environ["TELEMETRY_TABLE"],
         summary=os.environ["SUMMARY_TABLE"],
         robots=os.environ["ROBOTS_TABLE"],

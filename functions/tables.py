@@ -11,7 +11,7 @@ from typing import Any
 
 from boto3.dynamodb.types import TypeDeserializer
 
-from contract import OMITTED, ROBOT, SECOND, T_US, TOPIC, Value, packed_second
+from contract import OMITTED, ROBOT, SECOND, T_US, TOPIC, Statistics
 from functions.statistics import Vehicle
 
 _log = logging.getLogger(__name__)
@@ -41,25 +41,22 @@ def plain(image: Mapping[str, Any]) -> dict[str, Any]:
     return {name: _deserialize(value) for name, value in image.items()}
 
 
-def attribute(value: Value | list[Value]) -> dict[str, Any]:
+def attribute(value: Statistics) -> dict[str, Any]:
     """A value, or a list of some, as a DynamoDB attribute.
 
     A number too small becomes 0, one too large its own text.
     """
-    if value is None:
-        return {"NULL": True}
-    if isinstance(value, bool):
-        return {"BOOL": value}
-    if isinstance(value, str):
-        return {"S": value}
-    if isinstance(value, float):
-        if not math.isfinite(value) or abs(value) > _LARGEST:
-            return {"S": repr(value)}
-        if abs(value) < _SMALLEST:
-            return {"N": "0"}
     if isinstance(value, list):
         return {"L": list(map(attribute, value))}
-    return {"N": repr(value)}
+    if isinstance(value, float):
+        if _SMALLEST <= abs(value) <= _LARGEST:
+            return {"N": repr(value)}
+        return {"N": "0"} if abs(value) < _SMALLEST else {"S": repr(value)}
+    if isinstance(value, bool):
+        return {"BOOL": value}
+    if isinstance(value, int):
+        return {"N": repr(value)}
+    return {"NULL": True} if value is None else {"S": value}
 
 
 class Tables:
@@ -130,7 +127,7 @@ class Tables:
             cached = self._vehicles[robot] = (now, _vehicle(plain(answer.get("Item", {}))))
         return cached[1]
 
-    def put_seconds(self, seconds: Mapping[tuple[str, int], Mapping[str, Value]]) -> None:
+    def put_seconds(self, seconds: Mapping[tuple[str, int], Mapping[str, Statistics]]) -> None:
         """Write the summaries, keyed by topic and second; raises `TableError` if some stay unwritten."""
         requests = (
             {"PutRequest": {"Item": self._second_item(topic, second, summary)}}
@@ -139,8 +136,8 @@ class Tables:
         while chunk := list(islice(requests, _WRITE_SIZE)):
             self._write(chunk)
 
-    def _second_item(self, topic: str, second: int, summary: Mapping[str, Value]) -> dict[str, Any]:
-        item = fitting({name: attribute(value) for name, value in packed_second(summary).items()})
+    def _second_item(self, topic: str, second: int, summary: Mapping[str, Statistics]) -> dict[str, Any]:
+        item = fitting({name: attribute(value) for name, value in summary.items()})
         return {**item, TOPIC: {"S": topic}, SECOND: {"N": str(second)}}
 
     def _write(self, requests: Sequence[Mapping[str, Any]]) -> None:
@@ -174,11 +171,11 @@ def fitting(item: dict[str, Any]) -> dict[str, Any]:
 
 
 def _size(name: str, value: Mapping[str, Any]) -> int:
-    """About what DynamoDB counts: names and texts in UTF-8, and no number more than its digits."""
+    """At least what DynamoDB counts: names and texts in UTF-8, and no number more than its digits."""
     ((kind, content),) = value.items()
-    if kind == "L":
-        return len(name.encode()) + 3 + _MAX_NUMBER_BYTES * len(content)
-    return len(name.encode()) + len(str(content).encode("utf-8", "surrogatepass")) + 3
+    if kind == "S":
+        return len(name.encode()) + len(content.encode("utf-8", "surrogatepass")) + 3
+    return len(name.encode()) + 3 + _MAX_NUMBER_BYTES * (len(content) if kind == "L" else 1)
 
 
 def _vehicle(row: Mapping[str, Any]) -> Vehicle | None:

@@ -26,7 +26,6 @@ from contract import (
     encode_live,
     encode_ping,
     live_update,
-    packed_second,
     record_topic,
 )
 from device.sources.vehicle import Vehicle, VehicleConfig
@@ -133,4 +132,4 @@ def _summary(batch: Batch) -> dict[str, Any]:
     """The item that Lambda 2 makes of a second."""
     second = batch.t_us // 1_000_000
     summary = summarize_second(second, [replace(batch, seq=0)], Gain(VehicleConfig().speed_to_erpm_gain))
-    return {**packed_second(summary or {}), TOPIC: _rule()[TOPIC], SECOND: second, EXPIRES_S: _MS // 1000}
+    return {**(summary or {}), TOPIC: _rule()[TOPIC], SECOND: second, EXPIRES_S: _MS // 1000}

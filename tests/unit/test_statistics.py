@@ -9,7 +9,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from contract import Batch
+from contract import Batch, flat_second
 from functions.statistics import (
     Vehicle,
     count_holes,
@@ -32,12 +32,17 @@ def every(step_us, n, start_us=T0):
     return [start_us + i * step_us for i in range(n)]
 
 
+def summarized(second, batches, vehicle):
+    found = summarize_second(second, batches, vehicle)
+    return None if found is None else flat_second(found)
+
+
 # --- one second -------------------------------------------------------------------------------------
 
 
 def test_min_mean_max_and_last_of_every_field_and_what_the_stream_lacked():
     first = batch(every(100_000, 5), {"speed": [4624, 10, 9238, 10, 10], "mode": ["a", "b", None, "c", "d"]})
-    assert summarize_second(SECOND, [first], CAR) == {
+    assert summarized(SECOND, [first], CAR) == {
         "n": 5,
         "batches": 1,
         "missing_batches": 0,
@@ -56,13 +61,13 @@ def test_min_mean_max_and_last_of_every_field_and_what_the_stream_lacked():
 
 
 def test_a_second_without_a_sample_has_no_summary():
-    assert summarize_second(SECOND, [], CAR) is None
-    assert summarize_second(SECOND, [batch([T0 - 1], {"a": [1]}), batch([T0 + S], {"a": [1]})], CAR) is None
+    assert summarized(SECOND, [], CAR) is None
+    assert summarized(SECOND, [batch([T0 - 1], {"a": [1]}), batch([T0 + S], {"a": [1]})], CAR) is None
 
 
 def test_a_batch_over_the_boundary_counts_in_each_second_with_its_own_samples():
     across = batch([T0 - 20_000, T0 - 1, T0, T0 + 20_000], {"a": [1, 2, 3, 4]}, seq=4, nonfinite=3)
-    before, after = (summarize_second(second, [across], None) for second in (SECOND - 1, SECOND))
+    before, after = (summarized(second, [across], None) for second in (SECOND - 1, SECOND))
     assert (before["n"], before["a_min"], before["a_max"], before["a_last"]) == (2, 1, 2, 2)
     assert (after["n"], after["a_min"], after["a_max"], after["a_last"]) == (2, 3, 4, 4)
     assert (before["batches"], after["batches"]) == (1, 1)
@@ -73,8 +78,8 @@ def test_a_batch_over_the_boundary_counts_in_each_second_with_its_own_samples():
 
 def test_seconds_before_the_epoch_are_seconds_too():
     early = batch([-1, 0, 999_999], {"a": [1, 2, 3]})
-    assert summarize_second(-1, [early], None)["n"] == 1
-    assert summarize_second(0, [early], None)["n"] == 2
+    assert summarized(-1, [early], None)["n"] == 1
+    assert summarized(0, [early], None)["n"] == 2
 
 
 def test_fields_appear_and_vanish_from_batch_to_batch():
@@ -86,7 +91,7 @@ def test_fields_appear_and_vanish_from_batch_to_batch():
             {"a": [None, 7], "voltage_input": [12, 13], "current_input": [1, 2]},
         ),
     ]
-    second = summarize_second(SECOND, batches, None)
+    second = summarized(SECOND, batches, None)
     assert (second["a_min"], second["a_mean"], second["a_max"], second["a_last"]) == (
         1,
         pytest.approx(10 / 3),
@@ -105,7 +110,7 @@ def test_a_field_of_nulls_leaves_nothing_and_a_field_of_text_or_bools_its_last()
         "flag": [True, False, None],
         "mixed": [1, "x", 2.5],
     }
-    second = summarize_second(SECOND, [batch(every(1, 3), columns)], None)
+    second = summarized(SECOND, [batch(every(1, 3), columns)], None)
     assert {k: v for k, v in second.items() if "_" in k and not k.startswith("missing")} == {
         "text_last": "b",
         "flag_last": False,
@@ -127,7 +132,7 @@ def test_a_field_of_nulls_leaves_nothing_and_a_field_of_text_or_bools_its_last()
     ],
 )
 def test_numbers_at_the_ends_of_their_ranges(column):
-    second = summarize_second(SECOND, [batch(every(1, 3), {"a": column})], None)
+    second = summarized(SECOND, [batch(every(1, 3), {"a": column})], None)
     assert (second["a_min"], second["a_max"], second["a_last"]) == (min(column), max(column), column[-1])
     assert second["a_min"] <= second["a_mean"] <= second["a_max"]
     exact = float(sum(map(Fraction, column)) / 3)
@@ -142,7 +147,7 @@ def test_every_number_has_a_finite_summary_within_its_bounds(column, other):
     n = min(len(column), len(other))
     columns = {"speed": column[:n], "voltage_input": column[:n], "current_input": other[:n]}
     for vehicle in (None, CAR, Vehicle(1e-100), Vehicle(-1e300, 1e308)):
-        second = summarize_second(SECOND, [batch(every(1, n), columns)], vehicle)
+        second = summarized(SECOND, [batch(every(1, n), columns)], vehicle)
         for field in ("speed", "voltage_input", "current_input", "power_w", "speed_mps"):
             if f"{field}_mean" in second:
                 assert math.isfinite(second[f"{field}_mean"])
@@ -221,5 +226,5 @@ def test_holes_are_steps_over_three_times_the_usual(steps, holes):
 def test_a_hole_between_two_batches_is_seen_from_the_second_after():
     before = batch(every(20_000, 40, T0 - S), seq=0)
     after = batch(every(20_000, 50), seq=1)
-    assert summarize_second(SECOND, [before, after], None)["gaps"] == 1
-    assert summarize_second(SECOND, [after], None)["gaps"] == 0
+    assert summarized(SECOND, [before, after], None)["gaps"] == 1
+    assert summarized(SECOND, [after], None)["gaps"] == 0
