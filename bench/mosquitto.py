@@ -5,8 +5,6 @@ It only passes messages on: there are no rules, no tables and no policies behind
 
 from __future__ import annotations
 
-import datetime as dt
-import ipaddress
 import shutil
 import socket
 import subprocess
@@ -14,15 +12,12 @@ import time
 from pathlib import Path
 from types import TracebackType
 
-from cryptography import x509
-from cryptography.hazmat.primitives import hashes, serialization
-from cryptography.hazmat.primitives.asymmetric import ec
-from cryptography.x509.oid import NameOID
 from typing_extensions import Self
+
+from local.certificates import Identity
 
 HOST = "127.0.0.1"
 _START_S = 20.0
-_NAME = x509.Name([x509.NameAttribute(NameOID.COMMON_NAME, "iort bench")])
 # Messages leave at once, as they do from AWS IoT Core and the agent.
 _SETTINGS = """
 listener {port} {host}
@@ -50,7 +45,7 @@ class Mosquitto:
 
     def __init__(self, program: str, folder: Path) -> None:
         self._program, self._folder = program, folder
-        self._key = ec.generate_private_key(ec.SECP256R1())
+        self._authority = Identity.make("iort bench", HOST, authority=True)
         with socket.socket() as probe:
             probe.bind((HOST, 0))
             self.port = int(probe.getsockname()[1])
@@ -61,7 +56,7 @@ class Mosquitto:
         return self._folder / "ca.pem"
 
     def __enter__(self) -> Self:
-        self._write("ca", self._key, authority=True)
+        self._authority.write(self._folder, "ca")
         self.identity("broker")
         config = self._folder / "mosquitto.conf"
         config.write_text(_SETTINGS.format(port=self.port, host=HOST, folder=self._folder))
@@ -90,34 +85,4 @@ class Mosquitto:
 
     def identity(self, name: str) -> tuple[Path, Path]:
         """A new certificate and its key, as files."""
-        key = ec.generate_private_key(ec.SECP256R1())
-        return self._write(name, key, authority=False)
-
-    def _write(self, name: str, key: ec.EllipticCurvePrivateKey, *, authority: bool) -> tuple[Path, Path]:
-        now = dt.datetime.now(dt.timezone.utc)
-        subject = _NAME if authority else x509.Name([x509.NameAttribute(NameOID.COMMON_NAME, name)])
-        address = x509.IPAddress(ipaddress.ip_address(HOST))
-        made = (
-            x509.CertificateBuilder()
-            .subject_name(subject)
-            .issuer_name(_NAME)
-            .public_key(key.public_key())
-            .serial_number(x509.random_serial_number())
-            .not_valid_before(now - dt.timedelta(days=1))
-            .not_valid_after(now + dt.timedelta(days=2))
-            .add_extension(x509.BasicConstraints(ca=authority, path_length=None), critical=True)
-            .add_extension(x509.SubjectAlternativeName([address]), critical=False)
-            .sign(self._key, hashes.SHA256())
-        )
-        certificate_file, key_file = self._folder / f"{name}.pem", self._folder / f"{name}.key"
-        certificate_file.write_bytes(made.public_bytes(serialization.Encoding.PEM))
-        key_file.touch(mode=0o600)
-        key_file.write_bytes(
-            key.private_bytes(
-                serialization.Encoding.PEM,
-                # The agent's TLS library reads keys of elliptic curves in their own format.
-                serialization.PrivateFormat.TraditionalOpenSSL,
-                serialization.NoEncryption(),
-            )
-        )
-        return certificate_file, key_file
+        return Identity.make(name, HOST, signer=self._authority).write(self._folder, name)

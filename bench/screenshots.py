@@ -24,7 +24,7 @@ from typing import Any, Literal
 from bench.cars import Publisher, SimulatedCar, drive
 from local.cloud import EmbeddedCloud
 from local.deployment import ROOT
-from station import keys, robots
+from station import robots
 from station.answers import answers
 from station.page_server import PageServer
 
@@ -64,9 +64,7 @@ def main() -> None:
         vehicles = {f"car{i + 1}": {"speed_to_erpm_gain": 4614.0} for i in range(_FLEET + 1)}
         server = PageServer(
             namespace=cloud.namespace,
-            subscribe_key=cloud.subscribe_key,
-            origin=cloud.pubnub.origin,
-            tls=False,
+            **cloud.keys.reading(),
             vehicles=vehicles,
             answers=answers(cloud.cloud),
         )
@@ -130,9 +128,9 @@ def _driving(cloud: EmbeddedCloud, folder: Path) -> Iterator[None]:
     settings = {"sources": [source], "ping": {"rate_hz": 2}}
     bundle = robots.add(cloud.cloud, _REAL, out=folder, settings=settings)
     agent = [str(Path(sys.executable).parent / "iort-agent"), "run", "--config", str(bundle.config)]
-    publish_key = keys.load(cloud.cloud).publish_key
+    pubnub = cloud.keys
     publisher = Publisher(
-        origin=cloud.pubnub.origin, publish_key=publish_key, subscribe_key=cloud.subscribe_key
+        origin=pubnub.origin, publish_key=pubnub.publish_key, subscribe_key=pubnub.subscribe_key
     )
     cars = [SimulatedCar(f"car{i + 2}", i + 2, senses=i + 1 == _SENSES) for i in range(_FLEET)]
     stop = threading.Event()

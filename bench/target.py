@@ -52,10 +52,9 @@ class Target:
         """A subscriber of the robot's channel."""
         pubnub = keys.load(self.cloud)
         return Listener(
-            subscribe_key=pubnub.subscribe_key,
             robot=robot,
             namespace=self.cloud.namespace,
-            **pubnub.server(),
+            **pubnub.reading(),
         )
 
     def remove_robots(self, say: Say) -> None:

@@ -44,13 +44,14 @@ from contract import (
     encode_ping,
     live_event,
 )
-from local import gateway_certificate
+from local.certificates import Identity
 from local.deployment import ROOT, deploy
 from local.errors import LocalError
 from local.processes import Child
 from local.pubnub_standin import PubNubStandIn
 from station import keys
 from station.cloud import EMBEDDED, Cloud
+from station.keys import PubNubKeys
 
 FOLDER = EMBEDDED.parent
 
@@ -84,8 +85,7 @@ class EmbeddedCloud:
         self.cloud: Cloud
         self.pubnub: PubNubStandIn
         self.emulator: Child
-        self.subscribe_key = f"sub-c-{secrets.token_hex(8)}"
-        self._publish_key = f"pub-c-{secrets.token_hex(8)}"
+        self.keys: PubNubKeys
 
     def __enter__(self) -> Self:
         try:
@@ -103,7 +103,7 @@ class EmbeddedCloud:
     def _start(self) -> None:
         self._take_folder()
         ports = {name: self._port(name) for name in ("gateway", "mqtt", "pubnub")}
-        certificate, key = gateway_certificate.write(self.folder, self.host)
+        certificate, key = Identity.make("iort embedded cloud", self.host).write(self.folder, "gateway")
         self.cloud = Cloud(
             namespace=self.namespace,
             region=_REGION,
@@ -120,21 +120,17 @@ class EmbeddedCloud:
         # Robots send files to the gateway as well, whose certificate is one of its own.
         self.cloud = replace(self.cloud, root_ca_pem=root_ca + certificate.read_text())
         self._progress("PubNub stand-in")
+        publish_key, subscribe_key = (f"{kind}-c-{secrets.token_hex(8)}" for kind in ("pub", "sub"))
         self.pubnub = PubNubStandIn(
-            self.host, ports["pubnub"], publish_key=self._publish_key, subscribe_key=self.subscribe_key
+            self.host, ports["pubnub"], publish_key=publish_key, subscribe_key=subscribe_key
         )
         self.pubnub.start()
         self._exit.callback(self.pubnub.stop)
-        deploy(self.cloud, self.folder, self._progress)
-        keys.store(
-            self.cloud,
-            keys.PubNubKeys(
-                publish_key=self._publish_key,
-                subscribe_key=self.subscribe_key,
-                origin=self.pubnub.origin,
-                tls=False,
-            ),
+        self.keys = PubNubKeys(
+            publish_key=publish_key, subscribe_key=subscribe_key, origin=self.pubnub.origin, tls=False
         )
+        deploy(self.cloud, self.folder, self._progress)
+        keys.store(self.cloud, self.keys)
         self._warm_up()
         self.cloud.save(self.folder / EMBEDDED.name)
         self._exit.callback((self.folder / EMBEDDED.name).unlink, missing_ok=True)

@@ -124,9 +124,7 @@ class _Demo:
             page = stack.enter_context(
                 PageServer(
                     namespace=embedded.namespace,
-                    subscribe_key=embedded.subscribe_key,
-                    origin=embedded.pubnub.origin,
-                    tls=False,
+                    **embedded.keys.reading(),
                     vehicles=vehicles,
                     answers=answers(embedded.cloud),
                     port=self._options.port,
@@ -134,11 +132,9 @@ class _Demo:
             )
             listener = stack.enter_context(
                 Listener(
-                    subscribe_key=embedded.subscribe_key,
                     robot=ROBOT,
                     namespace=embedded.namespace,
-                    origin=embedded.pubnub.origin,
-                    tls=False,
+                    **embedded.keys.reading(),
                 )
             )
             self._step("car")

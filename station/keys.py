@@ -20,14 +20,15 @@ class PubNubKeys:
     origin: str = ""
     tls: bool = True
 
-    def server(self) -> dict[str, Any]:
-        """The server as keyword arguments; none for PubNub's own."""
-        return {"origin": self.origin, "tls": self.tls} if self.origin else {}
+    def reading(self) -> dict[str, Any]:
+        """What a listener or a page is given, as keyword arguments; no server where it is PubNub's own."""
+        server = {"origin": self.origin, "tls": self.tls} if self.origin else {}
+        return {"subscribe_key": self.subscribe_key, **server}
 
 
 def store(cloud: Cloud, keys: PubNubKeys) -> None:
     """Write the keys, replacing those that are there."""
-    value = {"publish_key": keys.publish_key, "subscribe_key": keys.subscribe_key, **keys.server()}
+    value = {"publish_key": keys.publish_key, **keys.reading()}
     cloud.client("ssm").put_parameter(
         Name=pubnub_parameter(cloud.namespace), Value=json.dumps(value), Type="SecureString", Overwrite=True
     )

@@ -15,7 +15,7 @@ import contract
 from contract import FILE, PING, PONG, Address, FileAnswer, FileRequest, build_topic
 from device.loopback import Loopback
 from device.uplink import Message
-from local import gateway_certificate
+from local.certificates import Identity
 
 
 class Store:
@@ -114,7 +114,7 @@ class _Server(http.server.ThreadingHTTPServer):
 @contextmanager
 def store(uplink: Loopback, folder: Path) -> Iterator[tuple[Store, Path]]:
     """The stand-in, and the certificate to trust."""
-    certificate, key = gateway_certificate.write(folder, "127.0.0.1")
+    certificate, key = Identity.make("store", "127.0.0.1").write(folder, "store")
     context = ssl.SSLContext(ssl.PROTOCOL_TLS_SERVER)
     context.load_cert_chain(certificate, key)
     with _Server(("127.0.0.1", 0), _Handler) as server:

@@ -36,13 +36,12 @@ def dashboard(
     pubnub_keys = keys.load(cloud)
     with PageServer(
         namespace=cloud.namespace,
-        subscribe_key=pubnub_keys.subscribe_key,
         vehicles=registry.vehicles(cloud),
         token=token,
         answers=answers(cloud),
         host=host,
         port=port,
-        **pubnub_keys.server(),
+        **pubnub_keys.reading(),
     ) as page:
         _out.print(f"{page.url}  (Ctrl-C stops)")
         threading.Event().wait()

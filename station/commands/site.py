@@ -38,9 +38,8 @@ def site(
     pubnub_keys = keys.load(cloud)
     told = config(
         namespace=cloud.namespace,
-        subscribe_key=pubnub_keys.subscribe_key,
         vehicles=registry.vehicles(cloud),
         token=token,
-        **pubnub_keys.server(),
+        **pubnub_keys.reading(),
     )
     _out.print(publish(cloud, told))

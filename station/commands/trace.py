@@ -50,11 +50,10 @@ def trace_(
 
     pubnub = keys.load(cloud)
     listener = Listener(
-        subscribe_key=pubnub.subscribe_key,
         robot=robot,
         namespace=cloud.namespace,
         on_update=take,
-        **pubnub.server(),
+        **pubnub.reading(),
     )
     with listener, _errors.status(f"listening to {robot}"):
         with trace.pubnub_clock(pubnub.origin or PUBNUB_ORIGIN, tls=pubnub.tls) as ask:

@@ -38,12 +38,11 @@ def watch(
     gains = {robot: car["speed_to_erpm_gain"] for robot, car in registry.vehicles(cloud).items()}
     fleet, done = FleetWatch(gains), threading.Event()
     listener = Listener(
-        subscribe_key=pubnub_keys.subscribe_key,
         robot=None,
         namespace=cloud.namespace,
         on_update=_Lines(done).take if as_json else fleet.take,
         token=token,
-        **pubnub_keys.server(),
+        **pubnub_keys.reading(),
     )
     try:
         with listener:

@@ -125,11 +125,9 @@ def test_live_lane_shows_now_while_the_backlog_drains(embedded, bundle, proxy, t
     log = counter_log(tmp_path / "counter.csv", 600)
     car = bundle(**_settings(log, proxy.port))
     with Listener(
-        subscribe_key=embedded.subscribe_key,
         robot=car.robot,
         namespace=embedded.namespace,
-        origin=embedded.pubnub.origin,
-        tls=False,
+        **embedded.keys.reading(),
     ) as listener:
         proxy.mode = REFUSE
         agent = Agent(car)

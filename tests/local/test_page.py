@@ -42,9 +42,7 @@ def watching(embedded: EmbeddedCloud) -> Iterator[subprocess.Popen[str]]:
 def served(embedded: EmbeddedCloud) -> PageServer:
     return PageServer(
         namespace=embedded.namespace,
-        subscribe_key=embedded.subscribe_key,
-        origin=embedded.pubnub.origin,
-        tls=False,
+        **embedded.keys.reading(),
         answers=answers(embedded.cloud),
     )
 
@@ -53,11 +51,9 @@ def test_what_the_car_sent_is_what_is_shown_live_and_later(embedded, bundle, ope
     source = {"type": "sim", "stream": VESC_STREAM, "rate_hz": RATE_HZ, "duration_s": DRIVE_S}
     car = bundle(sources=[source])
     listener = Listener(
-        subscribe_key=embedded.subscribe_key,
         robot=car.robot,
         namespace=embedded.namespace,
-        origin=embedded.pubnub.origin,
-        tls=False,
+        **embedded.keys.reading(),
     )
     with served(embedded) as server, watching(embedded) as watched, listener:
         page = open_page(f"{server.url}#/car/{car.robot}")

@@ -23,11 +23,9 @@ from tests.recordings import recording
 
 def _listener(embedded: EmbeddedCloud, robot: str) -> Listener:
     return Listener(
-        subscribe_key=embedded.subscribe_key,
         robot=robot,
         namespace=embedded.namespace,
-        origin=embedded.pubnub.origin,
-        tls=False,
+        **embedded.keys.reading(),
     )
 
 

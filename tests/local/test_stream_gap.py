@@ -11,6 +11,7 @@ from ministack.core.responses import request_scope
 from ministack.services import dynamodb, lambda_svc, sqs
 
 from local.stream_gap import StreamMappings
+from tests.local import series_table
 
 ACCOUNT, REGION = "000000000000", "eu-west-1"
 QUEUE_ARN = f"arn:aws:sqs:{REGION}:{ACCOUNT}:gap-destination"
@@ -20,21 +21,7 @@ QUEUE_ARN = f"arn:aws:sqs:{REGION}:{ACCOUNT}:gap-destination"
 def cloud(monkeypatch):
     """A table with a stream, a queue, and a function that answers what the test says."""
     with request_scope(ACCOUNT, REGION):
-        definition = {
-            "TableName": "gap",
-            "KeySchema": [
-                {"AttributeName": "topic", "KeyType": "HASH"},
-                {"AttributeName": "t", "KeyType": "RANGE"},
-            ],
-            "AttributeDefinitions": [
-                {"AttributeName": "topic", "AttributeType": "S"},
-                {"AttributeName": "t", "AttributeType": "N"},
-            ],
-            "BillingMode": "PAY_PER_REQUEST",
-            "StreamSpecification": {"StreamEnabled": True, "StreamViewType": "NEW_IMAGE"},
-        }
-        created = dynamodb._create_table(definition)
-        assert created[0] == 200, created
+        series_table.create("gap", StreamSpecification={"StreamEnabled": True, "StreamViewType": "NEW_IMAGE"})
         sqs._act_create_queue({"QueueName": "gap-destination"}, "")
         mapping = {
             "UUID": "gap-mapping",

@@ -12,6 +12,7 @@ from ministack.core.responses import request_scope
 from ministack.services import dynamodb
 
 from local import table_gap
+from tests.local import series_table
 
 ACCOUNT, REGION = "000000000000", "eu-west-1"
 TABLE = "ordered-gap"
@@ -43,18 +44,6 @@ def query():
 @pytest.fixture(scope="module")
 def table():
     """Holds numbers, whatever the order they came in."""
-    definition = {
-        "TableName": TABLE,
-        "KeySchema": [
-            {"AttributeName": "topic", "KeyType": "HASH"},
-            {"AttributeName": "t", "KeyType": "RANGE"},
-        ],
-        "AttributeDefinitions": [
-            {"AttributeName": "topic", "AttributeType": "S"},
-            {"AttributeName": "t", "AttributeType": "N"},
-        ],
-        "BillingMode": "PAY_PER_REQUEST",
-    }
     keep = table_gap._ordering(dynamodb._set_item)
 
     def hold(numbers):
@@ -67,8 +56,7 @@ def table():
             return held
 
     with request_scope(ACCOUNT, REGION):
-        created = dynamodb._create_table(definition)
-        assert created[0] == 200, created
+        series_table.create(TABLE)
     yield hold
     with request_scope(ACCOUNT, REGION):
         dynamodb._delete_table({"TableName": TABLE})

@@ -213,27 +213,30 @@ def test_command_prints_json_that_adds_up():
     assert summed == pytest.approx(answer["dollars_per_robot_hour"])
 
 
-def test_command_reads_the_rates_of_a_car(tmp_path):
+def usage_of_a_car(folder, settings):
+    """What `iort cost` makes of a car.yaml."""
     for name in ("certificate.pem", "private.key"):
-        (tmp_path / name).touch()
-    (tmp_path / "car.yaml").write_text(
+        (folder / name).touch()
+    config = folder / "car.yaml"
+    config.write_text(
         "robot: car7\nendpoint: example.org\ncertificate: certificate.pem\nprivate_key: private.key\n"
-        "sources:\n- {type: sim, rate_hz: 20}\nlive: {rate_hz: 2}\nrecord: {batch_s: 0.5}\n"
+        f"{settings}"
     )
-    done = CliRunner().invoke(app, ["cost", "--config", str(tmp_path / "car.yaml"), "--json"])
-    usage = json.loads(done.output)["usage"]
+    done = CliRunner().invoke(app, ["cost", "--config", str(config), "--json"])
+    assert done.exit_code == 0, done.output
+    return json.loads(done.output)["usage"]
+
+
+def test_command_reads_the_rates_of_a_car(tmp_path):
+    settings = "sources:\n- {type: sim, rate_hz: 20}\nlive: {rate_hz: 2}\nrecord: {batch_s: 0.5}\n"
+    usage = usage_of_a_car(tmp_path, settings)
     assert (usage["rate_hz"], usage["live_hz"], usage["batch_s"]) == (20.0, 2.0, 0.5)
 
 
 def test_command_counts_the_live_messages_of_every_stream(tmp_path):
-    for name in ("certificate.pem", "private.key"):
-        (tmp_path / name).touch()
-    (tmp_path / "car.yaml").write_text(
-        "robot: car7\nendpoint: example.org\ncertificate: certificate.pem\nprivate_key: private.key\n"
+    settings = (
         "live: {rate_hz: 4}\nsources:\n- {type: sim, rate_hz: 2}\n"
         "- type: rosbridge\n  url: ws://localhost:9090\n"
         "  topics: {/a: {stream: a, time: arrival}, /b: {stream: b, time: arrival}}\n"
     )
-    done = CliRunner().invoke(app, ["cost", "--config", str(tmp_path / "car.yaml"), "--json"])
-    assert done.exit_code == 0, done.output
-    assert json.loads(done.output)["usage"]["live_hz"] == 2 + 2 * 4
+    assert usage_of_a_car(tmp_path, settings)["live_hz"] == 2 + 2 * 4

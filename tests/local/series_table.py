@@ -1,0 +1,27 @@
+"""A table of the emulator's, in this process, with the keys that ours have."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from ministack.services import dynamodb
+
+
+def create(name: str, **more: Any) -> None:
+    """Topic by time; within a ``request_scope``."""
+    created = dynamodb._create_table(
+        {
+            "TableName": name,
+            "KeySchema": [
+                {"AttributeName": "topic", "KeyType": "HASH"},
+                {"AttributeName": "t", "KeyType": "RANGE"},
+            ],
+            "AttributeDefinitions": [
+                {"AttributeName": "topic", "AttributeType": "S"},
+                {"AttributeName": "t", "AttributeType": "N"},
+            ],
+            "BillingMode": "PAY_PER_REQUEST",
+            **more,
+        }
+    )
+    assert created[0] == 200, created
