@@ -16,7 +16,7 @@ local/cut_sessions.py; here, in order:
 - a stream's mapping tries a failed batch again until it succeeds, and a role's grant on a stream's ARN is
   not seen (local/stream_gap.py);
 - a Query takes time with every item of its partition (local/table_gap.py);
-- an invocation that logs nothing takes 50 ms more (local/log_gap.py).
+- an invocation that logs nothing takes 50 ms more, and what is logged has no level (local/log_gap.py).
 """
 
 from __future__ import annotations

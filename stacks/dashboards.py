@@ -36,6 +36,7 @@ class Dashboards(Construct):
         platform = self._dashboard("Platform")
         status = cloudwatch.AlarmStatusWidget(title="Alarms", alarms=list(alarms), width=24, height=4)
         platform.add_widgets(status)
+        platform.add_widgets(_warnings(watched))
         platform.add_widgets(*self._iot())
         platform.add_widgets(*self._tables(watched))
         platform.add_widgets(*self._functions(watched))
@@ -181,6 +182,23 @@ class Dashboards(Construct):
             _graph(f"{name}, each robot", [metrics.each_robot("health", name, namespace=self._namespace)])
             for name in ("BatteryVolts", "TemperatureDegC", "FaultSamples", "BacklogBatches")
         ]
+
+
+def _warnings(watched: Watched) -> cloudwatch.LogQueryWidget:
+    """The newest lines that a function warns with, or Lambda of a function."""
+    return cloudwatch.LogQueryWidget(
+        title="Warnings and errors in the functions' logs, newest first",
+        log_group_names=[function.log_group.log_group_name for function in watched.functions.values()],
+        # The levels of Python and of Lambda, in lines of text and of JSON, and what a crash leaves.
+        query_lines=[
+            "fields @timestamp, @log, @message",
+            "filter @message like /WARN|ERROR|CRITICAL|FATAL|Traceback|Task timed out/",
+            "sort @timestamp desc",
+            "limit 20",
+        ],
+        width=24,
+        height=6,
+    )
 
 
 def _graph(

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from contract import STATS, check_robot
-from station import cloudwatch, data, inventory
+from station import cloudwatch, cloudwatch_logs, data, inventory
 from station.cloud import Cloud
 from station.conditions import Column
 from station.errors import StationError
@@ -30,6 +30,12 @@ def answers(cloud: Cloud) -> dict[str, Callable[[Mapping[str, str]], dict[str, A
         "dashboards": lambda _asked: {"dashboards": cloudwatch.dashboards(cloud)},
         "dashboard": lambda asked: cloudwatch.dashboard(
             cloud, _text(asked, "name"), minutes=_whole(asked, "minutes", 1, 14 * 24 * 60)
+        ),
+        "log": lambda asked: cloudwatch_logs.rows(
+            cloud,
+            _text(asked, "name"),
+            _whole(asked, "widget", 0, 500),
+            minutes=_whole(asked, "minutes", 1, 14 * 24 * 60),
         ),
     }
 

@@ -9,7 +9,7 @@ import pytest
 
 import contract
 from contract import Batch, LiveSample, build_topic, encode, encode_live, record_topic
-from station import cloudwatch
+from station import cloudwatch, cloudwatch_logs
 from tests.local.conftest import run_agent, until
 from tests.local.robot import Robot
 
@@ -109,7 +109,24 @@ def test_a_fault_reaches_a_human_and_the_dashboards(embedded, bundle, inbox):
     assert wanted - {"Telemetry written"} <= drawn.keys()
 
 
-# After the test above, which awaits the moment that the alarm goes off.
+def test_what_a_function_warns_of_stands_on_the_platforms_dashboard(embedded, bundle):
+    bundle, name = bundle(), f"{embedded.namespace}-platform"
+    with Robot(bundle.folder) as robot:
+        robot.publish(build_topic(contract.PING, robot.name, contract.FILE), b"[]")
+    widgets = cloudwatch.dashboard(embedded.cloud, name, minutes=30)["widgets"]
+    (number,) = [widget["number"] for widget in widgets if widget["kind"] == "log"]
+
+    def told():
+        found = cloudwatch_logs.rows(embedded.cloud, name, number, minutes=30, now_s=time.time() + 1)
+        return [dict(zip(found["columns"], row, strict=True)) for row in found["rows"]]
+
+    line = until(lambda: next((row for row in told() if robot.name in row["@message"]), None))
+    assert line["@message"].startswith("[WARNING]")
+    assert "refused a request" in line["@message"]
+    assert "Upload" in line["@log"]
+
+
+# After the first test, which awaits the moment that the alarm goes off.
 @pytest.mark.parametrize(
     ("drive", "told"),
     [

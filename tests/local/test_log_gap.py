@@ -41,6 +41,26 @@ def test_the_worker_says_where_each_invocations_log_ends(installed, tmp_path):
     assert done.stderr.splitlines() == ["one", log_gap._END, log_gap._END, "two", log_gap._END]
 
 
+def test_what_a_function_logs_says_how_bad_it_is(installed, tmp_path):
+    handler = (
+        "import logging\nlog = logging.getLogger('said')\nlog.setLevel(logging.INFO)\n"
+        "def handler(event, context):\n    log.info('fine')\n    log.warning('not so %s', event)\n"
+    )
+    (tmp_path / "said.py").write_text(handler)
+    init = {"code_dir": str(tmp_path), "module": "said", "handler": "handler"}
+    done = subprocess.run(
+        [sys.executable, "-c", lambda_runtime._PYTHON_WORKER_SCRIPT],
+        input=f'{json.dumps(init)}\n{{"event": "good"}}\n',
+        capture_output=True,
+        text=True,
+        check=True,
+        timeout=60,
+    )
+    lines = [line.split("\t") for line in done.stderr.splitlines()]
+    assert [(line[0], line[-1]) for line in lines[:2]] == [("[INFO]", "fine"), ("[WARNING]", "not so good")]
+    assert lines[0][1].endswith("Z")
+
+
 def test_what_comes_after_the_end_is_the_next_invocations(installed):
     lines = queue.Queue()
     for line in ("one", "two", log_gap._END, "three", log_gap._END, log_gap._END):

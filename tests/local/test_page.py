@@ -7,7 +7,7 @@ import subprocess
 import sys
 import time
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from datetime import datetime, timezone
 from pathlib import Path
 
@@ -124,6 +124,17 @@ def _look_back(page, url, robot, samples, newest):
     assert plain(counted.nth(2).inner_text()) == f"+{newest['displacement']:.0f}"
 
 
+def logged(cloud, group, *lines):
+    """Write lines into a log group of CloudWatch, a millisecond apart."""
+    client, stream = cloud.client("logs"), str(time.time_ns())
+    with suppress(client.exceptions.ResourceAlreadyExistsException):
+        client.create_log_group(logGroupName=group)
+    client.create_log_stream(logGroupName=group, logStreamName=stream)
+    now_ms = time.time_ns() // 1_000_000 - 1000
+    events = [{"timestamp": now_ms + i, "message": line} for i, line in enumerate(lines)]
+    client.put_log_events(logGroupName=group, logStreamName=stream, logEvents=events)
+
+
 def test_cloudwatchs_dashboards_are_drawn_from_its_metrics(embedded, open_page):
     cloudwatch = embedded.cloud.client("cloudwatch")
     rows = [
@@ -153,6 +164,23 @@ def test_cloudwatchs_dashboards_are_drawn_from_its_metrics(embedded, open_page):
             },
         },
     ]
+    widgets.append(
+        {
+            "type": "log",
+            "x": 0,
+            "y": 7,
+            "width": 24,
+            "height": 5,
+            "properties": {
+                "title": "What went wrong",
+                "query": "SOURCE 'page-test' | fields @timestamp, @log, @message "
+                "| filter @message like /WARN/ | sort @timestamp desc | limit 2",
+                "region": "eu-west-1",
+                "view": "table",
+            },
+        }
+    )
+    logged(embedded.cloud, "page-test", "[WARN] first", "[INFO] fine", "[WARN] <b>bold</b>", "[WARN] last")
     cloudwatch.put_dashboard(DashboardName="page-test", DashboardBody=json.dumps({"widgets": widgets}))
     now = datetime.now(timezone.utc)
     for value in (2, 3):
@@ -172,3 +200,11 @@ def test_cloudwatchs_dashboards_are_drawn_from_its_metrics(embedded, open_page):
         until(lambda: "laps of a 5" in plain(widget.inner_text()), "the metric's value")
         assert widget.locator(".plot canvas").count() == 1
         assert page.locator(".words h3").inner_text() == "<b>Laps</b>"
+        log = page.locator("[data-widget='What went wrong']")
+        until(lambda: log.locator("tbody tr").count() == 2, "the lines of the log")
+        assert log.locator("th").all_inner_texts() == ["timestamp", "log", "message"]
+        assert log.locator("td.words").all_inner_texts() == ["[WARN] last", "[WARN] <b>bold</b>"]
+        # What is asked again draws over what stands there, and nothing of it is lost meanwhile.
+        logged(embedded.cloud, "page-test", "[WARN] newest")
+        page.select_option("#minutes", "15")
+        until(lambda: "newest" in log.locator("td.words").first.inner_text(), "the newest line")

@@ -38,6 +38,14 @@ def test_the_platform_shows_the_state_of_every_alarm(synthesized):
     assert all(f"'{logical_id}'" in told for logical_id in alarms)
 
 
+def test_the_platform_reads_every_functions_log(synthesized):
+    widgets = dashboards(synthesized)["iort-platform"]["widgets"]
+    (log,) = [widget for widget in widgets if widget["type"] == "log"]
+    # The names are known when it is deployed, and stand as they are until then.
+    read = re.findall(r"SOURCE '<(.+?)>'", log["properties"]["query"])
+    assert len(read) == len(set(read)) == len(synthesized.resources("AWS::Logs::LogGroup")) > 0
+
+
 def dashboards(app):
     """The bodies by name; what is only known when it is deployed stands for itself."""
     found = {}

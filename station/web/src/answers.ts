@@ -28,13 +28,24 @@ export interface Alarm {
   readonly since_s: number;
 }
 
+/** What a log widget finds; `found` may be more than there are rows. */
+export interface Logs {
+  readonly columns: readonly string[];
+  readonly rows: readonly (readonly string[])[];
+  readonly found: number;
+  readonly from_s: number;
+  readonly to_s: number;
+}
+
 export interface Widget {
+  /** Its place in the dashboard's body. */
+  readonly number: number;
   readonly x: number;
   readonly y: number;
   readonly width: number;
   readonly height: number;
   readonly title: string;
-  readonly kind: "series" | "number" | "alarms" | "text" | "other";
+  readonly kind: "series" | "number" | "alarms" | "log" | "text" | "other";
   readonly text: string;
   readonly period_s: number;
   readonly series: readonly Series[];

@@ -4,6 +4,7 @@ import { ask, AnswerError, type Alarm, type Dashboard, type Series, type Widget 
 import type { Config } from "../config";
 import { el, Text } from "../dom";
 import { NOTHING, number } from "../format";
+import { LogTable } from "../logtable";
 import { TimeChart, type Curve } from "../timechart";
 
 const REFRESH_S = 30;
@@ -18,6 +19,7 @@ export class CloudWatchView {
   private readonly note = new Text("history-note", "p", { role: "status" });
   private readonly grid = el("div", { class: "widgets" });
   private charts: TimeChart[] = [];
+  private logs = new Map<string, LogTable>();
   private timer: number | undefined;
   private loading: AbortController | undefined;
 
@@ -65,16 +67,17 @@ export class CloudWatchView {
     try {
       const dashboard = await ask<Dashboard>("dashboard", { name: this.choice.value, minutes: this.range.value }, loading.signal);
       if (loading.signal.aborted) return;
-      this.draw(dashboard);
+      this.draw(dashboard, loading.signal);
       this.note.set(`as of ${new Date(dashboard.to_s * 1000).toLocaleTimeString("en-GB")}, again every ${REFRESH_S} s`);
     } catch (error) {
       if (!loading.signal.aborted) this.note.set(error instanceof AnswerError ? error.message : String(error));
     }
   }
 
-  private draw({ widgets, from_s, to_s }: Dashboard): void {
+  private draw({ name, widgets, from_s, to_s }: Dashboard, signal: AbortSignal): void {
     for (const chart of this.charts) chart.destroy();
     this.charts = [];
+    const logs = new Map<string, LogTable>();
     const ordered = [...widgets].sort((a, b) => a.y - b.y || a.x - b.x);
     this.grid.replaceChildren(
       ...ordered.map((widget) => {
@@ -84,9 +87,18 @@ export class CloudWatchView {
         return [node, plot, widget] as const;
       }).map(([node, plot, widget]) => {
         if (plot) queueMicrotask(() => this.charts.push(chart(plot, widget, [from_s, to_s])));
+        if (widget.kind === "log") {
+          const asked = { name, widget: String(widget.number), minutes: this.range.value };
+          const key = JSON.stringify(asked);
+          const log = this.logs.get(key) ?? new LogTable(asked, widget.title);
+          logs.set(key, log);
+          node.append(log.node);
+          void log.refresh(signal);
+        }
         return node;
       }),
     );
+    this.logs = logs;
   }
 }
 
@@ -94,6 +106,7 @@ function frame(widget: Widget): [HTMLElement, HTMLElement | undefined] {
   if (widget.kind === "text") return [el("section", { class: "widget words" }, ...markdown(widget.text)), undefined];
   const heading = el("header", {}, el("h3", { title: widget.title }, widget.title));
   const node = el("section", { class: "panel widget", "aria-label": widget.title, "data-widget": widget.title }, heading);
+  if (widget.kind === "log") return [node, undefined];
   if (widget.kind === "other") {
     node.append(el("p", { class: "note" }, widget.text));
     return [node, undefined];

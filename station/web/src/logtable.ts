@@ -1,0 +1,65 @@
+// A log widget: what its query finds, as a table. Asked for by itself, because Logs Insights takes seconds.
+
+import { ask, AnswerError, type Logs } from "./answers";
+import { el, Text } from "./dom";
+import { clockTime } from "./format";
+
+// AWS bills a query by what it reads.
+const AGAIN_S = 60;
+
+export class LogTable {
+  readonly node: HTMLElement;
+  private readonly note = new Text("note", "p", { role: "status" });
+  private readonly host = el("div", { class: "log", tabindex: "0" });
+  private askedAt = -Infinity;
+
+  constructor(
+    private readonly parameters: Readonly<Record<string, string>>,
+    title: string,
+  ) {
+    this.host.setAttribute("aria-label", title);
+    this.node = el("div", { class: "log-widget" }, this.host, this.note.node);
+  }
+
+  /** Ask anew, unless that has just been done; what was found before stays until there is an answer. */
+  async refresh(signal: AbortSignal): Promise<void> {
+    const now = performance.now() / 1000;
+    if (now - this.askedAt < AGAIN_S) return;
+    this.askedAt = now;
+    if (!this.host.hasChildNodes()) this.note.set("Reading the logs …");
+    try {
+      this.draw(await ask<Logs>("log", this.parameters, signal));
+    } catch (error) {
+      this.askedAt = -Infinity;
+      if (!signal.aborted) this.note.set(error instanceof AnswerError ? error.message : String(error));
+    }
+  }
+
+  private draw({ columns, rows, found, to_s }: Logs): void {
+    const until = `until ${clockTime(to_s)}`;
+    this.note.set(found > rows.length ? `the first ${rows.length} of ${found} lines, ${until}` : found === 0 ? `Nothing in this range, ${until}.` : until);
+    this.host.replaceChildren(
+      ...(rows.length === 0
+        ? []
+        : [
+            el(
+              "table",
+              {},
+              el("thead", {}, el("tr", {}, ...columns.map((column) => el("th", { scope: "col" }, column.replace(/^@/, ""))))),
+              el("tbody", {}, ...rows.map((row) => el("tr", {}, ...row.map((value, i) => cell(columns[i]!, value))))),
+            ),
+          ]),
+    );
+  }
+}
+
+function cell(column: string, value: string): HTMLElement {
+  if (column === "@timestamp") {
+    // "2026-05-04 10:00:00.123", in UTC.
+    const at = Date.parse(`${value.replace(" ", "T")}Z`) / 1000;
+    return el("td", { class: "num", title: `${value} UTC` }, Number.isNaN(at) ? value : clockTime(at));
+  }
+  // "123456789012:/aws/lambda/name": the account is the viewer's own.
+  if (column === "@log") return el("td", { title: value }, value.replace(/^\d+:/, ""));
+  return el("td", { class: "words" }, value);
+}

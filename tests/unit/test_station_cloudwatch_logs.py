@@ -1,0 +1,88 @@
+"""The log widgets of dashboards: what is asked of Logs Insights, and what becomes of its answers."""
+
+from __future__ import annotations
+
+import json
+from typing import Any
+
+import pytest
+
+from station import cloudwatch_logs
+from station.errors import StationError
+
+NOW_S = 1_700_000_000
+QUERY = "SOURCE '/aws/lambda/a' | SOURCE \"b\" | fields @timestamp, @message\n| filter @message like /a|b/"
+
+
+class Insights:
+    """CloudWatch with one dashboard, and Logs Insights that has these answers, one a time."""
+
+    namespace = "iort"
+
+    def __init__(self, *answers: dict[str, Any], query: str = QUERY, **properties: Any) -> None:
+        self.answers = list(answers)
+        self.asked: dict[str, Any] = {}
+        widget = {"type": "log", "properties": {"query": query, **properties}}
+        self.body = {"widgets": [{"type": "text", "properties": {}}, widget]}
+
+    def client(self, _service: str) -> Insights:
+        return self
+
+    def get_dashboard(self, **_name: str) -> dict[str, str]:
+        return {"DashboardBody": json.dumps(self.body)}
+
+    def start_query(self, **asked: Any) -> dict[str, str]:
+        self.asked = asked
+        return {"queryId": "q"}
+
+    def get_query_results(self, **asked: str) -> dict[str, Any]:
+        assert asked == {"queryId": "q"}
+        return self.answers.pop(0)
+
+
+def row(**cells: str) -> list[dict[str, str]]:
+    return [{"field": f"@{name}", "value": value} for name, value in cells.items()]
+
+
+def test_the_widgets_own_query_is_asked_of_its_log_groups() -> None:
+    found = [row(timestamp="t1", message="one", ptr="x"), row(message="x" * 5000, log="1:a", ptr="y")]
+    cloud = Insights({"status": "Scheduled"}, {"status": "Running"}, {"status": "Complete", "results": found})
+    told = cloudwatch_logs.rows(cloud, "d", 1, minutes=15, now_s=NOW_S)
+    assert cloud.asked == {
+        "logGroupNames": ["/aws/lambda/a", "b"],
+        "queryString": "fields @timestamp, @message\n| filter @message like /a|b/",
+        "startTime": NOW_S - 900,
+        "endTime": NOW_S,
+    }
+    # As they come, by name; a cell that a row does not have is empty, and none is longer than anybody reads.
+    assert told["columns"] == ["@timestamp", "@message", "@log"]
+    assert told["rows"] == [["t1", "one", ""], ["", "x" * cloudwatch_logs.MAX_TEXT, "1:a"]]
+    assert (told["found"], told["from_s"], told["to_s"]) == (2, NOW_S - 900, NOW_S)
+
+
+def test_rows_that_nobody_reads_are_counted_and_left_out() -> None:
+    cloud = Insights({"status": "Complete", "results": [row(message=str(i)) for i in range(250)]})
+    told = cloudwatch_logs.rows(cloud, "d", 1, minutes=15, now_s=NOW_S)
+    assert (len(told["rows"]), told["found"]) == (cloudwatch_logs.MAX_ROWS, 250)
+
+
+def test_a_query_in_another_language_is_asked_in_it() -> None:
+    cloud = Insights({"status": "Complete"}, queryLanguage="PPL")
+    assert cloudwatch_logs.rows(cloud, "d", 1, minutes=15, now_s=NOW_S)["rows"] == []
+    assert cloud.asked["queryLanguage"] == "PPL"
+
+
+@pytest.mark.parametrize("status", ["Failed", "Cancelled", "Timeout"])
+def test_a_query_that_fails_says_so(status: str) -> None:
+    with pytest.raises(StationError, match=f"gave up on the query: {status.lower()}"):
+        cloudwatch_logs.rows(Insights({"status": status}), "d", 1, minutes=15)
+
+
+def test_nothing_else_can_be_asked_of_the_logs() -> None:
+    for number in (0, 2):
+        with pytest.raises(StationError, match="none of logs"):
+            cloudwatch_logs.rows(Insights(), "d", number, minutes=15)
+    with pytest.raises(StationError, match="names no log group"):
+        cloudwatch_logs.rows(
+            Insights(query="SOURCE logGroups(namePrefix: ['a']) | fields x"), "d", 1, minutes=15
+        )
