@@ -11,7 +11,8 @@ from contract import PING_PATHS
 from device.allowance import BYTES_PER_S
 from station import cost
 from station.cloud import Cloud
-from station.cost import Item, Usage
+from station.cost import Item
+from station.usage import Usage
 
 # AWS' units: a message and an action are metered by 5 KB, writes by 1 KB, reads by 4 KB and by half where
 # they need not be consistent.

@@ -10,8 +10,8 @@ ROOT = Path(__file__).resolve().parent.parent
 sys.path.insert(0, str(ROOT))
 
 from station import cost_tables, scale
-from station.cost import Usage
 from station.prices import AS_OF, REGION
+from station.usage import Usage
 
 _BLOCK = re.compile(r"(<!-- cost (\w+):.*?-->\n).*?(\n<!-- /cost -->)", re.DOTALL)
 FILES = (ROOT / "README.md", ROOT / "docs" / "cost.md")

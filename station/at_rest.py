@@ -7,8 +7,8 @@ table's stream are free, and the code's and the page's files are some megabytes.
 from __future__ import annotations
 
 from contract import METRICS
-from station.cost import Usage
 from station.prices import MONTH_HOURS, PRICES
+from station.usage import Usage
 
 # Lambda asks a queue with five long polls of at most 20 s around the clock. Without a bound on the
 # concurrency it goes down to two; the quarantine's mapping has one ("Configuring scaling behavior for SQS

@@ -6,8 +6,8 @@ from typing import NamedTuple
 
 from station import cost
 from station.at_rest import deployment_dollars_per_month
-from station.cost import Usage
 from station.scale import Scale
+from station.usage import Usage, variations
 
 
 class Rows(NamedTuple):
@@ -65,7 +65,7 @@ def month(usage: Usage) -> Rows:
 def what_if(usage: Usage) -> Rows:
     """One setting changed at a time: dollars a robot-hour, and the share of the thesis' layout."""
     body: list[tuple[str, ...]] = []
-    for name, other in cost.what_if(usage):
+    for name, other in variations(usage):
         ours, thesis = cost.total(cost.bill(other)), cost.total(cost.thesis_bill(other))
         pubnub = cost.total(cost.pubnub_bill(other))
         body.append((name, _dollars(ours), f"1/{thesis / ours:.1f}", _dollars(pubnub)))

@@ -5,9 +5,10 @@ from __future__ import annotations
 from dataclasses import replace
 from typing import NamedTuple
 
-from station.cost import Usage, bill, dollars_per_month, pubnub_bill, total
+from station.cost import bill, dollars_per_month, pubnub_bill, total
 from station.prices import QUOTAS, Quota
 from station.sizes import measure
+from station.usage import Usage
 
 # A robot listens to its shadow's four answers, the pong that sets its clock, and its commands.
 _SUBSCRIPTIONS = 6

@@ -8,8 +8,8 @@ from bench import plots
 from bench.result import Plot, Ratio, Section, Table
 from bench.target import Say, Target
 from station import cost, cost_tables, scale
-from station.cost import Usage
 from station.prices import AS_OF, REGION
+from station.usage import Usage
 
 # Nothing is measured here: the same settings have the same cost, to the last digit shown.
 _COMPUTED = 1.01

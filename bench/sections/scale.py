@@ -6,7 +6,7 @@ the section on cost.
 
 from __future__ import annotations
 
-from bench import fleet, plots
+from bench import fleet_run, plots
 from bench.result import Plot, Ratio, Section, Table
 from bench.target import Say, Target
 
@@ -33,12 +33,12 @@ def run(target: Target, say: Say) -> Section:
                 said["last"] = text
                 say(text)
 
-        runs.append(fleet.measure(target.embedded, count, seconds, tell, prefix="bench-scale"))
+        runs.append(fleet_run.measure(target.embedded, count, seconds, tell, prefix="bench-scale"))
     _report(section, runs)
     return section
 
 
-def _report(section: Section, runs: list[fleet.Fleet]) -> None:
+def _report(section: Section, runs: list[fleet_run.Fleet]) -> None:
     parts = list(runs[0].cpu_percent)
     section.tables.append(
         Table(

@@ -7,22 +7,20 @@ system, and projected to each memory size; on AWS the sizes are set and measured
 
 from __future__ import annotations
 
-import base64
 import json
-import re
 import subprocess
 import sys
 import threading
 import time
-from collections.abc import Callable, Iterator
-from contextlib import ExitStack, contextmanager
-from dataclasses import asdict, dataclass, field
+from contextlib import ExitStack
+from dataclasses import asdict
 from statistics import median
 from typing import Any
 
 from boto3.dynamodb.types import TypeSerializer
 
-from bench import borrowed, cpu, plots
+from bench import borrowed, plots
+from bench.invocations import Event, Measured, configure, invoke, measure, reporting
 from bench.machine import ROOT
 from bench.result import NOT_MEASURED, Plot, Ratio, Section, Table
 from bench.spread import spread
@@ -53,20 +51,10 @@ ROUNDS = 3
 CALLS = 60
 BATCHES = 100
 _CATCH_UP_S = 60.0
-_LOGS_S = 60.0
-_REPORT = re.compile(r"^REPORT .*?\tDuration: ([\d.]+) ms.*", re.MULTILINE)
-_INIT = re.compile(r"Init Duration: ([\d.]+) ms")
+_LIVE, _ONE, _EMPTY = "Lambda 1 (live)", "Lambda 2, an event of 1 batch", "empty function"
+_BACKLOG = f"Lambda 2, an event of {BATCHES} batches"
 # What an invocation costs by itself.
-_EMPTY = "def handler(event, context):\n    return None\n"
-
-
-@dataclass
-class Measured:
-    """Of one function: milliseconds an invocation, a list a round."""
-
-    duration_ms: list[list[float]] = field(default_factory=list)
-    cpu_ms: list[float] = field(default_factory=list)
-    init_ms: list[float] = field(default_factory=list)
+_NOTHING = "def handler(event, context):\n    return None\n"
 
 
 def run(target: Target, say: Say) -> Section:
@@ -75,31 +63,29 @@ def run(target: Target, say: Say) -> Section:
     batches = _store(target, say)
     # The newest batch alone is what a driving car makes of the stream; all of them, a backlog.
     one, many = _stream_event(batches[-1:]), _stream_event(batches)
-    events: dict[str, Callable[[int], dict[str, Any]]] = {
-        "Lambda 1 (live)": lambda i: _live_event(target, i),
-        "Lambda 2, an event of 1 batch": lambda _: one,
-        f"Lambda 2, an event of {BATCHES} batches": lambda _: many,
+    events: dict[str, Event] = {
+        _LIVE: lambda i: _live_event(target, i),
+        _ONE: lambda _: one,
+        _BACKLOG: lambda _: many,
     }
     live = target.cloud.output("processing", "LiveFunction")
     summarize = target.cloud.output("processing", "SummarizeFunction")
-    with borrowed.function(target, "empty", _EMPTY, memory_mb=256) as empty, ExitStack() as reports:
+    with borrowed.function(target, "empty", _NOTHING, memory_mb=256) as empty, ExitStack() as reports:
         names = dict(zip(events, (live, summarize, summarize), strict=True))
-        events["empty function"], names["empty function"] = (lambda _: {}), empty
+        events[_EMPTY], names[_EMPTY] = (lambda _: {}), empty
         for name in sorted(set(names.values())):
-            reports.enter_context(_reporting(target, name))
+            reports.enter_context(reporting(target, name))
         found = {name: Measured() for name in events}
         for name, event in events.items():
-            _invoke(target, names[name], event(0))
+            invoke(target, names[name], event(0))
         for turn in range(ROUNDS):
             for name, event in events.items():
                 say(f"{name}, warm, {turn + 1} of {ROUNDS}")
-                calls = CALLS // 10 if "100" in name else CALLS
-                _measure(target, names[name], event, calls, found[name])
-        sizes = _memory_sizes(target, live, events["Lambda 1 (live)"], say)
+                calls = CALLS // 10 if name == _BACKLOG else CALLS
+                measure(target, names[name], event, calls, found[name])
+        sizes = _memory_sizes(target, live, events[_LIVE], say)
         cold = {
-            name: _cold(target, names[name], event, say)
-            for name, event in events.items()
-            if "100" not in name
+            name: _cold(target, names[name], event, say) for name, event in events.items() if name != _BACKLOG
         }
     say("the node's cycle")
     cycle = _cycle()
@@ -123,7 +109,7 @@ def _report(
                 _duration(one),
                 f"{median(one.cpu_ms):.2f} ms" if one.cpu_ms else NOT_MEASURED,
                 _cold_text(frozen) if frozen else NOT_MEASURED,
-                "12 ms" if "1 batch" in name else NOT_MEASURED,
+                "12 ms" if name == _ONE else NOT_MEASURED,
             ]
         )
     rows.append(["robot's node, a cycle", f"{cycle['p50']:.4f} ms (p95 {cycle['p95']:.4f})", "", "", "2 ms"])
@@ -170,32 +156,16 @@ def _report(
 
 
 def _ratios(section: Section, found: dict[str, Measured], cycle: dict[str, float]) -> None:
-    live, empty = found["Lambda 1 (live)"], found["empty function"]
-    if live.cpu_ms and empty.cpu_ms:
-        beyond = median(a - b for a, b in zip(live.cpu_ms, empty.cpu_ms, strict=True))
-        section.ratios.append(
-            Ratio(
-                "Lambda 1 warm, processor time beyond an empty function",
-                round(beyond, 3),
-                3.0,
-                "ms",
-                tolerance=1.6,
-                by_machine=True,
+    empty_ms = found[_EMPTY].cpu_ms
+    for name, spent_ms, shared_by, most_ms in (
+        ("Lambda 1 warm, processor time beyond an empty function", found[_LIVE].cpu_ms, 1, 3.0),
+        ("Lambda 2, processor time a batch of 50 samples", found[_BACKLOG].cpu_ms, BATCHES, 1.0),
+    ):
+        if spent_ms and empty_ms:
+            beyond_ms = median(a - b for a, b in zip(spent_ms, empty_ms, strict=True)) / shared_by
+            section.ratios.append(
+                Ratio(name, round(beyond_ms, 3), most_ms, "ms", tolerance=1.6, by_machine=True)
             )
-        )
-    many = found[f"Lambda 2, an event of {BATCHES} batches"]
-    if many.cpu_ms:
-        each = median(a - b for a, b in zip(many.cpu_ms, empty.cpu_ms, strict=True)) / BATCHES
-        section.ratios.append(
-            Ratio(
-                "Lambda 2, processor time a batch of 50 samples",
-                round(each, 3),
-                1.0,
-                "ms",
-                tolerance=1.6,
-                by_machine=True,
-            )
-        )
     section.ratios.append(
         Ratio("node's cycle / thesis' 2 ms", round(cycle["p50"] / 2, 5), 0.05, tolerance=3, by_machine=True)
     )
@@ -222,71 +192,7 @@ def _cold_text(one: Measured) -> str:
     return f"{first:.0f} ms{spent}"
 
 
-def _measure(
-    target: Target, function: str, event: Callable[[int], dict[str, Any]], calls: int, found: Measured
-) -> None:
-    began_ms = int(time.time() * 1000)
-    before = _cpu(target)
-    told = [_invoke(target, function, event(i)) for i in range(calls)]
-    after = _cpu(target)
-    if before is not None and after is not None:
-        found.cpu_ms.append(cpu.spent_ms(before, after) / calls)
-    # AWS' answers end with the REPORT line; the embedded cloud's are in its log, where nobody else's are.
-    reports = [line for line in told if line is not None]
-    if len(reports) < calls:
-        reports = _logged(target, function, began_ms, calls)
-    found.duration_ms.append([float(match[1]) for line in reports if (match := _REPORT.match(line))])
-    found.init_ms += [float(match[1]) for line in reports if (match := _INIT.search(line))]
-
-
-def _cpu(target: Target) -> dict[int, int] | None:
-    return None if target.embedded is None else cpu.of_tree(target.embedded.emulator.pid)
-
-
-def _invoke(target: Target, function: str, event: dict[str, Any]) -> str | None:
-    """Run the function once and wait; its REPORT line, if the answer has it. Raises RuntimeError where it
-    fails."""
-    answer = target.cloud.client("lambda").invoke(
-        FunctionName=function, Payload=json.dumps(event).encode(), LogType="Tail"
-    )
-    if "FunctionError" in answer:
-        raise RuntimeError(f"{function}: {answer['Payload'].read()[:400]!r}")
-    return report_line(base64.b64decode(answer.get("LogResult", "")).decode(errors="replace"))
-
-
-def report_line(tail: str) -> str | None:
-    """The REPORT line of an invocation's log, if it is there."""
-    match = _REPORT.search(tail)
-    return None if match is None else match[0]
-
-
-def _logged(target: Target, function: str, began_ms: int, calls: int) -> list[str]:
-    """The REPORT lines in the function's log since then, once they are all there."""
-    client = target.cloud.client("lambda")
-    logging = client.get_function_configuration(FunctionName=function).get("LoggingConfig", {})
-    group = logging.get("LogGroup", f"/aws/lambda/{function}")
-    deadline = time.monotonic() + _LOGS_S
-    while True:
-        pages = target.cloud.client("logs").get_paginator("filter_log_events")
-        lines = [
-            event["message"]
-            for page in pages.paginate(logGroupName=group, startTime=began_ms, filterPattern="REPORT")
-            for event in page["events"]
-        ]
-        reports = [line for line in lines if _REPORT.match(line)]
-        if not reports and time.monotonic() > deadline:
-            raise RuntimeError(
-                f"{group} has no REPORT line after {_LOGS_S:.0f} s: deploy with function_logs=all"
-            )
-        if len(reports) >= calls or time.monotonic() > deadline:
-            return reports
-        # A log tells nobody when it has the next line.
-        threading.Event().wait(0.5)
-
-
-def _memory_sizes(
-    target: Target, function: str, event: Callable[[int], dict[str, Any]], say: Say
-) -> dict[int, Measured]:
+def _memory_sizes(target: Target, function: str, event: Event, say: Say) -> dict[int, Measured]:
     """Lambda 1 at each memory size, on AWS; the size that was is set again."""
     if target.embedded is not None:
         return {}
@@ -296,16 +202,16 @@ def _memory_sizes(
     try:
         for size in SIZES_MB:
             say(f"Lambda 1 at {size} MB")
-            _configure(client, function, MemorySize=size)
-            _invoke(target, function, event(0))
+            configure(client, function, MemorySize=size)
+            invoke(target, function, event(0))
             found[size] = Measured()
-            _measure(target, function, event, CALLS, found[size])
+            measure(target, function, event, CALLS, found[size])
     finally:
-        _configure(client, function, MemorySize=was)
+        configure(client, function, MemorySize=was)
     return found
 
 
-def _cold(target: Target, function: str, event: Callable[[int], dict[str, Any]], say: Say) -> Measured:
+def _cold(target: Target, function: str, event: Event, say: Say) -> Measured:
     """The first invocation of new environments: another environment variable makes one."""
     client = target.cloud.client("lambda")
     was = client.get_function_configuration(FunctionName=function).get("Environment", {}).get("Variables", {})
@@ -313,34 +219,11 @@ def _cold(target: Target, function: str, event: Callable[[int], dict[str, Any]],
     try:
         for turn in range(ROUNDS):
             say(f"{function}, cold, {turn + 1} of {ROUNDS}")
-            _configure(client, function, Environment={"Variables": {**was, "BENCH_TURN": str(turn)}})
-            _measure(target, function, event, 1, found)
+            configure(client, function, Environment={"Variables": {**was, "BENCH_TURN": str(turn)}})
+            measure(target, function, event, 1, found)
     finally:
-        _configure(client, function, Environment={"Variables": was})
+        configure(client, function, Environment={"Variables": was})
     return found
-
-
-def _configure(client: Any, function: str, **change: Any) -> None:
-    updated = client.get_waiter("function_updated_v2")
-    # An interrupt may have left the change before under way, and AWS refuses one meanwhile.
-    updated.wait(FunctionName=function)
-    client.update_function_configuration(FunctionName=function, **change)
-    updated.wait(FunctionName=function)
-
-
-@contextmanager
-def _reporting(target: Target, function: str) -> Iterator[None]:
-    """Have Lambda write its REPORT lines meanwhile, which the stacks leave out (`function_logs`)."""
-    client = target.cloud.client("lambda")
-    was = client.get_function_configuration(FunctionName=function).get("LoggingConfig", {})
-    if was.get("LogFormat") != "JSON":
-        yield
-        return
-    try:
-        _configure(client, function, LoggingConfig={"LogFormat": "Text", "LogGroup": was["LogGroup"]})
-        yield
-    finally:
-        _configure(client, function, LoggingConfig=was)
 
 
 def _store(target: Target, say: Say) -> list[dict[str, Any]]:

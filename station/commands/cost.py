@@ -17,9 +17,9 @@ from device.errors import AgentError
 from station import cost, cost_tables, scale
 from station.at_rest import deployment_dollars_per_month
 from station.cloud import Cloud
-from station.cost import Usage
 from station.errors import StationError
 from station.prices import AS_OF, REGION
+from station.usage import Usage
 
 commands = typer.Typer()
 _out = Console(highlight=False)

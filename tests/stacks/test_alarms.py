@@ -6,7 +6,7 @@ import re
 
 import contract
 from stacks.settings import ROOT, Settings
-from station.cost import Usage
+from station.usage import Usage
 from tests.stacks.aws_metrics import AWS_METRICS
 from tests.stacks.templates import name
 

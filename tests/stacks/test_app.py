@@ -10,7 +10,7 @@ import sys
 import pytest
 
 from stacks.settings import ROOT, Settings, SettingsError
-from station.cost import Usage
+from station.usage import Usage
 
 
 def run(tmp_path, name, **context):

@@ -4,22 +4,25 @@ from __future__ import annotations
 
 import pytest
 
+from bench import invocations
+from bench.invocations import Measured
+from bench.probes.ground import No
 from bench.result import Section
 from bench.sections import SECTIONS, abilities, outage, query, utilisation
-from bench.sections.utilisation import BATCHES, Measured
+from bench.sections.utilisation import BATCHES
 
 
 def test_report_lines_of_lambda_are_read():
     line = "REPORT RequestId: 8f50\tDuration: 12.34 ms\tBilled Duration: 13 ms\tMemory Size: 256 MB\t"
     cold = line + "Max Memory Used: 81 MB\tInit Duration: 250.5 ms\t"
     tail = f"START RequestId: 8f50 Version: $LATEST\nREPORTED\nEND RequestId: 8f50\n{cold}\n"
-    assert utilisation.report_line(tail) == cold
-    assert utilisation.report_line("START RequestId: 8f50\n") is None
-    duration, init = utilisation._REPORT.match(cold), utilisation._INIT.search(cold)
+    assert invocations.report_line(tail) == cold
+    assert invocations.report_line("START RequestId: 8f50\n") is None
+    duration, init = invocations._REPORT.match(cold), invocations._INIT.search(cold)
     assert duration is not None
     assert init is not None
     assert (float(duration[1]), float(init[1])) == (12.34, 250.5)
-    assert utilisation._INIT.search(line) is None
+    assert invocations._INIT.search(line) is None
 
 
 def test_projection_is_the_share_of_a_processor_that_memory_buys():
@@ -83,18 +86,18 @@ def test_thesis_reader_follows_every_page():
 
 
 def test_a_probe_that_raises_is_a_no_and_says_what_was_seen():
-    def refuses():
-        raise abilities.No("nothing came")
+    def refuses(_):
+        raise No("nothing came")
 
-    def breaks():
+    def breaks(_):
         raise ValueError("odd")
 
     for ask, answer in (
         (refuses, ("no", "nothing came")),
         (breaks, ("no", "ValueError: odd")),
-        (lambda: "it did", ("yes", "it did")),
+        (lambda _: "it did", ("yes", "it did")),
     ):
-        assert abilities._answer(abilities.Probe("t", "s", "a", "-", ask)) == answer
+        assert abilities._answer(abilities.Probe("s", "a", "-", ask), None) == answer
 
 
 def test_every_section_of_the_documentation_is_one_that_runs():

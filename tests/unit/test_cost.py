@@ -16,9 +16,9 @@ from scripts.costs import FILES, filled
 from station import cost, cost_tables, scale, sizes
 from station.at_rest import deployment_dollars_per_month
 from station.cli import app
-from station.cost import Usage
 from station.errors import StationError
 from station.prices import PRICES
+from station.usage import CLOCK_PING_S, Usage
 
 _ONE = Usage()
 
@@ -47,7 +47,7 @@ def test_live_lane_is_a_rule_an_action_and_an_invocation_each_and_a_message_in_t
 
 
 def test_a_car_that_measures_nothing_still_pings_for_the_clock():
-    assert cost.CLOCK_PING_S == CLOCK_EVERY_S
+    assert CLOCK_PING_S == CLOCK_EVERY_S
     items = cost.bill(_ONE)
     assert _units(items, "ping", "message") == 2 * 120, "a ping and a pong"
     assert _units(items, "ping", "rule") == _units(items, "ping", "action") == 120

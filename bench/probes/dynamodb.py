@@ -1,0 +1,85 @@
+"""What DynamoDB can do."""
+
+from __future__ import annotations
+
+import uuid
+from concurrent.futures import ThreadPoolExecutor
+
+from bench.probes.ground import Ground, No, equal, until
+from contract import (
+    VESC_STREAM,
+    build_topic,
+)
+from station import delivery
+
+WRITERS = 8
+
+
+def stores(ground: Ground) -> str:
+    """An item comes back as it was put."""
+    client, table = ground.cloud.client("dynamodb"), ground.cloud.output("storage", "RobotsTable")
+    item = {
+        "robot": {"S": ground.target.name("bench-ability-item")},
+        "value": {"S": uuid.uuid4().hex},
+        "n": {"N": "1.5"},
+    }
+    key = {"robot": item["robot"]}
+    client.put_item(TableName=table, Item=item)
+    try:
+        equal(client.get_item(TableName=table, Key=key, ConsistentRead=True)["Item"], item)
+    finally:
+        client.delete_item(TableName=table, Key=key)
+    return "an item came back as it was put"
+
+
+def range_of_time(ground: Ground) -> str:
+    """Of a drive, a range has the batches that begin in it."""
+    sent = ground.drive()
+    answer = ground.cloud.client("dynamodb").query(
+        TableName=ground.cloud.output("storage", "TelemetryTable"),
+        KeyConditionExpression="topic = :topic AND t BETWEEN :a AND :b",
+        ExpressionAttributeValues={
+            ":topic": {"S": build_topic("dt", ground.a, VESC_STREAM, ground.namespace)},
+            ":a": {"N": str(sent[1].t_us)},
+            ":b": {"N": str(sent[2].t_us - 1)},
+        },
+    )
+    equal([int(item["t"]["N"]) for item in answer["Items"]], [sent[1].t_us])
+    return "of three batches, a range gave the one in it"
+
+
+def stream_of_changes(ground: Ground) -> str:
+    """What is stored is summarised by the function behind the stream."""
+    before = delivery.samples_summarized(ground.cloud, ground.a, VESC_STREAM)
+    ground.drive()
+    until(
+        lambda: delivery.samples_summarized(ground.cloud, ground.a, VESC_STREAM) >= before + 150,
+        "the stream's function to write the other table",
+    )
+    return "what was stored in one table came summarised to the other"
+
+
+def many_writers(ground: Ground) -> str:
+    """Threads that write as fast as they can; one that is throttled raises."""
+    client, table = ground.cloud.client("dynamodb"), ground.cloud.output("storage", "RobotsTable")
+
+    def write(i: int) -> int:
+        key = {"robot": {"S": ground.target.name(f"bench-writer-{i}")}}
+        for n in range(25):
+            client.put_item(TableName=table, Item={**key, "n": {"N": str(n)}})
+        client.delete_item(TableName=table, Key=key)
+        return 25
+
+    with ThreadPoolExecutor(WRITERS) as pool:
+        written = sum(pool.map(write, range(WRITERS)))
+    return f"{written} writes by {WRITERS} threads, none refused"
+
+
+def on_demand(ground: Ground) -> str:
+    """The table's own word."""
+    table = ground.cloud.output("storage", "TelemetryTable")
+    described = ground.cloud.client("dynamodb").describe_table(TableName=table)["Table"]
+    mode = described.get("BillingModeSummary", {}).get("BillingMode")
+    if mode != "PAY_PER_REQUEST":
+        raise No(f"the billing mode is {mode}")
+    return f"the table says {mode}"

@@ -1,0 +1,137 @@
+"""What the probes stand on: two robots with raw connections, a function that says who it is, and waiting."""
+
+from __future__ import annotations
+
+import json
+import threading
+import time
+import uuid
+from collections.abc import Callable
+from contextlib import ExitStack
+from typing import Any
+
+from typing_extensions import Self
+
+from bench import borrowed
+from bench.raw_mqtt import RawClient
+from bench.target import Target
+from contract import (
+    LIVE,
+    PING,
+    PONG,
+    VESC_STREAM,
+    Batch,
+    LiveSample,
+    build_topic,
+    encode,
+    encode_live,
+    encode_ping,
+    record_topic,
+)
+from station import delivery
+
+WAIT_S = 30.0
+_WHO = """
+import os, time, uuid
+INSTANCE = uuid.uuid4().hex
+def handler(event, context):
+    time.sleep(event["seconds"])
+    return {"instance": INSTANCE, "memory_mb": os.environ.get("AWS_LAMBDA_FUNCTION_MEMORY_SIZE")}
+"""
+
+
+class No(Exception):  # noqa: N818 - an answer, not an error
+    """The service does not have the ability; the text says what was seen."""
+
+
+def equal(found: Any, expected: Any) -> None:
+    """Raises `No` unless it is."""
+    if found != expected:
+        raise No(f"{found!r:.80} is not {expected!r:.80}")
+
+
+def until(true: Callable[[], bool], what: str, seconds: float = WAIT_S) -> None:
+    """Wait; raises `No` where it takes longer."""
+    deadline = time.monotonic() + seconds
+    while not true():
+        if time.monotonic() > deadline:
+            raise No(f"waited {seconds:.0f} s for {what}")
+        threading.Event().wait(0.1)
+
+
+class Ground:
+    """From `__enter__` to `__exit__`: ``a`` and ``b`` are the robots' names, ``function`` the function's."""
+
+    def __init__(self, target: Target) -> None:
+        self.target, self._exit = target, ExitStack()
+        self.cloud, self.namespace = target.cloud, target.cloud.namespace
+        self._drives = self._seq = 0
+
+    def __enter__(self) -> Self:
+        self._bundles = [self.target.robot(f"bench-ability-{i}") for i in range(2)]
+        self.a, self.b = (bundle.robot for bundle in self._bundles)
+        self.function = self._exit.enter_context(
+            borrowed.function(self.target, "who", _WHO, memory_mb=128, timeout_s=10)
+        )
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._exit.close()
+
+    def client(self, index: int) -> RawClient:
+        """A connection of the first robot (0) or the second (1)."""
+        return RawClient(self._bundles[index].folder)
+
+    def topic(self, lane: str, robot: str, name: str) -> str:
+        """A topic of this deployment."""
+        return build_topic(lane, robot, name, self.namespace)
+
+    def pong(self, path: str) -> dict[str, Any]:
+        """What the path answers to a ping of the first robot's."""
+        with self.client(0) as client:
+            client.subscribe(self.topic(PONG, self.a, path))
+            number = time.time_ns() % 1_000_000
+            client.publish(self.topic(PING, self.a, path), encode_ping(number, time.time_ns() // 1000))
+            answer: dict[str, Any] = json.loads(client.receive()[1])
+        equal(answer["id"], number)
+        return answer
+
+    def drive(self) -> list[Batch]:
+        """Publish a drive of three seconds of the first robot's; its batches, once they are stored."""
+        # Each drive in seconds of its own, which the one before has not filled.
+        self._drives += 1
+        first_s = int(time.time()) - 60 * self._drives
+        boot = uuid.uuid4().hex[:8]
+        batches = [
+            Batch(boot, i, [(first_s + i) * 1_000_000 + k * 20_000 for k in range(50)], {"speed": [i] * 50})
+            for i in range(3)
+        ]
+        with self.client(0) as client:
+            for batch in batches:
+                client.publish(record_topic(self.a, VESC_STREAM, self.namespace), encode(batch))
+            client.ping()
+            until(lambda: sum(b.boot == boot for b in self.stored()) == 3, "the rule to store the batches")
+        return batches
+
+    def stored(self) -> list[Batch]:
+        """The first robot's batches in the telemetry table."""
+        return list(delivery.batches(self.cloud, self.a, VESC_STREAM))
+
+    def live_until(self, client: RawClient, true: Callable[[], bool], what: str) -> None:
+        """Publish live samples as a car does: the first ones may be stale before a cold function starts."""
+
+        def heard() -> bool:
+            self._seq += 1
+            now_us = time.time_ns() // 1000
+            live = encode_live(LiveSample("0badcafe", self._seq, now_us, now_us, {"speed": 1}))
+            client.publish(self.topic(LIVE, self.a, VESC_STREAM), live)
+            return true()
+
+        until(heard, what)
+
+    def who(self, seconds: float) -> dict[str, Any]:
+        """The function's answer, which takes it so many seconds: ``instance`` and ``memory_mb``."""
+        payload = json.dumps({"seconds": seconds}).encode()
+        answer = self.cloud.client("lambda").invoke(FunctionName=self.function, Payload=payload)
+        found: dict[str, Any] = json.loads(answer["Payload"].read())
+        return found

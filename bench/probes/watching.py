@@ -1,0 +1,90 @@
+"""What PubNub and CloudWatch can do."""
+
+from __future__ import annotations
+
+import json
+import time
+import uuid
+from contextlib import ExitStack
+from datetime import datetime, timedelta, timezone
+from typing import Any
+
+from bench.probes.ground import WAIT_S, Ground, No, equal, until
+from contract import (
+    LAMBDA,
+)
+
+LISTENERS = 4
+
+
+def live_sample(ground: Ground) -> str:
+    """A live sample comes to a subscriber."""
+    with ground.target.listener(ground.a) as listener, ground.client(0) as client:
+        ground.live_until(client, lambda: bool(listener.heard), "the subscriber to hear a sample")
+        return f"a live sample came to a subscriber after {listener.heard[0].delay_ms:.0f} ms"
+
+
+def many_subscribers(ground: Ground) -> str:
+    """The same comes to each of several."""
+    with ExitStack() as stack:
+        listeners = [stack.enter_context(ground.target.listener(ground.a)) for _ in range(LISTENERS)]
+        ground.live_until(
+            stack.enter_context(ground.client(0)),
+            lambda: all(listener.heard for listener in listeners),
+            "all subscribers to hear a sample",
+        )
+    return f"all {LISTENERS} heard one message"
+
+
+def metrics(ground: Ground) -> str:
+    """The mean of values that were put in."""
+    client, now = ground.cloud.client("cloudwatch"), datetime.now(timezone.utc)
+    name = f"Bench{uuid.uuid4().hex[:8]}"
+    values = {"Values": [1.0, 2.0, 6.0], "Counts": [1.0, 1.0, 1.0]}
+    client.put_metric_data(
+        Namespace="iort-bench", MetricData=[{"MetricName": name, "Timestamp": now, **values}]
+    )
+    found: list[dict[str, Any]] = []
+
+    def there() -> bool:
+        found[:] = client.get_metric_statistics(
+            Namespace="iort-bench",
+            MetricName=name,
+            StartTime=now - timedelta(minutes=5),
+            EndTime=now + timedelta(minutes=5),
+            Period=60,
+            Statistics=["Average", "SampleCount"],
+        )["Datapoints"]
+        return bool(found)
+
+    until(there, "the metric's statistics", 180 if ground.target.embedded is None else WAIT_S)
+    equal(round(found[0]["Average"], 6), 3.0)
+    return "the mean of 1, 2 and 6 came back as 3"
+
+
+def logs(ground: Ground) -> str:
+    """An invocation's lines are found in its log."""
+    function = ground.cloud.output("processing", "EchoFunction")
+    client = ground.cloud.client("lambda")
+    group = client.get_function_configuration(FunctionName=function)["LoggingConfig"]["LogGroup"]
+    since = int(time.time() * 1000) - 1000
+    ground.pong(LAMBDA)
+    logs = ground.cloud.client("logs")
+    until(
+        lambda: bool(logs.filter_log_events(logGroupName=group, startTime=since)["events"]),
+        "the log's lines",
+    )
+    return "an invocation's lines are in its log"
+
+
+def dashboards(ground: Ground) -> str:
+    """The deployment's dashboards, with their widgets."""
+    client = ground.cloud.client("cloudwatch")
+    names = [entry["DashboardName"] for entry in client.list_dashboards()["DashboardEntries"]]
+    if not names:
+        raise No("there is no dashboard")
+    widgets = sum(
+        len(json.loads(client.get_dashboard(DashboardName=name)["DashboardBody"])["widgets"])
+        for name in names
+    )
+    return f"{len(names)} dashboards of {widgets} widgets"

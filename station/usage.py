@@ -1,0 +1,107 @@
+"""How a fleet is driven, as far as it makes a bill."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+
+from contract import LIVE_BROKER_EVERY_S
+from station.errors import StationError
+from station.prices import MONTH_DAYS
+
+# A car that measures no round trips still pings a rule for its clock's offset; a test holds it to the agent.
+CLOCK_PING_S = 30.0
+
+
+@dataclass(frozen=True, kw_only=True)
+class Usage:
+    """How the fleet is driven. The defaults are the agent's and the stacks' own.
+
+    ``rate_hz`` samples, ``live_hz`` live messages and ``ping_hz`` pings a path, all a second and robot;
+    a batch spans ``batch_s``; ``agent_every_s`` between the agent's own figures; robots drive
+    ``hours_per_day``; each of ``viewers`` watches the whole fleet all that time; items are kept
+    ``retention_days``, ``recoverable`` to a point in time in stage prod.
+    ``function_logs`` is the deployment's parameter: "all" adds Lambda's own lines about every invocation.
+    What only AWS can say, the billed milliseconds of an invocation, and of each batch that Lambda 2 finds
+    in one, are assumptions and named so.
+    """
+
+    robots: int = 1
+    rate_hz: float = 50.0
+    live_hz: float = 10.0
+    batch_s: float = 1.0
+    ping_hz: float = 0.0
+    agent_every_s: float = 10.0
+    hours_per_day: float = 2.0
+    viewers: int = 1
+    retention_days: int = 90
+    live_memory_mb: int = 256
+    live_ms: float = 20.0
+    live_concurrency: int = 0
+    summarize_memory_mb: int = 512
+    summarize_ms: float = 20.0
+    summarize_batch_ms: float = 5.0
+    function_logs: str = "own"
+    alarms: int = 28
+    dashboards: int = 2
+    recoverable: bool = False
+    customer_key: bool = False
+    device_defender: bool = True
+
+    def check(self) -> Usage:
+        """Itself; raises `StationError` for what no fleet can do."""
+        for name, value in vars(self).items():
+            if not isinstance(value, str) and value < 0:
+                raise StationError(f"{name} {value}: allowed is 0 or more")
+        if self.robots < 1:
+            raise StationError(f"robots {self.robots}: allowed is 1 or more")
+        if not 0 < self.rate_hz <= 2000:
+            raise StationError(f"rate {self.rate_hz} Hz: allowed is more than 0 and up to 2000")
+        if self.batch_s > 1:
+            raise StationError(f"batch of {self.batch_s} s: allowed is 0 to 1, 0 sends each sample by itself")
+        if not 0 < self.hours_per_day <= 24:
+            raise StationError(f"{self.hours_per_day} hours a day: allowed is more than 0 and up to 24")
+        return self
+
+    @property
+    def batches_per_s(self) -> float:
+        """Batches of the source's stream, a robot."""
+        return min(self.rate_hz, max(1.0, 1 / self.batch_s)) if self.batch_s else self.rate_hz
+
+    @property
+    def own_batches_per_s(self) -> float:
+        """Batches of the agent's own streams: its figures, and round trips where it measures them."""
+        figures = 1 / self.agent_every_s if self.agent_every_s else 0.0
+        return figures + min(1.0, 3 * self.ping_hz)
+
+    @property
+    def live_at_broker_per_s(self) -> float:
+        """Live messages that pass the broker, a robot, while its fault code stays what it is."""
+        return min(self.live_hz, 1 / LIVE_BROKER_EVERY_S)
+
+    @property
+    def clock_pings_per_s(self) -> float:
+        """Pings through a rule, a robot, by which it knows the cloud's clock."""
+        return 0.0 if self.ping_hz else 1 / CLOCK_PING_S
+
+    @property
+    def robot_hours_per_month(self) -> float:
+        """Of the whole fleet."""
+        return self.robots * self.hours_per_day * MONTH_DAYS
+
+
+def variations(usage: Usage) -> Iterator[tuple[str, Usage]]:
+    """The settings that change the bill, one at a time."""
+    yield "as configured", usage
+    for live_hz in (5.0, 2.0, 1.0, 0.0):
+        if live_hz != usage.live_hz:
+            name = f"live lane at {live_hz:g} Hz" if live_hz else "no live lane"
+            yield name, replace(usage, live_hz=live_hz)
+    for batch_s in (0.2, 0.0):
+        name = f"batches of {batch_s:g} s" if batch_s else "one sample a batch"
+        yield name, replace(usage, batch_s=batch_s)
+    yield "round trips measured at 1 Hz", replace(usage, ping_hz=1.0)
+    yield "with Lambda's own log lines", replace(usage, function_logs="all")
+    yield "kept for 30 days", replace(usage, retention_days=30)
+    yield "tables recoverable to a point in time (`prod`)", replace(usage, recoverable=True)
+    yield "a thousand robots", replace(usage, robots=1000)
