@@ -10,6 +10,7 @@ Everything here that refuses its input raises `ContractError`, and nothing else.
 from __future__ import annotations
 
 from contract.batch import Batch, decode, decode_item, encode, split
+from contract.checks import check_field
 from contract.cloud import (
     FILES_PREFIX,
     LOW_VOLTAGE_V,
@@ -38,6 +39,7 @@ from contract.commands import (
     encode_command,
     encode_fleet,
 )
+from contract.effort import check_effort
 from contract.files import (
     CLAIM_FIELDS,
     KINDS,
@@ -66,7 +68,9 @@ from contract.limits import (
     LIVE_MAX_RATE_HZ,
     MAX_AHEAD_US,
     MAX_BATCH_SPAN_US,
+    MAX_BATCH_VALUES,
     MAX_COLUMNS_BYTES,
+    MAX_FIELD_CHARACTERS,
     MAX_FIELDS,
     MAX_MESSAGE_BYTES,
     MAX_PUBNUB_BYTES,
@@ -162,7 +166,6 @@ from contract.topics import (
     TYPES_STREAM,
     Topic,
     build_topic,
-    check_field,
     check_namespace,
     check_robot,
     check_stream,
@@ -239,8 +242,10 @@ __all__ = [
     "MAX_ADDRESSES",
     "MAX_AHEAD_US",
     "MAX_BATCH_SPAN_US",
+    "MAX_BATCH_VALUES",
     "MAX_COLUMNS_BYTES",
     "MAX_FIELDS",
+    "MAX_FIELD_CHARACTERS",
     "MAX_FILE_BYTES",
     "MAX_LEASE_MS",
     "MAX_MESSAGE_BYTES",
@@ -315,6 +320,7 @@ __all__ = [
     "Value",
     "build_topic",
     "channel",
+    "check_effort",
     "check_field",
     "check_namespace",
     "check_robot",

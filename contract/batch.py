@@ -8,19 +8,20 @@ from typing import Any, Mapping, Sequence
 
 from contract.checks import (
     COMPACT,
-    FIELD_NAME,
+    check_field,
     check_header,
     check_times,
     check_version,
-    checked,
     integer,
     json_object,
     shown,
     wire_column,
 )
 from contract.columns import CODEC, PLAIN_CODEC, inflate, packed_samples, unpacked
+from contract.effort import check_effort
 from contract.limits import (
     MAX_AHEAD_US,
+    MAX_BATCH_VALUES,
     MAX_FIELDS,
     MAX_SAMPLES,
     SCHEMA_VERSION,
@@ -65,10 +66,11 @@ def encode(batch: Batch) -> bytes:
         raise ContractError(f"batch of {n} samples: allowed is 1 to {MAX_SAMPLES}")
     if len(batch.columns) > MAX_FIELDS:
         raise ContractError(f"batch of {len(batch.columns)} fields: allowed is up to {MAX_FIELDS}")
+    _check_values(n, len(batch.columns))
     nonfinite = batch.nonfinite
     fields: dict[str, list[Value]] = {}
     for name, column in batch.columns.items():
-        checked(FIELD_NAME, name, "field name", "a ROS field name or a dotted path of them")
+        check_field(name)
         if len(column) != n:
             raise ContractError(f"field {name}: {len(column)} values for {n} samples")
         fields[name], nulled = wire_column(name, column)
@@ -105,21 +107,31 @@ def decode(message: bytes | str | Mapping[str, Any]) -> Batch:
     boot = check_header(envelope.get("boot"), seq, nonfinite)
     if not 1 <= n <= MAX_SAMPLES:
         raise ContractError(f"envelope says {n} samples: allowed is 1 to {MAX_SAMPLES}")
-    body = json_object(inflate(envelope.get("samples"), codec), "samples")
+    text = inflate(envelope.get("samples"), codec)
+    check_effort(text)
+    body = json_object(text, "samples")
     dt, fields = body.get("dt"), body.get("fields")
     if not isinstance(dt, list) or len(dt) != n or not isinstance(fields, dict):
         raise ContractError(f"samples: expected {n} dt and an object of fields")
     if len(fields) > MAX_FIELDS:
         raise ContractError(f"samples of {len(fields)} fields: allowed is up to {MAX_FIELDS}")
+    _check_values(n, len(fields))
     if dt[0] != 0 or not set(map(type, dt)) <= {int}:
         raise ContractError("samples: dt must be integers, the first 0")
     columns = {}
     for name, column in fields.items():
-        checked(FIELD_NAME, name, "field name", "a ROS field name or a dotted path of them")
+        check_field(name)
         columns[name] = unpacked(codec, name, column, n)
     times = list(accumulate(dt, initial=first_us))[1:]
     check_times(times)
     return Batch(boot, seq, times, columns, nonfinite)
+
+
+def _check_values(samples: int, fields: int) -> None:
+    if samples * fields > MAX_BATCH_VALUES:
+        raise ContractError(
+            f"{samples} samples of {fields} fields: allowed is up to {MAX_BATCH_VALUES} values in a batch"
+        )
 
 
 def decode_item(item: Mapping[str, Any]) -> tuple[Topic, Batch]:

@@ -11,6 +11,7 @@ from typing import Any, Mapping, Sequence
 
 from contract.limits import (
     MAX_BATCH_SPAN_US,
+    MAX_FIELD_CHARACTERS,
     MAX_FIELDS,
     MAX_SAMPLES,
     SCHEMA_VERSION,
@@ -20,7 +21,7 @@ from contract.limits import (
 from contract.tables import NONFINITE
 
 # A ROS field name, or a path of them; a number in a path is an array's index.
-FIELD_NAME = re.compile(r"[A-Za-z][A-Za-z0-9_]*(\.[A-Za-z0-9_]+)*")
+_FIELD_NAME = re.compile(r"[A-Za-z][A-Za-z0-9_]*(\.[A-Za-z0-9_]+)*")
 
 
 def checked(pattern: re.Pattern[str], name: object, what: str, allowed: str) -> str:
@@ -73,7 +74,7 @@ COMPACT = json.JSONEncoder(separators=(",", ":"), allow_nan=False)
 def wire_sample(sample: Mapping[str, Any]) -> tuple[dict[str, Value], int]:
     """As `wire_column`, of one value a field; all at once, for this is the live lane's way."""
     for name in sample:
-        _field_name(name)
+        check_field(name)
     try:
         values, nulled = wire_column("", list(sample.values()))
     except ContractError:
@@ -84,12 +85,19 @@ def wire_sample(sample: Mapping[str, Any]) -> tuple[dict[str, Value], int]:
 
 
 @lru_cache(maxsize=4096)
-def _field_name(name: str) -> str:
-    return checked(FIELD_NAME, name, "field name", "a ROS field name or a dotted path of them")
+def check_field(name: str) -> str:
+    """Return ``name`` if it may name a field."""
+    if isinstance(name, str) and len(name) > MAX_FIELD_CHARACTERS:
+        raise ContractError(f"field name {shown(name)}: over {MAX_FIELD_CHARACTERS} characters")
+    return checked(_FIELD_NAME, name, "field name", "a ROS field name or a dotted path of them")
 
 
 def _is_text(value: str) -> bool:
-    return len(value) <= _MAX_TEXT and not any(0xD800 <= ord(c) <= 0xDFFF for c in value)
+    try:
+        # Half of a surrogate pair is the one character that UTF-8 does not have.
+        return len(value) <= _MAX_TEXT and (value.isascii() or bool(value.encode()))
+    except UnicodeEncodeError:
+        return False
 
 
 def check_version(envelope: Mapping[str, Any]) -> None:
@@ -124,11 +132,14 @@ def offset_entry(offset_us: Any) -> dict[str, int]:
 
 def check_times(times_us: Sequence[int]) -> None:
     """Refuse times that do not increase, or that span more than a batch may."""
-    if set(map(type, times_us)) != {int} or min(times_us) <= -_MAX_TIME_US or max(times_us) >= _MAX_TIME_US:
+    if set(map(type, times_us)) != {int}:
         for t_us in times_us:
             check_time(t_us, "sample time")
     if not all(map(lt, times_us, times_us[1:])):
         raise ContractError("sample times must strictly increase within a batch")
+    # All others lie between them.
+    check_time(times_us[0], "sample time")
+    check_time(times_us[-1], "sample time")
     if times_us[-1] - times_us[0] >= MAX_BATCH_SPAN_US:
         raise ContractError(f"a batch must span less than {MAX_BATCH_SPAN_US} microseconds")
 

@@ -30,6 +30,11 @@ MAX_AHEAD_US = 366 * 86_400 * 1_000_000
 # A batch closes after a second, so a range read starts one second early and misses nothing.
 MAX_BATCH_SPAN_US = 1_000_000
 MAX_FIELDS = 512
+# Of a batch, samples times fields: what a car of 1000 Hz and 50 fields says in a second. The agent closes a
+# batch at 20,000 and halves one that holds more than this. Reading as many takes some 20 ms.
+MAX_BATCH_VALUES = 50_000
+# Nested messages make long paths; a name is not the place for megabytes.
+MAX_FIELD_CHARACTERS = 1024
 MAX_COLUMNS_BYTES = 8 * 1024 * 1024
 
 Value = Union[None, bool, int, float, str]

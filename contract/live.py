@@ -9,12 +9,11 @@ from typing import Any, Mapping, NamedTuple
 
 from contract.checks import (
     COMPACT,
-    FIELD_NAME,
     MAX_SEQ,
+    check_field,
     check_header,
     check_time,
     check_version,
-    checked,
     integer,
     json_object,
     offset_entry,
@@ -80,7 +79,7 @@ def decode_live(message: bytes | str) -> LiveSample:
     if not isinstance(sample, dict) or len(sample) > MAX_FIELDS:
         raise ContractError(f"sample: expected an object of up to {MAX_FIELDS} fields")
     for name, value in sample.items():
-        checked(FIELD_NAME, name, "field name", "a ROS field name or a dotted path of them")
+        check_field(name)
         if wire_column(name, (value,))[1]:
             raise ContractError(f"field {name}: the number is not finite")
     t_us = check_time(integer(envelope, T_US), "sample time")

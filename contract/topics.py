@@ -5,7 +5,7 @@ from __future__ import annotations
 import re
 from typing import NamedTuple
 
-from contract.checks import FIELD_NAME, checked, shown
+from contract.checks import checked, shown
 from contract.limits import DEFAULT_NAMESPACE, ContractError
 
 _NAME = re.compile(r"[A-Za-z0-9_-]{1,64}")
@@ -56,11 +56,6 @@ def check_robot(name: str) -> str:
 def check_stream(name: str) -> str:
     """Return ``name`` if it may name a stream or be the last level of any topic."""
     return checked(_NAME, name, "stream name", "1 to 64 of A-Z a-z 0-9 _ -")
-
-
-def check_field(name: str) -> str:
-    """Return ``name`` if it may name a field."""
-    return checked(FIELD_NAME, name, "field name", "a ROS field name or a dotted path of them")
 
 
 def check_namespace(name: str) -> str:

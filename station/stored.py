@@ -15,6 +15,7 @@ from contract import (
     CODEC,
     EXACT,
     MAX_BATCH_SPAN_US,
+    MAX_BATCH_VALUES,
     MAX_FIELDS,
     MAX_SAMPLES,
     PLAIN_CODEC,
@@ -25,6 +26,7 @@ from contract import (
     Batch,
     ContractError,
     Value,
+    check_effort,
     check_field,
     decode,
     inflate,
@@ -149,6 +151,7 @@ def _columns(body: bytes, n: int, codec: str) -> tuple[list[int], dict[str, list
     """The columns of a body of numbers alone; None for everything else."""
     if b"true" in body or b"false" in body or b"N" in body or b"I" in body:
         return None
+    check_effort(body)
     written = _parse(body.decode())
     dt, fields = written["dt"], written["fields"]
     if codec == PLAIN_CODEC:
@@ -159,6 +162,7 @@ def _columns(body: bytes, n: int, codec: str) -> tuple[list[int], dict[str, list
         or body.count(b"[") != flat
         or body.count(b"{") != 2
         or len(fields) > MAX_FIELDS
+        or n * len(fields) > MAX_BATCH_VALUES
         or not all(map(_is_field, fields))
         or any(len(column) != n + 1 for column in fields.values())
         or len(dt) != n

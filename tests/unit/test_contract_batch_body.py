@@ -54,8 +54,8 @@ BODIES = [
     (b"\xff\xfe{}", "not JSON"),
     (b'{"dt":[0,5],"fields":{"a":["\xff",1]}}', "not JSON"),
     (b"[" * DEEP, "nested"),
-    (b'{"dt":' + b"[" * DEEP + b"]" * DEEP + b',"fields":{}}', "nested"),
-    (b'{"dt":[0,5],"fields":' + b'{"a":' * DEEP + b"0" + b"}" * DEEP + b"}", "nested"),
+    (b'{"dt":' + b"[" * DEEP + b"]" * DEEP + b',"fields":{}}', "more than columns"),
+    (b'{"dt":[0,5],"fields":' + b'{"a":' * DEEP + b"0" + b"}" * DEEP + b"}", "too many texts"),
     (b'{"dt":[0,5],"fields":{"a":[' + b"[" * 500 + b"]" * 500 + b",1]}}", "neither number"),
     (b'{"dt":[0,5],"fields":{"a":[1,NaN]}}', "NaN"),
     (b'{"dt":[0,5],"fields":{"a":[1,-Infinity]}}', "Infinity"),
@@ -109,11 +109,14 @@ def test_the_last_of_duplicate_keys_counts():
 
 
 def test_body_of_the_greatest_size_is_read_and_no_larger():
-    body = b'{"dt":[0,5],"fields":{}}'
-    room = contract.MAX_COLUMNS_BYTES - len(body)
-    assert contract.decode(enveloped(body + b" " * room)).columns == {}
+    n = 8_388_608 // 4096
+    times = {"dt": [0] + [1] * (n - 1)}
+    room = contract.MAX_COLUMNS_BYTES - len(json.dumps({**times, "fields": {"a": [""] * n}}))
+    texts = ["x" * (room // n + (i < room % n)) for i in range(n)]
+    body = json.dumps({**times, "fields": {"a": texts}}).encode()
+    assert contract.decode(enveloped(body, n=n)).columns == {"a": texts}
     with pytest.raises(ContractError, match="over 8388608 bytes"):
-        contract.decode(enveloped(body + b" " * (room + 1)))
+        contract.decode(enveloped(body + b" ", n=n))
 
 
 def test_zip_bomb_is_not_inflated():

@@ -27,8 +27,10 @@ class Line:
         self.clock = ManualClock(now_us=T0)
         self.counts = StreamCounts()
         self.spool = MemorySpool(max_bytes=2**40)
-        packer = Packer(stream="vesc", boot=BOOT, spool=self.spool, counts=self.counts, stored=lambda: None)
-        self.batcher = Batcher(packer.store, batch_s=batch_s, clock=self.clock, counts=self.counts)
+        self.packer = Packer(
+            stream="vesc", boot=BOOT, spool=self.spool, counts=self.counts, stored=lambda: None
+        )
+        self.batcher = Batcher(self.packer.store, batch_s=batch_s, clock=self.clock, counts=self.counts)
 
     def messages(self) -> list[bytes]:
         out, after = [], 0
@@ -158,6 +160,17 @@ def test_messages_stay_below_the_limit() -> None:
     assert all(len(message) <= contract.MAX_MESSAGE_BYTES for message in line.messages())
     assert all(len(b.times_us) * 400 <= MAX_VALUES for b in line.batches())
     assert len(line.batches()) > 200 * 400 // MAX_VALUES, "some were split"
+
+
+def test_what_holds_too_many_values_for_a_batch_is_halved() -> None:
+    line = Line()
+    fields = dict.fromkeys((f"f{i}" for i in range(300)), 0)
+    line.packer.store(list(range(400)), [fields] * 400)
+    assert [t_us for t_us, _ in line.samples()] == list(range(400))
+    assert [len(batch.times_us) for batch in line.batches()] == [100] * 4
+    assert all(len(batch.times_us) * 300 <= contract.MAX_BATCH_VALUES for batch in line.batches())
+    assert [batch.seq for batch in line.batches()] == [0, 1, 2, 3]
+    assert line.counts.refused == 0
 
 
 @pytest.mark.parametrize(

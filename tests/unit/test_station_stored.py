@@ -49,6 +49,7 @@ HOSTILE = {
     "no fields": '{"dt":[0,5],"fields":null}',
     "infinite": '{"dt":[0,5],"fields":{"f0":[1e999,1]}}',
     "beyond 64 bits": '{"dt":[0,5],"fields":{"f0":[18446744073709551616,1]}}',
+    "dear": '{"dt":[0,5],"fields":{"f0":[' + "[]," * 50_000 + "0]}}",
     "beyond a float": '{"dt":[0,5],"fields":{"f0":[1' + 400 * "0" + ",1]}}",
 }
 
@@ -65,6 +66,14 @@ def test_what_a_stranger_stored_is_refused_and_its_neighbours_are_read(body, cod
     found, refused = read({**good, "t": -1_000_000}, strange, {**good, "t": 1_000_000})
     assert refused.count == 1
     assert [value for block in found for value in block.columns["f0"].tolist()] == [1, 3, 1, 3]
+
+
+def test_more_values_than_a_batch_may_hold_are_refused_and_its_neighbours_are_read():
+    n, good = contract.MAX_BATCH_VALUES // 2 + 1, message_of([0, 1, 2])
+    large = message_of([0] * (n + 1), [0] * (n + 1), n=n)
+    found, refused = read(good, {**large, "t": 1_000_000})
+    assert refused.count == 1
+    assert [value for block in found for value in block.columns["f0"].tolist()] == [1, 3]
 
 
 def test_a_batch_at_a_fraction_of_a_microsecond_is_refused_and_its_neighbours_are_read():

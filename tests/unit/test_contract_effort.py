@@ -1,0 +1,105 @@
+"""What a batch may cost to read: the largest is read, a dearer one is refused before its JSON is."""
+
+from __future__ import annotations
+
+import base64
+import json
+import zlib
+
+import pytest
+
+import contract
+from contract import Batch, ContractError
+from contract.effort import check_effort
+
+BOOT = "0123abcd"
+MOST = contract.MAX_BATCH_VALUES
+
+
+def full(fields, value):
+    n = MOST // fields
+    return Batch(BOOT, 0, range(n), {f"f{i}": [value] * n for i in range(fields)})
+
+
+@pytest.mark.parametrize(
+    ("fields", "value"),
+    [
+        (1, 0),
+        (1, -1.2345678901234567e-300),
+        (1, '{"a":[1,2,3]}'),
+        (1, 'say "yes, [no]" \\ \\" {'),
+        (50, 0.125),
+        (512, 2**63),
+        (500, None),
+        (512, "a,b"),
+    ],
+)
+def test_as_many_values_as_are_allowed_are_read(fields, value):
+    batch = full(fields, value)
+    assert contract.decode(contract.encode(batch)).columns == batch.columns
+
+
+def test_the_longest_texts_are_read_whatever_they_hold():
+    texts = ["," * 4096, '"' * 4096, "\\" * 4096, '\\"' * 2048, "[" * 4096, "{" * 4096, "é" * 4096]
+    batch = Batch(BOOT, 0, range(7 * 20), {"a": texts * 20})
+    assert contract.decode(contract.encode(batch)).columns == batch.columns
+
+
+def test_columns_that_somebody_indents_are_read():
+    columns = {"dt": [0] + [1] * 9_999, "fields": {"a.b": [0.5] * 10_000, "c": ["x", None] * 5_000}}
+    body = json.dumps(columns, indent=8).encode()
+    assert len(body) > 2 * MOST
+    assert len(contract.decode(enveloped(body, 10_000)).times_us) == 10_000
+
+
+@pytest.mark.parametrize(("samples", "fields"), [(MOST // 2 + 1, 2), (98, 512)])
+def test_more_values_are_refused_on_either_side(samples, fields):
+    said = f"{samples} samples of {fields} fields: allowed is up to {MOST} values"
+    with pytest.raises(ContractError, match=said):
+        contract.encode(Batch(BOOT, 0, range(samples), {f"f{i}": [1] * samples for i in range(fields)}))
+    columns = b",".join(b'"f%d":[%s0]' % (i, b"0," * (samples - 1)) for i in range(fields))
+    body = b'{"dt":[0%s],"fields":{%s}}' % (b",1" * (samples - 1), columns)
+    with pytest.raises(ContractError, match=said):
+        contract.decode(enveloped(body, samples))
+
+
+DEAR = {
+    "values": b'{"dt":[0],"fields":{"a":[' + b"0," * 2_000_000 + b"0]}}",
+    "columns": b'{"dt":[0],"fields":{' + b",".join(b'"f%d":[0]' % i for i in range(20_000)) + b"}}",
+    "names": b'{"dt":[0],"fields":{' + b",".join(b'"f%d":0' % i for i in range(200_000)) + b"}}",
+    "lists": b'{"dt":[0],"fields":{"a":[' + b"[]," * 1_000_000 + b"0]}}",
+    "lists in lists": b'{"dt":[0],"fields":{"a":[' + (b"[" * 190 + b"]" * 190 + b",") * 5_000 + b"0]}}",
+    "objects": b'{"dt":[0],"fields":{"a":[' + b"{}," * 1_000_000 + b"0]}}",
+    "texts": b'{"dt":[0],"fields":{"a":[' + b'"",' * 1_000_000 + b"0]}}",
+    "texts behind an escape": b'{"dt":[0],"fields":{"a":["\\"",' + b'"",' * 1_000_000 + b"0]}}",
+    "long integers": b'{"dt":[0],"fields":{"a":[' + (b"9" * 4_200 + b",") * 900 + b"0]}}",
+    "long floats": b'{"dt":[0],"fields":{"a":[' + (b"0." + b"9" * 4_200 + b",") * 900 + b"0]}}",
+    "white space": b'{"dt":[0],' + b" " * 4_000_000 + b'"fields":{"a":[0]}}',
+    "no JSON": b"[" * 4_000_000,
+}
+
+
+@pytest.mark.parametrize("body", DEAR.values(), ids=DEAR)
+def test_what_is_dear_to_read_is_refused_before_it_is_read(body):
+    with pytest.raises(ContractError, match=r"samples hold (more than columns|too many texts)"):
+        check_effort(body)
+    with pytest.raises(ContractError, match="samples hold"):
+        contract.decode(enveloped(body, 1))
+
+
+def test_names_are_no_place_for_megabytes():
+    longest = "a" + ".b" * 511 + "c"
+    batch = Batch(BOOT, 0, [0], {longest: [1]})
+    assert contract.decode(contract.encode(batch)) == batch
+    for name in (longest + "d", "a" + ".b" * 1_000_000):
+        with pytest.raises(ContractError, match="over 1024 characters"):
+            contract.encode(Batch(BOOT, 0, [0], {name: [1]}))
+        with pytest.raises(ContractError, match="over 1024 characters"):
+            contract.decode(enveloped(b'{"dt":[0],"fields":{"%s":[1]}}' % name.encode(), 1))
+
+
+def enveloped(body, n):
+    """A good envelope around any body, in the codec whose columns are their values alone."""
+    good = json.loads(contract.encode(Batch(BOOT, 0, [0], {"a": [1]})))
+    packed = base64.b64encode(zlib.compress(body)).decode()
+    return {**good, "n": n, "codec": contract.PLAIN_CODEC, "samples": packed}
