@@ -78,12 +78,13 @@ def bill(usage: Usage) -> list[Item]:
     ]
     items += _ping_items(usage.ping_hz * hour, sizes, all_lines=usage.function_logs == "all")
     writes = batches * _units(sizes.telemetry_item, _WRITE)
-    # Of one robot in an event: its batches, of which one query reads also the second before.
-    found = max(1.0, usage.batches_per_s * _shards_of(usage) / summarize_calls_per_s(usage))
-    read = found + max(1.0, usage.batches_per_s)
+    # Of one stream in an event: its batches, of which one query reads also the second before.
+    of_stream = usage.stream_batches_per_s
+    found = max(1.0, of_stream * _shards_of(usage) / summarize_calls_per_s(usage))
+    read = found + max(1.0, of_stream)
     reads = batches / found * _units(ceil(read) * sizes.telemetry_item, _READ)
     # A batch lies in one second; a second whose batches come in two events is written twice.
-    writes_s = batches * min(1.0, 1 / usage.batches_per_s + (usage.batches_per_s > 1) / found)
+    writes_s = batches * min(1.0, 1 / of_stream + (of_stream > 1) / found)
     items += [
         Item("DynamoDB", "record", "telemetry written", "write", writes),
         Item("DynamoDB", "agent, rtt", "telemetry written", "write", own * _units(own_item, _WRITE)),
@@ -92,7 +93,7 @@ def bill(usage: Usage) -> list[Item]:
         Item("DynamoDB", "record", "batches read by Lambda 2", "read", reads),
         Item("DynamoDB", "agent, rtt", "batches read by Lambda 2", "read", own),
     ]
-    seconds = min(batches, hour)
+    seconds = min(batches, usage.streams * hour)
     kept = [
         _storage("record", "telemetry kept", batches, sizes.telemetry_item, usage),
         _storage("record", "summary kept", seconds, sizes.summary_item, usage),
@@ -131,8 +132,8 @@ def thesis_bill(usage: Usage) -> list[Item]:
     no figures of the agent's own, no alarms and no metrics."""
     usage.check()
     sizes = measure(usage.rate_hz, usage.batch_s)
-    samples = usage.rate_hz * 3600
-    per_s = usage.robots * usage.rate_hz
+    samples = usage.samples_per_s * 3600
+    per_s = usage.robots * usage.samples_per_s
     polls = max(_THESIS_POLLS_PER_S * _shards(per_s), per_s / _THESIS_RECORDS_A_CALL)
     calls = min(per_s, polls) * 3600 / usage.robots
     written = samples * _units(sizes.sample_item, _WRITE)
@@ -158,7 +159,7 @@ def pubnub_bill(usage: Usage, *, thesis: bool = False) -> list[Item]:
     """What PubNub bills a robot-hour on its plan by transactions: a publish each, a receipt a viewer."""
     usage.check()
     size = measure(usage.rate_hz, usage.batch_s).update
-    messages = (usage.rate_hz if thesis else usage.live_hz) * 3600 * _units(size, _PUBNUB_UNIT)
+    messages = (usage.samples_per_s if thesis else usage.live_hz) * 3600 * _units(size, _PUBNUB_UNIT)
     return [
         Item("PubNub", "live", "published", "pubnub_publish", messages),
         Item("PubNub", "live", "received by viewers", "pubnub_receive", messages * usage.viewers),

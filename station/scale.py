@@ -100,6 +100,6 @@ def _per_robot(usage: Usage) -> dict[str, float]:
         "IoT Core: publishes of one connection": publishes,
         "DynamoDB: writes to table telemetry": telemetry,
         "DynamoDB: writes to table summary": summary,
-        "DynamoDB: writes to one partition": telemetry,
+        "DynamoDB: writes to one partition": usage.stream_batches_per_s * -(-sizes.telemetry_item // 1024),
         "Lambda: concurrent executions": busy,
     }

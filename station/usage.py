@@ -17,10 +17,11 @@ CLOCK_PING_S = 30.0
 class Usage:
     """How the fleet is driven. The defaults are the agent's and the stacks' own.
 
-    ``rate_hz`` samples, ``live_hz`` live messages and ``ping_hz`` pings a path, all a second and robot;
-    a batch spans ``batch_s``; ``agent_every_s`` between the agent's own figures; robots drive
-    ``hours_per_day``; each of ``viewers`` watches the whole fleet all that time; items are kept
-    ``retention_days``, ``recoverable`` to a point in time in stage prod.
+    A robot has ``streams``, each of ``rate_hz`` samples a second; ``live_hz`` are the live messages of all
+    of them and ``ping_hz`` the pings a path, a second and robot; a batch spans ``batch_s``;
+    ``agent_every_s`` between the agent's own figures; robots drive ``hours_per_day``; each of ``viewers``
+    watches the whole fleet all that time; items are kept ``retention_days``, ``recoverable`` to a point in
+    time in stage prod.
     ``function_logs`` is the deployment's parameter: "all" adds Lambda's own lines about every invocation.
     What only AWS can say, the billed milliseconds of an invocation, and of each batch that Lambda 2 finds
     in one, are assumptions and named so.
@@ -28,6 +29,7 @@ class Usage:
 
     robots: int = 1
     rate_hz: float = 50.0
+    streams: int = 1
     live_hz: float = 10.0
     batch_s: float = 1.0
     ping_hz: float = 0.0
@@ -55,6 +57,8 @@ class Usage:
                 raise StationError(f"{name} {value}: allowed is 0 or more")
         if self.robots < 1:
             raise StationError(f"robots {self.robots}: allowed is 1 or more")
+        if self.streams < 1:
+            raise StationError(f"streams {self.streams}: allowed is 1 or more")
         if not 0 < self.rate_hz <= 2000:
             raise StationError(f"rate {self.rate_hz} Hz: allowed is more than 0 and up to 2000")
         if self.batch_s > 1:
@@ -65,7 +69,17 @@ class Usage:
 
     @property
     def batches_per_s(self) -> float:
-        """Batches of the source's stream, a robot."""
+        """Batches of the sources' streams, a robot."""
+        return self.streams * self.stream_batches_per_s
+
+    @property
+    def samples_per_s(self) -> float:
+        """Samples of the sources' streams, a robot."""
+        return self.streams * self.rate_hz
+
+    @property
+    def stream_batches_per_s(self) -> float:
+        """Batches of one of the sources' streams."""
         return min(self.rate_hz, max(1.0, 1 / self.batch_s)) if self.batch_s else self.rate_hz
 
     @property
@@ -77,7 +91,7 @@ class Usage:
     @property
     def live_at_broker_per_s(self) -> float:
         """Live messages that pass the broker, a robot, while its fault code stays what it is."""
-        return min(self.live_hz, 1 / LIVE_BROKER_EVERY_S)
+        return min(self.live_hz, self.streams / LIVE_BROKER_EVERY_S)
 
     @property
     def clock_pings_per_s(self) -> float:

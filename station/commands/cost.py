@@ -6,6 +6,7 @@ import json
 import math
 from dataclasses import asdict, replace
 from pathlib import Path
+from statistics import mean
 from typing import Annotated, Any
 
 import typer
@@ -30,7 +31,8 @@ _DEFAULT = Usage()
 def cost_(
     context: typer.Context,
     robots: Annotated[int, typer.Option(help="How many robots.")] = 1,
-    rate_hz: Annotated[float | None, typer.Option(help="Samples a second.")] = None,
+    rate_hz: Annotated[float | None, typer.Option(help="Samples a second, of each stream.")] = None,
+    streams: Annotated[int | None, typer.Option(help="Streams that a robot's sources bring.")] = None,
     live_hz: Annotated[float | None, typer.Option(help="Live messages a second.")] = None,
     batch_s: Annotated[
         float | None, typer.Option(help="Seconds a batch spans; 0 sends each sample by itself.")
@@ -60,7 +62,13 @@ def cost_(
     usage = _configured(_DEFAULT, config)
     if deployed:
         usage = _as_deployed(usage, context.obj.cloud())
-    said: dict[str, Any] = {"rate_hz": rate_hz, "live_hz": live_hz, "batch_s": batch_s, "ping_hz": ping_hz}
+    said: dict[str, Any] = {
+        "rate_hz": rate_hz,
+        "streams": streams,
+        "live_hz": live_hz,
+        "batch_s": batch_s,
+        "ping_hz": ping_hz,
+    }
     usage = replace(
         usage,
         robots=robots,
@@ -75,7 +83,8 @@ def cost_(
         _out.print_json(json.dumps(_as_json(usage)))
         return
     _out.print(
-        f"List prices of {AS_OF} in US dollars, {REGION}: {usage.robots:,} robots at {usage.rate_hz:g} Hz, "
+        f"List prices of {AS_OF} in US dollars, {REGION}: {usage.robots:,} robots at {usage.rate_hz:g} Hz"
+        f"{f' in each of {usage.streams} streams' if usage.streams > 1 else ''}, "
         f"live {usage.live_hz:g} Hz, {usage.hours_per_day:g} h a day, kept {usage.retention_days} days.\n"
     )
     for title, rows in (
@@ -98,18 +107,21 @@ def _configured(usage: Usage, config: Path | None) -> Usage:
 
 
 def _rates(car: Config) -> dict[str, Any]:
-    rates = [source.rate_hz for source in car.sources if hasattr(source, "rate_hz")]
-    # The rate is of each stream, which sends no more than its source brings.
-    live_hz = sum(
-        max(1, len(set(source.streams()))) * min(car.live.rate_hz, getattr(source, "rate_hz", math.inf))
+    # What a source alone does not say, such as the rate of a ROS topic, is as in a `Usage`.
+    rates = [
+        (getattr(source, "rate_hz", _DEFAULT.rate_hz), getattr(source, "rate_hz", math.inf))
         for source in car.sources
-    )
+        for _ in range(max(1, len(set(source.streams()))))
+    ]
+    # The live lane's rate is of each stream, which sends no more than its source brings.
+    live_hz = sum(min(car.live.rate_hz, most_hz) for _, most_hz in rates)
     return {
         "live_hz": live_hz if car.live.enabled else 0.0,
         "batch_s": car.record.batch_s,
         "ping_hz": car.ping.rate_hz,
         "agent_every_s": car.metrics.every_s if car.metrics.enabled else 0.0,
-        **({"rate_hz": sum(rates)} if rates else {}),
+        "streams": len(rates),
+        "rate_hz": mean(rate_hz for rate_hz, _ in rates),
     }
 
 

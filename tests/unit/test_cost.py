@@ -239,4 +239,26 @@ def test_command_counts_the_live_messages_of_every_stream(tmp_path):
         "- type: rosbridge\n  url: ws://localhost:9090\n"
         "  topics: {/a: {stream: a, time: arrival}, /b: {stream: b, time: arrival}}\n"
     )
-    assert usage_of_a_car(tmp_path, settings)["live_hz"] == 2 + 2 * 4
+    usage = usage_of_a_car(tmp_path, settings)
+    assert usage["live_hz"] == 2 + 2 * 4
+    # A sample each half second, and two topics of which nothing is known.
+    assert (usage["streams"], usage["rate_hz"]) == (3, (2 + 50 + 50) / 3)
+
+
+@pytest.mark.parametrize("batch_s", [0.0, 0.2, 1.0])
+def test_streams_are_billed_each_by_itself(batch_s):
+    one, three = (
+        {(item.lane, item.what): item.units for item in cost.bill(Usage(streams=streams, batch_s=batch_s))}
+        for streams in (1, 3)
+    )
+    times = {what: three[what] / units for what, units in one.items() if units}
+    for what in ("rules triggered", "actions", "telemetry written", "telemetry kept", "summary kept"):
+        assert times["record", what] == pytest.approx(3), what
+    # How often Lambda 2 is called hangs on the window, until its events are full.
+    assert times["record", "Lambda 2 invoked"] <= 3
+    assert times["all", "connection"] == times["agent, rtt", "kept"] == 1
+    messages = [next(i.units for i in cost.thesis_bill(usage) if i.what == "messages") for usage in USAGES]
+    assert messages[1] == 3 * messages[0]
+
+
+USAGES = (Usage(), Usage(streams=3))
