@@ -17,7 +17,8 @@ LIVE_MAX_AGE_MS = 2_000
 # A car says by how much its clock and the cloud's differ only where it knows that well enough to judge
 # by: wrong by a quarter of the age above at most.
 CLOCK_MAX_UNCERTAINTY_MS = 500
-LIVE_MAX_RATE_HZ = 10.0
+# The slowest is seen by alarms that look at five minutes.
+LIVE_MIN_RATE_HZ, LIVE_MAX_RATE_HZ = 0.01, 10.0
 # Most live messages go straight to their rule, which costs no messaging; one as often as this, at least,
 # passes the broker, where other rules and subscribers see it.
 LIVE_BROKER_EVERY_S = 10.0

@@ -58,7 +58,9 @@ class LiveConfig:
     """The live lane. ``rate_hz``: at most so many messages a second of each stream."""
 
     enabled: bool = setting(flag(), default=True)
-    rate_hz: float = setting(number(0.01, contract.LIVE_MAX_RATE_HZ, unit="Hz"), contract.LIVE_MAX_RATE_HZ)
+    rate_hz: float = setting(
+        number(contract.LIVE_MIN_RATE_HZ, contract.LIVE_MAX_RATE_HZ, unit="Hz"), contract.LIVE_MAX_RATE_HZ
+    )
 
 
 @dataclass(frozen=True)

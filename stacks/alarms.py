@@ -46,8 +46,10 @@ class Alarms(Construct):
             behind_ms = limits.stream_behind_s * 1000
             self._alarm(f"{name}Behind", age, behind_ms, "the stream is read late", periods=3)
         self._ours("Quarantined", "quarantine", 0, "messages that could not be processed are in quarantine")
-        self._ours("PubNubFailed", "live", 0, "live samples did not reach PubNub", periods=3)
-        self._ours("CarToLambdaMs", "live", limits.car_to_lambda_ms, "live samples are late", periods=3)
+        # Of five minutes, since a live lane at 0.01 Hz, the slowest that there is, sends in three of them.
+        self._ours("PubNubFailed", "live", 0, "live samples did not reach PubNub", periods=3, within=5)
+        late_ms = limits.car_to_lambda_ms
+        self._ours("CarToLambdaMs", "live", late_ms, "live samples are late", periods=3, within=5)
         self._ours("BatchesMissing", "summarize", 0, "batches of a car are missing")
         self._ours("BatchesRefused", "summarize", 0, "batches cannot be decoded")
 
@@ -71,10 +73,18 @@ class Alarms(Construct):
         self._ours("BatteryVolts", "health", limits.low_voltage_v, "a car's battery is low", below=True)
 
     def _ours(
-        self, name: str, function: str, limit: float, what: str, *, periods: int = 1, below: bool = False
+        self,
+        name: str,
+        function: str,
+        limit: float,
+        what: str,
+        *,
+        periods: int = 1,
+        within: int | None = None,
+        below: bool = False,
     ) -> None:
         metric = metrics.ours(function, name, namespace=self._namespace)
-        self._alarm(name, metric, limit, what, periods=periods, below=below)
+        self._alarm(name, metric, limit, what, periods=periods, within=within, below=below)
 
     def _alarm(
         self,
@@ -84,8 +94,10 @@ class Alarms(Construct):
         what: str,
         *,
         periods: int = 1,
+        within: int | None = None,
         below: bool = False,
     ) -> None:
+        """``periods`` beyond the limit, one after the other or ``within`` so many, set it off."""
         operator = cloudwatch.ComparisonOperator
         alarm = cloudwatch.Alarm(
             self,
@@ -95,7 +107,7 @@ class Alarms(Construct):
             metric=metric,
             threshold=limit,
             comparison_operator=operator.LESS_THAN_THRESHOLD if below else operator.GREATER_THAN_THRESHOLD,
-            evaluation_periods=periods,
+            evaluation_periods=within or periods,
             datapoints_to_alarm=periods,
             treat_missing_data=cloudwatch.TreatMissingData.NOT_BREACHING,
         )

@@ -67,6 +67,18 @@ def test_the_thresholds_are_the_settings(production, synthesized):
     assert float(alert["Environment"]["Variables"]["LOW_VOLTAGE_V"]) == limits.low_voltage_v
 
 
+def test_the_slowest_live_lane_can_set_its_alarms_off(alarms):
+    """Three minutes one after the other with a message each are more than one in a hundred seconds has."""
+    every_s = 1 / contract.LIVE_MIN_RATE_HZ
+    for name_ in ("PubNubFailed", "CarToLambdaMs"):
+        alarm = alarms[name_]
+        periods, needed = alarm["EvaluationPeriods"], alarm["DatapointsToAlarm"]
+        assert alarm["Period"] == 60
+        for offset_s in range(60):
+            minutes = {int(offset_s + i * every_s) // 60 for i in range(100)}
+            assert all(len(minutes & set(range(i, i + periods))) >= needed for i in range(100))
+
+
 def test_the_address_subscribes_to_the_topic(production, synthesized):
     (subscription,) = production.resources("AWS::SNS::Subscription").values()
     assert (subscription["Protocol"], subscription["Endpoint"]) == ("email", "lab@example.org")
