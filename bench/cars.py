@@ -17,6 +17,7 @@ from collections.abc import Mapping
 from typing import Any
 
 import contract
+from bench import camera
 from device.sources.vehicle import Vehicle, VehicleConfig
 
 RATE_HZ = 10.0
@@ -27,7 +28,8 @@ _SENT_MS, _RECEIVED_MS, _LAMBDA_MS = 11.0, 7.0, 3.0
 
 
 class SimulatedCar:
-    """A car that drives laps: its motor controller and, with ``senses``, its pose and its accelerations."""
+    """A car that drives laps: its motor controller and, with ``senses``, its pose, its accelerations and
+    its camera."""
 
     def __init__(self, name: str, seed: int, *, senses: bool = False) -> None:
         self.name, self.senses = name, senses
@@ -72,7 +74,12 @@ class SimulatedCar:
             "linear_acceleration.y": round(speed_mps * yaw_rate, 3),
             "angular_velocity.z": round(yaw_rate, 3),
         }
-        return [self._update("odom", pose), self._update("imu", acceleration)]
+        picture = camera.claim(self.name, self._driven_m, yaw_rate)
+        return [
+            self._update("odom", pose),
+            self._update("imu", acceleration),
+            self._update("camera", picture),
+        ]
 
     def _update(self, stream: str, sample: Mapping[str, contract.Value]) -> dict[str, Any]:
         seq = self._seqs[stream] = self._seqs.get(stream, -1) + 1

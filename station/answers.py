@@ -43,8 +43,8 @@ def answers(cloud: Cloud) -> dict[str, Callable[[Mapping[str, str]], dict[str, A
 def history(cloud: Cloud, asked: Mapping[str, str]) -> dict[str, Any]:
     """The samples of ``robot`` and ``stream`` from ``from_us`` to ``to_us``, in at most ``rows`` rows.
 
-    A row that stands for several samples has the least, the mean and the most of every number, and the
-    last of everything else. Raises `StationError` for a request that cannot be answered.
+    A row that stands for several samples has the least, the mean and the most of every number, and of
+    everything else the last that is not null. Raises `StationError` for a request that cannot be answered.
     """
     start_us, end_us = (_whole(asked, name, 0, 2**53) for name in ("from_us", "to_us"))
     rows = _whole(asked, "rows", 2, MAX_ROWS)
@@ -86,7 +86,7 @@ def _by_statistic(columns: Mapping[str, Column]) -> dict[str, tuple[Column, Colu
 def _rows(of: tuple[Column, Column, Column], starts: Any, n: int, *, several: bool) -> dict[str, list[Any]]:
     mean, least, most = of
     if mean.dtype.kind != "f":
-        ends = np.append(starts[1:], n) - 1 if n else starts
+        ends = _last_known(mean, starts)
         return {"mean": mean[ends].tolist()}
     if not several or n == 0:
         return {"mean": _numbers(mean)}
@@ -99,6 +99,18 @@ def _rows(of: tuple[Column, Column, Column], starts: Any, n: int, *, several: bo
         "least": _numbers(np.fmin.reduceat(least, starts)),
         "most": _numbers(np.fmax.reduceat(most, starts)),
     }
+
+
+def _last_known(column: Column, starts: Any) -> Any:
+    """Of each row the index of its last value that is not null, or of its last where all are: most claims
+    on pictures are null, and the one that is not is what there is to see."""
+    n = len(column)
+    if not n:
+        return starts
+    known = np.array([value is not None for value in column.tolist()])
+    ranked = np.where(known, np.arange(n), -1)
+    last = np.maximum.reduceat(ranked, starts)
+    return np.where(last >= starts, last, np.append(starts[1:], n) - 1)
 
 
 def _numbers(column: Column) -> list[float | None]:

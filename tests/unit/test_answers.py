@@ -54,6 +54,13 @@ def test_what_is_no_number_is_the_last_of_its_row_and_null_stays_null():
     json.dumps(found, allow_nan=False)
 
 
+def test_a_picture_is_not_lost_among_those_that_the_car_left_out():
+    times = [START + 20_000 * i for i in range(6)]
+    columns = {"n": list(range(6)), "data.thumbnail": [None, "first", None, None, None, None]}
+    found = history(cloud_of(Batch("0badcafe", 0, times, columns)), {**ASKED, "rows": "2"})
+    assert found["fields"]["data.thumbnail"]["mean"] == ["first", None]
+
+
 def test_an_empty_range_is_no_error():
     late = {**ASKED, "from_us": str(START + 60_000_000), "to_us": str(START + 61_000_000)}
     found = history(cloud_of(*ride(10)), late)

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import http.client
-import json
 import socket
 import time
 from typing import TYPE_CHECKING, Any, Literal
@@ -14,81 +12,12 @@ import contract
 from local.pubnub_standin import PubNubStandIn
 from station.page_server import PageServer
 from tests.browser import drawn, plain, show, shown, until
+from tests.web.cars import GAIN, SAMPLE, SUBSCRIBE_KEY, Car
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Iterator, Mapping
+    from collections.abc import Callable
 
     from playwright.sync_api import Page
-
-PUBLISH_KEY, SUBSCRIBE_KEY = "pub-local", "sub-local"
-GAIN = 4614.0
-SAMPLE: dict[str, contract.Value] = {
-    "voltage_input": 11.65,
-    "temperature_pcb": 29.9,
-    "current_motor": 3.96,
-    "current_input": -5.27,
-    "speed": -12_020,
-    "duty_cycle": -0.127,
-    "charge_drawn": 19,
-    "energy_drawn": 222,
-    "displacement": -4044,
-    "fault_code": 0,
-}
-
-
-class Car:
-    """Publishes live updates as Lambda 1 does, over plain HTTP."""
-
-    def __init__(self, pubnub: PubNubStandIn, name: str = "car-1", boot: str = "0a1b2c3d") -> None:
-        self.pubnub, self.name, self.boot, self.seq = pubnub, name, boot, 0
-
-    def update(self, sample: Mapping[str, contract.Value] = SAMPLE, **change: Any) -> dict[str, Any]:
-        now_us = time.time_ns() // 1000
-        live = contract.LiveSample(self.boot, self.seq, now_us - 12_000, now_us - 10_000, dict(sample))
-        self.seq += 1
-        stream = change.pop("stream", contract.VESC_STREAM)
-        return {**contract.live_update(self.name, stream, live, now_us // 1000 - 6, now_us - 2_000), **change}
-
-    def send(self, sample: Mapping[str, contract.Value] = SAMPLE, **change: Any) -> dict[str, Any]:
-        update = self.update(sample, **change)
-        self.publish(update)
-        return update
-
-    def publish(self, message: Any, channel: str | None = None) -> None:
-        host, port = self.pubnub.origin.split(":")
-        connection = http.client.HTTPConnection(host, int(port), timeout=5)
-        path = f"/publish/{PUBLISH_KEY}/{SUBSCRIBE_KEY}/0/{channel or contract.channel(self.name)}/0"
-        connection.request("POST", path, json.dumps(message), {"Content-Type": "application/json"})
-        assert connection.getresponse().status == 200
-        connection.close()
-
-
-@pytest.fixture
-def pubnub() -> Iterator[PubNubStandIn]:
-    with PubNubStandIn(publish_key=PUBLISH_KEY, subscribe_key=SUBSCRIBE_KEY) as pubnub:
-        yield pubnub
-
-
-@pytest.fixture
-def car(pubnub: PubNubStandIn) -> Car:
-    return Car(pubnub)
-
-
-@pytest.fixture
-def url(pubnub: PubNubStandIn) -> Iterator[str]:
-    with PageServer(
-        namespace="iort",
-        subscribe_key=SUBSCRIBE_KEY,
-        origin=pubnub.origin,
-        tls=False,
-        vehicles={"car-1": {"speed_to_erpm_gain": GAIN}},
-    ) as server:
-        yield server.url
-
-
-@pytest.fixture
-def page(open_page: Callable[..., Page], url: str) -> Page:
-    return open_page(f"{url}#/car/car-1")
 
 
 def test_it_says_what_it_waits_for(page: Page, pubnub: PubNubStandIn) -> None:

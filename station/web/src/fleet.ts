@@ -1,6 +1,7 @@
 // What is known of every car: its streams' newest samples, the last 30 seconds, the delays and the faults.
 // Nothing here touches the page; times are those of clock.ts.
 
+import { claim, claimed, type Claim } from "./claims";
 import type { Config, FieldTable } from "./config";
 import type { Hops, Update, Value } from "./message";
 import { Ring } from "./ring";
@@ -15,7 +16,7 @@ export const MEDIAN_S = 10;
 
 // Names and fields come from the network, so whatever they make grow is bounded: 30 s at 16 Hz (the live
 // lane carries at most 10), and in all 12 MB of columns.
-export const BOUNDS = { rows: 512, delays: 2048, columns: 1536, robots: 256, streams: 32, boots: 8, faults: 100 } as const;
+export const BOUNDS = { rows: 512, delays: 2048, columns: 1536, robots: 256, streams: 32, boots: 8, faults: 100, claims: 4 } as const;
 
 export type Freshness = "live" | "stale" | "gone";
 
@@ -73,6 +74,8 @@ export class Stream {
   readonly columns = new Map<string, number>();
   /** Whether charge and energy have the ROS 2 driver's units: counts of 1e-4 Ah are whole. */
   ros2 = false;
+  /** Of fields of bytes the newest content that the car has kept, which is not that of every sample. */
+  readonly claims = new Map<string, { readonly claim: Claim; readonly takenAt: number }>();
   private readonly arrivals = new Ring(1, BOUNDS.rows);
   private readonly offset = new ClockOffset();
   private readonly oldBoots: string[] = [];
@@ -108,6 +111,10 @@ export class Stream {
       if (typeof value === "number" && !Number.isInteger(value) && this.table.fields[field]?.ros2_unit !== undefined) this.ros2 = true;
     }
     if (!(this.takenAt <= this.history.last(0))) this.keep(update.sample);
+    for (const field of claimed(update.sample).slice(0, BOUNDS.claims)) {
+      const kept = claim(field, (name) => update.sample.get(name));
+      if (kept && (this.claims.has(field) || this.claims.size < BOUNDS.claims)) this.claims.set(field, { claim: kept, takenAt: this.takenAt });
+    }
     return true;
   }
 

@@ -1,9 +1,12 @@
-// A stream's heading, and a tile for each of its fields: the newest value, its unit and its last 30 seconds.
+// A stream's heading, and a tile for each of its fields: the newest value, its unit and its last 30 seconds;
+// of a field of bytes, the newest picture.
 
+import { claimed, partsOf } from "./claims";
 import type { FieldTable } from "./config";
 import { el, setAttribute, Text } from "./dom";
 import { numeric, STALE_S, type Stream } from "./fleet";
 import { age, spec, write, type Spec } from "./format";
+import { Picture } from "./picture";
 import { Sparkline } from "./sparkline";
 
 /** The name under which a field is charted: fields of two streams may have the same name. */
@@ -60,6 +63,7 @@ export class StreamSection {
   private readonly facts = new Text("facts");
   private readonly list = el("div", { class: "tiles" });
   private readonly tiles = new Map<string, Tile>();
+  private readonly pictures = new Map<string, Picture>();
   private drawn = -1;
   private ros2 = false;
 
@@ -89,6 +93,7 @@ export class StreamSection {
     }
     this.arrange();
     for (const [field, tile] of this.tiles) tile.set(stream.sample.get(field));
+    for (const [field, picture] of this.pictures) picture.set(stream.claims.get(field)?.claim);
   }
 
   /** What changes with time. */
@@ -102,11 +107,20 @@ export class StreamSection {
       tile.draw(stream, now);
       tile.mark(charted.has(fieldKey(stream.name, field)));
     }
+    for (const [field, picture] of this.pictures) picture.old(now - (stream.claims.get(field)?.takenAt ?? NaN));
   }
 
   /** A tile for every field ever seen of this stream, the contract's first and in its order. */
   private arrange(): void {
-    const fresh = [...this.stream.sample.keys()].filter((field) => !this.tiles.has(field) && !this.except.has(field));
+    const ofBytes = claimed(this.stream.sample);
+    for (const field of ofBytes) {
+      if (this.pictures.has(field)) continue;
+      const picture = new Picture(spec(field, this.table).label, field);
+      this.pictures.set(field, picture);
+      this.list.prepend(picture.node);
+    }
+    const claims = new Set(ofBytes.flatMap(partsOf));
+    const fresh = [...this.stream.sample.keys()].filter((field) => !this.tiles.has(field) && !this.except.has(field) && !claims.has(field));
     if (fresh.length === 0) return;
     for (const field of fresh) {
       const charts = !Number.isNaN(numeric(this.stream.sample.get(field)));

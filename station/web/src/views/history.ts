@@ -1,10 +1,12 @@
 // What a car did: a range from the cloud's table, to scrub through and to hold against what it does now.
 
 import { ask, AnswerError, type Drive } from "../answers";
+import { claim, claimed, partsOf } from "../claims";
 import type { Config, FieldTable } from "../config";
 import { el, setAttribute, Text } from "../dom";
 import type { Fleet } from "../fleet";
 import { age, number, spec } from "../format";
+import { Picture } from "../picture";
 import { route } from "../route";
 import { TimeChart } from "../timechart";
 import { Comparison } from "./comparison";
@@ -30,7 +32,10 @@ export class HistoryView {
   private readonly play = el("button", { type: "button", class: "tool play" }, "Play");
   private readonly chips = el("div", { class: "chips", role: "group", "aria-label": "Fields to chart" });
   private readonly charts = el("div", { class: "charts three" });
+  private readonly pictures = el("div", { class: "tiles pictures" });
   private readonly comparison: Comparison;
+  /** Of each field of bytes its picture, and the rows in which the car has kept one. */
+  private readonly kept = new Map<string, { readonly picture: Picture; readonly rows: readonly number[] }>();
   private readonly shown = new Map<string, { readonly node: HTMLElement; readonly chart: TimeChart }>();
   private robot: string | undefined;
   private drive: Drive | undefined;
@@ -62,7 +67,7 @@ export class HistoryView {
     });
     this.scrub.addEventListener("input", () => this.point(Number(this.scrub.value)));
     this.play.addEventListener("click", () => (this.playing === undefined ? this.start() : this.stop()));
-    this.result.append(el("div", { class: "scrubber" }, this.play, this.scrub, this.at.node), this.chips, this.charts, this.comparison.node);
+    this.result.append(el("div", { class: "scrubber" }, this.play, this.scrub, this.at.node), this.pictures, this.chips, this.charts, this.comparison.node);
     const served = [form, this.note.node, this.result];
     const told = el("p", { class: "unserved" }, "This page was put on the web as it is, and cannot read the tables. To look into the past, run ", el("code", {}, "iort dashboard"), " on a machine with access to the cloud, or ", el("code", {}, "iort query"), ".");
     this.node = el(
@@ -153,7 +158,8 @@ export class HistoryView {
     if (drive.samples === 0) return;
     this.drive = drive;
     this.result.hidden = false;
-    const charted = Object.keys(drive.fields).filter((field) => drive.fields[field]!.mean.some((value) => typeof value === "number"));
+    const fields = this.look(drive);
+    const charted = fields.filter((field) => drive.fields[field]!.mean.some((value) => typeof value === "number"));
     const wanted = charted.filter((field) => (before.size > 0 ? before.has(field) : FIRST_FIELDS.includes(field)));
     const [first, last] = [drive.times_s[0]!, drive.times_s.at(-1)!];
     // The range that was asked for may reach far beyond what there is.
@@ -170,9 +176,24 @@ export class HistoryView {
         return chip;
       }),
     );
-    this.comparison.of(Object.keys(drive.fields), drive.ros2);
+    this.comparison.of(fields, drive.ros2);
     this.scrub.max = String(drive.times_s.length - 1);
     this.point(drive.times_s.length - 1);
+  }
+
+  /** Pictures for the fields of bytes; all other fields. */
+  private look(drive: Drive): string[] {
+    const all = new Map(Object.entries(drive.fields));
+    const ofBytes = claimed(all);
+    this.kept.clear();
+    for (const field of ofBytes) {
+      const keys = drive.fields[`${field}.key`]!.mean;
+      const rows = [...keys.keys()].filter((row) => keys[row] !== null);
+      this.kept.set(field, { picture: new Picture(spec(field, this.table).label, field), rows });
+    }
+    this.pictures.replaceChildren(...[...this.kept.values()].map(({ picture }) => picture.node));
+    const claims = new Set(ofBytes.flatMap(partsOf));
+    return [...all.keys()].filter((field) => !claims.has(field));
   }
 
   private toggle(field: string, range: readonly [number, number]): void {
@@ -222,6 +243,14 @@ export class HistoryView {
     const text = new Date(at * 1000).toLocaleTimeString("en-GB", { hour: "2-digit", minute: "2-digit", second: "2-digit", fractionalSecondDigits: 1 });
     this.at.set(text);
     setAttribute(this.scrub, "aria-valuetext", text);
+    for (const [field, { picture, rows }] of this.kept) {
+      // The newest that had been taken by then; before the first there is none, and the first is shown.
+      const row = rows.findLast((each) => each <= index) ?? rows[0];
+      if (row === undefined) continue;
+      picture.set(claim(field, (name) => drive.fields[name]?.mean[row] ?? null));
+      const away = drive.times_s[row]! - at;
+      picture.when(away > 0 ? `${age(away)} later` : `${age(-away)} before`);
+    }
     this.comparison.then(new Map(Object.entries(drive.fields).map(([field, { mean }]) => [field, mean[index] ?? null])));
   }
 
