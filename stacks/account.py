@@ -8,11 +8,12 @@ from __future__ import annotations
 
 from typing import Any
 
-from aws_cdk import Stack
+from aws_cdk import ArnFormat, Stack
 from aws_cdk import aws_iam as iam
 from aws_cdk import aws_iot as iot
 from constructs import Construct
 
+from stacks import iot_core
 from stacks.settings import Settings
 
 # "Audit checks" that are about certificates, policies and clients; the others are about role aliases,
@@ -57,7 +58,7 @@ class Account(Stack):
             self._log(settings.iot_log_level)
 
     def _audit(self) -> None:
-        role = self._role("AuditRole")
+        role = iot_core.role(self, "AuditRole")
         role.add_to_policy(
             iam.PolicyStatement(actions=[f"iot:{action}" for action in _AUDIT_READS], resources=["*"])
         )
@@ -81,12 +82,17 @@ class Account(Stack):
         daily.node.add_dependency(audit)
 
     def _log(self, level: str) -> None:
-        role = self._role("LogRole")
-        group = self.format_arn(service="logs", resource="log-group", resource_name=_LOG_GROUP)
+        role = iot_core.role(self, "LogRole")
+        streams = self.format_arn(
+            service="logs",
+            resource="log-group",
+            resource_name=f"{_LOG_GROUP}:*",
+            arn_format=ArnFormat.COLON_RESOURCE_NAME,
+        )
         role.add_to_policy(
             iam.PolicyStatement(
                 actions=["logs:CreateLogGroup", "logs:CreateLogStream", "logs:PutLogEvents"],
-                resources=[group.replace(f"/{_LOG_GROUP}", f":{_LOG_GROUP}:*")],
+                resources=[streams],
             )
         )
         log = iot.CfnLogging(
@@ -97,9 +103,3 @@ class Account(Stack):
             role_arn=role.role_arn,
         )
         log.node.add_dependency(role)
-
-    def _role(self, name: str) -> iam.Role:
-        principal = iam.ServicePrincipal(
-            "iot.amazonaws.com", conditions={"StringEquals": {"aws:SourceAccount": self.account}}
-        )
-        return iam.Role(self, name, assumed_by=principal)

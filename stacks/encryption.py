@@ -81,47 +81,30 @@ def _key(scope: Construct, settings: Settings) -> kms.Key:
         pending_window=Duration.days(30 if settings.protected else 7),
         removal_policy=settings.removal_policy,
     )
+
+    def let(sid: str, principal: iam.IPrincipal, actions: list[str], conditions: dict[str, Any]) -> None:
+        key.add_to_resource_policy(
+            iam.PolicyStatement(
+                sid=sid, principals=[principal], actions=actions, resources=["*"], conditions=conditions
+            )
+        )
+
     use = ["kms:Decrypt", "kms:Encrypt", "kms:GenerateDataKey*", "kms:ReEncrypt*", "kms:DescribeKey"]
     through = [f"{service}.{stack.region}.{Aws.URL_SUFFIX}" for service in SERVICES]
     ours = {"kms:CallerAccount": stack.account, "kms:ViaService": through}
-    key.add_to_resource_policy(
-        iam.PolicyStatement(
-            sid="ThroughTheServices",
-            principals=[iam.AnyPrincipal()],
-            actions=use,
-            resources=["*"],
-            conditions={"StringEquals": ours},
-        )
-    )
+    let("ThroughTheServices", iam.AnyPrincipal(), use, {"StringEquals": ours})
     # A table works in the background, with a grant that its maker gives to the service.
-    key.add_to_resource_policy(
-        iam.PolicyStatement(
-            sid="GrantsToTheServices",
-            principals=[iam.AnyPrincipal()],
-            actions=["kms:CreateGrant"],
-            resources=["*"],
-            conditions={"StringEquals": ours, "Bool": {"kms:GrantIsForAWSResource": True}},
-        )
-    )
+    for_aws = {"StringEquals": ours, "Bool": {"kms:GrantIsForAWSResource": True}}
+    let("GrantsToTheServices", iam.AnyPrincipal(), ["kms:CreateGrant"], for_aws)
     groups = stack.format_arn(
         service="logs", resource="log-group", resource_name="*", arn_format=ArnFormat.COLON_RESOURCE_NAME
     )
-    key.add_to_resource_policy(
-        iam.PolicyStatement(
-            sid="Logs",
-            principals=[iam.ServicePrincipal(f"logs.{stack.region}.{Aws.URL_SUFFIX}")],
-            actions=use,
-            resources=["*"],
-            conditions={"ArnLike": {"kms:EncryptionContext:aws:logs:arn": groups}},
-        )
-    )
-    key.add_to_resource_policy(
-        iam.PolicyStatement(
-            sid="Alarms",
-            principals=[iam.ServicePrincipal("cloudwatch.amazonaws.com")],
-            actions=["kms:Decrypt", "kms:GenerateDataKey*"],
-            resources=["*"],
-            conditions={"StringEquals": {"aws:SourceAccount": stack.account}},
-        )
+    of_a_group = {"ArnLike": {"kms:EncryptionContext:aws:logs:arn": groups}}
+    let("Logs", iam.ServicePrincipal(f"logs.{stack.region}.{Aws.URL_SUFFIX}"), use, of_a_group)
+    let(
+        "Alarms",
+        iam.ServicePrincipal("cloudwatch.amazonaws.com"),
+        ["kms:Decrypt", "kms:GenerateDataKey*"],
+        {"StringEquals": {"aws:SourceAccount": stack.account}},
     )
     return key

@@ -1,5 +1,4 @@
-"""Who may connect, and how a robot gets its certificate: thing type, thing group, IoT policies and
-the provisioning template."""
+"""Who may connect, and how a robot gets its certificate."""
 
 from __future__ import annotations
 
@@ -14,30 +13,16 @@ from aws_cdk import aws_lambda_destinations as destinations
 from constructs import Construct
 
 from contract import (
-    CMD,
-    FLEET,
-    LIVE,
-    PING,
     PRESENCE,
-    RECORD,
-    ROBOT_PARAMETER,
-    SERIAL_PARAMETER,
-    SHADOW,
     claim_name,
     fleet_name,
-    rule_name,
 )
+from stacks import iot_core
+from stacks.documents import claim_policy, provisioning_template, robot_policy
 from stacks.function import function
 from stacks.quarantine import Quarantine
 from stacks.settings import Settings
 from stacks.storage import Storage
-
-# A robot's name is its thing name and its client id; the certificate is attached to the thing.
-_ME = "${iot:Connection.Thing.ThingName}"
-# A robot hears its pongs, and its own ping on the path broker: one pattern for both, since the policy has
-# no room for two. In a policy ? is any one character ("Using wildcard characters in MQTT and AWS IoT Core
-# policies").
-_PING_OR_PONG = "p?ng"
 
 
 class Fleet(Stack):
@@ -96,15 +81,8 @@ class Fleet(Stack):
             ),
             template_body=json.dumps(provisioning_template(namespace)),
         )
-        asking = lambda_.CfnPermission(
-            self,
-            "AdmitPermission",
-            action="lambda:InvokeFunction",
-            function_name=self.admit.function_arn,
-            principal="iot.amazonaws.com",
-            source_account=self.account,
-            source_arn=self.format_arn(service="iot", resource="provisioningtemplate", resource_name=name),
-        )
+        template_arn = self.format_arn(service="iot", resource="provisioningtemplate", resource_name=name)
+        asking = iot_core.may_call(self, "AdmitPermission", self.admit, source_arn=template_arn)
         # RegisterThing names them, and role and hook are tried when the template is made.
         for needed in (robot_type, robots, policy, role, asking):
             template.node.add_dependency(needed)
@@ -143,10 +121,7 @@ class Fleet(Stack):
 
     def _provisioning_role(self, name: str) -> iam.Role:
         """What AWS IoT does in the template's name: this fleet's things, and certificates."""
-        principal = iam.ServicePrincipal(
-            "iot.amazonaws.com", conditions={"StringEquals": {"aws:SourceAccount": self.account}}
-        )
-        role = iam.Role(self, "ProvisioningRole", assumed_by=principal)
+        role = iot_core.role(self, "ProvisioningRole")
 
         def allow(actions: list[str], *resources: tuple[str, str]) -> None:
             arns = [self.format_arn(service="iot", resource=r, resource_name=n) for r, n in resources]
@@ -169,99 +144,3 @@ class Fleet(Stack):
         # These know no resources.
         allow(["ListAttachedPolicies", "ListPrincipalThings", "RegisterThing"])
         return role
-
-
-def provisioning_template(namespace: str) -> dict[str, Any]:
-    """The template's body. A thing that exists keeps its attributes, and one with another serial
-    number is refused: two robots do not share a name."""
-    name = fleet_name(namespace)
-    return {
-        "Parameters": {ROBOT_PARAMETER: {"Type": "String"}, SERIAL_PARAMETER: {"Type": "String"}},
-        "Resources": {
-            "certificate": {
-                "Type": "AWS::IoT::Certificate",
-                "Properties": {"CertificateId": {"Ref": "AWS::IoT::Certificate::Id"}, "Status": "Active"},
-            },
-            "policy": {"Type": "AWS::IoT::Policy", "Properties": {"PolicyName": name}},
-            "thing": {
-                "Type": "AWS::IoT::Thing",
-                "Properties": {
-                    "ThingName": {"Ref": ROBOT_PARAMETER},
-                    "ThingTypeName": name,
-                    "ThingGroups": [name],
-                    "AttributePayload": {"vehicle": "vesc", "serial": {"Ref": SERIAL_PARAMETER}},
-                },
-                "OverrideSettings": {
-                    "AttributePayload": "FAIL",
-                    "ThingTypeName": "FAIL",
-                    "ThingGroups": "DO_NOTHING",
-                },
-            },
-        },
-    }
-
-
-def claim_policy(stack: Stack, *, namespace: str) -> dict[str, Any]:
-    """The IoT policy document of a lasting claim: provisioning with this fleet's template, no more."""
-
-    def arns(kind: str, *names: str) -> list[str]:
-        return [stack.format_arn(service="iot", resource=kind, resource_name=name) for name in names]
-
-    asked = (
-        "$aws/certificates/create-from-csr/json",
-        f"$aws/provisioning-templates/{fleet_name(namespace)}/provision/json",
-    )
-    answered = [f"{topic}/{answer}" for topic in asked for answer in ("accepted", "rejected")]
-    client = f"{claim_name(namespace)}-*"
-    return {
-        "Version": "2012-10-17",
-        "Statement": [
-            {"Effect": "Allow", "Action": "iot:Connect", "Resource": arns("client", client)},
-            {"Effect": "Allow", "Action": "iot:Publish", "Resource": arns("topic", *asked)},
-            {"Effect": "Allow", "Action": "iot:Subscribe", "Resource": arns("topicfilter", *answered)},
-            {"Effect": "Allow", "Action": "iot:Receive", "Resource": arns("topic", *answered)},
-        ],
-    }
-
-
-def robot_policy(stack: Stack, *, namespace: str) -> dict[str, Any]:
-    """The IoT policy document of a robot: its own topics and shadow, and other robots' words to the fleet.
-
-    AWS allows 2048 characters; with the longest namespace and region this is some 15 below.
-    """
-
-    def arns(kind: str, *names: str) -> list[str]:
-        return [stack.format_arn(service="iot", resource=kind, resource_name=name) for name in names]
-
-    mine = f"{namespace}/{_ME}"
-    shadow = f"$aws/things/{_ME}/shadow/name/{SHADOW}"
-    publish = (
-        # Basic Ingest: the rule is named in the topic, and no other rule may be.
-        f"$aws/rules/{rule_name('record', namespace)}/{RECORD}/{mine}/*",
-        f"$aws/rules/{rule_name('live', namespace)}/{LIVE}/{mine}/*",
-        f"{LIVE}/{mine}/*",
-        f"{FLEET}/{mine}/*",
-        f"{PING}/{mine}/*",
-        f"{shadow}/*",
-    )
-    listen = (
-        f"{CMD}/{mine}/*",
-        f"{_PING_OR_PONG}/{mine}/*",
-        f"{FLEET}/{namespace}/*",
-        f"{shadow}/*",
-    )
-    attached = {"Bool": {"iot:Connection.Thing.IsAttached": ["true"]}}
-    return {
-        "Version": "2012-10-17",
-        "Statement": [
-            {
-                "Effect": "Allow",
-                "Action": "iot:Connect",
-                "Resource": arns("client", _ME),
-                "Condition": attached,
-            },
-            {"Effect": "Allow", "Action": "iot:Publish", "Resource": arns("topic", *publish)},
-            {"Effect": "Allow", "Action": "iot:Subscribe", "Resource": arns("topicfilter", *listen)},
-            {"Effect": "Allow", "Action": "iot:Receive", "Resource": arns("topic", *listen)},
-        ],
-    }

@@ -11,6 +11,7 @@ from aws_cdk import aws_lambda as lambda_
 from constructs import Construct
 
 from contract import PONG, RULE, pong_template, rule_name, rule_sql
+from stacks import iot_core
 from stacks.fleet import Fleet
 from stacks.processing import Processing
 from stacks.quarantine import Quarantine
@@ -77,23 +78,11 @@ class Ingest(Stack):
     def _lambda_rule(self, name: str, function: lambda_.Function) -> iot.CfnTopicRule:
         action = Action(lambda_=iot.CfnTopicRule.LambdaActionProperty(function_arn=function.function_arn))
         rule = self._rule(name, self._role(name), action)
-        # On this stack, not on the function, which would make the two stacks depend on each other.
-        lambda_.CfnPermission(
-            self,
-            f"{name.capitalize()}Permission",
-            action="lambda:InvokeFunction",
-            function_name=function.function_arn,
-            principal="iot.amazonaws.com",
-            source_account=self.account,
-            source_arn=rule.attr_arn,
-        )
+        iot_core.may_call(self, f"{name.capitalize()}Permission", function, source_arn=rule.attr_arn)
         return rule
 
     def _role(self, name: str) -> iam.Role:
-        principal = iam.ServicePrincipal(
-            "iot.amazonaws.com", conditions={"StringEquals": {"aws:SourceAccount": self.account}}
-        )
-        role = iam.Role(self, f"{name.capitalize()}Role", assumed_by=principal)
+        role = iot_core.role(self, f"{name.capitalize()}Role")
         self._rejected.grant(role, "sqs:SendMessage")
         return role
 

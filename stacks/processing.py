@@ -47,32 +47,32 @@ class Processing(Stack):
         super().__init__(scope, construct_id, **kwargs)
         self._settings, self._encryption = settings, storage.encryption
         self._rejected = quarantine.rejected
-        self.live = self._live(settings)
+        self.live = self._live()
         self.summarize = self._summarize(storage)
-        self.echo = self._echo(settings)
-        self.upload = self._upload(settings, storage)
+        self.echo = self._echo()
+        self.upload = self._upload(storage)
         self.query = self._query(storage)
-        self.alarms = self._alarms(settings)
-        self.alert = self._alert(settings, storage)
+        self.alarms = self._alarms()
+        self.alert = self._alert(storage)
 
-    def _live(self, settings: Settings) -> lambda_.Function:
-        name = pubnub_parameter(settings.namespace)
+    def _live(self) -> lambda_.Function:
+        name = pubnub_parameter(self._settings.namespace)
         live = function(
             self,
             "Live",
-            settings=settings,
+            settings=self._settings,
             encryption=self._encryption,
             memory_mb=256,
-            environment={"PUBNUB_PARAMETER": name, "LIVE_FIELDS": json.dumps(settings.live_fields)},
+            environment={"PUBNUB_PARAMETER": name, "LIVE_FIELDS": json.dumps(self._settings.live_fields)},
             layers=[
                 lambda_.LayerVersion(
                     self,
                     "PubNub",
-                    code=lambda_.Code.from_asset(str(settings.layer), exclude=["**/__pycache__"]),
+                    code=lambda_.Code.from_asset(str(self._settings.layer), exclude=["**/__pycache__"]),
                     compatible_runtimes=[RUNTIME],
                 )
             ],
-            reserved_concurrency=settings.reserved_for_live,
+            reserved_concurrency=self._settings.reserved_for_live,
         )
         self._invoked_once(live)
         parameter = self.format_arn(service="ssm", resource="parameter", resource_name=name.lstrip("/"))
@@ -145,7 +145,7 @@ class Processing(Stack):
         self._allow(query, ["s3:GetObject", "s3:PutObject"], results)
         return query
 
-    def _alarms(self, settings: Settings) -> sns.Topic:
+    def _alarms(self) -> sns.Topic:
         """Where every alarm and every car's alert goes."""
         topic = sns.Topic(self, "Alarms", enforce_ssl=True, **self._encryption.topic)
         # A topic with a policy of its own has lost the one that lets its account's alarms in.
@@ -157,22 +157,22 @@ class Processing(Stack):
                 conditions={"StringEquals": {"aws:SourceAccount": self.account}},
             )
         )
-        if settings.alarm_email:
-            topic.add_subscription(subscriptions.EmailSubscription(settings.alarm_email))
+        if self._settings.alarm_email:
+            topic.add_subscription(subscriptions.EmailSubscription(self._settings.alarm_email))
         CfnOutput(self, "AlarmTopic", value=topic.topic_arn)
         return topic
 
-    def _alert(self, settings: Settings, storage: Storage) -> lambda_.Function:
+    def _alert(self, storage: Storage) -> lambda_.Function:
         alert = function(
             self,
             "Alert",
-            settings=settings,
+            settings=self._settings,
             encryption=self._encryption,
             memory_mb=256,
             environment={
                 "ROBOTS_TABLE": storage.robots.table_name,
                 "ALARM_TOPIC": self.alarms.topic_arn,
-                "LOW_VOLTAGE_V": f"{settings.thresholds.low_voltage_v:g}",
+                "LOW_VOLTAGE_V": f"{self._settings.thresholds.low_voltage_v:g}",
             },
         )
         storage.may_keep(alert, f"{ALERT_PREFIX}*")
@@ -185,23 +185,23 @@ class Processing(Stack):
         )
         return alert
 
-    def _echo(self, settings: Settings) -> lambda_.Function:
-        echo = function(self, "Echo", settings=settings, encryption=self._encryption, memory_mb=256)
+    def _echo(self) -> lambda_.Function:
+        echo = function(self, "Echo", settings=self._settings, encryption=self._encryption, memory_mb=256)
         self._invoked_once(echo)
-        self._may_answer(echo, f"{PONG}/{settings.namespace}/*/{LAMBDA}")
+        self._may_answer(echo, f"{PONG}/{self._settings.namespace}/*/{LAMBDA}")
         return echo
 
-    def _upload(self, settings: Settings, storage: Storage) -> lambda_.Function:
+    def _upload(self, storage: Storage) -> lambda_.Function:
         upload = function(
             self,
             "Upload",
-            settings=settings,
+            settings=self._settings,
             encryption=self._encryption,
             memory_mb=256,
             environment={
                 "FILES_BUCKET": storage.files.bucket_name,
                 "ROBOTS_TABLE": storage.robots.table_name,
-                "UPLOAD_BYTES_A_DAY": str(settings.upload_gb_a_day * 10**9),
+                "UPLOAD_BYTES_A_DAY": str(self._settings.upload_gb_a_day * 10**9),
             },
         )
         # The robot asks again where no answer comes.
@@ -214,7 +214,7 @@ class Processing(Stack):
         )
         self._allow(upload, ["s3:ListBucket", "s3:ListBucketMultipartUploads"], storage.files.bucket_arn)
         storage.may_keep(upload, FILES_DAY, FILES_BYTES)
-        self._may_answer(upload, f"{PONG}/{settings.namespace}/*/{FILE}")
+        self._may_answer(upload, f"{PONG}/{self._settings.namespace}/*/{FILE}")
         return upload
 
     def _may_answer(self, one: lambda_.Function, topic: str) -> None:

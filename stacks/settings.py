@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import math
 import re
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, fields
 from pathlib import Path
 from typing import Any
@@ -33,6 +33,10 @@ _EMAIL = re.compile(r"[^@\s,]+@[^@\s,]+\.[^@\s,]+")
 # "Tag naming limits and requirements": up to 128 and 256 characters, and aws: is AWS' own.
 _TAG_KEY = re.compile(r"(?!aws:)[\w .:/=+@-]{1,128}", re.IGNORECASE)
 _TAG_VALUE = re.compile(r"[\w .:/=+@-]{0,256}")
+
+
+# Of a context key and its value what the setting is; raises `SettingsError`.
+_Reader = Callable[[str, Any], Any]
 
 
 class SettingsError(ValueError):
@@ -125,44 +129,9 @@ class Settings:
     def from_context(cls, app: App) -> Settings:
         """Read ``-c key=value`` and cdk.json; raises `SettingsError` for a value that is not allowed."""
         context = app.node.try_get_context
-        given: dict[str, Any] = {}
-        if (namespace := context("namespace")) is not None:
-            try:
-                given["namespace"] = check_namespace(namespace)
-            except ContractError as error:
-                raise SettingsError(f"context {error}") from error
-        if (stage := context("stage")) is not None:
-            if stage not in STAGES:
-                raise SettingsError(f"context stage = {stage!r}: allowed is {' or '.join(STAGES)}")
-            given["stage"] = stage
-        for key, low, high in (
-            ("retention_days", 1, 3650),
-            ("files_days", 0, 3650),
-            ("upload_gb_a_day", 1, 10_000),
-            ("live_concurrency", 0, 1000),
-            ("budget_usd", 0, 1_000_000),
-        ):
-            if (value := context(key)) is not None:
-                given[key] = _integer(key, value, low, high)
-        for key in ("embedded", "customer_key", "device_defender", "robot_metrics", "site"):
-            if (value := context(key)) is not None:
-                given[key] = _boolean(key, value)
-        if (level := context("iot_log_level")) is not None:
-            if level not in IOT_LOG_LEVELS:
-                raise SettingsError(
-                    f"context iot_log_level = {level!r}: allowed is one of {', '.join(IOT_LOG_LEVELS)}"
-                )
-            given["iot_log_level"] = "" if level == "off" else level
-        if (logs := context("function_logs")) is not None:
-            if logs not in FUNCTION_LOGS:
-                raise SettingsError(
-                    f"context function_logs = {logs!r}: allowed is {' or '.join(FUNCTION_LOGS)}"
-                )
-            given["function_logs"] = logs
-        if (email := context("alarm_email")) is not None:
-            given["alarm_email"] = _email("alarm_email", email)
-        if (tags := context("tags")) is not None:
-            given["tags"] = _tags(tags)
+        given: dict[str, Any] = {
+            key: read(key, value) for key, read in _READ.items() if (value := context(key)) is not None
+        }
         given["thresholds"] = Thresholds(
             **{
                 one.name: _positive(one.name, value)
@@ -170,8 +139,6 @@ class Settings:
                 if (value := context(one.name)) is not None
             }
         )
-        if (layer := context("layer")) is not None:
-            given["layer"] = ROOT / str(layer)
         settings = cls(**given)
         if settings.budget_usd and not settings.alarm_email:
             raise SettingsError("context budget_usd: a budget needs alarm_email, whom it tells")
@@ -184,12 +151,38 @@ class Settings:
         return settings
 
 
-def _integer(key: str, value: Any, low: int, high: int) -> int:
-    # The CDK CLI gives every -c as text, cdk.json a number of either kind.
-    text = str(int(value)) if isinstance(value, float) and value.is_integer() else str(value)
-    if not text.isdecimal() or not low <= int(text) <= high:
-        raise SettingsError(f"context {key} = {value!r}: allowed is a whole number from {low} to {high}")
-    return int(text)
+def _namespace(_key: str, value: Any) -> str:
+    try:
+        return check_namespace(value)
+    except ContractError as error:
+        raise SettingsError(f"context {error}") from error
+
+
+def _whole(low: int, high: int) -> _Reader:
+    def read(key: str, value: Any) -> int:
+        # The CDK CLI gives every -c as text, cdk.json a number of either kind.
+        text = str(int(value)) if isinstance(value, float) and value.is_integer() else str(value)
+        if not text.isdecimal() or not low <= int(text) <= high:
+            raise SettingsError(f"context {key} = {value!r}: allowed is a whole number from {low} to {high}")
+        return int(text)
+
+    return read
+
+
+def _one_of(*allowed: str) -> _Reader:
+    def read(key: str, value: Any) -> str:
+        if value not in allowed:
+            raise SettingsError(
+                f"context {key} = {value!r}: allowed is {', '.join(allowed[:-1])} or {allowed[-1]}"
+            )
+        return str(value)
+
+    return read
+
+
+def _log_level(key: str, value: Any) -> str:
+    level: str = _one_of(*IOT_LOG_LEVELS)(key, value)
+    return "" if level == "off" else level
 
 
 def _positive(key: str, value: Any) -> float:
@@ -214,22 +207,47 @@ def _email(key: str, value: Any) -> str:
     return value
 
 
-def _tags(value: Any) -> dict[str, str]:
+def _tags(key: str, value: Any) -> dict[str, str]:
     """From cdk.json an object, from the command line ``team=lab,cost-centre=7``."""
     tags: Mapping[Any, Any] | None = value if isinstance(value, Mapping) else None
     if isinstance(value, str):
         pairs = [pair.split("=", 1) for pair in value.split(",")]
         tags = {pair[0]: pair[-1] for pair in pairs} if all(len(pair) == 2 for pair in pairs) else None
     if tags is None or not all(
-        isinstance(key, str)
-        and _TAG_KEY.fullmatch(key)
+        isinstance(name, str)
+        and _TAG_KEY.fullmatch(name)
         and isinstance(text, str)
         and _TAG_VALUE.fullmatch(text)
-        for key, text in tags.items()
+        for name, text in tags.items()
     ):
-        raise SettingsError(f"context tags = {_shown(value)}: allowed is key=value,key=value with AWS' tags")
+        raise SettingsError(f"context {key} = {_shown(value)}: allowed is key=value,key=value with AWS' tags")
     return dict(tags)
+
+
+def _folder(_key: str, value: Any) -> Path:
+    return ROOT / str(value)
 
 
 def _shown(value: Any) -> str:
     return repr(value) if isinstance(value, str) else json.dumps(value, default=str)
+
+
+_READ: Mapping[str, _Reader] = {
+    "namespace": _namespace,
+    "stage": _one_of(*STAGES),
+    "retention_days": _whole(1, 3650),
+    "files_days": _whole(0, 3650),
+    "upload_gb_a_day": _whole(1, 10_000),
+    "live_concurrency": _whole(0, 1000),
+    "budget_usd": _whole(0, 1_000_000),
+    "embedded": _boolean,
+    "customer_key": _boolean,
+    "device_defender": _boolean,
+    "robot_metrics": _boolean,
+    "site": _boolean,
+    "iot_log_level": _log_level,
+    "function_logs": _one_of(*FUNCTION_LOGS),
+    "alarm_email": _email,
+    "tags": _tags,
+    "layer": _folder,
+}

@@ -43,7 +43,7 @@ class Storage(Stack):
         self.quarantine = self._table(
             "Quarantine", partition=ROBOT, sort=ENTRY, sort_type=_TEXT, expires=True
         )
-        self.files = self._files(settings)
+        self.files = self._files()
 
     def _table(
         self,
@@ -90,14 +90,14 @@ class Storage(Stack):
         )
         role.grant_principal.add_to_principal_policy(statement)
 
-    def _files(self, settings: Settings) -> s3.Bucket:
+    def _files(self) -> s3.Bucket:
         """What is too large for a message. Not versioned: a key is written once and names its content,
         and nothing of ours may delete, so that a second version can only be what somebody threw away."""
         rules = [
             s3.LifecycleRule(id="abandoned", abort_incomplete_multipart_upload_after=Duration.days(7)),
             s3.LifecycleRule(id="results", prefix=RESULTS_PREFIX, expiration=Duration.days(1)),
         ]
-        days = settings.files_days
+        days = self._settings.files_days
         if not 0 < days <= _RARE_AFTER_DAYS:
             rare = s3.Transition(
                 storage_class=s3.StorageClass.INFREQUENT_ACCESS,
@@ -116,7 +116,7 @@ class Storage(Stack):
             lifecycle_rules=rules,
             # CloudFormation deletes an empty bucket only; `iort files empty` comes before, because the
             # CDK's own way is a function that may delete every object, deployed for good.
-            removal_policy=settings.removal_policy,
+            removal_policy=self._settings.removal_policy,
             **self.encryption.bucket,
         )
         CfnOutput(self, "FilesBucket", value=bucket.bucket_name)

@@ -64,5 +64,7 @@ def test_the_level_of_the_context(tmp_path, given, level):
 
 
 def test_a_level_that_there_is_not(tmp_path):
-    with pytest.raises(SettingsError, match=r"iot_log_level = 'loud': allowed is one of off, error"):
+    with pytest.raises(
+        SettingsError, match=r"iot_log_level = 'loud': allowed is off, error, warn, info or debug"
+    ):
         Settings.from_context(App(context={"iot_log_level": "loud", "layer": str(tmp_path)}))

@@ -22,8 +22,8 @@ from contract import (
     record_topic,
     rule_name,
 )
-from stacks.fleet import claim_policy
-from stacks.fleet import robot_policy as robots_policy
+from stacks.documents import claim_policy
+from stacks.documents import robot_policy as robots_policy
 from tests.stacks.roles import IOT
 
 ME = "${iot:Connection.Thing.ThingName}"

@@ -1,0 +1,121 @@
+"""The fleet's documents: what a robot and a claim may do at the broker, and what provisioning makes."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from aws_cdk import Stack
+
+from contract import (
+    CMD,
+    FLEET,
+    LIVE,
+    PING,
+    RECORD,
+    ROBOT_PARAMETER,
+    SERIAL_PARAMETER,
+    SHADOW,
+    claim_name,
+    fleet_name,
+    rule_name,
+)
+
+# A robot's name is its thing name and its client id; the certificate is attached to the thing.
+_ME = "${iot:Connection.Thing.ThingName}"
+# A robot hears its pongs, and its own ping on the path broker: one pattern for both, since the policy has
+# no room for two. In a policy ? is any one character ("Using wildcard characters in MQTT and AWS IoT Core
+# policies").
+_PING_OR_PONG = "p?ng"
+
+
+def provisioning_template(namespace: str) -> dict[str, Any]:
+    """The template's body. A thing that exists keeps its attributes, and one with another serial
+    number is refused: two robots do not share a name."""
+    name = fleet_name(namespace)
+    return {
+        "Parameters": {ROBOT_PARAMETER: {"Type": "String"}, SERIAL_PARAMETER: {"Type": "String"}},
+        "Resources": {
+            "certificate": {
+                "Type": "AWS::IoT::Certificate",
+                "Properties": {"CertificateId": {"Ref": "AWS::IoT::Certificate::Id"}, "Status": "Active"},
+            },
+            "policy": {"Type": "AWS::IoT::Policy", "Properties": {"PolicyName": name}},
+            "thing": {
+                "Type": "AWS::IoT::Thing",
+                "Properties": {
+                    "ThingName": {"Ref": ROBOT_PARAMETER},
+                    "ThingTypeName": name,
+                    "ThingGroups": [name],
+                    "AttributePayload": {"vehicle": "vesc", "serial": {"Ref": SERIAL_PARAMETER}},
+                },
+                "OverrideSettings": {
+                    "AttributePayload": "FAIL",
+                    "ThingTypeName": "FAIL",
+                    "ThingGroups": "DO_NOTHING",
+                },
+            },
+        },
+    }
+
+
+def claim_policy(stack: Stack, *, namespace: str) -> dict[str, Any]:
+    """The IoT policy document of a lasting claim: provisioning with this fleet's template, no more."""
+    asked = (
+        "$aws/certificates/create-from-csr/json",
+        f"$aws/provisioning-templates/{fleet_name(namespace)}/provision/json",
+    )
+    answered = [f"{topic}/{answer}" for topic in asked for answer in ("accepted", "rejected")]
+    client = f"{claim_name(namespace)}-*"
+    return {
+        "Version": "2012-10-17",
+        "Statement": [
+            _allow("iot:Connect", _arns(stack, "client", client)),
+            _allow("iot:Publish", _arns(stack, "topic", *asked)),
+            _allow("iot:Subscribe", _arns(stack, "topicfilter", *answered)),
+            _allow("iot:Receive", _arns(stack, "topic", *answered)),
+        ],
+    }
+
+
+def robot_policy(stack: Stack, *, namespace: str) -> dict[str, Any]:
+    """The IoT policy document of a robot: its own topics and shadow, and other robots' words to the fleet.
+
+    AWS allows 2048 characters, white space not counted; a test holds it to that with the longest names.
+    """
+    mine = f"{namespace}/{_ME}"
+    shadow = f"$aws/things/{_ME}/shadow/name/{SHADOW}"
+    publish = (
+        # Basic Ingest: the rule is named in the topic, and no other rule may be.
+        f"$aws/rules/{rule_name('record', namespace)}/{RECORD}/{mine}/*",
+        f"$aws/rules/{rule_name('live', namespace)}/{LIVE}/{mine}/*",
+        f"{LIVE}/{mine}/*",
+        f"{FLEET}/{mine}/*",
+        f"{PING}/{mine}/*",
+        f"{shadow}/*",
+    )
+    listen = (
+        f"{CMD}/{mine}/*",
+        f"{_PING_OR_PONG}/{mine}/*",
+        f"{FLEET}/{namespace}/*",
+        f"{shadow}/*",
+    )
+    return {
+        "Version": "2012-10-17",
+        "Statement": [
+            {
+                **_allow("iot:Connect", _arns(stack, "client", _ME)),
+                "Condition": {"Bool": {"iot:Connection.Thing.IsAttached": ["true"]}},
+            },
+            _allow("iot:Publish", _arns(stack, "topic", *publish)),
+            _allow("iot:Subscribe", _arns(stack, "topicfilter", *listen)),
+            _allow("iot:Receive", _arns(stack, "topic", *listen)),
+        ],
+    }
+
+
+def _allow(action: str, resources: list[str]) -> dict[str, Any]:
+    return {"Effect": "Allow", "Action": action, "Resource": resources}
+
+
+def _arns(stack: Stack, kind: str, *names: str) -> list[str]:
+    return [stack.format_arn(service="iot", resource=kind, resource_name=name) for name in names]
