@@ -17,7 +17,7 @@ from botocore.config import Config
 
 _OPERATION = "dynamodb.BatchWriteItem"
 _BODY = "iort_body"
-_write = json.JSONEncoder(separators=(",", ":")).encode
+_write = json.JSONEncoder(separators=(",", ":"), check_circular=False).encode
 
 
 def client() -> Any:

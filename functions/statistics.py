@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import math
 from bisect import bisect_left
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from operator import sub
 from statistics import mean, median
-from typing import TypeGuard, cast
+from typing import TypeGuard
 
 from contract import (
     BATCHES,
@@ -110,21 +110,12 @@ def derive(columns: Mapping[str, Sequence[Value]], vehicle: Vehicle | None) -> d
     speed = columns.get("speed")
     if speed is not None and vehicle is not None:
         gain, offset = vehicle.speed_to_erpm_gain, vehicle.speed_to_erpm_offset
-        derived["speed_mps"] = _each(lambda erpm: (erpm - offset) / gain, speed)
+        derived["speed_mps"] = _finite([None if v is None else (v - offset) / gain for v in _numeric(speed)])
     volts, amperes = columns.get("voltage_input"), columns.get("current_input")
     if volts is not None and amperes is not None:
-        derived["power_w"] = _each(lambda volt, ampere: float(volt) * ampere, volts, amperes)
+        pairs = zip(_numeric(volts), _numeric(amperes), strict=True)
+        derived["power_w"] = _finite([None if v is None or a is None else float(v) * a for v, a in pairs])
     return derived
-
-
-def _each(formula: Callable[..., float], *columns: Sequence[Value]) -> list[Value]:
-    """The formula's value of each sample, None where a column has no number or the value is not finite."""
-    if all(map(_are_numbers, columns)):
-        values = list(map(formula, *columns))
-        if all(map(math.isfinite, values)):
-            return cast("list[Value]", values)
-    rows = zip(*columns, strict=True)
-    return [_finite(formula(*row)) if all(map(_is_number, row)) else None for row in rows]
 
 
 def _statistics(column: Sequence[Value]) -> Statistics:
@@ -157,8 +148,13 @@ def _mean(numbers: Sequence[int | float]) -> float:
         return float(mean(numbers))
 
 
-def _finite(value: float) -> float | None:
-    return value if math.isfinite(value) else None
+def _numeric(column: Sequence[Value]) -> Sequence[int | float | None]:
+    """The column with None for what is no number."""
+    return column if _are_numbers(column) else [value if _is_number(value) else None for value in column]
+
+
+def _finite(values: Sequence[float | None]) -> list[Value]:
+    return [None if value is None or not math.isfinite(value) else value for value in values]
 
 
 def _are_numbers(column: Sequence[Value]) -> TypeGuard[Sequence[int | float]]:

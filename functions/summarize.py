@@ -100,7 +100,7 @@ def summarize_topic(tables: Tables, topic: str, batches: Sequence[Batch]) -> Sum
     vehicle = tables.vehicle(parse_topic(topic).robot)
     summaries = Summaries()
     within: set[BatchKey] = set()
-    for touched in _runs({t_us // _SECOND_US for batch in batches for t_us in batch.times_us}):
+    for touched in _runs({second for batch in batches for second in _seconds(batch)}):
         stored = reader.read(touched[0], touched[-1])
         seconds = set(touched)
         previous: Batch | None = None
@@ -136,6 +136,10 @@ def around(stored: Sequence[Stored], second: int) -> Sequence[Stored]:
     inside = [i for i in range(first, end) if stored[i].batch.times_us[-1] >= start_us]
     near = stored[max(0, inside[0] - 1) : inside[-1] + 1] if inside else []
     return [entry for entry in near if not (entry.beyond and entry.batch.t_us >= start_us)]
+
+
+def _seconds(batch: Batch) -> range:
+    return range(batch.times_us[0] // _SECOND_US, batch.times_us[-1] // _SECOND_US + 1)
 
 
 def _start(entry: Stored) -> int:

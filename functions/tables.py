@@ -157,9 +157,11 @@ def fitting(item: dict[str, Any]) -> dict[str, Any]:
     A stream may have 512 fields of texts of 4096 characters, of which the summary keeps the last; the
     samples themselves are in the telemetry table.
     """
-    sizes = {name: _size(name, value) for name, value in item.items()}
-    total, dropped = sum(sizes.values()), set()
-    for name, size in sorted(sizes.items(), key=lambda pair: -pair[1]):
+    sizes = list(map(_size, item, item.values()))
+    if sum(sizes) <= _MAX_ITEM_BYTES and max(sizes) <= _MAX_NAME_BYTES:
+        return item
+    total, dropped = sum(sizes), set()
+    for size, name in sorted(zip(sizes, item, strict=True), reverse=True):
         if len(name.encode()) > _MAX_NAME_BYTES or total > _MAX_ITEM_BYTES:
             dropped.add(name)
             total -= size
