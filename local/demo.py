@@ -13,7 +13,7 @@ import sys
 import threading
 import time
 from collections.abc import Iterator
-from contextlib import ExitStack, contextmanager
+from contextlib import ExitStack, contextmanager, suppress
 from pathlib import Path
 from typing import Any, NoReturn
 
@@ -68,11 +68,17 @@ def main() -> None:
     except KeyboardInterrupt:
         console.print("stopped; nothing is left running")
         sys.exit(130)
+    if stopped.is_set():
+        console.print("stopped; nothing is left running")
     sys.exit(1 if figures.samples_lost else 0)
 
 
 def _options() -> argparse.Namespace:
-    parser = argparse.ArgumentParser(prog="make demo", description=(__doc__ or "").splitlines()[0])
+    parser = argparse.ArgumentParser(
+        prog="make demo",
+        usage="make demo [DURATION=20] [BAG=drive.bag] [REPORT=report.json] [PORT=8080]",
+        description=(__doc__ or "").splitlines()[0],
+    )
     parser.add_argument("--duration", type=_positive, metavar="S", help="seconds to drive (default 60)")
     parser.add_argument(
         "--bag", type=Path, metavar="FILE", help="drive a recording instead of a simulated car"
@@ -93,6 +99,8 @@ def _options() -> argparse.Namespace:
             parser.error(f"BAG={error}")
     if options.report is not None and not options.report.absolute().parent.is_dir():
         parser.error(f"REPORT={options.report}: there is no such folder")
+    if options.report is not None and options.report.is_dir():
+        parser.error(f"REPORT={options.report}: this is a folder; name a file in it")
     if not 0 <= options.port <= 65535:
         parser.error(f"PORT={options.port}: allowed is 1 to 65535")
     try:
@@ -148,7 +156,9 @@ class _Demo:
             if self._options.report is not None:
                 self._options.report.write_text(json.dumps(figures.as_json(), indent=2) + "\n")
             if sys.stdin.isatty() and sys.stdout.isatty():
-                self._stay(embedded, bundle, page.url)
+                # Somebody who has the figures ends the show; that is no failure.
+                with suppress(KeyboardInterrupt):
+                    self._stay(embedded, bundle, page.url)
             return figures
 
     def _step(self, name: str) -> None:

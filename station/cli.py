@@ -68,6 +68,11 @@ def _where(
     context.obj = Where(namespace, profile, region, local, embedded)
 
 
+def said(error: OSError) -> str:
+    """The operating system's error for people: the file and what is wrong with it, no number."""
+    return f"{error.filename}: {error.strerror}" if error.filename and error.strerror else str(error)
+
+
 def main() -> None:
     """Run the command; an error that is expected is one line on standard error, and status 1."""
     try:
@@ -79,6 +84,6 @@ def main() -> None:
     except BotoCoreError as error:
         sys.exit(f"iort: AWS could not be asked: {error}")
     except OSError as error:
-        sys.exit(f"iort: {error}")
+        sys.exit(f"iort: {said(error)}")
     except KeyboardInterrupt:
         sys.exit(130)

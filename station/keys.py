@@ -26,6 +26,18 @@ class PubNubKeys:
         return {"subscribe_key": self.subscribe_key, **server}
 
 
+def typed(publish_key: str, subscribe_key: str) -> PubNubKeys:
+    """The keys of PubNub's own servers as somebody typed them.
+
+    Raises `StationError` for what is no such key, without repeating it: it may be the secret one.
+    """
+    typed_keys = {"publish": publish_key.strip(), "subscribe": subscribe_key.strip()}
+    for kind, key in typed_keys.items():
+        if not key.startswith(f"{kind[:3]}-c-"):
+            raise StationError(f"the {kind} key: expected what PubNub's admin portal shows, {kind[:3]}-c-...")
+    return PubNubKeys(publish_key=typed_keys["publish"], subscribe_key=typed_keys["subscribe"])
+
+
 def store(cloud: Cloud, keys: PubNubKeys) -> None:
     """Write the keys, replacing those that are there."""
     value = {"publish_key": keys.publish_key, **keys.reading()}

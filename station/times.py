@@ -71,5 +71,14 @@ def has_zone(text: str) -> bool:
 
 def iso(t_us: int) -> str:
     """The time as ISO 8601 in UTC, to the microsecond."""
+    return _iso(t_us, "microseconds")
+
+
+def iso_s(t_us: int) -> str:
+    """The time as ISO 8601 in UTC, down to the second that it lies in."""
+    return _iso(t_us, "seconds")
+
+
+def _iso(t_us: int, to: str) -> str:
     at = _EPOCH + timedelta(microseconds=t_us)
-    return at.isoformat(timespec="microseconds").replace("+00:00", "Z")
+    return at.isoformat(timespec=to).replace("+00:00", "Z")

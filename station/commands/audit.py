@@ -15,7 +15,7 @@ from contract import OWN_STREAMS, VESC_STREAM, ContractError, check_robot, check
 from station import audit
 from station.audit import Audit, Range
 from station.errors import StationError
-from station.times import duration_us, iso, time_us
+from station.times import duration_us, iso, iso_s, time_us
 
 commands = typer.Typer()
 _out = Console(highlight=False)
@@ -139,7 +139,7 @@ def _table(one: Audit) -> Table:
         missing = sum(gap.batches for gap in run.missing)
         table.add_row(
             run.boot[:8],
-            f"{iso(run.first_us)[:19]}Z\n{iso(run.last_us)[:19]}Z",
+            f"{iso_s(run.first_us)}\n{iso_s(run.last_us)}",
             f"{run.first_seq:,}\n{run.last_seq:,}",
             f"{run.expected:,}",
             f"{run.batches:,}",

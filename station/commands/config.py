@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Mapping, Sequence
+from collections.abc import Set as AbstractSet
 from typing import Annotated, Any
 
 import typer
@@ -59,7 +60,7 @@ def config(
         refusals = {one.name: {"value": one.value, "reason": one.reason} for one in refused}
         _out.print_json(json.dumps({"settings": state.settings(), "refused": refusals, "answered": not late}))
     else:
-        _show(robot, state, wishes)
+        _show(robot, state, wishes, {refusal.name for refusal in refused})
         for refusal in refused:
             _errors.print(f"refused: {refusal.reason}", style="red", markup=False)
         if refused:
@@ -95,13 +96,13 @@ def _change(text: str) -> tuple[str, Any]:
         return name, value
 
 
-def _show(robot: str, state: State, wishes: Mapping[str, Any]) -> None:
+def _show(robot: str, state: State, wishes: Mapping[str, Any], refused: AbstractSet[str]) -> None:
     if not state.reported:
         _out.print(f"{robot} has reported no settings yet")
     said = {
         name: "  (asked for now)" if value is not None else "  (wish withdrawn)"
         for name, value in wishes.items()
-    }
+    } | dict.fromkeys(refused, "  (car.yaml's: the wish is refused)")
     for name, value in state.settings().items():
         shown = ",".join(value) if isinstance(value, list) else json.dumps(value).strip('"')
         _out.print(f"{name}={shown}{said.get(name, '')}", markup=False)

@@ -20,10 +20,11 @@ from station.cloud import Cloud
 from station.errors import StationError
 from station.files import StoredFile, Told
 from station.inventory import check_registered
-from station.times import duration_us, iso, time_us
+from station.times import duration_us, iso_s, time_us
 
 commands = typer.Typer(no_args_is_help=True, help="Bags, images and what else robots have uploaded.")
 _out = Console(highlight=False, soft_wrap=True)
+_errors = Console(stderr=True, highlight=False, soft_wrap=True)
 
 _Start = Annotated[str | None, typer.Option("--from", help="Written from here on: ISO 8601, now or -10m.")]
 _End = Annotated[str | None, typer.Option("--to", help="Written up to here.")]
@@ -46,11 +47,15 @@ def list_(
 
     What a robot that is no longer registered has uploaded stays, and is listed.
     """
+    none = True
     for one in _chosen(context.obj.cloud(), robot, name, start, end, last):
+        none = False
         if as_json:
             _out.print(json.dumps(asdict(one)), markup=False)
         else:
-            _out.print(f"{iso(one.second * 1_000_000)}  {one.size:>15,}  {one.name}", markup=False)
+            _out.print(f"{iso_s(one.second * 1_000_000)}  {one.size:>15,}  {one.name}", markup=False)
+    if none:
+        _errors.print(f"no file of {robot} is like this", markup=False)
 
 
 @commands.command("get")

@@ -8,6 +8,7 @@ import typer
 from rich.console import Console
 
 from station import keys
+from station.errors import StationError
 
 commands = typer.Typer()
 _out = Console(highlight=False)
@@ -26,7 +27,9 @@ def pubnub(
     """Store PubNub's keys, encrypted, where Lambda 1 reads them."""
     # Before anybody types a key for a cloud that is not there.
     cloud = context.obj.cloud()
+    if cloud.endpoint_url:
+        raise StationError("the embedded cloud has a stand-in for PubNub, with keys of its own")
     publish_key = publish_key or typer.prompt("Publish key", hide_input=True)
     subscribe_key = subscribe_key or typer.prompt("Subscribe key", hide_input=True)
-    keys.store(cloud, keys.PubNubKeys(publish_key=publish_key, subscribe_key=subscribe_key))
+    keys.store(cloud, keys.typed(publish_key, subscribe_key))
     _out.print("stored; Lambda 1 uses them from its next cold start on")

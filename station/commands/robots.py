@@ -16,16 +16,19 @@ from contract import (
     ADMISSION,
     ADMIT_UNTIL_S,
     AGENT_VERSION,
+    ALERT_PREFIX,
     CONNECTED_MS,
     DISCONNECT_REASON,
     DISCONNECTED_MS,
+    FILES_BYTES,
+    FILES_DAY,
     ONLINE,
     PRESENCE,
     ROBOT,
 )
 from station import certificates, claims, registry, robots, rotation
 from station.errors import StationError
-from station.times import iso
+from station.times import iso_s, time_us
 
 commands = typer.Typer(no_args_is_help=True, help="The robots that may connect.")
 _out, _errors = Console(highlight=False), Console(stderr=True, highlight=False)
@@ -46,7 +49,7 @@ def add(
     """Register a robot and write the folder that it needs: car.yaml, certificate and key."""
     bundle = robots.add(context.obj.cloud(), name, out=out, vehicle=_vehicle(speed_to_erpm_gain))
     _out.print(f"{name} is registered. Copy {bundle.folder} to it, then run there:\n")
-    _out.print(f"  iort-agent --config {bundle.folder.name}/car.yaml")
+    _out.print(f"  iort-agent run --config {bundle.folder.name}/car.yaml")
 
 
 @commands.command("register")
@@ -126,7 +129,10 @@ def list_(
     if as_json:
         _out.print_json(json.dumps(rows, default=float))
         return
-    table = Table("robot", "connection", "agent", "parameters", box=None, pad_edge=False)
+    table = Table("robot", box=None, pad_edge=False)
+    table.add_column("connection", no_wrap=True)
+    table.add_column("agent")
+    table.add_column("parameters")
     for row in rows:
         table.add_row(row[ROBOT], _connection(row), row.get(AGENT_VERSION, ""), _parameters(row))
     _out.print(table)
@@ -210,15 +216,19 @@ def _connection(row: Mapping[str, Any]) -> str:
 
 
 def _parameters(row: Mapping[str, Any]) -> str:
-    known = {ROBOT, *PRESENCE, *ADMISSION}
-    return ", ".join(f"{key} {value}" for key, value in sorted(row.items()) if key not in known)
+    known = {ROBOT, FILES_DAY, FILES_BYTES, *PRESENCE, *ADMISSION}
+    return ", ".join(
+        f"{key} {value}"
+        for key, value in sorted(row.items())
+        if key not in known and not key.startswith(ALERT_PREFIX)
+    )
 
 
 def _value(key: str, value: Any) -> str:
     if key.endswith("_ms"):
-        return iso(int(value) * 1000)
-    return iso(int(value) * 1_000_000) if key == ADMIT_UNTIL_S else str(value)
+        return iso_s(int(value) * 1000)
+    return iso_s(int(value) * 1_000_000) if key == ADMIT_UNTIL_S else str(value)
 
 
 def _time(when: Any) -> str | None:
-    return None if when is None else when.isoformat(timespec="seconds")
+    return None if when is None else iso_s(time_us(when, 0))

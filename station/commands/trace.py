@@ -12,9 +12,10 @@ import typer
 from rich.console import Console
 from rich.table import Table
 
-from contract import RTT_STREAM, VESC_STREAM, ContractError, check_robot
+from contract import RTT_STREAM, VESC_STREAM
 from station import audit, keys, trace
 from station.errors import StationError
+from station.inventory import check_registered
 from station.listener import Listener
 from station.page import PUBNUB_ORIGIN
 
@@ -35,10 +36,7 @@ def trace_(
 ) -> None:
     """Follow a robot's live updates from the sample in the car to here, hop by hop."""
     cloud = context.obj.cloud()
-    try:
-        check_robot(robot)
-    except ContractError as error:
-        raise StationError(str(error)) from error
+    check_registered(cloud, robot)
     found: list[trace.Times] = []
     enough = threading.Event()
 

@@ -18,6 +18,9 @@ def test_robot_is_added_listed_and_removed(iort, tmp_path):
     assert {"robot": "cli-car", "speed_to_erpm_gain": 3000.0, "speed_to_erpm_offset": 0.0} in json.loads(
         iort("robots", "list", "--json").output
     )
+    shown = iort("robots", "list").stdout
+    assert f"{'cli-car':<8}" in shown
+    assert "speed_to_erpm_gain 3000" in shown
     assert iort("robots", "remove", "cli-car").exit_code == 0
     assert "cli-car" not in iort("robots", "list").output
 
@@ -30,6 +33,8 @@ def test_robot_is_added_listed_and_removed(iort, tmp_path):
         (("files", "list", "nobody"), "there is no robot nobody; there is "),
         (("files", "list", "nobody", "--last", "1h", "--json"), "there is no robot nobody"),
         (("files", "get", "nobody"), "there is no robot nobody"),
+        (("trace", "nobody"), "there is no robot nobody"),
+        (("pubnub", "--publish-key", "pub-c-1", "--subscribe-key", "sub-c-1"), "keys of its own"),
     ],
 )
 def test_error_says_what_is_wrong(iort, tmp_path, arguments, said):
@@ -40,14 +45,15 @@ def test_error_says_what_is_wrong(iort, tmp_path, arguments, said):
 
 def test_a_robot_without_files_has_none_and_one_that_is_gone_keeps_them(embedded, iort, bundle):
     robot = bundle().robot
-    assert (iort("files", "list", robot).exit_code, iort("files", "list", robot).output) == (0, "")
+    none = iort("files", "list", robot)
+    assert (none.exit_code, none.stdout, none.stderr) == (0, "", f"no file of {robot} is like this\n")
     bucket = embedded.cloud.output("storage", "FilesBucket")
     file = File("a.bag", "recording", "application/octet-stream", 5, "0" * 64, 1_700_000_000_000_000)
     key = file_key("gone", file)
     embedded.cloud.client("s3").put_object(Bucket=bucket, Key=key, Body=b"drive")
     assert "a.bag" in iort("files", "list", "gone").output
     later = iort("files", "list", "gone", "--last", "1h")
-    assert (later.exit_code, later.output) == (0, "")
+    assert (later.exit_code, later.stdout) == (0, "")
 
 
 def test_the_cost_of_what_is_deployed(iort):

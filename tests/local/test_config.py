@@ -34,6 +34,7 @@ def test_a_running_agent_is_changed_and_answers(iort, bundle):
         shown = iort("config", car.robot)
         assert shown.exit_code == 0
         assert "ping.rate_hz=1" in shown.output
+        assert "live.rate_hz=10.0  (car.yaml's: the wish is refused)" in shown.output
         assert f"`iort config {car.robot} --unset live.rate_hz` withdraws it" in shown.stderr
         withdrawn = iort("config", car.robot, "--unset", "live.rate_hz", "--unset", "fields.vesc",
                          "--seconds", "120", "--json")  # fmt: skip

@@ -7,7 +7,7 @@ from datetime import datetime, timezone
 import pytest
 
 from station.errors import StationError
-from station.times import duration_us, has_zone, iso, time_us
+from station.times import duration_us, has_zone, iso, iso_s, time_us
 
 NOW = 1_700_000_000_123_456
 
@@ -55,3 +55,4 @@ def test_lengths():
 def test_written_times_are_read_back():
     assert iso(NOW) == "2023-11-14T22:13:20.123456Z"
     assert time_us(iso(NOW), 0) == NOW
+    assert iso_s(NOW) == "2023-11-14T22:13:20Z"

@@ -7,7 +7,8 @@ import os
 import pytest
 from typer.testing import CliRunner
 
-from station.cli import app
+from station import keys
+from station.cli import app, said
 from station.cloud import Cloud
 from station.errors import StationError
 from station.where import Where
@@ -63,6 +64,32 @@ def test_no_key_is_asked_for_before_there_is_a_cloud(tmp_path):
     done = CliRunner().invoke(app, ["--embedded", str(tmp_path / "cloud.json"), "pubnub"], input="a\nb\n")
     assert isinstance(done.exception, StationError)
     assert "key" not in done.output
+
+
+@pytest.mark.parametrize(
+    ("publish", "subscribe", "said"),
+    [
+        ("sub-c-1", "pub-c-1", "the publish key: expected what PubNub's admin portal shows, pub-c-"),
+        ("pub-c-1", "sec-c-1", "the subscribe key: expected what PubNub's admin portal shows, sub-c-"),
+        ("", "sub-c-1", "the publish key"),
+    ],
+)
+def test_a_key_that_is_another_is_refused_and_not_repeated(publish, subscribe, said):
+    with pytest.raises(StationError, match=said) as raised:
+        keys.typed(publish, subscribe)
+    assert "-c-1" not in str(raised.value)
+
+
+def test_a_typed_key_loses_what_was_copied_with_it():
+    typed = keys.typed(" pub-c-1", "sub-c-1\n")
+    assert (typed.publish_key, typed.subscribe_key) == ("pub-c-1", "sub-c-1")
+
+
+def test_a_file_that_cannot_be_written_is_named(tmp_path):
+    with pytest.raises(FileNotFoundError) as raised:
+        (tmp_path / "no" / "ride.csv").write_text("")
+    assert said(raised.value) == f"{tmp_path}/no/ride.csv: No such file or directory"
+    assert said(OSError("of no file")) == "of no file"
 
 
 def test_a_stack_that_is_not_deployed_is_named_with_its_region(aws):
