@@ -8,17 +8,15 @@ from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from typing import Any
 
-from boto3.dynamodb.types import TypeDeserializer
-
 from bench.fleet_load import SAMPLES as BATCH_SAMPLES
-from contract import RECEIVED_MS, RECORD, SAMPLES, SECOND, T_US, TOPIC, VESC_STREAM, build_topic
+from contract import RECEIVED_MS, SAMPLES, SECOND, T_US, VESC_STREAM
 from station.cloud import Cloud
+from station.items import of_topic, plain
 
 # Hears the share done, and of what.
 Tell = Callable[[float, str], None]
 # So long without any news, and no more comes.
 _CATCH_UP_S = 120.0
-_deserialize = TypeDeserializer().deserialize
 
 
 @dataclass(frozen=True)
@@ -79,7 +77,7 @@ def _samples(cloud: Cloud, robot: str) -> int:
 def _spanned(cloud: Cloud, robot: str) -> int:
     """The seconds from a robot's first to its last summary."""
     query = cloud.client("dynamodb").query
-    seconds = of_topic(cloud, "SummaryTable", robot, SECOND)
+    seconds = of_topic(cloud, "SummaryTable", robot, VESC_STREAM, SECOND)
     ends = [
         int(item[SECOND]["N"])
         for forward in (True, False)
@@ -90,18 +88,5 @@ def _spanned(cloud: Cloud, robot: str) -> int:
 
 def _items(cloud: Cloud, table: str, robot: str, *fields: str) -> Iterator[dict[str, Any]]:
     pages = cloud.client("dynamodb").get_paginator("query")
-    for page in pages.paginate(**of_topic(cloud, table, robot, *fields)):
-        for item in page["Items"]:
-            yield {name: _deserialize(value) for name, value in item.items()}
-
-
-def of_topic(cloud: Cloud, table: str, robot: str, *fields: str) -> dict[str, Any]:
-    """A Query's arguments: these fields of all that a robot has in a table."""
-    topic = build_topic(RECORD, robot, VESC_STREAM, cloud.namespace)
-    return {
-        "TableName": cloud.output("storage", table),
-        "KeyConditionExpression": "#topic = :topic",
-        "ExpressionAttributeNames": {"#topic": TOPIC, **{f"#{name}": name for name in fields}},
-        "ExpressionAttributeValues": {":topic": {"S": topic}},
-        "ProjectionExpression": ", ".join(f"#{name}" for name in fields),
-    }
+    for page in pages.paginate(**of_topic(cloud, table, robot, VESC_STREAM, *fields)):
+        yield from map(plain, page["Items"])

@@ -17,16 +17,17 @@ from typing import Any
 from botocore.exceptions import BotoCoreError, ClientError
 
 from bench import usage
-from bench.fleet_arrivals import Tell, of_topic, stored, summarized
+from bench.fleet_arrivals import Tell, stored, summarized
 from bench.fleet_load import SAMPLES as BATCH_SAMPLES
 from bench.fleet_load import Load
-from contract import SECOND
+from contract import SECOND, VESC_STREAM
 from local.cloud import EmbeddedCloud
 from local.deployment import ROOT
 from local.errors import LocalError
 from local.figures import Spread
 from station import robots
 from station.cloud import Cloud
+from station.items import of_topic
 
 
 @dataclass(frozen=True)
@@ -174,13 +175,12 @@ def _summary_age(cloud: Cloud, robot: str) -> Iterator[list[float]]:
     """How old the newest summarised second of a robot is, in seconds, once a second meanwhile."""
     seen: list[float] = []
     over = threading.Event()
+    newest = of_topic(cloud, "SummaryTable", robot, VESC_STREAM, SECOND)
 
     def watch() -> None:
         while not over.wait(1.0):
             try:
-                answer = cloud.client("dynamodb").query(
-                    **of_topic(cloud, "SummaryTable", robot, SECOND), ScanIndexForward=False, Limit=1
-                )
+                answer = cloud.client("dynamodb").query(**newest, ScanIndexForward=False, Limit=1)
             except (BotoCoreError, ClientError):
                 # A cloud that is overloaded answers late, or not; what it stores is what counts.
                 continue

@@ -10,10 +10,10 @@ from typing import Any
 
 import numpy as np
 
-from contract import STATS, check_robot
+from contract import check_robot
 from station import cloudwatch, cloudwatch_logs, data, inventory
 from station.cloud import Cloud
-from station.conditions import Column
+from station.conditions import Column, values
 from station.errors import StationError
 
 # A chart has no more points across.
@@ -75,7 +75,7 @@ def history(cloud: Cloud, asked: Mapping[str, str]) -> dict[str, Any]:
 
 def _by_statistic(columns: Mapping[str, Column]) -> dict[str, tuple[Column, Column, Column]]:
     """The summary's columns, one entry a field: mean, least, most."""
-    names = [name.removesuffix("_mean") for name in columns if name.endswith(f"_{STATS[1]}")]
+    names = [name.removesuffix("_mean") for name in columns if name.endswith("_mean")]
     return {
         name: (columns[f"{name}_mean"], columns[f"{name}_min"], columns[f"{name}_max"])
         for name in names
@@ -89,15 +89,15 @@ def _rows(of: tuple[Column, Column, Column], starts: Any, n: int, *, several: bo
         ends = _last_known(mean, starts)
         return {"mean": mean[ends].tolist()}
     if not several or n == 0:
-        return {"mean": _numbers(mean)}
+        return {"mean": values(mean)}
     known = ~np.isnan(mean)
     number = np.add.reduceat(known.astype(float), starts)
     with np.errstate(invalid="ignore"):
         average = np.add.reduceat(np.where(known, mean, 0.0), starts) / np.where(number == 0, np.nan, number)
     return {
-        "mean": _numbers(average),
-        "least": _numbers(np.fmin.reduceat(least, starts)),
-        "most": _numbers(np.fmax.reduceat(most, starts)),
+        "mean": values(average),
+        "least": values(np.fmin.reduceat(least, starts)),
+        "most": values(np.fmax.reduceat(most, starts)),
     }
 
 
@@ -111,11 +111,6 @@ def _last_known(column: Column, starts: Any) -> Any:
     ranked = np.where(known, np.arange(n), -1)
     last = np.maximum.reduceat(ranked, starts)
     return np.where(last >= starts, last, np.append(starts[1:], n) - 1)
-
-
-def _numbers(column: Column) -> list[float | None]:
-    # NaN is no JSON.
-    return [None if value != value else value for value in column.tolist()]  # noqa: PLR0124 - NaN is not itself
 
 
 def _text(asked: Mapping[str, str], name: str) -> str:

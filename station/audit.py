@@ -8,7 +8,7 @@ the car.
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from itertools import pairwise
 from typing import Any, NamedTuple
 
@@ -20,14 +20,18 @@ from contract import (
     T_US,
     TOPIC,
     Batch,
+    ContractError,
     build_topic,
     decode,
 )
 from station.cloud import Cloud
+from station.items import of_topic, plain
 
 # Later than the run's fastest batch by more than this. A batch is a second long, and the next one
 # that is sent at once arrives within milliseconds.
 LATE_MS = 5_000
+# No time reaches it, see contract/.
+_NEVER_US = 2**53
 
 
 class Stored(NamedTuple):
@@ -184,12 +188,11 @@ class Range:
 
     first_us: int | None = None
     last_us: int | None = None
-    _most: int = field(default=2**53, repr=False)
 
     def values(self) -> dict[str, dict[str, str]]:
         """As DynamoDB's expression values."""
-        first = -self._most if self.first_us is None else self.first_us
-        last = self._most if self.last_us is None else self.last_us
+        first = -_NEVER_US if self.first_us is None else self.first_us
+        last = _NEVER_US if self.last_us is None else self.last_us
         return {":first": {"N": str(first)}, ":last": {"N": str(last)}}
 
 
@@ -225,21 +228,12 @@ def last_figures(cloud: Cloud, robot: str) -> dict[str, float]:
 def last_batch(cloud: Cloud, robot: str, stream: str) -> Batch | None:
     """The newest stored batch of a stream; None where there is none that can be read."""
     answer = cloud.client("dynamodb").query(
-        TableName=cloud.output("storage", "TelemetryTable"),
-        KeyConditionExpression="#topic = :topic",
-        ExpressionAttributeNames={"#topic": TOPIC},
-        ExpressionAttributeValues={":topic": {"S": build_topic(RECORD, robot, stream, cloud.namespace)}},
+        **of_topic(cloud, "TelemetryTable", robot, stream),
         ScanIndexForward=False,
         ConsistentRead=True,
         Limit=1,
     )
     try:
-        return next((decode(_plain(item)) for item in answer["Items"]), None)
-    except ValueError:  # the contract's, or of a number that is not whole
+        return next((decode(plain(item)) for item in answer["Items"]), None)
+    except ContractError:
         return None
-
-
-def _plain(item: Mapping[str, Any]) -> dict[str, Any]:
-    return {
-        name: int(value["N"]) if "N" in value else next(iter(value.values())) for name, value in item.items()
-    }

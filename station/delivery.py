@@ -6,12 +6,9 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import Any
 
-from boto3.dynamodb.types import TypeDeserializer
-
-from contract import RECORD, SAMPLES, TOPIC, Batch, build_topic, decode
+from contract import SAMPLES, Batch, decode
 from station.cloud import Cloud
-
-_deserialize = TypeDeserializer().deserialize
+from station.items import of_topic, plain
 
 
 @dataclass(frozen=True)
@@ -57,18 +54,7 @@ def samples_summarized(cloud: Cloud, robot: str, stream: str) -> int:
     return sum(int(item[SAMPLES]) for item in _query(cloud, "SummaryTable", robot, stream, SAMPLES))
 
 
-def _query(
-    cloud: Cloud, table: str, robot: str, stream: str, only: str | None = None
-) -> Iterator[dict[str, Any]]:
-    names = {"#topic": TOPIC} | ({"#only": only} if only else {})
+def _query(cloud: Cloud, table: str, robot: str, stream: str, *fields: str) -> Iterator[dict[str, Any]]:
     pages = cloud.client("dynamodb").get_paginator("query")
-    for page in pages.paginate(
-        TableName=cloud.output("storage", table),
-        KeyConditionExpression="#topic = :topic",
-        ExpressionAttributeNames=names,
-        ExpressionAttributeValues={":topic": {"S": build_topic(RECORD, robot, stream, cloud.namespace)}},
-        ConsistentRead=True,
-        **({"ProjectionExpression": "#only"} if only else {}),
-    ):
-        for item in page["Items"]:
-            yield {name: _deserialize(value) for name, value in item.items()}
+    for page in pages.paginate(**of_topic(cloud, table, robot, stream, *fields), ConsistentRead=True):
+        yield from map(plain, page["Items"])

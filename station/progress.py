@@ -52,4 +52,4 @@ def reading(what: str, start_us: int | None, end_us: int | None) -> Iterator[Tol
 
 def say(text: str) -> None:
     """A line on standard error, where it does not get into what is piped on."""
-    print(f"iort: {text}", file=sys.stderr)
+    print(f"iort: {text}", file=sys.stderr, flush=True)

@@ -6,13 +6,11 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import Any
 
-from boto3.dynamodb.types import TypeDeserializer
-
 from contract import ENTRY, FIRST_MS, LAST_MS, PAYLOAD, REASON, REPLAYS, ROBOT, SEEN, SOURCE, TOPIC
 from station.cloud import Cloud
 from station.errors import StationError
+from station.items import plain
 
-_deserialize = TypeDeserializer().deserialize
 _LISTED = (ROBOT, ENTRY, SOURCE, TOPIC, REASON, FIRST_MS, LAST_MS, SEEN, REPLAYS)
 
 
@@ -111,7 +109,7 @@ def _depth(cloud: Cloud, queue: str) -> int:
 
 
 def _entry(item: dict[str, Any]) -> Entry:
-    values = {name: _deserialize(value) for name, value in item.items()}
+    values = plain(item)
     return Entry(
         robot=values[ROBOT],
         id=values[ENTRY],

@@ -7,13 +7,14 @@ from collections.abc import Iterator, Mapping
 from decimal import Decimal
 from typing import Any
 
-from boto3.dynamodb.types import TypeDeserializer, TypeSerializer
+from boto3.dynamodb.types import TypeSerializer
 
 from contract import ADMIT_CLAIM, ADMIT_UNTIL_S, ROBOT, ContractError, check_robot
 from station.cloud import Cloud
 from station.errors import StationError
+from station.items import plain
 
-_serialize, _deserialize = TypeSerializer().serialize, TypeDeserializer().deserialize
+_serialize = TypeSerializer().serialize
 
 
 def checked(robot: str) -> str:
@@ -28,7 +29,7 @@ def listed(cloud: Cloud) -> Iterator[dict[str, Any]]:
     """Every row of the registry, in no order."""
     for page in cloud.client("dynamodb").get_paginator("scan").paginate(TableName=_table(cloud)):
         for item in page["Items"]:
-            yield _plain(item)
+            yield plain(item)
 
 
 def vehicles(cloud: Cloud) -> dict[str, dict[str, float]]:
@@ -42,7 +43,7 @@ def find(cloud: Cloud, robot: str) -> dict[str, Any] | None:
     answer = cloud.client("dynamodb").get_item(
         TableName=_table(cloud), Key=_key(checked(robot)), ConsistentRead=True
     )
-    return _plain(answer["Item"]) if "Item" in answer else None
+    return plain(answer["Item"]) if "Item" in answer else None
 
 
 def get(cloud: Cloud, robot: str) -> dict[str, Any]:
@@ -111,7 +112,3 @@ def _table(cloud: Cloud) -> str:
 
 def _key(robot: str) -> dict[str, Any]:
     return {ROBOT: {"S": robot}}
-
-
-def _plain(item: Mapping[str, Any]) -> dict[str, Any]:
-    return {name: _deserialize(value) for name, value in item.items()}

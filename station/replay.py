@@ -11,7 +11,6 @@ from enum import Enum
 from functools import partial
 from typing import Any, NamedTuple
 
-from boto3.dynamodb.types import TypeDeserializer
 from botocore.exceptions import BotoCoreError, ClientError
 
 from contract import (
@@ -31,9 +30,10 @@ from contract import (
     parse_topic,
 )
 from station.cloud import Cloud
+from station.errors import StationError
+from station.items import plain
 from station.quarantine import Entry, key, load
 
-_deserialize = TypeDeserializer().deserialize
 # One that failed so often is for a person to look at.
 MAX_REPLAYS = 3
 _AT_ONCE = 8
@@ -61,8 +61,8 @@ class Outcome(NamedTuple):
     detail: str = ""
 
 
-class _NotForReplayError(Exception):
-    pass
+class _NotForReplayError(StationError):
+    """An entry that has no batch in it."""
 
 
 def replay(
@@ -114,7 +114,7 @@ def _batch(entry: Entry) -> Batch:
     """The batch in an entry that can be replayed; raises `ContractError` where it is none."""
     payload = entry.payload or b""
     if entry.source == BY_STREAM and entry.topic:
-        return decode_item({name: _deserialize(value) for name, value in json.loads(payload).items()})[1]
+        return decode_item(plain(json.loads(payload)))[1]
     if not _is_rules(entry) or not entry.topic.startswith(f"{RECORD}/"):
         raise _NotForReplayError("of its moment, or without a batch: only the record lane is replayed")
     parse_topic(entry.topic)
@@ -161,7 +161,7 @@ def _stored(cloud: Cloud, topic: str, batch: Batch) -> bool:
         Key={TOPIC: {"S": topic}, T_US: {"N": str(batch.t_us)}},
         ConsistentRead=True,
     )
-    item = {name: _deserialize(value) for name, value in answer.get("Item", {}).items()}
+    item = plain(answer.get("Item", {}))
     return (item.get("boot"), item.get("seq")) == (batch.boot, batch.seq)
 
 

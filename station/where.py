@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 import os
-import sys
 from dataclasses import dataclass
 from pathlib import Path
 
 from station.cloud import Cloud
 from station.errors import StationError
+from station.progress import say
 
 # Whoever has set one of these means an AWS account.
 _AWS_NAMED = ("AWS_PROFILE", "AWS_REGION", "AWS_DEFAULT_REGION", "AWS_ACCESS_KEY_ID")
@@ -32,7 +32,7 @@ class Where:
         said = self.profile or self.region or any(os.environ.get(name) for name in _AWS_NAMED)
         if self.local or (not said and self.embedded.exists()):
             if not self.local:
-                print("iort: on the embedded cloud that runs in this checkout", file=sys.stderr)
+                say("on the embedded cloud that runs in this checkout")
             return Cloud.load(self.embedded)
         cloud = Cloud(namespace=self.namespace, profile=self.profile, region=self.region)
         try:

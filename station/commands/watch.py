@@ -17,6 +17,7 @@ from rich.text import Text
 from contract import ROBOT, T_US, ContractError
 from station import keys, registry
 from station.listener import Listener
+from station.progress import say
 from station.watch import FleetWatch, read
 
 commands = typer.Typer()
@@ -47,7 +48,7 @@ def watch(
     try:
         with listener:
             if as_json:
-                print(f"iort: listening to {cloud.namespace}.*", file=sys.stderr, flush=True)
+                say(f"listening to {cloud.namespace}.*")
                 done.wait(seconds)
             else:
                 _show(fleet, seconds, cloud.namespace)
@@ -65,7 +66,7 @@ class _Lines:
         try:
             robot, sample, stamps = read(update)
         except ContractError as error:
-            print(f"iort: an update that is none: {error}", file=sys.stderr)
+            say(f"an update that is none: {error}")
             return
         delay_ms = (now_us - stamps["sent_us"] - stamps["offset_us"]) / 1000
         line = {ROBOT: robot, "stream": update["stream"], T_US: stamps["t_us"], "delay_ms": delay_ms}
