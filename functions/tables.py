@@ -23,7 +23,7 @@ _WRITE_ATTEMPTS = 8
 _MANY = 100
 _VEHICLE_CACHE_S = 60.0
 # "Limits", items: 400 KB with the names counted in; a little is left to how numbers are counted.
-_MAX_ITEM_BYTES, _MAX_NAME_BYTES = 380 * 1024, 65_535
+_MAX_ITEM_BYTES = 380 * 1024
 # A float's longest text; as a number it is shorter.
 _MAX_NUMBER_BYTES = 25
 # Later than any time that the contract allows.
@@ -158,15 +158,14 @@ def fitting(item: dict[str, Any]) -> dict[str, Any]:
     samples themselves are in the telemetry table.
     """
     sizes = list(map(_size, item, item.values()))
-    if sum(sizes) <= _MAX_ITEM_BYTES and max(sizes) <= _MAX_NAME_BYTES:
-        return item
     total, dropped = sum(sizes), set()
-    for size, name in sorted(zip(sizes, item, strict=True), reverse=True):
-        if len(name.encode()) > _MAX_NAME_BYTES or total > _MAX_ITEM_BYTES:
-            dropped.add(name)
-            total -= size
-    if not dropped:
+    if total <= _MAX_ITEM_BYTES:
         return item
+    for size, name in sorted(zip(sizes, item, strict=True), reverse=True):
+        if total <= _MAX_ITEM_BYTES:
+            break
+        dropped.add(name)
+        total -= size
     _log.warning("a summary of %d attributes is too large: %d left out", len(item), len(dropped))
     kept = {name: value for name, value in item.items() if name not in dropped}
     return {**kept, OMITTED: {"N": str(len(dropped))}}

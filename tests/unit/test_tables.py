@@ -200,14 +200,6 @@ def test_a_summary_too_large_for_an_item_goes_without_its_largest_values(dynamod
     assert sum(len(str(value).encode()) for value in item.values()) > 350_000
 
 
-def test_an_attribute_whose_name_dynamodb_does_not_take_is_left_out():
-    client = FakeDynamoDB()
-    tables(client).put_seconds({(TOPIC_OF_CAR, 1): {"n": 1, "x" * 65_536: 1}})
-    (item,) = summary_of(client).values()
-    assert (item["n"], item["omitted"]) == (1, 1)
-    assert len(item) == 4
-
-
 # --- values -----------------------------------------------------------------------------------------
 
 
