@@ -1,4 +1,4 @@
-"""What the live page may ask the server that serves it: a car's past, and CloudWatch's dashboards.
+"""What the live page may ask its server: cars' parameters, a car's past, and CloudWatch's dashboards.
 
 Each answer is a function of the request's parameters; station/web/src/answers.ts is the other end.
 """
@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from contract import check_robot
-from station import cloudwatch, cloudwatch_logs, data, inventory
+from station import cloudwatch, cloudwatch_logs, data, inventory, registry
 from station.cloud import Cloud
 from station.conditions import Column, values
 from station.errors import StationError
@@ -25,6 +25,7 @@ _SAMPLES_US = 3_600_000_000
 def answers(cloud: Cloud) -> dict[str, Callable[[Mapping[str, str]], dict[str, Any]]]:
     """Every answer by its name."""
     return {
+        "vehicles": lambda _asked: {"vehicles": registry.vehicles(cloud)},
         "streams": lambda asked: {"streams": inventory.streams_of(cloud, check_robot(_text(asked, "robot")))},
         "history": lambda asked: history(cloud, asked),
         "dashboards": lambda _asked: {"dashboards": cloudwatch.dashboards(cloud)},

@@ -87,5 +87,11 @@ def test_what_cannot_be_answered_says_why(change, says):
         history(cloud_of(*ride(10)), {**ASKED, **change})
 
 
+def test_vehicles_are_those_whose_gain_is_registered():
+    known = {"vehicles": {"car": {"speed_to_erpm_gain": 4614.0}}}
+    assert answers(cloud_of(*ride(10), gain="4614"))["vehicles"]({}) == known
+    assert answers(cloud_of(*ride(10)))["vehicles"]({}) == {"vehicles": {}}
+
+
 def test_streams_are_those_stored():
     assert answers(cloud_of(*ride(10)))["streams"]({"robot": "car"}) == {"streams": ["vesc"]}

@@ -288,6 +288,19 @@ def test_a_pubnub_that_hangs_is_noticed(open_page: Callable[..., Page]) -> None:
             until(lambda: "does not answer" in page.inner_text("#banner"), "the reason")
 
 
+def test_a_car_registered_after_the_page_was_opened_has_its_speed_in_metres(
+    open_page: Callable[..., Page], pubnub: PubNubStandIn
+) -> None:
+    registered: dict[str, Any] = {}
+    told = {"namespace": "iort", "subscribe_key": SUBSCRIBE_KEY, "origin": pubnub.origin, "tls": False}
+    with PageServer(**told, answers={"vehicles": lambda _: {"vehicles": registered}}) as server:
+        page = open_page(f"{server.url}#/car/car-2")
+        registered["car-2"] = {"speed_to_erpm_gain": GAIN}
+        Car(pubnub, "car-2").send()
+        speed = page.locator(".gauge").first
+        until(lambda: "m/s" in speed.inner_text(), "metres a second")
+
+
 def test_the_fleet_is_sorted_and_works_by_keyboard(page: Page, car: Car, url: str) -> None:
     page.goto(f"{url}#/")
     for name in ("car-10", "car-2", "car-1"):

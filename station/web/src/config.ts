@@ -9,8 +9,11 @@ export interface Config {
   readonly token: string;
   /** Whether the server also answers questions about the past; a static site does not. */
   readonly answers: boolean;
-  readonly vehicles: Readonly<Record<string, { readonly speed_to_erpm_gain?: number }>>;
+  readonly vehicles: Vehicles;
 }
+
+/** The parameters of cars, by their names, as they were registered when this was asked for. */
+export type Vehicles = Readonly<Record<string, { readonly speed_to_erpm_gain?: number }>>;
 
 export interface FieldTable {
   /** The contract's schema version: messages of another are refused. */

@@ -2,7 +2,7 @@
 
 import { el, setAttribute, Text } from "./dom";
 import type { Fault, Robot } from "./fleet";
-import { age, clockTime } from "./format";
+import { age, clockTime, zone } from "./format";
 
 const SHOWN = 6;
 
@@ -22,7 +22,7 @@ export class FaultLog {
       const cells = ["fault-at", "fault-name", "fault-for"].map((name) => new Text(name, "td"));
       return { node: el("tr", {}, ...cells.map(({ node }) => node)), cells };
     });
-    const head = el("tr", {}, ...["Since", "Fault", "For"].map((name) => el("th", { scope: "col" }, name)));
+    const head = el("tr", {}, ...[`Since, ${zone(Date.now() / 1000)}`, "Fault", "For"].map((name) => el("th", { scope: "col" }, name)));
     this.node = el(
       "section",
       { class: "panel faults", "aria-label": "Fault log" },

@@ -1,8 +1,9 @@
 // What is known of every car: its streams' newest samples, the last 30 seconds, the delays and the faults.
 // Nothing here touches the page; times are those of clock.ts.
 
+import { ask, AnswerError } from "./answers";
 import { claim, claimed, type Claim } from "./claims";
-import type { Config, FieldTable } from "./config";
+import type { Config, FieldTable, Vehicles } from "./config";
 import type { Hops, Update, Value } from "./message";
 import { Ring } from "./ring";
 import type { Arrival } from "./wire";
@@ -228,11 +229,14 @@ export class Fleet {
   /** Grows when a car or a stream is heard for the first time, or forgotten. */
   shape = 0;
   private columns = 0;
+  private vehicles: Vehicles;
 
   constructor(
     private readonly config: Config,
     private readonly table: FieldTable,
-  ) {}
+  ) {
+    this.vehicles = config.vehicles;
+  }
 
   /** Take what arrived, and how many messages were refused with it. */
   take(arrivals: readonly Arrival[], refused: number, lastRefusal: string): void {
@@ -271,7 +275,17 @@ export class Fleet {
 
   /** Metres a second for an erpm, where the car's parameters are known. */
   gain(robot: string): number | undefined {
-    return Object.hasOwn(this.config.vehicles, robot) ? this.config.vehicles[robot]?.speed_to_erpm_gain : undefined;
+    return Object.hasOwn(this.vehicles, robot) ? this.vehicles[robot]?.speed_to_erpm_gain : undefined;
+  }
+
+  /** Ask for the cars' parameters again: one was registered after the page was opened. */
+  private async learn(): Promise<void> {
+    try {
+      this.vehicles = (await ask<{ vehicles: Vehicles }>("vehicles", {})).vehicles;
+    } catch (error) {
+      // Its speed is shown in erpm, as without a server that answers.
+      if (!(error instanceof AnswerError)) throw error;
+    }
   }
 
   private meet(name: string): Robot {
@@ -280,6 +294,7 @@ export class Fleet {
       this.robots.delete(silent.name);
       for (const { columns } of silent.streams.values()) this.columns -= columns.size;
     }
+    if (this.config.answers && !Object.hasOwn(this.vehicles, name)) void this.learn();
     const robot = new Robot(name);
     this.robots.set(name, robot);
     this.shape += 1;

@@ -79,6 +79,12 @@ function humanise(field: string): string {
   return text.charAt(0).toUpperCase() + text.slice(1);
 }
 
+/** The time zone that times are shown in, at a time: UTC, CET, GMT+2. */
+export function zone(seconds: number): string {
+  const parts = new Intl.DateTimeFormat("en-GB", { timeZoneName: "short" }).formatToParts(seconds * 1000);
+  return parts.find(({ type }) => type === "timeZoneName")?.value ?? "local time";
+}
+
 /** The time of day here: 14:03:27. */
 export function clockTime(seconds: number): string {
   return new Date(seconds * 1000).toLocaleTimeString("en-GB");

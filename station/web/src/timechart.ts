@@ -57,7 +57,7 @@ export class TimeChart {
         ...PLAIN,
         width: Math.max(1, host.clientWidth),
         height: Math.max(1, host.clientHeight),
-        padding: [rem(0.5), right ? 0 : rem(0.9), 0, 0],
+        padding: [rem(0.5), right ? 0 : rem(1.7), 0, 0],
         cursor: {
           y: false,
           drag: { x: false, y: false, setScale: false },

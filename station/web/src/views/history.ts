@@ -5,7 +5,7 @@ import { claim, claimed, partsOf } from "../claims";
 import type { Config, FieldTable } from "../config";
 import { el, setAttribute, Text } from "../dom";
 import type { Fleet } from "../fleet";
-import { age, number, spec } from "../format";
+import { age, number, spec, zone } from "../format";
 import { Picture } from "../picture";
 import { route } from "../route";
 import { TimeChart } from "../timechart";
@@ -137,7 +137,7 @@ export class HistoryView {
       if (loading.signal.aborted) return;
       this.set(drive, [from_s, to_s]);
       const each = drive.row_s > 0 ? `, drawn as the mean of ${drive.row_s < 1 ? `${number(drive.row_s * 1000, 0)} ms` : age(drive.row_s)} each within its least and most` : "";
-      this.note.set(drive.samples === 0 ? "Nothing was stored in this range." : `${number(drive.samples)} samples in ${age((performance.now() - began) / 1000)}${each}.`);
+      this.note.set(drive.samples === 0 ? "Nothing was stored in this range." : `${number(drive.samples)} samples in ${age((performance.now() - began) / 1000)}${each}. Times are ${zone(to_s)}.`);
     } catch (error) {
       if (!loading.signal.aborted) this.note.set(words(error));
     }
