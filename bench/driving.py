@@ -12,6 +12,7 @@ from typing import Any
 
 from typing_extensions import Self
 
+from bench.errors import BenchError
 from bench.machine import ROOT
 from station.robots import Bundle
 
@@ -55,6 +56,6 @@ class Driving:
         status = self.process.wait(_END_S + self._drain_s)
         if status:
             self._log.seek(0)
-            raise RuntimeError(f"the agent ended with status {status}: {self._log.read()[-800:]!r}")
+            raise BenchError(f"the agent ended with status {status}: {self._log.read()[-800:]!r}")
         written: dict[str, Any] = json.loads(self._report.read_text())
         return written

@@ -26,6 +26,7 @@ from rich.console import Console
 from rich.progress import Progress
 from rich.table import Table
 
+from bench.errors import BenchError
 from bench.fleet_arrivals import Tell
 from bench.fleet_run import Fleet, measure
 from local.cloud import EmbeddedCloud
@@ -107,7 +108,7 @@ def main() -> None:
                 with progress(console) as tell:
                     runs.append(measure(embedded, count, options.seconds, tell))
                 console.print(as_table(runs[-1]))
-    except LocalError as error:
+    except (BenchError, LocalError) as error:
         sys.exit(f"bench-fleet: {error}")
     if options.json:
         report = {

@@ -50,7 +50,6 @@ class Sent:
     and when each batch left (robot -> ms since the epoch by number)."""
 
     batches: dict[str, int] = field(default_factory=dict)
-    unacknowledged: int = 0
     resent: int = 0
     lost_sessions: int = 0
     late_ms_max: float = 0.0
@@ -174,7 +173,6 @@ def drive(load: Load) -> Sent:
         robot.stop()
     return Sent(
         batches={robot.name: len(robot.sent_ms) for robot in robots},
-        unacknowledged=sum(len(robot.sent_ms) - len(robot.acknowledged) for robot in robots),
         resent=sum(robot.resent for robot in robots),
         lost_sessions=sum(robot.lost for robot in robots),
         late_ms_max=round(late_s * 1000, 1),

@@ -17,13 +17,13 @@ from typing import Any
 from botocore.exceptions import BotoCoreError, ClientError
 
 from bench import usage
+from bench.errors import BenchError
 from bench.fleet_arrivals import Tell, stored, summarized
 from bench.fleet_load import SAMPLES as BATCH_SAMPLES
 from bench.fleet_load import Load
 from contract import SECOND, VESC_STREAM
 from local.cloud import EmbeddedCloud
 from local.deployment import ROOT
-from local.errors import LocalError
 from local.figures import Spread
 from station import robots
 from station.cloud import Cloud
@@ -147,7 +147,7 @@ def _generator(load: Load) -> Iterator[Iterator[dict[str, Any]]]:
     ) as process:
         try:
             if process.stdin is None or process.stdout is None:
-                raise LocalError("the load generator has no pipes")
+                raise BenchError("the load generator has no pipes")
             process.stdin.write(json.dumps(asdict(load)) + "\n")
             process.stdin.flush()
             lines = process.stdout
@@ -155,7 +155,7 @@ def _generator(load: Load) -> Iterator[Iterator[dict[str, Any]]]:
             def said() -> Iterator[dict[str, Any]]:
                 for line in lines:
                     yield json.loads(line)
-                raise LocalError(f"the load generator ended with status {process.wait()}")
+                raise BenchError(f"the load generator ended with status {process.wait()}")
 
             yield said()
         finally:

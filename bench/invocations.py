@@ -14,6 +14,7 @@ from dataclasses import dataclass, field
 from typing import Any
 
 from bench import cpu
+from bench.errors import BenchError
 from bench.target import Target
 
 _LOGS_S = 60.0
@@ -37,7 +38,7 @@ class Measured:
 def measure(target: Target, function: str, event: Event, calls: int, found: Measured) -> None:
     """Invoke the function so often, one after the other, and add the round to what was ``found``.
 
-    Raises RuntimeError where an invocation fails, or no REPORT line comes.
+    Raises `BenchError` where an invocation fails, or no REPORT line comes.
     """
     began_ms = int(time.time() * 1000)
     before = _cpu(target)
@@ -58,13 +59,13 @@ def _cpu(target: Target) -> dict[int, int] | None:
 
 
 def invoke(target: Target, function: str, event: dict[str, Any]) -> str | None:
-    """Run the function once and wait; its REPORT line, if the answer has it. Raises RuntimeError where it
+    """Run the function once and wait; its REPORT line, if the answer has it. Raises `BenchError` where it
     fails."""
     answer = target.cloud.client("lambda").invoke(
         FunctionName=function, Payload=json.dumps(event).encode(), LogType="Tail"
     )
     if "FunctionError" in answer:
-        raise RuntimeError(f"{function}: {answer['Payload'].read()[:400]!r}")
+        raise BenchError(f"{function}: {answer['Payload'].read()[:400]!r}")
     return report_line(base64.b64decode(answer.get("LogResult", "")).decode(errors="replace"))
 
 
@@ -89,7 +90,7 @@ def _logged(target: Target, function: str, began_ms: int, calls: int) -> list[st
         ]
         reports = [line for line in lines if _REPORT.match(line)]
         if not reports and time.monotonic() > deadline:
-            raise RuntimeError(
+            raise BenchError(
                 f"{group} has no REPORT line after {_LOGS_S:.0f} s: deploy with function_logs=all"
             )
         if len(reports) >= calls or time.monotonic() > deadline:

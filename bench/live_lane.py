@@ -7,7 +7,6 @@ the same topic, broker, TLS and subscriber at the same time.
 from __future__ import annotations
 
 import struct
-import subprocess
 import tempfile
 from dataclasses import dataclass
 from pathlib import Path
@@ -15,7 +14,7 @@ from pathlib import Path
 import yaml
 
 from bench.mosquitto import HOST, Mosquitto
-from bench.ros_graph import RosError, RosGraph
+from bench.ros_graph import RosGraph
 from bench.watcher import listening, live_us
 from contract import LIVE, LIVE_MAX_RATE_HZ, VESC_STREAM, build_topic, live_topic
 from local.figures import Spread
@@ -61,20 +60,11 @@ def measure(program: str, python: str, rate_hz: int, seconds: int) -> Lane:
             every = max(1, round(rate_hz / LIVE_MAX_RATE_HZ))
             graph.start("bench.mqtt_floor", TOPIC, every, broker.port, *broker.identity("floor"), broker.ca,
                         _FLOOR)  # fmt: skip
-            publisher = graph.start("bench.ros_publisher", TOPIC, rate_hz, rate_hz * (seconds + _WARM_UP_S))
-            assert publisher.stdout is not None
-            assert publisher.stdin is not None
-            publisher.stdout.readline()
-            publisher.stdin.write("\n")
-            publisher.stdin.flush()
-            try:
-                publisher.wait(_WARM_UP_S)
-            except subprocess.TimeoutExpired:
-                before = {topic: len(delays) for topic, delays in heard.items()}
-            else:
-                raise RosError(f"the publisher stopped with status {publisher.returncode}")
-            if not publisher.stdout.readline():
-                raise RosError(f"the publisher stopped with status {publisher.wait()}")
+            publisher = graph.publisher(TOPIC, rate_hz, rate_hz * (seconds + _WARM_UP_S))
+            publisher.begin()
+            publisher.publish_for(_WARM_UP_S)
+            before = {topic: len(delays) for topic, delays in heard.items()}
+            publisher.finish()
             measured = {topic: delays[before[topic] :] for topic, delays in heard.items()}
             agent = [delay for topic in _AGENT for delay in measured[topic]]
     return Lane(rate_hz, Spread.of(agent), Spread.of(measured[_FLOOR]))

@@ -14,6 +14,7 @@ from types import TracebackType
 
 from typing_extensions import Self
 
+from bench.errors import BenchError
 from local.certificates import Identity
 
 HOST = "127.0.0.1"
@@ -40,7 +41,7 @@ def found() -> str | None:
 class Mosquitto:
     """The broker from `__enter__` to `__exit__`; `identity` makes certificates that it accepts.
 
-    Raises `OSError` where it does not start.
+    Raises `BenchError` where it does not start.
     """
 
     def __init__(self, program: str, folder: Path) -> None:
@@ -72,7 +73,7 @@ class Mosquitto:
             except OSError as error:
                 if self._process.poll() is not None or time.monotonic() > deadline:
                     said = (self._folder / "mosquitto.log").read_text()
-                    raise OSError(f"mosquitto does not start: {said}") from error
+                    raise BenchError(f"mosquitto does not start: {said}") from error
                 time.sleep(0.02)  # it has no other way to tell that it listens
             else:
                 return self

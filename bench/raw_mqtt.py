@@ -21,12 +21,14 @@ from typing import Any
 import yaml
 from typing_extensions import Self
 
+from bench.errors import BenchError
+
 _TIMEOUT_S = 20.0
 _CONNACK, _PUBLISH, _SUBACK, _PINGRESP = 2, 3, 9, 13
 _NOTHING = b""
 
 
-class RawError(Exception):
+class RawError(BenchError):
     """The broker said something else than what was waited for, or nothing."""
 
 
@@ -43,16 +45,15 @@ class RawClient:
             bundle / self._config["certificate"], bundle / self._config["private_key"]
         )
         self._socket: ssl.SSLSocket
-        self.tcp_connect_s = self.tls_handshake_s = 0.0
+        self.tcp_connect_s = 0.0
 
     def __enter__(self) -> Self:
         host, port = self._config["endpoint"], self._config["port"]
         began = time.perf_counter()
         plain = socket.create_connection((host, port), timeout=_TIMEOUT_S)
         plain.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
-        connected = time.perf_counter()
+        self.tcp_connect_s = time.perf_counter() - began
         self._socket = self._context.wrap_socket(plain, server_hostname=host)
-        self.tcp_connect_s, self.tls_handshake_s = connected - began, time.perf_counter() - connected
         name = self._config["robot"].encode()
         body = b"\x00\x04MQTT\x04\x02\x00\x3c" + _text(name)
         self._send(0x10, body)

@@ -14,13 +14,15 @@ from types import TracebackType
 
 from typing_extensions import Self
 
+from bench.errors import BenchError
+
 ROOT = Path(__file__).resolve().parent.parent
 SYSTEM_PYTHON = "/usr/bin/python3"
 PACKAGES = "python3-rospy python3-rosmaster python3-std-msgs python3-venv"
 _START_S = 20.0
 
 
-class RosError(Exception):
+class RosError(BenchError):
     """There is no ROS 1 here, or it does not start; the text says what to do."""
 
 
@@ -90,6 +92,10 @@ class RosGraph:
         """Run a module under the Python that sees rospy."""
         return self._run([self._python, "-m", module, *map(str, arguments)])
 
+    def publisher(self, topic: str, rate_hz: int, count: int) -> Publisher:
+        """A publisher of so many messages, which waits to be told to begin."""
+        return Publisher(self.start("bench.ros_publisher", topic, rate_hz, count))
+
     def _run(self, command: list[str]) -> subprocess.Popen[str]:
         process = subprocess.Popen(
             command,
@@ -102,3 +108,34 @@ class RosGraph:
         )
         self._processes.append(process)
         return process
+
+
+class Publisher:
+    """`bench.ros_publisher` in a process of its own; every method raises `RosError` where that has ended."""
+
+    def __init__(self, process: subprocess.Popen[str]) -> None:
+        self._process = process
+
+    def begin(self) -> None:
+        """Wait until both subscribers have come, and have it publish."""
+        self._hear()
+        assert self._process.stdin is not None
+        self._process.stdin.write("\n")
+        self._process.stdin.flush()
+
+    def publish_for(self, seconds: float) -> None:
+        """Let it publish for so long."""
+        try:
+            self._process.wait(seconds)
+        except subprocess.TimeoutExpired:
+            return
+        raise RosError(f"the publisher stopped with status {self._process.returncode}")
+
+    def finish(self) -> None:
+        """Wait until all is published."""
+        self._hear()
+
+    def _hear(self) -> None:
+        assert self._process.stdout is not None
+        if not self._process.stdout.readline():
+            raise RosError(f"the publisher stopped with status {self._process.wait()}")

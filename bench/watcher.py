@@ -11,6 +11,7 @@ from pathlib import Path
 from awscrt import mqtt5
 from awsiot import mqtt5_client_builder
 
+from bench.errors import BenchError
 from contract import decode_live
 from device.uplink import matches
 
@@ -53,7 +54,7 @@ def listening(
     )
     client.start()
     if not connected.wait(_WAIT_S):
-        raise TimeoutError(f"{NAME} was not connected within {_WAIT_S:.0f} s")
+        raise BenchError(f"{NAME} was not connected within {_WAIT_S:.0f} s")
     wanted = [
         mqtt5.Subscription(topic_filter=topic_filter, qos=mqtt5.QoS.AT_MOST_ONCE) for topic_filter in took_us
     ]

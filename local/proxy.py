@@ -70,10 +70,6 @@ class Proxy:
         with self._changed:
             return self._changed.wait_for(lambda: len(self.attempts) >= count, seconds)
 
-    def gaps_s(self) -> list[float]:
-        """The times between one connection and the next."""
-        return [after - before for before, after in zip(self.attempts, self.attempts[1:], strict=False)]
-
     def _run(self, coroutine: Any) -> Any:
         return asyncio.run_coroutine_threadsafe(coroutine, self._loop).result(60)
 

@@ -75,9 +75,9 @@ PRICES = {
 
 # PubNub's other kind of plan, by monthly active users: (users up to, dollars a month). Who connects is
 # a user: each viewer, and Lambda 1 as one; robots never connect to PubNub. Fair use bounds the messages,
-# and the free plan is for development only. Not found again since AS_OF.
+# and the free plan is for development only. Source: https://www.pubnub.com/pricing/, not found again since
+# AS_OF.
 PUBNUB_MAU_PLANS = ((1_000, 98.0), (5_000, 370.0), (10_000, 550.0), (25_000, 1_130.0))
-PUBNUB_MAU_PAGE = "https://www.pubnub.com/pricing/"
 
 
 class Quota(NamedTuple):

@@ -13,6 +13,7 @@ from typing import Any
 from typing_extensions import Self
 
 from bench import borrowed
+from bench.errors import BenchError
 from bench.raw_mqtt import RawClient
 from bench.target import Target
 from contract import (
@@ -40,7 +41,7 @@ def handler(event, context):
 """
 
 
-class No(Exception):  # noqa: N818 - an answer, not an error
+class No(BenchError):  # noqa: N818 - an answer, not an error
     """The service does not have the ability; the text says what was seen."""
 
 

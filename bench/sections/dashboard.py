@@ -13,6 +13,7 @@ from typing import Any
 
 from bench import plots
 from bench.driving import Driving
+from bench.errors import BenchError
 from bench.result import Plot, Ratio, Section, Table
 from bench.spread import spread
 from bench.target import Say, Target
@@ -83,11 +84,11 @@ def run(target: Target, say: Say) -> Section:
             else:
                 threading.Event().wait(SECONDS)
             if driving.process.poll() is not None:
-                raise RuntimeError("the agent stopped while it was watched")
+                raise BenchError("the agent stopped while it was watched")
             updates = list(found)
         figures = audit.last_figures(target.cloud, bundle.robot)
     if not updates:
-        raise RuntimeError("no live update was heard")
+        raise BenchError("no live update was heard")
     hops = trace.trace(updates, here_to_pubnub=here, car_uncertainty_ms=figures.get("clock_uncertainty_ms"))
     heard = [(one.here_us - one.sample_us) / 1000 for one in updates]
     shown = [at - t / 1000 for t, at in painted]

@@ -15,6 +15,7 @@ from typing import Any
 
 from bench import plots
 from bench.driving import Driving
+from bench.errors import BenchError
 from bench.result import Plot, Ratio, Section, Table
 from bench.spread import spread
 from bench.target import Say, Target
@@ -201,5 +202,5 @@ def _wait_for(true: Any, what: str, seconds: float = 30.0) -> None:
     deadline = time.monotonic() + seconds
     while not true():
         if time.monotonic() > deadline:
-            raise TimeoutError(f"waited {seconds:.0f} s for {what}")
+            raise BenchError(f"waited {seconds:.0f} s for {what}")
         threading.Event().wait(0.1)

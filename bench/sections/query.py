@@ -17,6 +17,7 @@ from boto3.dynamodb.conditions import Attr, Key
 from boto3.dynamodb.types import TypeSerializer
 
 from bench import cpu, plots
+from bench.errors import BenchError
 from bench.result import NOT_MEASURED, Plot, Ratio, Section, Table
 from bench.spread import ratio, spread
 from bench.target import Say, Target
@@ -94,7 +95,7 @@ def run(target: Target, say: Say) -> Section:
                     _add(found[name], looks[len(looks) // 2])
     for name, way in found.items():
         if way.read != POINTS:
-            raise RuntimeError(f"{name}: {way.read} of {POINTS} points")
+            raise BenchError(f"{name}: {way.read} of {POINTS} points")
     _report(section, found)
     _hour(target, section, say)
     return section
@@ -112,7 +113,7 @@ def _hour(target: Target, section: Section, say: Say) -> None:
         if turn:
             _add(way, one)
     if way.read != HOUR_POINTS:
-        raise RuntimeError(f"an hour: {way.read} of {HOUR_POINTS} points")
+        raise BenchError(f"an hour: {way.read} of {HOUR_POINTS} points")
     section.tables.append(
         Table(f"An hour of one robot, {HOUR_POINTS:,} points", _COLUMNS, [_row(OURS_QUERY, way)])
     )

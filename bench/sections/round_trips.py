@@ -16,6 +16,7 @@ from typing import Any
 from typing_extensions import Self
 
 from bench import plots
+from bench.errors import BenchError
 from bench.raw_mqtt import RawClient, tcp_connect_s
 from bench.result import NOT_MEASURED, Plot, Ratio, Section, Table
 from bench.spread import ratio, spread
@@ -91,7 +92,7 @@ class _Connected:
         self.uplink.on_connection(lambda up: connected.set() if up else None)
         self.uplink.start()
         if not connected.wait(_CONNECT_S):
-            raise TimeoutError(f"{self.config.robot} was not connected within {_CONNECT_S:.0f} s")
+            raise BenchError(f"{self.config.robot} was not connected within {_CONNECT_S:.0f} s")
         return self
 
     def __exit__(self, *_: object) -> None:
@@ -173,7 +174,7 @@ def _cell(
         thread.join()
     missing = [name for name in names if not found.get(name)]
     if missing:
-        raise RuntimeError(f"nothing was measured over {', '.join(missing)}")
+        raise BenchError(f"nothing was measured over {', '.join(missing)}")
     return found
 
 

@@ -20,6 +20,7 @@ from typing import Any
 from boto3.dynamodb.types import TypeSerializer
 
 from bench import borrowed, plots
+from bench.errors import BenchError
 from bench.invocations import Event, Measured, configure, invoke, measure, reporting
 from bench.machine import ROOT
 from bench.result import NOT_MEASURED, Plot, Ratio, Section, Table
@@ -250,7 +251,7 @@ def _store(target: Target, say: Say) -> list[dict[str, Any]]:
     deadline = time.monotonic() + _CATCH_UP_S
     while delivery.samples_summarized(target.cloud, target.name(ROBOT), VESC_STREAM) < 50 * BATCHES:
         if time.monotonic() > deadline:
-            raise RuntimeError("Lambda 2 has not summarised what was stored")
+            raise BenchError("Lambda 2 has not summarised what was stored")
         threading.Event().wait(0.2)
     return items
 
@@ -287,6 +288,6 @@ def _cycle() -> dict[str, float]:
         [sys.executable, "-m", "bench.cycle", "5000"], cwd=ROOT, capture_output=True, text=True, check=False
     )
     if done.returncode:
-        raise RuntimeError(f"bench.cycle failed: {done.stderr[-800:]}")
+        raise BenchError(f"bench.cycle failed: {done.stderr[-800:]}")
     found: dict[str, float] = json.loads(done.stdout)
     return found

@@ -14,8 +14,9 @@ from rich.table import Table
 from contract import OWN_STREAMS, VESC_STREAM, ContractError, check_robot, check_stream
 from station import audit
 from station.audit import Audit, Range
+from station.commands.options import bounds
 from station.errors import StationError
-from station.times import duration_us, iso, iso_s, time_us
+from station.times import duration_us, iso, iso_s
 
 commands = typer.Typer()
 _out = Console(highlight=False)
@@ -47,7 +48,7 @@ def audit_(
 
     Exit status 0 if every stream is complete, 1 if something is missing or nothing is stored.
     """
-    within = _range(start, end, last)
+    within = Range(*bounds(start, end, last, time.time_ns() // 1000))
     cloud = context.obj.cloud()
     try:
         check_robot(robot)
@@ -76,19 +77,6 @@ def audit_(
 
 def _count(value: float | None) -> int | None:
     return None if value is None else int(value)
-
-
-def _range(start: str | None, end: str | None, last: str | None) -> Range:
-    if last is not None and (start is not None or end is not None):
-        raise StationError("give --last, or --from and --to")
-    now_us = time.time_ns() // 1000
-    if last is not None:
-        return Range(now_us - duration_us(last), None)
-    first_us = None if start is None else time_us(start, now_us)
-    last_us = None if end is None else time_us(end, now_us)
-    if first_us is not None and last_us is not None and first_us > last_us:
-        raise StationError("the range ends before it starts")
-    return Range(first_us, last_us)
 
 
 def _counting(items: Any, name: str, status: Any) -> Any:

@@ -17,10 +17,11 @@ from rich.progress import BarColumn, DownloadColumn, Progress, TextColumn, Trans
 
 from station import files
 from station.cloud import Cloud
+from station.commands.options import bounds
 from station.errors import StationError
 from station.files import StoredFile, Told
 from station.inventory import check_registered
-from station.times import duration_us, iso_s, time_us
+from station.times import iso_s
 
 commands = typer.Typer(no_args_is_help=True, help="Bags, images and what else robots have uploaded.")
 _out = Console(highlight=False, soft_wrap=True)
@@ -115,11 +116,7 @@ def empty(
 def _chosen(
     cloud: Cloud, robot: str, name: str, start: str | None, end: str | None, last: str | None
 ) -> Iterator[StoredFile]:
-    if last is not None and (start is not None or end is not None):
-        raise StationError("give --last, or --from and --to")
-    now_us = time.time_ns() // 1000
-    start_us = now_us - duration_us(last) if last else None if start is None else time_us(start, now_us)
-    end_us = None if end is None else time_us(end, now_us)
+    start_us, end_us = bounds(start, end, last, time.time_ns() // 1000)
     none = True
     for one in files.listed(cloud, robot, start_us=start_us, end_us=end_us):
         none = False

@@ -32,6 +32,24 @@ def names(fields: str | None) -> list[str] | None:
     return [name.strip() for name in (fields or "").split(",") if name.strip()] or None
 
 
+def bounds(
+    start: str | None, end: str | None, last: str | None, now_us: int
+) -> tuple[int | None, int | None]:
+    """What --from, --to and --last name, in microseconds; None where they leave a side open.
+
+    Raises `StationError` for what is no time, and where they contradict one another.
+    """
+    if last is not None:
+        if start is not None or end is not None:
+            raise StationError("give --last, or --from and --to")
+        return now_us - duration_us(last), None
+    start_us = None if start is None else time_us(start, now_us)
+    end_us = None if end is None else time_us(end, now_us)
+    if start_us is not None and end_us is not None and start_us > end_us:
+        raise StationError("the range ends before it starts")
+    return start_us, end_us
+
+
 @dataclass(frozen=True)
 class Range:
     """From a time (included) to a time (not included), in microseconds; None is the very beginning or end."""
@@ -42,21 +60,18 @@ class Range:
     @classmethod
     def of(cls, start: str | None, end: str | None, last: str | None) -> Self:
         """The range that the options name; raises `StationError` where they contradict one another."""
-        if last is not None and (start is not None or end is not None):
-            raise StationError("give either --last or --from and --to")
         now_us = time.time_ns() // 1000
-        if last == "all":
-            return cls(None, None)
         if start is None and end is None:
+            if last == "all":
+                return cls(None, None)
             if last is None:
                 say(f"no range is given: the last {_USUAL}; --last all is everything")
-            return cls(now_us - duration_us(last or _USUAL), now_us)
+                last = _USUAL
+        elif end is None and last is None:
+            end = "now"
         for text in (start, end):
             if text is not None and not has_zone(text):
                 zone = datetime.now().astimezone()
                 say(f"{text} is taken as {zone.tzname()} (UTC{zone.strftime('%z')}), this machine's zone")
-        start_us = None if start is None else time_us(start, now_us)
-        end_us = now_us if end is None else time_us(end, now_us)
-        if start_us is not None and start_us > end_us:
-            raise StationError("the range ends before it starts")
-        return cls(start_us, end_us)
+        start_us, end_us = bounds(start, end, last, now_us)
+        return cls(start_us, now_us if end_us is None else end_us)

@@ -185,7 +185,7 @@ def iort(cloud, monkeypatch):
 def test_list(iort, store):
     store(name="a.bag")
     key = store(name="b.txt", second=NOON + 1)
-    assert iort("list", "car").output.splitlines()[0].split() == ["2023-11-14T22:13:20.000000Z", "7", "a.bag"]
+    assert iort("list", "car").output.splitlines()[0].split() == ["2023-11-14T22:13:20Z", "7", "a.bag"]
     (line,) = iort("list", "car", "--name", "*.txt", "--json").output.splitlines()
     assert json.loads(line)["key"] == key
     assert iort("list", "car", "--last", "1d").output == ""
