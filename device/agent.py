@@ -35,7 +35,8 @@ from device.upload_folder import make_uploads
 
 _log = logging.getLogger(__name__)
 
-_TICK_S = 0.05
+# What a tick may be late by: the last sample of a stream that falls silent, live, and its batch.
+_TICK_S = 0.2
 _RATES_S = 1.0
 _CLOSE_S = 5.0
 # A Lambda function that is warm answers well within this.
@@ -267,7 +268,6 @@ class Agent:
                     boot=self.boot,
                     spool=self._spool,
                     counts=counts,
-                    stored=self._record.wake,
                 )
                 self._batchers[stream] = Batcher(
                     packer.store, batch_s=self._config.record.batch_s, clock=self._clock, counts=counts

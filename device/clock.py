@@ -27,9 +27,8 @@ class SystemClock:
         """Wall time in microseconds since the Unix epoch."""
         return time.time_ns() // 1000
 
-    def monotonic(self) -> float:
-        """Seconds of the monotonic clock, which `time.monotonic` in every thread shares."""
-        return time.monotonic()
+    # Seconds of the monotonic clock, which every thread shares.
+    monotonic = staticmethod(time.monotonic)
 
     def wait(self, event: threading.Event, seconds: float | None) -> bool:
         """Wait in real time."""

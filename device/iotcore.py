@@ -25,6 +25,7 @@ from device.clock import Clock
 from device.dispatch import Dispatcher
 from device.errors import IdentityError, UplinkError
 from device.failures import code_name, error_name, explain, said, why_not_connected
+from device.native_thread import keep_state
 from device.nodelay import send_at_once
 from device.reconnect import SETTLED_S, SHORTEST_S, Backoff, Causes
 from device.uplink import Done, Message, OnConnection, OnMessage, UplinkStatus, matches
@@ -44,6 +45,7 @@ _RESUBSCRIBE_S, _RESUBSCRIBE_SLOWLY_S = 10.0, 60.0
 # How often to look whether certificate, key or root_ca were replaced.
 _LOOK_S = 2.0
 _CLIENT_STOPS_S = 15.0
+_QOS = (mqtt5.QoS.AT_MOST_ONCE, mqtt5.QoS.AT_LEAST_ONCE)
 _OUR_WISH = "AWS_ERROR_MQTT5_USER_REQUESTED_STOP"
 
 
@@ -175,17 +177,28 @@ class IotCore:
         if not self._connected:
             self._dispatcher.post(lambda: done(UplinkError("not connected")))
             return
-        packet = mqtt5.PublishPacket(topic=topic, payload=payload, qos=mqtt5.QoS(qos))
-        self._operate(lambda: self._client.publish(packet), lambda future: done(_publish_error(future)))
+        packet = mqtt5.PublishPacket(topic=topic, payload=payload, qos=_QOS[qos])
+        if qos:
+            self._operate(lambda: self._client.publish(packet), lambda future: done(_publish_error(future)))
+        else:
+            # Another thread to hear of it costs as much as the message.
+            self._begin(lambda: self._client.publish(packet)).add_done_callback(
+                lambda future: done(_write_error(future))
+            )
 
     def _operate(self, start: Callable[[], Future[Any]], finish: Callable[[Future[Any]], None]) -> None:
         """Start an operation of the client's; its result, or its refusal, comes by the dispatcher."""
+        self._begin(start).add_done_callback(lambda result: self._dispatcher.post(lambda: finish(result)))
+
+    @staticmethod
+    def _begin(start: Callable[[], Future[Any]]) -> Future[Any]:
+        """Start an operation of the client's; a refusal is a result as well."""
         try:
-            future = start()
+            return start()
         except Exception as error:  # noqa: BLE001 - the client raises AwsCrtError, TypeError, ...
-            future = Future()
+            future: Future[Any] = Future()
             future.set_exception(error)
-        future.add_done_callback(lambda result: self._dispatcher.post(lambda: finish(result)))
+            return future
 
     # What follows is called in the uplink's own thread.
 
@@ -278,6 +291,7 @@ class IotCore:
                 self._dispatcher.post(functools.partial(handler, message))
 
     def _on_connected(self, _: Any) -> None:
+        keep_state()
         send_at_once(self._port)
         self._switch(connected=True)
         self._connects += 1
@@ -391,10 +405,15 @@ def make_uplink(config: Config, clock: Clock) -> IotCore:
     )
 
 
-def _publish_error(future: Future[Any]) -> UplinkError | None:
+def _write_error(future: Future[Any]) -> UplinkError | None:
     error = future.exception()
+    return UplinkError(explain(error)) if error is not None else None
+
+
+def _publish_error(future: Future[Any]) -> UplinkError | None:
+    error = _write_error(future)
     if error is not None:
-        return UplinkError(explain(error))
+        return error
     puback = future.result().puback
     code = getattr(puback, "reason_code", None)
     # QoS 0 has no reason code; "no matching subscribers" is a rule's normal answer on some brokers.

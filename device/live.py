@@ -17,7 +17,7 @@ from __future__ import annotations
 import functools
 import logging
 import threading
-from typing import Callable, Mapping, NamedTuple
+from typing import Callable, Mapping
 
 import contract
 from contract import ContractError, LiveSample, Value
@@ -30,24 +30,21 @@ _log = logging.getLogger(__name__)
 _FASTEST_S = 1 / contract.LIVE_MAX_RATE_HZ
 
 
-class _Newest(NamedTuple):
-    t_us: int
-    values: Mapping[str, Value]
-    offered: float
-
-
 class _Slot:
-    """What the lane knows of one stream."""
+    """What the lane knows of one stream. ``values`` are the newest sample's as long as it waits."""
 
     def __init__(self, topic: str, broker_topic: str) -> None:
         self.topic = topic
         self.broker_topic = broker_topic
         self.broker_due = 0.0
         self.fault: Value = None
-        self.newest: _Newest | None = None
-        self.due = 0.0
-        self.sent = -_FASTEST_S
+        self.t_us = 0
+        self.values: Mapping[str, Value] | None = None
+        self.offered = 0.0
+        # When the next one may go: in its turn, and with another fault code.
+        self.due = self.fault_due = 0.0
         self.seq = 0
+        self.written = 0
         self.writing = False
 
 
@@ -78,8 +75,12 @@ class LiveLane:
         self._offset_us = offset_us
         self._lock = threading.Lock()
         self._slots: dict[str, _Slot] = {}
-        self.published = 0
         self.refused = 0
+
+    @property
+    def published(self) -> int:
+        """How many messages were written."""
+        return sum(slot.written for slot in list(self._slots.values()))
 
     def set_rate(self, rate_hz: float) -> None:
         """Another rate, from now on."""
@@ -102,32 +103,35 @@ class LiveLane:
                     contract.live_topic(self._robot, stream, self._namespace),
                     contract.build_topic(contract.LIVE, self._robot, stream, self._namespace),
                 )
-            slot.newest = _Newest(t_us, values, now)
-            if now >= slot.due or _fault_due(slot, now):
-                self._send(slot, now)
+            slot.t_us, slot.values, slot.offered = t_us, values, now
+            if now >= slot.due or (now >= slot.fault_due and _fault(values) != slot.fault):
+                self._send(slot, values, now)
 
     def tick(self) -> None:
         """Send what a stream left behind when it fell silent or the connection was down."""
         now = self._clock.monotonic()
         with self._lock:
             for slot in self._slots.values():
-                if slot.newest is None:
+                values = slot.values
+                if values is None:
                     continue
-                if now - slot.newest.offered > contract.LIVE_MAX_AGE_MS / 1000:
-                    slot.newest = None
-                elif now >= slot.due + self._period_s / 2 or _fault_due(slot, now):
-                    self._send(slot, now)
+                if now - slot.offered > contract.LIVE_MAX_AGE_MS / 1000:
+                    slot.values = None
+                elif now >= slot.due + self._period_s / 2 or (
+                    now >= slot.fault_due and _fault(values) != slot.fault
+                ):
+                    self._send(slot, values, now)
 
-    def _send(self, slot: _Slot, now: float) -> None:
-        if slot.writing or slot.newest is None or not self._uplink.connected():
+    def _send(self, slot: _Slot, values: Mapping[str, Value], now: float) -> None:
+        if slot.writing or not self._uplink.connected():
             return
-        newest, slot.newest = slot.newest, None
+        slot.values = None
         sample = LiveSample(
             boot=self._boot,
             seq=slot.seq,
-            t_us=newest.t_us,
+            t_us=slot.t_us,
             sent_us=self._clock.now_us(),
-            sample=newest.values,
+            sample=values,
             offset_us=self._offset_us(),
         )
         try:
@@ -143,32 +147,28 @@ class LiveLane:
             slot.due = max(slot.due, now - self._period_s / 2) + self._period_s
         else:
             slot.due = max(slot.due, now + _FASTEST_S)
-        slot.sent = now
+        slot.fault_due = now + _FASTEST_S
         slot.writing = True
-        topic = _topic(slot, _fault(newest), now)
+        topic = _topic(slot, _fault(values), now)
         self._allowance.spend(topic, payload)
         self._uplink.publish(topic, payload, qos=0, done=functools.partial(self._done, slot))
 
-    def _done(self, slot: _Slot, error: UplinkError | None) -> None:
-        with self._lock:
-            slot.writing = False
-            if error is None:
-                self.published += 1
-            else:
-                # It may have been one for the broker, and have said another fault code.
-                slot.broker_due, slot.fault = 0.0, None
+    @staticmethod
+    def _done(slot: _Slot, error: UplinkError | None) -> None:
+        # In the network's own thread, or within `_send`: so without the lock. Of a stream one message is
+        # on its way at a time, and no other before the last line.
+        if error is None:
+            slot.written += 1
+        else:
+            # It may have been one for the broker, and have said another fault code.
+            slot.broker_due, slot.fault = 0.0, None
+        slot.writing = False
 
 
-def _fault(newest: _Newest) -> Value:
+def _fault(values: Mapping[str, Value]) -> Value:
     """The fault code; None for NaN, which is another than itself each time."""
-    code = newest.values.get(contract.FAULT_FIELD)
+    code = values.get(contract.FAULT_FIELD)
     return code if code == code else None  # noqa: PLR0124 - what NaN is not
-
-
-def _fault_due(slot: _Slot, now: float) -> bool:
-    """Whether what waits has another fault code than was said last, and need not wait for its turn."""
-    waits = slot.newest is not None and _fault(slot.newest) != slot.fault
-    return waits and now >= slot.sent + _FASTEST_S
 
 
 def _topic(slot: _Slot, fault: Value, now: float) -> str:

@@ -24,7 +24,8 @@ Verdict = Callable[[Published], Optional[str]]
 
 
 class Loopback:
-    """Publishes come back to matching subscriptions. ``hold`` keeps acknowledgements back."""
+    """Publishes come back to matching subscriptions. ``hold`` keeps acknowledgements back, ``stalled``
+    what is told of writes, too."""
 
     def __init__(self, clock: Clock, dispatcher: Dispatcher, *, connected: bool = True) -> None:
         self._clock = clock
@@ -36,7 +37,7 @@ class Loopback:
         self._subscriptions: dict[str, OnMessage] = {}
         self._waiting: list[Done] = []
         self.published: list[Published] = []
-        self.hold = False
+        self.hold = self.stalled = False
         self.verdict: Verdict = lambda _: None
         self.stopped = False
 
@@ -71,10 +72,13 @@ class Loopback:
             self._finish(done, UplinkError(refusal))
             return
         self.published.append(message)
-        if self.hold and qos:
+        if self.stalled or (self.hold and qos):
             self._waiting.append(done)
-        else:
+        elif qos:
             self._finish(done, None)
+        else:
+            # The hardest that `Done` allows.
+            done(None)
         self.deliver(topic, payload)
 
     def deliver(self, topic: str, payload: bytes) -> None:

@@ -69,9 +69,14 @@ class ClockOffset:
         return found if found is not None and found.uncertainty_ms <= CLOCK_MAX_UNCERTAINTY_MS else None
 
     def known_us(self) -> int | None:
-        """The offset of `known` in microseconds."""
-        found = self.known()
-        return round(found.offset_ms * 1000) if found is not None else None
+        """The offset of `known` in microseconds; every live message asks."""
+        best = self._best
+        if best is None:
+            return None
+        now = self._clock.monotonic()
+        if best.uncertainty_ms(now) > CLOCK_MAX_UNCERTAINTY_MS:
+            return None
+        return round((best.cloud_minus_monotonic_ms + now * 1000) * 1000) - self._clock.now_us()
 
 
 def _replaces(new: _Seen, old: _Seen) -> bool:

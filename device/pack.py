@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import logging
 import math
-from typing import Callable, Mapping, Sequence
+from typing import Mapping, Sequence
 
 import contract
 from contract import Batch, ContractError, Value
@@ -17,20 +17,16 @@ _log = logging.getLogger(__name__)
 class Packer:
     """Encodes one stream's batches, halving those that do not fit, down to the sample to refuse."""
 
-    def __init__(
-        self, *, stream: str, boot: str, spool: Spool, counts: StreamCounts, stored: Callable[[], None]
-    ) -> None:
+    def __init__(self, *, stream: str, boot: str, spool: Spool, counts: StreamCounts) -> None:
         self._stream = stream
         self._boot = boot
         self._spool = spool
         self._counts = counts
-        self._stored = stored
 
     def store(self, times_us: list[int], samples: list[Mapping[str, Value]]) -> None:
         """Encode the samples and put them into the spool, in as many messages as they need."""
         columns = {name: [sample[name] for sample in samples] for name in samples[0]}
         self._put(Batch(self._boot, 0, times_us, columns))
-        self._stored()
 
     def _put(self, batch: Batch) -> None:
         seq = self._spool.next_seq(self._stream)

@@ -109,6 +109,7 @@ class RecordLane:
                 # Whenever it comes, an acknowledgement means that the broker has the batch.
                 self._spool.ack(entry.id)
                 self._changed.notify_all()
+            was_full = len(self._in_flight) >= self._window
             if epoch == self._epoch:
                 self._in_flight.discard(entry.id)
                 if error is None:
@@ -118,7 +119,10 @@ class RecordLane:
                     # A lost connection is told of elsewhere, and not a reason to wait.
                     if self._uplink.connected():
                         self._hold(entry, error)
-        self._wake.set()
+            waits = self._failed or was_full
+        # Otherwise the lane waits for the spool, which wakes it.
+        if waits:
+            self._wake.set()
 
     def _hold(self, entry: Entry, error: UplinkError) -> None:
         """Wait longer after each failure in a row, with full jitter above a floor."""

@@ -1,15 +1,16 @@
 """The spool on disk: what it has taken survives the process and, if so configured, a power cut.
 
 `put` and `ack` only note what is to be done; one thread, the only one that touches the disk, writes
-what has come up in one transaction, at most `GROUP_S` later. A batch is given to `next` after that
-transaction, never before, so
+what has come up in one transaction: at once, but not within `GROUP_S` of the one before. A batch is given
+to `next` after that transaction, never before, so
 
 - no batch leaves the robot whose number a crash could give to another one;
 - with ``durability: full`` a batch that is published survives a power cut, with ``process`` a kill;
 - a kill costs the puts of the last `GROUP_S`, whose numbers nobody has seen and which are used again.
 
-Acknowledgements are written in groups too. A crash may lose the last ones, and then batches are sent
-again, with the same number and the same content.
+Acknowledgements are written with the next batch, or `ACKS_S` later: to wake the thread for them costs
+more than to write them. A crash may lose those, and then batches are sent again, with the same number
+and the same content.
 
 A disk that is full, read-only or failing does not stop the agent: it is *adrift*. Batches stay in
 memory, up to `MEMORY_BYTES`, and are published from there; the alarm says so; writing is tried again
@@ -41,7 +42,8 @@ if TYPE_CHECKING:
 _log = logging.getLogger(__name__)
 
 # Puts wait at most so long for their transaction, and acknowledgements, which need not hurry, so long.
-GROUP_S, ACKS_S = 0.05, 0.5
+GROUP_S, ACKS_S = 0.05, 2.0
+_SHRINK_S = 0.5
 # Of what is not on the disk. What is on the disk may be far more.
 MEMORY_BYTES = 16 * 1024 * 1024
 RETRY_S = 1.0
@@ -94,6 +96,7 @@ class SqliteSpool:
             max_bytes=max_bytes, memory_bytes=memory_bytes, overwrite=policy == OVERWRITE_OLDEST
         )
         self._due: float | None = None
+        self._wrote_at = 0.0
         self._retry_at: float | None = None
         self._adrift: str | None = None
         self._flush_asked = self._flush_done = 0
@@ -147,7 +150,8 @@ class SqliteSpool:
         """Keep a batch; drops it or the oldest ones when there is no room."""
         with self._lock:
             self._stock.put(stream, seq, payload, samples)
-            self._schedule(0.0 if self._stock.group_is_full else GROUP_S)
+            waited_s = self._clock.monotonic() - self._wrote_at
+            self._schedule(0.0 if self._stock.group_is_full else max(0.0, GROUP_S - waited_s))
 
     def next(self, after: int) -> Entry | None:
         """The oldest durable batch after that one, if it is in memory; otherwise it is fetched."""
@@ -255,6 +259,7 @@ class SqliteSpool:
         with self._work_lock:
             with self._lock:
                 self._due = None
+                wrote_at = self._wrote_at
                 asked = self._flush_asked
                 force = force or asked > self._flush_done
                 early = self._retry_at is not None and self._clock.monotonic() < self._retry_at
@@ -265,8 +270,11 @@ class SqliteSpool:
             with self._lock:
                 if self._retry_at is not None:
                     self._schedule(0.0)
-                elif self._stock.pending or self._stock.acknowledged:
-                    self._schedule(GROUP_S if self._stock.pending else ACKS_S)
+                elif self._stock.pending:
+                    self._schedule(GROUP_S)
+                elif self._stock.acknowledged or self._wrote_at != wrote_at:
+                    # What was just written is acknowledged by then, without waking the thread for it.
+                    self._schedule(ACKS_S)
                 self._flush_done = asked
                 self._lock.notify_all()
         for handler in self._handlers:
@@ -303,6 +311,7 @@ class SqliteSpool:
             raise
         with self._lock:
             self._stock.written(group)
+            self._wrote_at = self._clock.monotonic()
             return bool(self._stock.pending)
 
     def _shrink(self) -> None:
@@ -311,7 +320,7 @@ class SqliteSpool:
             empty = not self._stock.backlog().batches
         if empty and self._disk.file is not None and self._disk.file.shrink():
             with self._lock:
-                self._schedule(ACKS_S)
+                self._schedule(_SHRINK_S)
 
     def _fetch(self) -> None:
         """Read what `next` asked for, or what it will soon ask for."""

@@ -7,7 +7,8 @@ from typing import Callable, NamedTuple, Optional, Protocol
 
 from device.errors import UplinkError
 
-# Called once for a publish: None when the broker has it (QoS 1) or it was written (QoS 0).
+# Called once for a publish: None when the broker has it (QoS 1) or it was written (QoS 0). Of QoS 0 it
+# hears at once, in whatever thread, even within the call: it may note that, and nothing else.
 Done = Callable[[Optional[UplinkError]], None]
 # Called with True after every connect, with False after every loss.
 OnConnection = Callable[[bool], None]
@@ -39,7 +40,8 @@ class Uplink(Protocol):
     """A connection that comes back by itself and keeps no message of its own over a loss.
 
     Callbacks run in one thread of the uplink's, in order, never within a call of these methods; they
-    may publish, but not wait. Handlers are given before `start`.
+    may publish, but not wait. What hears of QoS 0 is the exception: see `Done`. Handlers are given
+    before `start`.
     """
 
     def on_connection(self, handler: OnConnection) -> None:

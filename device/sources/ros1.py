@@ -32,7 +32,7 @@ _SILENT_S = 5.0
 _LOOK_S = 1.0
 # A topic changes its definition when somebody rebuilds a package, not all the time.
 _MAX_DECODERS = 32
-_MAX_LATCHED = 32
+_MAX_PUBLISHERS = 32
 
 _ROS_NAME = re.compile(r"(/[A-Za-z]\w*)(/\w+)*", re.ASCII)
 
@@ -141,6 +141,8 @@ class Intake:
         self._clock = clock
         self._seldom = Seldom(_log, clock)
         self._header: Mapping[str, str] | None = None
+        # Publisher -> its connection, whose messages' type was said.
+        self._connections: dict[str, Mapping[str, str]] = {}
         self._decoder: Decoder | None = None
         self._decoders: dict[tuple[str, str], Decoder | None] = {}
         # Publisher -> its connection, and the last message that came by it.
@@ -162,9 +164,7 @@ class Intake:
         # Two publishers of one topic are two threads; almost always there is one.
         with self._lock:
             if header is not self._header:
-                self._decoder = self._decoder_for(header)
-                self._header = header
-                self._say_type(header, arrival_us)
+                self._turn_to(header, arrival_us)
             decoder = self._decoder
         if decoder is None:
             self._seldom.warn("undecodable", f"topic {self._topic}: its messages cannot be decoded")
@@ -200,10 +200,21 @@ class Intake:
         publisher = header.get("callerid", "")
         with self._lock:
             connection, last = self._latched.get(publisher, (header, b""))
-            if publisher not in self._latched and len(self._latched) >= _MAX_LATCHED:
+            if publisher not in self._latched and len(self._latched) >= _MAX_PUBLISHERS:
                 self._latched.clear()
             self._latched[publisher] = header, data
         return connection is not header and last == data
+
+    def _turn_to(self, header: Mapping[str, str], t_us: int) -> None:
+        """Decode the messages of another connection, which may be a new one."""
+        self._decoder = self._decoder_for(header)
+        self._header = header
+        publisher = header.get("callerid", "")
+        if self._connections.get(publisher) is not header:
+            if len(self._connections) >= _MAX_PUBLISHERS:
+                self._connections.clear()
+            self._connections[publisher] = header
+            self._say_type(header, t_us)
 
     def _say_type(self, header: Mapping[str, str], t_us: int) -> None:
         """Say what the messages are, whenever a publisher connects."""

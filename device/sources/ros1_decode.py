@@ -12,7 +12,7 @@ element named in the selection (``ranges.540``) is taken from any array.
 from __future__ import annotations
 
 import struct
-from typing import Any, Callable, Dict, NamedTuple, Sequence
+from typing import Any, Callable, Dict, Optional, Sequence, Tuple
 
 from contract import MAX_FIELDS, Value
 from device.errors import MessageError
@@ -28,19 +28,15 @@ Step = Callable[[bytes, int, Dict[str, Value]], int]
 Wanted = Callable[[str], bool]
 
 _LENGTH = struct.Struct("<I")
-# The stamp travels in the sample under names that no field has, until `decode` takes it out.
-_SEC, _NANOSEC = "\0sec", "\0nanosec"
-_FRAME = "\0frame"
+# A header: seq, the stamp's seconds and nanoseconds, and the length of the frame_id that follows.
+_HEADER = struct.Struct("<IIII")
 _BLOBS = ("uint8", "char")
 
 
-class Decoded(NamedTuple):
-    """A sample; the header's stamp if the message has one and it was asked for; the header's frame_id,
-    as bytes, if the message begins with a header."""
-
-    values: dict[str, Value]
-    stamp_us: int | None
-    frame: bytes | None
+# A sample; the header's stamp in microseconds if the message has one and it was asked for; the header's
+# frame_id, as bytes, if the message begins with a header: it is nearly always the same, which is seen
+# without decoding it.
+Decoded = Tuple[Dict[str, Value], Optional[int], Optional[bytes]]
 
 
 class Decoder:
@@ -63,29 +59,31 @@ class Decoder:
         self._stamp = stamp and self._stamped
         self.left_out: dict[str, int] = {}
         compiler = _Compiler(definition, select, self.left_out, large=large)
-        self._steps = compiler.message(stamp=self._stamp)
+        self._steps = compiler.message(headed=self._stamped)
         self.unknown = sorted(set(select or ()) - compiler.used)
 
     def decode(self, data: bytes) -> Decoded:
         """The sample in a message. Raises `MessageError` where the bytes do not fit the definition."""
+        # Read here and not by steps: after a pause each function called costs as much as the work in it.
         values: dict[str, Value] = {}
-        at = 0
+        at, stamp_us, frame = 0, None, None
         try:
+            if self._stamped:
+                _, sec, nanosec, length = _HEADER.unpack_from(data)
+                at = _HEADER.size + length
+                frame = data[_HEADER.size : at]
+                if self._stamp:
+                    # Wholes and remainders apart, for a float of seconds would lose the last digits.
+                    stamp_us = sec * 1_000_000 + nanosec // 1000
             for step in self._steps:
                 at = step(data, at, values)
         except struct.error as error:
             raise MessageError(f"{self._kind}: the message of {len(data)} bytes is cut short") from error
         if at != len(data):
             raise MessageError(f"{self._kind}: the message has {len(data)} bytes, its definition {at}")
-        if not self._stamp:
-            stamp_us = None
-        else:
-            # Wholes and remainders apart, for a float of seconds would lose the last digits.
-            stamp_us = int(values.pop(_SEC)) * 1_000_000 + int(values.pop(_NANOSEC)) // 1000  # type: ignore[arg-type]  # whole numbers
-        frame: Any = values.pop(_FRAME) if self._stamped else None
         if len(values) > MAX_FIELDS:
             raise MessageError(f"{self._kind}: the message has over {MAX_FIELDS} fields; select some")
-        return Decoded(values, stamp_us, frame)
+        return values, stamp_us, frame
 
 
 class _Compiler:
@@ -107,21 +105,15 @@ class _Compiler:
         self._emitted = 0
         self.used: set[str] = set()
 
-    def message(self, *, stamp: bool) -> list[Step]:
-        """The steps of a whole message; a stamped one thing is that thing."""
+    def message(self, *, headed: bool) -> list[Step]:
+        """The steps of a whole message, behind its header if it begins with one; a stamped one thing is
+        that thing."""
         run = _Run()
         names = [field.name for field in self._definition.fields()]
         lone = len(names) == 2 and HEADER in names
-        stamped = self._definition.stamped()
-        for field in self._definition.fields():
+        for field in self._definition.fields()[1 if headed else 0 :]:
             if field.name == HEADER:
-                if stamped:
-                    run.fixed("I", None)
-                    run.fixed("I", _SEC if stamp else None)
-                    run.fixed("I", _NANOSEC if stamp else None)
-                    run.step(_frame)
-                else:
-                    self._skip(run, field)
+                self._skip(run, field)
             elif lone and field.length is None and field.kind in self._definition.types:
                 self._fields(run, field.kind, "")
             else:
@@ -369,13 +361,6 @@ def _noted(path: str, left_out: dict[str, int]) -> Step:
         return at
 
     return step
-
-
-def _frame(data: bytes, at: int, out: dict[str, Any]) -> int:
-    end = at + 4 + int(_LENGTH.unpack_from(data, at)[0])
-    # Bytes, for it is nearly always the same, which is seen without decoding it.
-    out[_FRAME] = data[at + 4 : end]
-    return end
 
 
 def _skip_text(data: bytes, at: int, _out: dict[str, Value]) -> int:

@@ -27,9 +27,7 @@ class Line:
         self.clock = ManualClock(now_us=T0)
         self.counts = StreamCounts()
         self.spool = MemorySpool(max_bytes=2**40)
-        self.packer = Packer(
-            stream="vesc", boot=BOOT, spool=self.spool, counts=self.counts, stored=lambda: None
-        )
+        self.packer = Packer(stream="vesc", boot=BOOT, spool=self.spool, counts=self.counts)
         self.batcher = Batcher(self.packer.store, batch_s=batch_s, clock=self.clock, counts=self.counts)
 
     def messages(self) -> list[bytes]:

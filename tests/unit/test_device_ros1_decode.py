@@ -21,7 +21,7 @@ from tests.unit.ros1_messages import HEADER, STAMPED, header, text, u32
 
 
 def decoded(definition: str, data: bytes, **how: Any) -> dict[str, Any]:
-    return Decoder(parse("a_msgs/A", definition), **how).decode(data).values
+    return Decoder(parse("a_msgs/A", definition), **how).decode(data)[0]
 
 
 @pytest.mark.parametrize(
@@ -70,8 +70,8 @@ def test_the_stamp_is_exact_to_the_microsecond() -> None:
         1_700_000_000_999_999,
         b"base_link",
     )
-    assert Decoder(parse("a_msgs/A", STAMPED + "uint8 u")).decode(header() + b"\x01").stamp_us is None
-    assert Decoder(parse("a_msgs/A", "uint8 u"), stamp=True).decode(b"\x01").stamp_us is None
+    assert Decoder(parse("a_msgs/A", STAMPED + "uint8 u")).decode(header() + b"\x01")[1] is None
+    assert Decoder(parse("a_msgs/A", "uint8 u"), stamp=True).decode(b"\x01")[1] is None
 
 
 SELECTABLE = (
@@ -108,7 +108,7 @@ SELECT_DATA = (
 )  # fmt: skip
 def test_only_what_is_selected(select: list[str], values: dict[str, Any], unknown: list[str]) -> None:
     decoder = Decoder(parse("a_msgs/A", SELECTABLE), select=select)
-    assert decoder.decode(SELECT_DATA).values == values
+    assert decoder.decode(SELECT_DATA)[0] == values
     assert decoder.unknown == unknown
     assert not decoder.left_out
 
@@ -118,10 +118,10 @@ def test_what_is_no_telemetry_is_left_out_and_counted() -> None:
     data = u32(3) + b"abc" + u32(65) + bytes(65 * 4) + bytes(800) + text("x" * (MAX_TEXT + 1)) + b"\x01"
     decoder = Decoder(parse("a_msgs/A", definition))
     for _ in range(2):
-        assert decoder.decode(data).values == {"last": 1}
+        assert decoder.decode(data)[0] == {"last": 1}
     assert decoder.left_out == {"image": 2, "ranges": 2, "grid": 2, "s": 2}
     small = u32(0) + u32(MAX_ELEMENTS) + bytes(MAX_ELEMENTS * 4) + bytes(800) + text("") + b"\x01"
-    assert len(decoder.decode(small).values) == MAX_ELEMENTS + 2
+    assert len(decoder.decode(small)[0]) == MAX_ELEMENTS + 2
 
 
 @pytest.mark.parametrize(
@@ -206,11 +206,11 @@ def test_a_real_recording_is_what_rosbags_reads() -> None:
             decoder = Decoder(parse(kind, definition), stamp=True)
             for _, _, raw in reader.readers[0].messages([connection]):
                 message = reader.deserialize(raw, connection.msgtype)
-                sample = decoder.decode(raw)
-                assert sample.values == flatten(message, fields_of)
-                if sample.stamp_us is not None:
+                values, stamp_us, _ = decoder.decode(raw)
+                assert values == flatten(message, fields_of)
+                if stamp_us is not None:
                     stamp = message.header.stamp
-                    assert sample.stamp_us == stamp.sec * 1_000_000 + stamp.nanosec // 1000
+                    assert stamp_us == stamp.sec * 1_000_000 + stamp.nanosec // 1000
                 counts[connection.topic] = counts.get(connection.topic, 0) + 1
     assert counts == {"/sensors/core": 2244, "/sensors/servo_position_command": 879}
 
@@ -295,9 +295,9 @@ def test_any_message_is_what_rosbags_wrote(case: tuple[str, list[Any], list[Any]
         if field.kind == "uint8" and field.length == VARIABLE
     )
     expected = {name: value for name, value in expected.items() if not name.startswith(blobs)}
-    assert Decoder(parsed).decode(data).values == expected
+    assert Decoder(parsed).decode(data)[0] == expected
     for name, value in expected.items():
-        assert Decoder(parsed, select=[name]).decode(data).values == {name: value}
+        assert Decoder(parsed, select=[name]).decode(data)[0] == {name: value}
 
 
 @given(st.binary(max_size=60), st.sampled_from([None, ["b.1.x"]]))

@@ -48,6 +48,17 @@ def test_a_publishers_type_is_said_when_it_connects() -> None:
     assert desk.types == [said]
 
 
+def test_a_type_is_said_once_a_connection_where_publishers_take_turns() -> None:
+    desk = Desk()
+    first, second = ({**CONNECTION, "callerid": name} for name in ("/front", "/rear"))
+    for _ in range(3):
+        desk.intake.take(first, b"")
+        desk.intake.take(second, b"")
+    assert len(desk.types) == 2
+    desk.intake.take({**first}, b"")
+    assert len(desk.types) == 3
+
+
 @pytest.mark.parametrize("time", ["header", "arrival"])
 def test_a_frame_is_said_once_and_when_it_is_another(time: str) -> None:
     desk = Desk(time=time)
