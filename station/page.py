@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, Any
 
 import contract
 from station.errors import StationError
+from station.units import ROS_UNITS, agent_unit
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
@@ -52,8 +53,9 @@ def config(
 ) -> dict[str, Any]:
     """What the page is told, ``/config.json``; raises `StationError` for what it must not be told.
 
-    ``vehicles`` maps a robot to its parameters; with ``speed_to_erpm_gain`` the page shows its speed
-    in m/s beside the motor's erpm. ``token`` is PubNub's access token for a page, which may only read.
+    ``vehicles`` maps a robot to its parameters; with ``speed_to_erpm_gain`` (and ``_offset``) the page
+    shows its speed in m/s beside the motor's erpm. ``token`` is PubNub's access token for a page, which may
+    only read.
     """
     try:
         contract.check_namespace(namespace)
@@ -74,6 +76,9 @@ def config(
         gain = car.get("speed_to_erpm_gain")
         if gain is not None and (not math.isfinite(gain) or gain == 0):
             raise StationError(f"speed_to_erpm_gain of {robot} is {gain}: allowed is a number, not 0")
+        offset = car.get("speed_to_erpm_offset", 0)
+        if not math.isfinite(offset):
+            raise StationError(f"speed_to_erpm_offset of {robot} is {offset}: allowed is a number")
     return {
         "namespace": namespace,
         "subscribe_key": subscribe_key,
@@ -96,11 +101,16 @@ def field_table() -> dict[str, Any]:
         name: {"unit": "ms", "meaning": f"round trip over the path {path}"}
         for path, name in contract.RTT_FIELDS.items()
     }
+    fields |= {
+        name: {"unit": agent_unit(name), "meaning": meaning}
+        for name, meaning in contract.AGENT_FIELDS.items()
+    }
     faults = {str(code): name for code, name in contract.FAULTS.items()}
     return {
         "version": contract.SCHEMA_VERSION,
         "stream": contract.VESC_STREAM,
         "fields": fields,
+        "ros_units": ROS_UNITS,
         "faults": faults,
     }
 

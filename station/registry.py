@@ -34,8 +34,12 @@ def listed(cloud: Cloud) -> Iterator[dict[str, Any]]:
 
 def vehicles(cloud: Cloud) -> dict[str, dict[str, float]]:
     """What is known of the cars whose speed can be told in m/s, by their names."""
-    gain = "speed_to_erpm_gain"
-    return {str(row[ROBOT]): {gain: float(row[gain])} for row in listed(cloud) if row.get(gain)}
+    gain, offset = "speed_to_erpm_gain", "speed_to_erpm_offset"
+    return {
+        str(row[ROBOT]): {gain: float(row[gain]), offset: float(row.get(offset) or 0)}
+        for row in listed(cloud)
+        if row.get(gain)
+    }
 
 
 def find(cloud: Cloud, robot: str) -> dict[str, Any] | None:

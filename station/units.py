@@ -18,6 +18,16 @@ from contract import (
 )
 from station.blocks import Block
 
+# REP 103, "Units", of what geometry_msgs, nav_msgs and sensor_msgs call by names of their own: the unit of
+# the fields x, y and z within.
+ROS_UNITS = {
+    "linear_acceleration": "m/s^2",
+    "angular_velocity": "rad/s",
+    "twist.linear": "m/s",
+    "twist.angular": "rad/s",
+    "position": "m",
+    "translation": "m",
+}
 _MEAN = f"_{STATS[1]}"
 _BY_DRIVER = tuple(field.name for field in VESC_FIELDS.values() if field.ros2_unit is not None)
 
@@ -53,5 +63,14 @@ def unit(stream: str, name: str, *, ros2: bool = False) -> str:
         if stream == RTT_STREAM and field in RTT_FIELDS.values():
             return "ms"
         if stream == AGENT_STREAM and field in AGENT_FIELDS:
-            return AGENT_FIELDS[field].split()[0].rstrip(",")
+            return agent_unit(field)
+        within, _, axis = field.rpartition(".")
+        if axis in {"x", "y", "z"}:
+            known_as = (of for of in ROS_UNITS if within == of or within.endswith(f".{of}"))
+            return next((ROS_UNITS[of] for of in known_as), "")
     return ""
+
+
+def agent_unit(field: str) -> str:
+    """The unit of one of the agent's own figures."""
+    return AGENT_FIELDS[field].split()[0].rstrip(",")

@@ -11,6 +11,7 @@ from rich.table import Table
 from rich.text import Text
 
 from contract import FAULTS, ROBOT, SCHEMA_VERSION, T_US, ContractError, check_robot, check_stream
+from functions.statistics import Vehicle
 
 # As on the page: older values are stale, and a car unheard of for longer is gone.
 STALE_S, GONE_S = 1.5, 4.5
@@ -59,8 +60,8 @@ class Car:
 class FleetWatch:
     """Takes updates in one thread, tells of them in another."""
 
-    def __init__(self, gains: Mapping[str, float]) -> None:
-        self._gains = gains
+    def __init__(self, vehicles: Mapping[str, Vehicle]) -> None:
+        self._vehicles = vehicles
         self._lock = threading.Lock()
         self._cars: dict[str, Car] = {}
         self.refused = 0
@@ -123,10 +124,12 @@ class FleetWatch:
 
     def _speed(self, car: Car) -> str:
         erpm = car.number("speed")
-        gain = self._gains.get(car.robot)
+        vehicle = self._vehicles.get(car.robot)
         if erpm is None:
             return "-"
-        return f"{erpm / gain:.1f} m/s" if gain else f"{erpm:.0f} erpm"
+        if vehicle is None:
+            return f"{erpm:.0f} erpm"
+        return f"{(erpm - vehicle.speed_to_erpm_offset) / vehicle.speed_to_erpm_gain:.1f} m/s"
 
 
 def read(update: Any) -> tuple[str, dict[str, Any], dict[str, int]]:

@@ -15,6 +15,7 @@ from rich.live import Live
 from rich.text import Text
 
 from contract import ROBOT, T_US, ContractError
+from functions.statistics import Vehicle
 from station import keys, registry
 from station.listener import Listener
 from station.progress import say
@@ -36,8 +37,8 @@ def watch(
     """Show every car in the terminal, live, until Ctrl-C."""
     cloud = context.obj.cloud()
     pubnub_keys = keys.load(cloud)
-    gains = {robot: car["speed_to_erpm_gain"] for robot, car in registry.vehicles(cloud).items()}
-    fleet, done = FleetWatch(gains), threading.Event()
+    vehicles = {robot: Vehicle(**car) for robot, car in registry.vehicles(cloud).items()}
+    fleet, done = FleetWatch(vehicles), threading.Event()
     listener = Listener(
         robot=None,
         namespace=cloud.namespace,

@@ -7,6 +7,7 @@ from typing import Any
 from rich.console import Console
 
 import contract
+from functions.statistics import Vehicle
 from station.watch import GONE_S, MAX_ROBOTS, STALE_S, FleetWatch
 
 NOW_US = 1_700_000_000_000_000
@@ -25,7 +26,7 @@ def text(fleet: FleetWatch, width: int = 120, now_us: int = NOW_US) -> str:
 
 
 def test_every_car_with_its_newest_values():
-    fleet = FleetWatch({"car1": 4614.0})
+    fleet = FleetWatch({"car1": Vehicle(4614.0)})
     fleet.take(update(speed=9228, voltage_input=11.72, temperature_pcb=28.4, fault_code=0), 0, NOW_US)
     fleet.take(update("car10", speed=500), 0, NOW_US)
     fleet.take(update("car2", fault_code=5), 0, NOW_US)
@@ -34,6 +35,12 @@ def test_every_car_with_its_newest_values():
     assert lines[1].split() == ["car1", "online", "2.0", "m/s", "11.7", "28", "10", "ms", "0.0", "s"]
     assert "MOSFET over-temperature (5)" in lines[2]
     assert "500 erpm" in lines[3]
+
+
+def test_speed_is_what_a_query_says_of_a_car_with_an_offset():
+    fleet = FleetWatch({"car1": Vehicle(4614.0, 4614.0)})
+    fleet.take(update(speed=9228), 0, NOW_US)
+    assert "1.0 m/s" in text(fleet)
 
 
 def test_old_is_stale_and_silent_is_gone():
@@ -62,7 +69,7 @@ def test_the_delay_is_on_the_clouds_clock():
 
 
 def test_it_fits_a_narrow_terminal():
-    fleet = FleetWatch({"car1": 4614.0})
+    fleet = FleetWatch({"car1": Vehicle(4614.0)})
     fleet.take(update(speed=9228, voltage_input=11.7, fault_code=5), 0, NOW_US)
     for width in (40, 60, 100):
         assert all(len(line) <= width for line in text(fleet, width).splitlines())

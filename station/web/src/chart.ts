@@ -2,6 +2,7 @@
 
 import uPlot from "uplot";
 import { WINDOW_S } from "./fleet";
+import { AS_SENT, linear, type Linear } from "./format";
 import { axis, calm, faint, fit, holes, labels, paint, PLAIN, rem, roundRange } from "./frame";
 import type { Ring } from "./ring";
 import { colour, onTheme } from "./theme";
@@ -41,7 +42,7 @@ const shared = uPlot.sync("charts");
 export class Chart {
   private readonly plot: uPlot;
   private shown: Shown | undefined;
-  private scale = 1;
+  private as: Linear = AS_SENT;
   private dirty = true;
   private drawnAt = -Infinity;
   private drawnEmpty = false;
@@ -109,11 +110,11 @@ export class Chart {
     });
   }
 
-  /** What to show from now on, undefined for nothing, and what to multiply it by. */
-  show(shown: Shown | undefined, scale: number): void {
+  /** What to show from now on, undefined for nothing, and as what. */
+  show(shown: Shown | undefined, as: Linear): void {
     const same = this.shown?.history === shown?.history && String(this.shown?.columns) === String(shown?.columns);
-    if (same && this.scale === scale) return;
-    [this.shown, this.scale] = [shown, scale];
+    if (same && this.as.scale === as.scale && this.as.shift === as.shift) return;
+    [this.shown, this.as] = [shown, as];
     this.dirty = true;
     this.drawnEmpty = false;
     this.low = this.high = NaN;
@@ -144,13 +145,13 @@ export class Chart {
   }
 
   private data(from: number): uPlot.AlignedData {
-    const { shown, scale } = this;
+    const { shown, as } = this;
     if (!shown) return [new Float64Array(0), ...this.options.lines.map(() => new Float64Array(0))];
     const times = shown.history.column(0, from);
     const columns = shown.columns.map((column) => {
       if (column === undefined) return new Float64Array(times.length).fill(NaN);
       const values = shown.history.column(column, from);
-      return scale === 1 ? values : values.map((value) => value * scale);
+      return as.scale === 1 && as.shift === 0 ? values : values.map((value) => linear(value, as));
     });
     return [times, ...columns];
   }

@@ -13,7 +13,7 @@ export interface Config {
 }
 
 /** The parameters of cars, by their names, as they were registered when this was asked for. */
-export type Vehicles = Readonly<Record<string, { readonly speed_to_erpm_gain?: number }>>;
+export type Vehicles = Readonly<Record<string, { readonly speed_to_erpm_gain?: number; readonly speed_to_erpm_offset?: number }>>;
 
 export interface FieldTable {
   /** The contract's schema version: messages of another are refused. */
@@ -22,6 +22,8 @@ export interface FieldTable {
   readonly stream: string;
   /** With `ros2_unit` where the ROS 2 driver has another unit. */
   readonly fields: Readonly<Record<string, { readonly unit: string; readonly ros2_unit?: string; readonly meaning: string }>>;
+  /** The unit of the fields x, y and z within what ROS' standard messages call so. */
+  readonly ros_units: Readonly<Record<string, string>>;
   readonly faults: Readonly<Record<string, string>>;
 }
 

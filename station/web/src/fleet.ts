@@ -4,6 +4,7 @@
 import { ask, AnswerError } from "./answers";
 import { claim, claimed, type Claim } from "./claims";
 import type { Config, FieldTable, Vehicles } from "./config";
+import type { Linear } from "./format";
 import type { Hops, Update, Value } from "./message";
 import { Ring } from "./ring";
 import type { Arrival } from "./wire";
@@ -273,9 +274,10 @@ export class Fleet {
     robot.delays.push([at, (wall_us - sent_us) / 1e3, ...legs.map((leg_us) => leg_us / 1e3)]);
   }
 
-  /** Metres a second for an erpm, where the car's parameters are known. */
-  gain(robot: string): number | undefined {
-    return Object.hasOwn(this.vehicles, robot) ? this.vehicles[robot]?.speed_to_erpm_gain : undefined;
+  /** Metres a second of an erpm, which is gain times them and an offset; undefined for a car that is not known. */
+  speed(robot: string): Linear | undefined {
+    const { speed_to_erpm_gain: gain, speed_to_erpm_offset: offset = 0 } = (Object.hasOwn(this.vehicles, robot) && this.vehicles[robot]) || {};
+    return gain ? { scale: 1 / gain, shift: offset === 0 ? 0 : -offset / gain } : undefined;
   }
 
   /** Ask for the cars' parameters again: one was registered after the page was opened. */
@@ -306,7 +308,7 @@ export function numeric(value: Value | undefined): number {
   return typeof value === "number" ? value : NaN;
 }
 
-function median(values: Float64Array): number {
+export function median(values: Float64Array): number {
   const sorted = values.slice().sort();
   const middle = sorted.length >> 1;
   return sorted.length % 2 === 1 ? sorted[middle]! : (sorted[middle - 1]! + sorted[middle]!) / 2;

@@ -2,7 +2,7 @@
 
 import { ask, AnswerError, type Logs } from "./answers";
 import { el, Text } from "./dom";
-import { clockTime } from "./format";
+import { clockTime, dayTime, zone } from "./format";
 
 // AWS bills a query by what it reads.
 const AGAIN_S = 60;
@@ -36,7 +36,7 @@ export class LogTable {
   }
 
   private draw({ columns, rows, found, to_s }: Logs): void {
-    const until = `until ${clockTime(to_s)}`;
+    const until = `until ${clockTime(to_s)} ${zone(to_s)}`;
     this.note.set(found > rows.length ? `the first ${rows.length} of ${found} lines, ${until}` : found === 0 ? `Nothing in this range, ${until}.` : until);
     this.host.replaceChildren(
       ...(rows.length === 0
@@ -57,7 +57,7 @@ function cell(column: string, value: string): HTMLElement {
   if (column === "@timestamp") {
     // "2026-05-04 10:00:00.123", in UTC.
     const at = Date.parse(`${value.replace(" ", "T")}Z`) / 1000;
-    return el("td", { class: "num", title: `${value} UTC` }, Number.isNaN(at) ? value : clockTime(at));
+    return el("td", { class: "num", title: `${value} UTC` }, Number.isNaN(at) ? value : dayTime(at));
   }
   // "123456789012:/aws/lambda/name": the account is the viewer's own.
   if (column === "@log") return el("td", { title: value }, value.replace(/^\d+:/, ""));

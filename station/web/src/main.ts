@@ -39,7 +39,7 @@ class Page {
       this.bar.linked(state);
       this.clockAt = -Infinity;
     });
-    this.bar = new StatusBar(config, this.fleet);
+    this.bar = new StatusBar(config, this.fleet, table);
     this.fleetView = new FleetView(this.fleet, table);
     this.carView = new CarView(this.fleet, table, this.tools);
     this.historyView = new HistoryView(config, table, this.fleet);

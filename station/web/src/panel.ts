@@ -2,7 +2,7 @@
 
 import { Chart, type ChartOptions, type Shown } from "./chart";
 import { el, setAttribute, Text } from "./dom";
-import { age, number } from "./format";
+import { age, AS_SENT, linear, number, type Linear } from "./format";
 
 /** A value in a panel's heading, computed from those of the panel's lines as they are drawn. */
 export interface Reading {
@@ -30,7 +30,7 @@ export class Panel {
   private readonly chart: Chart;
   private readonly units: Text[];
   private hovered = false;
-  private scale = 1;
+  private as: Linear = AS_SENT;
 
   constructor(
     host: HTMLElement,
@@ -78,16 +78,16 @@ export class Panel {
     });
   }
 
-  /** What to show, what to multiply it by, and the unit that this gives, where it is not the usual one. */
-  show(shown: Shown | undefined, scale: number, unit?: string): void {
-    this.scale = scale;
-    this.chart.show(shown, scale);
+  /** What to show, as what, and the unit that this gives, where it is not the usual one. */
+  show(shown: Shown | undefined, as: Linear, unit?: string): void {
+    this.as = as;
+    this.chart.show(shown, as);
     this.options.readings.forEach((reading, i) => this.units[i]!.set(unit ?? reading.unit));
   }
 
   update(values: readonly number[]): void {
     if (this.hovered) return;
-    this.read(values.map((value) => value * this.scale));
+    this.read(values.map((value) => linear(value, this.as)));
     this.note.set("");
     this.chart.wake();
   }

@@ -5,7 +5,8 @@ import { axis, faint, fit, labels, paint, PLAIN, rem, roundRange } from "./frame
 import { colour, onTheme } from "./theme";
 
 export interface PlaneOptions {
-  readonly x: string;
+  /** A text, or what gives one when the plane is drawn. */
+  readonly x: string | (() => string);
   readonly y: string;
   /** The least extent of each axis. */
   readonly span: readonly [number, number];
@@ -40,7 +41,7 @@ export class Plane {
     this.bounds = { x: [0, options.span[0]], y: [0, options.span[1]] };
     this.ink = colour("--accent");
     const colours = () => this.paint;
-    const named = (label: string, font = `${Math.round(rem(0.72))}px ${getComputedStyle(document.body).fontFamily}`): uPlot.Axis => ({
+    const named = (label: string | (() => string), font = `${Math.round(rem(0.72))}px ${getComputedStyle(document.body).fontFamily}`): uPlot.Axis => ({
       label,
       labelFont: font,
       labelSize: rem(1.1),

@@ -1,6 +1,6 @@
 // The bar above and the line below every view: who is there, whether the connection holds, what was refused.
 
-import type { Config } from "./config";
+import type { Config, FieldTable } from "./config";
 import { byId, setAttribute } from "./dom";
 import type { Fleet } from "./fleet";
 import { age, number } from "./format";
@@ -16,6 +16,7 @@ export class StatusBar {
   constructor(
     config: Config,
     private readonly fleet: Fleet,
+    private readonly table: FieldTable,
   ) {
     write("empty-channel", `${config.namespace}.*`);
     write("empty-origin", config.origin);
@@ -30,7 +31,11 @@ export class StatusBar {
     const count = { live: 0, stale: 0, gone: 0 };
     for (const robot of fleet.robots.values()) count[robot.freshness(at)] += 1;
     const counts = (["live", "stale", "gone"] as const).filter((state) => count[state] > 0);
-    write("count", counts.map((state) => `${count[state]} ${state === "live" ? "online" : state}`).join(" · "));
+    const words = counts.map((state) => `${count[state]} ${state === "live" ? "online" : state}`);
+    // Of a car that is gone nobody knows.
+    const faulty = [...fleet.robots.values()].filter((robot) => robot.freshness(at) !== "gone" && robot.fault(this.table) !== undefined).length;
+    write("count", words.join(" · "));
+    write("faulty", faulty === 0 ? "" : `${faulty} with a fault`);
     write("received", number(fleet.received));
     write("malformed", number(fleet.malformed));
     byId("malformed").title = fleet.lastRefusal ? `the last one: ${fleet.lastRefusal}` : "";

@@ -42,14 +42,14 @@ export class Waterfall {
         "header",
         {},
         el("h3", {}, "Delay by hop"),
-        el("p", { class: "reading" }, el("span", { class: "label", title: "from the car to the page" }, "total"), this.median.node, el("span", { class: "unit" }, "ms")),
+        el("p", { class: "reading" }, el("span", { class: "label", title: "from the car to the page, which then has to draw it" }, "to page"), this.median.node, el("span", { class: "unit" }, "ms")),
       ),
       list,
       this.warning.node,
     );
   }
 
-  /** `screen_ms`: how long the page took from the arrival of the newest message to drawing it. */
+  /** `screen_ms`: the median of how long the page took from a message's arrival to drawing it. */
   refresh(robot: Robot, now: number, screen_ms: number): void {
     const delay = robot.medianDelay(now);
     this.median.set(delay ? milliseconds(delay.total) : NOTHING);

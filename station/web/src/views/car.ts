@@ -4,22 +4,26 @@ import type { Shown } from "../chart";
 import type { FieldTable } from "../config";
 import { byName, el, setAttribute, Text } from "../dom";
 import { FaultLog } from "../faultlog";
-import { numeric, WINDOW_S, type Fleet, type Robot, type Stream } from "../fleet";
-import { age, spec } from "../format";
+import { median, MEDIAN_S, numeric, WINDOW_S, type Fleet, type Robot, type Stream } from "../fleet";
+import { age, AS_SENT, linear, spec, type Linear } from "../format";
 import { Gauge } from "../gauge";
 import { Panel } from "../panel";
 import { Plane, type Track } from "../plane";
+import { Ring } from "../ring";
 import { fieldKey, StreamSection } from "../tiles";
 import { Waterfall } from "../waterfall";
 import { DELAY_PANEL, GAUGES, PLANES, VESC_PANELS, type PlaneSpec } from "./carspec";
 
 const MOST_CHOSEN = 6;
+// Values are written at most 25 times a second.
+const SCREENS = 25 * MEDIAN_S;
 
 interface ShownPlane {
   readonly spec: PlaneSpec;
   readonly node: HTMLElement;
   readonly plane: Plane;
-  source: { readonly stream: Stream; readonly x: string; readonly y: string; readonly scale: number } | undefined;
+  source: { readonly stream: Stream; readonly x: string; readonly y: string; readonly as: Linear } | undefined;
+  unit: string;
 }
 
 export class CarView {
@@ -41,7 +45,8 @@ export class CarView {
   private readonly chosen = new Map<string, { readonly panel: Panel; readonly stream: Stream; readonly field: string; ros2: boolean }>();
   private robot: Robot | undefined;
   private drawn = -1;
-  private screen_ms = NaN;
+  /** When a message was drawn, and how long that was after its arrival, in milliseconds. */
+  private screens = new Ring(2, SCREENS);
 
   constructor(
     private readonly fleet: Fleet,
@@ -59,7 +64,8 @@ export class CarView {
       const host = el("div", { class: "plot", "aria-hidden": "true" });
       const node = el("section", { class: "panel", "aria-label": spec.title }, el("header", {}, el("h3", {}, spec.title), el("p", { class: "note" }, `last ${WINDOW_S} s`)), host);
       planeRow.append(node);
-      return { spec, node, plane: new Plane(host, spec), source: undefined };
+      const shown: ShownPlane = { spec, node, plane: new Plane(host, { ...spec, x: () => spec.x + shown.unit }), source: undefined, unit: "" };
+      return shown;
     });
     planeRow.append(this.faults.node);
     this.node = el(
@@ -82,7 +88,7 @@ export class CarView {
       for (const key of [...this.chosen.keys()]) this.close(key);
       for (const gauge of this.gauges) gauge.reset();
       this.drawn = -1;
-      this.screen_ms = NaN;
+      this.screens = new Ring(2, SCREENS);
       this.title.set(robot?.name ?? "");
     }
     this.arrange();
@@ -96,7 +102,7 @@ export class CarView {
     const gauged = new Set(vesc ? GAUGES.flatMap(({ fields }) => fields) : []);
     for (const each of [this.charts, this.gaugeRow]) each.hidden = vesc === undefined;
     setAttribute(this.node, "data-vesc", String(vesc !== undefined));
-    this.delay.show({ history: robot.delays, columns: [1] }, 1);
+    this.delay.show({ history: robot.delays, columns: [1] }, AS_SENT);
     const ordered = [...robot.streams.values()].sort((a, b) => Number(b === vesc) - Number(a === vesc) || byName(a.name, b.name));
     for (const stream of ordered) {
       let section = this.sections.get(stream);
@@ -117,7 +123,7 @@ export class CarView {
       return;
     }
     if (this.chosen.size >= MOST_CHOSEN) this.close(this.chosen.keys().next().value!);
-    const { label, unit, scale, digits } = spec(field, this.table, stream.ros2);
+    const { label, unit, digits, ...as } = spec(field, this.table, stream.ros2);
     const reading = { name: key, unit, from: ([value = NaN]: readonly number[]) => value, ...(digits === undefined ? {} : { digits }) };
     const panel = new Panel(this.chosenCharts, {
       title: label,
@@ -125,7 +131,7 @@ export class CarView {
       chart: { lines: [{ colour: "--accent" }], span: 1e-3 },
       onClose: () => this.close(key),
     });
-    panel.show({ history: stream.history, columns: [stream.columns.get(field)] }, scale);
+    panel.show({ history: stream.history, columns: [stream.columns.get(field)] }, as);
     this.chosen.set(key, { panel, stream, field, ros2: stream.ros2 });
     panel.node.scrollIntoView({ block: "nearest" });
   }
@@ -140,45 +146,46 @@ export class CarView {
     const { robot, table } = this;
     if (!robot || robot.version === this.drawn) return;
     this.drawn = robot.version;
-    this.screen_ms = (now - robot.heardAt) * 1000;
+    this.screens.push([now, (now - robot.heardAt) * 1000]);
     const vesc = robot.vesc(table);
-    const gain = this.fleet.gain(robot.name);
+    const speed = this.fleet.speed(robot.name);
     const newest = (field: string): number => numeric(vesc?.sample.get(field));
     GAUGES.forEach((each, i) => {
-      const show = each.show(newest, robot, gain);
-      const [least, most] = vesc && each.extent ? span(vesc, each.extent, now, show.scale ?? 1) : [NaN, NaN];
+      const show = each.show(newest, robot, speed);
+      const [least, most] = vesc && each.extent ? span(vesc, each.extent, now, show.as ?? AS_SENT) : [NaN, NaN];
       this.gauges[i]!.set(show.value, least, most, show.unit, show.digits);
     });
     this.panels.forEach((panel, i) => {
-      const { fields, scale } = VESC_PANELS[i]!;
-      panel.show(shown(vesc, fields), ...scale(gain));
+      const { fields, as } = VESC_PANELS[i]!;
+      panel.show(shown(vesc, fields), ...as(speed));
       panel.update(fields.map(newest));
     });
     this.delay.update([robot.newestDelay()?.total ?? NaN]);
     for (const each of this.chosen.values()) {
       const { panel, stream, field } = each;
       if (each.ros2 !== stream.ros2) {
-        const { unit, scale } = spec(field, table, stream.ros2);
-        panel.show({ history: stream.history, columns: [stream.columns.get(field)] }, scale, unit);
+        const as = spec(field, table, stream.ros2);
+        panel.show({ history: stream.history, columns: [stream.columns.get(field)] }, as, as.unit);
         each.ros2 = stream.ros2;
       }
       panel.update([numeric(stream.sample.get(field))]);
     }
     for (const section of this.sections.values()) section.values();
-    this.findPlanes(robot, gain);
+    this.findPlanes(robot, speed);
     const fault = robot.fault(table);
     const text = fault ? `Fault: ${fault}` : "";
     if (this.fault.textContent !== text) this.fault.textContent = text;
     this.fault.hidden = !fault;
   }
 
-  private findPlanes(robot: Robot, gain: number | undefined): void {
+  private findPlanes(robot: Robot, speed: Linear | undefined): void {
     for (const each of this.planes) {
       each.source = undefined;
+      if (each.spec.speed) each.unit = speed ? ", m/s" : ", erpm";
       for (const stream of robot.streams.values()) {
         const axes = each.spec.axes(stream.columns);
         if (axes) {
-          each.source = { stream, x: axes[0], y: axes[1], scale: each.spec.scaled && gain ? 1 / gain : 1 };
+          each.source = { stream, x: axes[0], y: axes[1], as: (each.spec.speed && speed) || AS_SENT };
           break;
         }
       }
@@ -192,7 +199,8 @@ export class CarView {
     if (!robot) return;
     const charted = new Set(this.chosen.keys());
     for (const section of this.sections.values()) section.clock(now, charted);
-    this.waterfall.refresh(robot, now, this.screen_ms);
+    const screens = this.screens.column(1, now - MEDIAN_S);
+    this.waterfall.refresh(robot, now, screens.length > 0 ? median(screens) : NaN);
     this.faults.refresh(robot);
     const fresh = robot.freshness(now);
     setAttribute(this.node, "data-state", linked || fresh === "live" ? fresh : "unlinked");
@@ -218,20 +226,21 @@ function shown(stream: Stream | undefined, fields: readonly string[]): Shown | u
   return stream && { history: stream.history, columns: fields.map((field) => stream.columns.get(field)) };
 }
 
-function track({ stream, x, y, scale }: NonNullable<ShownPlane["source"]>, now: number): Track {
+function track({ stream, x, y, as }: NonNullable<ShownPlane["source"]>, now: number): Track {
   const column = (field: string): Float64Array => stream.history.column(stream.columns.get(field) ?? 0, now - WINDOW_S);
   const across = column(x);
-  return { x: scale === 1 ? across : across.map((value) => value * scale), y: column(y) };
+  return { x: as === AS_SENT ? across : across.map((value) => linear(value, as)), y: column(y) };
 }
 
 /** The least and the most of a field in the last while. */
-function span(stream: Stream, field: string, now: number, scale: number): [number, number] {
+function span(stream: Stream, field: string, now: number, as: Linear): [number, number] {
   const column = stream.columns.get(field);
   if (column === undefined) return [NaN, NaN];
   let [low, high] = [Infinity, -Infinity];
   for (const value of stream.history.column(column, now - WINDOW_S)) {
-    if (value * scale < low) low = value * scale;
-    if (value * scale > high) high = value * scale;
+    const shown = linear(value, as);
+    if (shown < low) low = shown;
+    if (shown > high) high = shown;
   }
   return [low, high];
 }

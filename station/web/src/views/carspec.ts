@@ -1,6 +1,7 @@
 // What the view of a car shows of the motor controller's fields, and how to know what else a car reports.
 
 import type { Robot } from "../fleet";
+import { AS_SENT, linear, times, type Linear } from "../format";
 import type { GaugeOptions } from "../gauge";
 import type { PanelOptions } from "../panel";
 import type { PlaneOptions } from "../plane";
@@ -13,14 +14,14 @@ export interface GaugeSpec extends GaugeOptions {
   readonly show: (
     newest: (field: string) => number,
     robot: Robot,
-    gain: number | undefined,
-  ) => { readonly value: number; readonly scale?: number; readonly unit?: string; readonly digits?: number };
+    speed: Linear | undefined,
+  ) => { readonly value: number; readonly as?: Linear; readonly unit?: string; readonly digits?: number };
 }
 
 const plain = (field: string, scale = 1): Pick<GaugeSpec, "fields" | "extent" | "show"> => ({
   fields: [field],
   extent: field,
-  show: (newest) => ({ value: newest(field) * scale, scale }),
+  show: (newest) => ({ value: newest(field) * scale, as: times(scale) }),
 });
 
 /** The hottest of the temperatures that a controller reports; drivers leave those it has not at 0. */
@@ -35,8 +36,8 @@ export const GAUGES: readonly GaugeSpec[] = [
     name: "speed_mps", label: "Speed", unit: "m/s", digits: 2, from: 0, to: 4,
     fields: [],
     extent: "speed",
-    show: (newest, _, gain) =>
-      gain ? { value: newest("speed") / gain, scale: 1 / gain } : { value: newest("speed"), unit: "erpm", digits: 0 },
+    show: (newest, _, speed) =>
+      speed ? { value: linear(newest("speed"), speed), as: speed } : { value: newest("speed"), unit: "erpm", digits: 0 },
   },
   { name: "voltage_input", label: "Battery", unit: "V", digits: 2, from: 9, to: 13, ...plain("voltage_input") },
   {
@@ -60,12 +61,12 @@ export const GAUGES: readonly GaugeSpec[] = [
 
 interface VescPanel extends PanelOptions {
   readonly fields: readonly string[];
-  /** What to multiply by, and the unit that this gives, where it depends on the car. */
-  readonly scale: (gain: number | undefined) => readonly [number, string?];
+  /** As what it is shown, and the unit that this gives, where it depends on the car. */
+  readonly as: (speed: Linear | undefined) => readonly [Linear, string?];
 }
 
 const first = ([value = NaN]: readonly number[]): number => value;
-const one = (): readonly [number] => [1];
+const asSent = (): readonly [Linear] => [AS_SENT];
 
 export const VESC_PANELS: readonly VescPanel[] = [
   {
@@ -73,14 +74,14 @@ export const VESC_PANELS: readonly VescPanel[] = [
     fields: ["speed"],
     readings: [{ name: "speed", unit: "m/s", digits: 2, from: first }],
     chart: { lines: [{ colour: "--speed", fill: true }], span: 1, zero: true },
-    scale: (gain) => (gain ? [1 / gain, "m/s"] : [1, "erpm"]),
+    as: (speed) => (speed ? [speed, "m/s"] : [AS_SENT, "erpm"]),
   },
   {
     title: "Battery voltage",
     fields: ["voltage_input"],
     readings: [{ name: "voltage_input", unit: "V", digits: 2, from: first }],
     chart: { lines: [{ colour: "--voltage" }], span: 1 },
-    scale: one,
+    as: asSent,
   },
   {
     title: "Current",
@@ -90,14 +91,14 @@ export const VESC_PANELS: readonly VescPanel[] = [
       { name: "current_input", label: "battery", unit: "A", digits: 2, line: 1, from: ([, input = NaN]) => input },
     ],
     chart: { lines: [{ colour: "--motor" }, { colour: "--battery", dash: [5, 3] }], span: 4, zero: true },
-    scale: one,
+    as: asSent,
   },
   {
     title: "Duty cycle",
     fields: ["duty_cycle"],
     readings: [{ name: "duty_cycle", unit: "%", digits: 1, from: first }],
     chart: { lines: [{ colour: "--duty", fill: true }], span: 10, zero: true },
-    scale: () => [100],
+    as: () => [times(100)],
   },
 ];
 
@@ -107,10 +108,11 @@ export const DELAY_PANEL: PanelOptions = {
   chart: { lines: [{ colour: "--delay", fill: true }], span: 20, zero: true },
 };
 
-export interface PlaneSpec extends PlaneOptions {
+export interface PlaneSpec extends Omit<PlaneOptions, "x"> {
+  readonly x: string;
   readonly title: string;
-  /** The x axis is a speed in erpm: divide it by the car's gain. */
-  readonly scaled?: boolean;
+  /** The x axis is the motor's speed, which is the car's where that is known. */
+  readonly speed?: boolean;
   /** The stream's fields to draw, where it has them. */
   readonly axes: (fields: ReadonlyMap<string, number>) => readonly [string, string] | undefined;
 }
@@ -121,11 +123,11 @@ const POSITIONS = ["pose.pose.position.", "pose.position.", "position.", "transf
 export const PLANES: readonly PlaneSpec[] = [
   {
     title: "Speed and motor current",
-    x: "speed, m/s",
+    x: "speed",
     y: "motor current, A",
     span: [1, 10],
     zero: true,
-    scaled: true,
+    speed: true,
     axes: (fields) => (fields.has("speed") && fields.has("current_motor") ? ["speed", "current_motor"] : undefined),
   },
   {

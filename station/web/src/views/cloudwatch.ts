@@ -3,7 +3,7 @@
 import { ask, AnswerError, type Alarm, type Dashboard, type Series, type Widget } from "../answers";
 import type { Config } from "../config";
 import { el, Text } from "../dom";
-import { clockTime, NOTHING, number, zone } from "../format";
+import { clockTime, dayTime, NOTHING, number, zone } from "../format";
 import { LogTable } from "../logtable";
 import { TimeChart, type Curve } from "../timechart";
 
@@ -68,7 +68,9 @@ export class CloudWatchView {
       const dashboard = await ask<Dashboard>("dashboard", { name: this.choice.value, minutes: this.range.value }, loading.signal);
       if (loading.signal.aborted) return;
       this.draw(dashboard, loading.signal);
-      this.note.set(`as of ${clockTime(dashboard.to_s)} ${zone(dashboard.to_s)}, again every ${REFRESH_S} s`);
+      // The dashboard ends with the minute that is running.
+      const at = Date.now() / 1000;
+      this.note.set(`as of ${clockTime(at)} ${zone(at)}, again every ${REFRESH_S} s`);
     } catch (error) {
       if (!loading.signal.aborted) this.note.set(error instanceof AnswerError ? error.message : String(error));
     }
@@ -149,7 +151,7 @@ function byUrgency(a: Alarm, b: Alarm): number {
 }
 
 function alarm({ name, about, state, reason, since_s }: Alarm): HTMLElement {
-  const since = `${STATES[state]} since ${new Date(since_s * 1000).toLocaleString("en-GB")} ${zone(since_s)}`;
+  const since = `${STATES[state]} since ${dayTime(since_s)} ${zone(since_s)}`;
   return el(
     "li",
     { "data-alarm": name, "data-state": state, title: [about, since, reason].filter(Boolean).join("\n") },

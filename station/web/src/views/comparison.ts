@@ -1,9 +1,8 @@
 // Two columns of values: at the time that the viewer looks at, and now.
 
-import type { FieldTable } from "../config";
 import { el, Text } from "../dom";
 import type { Stream } from "../fleet";
-import { NOTHING, number, spec, write, type Spec } from "../format";
+import { NOTHING, number, write, type Spec } from "../format";
 import type { Value } from "../message";
 
 interface Row {
@@ -20,16 +19,16 @@ export class Comparison {
   private readonly rows = new Map<string, Row>();
   private live: Stream | undefined;
 
-  constructor(private readonly table: FieldTable) {
+  constructor() {
     const head = el("tr", {}, ...["Field", "Then", "Now", "Change", ""].map((name) => el("th", { scope: "col" }, name)));
     this.node = el("section", { class: "panel compare", "aria-label": "Then and now" }, el("table", {}, el("thead", {}, head), this.body));
   }
 
-  of(fields: readonly string[], ros2: boolean): void {
+  of(fields: readonly (readonly [string, Spec])[]): void {
     this.rows.clear();
     this.body.replaceChildren();
-    for (const field of fields) {
-      const row = { spec: spec(field, this.table, ros2), then: new Text("num"), now: new Text("num"), change: new Text("num"), value: null };
+    for (const [field, spec] of fields) {
+      const row = { spec, then: new Text("num"), now: new Text("num"), change: new Text("num"), value: null };
       this.rows.set(field, row);
       this.body.append(
         el(

@@ -3,7 +3,7 @@
 import type { FieldTable } from "../config";
 import { byName, el, setAttribute, Text } from "../dom";
 import { numeric, type Fleet, type Robot } from "../fleet";
-import { age, milliseconds, NOTHING, number } from "../format";
+import { age, linear, milliseconds, NOTHING, number } from "../format";
 import { route } from "../route";
 import { Sparkline } from "../sparkline";
 import { hottest } from "./carspec";
@@ -96,13 +96,14 @@ class Card {
     this.state.set({ live: "online", stale: "stale", gone: "gone", unlinked: "no link" }[shown]);
     this.freshness.set(age(now - (fresh === "gone" ? robot.heardAt : robot.takenAt)));
     const fault = robot.fault(table);
-    this.fault.set(fault ?? "no fault");
+    // Of a car that is gone nobody knows.
+    this.fault.set(fresh === "gone" ? (fault ? `${fault}, when last heard` : "not heard from") : (fault ?? "no fault"));
     setAttribute(this.node, "data-fault", String(fault !== undefined));
     const vesc = robot.vesc(table);
     const newest = (field: string): number => numeric(vesc?.sample.get(field));
-    const gain = fleet.gain(robot.name);
-    this.speed.set(gain ? number(newest("speed") / gain, 1) : number(newest("speed"), 0));
-    this.speedUnit.set(gain ? "m/s" : "erpm");
+    const speed = fleet.speed(robot.name);
+    this.speed.set(speed ? number(linear(newest("speed"), speed), 1) : number(newest("speed"), 0));
+    this.speedUnit.set(speed ? "m/s" : "erpm");
     this.voltage.set(number(newest("voltage_input"), 1));
     this.temperature.set(number(hottest(newest), 0));
     const delay = robot.newestDelay();

@@ -5,7 +5,7 @@ import { claim, claimed, partsOf } from "../claims";
 import type { Config, FieldTable } from "../config";
 import { el, setAttribute, Text } from "../dom";
 import type { Fleet } from "../fleet";
-import { age, number, spec, zone } from "../format";
+import { age, asSpeed, dayTime, linear, number, spec, zone, type Spec } from "../format";
 import { Picture } from "../picture";
 import { route } from "../route";
 import { TimeChart } from "../timechart";
@@ -24,6 +24,7 @@ export class HistoryView {
   private readonly back = el("a", { class: "tool" }, "Live");
   private readonly from = el("input", { type: "datetime-local", step: "1", id: "from", name: "from" });
   private readonly to = el("input", { type: "datetime-local", step: "1", id: "to", name: "to" });
+  private readonly zone = new Text("zone");
   private readonly stream = el("select", { id: "stream", name: "stream" });
   private readonly note = new Text("history-note", "p", { role: "status" });
   private readonly result = el("div", { class: "result", hidden: "" });
@@ -47,7 +48,7 @@ export class HistoryView {
     private readonly table: FieldTable,
     private readonly fleet: Fleet,
   ) {
-    this.comparison = new Comparison(table);
+    this.comparison = new Comparison();
     const form = el(
       "form",
       { class: "range" },
@@ -57,7 +58,7 @@ export class HistoryView {
         return button;
       }),
       el("label", {}, "from ", this.from),
-      el("label", {}, "to ", this.to),
+      el("label", {}, "to ", this.to, " ", this.zone.node),
       el("label", {}, "stream ", this.stream),
       el("button", { type: "submit", class: "tool primary" }, "Load"),
     );
@@ -65,6 +66,7 @@ export class HistoryView {
       event.preventDefault();
       void this.load(seconds(this.from), seconds(this.to));
     });
+    for (const each of [this.from, this.to]) each.addEventListener("input", () => this.sayZone());
     this.scrub.addEventListener("input", () => this.point(Number(this.scrub.value)));
     this.play.addEventListener("click", () => (this.playing === undefined ? this.start() : this.stop()));
     this.result.append(el("div", { class: "scrubber" }, this.play, this.scrub, this.at.node), this.pictures, this.chips, this.charts, this.comparison.node);
@@ -118,7 +120,14 @@ export class HistoryView {
     const to = Math.ceil(Date.now() / 1000);
     this.from.value = local(to - range_s);
     this.to.value = local(to);
+    this.sayZone();
     void this.load(to - range_s, to);
+  }
+
+  /** The zone of the times in the form, which in another season is another one. */
+  private sayZone(): void {
+    const zones = [this.from, this.to].map(seconds).filter((at) => !Number.isNaN(at)).map(zone);
+    this.zone.set([...new Set(zones)].join(" to "));
   }
 
   private async load(from_s: number, to_s: number): Promise<void> {
@@ -137,7 +146,7 @@ export class HistoryView {
       if (loading.signal.aborted) return;
       this.set(drive, [from_s, to_s]);
       const each = drive.row_s > 0 ? `, drawn as the mean of ${drive.row_s < 1 ? `${number(drive.row_s * 1000, 0)} ms` : age(drive.row_s)} each within its least and most` : "";
-      this.note.set(drive.samples === 0 ? "Nothing was stored in this range." : `${number(drive.samples)} samples in ${age((performance.now() - began) / 1000)}${each}. Times are ${zone(to_s)}.`);
+      this.note.set(drive.samples === 0 ? "Nothing was stored in this range." : `${number(drive.samples)} samples in ${age((performance.now() - began) / 1000)}${each}.`);
     } catch (error) {
       if (!loading.signal.aborted) this.note.set(words(error));
     }
@@ -176,9 +185,13 @@ export class HistoryView {
         return chip;
       }),
     );
-    this.comparison.of(fields, drive.ros2);
+    this.comparison.of(fields.map((field) => [field, this.spec(field)]));
     this.scrub.max = String(drive.times_s.length - 1);
     this.point(drive.times_s.length - 1);
+  }
+
+  private spec(field: string): Spec {
+    return asSpeed(field, spec(field, this.table, this.drive?.ros2), this.fleet.speed(this.robot ?? ""));
   }
 
   /** Pictures for the fields of bytes; all other fields. */
@@ -206,9 +219,10 @@ export class HistoryView {
     }
     const drive = this.drive!;
     if (this.shown.size >= MOST_CHARTS) return;
-    const { label, unit, scale } = spec(field, this.table, drive.ros2);
+    const as = this.spec(field);
+    const { label, unit } = as;
     const { mean, least, most } = drive.fields[field]!;
-    const scaled = (values: Drive["fields"][string]["mean"]): (number | null)[] => values.map((value) => (typeof value === "number" ? value * scale : null));
+    const scaled = (values: Drive["fields"][string]["mean"]): (number | null)[] => values.map((value) => (typeof value === "number" ? linear(value, as) : null));
     const plot = el("div", { class: "plot", "aria-hidden": "true" });
     const node = el("section", { class: "panel", "aria-label": label }, el("header", {}, el("h3", {}, label), el("p", { class: "reading" }, el("span", { class: "unit" }, unit))), plot);
     this.charts.append(node);
@@ -240,7 +254,7 @@ export class HistoryView {
     const at = drive?.times_s[index];
     if (!drive || at === undefined) return;
     this.scrub.value = String(index);
-    const text = new Date(at * 1000).toLocaleTimeString("en-GB", { hour: "2-digit", minute: "2-digit", second: "2-digit", fractionalSecondDigits: 1 });
+    const text = `${dayTime(at, { fractionalSecondDigits: 1 })} ${zone(at)}`;
     this.at.set(text);
     setAttribute(this.scrub, "aria-valuetext", text);
     for (const [field, { picture, rows }] of this.kept) {

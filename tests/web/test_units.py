@@ -1,0 +1,141 @@
+"""Every number has its unit and every time its zone: in the cars' past as in what they do now."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from itertools import product
+from typing import TYPE_CHECKING, Any
+
+import pytest
+
+from contract import VESC_STREAM
+from local.deployment import ROOT
+from station.page_server import PageServer
+from tests.browser import drawn, plain, show, shown, until
+from tests.web.cars import GAIN, SAMPLE, SUBSCRIBE_KEY, Car
+
+if TYPE_CHECKING:
+    from playwright.sync_api import Page
+
+    from local.pubnub_standin import PubNubStandIn
+
+OFFSET_ERPM = 461.4
+VEHICLE = {"speed_to_erpm_gain": GAIN, "speed_to_erpm_offset": OFFSET_ERPM}
+SPEED_ERPM = (9228.0 + OFFSET_ERPM, 4614.0 + OFFSET_ERPM)
+
+
+def history(asked: Any) -> dict[str, Any]:
+    """Two samples, a second apart."""
+    first = int(asked["from_us"]) / 1e6
+    fields = {"speed": {"mean": list(SPEED_ERPM)}, "voltage_input": {"mean": [12.0, 11.5]}}
+    return {"times_s": [first, first + 1], "fields": fields, "samples": 2, "ros2": False, "row_s": 0}
+
+
+@contextmanager
+def served(pubnub: PubNubStandIn, vehicles: dict[str, Any]) -> Iterator[PageServer]:
+    answers = {"streams": lambda _: {"streams": [VESC_STREAM]}, "history": history}
+    told: dict[str, Any] = {"subscribe_key": SUBSCRIBE_KEY, "origin": pubnub.origin, "tls": False}
+    with PageServer(namespace="iort", vehicles=vehicles, answers=answers, **told) as server:
+        yield server
+
+
+@pytest.fixture
+def server(pubnub: PubNubStandIn) -> Iterator[PageServer]:
+    with served(pubnub, {"car-1": VEHICLE}) as server:
+        yield server
+
+
+def test_speed_is_the_cars_with_its_gain_and_its_offset(
+    open_page: Callable[..., Page], server: PageServer, car: Car
+) -> None:
+    page = open_page(f"{server.url}#/car/car-1")
+    show(page, car.send({**SAMPLE, "speed": SPEED_ERPM[0]}))
+    assert shown(page, "speed_mps") == "2.00"
+    assert plain(page.locator("[data-reading=speed]").inner_text()) == "2.00"
+    # In the past as now.
+    page.goto(f"{server.url}#/history/car-1")
+    row = page.locator("tr[data-field=speed]")
+    told = ["1.00", "2.00", "+1.00", "m/s"]
+    until(lambda: [plain(text) for text in row.locator("td").all_inner_texts()] == told, "then and now")
+    page.locator(".scrub").focus()
+    page.keyboard.press("Home")
+    until(lambda: plain(row.locator("td").first.inner_text()) == "2.00", "the first sample")
+    panel = page.locator("section.panel[aria-label=Speed]")
+    assert panel.locator(".unit").inner_text() == "m/s"
+
+
+def test_a_car_that_is_not_known_has_its_motors_speed(
+    open_page: Callable[..., Page], pubnub: PubNubStandIn, car: Car
+) -> None:
+    with served(pubnub, {}) as server:
+        page = open_page(f"{server.url}#/history/car-1")
+        row = page.locator("tr[data-field=speed]")
+        until(lambda: "erpm" in row.inner_text(), "the past")
+        assert plain(row.locator("td").first.inner_text()) == f"{SPEED_ERPM[1]:.0f}"
+        page.goto(f"{server.url}#/car/car-1")
+        show(page, car.send())
+        assert page.locator(".gauge", has_text="Speed").locator(".gauge-value .unit").inner_text() == "erpm"
+
+
+@pytest.mark.parametrize(
+    ("timezone", "zone"), [("UTC", "UTC"), ("Asia/Kolkata", "GMT+5:30"), ("America/Phoenix", "GMT-7")]
+)
+def test_a_time_says_its_zone(
+    open_page: Callable[..., Page], server: PageServer, car: Car, timezone: str, zone: str
+) -> None:
+    page = open_page(f"{server.url}#/history/car-1", timezone_id=timezone)
+    until(lambda: page.locator(".scrub-at").is_visible(), "the past")
+    assert page.locator(".scrub-at").inner_text().endswith(f" {zone}")
+    assert page.locator(".zone").inner_text() == zone
+    page.goto(f"{server.url}#/car/car-1")
+    show(page, car.send({**SAMPLE, "fault_code": 5}))
+    assert page.locator(".faults th").first.inner_text() == f"Since, {zone}"
+
+
+def test_ros_standard_messages_have_their_units(page: Page, car: Car) -> None:
+    sample = {"linear_acceleration.x": 1.5, "twist.twist.angular.z": -0.25, "position.y": 2, "position.w": 3}
+    show(page, car.send(sample, stream="odom"))
+    tiles = page.locator("[data-stream=odom] .tile-value").all_inner_texts()
+    assert [plain(text).replace("\n", " ") for text in tiles] == ["1.50m/s²", "-0.25rad/s", "2.00m", "3"]
+
+
+def test_faults_are_counted_for_who_stands_across_the_room(page: Page, car: Car) -> None:
+    cars = [Car(car.pubnub, name) for name in ("a", "b", "c")]
+    for each, code in zip(cars, (5, 0, 3), strict=True):
+        show(page, each.send({**SAMPLE, "fault_code": code}))
+    until(lambda: page.inner_text("#faulty") == "2 with a fault", "the count")
+    show(page, cars[0].send({**SAMPLE, "fault_code": 0}))
+    until(lambda: page.inner_text("#faulty") == "1 with a fault", "one less")
+    show(page, cars[2].send({**SAMPLE, "fault_code": 0}))
+    drawn(page)
+    until(lambda: page.inner_text("#faulty") == "", "none")
+
+
+def luminance(colour: str) -> float:
+    """Relative luminance, WCAG 2.2."""
+    parts = [int(colour[i : i + 2], 16) / 255 for i in (1, 3, 5)]
+    red, green, blue = (p / 12.92 if p <= 0.04045 else ((p + 0.055) / 1.055) ** 2.4 for p in parts)
+    return 0.2126 * red + 0.7152 * green + 0.0722 * blue
+
+
+def contrast(one: str, other: str) -> float:
+    low, high = sorted((luminance(one), luminance(other)))
+    return (high + 0.05) / (low + 0.05)
+
+
+def test_text_and_lines_can_be_read_in_both_themes() -> None:
+    style = (ROOT / "station" / "web" / "style.css").read_text()
+    pairs = re.findall(r"--([a-z0-9-]+): light-dark\((#\w{6}), (#\w{6})\)", style)
+    colours = {name: (light, dark) for name, light, dark in pairs}
+    lines = {"speed", "voltage", "motor", "battery", "duty", "delay", *(f"hue-{i}" for i in range(1, 7))}
+    assert lines < colours.keys()
+    # WCAG's AA: 4.5 for text, 3 for what is drawn.
+    wanted = dict.fromkeys(lines, 3.0) | dict.fromkeys(("text", "muted", "good", "warn", "bad"), 4.5)
+    for theme, ground in product((0, 1), ("page", "panel")):
+        for name, least in wanted.items():
+            found = contrast(colours[name][theme], colours[ground][theme])
+            assert found >= least, f"{name} on {ground}, {('light', 'dark')[theme]}: {found:.2f}"
+    for theme in (0, 1):
+        assert contrast("#ffffff", colours["bad-fill"][theme]) >= 4.5
