@@ -88,7 +88,7 @@ def test_what_cannot_be_answered_says_why(change, says):
 
 
 def test_vehicles_are_those_whose_gain_is_registered():
-    known = {"vehicles": {"car": {"speed_to_erpm_gain": 4614.0}}}
+    known = {"vehicles": {"car": {"speed_to_erpm_gain": 4614.0, "speed_to_erpm_offset": 0.0}}}
     assert answers(cloud_of(*ride(10), gain="4614"))["vehicles"]({}) == known
     assert answers(cloud_of(*ride(10)))["vehicles"]({}) == {"vehicles": {}}
 

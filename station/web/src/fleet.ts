@@ -284,6 +284,8 @@ export class Fleet {
   private async learn(): Promise<void> {
     try {
       this.vehicles = (await ask<{ vehicles: Vehicles }>("vehicles", {})).vehicles;
+      // What stands on the page was written without.
+      for (const robot of this.robots.values()) robot.version += 1;
     } catch (error) {
       // Its speed is shown in erpm, as without a server that answers.
       if (!(error instanceof AnswerError)) throw error;
