@@ -46,8 +46,8 @@ class LiveSettings:
         return cls({stream: frozenset(fields) for stream, fields in named.items()})
 
 
-def age_ms(live: LiveSample, received_ms: int, now_us: int, legs: Legs) -> float:
-    """How old the sample is, whatever the car's clock says.
+def age_ms(robot: str, live: LiveSample, received_ms: int, now_us: int, legs: Legs) -> float:
+    """How old a robot's sample is, whatever the car's clock says.
 
     A car that has measured how far the cloud's clock is from its own says so in the message: then the
     whole way is on one clock. Of any other the age is its time in the car and its time in the cloud, each
@@ -57,7 +57,7 @@ def age_ms(live: LiveSample, received_ms: int, now_us: int, legs: Legs) -> float
         return (now_us - live.t_us - live.offset_us) / 1000
     in_car_us = live.sent_us - live.t_us
     in_cloud_us = now_us - received_ms * 1000
-    excess_us = legs.excess_us(live.boot, live.sent_us, received_ms)
+    excess_us = legs.excess_us(robot, live.boot, live.sent_us, received_ms)
     return (in_car_us + excess_us + in_cloud_us) / 1000
 
 
@@ -91,7 +91,7 @@ def process(
     if live.offset_us is not None:
         uplink_ms = max(0.0, received_ms - (live.sent_us + live.offset_us) / 1000)
         way_ms = max(0.0, (now_us - live.sent_us - live.offset_us) / 1000)
-    if age_ms(live, received_ms, now_us, legs) > LIVE_MAX_AGE_MS:
+    if age_ms(topic.robot, live, received_ms, now_us, legs) > LIVE_MAX_AGE_MS:
         # The stale ones are the late ones: an alarm that does not hear of them never goes off.
         counted.add(now_us / 1e6, LiveStale=1, CarToLambdaMs=way_ms)
         return

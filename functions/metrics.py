@@ -14,6 +14,8 @@ from contract import METRIC_DEPLOYMENT, METRIC_FUNCTION, METRIC_NAMESPACE, METRI
 MOST_VALUES = 100
 # So long values are gathered: the frame of a line is 400 bytes, a value in it seven.
 GATHER_S = 10.0
+# "MetricDatum": CloudWatch rejects what is beyond, and with it what else the line holds, of other robots too.
+_MOST = 2.0**360
 
 Values = Mapping[str, float | Sequence[float]]
 Write = Callable[[str, Values, float], None]
@@ -27,7 +29,8 @@ def emit(function: str, *, robot: str | None = None, **values: float | Sequence[
 def write(function: str, values: Values, at_s: float, robot: str | None = None) -> None:
     """Write the values that are not zero as one EMF line to standard output.
 
-    A list is so many values of one metric, of which the newest hundred are written. With a ``robot``
+    A list is so many values of one metric, of which the newest hundred are written; a value beyond what
+    CloudWatch takes is as large as it takes. With a ``robot``
     the same is counted for that robot alone as well. The values are of ``at_s``, in seconds since the epoch.
     ``function`` and the metric names must be the contract's; a name it does not know is a KeyError,
     so that no dashboard can wait for a metric that nothing emits.
@@ -36,7 +39,9 @@ def write(function: str, values: Values, at_s: float, robot: str | None = None) 
     """
     known = METRICS[function]
     shown = {
-        name: list(value)[-MOST_VALUES:] if isinstance(value, Sequence) else value
+        name: [_bounded(each) for each in value[-MOST_VALUES:]]
+        if isinstance(value, Sequence)
+        else _bounded(value)
         for name, value in values.items()
         if value
     }
@@ -98,6 +103,10 @@ class Gathered:
         self._written_s = at_s
         shown = {name: kept[0] if len(kept) == 1 else kept for name, kept in gathered.items()}
         self._write(self._function, shown, at_s)
+
+
+def _bounded(value: float) -> float:
+    return max(-_MOST, min(_MOST, value))
 
 
 def _unit(name: str) -> str:

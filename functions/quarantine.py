@@ -100,7 +100,7 @@ def entries(body: str, records: Records) -> list[Entry]:
             ]
         if "requestPayload" in document:
             return [_of_invocation(document)]
-    except (KeyError, TypeError, ValueError, AttributeError, binascii.Error) as error:
+    except (KeyError, TypeError, ValueError, AttributeError, RecursionError, binascii.Error) as error:
         reason = f"a message that the quarantine does not know: {type(error).__name__}: {error}"
     else:
         reason = "a message that the quarantine does not know"
@@ -164,7 +164,7 @@ class Store:
     def put(self, entry: Entry, sent_ms: int) -> None:
         """Keep the message; one that is there already counts once more. Of one that does not fit into
         an item, the beginning: the item that it is made of stands in the telemetry table."""
-        payload, reason = entry.payload, entry.reason[:_REASON_CHARACTERS]
+        payload, reason = entry.payload, _unicode(entry.reason[:_REASON_CHARACTERS])
         if len(payload) > _MAX_PAYLOAD_BYTES:
             payload = payload[:_MAX_PAYLOAD_BYTES]
             reason = f"cut from {len(entry.payload)} bytes; {reason}"
@@ -172,7 +172,7 @@ class Store:
         expires_s = sent_ms // 1000 + self._retention_s
         self._client.update_item(
             TableName=self._table,
-            Key={ROBOT: {"S": entry.robot}, ENTRY: {"S": entry.id}},
+            Key={ROBOT: {"S": _unicode(entry.robot)}, ENTRY: {"S": entry.id}},
             UpdateExpression=(
                 f"SET #{SOURCE} = :source, #{TOPIC} = :topic, #{REASON} = :reason, #{PAYLOAD} = :payload,"
                 f" #{FIRST_MS} = if_not_exists(#{FIRST_MS}, :sent), #{LAST_MS} = :sent,"
@@ -182,7 +182,7 @@ class Store:
             ExpressionAttributeNames={f"#{name}": name for name in names},
             ExpressionAttributeValues={
                 ":source": {"S": entry.source},
-                ":topic": {"S": entry.topic},
+                ":topic": {"S": _unicode(entry.topic)},
                 ":reason": {"S": reason},
                 ":payload": {"B": payload},
                 ":sent": {"N": str(sent_ms)},
@@ -190,6 +190,11 @@ class Store:
                 ":one": {"N": "1"},
             },
         )
+
+
+def _unicode(text: str) -> str:
+    """The text with escapes for halves of surrogate pairs, which JSON may hold and no table takes."""
+    return text.encode("utf-8", "backslashreplace").decode()
 
 
 class StreamError(Exception):
@@ -246,6 +251,9 @@ def process(event: Mapping[str, Any], store: Store, records: Records) -> dict[st
                 kept += 1
         except (BotoCoreError, ClientError, StreamError) as error:
             _log.warning("message %s comes again: %s", message["messageId"], error)
+            failed.append(message["messageId"])
+        except Exception:  # noqa: BLE001 - whatever one message does, its neighbours are kept
+            _log.exception("message %s cannot be kept", message["messageId"])
             failed.append(message["messageId"])
     emit("quarantine", Quarantined=kept)
     return {"batchItemFailures": [{"itemIdentifier": number} for number in failed]}

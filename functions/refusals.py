@@ -10,11 +10,13 @@ from typing import Any, NamedTuple
 
 from botocore.exceptions import BotoCoreError, ClientError
 
-from contract import ITEM_BASE64, REASON
+from contract import ITEM_BASE64, REASON, T_US, TOPIC
 
 _log = logging.getLogger(__name__)
 # SendMessageBatch: at most ten messages, of 256 KiB together.
 _MESSAGES, _BYTES = 10, 256 * 1024
+# And one of its messages alone.
+_MOST_BYTES = 1024 * 1024
 
 
 class Refused(NamedTuple):
@@ -64,11 +66,19 @@ def _calls(refused: Sequence[Refused]) -> Iterator[dict[str, tuple[Refused, str]
 
 
 def message(refused: Refused) -> str:
-    """The queue's message. The item is in base64: its text may hold what SQS does not carry."""
-    item = json.dumps(refused.image, separators=(",", ":"), ensure_ascii=False)
-    return json.dumps(
-        {
-            REASON: refused.reason[:1000],
-            ITEM_BASE64: base64.b64encode(item.encode("utf-8", "surrogatepass")).decode(),
-        }
-    )
+    """The queue's message. The item is in base64: its text may hold what SQS does not carry.
+
+    Of an item that is too large as JSON (a number of four characters on the wire may have 126 digits there)
+    only the key is told. A record that no queue takes would come again and hold its shard up.
+    """
+    body = _body(refused.reason, refused.image)
+    if len(body) > _MOST_BYTES:
+        key = {name: refused.image[name] for name in (TOPIC, T_US) if name in refused.image}
+        body = _body(f"too large for the queue, see the telemetry table; {refused.reason}", key)
+    return body
+
+
+def _body(reason: str, item: Mapping[str, Any]) -> str:
+    text = json.dumps(item, separators=(",", ":"), ensure_ascii=False)
+    encoded = base64.b64encode(text.encode("utf-8", "surrogatepass")).decode()
+    return json.dumps({REASON: reason[:1000], ITEM_BASE64: encoded})

@@ -140,7 +140,7 @@ def test_stale_by_its_time_in_the_car_and_in_the_cloud(
     now_us = RECEIVED * 1000 + round(in_cloud_ms * 1000)
     channels = Channels()
     show(event(t=t_us, sent_us=sent_us), channels, now_us=now_us)
-    age = age_ms(LiveSample("0123abcd", 0, t_us, sent_us, {}), RECEIVED, now_us, Legs())
+    age = age_ms("car", LiveSample("0123abcd", 0, t_us, sent_us, {}), RECEIVED, now_us, Legs())
     assert age == in_car_ms + in_cloud_ms
     assert len(channels.sent) == (not stale)
     totals = counted()
@@ -315,9 +315,9 @@ def test_the_loggers_that_would_show_the_keys_are_quiet():
         assert not logging.getLogger(name).isEnabledFor(logging.INFO)
 
 
-def late(sent_us, received_ms, legs, channels):
+def late(sent_us, received_ms, legs, channels, robot="car"):
     """A live message that was received at once by Lambda, however long it took to get there."""
-    message = {**event(t=sent_us, sent_us=sent_us), "received_ms": received_ms}
+    message = {**event(robot=robot, t=sent_us, sent_us=sent_us), "received_ms": received_ms}
     show(message, channels, legs=legs, now_us=received_ms * 1000)
 
 
@@ -358,15 +358,34 @@ def test_a_car_that_knows_its_clocks_offset_is_judged_by_it_in_an_environment_wi
 
 def test_clock_set_back_is_believed_after_the_window():
     legs = Legs()
-    assert legs.excess_us("0badcafe", 0, 0) == 0
-    assert legs.excess_us("0badcafe", -5_000_000, 100) == 5_100_000
+    assert legs.excess_us("car", "0badcafe", 0, 0) == 0
+    assert legs.excess_us("car", "0badcafe", -5_000_000, 100) == 5_100_000
     for second in range(1, 40):
-        excess = legs.excess_us("0badcafe", second * 1_000_000 - 5_000_000, second * 1000)
+        excess = legs.excess_us("car", "0badcafe", second * 1_000_000 - 5_000_000, second * 1000)
     assert excess == 0
 
 
-def test_legs_remember_a_bounded_number_of_runs():
+def test_a_robot_that_says_anothers_run_makes_nothing_of_the_others_late(capsys):
+    """The name of a run stands in what robots send each other."""
+    channels, legs = Channels(), Legs()
+    late(NOW_US, NOW_US // 1000 + 30, legs, channels)
+    late(NOW_US + 3_600_000_000, NOW_US // 1000 + 40, legs, channels, robot="thief")
+    late(NOW_US + 100_000, NOW_US // 1000 + 130, legs, channels)
+    assert [channel for channel, _ in channels.sent] == ["iort.car", "iort.thief", "iort.car"]
+    assert "LiveStale" not in capsys.readouterr().out
+
+
+def test_another_run_of_a_robot_is_measured_by_itself():
+    legs = Legs()
+    assert legs.excess_us("car", "0badcafe", 3_600_000_000, 0) == 0
+    assert legs.excess_us("car", "cafebabe", 0, 0) == 0
+    assert legs.excess_us("car", "cafebabe", 0, 70) == 70_000
+
+
+def test_legs_remember_a_bounded_number_of_robots_and_one_run_of_each():
     legs = Legs()
     for i in range(3000):
-        legs.excess_us(f"{i:08x}", 0, 0)
+        legs.excess_us(f"car{i}", "0badcafe", 0, 0)
+        legs.excess_us("hostile", f"{i:08x}", 0, 0)
     assert len(legs._runs) == 1000
+    assert "car2999" in legs._runs

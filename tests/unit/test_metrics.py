@@ -49,6 +49,14 @@ def test_a_list_is_values_and_a_robot_a_metric_of_its_own(capsys):
     assert json.loads(capsys.readouterr().out)["BatteryVolts"] == [float(i) for i in range(50, 150)]
 
 
+def test_a_value_that_cloudwatch_would_reject_leaves_the_others_readable(capsys):
+    emit("health", BatteryVolts=[11.5, 1e308, -1e308], TemperatureDegC=1e200)
+    line = json.loads(capsys.readouterr().out)
+    # "MetricDatum": "Values must be in the range of -2^360 to 2^360."
+    assert line["BatteryVolts"] == [11.5, 2.0**360, -(2.0**360)]
+    assert line["TemperatureDegC"] == 2.0**360
+
+
 def test_a_zero_is_not_written_and_a_line_of_zeros_neither(capsys):
     emit("live", LivePublished=1, LiveStale=0)
     line = json.loads(capsys.readouterr().out)

@@ -220,20 +220,43 @@ def test_a_message_that_comes_again_is_one_entry_that_says_how_often(dynamodb, s
 class Broken:
     """A table that takes everything but the second item."""
 
-    def __init__(self):
-        self.calls = 0
+    def __init__(self, error):
+        self.calls, self.error = 0, error
 
     def update_item(self, **_):
         self.calls += 1
         if self.calls == 2:
-            error = {"Error": {"Code": "ProvisionedThroughputExceededException", "Message": "slow down"}}
-            raise ClientError(error, "UpdateItem")
+            raise self.error
 
 
-def test_only_the_message_that_the_table_did_not_take_comes_again():
-    event = sqs_event(rule_error(b"1"), rule_error(b"2"), rule_error(b"3"))
-    answer = process(event, Store(Broken(), table=QUARANTINE, retention_s=1), none)
+THROTTLED = {"Error": {"Code": "ProvisionedThroughputExceededException", "Message": "slow down"}}
+
+
+@pytest.mark.parametrize(
+    "error", [ClientError(THROTTLED, "UpdateItem"), RuntimeError("nobody thought of it")]
+)
+def test_only_the_message_that_was_not_kept_comes_again(error):
+    event, table = sqs_event(rule_error(b"1"), rule_error(b"2"), rule_error(b"3")), Broken(error)
+    answer = process(event, Store(table, table=QUARANTINE, retention_s=1), none)
     assert answer == {"batchItemFailures": [{"itemIdentifier": "m1"}]}
+    assert table.calls == 3
+
+
+@pytest.mark.parametrize(
+    "odd",
+    [
+        invocation({"topic": "live/iort/car/vesc"}, "half of a pair: \ud800"),
+        invocation({"topic": "live/iort/car\udfff/vesc"}),
+        rule_error(topic="dt/iort/car\ud800/vesc"),
+        invocation({"topic": "ping/iort/car/lambda", "a": "NEST"}).replace(
+            '"NEST"', "[" * 50_000 + "]" * 50_000
+        ),
+    ],
+    ids=["reason", "robot", "topic", "nested"],
+)
+def test_what_no_table_or_reader_takes_is_kept_and_its_neighbours_are(odd, dynamodb, store):
+    assert process(sqs_event(rule_error(), odd, failed_batch()), store, records) == {"batchItemFailures": []}
+    assert len(kept(dynamodb)) == 4
 
 
 # --- the stream, and the queue before ----------------------------------------------------------------
@@ -337,3 +360,16 @@ def test_what_the_queue_does_not_take_comes_back():
     queue = FakeQueue(refuses={"reason 1"})
     assert Refusals(queue, queue_url="queue").refuse(refused) == [refused[1]]
     assert [json.loads(body)["reason"] for body in queue.bodies] == ["reason 0", "reason 2"]
+
+
+def test_a_record_too_large_for_any_queue_is_told_by_its_key():
+    # "1e125" on the wire, and there may be ten thousand of them in a message.
+    numbers = {f"a{i}": {"N": "1" + "0" * 125} for i in range(8_000)}
+    refused = Refused("5", "schema version 9", {**image(7), **numbers})
+    body = message(refused)
+    assert len(body) <= 1024 * 1024
+    (entry,) = entries(body, none)
+    assert (entry.source, entry.topic, entry.robot) == (BY_STREAM, TOPIC_OF_CAR, "car")
+    assert json.loads(entry.payload) == {"topic": {"S": TOPIC_OF_CAR}, "t": {"N": "7"}}
+    assert "telemetry table" in entry.reason
+    assert "schema version 9" in entry.reason
