@@ -188,7 +188,7 @@ def test_list(iort, store):
     assert iort("list", "car").output.splitlines()[0].split() == ["2023-11-14T22:13:20Z", "7", "a.bag"]
     (line,) = iort("list", "car", "--name", "*.txt", "--json").output.splitlines()
     assert json.loads(line)["key"] == key
-    assert iort("list", "car", "--last", "1d").output == ""
+    assert iort("list", "car", "--last", "1d").stdout == ""
     assert "give --last, or" in str(iort("list", "car", "--last", "1d", "--to", "now", status=1).exception)
 
 

@@ -57,7 +57,9 @@ def middle(page: Page) -> list[int]:
 
 
 def is_drawn(page: Page, colour: tuple[int, int, int]) -> None:
-    near = lambda: all(abs(a - b) < 12 for a, b in zip(middle(page), colour, strict=True))  # noqa: E731
+    def near() -> bool:
+        return all(abs(a - b) < 12 for a, b in zip(middle(page), colour, strict=True))
+
     until(near, f"a picture of {colour}")
 
 
@@ -142,8 +144,7 @@ def test_the_past_shows_the_picture_of_the_time_that_is_looked_at(
     with PageServer(**told, answers=answers) as server:
         page = open_page(f"{server.url}#/history/car-1")
         tile = page.locator("[data-picture=data]")
-        is_drawn_later = lambda: tile.count() == 1 and tile.locator("canvas").is_visible()  # noqa: E731
-        until(is_drawn_later, "the last picture")
+        until(lambda: tile.count() == 1 and tile.locator("canvas").is_visible(), "the last picture")
         is_drawn(page, (20, 160, 40))
         assert "0.5 s before" in tile.inner_text()
         page.locator(".scrub").focus()
