@@ -149,7 +149,10 @@ class _Demo:
             bundle = robots.add(
                 embedded.cloud, ROBOT, out=embedded.folder / "robots", settings=self._settings()
             )
-            self._console.print(f"\n[bold]Watch the car:[/bold] {page.url}#/car/{ROBOT}\n", highlight=False)
+            self._console.print(f"\n[bold]Watch the car:[/bold] {page.url}#/car/{ROBOT}", highlight=False)
+            ports = (page.port, embedded.pubnub.port)
+            forwarded = " ".join(f"-L {port}:127.0.0.1:{port}" for port in ports)
+            self._console.print(f"From elsewhere: ssh {forwarded} {socket.gethostname()}\n", soft_wrap=True)
             report = self._drive(embedded, bundle, listener)
             figures = self._count(embedded, report, listener)
             self._console.print(figures.as_table())

@@ -26,6 +26,10 @@ _BASE, _NAME, _ARRAY = 1, 2, 3
 _HEADER = "std_msgs/msg/Header"
 _TIMES = {"builtin_interfaces/msg/Time", "builtin_interfaces/msg/Duration"}
 _HEADER_TEXT = "=" * 80 + "\nMSG: std_msgs/Header\nuint32 seq\ntime stamp\nstring frame_id\n"
+# ROS 2's has no seq.
+_ROS2_HEADER = re.compile(
+    r"=+\nMSG: std_msgs/Header\n\s*(time|builtin_interfaces/Time) stamp\n\s*string frame_id\n"
+)
 
 
 class Said(NamedTuple):
@@ -80,7 +84,8 @@ def _plain(path: str) -> str:
 class Maker:
     """Makes messages of one type out of samples.
 
-    ``definition`` and ``md5sum`` are the type's as ROS 1 knows them. ``lacking`` are fields of the type
+    ``definition`` and ``md5sum`` are the type's as ROS 1 knows them, whose headers have a seq, also where
+    the samples come from ROS 2. ``lacking`` are fields of the type
     that the samples do not have, which are zero or empty in the messages; ``foreign`` are fields of the
     samples that the type does not have. ``own`` is for a type of `made_of`; ``frames``, in order of time,
     say what the headers have.
@@ -102,14 +107,15 @@ class Maker:
         self._field = _plain if own else str
         fields = [self._field(name) for name in fields]
         self._name = kind.kind.replace("/", "/msg/") if "/msg/" not in kind.kind else kind.kind
-        self._store = get_typestore(Stores.EMPTY)
+        self.definition = _ROS2_HEADER.sub(_HEADER_TEXT, kind.definition)
         try:
-            self._store.register(get_types_from_msg(kind.definition, self._name))
-            self.definition, self.md5sum = kind.definition, self._store.generate_msgdef(self._name)[1]
+            said_md5sum = _known(kind.definition, self._name).generate_msgdef(self._name)[1]
+            self._store = _known(self.definition, self._name)
+            self.md5sum = self._store.generate_msgdef(self._name)[1]
             paths, self._build = self._compile(fields)
         except Exception as error:  # whatever a library raises on a text
             raise StationError(f"the type {kind.kind} cannot be made again: {error}") from error
-        if kind.md5sum not in {"", self.md5sum}:
+        if kind.md5sum not in {"", said_md5sum}:
             raise StationError(f"the definition of {kind.kind} is not that of its checksum {kind.md5sum}")
         self.lacking = sorted(path for path in paths if path not in fields)
         self.foreign = sorted(set(fields) - paths)
@@ -187,6 +193,12 @@ class Maker:
                 **{"header": outermost(sample, t_us), lone[0][0]: inner(sample, t_us)}
             )
         return paths, builder(self._name, "")
+
+
+def _known(definition: str, name: str) -> Any:
+    store = get_typestore(Stores.EMPTY)
+    store.register(get_types_from_msg(definition, name))
+    return store
 
 
 _DTYPES = {"bool": "bool", "byte": "uint8", "char": "uint8", "octet": "uint8"}

@@ -42,6 +42,24 @@ def test_a_header_and_one_thing():
     assert maker.lacking == maker.foreign == []
 
 
+def test_a_header_of_ros_2_becomes_one_of_ros_1():
+    of_ros2 = STAMPED.replace("uint32 seq\n", "")
+    assert of_ros2 != STAMPED
+    maker = Maker(MessageType("s", "/t", "a_msgs/A", "", of_ros2), ["x", "code"])
+    assert maker.definition == STAMPED
+    assert maker.md5sum == Maker(MessageType("s", "/t", "a_msgs/A", "", STAMPED), ["x", "code"]).md5sum
+    of_ros2_md5sum = get_typestore(Stores.EMPTY)
+    of_ros2_md5sum.register(get_types_from_msg(of_ros2, "a_msgs/msg/A"))
+    said = of_ros2_md5sum.generate_msgdef("a_msgs/msg/A")[1]
+    assert Maker(MessageType("s", "/t", "a_msgs/A", said, of_ros2), []).md5sum == maker.md5sum != said
+    block = Block(np.array([T_US]), {"x": column_of([1.5]), "code": column_of([7.0])})
+    ((_, raw),) = maker.messages(block)
+    store = get_typestore(Stores.EMPTY)
+    store.register(get_types_from_msg(STAMPED, "a_msgs/msg/A"))
+    message = store.deserialize_ros1(raw, "a_msgs/msg/A")
+    assert (message.header.seq, message.b.x) == (0, 1.5)
+
+
 def test_headers_are_numbered_and_have_the_frame_of_their_time():
     path = "Header header\nB[2] parts\n" + HEADER + LINE + "MSG: a_msgs/B\nHeader header\nfloat64 x\n"
     frames = [FrameId("s", "/t", name, T_US + since) for name, since in (("laser", 1), ("map", 3))]
