@@ -152,7 +152,7 @@ class _Demo:
             self._console.print(f"\n[bold]Watch the car:[/bold] {page.url}#/car/{ROBOT}", highlight=False)
             ports = (page.port, embedded.pubnub.port)
             forwarded = " ".join(f"-L {port}:127.0.0.1:{port}" for port in ports)
-            self._console.print(f"From elsewhere: ssh {forwarded} {socket.gethostname()}\n", soft_wrap=True)
+            self._console.print(f"From elsewhere: ssh {forwarded} {socket.gethostname()}\n", highlight=False)
             report = self._drive(embedded, bundle, listener)
             figures = self._count(embedded, report, listener)
             self._console.print(figures.as_table())

@@ -26,9 +26,9 @@ _BASE, _NAME, _ARRAY = 1, 2, 3
 _HEADER = "std_msgs/msg/Header"
 _TIMES = {"builtin_interfaces/msg/Time", "builtin_interfaces/msg/Duration"}
 _HEADER_TEXT = "=" * 80 + "\nMSG: std_msgs/Header\nuint32 seq\ntime stamp\nstring frame_id\n"
-# ROS 2's has no seq.
+# ROS 2's has no seq. It may end the text.
 _ROS2_HEADER = re.compile(
-    r"=+\nMSG: std_msgs/Header\n\s*(time|builtin_interfaces/Time) stamp\n\s*string frame_id\n"
+    r"=+\nMSG: std_msgs/Header\n\s*(time|builtin_interfaces/Time) stamp\n\s*string frame_id(\n|\Z)"
 )
 
 
