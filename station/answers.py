@@ -25,6 +25,7 @@ _SAMPLES_US = 3_600_000_000
 def answers(cloud: Cloud) -> dict[str, Callable[[Mapping[str, str]], dict[str, Any]]]:
     """Every answer by its name."""
     return {
+        "robots": lambda _asked: {"robots": registry.presence(cloud)},
         "vehicles": lambda _asked: {"vehicles": registry.vehicles(cloud)},
         "streams": lambda asked: {"streams": inventory.streams_of(cloud, check_robot(_text(asked, "robot")))},
         "history": lambda asked: history(cloud, asked),

@@ -9,7 +9,16 @@ from typing import Any
 
 from boto3.dynamodb.types import TypeSerializer
 
-from contract import ADMIT_CLAIM, ADMIT_UNTIL_S, ROBOT, ContractError, check_robot
+from contract import (
+    ADMIT_CLAIM,
+    ADMIT_UNTIL_S,
+    CONNECTED_MS,
+    DISCONNECTED_MS,
+    ONLINE,
+    ROBOT,
+    ContractError,
+    check_robot,
+)
 from station.cloud import Cloud
 from station.errors import StationError
 from station.items import plain
@@ -40,6 +49,17 @@ def vehicles(cloud: Cloud) -> dict[str, dict[str, float]]:
         for row in listed(cloud)
         if row.get(gain)
     }
+
+
+def presence(cloud: Cloud) -> dict[str, dict[str, Any]]:
+    """Of every robot whether it is ``online`` and, as ``since_ms``, since when it is or is not; None where it
+    has never connected."""
+    found = {}
+    for row in listed(cloud):
+        online = bool(row.get(ONLINE))
+        at_ms = row.get(CONNECTED_MS if online else DISCONNECTED_MS)
+        found[str(row[ROBOT])] = {"online": online, "since_ms": None if at_ms is None else int(at_ms)}
+    return found
 
 
 def find(cloud: Cloud, robot: str) -> dict[str, Any] | None:

@@ -9,6 +9,21 @@ from tests.fakes import ROBOTS, serialize
 from tests.unit.test_station_data import cloud_of
 
 
+def test_presence_says_since_when():
+    cloud = cloud_of(robot="new")
+    rows = [
+        {"robot": "on", "online": True, "connected_ms": Decimal(2000), "disconnected_ms": Decimal(1000)},
+        {"robot": "off", "online": False, "connected_ms": Decimal(2000), "disconnected_ms": Decimal(3000)},
+    ]
+    for row in rows:
+        cloud.table.put(ROBOTS, {name: serialize(value) for name, value in row.items()})
+    assert registry.presence(cloud) == {
+        "new": {"online": False, "since_ms": None},
+        "on": {"online": True, "since_ms": 2000},
+        "off": {"online": False, "since_ms": 3000},
+    }
+
+
 def test_vehicles_have_what_speed_is_derived_with():
     cloud = cloud_of(robot="plain", gain="4614")
     rows = [

@@ -20,6 +20,9 @@ export interface Series {
   readonly values: readonly number[];
 }
 
+/** Of every registered car whether it is connected, and since when it is or is not; null if it never was. */
+export type Presence = Readonly<Record<string, { readonly online: boolean; readonly since_ms: number | null }>>;
+
 export interface Alarm {
   readonly name: string;
   readonly about: string;

@@ -33,14 +33,17 @@ class Page {
   private clockAt = -Infinity;
   private valuesAt = -Infinity;
 
-  constructor(config: Config, table: FieldTable) {
+  constructor(
+    private readonly config: Config,
+    table: FieldTable,
+  ) {
     this.fleet = new Fleet(config, table);
     this.feed = new Feed(config, table, this.fleet, (state) => {
       this.bar.linked(state);
       this.clockAt = -Infinity;
     });
     this.bar = new StatusBar(config, this.fleet, table);
-    this.fleetView = new FleetView(this.fleet, table);
+    this.fleetView = new FleetView(config, this.fleet, table);
     this.carView = new CarView(this.fleet, table, this.tools);
     this.historyView = new HistoryView(config, table, this.fleet);
     this.cloudWatchView = new CloudWatchView(config);
@@ -70,6 +73,7 @@ class Page {
     }
     this.historyView.show(view === "history" ? robot : undefined);
     this.cloudWatchView.show(view === "cloudwatch");
+    this.fleetView.show(view === "fleet");
     this.arrange();
   }
 
@@ -92,6 +96,8 @@ class Page {
     const waits = this.route.view === "fleet" ? this.fleet.robots.size === 0 : this.route.view === "car" && !this.fleet.robots.has(robot!);
     document.body.dataset["empty"] = String(waits);
     byId("empty-name").textContent = robot ?? "a car";
+    byId("empty-past").hidden = robot === undefined || !this.config.answers;
+    if (robot !== undefined) byId("empty-past").setAttribute("href", route({ view: "history", robot }));
     this.clockAt = -Infinity;
   }
 

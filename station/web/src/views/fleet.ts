@@ -1,6 +1,7 @@
 // Every car: one card each, in the order of their names, so that a card stays where it is.
 
-import type { FieldTable } from "../config";
+import { Absent } from "../absent";
+import type { Config, FieldTable } from "../config";
 import { byName, el, setAttribute, Text } from "../dom";
 import { numeric, type Fleet, type Robot } from "../fleet";
 import { age, linear, milliseconds, NOTHING, number } from "../format";
@@ -9,14 +10,23 @@ import { Sparkline } from "../sparkline";
 import { hottest } from "./carspec";
 
 export class FleetView {
-  readonly node = el("nav", { class: "cars", id: "cars", "aria-label": "Cars" });
+  readonly node: HTMLElement;
+  private readonly nav = el("nav", { class: "cars", id: "cars", "aria-label": "Cars" });
+  private readonly absent: Absent;
   private readonly cards = new Map<string, Card>();
 
   constructor(
+    config: Config,
     private readonly fleet: Fleet,
     private readonly table: FieldTable,
   ) {
-    this.node.addEventListener("keydown", (event) => this.key(event));
+    this.absent = new Absent(config, fleet);
+    this.node = el("div", { class: "fleet" }, this.nav, this.absent.node);
+    this.nav.addEventListener("keydown", (event) => this.key(event));
+  }
+
+  show(shown: boolean): void {
+    this.absent.show(shown);
   }
 
   /** Cards for the cars there are. */
@@ -33,8 +43,9 @@ export class FleetView {
         card = new Card(name);
         this.cards.set(name, card);
       }
-      if (this.node.children[i] !== card.node) this.node.insertBefore(card.node, this.node.children[i] ?? null);
+      if (this.nav.children[i] !== card.node) this.nav.insertBefore(card.node, this.nav.children[i] ?? null);
     });
+    this.absent.arrange();
   }
 
   clock(now: number, linked: boolean): void {
@@ -45,7 +56,7 @@ export class FleetView {
 
   /** Arrow keys move between the cards, which are links: Enter opens one. */
   private key(event: KeyboardEvent): void {
-    const cards = [...this.node.children] as HTMLElement[];
+    const cards = [...this.nav.children] as HTMLElement[];
     const at = cards.indexOf(document.activeElement as HTMLElement);
     // As many cards as stand in the first row.
     const columns = Math.max(1, cards.filter((card) => card.offsetTop === cards[0]!.offsetTop).length);
