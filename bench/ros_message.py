@@ -27,9 +27,19 @@ DEFINITION = "\n".join(
 )
 
 
+# The firmware sends whole numbers, the driver divides these by so much, and the rest by one.
+_PARTS = {
+    "voltage_input": 10,
+    "temperature_pcb": 10,
+    "current_motor": 100,
+    "current_input": 100,
+    "duty_cycle": 1000,
+}
+
+
 def values(i: int) -> list[float]:
-    """The fields of the i-th message; the speed counts."""
-    return [float(i) if name == "speed" else 11.5 + (i % 97) * 0.1 for name in FIELDS]
+    """The fields of the i-th message, with as many digits as a VESC's have; the speed counts."""
+    return [float(i) if name == "speed" else (115 + i % 97) / _PARTS.get(name, 1) for name in FIELDS]
 
 
 def body(i: int) -> bytes:

@@ -58,9 +58,13 @@ class Packer:
 
 
 def _nonfinite(columns: Mapping[str, Sequence[Value]]) -> int:
-    return sum(
-        1
-        for column in columns.values()
-        for value in column
-        if type(value) is float and not math.isfinite(value)
-    )
+    return sum(map(_nonfinite_of, columns.values()))
+
+
+def _nonfinite_of(column: Sequence[Value]) -> int:
+    try:
+        if all(map(math.isfinite, column)):  # type: ignore[arg-type]  # what is no number is told apart below
+            return 0
+    except (TypeError, OverflowError):
+        pass  # a text, a null, or an integer beyond every float among them
+    return sum(type(value) is float and not math.isfinite(value) for value in column)
