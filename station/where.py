@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import os
+import socket
 from dataclasses import dataclass
 from pathlib import Path
+from urllib.parse import urlsplit
 
 from station.cloud import Cloud
 from station.errors import StationError
@@ -12,6 +14,8 @@ from station.progress import say
 
 # Whoever has set one of these means an AWS account.
 _AWS_NAMED = ("AWS_PROFILE", "AWS_REGION", "AWS_DEFAULT_REGION", "AWS_ACCESS_KEY_ID")
+# It is on this machine.
+_CONNECT_S = 5.0
 
 
 @dataclass
@@ -33,7 +37,7 @@ class Where:
         if self.local or (not said and self.embedded.exists()):
             if not self.local:
                 say("on the embedded cloud that runs in this checkout")
-            return Cloud.load(self.embedded)
+            return _alive(Cloud.load(self.embedded), self.embedded)
         cloud = Cloud(namespace=self.namespace, profile=self.profile, region=self.region)
         try:
             return cloud.check()
@@ -43,3 +47,15 @@ class Where:
             raise StationError(
                 f"{error}. No embedded cloud runs here either; `make demo` starts one"
             ) from error
+
+
+def _alive(cloud: Cloud, path: Path) -> Cloud:
+    """The embedded cloud; raises `StationError` where nothing is left of it but its description."""
+    address = urlsplit(cloud.endpoint_url or "")
+    try:
+        socket.create_connection((address.hostname or "", address.port or 0), _CONNECT_S).close()
+    except OSError as error:
+        raise StationError(
+            f"the embedded cloud of {path} does not answer, as after a kill: `make demo` starts another"
+        ) from error
+    return cloud

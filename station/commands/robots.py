@@ -129,6 +129,9 @@ def list_(
     if as_json:
         _out.print_json(json.dumps(rows, default=float))
         return
+    if not rows:
+        _errors.print("no robot is registered; `iort robots add NAME` registers one")
+        return
     table = Table("robot", box=None, pad_edge=False)
     table.add_column("connection", no_wrap=True)
     table.add_column("agent")
@@ -174,7 +177,7 @@ def remove(
     everything: Annotated[
         bool, typer.Option("--all", help="Every robot and lasting claim, before `make destroy`.")
     ] = False,
-    yes: Annotated[bool, typer.Option("--yes", help="Do not ask.")] = False,
+    yes: Annotated[bool, typer.Option("--yes", help="Do not ask before --all.")] = False,
 ) -> None:
     """Revoke a robot's certificates, cut its session and forget it. What it has sent stays."""
     if everything == (name is not None):

@@ -6,8 +6,12 @@ import json
 import stat
 
 import pytest
+from typer.testing import CliRunner
 
 from contract import File, file_key
+from station.cli import app
+from station.cloud import Cloud
+from tests.ports import free_port
 
 
 def test_robot_is_added_listed_and_removed(iort, tmp_path):
@@ -54,6 +58,15 @@ def test_a_robot_without_files_has_none_and_one_that_is_gone_keeps_them(embedded
     assert "a.bag" in iort("files", "list", "gone").output
     later = iort("files", "list", "gone", "--last", "1h")
     assert (later.exit_code, later.stdout) == (0, "")
+
+
+def test_an_embedded_cloud_that_was_killed_is_told_from_one_that_runs(tmp_path):
+    port = free_port()
+    Cloud(endpoint_url=f"https://127.0.0.1:{port}").save(tmp_path / "cloud.json")
+    outcome = CliRunner().invoke(
+        app, ["--local", "--embedded", str(tmp_path / "cloud.json"), "robots", "list"]
+    )
+    assert f"{tmp_path / 'cloud.json'} does not answer" in str(outcome.exception)
 
 
 def test_the_cost_of_what_is_deployed(iort):
