@@ -62,7 +62,7 @@ deploy: layer ## deploy to the AWS account of your credentials; ARGS="-c key=val
 	@$(CDK) deploy --all $(ARGS)
 
 diff: layer ## what a deploy would change, resource by resource
-	@$(CDK) diff --all $(ARGS)
+	@$(CDK) diff $(ARGS)
 
 destroy: layer ## remove everything from it again, the data included
 	@$(CDK) destroy --all $(ARGS)
