@@ -9,19 +9,19 @@ from __future__ import annotations
 
 import argparse
 import io
-import os
-import shutil
 import subprocess
 import sys
 import tempfile
 import threading
 import time
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import ExitStack, contextmanager
 from pathlib import Path
 from typing import Any, Literal
 
+from bench import chromium
 from bench.cars import Publisher, SimulatedCar, drive
+from bench.errors import BenchError
 from local.cloud import EmbeddedCloud
 from local.deployment import ROOT
 from station import robots
@@ -52,16 +52,20 @@ def main() -> None:
     parser.add_argument("--out", type=Path, default=OUT)
     parser.add_argument("--only", choices=[*VIEWS], nargs="*", default=[*VIEWS])
     options = parser.parse_args()
-    from playwright.sync_api import sync_playwright  # noqa: PLC0415 - only this command needs it
+    try:
+        _take(options.only, options.out)
+    except BenchError as error:
+        sys.exit(f"screenshots: {error}")
 
-    chromium = os.environ.get("CHROMIUM") or shutil.which("chromium")
-    if not chromium:
-        sys.exit("screenshots: there is no chromium here: apt-get install chromium, or name it in CHROMIUM")
+
+def _take(views: Sequence[str], out: Path) -> None:
     with ExitStack() as stack:
+        # First, because nothing is worth starting without it.
+        browser = stack.enter_context(chromium.opened())
         folder = Path(stack.enter_context(tempfile.TemporaryDirectory()))
         cloud = stack.enter_context(EmbeddedCloud(folder / "local"))
         stack.enter_context(_driving(cloud, folder))
-        vehicles = {f"car{i + 1}": {"speed_to_erpm_gain": 4614.0} for i in range(_FLEET + 1)}
+        vehicles = {f"car{i + 1}": robots.F1TENTH for i in range(_FLEET + 1)}
         server = PageServer(
             namespace=cloud.namespace,
             **cloud.keys.reading(),
@@ -69,15 +73,13 @@ def main() -> None:
             answers=answers(cloud.cloud),
         )
         url = stack.enter_context(server).url
-        play = stack.enter_context(sync_playwright())
-        browser = play.chromium.launch(executable_path=chromium, args=["--no-sandbox", "--disable-gpu"])
         pages = {
             "laptop": _page(browser, url, LAPTOP, ratio=1),
             "phone": _page(browser, url, PHONE, ratio=2),
         }
         # Until the charts are full, and a minute's metrics have been counted.
         threading.Event().wait(_FILL_S)
-        for view in options.only:
+        for view in views:
             on_phone: Theme = "light" if view in {"car", "cloudwatch"} else "dark"
             looks: list[tuple[str, str, Theme]] = [
                 ("dark", "laptop", "dark"),
@@ -86,8 +88,7 @@ def main() -> None:
             ]
             for name, device, theme in looks:
                 _look(pages[device], url + VIEWS[view], theme)
-                _write(options.out / f"{view}-{name}.webp", pages[device].screenshot())
-        browser.close()
+                _write(out / f"{view}-{name}.webp", pages[device].screenshot())
 
 
 def _page(browser: Any, url: str, size: tuple[int, int], *, ratio: int) -> Any:

@@ -41,6 +41,18 @@ _TOKEN = re.compile(r"[A-Za-z0-9_=-]{1,4096}")
 _ORIGIN = re.compile(r"([A-Za-z0-9.-]{1,253}|\[[0-9A-Fa-f:]{2,45}\])(:[0-9]{1,5})?")
 
 
+def built_files(built: Path = BUILT) -> dict[str, bytes]:
+    """Every file of the built page by its path within; raises `StationError` where it is not built."""
+    index = built / "index.html"
+    if not index.is_file():
+        raise StationError(f"the live page is not built ({index} is missing): run `make setup`")
+    return {
+        path.relative_to(built).as_posix(): path.read_bytes()
+        for path in sorted(built.rglob("*"))
+        if path.is_file() and path.suffix in TYPES
+    }
+
+
 def config(
     *,
     namespace: str,

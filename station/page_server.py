@@ -30,7 +30,16 @@ from typing_extensions import Self
 
 import contract
 from station.errors import StationError
-from station.page import BUILT, HEADERS, PUBNUB_ORIGIN, TYPES, config, field_table, security_policy
+from station.page import (
+    BUILT,
+    HEADERS,
+    PUBNUB_ORIGIN,
+    TYPES,
+    built_files,
+    config,
+    field_table,
+    security_policy,
+)
 
 Answer = Callable[[Mapping[str, str]], Mapping[str, Any]]
 
@@ -215,14 +224,7 @@ class _Handler(BaseHTTPRequestHandler):
 
 def _load(built: Path) -> dict[str, _File]:
     """Every file of the build by its address, so that nothing else can be asked for."""
-    index = built / "index.html"
-    if not index.is_file():
-        raise StationError(f"the live page is not built ({index} is missing): run `npm ci && npm run build`")
-    files = {
-        f"/{path.relative_to(built).as_posix()}": _file(TYPES[path.suffix], path.read_bytes())
-        for path in sorted(built.rglob("*"))
-        if path.is_file() and path.suffix in TYPES
-    }
+    files = {f"/{name}": _file(TYPES[Path(name).suffix], body) for name, body in built_files(built).items()}
     files["/"] = files["/index.html"]
     return files
 

@@ -12,7 +12,7 @@ from botocore.exceptions import ClientError
 
 from station.cloud import Cloud
 from station.errors import StationError
-from station.page import BUILT, TYPES, field_table
+from station.page import BUILT, TYPES, built_files, field_table
 
 # Names do not change with their content, so a browser asks each time whether they are still the same.
 _CACHE = "no-cache"
@@ -24,15 +24,10 @@ def files(told: Mapping[str, Any], built: Path = BUILT) -> dict[str, bytes]:
 
     Raises `StationError` where the page is not built.
     """
-    if not (built / "index.html").is_file():
-        raise StationError(f"the live page is not built ({built} has no index.html): run `make setup`")
-    content = {
-        path.relative_to(built).as_posix(): path.read_bytes()
-        for path in sorted(built.rglob("*"))
-        if path.is_file() and path.suffix in TYPES
-    }
     tables = {"config.json": told, "fields.json": field_table()}
-    return content | {name: json.dumps(value, allow_nan=False).encode() for name, value in tables.items()}
+    return built_files(built) | {
+        name: json.dumps(value, allow_nan=False).encode() for name, value in tables.items()
+    }
 
 
 def upload(s3: Any, bucket: str, content: Mapping[str, bytes]) -> list[str]:

@@ -156,9 +156,11 @@ def trace(
 
 def round_trips_ms(newest: Batch | None) -> dict[str, float]:
     """The median round trip of each path in a batch of the stream ``rtt``."""
-    found = {}
-    for path in PING_PATHS if newest is not None else ():
-        column = newest.columns.get(RTT_FIELDS[path], ()) if newest is not None else ()
+    found: dict[str, float] = {}
+    if newest is None:
+        return found
+    for path in PING_PATHS:
+        column = newest.columns.get(RTT_FIELDS[path], ())
         values = sorted(float(value) for value in column if isinstance(value, (int, float)))
         if values:
             found[path] = values[len(values) // 2]

@@ -2,40 +2,31 @@
 
 from __future__ import annotations
 
-import os
-import shutil
 import time
 from collections.abc import Callable, Iterator, Mapping
 from typing import TYPE_CHECKING, Any
 
 import pytest
 
-from station.page import BUILT
+from bench import chromium
 
 if TYPE_CHECKING:
     from playwright.sync_api import Browser, Page
 
-FLAGS = (
-    "--no-sandbox",
-    "--disable-gpu",
-    "--disable-quic",
-    "--no-first-run",
-    "--disable-background-networking",
-    "--disable-component-update",
-    "--disable-sync",
-)
-
 
 @pytest.fixture(scope="module")
 def browser() -> Iterator[Browser]:
+    # Imported here: every test loads this file, the robot's on Python 3.8 too, where the station does not run.
+    from station.page import BUILT
+
     playwright_api = pytest.importorskip("playwright.sync_api", reason="playwright is not installed")
-    chromium = os.environ.get("CHROMIUM") or shutil.which("chromium") or shutil.which("chromium-browser")
-    if not chromium:
+    program = chromium.found()
+    if program is None:
         pytest.skip("there is no chromium on this machine: apt-get install chromium, or name it in CHROMIUM")
     if not (BUILT / "index.html").is_file():
         pytest.skip("the live page is not built: npm run build")
     with playwright_api.sync_playwright() as play:
-        browser = play.chromium.launch(executable_path=chromium, args=list(FLAGS))
+        browser = play.chromium.launch(executable_path=program, args=list(chromium.FLAGS))
         yield browser
         browser.close()
 

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import os
-import shutil
 import threading
 import time
 from collections.abc import Iterator
@@ -11,7 +9,7 @@ from contextlib import contextmanager
 from dataclasses import asdict
 from typing import Any
 
-from bench import plots
+from bench import chromium, plots
 from bench.driving import Driving
 from bench.errors import BenchError
 from bench.result import Plot, Ratio, Section, Table
@@ -29,7 +27,6 @@ SECONDS = 24
 _CHUNKS = 3
 _WARM_UP_S = 3.0
 _THESIS_MS = 300
-_FLAGS = ("--no-sandbox", "--disable-gpu", "--disable-quic", "--no-first-run", "--disable-sync")
 # After the frame that shows an update has been handed over, in the page's own clock, which is the
 # machine's: [time of the sample, in microseconds; time of the frame, in milliseconds].
 _WATCH = """robot => {
@@ -73,7 +70,7 @@ def run(target: Target, say: Say) -> Section:
     painted: list[tuple[float, float]] = []
     with listener, trace.pubnub_clock(pubnub.origin or PUBNUB_ORIGIN, tls=pubnub.tls) as ask:
         here = trace.clock_of(ask, lambda: time.time_ns() // 1000)
-        with Driving(bundle) as driving, _chromium(target, bundle.robot, say) as page:
+        with Driving(bundle) as driving, _page(target, bundle.robot, say) as page:
             threading.Event().wait(_WARM_UP_S)
             found.clear()
             say(f"driving for {SECONDS} s")
@@ -151,25 +148,17 @@ def _chunks(values: list[float]) -> list[list[float]]:
 
 
 @contextmanager
-def _chromium(target: Target, robot: str, say: Say) -> Iterator[Any]:
+def _page(target: Target, robot: str, say: Say) -> Iterator[Any]:
     """The live page in a real browser; None where there is no browser or no built page."""
-    chromium = os.environ.get("CHROMIUM") or shutil.which("chromium") or shutil.which("chromium-browser")
-    if not chromium or not (BUILT / "index.html").is_file():
+    if chromium.found() is None or not (BUILT / "index.html").is_file():
         say("no Chromium, or the page is not built: measured to the subscriber only")
         yield None
         return
-    from playwright.sync_api import sync_playwright  # noqa: PLC0415 - only where there is a browser
-
-    pubnub = keys.load(target.cloud)
-    server = PageServer(namespace=target.cloud.namespace, **pubnub.reading())
-    with server as page_server, sync_playwright() as play:
-        browser = play.chromium.launch(executable_path=chromium, args=list(_FLAGS))
-        try:
-            page = browser.new_page(viewport={"width": 1280, "height": 900})
-            page.goto(page_server.url)
-            page.wait_for_function(
-                "robot => window.iort?.robots[robot]?.streams?.vesc", arg=robot, timeout=60_000
-            )
-            yield page
-        finally:
-            browser.close()
+    server = PageServer(namespace=target.cloud.namespace, **keys.load(target.cloud).reading())
+    with server as page_server, chromium.opened() as browser:
+        page = browser.new_page(viewport={"width": 1280, "height": 900})
+        page.goto(page_server.url)
+        page.wait_for_function(
+            "robot => window.iort?.robots[robot]?.streams?.vesc", arg=robot, timeout=60_000
+        )
+        yield page

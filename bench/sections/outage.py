@@ -54,7 +54,7 @@ def run(target: Target, say: Say) -> Section:
         heard = list(listener.heard)
     sent = sum(s["samples"] for name, s in report["streams"].items() if name not in OWN_STREAMS)
     # What is lost never comes; it is counted, not waited for.
-    with suppress(TimeoutError):
+    with suppress(BenchError):
         _wait_for(
             lambda: delivery.samples_summarized(target.cloud, bundle.robot, VESC_STREAM) >= sent,
             "Lambda 2",

@@ -10,7 +10,7 @@ from contextlib import contextmanager
 from dataclasses import asdict, dataclass, field
 from decimal import Decimal
 from statistics import median
-from typing import Any
+from typing import Any, NamedTuple
 
 import boto3
 from boto3.dynamodb.conditions import Attr, Key
@@ -90,7 +90,10 @@ def run(target: Target, say: Say) -> Section:
             for name, read in ways.items():
                 say(f"{name}, {turn} of {REPEATS}" if turn else f"{name}, to warm up")
                 # A twentieth of a second is read several times a turn: one look says more of the machine.
-                looks = sorted((_timed(target, read) for _ in range(_LOOKS.get(name, 1))), key=_client_cpu_s)
+                looks = sorted(
+                    (_timed(target, read) for _ in range(_LOOKS.get(name, 1))),
+                    key=lambda look: look.client_cpu_s,
+                )
                 if turn:
                     _add(found[name], looks[len(looks) // 2])
     for name, way in found.items():
@@ -186,7 +189,16 @@ def _text(one: Any) -> str:
     return NOT_MEASURED if one is None else f"{one.p50:.3f} s ({one.low:.3f} to {one.high:.3f})"
 
 
-def _timed(target: Target, read: Callable[[], int]) -> tuple[int, float, float, float | None]:
+class _Look(NamedTuple):
+    """The points that were read, and the seconds that it took."""
+
+    points: int
+    wall_s: float
+    client_cpu_s: float
+    server_cpu_s: float | None
+
+
+def _timed(target: Target, read: Callable[[], int]) -> _Look:
     server = None if target.embedded is None else target.embedded.emulator.pid
     before = _server(server)
     cpu_s, wall_s = time.process_time(), time.perf_counter()
@@ -194,11 +206,7 @@ def _timed(target: Target, read: Callable[[], int]) -> tuple[int, float, float, 
     wall_s, cpu_s = time.perf_counter() - wall_s, time.process_time() - cpu_s
     after = _server(server)
     spent = None if before is None or after is None else cpu.spent_ms(before, after) / 1000
-    return count, wall_s, cpu_s, spent
-
-
-def _client_cpu_s(one: tuple[int, float, float, float | None]) -> float:
-    return one[2]
+    return _Look(count, wall_s, cpu_s, spent)
 
 
 def _server(pid: int | None) -> dict[int, int] | None:
@@ -206,12 +214,12 @@ def _server(pid: int | None) -> dict[int, int] | None:
     return None if pid is None else cpu.of_process(pid) | cpu.of_tree(pid)
 
 
-def _add(way: Way, one: tuple[int, float, float, float | None]) -> None:
-    way.read, wall_s, client_s, server_s = one
-    way.wall_s.append(round(wall_s, 4))
-    way.client_cpu_s.append(round(client_s, 4))
-    if server_s is not None:
-        way.server_cpu_s.append(round(server_s, 4))
+def _add(way: Way, look: _Look) -> None:
+    way.read = look.points
+    way.wall_s.append(round(look.wall_s, 4))
+    way.client_cpu_s.append(round(look.client_cpu_s, 4))
+    if look.server_cpu_s is not None:
+        way.server_cpu_s.append(round(look.server_cpu_s, 4))
 
 
 def _pages(read: Callable[..., dict[str, Any]], **arguments: Any) -> int:

@@ -156,7 +156,7 @@ def test_a_port_that_is_none_says_so(built: Path, port: int) -> None:
 
 
 def test_a_page_that_is_not_built_says_how(tmp_path: Path) -> None:
-    with pytest.raises(StationError, match="npm run build"):
+    with pytest.raises(StationError, match="make setup"):
         PageServer(**TOLD, built=tmp_path)
 
 
