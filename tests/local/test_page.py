@@ -19,6 +19,7 @@ from station.cloud import EMBEDDED
 from station.listener import Listener
 from station.page_server import PageServer
 from tests.browser import plain, shown, until
+from tests.images import TOPIC, jpeg, write_bag
 from tests.local.conftest import run_agent
 
 RATE_HZ, DRIVE_S = 50, 4
@@ -122,6 +123,33 @@ def _look_back(page, url, robot, samples, newest):
     until(lambda: plain(counted.nth(0).inner_text()) == "0", "the value at the start")
     assert plain(counted.nth(1).inner_text()) == f"{newest['displacement']:.0f}"
     assert plain(counted.nth(2).inner_text()) == f"+{newest['displacement']:.0f}"
+
+
+def test_a_cameras_thumbnails_come_from_the_car_to_the_page(embedded, bundle, open_page, tmp_path):
+    recording = write_bag(tmp_path / "camera.bag", [jpeg(seed) for seed in range(4)])
+    source = {"type": "bag", "path": str(recording), "topics": {TOPIC: "camera"}, "large": "upload"}
+    car = bundle(sources=[source], files={"large_folder": "large", "rate_kb_s": 0})
+    with served(embedded) as server:
+        page = open_page(f"{server.url}#/car/{car.robot}")
+        run_agent(car)
+        picture = page.locator("[data-picture=data]")
+        canvas = picture.locator("canvas")
+        until(canvas.is_visible, "a picture")
+        assert page.evaluate("(c) => [c.width, c.height]", canvas.element_handle()) == [96, 72]
+        # And from the table, by whoever comes later.
+        page.goto(f"{server.url}#/history/{car.robot}")
+        until(lambda: "camera" in page.locator("#stream option").all_inner_texts(), "the streams")
+        page.select_option("#stream", "camera")
+
+        def loaded():
+            if picture.count() and picture.locator(".picture-taken").inner_text().endswith(" before"):
+                return True
+            if "Loading" not in page.locator(".history-note").inner_text():
+                page.get_by_role("button", name="Last 5 min").click()
+            return False
+
+        until(loaded, "the past")
+        until(canvas.is_visible, "its picture")
 
 
 def logged(cloud, group, *lines):
