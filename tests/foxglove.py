@@ -6,6 +6,7 @@ import json
 import os
 import shutil
 import subprocess
+import sys
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -24,7 +25,8 @@ class Opened(NamedTuple):
 
 def opened(path: Path) -> Opened:
     """The recording, every message of it decoded; skips the test where Node or the libraries are missing."""
-    node = shutil.which("node")
+    # The environment's own first, which npm came with.
+    node = shutil.which("node", path=os.pathsep.join([str(Path(sys.executable).parent), os.environ["PATH"]]))
     modules = Path(os.environ.get("IORT_NODE_MODULES") or ROOT / "node_modules")
     if node is None or not (modules / "@mcap" / "core").is_dir():
         pytest.skip("needs node and Foxglove's libraries: run make setup")
