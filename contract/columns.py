@@ -123,12 +123,15 @@ def unpacked(codec: str, name: str, column: Any, n: int) -> list[Value]:
         return values
     if type(decimals) is not int or not 0 <= decimals < len(SCALES):
         raise ContractError(f"field {name}: {shown(decimals)} decimals; allowed is 0 to {len(SCALES) - 1}")
+    # The first decides: texts and lists have a sum as well, whose parts grow with the square of their length.
+    if type(values[0]) is not int:
+        raise ContractError(f"field {name}: the steps must be integers")
     try:
         whole = list(accumulate(values))
-    except TypeError:
+    except (TypeError, OverflowError):
         whole = [None]
     # A sum is an integer where all its parts are, or say true or false, which are the steps 1 and 0.
-    if type(values[0]) is not int or type(whole[-1]) is not int:
+    if type(whole[-1]) is not int:
         raise ContractError(f"field {name}: the steps must be integers")
     # Sorting finds both ends in half the time of min and max.
     ordered = sorted(whole)

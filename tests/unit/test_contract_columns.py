@@ -7,6 +7,7 @@ import hashlib
 import json
 import re
 import struct
+import tracemalloc
 import zlib
 
 import pytest
@@ -152,6 +153,8 @@ WRONG = [
     ([0, 1, 2**64], "beyond 53 bits"),
     ([0, 2**63, 2**63], "beyond 53 bits"),
     ([0, 1, 10**4000], "beyond 53 bits"),
+    ([0, 10**400, 1.5], "must be integers"),
+    ([0, [1], [2]], "must be integers"),
     ([None, 1, [2]], "neither number"),
     ([None, 1, float("1e999")], "Infinity"),
 ]
@@ -167,6 +170,19 @@ def test_columns_that_nobody_writes_are_refused(column, named):
 def test_a_sum_that_comes_back_through_64_bits_is_refused():
     with pytest.raises(ContractError, match="beyond 53 bits"):
         contract.decode(message_of([0, 1, *[2**62] * 4, 1], n=6))
+
+
+@pytest.mark.parametrize("first", ["x" * 1_000_000, [1] * 10_000])
+def test_sums_of_what_is_no_number_are_not_made(first):
+    """Of a text and a hundred characters behind it, they would take a hundred times the memory."""
+    message = message_of([0, first, *[first[:1]] * 99], n=100)
+    tracemalloc.start()
+    try:
+        with pytest.raises(ContractError, match="must be integers"):
+            contract.decode(message)
+        assert tracemalloc.get_traced_memory()[1] < 20 * len(json.dumps(first))
+    finally:
+        tracemalloc.stop()
 
 
 def test_columns_take_no_more_memory_than_before():
