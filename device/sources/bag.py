@@ -196,6 +196,13 @@ class Recording:
         return _Wrapped(f"{self._path}: {what}")
 
 
+# What rosbags says, and what to do about it.
+_ADVICE = (
+    ("index looks damaged", "`rosbag reindex` mends a recording that was cut off"),
+    ("Profile is not ros2", "a recording of ROS 1 is read as .bag only"),
+)
+
+
 class _Wrapped:
     """Turns whatever a bag library raises into `SourceError`: damaged files raise about anything."""
 
@@ -207,7 +214,8 @@ class _Wrapped:
 
     def __exit__(self, _kind: object, error: BaseException | None, _trace: object) -> None:
         if isinstance(error, Exception) and not isinstance(error, SourceError):
-            raise SourceError(f"{self._what}: {type(error).__name__}: {error}") from error
+            advice = next((f"; {what}" for sign, what in _ADVICE if sign in str(error)), "")
+            raise SourceError(f"{self._what}: {type(error).__name__}: {error}{advice}") from error
 
 
 def _stamp_ns(message: Any, recorded_ns: int) -> int:

@@ -276,5 +276,5 @@ def test_what_is_no_recording(tmp_path: Path, name: str) -> None:
 def test_a_recording_cut_short_says_so(tmp_path: Path) -> None:
     path = write_ros1(tmp_path / "a.bag")
     path.write_bytes(path.read_bytes()[:-200])
-    with pytest.raises(SourceError, match=r"a\.bag"):
+    with pytest.raises(SourceError, match=r"a\.bag.*`rosbag reindex` mends"):
         play(path)
