@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 import csv
+import itertools
 import json
 from collections.abc import Iterator, Sequence
-from typing import IO, Any
+from typing import IO, Any, NamedTuple
 
 import numpy as np
 from rich.table import Table
@@ -15,6 +16,10 @@ from station.data import Result
 
 # Of a long result a terminal shows the beginning and the end.
 _SHOWN = 20
+_TIME_WIDE = "2026-05-04 10:00:00.000000"
+_GAP = 2
+# Longer texts are folded.
+_TEXT_WIDE = 40
 _CHUNK = 10_000
 
 
@@ -24,21 +29,56 @@ def texts_of_time(result: Result) -> list[str]:
     return [f"{text}Z" for text in np.datetime_as_string(times, unit="us").tolist()]
 
 
-def terminal(result: Result) -> Table:
-    """The first and last samples, with units."""
-    table = Table(box=None, pad_edge=False, header_style="bold", caption_justify="left")
-    table.add_column("time (UTC)", no_wrap=True)
-    for name in result.columns:
-        unit = result.unit(name)
-        table.add_column(f"{name}\n{unit}" if unit else name, justify="right")
+class Shown(NamedTuple):
+    """A table for people, and the fields that it has no room for."""
+
+    table: Table
+    left_out: list[str]
+
+
+def terminal(result: Result, width: int | None = None) -> Shown:
+    """The first and last samples, with units, in so many characters a line: names that do not fit break
+    after an underscore, and fields that do not fit then are left out."""
     n = len(result)
-    chosen = range(n) if n <= 2 * _SHOWN else [*range(_SHOWN), *range(n - _SHOWN, n)]
-    times, columns = texts_of_time(result), list(result.columns.values())
-    for place, i in enumerate(chosen):
+    chosen = [*range(n)] if n <= 2 * _SHOWN else [*range(_SHOWN), *range(n - _SHOWN, n)]
+    times = texts_of_time(Result(result.robot, result.stream, result.times_us[chosen], {}))
+    stamps = [text[:-1].replace("T", " ") for text in times]
+    columns = [
+        _Column(name, result.unit(name), [_cell(column[i]) for i in chosen])
+        for name, column in result.columns.items()
+    ]
+    room = None if width is None else width - len(_TIME_WIDE)
+    if room is not None and sum(_GAP + column.width for column in columns) > room:
+        columns = [column._replace(name=column.name.replace("_", "_\n")) for column in columns]
+        ends = itertools.accumulate(_GAP + column.width for column in columns)
+        # One is there however narrow it is.
+        fitting = max(1, sum(end <= room for end in ends))
+        columns, left_out = columns[:fitting], list(result.columns)[fitting:]
+    else:
+        left_out = []
+    table = Table(box=None, pad_edge=False, header_style="bold")
+    table.add_column("time (UTC)", no_wrap=True)
+    for column in columns:
+        table.add_column(column.heading, justify="right", max_width=_TEXT_WIDE, overflow="fold")
+    for place, row in enumerate(zip(stamps, *(column.cells for column in columns), strict=True)):
         if n > 2 * _SHOWN and place == _SHOWN:
             table.add_row("...", *["..."] * len(columns))
-        table.add_row(times[i][:-1].replace("T", " "), *(_cell(column[i]) for column in columns))
-    return table
+        table.add_row(*row)
+    return Shown(table, left_out)
+
+
+class _Column(NamedTuple):
+    name: str
+    unit: str | None
+    cells: Sequence[str]
+
+    @property
+    def heading(self) -> str:
+        return f"{self.name}\n{self.unit}" if self.unit else self.name
+
+    @property
+    def width(self) -> int:
+        return min(_TEXT_WIDE, max(map(len, [*self.heading.split("\n"), *self.cells])))
 
 
 def to_csv(result: Result, file: IO[str]) -> None:

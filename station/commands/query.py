@@ -121,4 +121,8 @@ def _write(result: Result, form: Format, output: Path | None) -> None:
         else:
             # A terminal's width is its own; in a file nothing needs to fit.
             width = None if text.isatty() else 32 + 24 * len(result.columns)
-            Console(file=text, highlight=False, width=width).print(tables.terminal(result))
+            console = Console(file=text, highlight=False, width=width)
+            shown = tables.terminal(result, console.width)
+            console.print(shown.table)
+            if shown.left_out:
+                say(f"no room for {', '.join(shown.left_out)}: choose with --fields, or --format csv")

@@ -74,12 +74,42 @@ def test_parquet_keeps_times_types_null_and_units():
 
 def test_a_terminal_shows_units_and_both_ends():
     console = Console(width=120, file=io.StringIO())
-    console.print(tables.terminal(result(1000)))
+    shown = tables.terminal(result(1000), 120)
+    console.print(shown.table)
     text = console.file.getvalue()
+    assert shown.left_out == []
+    assert "current_motor" in text
     assert "erpm" in text
     assert "22:13:20.123456" in text
     assert "22:13:40.103456" in text
     assert "22:13:30" not in text
+
+
+@pytest.mark.parametrize(
+    ("width", "left_out"),
+    [(80, []), (70, []), (60, []), (50, ["on"]), (48, ["name", "on"]), (36, ["current_motor", "name", "on"])],
+)
+def test_a_narrow_terminal_shows_whole_values_and_names_the_fields_that_it_lacks(width, left_out):
+    found = result(50)
+    found.columns["speed"] += 1000
+    console = Console(width=width, file=io.StringIO())
+    shown = tables.terminal(found, console.width)
+    console.print(shown.table)
+    lines = console.file.getvalue().splitlines()
+    assert shown.left_out == left_out
+    assert max(map(len, lines)) <= width
+    assert "1073.5" in lines[-1]
+    assert "\u2026" not in console.file.getvalue()
+
+
+def test_a_long_text_is_folded_and_leaves_room():
+    found = result(1)
+    found.columns["name"][0] = "x" * 100
+    console = Console(width=110, file=io.StringIO())
+    shown = tables.terminal(found, console.width)
+    console.print(shown.table)
+    assert shown.left_out == []
+    assert console.file.getvalue().count("x") == 100
 
 
 def test_ranges(capsys):
