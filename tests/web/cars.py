@@ -50,7 +50,7 @@ class Car:
 
     def publish(self, message: Any, channel: str | None = None) -> None:
         host, port = self.pubnub.origin.split(":")
-        connection = http.client.HTTPConnection(host, int(port), timeout=5)
+        connection = http.client.HTTPConnection(host, int(port), timeout=60)
         path = f"/publish/{PUBLISH_KEY}/{SUBSCRIBE_KEY}/0/{channel or contract.channel(self.name)}/0"
         connection.request("POST", path, json.dumps(message), {"Content-Type": "application/json"})
         assert connection.getresponse().status == 200

@@ -93,10 +93,14 @@ def test_what_the_agent_makes_of_a_camera_is_drawn(page: Page, car: Car) -> None
 
 
 def hostile() -> dict[str, str]:
-    """Texts that are no thumbnail of ours; the last says that it is 65,500 pixels wide."""
+    """Texts that are no thumbnail of ours; the last two say that they are larger than any."""
     small = bytearray(base64.b64decode(plain_jpeg((0, 0, 0))))
     at = small.index(b"\xff\xc0")
     small[at + 5 : at + 9] = (65_500).to_bytes(2, "big") * 2
+    # A whole picture behind a marker without length (TEM), where who takes one for granted sees the next.
+    whole = base64.b64decode(plain_jpeg((0, 200, 0), (300, 300)))[2:]
+    little = base64.b64decode(plain_jpeg((0, 0, 0)))[2:]
+    hidden = b"\xff\xd8\xff\x01" + (2 + len(whole)).to_bytes(2, "big") + whole + little
     return {
         "no base64": "<img src=x onerror=alert(1)>",
         "nothing": "",
@@ -104,6 +108,7 @@ def hostile() -> dict[str, str]:
         "a JPEG cut short": plain_jpeg((0, 0, 0))[:40],
         "a JPEG without end": base64.b64encode(b"\xff\xd8" + b"\xff\xe0\x00\x00" * 10).decode(),
         "a bomb": base64.b64encode(bytes(small)).decode(),
+        "a bomb behind a curtain": base64.b64encode(hidden).decode(),
     }
 
 

@@ -8,7 +8,11 @@ import { age } from "./format";
 
 // The cars' are of 96 pixels; see device/thumbnail.py.
 const MOST_PIXELS = 256;
-const START_OF_FRAME = new Set([0xc0, 0xc1, 0xc2]);
+// Of a frame, whatever it is coded by; the three of the range that are none are tables (ITU T.81, table B.1).
+const START_OF_FRAME = (marker: number): boolean => marker >= 0xc0 && marker <= 0xcf && ![0xc4, 0xc8, 0xcc].includes(marker);
+// What may come before it: tables, the application's own and comments. All of them say their length; behind
+// what does not, a decoder would look for the next marker elsewhere than this does.
+const BEFORE_FRAME = (marker: number): boolean => [0xc4, 0xdb, 0xdd, 0xfe].includes(marker) || (marker >= 0xe0 && marker <= 0xef);
 
 export class Picture {
   readonly node: HTMLElement;
@@ -84,7 +88,8 @@ export function jpegOf(base64: string): Uint8Array<ArrayBuffer> | undefined {
   // Segments: a marker of two bytes, and a length that counts itself, until the frame's, which has its size.
   const view = new DataView(data.buffer);
   for (let at = 2; at + 9 <= data.length && data[at] === 0xff; at += 2 + view.getUint16(at + 2)) {
-    if (!START_OF_FRAME.has(data[at + 1]!)) continue;
+    if (BEFORE_FRAME(data[at + 1]!)) continue;
+    if (!START_OF_FRAME(data[at + 1]!)) return undefined;
     const [height, width] = [view.getUint16(at + 5), view.getUint16(at + 7)];
     return Math.min(height, width) > 0 && Math.max(height, width) <= MOST_PIXELS ? data : undefined;
   }
