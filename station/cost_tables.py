@@ -59,7 +59,7 @@ def month(usage: Usage) -> Rows:
         ("PubNub, plan by transactions", f"{transactions:,.2f}"),
         ("PubNub, plan by monthly active users", "ask PubNub" if users is None else f"{users:,.2f}"),
     ]
-    return Rows((f"dollars a month, {usage.robots:,} robots", ""), body)
+    return Rows((f"dollars a month, {usage.robots:,} robot{'s' * (usage.robots != 1)}", ""), body)
 
 
 def what_if(usage: Usage) -> Rows:

@@ -83,7 +83,8 @@ def cost_(
         _out.print_json(json.dumps(_as_json(usage)))
         return
     _out.print(
-        f"List prices of {AS_OF} in US dollars, {REGION}: {usage.robots:,} robots at {usage.rate_hz:g} Hz"
+        f"List prices of {AS_OF} in US dollars, {REGION}: "
+        f"{usage.robots:,} robot{'s' * (usage.robots != 1)} at {usage.rate_hz:g} Hz"
         f"{f' in each of {usage.streams} streams' if usage.streams > 1 else ''}, "
         f"live {usage.live_hz:g} Hz, {usage.hours_per_day:g} h a day, kept {usage.retention_days} days.\n"
     )

@@ -22,7 +22,8 @@ from station.page import PUBNUB_ORIGIN
 commands = typer.Typer()
 _out = Console(highlight=False)
 _errors = Console(stderr=True, highlight=False)
-_BAR = 30
+# Characters of the other columns, and of the longest and shortest whole bar.
+_OTHERS, _LONGEST, _SHORTEST = 64, 30, 8
 
 
 @commands.command("trace")
@@ -79,13 +80,14 @@ def _show(robot: str, result: trace.Trace) -> None:
     table = Table(title=f"{robot}: {result.updates} live updates", title_justify="left")
     for name in ("hop", "median", "95 %", "clocks", ""):
         table.add_column(name, justify="left" if name in {"hop", ""} else "right")
+    width = max(_SHORTEST, min(_LONGEST, _out.width - _OTHERS))
     whole = max(result.whole.p50_ms, 1e-3)
     begins = 0.0
     for hop in result.hops:
-        table.add_row(*_cells(hop), bar(begins / whole, hop.p50_ms / whole))
+        table.add_row(*_cells(hop), bar(begins / whole, hop.p50_ms / whole, width))
         begins += max(0.0, hop.p50_ms)
     table.add_section()
-    table.add_row(*_cells(result.whole), bar(0, 1), style="bold")
+    table.add_row(*_cells(result.whole), bar(0, 1, width), style="bold")
     _out.print(table)
     _out.print("clocks: by how much a hop may be wrong; ? where two providers' clocks are taken as they are")
     if result.round_trips_ms:
@@ -93,11 +95,11 @@ def _show(robot: str, result: trace.Trace) -> None:
         _out.print(f"round trips that the car measured last: {trips}")
 
 
-def bar(begins: float, share: float) -> str:
-    """A bar from one share of the whole on, in eighths of a character."""
-    begins = min(max(begins, 0.0), 1.0)
-    eighths = round(min(max(share, 0.0), 1.0 - begins) * _BAR * 8)
-    return " " * round(begins * _BAR) + "█" * (eighths // 8) + " ▏▎▍▌▋▊▉"[eighths % 8].strip()
+def bar(begins: float, share: float, width: int) -> str:
+    """A bar from one share of the whole on, which is ``width`` characters, to eighths of one."""
+    before = round(min(max(begins, 0.0), 1.0) * width)
+    eighths = min(round(max(share, 0.0) * width * 8), (width - before) * 8)
+    return " " * before + "█" * (eighths // 8) + " ▏▎▍▌▋▊▉"[eighths % 8].strip()
 
 
 def _cells(hop: trace.Hop) -> tuple[str, ...]:

@@ -67,8 +67,10 @@ def test_round_trips_are_the_medians_of_the_newest_batch():
 
 @pytest.mark.parametrize(("begins", "share"), [(0, 1), (0.5, 0.5), (0.9, 0.5), (-1, 2), (1, 0), (0.3, -1)])
 def test_bars_stay_inside_their_column(begins, share):
-    assert len(bar(begins, share)) <= 31
+    assert len(bar(begins, share, 30)) <= 30
+    assert len(bar(begins, share, 8)) <= 8
 
 
 def test_bars_begin_where_the_last_ended():
-    assert bar(0.5, 0.25).index("█") == 15
+    assert bar(0.5, 0.25, 30).index("█") == 15
+    assert bar(0.5, 0.25, 8) == "    ██"
