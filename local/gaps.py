@@ -6,6 +6,7 @@ local/cut_sessions.py; here, in order:
 
 - a republish action's topic is not expanded: ``${topic(3)}`` stays literal;
 - the SQL function floor() gives nothing;
+- a payload nested deeper than Python reads ends the session, whose messages are never acknowledged again;
 - a message above 128 KB is taken from an MQTT 3.1.1 client or by HTTP (AWS refuses it);
 - on Python 3.10 the MQTT listener pauses reading too early, loses the ClientHello and never answers;
 - a rule's SQS action counts as plain HTTP, which the queues' policies refuse (AWS calls itself by TLS);
@@ -54,6 +55,7 @@ def install() -> None:
     cut_sessions.install()
     iot._run_rule_actions = _expanding_republish(iot._run_rule_actions)
     iot._eval_select_function = _with_floor(iot._eval_select_function)
+    iot._rule_message = as_text_if_deep(iot._rule_message)
     iot._IMPLEMENTED_SQL_FUNCS |= {"floor"}
     iot.broker_publish = _refusing_large(iot.broker_publish)
     iot._MtlsAcceptor.connection_made = _once_reading(iot._MtlsAcceptor.connection_made)
@@ -107,6 +109,19 @@ def _with_floor(evaluate: Callable[..., Any]) -> Callable[..., Any]:
         return iot._MISSING if value is None else math.floor(value)
 
     return evaluate_function
+
+
+def as_text_if_deep(read: Callable[[bytes], Any]) -> Callable[[bytes], Any]:
+    """A payload as rules see it; one that is nested too deeply as any other that is no JSON."""
+
+    @wraps(read)
+    def message(payload: bytes) -> Any:
+        try:
+            return read(payload)
+        except RecursionError:
+            return payload.decode()
+
+    return message
 
 
 def _refusing_large(publish: Callable[..., Any]) -> Callable[..., Any]:

@@ -81,6 +81,16 @@ def test_floor():
     assert evaluate("topic", ["1"], "a/b", b"", {}) == "a"
 
 
+def test_a_payload_nested_too_deeply_is_a_text_to_the_rules():
+    deep = b'{"t":1,"a":' + b"[" * 50_000 + b"]" * 50_000 + b"}"
+    with pytest.raises(RecursionError):
+        iot._rule_message(deep)
+    read = gaps.as_text_if_deep(iot._rule_message)
+    assert read(deep) == deep.decode()
+    assert read(b'{"t":1}') == {"t": 1}
+    assert read(b"\xff") is iot._MISSING
+
+
 def test_large_publish_is_refused_before_anything_happens():
     async def publish(*_args, **_named):
         raise AssertionError

@@ -61,8 +61,16 @@ def batch(seq=0, **changes):
 
 @pytest.mark.parametrize(
     "payload",
-    [b"not json", b"\xff\xfe\x00", b'{"v": 1}', b"[]", b'{"t": "text"}', b""],
-    ids=["text", "not-utf8", "no-key", "array", "key-of-another-type", "empty"],
+    [
+        b"not json",
+        b"\xff\xfe\x00",
+        b'{"v": 1}',
+        b"[]",
+        b'{"t": "text"}',
+        b"",
+        b'{"t": 1, "a": ' + b"[" * 50_000 + b"]" * 50_000 + b"}",
+    ],
+    ids=["text", "not-utf8", "no-key", "array", "key-of-another-type", "empty", "nested"],
 )
 def test_what_the_rule_cannot_store_is_kept_byte_by_byte(bundle, entry_of, payload):
     car = bundle()
