@@ -231,6 +231,7 @@ export class Fleet {
   shape = 0;
   private columns = 0;
   private vehicles: Vehicles;
+  private learning: Promise<void> | undefined;
 
   constructor(
     private readonly config: Config,
@@ -298,7 +299,10 @@ export class Fleet {
       this.robots.delete(silent.name);
       for (const { columns } of silent.streams.values()) this.columns -= columns.size;
     }
-    if (this.config.answers && !Object.hasOwn(this.vehicles, name)) void this.learn();
+    if (this.config.answers && !Object.hasOwn(this.vehicles, name)) {
+      // Twenty cars that come at once are one question.
+      this.learning ??= this.learn().finally(() => (this.learning = undefined));
+    }
     const robot = new Robot(name);
     this.robots.set(name, robot);
     this.shape += 1;
