@@ -3,7 +3,6 @@ layout of one item a sample read through boto3's Table, in the same run; and an 
 
 from __future__ import annotations
 
-import json
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -14,23 +13,20 @@ from typing import Any, NamedTuple
 
 import boto3
 from boto3.dynamodb.conditions import Attr, Key
-from boto3.dynamodb.types import TypeSerializer
 
-from bench import cpu, plots
+from bench import cpu, drives, plots
 from bench.errors import BenchError
 from bench.result import NOT_MEASURED, Plot, Ratio, Section, Table
 from bench.spread import ratio, spread
 from bench.target import Say, Target
-from contract import EXPIRES_S, RECEIVED_MS, RECORD, TOPIC, VESC_STREAM, Batch, Value, build_topic, encode
-from device.sources.vehicle import Vehicle, VehicleConfig
+from contract import RECEIVED_MS, RECORD, TOPIC, VESC_STREAM, build_topic
 from station import data, delivery
 from station.sizes import item_bytes
 
 POINTS = 14_368
 ROBOT, HOUR_ROBOT = "bench-query", "bench-hour"
 REPEATS = 3
-_RATE_HZ = 50
-HOUR_POINTS = 3600 * _RATE_HZ
+HOUR_POINTS = 3600 * drives.RATE_HZ
 _CATCH_UP_S = 120.0
 THESIS_QUERY, THESIS_SCAN = "thesis' layout, query through Table", "thesis' layout, scan through Table"
 OURS_QUERY, OURS_SCAN = "iort, query on premises", "iort, scan on premises"
@@ -60,9 +56,9 @@ class Way:
 def run(target: Target, say: Say) -> Section:
     """Store the same drive in both layouts, then read it back in turns."""
     section = Section("query", "Query and scan (table 6.6)")
-    robot, samples = target.name(ROBOT), _drive(POINTS)
+    robot, samples = target.name(ROBOT), drives.simulated(POINTS)
     say(f"storing {POINTS:,} points in both layouts")
-    _store(target, robot, samples)
+    drives.store(target, robot, samples)
     _until_summarized(target, robot, POINTS, say)
     with _thesis_table(target, robot, samples) as table:
         topic = build_topic(RECORD, robot, VESC_STREAM, target.cloud.namespace)
@@ -107,7 +103,7 @@ def run(target: Target, say: Say) -> Section:
 def _hour(target: Target, section: Section, say: Say) -> None:
     robot = target.name(HOUR_ROBOT)
     say(f"storing an hour of one robot, {HOUR_POINTS:,} points")
-    _store(target, robot, _drive(HOUR_POINTS))
+    drives.store(target, robot, drives.simulated(HOUR_POINTS))
     _until_summarized(target, robot, HOUR_POINTS, say)
     way = Way()
     for turn in range(REPEATS + 1):
@@ -233,31 +229,6 @@ def _pages(read: Callable[..., dict[str, Any]], **arguments: Any) -> int:
         arguments["ExclusiveStartKey"] = page["LastEvaluatedKey"]
 
 
-def _drive(points: int) -> list[tuple[int, dict[str, Value]]]:
-    vehicle = Vehicle(VehicleConfig(), seed=1)
-    first_us = (int(time.time()) - points // _RATE_HZ - 60) * 1_000_000
-    samples = []
-    for i in range(points):
-        vehicle.step(1 / _RATE_HZ)
-        samples.append((first_us + i * 1_000_000 // _RATE_HZ, vehicle.sample()))
-    return samples
-
-
-def _store(target: Target, robot: str, samples: list[tuple[int, dict[str, Value]]]) -> None:
-    serialize = TypeSerializer().serialize
-    client, table = target.cloud.client("dynamodb"), target.cloud.output("storage", "TelemetryTable")
-    topic, expires_s = (
-        build_topic(RECORD, robot, VESC_STREAM, target.cloud.namespace),
-        int(time.time()) + 86_400,
-    )
-    for seq, at in enumerate(range(0, len(samples), _RATE_HZ)):
-        part = samples[at : at + _RATE_HZ]
-        columns = {name: [sample[name] for _, sample in part] for name in part[0][1]}
-        item = json.loads(encode(Batch("0badcafe", seq, [t for t, _ in part], columns)))
-        item |= {TOPIC: topic, RECEIVED_MS: part[-1][0] // 1000, EXPIRES_S: expires_s}
-        client.put_item(TableName=table, Item={name: serialize(value) for name, value in item.items()})
-
-
 def _header(seq: int, t_us: int) -> dict[str, Any]:
     """What a ROS message carries besides its fields, and when it was received: with them an item is
     nearly as large as the thesis' were, 4.95 MB / 14,368."""
@@ -271,7 +242,7 @@ def _header(seq: int, t_us: int) -> dict[str, Any]:
 
 
 @contextmanager
-def _thesis_table(target: Target, robot: str, samples: list[tuple[int, dict[str, Value]]]) -> Iterator[Any]:
+def _thesis_table(target: Target, robot: str, samples: list[drives.Sample]) -> Iterator[Any]:
     """A table of one item a sample, as the thesis' rule wrote it; gone afterwards."""
     name = target.name(f"{target.cloud.namespace}-bench-thesis")
     cloud = target.cloud

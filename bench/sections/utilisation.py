@@ -17,9 +17,7 @@ from dataclasses import asdict
 from statistics import median
 from typing import Any
 
-from boto3.dynamodb.types import TypeSerializer
-
-from bench import borrowed, plots
+from bench import borrowed, drives, plots
 from bench.errors import BenchError
 from bench.invocations import Event, Measured, configure, invoke, measure, reporting
 from bench.machine import ROOT
@@ -27,17 +25,12 @@ from bench.result import NOT_MEASURED, Plot, Ratio, Section, Table
 from bench.spread import spread
 from bench.target import Say, Target
 from contract import (
-    EXPIRES_S,
     LIVE,
-    RECEIVED_MS,
-    RECORD,
     T_US,
     TOPIC,
     VESC_STREAM,
-    Batch,
     LiveSample,
     build_topic,
-    encode,
     encode_live,
     live_event,
 )
@@ -228,28 +221,12 @@ def _cold(target: Target, function: str, event: Event, say: Say) -> Measured:
 
 
 def _store(target: Target, say: Say) -> list[dict[str, Any]]:
-    """The items of a drive of 100 s at 50 Hz in the telemetry table; waits until Lambda 2 has seen them."""
+    """The items of a drive of 100 s in the telemetry table; waits until Lambda 2 has seen them."""
     say("storing a drive")
-    serialize = TypeSerializer().serialize
-    topic = build_topic(RECORD, target.name(ROBOT), VESC_STREAM, target.cloud.namespace)
-    vehicle = Vehicle(VehicleConfig(), seed=1)
-    first_s = int(time.time()) - BATCHES - 10
-    items = []
-    for seq in range(BATCHES):
-        samples = []
-        for _ in range(50):
-            vehicle.step(0.02)
-            samples.append(vehicle.sample())
-        times = [(first_s + seq) * 1_000_000 + i * 20_000 for i in range(50)]
-        batch = Batch("0badcafe", seq, times, {name: [s[name] for s in samples] for name in samples[0]})
-        item = {**json.loads(encode(batch)), TOPIC: topic, RECEIVED_MS: times[-1] // 1000}
-        item[EXPIRES_S] = int(time.time()) + 86_400
-        items.append({name: serialize(value) for name, value in item.items()})
-    client, table = target.cloud.client("dynamodb"), target.cloud.output("storage", "TelemetryTable")
-    for item in items:
-        client.put_item(TableName=table, Item=item)
+    robot = target.name(ROBOT)
+    items = drives.store(target, robot, drives.simulated(BATCHES * drives.RATE_HZ))
     deadline = time.monotonic() + _CATCH_UP_S
-    while delivery.samples_summarized(target.cloud, target.name(ROBOT), VESC_STREAM) < 50 * BATCHES:
+    while delivery.samples_summarized(target.cloud, robot, VESC_STREAM) < BATCHES * drives.RATE_HZ:
         if time.monotonic() > deadline:
             raise BenchError("Lambda 2 has not summarised what was stored")
         threading.Event().wait(0.2)

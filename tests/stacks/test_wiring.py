@@ -171,25 +171,25 @@ def test_what_the_variables_say_is_what_the_functions_expect(functions, reader, 
     assert LiveSettings.from_environment().fields == {contract.VESC_STREAM: frozenset(contract.VESC_FIELDS)}
     assert live["PUBNUB_PARAMETER"] == contract.pubnub_parameter()
     assert live["NAMESPACE"] == contract.DEFAULT_NAMESPACE
-    tables = functions["Summarize"]["Environment"]["Variables"]
-    assert {key: reader.text(value) for key, value in tables.items()} == {
-        "NAMESPACE": contract.DEFAULT_NAMESPACE,
+
+    def given(function):
+        variables = functions[function]["Environment"]["Variables"]
+        assert variables["NAMESPACE"] == contract.DEFAULT_NAMESPACE
+        return {key: reader.text(value) for key, value in variables.items() if key != "NAMESPACE"}
+
+    assert given("Summarize") == {
         "TELEMETRY_TABLE": "Telemetry",
         "SUMMARY_TABLE": "Summary",
         "ROBOTS_TABLE": "Robots",
         "REJECTED_QUEUE": "Rejected",
         "ROBOT_METRICS": "false",
     }
-    query = functions["Query"]["Environment"]["Variables"]
-    assert {key: reader.text(value) for key, value in query.items()} == {
-        "NAMESPACE": contract.DEFAULT_NAMESPACE,
+    assert given("Query") == {
         "TELEMETRY_TABLE": "Telemetry",
         "ROBOTS_TABLE": "Robots",
         "FILES_BUCKET": "Files",
     }
-    upload = functions["Upload"]["Environment"]["Variables"]
-    assert {key: reader.text(value) for key, value in upload.items()} == {
-        "NAMESPACE": contract.DEFAULT_NAMESPACE,
+    assert given("Upload") == {
         "FILES_BUCKET": "Files",
         "ROBOTS_TABLE": "Robots",
         "UPLOAD_BYTES_A_DAY": str(50 * 10**9),
