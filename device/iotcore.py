@@ -24,11 +24,12 @@ from device.certificate import Certificate, read_certificate, stamp
 from device.clock import Clock
 from device.dispatch import Dispatcher
 from device.errors import IdentityError, UplinkError
-from device.failures import code_name, error_name, explain, said, why_not_connected
+from device.failures import error_name, explain, said, why_not_connected
 from device.native_thread import keep_state
 from device.nodelay import send_at_once
 from device.reconnect import SETTLED_S, SHORTEST_S, Backoff, Causes
-from device.uplink import Done, Message, OnConnection, OnMessage, UplinkStatus, matches
+from device.subscriptions import Subscriptions
+from device.uplink import Done, Message, OnConnection, OnMessage, UplinkStatus
 
 if TYPE_CHECKING:
     from device.config import Config
@@ -41,7 +42,6 @@ PING_TIMEOUT_S = 10
 _ACK_TIMEOUT_S = 20
 # The client's own reconnects: so late that ours always come first.
 _NEVER_MS = 24 * 3600 * 1000
-_RESUBSCRIBE_S, _RESUBSCRIBE_SLOWLY_S = 10.0, 60.0
 # How often to look whether certificate, key or root_ca were replaced.
 _LOOK_S = 2.0
 _CLIENT_STOPS_S = 15.0
@@ -108,9 +108,12 @@ class IotCore:
         self._since = clock.monotonic()
         self._last_error: str | None = None
         self._handlers: list[OnConnection] = []
-        self._subscriptions: dict[str, OnMessage] = {}
-        self._confirmed: set[str] = set()
-        self._refused: set[str] = set()
+        self._subscriptions = Subscriptions(
+            dispatcher,
+            subscribe=self._subscribe,
+            usable=lambda: self._connected and not self._stop.is_set(),
+            refused=self._note_error,
+        )
 
     def on_connection(self, handler: OnConnection) -> None:
         """Tell the handler of every connect and loss."""
@@ -118,13 +121,11 @@ class IotCore:
 
     def subscribe(self, topic_filter: str, handler: OnMessage) -> None:
         """Receive what matches the filter, from now or the next connect on."""
-        self._subscriptions[topic_filter] = handler
-        if self._connected:
-            self._dispatcher.post(self._resubscribe)
+        self._subscriptions.add(topic_filter, handler)
 
     def subscribed(self, topic_filter: str) -> bool:
         """Whether the broker has confirmed the subscription on this connection."""
-        return topic_filter in self._confirmed
+        return topic_filter in self._subscriptions.confirmed
 
     def connected(self) -> bool:
         """Whether the broker has accepted the connection and it is not known to be lost."""
@@ -160,9 +161,10 @@ class IotCore:
         if not self._thread.is_alive():
             return
         until = self._clock.monotonic() + timeout_s
-        if self._connected and self._confirmed:
+        if self._connected and self._subscriptions.confirmed:
             gone = threading.Event()
-            future = self._client.unsubscribe(mqtt5.UnsubscribePacket(topic_filters=sorted(self._confirmed)))
+            filters = sorted(self._subscriptions.confirmed)
+            future = self._client.unsubscribe(mqtt5.UnsubscribePacket(topic_filters=filters))
             future.add_done_callback(lambda _: gone.set())
             gone.wait(timeout_s / 2)
         self._stop.set()
@@ -285,10 +287,7 @@ class IotCore:
     def _on_publish(self, data: Any) -> None:
         at = self._clock.monotonic()
         packet = data.publish_packet
-        message = Message(packet.topic, bytes(packet.payload or b""), at)
-        for topic_filter, handler in list(self._subscriptions.items()):
-            if matches(topic_filter, message.topic):
-                self._dispatcher.post(functools.partial(handler, message))
+        self._subscriptions.hand_out(Message(packet.topic, bytes(packet.payload or b""), at))
 
     def _on_connected(self, _: Any) -> None:
         keep_state()
@@ -297,7 +296,7 @@ class IotCore:
         self._connects += 1
         self._causes.connected()
         _log.info("connected to %s as %s", self._endpoint, self._client_id)
-        self._dispatcher.post(self._resubscribe)
+        self._dispatcher.post(self._subscriptions.renew)
         self._tell(connected=True)
 
     def _on_refused(self, data: Any) -> None:
@@ -318,7 +317,7 @@ class IotCore:
         self._down.set()
 
     def _on_lost(self, data: Any) -> None:
-        self._confirmed.clear()
+        self._subscriptions.confirmed.clear()
         if self._clock.monotonic() - self._since > SETTLED_S:
             self._backoff.reset()
         self._switch(connected=False)
@@ -351,44 +350,12 @@ class IotCore:
 
     # What follows is called by the dispatcher.
 
-    def _resubscribe(self) -> None:
-        for topic_filter in list(self._subscriptions):
-            if self._connected and not self._stop.is_set() and topic_filter not in self._confirmed:
-                packet = mqtt5.SubscribePacket([mqtt5.Subscription(topic_filter, mqtt5.QoS.AT_LEAST_ONCE)])
-                self._operate(
-                    functools.partial(self._client.subscribe, packet),
-                    functools.partial(self._on_suback, topic_filter),
-                )
+    def _subscribe(self, topic_filter: str, done: Callable[[Future[Any]], None]) -> None:
+        packet = mqtt5.SubscribePacket([mqtt5.Subscription(topic_filter, mqtt5.QoS.AT_LEAST_ONCE)])
+        self._operate(functools.partial(self._client.subscribe, packet), done)
 
-    def _on_suback(self, topic_filter: str, future: Future[Any]) -> None:
-        error = future.exception()
-        if error is None:
-            packet = future.result()
-            code = packet.reason_codes[0] if packet.reason_codes else None
-            if code is not None and code < 128:
-                if self._connected:
-                    self._confirmed.add(topic_filter)
-                    self._refused.discard(topic_filter)
-                return
-            why = f"the broker says {code_name(code)}" + (
-                f", {packet.reason_string}" if packet.reason_string else ""
-            )
-        else:
-            why = explain(error)
-        if not self._connected or self._stop.is_set():
-            return  # the next connect subscribes anew
-        delay_s = _RESUBSCRIBE_SLOWLY_S if topic_filter in self._refused else _RESUBSCRIBE_S
-        if topic_filter not in self._refused:
-            self._refused.add(topic_filter)
-            self._last_error = f"cannot subscribe to {topic_filter}: {why}"
-            _log.error(
-                "cannot subscribe to %s, nothing will arrive there; trying again every minute: %s. "
-                "If it is not authorized, the robot's policy is older than this agent",
-                topic_filter, why,
-            )  # fmt: skip
-        timer = threading.Timer(delay_s, self._dispatcher.post, (self._resubscribe,))
-        timer.daemon = True
-        timer.start()
+    def _note_error(self, text: str) -> None:
+        self._last_error = text
 
 
 def make_uplink(config: Config, clock: Clock) -> IotCore:

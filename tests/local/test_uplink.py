@@ -15,7 +15,7 @@ from typing import Any
 import pytest
 
 import contract
-from device import iotcore
+from device import iotcore, subscriptions
 from device.clock import SystemClock
 from device.dispatch import Dispatcher
 from device.iotcore import IotCore
@@ -237,8 +237,8 @@ def test_without_a_root_ca_the_system_decides(bundle, proxy, caplog):
 
 
 def test_a_refused_subscription_is_said_once_and_spoils_no_other(bundle, proxy, caplog, monkeypatch):
-    monkeypatch.setattr(iotcore, "_RESUBSCRIBE_S", 0.1)
-    monkeypatch.setattr(iotcore, "_RESUBSCRIBE_SLOWLY_S", 0.1)
+    monkeypatch.setattr(subscriptions, "_AGAIN_S", 0.1)
+    monkeypatch.setattr(subscriptions, "_AGAIN_SLOWLY_S", 0.1)
     with connecting(bundle(), proxy) as told:
         told.uplink.subscribe("cmd/iort/somebody-else/drive", lambda _: None)
         told.echo(b"good")
