@@ -14,6 +14,7 @@ from pathlib import Path
 from typing import Any
 
 import boto3
+import botocore.session
 from botocore.config import Config
 from botocore.exceptions import BotoCoreError, ClientError
 
@@ -23,6 +24,8 @@ from station.errors import StationError
 # Where an embedded cloud that runs in this checkout says how to reach it.
 EMBEDDED = Path(__file__).resolve().parent.parent / "build" / "local" / "cloud.json"
 
+# An embedded cloud has credentials of its own, and the profile that AWS_PROFILE names need not exist.
+_NO_PROFILE = {"profile": (None, None, None, None)}
 _CONFIG = Config(retries={"mode": "standard", "max_attempts": 5}, connect_timeout=5, read_timeout=20)
 
 
@@ -58,6 +61,7 @@ class Cloud:
     @cached_property
     def _session(self) -> boto3.Session:
         return boto3.Session(
+            botocore_session=None if self.access_key_id is None else botocore.session.Session(_NO_PROFILE),
             profile_name=self.profile,
             # Of AWS' tools boto3 alone reads AWS_DEFAULT_REGION only.
             region_name=self.region or os.environ.get("AWS_REGION"),

@@ -60,6 +60,14 @@ def test_the_region_of_the_cdks_own_variable_is_taken(found, monkeypatch):
     assert found(region="eu-west-1").client("iot").meta.region_name == "eu-west-1"
 
 
+def test_an_embedded_cloud_asks_for_no_profile(monkeypatch):
+    monkeypatch.setenv("AWS_PROFILE", "nobody")
+    embedded = Cloud(region="eu-west-1", access_key_id="test", secret_access_key="test")
+    assert embedded.client("iot").meta.region_name == "eu-west-1"
+    with pytest.raises(StationError, match="nobody"):
+        Cloud(region="eu-west-1").check()
+
+
 def test_no_key_is_asked_for_before_there_is_a_cloud(tmp_path):
     done = CliRunner().invoke(app, ["--embedded", str(tmp_path / "cloud.json"), "pubnub"], input="a\nb\n")
     assert isinstance(done.exception, StationError)
