@@ -9,13 +9,11 @@ from collections.abc import Iterator, Mapping, Sequence
 from itertools import islice
 from typing import Any
 
-from boto3.dynamodb.types import TypeDeserializer
-
 from contract import OMITTED, ROBOT, SECOND, T_US, TOPIC, Statistics
+from functions.attributes import deserialize
 from functions.statistics import Vehicle
 
 _log = logging.getLogger(__name__)
-_deserialize = TypeDeserializer().deserialize
 # BatchWriteItem takes at most this many items a call.
 _WRITE_SIZE = 25
 _WRITE_ATTEMPTS = 8
@@ -38,7 +36,7 @@ class TableError(Exception):
 
 def plain(image: Mapping[str, Any]) -> dict[str, Any]:
     """An item as Python values; numbers are Decimal."""
-    return {name: _deserialize(value) for name, value in image.items()}
+    return {name: deserialize(value) for name, value in image.items()}
 
 
 def attribute(value: Statistics) -> dict[str, Any]:

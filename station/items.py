@@ -5,17 +5,14 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any
 
-from boto3.dynamodb.types import TypeDeserializer
-
 from contract import RECORD, TOPIC, build_topic
+from functions.attributes import deserialize
 from station.cloud import Cloud
-
-_deserialize = TypeDeserializer().deserialize
 
 
 def plain(item: Mapping[str, Any]) -> dict[str, Any]:
     """An item as Python values; numbers are Decimals, bytes are boto3's `Binary`."""
-    return {name: _deserialize(value) for name, value in item.items()}
+    return {name: deserialize(value) for name, value in item.items()}
 
 
 def of_topic(cloud: Cloud, table: str, robot: str, stream: str, *fields: str) -> dict[str, Any]:

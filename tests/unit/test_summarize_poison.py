@@ -43,6 +43,8 @@ POISON = {
     "text for seq": poison(seq="7"),
     "fraction for seq": {**poison(), "seq": {"N": "7.5"}},
     "huge seq": {**poison(), "seq": {"N": "1E+125"}},
+    "huge seq with its digits": {**poison(), "seq": {"N": "1" + "0" * 125}},
+    "huge time with its digits": {**poison(), "t": {"N": "1" + "0" * 124}},
     "binary samples": {**poison(), "samples": {"B": b"AAAA"}},
     "map for boot": {**poison(), "boot": {"M": {}}},
     "other topic": {**poison(), "topic": {"S": "dt/iort/car"}},
@@ -115,3 +117,15 @@ def test_a_vehicle_whose_parameters_are_wrong_stops_nothing(stream, caplog):
     stream.deliver(batch(T0, 2, speed=[1, 2]))
     assert stream.column("speed_max") == {0: 2}
     assert "car" in caplog.text
+
+
+def test_an_attribute_of_more_digits_than_boto3_reads_keeps_no_batch_from_its_summary(stream):
+    """DynamoDB holds numbers up to 9.99e125, however many digits it writes them with."""
+    odd = {"N": "-1" + "0" * 125}
+    item = item_of_message(contract.encode(batch(T0, 3, a=[1.5] * 3)))
+    odd_item = {**item, "far": odd, "deep": {"M": {"far": {"L": [odd]}}}}
+    assert stream.summarize([stream.store_item(odd_item)]) == {"batchItemFailures": []}
+    assert stream.column("n") == {0: 3}
+    stream.deliver(batch(T0 + S // 2, 2, seq=1, a=[2.5] * 2))
+    assert stream.column("n") == {0: 5}
+    assert stream.refused == []

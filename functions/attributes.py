@@ -1,0 +1,18 @@
+"""Attributes of stored items as Python values, whatever a robot has put there."""
+
+from __future__ import annotations
+
+from decimal import Decimal
+
+from boto3.dynamodb.types import TypeDeserializer
+
+
+class _Exact(TypeDeserializer):  # type: ignore[misc]  # boto3 has no types
+    """Numbers as they are written: boto3's own context raises for one of over 38 digits, and 1e125 may be
+    written as 126."""
+
+    def _deserialize_n(self, value: str) -> Decimal:
+        return Decimal(value)
+
+
+deserialize = _Exact().deserialize
