@@ -12,6 +12,8 @@ export class LogTable {
   private readonly note = new Text("note", "p", { role: "status" });
   private readonly host = el("div", { class: "log", role: "region", tabindex: "0" });
   private askedAt = -Infinity;
+  // A query may take longer than the dashboard beside it stays the newest.
+  private asking: AbortController | undefined;
 
   constructor(
     private readonly parameters: Readonly<Record<string, string>>,
@@ -22,17 +24,25 @@ export class LogTable {
   }
 
   /** Ask anew, unless that has just been done; what was found before stays until there is an answer. */
-  async refresh(signal: AbortSignal): Promise<void> {
+  async refresh(): Promise<void> {
     const now = performance.now() / 1000;
-    if (now - this.askedAt < AGAIN_S) return;
-    this.askedAt = now;
+    if (this.asking || now - this.askedAt < AGAIN_S) return;
+    const asking = new AbortController();
+    [this.askedAt, this.asking] = [now, asking];
     if (!this.host.hasChildNodes()) this.note.set("Reading the logs …");
     try {
-      this.draw(await ask<Logs>("log", this.parameters, signal));
+      this.draw(await ask<Logs>("log", this.parameters, asking.signal));
     } catch (error) {
       this.askedAt = -Infinity;
-      if (!signal.aborted) this.note.set(error instanceof AnswerError ? error.message : String(error));
+      if (!asking.signal.aborted) this.note.set(error instanceof AnswerError ? error.message : String(error));
+    } finally {
+      this.asking = undefined;
     }
+  }
+
+  /** Wait for no answer any longer. */
+  stop(): void {
+    this.asking?.abort();
   }
 
   private draw({ columns, rows, found, to_s }: Logs): void {

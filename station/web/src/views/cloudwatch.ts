@@ -40,6 +40,7 @@ export class CloudWatchView {
   show(shown: boolean): void {
     window.clearInterval(this.timer);
     this.loading?.abort();
+    if (!shown) for (const log of this.logs.values()) log.stop();
     if (!shown || !this.config.answers) return;
     void this.find();
     this.timer = window.setInterval(() => !document.hidden && void this.load(), REFRESH_S * 1000);
@@ -67,7 +68,7 @@ export class CloudWatchView {
     try {
       const dashboard = await ask<Dashboard>("dashboard", { name: this.choice.value, minutes: this.range.value }, loading.signal);
       if (loading.signal.aborted) return;
-      this.draw(dashboard, loading.signal);
+      this.draw(dashboard);
       // The dashboard ends with the minute that is running.
       const at = Date.now() / 1000;
       this.note.set(`as of ${clockTime(at)} ${zone(at)}, again every ${REFRESH_S} s`);
@@ -76,7 +77,7 @@ export class CloudWatchView {
     }
   }
 
-  private draw({ name, widgets, from_s, to_s }: Dashboard, signal: AbortSignal): void {
+  private draw({ name, widgets, from_s, to_s }: Dashboard): void {
     for (const chart of this.charts) chart.destroy();
     this.charts = [];
     const logs = new Map<string, LogTable>();
@@ -95,11 +96,12 @@ export class CloudWatchView {
           const log = this.logs.get(key) ?? new LogTable(asked, widget.title);
           logs.set(key, log);
           node.append(log.node);
-          void log.refresh(signal);
+          void log.refresh();
         }
         return node;
       }),
     );
+    for (const [key, log] of this.logs) if (!logs.has(key)) log.stop();
     this.logs = logs;
   }
 }
