@@ -50,7 +50,7 @@ from local.errors import LocalError
 from local.processes import Child
 from local.pubnub_standin import PubNubStandIn
 from station import keys
-from station.cloud import EMBEDDED, Cloud
+from station.cloud import EMBEDDED, Cloud, without_proxy
 from station.keys import PubNubKeys
 
 FOLDER = EMBEDDED.parent
@@ -102,6 +102,7 @@ class EmbeddedCloud:
 
     def _start(self) -> None:
         self._take_folder()
+        without_proxy(self.host)
         ports = {name: self._port(name) for name in ("gateway", "mqtt", "pubnub")}
         certificate, key = Identity.make("iort embedded cloud", self.host).write(self.folder, "gateway")
         self.cloud = Cloud(

@@ -12,6 +12,7 @@ from dataclasses import asdict, dataclass, field
 from functools import cache, cached_property
 from pathlib import Path
 from typing import Any
+from urllib.parse import urlsplit
 
 import boto3
 import botocore.session
@@ -27,6 +28,13 @@ EMBEDDED = Path(__file__).resolve().parent.parent / "build" / "local" / "cloud.j
 # An embedded cloud has credentials of its own, and the profile that AWS_PROFILE names need not exist.
 _NO_PROFILE = {"profile": (None, None, None, None)}
 _CONFIG = Config(retries={"mode": "standard", "max_attempts": 5}, connect_timeout=5, read_timeout=20)
+
+
+def without_proxy(host: str) -> None:
+    """Let no library of this process ask a proxy for ``host``, which is on this machine."""
+    known = os.environ.get("no_proxy") or os.environ.get("NO_PROXY", "")
+    if host and host not in known.split(","):
+        os.environ["no_proxy"] = os.environ["NO_PROXY"] = f"{known},{host}".lstrip(",")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -48,11 +56,13 @@ class Cloud:
     def load(cls, path: Path) -> Cloud:
         """The embedded cloud that wrote ``path``; raises `StationError` where none is running."""
         try:
-            return cls(**json.loads(path.read_text()))
+            cloud = cls(**json.loads(path.read_text()))
         except FileNotFoundError as error:
             raise StationError(f"no embedded cloud is running: {path} is not there") from error
         except (OSError, TypeError, ValueError) as error:
             raise StationError(f"{path} does not describe an embedded cloud: {error}") from error
+        without_proxy(urlsplit(cloud.endpoint_url or "").hostname or "")
+        return cloud
 
     def save(self, path: Path) -> None:
         """Write what `load` reads."""

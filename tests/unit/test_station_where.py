@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+from urllib.request import proxy_bypass
 
 import pytest
 from typer.testing import CliRunner
@@ -66,6 +67,27 @@ def test_an_embedded_cloud_asks_for_no_profile(monkeypatch):
     assert embedded.client("iot").meta.region_name == "eu-west-1"
     with pytest.raises(StationError, match="nobody"):
         Cloud(region="eu-west-1").check()
+
+
+@pytest.mark.parametrize(
+    ("name", "value"), [("NO_PROXY", "lab.example"), ("no_proxy", "lab.example"), (None, "")]
+)
+def test_an_embedded_cloud_is_asked_around_a_proxy(monkeypatch, tmp_path, name, value):
+    for each in ("NO_PROXY", "no_proxy"):
+        # What is set first is put back afterwards, also where it was not there.
+        monkeypatch.setenv(each, "")
+        monkeypatch.delenv(each)
+    if name:
+        monkeypatch.setenv(name, value)
+    monkeypatch.setenv("HTTPS_PROXY", "http://proxy.example:3128")
+    Cloud(endpoint_url="https://127.0.0.1:4566").save(tmp_path / "cloud.json")
+    for _ in range(2):
+        Cloud.load(tmp_path / "cloud.json")
+        assert (
+            os.environ["no_proxy"] == os.environ["NO_PROXY"] == ",".join(filter(None, [value, "127.0.0.1"]))
+        )
+    assert proxy_bypass("127.0.0.1")
+    assert not proxy_bypass("sts.amazonaws.com")
 
 
 def test_no_key_is_asked_for_before_there_is_a_cloud(tmp_path):
