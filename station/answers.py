@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from contract import check_robot
+from contract import CLAIM_FIELDS, check_robot
 from station import cloudwatch, cloudwatch_logs, data, inventory, registry
 from station.cloud import Cloud
 from station.conditions import Column, values
@@ -45,8 +45,9 @@ def answers(cloud: Cloud) -> dict[str, Callable[[Mapping[str, str]], dict[str, A
 def history(cloud: Cloud, asked: Mapping[str, str]) -> dict[str, Any]:
     """The samples of ``robot`` and ``stream`` from ``from_us`` to ``to_us``, in at most ``rows`` rows.
 
-    A row that stands for several samples has the least, the mean and the most of every number, and of
-    everything else the last that is not null. Raises `StationError` for a request that cannot be answered.
+    A row that stands for several samples has the least, the mean and the most of every number, of a claim
+    on content the last whole one, and of everything else the last that is not null. Raises `StationError`
+    for a request that cannot be answered.
     """
     start_us, end_us = (_whole(asked, name, 0, 2**53) for name in ("from_us", "to_us"))
     rows = _whole(asked, "rows", 2, MAX_ROWS)
@@ -58,6 +59,7 @@ def history(cloud: Cloud, asked: Mapping[str, str]) -> dict[str, Any]:
     columns = (
         _by_statistic(found.columns) if summary else {name: (c, c, c) for name, c in found.columns.items()}
     )
+    claims = _claims(columns)
     n = len(found)
     row_us = 0
     starts = np.arange(n)
@@ -66,9 +68,16 @@ def history(cloud: Cloud, asked: Mapping[str, str]) -> dict[str, Any]:
         bins = (found.times_us - found.times_us[0]) // row_us
         starts = np.flatnonzero(np.append(True, bins[1:] != bins[:-1]))
     several = summary or row_us > 0
+    fields = {
+        name: _rows(each, starts, n, several=several) for name, each in columns.items() if name not in claims
+    }
+    for name, key in claims.items():
+        # The five fields of one claim belong together, so they are of one sample.
+        told, ends = values(found.columns[name]), _last_known(found.columns[key], starts)
+        fields[name] = {"mean": [told[end] for end in ends]}
     return {
         "times_s": [t_us / 1e6 for t_us in found.times_us[starts].tolist()],
-        "fields": {name: _rows(each, starts, n, several=several) for name, each in columns.items()},
+        "fields": fields,
         "samples": int(np.nansum(found.columns["n"])) if summary and "n" in found.columns else n,
         "ros2": found.ros2,
         "row_s": max(row_us / 1e6, 1.0 if summary else 0.0),
@@ -82,6 +91,17 @@ def _by_statistic(columns: Mapping[str, Column]) -> dict[str, tuple[Column, Colu
         name: (columns[f"{name}_mean"], columns[f"{name}_min"], columns[f"{name}_max"])
         for name in names
         if f"{name}_min" in columns and f"{name}_max" in columns
+    }
+
+
+def _claims(columns: Mapping[str, Any]) -> dict[str, str]:
+    """The fields of claims on content (docs/files.md) by name, each with that of its claim's key."""
+    fields = [name.removesuffix(".key") for name in columns if name.endswith(".key")]
+    return {
+        f"{field}.{part}": f"{field}.key"
+        for field in fields
+        if all(f"{field}.{part}" in columns for part in CLAIM_FIELDS)
+        for part in CLAIM_FIELDS
     }
 
 

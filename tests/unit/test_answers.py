@@ -61,6 +61,22 @@ def test_a_picture_is_not_lost_among_those_that_the_car_left_out():
     assert found["fields"]["data.thumbnail"]["mean"] == ["first", None]
 
 
+def test_the_fields_of_a_claim_are_of_one_sample():
+    parts = {
+        "key": ["a.jpg", "b.bin", None, None],
+        "sha256": ["0" * 64, "1" * 64, None, None],
+        "size": [1_000, 3_000, None, None],
+        "content_type": ["image/jpeg", "application/octet-stream", None, None],
+        "thumbnail": ["small a", None, None, None],
+    }
+    columns = {f"data.{part}": values for part, values in parts.items()}
+    times = [START + 20_000 * i for i in range(4)]
+    found = history(cloud_of(Batch("0badcafe", 0, times, columns)), {**ASKED, "rows": "2"})
+    assert found["fields"] == {
+        f"data.{part}": {"mean": [values[1], values[3]]} for part, values in parts.items()
+    }
+
+
 def test_an_empty_range_is_no_error():
     late = {**ASKED, "from_us": str(START + 60_000_000), "to_us": str(START + 61_000_000)}
     found = history(cloud_of(*ride(10)), late)
