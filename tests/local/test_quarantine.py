@@ -14,6 +14,7 @@ from contract import ENTRY, LIVE, VESC_STREAM, Batch, build_topic, record_topic
 from station import delivery, quarantine
 from station.cli import app
 from station.cloud import EMBEDDED
+from station.items import of_topic
 from tests.local.conftest import until
 from tests.local.robot import Robot
 
@@ -216,4 +217,38 @@ def test_what_the_quarantine_cannot_keep_ends_in_the_last_queue_and_comes_back(e
     assert "on the way to it again" in iort("replay-errors", "--robot", car.robot).stderr
     (entry,) = until(lambda: list(quarantine.entries(cloud, robot=car.robot)), seconds=60)
     assert quarantine.load(cloud, entry).payload == b"never kept so far"
-    assert quarantine.waiting(cloud).last == 0
+
+
+# --- what one robot does to the others ----------------------------------------------------------------
+
+
+def hostile():
+    """Messages that no agent sends, which the record rule stores or refuses."""
+    t_us = int(time.time()) * 1_000_000
+    far = {f"a{i}": 1e125 for i in range(1000)}
+    changes = [
+        {"t": 10**124},
+        far,
+        {"t": 1.5},
+        {"t": -5},
+        {"nonfinite": -1},
+        {"n": 10**9},
+        {"robot": "other"},
+    ]
+    changes += [{"samples": "x" * 100_000}, {"boot": "\ud800"}, {"x": [1] * 20_000}, {"codec": None}]
+    nested = b'{"v":1,"t":%d,"a":' % t_us + b"[" * 900 + b"]" * 900 + b"}"
+    return [batch(i, **change) for i, change in enumerate(changes)] + [
+        nested,
+        b'{"t":1e400}',
+        b'{"":1,"t":7}',
+    ]
+
+
+def test_a_hail_of_nonsense_leaves_the_others_their_summaries(bundle, embedded):
+    cloud = embedded.cloud
+    send(bundle("bad"), *hostile())
+    good = bundle("good")
+    send(good, batch())
+    items = of_topic(cloud, "SummaryTable", good.robot, VESC_STREAM)
+    (second,) = until(lambda: cloud.client("dynamodb").query(**items)["Items"])
+    assert second[contract.SAMPLES] == {"N": "1"}
