@@ -317,7 +317,7 @@ class IotCore:
         self._down.set()
 
     def _on_lost(self, data: Any) -> None:
-        self._subscriptions.confirmed.clear()
+        self._subscriptions.lost()
         if self._clock.monotonic() - self._since > SETTLED_S:
             self._backoff.reset()
         self._switch(connected=False)

@@ -38,6 +38,7 @@ class Subscriptions:
         # What the broker has agreed to on this connection.
         self.confirmed: set[str] = set()
         self._refused: set[str] = set()
+        self._losses = 0
 
     def add(self, topic_filter: str, handler: OnMessage) -> None:
         """Receive what matches the filter, from now or the next connect on."""
@@ -51,13 +52,20 @@ class Subscriptions:
             if matches(topic_filter, message.topic):
                 self._dispatcher.post(functools.partial(handler, message))
 
+    def lost(self) -> None:
+        """The connection is lost, and every subscription with it; from the network's own thread."""
+        self._losses += 1
+        self.confirmed.clear()
+
     def renew(self) -> None:
         """Ask for what is not confirmed."""
         for topic_filter in list(self._handlers):
             if self._usable() and topic_filter not in self.confirmed:
-                self._subscribe(topic_filter, functools.partial(self._on_answer, topic_filter))
+                self._subscribe(topic_filter, functools.partial(self._on_answer, topic_filter, self._losses))
 
-    def _on_answer(self, topic_filter: str, future: Future[Any]) -> None:
+    def _on_answer(self, topic_filter: str, losses: int, future: Future[Any]) -> None:
+        if losses != self._losses:
+            return  # of a connection before: this one is asked anew
         error = future.exception()
         if error is None:
             packet = future.result()
