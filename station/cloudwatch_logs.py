@@ -28,8 +28,13 @@ _POINTER = "@ptr"
 def rows(cloud: Cloud, name: str, number: int, *, minutes: int, now_s: float | None = None) -> dict[str, Any]:
     """What the widget ``number`` of a dashboard finds in the last ``minutes``, as answers.ts describes it.
 
-    Raises `StationError` where there is no such log widget, or Logs Insights has no answer.
+    Raises `StationError` where there is no such log widget, or Logs Insights has no answer. Of the account's
+    other dashboards a page shows the metrics alone: logs say more than whoever can reach it may need to know.
     """
+    if not name.startswith(f"{cloud.namespace}-"):
+        raise StationError(
+            f"dashboard {name[:80]!r} is another deployment's, whose logs stay in the AWS console"
+        )
     widgets = body_of(cloud, name)
     widget = widgets[number] if number < len(widgets) else {}
     if widget.get("type") != "log":

@@ -11,6 +11,7 @@ from station import cloudwatch_logs
 from station.errors import StationError
 
 NOW_S = 1_700_000_000
+NAME = "iort-platform"
 QUERY = "SOURCE '/aws/lambda/a' | SOURCE \"b\" | fields @timestamp, @message\n| filter @message like /a|b/"
 
 
@@ -47,7 +48,7 @@ def row(**cells: str) -> list[dict[str, str]]:
 def test_the_widgets_own_query_is_asked_of_its_log_groups() -> None:
     found = [row(timestamp="t1", message="one", ptr="x"), row(message="x" * 5000, log="1:a", ptr="y")]
     cloud = Insights({"status": "Scheduled"}, {"status": "Running"}, {"status": "Complete", "results": found})
-    told = cloudwatch_logs.rows(cloud, "d", 1, minutes=15, now_s=NOW_S)
+    told = cloudwatch_logs.rows(cloud, NAME, 1, minutes=15, now_s=NOW_S)
     assert cloud.asked == {
         "logGroupNames": ["/aws/lambda/a", "b"],
         "queryString": "fields @timestamp, @message\n| filter @message like /a|b/",
@@ -62,27 +63,35 @@ def test_the_widgets_own_query_is_asked_of_its_log_groups() -> None:
 
 def test_rows_that_nobody_reads_are_counted_and_left_out() -> None:
     cloud = Insights({"status": "Complete", "results": [row(message=str(i)) for i in range(250)]})
-    told = cloudwatch_logs.rows(cloud, "d", 1, minutes=15, now_s=NOW_S)
+    told = cloudwatch_logs.rows(cloud, NAME, 1, minutes=15, now_s=NOW_S)
     assert (len(told["rows"]), told["found"]) == (cloudwatch_logs.MAX_ROWS, 250)
 
 
 def test_a_query_in_another_language_is_asked_in_it() -> None:
     cloud = Insights({"status": "Complete"}, queryLanguage="PPL")
-    assert cloudwatch_logs.rows(cloud, "d", 1, minutes=15, now_s=NOW_S)["rows"] == []
+    assert cloudwatch_logs.rows(cloud, NAME, 1, minutes=15, now_s=NOW_S)["rows"] == []
     assert cloud.asked["queryLanguage"] == "PPL"
 
 
 @pytest.mark.parametrize("status", ["Failed", "Cancelled", "Timeout"])
 def test_a_query_that_fails_says_so(status: str) -> None:
     with pytest.raises(StationError, match=f"gave up on the query: {status.lower()}"):
-        cloudwatch_logs.rows(Insights({"status": status}), "d", 1, minutes=15)
+        cloudwatch_logs.rows(Insights({"status": status}), NAME, 1, minutes=15)
 
 
 def test_nothing_else_can_be_asked_of_the_logs() -> None:
     for number in (0, 2):
         with pytest.raises(StationError, match="none of logs"):
-            cloudwatch_logs.rows(Insights(), "d", number, minutes=15)
+            cloudwatch_logs.rows(Insights(), NAME, number, minutes=15)
     with pytest.raises(StationError, match="names no log group"):
         cloudwatch_logs.rows(
-            Insights(query="SOURCE logGroups(namePrefix: ['a']) | fields x"), "d", 1, minutes=15
+            Insights(query="SOURCE logGroups(namePrefix: ['a']) | fields x"), NAME, 1, minutes=15
         )
+
+
+@pytest.mark.parametrize("name", ["billing", "iort", "iort2-platform", "IORT-platform"])
+def test_the_logs_of_other_dashboards_are_not_asked_for(name: str) -> None:
+    cloud = Insights({"status": "Complete"})
+    with pytest.raises(StationError, match="another deployment's"):
+        cloudwatch_logs.rows(cloud, name, 1, minutes=15)
+    assert not cloud.asked
