@@ -209,7 +209,9 @@ def test_cloudwatchs_dashboards_are_drawn_from_its_metrics(embedded, open_page):
         }
     )
     logged(embedded.cloud, "page-test", "[WARN] first", "[INFO] fine", "[WARN] <b>bold</b>", "[WARN] last")
-    cloudwatch.put_dashboard(DashboardName="page-test", DashboardBody=json.dumps({"widgets": widgets}))
+    cloudwatch.put_dashboard(
+        DashboardName=f"{embedded.namespace}-test", DashboardBody=json.dumps({"widgets": widgets})
+    )
     now = datetime.now(timezone.utc)
     for value in (2, 3):
         datum = {"MetricName": "Laps", "Dimensions": [{"Name": "Car", "Value": "a"}], "Timestamp": now}
@@ -217,13 +219,13 @@ def test_cloudwatchs_dashboards_are_drawn_from_its_metrics(embedded, open_page):
     with served(embedded) as server:
         page = open_page(f"{server.url}#/cloudwatch")
         names = page.locator("#dashboard option")
-        until(lambda: "page-test" in names.all_inner_texts(), "the dashboards")
+        until(lambda: f"{embedded.namespace}-test" in names.all_inner_texts(), "the dashboards")
         # Our own deployment's stands first, and is drawn.
         assert names.first.inner_text().lower().startswith(embedded.namespace)
         alarms = page.locator("[data-widget='Alarms'] li")
         deployed = cloudwatch.describe_alarms(AlarmNamePrefix=embedded.namespace)["MetricAlarms"]
         until(lambda: alarms.count() == len(deployed) > 0, "the alarms")
-        page.select_option("#dashboard", "page-test")
+        page.select_option("#dashboard", f"{embedded.namespace}-test")
         widget = page.locator("[data-widget='Laps driven']")
         until(lambda: "laps of a 5" in plain(widget.inner_text()), "the metric's value")
         assert widget.locator(".plot canvas").count() == 1
