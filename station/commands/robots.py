@@ -33,6 +33,8 @@ from station.times import iso_s, time_us
 commands = typer.Typer(no_args_is_help=True, help="The robots that may connect.")
 _out, _errors = Console(highlight=False), Console(stderr=True, highlight=False)
 
+_WIDEST = 10_000
+
 _GAIN = typer.Option(help="erpm per m/s (vesc.yaml).")
 _CLAIM_FOLDER = typer.Option(help="The folder to write the claim into.")
 
@@ -132,13 +134,16 @@ def list_(
     if not rows:
         _errors.print("no robot is registered; `iort robots add NAME` registers one")
         return
-    table = Table("robot", box=None, pad_edge=False)
-    table.add_column("connection", no_wrap=True)
-    table.add_column("agent")
-    table.add_column("parameters")
+    table = Table(box=None, pad_edge=False)
+    # Half a name is of no use to who copies it; what is long instead has a second line.
+    table.add_column("robot", min_width=max(len(str(row[ROBOT])) for row in rows))
+    for heading in ("connection", "agent", "parameters"):
+        table.add_column(heading, overflow="fold")
     for row in rows:
         table.add_row(row[ROBOT], _connection(row), row.get(AGENT_VERSION, ""), _parameters(row))
-    _out.print(table)
+    # What reads a pipe has no edge at which a line must end.
+    out = _out if _out.is_terminal else Console(width=_WIDEST, highlight=False)
+    out.print(table)
 
 
 @commands.command("show")
