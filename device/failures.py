@@ -49,11 +49,11 @@ def why_not_connected(
     client_id: str,
     certificate: Certificate | None,
     now_us: int,
-    hung_up: Callable[[], bool],
+    hung_up: Callable[..., bool],
 ) -> Cause:
     """What to make of a connection that was not made, for a robot with this certificate (None: it could
     not be read) by a clock that says ``now_us``; ``hung_up`` is asked whether the broker hangs up
-    again and again."""
+    again and again (`device.reconnect.Causes.hung_up`)."""
     packet = data.connack_packet
     code = packet.reason_code if packet is not None else None
     name = error_name(data.exception)
@@ -67,7 +67,7 @@ def why_not_connected(
             f"or its policy does not let it connect. {_ADVICE}"
         )
         return Cause("refused", text, slow=True)
-    if suspicious and hung_up():
+    if suspicious and hung_up(before_tls=name == _CLOSED):
         if name == _TLS_FAILED:
             text = f"{words}: the broker's certificate does not fit root_ca, or the broker refuses ours"
         else:

@@ -54,6 +54,7 @@ class Causes:
     def __init__(self) -> None:
         self._said: str | None = None
         self._hangups = 0
+        self._before_tls = False
 
     def connected(self) -> None:
         """Whatever comes now is news."""
@@ -65,7 +66,12 @@ class Causes:
         news, self._said = cause.kind != self._said, cause.kind
         return news
 
-    def hung_up(self) -> bool:
-        """Count a connection closed without an answer; whether it is time to call it a refusal."""
-        self._hangups += 1
+    def hung_up(self, *, before_tls: bool) -> bool:
+        """Count a connection closed without an answer; whether it is time to call it a refusal.
+
+        A proxy with no broker behind it resets connections. Some of those resets come while TLS begins, and
+        the client calls that a failure of TLS; so what counts is how often in a row TLS had begun, or not.
+        """
+        self._hangups = self._hangups + 1 if before_tls == self._before_tls else 1
+        self._before_tls = before_tls
         return self._hangups >= HANGUPS

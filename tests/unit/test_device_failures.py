@@ -48,7 +48,11 @@ def test_each_failure_has_its_cause(
     data: Any, certificate: Certificate | None, again: bool, expected: tuple[str, bool], words: str
 ) -> None:
     cause = why_not_connected(
-        data, client_id="car7", certificate=certificate, now_us=NOW_S * 1_000_000, hung_up=lambda: again
+        data,
+        client_id="car7",
+        certificate=certificate,
+        now_us=NOW_S * 1_000_000,
+        hung_up=lambda before_tls: again,
     )
     assert words in cause.text
     kind, slow = expected

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import random
 
+import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
@@ -48,8 +49,18 @@ def test_a_cause_is_news_once() -> None:
     assert causes.is_news(a)
 
 
-def test_hangups_become_a_refusal_only_in_a_row() -> None:
+@pytest.mark.parametrize("before_tls", [False, True])
+def test_hangups_become_a_refusal_only_in_a_row(before_tls: bool) -> None:
     causes = Causes()
-    assert [causes.hung_up() for _ in range(HANGUPS)] == [False] * (HANGUPS - 1) + [True]
+    told = [causes.hung_up(before_tls=before_tls) for _ in range(HANGUPS)]
+    assert told == [False] * (HANGUPS - 1) + [True]
     causes.connected()
-    assert not causes.hung_up()
+    assert not causes.hung_up(before_tls=before_tls)
+
+
+def test_a_reset_that_looks_like_a_failure_of_tls_is_no_refusal() -> None:
+    causes = Causes()
+    for _ in range(HANGUPS):
+        causes.hung_up(before_tls=True)
+    assert not causes.hung_up(before_tls=False)
+    assert not causes.hung_up(before_tls=True)
