@@ -9,7 +9,7 @@ from dataclasses import dataclass
 from typing import Any
 
 from bench.fleet_load import SAMPLES as BATCH_SAMPLES
-from contract import RECEIVED_MS, SAMPLES, SECOND, T_US, VESC_STREAM
+from contract import BATCH, RECEIVED_MS, SAMPLES, SECOND, VESC_STREAM, batch_id
 from station.cloud import Cloud
 from station.items import of_topic, plain
 
@@ -32,8 +32,8 @@ class Stored:
 
 def stored(cloud: Cloud, robot: str, sent_ms: list[int]) -> Stored:
     """A robot's items against what it sent: which are there, and in the order of their numbers."""
-    items = list(_items(cloud, "TelemetryTable", robot, "seq", T_US, RECEIVED_MS))
-    seqs = [int(item["seq"]) for item in items]
+    items = list(_items(cloud, "TelemetryTable", robot, BATCH, RECEIVED_MS))
+    seqs = [batch_id(item[BATCH]).seq for item in items]
     received = [int(item[RECEIVED_MS]) for item in items]
     return Stored(
         batches=len(items),

@@ -9,7 +9,17 @@ Everything here that refuses its input raises `ContractError`, and nothing else.
 
 from __future__ import annotations
 
-from contract.batch import Batch, decode, decode_item, encode, split
+from contract.batch import (
+    Batch,
+    BatchId,
+    batch_id,
+    batches_between,
+    decode,
+    decode_item,
+    encode,
+    messages_of,
+    split,
+)
 from contract.checks import check_field
 from contract.cloud import (
     FILES_PREFIX,
@@ -27,7 +37,7 @@ from contract.cloud import (
     pubnub_parameter,
     rule_sql,
 )
-from contract.columns import CODEC, DICTIONARY, EXACT, PLAIN_CODEC, SCALES, inflate
+from contract.columns import CODEC, DICTIONARY, EXACT, PLAIN_CODEC, SCALES, SERIALIZED_CODEC, inflate
 from contract.commands import (
     FLEET_MAX_AGE_MS,
     MAX_LEASE_MS,
@@ -41,6 +51,7 @@ from contract.commands import (
 )
 from contract.effort import check_effort
 from contract.files import (
+    CLAIM_AT,
     CLAIM_FIELDS,
     KINDS,
     MAX_ADDRESSES,
@@ -61,6 +72,7 @@ from contract.files import (
     part_range,
 )
 from contract.limits import (
+    BATCH_VERSION,
     CLOCK_MAX_UNCERTAINTY_MS,
     DEFAULT_NAMESPACE,
     LIVE_BROKER_EVERY_S,
@@ -78,6 +90,7 @@ from contract.limits import (
     MAX_SAMPLES,
     SCHEMA_VERSION,
     ContractError,
+    MessageError,
     Value,
 )
 from contract.live import (
@@ -92,7 +105,8 @@ from contract.live import (
     live_message,
     live_update,
 )
-from contract.message_type import FrameId, MessageType, frame_id, message_type
+from contract.message_type import MessageType, message_type
+from contract.ros1.message import Messages, RosMessage, RosType, type_id
 from contract.seconds import Statistics, flat_second, packed_second
 from contract.tables import (
     ADMISSION,
@@ -102,6 +116,7 @@ from contract.tables import (
     ADMITTED_MS,
     AGENT_VERSION,
     ALERT_PREFIX,
+    BATCH,
     BATCHES,
     BY_FUNCTION,
     BY_RULE,
@@ -198,12 +213,15 @@ __all__ = [
     "AGENT_STREAM",
     "AGENT_VERSION",
     "ALERT_PREFIX",
+    "BATCH",
     "BATCHES",
+    "BATCH_VERSION",
     "BROKER",
     "BY_FUNCTION",
     "BY_RULE",
     "BY_STREAM",
     "CERTIFICATE_ID",
+    "CLAIM_AT",
     "CLAIM_FIELDS",
     "CLOCK_MAX_UNCERTAINTY_MS",
     "CMD",
@@ -291,6 +309,7 @@ __all__ = [
     "SECOND",
     "SEEN",
     "SERIAL",
+    "SERIALIZED_CODEC",
     "SERIAL_PARAMETER",
     "SESSION_VERSION",
     "SHADOW",
@@ -305,6 +324,7 @@ __all__ = [
     "VOLTAGE_FIELD",
     "Address",
     "Batch",
+    "BatchId",
     "Command",
     "ContractError",
     "Field",
@@ -313,13 +333,18 @@ __all__ = [
     "FileKey",
     "FileRequest",
     "FleetMessage",
-    "FrameId",
     "LiveSample",
+    "MessageError",
     "MessageType",
+    "Messages",
     "Pong",
+    "RosMessage",
+    "RosType",
     "Statistics",
     "Topic",
     "Value",
+    "batch_id",
+    "batches_between",
     "build_topic",
     "channel",
     "check_effort",
@@ -346,13 +371,13 @@ __all__ = [
     "file_key",
     "flat_second",
     "fleet_name",
-    "frame_id",
     "inflate",
     "live_event",
     "live_message",
     "live_topic",
     "live_update",
     "message_type",
+    "messages_of",
     "packed_second",
     "parse_file_key",
     "parse_topic",
@@ -363,4 +388,5 @@ __all__ = [
     "rule_name",
     "rule_sql",
     "split",
+    "type_id",
 ]

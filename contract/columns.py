@@ -18,9 +18,14 @@ from contract.checks import COMPACT, shown, wire_column
 from contract.limits import MAX_COLUMNS_BYTES, ContractError, Value
 
 # Of the batches that are written, and of those that were written before and are read for ever.
-CODEC, PLAIN_CODEC = "steps", "columns+zlib+base64"
+# `SERIALIZED_CODEC` keeps ROS messages as they were published: contract/ros1/serialized.py.
+CODEC, SERIALIZED_CODEC, PLAIN_CODEC = "steps", "ros1", "columns+zlib+base64"
 # A step has half the characters of the value that it stands for, which takes as much memory.
-_MOST_BYTES = {CODEC: MAX_COLUMNS_BYTES // 2, PLAIN_CODEC: MAX_COLUMNS_BYTES}
+_MOST_BYTES = {
+    CODEC: MAX_COLUMNS_BYTES // 2,
+    SERIALIZED_CODEC: MAX_COLUMNS_BYTES + 2 * 1024 * 1024,
+    PLAIN_CODEC: MAX_COLUMNS_BYTES,
+}
 # zlib's preset dictionary. Frozen with the codec's name, since it is needed to read what is stored; a
 # field that it does not know costs its name. What is nearest to the end is the cheapest to point to.
 DICTIONARY = (
@@ -40,8 +45,9 @@ EXACT = 2**53
 SCALES = tuple(float(f"1e{decimals}") for decimals in range(23))
 
 
-def packed_samples(dt: Sequence[int], fields: Mapping[str, Sequence[Value]]) -> str:
-    """A batch's times and columns, of the values that `wire_column` has made, as `CODEC` has them.
+def packed_samples(dt: Sequence[int], fields: Mapping[str, Sequence[Value]], behind: bytes = b"") -> str:
+    """A batch's times and columns, of the values that `wire_column` has made, as `CODEC` has them; what
+    comes ``behind`` follows a line's end.
 
     Raises `ContractError` where they are too large.
     """
@@ -50,7 +56,8 @@ def packed_samples(dt: Sequence[int], fields: Mapping[str, Sequence[Value]]) -> 
     if len(text) > _MOST_BYTES[CODEC]:
         raise ContractError(f"batch of {len(text)} bytes of columns: allowed is up to {_MOST_BYTES[CODEC]}")
     deflater = zlib.compressobj(6, zdict=DICTIONARY)
-    return base64.b64encode(deflater.compress(text.encode()) + deflater.flush()).decode()
+    body = text.encode() + (b"\n" + behind if behind else b"")
+    return base64.b64encode(deflater.compress(body) + deflater.flush()).decode()
 
 
 def inflate(samples: Any, codec: str) -> bytes:
@@ -60,7 +67,7 @@ def inflate(samples: Any, codec: str) -> bytes:
     most = _MOST_BYTES[codec]
     try:
         deflated = base64.b64decode(samples, validate=True)
-        inflater = zlib.decompressobj(zdict=DICTIONARY if codec == CODEC else b"")
+        inflater = zlib.decompressobj(zdict=b"" if codec == PLAIN_CODEC else DICTIONARY)
         body = inflater.decompress(deflated, most + 1)
     except (binascii.Error, ValueError, zlib.error) as error:
         raise ContractError(f"samples are not base64 of zlib: {error}") from error

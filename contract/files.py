@@ -32,6 +32,8 @@ CLAIM_FIELDS = {
     "content_type": "of the content",
     "thumbnail": "of an image: base64 of a small JPEG",
 }
+# And where in the serialized message the content was, which is an empty array there.
+CLAIM_AT = "at"
 
 _FILE_LEVEL = r"[A-Za-z0-9][A-Za-z0-9._-]{0,99}"
 _FILE_NAME = re.compile(rf"{_FILE_LEVEL}(/{_FILE_LEVEL}){{0,3}}")

@@ -5,6 +5,8 @@ from __future__ import annotations
 from typing import Union
 
 SCHEMA_VERSION = 1
+# Of the record lane: batches of version 1 had no id.
+BATCH_VERSION = 2
 DEFAULT_NAMESPACE = "iort"
 
 # AWS IoT Core closes a connection that publishes more than 128 KB ("Message size", service quotas),
@@ -37,9 +39,15 @@ MAX_BATCH_VALUES = 50_000
 # Nested messages make long paths; a name is not the place for megabytes.
 MAX_FIELD_CHARACTERS = 1024
 MAX_COLUMNS_BYTES = 8 * 1024 * 1024
+# Of a batch of serialized messages; one message alone may be as large as a batch's columns.
+MAX_SERIALIZED_BYTES = 2 * 1024 * 1024
 
 Value = Union[None, bool, int, float, str]
 
 
 class ContractError(ValueError):
     """A name, topic, message or item that the contract does not allow; the text says which."""
+
+
+class MessageError(ContractError):
+    """A ROS message does not fit its definition, or the definition is none."""

@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 # Attributes of the telemetry and summary tables that are not the robot's own.
-TOPIC, T_US, SECOND = "topic", "t", "second"
+TOPIC, BATCH, SECOND = "topic", "batch", "second"
+# A time in a message, microseconds since the epoch.
+T_US = "t"
 RECEIVED_MS, EXPIRES_S = "received_ms", "expires_s"
 ROBOT = "robot"
 # Of a robot in the registry: on which day (UTC) it has asked to upload how many bytes.

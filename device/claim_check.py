@@ -1,8 +1,8 @@
 """The claim check: what is too large for a message becomes a file, and the sample says which.
 
-A source hands such a field over as bytes. They are written into a folder that `device.upload_folder`
-empties into the bucket, under a key that is known before anything is sent, so that the sample need
-not wait for the upload.
+A source hands such a field over with the message. Its bytes are written into a folder that
+`device.upload_folder` empties into the bucket, under a key that is known before anything is sent, so that
+the sample need not wait for the upload.
 """
 
 from __future__ import annotations
@@ -15,7 +15,8 @@ from pathlib import Path
 from typing import Any, Callable, Mapping
 
 import contract
-from contract import CLAIM_FIELDS, File, Value
+from contract import CLAIM_AT, CLAIM_FIELDS, File, RosMessage, Value
+from contract.ros1.message import cut
 from device.clock import Clock
 from device.seldom import Seldom
 from device.sources import Emit
@@ -62,27 +63,27 @@ class ClaimCheck:
     def around(self, emit: Emit) -> Emit:
         """An `Emit` that puts claims in before the sample goes on."""
 
-        def emit_claims(stream: str, t_us: int, values: Mapping[str, Any]) -> None:
-            if any(type(value) is bytes for value in values.values()):
+        def emit_claims(stream: str, t_us: int, values: Mapping[str, Value]) -> None:
+            if isinstance(values, RosMessage) and values.large:
                 values = self.claim(stream, t_us, values)
             emit(stream, t_us, values)
 
         return emit_claims
 
-    def claim(self, stream: str, t_us: int, values: Mapping[str, Any]) -> dict[str, Value]:
-        """The sample with a claim for each field of bytes; the other fields as they are."""
+    def claim(self, stream: str, t_us: int, message: RosMessage) -> RosMessage:
+        """The message with an empty array for each of its large ones, and a claim beside it, which says where
+        the content is kept and where in the message it was."""
         keep = self._is_due(stream, t_us)
-        sample: dict[str, Value] = {}
-        for field, value in values.items():
-            if type(value) is not bytes:
-                sample[field] = value
-                continue
-            claim = self._keep(stream, t_us, field, value) if keep else None
+        raw = message.raw
+        beside: dict[str, Value] = {}
+        for field, content in message.large.items():
+            raw, at = cut(raw, content)
+            claim = self._keep(stream, t_us, field, content) if keep else None
             if claim is None:
                 self.left_out += 1
                 claim = dict.fromkeys(CLAIM_FIELDS)
-            sample.update((f"{field}.{name}", one) for name, one in claim.items())
-        return sample
+            beside.update((f"{field}.{name}", one) for name, one in {**claim, CLAIM_AT: at}.items())
+        return RosMessage(raw, message.kind, beside=beside)
 
     def wait_empty(self, timeout_s: float) -> bool:
         """Wait until the folder is uploaded; whether it is."""

@@ -14,16 +14,17 @@ from typing import Any, Callable, Iterable, Mapping, Optional, Sequence
 
 import contract
 from contract import CMD, FLEET, Command, ContractError, FleetMessage
+from contract.limits import MessageError
+from contract.ros1.definition import Definition, parse
 from device.allowance import Allowance
 from device.clock import Clock
 from device.downlink_config import ROBOT_IN_TOPIC, CommandConfig, DownlinkConfig, FleetConfig, ShareConfig
-from device.errors import ConfigError, MessageError, UplinkError
+from device.errors import ConfigError, UplinkError
 from device.leases import Leases, Limits
 from device.offset import Offset
 from device.ros1_json import decode, encode
 from device.ros1_node import DEFAULT_NODE
 from device.ros1_publish import Graph, Ros1Graph
-from device.ros1_types import Definition, parse
 from device.seldom import Seldom
 from device.sources.ros1 import Ros1Config
 from device.uplink import Message, Uplink

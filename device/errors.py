@@ -6,7 +6,6 @@ SourceError    a source cannot give samples (a bag unreadable, a type unknown)
 UplinkError    the broker cannot be reached, or refused a message
 IdentityError  certificate or key cannot be read, do not belong together, or cannot be had
 UploadError    a file cannot be uploaded
-MessageError   a ROS message, or its definition, is not what it should be
 """
 
 from __future__ import annotations
@@ -26,10 +25,6 @@ class SourceError(AgentError):
 
 class UplinkError(AgentError):
     """The connection, a publish or a subscription failed; the text has the broker's own words."""
-
-
-class MessageError(AgentError):
-    """A ROS message does not fit its definition, or the definition is none."""
 
 
 class IdentityError(AgentError):

@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import logging
 import math
-from typing import Mapping, Sequence
+from typing import Hashable, Mapping, Sequence
 
 import contract
-from contract import Batch, ContractError, Value
-from device.batch import StreamCounts
+from contract import Batch, ContractError, Messages, RosMessage, Value
+from device.batch import Sample, StreamCounts
 from device.spool import Spool
 
 _log = logging.getLogger(__name__)
@@ -23,16 +23,26 @@ class Packer:
         self._spool = spool
         self._counts = counts
 
-    def store(self, times_us: list[int], samples: list[Mapping[str, Value]]) -> None:
-        """Encode the samples and put them into the spool, in as many messages as they need."""
-        columns = {name: [sample[name] for sample in samples] for name in samples[0]}
-        self._put(Batch(self._boot, 0, times_us, columns))
+    def store(self, samples: list[Sample]) -> None:
+        """Encode the samples and put them into the spool, in as many messages as they need: one for each
+        ROS type, or each set of fields, since a missing field is not the same as a null one."""
+        alike: dict[Hashable, list[Sample]] = {}
+        for sample in samples:
+            values = sample[1]
+            names = values.beside if isinstance(values, RosMessage) else values
+            kind = values.kind.id if isinstance(values, RosMessage) else None
+            shape = (kind, frozenset(names))
+            alike.setdefault(shape, []).append(sample)
+        for group in alike.values():
+            self._put(_batch(self._boot, group))
 
     def _put(self, batch: Batch) -> None:
         seq = self._spool.next_seq(self._stream)
         n = len(batch.times_us)
         try:
-            payload = contract.encode(Batch(batch.boot, seq, batch.times_us, batch.columns))
+            payload = contract.encode(
+                Batch(batch.boot, seq, batch.times_us, batch.columns, 0, batch.messages)
+            )
         except ContractError as error:
             # One bad value must not cost the others: halve until it stands alone.
             if n == 1:
@@ -42,6 +52,7 @@ class Packer:
             if len(payload) <= contract.MAX_MESSAGE_BYTES:
                 self._spool.put(self._stream, seq, payload, samples=n)
                 self._counts.batches += 1
+                self._counts.stored += n
                 self._counts.nulled += _nonfinite(batch.columns)
                 return
             if n == 1:
@@ -55,6 +66,18 @@ class Packer:
         # A stream that is wrong is wrong at its full rate; the first one says it all.
         level = logging.WARNING if self._counts.refused == 1 else logging.DEBUG
         _log.log(level, "stream %s: a sample cannot be sent: %s", self._stream, why)
+
+
+def _batch(boot: str, samples: Sequence[Sample]) -> Batch:
+    times = [t_us for t_us, _ in samples]
+    first = samples[0][1]
+    if isinstance(first, RosMessage):
+        messages = [values for _, values in samples if isinstance(values, RosMessage)]
+        beside = {name: [message.beside[name] for message in messages] for name in first.beside}
+        raw = [message.raw for message in messages]
+        return Batch(boot, 0, times, beside, 0, Messages(first.kind.id, first.kind.layout, raw))
+    columns = {name: [values[name] for _, values in samples] for name in first}
+    return Batch(boot, 0, times, columns)
 
 
 def _nonfinite(columns: Mapping[str, Sequence[Value]]) -> int:

@@ -12,8 +12,8 @@ import math
 import struct
 from typing import Any, Mapping
 
-from device.errors import MessageError
-from device.ros1_types import LETTERS, STRING, VARIABLE, Definition, Field
+from contract.limits import MessageError
+from contract.ros1.definition import LETTERS, STRING, VARIABLE, Definition, Field
 
 _LENGTH = struct.Struct("<I")
 # A message of JSON within the broker's limit has no more elements; nested empties could.

@@ -16,9 +16,10 @@ import threading
 import xmlrpc.client
 from typing import Any, Callable, Mapping
 
+from contract.limits import MessageError
+from contract.ros1.definition import Definition, parse
 from device.clock import Clock, SystemClock
-from device.errors import MessageError, SourceError
-from device.ros1_types import Definition, parse
+from device.errors import SourceError
 
 _log = logging.getLogger(__name__)
 

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 from typing import Any, Protocol
 
+from contract.ros1.definition import Definition
 from device.clock import Clock
 from device.ros1_node import OnBytes, definition_of, shared
-from device.ros1_types import Definition
 
 
 class Graph(Protocol):

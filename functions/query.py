@@ -22,15 +22,16 @@ import boto3
 from botocore.config import Config
 
 from contract import (
+    BATCH,
     DERIVED_UNITS,
     MAX_BATCH_SPAN_US,
     PLAIN_CODEC,
     RECORD,
     RESULTS_PREFIX,
-    T_US,
     TOPIC,
     ContractError,
     Value,
+    batches_between,
     build_topic,
     decode,
     parse_topic,
@@ -184,7 +185,7 @@ def answer(
             items += 1
             found.add(plain(item))
             if found.values > max_values and number < len(page):
-                token = {name: item[name] for name in (TOPIC, T_US)}
+                token = {name: item[name] for name in (TOPIC, BATCH)}
                 break
         if token is not None and (left_ms() < MARGIN_MS or found.values > max_values):
             break
@@ -208,18 +209,18 @@ def _pages(
     request: Request, tables: Tables
 ) -> Iterator[tuple[Sequence[Mapping[str, Any]], Mapping[str, Any] | None]]:
     """Pages of items, each with the key after which the next one begins; None behind the last."""
-    first, last = request.start_us - MAX_BATCH_SPAN_US + 1, request.end_us - 1
+    first, last = batches_between(request.start_us - MAX_BATCH_SPAN_US + 1, request.end_us - 1)
     if first > last:
         return
     condition = {
         ("FilterExpression" if request.scan else "KeyConditionExpression"): (
-            "#topic = :topic AND #t BETWEEN :first AND :last"
+            "#topic = :topic AND #batch BETWEEN :first AND :last"
         ),
-        "ExpressionAttributeNames": {"#topic": TOPIC, "#t": T_US},
+        "ExpressionAttributeNames": {"#topic": TOPIC, "#batch": BATCH},
         "ExpressionAttributeValues": {
             ":topic": {"S": request.topic},
-            ":first": {"N": str(first)},
-            ":last": {"N": str(last)},
+            ":first": {"S": first},
+            ":last": {"S": last},
         },
     }
     token = request.token

@@ -10,7 +10,7 @@ from typing import Any, NamedTuple
 
 from botocore.exceptions import BotoCoreError, ClientError
 
-from contract import ITEM_BASE64, REASON, T_US, TOPIC
+from contract import BATCH, ITEM_BASE64, REASON, TOPIC
 
 _log = logging.getLogger(__name__)
 # SendMessageBatch: at most ten messages, of 256 KiB together.
@@ -73,7 +73,7 @@ def message(refused: Refused) -> str:
     """
     body = _body(refused.reason, refused.image)
     if len(body) > _MOST_BYTES:
-        key = {name: refused.image[name] for name in (TOPIC, T_US) if name in refused.image}
+        key = {name: refused.image[name] for name in (TOPIC, BATCH) if name in refused.image}
         body = _body(f"too large for the queue, see the telemetry table; {refused.reason}", key)
     return body
 

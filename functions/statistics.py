@@ -17,6 +17,7 @@ from contract import (
     NONFINITE,
     SAMPLES,
     Batch,
+    BatchId,
     Statistics,
     Value,
     packed_second,
@@ -38,9 +39,10 @@ class Vehicle:
 
 
 def summarize_second(
-    second: int, batches: Sequence[Batch], vehicle: Vehicle | None
+    second: int, batches: Sequence[Batch], vehicle: Vehicle | None, missing: int = 0
 ) -> dict[str, Statistics] | None:
-    """The summary of one second as it is stored, or None where no sample lies in it.
+    """The summary of one second as it is stored, or None where no sample lies in it; ``missing`` batches
+    are known to lack before those that start in it.
 
     ``batches`` are those of one stream, in order of time: every one that has a sample in the second
     and the one before, from which holes and missing batches are seen. The result has ``n``, ``batches``,
@@ -50,9 +52,8 @@ def summarize_second(
     start_us, end_us = second * _SECOND_US, (second + 1) * _SECOND_US
     times: list[int] = []
     columns: dict[str, list[Value]] = {}
-    missing = nonfinite = touching = 0
+    nonfinite = touching = 0
     before: list[int] = []
-    previous: Batch | None = None
     for batch in batches:
         first, end = bisect_left(batch.times_us, start_us), bisect_left(batch.times_us, end_us)
         if first < end:
@@ -63,36 +64,39 @@ def summarize_second(
             for column in columns.values():
                 column.extend([None] * (len(times) - len(column)))
         if start_us <= batch.t_us < end_us:
-            missing += missing_before(previous, batch)
             nonfinite += batch.nonfinite
         if first:
             before = [batch.times_us[first - 1]]
-        previous = batch
     if not times:
         return None
     counts: dict[str, Value] = {
         SAMPLES: len(times),
         BATCHES: touching,
         MISSING_BATCHES: missing,
-        GAPS: count_holes([*before, *times]),
+        GAPS: count_holes([*before, *sorted(times)]),
         NONFINITE: nonfinite,
     }
     found = {name: _statistics(column) for name, column in {**columns, **derive(columns, vehicle)}.items()}
     return packed_second(counts, {name: known for name, known in found.items() if known is not None})
 
 
-def missing_before(previous: Batch | None, batch: Batch) -> int:
-    """How many batches the stream lacks between two neighbours, by their numbers.
+def missing_before(batch: BatchId, near: Sequence[BatchId]) -> int:
+    """How many batches the stream lacks just before one, by their numbers.
 
-    ``previous`` is None for the first batch that is stored at all. Numbers grow by one, also over a
-    restart where the spool is durable; one that starts again at a lower number with a new ``boot``
-    is a spool that was lost, of which only the start can be told.
+    ``near`` are the batches around it in order of time, and at least the one before. Numbers grow by one,
+    also over a restart where the spool is durable; one that starts again at a lower number with a new
+    ``boot`` is a spool that was lost, of which only the start can be told. Where two runs lie over one
+    another in time, as of a recording that was played twice, nothing is told of the first of a run.
     """
-    if previous is None:
+    own = [other.seq for other in near if other.boot == batch.boot and other.seq < batch.seq]
+    if own:
+        return batch.seq - max(own) - 1
+    before = [other for other in near if other.boot != batch.boot and other < batch]
+    if not before:
         return batch.seq
-    if batch.seq > previous.seq:
-        return batch.seq - previous.seq - 1
-    return batch.seq if batch.boot != previous.boot else 0
+    if any(other.boot == before[-1].boot and other > batch for other in near):
+        return 0
+    return batch.seq - before[-1].seq - 1 if batch.seq > before[-1].seq else batch.seq
 
 
 def count_holes(times_us: Sequence[int]) -> int:

@@ -2,15 +2,28 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from itertools import islice
 from typing import Any, NamedTuple
 
-from contract import EXPIRES_S, MAX_BATCH_SPAN_US, MAX_COLUMNS_BYTES, T_US, Batch, ContractError, decode_item
+from contract import (
+    BATCH,
+    EXPIRES_S,
+    MAX_BATCH_SPAN_US,
+    MAX_COLUMNS_BYTES,
+    Batch,
+    BatchId,
+    ContractError,
+    batch_id,
+    decode_item,
+)
+from functions.statistics import missing_before
 from functions.tables import Tables
 
 _SECOND_US = 1_000_000
+# By how much the clocks of two publishers of a stream may differ before batches seem to be missing.
+_ASIDE_US = 10_000_000
 # A second is made of so many batches of a stream, and of about so much of their columns: one robot that puts
 # more in it must not hold up the others. AWS takes as many messages a second from a connection.
 SECOND_BATCHES, _SECOND_BYTES = 100, MAX_COLUMNS_BYTES
@@ -18,8 +31,6 @@ SECOND_BATCHES, _SECOND_BYTES = 100, MAX_COLUMNS_BYTES
 _BESIDE = 2
 # A neighbour that cannot be decoded is passed over for the next; so many of them end the search.
 _NEIGHBOURS = 10
-
-BatchKey = tuple[int, str, int]
 
 
 class Stored(NamedTuple):
@@ -31,11 +42,6 @@ class Stored(NamedTuple):
     beyond: bool = False
 
 
-def key_of(batch: Batch) -> BatchKey:
-    """What a batch is told by from others of its topic."""
-    return batch.t_us, batch.boot, batch.seq
-
-
 @dataclass
 class Reader:
     """Reads one topic; what is ``known`` need not be decoded again. ``full`` are the seconds that it found to
@@ -43,7 +49,7 @@ class Reader:
 
     tables: Tables
     topic: str
-    known: Mapping[BatchKey, Batch]
+    known: Mapping[BatchId, Batch]
     full: set[int] = field(default_factory=set)
 
     def read(self, first: int, last: int) -> list[Stored]:
@@ -67,6 +73,18 @@ class Reader:
             stored = [*self._before(stored[0].batch.t_us), *stored]
         return stored
 
+    def missing_before(self, batch: Batch, previous: Batch | None, stored: Sequence[Stored]) -> int:
+        """How many batches the stream lacks just before this one, by their numbers."""
+        if previous is not None and (previous.boot, previous.seq + 1) == (batch.boot, batch.seq):
+            return 0
+        ids = [entry.batch.id for entry in stored]
+        missing = missing_before(batch.id, ids)
+        if missing:
+            # Clocks may interleave: what is missing here may lie some seconds to the side.
+            near = self.tables.numbers(self.topic, batch.t_us - _ASIDE_US, batch.t_us + _ASIDE_US)
+            missing = missing_before(batch.id, sorted({*ids, *near}))
+        return missing
+
     def _bounded(self, first_us: int, at_once: int) -> Iterator[tuple[int, Stored | None]]:
         """The batches from a time on and when they start, None for an item that is none. Of a second that
         holds more than it may, the rest is passed over up to its last."""
@@ -76,7 +94,8 @@ class Reader:
             second, count, size, t_us = -1, 0, 0, -1
             entry: Stored | None = None
             for item in self.tables.batches_from(self.topic, start_us, at_once=at_once):
-                before_us, t_us = t_us, int(item[T_US])
+                # A key of no batch begins with a time all the same, or sorts behind them all.
+                before_us, t_us = t_us, _time_of(item, t_us)
                 if t_us // _SECOND_US != second:
                     second, count, size = t_us // _SECOND_US, 0, 0
                 elif entry is not None:
@@ -101,12 +120,18 @@ class Reader:
         here it only must not stop its neighbours."""
         for item in items:
             try:
-                key = int(item[T_US]), item["boot"], int(item["seq"])
-                batch = self.known.get(key) or decode_item(item)[1]
+                batch = self.known.get(batch_id(item[BATCH])) or decode_item(item)[1]
                 expires_s = int(item[EXPIRES_S]) if EXPIRES_S in item else None
             except (ContractError, KeyError, TypeError, ValueError, OverflowError):
                 continue
             yield Stored(batch, expires_s)
+
+
+def _time_of(item: Mapping[str, Any], otherwise: int) -> int:
+    try:
+        return batch_id(item[BATCH]).t_us
+    except ContractError:
+        return otherwise
 
 
 def _bytes(batch: Batch) -> int:

@@ -25,6 +25,7 @@ from contract import (
     MAX_BATCH_SPAN_US,
     REPLAY,
     Batch,
+    BatchId,
     ContractError,
     Statistics,
     decode_item,
@@ -34,8 +35,8 @@ from functions import quick_dynamodb
 from functions.health import measure, together
 from functions.metrics import emit
 from functions.refusals import Refusals, Refused
-from functions.statistics import missing_before, summarize_second
-from functions.stored import SECOND_BATCHES, BatchKey, Reader, Stored, key_of
+from functions.statistics import summarize_second
+from functions.stored import SECOND_BATCHES, Reader, Stored
 from functions.tables import Tables, plain
 
 # Topics that are read side by side; a client keeps ten connections.
@@ -54,12 +55,12 @@ class Decoded:
     """The good batches of some stream records by topic, and what is wrong with the others."""
 
     batches: dict[str, list[Batch]] = field(default_factory=lambda: defaultdict(list))
-    records: dict[tuple[str, BatchKey], Mapping[str, Any]] = field(default_factory=dict)
+    records: dict[tuple[str, BatchId], Mapping[str, Any]] = field(default_factory=dict)
     refused: list[Refused] = field(default_factory=list)
 
-    def refuse(self, topic: str, keys: AbstractSet[BatchKey], reason: str) -> None:
+    def refuse(self, topic: str, keys: AbstractSet[BatchId], reason: str) -> None:
         """Count batches of a topic among what is refused."""
-        self.batches[topic] = [batch for batch in self.batches[topic] if key_of(batch) not in keys]
+        self.batches[topic] = [batch for batch in self.batches[topic] if batch.id not in keys]
         for change in (self.records[topic, key] for key in sorted(keys)):
             self.refused.append(Refused(change["SequenceNumber"], reason, change["NewImage"]))
 
@@ -78,7 +79,7 @@ def decode_records(records: Iterable[Mapping[str, Any]]) -> Decoded:
             decoded.refused.append(Refused(record["dynamodb"]["SequenceNumber"], str(error), image))
         else:
             decoded.batches[str(topic)].append(batch)
-            decoded.records[str(topic), key_of(batch)] = record["dynamodb"]
+            decoded.records[str(topic), batch.id] = record["dynamodb"]
     return decoded
 
 
@@ -89,33 +90,38 @@ class Summaries:
 
     seconds: dict[int, dict[str, Statistics]] = field(default_factory=dict)
     missing: int = 0
-    beyond: set[BatchKey] = field(default_factory=set)
+    beyond: set[BatchId] = field(default_factory=set)
 
 
 def summarize_topic(tables: Tables, topic: str, batches: Sequence[Batch]) -> Summaries:
     """The summaries of every second that the batches touch, and of the second of the batch after
     each: a late batch fills the hole that its successor had reported."""
-    known = {key_of(batch): batch for batch in batches}
+    known = {batch.id: batch for batch in batches}
     reader = Reader(tables, topic, known)
     vehicle = tables.vehicle(parse_topic(topic).robot)
     summaries = Summaries()
-    within: set[BatchKey] = set()
+    within: set[BatchId] = set()
     for touched in _runs({second for batch in batches for second in _seconds(batch)}):
         stored = reader.read(touched[0], touched[-1])
         seconds = set(touched)
         previous: Batch | None = None
+        missing: dict[int, int] = defaultdict(int)
         for batch, _, beyond in stored:
             second = batch.t_us // _SECOND_US
             # What is read in front of a run is there in part, and belongs to another, as does what follows.
-            if previous is not None and key_of(previous) in known and second >= touched[0]:
+            if previous is not None and previous.id in known and second >= touched[0]:
                 seconds.add(second)
-            if key_of(batch) in known and not beyond and touched[0] <= second <= touched[-1]:
-                within.add(key_of(batch))
-                summaries.missing += missing_before(previous, batch)
+            if second in seconds:
+                lacking = reader.missing_before(batch, previous, stored)
+                missing[second] += lacking
+                if batch.id in known and not beyond and second <= touched[-1]:
+                    within.add(batch.id)
+                    summaries.missing += lacking
             previous = batch
         for second in seconds:
             near = around(stored, second)
-            summary = summarize_second(second, [entry.batch for entry in near], vehicle)
+            batches_near = [entry.batch for entry in near]
+            summary = summarize_second(second, batches_near, vehicle, missing[second])
             if summary is None:
                 continue
             # It is kept as long as what it was made from, which has the time of its receipt: the
@@ -123,7 +129,7 @@ def summarize_topic(tables: Tables, topic: str, batches: Sequence[Batch]) -> Sum
             if expires := [entry.expires_s for entry in near if entry.expires_s]:
                 summary[EXPIRES_S] = max(expires)
             summaries.seconds[second] = summary
-    summaries.beyond = {key for key in known if key[0] // _SECOND_US in reader.full} - within
+    summaries.beyond = {key for key in known if key.t_us // _SECOND_US in reader.full} - within
     return summaries
 
 

@@ -6,10 +6,22 @@ import logging
 import math
 import time
 from collections.abc import Iterator, Mapping, Sequence
+from contextlib import suppress
 from itertools import islice
 from typing import Any
 
-from contract import OMITTED, ROBOT, SECOND, T_US, TOPIC, Statistics
+from contract import (
+    BATCH,
+    OMITTED,
+    ROBOT,
+    SECOND,
+    TOPIC,
+    BatchId,
+    ContractError,
+    Statistics,
+    batch_id,
+    batches_between,
+)
 from functions.attributes import deserialize
 from functions.statistics import Vehicle
 
@@ -24,8 +36,6 @@ _VEHICLE_CACHE_S = 60.0
 _MAX_ITEM_BYTES = 380 * 1024
 # A float's longest text; as a number it is shorter.
 _MAX_NUMBER_BYTES = 25
-# Later than any time that the contract allows.
-_LAST_US = 2**53
 # What a DynamoDB number can hold, "Supported data types": 38 digits, 1e-130 to 9.99e125.
 _LARGEST, _SMALLEST = 9.99e125, 1e-130
 
@@ -68,34 +78,45 @@ class Tables:
     def batches_from(self, topic: str, first_us: int, *, at_once: int) -> Iterator[dict[str, Any]]:
         """The stored batches of a topic that start then or later, in order of time. ``at_once`` are read
         first, and if more are asked for a hundred at a time: nobody wants a whole drive."""
-        few = self._from(topic, first_us, at_once)
+        first, last = batches_between(first_us, None)
+        few = self._between(topic, first, last, at_once)
         read = 0
         for item in islice(few, at_once):
-            read, first_us = read + 1, int(item[T_US]) + 1
+            # Behind this one: no key ends with a space.
+            read, first = read + 1, f"{item[BATCH]} "
             yield item
         if read == at_once:
-            yield from self._from(topic, first_us, _MANY)
+            yield from self._between(topic, first, last, _MANY)
 
-    def _from(self, topic: str, first_us: int, at_once: int) -> Iterator[dict[str, Any]]:
-        return self._query(
-            topic, "#t BETWEEN :first AND :last", {":first": first_us, ":last": _LAST_US}, at_once=at_once
-        )
+    def _between(self, topic: str, first: str, last: str, at_once: int) -> Iterator[dict[str, Any]]:
+        condition = "#batch BETWEEN :first AND :last"
+        return self._query(topic, condition, {":first": first, ":last": last}, at_once=at_once)
 
     def before(self, topic: str, t_us: int) -> Iterator[dict[str, Any]]:
         """The stored batches of a topic that start before the time, the nearest first. Each is read when
         it is asked for, since the first is nearly always the one that is wanted."""
-        return self._query(topic, "#t < :t", {":t": t_us}, at_once=1, ScanIndexForward=False)
+        first, _ = batches_between(t_us, None)
+        return self._query(topic, "#batch < :first", {":first": first}, at_once=1, ScanIndexForward=False)
+
+    def numbers(self, topic: str, first_us: int, last_us: int) -> Iterator[BatchId]:
+        """Which batches of a topic start between these times, in order of time, without their samples."""
+        first, last = batches_between(first_us, last_us)
+        condition = "#batch BETWEEN :first AND :last"
+        values = {":first": first, ":last": last}
+        for item in self._query(topic, condition, values, at_once=_MANY, ProjectionExpression="#batch"):
+            with suppress(ContractError):
+                yield batch_id(item[BATCH])
 
     def _query(
-        self, topic: str, condition: str, values: Mapping[str, int], *, at_once: int, **how: Any
+        self, topic: str, condition: str, values: Mapping[str, str], *, at_once: int, **how: Any
     ) -> Iterator[dict[str, Any]]:
-        numbers = {name: {"N": str(value)} for name, value in values.items()}
+        texts = {name: {"S": value} for name, value in values.items()}
         pages = self._client.get_paginator("query").paginate(
             TableName=self._telemetry,
             ConsistentRead=True,
             KeyConditionExpression=f"#topic = :topic AND {condition}",
-            ExpressionAttributeNames={"#topic": TOPIC, "#t": T_US},
-            ExpressionAttributeValues={":topic": {"S": topic}, **numbers},
+            ExpressionAttributeNames={"#topic": TOPIC, "#batch": BATCH},
+            ExpressionAttributeValues={":topic": {"S": topic}, **texts},
             PaginationConfig={"PageSize": at_once},
             **how,
         )

@@ -10,7 +10,7 @@ from aws_cdk import aws_iam as iam
 from aws_cdk import aws_s3 as s3
 from constructs import Construct
 
-from contract import ENTRY, EXPIRES_S, FILES_PREFIX, RESULTS_PREFIX, ROBOT, SECOND, T_US, TOPIC
+from contract import BATCH, ENTRY, EXPIRES_S, FILES_PREFIX, RESULTS_PREFIX, ROBOT, SECOND, TOPIC
 from stacks.encryption import Encryption
 from stacks.settings import Settings
 
@@ -31,10 +31,13 @@ class Storage(Stack):
         super().__init__(scope, construct_id, **kwargs)
         self._settings = settings
         self.encryption = Encryption(self, settings=settings)
+        # Another name than the table's of before, which was keyed by time alone: see docs/upgrading.md.
         self.telemetry = self._table(
-            "Telemetry",
+            "Batches",
+            output="TelemetryTable",
             partition=TOPIC,
-            sort=T_US,
+            sort=BATCH,
+            sort_type=_TEXT,
             expires=True,
             stream=dynamodb.StreamViewType.NEW_IMAGE,
         )
@@ -54,6 +57,7 @@ class Storage(Stack):
         sort_type: dynamodb.AttributeType = dynamodb.AttributeType.NUMBER,
         expires: bool = False,
         stream: dynamodb.StreamViewType | None = None,
+        output: str | None = None,
     ) -> dynamodb.Table:
         table = dynamodb.Table(
             self,
@@ -70,7 +74,7 @@ class Storage(Stack):
             ),
             **self.encryption.table,
         )
-        CfnOutput(self, f"{name}Table", value=table.table_name)
+        CfnOutput(self, output or f"{name}Table", value=table.table_name)
         return table
 
     def may_keep(self, role: iam.IGrantable, *attributes: str) -> None:

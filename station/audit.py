@@ -14,13 +14,15 @@ from typing import Any, NamedTuple
 
 from contract import (
     AGENT_STREAM,
+    BATCH,
     RECEIVED_MS,
     RECORD,
     SAMPLES,
-    T_US,
     TOPIC,
     Batch,
     ContractError,
+    batch_id,
+    batches_between,
     build_topic,
     decode,
 )
@@ -30,8 +32,6 @@ from station.items import of_topic, plain
 # Later than the run's fastest batch by more than this. A batch is a second long, and the next one
 # that is sent at once arrives within milliseconds.
 LATE_MS = 5_000
-# No time reaches it, see contract/.
-_NEVER_US = 2**53
 
 
 class Stored(NamedTuple):
@@ -175,35 +175,34 @@ def _before(previous: Run | None, run: Run) -> Missing | None:
 def _stored(item: Mapping[str, Any]) -> Stored | None:
     """The item as a batch; None if it is not one."""
     try:
-        seq, t_us, samples = int(item["seq"]), int(item[T_US]), int(item[SAMPLES])
-        stored = Stored(item["boot"], seq, t_us, samples, int(item[RECEIVED_MS]))
-    except (KeyError, TypeError, ValueError, ArithmeticError):
+        t_us, boot, seq = batch_id(item[BATCH])
+        stored = Stored(boot, seq, t_us, int(item[SAMPLES]), int(item[RECEIVED_MS]))
+    except (ContractError, KeyError, TypeError, ValueError, ArithmeticError):
         return None
-    return stored if isinstance(stored.boot, str) and seq >= 0 and samples >= 1 else None
+    return stored if stored.samples >= 1 else None
 
 
 @dataclass(frozen=True)
 class Range:
-    """Of the samples' times, both ends included; None is open."""
+    """Of the batches' first samples, both ends included; None is open."""
 
     first_us: int | None = None
     last_us: int | None = None
 
     def values(self) -> dict[str, dict[str, str]]:
         """As DynamoDB's expression values."""
-        first = -_NEVER_US if self.first_us is None else self.first_us
-        last = _NEVER_US if self.last_us is None else self.last_us
-        return {":first": {"N": str(first)}, ":last": {"N": str(last)}}
+        first, last = batches_between(self.first_us, self.last_us)
+        return {":first": {"S": first}, ":last": {"S": last}}
 
 
 def headers(cloud: Cloud, robot: str, stream: str, within: Range) -> Iterator[dict[str, Any]]:
     """The stored batches without their samples, page by page: what an audit needs and no more."""
-    names = {"#topic": TOPIC, "#t": T_US, "#boot": "boot", "#seq": "seq", "#n": SAMPLES, "#at": RECEIVED_MS}
+    names = {"#topic": TOPIC, "#batch": BATCH, "#n": SAMPLES, "#at": RECEIVED_MS}
     pages = cloud.client("dynamodb").get_paginator("query")
     for page in pages.paginate(
         TableName=cloud.output("storage", "TelemetryTable"),
-        KeyConditionExpression="#topic = :topic AND #t BETWEEN :first AND :last",
-        ProjectionExpression="#t, #boot, #seq, #n, #at",
+        KeyConditionExpression="#topic = :topic AND #batch BETWEEN :first AND :last",
+        ProjectionExpression="#batch, #n, #at",
         ExpressionAttributeNames=names,
         ExpressionAttributeValues={
             ":topic": {"S": build_topic(RECORD, robot, stream, cloud.namespace)},

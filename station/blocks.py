@@ -44,13 +44,11 @@ def join(parts: Sequence[Block]) -> Block:
 
 
 def ordered(block: Block) -> Block:
-    """The samples in order of time, one a microsecond: the later of two that share it."""
+    """The samples in order of time; those of the same time stay as they are."""
     times = block.times_us
-    if len(times) < 2 or bool((times[1:] > times[:-1]).all()):
+    if len(times) < 2 or bool((times[1:] >= times[:-1]).all()):
         return block
-    block = block.take(np.argsort(times, kind="stable"))
-    times = block.times_us
-    return block.take(np.append(times[1:] > times[:-1], True))
+    return block.take(np.argsort(times, kind="stable"))
 
 
 def joined(parts: Sequence[tuple[Column | None, int]]) -> Column:

@@ -18,7 +18,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from contract import DERIVED_UNITS, T_US
+from contract import DERIVED_UNITS
 from station import inventory, reading, remote
 from station.blocks import Block, join
 from station.cloud import Cloud
@@ -40,7 +40,7 @@ CLIENT, LAMBDA = "client", "lambda"
 class Result:
     """Samples in order of time.
 
-    ``times_us`` are int64 microseconds since the epoch, strictly increasing; ``columns`` one array a
+    ``times_us`` are int64 microseconds since the epoch, in order; ``columns`` one array a
     field: float64 with NaN for null, bool for flags, objects for texts. ``refused`` counts stored items
     that are not batches, of which ``reason`` says what was wrong with the first. ``ros2`` where charge and
     energy have the ROS 2 driver's units.
@@ -124,13 +124,15 @@ def samples(
     refused: Refused,
     scan: bool = False,
     progress: Told | None = None,
+    messages: bool = True,
 ) -> Iterator[Block]:
-    """The selection's samples a block at a time, for what is too long to be held at once.
+    """The selection's samples a block at a time, for what is too long to be held at once; without
+    ``messages`` those alone that are no ROS messages.
 
     Raises `StationError` at the end where a field that was named was in none of the samples.
     """
     pages = reading.batches(cloud, selection, ATTRIBUTES, scan=scan)
-    found = blocks(reading.told(pages, progress, T_US), refused, selection.needs)
+    found = blocks(reading.told(pages, progress), refused, selection.needs, messages=messages)
     condition, fields, named = selection.condition, selection.fields, selection.named()
     derived = sorted(named & DERIVED_UNITS.keys())
     vehicle = inventory.vehicle_of(cloud, selection.robot) if derived else None

@@ -103,6 +103,15 @@ def download(cloud: Cloud, file: StoredFile, out: Path, told: Told = lambda _byt
     return path
 
 
+def content(cloud: Cloud, key: str) -> bytes | None:
+    """What a file holds; None where it is not there, or not yet."""
+    client = cloud.client("s3")
+    try:
+        return bytes(client.get_object(Bucket=_bucket(cloud), Key=key)["Body"].read())
+    except client.exceptions.NoSuchKey:
+        return None
+
+
 def empty(cloud: Cloud, told: Told = lambda _count: None) -> None:
     """Delete everything in the bucket, uploads that were begun included: for a stack that is to go."""
     client, bucket = cloud.client("s3"), _bucket(cloud)

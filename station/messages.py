@@ -1,18 +1,18 @@
-"""Samples made into ROS 1 messages again, of the type that they came from."""
+"""Samples made into ROS 1 messages, where they are not kept as messages: of fields that were selected, of
+sources that are no ROS."""
 
 from __future__ import annotations
 
 import math
 import re
-from bisect import bisect_right
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import suppress
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
-from contract import TYPES_STREAM, ContractError, FrameId, MessageType, Value, frame_id, message_type
+from contract import TYPES_STREAM, ContractError, MessageType, Value, message_type
 from station import data
 from station.blocks import Block
 from station.cloud import Cloud
@@ -32,37 +32,19 @@ _ROS2_HEADER = re.compile(
 )
 
 
-class Said(NamedTuple):
-    """What a robot has said of a stream's messages: the type, None where it has said none, and the frames
-    of its topic, in order of time."""
-
-    kind: MessageType | None
-    frames: Sequence[FrameId]
-
-
-def said(cloud: Cloud, selection: Selection) -> Said:
-    """Of the types, the last before the range ends, or else the first after; of the frames, all."""
-    whole = Selection(robot=selection.robot, stream=TYPES_STREAM)
-    kinds: list[tuple[int, MessageType]] = []
-    frames: list[FrameId] = []
+def types(cloud: Cloud, robot: str, stream: str) -> dict[str, tuple[int, MessageType]]:
+    """The types that a robot has said a stream's messages to be, by their ids, and when it first did."""
+    found: dict[str, tuple[int, MessageType]] = {}
+    whole = Selection(robot=robot, stream=TYPES_STREAM)
     for block in data.samples(cloud, whole, refused=Refused()):
         columns = {name: values(column) for name, column in block.columns.items()}
         for i, t_us in enumerate(block.times_us.tolist()):
             sample = {name: column[i] for name, column in columns.items()}
-            if sample.get("stream") != selection.stream:
-                continue
-            with suppress(ContractError):
-                kinds.append((t_us, message_type(sample)))
-            with suppress(ContractError):
-                frames.append(frame_id(sample))
-    before = [kind for t_us, kind in kinds if selection.end_us is None or t_us < selection.end_us]
-    kind = before[-1] if before else kinds[0][1] if kinds else None
-    # Topics that share a stream have frames of their own; without a type, none is known to be the one.
-    topics = {frame.topic for frame in frames} if kind is None else {kind.topic}
-    if len(topics) > 1:
-        return Said(kind, ())
-    frames = sorted((frame for frame in frames if frame.topic in topics), key=lambda frame: frame.since_us)
-    return Said(kind, frames)
+            if sample.get("stream") == stream:
+                with suppress(ContractError):
+                    kind = message_type(sample)
+                    found.setdefault(kind.id, (t_us, kind))
+    return found
 
 
 def made_of(stream: str, columns: Mapping[str, Any]) -> MessageType:
@@ -87,8 +69,7 @@ class Maker:
     ``definition`` and ``md5sum`` are the type's as ROS 1 knows them, whose headers have a seq, also where
     the samples come from ROS 2. ``lacking`` are fields of the type
     that the samples do not have, which are zero or empty in the messages; ``foreign`` are fields of the
-    samples that the type does not have. ``own`` is for a type of `made_of`; ``frames``, in order of time,
-    say what the headers have.
+    samples that the type does not have. ``own`` is for a type of `made_of`.
 
     Raises `StationError` for a type that ROS 1 cannot have.
     """
@@ -99,10 +80,8 @@ class Maker:
         fields: Sequence[str],
         *,
         own: bool = False,
-        frames: Sequence[FrameId] = (),
     ) -> None:
         self.kind = kind
-        self._frames = frames
         self._seq = -1
         self._field = _plain if own else str
         fields = [self._field(name) for name in fields]
@@ -124,7 +103,7 @@ class Maker:
         """Time in nanoseconds since the epoch, and the message as ROS 1 sends it, of each sample.
 
         A header's stamp is the sample's time, to the microsecond; its seq counts the messages from 0; its
-        frame_id is what was said of the sample's time, or first, and empty in a header further within.
+        frame_id is empty.
         """
         columns = {self._field(name): values(column) for name, column in block.columns.items()}
         for i, t_us in enumerate(block.times_us.tolist()):
@@ -132,12 +111,6 @@ class Maker:
             self._seq += 1
             message = self._build(sample, t_us)
             yield t_us * 1000, bytes(self._store.serialize_ros1(message, self._name))
-
-    def _frame(self, t_us: int) -> str:
-        if not self._frames:
-            return ""
-        at = bisect_right(self._frames, t_us, key=lambda frame: frame.since_us)
-        return self._frames[max(0, at - 1)].frame_id
 
     def _compile(self, fields: Sequence[str]) -> tuple[set[str], Any]:
         """The paths that the type has, and what makes a message of a sample."""
@@ -150,23 +123,17 @@ class Maker:
             parts = {field: part(kind, f"{prefix}{field}") for field, kind in definitions[name][1] if field}
             return lambda sample, t_us: made(**{field: of(sample, t_us) for field, of in parts.items()})
 
-        def header(frame: str, t_us: int) -> Any:
+        def header(_sample: Mapping[str, Value], t_us: int) -> Any:
             stamp = store.types["builtin_interfaces/msg/Time"](
                 sec=t_us // 1_000_000, nanosec=t_us % 1_000_000 * 1000
             )
-            return store.types[_HEADER](seq=self._seq % 2**32, stamp=stamp, frame_id=frame)
-
-        def outermost(_sample: Mapping[str, Value], t_us: int) -> Any:
-            return header(self._frame(t_us), t_us)
-
-        def within(_sample: Mapping[str, Value], t_us: int) -> Any:
-            return header("", t_us)
+            return store.types[_HEADER](seq=self._seq % 2**32, stamp=stamp, frame_id="")
 
         def part(kind: Any, path: str) -> Any:
             node, detail = int(kind[0]), kind[1]
             if node == _NAME:
                 if detail == _HEADER:
-                    return outermost if path == "header" else within
+                    return header
                 return builder(detail, f"{path}.")
             if node == _BASE:
                 base = detail[0]
@@ -190,7 +157,7 @@ class Maker:
             inner = builder(lone[0][1][1], "")
             whole = store.types[self._name]
             return paths, lambda sample, t_us: whole(
-                **{"header": outermost(sample, t_us), lone[0][0]: inner(sample, t_us)}
+                **{"header": header(sample, t_us), lone[0][0]: inner(sample, t_us)}
             )
         return paths, builder(self._name, "")
 

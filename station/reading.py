@@ -7,7 +7,17 @@ from concurrent.futures import ThreadPoolExecutor
 from decimal import Decimal
 from typing import Any, TypeVar
 
-from contract import MAX_BATCH_SPAN_US, RECORD, SECOND, T_US, TOPIC, build_topic
+from contract import (
+    BATCH,
+    MAX_BATCH_SPAN_US,
+    RECORD,
+    SECOND,
+    TOPIC,
+    ContractError,
+    batch_id,
+    batches_between,
+    build_topic,
+)
 from station.cloud import Cloud
 from station.progress import Told
 from station.selection import Selection
@@ -27,36 +37,39 @@ def batches(
     A batch may start one batch length before the range. ``scan`` reads the whole table, every robot's,
     and has DynamoDB drop the rest: as slow and expensive as it sounds, and there to be compared with.
     """
-    first = _FIRST if selection.start_us is None else selection.start_us - MAX_BATCH_SPAN_US + 1
-    last = _LAST if selection.end_us is None else selection.end_us - 1
-    request = _request(cloud, selection, ("TelemetryTable", T_US), (first, last), scan=scan)
+    first_us = None if selection.start_us is None else selection.start_us - MAX_BATCH_SPAN_US + 1
+    last_us = None if selection.end_us is None else selection.end_us - 1
+    first, last = batches_between(first_us, last_us)
+    request = _request(cloud, selection, ("TelemetryTable", BATCH), ({"S": first}, {"S": last}), scan=scan)
     request["ExpressionAttributeNames"] |= {f"#a{i}": name for i, name in enumerate(attributes)}
     request["ProjectionExpression"] = ", ".join(f"#a{i}" for i in range(len(attributes)))
-    return _pages(cloud, request, T_US, scan=scan) if first <= last else iter(())
+    return _pages(cloud, request, BATCH, scan=scan) if first <= last else iter(())
 
 
 def seconds(cloud: Cloud, selection: Selection, *, scan: bool = False) -> Iterator[Sequence[Item]]:
     """Pages of the summary's seconds that begin in the selection's range, in order of time."""
     first = _FIRST if selection.start_us is None else -(-selection.start_us // 1_000_000)
     last = _LAST if selection.end_us is None else (selection.end_us - 1) // 1_000_000
-    request = _request(cloud, selection, ("SummaryTable", SECOND), (first, last), scan=scan)
+    between = ({"N": str(first)}, {"N": str(last)})
+    request = _request(cloud, selection, ("SummaryTable", SECOND), between, scan=scan)
     return _pages(cloud, request, SECOND, scan=scan) if first <= last else iter(())
 
 
 def outermost(cloud: Cloud, robot: str, stream: str, *, newest: bool) -> int | None:
     """The time at which the oldest or newest stored batch of a stream starts; None where there is none."""
     whole = Selection(robot=robot, stream=stream)
-    request = _request(cloud, whole, ("TelemetryTable", T_US), (_FIRST, _LAST), scan=False)
+    first, last = batches_between(None, None)
+    request = _request(cloud, whole, ("TelemetryTable", BATCH), ({"S": first}, {"S": last}), scan=False)
     request["ProjectionExpression"] = "#key"
     found = cloud.client("dynamodb").query(**request, Limit=1, ScanIndexForward=not newest)["Items"]
-    return whole_part(found[0][T_US]) if found else None
+    return time_of(found[0]) if found else None
 
 
 def _request(
     cloud: Cloud,
     selection: Selection,
     table_and_key: tuple[str, str],
-    between: tuple[int, int],
+    between: tuple[Mapping[str, str], Mapping[str, str]],
     *,
     scan: bool,
 ) -> dict[str, Any]:
@@ -70,8 +83,8 @@ def _request(
         "ExpressionAttributeNames": {"#topic": TOPIC, "#key": key},
         "ExpressionAttributeValues": {
             ":topic": {"S": topic},
-            ":first": {"N": str(between[0])},
-            ":last": {"N": str(between[1])},
+            ":first": between[0],
+            ":last": between[1],
         },
     }
 
@@ -81,7 +94,7 @@ def _pages(cloud: Cloud, request: Mapping[str, Any], key: str, *, scan: bool) ->
     found = (page["Items"] for page in paginator.paginate(**request))
     if scan:
         # Nothing promises the order of a scan.
-        yield sorted((item for items in found for item in items), key=lambda item: Decimal(item[key]["N"]))
+        yield sorted((item for items in found for item in items), key=lambda item: _sorted_by(item[key]))
     else:
         yield from ahead(found)
 
@@ -96,17 +109,21 @@ def ahead(items: Iterable[_T]) -> Iterator[_T]:
             yield item  # type: ignore[misc]  # told apart from the end
 
 
-def whole_part(value: Mapping[str, str]) -> int:
-    """The whole part of a number that a table holds: a robot may have sent fractions of a microsecond, which
-    its batch is refused for, but not its neighbours."""
-    return int(Decimal(value["N"]))
+def _sorted_by(value: Mapping[str, str]) -> Any:
+    return Decimal(value["N"]) if "N" in value else value["S"]
 
 
-def told(
-    pages: Iterable[Sequence[Item]], progress: Told | None, key: str, unit_us: int = 1
-) -> Iterator[Sequence[Item]]:
+def time_of(item: Item) -> int:
+    """When a stored batch or second begins, in microseconds; 0 where nobody can tell."""
+    try:
+        return batch_id(item[BATCH]["S"]).t_us if BATCH in item else int(item[SECOND]["N"]) * 1_000_000
+    except (ContractError, KeyError, ValueError):
+        return 0
+
+
+def told(pages: Iterable[Sequence[Item]], progress: Told | None) -> Iterator[Sequence[Item]]:
     """The pages, telling ``progress`` of each."""
     for items in pages:
         if progress is not None and items:
-            progress(len(items), whole_part(items[-1][key]) * unit_us)
+            progress(len(items), time_of(items[-1]))
         yield items

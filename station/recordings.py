@@ -3,61 +3,77 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Protocol
+from typing import Any, Protocol
 
 from mcap.writer import Writer as McapWriter
 from rosbags.rosbag1 import Writer as BagWriter
+from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
-from station.blocks import Block
 from station.errors import StationError
-from station.messages import Maker
+
+Write = Callable[[int, bytes], None]
 
 
 class Recording(Protocol):
     """A file that messages are written into."""
 
-    def add(self, maker: Maker, blocks: Iterator[Block]) -> int:
-        """Write all samples as messages of one topic; how many there were."""
+    def topic(self, topic: str, kind: str, definition: str, md5sum: str) -> Write:
+        """Begin a topic's messages of one ROS 1 type; what is returned writes one, with its time in
+        nanoseconds since the epoch. Raises `StationError` for a definition that is none."""
 
 
 class _Bag:
     def __init__(self, writer: BagWriter) -> None:
         self._writer = writer
+        self._connections: dict[tuple[str, str, str], Any] = {}
 
-    def add(self, maker: Maker, blocks: Iterator[Block]) -> int:
-        kind, written = maker.kind, 0
-        connection = self._writer.add_connection(
-            kind.topic,
-            kind.kind.replace("/", "/msg/"),
-            msgdef=maker.definition,
-            md5sum=maker.md5sum,
-            callerid="/iort",
-        )
-        for block in blocks:
-            for t_ns, message in maker.messages(block):
-                self._writer.write(connection, t_ns, message)
-                written += 1
-        return written
+    def topic(self, topic: str, kind: str, definition: str, md5sum: str) -> Write:
+        named = (topic, kind, md5sum)
+        if named not in self._connections:
+            try:
+                self._connections[named] = self._writer.add_connection(
+                    topic,
+                    kind.replace("/", "/msg/"),
+                    msgdef=definition,
+                    md5sum=md5sum or checksum(kind, definition),
+                    # A bag keeps two types of one topic apart by who published them.
+                    callerid="/iort" if not self._connections else f"/iort_{len(self._connections)}",
+                )
+            except Exception as error:  # whatever a bag library raises
+                raise StationError(f"topic {topic} of type {kind} cannot be written: {error}") from error
+        connection = self._connections[named]
+        return lambda t_ns, message: self._writer.write(connection, t_ns, message)
 
 
 class _Mcap:
     def __init__(self, writer: McapWriter) -> None:
         self._writer = writer
+        self._sequence = 0
 
-    def add(self, maker: Maker, blocks: Iterator[Block]) -> int:
-        kind, written = maker.kind, 0
-        schema = self._writer.register_schema(kind.kind, "ros1msg", maker.definition.encode())
-        channel = self._writer.register_channel(
-            kind.topic, "ros1", schema, {"md5sum": maker.md5sum, "callerid": "/iort"}
-        )
-        for block in blocks:
-            for t_ns, message in maker.messages(block):
-                self._writer.add_message(channel, t_ns, message, t_ns, written)
-                written += 1
-        return written
+    def topic(self, topic: str, kind: str, definition: str, md5sum: str) -> Write:
+        schema = self._writer.register_schema(kind, "ros1msg", definition.encode())
+        about = {"md5sum": md5sum or checksum(kind, definition), "callerid": "/iort"}
+        channel = self._writer.register_channel(topic, "ros1", schema, about)
+
+        def write(t_ns: int, message: bytes) -> None:
+            self._writer.add_message(channel, t_ns, message, t_ns, self._sequence)
+            self._sequence += 1
+
+        return write
+
+
+def checksum(kind: str, definition: str) -> str:
+    """ROS 1's MD5 of a definition. Raises `StationError` for what is none."""
+    name = kind.replace("/", "/msg/")
+    try:
+        store = get_typestore(Stores.EMPTY)
+        store.register(get_types_from_msg(definition, name))
+        return str(store.generate_msgdef(name, ros_version=1)[1])
+    except Exception as error:  # whatever a library raises on a text
+        raise StationError(f"the type {kind} cannot be read: {error}") from error
 
 
 @contextmanager

@@ -43,7 +43,7 @@ def seconds(
     `StationError` for a field that no second has.
     """
     there: dict[str, None] = {}
-    for items in reading.told(reading.seconds(cloud, selection, scan=scan), progress, SECOND, 1_000_000):
+    for items in reading.told(reading.seconds(cloud, selection, scan=scan), progress):
         if not items:
             continue
         block = _block(items)

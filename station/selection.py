@@ -41,6 +41,12 @@ class Selection:
         named = self.named()
         return name in named or any(name in parts for made, parts in MADE_OF.items() if made in named)
 
+    def holds_time(self, t_us: int) -> bool:
+        """Whether the range holds a time."""
+        return (self.start_us is None or self.start_us <= t_us) and (
+            self.end_us is None or t_us < self.end_us
+        )
+
 
 def select(
     robot: str,

@@ -12,6 +12,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from contract import (
+    BATCH,
+    BATCH_VERSION,
     CODEC,
     EXACT,
     MAX_BATCH_SPAN_US,
@@ -21,11 +23,11 @@ from contract import (
     PLAIN_CODEC,
     SAMPLES,
     SCALES,
-    SCHEMA_VERSION,
-    T_US,
+    SERIALIZED_CODEC,
     Batch,
     ContractError,
     Value,
+    batch_id,
     check_effort,
     check_field,
     decode,
@@ -33,10 +35,10 @@ from contract import (
 )
 from station.blocks import EMPTY, Block, column_of, join, joined, ordered
 from station.conditions import Column
-from station.reading import whole_part
+from station.reading import time_of
 
 # What of a stored item is needed to read its samples.
-ATTRIBUTES = ("v", "boot", "seq", T_US, SAMPLES, "nonfinite", "codec", "samples")
+ATTRIBUTES = ("v", BATCH, SAMPLES, "nonfinite", "codec", "samples")
 _SCALES = np.array(SCALES)
 _OF_64_BITS = 2.0**63
 Item = Mapping[str, Any]
@@ -57,28 +59,41 @@ class Refused:
 
 
 def blocks(
-    pages: Iterable[Sequence[Item]], refused: Refused, wanted: Wanted = lambda _name: True
+    pages: Iterable[Sequence[Item]],
+    refused: Refused,
+    wanted: Wanted = lambda _name: True,
+    *,
+    messages: bool = True,
 ) -> Iterator[Block]:
     """The samples of pages of items (attribute values as DynamoDB sends them, in order of the batches'
-    times), strictly increasing in time and with the fields ``wanted``.
+    times), in order of time and with the fields ``wanted``.
 
-    Batches may reach into one another where a car's clock was set back. Of two samples of the same
-    microsecond the one of the batch that starts later counts.
+    Batches may reach into one another where a car's clock was set back, or several publish on a topic.
+    Without ``messages`` batches of ROS messages are passed over.
     """
     held = EMPTY
     for items in pages:
-        page = _read(items, refused, wanted)
+        chosen = items if messages else [item for item in items if not _is_messages(item)]
+        page = _read(chosen, refused, wanted)
         if not len(page.times_us):
             continue
         both = ordered(join([held, page]))
         # What starts later may still reach before these.
-        last_us = whole_part(items[-1][T_US])
-        final = int(np.searchsorted(both.times_us, last_us, side="right"))
+        last_us = time_of(items[-1])
+        final = int(np.searchsorted(both.times_us, last_us, side="left"))
         held = both.take(slice(final, None))
         if final:
             yield both.take(slice(final))
     if len(held.times_us):
         yield held
+
+
+def _is_messages(item: Item) -> bool:
+    try:
+        codec = item["codec"]["S"]
+        return codec == SERIALIZED_CODEC or b"\n" in inflate(item["samples"]["S"], codec)
+    except (ContractError, KeyError):
+        return False
 
 
 class _Open(NamedTuple):
@@ -135,10 +150,13 @@ def _open(item: Item) -> _Open:
     could hold. The rest is left to the contract, which looks at each value and says what is wrong.
     """
     try:
-        n, t_us, codec = int(item[SAMPLES]["N"]), int(item[T_US]["N"]), item["codec"]["S"]
-        if item["v"]["N"] == str(SCHEMA_VERSION) and codec in {CODEC, PLAIN_CODEC} and 1 <= n <= MAX_SAMPLES:
-            found = _columns(inflate(item["samples"]["S"], codec), n, codec)
-            if found is not None and abs(t_us) < EXACT - MAX_BATCH_SPAN_US:
+        n, codec = int(item[SAMPLES]["N"]), item["codec"]["S"]
+        if item["v"]["N"] == str(BATCH_VERSION) and codec in {CODEC, PLAIN_CODEC} and 1 <= n <= MAX_SAMPLES:
+            t_us = batch_id(item[BATCH]["S"]).t_us
+            # What stands behind the columns is for those who make messages of them.
+            body = inflate(item["samples"]["S"], codec).partition(b"\n")[0]
+            found = _columns(body, n, codec)
+            if found is not None and t_us < EXACT - MAX_BATCH_SPAN_US:
                 dt, columns = found
                 return _Open(item, tuple(columns), list(accumulate(dt, initial=t_us))[1:], columns)
     except (AttributeError, KeyError, RecursionError, TypeError, ValueError):
@@ -168,7 +186,7 @@ def _columns(body: bytes, n: int, codec: str) -> tuple[list[int], dict[str, list
         or len(dt) != n
         or set(map(type, dt)) != {int}
         or dt[0] != 0
-        or (n > 1 and min(dt[1:]) <= 0)
+        or (n > 1 and min(dt[1:]) < 0)
         or sum(dt) >= MAX_BATCH_SPAN_US
     ):
         return None

@@ -25,8 +25,8 @@ from bench.result import NOT_MEASURED, Plot, Ratio, Section, Table
 from bench.spread import spread
 from bench.target import Say, Target
 from contract import (
+    BATCH,
     LIVE,
-    T_US,
     TOPIC,
     VESC_STREAM,
     LiveSample,
@@ -240,7 +240,7 @@ def _stream_event(items: list[dict[str, Any]]) -> dict[str, Any]:
             "eventName": "INSERT",
             "eventSource": "aws:dynamodb",
             "dynamodb": {
-                "Keys": {name: item[name] for name in (TOPIC, T_US)},
+                "Keys": {name: item[name] for name in (TOPIC, BATCH)},
                 "NewImage": item,
                 "SequenceNumber": f"{i + 1:021}",
                 "StreamViewType": "NEW_IMAGE",

@@ -6,17 +6,21 @@ Needs no ROS.
 from __future__ import annotations
 
 import logging
+import re
 import threading
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, ContextManager, Iterator, Mapping, Sequence
+from typing import Any, ContextManager, Iterator, Mapping, NamedTuple, Optional, Sequence
 
 import contract
+from contract import RosMessage, RosType
+from contract.ros1.decode import HEADER, Decoder
+from contract.ros1.definition import parse
 from device.clock import Clock
 from device.errors import SourceError
 from device.schema import choice, existing_path, flag, number, pairs, setting, text
 from device.sources import REFUSE, UPLOAD, Emit
-from device.sources.flatten import flatten
 from device.sources.player import NOW, ORIGINAL, Message, Open, Playback, play
 from device.sources.vesc_csv import VescLog
 
@@ -117,7 +121,7 @@ class Recording:
             self._reader.open()
         store = self._reader.typestore
         # Renamed between the versions for Python 3.8 and later.
-        self._fields: dict[str, Any] = store.fielddefs if hasattr(store, "fielddefs") else store.FIELDDEFS
+        self._known: dict[str, Any] = store.fielddefs if hasattr(store, "fielddefs") else store.FIELDDEFS
         try:
             return self._messages(self._streams())
         except SourceError:
@@ -141,7 +145,7 @@ class Recording:
                 f"the recording has {listed}"
             )
         for topic in wanted:
-            if there[topic] not in self._fields:
+            if there[topic] not in self._known:
                 raise SourceError(
                     f"{self._path}: the topic {topic} is of type {there[topic]}, whose definition is neither "
                     "in the recording nor known to the agent; `ros2 bag convert` into MCAP adds it"
@@ -153,44 +157,52 @@ class Recording:
         connections = [c for c in self._reader.connections if c.topic in streams]
         start_ns = int(self._reader.start_time)
         iterator = iter(self._reader.messages(connections=connections))
-        said: set[str] = set()
+        kinds: dict[tuple[str, str], _Kind] = {}
         while True:
             with self._wrapped("is damaged"):
                 found = next(iterator, None)
                 if found is None:
                     return
                 connection, recorded_ns, raw = found
-                message = self._reader.deserialize(raw, connection.msgtype)
-            try:
-                values = flatten(message, self._fields_of, large=self._large)
-            except SourceError as error:
-                raise SourceError(f"{self._path}: topic {connection.topic}: {error}") from error
-            stamp_ns = _stamp_ns(message, recorded_ns)
+                if not self._reader.is2:
+                    raw = bytes(raw)
+                else:
+                    raw = bytes(self._reader.typestore.cdr_to_ros1(raw, connection.msgtype))
             stream, at_ns = streams[connection.topic], recorded_ns - start_ns
-            if connection.topic not in said:
-                said.add(connection.topic)
-                kind = self._type(stream, connection)
-                if kind is not None:
-                    yield Message(contract.TYPES_STREAM, at_ns, stamp_ns, kind)
-            frame = getattr(getattr(message, "header", None), "frame_id", None)
-            in_frame = (connection.topic, frame) if isinstance(frame, str) else None
-            yield Message(stream, at_ns, stamp_ns, values, in_frame)
+            named = (connection.topic, connection.msgtype)
+            kind = kinds.get(named)
+            said = kind is not None
+            if kind is None:
+                kind = kinds[named] = self._kind(stream, connection)
+            stamp_ns = _stamp_ns(raw, recorded_ns) if kind.stamped else recorded_ns
+            if not said and kind.sample is not None:
+                yield Message(contract.TYPES_STREAM, at_ns, stamp_ns, kind.sample)
+            contents: dict[str, Any] = {}
+            if kind.large is not None:
+                with suppress(contract.MessageError):
+                    values: dict[str, Any] = dict(kind.large.decode(raw)[0])
+                    contents = {name: v for name, v in values.items() if isinstance(v, bytes) and v}
+            yield Message(stream, at_ns, stamp_ns, RosMessage(raw, kind.whole, large=contents))
 
-    def _type(self, stream: str, connection: Any) -> Mapping[str, contract.Value] | None:
-        """What the messages of a topic are, as ROS 1 has it; None where it cannot be told."""
+    def _kind(self, stream: str, connection: Any) -> _Kind:
+        """What the messages of a topic are, as ROS 1 has it."""
         kind = connection.msgtype.replace("/msg/", "/")
+        with self._wrapped(f"topic {connection.topic}: its type {kind} cannot be had"):
+            store = self._reader.typestore
+            definition, md5sum = store.generate_msgdef(connection.msgtype, ros_version=1)
+            if self._reader.is2:
+                definition, md5sum = _with_seq(definition, md5sum, connection.msgtype)
+            else:
+                # As it was recorded: with constants and comments.
+                definition = getattr(connection.msgdef, "data", connection.msgdef) or definition
+        whole = RosType(connection.topic, kind, md5sum, definition)
+        parsed = parse(kind, definition)
+        sample = None
         try:
-            definition, md5sum = self._reader.typestore.generate_msgdef(connection.msgtype, ros_version=1)
-            return contract.MessageType(stream, connection.topic, kind, md5sum, definition).sample()
-        except Exception as error:  # noqa: BLE001 - whatever a bag library raises
-            # The samples are worth more than knowing how to make a bag of them again.
-            _log.warning("%s: topic %s: its type cannot be told: %s", self._path, connection.topic, error)
-            return None
-
-    def _fields_of(self, value: Any) -> list[str] | None:
-        # The object's own attributes would include the constants of its type.
-        definition = self._fields.get(getattr(value, "__msgtype__", ""))
-        return None if definition is None else [name for name, _ in definition[1]]
+            sample = contract.MessageType(stream, connection.topic, kind, md5sum, definition).sample()
+        except contract.ContractError as error:
+            _log.warning("%s: topic %s: %s", self._path, connection.topic, error)
+        return _Kind(whole, sample, parsed.stamped(), Decoder(parsed, large=True) if self._large else None)
 
     def _wrapped(self, what: str) -> _Wrapped:
         return _Wrapped(f"{self._path}: {what}")
@@ -218,12 +230,39 @@ class _Wrapped:
             raise SourceError(f"{self._what}: {type(error).__name__}: {error}{advice}") from error
 
 
-def _stamp_ns(message: Any, recorded_ns: int) -> int:
-    """The header's stamp, or when the message was recorded if there is none to believe."""
-    stamp = getattr(getattr(message, "header", None), "stamp", None)
-    if stamp is None:
+class _Kind(NamedTuple):
+    """The type of a topic's messages, and the sample that says so."""
+
+    whole: RosType
+    sample: Optional[Mapping[str, contract.Value]]  # noqa: UP045 - evaluated, on Python 3.8 too
+    stamped: bool
+    large: Optional[Decoder]  # noqa: UP045 - as above
+
+
+# A header of ROS 2 has no seq. The definition may end the text.
+_ROS2_HEADER = re.compile(
+    r"(=+\nMSG: std_msgs/Header\n)\s*(?:time|builtin_interfaces/Time) stamp\n\s*string frame_id(\n|\Z)"
+)
+
+
+def _with_seq(definition: str, md5sum: str, name: str) -> tuple[str, str]:
+    """The definition and checksum with ROS 1's header, which the messages have once they are converted."""
+    from rosbags.typesys import Stores, get_types_from_msg, get_typestore  # noqa: PLC0415 - optional
+
+    with_seq = _ROS2_HEADER.sub(r"\1uint32 seq\ntime stamp\nstring frame_id\2", definition)
+    if with_seq == definition:
+        return definition, md5sum
+    store = get_typestore(Stores.EMPTY)
+    store.register(get_types_from_msg(with_seq, name))
+    return with_seq, store.generate_msgdef(name, ros_version=1)[1]
+
+
+def _stamp_ns(raw: bytes, recorded_ns: int) -> int:
+    """The header's stamp, or when the message was recorded if that is none to believe."""
+    if len(raw) < HEADER.size:
         return recorded_ns
-    stamp_ns = int(stamp.sec) * 1_000_000_000 + int(stamp.nanosec)
+    _, sec, nanosec, _ = HEADER.unpack_from(raw)
+    stamp_ns = int(sec) * 1_000_000_000 + int(nanosec)
     return stamp_ns if abs(stamp_ns - recorded_ns) < _BELIEVABLE_NS else recorded_ns
 
 

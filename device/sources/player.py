@@ -3,12 +3,11 @@
 from __future__ import annotations
 
 import threading
-from typing import Callable, ContextManager, Iterator, Mapping, NamedTuple, Optional, Tuple
+from typing import Callable, ContextManager, Iterator, Mapping, NamedTuple, Optional
 
 import contract
 from device.clock import Clock, Pace
 from device.sources import Emit
-from device.sources.frames import Frames
 
 NOW, ORIGINAL = "now", "original"
 # Between the rounds of a recording with a single message.
@@ -16,14 +15,12 @@ _LONE_NS = 1_000_000_000
 
 
 class Message(NamedTuple):
-    """A message of the recording: when it was recorded, from the start, and when it was measured;
-    ``in_frame`` is its topic and its header's frame_id, where it has a header."""
+    """A message of the recording: when it was recorded, from the start, and when it was measured."""
 
     stream: str
     at_ns: int
     stamp_ns: int
     values: Mapping[str, contract.Value]
-    in_frame: Optional[Tuple[str, str]] = None  # noqa: UP006, UP045 - as in `Playback`
 
 
 # Opens the recording anew for each round; what is opened is the messages, in the order recorded.
@@ -45,7 +42,6 @@ def play(recording: Open, how: Playback, clock: Clock, emit: Emit, stop: threadi
     passed_ns = 0  # of recorded time, in the loops before this one
     limit_ns = None if how.duration_s is None else round(how.duration_s * 1e9)
     base_us = clock.now_us()
-    frames: dict[str, Frames] = {}
     while True:
         with recording() as messages:
             played, at_ns = 0, passed_ns
@@ -61,13 +57,6 @@ def play(recording: Open, how: Playback, clock: Clock, emit: Emit, stop: threadi
                     t_us = base_us + round(at_ns / 1000 / how.speed)
                 else:
                     t_us = clock.now_us()
-                if message.in_frame is not None:
-                    topic, frame = message.in_frame
-                    if topic not in frames:
-                        frames[topic] = Frames(message.stream, topic)
-                    said = frames[topic].sample(frame, t_us)
-                    if said is not None:
-                        emit(contract.TYPES_STREAM, t_us, said)
                 emit(message.stream, t_us, message.values)
                 # A type comes with the first message of it, and is none.
                 played += message.stream != contract.TYPES_STREAM

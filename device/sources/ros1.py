@@ -1,7 +1,7 @@
 """A node in a ROS 1 graph: any topic, of any message type, whose class need not be installed.
 
-The publisher sends its message's definition when it connects; the decoder is made of that, once for
-each type and checksum, so a changed definition is just another decoder.
+The publisher sends its message's definition when it connects. Messages are recorded as they came, so that
+whatever the type is, what is exported is what was published; only a selection of fields is decoded here.
 """
 
 from __future__ import annotations
@@ -10,18 +10,20 @@ import logging
 import re
 import threading
 from dataclasses import dataclass
-from typing import Any, Mapping, Sequence
+from typing import Any, Mapping, NamedTuple, Optional, Sequence
 
 import contract
+from contract import RosMessage, RosType, Value
+from contract.limits import MessageError
+from contract.ros1.decode import HEADER as HEADER_STRUCT
+from contract.ros1.decode import Decoder
+from contract.ros1.definition import layout, parse
 from device.clock import Clock
-from device.errors import MessageError, SourceError
+from device.errors import SourceError
 from device.ros1_node import ANY_TYPE, DEFAULT_NODE, definition_of, shared
-from device.ros1_types import Definition, parse
 from device.schema import Where, choice, items, pairs, section, setting, text
 from device.seldom import Seldom
 from device.sources import REFUSE, UPLOAD, Emit
-from device.sources.frames import Frames
-from device.sources.ros1_decode import Decoder
 
 _log = logging.getLogger(__name__)
 
@@ -31,7 +33,7 @@ _BELIEVABLE_US = 3600 * 1_000_000
 _SILENT_S = 5.0
 _LOOK_S = 1.0
 # A topic changes its definition when somebody rebuilds a package, not all the time.
-_MAX_DECODERS = 32
+_MAX_KINDS = 32
 _MAX_PUBLISHERS = 32
 
 _ROS_NAME = re.compile(r"(/[A-Za-z]\w*)(/\w+)*", re.ASCII)
@@ -143,12 +145,10 @@ class Intake:
         self._header: Mapping[str, str] | None = None
         # Publisher -> its connection, whose messages' type was said.
         self._connections: dict[str, Mapping[str, str]] = {}
-        self._decoder: Decoder | None = None
-        self._decoders: dict[tuple[str, str], Decoder | None] = {}
+        self._kind: _Kind | None = None
+        self._kinds: dict[tuple[str, str], _Kind] = {}
         # Publisher -> its connection, and the last message that came by it.
         self._latched: dict[str, tuple[Mapping[str, str], bytes]] = {}
-        self._frame: bytes | None = None
-        self._frames = Frames(config.stream, topic)
         self._lock = threading.Lock()
         self._messages = self._seen = 0
         self._heard = clock.monotonic()
@@ -165,34 +165,41 @@ class Intake:
         with self._lock:
             if header is not self._header:
                 self._turn_to(header, arrival_us)
-            decoder = self._decoder
-        if decoder is None:
-            self._seldom.warn("undecodable", f"topic {self._topic}: its messages cannot be decoded")
-            return
-        try:
-            values, t_us, frame = decoder.decode(data)
-        except MessageError as error:
-            self._seldom.warn("malformed", f"topic {self._topic}: {error}")
-            return
+            kind = self._kind
+        assert kind is not None
+        t_us, values = self._sample(kind, data)
         if t_us is None or self.sim_time or not -_BELIEVABLE_US < t_us - arrival_us < _BELIEVABLE_US:
             if self._config.time == HEADER:
                 self._flag(t_us, arrival_us)
             t_us = arrival_us
-        if not values:
-            self._seldom.warn("empty", f"topic {self._topic}: there is no field in its messages to send")
+        if values is None:
             return
-        if frame is not None and frame != self._frame:
-            self._say_frame(frame, t_us)
         self._emit(self._config.stream, t_us, values)
 
-    def _say_frame(self, frame: bytes, t_us: int) -> None:
-        """Say whose frame the messages are in from this one on."""
-        with self._lock:
-            self._frame = frame
-            # ROS 1 does not say how a text is encoded.
-            said = self._frames.sample(frame.decode("utf-8", "replace"), t_us)
-        if said is not None:
-            self._emit(contract.TYPES_STREAM, t_us, said)
+    def _sample(self, kind: _Kind, data: bytes) -> tuple[int | None, Mapping[str, Value] | None]:
+        """The header's stamp, if it has one, and the sample: the message, or what is selected of it."""
+        stamp_us = None
+        if kind.stamped and len(data) >= HEADER_STRUCT.size:
+            _, sec, nanosec, _ = HEADER_STRUCT.unpack_from(data)
+            # Wholes and remainders apart, for a float of seconds would lose the last digits.
+            stamp_us = sec * 1_000_000 + nanosec // 1000
+        if self._config.time == ARRIVAL:
+            stamp_us = None
+        if kind.decoder is None:
+            return stamp_us, RosMessage(data, kind.whole)
+        try:
+            values = kind.decoder.decode(data)[0]
+        except MessageError as error:
+            self._seldom.warn("malformed", f"topic {self._topic}: {error}")
+            return stamp_us, None if self._config.fields else RosMessage(data, kind.whole)
+        if not self._config.fields:
+            found: Mapping[str, Any] = values
+            contents = {name: value for name, value in found.items() if isinstance(value, bytes) and value}
+            return stamp_us, RosMessage(data, kind.whole, large=contents)
+        if not values:
+            self._seldom.warn("empty", f"topic {self._topic}: there is no field in its messages to send")
+            return stamp_us, None
+        return stamp_us, values
 
     def _came_before(self, header: Mapping[str, str], data: bytes) -> bool:
         """Whether it is what a latching publisher sends with every connection, and is known from the
@@ -207,7 +214,7 @@ class Intake:
 
     def _turn_to(self, header: Mapping[str, str], t_us: int) -> None:
         """Decode the messages of another connection, which may be a new one."""
-        self._decoder = self._decoder_for(header)
+        self._kind = self._kind_of(header)
         self._header = header
         publisher = header.get("callerid", "")
         if self._connections.get(publisher) is not header:
@@ -219,8 +226,6 @@ class Intake:
     def _say_type(self, header: Mapping[str, str], t_us: int) -> None:
         """Say what the messages are, whenever a publisher connects."""
         config, definition = self._config, header.get("message_definition", "")
-        if self._decoder is None or not definition.strip():
-            return
         kind, md5sum = header.get("type", ""), header.get("md5sum", "")
         said = contract.MessageType(config.stream, self._topic, kind, md5sum, definition)
         try:
@@ -244,8 +249,8 @@ class Intake:
     def report(self) -> dict[str, Any]:
         """What became of the messages."""
         left_out: dict[str, int] = {}
-        for decoder in list(self._decoders.values()):
-            for path, count in decoder.left_out.items() if decoder is not None else ():
+        for kind in list(self._kinds.values()):
+            for path, count in kind.decoder.left_out.items() if kind.decoder is not None else ():
                 left_out[path] = left_out.get(path, 0) + count
         return {
             "messages": self._messages,
@@ -264,33 +269,38 @@ class Intake:
             reason, why = "unbelieved_stamps", f"its stamps are {off:.0f} s off the clock"
         self._seldom.warn(reason, f"topic {self._topic}: {why}; using the time of arrival")
 
-    def _decoder_for(self, header: Mapping[str, str]) -> Decoder | None:
+    def _kind_of(self, header: Mapping[str, str]) -> _Kind:
         key = (header.get("type", ""), header.get("md5sum", ""))
-        if key not in self._decoders or key[1] == ANY_TYPE:
-            if len(self._decoders) >= _MAX_DECODERS:
-                self._decoders.clear()
-            self._decoders[key] = self._compile(*key, header.get("message_definition", ""))
-        return self._decoders[key]
+        if key not in self._kinds or key[1] == ANY_TYPE:
+            if len(self._kinds) >= _MAX_KINDS:
+                self._kinds.clear()
+            self._kinds[key] = self._made(*key, header.get("message_definition", ""))
+        return self._kinds[key]
 
-    def _compile(self, kind: str, md5sum: str, definition: str) -> Decoder | None:
+    def _made(self, kind: str, md5sum: str, text: str) -> _Kind:
         config = self._config
+        decoder, stamped = None, False
         try:
-            decoder = Decoder(
-                _definition(kind, definition),
-                select=config.fields,
-                stamp=config.time == HEADER,
-                large=config.large == UPLOAD,
-            )
+            # Some small clients send no definition; then only an installed class can tell.
+            definition = parse(kind, text) if text.strip() else definition_of(kind)[0]
+            stamped = definition.stamped()
+            if config.fields or config.large == UPLOAD:
+                decoder = Decoder(definition, select=config.fields, large=config.large == UPLOAD)
+            text = text if text.strip() else layout(definition)
         except (MessageError, SourceError) as error:
-            _log.error("topic %s: its messages cannot be decoded: %s", self._topic, error)
-            return None
+            self._seldom.warn(
+                "undecodable", f"topic {self._topic}: its messages cannot be looked into: {error}"
+            )
         _log.info("topic %s: %s, %s", self._topic, kind, md5sum)
-        if decoder.unknown:
+        if decoder is not None and decoder.unknown:
             unknown = ", ".join(decoder.unknown)
             _log.warning("topic %s: %s has no field %s", self._topic, kind, unknown)
-        return decoder
+        return _Kind(RosType(self._topic, kind, md5sum, text), decoder, stamped=stamped)
 
 
-def _definition(kind: str, definition: str) -> Definition:
-    # Some small clients send none; then only an installed class can tell.
-    return parse(kind, definition) if definition.strip() else definition_of(kind)[0]
+class _Kind(NamedTuple):
+    """A type of the topic's messages; ``decoder`` where fields are selected, or bytes kept elsewhere."""
+
+    whole: RosType
+    decoder: Optional[Decoder]  # noqa: UP045 - a NamedTuple's types are evaluated, on Python 3.8 too
+    stamped: bool

@@ -32,7 +32,6 @@ from device.seldom import Seldom
 from device.sources import Emit
 from device.sources.flatten import HEADER as HEADER_FIELD
 from device.sources.flatten import flatten
-from device.sources.frames import Frames
 
 _log = logging.getLogger(__name__)
 
@@ -305,7 +304,6 @@ class Intake:
         self._config = config
         self._emit = emit
         self._seldom = Seldom(_log, clock)
-        self._frames = Frames(config.stream, topic)
         self._messages = 0
 
     def take(self, message: Any, arrival_us: int) -> None:
@@ -323,10 +321,6 @@ class Intake:
             self._seldom.warn("empty", f"topic {self._topic}: there is no field in its messages to send")
             return
         t_us = arrival_us if self._config.time == ARRIVAL else self._stamp_us(message, arrival_us)
-        frame = getattr(getattr(message, HEADER_FIELD, None), "frame_id", None)
-        said = self._frames.sample(frame, t_us) if isinstance(frame, str) else None
-        if said is not None:
-            self._emit(contract.TYPES_STREAM, t_us, said)
         self._emit(self._config.stream, t_us, values)
 
     def report(self) -> dict[str, Any]:

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Mapping
+from itertools import chain
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -13,9 +14,9 @@ from station.errors import StationError
 from station.progress import reading, say
 
 if TYPE_CHECKING:
-    from station.blocks import Block
+    from contract import MessageType
     from station.cloud import Cloud
-    from station.recordings import Recording
+    from station.recordings import Recording, Write
     from station.selection import Selection
 
 commands = typer.Typer()
@@ -33,9 +34,9 @@ def export(
 ) -> None:
     """Write a recording: MCAP, which Foxglove opens, or a ROS 1 bag, which rosbag plays.
 
-    The messages have the type that the robot's source read them as, where it said so; otherwise one made
-    of the fields. Stamps are the samples' times, to the microsecond; headers have the frame_id that they
-    had, and are numbered anew. For CSV and Parquet: iort query.
+    ROS messages are written byte for byte as they were published, whatever their type. Samples that are no
+    messages (of a simulated car, a serial line, a selection of fields) are made into some, of the type that
+    their source said, or of their fields. For CSV and Parquet: iort query.
     """
     # numpy takes longer to load than most commands to run.
     from station import recordings  # noqa: PLC0415 - see above
@@ -56,25 +57,58 @@ def export(
 
 def _write(cloud: Cloud, selection: Selection, file: Recording) -> int:
     """How many messages were written."""
-    from station import data, inventory, messages  # noqa: PLC0415 - as above
+    from station import files, inventory, messages  # noqa: PLC0415 - as above
+    from station.published import Export  # noqa: PLC0415 - as above
+
+    robot, stream = selection.robot, selection.stream
+    said = {name: kind for name, (_, kind) in messages.types(cloud, robot, stream).items()}
+    export = Export(cloud, selection, said, lambda key: files.content(cloud, key))
+    counts: dict[str, int] = {}
+    writers: dict[str, Write] = {}
+    with reading(f"{robot} {stream}", selection.start_us, selection.end_us) as progress:
+        for t_us, name, raw in export.messages(progress):
+            if name not in writers:
+                kind = export.types[name]
+                writers[name] = file.topic(kind.topic, kind.kind, kind.definition, kind.md5sum)
+            writers[name](t_us * 1000, raw)
+            counts[name] = counts.get(name, 0) + 1
+    for name, count in counts.items():
+        kind = export.types[name]
+        say(f"{robot} {stream}: {count:,} messages of {kind.kind} on {kind.topic}, as they were published")
+        if name not in said:
+            say("  its definition is not stored, so topic, comments and constants are not the publisher's")
+    if export.refused.count:
+        say(f"{export.refused.count} stored items cannot be exported; the first: {export.refused.reason}")
+    if export.empty:
+        say(f"{export.empty} messages have an empty array: their content was not kept, or is not uploaded")
+    made = _make(cloud, selection, file, said) if export.others else 0
+    if not counts and not made:
+        inventory.check_there(cloud, robot, stream)
+        say(f"{robot} {stream}: no samples in this range")
+    return sum(counts.values()) + made
+
+
+def _make(cloud: Cloud, selection: Selection, file: Recording, said: Mapping[str, MessageType]) -> int:
+    """Write messages made of the samples that are none; how many."""
+    from station import data, messages  # noqa: PLC0415 - as above
     from station.stored import Refused  # noqa: PLC0415 - as above
 
-    refused = Refused()
     robot, stream = selection.robot, selection.stream
-    with reading(f"{robot} {stream}", selection.start_us, selection.end_us) as progress:
-        blocks = data.samples(cloud, selection, refused=refused, progress=progress)
-        first = next(blocks, None)
-        if first is None:
-            inventory.check_there(cloud, robot, stream)
-            say(f"{robot} {stream}: no samples in this range")
-            return 0
-        kind, frames = messages.said(cloud, selection)
-        made = kind or messages.made_of(stream, first.columns)
-        maker = messages.Maker(made, list(first.columns), own=kind is None, frames=frames)
-        written = file.add(maker, _all(first, blocks))
-    if refused.count:
-        say(f"{refused.count} stored items are no batches and were left out; the first: {refused.reason}")
-    say(f"{robot} {stream}: {written:,} messages of {maker.kind.kind} on {maker.kind.topic}")
+    blocks = data.samples(cloud, selection, refused=Refused(), messages=False)
+    first = next(blocks, None)
+    if first is None:
+        return 0
+    kind = next(iter(reversed(list(said.values()))), None)
+    maker = messages.Maker(
+        kind or messages.made_of(stream, first.columns), list(first.columns), own=kind is None
+    )
+    write = file.topic(maker.kind.topic, maker.kind.kind, maker.definition, maker.md5sum)
+    written = 0
+    for block in chain([first], blocks):
+        for t_ns, message in maker.messages(block):
+            write(t_ns, message)
+            written += 1
+    say(f"{robot} {stream}: {written:,} messages of {maker.kind.kind} on {maker.kind.topic}, made of samples")
     if kind is None:
         say(f"{robot} has not said what {stream} is made of, so the type is made of its fields")
     if maker.lacking:
@@ -82,8 +116,3 @@ def _write(cloud: Cloud, selection: Selection, file: Recording) -> int:
     if maker.foreign:
         say(f"not in the type, so left out: {', '.join(maker.foreign)}")
     return written
-
-
-def _all(first: Block, rest: Iterator[Block]) -> Iterator[Block]:
-    yield first
-    yield from rest

@@ -11,9 +11,9 @@ import sys
 import genpy
 import genpy.dynamic
 
-from device.ros1_types import LETTERS, parse
+from contract.ros1.decode import Decoder
+from contract.ros1.definition import LETTERS, parse
 from device.sources.flatten import flatten
-from device.sources.ros1_decode import Decoder
 
 RULE = "=" * 80
 KINDS = [*LETTERS, "string", "time", "duration"]

@@ -11,6 +11,7 @@ from typing import Any
 
 import contract
 from contract import Command
+from contract.ros1.definition import Definition, parse
 from device.allowance import Allowance
 from device.clock import ManualClock
 from device.dispatch import Dispatcher
@@ -19,7 +20,6 @@ from device.downlink_config import DownlinkConfig, share_rule
 from device.errors import SourceError
 from device.loopback import Loopback
 from device.offset import Offset
-from device.ros1_types import Definition, parse
 from device.schema import Where, load
 
 RULE = "=" * 80

@@ -14,13 +14,14 @@ from PIL import Image
 
 import contract
 from contract import CLAIM_FIELDS
+from contract.limits import MessageError
+from contract.ros1.decode import Decoder
+from contract.ros1.definition import parse
 from device.claim_check import ClaimCheck
 from device.clock import ManualClock
 from device.config import load_config
-from device.errors import ConfigError, MessageError, SourceError
-from device.ros1_types import parse
+from device.errors import ConfigError, SourceError
 from device.sources.bag import BagConfig
-from device.sources.ros1_decode import Decoder
 from device.thumbnail import thumbnail
 from device.upload_file import read
 from device.upload_folder import Folder

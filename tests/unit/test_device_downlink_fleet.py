@@ -6,12 +6,12 @@ from typing import Any
 
 import contract
 from contract import FleetMessage
+from contract.ros1.definition import parse
 from device.clock import ManualClock
 from device.dispatch import Dispatcher
 from device.loopback import Loopback
 from device.offset import Offset
 from device.ros1_json import encode
-from device.ros1_types import parse
 from device.uplink import Message
 from tests.unit.downlink_rig import POSE, POSE_MESSAGE, T0, Rig, doubles
 

@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 import pytest
+from device.sources.frames import MAX_CHANGES, Frames
 
 from contract import ContractError, FrameId, frame_id, message_type
-from device.sources.frames import MAX_CHANGES, Frames
 
 
 def test_a_frame_survives_the_wire_and_a_wrong_one_is_refused() -> None:

@@ -8,9 +8,9 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from device.errors import MessageError
+from contract.limits import MessageError
+from contract.ros1.definition import parse
 from device.ros1_json import decode, encode
-from device.ros1_types import parse
 from tests.unit.downlink_rig import POSE, POSE_MESSAGE, RULE, T0
 
 MIXED = f"""bool b

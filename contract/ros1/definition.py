@@ -9,7 +9,7 @@ from __future__ import annotations
 import re
 from typing import NamedTuple, Tuple
 
-from device.errors import MessageError
+from contract.limits import MessageError
 
 # Builtin type -> its letter in `struct`. A ROS 1 char is an unsigned byte, a byte a signed one.
 LETTERS = {
@@ -31,7 +31,7 @@ STRING, TIME, DURATION, HEADER_TYPE = "string", "time", "duration", "std_msgs/He
 VARIABLE = -1
 
 _SEPARATOR = re.compile(r"^={20,}\s*$", re.MULTILINE)
-_LINE = re.compile(r"([A-Za-z][\w/]*)(?:\[(\d*)\])?\s+([A-Za-z]\w*)\s*(=?)")
+_LINE = re.compile(r"([A-Za-z][\w/]*)(?:\[(\d*)\])?\s+([A-Za-z]\w*)\s*(=?)", re.ASCII)
 # Deeper nesting, or a message of more fields, is no message that anybody sends.
 _MAX_DEPTH, _MAX_TYPES, _MAX_ARRAY = 32, 256, 2**24
 
@@ -82,6 +82,25 @@ def parse(kind: str, text: str) -> Definition:
     definition = Definition(kind, types)
     _check(definition, kind, (), set())
     return definition
+
+
+def layout(definition: Definition) -> str:
+    """The definition without comments and constants, for `parse` to read: all that decoding needs."""
+    order = [definition.kind]
+    for kind in order:
+        nested = {field.kind: None for field in definition.types[kind]}
+        order += [name for name in nested if "/" in name and name not in order]
+    first, *others = (
+        "".join(f"{f.kind}{_brackets(f.length)} {f.name}\n" for f in definition.types[kind]) for kind in order
+    )
+    rest = (f"{'=' * 80}\nMSG: {kind}\n{text}" for kind, text in zip(order[1:], others))
+    return first + "".join(rest)
+
+
+def _brackets(length: int | None) -> str:
+    if length is None:
+        return ""
+    return "[]" if length == VARIABLE else f"[{length}]"
 
 
 def _fields(kind: str, text: str) -> Fields:

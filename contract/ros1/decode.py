@@ -1,26 +1,31 @@
-"""A ROS 1 message's bytes as one flat sample, by the definition that the publisher sends.
+"""A ROS 1 message's bytes as one flat sample, by its definition: field path -> value.
 
 A definition is compiled once to a list of steps: neighbouring fixed-size fields are one
-`struct.Struct`, in which what is not wanted is padding. Names follow the rule of
-`device.sources.flatten`, and time and duration are ``sec`` and ``nanosec`` as in ROS 2, so that a
-topic gives the same fields live, from a bag and through rosbridge. Left out, and counted, is what is
-no telemetry: arrays of more than `MAX_ELEMENTS`, ``uint8[]`` of any length, texts that the contract
-would refuse. With ``large``, a ``uint8[]`` stays the bytes that it is, for `device.claim_check` to take. An
-element named in the selection (``ranges.540``) is taken from any array.
+`struct.Struct`, in which what is not wanted is padding. Nested messages flatten to dotted paths and
+arrays to indexes: ``pose.position.x``, ``covariance.0``; time and duration are ``sec`` and ``nanosec`` as in
+ROS 2. The header that a message begins with is left out: its stamp is the sample's time. A message that
+is a header and exactly one nested message (VescStateStamped, PoseStamped) gives that message's fields without
+a prefix.
+
+The sample is a view; what is recorded is the message. Left out of the view, and counted, is what no table
+shows: arrays of more than `MAX_ELEMENTS`, ``uint8[]`` of any length, texts that the contract would
+refuse, fields beyond `MAX_FIELDS`. An element named in the selection (``ranges.540``) is taken from any
+array. With ``large``, a ``uint8[]`` stays the bytes that it is.
 """
 
 from __future__ import annotations
 
 import struct
+from itertools import islice
 from typing import Any, Callable, Dict, Optional, Sequence, Tuple
 
-from contract import MAX_FIELDS, Value
-from device.errors import MessageError
-from device.ros1_types import LETTERS, STRING, VARIABLE, Definition, Field
-from device.sources.flatten import HEADER
+from contract.limits import MAX_FIELDS, MessageError, Value
+from contract.ros1.definition import LETTERS, STRING, VARIABLE, Definition, Field
 
 MAX_ELEMENTS = 64
 MAX_TEXT = 4096
+# Elements of variable size are walked one by one; a message of more is not looked into.
+_MAX_WALKED = 20_000
 
 # Reads from the bytes at an offset into the sample; returns the offset behind what it has read.
 Step = Callable[[bytes, int, Dict[str, Value]], int]
@@ -29,8 +34,9 @@ Wanted = Callable[[str], bool]
 
 _LENGTH = struct.Struct("<I")
 # A header: seq, the stamp's seconds and nanoseconds, and the length of the frame_id that follows.
-_HEADER = struct.Struct("<IIII")
+HEADER = struct.Struct("<IIII")
 _BLOBS = ("uint8", "char")
+_BEYOND = f"(fields beyond {MAX_FIELDS})"
 
 
 # A sample; the header's stamp in microseconds if the message has one and it was asked for; the header's
@@ -42,8 +48,9 @@ Decoded = Tuple[Dict[str, Value], Optional[int], Optional[bytes]]
 class Decoder:
     """Decodes the messages of one definition. ``select`` are the paths wanted; None is for all.
 
-    Raises `MessageError` for a definition that gives more fields than a sample may have. ``unknown``
-    are selected paths that the message does not have; ``left_out`` counts what was, by path.
+    ``stamped`` says whether messages begin with a header. ``unknown`` are selected paths that the message
+    does not have; ``left_out`` counts what was, by path. ``flat`` is the layout of a message that is
+    nothing but numbers at fixed places behind its header, and their names; None for all others.
     """
 
     def __init__(
@@ -55,12 +62,15 @@ class Decoder:
         large: bool = False,
     ) -> None:
         self._kind = definition.kind
-        self._stamped = definition.stamped()
-        self._stamp = stamp and self._stamped
+        self.stamped = definition.stamped()
+        self._stamp = stamp and self.stamped
         self.left_out: dict[str, int] = {}
         compiler = _Compiler(definition, select, self.left_out, large=large)
-        self._steps = compiler.message(headed=self._stamped)
+        self._steps = compiler.message(headed=self.stamped)
         self.unknown = sorted(set(select or ()) - compiler.used)
+        self.flat: tuple[struct.Struct, list[str]] | None = None
+        if len(self._steps) == 1:
+            self.flat = compiler.fixed.get(self._steps[0])
 
     def decode(self, data: bytes) -> Decoded:
         """The sample in a message. Raises `MessageError` where the bytes do not fit the definition."""
@@ -68,10 +78,10 @@ class Decoder:
         values: dict[str, Value] = {}
         at, stamp_us, frame = 0, None, None
         try:
-            if self._stamped:
-                _, sec, nanosec, length = _HEADER.unpack_from(data)
-                at = _HEADER.size + length
-                frame = data[_HEADER.size : at]
+            if self.stamped:
+                _, sec, nanosec, length = HEADER.unpack_from(data)
+                at = HEADER.size + length
+                frame = data[HEADER.size : at]
                 if self._stamp:
                     # Wholes and remainders apart, for a float of seconds would lose the last digits.
                     stamp_us = sec * 1_000_000 + nanosec // 1000
@@ -82,7 +92,8 @@ class Decoder:
         if at != len(data):
             raise MessageError(f"{self._kind}: the message has {len(data)} bytes, its definition {at}")
         if len(values) > MAX_FIELDS:
-            raise MessageError(f"{self._kind}: the message has over {MAX_FIELDS} fields; select some")
+            self.left_out[_BEYOND] = self.left_out.get(_BEYOND, 0) + 1
+            values = dict(islice(values.items(), MAX_FIELDS))
         return values, stamp_us, frame
 
 
@@ -104,17 +115,16 @@ class _Compiler:
         self._sizes: dict[str, int | None] = {}
         self._emitted = 0
         self.used: set[str] = set()
+        self.fixed: dict[Step, tuple[struct.Struct, list[str]]] = {}
 
     def message(self, *, headed: bool) -> list[Step]:
         """The steps of a whole message, behind its header if it begins with one; a stamped one thing is
         that thing."""
-        run = _Run()
-        names = [field.name for field in self._definition.fields()]
-        lone = len(names) == 2 and HEADER in names
-        for field in self._definition.fields()[1 if headed else 0 :]:
-            if field.name == HEADER:
-                self._skip(run, field)
-            elif lone and field.length is None and field.kind in self._definition.types:
+        run = _Run(self.fixed)
+        body = self._definition.fields()[1 if headed else 0 :]
+        lone = headed and len(body) == 1
+        for field in body:
+            if lone and field.length is None and field.kind in self._definition.types:
                 self._fields(run, field.kind, "")
             else:
                 self._field(run, field, field.name)
@@ -122,10 +132,7 @@ class _Compiler:
 
     def _fields(self, run: _Run, kind: str, prefix: str) -> None:
         for field in self._definition.fields(kind):
-            if field.name == HEADER:
-                self._skip(run, field)
-            else:
-                self._field(run, field, prefix + field.name)
+            self._field(run, field, prefix + field.name)
 
     def _field(self, run: _Run, field: Field, path: str) -> None:
         if not self._within(path):
@@ -145,7 +152,9 @@ class _Compiler:
         if wanted:
             self._emitted += 1
             if self._emitted > MAX_FIELDS:
-                raise MessageError(f"{self._definition.kind}: has over {MAX_FIELDS} fields; select some")
+                if self._emitted == MAX_FIELDS + 1:
+                    run.step(_noted(_BEYOND, self._left_out))
+                wanted = False
         if kind == STRING:
             run.step(_text(path, self._left_out) if wanted else _skip_text)
         else:
@@ -201,6 +210,8 @@ class _Compiler:
                 for i in range(n) if all_of_it else (i for i in few if i < n):
                     _walk(steps(i), data, at + i * size, out)
                 return at + int(n) * size
+            if n > _MAX_WALKED:
+                raise MessageError(f"{path}: {n} elements are too many to look into")
             for i in range(n):
                 at = _walk(steps(i) if all_of_it or i in few else skip, data, at, out)
             return at
@@ -208,7 +219,7 @@ class _Compiler:
         return step
 
     def _element(self, kind: str, path: str | None) -> list[Step]:
-        run = _Run()
+        run = _Run({})
         emitted, self._emitted = self._emitted, 0
         if path is None:
             self._skip(run, Field("", kind, None))
@@ -281,7 +292,8 @@ class _Compiler:
 class _Run:
     """Collects neighbouring fixed-size fields into one struct."""
 
-    def __init__(self) -> None:
+    def __init__(self, fixed: dict[Step, tuple[struct.Struct, list[str]]]) -> None:
+        self._of = fixed
         self._steps: list[Step] = []
         self._format: list[str] = []
         self._names: list[str] = []
@@ -304,7 +316,10 @@ class _Run:
     def finish(self) -> list[Step]:
         if self._format:
             reader = struct.Struct("<" + "".join(self._format))
-            self._steps.append(_fixed(reader, self._names) if self._names else _skip_bytes(reader.size))
+            step = _fixed(reader, self._names) if self._names else _skip_bytes(reader.size)
+            if len(self._format) == len(self._names):
+                self._of[step] = reader, self._names
+            self._steps.append(step)
             self._format, self._names = [], []
         return self._steps
 
@@ -377,6 +392,8 @@ def _skip_many(size: int | None, element: list[Step] | None) -> Step:
         at += 4
         if element is None:
             return at + int(n) * (size or 0)
+        if n > _MAX_WALKED:
+            raise MessageError(f"{n} elements are too many to look into")
         for _ in range(n):
             at = _walk(element, data, at, out)
         return at

@@ -12,10 +12,10 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from device.errors import MessageError
-from device.ros1_types import VARIABLE, parse
+from contract.limits import MessageError
+from contract.ros1.decode import MAX_ELEMENTS, MAX_TEXT, Decoder
+from contract.ros1.definition import VARIABLE, parse
 from device.sources.flatten import flatten
-from device.sources.ros1_decode import MAX_ELEMENTS, MAX_TEXT, Decoder
 from tests.recordings import recording
 from tests.unit.ros1_messages import HEADER, STAMPED, header, text, u32
 
