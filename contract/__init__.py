@@ -95,6 +95,7 @@ from contract.live import (
 from contract.message_type import FrameId, MessageType, frame_id, message_type
 from contract.seconds import Statistics, flat_second, packed_second
 from contract.tables import (
+    ABSENT,
     ADMISSION,
     ADMIT_CLAIM,
     ADMIT_UNTIL_S,
@@ -176,18 +177,23 @@ from contract.topics import (
     rule_name,
 )
 from contract.vesc import (
+    ABSENT_FROM,
     AGENT_FIELDS,
     DERIVED_UNITS,
     FAULT_CODES,
     FAULT_FIELD,
     FAULTS,
+    NO_SENSOR_DEGC,
     VESC_FIELDS,
     VESC_STREAM,
     VOLTAGE_FIELD,
     Field,
+    absent,
 )
 
 __all__ = [
+    "ABSENT",
+    "ABSENT_FROM",
     "ACCEPTED",
     "ADMISSION",
     "ADMITTED_CERTIFICATE",
@@ -263,6 +269,7 @@ __all__ = [
     "MISSING_BATCHES",
     "NONFINITE",
     "NO_ROBOT",
+    "NO_SENSOR_DEGC",
     "OMITTED",
     "ONLINE",
     "OWN_STREAMS",
@@ -320,6 +327,7 @@ __all__ = [
     "Statistics",
     "Topic",
     "Value",
+    "absent",
     "build_topic",
     "channel",
     "check_effort",

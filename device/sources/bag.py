@@ -67,10 +67,13 @@ class BagSource:
     def __init__(self, config: BagConfig, clock: Clock) -> None:
         self._config = config
         self._clock = clock
+        is_log = config.path.suffix.lower() == ".csv"
+        self._log = VescLog(config.path, config.stream, config.stamps) if is_log else None
 
     def report(self) -> Mapping[str, Any]:
-        """Nothing that the streams' own counts do not say."""
-        return {}
+        """Of a log of VESC Tool what became of its rows; of a bag nothing that the streams' own counts do
+        not say."""
+        return {} if self._log is None else self._log.report()
 
     def run(self, emit: Emit, stop: threading.Event) -> None:
         """Play until the end, or for ever with ``loop``. Raises `SourceError`."""
@@ -84,12 +87,12 @@ class BagSource:
 
     def _recording(self) -> Open:
         config = self._config
-        if config.path.suffix.lower() != ".csv":
+        if self._log is None:
             large = config.large == UPLOAD
             return lambda: Recording(config.path, config.topics, config.stream, large=large)
         if config.topics is not None:
             raise SourceError(f"{config.path}: a log of VESC Tool has no topics; `stream` names its stream")
-        return VescLog(config.path, config.stream, config.stamps).open
+        return self._log.open
 
 
 class Recording:
