@@ -18,6 +18,7 @@ from device.schema import choice, existing_path, flag, number, pairs, setting, t
 from device.sources import REFUSE, UPLOAD, Emit
 from device.sources.flatten import flatten
 from device.sources.player import NOW, ORIGINAL, Message, Open, Playback, play
+from device.sources.unreadable import Wrapped, check_kind
 from device.sources.vesc_csv import VescLog
 
 _log = logging.getLogger(__name__)
@@ -106,6 +107,7 @@ class Recording:
             from rosbags.highlevel import AnyReader  # noqa: PLC0415 - optional
         except ImportError as error:
             raise SourceError("playing a bag needs the package rosbags: pip install 'iort[bag]'") from error
+        check_kind(path)
         # rosbags opens the folder of a ROS 2 recording; people name the file in it.
         in_folder = path.suffix in (".db3", ".mcap") and (path.parent / "metadata.yaml").exists()
         self._path = path
@@ -195,30 +197,8 @@ class Recording:
         definition = self._fields.get(getattr(value, "__msgtype__", ""))
         return None if definition is None else [name for name, _ in definition[1]]
 
-    def _wrapped(self, what: str) -> _Wrapped:
-        return _Wrapped(f"{self._path}: {what}")
-
-
-# What rosbags says, and what to do about it.
-_ADVICE = (
-    ("index looks damaged", "`rosbag reindex` mends a recording that was cut off"),
-    ("Profile is not ros2", "a recording of ROS 1 is read as .bag only"),
-)
-
-
-class _Wrapped:
-    """Turns whatever a bag library raises into `SourceError`: damaged files raise about anything."""
-
-    def __init__(self, what: str) -> None:
-        self._what = what
-
-    def __enter__(self) -> None:
-        pass
-
-    def __exit__(self, _kind: object, error: BaseException | None, _trace: object) -> None:
-        if isinstance(error, Exception) and not isinstance(error, SourceError):
-            advice = next((f"; {what}" for sign, what in _ADVICE if sign in str(error)), "")
-            raise SourceError(f"{self._what}: {type(error).__name__}: {error}{advice}") from error
+    def _wrapped(self, what: str) -> Wrapped:
+        return Wrapped(f"{self._path}: {what}")
 
 
 def _stamp_ns(message: Any, recorded_ns: int) -> int:

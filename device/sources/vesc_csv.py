@@ -17,7 +17,7 @@ from itertools import chain, islice
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Callable, Iterator, Mapping, NamedTuple, Sequence
 
-from contract import FAULT_CODES, Value
+from contract import FAULT_CODES, MAX_FIELDS, Value
 from device.errors import SourceError
 from device.sources.player import ORIGINAL, Message
 
@@ -160,6 +160,11 @@ class VescLog:
         first_rows = list(islice(rows, _FIRST_ROWS))
         table = _Table(names, [cells for _, cells in first_rows])
         self._dropped = table.dropped
+        if table.width > MAX_FIELDS:
+            raise SourceError(
+                f"{self._path}: {table.width} of its columns hold numbers, and a sample has at most "
+                f"{MAX_FIELDS} fields: take columns out of the file"
+            )
         if table.dropped:
             self._once("dropped", f"columns that hold no numbers: {', '.join(table.dropped)}")
         elapsed = _Elapsed()
@@ -310,6 +315,11 @@ class _Table:
         ]
         self._columns = [column for column in columns if self._fits(column, first_rows)]
         self.dropped = [column.label or "(no name)" for column in columns if column not in self._columns]
+
+    @property
+    def width(self) -> int:
+        """How many columns are fields."""
+        return len(self._columns)
 
     def time_of(self, cells: Sequence[str]) -> int:
         """The row's time of day in milliseconds. Raises `_BadRowError`."""
