@@ -109,6 +109,7 @@ from contract.message_type import MessageType, message_type
 from contract.ros1.message import Messages, RosMessage, RosType, type_id
 from contract.seconds import Statistics, flat_second, packed_second
 from contract.tables import (
+    ABSENT,
     ADMISSION,
     ADMIT_CLAIM,
     ADMIT_UNTIL_S,
@@ -191,18 +192,23 @@ from contract.topics import (
     rule_name,
 )
 from contract.vesc import (
+    ABSENT_FROM,
     AGENT_FIELDS,
     DERIVED_UNITS,
     FAULT_CODES,
     FAULT_FIELD,
     FAULTS,
+    NO_SENSOR_DEGC,
     VESC_FIELDS,
     VESC_STREAM,
     VOLTAGE_FIELD,
     Field,
+    absent,
 )
 
 __all__ = [
+    "ABSENT",
+    "ABSENT_FROM",
     "ACCEPTED",
     "ADMISSION",
     "ADMITTED_CERTIFICATE",
@@ -281,6 +287,7 @@ __all__ = [
     "MISSING_BATCHES",
     "NONFINITE",
     "NO_ROBOT",
+    "NO_SENSOR_DEGC",
     "OMITTED",
     "ONLINE",
     "OWN_STREAMS",
@@ -343,6 +350,7 @@ __all__ = [
     "Statistics",
     "Topic",
     "Value",
+    "absent",
     "batch_id",
     "batches_between",
     "build_topic",

@@ -106,6 +106,7 @@ class Agent:
         self._counts: dict[str, StreamCounts] = {}
         self._fields: dict[str, Any] = {}
         self._failed: list[str] = []
+        self._ended: list[int] = []
         self._sources = [(source.describe(), source.build(clock)) for source in config.sources]
         self._stop = threading.Event()
         self._rates = Rates(clock)
@@ -150,8 +151,9 @@ class Agent:
     def run(self, *, drain_s: float) -> int:
         """Run until every source has ended or `stop` is called, then deliver what is left.
 
-        Returns the exit status: 0, or 1 if a source failed or a batch could not be delivered within
-        ``drain_s``. Raises `UplinkError` where the uplink cannot start at all.
+        Returns the exit status: 0, or 1 if a source failed or ended without anything that could be stored,
+        or a batch could not be delivered within ``drain_s``. Raises `UplinkError` where the uplink cannot
+        start at all.
         """
         self._uplink.start()
         if self._downlink is not None:
@@ -160,7 +162,7 @@ class Agent:
         lane = self._thread("record", lambda: self._record.run(record_stop))
         ticker = self._thread("ticker", self._tick)
         sources = [
-            self._thread(f"source {i}", self._source(what, source))
+            self._thread(f"source {i}", self._source(i, what, source))
             for i, (what, source) in enumerate(self._sources)
         ]
         watcher = self._thread("watcher", lambda: self._end_with(sources))
@@ -175,6 +177,7 @@ class Agent:
             thread.join()
         self._pings.close(min(_LAST_PONGS_S, drain_s))
         delivered = self._drain(drain_s)
+        self._fail_without_samples()
         if self._downlink is not None:
             self._downlink.close()
         self._end_uploads(uploads_stop, drain_s)
@@ -274,7 +277,7 @@ class Agent:
                 )
             return self._batchers[stream]
 
-    def _source(self, what: str, source: Source) -> Any:
+    def _source(self, i: int, what: str, source: Source) -> Any:
         def run() -> None:
             _log.info("source started: %s", what)
             try:
@@ -288,8 +291,25 @@ class Agent:
                 self._failed.append(what)
             else:
                 _log.info("source ended: %s", what)
+                if not self._stop.is_set():
+                    self._ended.append(i)
 
         return run
+
+    def _fail_without_samples(self) -> None:
+        """A source that ended by itself, and of which nothing could be stored, has failed."""
+        for i in self._ended:
+            what = self._sources[i][0]
+            streams = self._config.sources[i].streams()
+            counts = [self._counts[name] for name in streams if name in self._counts]
+            samples, refused = sum(one.samples for one in counts), sum(one.refused for one in counts)
+            if not counts:
+                _log.error("source failed: %s: it gave no sample", what)
+            elif samples and samples == refused:
+                _log.error("source failed: %s: none of its %d samples could be stored", what, samples)
+            else:
+                continue
+            self._failed.append(what)
 
     def _run_uploads(self, stop: threading.Event) -> Any:
         uploads = self._uploads

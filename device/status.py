@@ -158,6 +158,13 @@ def render(state: Mapping[str, Any]) -> str:
             f"stream    {name}: {stream['per_s']:g}/s, {stream['samples']} samples, "
             f"{stream['refused']} refused{silent}{fields}"
         )
+    for source in state["sources"]:
+        counts = {name: value for name, value in source.items() if name != "source"}
+        flat = {name: value for name, value in counts.items() if not isinstance(value, Mapping)}
+        lines.append(f"source    {source['source']}{_told(flat, ': ')}")
+        for name, value in counts.items():
+            if name not in flat and _told(value):
+                lines.append(f"          {name}{_told(value, ': ')}")
     files = state.get("files")
     if files is not None:
         current = f", now {files['current']} ({files['current_bytes']:,} bytes)" if files["current"] else ""
@@ -176,6 +183,18 @@ def render(state: Mapping[str, Any]) -> str:
         at = time.strftime("%H:%M:%SZ", time.gmtime(trouble["at_s"]))
         lines.append(f"{trouble['level']:<9} {at} {trouble['text']}")
     return "\n".join(lines)
+
+
+def _told(counts: Mapping[str, Any], before: str = "") -> str:
+    """Those counts of a source that are not zero or empty; nothing where all are."""
+    parts = []
+    for name, value in counts.items():
+        if isinstance(value, Mapping):
+            parts += [f"{name} ({_told(value)})"] if _told(value) else []
+        elif value:
+            texts = value if isinstance(value, list) else [value]
+            parts.append(name if value is True else f"{name} {' '.join(map(str, texts))}")
+    return before + ", ".join(parts) if parts else ""
 
 
 def _on(lane: Mapping[str, Any]) -> str:

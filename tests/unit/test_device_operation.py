@@ -312,6 +312,7 @@ def test_status_of_an_agent_for_a_person() -> None:
     assert "robot     car1" in text
     assert "stream    vesc: " in text
     assert "500 samples" in text
+    assert "source    script: played" in text
     assert "NOT connected" in text
     assert "files " not in text
     state["files"] = {
@@ -322,3 +323,25 @@ def test_status_of_an_agent_for_a_person() -> None:
     line = "files     2 waiting, 1 uploaded, 1,234,567 bytes sent, now drive.bag (8,388,608 bytes)"
     assert line in text
     assert "last error: drive.bag: refused: not today" in text
+
+
+def test_status_says_what_became_of_what_the_sources_read() -> None:
+    from tests.unit.test_device_agent import Rig, drive
+
+    rig = Rig(drive)
+    assert rig.agent.run(drain_s=10) == 0
+    state = rig.agent.status()
+    state["sources"] = [
+        {"source": "bag ride.csv", "rows": 168, "skipped": {"columns": 100, "time": 40}, "bad_cells": {},
+         "clock_back": 53, "columns_left_out": ["note", "gnss lat"], "gnss_ahead_ms": None},
+        {"source": "ROS 1", "/tf": {"messages": 7, "silent": True, "left_out": {"a.b": 2}, "odd": 0}},
+        {"source": "VESC", "samples": 0},
+    ]  # fmt: skip
+    lines = [
+        "source    bag ride.csv: rows 168, clock_back 53, columns_left_out note gnss lat",
+        "          skipped: columns 100, time 40",
+        "source    ROS 1",
+        "          /tf: messages 7, silent, left_out (a.b 2)",
+        "source    VESC",
+    ]
+    assert "\n".join(lines) in render(state)
