@@ -161,6 +161,7 @@ from contract.tables import (
 )
 from contract.topics import (
     ACCEPTED,
+    ACCOUNT_STREAM,
     AGENT_STREAM,
     BROKER,
     CMD,
@@ -210,6 +211,7 @@ __all__ = [
     "ABSENT",
     "ABSENT_FROM",
     "ACCEPTED",
+    "ACCOUNT_STREAM",
     "ADMISSION",
     "ADMITTED_CERTIFICATE",
     "ADMITTED_MS",

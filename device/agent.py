@@ -12,6 +12,7 @@ from typing import Any, Mapping
 
 import contract
 from contract import Value
+from device.account import EVERY_S, Accounts
 from device.allowance import Allowance
 from device.batch import Batcher, StreamCounts
 from device.claim_check import make_claims
@@ -112,6 +113,17 @@ class Agent:
         self._rates = Rates(clock)
         self._metrics = AgentMetrics(
             clock=clock, spool=spool, uplink=uplink, offset=self._offset, uploads=self._uploads
+        )
+        self._accounts = Accounts(
+            clock=clock,
+            spool=spool,
+            streams=[stream for source in config.sources for stream in source.streams()],
+            counted=self._counted,
+            reports=[
+                *((what, source.report) for what, source in self._sources),
+                *([("contents", self._claims.report)] if self._claims is not None else []),
+            ],
+            emit=self.record,
         )
         self.tune(self._tuning)
 
@@ -265,7 +277,7 @@ class Agent:
             if stream not in self._batchers:
                 contract.check_stream(stream)
                 self._fields.setdefault(stream, values.keys())
-                counts = self._counts[stream] = StreamCounts()
+                counts = self._counts[stream] = StreamCounts(first_seq=self._spool.next_seq(stream))
                 packer = Packer(
                     stream=stream,
                     boot=self.boot,
@@ -333,7 +345,8 @@ class Agent:
         self._stop.set()
 
     def _tick(self) -> None:
-        measured = looked = self._clock.monotonic()
+        measured = looked = told = self._clock.monotonic()
+        self._accounts.tell()
         while not self._clock.wait(self._stop, _TICK_S):
             for batcher in list(self._batchers.values()):
                 batcher.tick()
@@ -344,9 +357,18 @@ class Agent:
             if now - looked >= _RATES_S:
                 looked = now
                 self._rates.update(self._counts.copy())
+            if now - told >= EVERY_S:
+                told = now
+                self._accounts.tell()
             if self._config.metrics.enabled and now - measured >= self._config.metrics.every_s:
                 measured = now
                 self._measure()
+
+    def _counted(self) -> dict[str, tuple[StreamCounts, int]]:
+        return {
+            name: (batcher.counts(), self._spool.next_seq(name))
+            for name, batcher in list(self._batchers.items())
+        }
 
     def _measure(self) -> None:
         """A sample of the agent's own stream."""
@@ -354,9 +376,15 @@ class Agent:
         samples = sum(c.samples for name, c in counts.items() if name not in contract.OWN_STREAMS)
         self.record(contract.AGENT_STREAM, self._clock.now_us(), self._metrics.sample(samples))
 
-    def _drain(self, drain_s: float) -> bool:
+    def _flush(self) -> None:
         for batcher in list(self._batchers.values()):
             batcher.flush()
+
+    def _drain(self, drain_s: float) -> bool:
+        self._flush()
+        # Once every batch is closed, so that nothing is left open but its own.
+        self._accounts.tell(ended=True)
+        self._flush()
         left = self._spool.backlog()
         if left.batches:
             _log.info("delivering the last %d batches", left.batches)
