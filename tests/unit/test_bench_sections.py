@@ -4,12 +4,14 @@ from __future__ import annotations
 
 import pytest
 
-from bench import invocations
+from bench import far, invocations, thesis
 from bench.invocations import Measured
+from bench.lines import RAW
 from bench.probes.ground import No
 from bench.result import Section
 from bench.sections import SECTIONS, abilities, outage, query, utilisation
 from bench.sections.utilisation import BATCHES
+from contract import BROKER, LAMBDA, RULE
 
 
 def test_report_lines_of_lambda_are_read():
@@ -98,6 +100,60 @@ def test_a_probe_that_raises_is_a_no_and_says_what_was_seen():
         (lambda _: "it did", ("yes", "it did")),
     ):
         assert abilities._answer(abilities.Probe("s", "a", "-", ask), None) == answer
+
+
+def test_what_the_thesis_says_stands_beside_each_ability():
+    entries = {
+        f"{criterion}: {entry}"
+        for table in thesis.TABLES
+        for row in table.rows.values()
+        for criterion, entry in zip(table.criteria, row, strict=True)
+    }
+    by_ability = {probe.ability: probe.thesis for probes in abilities.PROBES.values() for probe in probes}
+    for said in by_ability.values():
+        assert said.removeprefix("Lambda's ") in {*entries, thesis.UNSAID}
+    assert by_ability["transforms messages by rule"] == "compute: partially (SQL only)"
+    assert by_ability["paid by request, no capacity to set"] == "elasticity: limited (stream shards)"
+    assert by_ability["pushes to a dashboard"] == thesis.UNSAID
+    with pytest.raises(KeyError):
+        thesis.said(thesis.ROS, "colour")
+
+
+def test_the_thesis_tables_are_in_the_report_with_their_source():
+    table = thesis.FUNCTIONALITY.as_table()
+    assert table.title == "KTH thesis of 2018, table 6.1: functionality"
+    assert ["Lambda", "no", "yes (disk 512 MB)", "no", "own"] in table.rows
+    assert all(len(row) == len(one.criteria) for one in thesis.TABLES for row in one.rows.values())
+
+
+def test_round_trips_with_the_thesis_ping_stand_beside_its_figures():
+    took_ms = {BROKER: 52.0, RULE: 53.0, LAMBDA: 58.0, RAW: 51.0}
+    found = {f"{way} at {hz} Hz": [[ms] * 3] * 3 for way, ms in took_ms.items() for hz in far.RATES_HZ}
+    section = Section("round_trips", "")
+    far.report(section, {**found, far.DASHBOARD: [[60.0] * 3], far.ECHO: [[50.5] * 3]})
+    rows = {row[0]: row[1:] for row in section.tables[0].rows}
+    ten_hz = {name: (row[1], row[-1]) for name, row in rows.items()}
+    assert ten_hz["robot - broker, with 25 ms each way"] == ("52.0 ms (p95 52.0, p99 52.0)", "50 - 60 ms")
+    assert ten_hz["robot - rule, with 25 ms each way"][1] == "100 - 110 ms"
+    assert ten_hz["robot - lambda, with 25 ms each way"][1] == "150 - 200 ms"
+    assert ten_hz["floor: raw MQTT client, with 25 ms each way"][0].startswith("51.0 ms")
+    assert ten_hz["car to PubNub subscriber, with 25 ms each way"][1] == "250 - 300 ms"
+    values = {ratio.name: ratio.value for ratio in section.ratios}
+    assert values["broker round trip / raw MQTT client, with 25 ms each way"] == 1.02
+    assert values["robot - broker with 25 ms each way / thesis' 60 ms"] == 0.867
+    assert values["car to subscriber with 25 ms each way / thesis' 300 ms"] == 0.2
+
+
+def test_a_query_stands_beside_the_thesis_query_at_the_same_place():
+    section = Section("query", "")
+    ways = {name: query.Way([1.0], [0.5], [], query.POINTS) for name in query.THESIS_S}
+    query._report(section, ways)
+    theirs = {row[0]: row[-1] for row in section.tables[0].rows}
+    assert theirs[query.OURS_QUERY] == theirs[query.THESIS_QUERY] == "6.1 s"
+    assert theirs[query.OURS_SCAN] == theirs[query.THESIS_SCAN] == "14.1 s"
+    assert theirs[query.LAMBDA_QUERY] == "5.5 s (512 MB)"
+    hour = query.Way([1.0], [0.5], [], query.HOUR_POINTS)
+    assert query._row(query.OURS_QUERY, hour)[-1] == "-", "the thesis read no hour"
 
 
 def test_every_section_of_the_documentation_is_one_that_runs():
