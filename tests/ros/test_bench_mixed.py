@@ -22,4 +22,5 @@ def test_mixed_robot_is_recorded_by_both(ros_python: str) -> None:
     assert found.recorded == found.published
     for name in ("/sensors/core", "/odom", "/diagnostics"):
         assert found.arrived[name] == found.published[name]
+    assert 0 < found.bag_bz2_bytes < found.bag_bytes
     assert all(cpu_s > 0 for cpu_s in found.cpu_s.values())

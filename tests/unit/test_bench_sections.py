@@ -173,7 +173,7 @@ def test_mixed_robot_has_the_types_that_its_definitions_say():
 
 
 def mixed_run(arrived):
-    found = mixed.Found(seconds=mixed.SECONDS, bag_bytes=4000)
+    found = mixed.Found(seconds=mixed.SECONDS, bag_bytes=4000, bag_bz2_bytes=2000)
     found.published.update({"/tf": 60, "/imu": 40})
     found.recorded.update({"/tf": 60, "/imu": 40})
     found.cpu_s = {mixed.RECORDER: 0.1, mixed.AGENT: 0.3, mixed.FLOOR: 0.2}
@@ -217,6 +217,7 @@ def test_mixed_robot_is_held_to_what_it_lost_and_left_out():
     assert values["the agent's processor / rosbag record's"].value == 3.0
     assert values["the agent's processor / a bare rospy subscriber's"].value == 1.5
     assert values["bytes published / bytes of the bag"].value == round(len(sent) / 4000, 3)
+    assert any("not sent" in note for note in section.notes)
     json.dumps(section.as_json())
 
 
