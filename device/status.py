@@ -158,6 +158,8 @@ def render(state: Mapping[str, Any]) -> str:
             f"stream    {name}: {stream['per_s']:g}/s, {stream['samples']} samples, "
             f"{stream['refused']} refused{silent}{fields}"
         )
+    for source in state["sources"]:
+        lines += [f"topic     {name}: {what}" for name, what in _not_recorded(source)]
     files = state.get("files")
     if files is not None:
         current = f", now {files['current']} ({files['current_bytes']:,} bytes)" if files["current"] else ""
@@ -176,6 +178,25 @@ def render(state: Mapping[str, Any]) -> str:
         at = time.strftime("%H:%M:%SZ", time.gmtime(trouble["at_s"]))
         lines.append(f"{trouble['level']:<9} {at} {trouble['text']}")
     return "\n".join(lines)
+
+
+def _not_recorded(source: Mapping[str, Any]) -> Iterator[tuple[str, str]]:
+    """The topics of a source's report of which something is missing, and what."""
+    for topic, counts in source.items():
+        if not isinstance(counts, dict) or "messages" not in counts:
+            continue
+        words = []
+        for cause, count in counts.items():
+            # Of what is counted by field, the fields are named.
+            by_name = count.items() if isinstance(count, dict) else [("", count)]
+            words += [
+                f"{n} {cause.replace('_', ' ')} {name}".rstrip()
+                for name, n in by_name
+                if type(n) is int and n and cause != "messages"
+            ]
+        silent = ", SILENT" if counts.get("silent") else ""
+        if words or silent:
+            yield topic, "; ".join([f"{counts['messages']} messages{silent}", *words])
 
 
 def _on(lane: Mapping[str, Any]) -> str:
