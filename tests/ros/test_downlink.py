@@ -27,10 +27,10 @@ CONFIG = {
 POSE = {"pose": {"position": {"x": 1, "y": 2, "z": 3}, "orientation": {"x": 0, "y": 0, "z": 0, "w": 1}}}
 
 
-def start(graph: Graph) -> Process:
+def start(graph: Graph, *arguments: str) -> Process:
     file = graph.folder / "downlink.json"
     file.write_text(json.dumps(CONFIG))
-    process = graph.run("downlinks.py", file)
+    process = graph.run("downlinks.py", file, *arguments)
     process.until(lambda: "started" in process.lines, "start")
     return process
 

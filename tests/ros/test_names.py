@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import xmlrpc.client
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import yaml
 
@@ -14,10 +14,12 @@ from device.status import fetch
 from tests.local.conftest import until
 from tests.local.test_uplink import self_signed
 from tests.ros.conftest import Graph, Process
+from tests.ros.test_downlink import connected, drive, has, start
 from tests.ros.test_source import Cars, turns, until_turns
 from tests.unit.test_device_agent import config_file
 
 WAITS = "another node is called /iort_agent at http://127.0.0.1:"
+WHEELS = {"type": "ros1", "topics": {"/wheel": {"stream": "wheel", "time": "header"}}}
 WAIT_S = 60
 
 
@@ -81,35 +83,77 @@ def test_the_status_says_what_the_agent_waits_for_and_other_sources_go_on(
 ) -> None:
     taker = graph.run("listener.py", "iort_agent", "/elsewhere", "std_msgs/Float64")
     until(lambda: registered(graph, "/iort_agent"), seconds=WAIT_S)
-    topics = {"/wheel": {"stream": "wheel", "time": "header"}}
-    sources = [{"type": "ros1", "topics": topics}, {"type": "sim"}]
-    text = yaml.safe_dump(sources, default_flow_style=True, width=1000).strip()[1:-1]
-    config = config_file(tmp_path, text, "queue: {path: queue.db}\nport: 1")
-    self_signed(tmp_path)
-    for made, named in (("private.key", "key.pem"), ("certificate.pem", "cert.pem")):
-        (tmp_path / made).replace(tmp_path / named)
-    (tmp_path / "ca.pem").write_bytes((tmp_path / "cert.pem").read_bytes())
-    agent = graph.module("device.main", "run", "--config", config, "--drain-s", 0)
-
-    def status() -> dict[str, Any]:
-        assert agent.alive(), "\n".join(agent.errors)
-        try:
-            return fetch(tmp_path / "agent.sock")
-        except AgentError:
-            return {}
-
-    (alarm,) = until(lambda: status().get("alarms"), seconds=WAIT_S)
+    agent = agent_of(graph, tmp_path, WHEELS, {"type": "sim"})
+    (alarm,) = until(lambda: agent.status().get("alarms"), seconds=WAIT_S)
     assert alarm.startswith(f"source waits: {WAITS}")
     assert alarm.endswith("set sources[].node")
-    before = status()["streams"]["vesc"]["samples"]
-    until(lambda: status()["streams"]["vesc"]["samples"] > before, seconds=WAIT_S)
+    before = agent.samples("vesc")
+    until(lambda: agent.samples("vesc") > before, seconds=WAIT_S)
     taker.kill()
-    until(lambda: status().get("alarms") == [], seconds=WAIT_S)
-    assert agent.terminate() == 0, "\n".join(agent.errors)
+    until(lambda: agent.status()["alarms"] == [], seconds=WAIT_S)
+    assert agent.process.terminate() == 0, "\n".join(agent.process.errors)
+
+
+def test_what_roslaunch_adds_to_the_command_is_honoured(graph: Graph, tmp_path: Path) -> None:
+    master = graph.environment.pop("ROS_MASTER_URI")
+    arguments = (
+        f"__master:={master}", "__name:=recorder", f"__log:={tmp_path}/recorder-1.log", "__ns:=/lab",
+        "__ip:=127.0.0.1", "wheel:=/robot1/wheel", "/wheel:=/robot1/wheel", "_rate:=5",
+    )  # fmt: skip
+    agent = agent_of(graph, tmp_path, WHEELS, arguments=arguments)
+    graph.environment["ROS_MASTER_URI"] = master
+    agent.process.until_said("_rate:=5 is ignored")
+    Cars(graph).publisher("pub", topic="/robot1/wheel")
+    until(lambda: agent.samples("wheel") > 5, seconds=WAIT_S)
+    assert registered(graph, "/lab/recorder").startswith("http://127.0.0.1:")
+    assert registered(graph, "/iort_agent") == ""
+    # What it says of the topic has the topic's name in the graph.
+    agent.process.until_said("topic /robot1/wheel: strange_msgs/Wheel")
+    # A master that is restarted is told of the topic by that name too.
+    graph.master.kill()
+    agent.process.until_said("does not answer")
+    graph.start_master()
+    agent.process.until_said("had forgotten /robot1/wheel: registered again")
+    assert agent.process.terminate() == 0, "\n".join(agent.process.errors)
+
+
+def test_commands_and_shares_are_remapped_too(graph: Graph) -> None:
+    downlink = start(graph, "/cmd_vel:=/robot1/cmd_vel")
+    listener = graph.run("listener.py", "driver", "/robot1/cmd_vel", "geometry_msgs/TwistStamped")
+    connected(downlink, "/robot1/cmd_vel")
+    drive(downlink, 1.5)
+    listener.until(lambda: has(listener, 1.5), "command")
 
 
 def newest(*collectors: Process) -> int:
     return max(turn for one in collectors for turn in [-1, *turns(one)])
+
+
+def agent_of(graph: Graph, folder: Path, *sources: dict[str, Any], arguments: tuple[str, ...] = ()) -> Agent:
+    """The real agent in a graph, with no broker in reach."""
+    text = yaml.safe_dump(list(sources), default_flow_style=True, width=1000).strip()[1:-1]
+    config = config_file(folder, text, "queue: {path: queue.db}\nport: 1")
+    self_signed(folder)
+    for made, named in (("private.key", "key.pem"), ("certificate.pem", "cert.pem")):
+        (folder / made).replace(folder / named)
+    (folder / "ca.pem").write_bytes((folder / "cert.pem").read_bytes())
+    command = ("device.main", "run", "--config", config, "--drain-s", 0, *arguments)
+    return Agent(graph.module(*map(str, command)), folder)
+
+
+class Agent(NamedTuple):
+    process: Process
+    folder: Path
+
+    def status(self) -> dict[str, Any]:
+        assert self.process.alive(), "\n".join(self.process.errors)
+        try:
+            return fetch(self.folder / "agent.sock")
+        except AgentError:
+            return {}  # not yet
+
+    def samples(self, stream: str) -> int:
+        return int(self.status().get("streams", {}).get(stream, {}).get("samples", 0))
 
 
 def said(process: Process, text: str) -> int:

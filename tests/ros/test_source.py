@@ -45,11 +45,11 @@ class Cars:
             "publisher.py", name, topic, "strange_msgs/Wheel", file, "--field", "state.turns", *arguments
         )
 
-    def collector(self, *topics: str, arguments: tuple[str, ...] = (), **settings: Any) -> Process:
+    def collector(self, *topics: str, **settings: Any) -> Process:
         file = self.graph.folder / "source.json"
         each = {"time": "header", **settings}
         file.write_text(json.dumps({"topics": {t: {"stream": t[1:], **each} for t in topics or ("/wheel",)}}))
-        return self.graph.run("collector.py", file, *arguments)
+        return self.graph.run("collector.py", file)
 
 
 @pytest.fixture
