@@ -79,8 +79,11 @@ def account(sample: Mapping[str, Value]) -> Account:
         except (KeyError, ValueError, TypeError, AttributeError) as error:
             raise ContractError(f"a source's account that cannot be read: {error}") from error
     try:
-        numbers = (int(sample[name]) for name in StreamAccount._fields[1:-1])  # type: ignore[arg-type]  # as below
-        return StreamAccount(str(sample["stream"]), *numbers, ended=bool(sample["ended"]))
+        names = StreamAccount._fields[1:-1]
+        taken, stored, refused, nulled, first_seq, next_seq = (int(sample[name] or 0) for name in names)
+        return StreamAccount(
+            str(sample["stream"]), taken, stored, refused, nulled, first_seq, next_seq, bool(sample["ended"])
+        )
     except (KeyError, ValueError, TypeError) as error:
         raise ContractError(f"a stream's account that cannot be read: {error}") from error
 

@@ -1,4 +1,4 @@
-"""Tells what this run took and stored, and what it did not record, for `iort audit` to hold against the table."""
+"""Tells what this run took, stored and did not record, for `iort audit` to hold against the table."""
 
 from __future__ import annotations
 
@@ -55,10 +55,10 @@ class Accounts:
             self._emit(ACCOUNT_STREAM, now_us, of.sample())
         dropped = self._spool.dropped()
         queue = {"dropped_batches": dropped.batches, "dropped_samples": dropped.samples}
-        for source, report in (("queue", lambda: queue), *self._reports):
-            counts_of = {path: count for path, count in _counts(report(), "") if count}
-            if counts_of:
-                self._emit(ACCOUNT_STREAM, now_us, SourceAccount(source, counts_of).sample())
+        for source, report in [("queue", queue), *((name, report()) for name, report in self._reports)]:
+            found = {path: count for path, count in _counts(report, "") if count}
+            if found:
+                self._emit(ACCOUNT_STREAM, now_us, SourceAccount(source, found).sample())
 
 
 def _counts(report: Mapping[str, Any], prefix: str) -> Iterator[tuple[str, int]]:

@@ -229,6 +229,7 @@ class Agent:
         tuning, offset = self._tuning, self._offset.estimate()
         alarms = [self._spool.alarm] if self._spool.alarm else []
         alarms += [f"source failed: {what}" for what in self._failed]
+        alarms += [f"source waits: {why}" for why in self._waits()]
         return {
             "robot": self._config.robot,
             "boot": self.boot,
@@ -271,6 +272,13 @@ class Agent:
             "alarms": alarms,
             "troubles": self._troubles.last() if self._troubles is not None else [],
         }
+
+    def _waits(self) -> list[str]:
+        """What sources and commands wait for, each said once: they may share a ROS node."""
+        found = [source.report().get("waits") for _, source in self._sources]
+        if self._downlink is not None:
+            found.append(self._downlink.report()["waits"])
+        return [str(why) for why in dict.fromkeys(found) if why]
 
     def _new_batcher(self, stream: str, values: Mapping[str, Value]) -> Batcher:
         with self._lock:

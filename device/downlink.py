@@ -130,12 +130,15 @@ class Downlink:
         self._wake.set()
 
     def close(self) -> None:
-        """Stop what moves and leave the ROS graph."""
+        """Stop what moves, every stop said, and leave the ROS graph."""
         self.halt()
         self._end.set()
         self._wake.set()
         if self._thread.is_alive():
             self._thread.join()
+        while self._stops_due():
+            self._clock.wait(threading.Event(), max(0.0, min(self._stops_due()) - self._clock.monotonic()))
+            self.tick()
         self._graph.close()
 
     def tick(self) -> float:
@@ -143,11 +146,12 @@ class Downlink:
         with self._lock:
             self._say_stops()
             now = self._clock.monotonic()
-            due = [command.leases.next_due() for command in self._commands.values()]
+            due = self._stops_due()
             for shared in self._shares:
                 self._send(shared, now)
-                due.append(shared.due if shared.newest is not None else None)
-        return max(0.0, min((at - now for at in due if at is not None), default=_IDLE_S))
+                if shared.newest is not None:
+                    due.append(shared.due)
+        return max(0.0, min(due, default=now + _IDLE_S) - now)
 
     def report(self) -> dict[str, Any]:
         """What became of everything."""
@@ -159,6 +163,7 @@ class Downlink:
             "fleet": {name: dict(fleet.passed) for name, fleet in self._fleet.items()},
             "shared": {shared.ros_topic: shared.seq for shared in self._shares},
             "refused": self._seldom.counts(),
+            "waits": self._graph.waits(),
         }
 
     def _run(self) -> None:
@@ -217,6 +222,11 @@ class Downlink:
                 command.leases.cut(self._clock.monotonic())
             self._say_stops()
         self._wake.set()
+
+    def _stops_due(self) -> list[float]:
+        """When leases end or stops are to be said again, of the commands that move or are being stopped."""
+        due = [command.leases.next_due() for command in self._commands.values()]
+        return [at for at in due if at is not None]
 
     def _say_stops(self) -> None:
         for command in self._commands.values():

@@ -159,12 +159,17 @@ def render(state: Mapping[str, Any]) -> str:
             f"{stream['refused']} refused{silent}{fields}"
         )
     for source in state["sources"]:
-        counts = {name: value for name, value in source.items() if name != "source"}
+        counts = {
+            name: value
+            for name, value in source.items()
+            if name != "source" and not (isinstance(value, Mapping) and "messages" in value)
+        }
         flat = {name: value for name, value in counts.items() if not isinstance(value, Mapping)}
         lines.append(f"source    {source['source']}{_told(flat, ': ')}")
         for name, value in counts.items():
             if name not in flat and _told(value):
                 lines.append(f"          {name}{_told(value, ': ')}")
+        lines += [f"topic     {name}: {what}" for name, what in _not_recorded(source)]
     files = state.get("files")
     if files is not None:
         current = f", now {files['current']} ({files['current_bytes']:,} bytes)" if files["current"] else ""
@@ -195,6 +200,25 @@ def _told(counts: Mapping[str, Any], before: str = "") -> str:
             texts = value if isinstance(value, list) else [value]
             parts.append(name if value is True else f"{name} {' '.join(map(str, texts))}")
     return before + ", ".join(parts) if parts else ""
+
+
+def _not_recorded(source: Mapping[str, Any]) -> Iterator[tuple[str, str]]:
+    """The topics of a source's report of which something is missing, and what."""
+    for topic, counts in source.items():
+        if not isinstance(counts, dict) or "messages" not in counts:
+            continue
+        words = []
+        for cause, count in counts.items():
+            # Of what is counted by field, the fields are named.
+            by_name = count.items() if isinstance(count, dict) else [("", count)]
+            words += [
+                f"{n} {cause.replace('_', ' ')} {name}".rstrip()
+                for name, n in by_name
+                if type(n) is int and n and cause != "messages"
+            ]
+        silent = ", SILENT" if counts.get("silent") else ""
+        if words or silent:
+            yield topic, "; ".join([f"{counts['messages']} messages{silent}", *words])
 
 
 def _on(lane: Mapping[str, Any]) -> str:

@@ -14,7 +14,7 @@ from bench.result import Section
 from bench.sections import SECTIONS, abilities, mixed, outage, query, utilisation
 from bench.sections.utilisation import BATCHES
 from contract import BROKER, LAMBDA, RULE, Batch, encode, live_topic, record_topic
-from device.ros1_types import parse
+from contract.ros1.definition import parse
 
 
 def test_report_lines_of_lambda_are_read():

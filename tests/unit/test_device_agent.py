@@ -302,6 +302,17 @@ def test_the_command_checks_a_configuration(tmp_path: Path, capsys: pytest.Captu
     assert "good, robot car1, 1 source" in capsys.readouterr().out
 
 
+def test_roslaunchs_remappings_are_no_wrong_use(tmp_path: Path) -> None:
+    config = str(config_file(tmp_path, "{type: sim}"))
+    remappings = ["__name:=x", "__log:=/tmp/y.log", "/from:=/to", "~from:=to", "from:=/to", "_rate:=5"]
+    assert main(["--config", config, *remappings, "--check-config"]) == 0
+    for wrong in ("1from:=/to", "/a:=/b:=/c", "from:/to"):
+        with pytest.raises(SystemExit):
+            main(["--config", config, "--check-config", wrong])
+    with pytest.raises(SystemExit):
+        main(["status", "--config", config, "__name:=x"])
+
+
 def test_a_wrong_configuration_is_a_message_and_status_2(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -8,6 +8,7 @@ import logging
 import os
 import random
 import stat
+import subprocess
 import sys
 from collections.abc import Iterator
 from pathlib import Path
@@ -60,6 +61,15 @@ def test_the_last_troubles_are_kept() -> None:
     for i in range(9):
         troubles.handle(record(logging.WARNING, f"trouble {i}"))
     assert [line["text"] for line in troubles.last()] == [f"trouble {i}" for i in range(4, 9)]
+
+
+def test_warnings_do_not_displace_errors() -> None:
+    troubles = Troubles()
+    troubles.handle(record(logging.ERROR, "the one that matters"))
+    for i in range(9):
+        troubles.handle(record(logging.WARNING, f"trouble {i}"))
+    kept = [(line["level"], line["text"]) for line in troubles.last()]
+    assert kept == [("error", "the one that matters"), *(("warning", f"trouble {i}") for i in range(4, 9))]
 
 
 @given(
@@ -256,6 +266,23 @@ def test_status_and_check_by_command(
     assert findings["endpoint"]["level"] == "fail"
 
 
+def test_a_reader_that_has_seen_enough_is_no_error(tmp_path: Path) -> None:
+    from tests.unit.test_device_agent import Rig, config_file, drive
+
+    rig = Rig(drive)
+    assert rig.agent.run(drain_s=10) == 0
+    config = config_file(tmp_path, "{type: sim}")
+    server = StatusServer(tmp_path / "agent.sock", rig.agent.status)
+    server.start()
+    reading, writing = os.pipe()
+    os.close(reading)
+    with os.fdopen(writing) as output:
+        command = [sys.executable, "-m", "device.main", "status", "--config", str(config)]
+        done = subprocess.run(command, stdout=output, stderr=subprocess.PIPE, text=True, check=False)
+    server.stop()
+    assert (done.stderr, done.returncode) == ("", 1)
+
+
 @contextlib.contextmanager
 def unprivileged() -> Iterator[None]:
     """This process as one that may not write everywhere, if root runs the tests."""
@@ -315,6 +342,21 @@ def test_status_of_an_agent_for_a_person() -> None:
     assert "source    script: played" in text
     assert "NOT connected" in text
     assert "files " not in text
+    assert "topic " not in text
+    state["sources"] = [
+        {
+            "source": "ROS 1 topics /scan, /imu, /lost",
+            "/scan": {"messages": 201, "silent": False, "left_out": {}, "undecodable": 201},
+            "/imu": {"messages": 9, "silent": False, "left_out": {}},
+            "/lost": {"messages": 3, "silent": True, "left_out": {"ranges": 3}, "malformed": 1},
+            "waits": "another node took the name",
+        }
+    ]
+    topics = [line for line in render(state).splitlines() if line.startswith("topic ")]
+    assert topics == [
+        "topic     /scan: 201 messages; 201 undecodable",
+        "topic     /lost: 3 messages, SILENT; 3 left out ranges; 1 malformed",
+    ]
     state["files"] = {
         "waiting": 2, "uploaded": 1, "sent_bytes": 1_234_567, "current": "drive.bag",
         "current_bytes": 8_388_608, "last_error": "drive.bag: refused: not today", "large": None,
