@@ -21,6 +21,7 @@ from typing import Any, Iterator, NamedTuple
 from device.certificate import Certificate, check_pair, read_certificate
 from device.config import Config
 from device.errors import AgentError, IdentityError
+from device.record import TODO, too_many
 from device.status import fetch
 
 OK, WARN, FAIL = "ok", "warn", "fail"
@@ -54,6 +55,7 @@ def check(config: Config, status_socket: Path) -> Iterator[Finding]:
     for i, source in enumerate(config.sources):
         yield from _source(f"source {i}", source)
     yield from _queue(config)
+    yield _lanes(config)
     if running is None:
         yield Finding("agent", OK, "not running")
     else:
@@ -306,3 +308,10 @@ def _queue(config: Config) -> Iterator[Finding]:
         yield Finding("queue", WARN, text, "the disk is full before the queue is: lower queue.max_bytes")
     else:
         yield Finding("queue", OK, text)
+
+
+def _lanes(config: Config) -> Finding:
+    problem = too_many(config)
+    if problem is not None:
+        return Finding("record lane", WARN, problem, TODO)
+    return Finding("record lane", OK, "the streams named are few enough for one connection")

@@ -115,7 +115,8 @@ class _Connected:
             padding_bytes=max(0, size - _ENVELOPE),
             uplink=self.uplink,
             clock=self.clock,
-            allowance=Allowance(self.clock),
+            # It is `RATES_HZ` and `SIZES` that keep below the limits here.
+            allowance=Allowance(self.clock, publishes_per_s=1e6, bytes_per_s=1e9),
             emit=emit,
             on_stamp=lambda _sent, _received, _stamp_ms: None,
         )
