@@ -151,7 +151,7 @@ class RecordLane:
         was, self.alarm = self.alarm, self._alarm(left.batches) if production.behind else None
         if self.alarm and not was:
             _log.warning("record: %s", self.alarm)
-        elif was and not self.alarm:
+        elif was and not self.alarm and self._uplink.connected():
             _log.info("record: the queue no longer grows")
 
     def wait_empty(self, timeout_s: float) -> bool:
