@@ -138,7 +138,7 @@ class _Connected:
             padding_bytes=max(0, size - _ENVELOPE),
             uplink=self.uplink,
             clock=self.clock,
-            allowance=Allowance(self.clock),
+            allowance=Allowance(self.clock, publishes_per_s=1e6, bytes_per_s=1e9),
             emit=emit,
             on_stamp=lambda _sent, _received, _stamp_ms: None,
         )

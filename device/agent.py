@@ -26,7 +26,7 @@ from device.metrics import AgentMetrics, Rates
 from device.offset import ClockOffset
 from device.pack import Packer
 from device.pings import Pings
-from device.record import RecordLane
+from device.record import TODO, RecordLane, too_many
 from device.remote import Remote
 from device.sources import Source
 from device.spool import Spool
@@ -167,6 +167,9 @@ class Agent:
         or a batch could not be delivered within ``drain_s``. Raises `UplinkError` where the uplink cannot
         start at all.
         """
+        problem = too_many(self._config)
+        if problem is not None:
+            _log.warning("record: %s; %s", problem, TODO)
         self._uplink.start()
         if self._downlink is not None:
             self._downlink.start()
@@ -200,6 +203,15 @@ class Agent:
         self._uplink.stop(_CLOSE_S)
         return 0 if delivered and not self._failed else 1
 
+    def tick(self) -> None:
+        """Look around in batches and lanes; `run` does it several times a second."""
+        for batcher in list(self._batchers.values()):
+            batcher.tick()
+        self._record.tick()
+        self._live.tick()
+        self._pings.tick()
+        self._remote.tick()
+
     def report(self) -> dict[str, Any]:
         """What became of everything, for a file or a test."""
         left, dropped = self._spool.backlog(), self._spool.dropped()
@@ -210,6 +222,7 @@ class Agent:
             "streams": {name: vars(counts).copy() for name, counts in sorted(self._counts.items())},
             "live_published": self._live.published,
             "live_refused": self._live.refused,
+            "live": {**self._live.tempo._asdict(), "streams_hz": self._live.rates_hz()},
             "spool": {
                 "left_batches": left.batches,
                 "left_samples": left.samples,
@@ -227,7 +240,8 @@ class Agent:
         """How it goes right now, for `iort-agent status`."""
         uplink, backlog, dropped = self._uplink.status(), self._spool.backlog(), self._spool.dropped()
         tuning, offset = self._tuning, self._offset.estimate()
-        alarms = [self._spool.alarm] if self._spool.alarm else []
+        tempo, live_hz = self._live.tempo, self._live.rates_hz()
+        alarms = [alarm for alarm in (self._spool.alarm, self._record.alarm) if alarm]
         alarms += [f"source failed: {what}" for what in self._failed]
         alarms += [f"source waits: {why}" for why in self._waits()]
         return {
@@ -244,16 +258,19 @@ class Agent:
                 "live": {
                     "enabled": tuning.live_enabled,
                     "rate_hz": tuning.live_rate_hz,
+                    "effective_hz": tempo.effective_hz,
+                    "slowed": tempo.slowed,
                     "published": self._live.published,
                     "refused": self._live.refused,
                 },
-                "ping": {"rate_hz": tuning.ping_rate_hz},
+                "ping": {"rate_hz": tuning.ping_rate_hz, "held_back": self._pings.held_back},
             },
             "sources": [{"source": what, **source.report()} for what, source in self._sources],
             "streams": {
                 name: {
                     **vars(counts),
                     "per_s": self._rates.per_s.get(name, 0.0),
+                    "live_hz": live_hz.get(name, 0.0),
                     "silent_s": self._rates.silent_s(name),
                     "fields": list(tuning.fields.get(name, ())),
                 }
@@ -356,11 +373,7 @@ class Agent:
         measured = looked = told = self._clock.monotonic()
         self._accounts.tell()
         while not self._clock.wait(self._stop, _TICK_S):
-            for batcher in list(self._batchers.values()):
-                batcher.tick()
-            self._live.tick()
-            self._pings.tick()
-            self._remote.tick()
+            self.tick()
             now = self._clock.monotonic()
             if now - looked >= _RATES_S:
                 looked = now

@@ -22,6 +22,7 @@ from device.certificate import Certificate, check_pair, read_certificate
 from device.clock import SystemClock
 from device.config import Config
 from device.errors import AgentError, IdentityError
+from device.record import TODO, too_many
 from device.recording_check import look_into
 from device.status import fetch
 
@@ -58,6 +59,7 @@ def check(config: Config, status_socket: Path) -> Iterator[Finding]:
     for i, source in enumerate(config.sources):
         yield from source_findings(f"source {i}", source)
     yield from _queue(config)
+    yield _lanes(config)
     if running is None:
         yield Finding("agent", OK, "not running")
     else:
@@ -323,3 +325,10 @@ def _queue(config: Config) -> Iterator[Finding]:
         yield Finding("queue", WARN, text, "the disk is full before the queue is: lower queue.max_bytes")
     else:
         yield Finding("queue", OK, text)
+
+
+def _lanes(config: Config) -> Finding:
+    problem = too_many(config)
+    if problem is not None:
+        return Finding("record lane", WARN, problem, TODO)
+    return Finding("record lane", OK, "the streams named are few enough for one connection")

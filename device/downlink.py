@@ -16,7 +16,7 @@ import contract
 from contract import CMD, FLEET, Command, ContractError, FleetMessage
 from contract.limits import MessageError
 from contract.ros1.definition import Definition, parse
-from device.allowance import Allowance
+from device.allowance import STEADY, Allowance
 from device.clock import Clock
 from device.downlink_config import ROBOT_IN_TOPIC, CommandConfig, DownlinkConfig, FleetConfig, ShareConfig
 from device.errors import ConfigError, UplinkError
@@ -32,6 +32,8 @@ from device.uplink import Message, Uplink
 _log = logging.getLogger(__name__)
 
 _IDLE_S = 1.0
+# A message that the connection has no room for waits so long, unless a newer one replaces it.
+_NO_ROOM_S = 0.05
 # Each robot heard becomes a ROS topic; a lab has fewer than this.
 _MAX_ROBOTS = 64
 _MAX_DEFINITIONS = 8
@@ -285,6 +287,9 @@ class Downlink:
 
     def _send(self, shared: _Share, now: float) -> None:
         if shared.newest is None or now < shared.due:
+            return
+        if not self._allowance.may_go(STEADY, shared.topic, len(shared.newest[1])):
+            shared.due = now + _NO_ROOM_S
             return
         (header, data, at), shared.newest = shared.newest, None
         if now - at > contract.FLEET_MAX_AGE_MS / 1000 or not self._uplink.connected():

@@ -147,16 +147,17 @@ def render(state: Mapping[str, Any]) -> str:
         f"{spool['bytes']:,} bytes waiting; {spool['dropped_batches']} batch(es) dropped"
     )
     live = lanes["live"]
+    slowed = f", SLOWED to {live['effective_hz']:g} Hz a stream by AWS' limit" if live["slowed"] else ""
     lines.append(
-        f"live      {_on(live)}, up to {live['rate_hz']:g} Hz, {live['published']} sent, "
+        f"live      {_on(live)}, up to {live['rate_hz']:g} Hz{slowed}, {live['published']} sent, "
         f"{live['refused']} refused"
     )
     for name, stream in state["streams"].items():
         fields = f", only {', '.join(stream['fields'])}" if stream.get("fields") else ""
         silent = f", SILENT for {_duration(stream['silent_s'])}" if stream["silent_s"] >= 5 else ""
         lines.append(
-            f"stream    {name}: {stream['per_s']:g}/s, {stream['samples']} samples, "
-            f"{stream['refused']} refused{silent}{fields}"
+            f"stream    {name}: {stream['per_s']:g}/s, live {stream['live_hz']:g}/s, "
+            f"{stream['samples']} samples, {stream['refused']} refused{silent}{fields}"
         )
     for source in state["sources"]:
         counts = {

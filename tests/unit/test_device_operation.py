@@ -263,6 +263,7 @@ def test_status_and_check_by_command(
     assert findings["key's mode"]["level"] == "warn"
     assert findings["key's mode"]["todo"].startswith("chmod 600 ")
     assert findings["queue"]["level"] == "warn"
+    assert findings["record lane"]["level"] == "ok"
     assert findings["endpoint"]["level"] == "fail"
 
 
