@@ -156,6 +156,7 @@ from contract.tables import (
     SESSION_VERSION,
     SOURCE,
     STATS,
+    STREAMS,
     T_US,
     TOPIC,
 )
@@ -324,6 +325,7 @@ __all__ = [
     "SHADOW",
     "SOURCE",
     "STATS",
+    "STREAMS",
     "TOPIC",
     "TYPES_STREAM",
     "T_US",

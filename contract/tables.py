@@ -34,6 +34,8 @@ REPLAY = "replay"
 # What a queue's message of Lambda 2's carries: the stored item as DynamoDB JSON, in base64.
 ITEM_BASE64 = "base64Item"
 
+# Of a robot in the registry: the streams that Lambda 2 has seen of it.
+STREAMS = "streams"
 # The registry's row of a robot, beside its vehicle parameters. Of its connection, by the broker's
 # lifecycle events: times are the broker's, and the certificate is the one that it connected with.
 ONLINE, LAST_SEEN_MS = "online", "last_seen_ms"
