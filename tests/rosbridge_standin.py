@@ -211,7 +211,9 @@ class RosbridgeStandin:
         if service == "/rosapi/topic_type":
             return {"type": topics.get(arguments["topic"], "")}
         if service == "/rosapi/message_details" and arguments["type"] in self.definitions:
-            return {"typedefs": typedefs(arguments["type"], self.definitions[arguments["type"]])}
+            found = typedefs(arguments["type"], self.definitions[arguments["type"]])
+            # rosapi takes a char for a message, and fails.
+            return None if any("char" in one["fieldtypes"] for one in found) else {"typedefs": found}
         return None
 
 

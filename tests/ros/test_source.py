@@ -186,6 +186,7 @@ def test_another_node_of_the_same_name_ends_the_source(cars: Cars) -> None:
     collector.until_said("another node took its name")
 
 
-def test_decoding_agrees_with_genpy(graph: Graph) -> None:
-    found = graph.run("against_genpy.py")
+@pytest.mark.parametrize("script", ["against_genpy.py", "rosbridge_against_genpy.py"])
+def test_decoding_and_writing_agree_with_genpy(graph: Graph, script: str) -> None:
+    found = graph.run(script)
     found.until(lambda: "agreed" in "".join(found.lines), "agreement")
