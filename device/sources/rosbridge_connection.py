@@ -317,7 +317,7 @@ class _Hearing:
         self._doubted = None
         self._last = now
         self._patience = self._times.patience_s
-        self.due, self.ask_again = now + self._times.patience_s, now + self._times.ask_again_s
+        self.due, self.ask_again = now + self._least_s(), now + self._times.ask_again_s
 
     def hear(self, now: float) -> None:
         if self._doubted is not None:
@@ -332,7 +332,10 @@ class _Hearing:
         self._last = now
 
     def silent(self, now: float) -> bool:
-        return now - self._last >= max(self._times.patience_s, _INTERVALS * self._longest_s)
+        return now - self._last >= self._least_s()
+
+    def _least_s(self) -> float:
+        return max(self._times.patience_s, _INTERVALS * self._longest_s)
 
     def resubscribing(self, now: float) -> None:
         if self._ever:

@@ -223,6 +223,13 @@ def test_a_slow_topic_keeps_its_subscription(server: RosbridgeStandin) -> None:
             time.sleep(0.05)  # the pace of a publisher
         server.publish("/slow", numbered(2))
         eventually(lambda: running.source.report()["/slow"]["messages"] == 2)
+        # The pace is known after an interruption.
+        server.cut()
+        server.wait_for("subscribe", 4)
+        began = time.monotonic()
+        while time.monotonic() - began < 1.0:
+            server.publish("/fast", {"n": time.monotonic()})
+            time.sleep(0.05)  # the pace of a publisher
     assert [op["op"] for op in server.operations if op["op"] == "unsubscribe"] == []
     assert "resubscribed" not in running.source.report()["/slow"]
 
