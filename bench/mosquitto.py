@@ -64,8 +64,8 @@ class Mosquitto:
         # Started by root it would become the user mosquitto, who may not read the keys.
         with config.open("a") as file:
             file.write("user root\n")
-        log = (self._folder / "mosquitto.log").open("w")
-        self._process = subprocess.Popen([self._program, "-c", config], stdout=log, stderr=log)
+        with (self._folder / "mosquitto.log").open("w") as log:
+            self._process = subprocess.Popen([self._program, "-c", config], stdout=log, stderr=log)
         deadline = time.monotonic() + _START_S
         while True:
             try:

@@ -55,6 +55,37 @@ def bars(title: str, values: Mapping[str, float], *, unit: str, log: bool = Fals
     return _svg(figure)
 
 
+def ranges(
+    title: str, names: Sequence[str], series: Mapping[str, Mapping[str, tuple[float, float]]], *, unit: str
+) -> str:
+    """A row a name, and in it a bar from least to most for each series that has the name."""
+    figure, axes = _figure(title, height=0.5 * len(names) + 1.0)
+    thick = 0.8 / len(series)
+    longest = max(most for bars in series.values() for _, most in bars.values())
+    for i, (label, bars) in enumerate(series.items()):
+        at = [names.index(name) + (i - (len(series) - 1) / 2) * thick for name in bars]
+        left = [least for least, _ in bars.values()]
+        # A range of nothing is seen too.
+        wide = [max(most - least, longest / 300) for least, most in bars.values()]
+        axes.barh(at, wide, thick * 0.8, left, color=COLOURS[i % 7], label=label)
+        for y, (least, most) in zip(at, bars.values(), strict=True):
+            axes.annotate(
+                f"{least:.0f} - {most:.0f}",
+                (most, y),
+                (4, 0),
+                textcoords="offset points",
+                va="center",
+                fontsize=8,
+                annotation_clip=False,
+            )
+    axes.set_yticks(range(len(names)), names)
+    axes.invert_yaxis()
+    axes.set_xlim(0, longest * 1.15)
+    axes.set_xlabel(unit)
+    axes.legend(fontsize=8, loc="upper right")
+    return _svg(figure)
+
+
 def lines(
     title: str,
     x: Sequence[float],

@@ -33,11 +33,11 @@ class RawError(BenchError):
 
 
 class RawClient:
-    """A connection with the certificate of a registered robot, as that robot."""
+    """A connection with the certificate of a registered robot, as that robot; to ``port`` if given."""
 
-    def __init__(self, bundle: Path) -> None:
+    def __init__(self, bundle: Path, port: int | None = None) -> None:
         self._config: dict[str, Any] = yaml.safe_load((bundle / "car.yaml").read_text())
-        self._bundle = bundle
+        self._port = port or int(self._config["port"])
         self._context = ssl.create_default_context(
             cafile=str(bundle / self._config["root_ca"]) if "root_ca" in self._config else None
         )
@@ -48,9 +48,9 @@ class RawClient:
         self.tcp_connect_s = 0.0
 
     def __enter__(self) -> Self:
-        host, port = self._config["endpoint"], self._config["port"]
+        host = self._config["endpoint"]
         began = time.perf_counter()
-        plain = socket.create_connection((host, port), timeout=_TIMEOUT_S)
+        plain = socket.create_connection((host, self._port), timeout=_TIMEOUT_S)
         plain.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
         self.tcp_connect_s = time.perf_counter() - began
         self._socket = self._context.wrap_socket(plain, server_hostname=host)

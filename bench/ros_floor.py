@@ -1,4 +1,4 @@
-"""The floor: a bare rospy subscriber that counts messages and does nothing with them."""
+"""The floor: a bare rospy subscriber of some topics that counts messages and does nothing with them."""
 
 import sys
 
@@ -14,6 +14,6 @@ def take(_message: rospy.AnyMsg) -> None:
 
 
 rospy.init_node("bench_floor", disable_signals=True)
-subscriber = rospy.Subscriber(sys.argv[1], rospy.AnyMsg, take, tcp_nodelay=True)
+subscribers = [rospy.Subscriber(topic, rospy.AnyMsg, take, tcp_nodelay=True) for topic in sys.argv[1:]]
 sys.stdin.readline()
 print(count, flush=True)

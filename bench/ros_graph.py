@@ -67,7 +67,7 @@ class RosGraph:
         self._processes: list[subprocess.Popen[str]] = []
 
     def __enter__(self) -> Self:
-        self._run([SYSTEM_PYTHON, str(shutil.which("rosmaster")), "--core", "-p", str(self._port)])
+        self.run([SYSTEM_PYTHON, str(shutil.which("rosmaster")), "--core", "-p", str(self._port)])
         deadline = time.monotonic() + _START_S
         while True:
             try:
@@ -90,35 +90,45 @@ class RosGraph:
 
     def start(self, module: str, *arguments: object) -> subprocess.Popen[str]:
         """Run a module under the Python that sees rospy."""
-        return self._run([self._python, "-m", module, *map(str, arguments)])
+        return self.run([self._python, "-m", module, *map(str, arguments)])
 
     def publisher(self, topic: str, rate_hz: int, count: int) -> Publisher:
         """A publisher of so many messages, which waits to be told to begin."""
         return Publisher(self.start("bench.ros_publisher", topic, rate_hz, count))
 
-    def _run(self, command: list[str]) -> subprocess.Popen[str]:
-        process = subprocess.Popen(
-            command,
-            env=self.environment,
-            cwd=ROOT,
-            text=True,
-            stdin=subprocess.PIPE,
-            stdout=subprocess.PIPE,
-            stderr=(self._folder / f"{len(self._processes)}.log").open("w"),
-        )
+    def run(self, command: list[str]) -> subprocess.Popen[str]:
+        """Run a command in the graph."""
+        with (self._folder / f"{len(self._processes)}.log").open("w") as log:
+            process = subprocess.Popen(
+                command,
+                env=self.environment,
+                cwd=ROOT,
+                text=True,
+                stdin=subprocess.PIPE,
+                stdout=subprocess.PIPE,
+                stderr=log,
+            )
         self._processes.append(process)
         return process
 
 
 class Publisher:
-    """`bench.ros_publisher` in a process of its own; every method raises `RosError` where that has ended."""
+    """A publisher of the bench in a process of its own; methods raise `RosError` where that has ended."""
 
     def __init__(self, process: subprocess.Popen[str]) -> None:
         self._process = process
 
     def begin(self) -> None:
-        """Wait until both subscribers have come, and have it publish."""
+        """Wait until all subscribers have come, and have it publish."""
+        self.ready()
+        self.go()
+
+    def ready(self) -> None:
+        """Wait until all subscribers have come."""
         self._hear()
+
+    def go(self) -> None:
+        """Have it publish."""
         assert self._process.stdin is not None
         self._process.stdin.write("\n")
         self._process.stdin.flush()
@@ -131,11 +141,13 @@ class Publisher:
             return
         raise RosError(f"the publisher stopped with status {self._process.returncode}")
 
-    def finish(self) -> None:
-        """Wait until all is published."""
-        self._hear()
+    def finish(self) -> str:
+        """Wait until all is published; what it says of it."""
+        return self._hear()
 
-    def _hear(self) -> None:
+    def _hear(self) -> str:
         assert self._process.stdout is not None
-        if not self._process.stdout.readline():
+        line = self._process.stdout.readline()
+        if not line:
             raise RosError(f"the publisher stopped with status {self._process.wait()}")
+        return line

@@ -1,10 +1,10 @@
-"""Listens at a broker and says how long messages took."""
+"""Listens at a broker, and says how long messages took."""
 
 from __future__ import annotations
 
 import threading
 import time
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 
@@ -32,15 +32,31 @@ def listening(
     """The delays in ms of every message meanwhile by topic filter, each of which says how to read the
     time at which a message's way began."""
     heard: dict[str, list[float]] = {topic_filter: [] for topic_filter in took_us}
-    connected, stopped = threading.Event(), threading.Event()
 
-    def take(data: mqtt5.PublishReceivedData) -> None:
+    def take(topic: str, payload: bytes) -> None:
         now_us = time.time_ns() // 1000
-        packet = data.publish_packet
         for topic_filter, began_us in took_us.items():
-            if matches(topic_filter, packet.topic):
-                heard[topic_filter].append((now_us - began_us(packet.payload)) / 1000)
+            if matches(topic_filter, topic):
+                heard[topic_filter].append((now_us - began_us(payload)) / 1000)
 
+    with subscribed((endpoint, port), (certificate, key, ca), list(took_us), take):
+        yield heard
+
+
+@contextmanager
+def subscribed(
+    address: tuple[str, int],
+    files: tuple[Path, Path, Path],
+    topic_filters: Sequence[str],
+    take: Callable[[str, bytes], None],
+    *,
+    qos: mqtt5.QoS = mqtt5.QoS.AT_MOST_ONCE,
+) -> Iterator[None]:
+    """Have ``take`` called with topic and payload of every message meanwhile, in the client's thread;
+    ``files`` are the certificate, its key and the authority's certificate."""
+    connected, stopped = threading.Event(), threading.Event()
+    certificate, key, ca = files
+    endpoint, port = address
     client = mqtt5_client_builder.mtls_from_path(
         str(certificate),
         str(key),
@@ -48,19 +64,17 @@ def listening(
         port=port,
         ca_filepath=str(ca),
         client_id=NAME,
-        on_publish_received=take,
+        on_publish_received=lambda data: take(data.publish_packet.topic, data.publish_packet.payload),
         on_lifecycle_connection_success=lambda _: connected.set(),
         on_lifecycle_stopped=lambda _: stopped.set(),
     )
     client.start()
     if not connected.wait(_WAIT_S):
         raise BenchError(f"{NAME} was not connected within {_WAIT_S:.0f} s")
-    wanted = [
-        mqtt5.Subscription(topic_filter=topic_filter, qos=mqtt5.QoS.AT_MOST_ONCE) for topic_filter in took_us
-    ]
+    wanted = [mqtt5.Subscription(topic_filter=topic_filter, qos=qos) for topic_filter in topic_filters]
     client.subscribe(mqtt5.SubscribePacket(subscriptions=wanted)).result(_WAIT_S)
     try:
-        yield heard
+        yield
     finally:
         client.stop()
         stopped.wait(_WAIT_S)

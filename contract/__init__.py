@@ -109,6 +109,7 @@ from contract.message_type import MessageType, message_type
 from contract.ros1.message import Messages, RosMessage, RosType, type_id
 from contract.seconds import Statistics, flat_second, packed_second
 from contract.tables import (
+    ABSENT,
     ADMISSION,
     ADMIT_CLAIM,
     ADMIT_UNTIL_S,
@@ -155,11 +156,13 @@ from contract.tables import (
     SESSION_VERSION,
     SOURCE,
     STATS,
+    STREAMS,
     T_US,
     TOPIC,
 )
 from contract.topics import (
     ACCEPTED,
+    ACCOUNT_STREAM,
     AGENT_STREAM,
     BROKER,
     CMD,
@@ -191,19 +194,25 @@ from contract.topics import (
     rule_name,
 )
 from contract.vesc import (
+    ABSENT_FROM,
     AGENT_FIELDS,
     DERIVED_UNITS,
     FAULT_CODES,
     FAULT_FIELD,
     FAULTS,
+    NO_SENSOR_DEGC,
     VESC_FIELDS,
     VESC_STREAM,
     VOLTAGE_FIELD,
     Field,
+    absent,
 )
 
 __all__ = [
+    "ABSENT",
+    "ABSENT_FROM",
     "ACCEPTED",
+    "ACCOUNT_STREAM",
     "ADMISSION",
     "ADMITTED_CERTIFICATE",
     "ADMITTED_MS",
@@ -281,6 +290,7 @@ __all__ = [
     "MISSING_BATCHES",
     "NONFINITE",
     "NO_ROBOT",
+    "NO_SENSOR_DEGC",
     "OMITTED",
     "ONLINE",
     "OWN_STREAMS",
@@ -315,6 +325,7 @@ __all__ = [
     "SHADOW",
     "SOURCE",
     "STATS",
+    "STREAMS",
     "TOPIC",
     "TYPES_STREAM",
     "T_US",
@@ -343,6 +354,7 @@ __all__ = [
     "Statistics",
     "Topic",
     "Value",
+    "absent",
     "batch_id",
     "batches_between",
     "build_topic",

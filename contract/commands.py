@@ -33,7 +33,7 @@ class Command:
     Commands are in the order of ``started_us``, ``session``, ``seq``: ``session`` names an operator's
     session, which began at ``started_us``, and ``seq`` numbers its commands; a later session takes
     over. After ``valid_ms`` from ``sent_us``, by the cloud's clock, the command is stale. ``lease_ms``,
-    without which a motion is refused, is how long it may go on until the next one. ``message`` is the
+    without which a motion is refused, is how long from ``sent_us`` it may go on. ``message`` is the
     ROS message. With ``answer`` the robot says in its shadow what became of it: `COMMANDS`, name,
     ``session``, ``seq`` and ``outcome``, `ACCEPTED` or why not.
     """

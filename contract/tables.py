@@ -17,6 +17,8 @@ STATS = ("min", "mean", "max", "last")
 # between samples, values that were not finite.
 SAMPLES, BATCHES, MISSING_BATCHES = "n", "batches", "missing_batches"
 GAPS, NONFINITE = "gaps", "nonfinite"
+# And, only where there are some, values of sensors that are not fitted (contract/vesc.py).
+ABSENT = "absent"
 # Of a second that would be larger than DynamoDB's 400 KB: attributes left out, the largest first.
 OMITTED = "omitted"
 
@@ -32,6 +34,8 @@ REPLAY = "replay"
 # What a queue's message of Lambda 2's carries: the stored item as DynamoDB JSON, in base64.
 ITEM_BASE64 = "base64Item"
 
+# Of a robot in the registry: the streams that Lambda 2 has seen of it.
+STREAMS = "streams"
 # The registry's row of a robot, beside its vehicle parameters. Of its connection, by the broker's
 # lifecycle events: times are the broker's, and the certificate is the one that it connected with.
 ONLINE, LAST_SEEN_MS = "online", "last_seen_ms"

@@ -25,8 +25,10 @@ RTT_FIELDS = {path: f"{path}_ms" for path in PING_PATHS}
 AGENT_STREAM = "agent"
 # What the messages were that a stream's samples are made of: `MessageType`.
 TYPES_STREAM = "types"
+# What the agent took, stored and did not record: contract/account.py.
+ACCOUNT_STREAM = "account"
 # The streams that every robot may have and no source's configuration names.
-OWN_STREAMS = frozenset({RTT_STREAM, AGENT_STREAM, TYPES_STREAM})
+OWN_STREAMS = frozenset({RTT_STREAM, AGENT_STREAM, TYPES_STREAM, ACCOUNT_STREAM})
 # The named shadow of a robot's thing that carries the agent's settings.
 SHADOW = "agent"
 # Where the shadow says what became of the commands that asked for an answer.

@@ -4,6 +4,14 @@ from __future__ import annotations
 
 from typing import NamedTuple
 
+from contract.limits import Value
+
+# A thermistor that is not fitted reads as colder than this, down to absolute zero.
+NO_SENSOR_DEGC = -50.0
+
+
+_NUMBERS = (int, float)
+
 
 class Field(NamedTuple):
     """One field of VescStateStamped: its unit, what it means and which driver reports it. The ROS 2
@@ -52,6 +60,20 @@ VESC_FIELDS: dict[str, Field] = {
         Field("avg_vq", "V", "quadrature-axis voltage", (2,)),
     )
 }
+# Field -> at this and below, its value only says that its sensor is not fitted; for whole columns.
+ABSENT_FROM = {f.name: NO_SENSOR_DEGC for f in VESC_FIELDS.values() if f.unit == "degC"}
+
+
+def absent(field: str, value: Value) -> bool:
+    """Whether a value only says that its sensor is not fitted.
+
+    Such values are recorded, and exported as messages, as they came. Whoever makes numbers of them, or
+    shows one, takes null instead: the summary, queries, pictures, live updates and the health metrics.
+    """
+    limit = ABSENT_FROM.get(field)
+    return limit is not None and type(value) in _NUMBERS and value <= limit  # type: ignore[operator]  # a number
+
+
 # The firmware's mc_fault_code, in its order: the code is the place. Its own name, which VESC Tool's logs
 # have, and what it means.
 _FAULTS = (

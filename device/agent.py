@@ -12,6 +12,7 @@ from typing import Any, Mapping
 
 import contract
 from contract import Value
+from device.account import EVERY_S, Accounts
 from device.allowance import Allowance
 from device.batch import Batcher, StreamCounts
 from device.claim_check import make_claims
@@ -25,7 +26,7 @@ from device.metrics import AgentMetrics, Rates
 from device.offset import ClockOffset
 from device.pack import Packer
 from device.pings import Pings
-from device.record import RecordLane
+from device.record import TODO, RecordLane, too_many
 from device.remote import Remote
 from device.sources import Source
 from device.spool import Spool
@@ -106,11 +107,23 @@ class Agent:
         self._counts: dict[str, StreamCounts] = {}
         self._fields: dict[str, Any] = {}
         self._failed: list[str] = []
+        self._ended: list[int] = []
         self._sources = [(source.describe(), source.build(clock)) for source in config.sources]
         self._stop = threading.Event()
         self._rates = Rates(clock)
         self._metrics = AgentMetrics(
             clock=clock, spool=spool, uplink=uplink, offset=self._offset, uploads=self._uploads
+        )
+        self._accounts = Accounts(
+            clock=clock,
+            spool=spool,
+            streams=[stream for source in config.sources for stream in source.streams()],
+            counted=self._counted,
+            reports=[
+                *((what, source.report) for what, source in self._sources),
+                *([("contents", self._claims.report)] if self._claims is not None else []),
+            ],
+            emit=self.record,
         )
         self.tune(self._tuning)
 
@@ -150,9 +163,13 @@ class Agent:
     def run(self, *, drain_s: float) -> int:
         """Run until every source has ended or `stop` is called, then deliver what is left.
 
-        Returns the exit status: 0, or 1 if a source failed or a batch could not be delivered within
-        ``drain_s``. Raises `UplinkError` where the uplink cannot start at all.
+        Returns the exit status: 0, or 1 if a source failed or ended without anything that could be stored,
+        or a batch could not be delivered within ``drain_s``. Raises `UplinkError` where the uplink cannot
+        start at all.
         """
+        problem = too_many(self._config)
+        if problem is not None:
+            _log.warning("record: %s; %s", problem, TODO)
         self._uplink.start()
         if self._downlink is not None:
             self._downlink.start()
@@ -160,7 +177,7 @@ class Agent:
         lane = self._thread("record", lambda: self._record.run(record_stop))
         ticker = self._thread("ticker", self._tick)
         sources = [
-            self._thread(f"source {i}", self._source(what, source))
+            self._thread(f"source {i}", self._source(i, what, source))
             for i, (what, source) in enumerate(self._sources)
         ]
         watcher = self._thread("watcher", lambda: self._end_with(sources))
@@ -175,6 +192,7 @@ class Agent:
             thread.join()
         self._pings.close(min(_LAST_PONGS_S, drain_s))
         delivered = self._drain(drain_s)
+        self._fail_without_samples()
         if self._downlink is not None:
             self._downlink.close()
         self._end_uploads(uploads_stop, drain_s)
@@ -184,6 +202,15 @@ class Agent:
         lane.join()
         self._uplink.stop(_CLOSE_S)
         return 0 if delivered and not self._failed else 1
+
+    def tick(self) -> None:
+        """Look around in batches and lanes; `run` does it several times a second."""
+        for batcher in list(self._batchers.values()):
+            batcher.tick()
+        self._record.tick()
+        self._live.tick()
+        self._pings.tick()
+        self._remote.tick()
 
     def report(self) -> dict[str, Any]:
         """What became of everything, for a file or a test."""
@@ -195,6 +222,7 @@ class Agent:
             "streams": {name: vars(counts).copy() for name, counts in sorted(self._counts.items())},
             "live_published": self._live.published,
             "live_refused": self._live.refused,
+            "live": {**self._live.tempo._asdict(), "streams_hz": self._live.rates_hz()},
             "spool": {
                 "left_batches": left.batches,
                 "left_samples": left.samples,
@@ -212,8 +240,10 @@ class Agent:
         """How it goes right now, for `iort-agent status`."""
         uplink, backlog, dropped = self._uplink.status(), self._spool.backlog(), self._spool.dropped()
         tuning, offset = self._tuning, self._offset.estimate()
-        alarms = [self._spool.alarm] if self._spool.alarm else []
+        tempo, live_hz = self._live.tempo, self._live.rates_hz()
+        alarms = [alarm for alarm in (self._spool.alarm, self._record.alarm) if alarm]
         alarms += [f"source failed: {what}" for what in self._failed]
+        alarms += [f"source waits: {why}" for why in self._waits()]
         return {
             "robot": self._config.robot,
             "boot": self.boot,
@@ -228,16 +258,19 @@ class Agent:
                 "live": {
                     "enabled": tuning.live_enabled,
                     "rate_hz": tuning.live_rate_hz,
+                    "effective_hz": tempo.effective_hz,
+                    "slowed": tempo.slowed,
                     "published": self._live.published,
                     "refused": self._live.refused,
                 },
-                "ping": {"rate_hz": tuning.ping_rate_hz},
+                "ping": {"rate_hz": tuning.ping_rate_hz, "held_back": self._pings.held_back},
             },
             "sources": [{"source": what, **source.report()} for what, source in self._sources],
             "streams": {
                 name: {
                     **vars(counts),
                     "per_s": self._rates.per_s.get(name, 0.0),
+                    "live_hz": live_hz.get(name, 0.0),
                     "silent_s": self._rates.silent_s(name),
                     "fields": list(tuning.fields.get(name, ())),
                 }
@@ -257,12 +290,19 @@ class Agent:
             "troubles": self._troubles.last() if self._troubles is not None else [],
         }
 
+    def _waits(self) -> list[str]:
+        """What sources and commands wait for, each said once: they may share a ROS node."""
+        found = [source.report().get("waits") for _, source in self._sources]
+        if self._downlink is not None:
+            found.append(self._downlink.report()["waits"])
+        return [str(why) for why in dict.fromkeys(found) if why]
+
     def _new_batcher(self, stream: str, values: Mapping[str, Value]) -> Batcher:
         with self._lock:
             if stream not in self._batchers:
                 contract.check_stream(stream)
                 self._fields.setdefault(stream, values.keys())
-                counts = self._counts[stream] = StreamCounts()
+                counts = self._counts[stream] = StreamCounts(first_seq=self._spool.next_seq(stream))
                 packer = Packer(
                     stream=stream,
                     boot=self.boot,
@@ -274,7 +314,7 @@ class Agent:
                 )
             return self._batchers[stream]
 
-    def _source(self, what: str, source: Source) -> Any:
+    def _source(self, i: int, what: str, source: Source) -> Any:
         def run() -> None:
             _log.info("source started: %s", what)
             try:
@@ -288,8 +328,25 @@ class Agent:
                 self._failed.append(what)
             else:
                 _log.info("source ended: %s", what)
+                if not self._stop.is_set():
+                    self._ended.append(i)
 
         return run
+
+    def _fail_without_samples(self) -> None:
+        """A source that ended by itself, and of which nothing could be stored, has failed."""
+        for i in self._ended:
+            what = self._sources[i][0]
+            streams = self._config.sources[i].streams()
+            counts = [self._counts[name] for name in streams if name in self._counts]
+            samples, refused = sum(one.samples for one in counts), sum(one.refused for one in counts)
+            if not counts:
+                _log.error("source failed: %s: it gave no sample", what)
+            elif samples and samples == refused:
+                _log.error("source failed: %s: none of its %d samples could be stored", what, samples)
+            else:
+                continue
+            self._failed.append(what)
 
     def _run_uploads(self, stop: threading.Event) -> Any:
         uploads = self._uploads
@@ -313,20 +370,26 @@ class Agent:
         self._stop.set()
 
     def _tick(self) -> None:
-        measured = looked = self._clock.monotonic()
+        measured = looked = told = self._clock.monotonic()
+        self._accounts.tell()
         while not self._clock.wait(self._stop, _TICK_S):
-            for batcher in list(self._batchers.values()):
-                batcher.tick()
-            self._live.tick()
-            self._pings.tick()
-            self._remote.tick()
+            self.tick()
             now = self._clock.monotonic()
             if now - looked >= _RATES_S:
                 looked = now
                 self._rates.update(self._counts.copy())
+            if now - told >= EVERY_S:
+                told = now
+                self._accounts.tell()
             if self._config.metrics.enabled and now - measured >= self._config.metrics.every_s:
                 measured = now
                 self._measure()
+
+    def _counted(self) -> dict[str, tuple[StreamCounts, int]]:
+        return {
+            name: (batcher.counts(), self._spool.next_seq(name))
+            for name, batcher in list(self._batchers.items())
+        }
 
     def _measure(self) -> None:
         """A sample of the agent's own stream."""
@@ -334,9 +397,15 @@ class Agent:
         samples = sum(c.samples for name, c in counts.items() if name not in contract.OWN_STREAMS)
         self.record(contract.AGENT_STREAM, self._clock.now_us(), self._metrics.sample(samples))
 
-    def _drain(self, drain_s: float) -> bool:
+    def _flush(self) -> None:
         for batcher in list(self._batchers.values()):
             batcher.flush()
+
+    def _drain(self, drain_s: float) -> bool:
+        self._flush()
+        # Once every batch is closed, so that nothing is left open but its own.
+        self._accounts.tell(ended=True)
+        self._flush()
         left = self._spool.backlog()
         if left.batches:
             _log.info("delivering the last %d batches", left.batches)

@@ -14,7 +14,7 @@ is the same.
 from __future__ import annotations
 
 import threading
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from operator import itemgetter
 from typing import Callable, List, Mapping, Tuple
 
@@ -34,13 +34,15 @@ _MOST_OPEN = 8
 @dataclass
 class StreamCounts:
     """What became of a stream's samples since the start: ``samples`` were taken, and ``stored`` of them put
-    into the queue, in ``batches``; ``refused`` cannot be sent; ``nulled`` values were not finite."""
+    into the queue, in ``batches`` numbered from ``first_seq``; ``refused`` cannot be sent; ``nulled`` values
+    were not finite."""
 
     samples: int = 0
     stored: int = 0
     batches: int = 0
     refused: int = 0
     nulled: int = 0
+    first_seq: int = 0
 
 
 Sample = Tuple[int, Mapping[str, Value]]
@@ -89,6 +91,11 @@ class Batcher:
                 batch.full += max(1, len(values)) / MAX_VALUES
             if batch.full >= 1 or len(batch.samples) >= MAX_SAMPLES or not self._batch_us:
                 self._close(slot)
+
+    def counts(self) -> StreamCounts:
+        """The counts of one moment."""
+        with self._lock:
+            return replace(self._counts)
 
     def tick(self) -> None:
         """Close the batches of a topic that has fallen silent."""

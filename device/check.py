@@ -19,13 +19,18 @@ from pathlib import Path
 from typing import Any, Iterator, NamedTuple
 
 from device.certificate import Certificate, check_pair, read_certificate
+from device.clock import SystemClock
 from device.config import Config
 from device.errors import AgentError, IdentityError
+from device.record import TODO, too_many
+from device.recording_check import look_into
 from device.status import fetch
 
 OK, WARN, FAIL = "ok", "warn", "fail"
 
 _TIMEOUT_S = 5.0
+# A recording is looked into for so long.
+_LOOK_S = 10.0
 _EXPIRES_SOON_S = 30 * 86_400
 # An agent of this age cannot run earlier than this: 2026-01-01.
 _EARLIEST_S = 1_767_225_600
@@ -52,8 +57,9 @@ def check(config: Config, status_socket: Path) -> Iterator[Finding]:
     yield from _clock(config, running)
     yield from _endpoint(config, running)
     for i, source in enumerate(config.sources):
-        yield from _source(f"source {i}", source)
+        yield from source_findings(f"source {i}", source)
     yield from _queue(config)
+    yield _lanes(config)
     if running is None:
         yield Finding("agent", OK, "not running")
     else:
@@ -213,7 +219,8 @@ def _connack(secure: socket.socket, robot: str) -> Finding:
     return Finding("broker", FAIL, f"refuses {robot}: {said}", todo)
 
 
-def _source(what: str, source: Any) -> Iterator[Finding]:
+def source_findings(what: str, source: Any) -> Iterator[Finding]:
+    """Whether one source of a configuration would give samples."""
     kind = type(source).__name__
     title = f"{what} ({source.describe()})"
     if kind == "Ros1Config":
@@ -222,8 +229,8 @@ def _source(what: str, source: Any) -> Iterator[Finding]:
         yield from _serial_port(title, Path(source.port))
     elif kind == "RosbridgeConfig":
         yield _listener(title, source.url)
-    elif hasattr(source, "path"):
-        yield _readable(title, Path(source.path))
+    elif kind == "BagConfig":
+        yield from _recording(title, source)
     else:
         yield Finding(title, OK, "needs nothing")
 
@@ -277,14 +284,26 @@ def _listener(title: str, url: str) -> Finding:
     return Finding(title, OK, f"{url} listens")
 
 
-def _readable(title: str, path: Path) -> Finding:
+def _recording(title: str, config: Any) -> Iterator[Finding]:
+    path: Path = config.path
     if not path.exists():
-        return Finding(title, FAIL, f"{path} is not there")
+        yield Finding(title, FAIL, f"{path} is not there")
+        return
     if not os.access(path, os.R_OK):
-        return Finding(title, FAIL, f"{path} may not be read", f"chmod a+r {path}")
-    if path.is_file() and path.stat().st_size == 0:
-        return Finding(title, FAIL, f"{path} is empty")
-    return Finding(title, OK, f"{path} can be read")
+        yield Finding(title, FAIL, f"{path} may not be read", f"chmod a+r {path}")
+        return
+    wanted = set(config.streams())
+    looked = look_into(config.build(SystemClock()), wanted, _LOOK_S)
+    if looked.error:
+        yield Finding(title, FAIL, looked.error)
+        return
+    if looked.streams:
+        yield Finding(title, OK, f"has messages of {', '.join(looked.streams)}")
+    missing = ", ".join(sorted(wanted.difference(looked.streams)))
+    if missing and looked.ended:
+        yield Finding(title, FAIL, f"there is no message of {missing} in it", "see `topics`")
+    elif missing:
+        yield Finding(title, WARN, f"no message of {missing} was found within {_LOOK_S:g} s")
 
 
 def _queue(config: Config) -> Iterator[Finding]:
@@ -306,3 +325,10 @@ def _queue(config: Config) -> Iterator[Finding]:
         yield Finding("queue", WARN, text, "the disk is full before the queue is: lower queue.max_bytes")
     else:
         yield Finding("queue", OK, text)
+
+
+def _lanes(config: Config) -> Finding:
+    problem = too_many(config)
+    if problem is not None:
+        return Finding("record lane", WARN, problem, TODO)
+    return Finding("record lane", OK, "the streams named are few enough for one connection")

@@ -16,7 +16,7 @@ import contract
 from contract import CMD, FLEET, Command, ContractError, FleetMessage
 from contract.limits import MessageError
 from contract.ros1.definition import Definition, parse
-from device.allowance import Allowance
+from device.allowance import STEADY, Allowance
 from device.clock import Clock
 from device.downlink_config import ROBOT_IN_TOPIC, CommandConfig, DownlinkConfig, FleetConfig, ShareConfig
 from device.errors import ConfigError, UplinkError
@@ -32,6 +32,8 @@ from device.uplink import Message, Uplink
 _log = logging.getLogger(__name__)
 
 _IDLE_S = 1.0
+# A message that the connection has no room for waits so long, unless a newer one replaces it.
+_NO_ROOM_S = 0.05
 # Each robot heard becomes a ROS topic; a lab has fewer than this.
 _MAX_ROBOTS = 64
 _MAX_DEFINITIONS = 8
@@ -130,12 +132,15 @@ class Downlink:
         self._wake.set()
 
     def close(self) -> None:
-        """Stop what moves and leave the ROS graph."""
+        """Stop what moves, every stop said, and leave the ROS graph."""
         self.halt()
         self._end.set()
         self._wake.set()
         if self._thread.is_alive():
             self._thread.join()
+        while self._stops_due():
+            self._clock.wait(threading.Event(), max(0.0, min(self._stops_due()) - self._clock.monotonic()))
+            self.tick()
         self._graph.close()
 
     def tick(self) -> float:
@@ -143,11 +148,12 @@ class Downlink:
         with self._lock:
             self._say_stops()
             now = self._clock.monotonic()
-            due = [command.leases.next_due() for command in self._commands.values()]
+            due = self._stops_due()
             for shared in self._shares:
                 self._send(shared, now)
-                due.append(shared.due if shared.newest is not None else None)
-        return max(0.0, min((at - now for at in due if at is not None), default=_IDLE_S))
+                if shared.newest is not None:
+                    due.append(shared.due)
+        return max(0.0, min(due, default=now + _IDLE_S) - now)
 
     def report(self) -> dict[str, Any]:
         """What became of everything."""
@@ -159,6 +165,7 @@ class Downlink:
             "fleet": {name: dict(fleet.passed) for name, fleet in self._fleet.items()},
             "shared": {shared.ros_topic: shared.seq for shared in self._shares},
             "refused": self._seldom.counts(),
+            "waits": self._graph.waits(),
         }
 
     def _run(self) -> None:
@@ -218,6 +225,11 @@ class Downlink:
             self._say_stops()
         self._wake.set()
 
+    def _stops_due(self) -> list[float]:
+        """When leases end or stops are to be said again, of the commands that move or are being stopped."""
+        due = [command.leases.next_due() for command in self._commands.values()]
+        return [at for at in due if at is not None]
+
     def _say_stops(self) -> None:
         for command in self._commands.values():
             if command.leases.stop_due(self._clock.monotonic()):
@@ -275,6 +287,9 @@ class Downlink:
 
     def _send(self, shared: _Share, now: float) -> None:
         if shared.newest is None or now < shared.due:
+            return
+        if not self._allowance.may_go(STEADY, shared.topic, len(shared.newest[1])):
+            shared.due = now + _NO_ROOM_S
             return
         (header, data, at), shared.newest = shared.newest, None
         if now - at > contract.FLEET_MAX_AGE_MS / 1000 or not self._uplink.connected():

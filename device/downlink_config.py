@@ -57,9 +57,9 @@ def _by(check: Callable[[str], str], rule: Rule, what: str) -> Rule:
 
 @dataclass(frozen=True)
 class MotionConfig:
-    """A command that moves the robot. ``lease_s``: it goes on at most so long without the next one;
-    then, on a lost connection and at the agent's end, ``stop`` is published: the message's fields,
-    of which those left out are zero."""
+    """A command that moves the robot. ``lease_s``: it goes on at most so long after it was sent; then,
+    on a lost connection and at the agent's end, ``stop`` is published: the message's fields, of which
+    those left out are zero."""
 
     stop: Mapping[str, Any] = setting(_object)
     lease_s: float = setting(number(0.05, contract.MAX_LEASE_MS / 1000, unit="s"), 0.5)

@@ -1,9 +1,10 @@
 """Which commands may pass, and when the robot must be stopped: a state machine without clock or ROS.
 
 A motion command is a promise of the operator to say something again soon. The lease is how long the
-robot takes his word for it: when it ends unrenewed, a stop is due, and is due again a few times, for
-a single message may find a node that is just starting. Then there is silence, so that whoever drives
-the robot next (a joystick, a planner on board) is not held down for ever.
+robot takes his word for it, from when he said it: a word that was long on its way, or waited in a robot
+that was frozen, has that much less of it left, or none. When the lease ends unrenewed, a stop is due, and
+is due again a few times, for a single message may find a node that is just starting. Then there is silence,
+so that whoever drives the robot next (a joystick, a planner on board) is not held down for ever.
 
 Only what is later than everything that has passed may pass. Commands are timed by the cloud's clock, and so
 is their age, which the robot knows to within the uncertainty of its measured offset (`device.offset`): the
@@ -21,8 +22,9 @@ from contract import Command
 STOP_REPEATS = 4
 STOP_REPEAT_S = 0.25
 
-STALE, EARLY, REPEATED, SUPERSEDED, NO_LEASE, CLOCK_UNKNOWN, CLOSED = (
+STALE, LEASE_OVER, EARLY, REPEATED, SUPERSEDED, NO_LEASE, CLOCK_UNKNOWN, CLOSED = (
     "stale",
+    "lease_over",
     "from_the_future",
     "repeated_or_out_of_order",
     "from_an_earlier_session",
@@ -57,12 +59,14 @@ class Leases:
 
         ``now_us`` is the cloud's time, to within ``wrong_us``, or the robot's own where that is None.
         """
-        refusal = self._refusal(command, now_us, wrong_us)
+        age_us = now_us - command.sent_us + (wrong_us or 0)
+        lease_s = self._lease_s(command, age_us)
+        refusal = self._refusal(command, age_us, wrong_us, lease_s)
         if refusal is not None:
             return refusal
         self._last = command
-        if self._limits.lease_s is not None and command.lease_ms is not None:
-            self._ends = now + min(command.lease_ms / 1000, self._limits.lease_s)
+        if lease_s is not None:
+            self._ends = now + lease_s
             self._stops = 0
         return None
 
@@ -93,9 +97,17 @@ class Leases:
             return self._ends
         return self._next_stop if self._stops else None
 
-    def _refusal(self, command: Command, now_us: int, wrong_us: int | None) -> str | None:
+    def _lease_s(self, command: Command, age_us: int) -> float | None:
+        """How long a motion may go on from now; None for what does not move."""
+        if self._limits.lease_s is None or command.lease_ms is None:
+            return None
+        # A sender whose clock is ahead gets no more than one whose word arrives at once.
+        return min(command.lease_ms / 1000, self._limits.lease_s) - max(0, age_us) / 1e6
+
+    def _refusal(
+        self, command: Command, age_us: int, wrong_us: int | None, lease_s: float | None
+    ) -> str | None:
         limits, last = self._limits, self._last
-        age_us = now_us - command.sent_us + (wrong_us or 0)
         if self._closed:
             return CLOSED
         if limits.lease_s is not None and wrong_us is None:
@@ -106,6 +118,8 @@ class Leases:
             return EARLY
         if limits.lease_s is not None and command.lease_ms is None:
             return NO_LEASE
+        if lease_s is not None and lease_s <= 0:
+            return LEASE_OVER
         if last is not None and command.order <= last.order:
             return REPEATED if command.session == last.session else SUPERSEDED
         return None

@@ -14,21 +14,23 @@ _KEPT = 5
 
 
 class Troubles(logging.Handler):
-    """Keeps the last few warnings and errors."""
+    """Keeps the last few warnings, and the last few errors, which no warning displaces."""
 
     def __init__(self) -> None:
         super().__init__(logging.WARNING)
-        self._lines: deque[dict[str, Any]] = deque(maxlen=_KEPT)
+        self._warnings: deque[dict[str, Any]] = deque(maxlen=_KEPT)
+        self._errors: deque[dict[str, Any]] = deque(maxlen=_KEPT)
 
     def emit(self, record: logging.LogRecord) -> None:
         """Keep a record's text."""
-        self._lines.append(
+        lines = self._errors if record.levelno >= logging.ERROR else self._warnings
+        lines.append(
             {"at_s": round(record.created, 3), "level": record.levelname.lower(), "text": record.getMessage()}
         )
 
     def last(self) -> list[dict[str, Any]]:
         """The newest last."""
-        return list(self._lines)
+        return sorted([*self._errors, *self._warnings], key=lambda line: float(line["at_s"]))
 
 
 class JournalFormatter(logging.Formatter):

@@ -7,6 +7,7 @@ import dataclasses
 import json
 import logging
 import os
+import re
 import signal
 import sys
 import time
@@ -26,6 +27,9 @@ _log = logging.getLogger("iort-agent")
 
 # A terminal signals the whole group and a supervisor passes it on: that is one wish, not two.
 _SAME_SIGNAL_S = 1.0
+# ROS' NAME:=VALUE, which roslaunch adds to every command; those of one underscore are parameters.
+_REMAPPING = re.compile(r"(?:~|/|[A-Za-z]|__?)[\w/]*:=(?!.*:=).*", re.ASCII)
+_PARAMETER = re.compile(r"_[^_]")
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -33,9 +37,16 @@ def main(arguments: Sequence[str] | None = None) -> int:
     options = _parse(list(sys.argv[1:] if arguments is None else arguments))
     try:
         status: int = options.command(options)
+        sys.stdout.flush()
     except ConfigError as error:
         print(f"iort-agent: {error}", file=sys.stderr)
         return 2
+    except BrokenPipeError:
+        if options.command is run:
+            raise
+        # Whoever read our output has seen enough. Python would complain at its end, when it flushes.
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        return 1
     except AgentError as error:
         if options.command is not run:
             print(f"iort-agent: {error}", file=sys.stderr)
@@ -86,7 +97,14 @@ def _parse(arguments: list[str]) -> argparse.Namespace:
     renewing.add_argument("--claim", type=Path, required=True, metavar="FILE", help="the claim's YAML file")
     if arguments and arguments[0] not in commands.choices and arguments[0] not in ("-h", "--help"):
         arguments = ["run", *arguments]
-    return parser.parse_args(arguments)
+    remappings = []
+    if arguments and arguments[0] == "run":
+        # The ROS node reads them where every ROS node does, in sys.argv.
+        remappings = [argument for argument in arguments if _REMAPPING.fullmatch(argument)]
+        arguments = [argument for argument in arguments if argument not in remappings]
+    options = parser.parse_args(arguments)
+    options.ignored = [argument for argument in remappings if _PARAMETER.match(argument)]
+    return options
 
 
 def _seconds(value: str) -> float:
@@ -105,6 +123,9 @@ def run(options: argparse.Namespace) -> int:
     if options.log_level is not None:
         config = dataclasses.replace(config, log_level=options.log_level)
     troubles = set_up(config.log_level)
+    for argument in options.ignored:
+        _log.warning("%s is ignored: the agent has no ROS parameters, %s has its settings", argument,
+                     options.config)  # fmt: skip
     # Reading a configuration must not need the network's library.
     from device.iotcore import make_uplink  # noqa: PLC0415 - it loads the library
 

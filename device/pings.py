@@ -8,7 +8,7 @@ from typing import Callable, NamedTuple, Sequence
 
 import contract
 from contract import PING, PONG, ContractError, Value
-from device.allowance import Allowance
+from device.allowance import STEADY, Allowance
 from device.clock import Clock, Pace
 from device.errors import UplinkError
 from device.sources import Emit
@@ -18,6 +18,8 @@ TIMEOUT_S = 10.0
 # Where round trips through a rule are not measured, a ping now and then still finds the clock's offset,
 # and more often until one came back.
 CLOCK_EVERY_S, CLOCK_FIRST_EVERY_S = 30.0, 1.0
+# A ping without its padding, at most.
+_ENVELOPE_BYTES = 100
 # Percentiles are of the newest so many, so that a run of weeks does not grow.
 _KEPT = 20_000
 
@@ -50,7 +52,8 @@ class Pings:
     """Sends pings, takes pongs, and emits each round trip as a sample of `contract.RTT_STREAM`.
 
     Every round trip through a rule is told to ``on_stamp``; where none is measured, one every
-    `CLOCK_EVERY_S` is made for that alone."""
+    `CLOCK_EVERY_S` is made for that alone. A ping that the connection has no room for, since recordings go
+    first, is not sent, and counted in ``held_back`` alone."""
 
     def __init__(
         self,
@@ -75,6 +78,7 @@ class Pings:
         self._allowance = allowance
         self._emit = emit
         self._lock = threading.Condition()
+        self.held_back = 0
         self._next_id = 0
         self._paths: dict[str, _Path] = {}
         self._names = list(paths)
@@ -111,9 +115,12 @@ class Pings:
         self._changed.set()
 
     def send(self, name: str) -> bool:
-        """Send one ping, if there is a connection and the way back is open; whether it was."""
+        """Send one ping, if there is a connection with room and the way back is open; whether it was."""
         path = self._paths[name]
         if not self._uplink.subscribed(path.pong):
+            return False
+        if not self._allowance.may_go(STEADY, path.ping, _ENVELOPE_BYTES + len(self._padding)):
+            self.held_back += 1
             return False
         with self._lock:
             ping_id = self._next_id

@@ -5,26 +5,54 @@ spool with their PUBACK only. After a failure nothing more is sent until every p
 succeeded or failed; then what is left in the spool is sent again from the oldest on. After a lost
 connection the same, once it is back. A batch may therefore arrive twice, which downstream does no
 harm: it has the same key and the same content.
+
+It goes first on its connection: it tells the `Allowance` what it needs, and the others share the rest.
 """
 
 from __future__ import annotations
 
 import functools
 import logging
+import math
 import random
 import threading
 
 import contract
-from device.allowance import Allowance
+from device.allowance import PUBLISHES_PER_S, SHARE, Allowance
 from device.clock import Clock
+from device.config import Config
 from device.errors import UplinkError
+from device.production import Production, Rate
 from device.spool import Entry, Spool
 from device.uplink import Uplink
 
 _log = logging.getLogger(__name__)
 
-WINDOW = 20
+# As many a round trip can be sent: with 0.5 s of it, 100 a second. AWS allows 100.
+WINDOW = 50
+# What to do where more is recorded than one connection may send.
+TODO = (
+    "record fewer topics or fields, let topics of one type share a stream, or give some of them to a second "
+    "agent with a robot name of its own"
+)
 _MIN_RETRY_S, _MAX_RETRY_S = 0.5, 30.0
+
+
+def too_many(config: Config) -> str | None:
+    """Why the streams of a configuration are too many for one connection, in a line; None where they are not.
+
+    It is about streams that bring samples all the time; where every sample goes by itself (``batch_s`` 0),
+    nobody knows how many that are.
+    """
+    if not config.record.enabled:
+        return None
+    batch_s, most = config.record.batch_s, PUBLISHES_PER_S * SHARE
+    streams = sum(len(source.streams()) for source in config.sources)
+    # A batch lies within a second.
+    made = streams * math.ceil(1 / batch_s) if batch_s else streams
+    if made <= most:
+        return None
+    return f"{streams} streams are up to {made} batches a second, and one connection takes {most:.0f}"
 
 
 class RecordLane:
@@ -60,6 +88,10 @@ class RecordLane:
         self._failures = 0
         self._failed = False
         self._hold_until = 0.0
+        self._acked = Rate(0, 0)
+        self._production = Production()
+        # What the operator should know and do, in a line; None while all that is recorded gets away.
+        self.alarm: str | None = None
         uplink.on_connection(self._on_connection)
         spool.on_stored(self.wake)
 
@@ -87,16 +119,40 @@ class RecordLane:
                 entry = self._spool.next(self._sent_id)
                 if entry is None:
                     return None
-                delay_s = self._allowance.delay_s()
+                topic = contract.record_topic(self._robot, entry.stream, self._namespace)
+                delay_s = self._allowance.record(topic, entry.payload)
                 if delay_s > 0:
                     return delay_s
                 self._in_flight.add(entry.id)
                 self._sent_id = entry.id
                 done = functools.partial(self._done, self._epoch, entry)
-            topic = contract.record_topic(self._robot, entry.stream, self._namespace)
-            self._allowance.spend(topic, entry.payload)
             self._uplink.publish(topic, entry.payload, qos=1, done=done)
         return None
+
+    def tick(self) -> None:
+        """Learn how much is recorded, tell the allowance, and see whether all of it gets away."""
+        with self._changed:
+            acked, left = self._acked, self._spool.backlog()
+        made = Rate(
+            left.batches + acked.batches + self._spool.dropped().batches,
+            left.payload_bytes + acked.payload_bytes,
+        )
+        production, (publishes, payloads) = self._production, self._allowance.rates
+        production.note(
+            self._clock.monotonic(),
+            made=made,
+            sent=acked,
+            backlog=left.batches,
+            connected=self._uplink.connected(),
+        )
+        self._allowance.expect(
+            production.made, backlog=left.batches > publishes or left.payload_bytes > payloads
+        )
+        was, self.alarm = self.alarm, self._alarm(left.batches) if production.behind else None
+        if self.alarm and not was:
+            _log.warning("record: %s", self.alarm)
+        elif was and not self.alarm and self._uplink.connected():
+            _log.info("record: the queue no longer grows")
 
     def wait_empty(self, timeout_s: float) -> bool:
         """Wait until everything in the spool is acknowledged; whether it is."""
@@ -108,6 +164,8 @@ class RecordLane:
             if error is None:
                 # Whenever it comes, an acknowledgement means that the broker has the batch.
                 self._spool.ack(entry.id)
+                acked = self._acked
+                self._acked = Rate(acked.batches + 1, acked.payload_bytes + len(entry.payload))
                 self._changed.notify_all()
             was_full = len(self._in_flight) >= self._window
             if epoch == self._epoch:
@@ -135,6 +193,17 @@ class RecordLane:
             entry.seq, entry.stream, delay, error,
         )  # fmt: skip
 
+    def _alarm(self, left: int) -> str:
+        made, sent, limit = self._production.made, self._production.sent, Rate(*self._allowance.rates)
+        if made.batches > limit.batches or made.payload_bytes > limit.payload_bytes:
+            todo = f"the limit allows {_text(limit)}: {TODO}"
+        else:
+            todo = f"the limit would allow {_text(limit)}: the network is too slow or loses messages"
+        return (
+            f"more is recorded than is sent: {left} batches wait, {_text(made)} are made, "
+            f"{_text(sent)} were sent; {todo}"
+        )
+
     def _rewind(self) -> None:
         self._epoch += 1
         self._in_flight.clear()
@@ -149,3 +218,7 @@ class RecordLane:
                 self._failures = 0
                 self._hold_until = 0.0
         self._wake.set()
+
+
+def _text(rate: Rate) -> str:
+    return f"{rate.batches:.0f} batches/s ({rate.payload_bytes / 1024:.0f} KB/s)"

@@ -2,8 +2,8 @@
 
 Nothing is guessed: a field that the type does not have, one that is missing, a number that does not
 fit, an array of another length are each a `MessageError` that names the field. Two things may be left
-out: the header of a stamped message, which then says now, and, with ``partial``, any field, which
-then is zero. Times are ``{"sec": 1, "nanosec": 2}``.
+out: the header of a stamped message, which then says now, a header's seq, and, with ``partial``, any field,
+which then is zero. Times are ``{"sec": 1, "nanosec": 2}``; ROS 1's own ``secs`` and ``nsecs`` are taken too.
 """
 
 from __future__ import annotations
@@ -13,11 +13,23 @@ import struct
 from typing import Any, Mapping
 
 from contract.limits import MessageError
-from contract.ros1.definition import LETTERS, STRING, VARIABLE, Definition, Field
+from contract.ros1.definition import (
+    DURATION,
+    HEADER_TYPE,
+    LETTERS,
+    STRING,
+    TIME,
+    VARIABLE,
+    Definition,
+    Field,
+)
 
 _LENGTH = struct.Struct("<I")
 # A message of JSON within the broker's limit has no more elements; nested empties could.
 _MAX_ELEMENTS = 100_000
+_MAX_NANOSEC = 999_999_999
+# As genpy and roslibjs call the fields of a time.
+_SPELLINGS = {"secs": "sec", "nsecs": "nanosec"}
 
 
 def encode(
@@ -66,6 +78,8 @@ class _Writer:
         fields = self._definition.fields(kind)
         if not isinstance(value, dict):
             raise _wrong(path, value, f"an object of {', '.join(f.name for f in fields) or 'no fields'}")
+        if kind in (TIME, DURATION):
+            value = _time(value, path)
         names = {field.name for field in fields}
         unknown = sorted(str(name) for name in value.keys() - names)
         if unknown:
@@ -74,7 +88,7 @@ class _Writer:
             below = _join(path, field.name)
             if field.name in value:
                 self.put(field, value[field.name], below)
-            elif self._partial:
+            elif self._partial or (kind == HEADER_TYPE and field.name == "seq"):
                 self.put(field, _zero(field), below)
             else:
                 raise MessageError(f"{below}: is missing")
@@ -130,6 +144,17 @@ def _number(kind: str, value: Any, path: str) -> bytes:
         return struct.pack(f"<{letter}", value)
     except (struct.error, OverflowError) as error:
         raise _wrong(path, value, f"a number that fits in {kind}") from error
+
+
+def _time(value: Mapping[str, Any], path: str) -> Mapping[str, Any]:
+    """A time or duration under the names that the definition has."""
+    found = {_SPELLINGS.get(name, name): each for name, each in value.items()}
+    if len(found) != len(value):
+        raise MessageError(f"{path}: has both spellings of a field, {', '.join(value)}")
+    nanosec = found.get("nanosec", 0)
+    if isinstance(nanosec, (int, float)) and not 0 <= nanosec <= _MAX_NANOSEC:
+        raise _wrong(_join(path, "nanosec"), nanosec, f"an integer from 0 to {_MAX_NANOSEC}")
+    return found
 
 
 def _text(value: Any, path: str) -> bytes:

@@ -3,8 +3,8 @@
 rospy registers with the master once and never again, so that a node is deaf after the master's
 restart, or connects to no publisher that came while it was away. The node's own thread asks the master
 every few seconds what it knows and registers again what it has forgotten, without dropping the
-connections that still stand. It also waits for a master that is not there yet: nobody who uses the
-node ever waits for the master.
+connections that still stand. It also waits for a master that is not there yet, and for another node of
+its name to go: a master ends the older one of two. Nobody who uses the node ever waits for either.
 """
 
 from __future__ import annotations
@@ -12,6 +12,8 @@ from __future__ import annotations
 import http.client
 import importlib
 import logging
+import random
+import sys
 import threading
 import xmlrpc.client
 from typing import Any, Callable, Mapping
@@ -27,6 +29,8 @@ DEFAULT_NODE = "iort_agent"
 ANY_TYPE = "*"
 _POLL_S = 4.0
 _WAIT_S = 1.0
+# Two that took the name from each other must not try again at the same moment, nor often.
+_MAX_RETREAT_S = 60.0
 _MASTER_TIMEOUT_S = 3.0
 # rospy hands the last messages to threads of its own, and says of none when it is written.
 _LAST_WRITE_S = 0.2
@@ -69,6 +73,11 @@ def shared(name: str = DEFAULT_NODE, clock: Clock | None = None) -> Node:
 
 
 def _rospy() -> Any:
+    """rospy, imported anew where it was shut down: a node begins once for each import."""
+    core = sys.modules.get("rospy.core")
+    if core is not None and core.is_shutdown_requested():
+        for module in [name for name in sys.modules if name.partition(".")[0] == "rospy"]:
+            del sys.modules[module]
     try:
         return importlib.import_module("rospy")
     except ImportError as error:
@@ -102,6 +111,7 @@ class Node:
         self.name = name
         self.users = 0
         self.failed: str | None = None
+        self.waits: str | None = None
         self.sim_time = False
         self.ready = threading.Event()
         self._rospy = rospy
@@ -114,7 +124,21 @@ class Node:
         self._wanted: dict[str, Any] = {}
         self._publishers: dict[str, Any] = {}
         self._absent = False
+        self._displaced = False
+        self._losses = 0
+        # Where the other node of our name was seen.
+        self._holder: str | None = None
         rosgraph = importlib.import_module("rosgraph")
+        # The command line's remappings, as every ROS node reads them.
+        names = importlib.import_module("rosgraph.names")
+        mappings = names.load_mappings(sys.argv)
+        self._base: str = mappings.get("__name", name)
+        self._me: str = names.ns_join(names.get_ros_namespace(), self._base)
+        self._remapped: dict[str, str] = {
+            names.resolve_name(topic, self._me): names.resolve_name(other, self._me)
+            for topic, other in mappings.items()
+            if not topic.startswith("__")
+        }
         self._uri: str = rosgraph.get_master_uri()
         try:
             self._master = _proxy(self._uri)
@@ -143,6 +167,10 @@ class Node:
         self._rospy.signal_shutdown("the agent has ended")
         self._thread.join(_MASTER_TIMEOUT_S)
 
+    def resolve(self, topic: str) -> str:
+        """What a topic is called in the graph: the command line may remap it. All else takes this name."""
+        return self._remapped.get(topic, topic)
+
     def subscribe(self, topic: str, handler: OnBytes) -> None:
         """Receive a topic's messages of whatever type, in threads of rospy's."""
         with self._lock:
@@ -160,7 +188,7 @@ class Node:
     def advertise(self, topic: str, message_class: Any) -> None:
         """Be a publisher of the topic, whose subscribers then connect: `publish` alone is too late."""
         with self._lock:
-            self._wanted.setdefault(topic, _bytes_of(self._rospy.AnyMsg, message_class))
+            self._wanted.setdefault(topic, message_class)
         self._wake.set()
 
     def publish(self, topic: str, data: bytes) -> bool:
@@ -168,7 +196,7 @@ class Node:
         publisher = self._publishers.get(topic)
         if publisher is None:
             return False
-        message = self._wanted[topic]()
+        message = publisher.data_class()
         message.deserialize(data)
         try:
             publisher.publish(message)
@@ -190,26 +218,94 @@ class Node:
 
     def _run(self) -> None:
         try:
-            self._await_master()
-            if not self._stop.is_set():
-                self._begin()
-            while not self._stop.is_set():
-                self._wake.clear()
-                self._change()
-                self.ready.set()
-                if self._rospy.is_shutdown():
-                    self._fail("it was shut down from outside, or another node took its name")
-                    return
-                if not self._clock.wait(self._wake, _POLL_S):
-                    self._look_after()
+            while not self._stop.is_set() and self.failed is None:
+                self._await_master()
+                self._await_name()
+                if not self._stop.is_set():
+                    self._take_part()
         except Exception as error:  # noqa: BLE001 - rospy raises about anything, and its thread is ours
             if not self._stop.is_set():
                 _log.exception("the ROS node failed")
                 self._fail(f"{type(error).__name__}: {error}")
 
+    def _take_part(self) -> None:
+        """Be in the graph until the agent ends, or somebody ends the node."""
+        try:
+            self._begin()
+            while not self._stop.is_set() and not self._displaced:
+                self._wake.clear()
+                if self._rospy.core.is_shutdown_requested():
+                    self._fail("it was shut down from outside")
+                    return
+                self._change()
+                self.ready.set()
+                if not self._clock.wait(self._wake, _POLL_S):
+                    self._look_after()
+        except Exception:
+            if not self._displaced:
+                raise
+        if self._displaced and not self._stop.is_set():
+            self._retreat()
+
     def _fail(self, why: str) -> None:
         if not self._stop.is_set():
-            self.failed = f"the ROS node /{self.name} has ended: {why}"
+            self.failed = f"the ROS node {self._me} has ended: {why}"
+
+    def _retreat(self) -> None:
+        """Leave the graph to the node that took the name, ready to begin anew."""
+        self.waits = f"another node took the name {self._me}; set sources[].node"
+        _log.warning("%s: this one leaves the graph, and comes back when the other has gone", self.waits)
+        self.ready.clear()
+        self._rospy.signal_shutdown("another node took the name")
+        with self._lock:
+            self._subscribers, self._publishers = {}, {}
+        self._rospy = _rospy()
+        self._displaced = False
+        self._losses += 1
+        most_s = min(_MAX_RETREAT_S, 2.0**self._losses)
+        self._clock.wait(self._stop, random.uniform(0, most_s))  # noqa: S311 - jitter, not secrets
+
+    def _await_name(self) -> None:
+        """Wait while another living node has our name: whoever registers later ends the one before."""
+        while not self._stop.is_set():
+            try:
+                self._holder = self._living_namesake()
+            except _MASTER_ERRORS:
+                self._clock.wait(self._stop, _WAIT_S)
+                self._await_master()
+                continue
+            if self._holder is None:
+                break
+            waits = f"another node is called {self._me} at {self._holder}; set sources[].node"
+            if waits != self.waits:
+                _log.warning("%s: waiting for it to go", waits)
+            self.waits, self._losses = waits, 0
+            self._clock.wait(self._stop, _WAIT_S)
+        self.waits = None
+
+    def _living_namesake(self) -> str | None:
+        """Where a node of our name answers; a dead one's registration stays at the master for ever."""
+        _, _, registered = self._master.lookupNode(self._me, self._me)
+        # A master that was restarted does not know yet whom we wait for.
+        for uri in (registered, self._holder):
+            if uri and self._answers(uri):
+                return str(uri)
+        return None
+
+    def _answers(self, uri: str) -> bool:
+        try:
+            status, _, name = _proxy(uri).getName(self._me)
+        except xmlrpc.client.Fault:
+            return True  # only rospy's nodes say their names
+        except _MASTER_ERRORS:
+            return False
+        # Another node may have the port by now.
+        return bool(status == 1 and name == self._me)
+
+    def _on_shutdown(self, reason: str) -> None:
+        # The master ends a node only where another one takes its name.
+        self._displaced = self._displaced or "[/master]" in reason
+        self._wake.set()
 
     def _await_master(self) -> None:
         said = False
@@ -235,9 +331,10 @@ class Node:
         rospy.core.configure_logging = lambda *_args, **_settings: None
         for name, level in _LOGGERS.items():
             logging.getLogger(name).setLevel(level)
-        # Signals are the agent's, its arguments are no remappings, and it has no use for /clock.
+        rospy.core.add_preshutdown_hook(self._on_shutdown)
+        # Signals are the agent's, names are resolved here already, and it has no use for /clock.
         rospy.init_node(
-            self.name, argv=[self.name], disable_signals=True, disable_rosout=True, disable_rostime=True
+            self._base, argv=[self._base], disable_signals=True, disable_rosout=True, disable_rostime=True
         )
         self._absent = False
         _log.info("ROS node %s at %s", rospy.get_name(), self._uri)
@@ -259,7 +356,7 @@ class Node:
         for topic, message_class in wanted.items():
             if topic not in self._publishers:
                 self._publishers[topic] = self._rospy.Publisher(
-                    topic, message_class, queue_size=_QUEUE, tcp_nodelay=True
+                    topic, _bytes_of(self._rospy.AnyMsg, message_class), queue_size=_QUEUE, tcp_nodelay=True
                 )
 
     def _deliver(self, message: Any, topic: str) -> None:
@@ -268,13 +365,18 @@ class Node:
 
     def _look_after(self) -> None:
         try:
-            # Both in one request: this is all that the node costs while no message comes.
+            # All in one request: this is all that the node costs while no message comes.
             questions: Any = xmlrpc.client.MultiCall(self._master)
-            questions.getSystemState(self._rospy.get_name())
-            questions.getParam(self._rospy.get_name(), "/use_sim_time")
-            (_, _, (publishers, subscribers, _)), (status, _, sim_time) = tuple(questions())
+            questions.getSystemState(self._me)
+            questions.getParam(self._me, "/use_sim_time")
+            questions.lookupNode(self._me, self._me)
+            (_, _, (publishers, subscribers, _)), (status, _, sim_time), (_, _, uri) = tuple(questions())
             self.sim_time = status == 1 and bool(sim_time)
             self._absent = self._told_of_return()
+            if uri and uri != self._rospy.get_node_uri() and self._answers(uri):
+                # To register again would end the other one.
+                self._displaced = True
+                return
             forgotten = self._register_again(dict(publishers), dict(subscribers))
             self._connect(dict(publishers))
         except _MASTER_ERRORS as error:
@@ -291,7 +393,7 @@ class Node:
         return False
 
     def _register_again(self, publishers: Mapping[str, Any], subscribers: Mapping[str, Any]) -> list[str]:
-        me, api = self._rospy.get_name(), self._rospy.get_node_uri()
+        me, api = self._me, self._rospy.get_node_uri()
         forgotten = []
         for topic in self._subscribers:
             if me not in subscribers.get(topic, ()):
@@ -308,7 +410,7 @@ class Node:
         for topic in self._subscribers:
             names = publishers.get(topic, ())
             if len(names) > self.connections(topic):
-                found = [self._master.lookupNode(self._rospy.get_name(), name) for name in names]
+                found = [self._master.lookupNode(self._me, name) for name in names]
                 self._tell(topic, [uri for status, _, uri in found if status == 1])
 
     def _tell(self, topic: str, uris: list[str]) -> None:
@@ -317,8 +419,7 @@ class Node:
             _proxy(self._rospy.get_node_uri()).publisherUpdate("/master", topic, uris)
 
     def _ask(self, method: str, *arguments: Any) -> Any:
-        caller = self._rospy.get_name() if self.ready.is_set() else f"/{self.name}"
-        status, text, value = getattr(self._master, method)(caller, *arguments)
+        status, text, value = getattr(self._master, method)(self._me, *arguments)
         if status != 1:
             raise xmlrpc.client.ResponseError(f"{method}: {text}")
         return value

@@ -24,6 +24,9 @@ class Graph(Protocol):
     def subscribe(self, topic: str, handler: OnBytes) -> None:
         """Receive a topic's messages, of whatever type, in another thread."""
 
+    def waits(self) -> str | None:
+        """What keeps us from joining the graph, for a person."""
+
     def start(self) -> None:
         """Join the graph, as soon as there is one."""
 
@@ -50,15 +53,19 @@ class Ros1Graph:
     def advertise(self, topic: str, kind: str) -> None:
         """Become a publisher of a topic, not latched: an old command is no command."""
         self.definition(kind)
-        self._node.advertise(topic, self._types[kind][1])
+        self._node.advertise(self._node.resolve(topic), self._types[kind][1])
 
     def publish(self, topic: str, data: bytes) -> bool:
         """Publish a message on an advertised topic."""
-        return self._node.publish(topic, data)
+        return self._node.publish(self._node.resolve(topic), data)
 
     def subscribe(self, topic: str, handler: OnBytes) -> None:
         """Receive a topic's messages."""
-        self._node.subscribe(topic, handler)
+        self._node.subscribe(self._node.resolve(topic), handler)
+
+    def waits(self) -> str | None:
+        """What keeps us from joining the graph: another node of our name."""
+        return self._node.waits
 
     def start(self) -> None:
         """Join the graph."""

@@ -147,17 +147,30 @@ def render(state: Mapping[str, Any]) -> str:
         f"{spool['bytes']:,} bytes waiting; {spool['dropped_batches']} batch(es) dropped"
     )
     live = lanes["live"]
+    slowed = f", SLOWED to {live['effective_hz']:g} Hz a stream by AWS' limit" if live["slowed"] else ""
     lines.append(
-        f"live      {_on(live)}, up to {live['rate_hz']:g} Hz, {live['published']} sent, "
+        f"live      {_on(live)}, up to {live['rate_hz']:g} Hz{slowed}, {live['published']} sent, "
         f"{live['refused']} refused"
     )
     for name, stream in state["streams"].items():
         fields = f", only {', '.join(stream['fields'])}" if stream.get("fields") else ""
         silent = f", SILENT for {_duration(stream['silent_s'])}" if stream["silent_s"] >= 5 else ""
         lines.append(
-            f"stream    {name}: {stream['per_s']:g}/s, {stream['samples']} samples, "
-            f"{stream['refused']} refused{silent}{fields}"
+            f"stream    {name}: {stream['per_s']:g}/s, live {stream['live_hz']:g}/s, "
+            f"{stream['samples']} samples, {stream['refused']} refused{silent}{fields}"
         )
+    for source in state["sources"]:
+        counts = {
+            name: value
+            for name, value in source.items()
+            if name != "source" and not (isinstance(value, Mapping) and "messages" in value)
+        }
+        flat = {name: value for name, value in counts.items() if not isinstance(value, Mapping)}
+        lines.append(f"source    {source['source']}{_told(flat, ': ')}")
+        for name, value in counts.items():
+            if name not in flat and _told(value):
+                lines.append(f"          {name}{_told(value, ': ')}")
+        lines += [f"topic     {name}: {what}" for name, what in _not_recorded(source)]
     files = state.get("files")
     if files is not None:
         current = f", now {files['current']} ({files['current_bytes']:,} bytes)" if files["current"] else ""
@@ -176,6 +189,37 @@ def render(state: Mapping[str, Any]) -> str:
         at = time.strftime("%H:%M:%SZ", time.gmtime(trouble["at_s"]))
         lines.append(f"{trouble['level']:<9} {at} {trouble['text']}")
     return "\n".join(lines)
+
+
+def _told(counts: Mapping[str, Any], before: str = "") -> str:
+    """Those counts of a source that are not zero or empty; nothing where all are."""
+    parts = []
+    for name, value in counts.items():
+        if isinstance(value, Mapping):
+            parts += [f"{name} ({_told(value)})"] if _told(value) else []
+        elif value:
+            texts = value if isinstance(value, list) else [value]
+            parts.append(name if value is True else f"{name} {' '.join(map(str, texts))}")
+    return before + ", ".join(parts) if parts else ""
+
+
+def _not_recorded(source: Mapping[str, Any]) -> Iterator[tuple[str, str]]:
+    """The topics of a source's report of which something is missing, and what."""
+    for topic, counts in source.items():
+        if not isinstance(counts, dict) or "messages" not in counts:
+            continue
+        words = []
+        for cause, count in counts.items():
+            # Of what is counted by field, the fields are named.
+            by_name = count.items() if isinstance(count, dict) else [("", count)]
+            words += [
+                f"{n} {cause.replace('_', ' ')} {name}".rstrip()
+                for name, n in by_name
+                if type(n) is int and n and cause != "messages"
+            ]
+        silent = ", SILENT" if counts.get("silent") else ""
+        if words or silent:
+            yield topic, "; ".join([f"{counts['messages']} messages{silent}", *words])
 
 
 def _on(lane: Mapping[str, Any]) -> str:

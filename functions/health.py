@@ -13,6 +13,7 @@ from contract import (
     RTT_STREAM,
     VOLTAGE_FIELD,
     Batch,
+    absent,
 )
 from functions.metrics import MOST_VALUES
 from functions.statistics import count_holes, numbers_of
@@ -41,7 +42,12 @@ def measure(stream: str, batches: Sequence[Batch]) -> Measured:
         backlog = _numbers(batches, "backlog_batches")
         return {"AgentReports": sum(len(batch.times_us) for batch in batches), "BacklogBatches": backlog[-1:]}
     volts = [value for value in _numbers(batches, VOLTAGE_FIELD) if value > 0]
-    hot = [value for name in _TEMPERATURES for value in _numbers(batches, name) if value]
+    hot = [
+        value
+        for name in _TEMPERATURES
+        for value in _numbers(batches, name)
+        if value and not absent(name, value)
+    ]
     return {
         "SampleGaps": sum(count_holes(batch.times_us) for batch in batches),
         "FaultSamples": sum(map(bool, _numbers(batches, FAULT_FIELD))),

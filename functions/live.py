@@ -17,6 +17,7 @@ from contract import (
     TOPIC,
     ContractError,
     LiveSample,
+    absent,
     channel,
     decode_live,
     live_message,
@@ -95,10 +96,11 @@ def process(
         # The stale ones are the late ones: an alarm that does not hear of them never goes off.
         counted.add(now_us / 1e6, LiveStale=1, CarToLambdaMs=way_ms)
         return
-    chosen = settings.fields.get(topic.name)
-    if chosen is not None:
-        picked = {name: value for name, value in live.sample.items() if name in chosen}
-        live = replace(live, sample=picked)
+    chosen = settings.fields.get(topic.name, live.sample.keys())
+    picked = {
+        name: None if absent(name, value) else value for name, value in live.sample.items() if name in chosen
+    }
+    live = replace(live, sample=picked)
     update = live_update(topic.robot, topic.name, live, received_ms, now_us)
     try:
         publish(channel(topic.robot, topic.namespace), update)

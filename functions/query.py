@@ -12,6 +12,7 @@ import json
 import os
 import uuid
 import zlib
+from collections import Counter
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cache
@@ -38,7 +39,7 @@ from contract import (
 )
 from functions import expression
 from functions.expression import ExpressionError, Node
-from functions.statistics import derive
+from functions.statistics import derive, without_absent
 from functions.tables import Tables, plain
 
 # Lambda's synchronous answer holds 6 MB; the envelope around the samples is some hundred bytes.
@@ -72,6 +73,11 @@ class Request:
     condition: Node | None
     scan: bool
     token: Mapping[str, Any] | None
+
+    def needs(self, name: str) -> bool:
+        """Whether it takes this stored field to answer."""
+        deciding = expression.names(self.condition) if self.condition is not None else ()
+        return self.fields is None or name in self.fields or name in deciding
 
     @classmethod
     def read(cls, event: Mapping[str, Any], namespace: str) -> Request:
@@ -119,6 +125,8 @@ class Found:
         self.there: dict[str, None] = {}
         self.refused = 0
         self.reason = ""
+        # Values of sensors that are not fitted, by field.
+        self.absent: Counter[str] = Counter()
 
     @property
     def values(self) -> int:
@@ -134,10 +142,15 @@ class Found:
             self.refused += 1
             self.reason = self.reason or str(error)
             return
-        times, columns = batch.times_us, dict(batch.columns)
+        times = batch.times_us
         inside = [request.start_us <= t_us < request.end_us for t_us in times]
         if not any(inside):
             return
+        known, absences = without_absent(batch.columns)
+        columns = dict(known)
+        for name in absences:
+            pairs = zip(batch.columns[name], columns[name], inside, strict=True)
+            self.absent[name] += sum(is_in and value != left for value, left, is_in in pairs)
         if self._derived:
             made = derive(columns, self._vehicle)
             columns |= {name: made[name] for name in self._derived if name in made}
@@ -198,6 +211,7 @@ def answer(
         "pages": pages,
         "refused": found.refused,
         "reason": found.reason,
+        "absent": {name: n for name, n in found.absent.items() if request.needs(name)},
         "token": token,
     }
     if len(samples) * 4 // 3 <= max_inline_bytes:

@@ -11,6 +11,8 @@ from statistics import mean, median
 from typing import TypeGuard
 
 from contract import (
+    ABSENT,
+    ABSENT_FROM,
     BATCHES,
     GAPS,
     MISSING_BATCHES,
@@ -20,6 +22,7 @@ from contract import (
     BatchId,
     Statistics,
     Value,
+    absent,
     packed_second,
 )
 
@@ -47,7 +50,8 @@ def summarize_second(
     ``batches`` are those of one stream, in order of time: every one that has a sample in the second
     and the one before, from which holes and missing batches are seen. The result has ``n``, ``batches``,
     ``missing_batches``, ``gaps``, ``nonfinite`` and every field, with ``speed_mps`` and ``power_w`` derived
-    where the fields and the vehicle's parameters allow (contract/seconds.py says how).
+    where the fields and the vehicle's parameters allow (contract/seconds.py says how); ``absent`` counts
+    values of sensors that are not fitted, which are null here.
     """
     start_us, end_us = second * _SECOND_US, (second + 1) * _SECOND_US
     times: list[int] = []
@@ -76,8 +80,29 @@ def summarize_second(
         GAPS: count_holes([*before, *sorted(times)]),
         NONFINITE: nonfinite,
     }
-    found = {name: _statistics(column) for name, column in {**columns, **derive(columns, vehicle)}.items()}
+    without, absences = without_absent(columns)
+    if absences:
+        counts[ABSENT] = sum(absences.values())
+    found = {name: _statistics(column) for name, column in {**without, **derive(without, vehicle)}.items()}
     return packed_second(counts, {name: known for name, known in found.items() if known is not None})
+
+
+def without_absent(
+    columns: Mapping[str, Sequence[Value]],
+) -> tuple[Mapping[str, Sequence[Value]], dict[str, int]]:
+    """The columns with None for values of sensors that are not fitted, and how many those are by field."""
+    found: dict[str, Sequence[Value]] = {}
+    absences: dict[str, int] = {}
+    for name in columns.keys() & ABSENT_FROM.keys():
+        column = columns[name]
+        # Of nearly every column one look at its least tells.
+        if _are_numbers(column) and not (column and absent(name, min(column))):
+            continue
+        known = [None if absent(name, value) else value for value in column]
+        count = sum(value is None for value in known) - sum(value is None for value in column)
+        if count:
+            found[name], absences[name] = known, count
+    return ({**columns, **found} if found else columns), absences
 
 
 def missing_before(batch: BatchId, near: Sequence[BatchId]) -> int:

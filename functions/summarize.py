@@ -190,6 +190,8 @@ def process(
             for second, summary in summaries.seconds.items()
         }
     )
+    for name in map(parse_topic, topics):
+        tables.note_stream(name.robot, name.name)
     for topic, summaries in topics.items():
         decoded.refuse(topic, summaries.beyond, _BEYOND)
     left = decoded.refused if event.get(REPLAY) else refuse(decoded.refused)

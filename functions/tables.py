@@ -10,11 +10,14 @@ from contextlib import suppress
 from itertools import islice
 from typing import Any
 
+from botocore.exceptions import ClientError
+
 from contract import (
     BATCH,
     OMITTED,
     ROBOT,
     SECOND,
+    STREAMS,
     TOPIC,
     BatchId,
     ContractError,
@@ -74,6 +77,7 @@ class Tables:
         self._client = client
         self._telemetry, self._summary, self._robots = telemetry, summary, robots
         self._vehicles: dict[str, tuple[float, Vehicle | None]] = {}
+        self._noted: set[tuple[str, str]] = set()
 
     def batches_from(self, topic: str, first_us: int, *, at_once: int) -> Iterator[dict[str, Any]]:
         """The stored batches of a topic that start then or later, in order of time. ``at_once`` are read
@@ -145,6 +149,25 @@ class Tables:
             answer = self._client.get_item(TableName=self._robots, Key={ROBOT: {"S": robot}})
             cached = self._vehicles[robot] = (now, _vehicle(plain(answer.get("Item", {}))))
         return cached[1]
+
+    def note_stream(self, robot: str, stream: str) -> None:
+        """Keep in the robot's row that it has the stream, once an environment; a robot that is not
+        registered has no row, and gets none."""
+        if (robot, stream) in self._noted:
+            return
+        try:
+            self._client.update_item(
+                TableName=self._robots,
+                Key={ROBOT: {"S": robot}},
+                UpdateExpression="ADD #streams :stream",
+                ConditionExpression="attribute_exists(#robot)",
+                ExpressionAttributeNames={"#streams": STREAMS, "#robot": ROBOT},
+                ExpressionAttributeValues={":stream": {"SS": [stream]}},
+            )
+        except ClientError as error:
+            # It only helps those who look for streams; no summary waits for it.
+            _log.info("the stream %s of %s is not noted: %s", stream, robot, error)
+        self._noted.add((robot, stream))
 
     def put_seconds(self, seconds: Mapping[tuple[str, int], Mapping[str, Statistics]]) -> None:
         """Write the summaries, keyed by topic and second; raises `TableError` if some stay unwritten."""

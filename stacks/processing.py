@@ -23,6 +23,7 @@ from contract import (
     LAMBDA,
     PONG,
     RESULTS_PREFIX,
+    STREAMS,
     pubnub_parameter,
 )
 from stacks.function import RUNTIME, function
@@ -98,6 +99,7 @@ class Processing(Stack):
         storage.telemetry.grant(summarize, "dynamodb:Query")
         storage.summary.grant(summarize, "dynamodb:BatchWriteItem")
         storage.robots.grant(summarize, "dynamodb:GetItem")
+        storage.may_keep(summarize, STREAMS)
         summarize.add_event_source(
             sources.DynamoEventSource(
                 storage.telemetry,

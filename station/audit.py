@@ -60,7 +60,8 @@ class Missing(NamedTuple):
 
 @dataclass(frozen=True)
 class Run:
-    """One run of the agent: its batches from the lowest number to the highest, and when its samples are."""
+    """One run of the agent: its batches from the lowest number to the highest, when its samples are, and
+    how many each batch has, by its number."""
 
     boot: str
     first_seq: int
@@ -73,11 +74,21 @@ class Run:
     late: int
     latest_ms: int
     missing: list[Missing]
+    samples_of: Mapping[int, int]
 
     @property
     def expected(self) -> int:
         """Batches from the first number to the last, and those missing before the first."""
         return self.batches + sum(gap.batches for gap in self.missing)
+
+
+class Shortfall(NamedTuple):
+    """A difference between what a run says it took and what is stored: how many samples, None where nobody
+    can know, and why."""
+
+    boot: str
+    samples: int | None
+    cause: str
 
 
 @dataclass(frozen=True)
@@ -86,7 +97,8 @@ class Audit:
 
     ``before_first`` numbers lie before the first stored one: expired, outside of the range asked for, or
     lost. ``refused`` items are not batches. ``in_car`` and ``dropped`` are what the agent last said of
-    its queue, None where it said nothing.
+    its queue, None where it said nothing. ``taken`` are the samples that the runs say they took, None where
+    none said so, and ``shortfalls`` in what the table differs from that.
     """
 
     stream: str
@@ -95,6 +107,8 @@ class Audit:
     refused: int = 0
     in_car: int | None = None
     dropped: int | None = None
+    taken: int | None = None
+    shortfalls: tuple[Shortfall, ...] = ()
 
     @property
     def missing(self) -> int:
@@ -103,8 +117,9 @@ class Audit:
 
     @property
     def complete(self) -> bool:
-        """Something is stored, and nothing of it is missing or unreadable."""
-        return bool(self.runs) and not self.missing and not self.refused
+        """Nothing is missing or unreadable, and there is something, or the agent says that there was not."""
+        there = bool(self.runs) or self.taken == 0
+        return there and not self.missing and not self.refused and not self.shortfalls
 
 
 def audit(
@@ -159,6 +174,7 @@ def _run(found: list[Stored], late_ms: int) -> Run:
         late=sum(excess > late_ms for excess in excess_ms),
         latest_ms=max(excess_ms),
         missing=missing,
+        samples_of={seq: stored.samples for seq, stored in by_seq.items()},
     )
 
 

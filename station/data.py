@@ -12,7 +12,7 @@ A range includes its start and not its end, to the microsecond.
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
@@ -28,6 +28,7 @@ from station.progress import Told
 from station.resample import resample
 from station.seconds import seconds
 from station.selection import Selection, select
+from station.sensors import Sensors
 from station.stored import ATTRIBUTES, Refused, blocks
 from station.times import Time, duration_us
 from station.units import Driver, unit
@@ -42,7 +43,8 @@ class Result:
 
     ``times_us`` are int64 microseconds since the epoch, in order; ``columns`` one array a
     field: float64 with NaN for null, bool for flags, objects for texts. ``refused`` counts stored items
-    that are not batches, of which ``reason`` says what was wrong with the first. ``ros2`` where charge and
+    that are not batches, of which ``reason`` says what was wrong with the first. ``absent`` counts by
+    field values that were taken for null because their sensor is not fitted. ``ros2`` where charge and
     energy have the ROS 2 driver's units.
     """
 
@@ -53,6 +55,7 @@ class Result:
     refused: int = 0
     reason: str = ""
     ros2: bool = False
+    absent: Mapping[str, int] = field(default_factory=dict)
 
     def __len__(self) -> int:
         return len(self.times_us)
@@ -100,21 +103,32 @@ def query(
     """
     selection = select(robot, stream, start, end, fields=fields, where=where)
     every_us = duration_us(every) if every is not None else None
-    refused = Refused()
+    refused, sensors = Refused(), Sensors()
     if on == LAMBDA:
         if summary:
             raise StationError("the query function reads samples; the summary is read from here")
-        found = remote.samples(cloud, selection, refused=refused, scan=scan, progress=progress)
+        found = remote.samples(
+            cloud, selection, refused=refused, sensors=sensors, scan=scan, progress=progress
+        )
     elif summary:
         found = seconds(cloud, selection, scan=scan, progress=progress)
     else:
-        found = samples(cloud, selection, refused=refused, scan=scan, progress=progress)
+        found = samples(cloud, selection, refused=refused, sensors=sensors, scan=scan, progress=progress)
     driver = Driver()
     found = driver.told(found)
     block = join(list(found)) if every_us is None else resample(found, every_us)
     if not len(block.times_us):
         inventory.check_there(cloud, robot, stream)
-    return Result(robot, stream, block.times_us, block.columns, refused.count, refused.reason, driver.ros2)
+    return Result(
+        robot,
+        stream,
+        block.times_us,
+        block.columns,
+        refused.count,
+        refused.reason,
+        driver.ros2,
+        sensors.absent,
+    )
 
 
 def samples(
@@ -122,6 +136,7 @@ def samples(
     selection: Selection,
     *,
     refused: Refused,
+    sensors: Sensors | None = None,
     scan: bool = False,
     progress: Told | None = None,
     messages: bool = True,
@@ -129,6 +144,7 @@ def samples(
     """The selection's samples a block at a time, for what is too long to be held at once; without
     ``messages`` those alone that are no ROS messages.
 
+    Values of ``sensors`` that are not fitted become null; without, they are as they were recorded.
     Raises `StationError` at the end where a field that was named was in none of the samples.
     """
     pages = reading.batches(cloud, selection, ATTRIBUTES, scan=scan)
@@ -140,6 +156,7 @@ def samples(
     some = False
     for whole in found:
         block = _trimmed(whole, selection)
+        block = block if sensors is None else sensors.known(block)
         some = some or len(block.times_us) > 0
         columns = dict(block.columns)
         if derived:

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Set as AbstractSet
 from dataclasses import replace
 
-from contract import OWN_STREAMS, ROBOT, TYPES_STREAM, VESC_STREAM
+from contract import ACCOUNT_STREAM, OWN_STREAMS, ROBOT, STREAMS, TYPES_STREAM, VESC_STREAM
 from functions.statistics import Vehicle
 from station import reading, registry
 from station.cloud import Cloud
@@ -63,17 +63,24 @@ def check_fields(cloud: Cloud, selection: Selection, there: AbstractSet[str]) ->
 
 
 def streams_of(cloud: Cloud, robot: str) -> list[str]:
-    """The streams of a robot that have something stored, as far as they are known by name: those that
-    every robot has, and those whose message types its sources have said."""
-    types = reading.batches(cloud, Selection(robot=robot, stream=TYPES_STREAM), ATTRIBUTES)
+    """The streams of a robot that have something stored, as far as they are `known`."""
+    names = known(cloud, robot)
+    return [name for name in names if reading.outermost(cloud, robot, name, newest=True) is not None]
+
+
+def known(cloud: Cloud, robot: str) -> list[str]:
+    """Every stream that the robot's agent has said that it has, that Lambda 2 has seen, or that every robot
+    may have."""
+    row = registry.find(cloud, robot) or {}
+    seen = {str(name) for name in row.get(STREAMS, ())}
     said = {
         name
-        for block in blocks(types, Refused())
+        for own in (TYPES_STREAM, ACCOUNT_STREAM)
+        for block in blocks(reading.batches(cloud, Selection(robot=robot, stream=own), ATTRIBUTES), Refused())
         for name in block.columns.get("stream", ())
         if isinstance(name, str)
     }
-    known = sorted({VESC_STREAM, *OWN_STREAMS, *said})
-    return [stream for stream in known if reading.outermost(cloud, robot, stream, newest=True) is not None]
+    return sorted({VESC_STREAM, *OWN_STREAMS, *seen, *said})
 
 
 def extent(cloud: Cloud, robot: str, stream: str) -> tuple[str, str] | None:

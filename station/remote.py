@@ -19,6 +19,7 @@ from station.cloud import Cloud
 from station.errors import StationError
 from station.progress import Told
 from station.selection import Selection
+from station.sensors import Sensors
 from station.stored import Refused
 
 _DOWNLOAD_S = 60
@@ -29,6 +30,7 @@ def samples(
     selection: Selection,
     *,
     refused: Refused,
+    sensors: Sensors,
     scan: bool = False,
     progress: Told | None = None,
 ) -> Iterator[Block]:
@@ -56,6 +58,7 @@ def samples(
         there |= set(reply["fields"])
         refused.count += reply["refused"]
         refused.reason = refused.reason or reply["reason"]
+        sensors.absent.update(reply["absent"])
         if progress is not None and len(part.times_us):
             progress(reply["items"], int(part.times_us[-1]))
         if reply["token"] is None:

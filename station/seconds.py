@@ -8,6 +8,7 @@ from typing import Any
 from boto3.dynamodb.types import TypeDeserializer
 
 from contract import (
+    ABSENT,
     BATCHES,
     EXPIRES_S,
     GAPS,
@@ -30,7 +31,7 @@ from station.reading import Item
 from station.selection import Selection
 
 # What a second says of its samples as a whole.
-_OF_ALL = (SAMPLES, BATCHES, MISSING_BATCHES, GAPS, NONFINITE)
+_OF_ALL = (SAMPLES, BATCHES, MISSING_BATCHES, GAPS, NONFINITE, ABSENT)
 _deserialize = TypeDeserializer().deserialize
 
 

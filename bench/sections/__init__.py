@@ -9,6 +9,7 @@ from bench.sections import (
     abilities,
     cost,
     dashboard,
+    mixed,
     outage,
     query,
     round_trips,
@@ -28,4 +29,5 @@ SECTIONS: dict[str, Run] = {
     "cost": cost.run,
     "outage": outage.run,
     "scale": scale.run,
+    "mixed": mixed.run,
 }

@@ -17,7 +17,7 @@ from dataclasses import asdict
 from statistics import median
 from typing import Any
 
-from bench import borrowed, drives, plots
+from bench import borrowed, drives, plots, thesis
 from bench.errors import BenchError
 from bench.invocations import Event, Measured, configure, invoke, measure, reporting
 from bench.machine import ROOT
@@ -47,6 +47,8 @@ BATCHES = 100
 _CATCH_UP_S = 60.0
 _LIVE, _ONE, _EMPTY = "Lambda 1 (live)", "Lambda 2, an event of 1 batch", "empty function"
 _BACKLOG = f"Lambda 2, an event of {BATCHES} batches"
+_THESIS = {_LIVE: f"{thesis.LAMBDA_1[256]} (256 MB)", _ONE: thesis.LAMBDA_2}
+_NODE = f"{thesis.NODE_CYCLE_MS} ms"
 # What an invocation costs by itself.
 _NOTHING = "def handler(event, context):\n    return None\n"
 
@@ -103,10 +105,10 @@ def _report(
                 _duration(one),
                 f"{median(one.cpu_ms):.2f} ms" if one.cpu_ms else NOT_MEASURED,
                 _cold_text(frozen) if frozen else NOT_MEASURED,
-                "12 ms" if name == _ONE else NOT_MEASURED,
+                _THESIS.get(name, NOT_MEASURED),
             ]
         )
-    rows.append(["robot's node, a cycle", f"{cycle['p50']:.4f} ms (p95 {cycle['p95']:.4f})", "", "", "2 ms"])
+    rows.append(["robot's node, a cycle", f"{cycle['p50']:.4f} ms (p95 {cycle['p95']:.4f})", "", "", _NODE])
     section.tables.append(
         Table(
             "An invocation",
@@ -132,8 +134,11 @@ def _report(
         section.tables.append(
             Table(
                 "Lambda 1 by memory size",
-                ["memory", "duration, warm"],
-                [[f"{mb} MB", _duration(one)] for mb, one in sizes.items()],
+                ["memory", "duration, warm", "thesis, 2018"],
+                [
+                    [f"{mb} MB", _duration(one), thesis.LAMBDA_1.get(mb, NOT_MEASURED)]
+                    for mb, one in sizes.items()
+                ],
             )
         )
     _ratios(section, found, cycle)

@@ -22,6 +22,7 @@ from device.errors import SourceError
 from device.schema import choice, existing_path, flag, number, pairs, setting, text
 from device.sources import REFUSE, UPLOAD, Emit
 from device.sources.player import NOW, ORIGINAL, Message, Open, Playback, play
+from device.sources.unreadable import Wrapped, check_kind
 from device.sources.vesc_csv import VescLog
 
 _log = logging.getLogger(__name__)
@@ -71,10 +72,13 @@ class BagSource:
     def __init__(self, config: BagConfig, clock: Clock) -> None:
         self._config = config
         self._clock = clock
+        is_log = config.path.suffix.lower() == ".csv"
+        self._log = VescLog(config.path, config.stream, config.stamps) if is_log else None
 
     def report(self) -> Mapping[str, Any]:
-        """Nothing that the streams' own counts do not say."""
-        return {}
+        """Of a log of VESC Tool what became of its rows; of a bag nothing that the streams' own counts do
+        not say."""
+        return {} if self._log is None else self._log.report()
 
     def run(self, emit: Emit, stop: threading.Event) -> None:
         """Play until the end, or for ever with ``loop``. Raises `SourceError`."""
@@ -88,12 +92,12 @@ class BagSource:
 
     def _recording(self) -> Open:
         config = self._config
-        if config.path.suffix.lower() != ".csv":
+        if self._log is None:
             large = config.large == UPLOAD
             return lambda: Recording(config.path, config.topics, config.stream, large=large)
         if config.topics is not None:
             raise SourceError(f"{config.path}: a log of VESC Tool has no topics; `stream` names its stream")
-        return VescLog(config.path, config.stream, config.stamps).open
+        return self._log.open
 
 
 class Recording:
@@ -107,6 +111,7 @@ class Recording:
             from rosbags.highlevel import AnyReader  # noqa: PLC0415 - optional
         except ImportError as error:
             raise SourceError("playing a bag needs the package rosbags: pip install 'iort[bag]'") from error
+        check_kind(path)
         # rosbags opens the folder of a ROS 2 recording; people name the file in it.
         in_folder = path.suffix in (".db3", ".mcap") and (path.parent / "metadata.yaml").exists()
         self._path = path
@@ -204,30 +209,8 @@ class Recording:
             _log.warning("%s: topic %s: %s", self._path, connection.topic, error)
         return _Kind(whole, sample, parsed.stamped(), Decoder(parsed, large=True) if self._large else None)
 
-    def _wrapped(self, what: str) -> _Wrapped:
-        return _Wrapped(f"{self._path}: {what}")
-
-
-# What rosbags says, and what to do about it.
-_ADVICE = (
-    ("index looks damaged", "`rosbag reindex` mends a recording that was cut off"),
-    ("Profile is not ros2", "a recording of ROS 1 is read as .bag only"),
-)
-
-
-class _Wrapped:
-    """Turns whatever a bag library raises into `SourceError`: damaged files raise about anything."""
-
-    def __init__(self, what: str) -> None:
-        self._what = what
-
-    def __enter__(self) -> None:
-        pass
-
-    def __exit__(self, _kind: object, error: BaseException | None, _trace: object) -> None:
-        if isinstance(error, Exception) and not isinstance(error, SourceError):
-            advice = next((f"; {what}" for sign, what in _ADVICE if sign in str(error)), "")
-            raise SourceError(f"{self._what}: {type(error).__name__}: {error}{advice}") from error
+    def _wrapped(self, what: str) -> Wrapped:
+        return Wrapped(f"{self._path}: {what}")
 
 
 class _Kind(NamedTuple):

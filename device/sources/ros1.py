@@ -20,7 +20,7 @@ from contract.ros1.decode import Decoder
 from contract.ros1.definition import layout, parse
 from device.clock import Clock
 from device.errors import SourceError
-from device.ros1_node import ANY_TYPE, DEFAULT_NODE, definition_of, shared
+from device.ros1_node import ANY_TYPE, DEFAULT_NODE, Node, definition_of, shared
 from device.schema import Where, choice, items, pairs, section, setting, text
 from device.seldom import Seldom
 from device.sources import REFUSE, UPLOAD, Emit
@@ -105,15 +105,16 @@ class Ros1Source:
         self._config = config
         self._clock = clock
         self._intakes: dict[str, Intake] = {}
+        self._node: Node | None = None
 
     def run(self, emit: Emit, stop: threading.Event) -> None:
         """Be subscribed until ``stop`` is set. Raises `SourceError` without rospy, or if the node ends."""
-        node = shared(self._config.node, self._clock)
+        node = self._node = shared(self._config.node, self._clock)
         try:
             for topic, settings in self._config.topics:
-                intake = Intake(topic, settings, emit=emit, clock=self._clock)
+                intake = Intake(node.resolve(topic), settings, emit=emit, clock=self._clock)
                 self._intakes[topic] = intake
-                node.subscribe(topic, intake.take)
+                node.subscribe(node.resolve(topic), intake.take)
             node.start()
             while not self._clock.wait(stop, _LOOK_S):
                 if node.failed:
@@ -121,15 +122,17 @@ class Ros1Source:
                 for topic, intake in self._intakes.items():
                     intake.sim_time = node.sim_time
                     if node.ready.is_set():
-                        intake.look(node.connections(topic))
+                        intake.look(node.connections(node.resolve(topic)))
         finally:
             for topic, intake in self._intakes.items():
-                node.unsubscribe(topic, intake.take)
+                node.unsubscribe(node.resolve(topic), intake.take)
             node.release()
 
     def report(self) -> dict[str, Any]:
-        """What became of the messages, by topic."""
-        return {topic: intake.report() for topic, intake in self._intakes.items()}
+        """What became of the messages, by topic, and why the node waits, if it does."""
+        waits = self._node.waits if self._node is not None else None
+        topics = {topic: intake.report() for topic, intake in self._intakes.items()}
+        return {**topics, "waits": waits} if waits is not None else topics
 
 
 class Intake:

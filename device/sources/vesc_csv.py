@@ -1,8 +1,9 @@
 """Reads a log of VESC Tool: one row an answer of the controller, in columns named by VESC Tool.
 
 The columns that the contract knows get its names and units, the others keep their own. What a log is
-not sure to be is looked at, not assumed: the separator by the header, the decimal point or comma by the
-first number that has one. A row that does not fit is skipped, counted and its number told once.
+not sure to be is looked at in its first rows, not assumed: the separator by the header, the decimal point
+or comma by the numbers, and which other columns hold numbers at all. A cell that is no number is null; a
+row that does not fit is skipped. Both are counted by cause, and told once.
 """
 
 from __future__ import annotations
@@ -11,13 +12,14 @@ import datetime as dt
 import logging
 import math
 import re
+from collections import Counter
+from itertools import chain, islice
 from pathlib import Path
-from typing import TYPE_CHECKING, Callable, Iterator, Mapping, NamedTuple, Sequence
+from typing import TYPE_CHECKING, Any, Callable, Iterator, Mapping, NamedTuple, Sequence
 
-from contract import FAULT_CODES, Value
+from contract import FAULT_CODES, MAX_FIELDS, Value
 from device.errors import SourceError
 from device.sources.player import ORIGINAL, Message
-from device.sources.vesc_protocol import without_sensor
 
 if TYPE_CHECKING:
     from typing_extensions import Self
@@ -25,14 +27,23 @@ if TYPE_CHECKING:
 _log = logging.getLogger(__name__)
 
 TIME = "ms_today"
+GNSS_TIME = "gnss_posTime"
 _DAY_MS = 24 * 3600 * 1000
-# VESC Tool names its logs by when they were begun, in the local time that ms_today counts.
+# VESC Tool names its logs by when they were begun, in local time; the rows' time of day is UTC since 2019-09.
 _BEGUN = re.compile(r"\d{4}-\d\d-\d\d_\d\d-\d\d-\d\d")
 _BEGUN_FORMAT = "%Y-%m-%d_%H-%M-%S"
 _FIELD = re.compile(r"[A-Za-z][A-Za-z0-9_]*")
 _WHOLE = re.compile(r"[+-]?\d{1,18}", re.ASCII)
 _NUMBER = re.compile(r"[+-]?(\d+\.?\d*|\.\d+)([eE][+-]?\d+)?|[+-]?(nan|inf)", re.ASCII)
+# A number that only the one or the other decimal sign makes one.
+_WITH_COMMA = re.compile(r"[+-]?\d*,\d+", re.ASCII)
+_WITH_POINT = re.compile(r"[+-]?\d*\.\d+", re.ASCII)
 _FAULT_PREFIX = "FAULT_CODE_"
+
+# So many rows say what a log is.
+_FIRST_ROWS = 100
+# A fix is older than its row by up to three seconds, and a phone's clock may be off by as much again.
+_GNSS_APART_MS = 60_000
 
 Read = Callable[[float], Value]
 
@@ -53,7 +64,7 @@ _COLUMNS: dict[str, tuple[str, Read]] = {
     "temp_mos_1": ("ntc_temp_mos1", _as_is),
     "temp_mos_2": ("ntc_temp_mos2", _as_is),
     "temp_mos_3": ("ntc_temp_mos3", _as_is),
-    "temp_motor": ("temp_motor", without_sensor),
+    "temp_motor": ("temp_motor", _as_is),
     "current_motor": ("current_motor", _as_is),
     "current_in": ("current_input", _as_is),
     "d_axis_current": ("avg_id", _as_is),
@@ -72,6 +83,7 @@ _COLUMNS: dict[str, tuple[str, Read]] = {
     "d_axis_voltage": ("avg_vd", _as_is),
     "q_axis_voltage": ("avg_vq", _as_is),
 }
+_CONTRACTS = frozenset(name for name, _ in _COLUMNS.values())
 
 
 class _Column(NamedTuple):
@@ -83,18 +95,43 @@ class _Column(NamedTuple):
 
 
 class _BadRowError(ValueError):
-    """The row cannot be taken; the text says why."""
+    """The row cannot be taken: why, for people, and the cause that it is counted under."""
+
+    def __init__(self, cause: str, text: str) -> None:
+        super().__init__(text)
+        self.cause = cause
+
+
+class _BadCellError(ValueError):
+    """A cell is no number."""
 
 
 class VescLog:
-    """A log, opened anew for each round of the player; ``skipped`` counts the rows of all rounds."""
+    """A log, opened anew for each round of the player; what is counted is of all rounds."""
 
     def __init__(self, path: Path, stream: str, stamps: str) -> None:
-        self.skipped = 0
         self._path = path
         self._stream = stream
         self._stamps = stamps
         self._said: set[str] = set()
+        self._rows_read = self._clock_back = 0
+        self._skipped: Counter[str] = Counter()
+        self._bad_cells: Counter[str] = Counter()
+        self._dropped: list[str] = []
+        self._gnss_ahead_ms: int | None = None
+
+    def report(self) -> dict[str, Any]:
+        """Rows read; rows skipped by cause and cells that were null for being no number by column; rows
+        whose clock had gone back; columns without numbers; and how far ahead of the log's clock the first
+        position's time is."""
+        return {
+            "rows": self._rows_read,
+            "skipped": dict(self._skipped),
+            "bad_cells": dict(self._bad_cells),
+            "clock_back": self._clock_back,
+            "columns_left_out": list(self._dropped),
+            "gnss_ahead_ms": self._gnss_ahead_ms,
+        }
 
     def open(self) -> Self:
         """The log, to be entered."""
@@ -110,36 +147,76 @@ class VescLog:
 
     def __exit__(self, *_: object) -> None:
         self._file.close()
-        if self.skipped:
-            self._once("total", f"{self.skipped} rows have been skipped")
+        if self._skipped:
+            self._once("total", f"{sum(self._skipped.values())} rows have been skipped")
+        if self._clock_back:
+            self._once("back", f"the clock went back before {self._clock_back} rows")
 
     def _messages(self) -> Iterator[Message]:
-        rows = self._rows()
-        _, header = next(rows, (0, ""))
+        lines = self._lines()
+        _, header = next(lines, (0, ""))
         separator, names = self._header(header)
-        table = _Table(names)
+        rows = self._cells(lines, separator, len(names))
+        first_rows = list(islice(rows, _FIRST_ROWS))
+        table = _Table(names, [cells for _, cells in first_rows])
+        self._dropped = table.dropped
+        if table.width > MAX_FIELDS:
+            raise SourceError(
+                f"{self._path}: {table.width} of its columns hold numbers, and a sample has at most "
+                f"{MAX_FIELDS} fields: take columns out of the file"
+            )
+        if table.dropped:
+            self._once("dropped", f"columns that hold no numbers: {', '.join(table.dropped)}")
         elapsed = _Elapsed()
         base_ns = 0
-        for number, line in rows:
+        for number, cells in chain(first_rows, rows):
             try:
-                cells = _cells(line, separator, len(names))
-                ms_today, values = table.read(cells)
-                at_ms = elapsed.at(ms_today)
+                ms_today = table.time_of(cells)
             except _BadRowError as error:
-                self.skipped += 1
-                self._once("skipped", f"row {number} is skipped: {error}")
+                self._skip(number, error)
                 continue
+            at_ms, measured_ms = elapsed.at(ms_today)
             if elapsed.rows == 1:
                 base_ns = self._begin_ns(ms_today)
-                if table.dropped:
-                    self._once("dropped", f"columns that hold no numbers: {', '.join(table.dropped)}")
-            for what in table.odd:
-                self._once(what, f"row {number}: {what}")
-            yield Message(self._stream, at_ms * 1_000_000, base_ns + at_ms * 1_000_000, values)
+            self._clock_back += measured_ms < at_ms
+            values = table.read(cells)
+            for column, why in table.bad:
+                self._bad_cells[column] += 1
+                self._once(f"cell {column}", f"row {number}: {why}: null")
+            self._compare(ms_today, values.get(GNSS_TIME))
+            yield Message(self._stream, at_ms * 1_000_000, base_ns + measured_ms * 1_000_000, values)
         if not elapsed.rows:
             raise SourceError(f"{self._path}: there is no row in it that can be read")
 
-    def _rows(self) -> Iterator[tuple[int, str]]:
+    def _cells(
+        self, lines: Iterator[tuple[int, str]], separator: str, wanted: int
+    ) -> Iterator[tuple[int, list[str]]]:
+        for number, line in lines:
+            self._rows_read += 1
+            try:
+                yield number, _cells(line, separator, wanted)
+            except _BadRowError as error:
+                self._skip(number, error)
+
+    def _skip(self, number: int, error: _BadRowError) -> None:
+        self._skipped[error.cause] += 1
+        self._once("skipped", f"row {number} is skipped: {error}")
+
+    def _compare(self, ms_today: int, fix_ms: Value) -> None:
+        """Hold the first position's time, UTC whatever the device's clock says, against its row's."""
+        if self._gnss_ahead_ms is not None or not isinstance(fix_ms, (int, float)) or not fix_ms > 0:
+            return
+        # Over midnight, too: between minus and plus half a day.
+        ahead_ms = (round(fix_ms) - ms_today + _DAY_MS // 2) % _DAY_MS - _DAY_MS // 2
+        self._gnss_ahead_ms = ahead_ms
+        if abs(ahead_ms) > _GNSS_APART_MS:
+            self._once(
+                "gnss",
+                f"the clock of the log is {-ahead_ms / 1000:+.0f} s off, by the first position's time "
+                f"({GNSS_TIME}); VESC Tool of before September 2019 wrote local time",
+            )
+
+    def _lines(self) -> Iterator[tuple[int, str]]:
         """The lines that are not empty, numbered as an editor does."""
         try:
             for number, line in enumerate(self._file, 1):
@@ -176,12 +253,11 @@ class VescLog:
                 f"{self._path}: `stamps: original` needs the day, and rows hold only the time of day: name "
                 "the file by when it was begun, as VESC Tool does (2024-06-12_00-34-31.csv)"
             )
-        midnight = named.replace(hour=0, minute=0, second=0)
-        # The first row may come after the midnight that the file was opened before.
-        named_ms = (named - midnight) // dt.timedelta(milliseconds=1)
-        days = 1 if named_ms - ms_today > _DAY_MS // 2 else 0
-        first = midnight + dt.timedelta(days=days, milliseconds=ms_today)
-        return round(first.timestamp() * 1000) * 1_000_000
+        # The name is local time, by this machine's zone, and the row UTC without a date: of the dates around
+        # the name's, the one that comes nearest to it. So a zone that is wrong by hours does no harm.
+        named_ms = round(named.timestamp() * 1000)
+        days = round((named_ms - ms_today) / _DAY_MS)
+        return (days * _DAY_MS + ms_today) * 1_000_000
 
     def _once(self, key: str, text: str) -> None:
         if key not in self._said:
@@ -195,7 +271,7 @@ def _cells(line: str, separator: str, wanted: int) -> list[str]:
     if len(cells) == wanted + 1 and not cells[-1].strip():
         cells.pop()
     if len(cells) != wanted:
-        raise _BadRowError(f"{len(cells)} columns, and the first line names {wanted}")
+        raise _BadRowError("columns", f"{len(cells)} columns, and the first line names {wanted}")
     return [cell.strip() for cell in cells]
 
 
@@ -207,7 +283,8 @@ class _Elapsed:
         self._first = self._last = 0
         self._days = 0
 
-    def at(self, ms_today: int) -> int:
+    def at(self, ms_today: int) -> tuple[int, int]:
+        """As it passed, and as the log's clock said it; the latter is less where that clock was set back."""
         if not self.rows:
             self._first = self._last = ms_today
         elif self._last - ms_today > _DAY_MS // 2:
@@ -216,75 +293,82 @@ class _Elapsed:
         # A clock set back a little: no time passes until it has caught up.
         self._last = max(self._last, ms_today)
         self.rows += 1
-        return self._days * _DAY_MS + self._last - self._first
+        begun = self._days * _DAY_MS - self._first
+        return begun + self._last, begun + ms_today
 
 
 class _Table:
-    """The columns, and how their cells are read. Which ones hold numbers, the first good row tells."""
+    """The columns, and how their cells are read, as far as the first rows tell. ``bad`` are the columns of
+    the row last read whose cell is no number, and why."""
 
-    def __init__(self, names: Sequence[str]) -> None:
-        self.dropped: list[str] = []
-        self.odd: list[str] = []
+    def __init__(self, names: Sequence[str], first_rows: Sequence[Sequence[str]]) -> None:
+        self.bad: list[tuple[str, str]] = []
         self._time = names.index(TIME)
-        self._decimal = ""
-        self._columns = [
+        cells = [cell for row in first_rows for cell in row]
+        commas = sum(map(bool, map(_WITH_COMMA.fullmatch, cells)))
+        points = sum(map(bool, map(_WITH_POINT.fullmatch, cells)))
+        self._comma = commas > points
+        columns = [
             _Column(i, name, *_COLUMNS.get(name, (name, _as_is)), known=name in _COLUMNS)
             for i, name in enumerate(names)
             if name != TIME
         ]
-        self._settled = False
+        self._columns = [column for column in columns if self._fits(column, first_rows)]
+        self.dropped = [column.label or "(no name)" for column in columns if column not in self._columns]
 
-    def read(self, cells: Sequence[str]) -> tuple[int, Mapping[str, Value]]:
-        """The time of day in milliseconds, and the sample. Raises `_BadRowError`."""
-        self.odd = []
-        decimal = self._decimal_of(cells)
-        ms_today = self._number(cells[self._time], decimal, TIME)
+    @property
+    def width(self) -> int:
+        """How many columns are fields."""
+        return len(self._columns)
+
+    def time_of(self, cells: Sequence[str]) -> int:
+        """The row's time of day in milliseconds. Raises `_BadRowError`."""
+        try:
+            ms_today = self._number(cells[self._time], TIME)
+        except _BadCellError as error:
+            raise _BadRowError("time", str(error)) from error
         if ms_today is None or not 0 <= ms_today < _DAY_MS:
-            raise _BadRowError(f"{TIME} is {cells[self._time]!r}, and a day has {_DAY_MS} ms")
-        columns, dropped = (self._columns, self.dropped) if self._settled else self._settle(cells, decimal)
-        values = {column.name: self._value(column, cells[column.at], decimal) for column in columns}
-        # Only a row that is good to its end says anything about the others.
-        self._settled, self._columns, self.dropped, self._decimal = True, columns, dropped, decimal
-        return int(ms_today), values
+            raise _BadRowError(
+                "time", f"{TIME} is {cells[self._time]!r}, and must be from 0 to {_DAY_MS - 1}"
+            )
+        return int(ms_today)
 
-    def _settle(self, cells: Sequence[str], decimal: str) -> tuple[list[_Column], list[str]]:
-        taken = {name for name, _ in _COLUMNS.values()}
-        kept: list[_Column] = []
-        dropped: list[_Column] = []
-        for column in self._columns:
-            fits = column.known or (_FIELD.fullmatch(column.name) and column.name not in taken)
-            try:
-                if not column.known:
-                    self._number(cells[column.at], decimal, column.label)
-            except _BadRowError:
-                fits = False
-            (kept if fits else dropped).append(column)
-        return kept, [column.name or "(no name)" for column in dropped]
+    def read(self, cells: Sequence[str]) -> Mapping[str, Value]:
+        """The sample."""
+        self.bad = []
+        return {column.name: self._value(column, cells[column.at]) for column in self._columns}
 
-    def _value(self, column: _Column, cell: str, decimal: str) -> Value:
+    def _fits(self, column: _Column, rows: Sequence[Sequence[str]]) -> bool:
+        """Whether a column can be a field: another than the contract's has a name that can be one, and a
+        number in any of the rows, or no cell that is none."""
+        if column.known:
+            return True
+        if not _FIELD.fullmatch(column.name) or column.name in _CONTRACTS:
+            return False
+        filled = [row[column.at] for row in rows if row[column.at]]
+        return not filled or any(_NUMBER.fullmatch(self._plain(cell)) for cell in filled)
+
+    def _value(self, column: _Column, cell: str) -> Value:
         if column.name == "fault_code" and cell[:1].isalpha():
             code = FAULT_CODES.get(cell[len(_FAULT_PREFIX) :] if cell.startswith(_FAULT_PREFIX) else cell)
             if code is None:
-                self.odd.append(f"no such fault is known as {cell!r}")
+                self.bad.append((column.label, f"no such fault is known as {cell[:40]!r}"))
             return code
-        number = self._number(cell, decimal, column.label)
+        try:
+            number = self._number(cell, column.label)
+        except _BadCellError as error:
+            self.bad.append((column.label, str(error)))
+            return None
         return None if number is None else column.read(number)
 
-    def _decimal_of(self, cells: Sequence[str]) -> str:
-        """The decimal sign of the log, once a cell has one."""
-        if self._decimal:
-            return self._decimal
-        signs = {sign for cell in cells for sign in ".," if sign in cell}
-        if len(signs) > 1:
-            raise _BadRowError("both point and comma stand in numbers")
-        return signs.pop() if signs else ""
-
-    @staticmethod
-    def _number(cell: str, decimal: str, name: str) -> float | None:
+    def _number(self, cell: str, name: str) -> float | None:
         if not cell:
             return None
-        # In a log with commas, a point separates nothing that we know of.
-        plain = cell.replace(".", "?").replace(",", ".") if decimal == "," else cell
+        plain = self._plain(cell)
         if not _NUMBER.fullmatch(plain):
-            raise _BadRowError(f"{name} is {cell[:40]!r}, which is no number")
+            raise _BadCellError(f"{name} is {cell[:40]!r}, which is no number")
         return int(plain) if _WHOLE.fullmatch(plain) else float(plain)
+
+    def _plain(self, cell: str) -> str:
+        # In a log with commas, a point separates nothing that we know of.
+        return cell.replace(".", "?").replace(",", ".") if self._comma else cell

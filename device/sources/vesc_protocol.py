@@ -27,9 +27,6 @@ _LONG_FROM = 255
 _MAX_FRAME = MAX_PAYLOAD + 6
 _MAX_BUFFER = 4 * _MAX_FRAME
 
-# A motor without a temperature sensor reads as colder than this, down to -273.
-NO_SENSOR_DEGC = -50.0
-
 
 class ProtocolError(ValueError):
     """A payload that is not what it should be; the text says what it is."""
@@ -255,19 +252,10 @@ LAYOUTS: dict[int, Decode] = dict(
 def decode_values(payload: bytes) -> dict[str, Value]:
     """The sample in an answer to COMM_GET_VALUES, in the contract's names and units.
 
-    A motor without a temperature sensor has None for ``temp_motor``. Raises `ProtocolError` for a
-    length that no known firmware sends.
+    Raises `ProtocolError` for a length that no known firmware sends.
     """
     decode = LAYOUTS.get(len(payload))
     if decode is None or payload[0] != COMM_GET_VALUES:
         known = ", ".join(map(str, sorted(LAYOUTS)))
         raise ProtocolError(f"values of {len(payload)} bytes; known are those of {known}")
-    values = decode(payload)
-    if "temp_motor" in values:
-        values["temp_motor"] = without_sensor(values["temp_motor"])
-    return values
-
-
-def without_sensor(degc: Value) -> Value:
-    """The motor's temperature, or None where what is measured is that there is no sensor."""
-    return None if isinstance(degc, (int, float)) and degc <= NO_SENSOR_DEGC else degc
+    return decode(payload)

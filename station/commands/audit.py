@@ -9,10 +9,11 @@ from typing import Annotated, Any
 
 import typer
 from rich.console import Console
+from rich.markup import escape
 from rich.table import Table
 
-from contract import OWN_STREAMS, VESC_STREAM, ContractError, check_robot, check_stream
-from station import audit
+from contract import ContractError, check_robot, check_stream
+from station import accounts, audit, inventory
 from station.audit import Audit, Range
 from station.commands.options import bounds
 from station.errors import StationError
@@ -44,35 +45,49 @@ def audit_(
     ] = False,
     as_json: Annotated[bool, typer.Option("--json", help="As JSON.")] = False,
 ) -> None:
-    """Prove delivery: batch numbers expected, stored, missing, twice, late, by run of the agent.
+    """Prove delivery, of every stream that the robot has, by run of its agent.
 
-    Exit status 0 if every stream is complete, 1 if something is missing or nothing is stored.
+    Batch numbers are looked at, and the samples that are stored are held against those that the agent says it
+    took; what it did not record is told by cause. Exit status 0 if every stream is complete and nothing was
+    left out, 1 otherwise, or if nothing is stored.
     """
     within = Range(*bounds(start, end, last, time.time_ns() // 1000))
     cloud = context.obj.cloud()
     try:
         check_robot(robot)
-        names = [check_stream(name) for name in streams or ()] or sorted({VESC_STREAM, *OWN_STREAMS})
+        names = [check_stream(name) for name in streams or ()] or inventory.known(cloud, robot)
     except ContractError as error:
         raise StationError(str(error)) from error
     figures = audit.last_figures(cloud, robot)
-    found = []
+    found, now_us = [], time.time_ns() // 1000
+    told = accounts.accounts(cloud, robot)
     with _errors.status("reading") as status:
         for name in names:
             counted = _counting(audit.headers(cloud, robot, name, within), name, status)
             one = audit.audit(name, counted, late_ms=duration_us(late) // 1000, from_start=from_start)
-            if one.runs or one.refused or streams:
+            # A part of a run cannot be held against what the whole of it took.
+            if within == Range():
+                one = accounts.held_against(one, told, now_us)
+            if one.runs or one.refused or one.shortfalls or streams:
                 found.append(one)
     in_car, dropped = (_count(figures.get(name)) for name in ("backlog_batches", "dropped_batches"))
     found = [replace(one, in_car=in_car, dropped=dropped) for one in found]
+    causes = {} if streams else {boot: run.not_recorded() for boot, run in told.items() if run.not_recorded()}
     if as_json:
-        _out.print_json(json.dumps([_as_json(one) for one in found]))
+        answer = {"streams": [_as_json(one) for one in found], "not_recorded": causes}
+        _out.print_json(json.dumps(answer))
     elif not found:
         _errors.print(f"nothing of {robot} is stored in this range")
     else:
         for one in found:
             _show(one)
-    raise typer.Exit(0 if found and all(one.complete for one in found) else 1)
+        for boot, sources in causes.items():
+            for source, counts in sources.items():
+                _out.print(f"[red]run {boot[:8]}, {escape(source)}: not recorded[/]")
+                for cause, count in counts.items():
+                    _out.print(f"  {count:,} {escape(cause)}")
+    complete = found and not causes and all(one.complete for one in found)
+    raise typer.Exit(0 if complete else 1)
 
 
 def _count(value: float | None) -> int | None:
@@ -103,6 +118,9 @@ def _show(one: Audit) -> None:
         _out.print(
             f"  the first stored number is {one.before_first:,}: before it is expired, out of range or lost"
         )
+    for boot, samples, cause in one.shortfalls:
+        count = "samples" if samples is None else f"{samples:,} samples"
+        _out.print(f"  [red]run {boot[:8]}: {count} {cause}[/]")
     if one.refused:
         _out.print(f"  [red]{one.refused:,} items are not batches[/]")
     if one.in_car:
@@ -112,7 +130,11 @@ def _show(one: Audit) -> None:
 
 
 def _said(one: Audit) -> str:
-    return "[green]complete[/]" if one.complete else f"[bold red]{one.missing:,} batches missing[/]"
+    told = "" if one.taken is None else f" ({one.taken:,} samples taken by the agent)"
+    if one.complete:
+        return f"[green]complete[/]{told}"
+    what = f"{one.missing:,} batches missing" if one.missing else "not complete"
+    return f"[bold red]{what}[/]{told}"
 
 
 def _table(one: Audit) -> Table:
@@ -143,11 +165,18 @@ def _table(one: Audit) -> Table:
 def _as_json(one: Audit) -> dict[str, Any]:
     runs = [
         {
-            **asdict(run),
+            **{name: value for name, value in asdict(run).items() if name != "samples_of"},
             "expected": run.expected,
             "missing_batches": sum(gap.batches for gap in run.missing),
             "missing": [gap._asdict() for gap in run.missing],
         }
         for run in one.runs
     ]
-    return {**asdict(one), "runs": runs, "missing": one.missing, "complete": one.complete}
+    shortfalls = [short._asdict() for short in one.shortfalls]
+    return {
+        **asdict(one),
+        "runs": runs,
+        "shortfalls": shortfalls,
+        "missing": one.missing,
+        "complete": one.complete,
+    }

@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 from rich.console import Console
 
+from contract import NO_SENSOR_DEGC
 from station.commands.options import Every, From, Last, Range, Robot, Stream, To, names
 from station.errors import StationError
 from station.progress import reading, say
@@ -98,6 +99,9 @@ def query(
     _write(result, Format.jsonl if as_json else form, output)
     if result.refused:
         say(f"{result.refused} stored items are no batches and were left out; the first: {result.reason}")
+    if result.absent:
+        counted = ", ".join(f"{name} {count:,}" for name, count in sorted(result.absent.items()))
+        say(f"null because their sensor is not fitted ({NO_SENSOR_DEGC:g} degC and below): {counted}")
     say(f"{len(result):,} {'seconds' if summary and not every else 'samples'} in {took_s:.2f} s")
     if not len(result) and (extent := inventory.extent(cloud, robot, stream)):
         say(f"none in this range; {robot} has {stream} from {extent[0]} to {extent[1]}")

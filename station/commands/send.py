@@ -28,7 +28,9 @@ def send(
     message: Annotated[str, typer.Argument(help="The ROS message as JSON, by its type's own fields.")],
     lease_ms: Annotated[
         int | None,
-        typer.Option(min=1, max=MAX_LEASE_MS, help="What moves the robot needs one: for how long it may."),
+        typer.Option(
+            min=1, max=MAX_LEASE_MS, help="What moves the robot needs one: for how long it may, from now."
+        ),
     ] = None,
     valid_ms: Annotated[
         int, typer.Option(min=1, max=MAX_VALID_MS, help="Refused when it arrives later than this.")

@@ -58,8 +58,9 @@ def cars(graph: Graph) -> Cars:
 
 
 def samples(collector: Process, stream: str = "wheel") -> list[tuple[int, dict[str, Any]]]:
-    found = [json.loads(line) for line in list(collector.lines)]
-    return [(s[1], s[2]) for s in found if isinstance(s, list) and s[0] == stream]
+    # rospy prints a line of its own where it is told to end.
+    found = [json.loads(line) for line in list(collector.lines) if line.startswith("[")]
+    return [(s[1], s[2]) for s in found if s[0] == stream]
 
 
 def turns(collector: Process, stream: str = "wheel") -> list[int]:
@@ -176,14 +177,6 @@ def test_use_sim_time_is_seen_while_running(cars: Cars) -> None:
     until_turns(collector, 5)
     cars.graph.parameter("/use_sim_time", True)
     collector.until_said("/use_sim_time")
-
-
-def test_another_node_of_the_same_name_ends_the_source(cars: Cars) -> None:
-    collector = cars.collector()
-    cars.publisher("pub")
-    until_turns(collector, 5)
-    cars.publisher("iort_agent", topic="/elsewhere")
-    collector.until_said("another node took its name")
 
 
 def test_decoding_agrees_with_genpy(graph: Graph) -> None:

@@ -23,7 +23,7 @@ DRIVE = {
     "topic": "/speed",
     "type": "std_msgs/Float64",
     "max_age_s": 60,
-    "motion": {"lease_s": 0.5, "stop": {"data": 0.0}},
+    "motion": {"lease_s": 2, "stop": {"data": 0.0}},
 }
 
 
@@ -94,7 +94,7 @@ def test_two_robots_see_each_others_poses_and_take_commands(
     topic = contract.build_topic(contract.CMD, cars[0].robot, "drive", embedded.namespace)
     while 1.5 not in [m["data"] for m in messages(driver)]:
         command = contract.Command(
-            "feedbeef", started_us, seq, time.time_ns() // 1000, 60_000, {"data": 1.5}, 300
+            "feedbeef", started_us, seq, time.time_ns() // 1000, 60_000, {"data": 1.5}, 2000
         )
         operator.publish(topic=topic, qos=1, payload=contract.encode_command(command))
         seq += 1
@@ -103,7 +103,7 @@ def test_two_robots_see_each_others_poses_and_take_commands(
     driver.until(lambda: messages(driver)[-1]["data"] == 0, "stop")
 
     # And by `iort send`, which knows what became of it.
-    sent = iort("send", cars[0].robot, "drive", '{"data": 2.5}', "--lease-ms", "300", "--valid-ms", "60000",
+    sent = iort("send", cars[0].robot, "drive", '{"data": 2.5}', "--lease-ms", "2000", "--valid-ms", "60000",
                 "--seconds", "60")  # fmt: skip
     assert sent.exit_code == 0, sent.output + str(sent.exception) + "\n".join(agents[0].errors)
     assert "has accepted drive" in sent.output

@@ -87,6 +87,9 @@ class FakeGraph:
     def hear(self, topic: str, kind: str, data: bytes) -> None:
         self._handlers[topic]({"type": kind, "message_definition": TYPES[kind]}, data)
 
+    def waits(self) -> str | None:
+        return None
+
     def start(self) -> None:
         self.closed = False
 

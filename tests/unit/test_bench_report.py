@@ -187,6 +187,7 @@ def test_plots_are_small_xml_and_the_same_every_time():
     for svg in (
         first,
         plots.lines("L", [1, 10], {"a": [1, 2]}, x_label="x", y_label="y", log=True),
+        plots.ranges("R", ["a", "b"], {"x": {"a": (1, 2), "b": (3, 3)}, "y": {"b": (4, 5)}}, unit="ms"),
         plots.points("P", {"a": ([1, 2], [3, 4])}, x_label="x", y_label="y", shaded=(1, 2)),
     ):
         assert ET.fromstring(svg).tag.endswith("svg")

@@ -2,14 +2,19 @@
 
 from __future__ import annotations
 
+import json
+
 import pytest
 
-from bench import invocations
+from bench import far, invocations, mixed_robot, thesis
 from bench.invocations import Measured
+from bench.lines import RAW
 from bench.probes.ground import No
 from bench.result import Section
-from bench.sections import SECTIONS, abilities, outage, query, utilisation
+from bench.sections import SECTIONS, abilities, mixed, outage, query, utilisation
 from bench.sections.utilisation import BATCHES
+from contract import BROKER, LAMBDA, RULE, Batch, encode, live_topic, record_topic
+from contract.ros1.definition import parse
 
 
 def test_report_lines_of_lambda_are_read():
@@ -98,6 +103,122 @@ def test_a_probe_that_raises_is_a_no_and_says_what_was_seen():
         (lambda _: "it did", ("yes", "it did")),
     ):
         assert abilities._answer(abilities.Probe("s", "a", "-", ask), None) == answer
+
+
+def test_what_the_thesis_says_stands_beside_each_ability():
+    entries = {
+        f"{criterion}: {entry}"
+        for table in thesis.TABLES
+        for row in table.rows.values()
+        for criterion, entry in zip(table.criteria, row, strict=True)
+    }
+    by_ability = {probe.ability: probe.thesis for probes in abilities.PROBES.values() for probe in probes}
+    for said in by_ability.values():
+        assert said.removeprefix("Lambda's ") in {*entries, thesis.UNSAID}
+    assert by_ability["transforms messages by rule"] == "compute: partially (SQL only)"
+    assert by_ability["paid by request, no capacity to set"] == "elasticity: limited (stream shards)"
+    assert by_ability["pushes to a dashboard"] == thesis.UNSAID
+    with pytest.raises(KeyError):
+        thesis.said(thesis.ROS, "colour")
+
+
+def test_the_thesis_tables_are_in_the_report_with_their_source():
+    table = thesis.FUNCTIONALITY.as_table()
+    assert table.title == "KTH thesis of 2018, table 6.1: functionality"
+    assert ["Lambda", "no", "yes (disk 512 MB)", "no", "own"] in table.rows
+    assert all(len(row) == len(one.criteria) for one in thesis.TABLES for row in one.rows.values())
+
+
+def test_round_trips_with_the_thesis_ping_stand_beside_its_figures():
+    took_ms = {BROKER: 52.0, RULE: 53.0, LAMBDA: 58.0, RAW: 51.0}
+    found = {f"{way} at {hz} Hz": [[ms] * 3] * 3 for way, ms in took_ms.items() for hz in far.RATES_HZ}
+    section = Section("round_trips", "")
+    far.report(section, {**found, far.DASHBOARD: [[60.0] * 3], far.ECHO: [[50.5] * 3]})
+    rows = {row[0]: row[1:] for row in section.tables[0].rows}
+    ten_hz = {name: (row[1], row[-1]) for name, row in rows.items()}
+    assert ten_hz["robot - broker, with 25 ms each way"] == ("52.0 ms (p95 52.0, p99 52.0)", "50 - 60 ms")
+    assert ten_hz["robot - rule, with 25 ms each way"][1] == "100 - 110 ms"
+    assert ten_hz["robot - lambda, with 25 ms each way"][1] == "150 - 200 ms"
+    assert ten_hz["floor: raw MQTT client, with 25 ms each way"][0].startswith("51.0 ms")
+    assert ten_hz["car to PubNub subscriber, with 25 ms each way"][1] == "250 - 300 ms"
+    values = {ratio.name: ratio.value for ratio in section.ratios}
+    assert values["broker round trip / raw MQTT client, with 25 ms each way"] == 1.02
+    assert values["robot - broker with 25 ms each way / thesis' 60 ms"] == 0.867
+    assert values["car to subscriber with 25 ms each way / thesis' 300 ms"] == 0.2
+
+
+def test_a_query_stands_beside_the_thesis_query_at_the_same_place():
+    section = Section("query", "")
+    ways = {name: query.Way([1.0], [0.5], [], query.POINTS) for name in query.THESIS_S}
+    query._report(section, ways)
+    theirs = {row[0]: row[-1] for row in section.tables[0].rows}
+    assert theirs[query.OURS_QUERY] == theirs[query.THESIS_QUERY] == "6.1 s"
+    assert theirs[query.OURS_SCAN] == theirs[query.THESIS_SCAN] == "14.1 s"
+    assert theirs[query.LAMBDA_QUERY] == "5.5 s (512 MB)"
+    hour = query.Way([1.0], [0.5], [], query.HOUR_POINTS)
+    assert query._row(query.OURS_QUERY, hour)[-1] == "-", "the thesis read no hour"
+
+
+def test_mixed_robot_has_the_types_that_its_definitions_say():
+    for topic in mixed_robot.topics().values():
+        assert parse(topic.kind, topic.definition).kind == topic.kind
+    by_name = mixed_robot.topics()
+    assert by_name["/imu"].rate_hz == 1000
+    assert by_name["/map"].rate_hz == 0, "latched"
+    assert [name for name, one in by_name.items() if one.time == mixed_robot.ARRIVAL] == [
+        "/tf",
+        "/tick",
+        "/contact",
+    ]
+
+
+def mixed_run(arrived):
+    found = mixed.Found(seconds=mixed.SECONDS, bag_bytes=4000, bag_bz2_bytes=2000)
+    found.published.update({"/tf": 60, "/imu": 40})
+    found.recorded.update({"/tf": 60, "/imu": 40})
+    found.cpu_s = {mixed.RECORDER: 0.1, mixed.AGENT: 0.3, mixed.FLOOR: 0.2}
+    found.rss_mb = dict.fromkeys(found.cpu_s, 50.0)
+    found.agent = {"sources": [{"source": "ROS 1", "/scan": {"messages": 5, "left_out": {"ranges": 5}}}]}
+    mixed.count(found, arrived, ended=100.0)
+    return found
+
+
+def batch(seq, n):
+    return encode(Batch("0badcafe", seq, [1_700_000_000_000_000 + i for i in range(n)], {"x": [1.0] * n}))
+
+
+def test_mixed_robot_counts_a_batch_once_and_what_came_late():
+    tf, imu = record_topic("bench", "tf"), record_topic("bench", "imu")
+    found = mixed_run(
+        [
+            (99.0, tf, batch(0, 30)),
+            (99.5, tf, batch(0, 30)),
+            (103.0, tf, batch(1, 20)),
+            (99.0, imu, batch(0, 40)),
+            (99.0, live_topic("bench", "imu"), b"live"),
+            (99.0, record_topic("bench", "agent"), batch(0, 1)),
+        ]
+    )
+    assert found.arrived == {"/tf": 50, "/imu": 40}
+    assert (found.batches, found.late) == (4, 20)
+    assert found.lane_bytes["live"] == 4
+    assert found.lost(found.arrived) == 10
+    assert found.lost({"/tf": 90, "/imu": 40}) == 0
+
+
+def test_mixed_robot_is_held_to_what_it_lost_and_left_out():
+    sent = batch(0, 60)
+    section = Section("mixed", "")
+    mixed.report(section, mixed_run([(99.0, record_topic("bench", "tf"), sent)]))
+    values = {ratio.name.removeprefix("mixed robot: "): ratio for ratio in section.ratios}
+    assert values["messages that the agent lost"].value == 40
+    assert values["messages that the agent lost"].reached is False
+    assert values["fields that the agent left out"].value == 5
+    assert values["the agent's processor / rosbag record's"].value == 3.0
+    assert values["the agent's processor / a bare rospy subscriber's"].value == 1.5
+    assert values["bytes published / bytes of the bag"].value == round(len(sent) / 4000, 3)
+    assert any("not sent" in note for note in section.notes)
+    json.dumps(section.as_json())
 
 
 def test_every_section_of_the_documentation_is_one_that_runs():

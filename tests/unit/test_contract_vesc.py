@@ -78,3 +78,24 @@ def test_faults_are_the_firmwares_whole_list():
     assert contract.FAULT_CODES["ABS_OVERSPEED"] == 33
     assert len(set(contract.FAULTS.values())) == 34
     assert set(contract.FAULT_CODES.values()) == contract.FAULTS.keys()
+
+
+@pytest.mark.parametrize(
+    ("field", "value", "expected"),
+    [
+        ("temp_motor", -273.15, True),
+        ("temp_motor", -50, True),
+        ("temp_motor", -49.9, False),
+        ("temp_motor", 0, False),
+        ("temp_motor", None, False),
+        ("temp_motor", False, False),
+        ("temp_motor", "-273", False),
+        ("temp_motor", float("nan"), False),
+        ("temperature_pcb", -60.0, True),
+        ("ntc_temp_mos3", -60.0, True),
+        ("current_motor", -60.0, False),
+        ("temperature_outside", -60.0, False),
+    ],
+)
+def test_a_sensor_that_is_not_fitted(field, value, expected):
+    assert contract.absent(field, value) is expected

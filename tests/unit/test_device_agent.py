@@ -18,6 +18,7 @@ from device.errors import SourceError
 from device.loopback import Loopback, Published
 from device.main import main
 from device.sources import Emit
+from device.sources.bag import BagConfig
 from device.spool import REJECT_NEW, MemorySpool
 from device.uplink import matches
 
@@ -140,10 +141,63 @@ def test_a_source_that_fails_does_not_take_the_others_with_it(
     assert text in caplog.text
 
 
+def give_nothing(emit: Emit, stop: threading.Event) -> None:
+    pass
+
+
+def give_too_wide(emit: Emit, stop: threading.Event) -> None:
+    for i in range(3):
+        emit("vesc", T0 + i, dict.fromkeys((f"x{i}" for i in range(contract.MAX_FIELDS + 1)), 1.0))
+
+
+@pytest.mark.parametrize(
+    ("run", "why"),
+    [(give_nothing, "it gave no sample"), (give_too_wide, "none of its 3 samples could be stored")],
+)
+def test_a_source_that_ends_with_nothing_stored_has_failed(
+    run: Any, why: str, caplog: pytest.LogCaptureFixture
+) -> None:
+    rig = Rig(run)
+    assert rig.agent.run(drain_s=10) == 1
+    assert rig.agent.report()["failed_sources"] == ["script"]
+    assert f"source failed: script: {why}" in caplog.text
+
+
+def test_one_sample_that_is_refused_is_no_failure() -> None:
+    def both(emit: Emit, stop: threading.Event) -> None:
+        give_too_wide(emit, stop)
+        drive(emit, stop)
+
+    rig = Rig(both)
+    assert rig.agent.run(drain_s=10) == 0
+    assert rig.agent.report()["streams"]["vesc"]["refused"] == 3
+
+
+def test_a_source_that_was_stopped_before_its_first_sample_has_not_failed() -> None:
+    def wait(emit: Emit, stop: threading.Event) -> None:
+        rig.agent.stop()
+        assert stop.wait(10)
+
+    rig = Rig(wait)
+    assert rig.agent.run(drain_s=10) == 0
+
+
+def test_a_log_with_too_many_columns_is_a_failure_that_says_so(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    path = tmp_path / "ride.csv"
+    names = [f"x{i}" for i in range(754)]
+    path.write_text("\n".join([";".join(["ms_today", *names]), ";".join(["1000", *["1"] * 754])]) + "\n")
+    rig = Rig(sources=(BagConfig(path=path),))
+    assert rig.agent.run(drain_s=10) == 1
+    assert "754 of its columns hold numbers" in caplog.text
+
+
 def test_round_trips_are_recorded_like_any_stream() -> None:
     enough = threading.Event()
 
     def wait_for_pings(emit: Emit, stop: threading.Event) -> None:
+        emit("vesc", T0, {"speed": 1})
         assert enough.wait(10)
 
     rig = Rig(wait_for_pings, ping=PingConfig(rate_hz=20, paths=("broker",)))
@@ -203,6 +257,7 @@ def test_its_own_figures_are_a_stream() -> None:
     seen = threading.Event()
 
     def wait(emit: Emit, stop: threading.Event) -> None:
+        emit("vesc", T0, {"speed": 1})
         assert seen.wait(10)
 
     rig = Rig(wait, metrics=MetricsConfig(every_s=0.1), record=RecordConfig(batch_s=0))
@@ -245,6 +300,17 @@ def config_file(folder: Path, source: str, more: str = "") -> Path:
 def test_the_command_checks_a_configuration(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["--config", str(config_file(tmp_path, "{type: sim}")), "--check-config"]) == 0
     assert "good, robot car1, 1 source" in capsys.readouterr().out
+
+
+def test_roslaunchs_remappings_are_no_wrong_use(tmp_path: Path) -> None:
+    config = str(config_file(tmp_path, "{type: sim}"))
+    remappings = ["__name:=x", "__log:=/tmp/y.log", "/from:=/to", "~from:=to", "from:=/to", "_rate:=5"]
+    assert main(["--config", config, *remappings, "--check-config"]) == 0
+    for wrong in ("1from:=/to", "/a:=/b:=/c", "from:/to"):
+        with pytest.raises(SystemExit):
+            main(["--config", config, "--check-config", wrong])
+    with pytest.raises(SystemExit):
+        main(["status", "--config", config, "__name:=x"])
 
 
 def test_a_wrong_configuration_is_a_message_and_status_2(

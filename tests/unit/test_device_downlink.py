@@ -95,9 +95,22 @@ def test_a_deadline_is_judged_by_the_clouds_clock_and_what_may_be_too_old_is() -
         cloud_us = rig.clock.now_us() + hour * 3_600_000_000
         for age_us in (0, 400_000, 400_001):
             sent_us = cloud_us - age_us
-            rig.send({"data": 1.0}, started_us=T0 - 7_200_000_000, sent_us=sent_us, valid_ms=500)
+            times = {"started_us": T0 - 7_200_000_000, "sent_us": sent_us, "valid_ms": 500}
+            rig.send({"data": "hello"}, name="say", lease_ms=None, **times)
     assert len(rig.graph.published) == 4
-    assert rig.refused() == {"cmd/iort/car1/speed stale": 2}
+    assert rig.refused() == {"cmd/iort/car1/say stale": 2}
+
+
+def test_what_waited_in_a_frozen_car_drives_no_further_than_its_lease() -> None:
+    rig = Rig()
+    waiting = [T0 + i * 100_000 for i in range(20)]
+    rig.clock.advance(2)
+    for sent_us in waiting:
+        rig.send({"data": 1.0}, started_us=T0, sent_us=sent_us, valid_ms=60_000)
+    # Sent 0.2 and 0.1 s ago, with 0.3 s each: the last word holds for 0.2 s more.
+    assert len(rig.graph.published) == 2
+    assert rig.refused() == {"cmd/iort/car1/speed stale": 10, "cmd/iort/car1/speed lease_over": 8}
+    assert rig.downlink.tick() == pytest.approx(0.2)
 
 
 def test_a_car_that_does_not_know_the_clouds_time_does_not_move_but_speaks(
@@ -155,6 +168,8 @@ def test_halt_stops_the_car_and_takes_no_more_commands() -> None:
     rig.send({"data": 2.5})
     assert rig.refused() == {"cmd/iort/car1/speed shutting_down": 1}
     rig.downlink.close()
+    assert rig.graph.published[1:] == [STOP] * 5, "who hears badly hears one of five"
+    assert rig.clock.monotonic() == pytest.approx(1001)
     assert rig.graph.closed
 
 

@@ -12,6 +12,7 @@ from contract import Command
 from device.leases import (
     CLOSED,
     EARLY,
+    LEASE_OVER,
     NO_LEASE,
     REPEATED,
     STALE,
@@ -40,7 +41,10 @@ def command(seq: int = 0, **changes: Any) -> Command:
     ("changes", "refusal"),
     [
         ({}, None),
-        ({"sent_us": T0 - 800_000}, None),
+        ({"sent_us": T0 - 299_999}, None),
+        ({"sent_us": T0 - 300_000}, LEASE_OVER),
+        ({"sent_us": T0 - 499_999, "lease_ms": 10_000}, None),
+        ({"sent_us": T0 - 500_000, "lease_ms": 10_000}, LEASE_OVER),
         ({"sent_us": T0 - 800_001}, STALE),
         ({"sent_us": T0 - 1_000_001, "valid_ms": 60_000}, STALE),
         ({"sent_us": T0 + 500_000}, None),
@@ -90,6 +94,19 @@ def test_the_robots_own_limit_is_the_shorter_one() -> None:
     leases = Leases(LIMITS)
     leases.offer(command(lease_ms=10_000), now_us=T0, wrong_us=0, now=0)
     assert leases.next_due() == 0.5
+
+
+@pytest.mark.parametrize(("age_us", "wrong_us"), [(200_000, 0), (50_000, 150_000), (0, 200_000)])
+def test_the_lease_runs_from_when_the_command_may_have_been_sent(age_us: int, wrong_us: int) -> None:
+    leases = Leases(LIMITS)
+    assert leases.offer(command(sent_us=T0 - age_us), now_us=T0, wrong_us=wrong_us, now=7) is None
+    assert leases.next_due() == pytest.approx(7.1)
+
+
+def test_a_sender_whose_clock_is_ahead_gets_no_longer_lease() -> None:
+    leases = Leases(LIMITS)
+    assert leases.offer(command(sent_us=T0 + 500_000), now_us=T0, wrong_us=0, now=7) is None
+    assert leases.next_due() == pytest.approx(7.3)
 
 
 def test_renewed_in_time_there_is_no_stop() -> None:
@@ -144,6 +161,14 @@ EVENTS = st.lists(
 TICK = 0.05
 
 
+def left_s(motion: Command, latest_us: int) -> float:
+    """What is left of a motion's lease, by the latest time that it may be."""
+    assert motion.lease_ms is not None
+    left = min(motion.lease_ms / 1000, 0.5) - max(0, latest_us - motion.sent_us) / 1e6
+    assert left > 0, "what has no time left does not move"
+    return left
+
+
 @given(EVENTS)
 @example([(1,), command(seq=0, sent_us=T0 + 500_001, valid_ms=1, lease_ms=1)])
 def test_whatever_happens(events: list[Any]) -> None:
@@ -192,9 +217,8 @@ def test_whatever_happens(events: list[Any]) -> None:
                 assert now_us + wrong_us - event.sent_us <= min(event.valid_ms * 1000, 1_000_000)
                 # Early is only what is so by any clock that this may be.
                 assert event.sent_us - now_us - wrong_us <= 500_000
-                assert event.lease_ms is not None
                 passed.append(event)
-                moving_until = now + min(event.lease_ms / 1000, 0.5)
+                moving_until = now + left_s(event, now_us + wrong_us)
     # Then there is nobody any more.
     end = now + 3
     while now < end:

@@ -8,6 +8,7 @@ import logging
 import os
 import random
 import stat
+import subprocess
 import sys
 from collections.abc import Iterator
 from pathlib import Path
@@ -60,6 +61,15 @@ def test_the_last_troubles_are_kept() -> None:
     for i in range(9):
         troubles.handle(record(logging.WARNING, f"trouble {i}"))
     assert [line["text"] for line in troubles.last()] == [f"trouble {i}" for i in range(4, 9)]
+
+
+def test_warnings_do_not_displace_errors() -> None:
+    troubles = Troubles()
+    troubles.handle(record(logging.ERROR, "the one that matters"))
+    for i in range(9):
+        troubles.handle(record(logging.WARNING, f"trouble {i}"))
+    kept = [(line["level"], line["text"]) for line in troubles.last()]
+    assert kept == [("error", "the one that matters"), *(("warning", f"trouble {i}") for i in range(4, 9))]
 
 
 @given(
@@ -253,7 +263,25 @@ def test_status_and_check_by_command(
     assert findings["key's mode"]["level"] == "warn"
     assert findings["key's mode"]["todo"].startswith("chmod 600 ")
     assert findings["queue"]["level"] == "warn"
+    assert findings["record lane"]["level"] == "ok"
     assert findings["endpoint"]["level"] == "fail"
+
+
+def test_a_reader_that_has_seen_enough_is_no_error(tmp_path: Path) -> None:
+    from tests.unit.test_device_agent import Rig, config_file, drive
+
+    rig = Rig(drive)
+    assert rig.agent.run(drain_s=10) == 0
+    config = config_file(tmp_path, "{type: sim}")
+    server = StatusServer(tmp_path / "agent.sock", rig.agent.status)
+    server.start()
+    reading, writing = os.pipe()
+    os.close(reading)
+    with os.fdopen(writing) as output:
+        command = [sys.executable, "-m", "device.main", "status", "--config", str(config)]
+        done = subprocess.run(command, stdout=output, stderr=subprocess.PIPE, text=True, check=False)
+    server.stop()
+    assert (done.stderr, done.returncode) == ("", 1)
 
 
 @contextlib.contextmanager
@@ -312,8 +340,24 @@ def test_status_of_an_agent_for_a_person() -> None:
     assert "robot     car1" in text
     assert "stream    vesc: " in text
     assert "500 samples" in text
+    assert "source    script: played" in text
     assert "NOT connected" in text
     assert "files " not in text
+    assert "topic " not in text
+    state["sources"] = [
+        {
+            "source": "ROS 1 topics /scan, /imu, /lost",
+            "/scan": {"messages": 201, "silent": False, "left_out": {}, "undecodable": 201},
+            "/imu": {"messages": 9, "silent": False, "left_out": {}},
+            "/lost": {"messages": 3, "silent": True, "left_out": {"ranges": 3}, "malformed": 1},
+            "waits": "another node took the name",
+        }
+    ]
+    topics = [line for line in render(state).splitlines() if line.startswith("topic ")]
+    assert topics == [
+        "topic     /scan: 201 messages; 201 undecodable",
+        "topic     /lost: 3 messages, SILENT; 3 left out ranges; 1 malformed",
+    ]
     state["files"] = {
         "waiting": 2, "uploaded": 1, "sent_bytes": 1_234_567, "current": "drive.bag",
         "current_bytes": 8_388_608, "last_error": "drive.bag: refused: not today", "large": None,
@@ -322,3 +366,25 @@ def test_status_of_an_agent_for_a_person() -> None:
     line = "files     2 waiting, 1 uploaded, 1,234,567 bytes sent, now drive.bag (8,388,608 bytes)"
     assert line in text
     assert "last error: drive.bag: refused: not today" in text
+
+
+def test_status_says_what_became_of_what_the_sources_read() -> None:
+    from tests.unit.test_device_agent import Rig, drive
+
+    rig = Rig(drive)
+    assert rig.agent.run(drain_s=10) == 0
+    state = rig.agent.status()
+    state["sources"] = [
+        {"source": "bag ride.csv", "rows": 168, "skipped": {"columns": 100, "time": 40}, "bad_cells": {},
+         "clock_back": 53, "columns_left_out": ["note", "gnss lat"], "gnss_ahead_ms": None},
+        {"source": "ROS 1", "/tf": {"messages": 7, "silent": True, "left_out": {"a.b": 2}, "odd": 0}},
+        {"source": "VESC", "samples": 0},
+    ]  # fmt: skip
+    lines = [
+        "source    bag ride.csv: rows 168, clock_back 53, columns_left_out note gnss lat",
+        "          skipped: columns 100, time 40",
+        "source    ROS 1",
+        "          /tf: messages 7, silent, left_out (a.b 2)",
+        "source    VESC",
+    ]
+    assert "\n".join(lines) in render(state)

@@ -21,6 +21,7 @@ string s
 int16[2] two
 float64[] many
 time t
+duration ago
 Inner[] inner
 {RULE}
 MSG: a_msgs/Inner
@@ -29,7 +30,8 @@ string[2] names
 """
 GOOD = {
     "b": True, "small": -128, "large": 2**64 - 1, "f": 1.5, "s": "grün", "two": [1, -2], "many": [1, 2.5],
-    "t": {"sec": 1, "nanosec": 2}, "inner": [{"raw": [1, 255], "names": ["a", ""]}],
+    "t": {"sec": 1, "nanosec": 2}, "ago": {"sec": -1, "nanosec": 999_999_999},
+    "inner": [{"raw": [1, 255], "names": ["a", ""]}],
 }  # fmt: skip
 
 
@@ -47,7 +49,7 @@ def test_json_is_what_rosbags_writes() -> None:
     types = store.types
     message = types["a_msgs/msg/A"](
         True, -128, 2**64 - 1, 1.5, "grün", np.array([1, -2], np.int16), np.array([1, 2.5]),
-        types["builtin_interfaces/msg/Time"](1, 2),
+        types["builtin_interfaces/msg/Time"](1, 2), types["builtin_interfaces/msg/Duration"](-1, 999_999_999),
         [types["a_msgs/msg/Inner"](np.array([1, 255], np.uint8), ["a", ""])],
     )  # fmt: skip
     expected = bytes(store.serialize_ros1(message, "a_msgs/msg/A"))
@@ -72,6 +74,11 @@ def test_json_is_what_rosbags_writes() -> None:
         ({"many": [1, "2"]}, r"many\.1: found '2'"),
         ({"t": 5.0}, "t: found 5.0; allowed is an object of sec, nanosec"),
         ({"t": {"sec": 1}}, r"t\.nanosec: is missing"),
+        ({"t": {"secs": 1}}, r"t\.nanosec: is missing"),
+        ({"t": {"sec": 1, "secs": 1, "nsecs": 2}}, "t: has both spellings of a field, sec, secs, nsecs"),
+        ({"t": {"sec": 1, "nanosec": 10**9}}, r"t\.nanosec: found 1000000000; allowed is an integer from 0"),
+        ({"t": {"secs": 1, "nsecs": -1}}, r"t\.nanosec: found -1; allowed is an integer from 0 to 999999999"),
+        ({"ago": {"sec": -1, "nanosec": -1}}, r"ago\.nanosec: found -1"),
         ({"inner": [{"raw": [256], "names": ["", ""]}]}, r"inner\.0\.raw\.0: found 256"),
         ({"other": 1}, "other: a_msgs/A has no such field"),
     ],
@@ -86,12 +93,23 @@ def test_partial_means_zero_and_a_header_means_now() -> None:
     zero = decode(mixed, encode(mixed, {"s": "x"}, now_us=T0, partial=True))
     assert zero == {
         "b": False, "small": 0, "large": 0, "f": 0.0, "s": "x", "two": [0, 0], "many": [],
-        "t": {"sec": 0, "nanosec": 0}, "inner": [],
+        "t": {"sec": 0, "nanosec": 0}, "ago": {"sec": 0, "nanosec": 0}, "inner": [],
     }  # fmt: skip
     stamped = decode(pose, encode(pose, POSE_MESSAGE, now_us=T0 + 5))
     assert stamped["header"] == {"seq": 0, "stamp": {"sec": T0 // 10**6, "nanosec": 5000}, "frame_id": ""}
     given = {**POSE_MESSAGE, "header": {"seq": 1, "stamp": {"sec": 2, "nanosec": 3}, "frame_id": "map"}}
     assert decode(pose, encode(pose, given, now_us=T0))["header"] == given["header"]
+
+
+def test_roslibjs_own_spellings_of_times_and_a_header_without_seq() -> None:
+    mixed, pose = parse("a_msgs/A", MIXED), parse("geometry_msgs/PoseStamped", POSE)
+    theirs = {**GOOD, "t": {"secs": 1, "nsecs": 2}, "ago": {"secs": -1, "nsecs": 999_999_999}}
+    assert encode(mixed, theirs, now_us=T0) == encode(mixed, GOOD, now_us=T0)
+    header = {"stamp": {"secs": 2, "nsecs": 3}, "frame_id": "map"}
+    found = decode(pose, encode(pose, {**POSE_MESSAGE, "header": header}, now_us=T0))
+    assert found["header"] == {"seq": 0, "stamp": {"sec": 2, "nanosec": 3}, "frame_id": "map"}
+    with pytest.raises(MessageError, match=r"header\.frame_id: is missing"):
+        encode(pose, {**POSE_MESSAGE, "header": {"stamp": {"sec": 2, "nanosec": 3}}}, now_us=T0)
 
 
 JSON = st.recursive(

@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
+import datetime as dt
 import logging
 import threading
 import time
 from pathlib import Path
-from typing import Any, Tuple
+from typing import Any, Mapping, Tuple
 
 import pytest
 from hypothesis import HealthCheck, given, settings
@@ -31,10 +32,16 @@ def log(caplog: pytest.LogCaptureFixture) -> pytest.LogCaptureFixture:
 
 
 def play(path: Path, clock: ManualClock | None = None, **how: Any) -> list[Sample]:
+    return play_and_report(path, clock, **how)[0]
+
+
+def play_and_report(
+    path: Path, clock: ManualClock | None = None, **how: Any
+) -> tuple[list[Sample], Mapping[str, Any]]:
     out: list[Sample] = []
     source = BagConfig(path=path, **how).build(clock or ManualClock(now_us=NOW))
     source.run(lambda *sample: out.append(sample), threading.Event())
-    return out
+    return out, source.report()
 
 
 def write(folder: Path, *rows: str, header: str = HEADER, name: str = "ride.csv") -> Path:
@@ -49,8 +56,12 @@ def row(ms: int, *, volts: str = "46.4", motor: str = "25", fault: str = "0", ro
 
 def test_a_real_ride(log: pytest.LogCaptureFixture) -> None:
     clock = ManualClock(now_us=NOW)
-    samples = play(recording("vesc-tool-ride.csv"), clock)
+    samples, report = play_and_report(recording("vesc-tool-ride.csv"), clock)
     assert len(samples) == 877
+    assert report == {
+        "rows": 877, "skipped": {}, "bad_cells": {}, "clock_back": 0, "columns_left_out": [],
+        "gnss_ahead_ms": None,
+    }  # fmt: skip
     stream, t_us, first = samples[0]
     assert (stream, t_us) == ("vesc", NOW)
     ros2 = {name for name, field in contract.VESC_FIELDS.items() if 2 in field.ros}
@@ -61,7 +72,8 @@ def test_a_real_ride(log: pytest.LogCaptureFixture) -> None:
     assert first["energy_drawn"] == 12908
     assert (first["displacement"], first["distance_traveled"]) == (106353, 109537)
     assert first["pid_pos_now"] == 307.511
-    assert all(values["temp_motor"] is None for _, _, values in samples), "no sensor is fitted"
+    # No sensor is fitted: what the controller says is recorded, and null wherever numbers are made of it.
+    assert all(contract.absent("temp_motor", values["temp_motor"]) for _, _, values in samples)
     # The columns that are not the contract's keep their names, the time of day is no field.
     assert first["battery_level"] == 9.152
     assert "ms_today" not in first
@@ -105,35 +117,79 @@ def test_midnight(tmp_path: Path) -> None:
     assert [t - NOW for _, t, _ in samples] == [0, 50_000, 100_000, 150_000]
 
 
-def test_a_clock_set_back_a_little_is_no_midnight(tmp_path: Path) -> None:
-    samples = play(write(tmp_path, *map(row, [5000, 5100, 4000, 5050, 5200])))
+def test_a_clock_set_back_a_little_is_no_midnight_and_counted(
+    tmp_path: Path, log: pytest.LogCaptureFixture
+) -> None:
+    rows = list(map(row, [5000, 5100, 4000, 5050, 5200]))
+    samples, report = play_and_report(write(tmp_path, *rows))
     assert [t - NOW for _, t, _ in samples] == [0, 100_000, 100_000, 100_000, 200_000]
+    assert (report["rows"], report["clock_back"]) == (5, 2)
+    assert log.text.count("the clock went back before 2 rows") == 1
+
+
+def test_original_stamps_are_what_the_log_says_though_its_clock_was_set_back(tmp_path: Path) -> None:
+    rows = list(map(row, [5000, 5100, 4000, 5050, 5200]))
+    samples = play(write(tmp_path, *rows, name="2024-06-12_00-00-05.csv"), stamps="original")
+    assert [t - samples[0][1] for _, t, _ in samples] == [0, 100_000, -1_000_000, 50_000, 200_000]
 
 
 @pytest.fixture
-def berlin(monkeypatch: pytest.MonkeyPatch) -> Any:
-    monkeypatch.setenv("TZ", "Europe/Berlin")
+def zone(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> Any:
+    monkeypatch.setenv("TZ", request.param)
     time.tzset()
-    yield
+    yield request.param
     monkeypatch.undo()
     time.tzset()
 
 
-@pytest.mark.usefixtures("berlin")
+def ms_of(utc: dt.datetime) -> int:
+    midnight = utc.replace(hour=0, minute=0, second=0, microsecond=0)
+    return (utc - midnight) // dt.timedelta(milliseconds=1)
+
+
 @pytest.mark.parametrize(
-    ("name", "ms", "expected"),
-    [
-        # 00:34:31 in Berlin's summer is 22:34:31 UTC of the day before.
-        ("2024-06-12_00-34-31.csv", 2_071_500, 1_718_145_271_500_000),
-        # Begun just before midnight, the first row comes after it.
-        ("log 2024-06-11_23-59-59.csv", 500, 1_718_143_200_500_000),
-    ],
+    "zone",
+    ["Europe/Berlin", "America/Los_Angeles", "Asia/Kolkata", "Pacific/Kiritimati", "Etc/GMT+12", "UTC"],
+    indirect=True,
 )
-def test_original_stamps_take_the_day_from_the_files_name(
-    tmp_path: Path, name: str, ms: int, expected: int
+@pytest.mark.parametrize("hour", range(0, 24, 3))
+def test_original_stamps_are_utc_of_the_day_that_the_local_name_means(
+    tmp_path: Path, zone: str, hour: int
 ) -> None:
-    samples = play(write(tmp_path, row(ms), row(ms + 100), name=name), stamps="original")
+    # VESC Tool names the file by local time and counts ms_today in UTC.
+    opened = dt.datetime(2024, 6, 11, hour, 59, 59, tzinfo=dt.timezone.utc)
+    first = opened + dt.timedelta(seconds=1.5)
+    name = opened.astimezone().strftime("ride %Y-%m-%d_%H-%M-%S.csv")
+    rows = [row(ms_of(first)), row(ms_of(first + dt.timedelta(seconds=0.1)))]
+    expected = round(first.timestamp() * 1e6)
+    samples = play(write(tmp_path, *rows, name=name), stamps="original")
     assert [t for _, t, _ in samples] == [expected, expected + 100_000]
+
+
+@pytest.mark.parametrize("zone", ["UTC"], indirect=True)
+def test_an_agent_in_another_zone_than_the_phone_gets_the_same_instants(tmp_path: Path, zone: str) -> None:
+    # Half past midnight in Berlin's summer, read by a robot whose clock shows UTC.
+    path = write(tmp_path, row(81_271_500), name="2024-06-12_00-34-31.csv")
+    assert play(path, stamps="original")[0][1] == 1_718_145_271_500_000
+
+
+@pytest.mark.parametrize(
+    ("fix_ms", "ahead_ms"),
+    [
+        # Two seconds old; a clock an hour behind; local time two hours ahead of UTC; over midnight.
+        (1_000_000, -2_000), (4_602_000, 3_600_000), (80_202_000, -7_200_000), (85_402_000, -2_000_000),
+    ],
+)  # fmt: skip
+def test_the_time_of_the_position_is_a_check_of_the_clock(
+    tmp_path: Path, log: pytest.LogCaptureFixture, fix_ms: int, ahead_ms: int
+) -> None:
+    header = HEADER + ";gnss_posTime"
+    rows = [row(1_001_900) + "-1;", row(1_002_000) + f"{fix_ms};", row(1_003_000) + f"{fix_ms};"]
+    samples, report = play_and_report(write(tmp_path, *rows, header=header))
+    assert report["gnss_ahead_ms"] == ahead_ms
+    off = f"the clock of the log is {-ahead_ms / 1000:+.0f} s off, by the first position's time"
+    assert log.text.count(off) == (0 if ahead_ms == -2_000 else 1)
+    assert [values["gnss_posTime"] for _, _, values in samples] == [-1, fix_ms, fix_ms]
 
 
 @pytest.mark.parametrize("name", ["ride.csv", "2024-13-12_00-34-31.csv"])
@@ -143,25 +199,25 @@ def test_original_stamps_without_a_day_are_refused(tmp_path: Path, name: str) ->
 
 
 @pytest.mark.parametrize(
-    ("bad", "why"),
+    ("bad", "why", "cause"),
     [
-        ("1100;46.4;25;", "4 columns, and the first line names 7"),
-        ("1100;46.4;25;1200;0.0281;0;0.5;9;", "9 columns"),
-        ("1100;46.x;25;1200;0.0281;0;0.5;", "input_voltage is '46.x', which is no number"),
-        (row(1100, volts="46,4"), "input_voltage is '46,4'"),
-        (row(1100, volts="1_000"), "input_voltage is '1_000'"),
-        (row(86_400_000), "a day has 86400000 ms"),
-        (row(-1), "a day has"),
-        (row(1100).replace("1100", ""), "ms_today is ''"),
-        (row(1100).replace("1100", "nan"), "ms_today is 'nan'"),
-        (row(1100, roll="left"), "roll is 'left', which is no number"),
-        ("\x00\x00\x00\x00", "1 columns"),
+        ("1100;46.4;25;", "4 columns, and the first line names 7", "columns"),
+        ("1100;46.4;25;1200;0.0281;0;0.5;9;", "9 columns", "columns"),
+        (row(86_400_000), "must be from 0 to 86399999", "time"),
+        (row(-1), "must be from 0", "time"),
+        (row(1100).replace("1100", ""), "ms_today is ''", "time"),
+        (row(1100).replace("1100", "nan"), "ms_today is 'nan'", "time"),
+        (row(1100).replace("1100", "noon"), "ms_today is 'noon'", "time"),
+        ("\x00\x00\x00\x00", "1 columns", "columns"),
     ],
 )
-def test_a_malformed_row_is_skipped_and_told_once(
-    tmp_path: Path, log: pytest.LogCaptureFixture, bad: str, why: str
+def test_a_malformed_row_is_skipped_counted_by_cause_and_told_once(
+    tmp_path: Path, log: pytest.LogCaptureFixture, bad: str, why: str, cause: str
 ) -> None:
     path = write(tmp_path, row(1000), bad, row(1200), bad, row(1300))
+    rows, report = play_and_report(path)
+    assert (len(rows), report["rows"], report["skipped"]) == (3, 5, {cause: 2})
+    log.clear()
     samples = play(path, loop=True, duration_s=0.7)
     assert [t - NOW for _, t, _ in samples[:3]] == [0, 200_000, 300_000]
     told = [record.getMessage() for record in log.records]
@@ -169,6 +225,30 @@ def test_a_malformed_row_is_skipped_and_told_once(
     assert why in log.text
     assert any("2 rows have been skipped" in text for text in told)
     assert not any("row 5" in text for text in told)
+
+
+@pytest.mark.parametrize("place", [0, 1, 2])
+@pytest.mark.parametrize(
+    ("bad", "column", "why"),
+    [
+        (row(1001, volts="46.x"), "input_voltage", "input_voltage is '46.x', which is no number"),
+        (row(1001, volts="46,4"), "input_voltage", "input_voltage is '46,4'"),
+        (row(1001, volts="1_000"), "input_voltage", "input_voltage is '1_000'"),
+        (row(1001, roll="left"), "roll", "roll is 'left', which is no number"),
+        (row(1001, fault="FAULT_CODE_GREMLINS"), "fault_code", "no such fault is known as"),
+    ],
+)
+def test_a_bad_cell_is_null_and_costs_neither_its_row_nor_its_column(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture, bad: str, column: str, why: str, *, place: int
+) -> None:
+    rows = [row(1001) for _ in range(3)]
+    rows[place] = bad
+    samples, report = play_and_report(write(tmp_path, *rows))
+    field = {"input_voltage": "voltage_input"}.get(column, column)
+    assert [values[field] is None for _, _, values in samples] == [i == place for i in range(3)]
+    assert all(len(values) == 6 for _, _, values in samples)
+    assert (report["bad_cells"], report["skipped"]) == ({column: 1}, {})
+    assert caplog.text.count(f"row {place + 2}: {why}") == 1
 
 
 def test_a_first_row_cut_short_says_nothing_about_the_others(tmp_path: Path) -> None:
@@ -179,15 +259,27 @@ def test_a_first_row_cut_short_says_nothing_about_the_others(tmp_path: Path) -> 
 def test_a_decimal_comma(tmp_path: Path, log: pytest.LogCaptureFixture) -> None:
     whole = row(1000).replace("46.4", "46").replace("0.0281", "0").replace("0.5", "0")
     comma = [row(ms).replace(".", ",") for ms in (1100, 1200)]
-    samples = play(write(tmp_path, whole, *comma, row(1300)))
-    assert [values["voltage_input"] for _, _, values in samples] == [46, 46.4, 46.4]
+    samples, report = play_and_report(write(tmp_path, whole, *comma, row(1300)))
+    assert [values["voltage_input"] for _, _, values in samples] == [46, 46.4, 46.4, None]
     assert samples[1][2]["charge_drawn"] == 281
-    assert "row 5 is skipped" in log.text
+    assert report["bad_cells"] == {"input_voltage": 1, "amp_hours_used": 1, "roll": 1}
 
 
-def test_neither_is_guessed_at(tmp_path: Path, log: pytest.LogCaptureFixture) -> None:
-    assert len(play(write(tmp_path, row(1000, volts="46,4"), row(1100)))) == 1
-    assert "both point and comma" in log.text
+def test_a_text_with_a_comma_says_nothing_about_the_decimal_sign(tmp_path: Path) -> None:
+    header = HEADER + ";note"
+    rows = [row(1000 + i) + "left, then right;" for i in range(3)]
+    samples, report = play_and_report(write(tmp_path, *rows, header=header))
+    assert [values["voltage_input"] for _, _, values in samples] == [46.4] * 3
+    assert report["columns_left_out"] == ["note"]
+
+
+def test_a_column_that_has_a_number_now_and_then_is_kept_with_the_rows(tmp_path: Path) -> None:
+    header = HEADER + ";gnss_lat"
+    rows = [row(1000 + i) + ("n/a;" if i % 6 else "47.5;") for i in range(168)]
+    samples, report = play_and_report(write(tmp_path, *rows, header=header))
+    assert len(samples) == 168
+    assert [values["gnss_lat"] for _, _, values in samples].count(47.5) == 28
+    assert report["bad_cells"] == {"gnss_lat": 140}
 
 
 @pytest.mark.parametrize("separator", ["\t", ","])
@@ -222,8 +314,8 @@ def test_faults_by_name(tmp_path: Path, log: pytest.LogCaptureFixture, text: str
     assert log.text.count("GREMLINS") == (1 if code is None else 0)
 
 
-@pytest.mark.parametrize(("motor", "value"), [("-57", None), ("-50", None), ("-49.9", -49.9), ("31", 31)])
-def test_no_sensor_is_no_temperature(tmp_path: Path, motor: str, value: float | None) -> None:
+@pytest.mark.parametrize(("motor", "value"), [("-273.15", -273.15), ("-50", -50), ("31", 31)])
+def test_what_is_recorded_is_what_the_controller_said(tmp_path: Path, motor: str, value: float) -> None:
     assert play(write(tmp_path, row(1000, motor=motor)))[0][2]["temp_motor"] == value
 
 

@@ -29,6 +29,8 @@ def test_the_worst_of_a_drive_counts():
 def test_what_is_not_measured_is_not_counted():
     nothing = {"SampleGaps": 0, "FaultSamples": 0, "BatteryVolts": [], "TemperatureDegC": []}
     assert measure("vesc", [batch({"voltage_input": [0.0, None], "temp_fet": [0, 0]})]) == nothing
+    cold = {"voltage_input": [0.0], "temp_motor": [-273.15], "temp_fet": [-57]}
+    assert measure("vesc", [batch(cold)]) == nothing
     assert measure("imu", [batch({"x": [1.0], "fault_code": ["odd"], "voltage_input": [True]})]) == nothing
 
 

@@ -105,6 +105,17 @@ def test_a_stream_configured_with_no_field_sends_none_and_fields_that_are_not_th
     assert [message["sample"] for _, message in channels.sent] == [{}, {"speed": 1200}]
 
 
+def test_what_is_shown_live_is_null_where_no_sensor_is_fitted():
+    channels = Channels()
+    sample = {"temp_motor": -273.15, "temp_fet": 31.5, "current_motor": -60}
+    for fields in ({}, {"vesc": frozenset({"temp_motor"})}):
+        show(event(sample=sample), channels, settings=LiveSettings(fields))
+    assert [message["sample"] for _, message in channels.sent] == [
+        {"temp_motor": None, "temp_fet": 31.5, "current_motor": -60},
+        {"temp_motor": None},
+    ]
+
+
 def test_another_deployment_has_channels_of_its_own():
     channels = Channels()
     show(event(namespace="lab2"), channels)

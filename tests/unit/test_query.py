@@ -12,7 +12,9 @@ import pytest
 from contract import Batch
 from functions.query import answer
 from station import data
+from station.conditions import values
 from station.errors import StationError
+from station.stored import Refused
 from tests.fakes import ROBOTS, TELEMETRY, FakeDynamoDB, item_of, serialize, tables
 
 START = 1_700_000_000_000_000
@@ -191,6 +193,37 @@ def test_all_four_ways_give_the_same(question, scan, left_ms):
         k: v.tolist() for k, v in here.columns.items()
     }
     assert len(here) > 0
+
+
+COLD = [-273.15, 20.0, 21.5, -50]
+
+
+@pytest.mark.parametrize("on", ["client", "lambda"])
+@pytest.mark.parametrize("motor", [COLD, [*COLD[:2], "cold", -50]])
+def test_a_sensor_that_is_not_fitted_is_null_and_counted(on, motor):
+    times = [START + i for i in range(4)]
+    columns = {"temp_motor": motor, "speed": [1, 2, 3, 4], "ntc_temp_mos1": [-57] * 4}
+    cloud = Cloud(table(Batch("0badcafe", 0, times, columns)))
+
+    def query(**question):
+        return data.query(cloud, "car", "vesc", on=on, **question)
+
+    whole = query()
+    assert values(whole.columns["temp_motor"]) == [None, motor[1], motor[2], None]
+    assert values(whole.columns["ntc_temp_mos1"]) == [None] * 4
+    assert whole.absent == {"temp_motor": 2, "ntc_temp_mos1": 4}
+    cold = query(where="temp_motor < 0")
+    assert (len(cold), cold.absent["temp_motor"]) == (0, 2)
+    assert query(fields=["speed"]).absent == {}
+    part = query(start=START + 1, end=START + 4, fields=["temp_motor"])
+    assert part.absent == {"temp_motor": 1}
+
+
+def test_what_is_exported_as_messages_is_what_was_recorded():
+    columns = {"temp_motor": COLD}
+    cloud = Cloud(table(Batch("0badcafe", 0, [START + i for i in range(4)], columns)))
+    blocks = data.samples(cloud, data.select("car", "vesc"), refused=Refused())
+    assert [value for block in blocks for value in block.columns["temp_motor"].tolist()] == COLD
 
 
 def test_a_mistake_is_answered_from_there_as_from_here():

@@ -118,6 +118,22 @@ def test_a_field_of_nulls_leaves_nothing_and_a_field_of_text_or_bools_its_last()
     }
 
 
+def test_a_sensor_that_is_not_fitted_is_no_temperature_and_counted():
+    columns = {
+        "temp_motor": [-273.15, 31, 33, -50],
+        "temp_fet": [-57] * 4,
+        "temperature_pcb": [None, -49.9, "cold", -60],
+        "current_motor": [-60] * 4,
+    }
+    second = summarized(SECOND, [batch(every(1, 4), columns)], None)
+    assert [second[f"temp_motor_{name}"] for name in ("min", "mean", "max", "last")] == [31, 32, 33, 33]
+    assert not [name for name in second if name.startswith("temp_fet")]
+    assert second["temperature_pcb_last"] == "cold"
+    assert second["current_motor_mean"] == -60
+    assert second["absent"] == 2 + 4 + 1
+    assert "absent" not in summarized(SECOND, [batch(every(1, 4), {"temp_motor": [31] * 4})], None)
+
+
 @pytest.mark.parametrize(
     "column",
     [

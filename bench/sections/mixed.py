@@ -1,0 +1,325 @@
+"""A mixed robot on a real ROS 1 graph: what the agent costs beside `rosbag record` of the same topics.
+
+Both are subscribed to every topic of `bench.mixed_robot` at the same time, and so is a bare rospy subscriber,
+which is what Python and rospy take by themselves. The agent publishes to mosquitto, where all is counted.
+Where ROS 1 or mosquitto is not installed, the section says so and has no figures.
+"""
+
+from __future__ import annotations
+
+import json
+import shutil
+import signal
+import subprocess
+import tempfile
+import threading
+import time
+from collections import Counter
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import yaml
+from awscrt import mqtt5
+
+from bench import plots, usage
+from bench.errors import BenchError
+from bench.mixed_robot import NODES, topics
+from bench.mosquitto import HOST, Mosquitto, found
+from bench.result import NOT_MEASURED, Plot, Ratio, Section, Table
+from bench.ros_graph import PACKAGES, SYSTEM_PYTHON, Publisher, RosGraph, python_with_rospy
+from bench.target import Say, Target
+from bench.watcher import subscribed
+from contract import LIVE, RECORD, decode, parse_topic
+
+SECONDS = 30
+RECORDER, AGENT, FLOOR = "rosbag record", "agent", "bare rospy subscriber"
+_SUBSCRIBERS = 3
+_WARM_UP_S, _CATCH_UP_S, _END_S = 3, 30.0, 30.0
+_ROBOT = "bench"
+_BASIC_INGEST = "$aws/rules/"
+_PACKAGES = f"{PACKAGES} python3-rosbag mosquitto"
+
+
+@dataclass
+class Found:
+    """What one run came to, by topic or by subscriber. ``late`` samples came after the driving had ended."""
+
+    seconds: float = 0.0
+    published: Counter[str] = field(default_factory=Counter)
+    recorded: Counter[str] = field(default_factory=Counter)
+    arrived: Counter[str] = field(default_factory=Counter)
+    late: int = 0
+    cpu_s: dict[str, float] = field(default_factory=dict)
+    rss_mb: dict[str, float] = field(default_factory=dict)
+    bag_bytes: int = 0
+    bag_bz2_bytes: int = 0
+    lane_bytes: Counter[str] = field(default_factory=Counter)
+    stream_bytes: Counter[str] = field(default_factory=Counter)
+    batches: int = 0
+    agent: dict[str, Any] = field(default_factory=dict)
+
+    def left_out(self) -> Counter[str]:
+        """How often the agent left a field of a message out, by topic, in its own words."""
+        return Counter(
+            {
+                topic: sum(said.get("left_out", {}).values())
+                for source in self.agent.get("sources", [])
+                for topic, said in source.items()
+                if isinstance(said, dict)
+            }
+        )
+
+    def lost(self, got: Mapping[str, int]) -> int:
+        """The messages that somebody did not get; one that came twice makes up for none."""
+        return sum(max(0, sent - got.get(topic, 0)) for topic, sent in self.published.items())
+
+
+def run(_target: Target, say: Say) -> Section:
+    """Drive the mixed robot once; it needs nothing of the target."""
+    section = Section("mixed", "A mixed robot beside rosbag record")
+    program = found()
+    if program is None or shutil.which("rosmaster") is None or shutil.which("rosbag") is None:
+        section.notes.append(f"Not measured here: it needs ROS 1 and mosquitto (apt install {_PACKAGES}).")
+    else:
+        report(section, measure(program, python_with_rospy(), SECONDS, say))
+    return section
+
+
+def measure(program: str, python: str, seconds: int, say: Say) -> Found:
+    """Drive for so long, then wait until the agent has delivered what it has."""
+    result = Found()
+    heard: list[tuple[float, str, bytes]] = []
+    with (
+        tempfile.TemporaryDirectory() as name,
+        Mosquitto(program, Path(name)) as broker,
+        RosGraph(python, Path(name)) as graph,
+        subscribed(
+            (HOST, broker.port),
+            (*broker.identity("watcher"), broker.ca),
+            [f"{_BASIC_INGEST}#", f"{RECORD}/#", f"{LIVE}/#"],
+            lambda topic, payload: heard.append((time.monotonic(), topic, payload)),
+            qos=mqtt5.QoS.AT_LEAST_ONCE,
+        ),
+    ):
+        folder, rosbag = Path(name), [SYSTEM_PYTHON, str(shutil.which("rosbag"))]
+        config, written, bag = _car(broker, folder), folder / "report.json", folder / "drive.bag"
+        processes = {
+            RECORDER: graph.run([*rosbag, "record", "--quiet", "-O", str(bag), *topics()]),
+            AGENT: graph.start(
+                "device.main", "run", "--config", config, "--report", written, "--drain-s", _CATCH_UP_S
+            ),
+            FLOOR: graph.start("bench.ros_floor", *topics()),
+        }
+        lasts_s = seconds + _WARM_UP_S
+        publishers = [
+            Publisher(graph.start("bench.mixed_publisher", node, lasts_s, _SUBSCRIBERS)) for node in NODES
+        ]
+        say("waiting for every subscriber of every topic")
+        for publisher in publishers:
+            publisher.ready()
+        for publisher in publishers:
+            publisher.go()
+        publishers[0].publish_for(_WARM_UP_S)
+        say(f"driving for {seconds} s")
+        before, began = _used(processes), time.monotonic()
+        publishers[0].publish_for(seconds - 1)
+        after, result.seconds = _used(processes), time.monotonic() - began
+        for publisher in publishers:
+            result.published.update(json.loads(publisher.finish()))
+        ended = time.monotonic()
+        say("waiting for what is under way")
+        _finish(processes[RECORDER], signal.SIGINT)
+        _finish(processes[AGENT], signal.SIGTERM)
+        # What the agent has published last is on its way from the broker to the watcher.
+        threading.Event().wait(1.0)
+        result.agent = json.loads(written.read_text())
+        result.bag_bytes, result.recorded = bag.stat().st_size, _in_bag(bag)
+        smaller = folder / "bz2"
+        smaller.mkdir()
+        compress = [*rosbag, "compress", "--quiet", "--bz2", f"--output-dir={smaller}", str(bag)]
+        if graph.run(compress).wait(_END_S + seconds):
+            raise BenchError("`rosbag compress` failed")
+        result.bag_bz2_bytes = (smaller / bag.name).stat().st_size
+    result.cpu_s = {who: after[who].cpu_s - before[who].cpu_s for who in processes}
+    result.rss_mb = {who: after[who].rss_mb for who in processes}
+    count(result, heard, ended)
+    return result
+
+
+def _car(broker: Mosquitto, folder: Path) -> Path:
+    certificate, key = broker.identity(_ROBOT)
+    config = folder / "car.yaml"
+    source = {
+        "type": "ros1",
+        "topics": {one.name: {"stream": one.stream, "time": one.time} for one in topics().values()},
+    }
+    config.write_text(
+        yaml.safe_dump(
+            {
+                "robot": _ROBOT,
+                "endpoint": HOST,
+                "port": broker.port,
+                "certificate": str(certificate),
+                "private_key": str(key),
+                "root_ca": str(broker.ca),
+                "sources": [source],
+                "queue": {"path": "spool.db"},
+            }
+        )
+    )
+    return config
+
+
+def _used(processes: Mapping[str, subprocess.Popen[str]]) -> dict[str, usage.Usage]:
+    # `rosbag` is a script that has started the recorder.
+    return {who: usage.of(one.pid) + usage.below(one.pid) for who, one in processes.items()}
+
+
+def _finish(process: subprocess.Popen[str], number: signal.Signals) -> None:
+    process.send_signal(number)
+    try:
+        process.wait(_CATCH_UP_S + _END_S)
+    except subprocess.TimeoutExpired as error:
+        raise BenchError(f"{process.args!r:.80} did not end") from error
+
+
+def _in_bag(bag: Path) -> Counter[str]:
+    from rosbags.rosbag1 import Reader  # noqa: PLC0415 - optional, and only this section needs it
+
+    counted: Counter[str] = Counter()
+    with Reader(bag) as reader:
+        for connection in reader.connections:
+            counted[connection.topic] += connection.msgcount
+    return counted
+
+
+def count(result: Found, heard: list[tuple[float, str, bytes]], ended: float) -> None:
+    """Count samples and bytes of what was heard, a batch once however often it came."""
+    names = {one.stream: one.name for one in topics().values()}
+    numbers: set[tuple[str, str, int]] = set()
+    for at, whole, payload in heard:
+        # By Basic Ingest a topic has the rule before it.
+        topic = parse_topic(whole.split("/", 3)[-1] if whole.startswith(_BASIC_INGEST) else whole)
+        result.lane_bytes[topic.lane] += len(payload)
+        if topic.lane != RECORD:
+            continue
+        result.stream_bytes[topic.name] += len(payload)
+        batch = decode(payload)
+        if (topic.name, batch.boot, batch.seq) in numbers:
+            continue
+        numbers.add((topic.name, batch.boot, batch.seq))
+        result.batches += 1
+        if topic.name in names:
+            result.arrived[names[topic.name]] += len(batch.times_us)
+            result.late += len(batch.times_us) if at > ended + 2 else 0
+
+
+def report(section: Section, result: Found) -> None:
+    """Add the tables, the picture and the ratios."""
+    messages = sum(result.published.values())
+    # Rates are even, so that a stretch has its share of the messages.
+    measured = messages * result.seconds / (SECONDS + _WARM_UP_S)
+    each_us = {who: cpu_s / measured * 1e6 for who, cpu_s in result.cpu_s.items()}
+    sent = result.lane_bytes[RECORD]
+    got = {RECORDER: result.recorded, AGENT: result.arrived}
+    lost = {who: result.lost(counted) for who, counted in got.items()}
+    left_out = result.left_out()
+    order = (RECORDER, AGENT, FLOOR)
+    section.tables.append(
+        Table(
+            f"{len(result.published)} topics, {messages:,} messages in {SECONDS + _WARM_UP_S} s",
+            ["figure", *order, f"{AGENT} / {RECORDER}"],
+            [
+                [
+                    "processor a message",
+                    *(f"{each_us[who]:.0f} us" for who in order),
+                    f"{each_us[AGENT] / each_us[RECORDER]:.2f}",
+                ],
+                [
+                    "of one core",
+                    *(f"{result.cpu_s[who] / result.seconds:.1%}" for who in order),
+                    NOT_MEASURED,
+                ],
+                ["memory", *(f"{result.rss_mb[who]:.0f} MB" for who in order), NOT_MEASURED],
+                [
+                    "bytes a message, to the file and to the cloud's record lane",
+                    f"{result.bag_bytes / messages:.0f}",
+                    f"{sent / messages:.0f}",
+                    NOT_MEASURED,
+                    f"{sent / result.bag_bytes:.3f}",
+                ],
+                [
+                    "the same, of the bag after rosbag compress --bz2",
+                    f"{result.bag_bz2_bytes / messages:.0f}",
+                    f"{sent / messages:.0f}",
+                    NOT_MEASURED,
+                    f"{sent / result.bag_bz2_bytes:.3f}",
+                ],
+                [
+                    "messages lost",
+                    *(f"{lost[who]:,} of {messages:,}" for who in (RECORDER, AGENT)),
+                    NOT_MEASURED,
+                    NOT_MEASURED,
+                ],
+            ],
+        )
+    )
+    section.tables.append(
+        Table(
+            "By topic",
+            [
+                "topic",
+                "type",
+                "published",
+                "in the bag",
+                "arrived from the agent",
+                "fields left out",
+                "bytes a message",
+            ],
+            [
+                [
+                    name,
+                    topic.kind,
+                    *(
+                        f"{counted[name]:,}"
+                        for counted in (result.published, result.recorded, result.arrived, left_out)
+                    ),
+                    f"{result.stream_bytes[topic.stream] / result.arrived[name]:.0f}"
+                    if result.arrived[name]
+                    else NOT_MEASURED,
+                ]
+                for name, topic in topics().items()
+            ],
+        )
+    )
+    title = "Processor time a message of the mixed robot"
+    section.plots.append(Plot("mixed", title, plots.bars(title, {w: each_us[w] for w in order}, unit="us")))
+    section.ratios += [
+        Ratio("mixed robot: messages that the agent lost", lost[AGENT], 0, "messages"),
+        Ratio("mixed robot: fields that the agent left out", left_out.total(), 0, "fields"),
+        Ratio(
+            "mixed robot: the agent's processor / rosbag record's",
+            round(each_us[AGENT] / each_us[RECORDER], 2),
+            None,
+            tolerance=2,
+        ),
+        Ratio(
+            "mixed robot: the agent's processor / a bare rospy subscriber's",
+            round(each_us[AGENT] / each_us[FLOOR], 2),
+            None,
+            tolerance=2,
+        ),
+        Ratio("mixed robot: bytes published / bytes of the bag", round(sent / result.bag_bytes, 3), 1.0),
+    ]
+    section.notes.append(
+        f"The agent's live lane published {result.lane_bytes[LIVE] / 1e6:.1f} MB beside, and the record lane "
+        f"{result.batches:,} batches; {result.late:,} samples came over two seconds after the last message. "
+        "The bag is as `rosbag record`, a program in C++, writes it: not compressed."
+    )
+    if lost[AGENT] or left_out.total():
+        section.notes.append("What was lost and left out was not sent: it makes the agent's ratios smaller.")
+    # `dataclasses.asdict`, by which the report is written, makes no sense of a Counter.
+    plain = {name: dict(one) if isinstance(one, Counter) else one for name, one in vars(result).items()}
+    section.raw = {**plain, "lost": lost}

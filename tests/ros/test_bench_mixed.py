@@ -1,0 +1,26 @@
+"""The bench's mixed robot drives on a real graph, and both who record it are measured."""
+
+from __future__ import annotations
+
+import shutil
+
+import pytest
+
+from bench import mosquitto
+from bench.mixed_robot import topics
+from bench.sections import mixed
+
+
+def test_mixed_robot_is_recorded_by_both(ros_python: str) -> None:
+    program = mosquitto.found()
+    if program is None or shutil.which("rosbag") is None:
+        pytest.skip("the mixed robot needs more: apt install mosquitto python3-rosbag")
+    found = mixed.measure(program, ros_python, 2, lambda _: None)
+    assert set(found.published) == set(topics())
+    assert found.published["/map"] == 1
+    assert found.published["/joint_states"] == 2 * found.published["/sensors/core"], "of two publishers"
+    assert found.recorded == found.published
+    for name in ("/sensors/core", "/odom", "/diagnostics"):
+        assert found.arrived[name] == found.published[name]
+    assert 0 < found.bag_bz2_bytes < found.bag_bytes
+    assert all(cpu_s > 0 for cpu_s in found.cpu_s.values())

@@ -1,0 +1,167 @@
+"""What the node is called: two of one name, of which the later waits, and the command line's remappings."""
+
+from __future__ import annotations
+
+import json
+import xmlrpc.client
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import yaml
+
+from device.errors import AgentError
+from device.status import fetch
+from tests.local.conftest import until
+from tests.local.test_uplink import self_signed
+from tests.ros.conftest import Graph, Process
+from tests.ros.test_downlink import connected, drive, has, start
+from tests.ros.test_source import Cars, turns, until_turns
+from tests.unit.test_device_agent import config_file
+
+WAITS = "another node is called /iort_agent at http://127.0.0.1:"
+WHEELS = {"type": "ros1", "topics": {"/wheel": {"stream": "wheel", "time": "header"}}}
+WAIT_S = 60
+
+
+def test_the_later_of_two_waits_until_the_first_is_gone(graph: Graph) -> None:
+    cars = Cars(graph)
+    cars.publisher("pub")
+    first = cars.collector()
+    until_turns(first, 5)
+    second = cars.collector()
+    second.until_said(WAITS)
+    until_turns(first, max(turns(first)) + 50)
+    assert turns(second) == []
+    assert second.alive()
+    # Killed, it stays registered at the master; that counts for nothing.
+    first.kill()
+    until_turns(second, max(turns(first)) + 1)
+    assert "waits" not in json.loads(second.quit()[-1])
+
+
+def test_who_loses_the_name_takes_it_again_when_it_is_free(graph: Graph) -> None:
+    cars = Cars(graph)
+    cars.publisher("pub")
+    collector = cars.collector()
+    until_turns(collector, 5)
+    for i in range(2):
+        # Any other program, which does not ask.
+        taker = cars.publisher("iort_agent", topic=f"/elsewhere{i}")
+        collector.until(lambda i=i: said(collector, WAITS) > i, "waiting")
+        taker.kill()
+        until_turns(collector, max(turns(collector)) + 50)
+    assert said(collector, "another node took the name /iort_agent") == 2
+    collector.quit()
+
+
+def test_of_two_that_start_at_once_one_waits_and_neither_ends(graph: Graph) -> None:
+    cars = Cars(graph)
+    cars.publisher("pub")
+    both = [cars.collector() for _ in range(2)]
+    until(lambda: newest(*both) >= 300, seconds=WAIT_S)
+    # By now it is decided, for good: one has the name and all messages, the other waits.
+    holder, before = registered(graph, "/iort_agent"), [newest(one) for one in both]
+    until(lambda: newest(*both) >= 500, seconds=WAIT_S)
+    assert registered(graph, "/iort_agent") == holder
+    assert [newest(one) > n for one, n in zip(both, before, strict=True)].count(True) == 1
+    assert sum(said(one, WAITS) for one in both) >= 1
+    assert [one.alive() for one in both] == [True, True]
+
+
+def test_a_node_that_is_told_to_end_ends_the_source(graph: Graph) -> None:
+    cars = Cars(graph)
+    cars.publisher("pub")
+    collector = cars.collector()
+    until_turns(collector, 5)
+    with xmlrpc.client.ServerProxy(registered(graph, "/iort_agent")) as node:
+        node.shutdown("/rosnode-1-2", "user request")
+    collector.until_said("the ROS node /iort_agent has ended: it was shut down from outside")
+
+
+def test_the_status_says_what_the_agent_waits_for_and_other_sources_go_on(
+    graph: Graph, tmp_path: Path
+) -> None:
+    taker = graph.run("listener.py", "iort_agent", "/elsewhere", "std_msgs/Float64")
+    until(lambda: registered(graph, "/iort_agent"), seconds=WAIT_S)
+    agent = agent_of(graph, tmp_path, WHEELS, {"type": "sim"})
+    (alarm,) = until(lambda: agent.status().get("alarms"), seconds=WAIT_S)
+    assert alarm.startswith(f"source waits: {WAITS}")
+    assert alarm.endswith("set sources[].node")
+    before = agent.samples("vesc")
+    until(lambda: agent.samples("vesc") > before, seconds=WAIT_S)
+    taker.kill()
+    until(lambda: agent.status()["alarms"] == [], seconds=WAIT_S)
+    assert agent.process.terminate() == 0, "\n".join(agent.process.errors)
+
+
+def test_what_roslaunch_adds_to_the_command_is_honoured(graph: Graph, tmp_path: Path) -> None:
+    master = graph.environment.pop("ROS_MASTER_URI")
+    arguments = (
+        f"__master:={master}", "__name:=recorder", f"__log:={tmp_path}/recorder-1.log", "__ns:=/lab",
+        "__ip:=127.0.0.1", "wheel:=/robot1/wheel", "/wheel:=/robot1/wheel", "_rate:=5",
+    )  # fmt: skip
+    agent = agent_of(graph, tmp_path, WHEELS, arguments=arguments)
+    graph.environment["ROS_MASTER_URI"] = master
+    agent.process.until_said("_rate:=5 is ignored")
+    Cars(graph).publisher("pub", topic="/robot1/wheel")
+    until(lambda: agent.samples("wheel") > 5, seconds=WAIT_S)
+    assert registered(graph, "/lab/recorder").startswith("http://127.0.0.1:")
+    assert registered(graph, "/iort_agent") == ""
+    # What it says of the topic has the topic's name in the graph.
+    agent.process.until_said("topic /robot1/wheel: strange_msgs/Wheel")
+    # A master that is restarted is told of the topic by that name too.
+    graph.master.kill()
+    agent.process.until_said("does not answer")
+    graph.start_master()
+    agent.process.until_said("had forgotten /robot1/wheel: registered again")
+    assert agent.process.terminate() == 0, "\n".join(agent.process.errors)
+
+
+def test_commands_and_shares_are_remapped_too(graph: Graph) -> None:
+    downlink = start(graph, "/cmd_vel:=/robot1/cmd_vel")
+    listener = graph.run("listener.py", "driver", "/robot1/cmd_vel", "geometry_msgs/TwistStamped")
+    connected(downlink, "/robot1/cmd_vel")
+    drive(downlink, 1.5)
+    listener.until(lambda: has(listener, 1.5), "command")
+
+
+def newest(*collectors: Process) -> int:
+    return max(turn for one in collectors for turn in [-1, *turns(one)])
+
+
+def agent_of(graph: Graph, folder: Path, *sources: dict[str, Any], arguments: tuple[str, ...] = ()) -> Agent:
+    """The real agent in a graph, with no broker in reach."""
+    text = yaml.safe_dump(list(sources), default_flow_style=True, width=1000).strip()[1:-1]
+    config = config_file(folder, text, "queue: {path: queue.db}\nport: 1")
+    self_signed(folder)
+    for made, named in (("private.key", "key.pem"), ("certificate.pem", "cert.pem")):
+        (folder / made).replace(folder / named)
+    (folder / "ca.pem").write_bytes((folder / "cert.pem").read_bytes())
+    command = ("device.main", "run", "--config", config, "--drain-s", 0, *arguments)
+    return Agent(graph.module(*map(str, command)), folder)
+
+
+class Agent(NamedTuple):
+    process: Process
+    folder: Path
+
+    def status(self) -> dict[str, Any]:
+        assert self.process.alive(), "\n".join(self.process.errors)
+        try:
+            return fetch(self.folder / "agent.sock")
+        except AgentError:
+            return {}  # not yet
+
+    def samples(self, stream: str) -> int:
+        return int(self.status().get("streams", {}).get(stream, {}).get("samples", 0))
+
+
+def said(process: Process, text: str) -> int:
+    return sum(text in line for line in process.errors)
+
+
+def registered(graph: Graph, name: str) -> str:
+    """The address of the node that the master knows by a name."""
+    with xmlrpc.client.ServerProxy(graph.environment["ROS_MASTER_URI"]) as master:
+        _, _, uri = master.lookupNode("/test", name)
+    return str(uri)
