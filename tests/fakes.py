@@ -11,7 +11,7 @@ from typing import Any
 from boto3.dynamodb.types import TypeSerializer
 
 import contract
-from contract import EXPIRES_S, RECEIVED_MS, ROBOT, SECOND, T_US, TOPIC, Batch
+from contract import BATCH, EXPIRES_S, RECEIVED_MS, ROBOT, SECOND, TOPIC, Batch
 from contract.checks import json_object
 from functions.tables import Tables, plain
 
@@ -20,7 +20,7 @@ serialize = TypeSerializer().serialize
 TELEMETRY, SUMMARY, ROBOTS, QUARANTINE = "telemetry", "summary", "robots", "quarantine"
 # What Lambda 2 is given, as the arguments of Tables.
 NAMES = {"telemetry": TELEMETRY, "summary": SUMMARY, "robots": ROBOTS}
-KEYS = {TELEMETRY: (TOPIC, T_US), SUMMARY: (TOPIC, SECOND), ROBOTS: (ROBOT,)}
+KEYS = {TELEMETRY: (TOPIC, BATCH), SUMMARY: (TOPIC, SECOND), ROBOTS: (ROBOT,)}
 TOPIC_OF_CAR = contract.build_topic(contract.RECORD, "car", contract.VESC_STREAM)
 EXPIRES = 1_800_000_000
 
@@ -36,8 +36,7 @@ class FakeDynamoDB:
         self.read = 0
 
     def put(self, table: str, item: dict[str, Any]) -> None:
-        first, *rest = (next(iter(item[name].values())) for name in KEYS[table])
-        self.items[table][(first, *map(Decimal, rest))] = item
+        self.items[table][_key(table, item)] = item
 
     def get_paginator(self, operation: str) -> FakeDynamoDB:
         if operation == "scan":
@@ -55,13 +54,12 @@ class FakeDynamoDB:
         assert names["#topic"] == TOPIC
         assert set(names.values()) >= set(KEYS[query["TableName"]])
         topic = values[":topic"]["S"]
-        bounds = {name: Decimal(value["N"]) for name, value in values.items() if name != ":topic"}
-        match = re.fullmatch(r"#topic = :topic AND #(?:t|key) (.+)", query["KeyConditionExpression"])
+        bounds = {name: _comparable(value) for name, value in values.items() if name != ":topic"}
+        match = re.fullmatch(r"#topic = :topic AND #(?:batch|key) (.+)", query["KeyConditionExpression"])
         assert match
         inside = {
-            "< :t": lambda t: t < bounds[":t"],
-            "> :t": lambda t: t > bounds[":t"],
-            "BETWEEN :first AND :last": lambda t: bounds[":first"] <= t <= bounds[":last"],
+            "< :first": lambda key: key < bounds[":first"],
+            "BETWEEN :first AND :last": lambda key: bounds[":first"] <= key <= bounds[":last"],
         }[match[1]]
         found = sorted(key for key in self.items[query["TableName"]] if key[0] == topic and inside(key[1]))
         if not query.get("ScanIndexForward", True):
@@ -75,8 +73,7 @@ class FakeDynamoDB:
 
     def get_item(self, *, TableName: str, Key: dict[str, Any], **_: Any) -> dict[str, Any]:
         self.calls["get_item"] += 1
-        first, *rest = (next(iter(Key[name].values())) for name in KEYS[TableName])
-        item = self.items[TableName].get((first, *map(Decimal, rest)))
+        item = self.items[TableName].get(_key(TableName, Key))
         return {"Item": item} if item else {}
 
     def batch_write_item(self, *, RequestItems: dict[str, Any]) -> dict[str, Any]:
@@ -91,6 +88,16 @@ class FakeDynamoDB:
             self.put(table, item)
         left = requests[len(taken) :]
         return {"UnprocessedItems": {table: left} if left else {}}
+
+
+def _key(table: str, item: dict[str, Any]) -> tuple[Any, ...]:
+    return tuple(_comparable(item[name]) for name in KEYS[table])
+
+
+def _comparable(value: dict[str, str]) -> Any:
+    """A key attribute as DynamoDB orders it: numbers by their value, texts by their bytes."""
+    ((kind, content),) = value.items()
+    return Decimal(content) if kind == "N" else content
 
 
 class _Scans:

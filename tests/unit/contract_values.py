@@ -26,8 +26,9 @@ values = st.none() | st.booleans() | integers | finite | st.text(max_size=20)
 
 @st.composite
 def batches(draw, kinds=values):
-    offsets = draw(st.sets(st.integers(1, contract.MAX_BATCH_SPAN_US - 1), max_size=12))
-    first = draw(st.integers(-LIMIT_US, LIMIT_US - contract.MAX_BATCH_SPAN_US) | st.just(0))
+    # Of one time there may be several.
+    offsets = draw(st.lists(st.integers(0, contract.MAX_BATCH_SPAN_US - 1) | st.integers(0, 3), max_size=12))
+    first = draw(st.integers(0, LIMIT_US - contract.MAX_BATCH_SPAN_US) | st.just(0))
     n = 1 + len(offsets)
     # Columns as recordings have them, of one kind, and of any mixture.
     column = st.one_of(

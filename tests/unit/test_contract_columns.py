@@ -82,9 +82,9 @@ def plain_message(envelope, body):
     return {**envelope, "codec": "columns+zlib+base64", "samples": samples}
 
 
-# Written by the agent as it was before this codec.
+# Of the agent as it was before this codec, under the id that batches have since.
 STORED = (
-    b'{"v":1,"boot":"0123abcd","seq":7,"t":1000,"n":3,"nonfinite":0,"codec":"columns+zlib+base64",'
+    b'{"v":2,"batch":"0000000000001000-0123abcd-7","n":3,"nonfinite":0,"codec":"columns+zlib+base64",'
     b'"samples":"eJyrVkopUbKKNtAxAiJT01gdpbTM1JyUYiWraqVEoIShjoGekU5eaU4OUCoJKKCUr6RTUlSaqpOWmFOcGltbCwBm'
     b'dxOr"}'
 )
