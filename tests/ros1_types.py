@@ -17,8 +17,9 @@ SIZES = {
     "int64": 8, "uint64": 8, "float32": 4, "float64": 8, "time": 8, "duration": 8,
 }  # fmt: skip
 _LETTERS = {
-    "bool": "?", "int8": "b", "uint8": "B", "byte": "b", "char": "B", "int16": "h", "uint16": "H", "int32": "i",
-    "uint32": "I", "int64": "q", "uint64": "Q", "float32": "f", "float64": "d", "time": "II", "duration": "ii",
+    "bool": "?", "int8": "b", "uint8": "B", "byte": "b", "char": "B", "int16": "h", "uint16": "H",
+    "int32": "i", "uint32": "I", "int64": "q", "uint64": "Q", "float32": "f", "float64": "d",
+    "time": "II", "duration": "ii",
 }  # fmt: skip
 STRING, HEADER = "string", "std_msgs/Header"
 HEADER_TEXT = "uint32 seq\ntime stamp\nstring frame_id"

@@ -5,6 +5,7 @@ What `mixed_publisher.py` publishes, in processes under ROS' own Python, and the
 
 from __future__ import annotations
 
+import hashlib
 import math
 import random
 import struct
@@ -45,7 +46,8 @@ TEXTS = {
     ),
     "sensor_msgs/LaserScan": (
         "Header header\nfloat32 angle_min\nfloat32 angle_max\nfloat32 angle_increment\n"
-        "float32 time_increment\nfloat32 scan_time\nfloat32 range_min\nfloat32 range_max\nfloat32[] ranges\nfloat32[] intensities"
+        "float32 time_increment\nfloat32 scan_time\nfloat32 range_min\nfloat32 range_max\n"
+        "float32[] ranges\nfloat32[] intensities"
     ),
     "sensor_msgs/Image": (
         "Header header\nuint32 height\nuint32 width\nstring encoding\nuint8 is_bigendian\n"
@@ -145,6 +147,11 @@ _EDGES = {
     "int64": [-(2**63), 2**53 + 1],
 }
 _WORDS = (b"", b"base_link", "grün".encode(), b"not UTF-8: \xff\xfe", b"\xc3", b"a\0b", b"joint_1")
+
+
+def digest(content: bytes) -> str:
+    """What a message is told from others by, where its bytes would be too many."""
+    return hashlib.blake2b(content, digest_size=12).hexdigest()
 
 
 class Values:
