@@ -84,23 +84,24 @@ class Difference(NamedTuple):
 
 
 def compare(
-    recorded: Bag, exported: Bag, *, same: Callable[[Kind, bytes], object] = lambda _kind, data: data
+    recorded: Bag, exported: Bag, *, same: Callable[[str, bytes], object] = lambda _topic, data: data
 ) -> list[Difference]:
-    """The topics that are not the same, as multisets; ``same`` says by what a message is told from others."""
+    """The topics that are not the same, as multisets; ``same`` says by what a topic's message is told from
+    others."""
     found = []
     for topic, kind in recorded.kinds.items():
         sent, came = recorded.of(topic), exported.of(topic)
-        left = Counter(same(kind, one.data) for one in came)
+        left = Counter(same(topic, one.data) for one in came)
         missing = []
         for one in sent:
-            key = same(kind, one.data)
+            key = same(topic, one.data)
             if left[key]:
                 left[key] -= 1
             else:
                 missing.append(one)
         extra = []
         for one in reversed(came):
-            key = same(kind, one.data)
+            key = same(topic, one.data)
             if left[key]:
                 left[key] -= 1
                 extra.insert(0, one)

@@ -2,7 +2,7 @@
 
 Publishes bytes put together beforehand, of types that nobody has installed. Says ``ready`` when every topic
 has its subscribers, begins when it is told to by a line on its input, says ``sent {...}`` with the number
-of messages by topic, and ends with the next line. The ledger has a line for each message: topic and digest.
+of messages by topic, and ends with the next line. The ledger has a line for each message: topic and base64.
 Whenever a topic's number of connections has changed, it
 says so in JSON, with the number of the message that found it changed.
 """
@@ -10,13 +10,14 @@ says so in JSON, with the number of the message that found it changed.
 # ruff: noqa: T201 - what it says goes to the test that started it
 
 import argparse
+import base64
 import json
 import sys
 import time
 
 import rospy
 
-from tests.ros.mixed_robot import NODES, Maker, digest
+from tests.ros.mixed_robot import NODES, Maker
 from tests.ros1_types import header
 
 parser = argparse.ArgumentParser()
@@ -61,7 +62,7 @@ class Publisher:
         stamp_us = now_us - now_us % topic.grid_us
         content = self._maker.made(self.sent, header(self.sent, stamp_us, options.node.encode()))
         self.publisher.publish(content)
-        options.ledger.write(f"{topic.name} {digest(content)}\n")
+        options.ledger.write(f"{topic.name} {base64.b64encode(content).decode()}\n")
         self.sent += 1
         # One of no rate is published once.
         self.due_s = self.sent / topic.rate_hz if topic.rate_hz else options.seconds

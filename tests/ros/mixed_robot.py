@@ -5,7 +5,6 @@ What `mixed_publisher.py` publishes, in processes under ROS' own Python, and the
 
 from __future__ import annotations
 
-import hashlib
 import math
 import random
 import struct
@@ -147,11 +146,6 @@ _EDGES = {
     "int64": [-(2**63), 2**53 + 1],
 }
 _WORDS = (b"", b"base_link", "grün".encode(), b"not UTF-8: \xff\xfe", b"\xc3", b"a\0b", b"joint_1")
-
-
-def digest(content: bytes) -> str:
-    """What a message is told from others by, where its bytes would be too many."""
-    return hashlib.blake2b(content, digest_size=12).hexdigest()
 
 
 class Values:

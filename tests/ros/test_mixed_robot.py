@@ -7,13 +7,16 @@ mistake. IORT_MIXED_S is how long it lasts, see `make prove-mixed`.
 
 from __future__ import annotations
 
+import base64
+import contextlib
 import json
 import os
 import shutil
+import sys
 import threading
 import time
 from collections import Counter, defaultdict
-from collections.abc import Iterator
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -28,7 +31,9 @@ from station import robots
 from tests.local.conftest import embedded, iort, until  # noqa: F401 - fixtures
 from tests.ros.conftest import Graph, Process, ros_python  # noqa: F401 - a fixture
 from tests.ros.mixed_compare import Bag, Difference, Recorded, compare, read
-from tests.ros.mixed_robot import NODES, TOPICS, digest
+from tests.ros.mixed_robot import NODES, TOPICS
+from tests.ros.mixed_rosbridge import GraphServer
+from tests.ros1_types import as_json
 
 RECORD = Path("/usr/lib/rosbag/record")
 DURATION_S = float(os.environ.get("IORT_MIXED_S") or 30)
@@ -46,15 +51,16 @@ Publisher = tuple[str, str]
 
 @dataclass(frozen=True, repr=False)
 class Drive:
-    """What was recorded, what came back, and what was published: the digest of every message."""
+    """What was recorded, what came back, and what was published. ``same`` is what a topic's message
+    is told from others by."""
 
     recorded: Bag
     exported: Bag
-    sent: dict[Publisher, list[str]]
+    sent: dict[Publisher, list[bytes]]
     # Topics whose export failed, and how.
     failed: dict[str, str]
-    # Publisher's topic and node -> its messages, by number, that no agent was connected for.
-    unheard: dict[Publisher, range]
+    # Topic -> its messages that no agent was connected for.
+    unheard: dict[str, list[bytes]]
     killed_ns: int
     audit_status: int
     audit: list[dict[str, Any]]
@@ -62,13 +68,16 @@ class Drive:
     second: list[tuple[int | None, str]]
     # How many agents have run, each of which is sent what is latched.
     agents: int
+    same: Callable[[str, bytes], object]
 
 
 class Mixed:
     """The graph with its publishers, its recorder, and the agents beside it."""
 
-    def __init__(self, graph: Graph, cloud: EmbeddedCloud, proxy: Proxy, out: Path) -> None:
-        self.graph, self.proxy, self.out = graph, proxy, out
+    def __init__(
+        self, graph: Graph, cloud: EmbeddedCloud, proxy: Proxy, out: Path, server: GraphServer | None
+    ) -> None:
+        self.graph, self.proxy, self.out, self.server = graph, proxy, out, server
         topics = {
             name: {"stream": topic.stream, "time": "header" if topic.message.stamped else "arrival"}
             for name, topic in TOPICS.items()
@@ -76,16 +85,27 @@ class Mixed:
         settings = {
             "port": proxy.port,
             "queue": {"path": "spool.db"},
-            "sources": [{"type": "ros1", "topics": topics}],
+            "sources": [
+                {"type": "ros1", "topics": topics}
+                if server is None
+                else {"type": "rosbridge", "url": server.url, "topics": topics}
+            ],
         }
-        self.bundle = robots.add(cloud.cloud, f"mixed-{out.name}"[-50:], out=out, settings=settings)
+        self.bundle = robots.add(cloud.cloud, out.name, out=out, settings=settings)
         self.agents = 0
 
     def agent(self, folder: Path | None = None) -> Process:
         """An agent of the robot, of its own folder or of a copy of it."""
         config = (folder or self.bundle.folder) / self.bundle.config.name
         self.agents += 1
-        return self.graph.module("device.main", "run", "--config", config, "--drain-s", 60)
+        # A robot of rosbridge needs no ROS, and has a Python of its own.
+        python = self.graph.python if self.server is None else sys.executable
+        command = ["-m", "device.main", "run", "--config", str(config), "--drain-s", "60"]
+        return self.graph.start([python, *command])
+
+    def same(self, topic: str, data: bytes) -> object:
+        """What a message is told from others by: all of it, or what rosbridge can say of it."""
+        return data if self.server is None else json.dumps(as_json(TOPICS[topic].message, data))
 
     def copy(self) -> Path:
         """The folder on another computer: with the certificate, without the queue."""
@@ -110,20 +130,23 @@ def _connections(publishers: dict[str, Process]) -> Iterator[tuple[Publisher, in
                 yield (said["topic"], node), said["n"], said["connections"]
 
 
-@pytest.fixture(scope="module")
+@pytest.fixture(scope="module", params=["ros1", "rosbridge"])
 def drive(
+    request: pytest.FixtureRequest,
     embedded: EmbeddedCloud,  # noqa: F811 - the fixture
     ros_python: str,  # noqa: F811 - the fixture
     tmp_path_factory: pytest.TempPathFactory,
 ) -> Iterator[Drive]:
     if not RECORD.is_file():
         pytest.skip("ROS 1's recorder is not installed: apt install rosbag")
-    folder = tmp_path_factory.mktemp("mixed")
+    folder = tmp_path_factory.mktemp(f"mixed-{request.param}-")
     graph = Graph(ros_python, folder)
     try:
         graph.start_master()
-        with Proxy("127.0.0.1", embedded.cloud.mqtt_port) as proxy:
-            yield _driven(Mixed(graph, embedded, proxy, folder), embedded)
+        with contextlib.ExitStack() as stack:
+            proxy = stack.enter_context(Proxy("127.0.0.1", embedded.cloud.mqtt_port))
+            server = stack.enter_context(GraphServer(graph)) if request.param == "rosbridge" else None
+            yield _driven(Mixed(graph, embedded, proxy, folder, server), embedded)
     finally:
         graph.stop()
 
@@ -149,6 +172,8 @@ def _driven(mixed: Mixed, embedded: EmbeddedCloud) -> Drive:  # noqa: F811 - the
     for publisher in publishers.values():
         publisher.until(lambda publisher=publisher: "ready" in publisher.lines, "connections")
     agent.until_said("connected to 127.0.0.1")
+    if mixed.server is not None:
+        mixed.server.wait_for("subscribe", len(TOPICS))
     for publisher in publishers.values():
         publisher.say("begin")
     began = time.monotonic()
@@ -161,10 +186,10 @@ def _driven(mixed: Mixed, embedded: EmbeddedCloud) -> Drive:  # noqa: F811 - the
     pause.wait(OUTAGE_S)
     mixed.proxy.mode = PASS
     at(0.45)
-    # The same command again, and the robot's folder on another computer.
-    again, elsewhere = mixed.agent(), mixed.agent(mixed.copy())
+    # The same command again, and the robot's folder elsewhere: rosbridge has no names that would tell.
+    others = [mixed.agent(), *([mixed.agent(mixed.copy())] if mixed.server is None else [])]
     pause.wait(SECOND_S)
-    second = [(process.terminate(), "\n".join(process.errors)) for process in (again, elsewhere)]
+    second = [(process.terminate(), "\n".join(process.errors)) for process in others]
     if not agent.alive() or any("source failed" in line for line in agent.errors):
         # It should not be so. The drive goes on with another one, so that what else differs is seen.
         agent.terminate()
@@ -175,15 +200,16 @@ def _driven(mixed: Mixed, embedded: EmbeddedCloud) -> Drive:  # noqa: F811 - the
     agent.kill()
     pause.wait(1)
     agent = mixed.agent()
-    sent: dict[Publisher, list[str]] = defaultdict(list)
+    sent: dict[Publisher, list[bytes]] = defaultdict(list)
     for node, publisher in publishers.items():
         publisher.until(lambda publisher=publisher: publisher.lines[-1].startswith("sent "), "end")
         for line in (mixed.out / f"{node}.sent").read_text().splitlines():
-            topic, told = line.split()
-            sent[topic, node].append(told)
+            topic, content = line.split(" ")
+            sent[topic, node].append(base64.b64decode(content))
     pause.wait(SETTLE_S)
     until(lambda: mixed.waiting() == 0, seconds=300)
-    unheard = _unheard(publishers, before, sent)
+    server = mixed.server
+    unheard = _unheard(publishers, before, sent) if server is None else server.unheard
     for publisher in publishers.values():
         publisher.say("quit")
     assert agent.terminate() in {0, 1}, "\n".join(agent.errors[-25:])
@@ -194,26 +220,26 @@ def _driven(mixed: Mixed, embedded: EmbeddedCloud) -> Drive:  # noqa: F811 - the
     assert audited.exit_code in {0, 1}, audited.output
     return Drive(
         read(bag), exported, sent, failed, unheard, killed_ns, audited.exit_code,
-        json.loads(audited.stdout), second, mixed.agents,
+        json.loads(audited.stdout), second, mixed.agents, mixed.same,
     )  # fmt: skip
 
 
 def _unheard(
-    publishers: dict[str, Process], before: dict[Publisher, int], sent: dict[Publisher, list[str]]
-) -> dict[Publisher, range]:
+    publishers: dict[str, Process], before: dict[Publisher, int], sent: dict[Publisher, list[bytes]]
+) -> dict[str, list[bytes]]:
     """The messages from the kill until an agent was there again, by their publishers' own words."""
     changes = defaultdict(list)
     for publisher, n, connections in _connections(publishers):
         if n > before.get(publisher, -1):
             changes[publisher].append((n, connections))
-    found = {}
+    found: dict[str, list[bytes]] = defaultdict(list)
     for publisher, those in changes.items():
         lost = next((n for n, connections in those if connections < 2), None)
         if lost is not None:
             back = next(
                 (n for n, connections in those if n > lost and connections >= 2), len(sent[publisher])
             )
-            found[publisher] = range(lost, back)
+            found[publisher[0]] += sent[publisher][lost:back]
     return found
 
 
@@ -238,21 +264,22 @@ def named(audit: list[dict[str, Any]], stream: str) -> int:
 def differences(drive: Drive) -> list[Difference]:
     """Where the bags differ, but for what no agent was there to hear, what the recorder itself has lost, and
     what an agent heard again: a latched message is sent to each."""
-    recorded: dict[Publisher, Counter[str]] = defaultdict(Counter)
-    for one in drive.recorded.messages:
-        recorded[one.topic, one.node][digest(one.data)] += 1
-    unheard: dict[str, Counter[str]] = defaultdict(Counter)
-    lost: dict[str, Counter[str]] = defaultdict(Counter)
-    for (topic, node), told in drive.sent.items():
-        unheard[topic].update(told[n] for n in drive.unheard.get((topic, node), ()))
-        lost[topic] += Counter(told) - recorded[topic, node]
-        if TOPICS[topic].latched:
-            lost[topic].update(told * (drive.agents - 1))
 
-    def less(messages: list[Recorded], excused: dict[str, Counter[str]]) -> list[Recorded]:
+    def counted(topic: str, messages: Iterable[bytes]) -> Counter[object]:
+        return Counter(drive.same(topic, data) for data in messages)
+
+    unheard = {topic: counted(topic, drive.unheard.get(topic, ())) for topic in TOPICS}
+    lost: dict[str, Counter[object]] = {topic: Counter() for topic in TOPICS}
+    for (topic, node), messages in drive.sent.items():
+        recorded = [one.data for one in drive.recorded.of(topic) if one.node == node]
+        lost[topic] += counted(topic, messages) - counted(topic, recorded)
+        if TOPICS[topic].latched:
+            lost[topic] += counted(topic, messages * (drive.agents - 1))
+
+    def less(messages: list[Recorded], excused: dict[str, Counter[object]]) -> list[Recorded]:
         found = []
         for one in messages:
-            told = digest(one.data)
+            told = drive.same(one.topic, one.data)
             if not excused[one.topic][told]:
                 found.append(one)
             else:
@@ -260,7 +287,7 @@ def differences(drive: Drive) -> list[Difference]:
         return found
 
     found = []
-    for one in compare(drive.recorded, drive.exported):
+    for one in compare(drive.recorded, drive.exported, same=drive.same):
         missing, extra = less(one.missing, unheard), less(one.extra, lost)
         if missing or extra or (not one.missing and not one.extra):
             found.append(one._replace(missing=missing, extra=extra))
@@ -275,9 +302,9 @@ def with_the_process(drive: Drive, one: Difference) -> bool:
 
 def test_what_was_published_is_what_was_recorded(drive: Drive) -> None:
     """The recorder's own queue is 100 messages: a machine that is busy elsewhere loses some of 1 kHz."""
-    recorded: dict[Publisher, list[str]] = defaultdict(list)
+    recorded: dict[Publisher, list[bytes]] = defaultdict(list)
     for one in drive.recorded.messages:
-        recorded[one.topic, one.node].append(digest(one.data))
+        recorded[one.topic, one.node].append(one.data)
     assert recorded.keys() == drive.sent.keys()
     for publisher, told in drive.sent.items():
         assert not Counter(recorded[publisher]) - Counter(told)
@@ -286,11 +313,11 @@ def test_what_was_published_is_what_was_recorded(drive: Drive) -> None:
 
 
 def test_an_agent_that_is_there_goes_on_beside_a_second_one(drive: Drive) -> None:
-    (status, said), _ = drive.second
+    status, said = drive.second[0]
     assert status == 1, said
     assert "the queue is in use by" in said or "already running" in said
-    # There is the agent, the same one again, its copy, and the one after the kill.
-    assert drive.agents == 4
+    # There is the agent, the others, and the one after the kill.
+    assert drive.agents == 2 + len(drive.second)
 
 
 def test_every_message_comes_back_or_the_audit_says_why(drive: Drive) -> None:
