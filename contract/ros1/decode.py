@@ -26,6 +26,8 @@ MAX_ELEMENTS = 64
 MAX_TEXT = 4096
 # Elements of variable size are walked one by one; a message of more is not looked into.
 _MAX_WALKED = 20_000
+# Of the places in a message that a decoder has a name for: a few lines can nest to more than anybody walks.
+_MAX_NAMED = 20_000
 
 # Reads from the bytes at an offset into the sample; returns the offset behind what it has read.
 Step = Callable[[bytes, int, Dict[str, Value]], int]
@@ -66,7 +68,10 @@ class Decoder:
         self._stamp = stamp and self.stamped
         self.left_out: dict[str, int] = {}
         compiler = _Compiler(definition, select, self.left_out, large=large)
-        self._steps = compiler.message(headed=self.stamped)
+        try:
+            self._steps = compiler.message(headed=self.stamped)
+        except struct.error as error:
+            raise MessageError(f"{self._kind}: no message is so large: {error}") from error
         self.unknown = sorted(set(select or ()) - compiler.used)
         self.flat: tuple[struct.Struct, list[str]] | None = None
         if len(self._steps) == 1:
@@ -113,7 +118,8 @@ class _Compiler:
         self._select = select
         self._left_out = left_out
         self._sizes: dict[str, int | None] = {}
-        self._emitted = 0
+        self._skips: dict[str, list[Step]] = {}
+        self._emitted = self._named = 0
         self.used: set[str] = set()
         self.fixed: dict[Step, tuple[struct.Struct, list[str]]] = {}
 
@@ -135,7 +141,8 @@ class _Compiler:
             self._field(run, field, prefix + field.name)
 
     def _field(self, run: _Run, field: Field, path: str) -> None:
-        if not self._within(path):
+        self._named += 1
+        if self._full() or not self._within(path):
             self._skip(run, field)
         elif field.length is None:
             self._single(run, field.kind, path)
@@ -143,6 +150,10 @@ class _Compiler:
             run.step(self._variable(field.kind, path))
         else:
             self._array(run, field, path, field.length)
+
+    def _full(self) -> bool:
+        """Whether nothing more can be shown: what comes is stepped over and not taken apart."""
+        return self._emitted > MAX_FIELDS or self._named > _MAX_NAMED
 
     def _single(self, run: _Run, kind: str, path: str) -> None:
         if kind in self._definition.types:
@@ -168,6 +179,8 @@ class _Compiler:
         taken = range(length) if whole and length <= MAX_ELEMENTS else self._indexes(path, length)
         done = 0
         for i in taken:
+            if self._full():
+                break
             self._skip(run, Field(field.name, field.kind, i - done))
             self._single(run, field.kind, f"{path}.{i}")
             done = i + 1
@@ -182,13 +195,17 @@ class _Compiler:
         if blob and whole and self._large:
             return _bytes(path)
         elements: dict[int, list[Step]] = {}
-        structs: dict[int, tuple[struct.Struct, list[str]]] = {}
-        skip = self._element(kind, None)
+        structs: dict[int, struct.Struct] = {}
+        names: list[str] = []
+        skip = self._skipped(kind)
         letter = LETTERS.get(kind)
+        self._named += MAX_ELEMENTS if letter else 1
 
         def steps(i: int) -> list[Step]:
             # Made when a message is first so long: most arrays stay short.
             if i not in elements:
+                if self._full():
+                    return skip
                 elements[i] = self._element(kind, f"{path}.{i}")
             return elements[i]
 
@@ -198,12 +215,15 @@ class _Compiler:
             all_of_it = whole and not blob and n <= MAX_ELEMENTS
             if whole and not all_of_it:
                 left_out[path] = left_out.get(path, 0) + 1
+            # What comes now is cut off anyway.
+            all_of_it = all_of_it and len(out) <= MAX_FIELDS
             if size is not None and at + n * size > len(data):
                 raise struct.error
             if all_of_it and letter:
-                if n not in structs:
-                    structs[n] = (struct.Struct(f"<{n}{letter}"), [f"{path}.{i}" for i in range(n)])
-                reader, names = structs[n]
+                reader = structs.get(n)
+                if reader is None:
+                    reader = structs[n] = struct.Struct(f"<{n}{letter}")
+                    names.extend(f"{path}.{i}" for i in range(len(names), n))
                 out.update(zip(names, reader.unpack_from(data, at)))
                 return at + int(reader.size)
             if size is not None:
@@ -218,30 +238,41 @@ class _Compiler:
 
         return step
 
-    def _element(self, kind: str, path: str | None) -> list[Step]:
+    def _element(self, kind: str, path: str) -> list[Step]:
         run = _Run({})
         emitted, self._emitted = self._emitted, 0
-        if path is None:
-            self._skip(run, Field("", kind, None))
-        else:
-            self._single(run, kind, path)
+        self._single(run, kind, path)
         self._emitted = emitted
         return run.finish()
 
     def _skip(self, run: _Run, field: Field) -> None:
         size = self._size(field.kind)
         if field.length == VARIABLE:
-            run.step(_skip_many(size, None if size is not None else self._element(field.kind, None)))
+            run.step(_skip_many(size, self._skipped(field.kind)))
         elif size is not None:
             run.pad(size * (1 if field.length is None else field.length))
-        elif field.length is not None:
-            if field.length:
-                run.step(_repeated(self._element(field.kind, None), field.length))
-        elif field.kind == STRING:
-            run.step(_skip_text)
-        else:
-            for nested in self._definition.fields(field.kind):
-                self._skip(run, nested)
+        elif field.length is None:
+            for step in self._skipped(field.kind):
+                run.step(step)
+        elif field.length:
+            run.step(_repeated(self._skipped(field.kind), field.length))
+
+    def _skipped(self, kind: str) -> list[Step]:
+        """The steps over one value of a type, made once."""
+        if kind not in self._skips:
+            run = _Run({})
+            if self._size(kind) is not None:
+                self._skip(run, Field("", kind, None))
+            elif kind == STRING:
+                run.step(_skip_text)
+            else:
+                inner = _Run({})
+                for nested in self._definition.fields(kind):
+                    self._skip(inner, nested)
+                # One step, however much is within.
+                run.step(_repeated(inner.finish(), 1))
+            self._skips[kind] = run.finish()
+        return self._skips[kind]
 
     def _size(self, kind: str) -> int | None:
         """The bytes of a type, or None where a message's own content decides."""
@@ -252,6 +283,8 @@ class _Compiler:
         if kind not in self._sizes:
             total: int | None = 0
             for field in self._definition.fields(kind):
+                if field.length == 0:
+                    continue
                 size = None if field.length == VARIABLE else self._size(field.kind)
                 if size is None:
                     total = None
@@ -386,12 +419,12 @@ def _skip_bytes(size: int) -> Step:
     return lambda _data, at, _out: at + size
 
 
-def _skip_many(size: int | None, element: list[Step] | None) -> Step:
+def _skip_many(size: int | None, element: list[Step]) -> Step:
     def step(data: bytes, at: int, out: dict[str, Value]) -> int:
         (n,) = _LENGTH.unpack_from(data, at)
         at += 4
-        if element is None:
-            return at + int(n) * (size or 0)
+        if size is not None:
+            return at + int(n) * size
         if n > _MAX_WALKED:
             raise MessageError(f"{n} elements are too many to look into")
         for _ in range(n):

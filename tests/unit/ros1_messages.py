@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import struct
 
+LINE = "=" * 80 + "\n"
 HEADER = """
 ================================================================================
 MSG: std_msgs/Header

@@ -6,6 +6,7 @@ rosbags, which is independent of it, serialises the messages and says what must 
 from __future__ import annotations
 
 import struct
+import tracemalloc
 from typing import Any
 
 import pytest
@@ -17,7 +18,13 @@ from contract.ros1.decode import MAX_ELEMENTS, MAX_TEXT, Decoder
 from contract.ros1.definition import VARIABLE, parse
 from device.sources.flatten import flatten
 from tests.recordings import recording
-from tests.unit.ros1_messages import HEADER, STAMPED, header, text, u32
+from tests.unit.ros1_messages import HEADER, LINE, STAMPED, header, text, u32
+
+
+def nested_header(path: str) -> dict[str, Any]:
+    """What `header()` is in the view where it is not the message's own."""
+    return {f"{path}.seq": 1, f"{path}.stamp.sec": 5, f"{path}.stamp.nanosec": 7000,
+            f"{path}.frame_id": "base_link"}  # fmt: skip
 
 
 def decoded(definition: str, data: bytes, **how: Any) -> dict[str, Any]:
@@ -48,8 +55,15 @@ def decoded(definition: str, data: bytes, **how: Any) -> dict[str, Any]:
          {"b.0.u": 1, "b.1.u": 2, "c": 3}),
         ("Header header\nuint8 a" + HEADER, header() + b"\x01", {"a": 1}),
         ("Header header\na_msgs/B b" + HEADER + "=" * 80 + "\nMSG: a_msgs/B\nHeader header\nuint8 u\nuint8 v",
-         header() + header() + b"\x01\x02", {"u": 1, "v": 2}),
-        ("uint8 a\nHeader header" + HEADER, b"\x01" + header(), {"a": 1}),
+         header() + header() + b"\x01\x02", {**nested_header("header"), "u": 1, "v": 2}),
+        ("uint8 a\nHeader header" + HEADER, b"\x01" + header(), {"a": 1, **nested_header("header")}),
+        ("Header header\nHeader other\nuint8 a" + HEADER, header() + header() + b"\x01",
+         {**nested_header("other"), "a": 1}),
+        ("Header[] header\nuint8 a" + HEADER, u32(1) + header() + b"\x01",
+         {**nested_header("header.0"), "a": 1}),
+        ("float32 header\nuint8 a", struct.pack("<fB", 0.5, 1), {"header": 0.5, "a": 1}),
+        ("B header\n" + "=" * 80 + "\nMSG: a_msgs/B\nuint8 u", b"\x01", {"header.u": 1}),
+        ("Header header" + HEADER, header(), {}),
         ("Header header\ntime t" + HEADER, header() + u32(3, 4), {"sec": 3, "nanosec": 4}),
         ("uint8 X=1 # one\nstring S=a # is = part of it\nfloat32 PI = 3\nuint8 y # = 5", b"\x09", {"y": 9}),
         ("B b\n" + "=" * 80 + "\nMSG: a_msgs/B\nuint8 NOTHING=0", b"", {}),
@@ -124,23 +138,70 @@ def test_what_is_no_telemetry_is_left_out_and_counted() -> None:
     assert len(decoder.decode(small)[0]) == MAX_ELEMENTS + 2
 
 
+BEYOND = "(fields beyond 512)"
+
+
 @pytest.mark.parametrize(
-    "definition",
+    ("definition", "size", "first"),
     [
-        "float64[64] a\nfloat64[64] b\n" * 5,
-        "B[64] b\n" + "=" * 80 + "\nMSG: a_msgs/B\nC[64] c\n" + "=" * 80 + "\nMSG: a_msgs/C\nuint8[64] u",
+        ("".join(f"float64[60] f{i}\n" for i in range(10)), 4800, ["f0.0", "f0.1"]),
+        ("B[64] b\n" + LINE + "MSG: a_msgs/B\nC[64] c\n" + LINE + "MSG: a_msgs/C\nuint8[64] u\nuint8 v",
+         64 * 64 * 65, ["b.0.c.0.u.0", "b.0.c.0.u.1"]),
+        ("B[64] b\n" + LINE + "MSG: a_msgs/B\nfloat64[64] u", 64 * 64 * 8, ["b.0.u.0", "b.0.u.1"]),
+        ("uint8 a\nB[] b\n" + LINE + "MSG: a_msgs/B\nuint8[64] u", None, ["a", "b.0.u.0"]),
+        ("uint8 a\nB[] b\n" + LINE + "MSG: a_msgs/B\nC[] c\n" + LINE + "MSG: a_msgs/C\nuint8[64] u", None,
+         ["a", "b.0.c.0.u.0"]),
     ],
-)
-def test_too_many_fields(definition: str) -> None:
-    with pytest.raises(MessageError, match="has over 512 fields; select some"):
-        Decoder(parse("a_msgs/A", definition))
+)  # fmt: skip
+def test_fields_beyond_512_are_cut_from_the_view_and_counted(
+    definition: str, size: int | None, first: list[str]
+) -> None:
+    decoder = Decoder(parse("a_msgs/A", definition))
+    within = b"\1" + (u32(20) + bytes(20 * 64)) if "c\n" not in definition else b""
+    data = bytes(size) if size is not None else within or b"\1" + u32(4) + 4 * (u32(9) + bytes(9 * 64))
+    for times in (1, 2):
+        values = decoder.decode(data)[0]
+        assert (len(values), list(values)[:2]) == (512, first)
+        assert decoder.left_out == {BEYOND: times}
+    assert decoder.flat is None
 
 
-def test_too_many_fields_of_a_message() -> None:
-    nested = "B[] b\n" + "=" * 80 + "\nMSG: a_msgs/B\nfloat64[64] u"
-    decoder = Decoder(parse("a_msgs/A", nested))
-    with pytest.raises(MessageError, match="over 512 fields"):
-        decoder.decode(u32(9) + bytes(9 * 64 * 8))
+@pytest.mark.parametrize("length", ["", "[64]", "[16777216]"])
+@pytest.mark.parametrize("leaf", ["uint8 u", "string s", "string[0] s", "uint8[] u"])
+def test_types_within_types_cost_no_more_than_a_view(length: str, leaf: str) -> None:
+    """Some lines nest so deeply that nobody could walk through all of it."""
+    kinds = [f"T{i}" for i in range(20)]
+    line = "".join(f"{{0}}{length} a{i}\n" for i in range(9 if not length else 1))
+    definition = line.format(kinds[0])
+    for kind, inner in zip(kinds, kinds[1:]):
+        definition += f"{LINE}MSG: a_msgs/{kind}\n{line.format(inner)}"
+    definition += f"{LINE}MSG: a_msgs/{kinds[-1]}\n{leaf}\n"
+    for select in (None, ["a0.x"]):
+        try:
+            Decoder(parse("a_msgs/A", definition), select=select).decode(bytes(1000))
+        except MessageError:
+            continue
+        # Only a message without a byte is as long as its definition says.
+        raise AssertionError("1000 bytes are no such message")
+
+
+@pytest.mark.parametrize(("n", "fields"), [(60, 512), (0, 0)], ids=["full", "empty"])
+def test_arrays_within_arrays_cost_no_more_than_a_view(n: int, fields: int) -> None:
+    """A message of megabytes may hold millions of values, or a quarter of a million empty arrays."""
+    kinds = ["T0", "T1", "T2"]
+    definition = "T0[] a\n"
+    for kind, inner in zip(kinds, [*kinds[1:], "int8"]):
+        definition += f"{LINE}MSG: a_msgs/{kind}\n{inner}[] a\n"
+    data = u32(n) + bytes(n)
+    for _ in kinds:
+        data = u32(60) + data * 60
+    decoder = Decoder(parse("a_msgs/A", definition))
+    tracemalloc.start()
+    try:
+        assert len(decoder.decode(data)[0]) == fields
+        assert tracemalloc.get_traced_memory()[1] < 20_000_000
+    finally:
+        tracemalloc.stop()
 
 
 @pytest.mark.parametrize(
@@ -152,7 +213,8 @@ def test_too_many_fields_of_a_message() -> None:
         ("string s", b"\x01", "cut short"),
         ("float64[] a", u32(2**32 - 1), "cut short"),
         ("uint8[] a", u32(2**32 - 1), "cut short"),
-        ("string[] a", u32(2**32 - 1), "cut short"),
+        ("string[] a", u32(20_000), "cut short"),
+        ("string[] a", u32(2**32 - 1), "4294967295 elements are too many"),
         ("string[1000000] a", b"", "cut short"),
     ],
 )
