@@ -4,7 +4,7 @@ BIN := .venv/bin
 # cdk.json runs `python app.py`.
 bootstrap deploy diff destroy: export PATH := $(CURDIR)/$(BIN):$(PATH)
 
-.PHONY: help demo test test-oldest check setup bench bench-guard bench-agent bench-page screenshots bench-fleet layer bootstrap deploy diff destroy lock clean
+.PHONY: help demo test test-oldest check setup prove-mixed bench bench-guard bench-agent bench-page screenshots bench-fleet layer bootstrap deploy diff destroy lock clean
 
 help: ## show this
 	@grep -hE '^[a-z-]+:.*## ' Makefile | sed -E 's/^([a-z-]+):.*## /\1\t/' | expand -t 14
@@ -28,6 +28,9 @@ check: setup ## run the linters, the type checkers, and cfn-lint, cdk-nag and ch
 	@$(PYTHON) scripts/setup.py --checkov
 	@$(BIN)/ruff check . && $(BIN)/ruff format --check . && $(BIN)/mypy app.py contract scripts device functions stacks station local bench && $(BIN)/npm run --silent check
 	@PATH="$(CURDIR)/$(BIN):$$PATH" $(BIN)/python scripts/check_stacks.py --checkov build/checkov/bin/checkov
+
+prove-mixed: setup ## drive a robot of every shape of message beside rosbag record: DURATION=300
+	@IORT_MIXED_S=$(or $(DURATION),300) $(BIN)/python -m pytest -rA tests/ros/test_mixed_robot.py
 
 bench: setup ## measure every table of the thesis: ONLY=query,outage TARGET=aws OUT=docs/bench
 	@$(BIN)/python -m bench.run $(if $(ONLY),--only $(ONLY)) $(if $(TARGET),--target $(TARGET)) \

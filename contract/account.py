@@ -65,6 +65,10 @@ LOST = frozenset(
         "full",
         "disk",
         "left_out",
+        "skipped",
+        "bad_cells",
+        "structure_not_kept",
+        "not_a_number",
         "others",
     }
 )

@@ -31,6 +31,8 @@ NO_ROBOT = "-"
 BY_RULE, BY_STREAM, BY_FUNCTION = "rule", "stream", "function"
 # In an event for Lambda 2: a replay, whose records are answered for and not put into quarantine again.
 REPLAY = "replay"
+# Or the second from which stored batches are summarised again, whose answer says as `RECOMPUTED` which were.
+RECOMPUTE_FROM_S, RECOMPUTED = "recompute_from_s", "recomputed"
 # What a queue's message of Lambda 2's carries: the stored item as DynamoDB JSON, in base64.
 ITEM_BASE64 = "base64Item"
 

@@ -11,7 +11,8 @@ from device.clock import Clock
 from device.sources import Emit
 from device.spool import Spool
 
-EVERY_S = 30.0
+# Losses are told within a second, all else once in ten: a run that is killed has told nearly everything.
+_EVERY_S, _LOSS_S = 10.0, 1.0
 # Counts of what was given: no cause of anything.
 _GIVEN = frozenset({"messages", "samples", "rows", "opened", "silent", "kept", "published"})
 
@@ -35,9 +36,18 @@ class Accounts:
     ) -> None:
         self._clock, self._spool, self._streams = clock, spool, streams
         self._counted, self._reports, self._emit = counted, reports, emit
+        self._told = clock.monotonic()
+        self._lost = 0
+
+    def tick(self) -> None:
+        """Tell if it is time; call it several times a second."""
+        passed = self._clock.monotonic() - self._told
+        if passed >= _EVERY_S or (passed >= _LOSS_S and self._losses() != self._lost):
+            self.tell()
 
     def tell(self, *, ended: bool = False) -> None:
         """Emit a sample a stream and a source; ``ended`` with the last, once every batch is closed."""
+        self._told, self._lost = self._clock.monotonic(), self._losses()
         now_us = self._clock.now_us()
         counted = self._counted()
         for name in sorted({*self._streams, *counted} - {ACCOUNT_STREAM}):
@@ -59,6 +69,10 @@ class Accounts:
             found = {path: count for path, count in _counts(report, "") if count}
             if found:
                 self._emit(ACCOUNT_STREAM, now_us, SourceAccount(source, found).sample())
+
+    def _losses(self) -> int:
+        refused = sum(counts.refused for counts, _ in self._counted().values())
+        return refused + self._spool.dropped().samples
 
 
 def _counts(report: Mapping[str, Any], prefix: str) -> Iterator[tuple[str, int]]:

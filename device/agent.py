@@ -12,7 +12,7 @@ from typing import Any, Mapping
 
 import contract
 from contract import Value
-from device.account import EVERY_S, Accounts
+from device.account import Accounts
 from device.allowance import Allowance
 from device.batch import Batcher, StreamCounts
 from device.claim_check import make_claims
@@ -370,7 +370,7 @@ class Agent:
         self._stop.set()
 
     def _tick(self) -> None:
-        measured = looked = told = self._clock.monotonic()
+        measured = looked = self._clock.monotonic()
         self._accounts.tell()
         while not self._clock.wait(self._stop, _TICK_S):
             self.tick()
@@ -378,9 +378,7 @@ class Agent:
             if now - looked >= _RATES_S:
                 looked = now
                 self._rates.update(self._counts.copy())
-            if now - told >= EVERY_S:
-                told = now
-                self._accounts.tell()
+            self._accounts.tick()
             if self._config.metrics.enabled and now - measured >= self._config.metrics.every_s:
                 measured = now
                 self._measure()

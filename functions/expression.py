@@ -1,9 +1,11 @@
 """A condition on samples, such as ``speed_mps > 1.2 and fault_code == 0``: parsed, never evaluated by Python.
 
 The language is a part of Python's own syntax: fields (a dotted path, ``covariance[0]`` for an element),
-numbers, texts, ``+ - * / %``, ``abs()``, comparisons (also chained, ``in (...)`` and ``is None``),
-``and``, ``or``, ``not`` and brackets. What is null makes arithmetic null and every comparison false;
-division by zero is null. A field by itself is true where it is neither null, zero nor empty.
+numbers, texts, ``+ - * / %``, ``abs()``, comparisons (also chained and ``in (...)``), ``is None`` and
+``is not None`` (also written ``== None`` and ``!= None``), ``and``, ``or``, ``not`` and brackets. What is
+null makes arithmetic null and every comparison false; division by zero is null. A field by itself is true
+where it is neither null, zero nor empty. A number compared with a text is an error, as is calculating with
+a text: no sample could ever answer it.
 
 The query function evaluates over lists; station/conditions.py over numpy's columns, with the same answers.
 """
@@ -21,6 +23,13 @@ from contract import ContractError, Value, check_field
 MAX_LENGTH = 1000
 # Deeper than anybody writes, and far from the interpreter's own limit.
 _MAX_DEPTH = 40
+# What a value is, as far as comparing goes; a flag is 0 or 1.
+_NULL, _NUMBER, _TEXT = "null", "a number", "a text"
+_Kinds: TypeAlias = Mapping[str, frozenset[str]]
+
+
+class MismatchError(ValueError):
+    """A condition that compares a number with a text, or calculates with a text; the text says which."""
 
 
 class ExpressionError(ValueError):
@@ -38,9 +47,9 @@ class Field(NamedTuple):
 
 
 class Constant(NamedTuple):
-    """A number, text, True, False or None."""
+    """A number, text, True or False."""
 
-    value: Value
+    value: float | str
 
 
 class Arithmetic(NamedTuple):
@@ -140,8 +149,14 @@ def names(node: Node) -> frozenset[str]:
 
 
 def holds(node: Node, columns: Mapping[str, Sequence[Value]], n: int) -> list[bool]:
-    """Where the condition is true, a value a sample; a field that is not there is null."""
+    """Where the condition is true, a value a sample; a field that is not there is null.
+
+    Raises `MismatchError` where numbers and texts would be compared.
+    """
     fields = {name: columns.get(name) or [None] * n for name in names(node)}
+    kinds = {name: frozenset(map(_kind, column)) - {_NULL} for name, column in fields.items()}
+    if problem := _mismatch(node, kinds):
+        raise MismatchError(problem)
     return [_is_true(_value(node, {name: column[i] for name, column in fields.items()})) for i in range(n)]
 
 
@@ -183,9 +198,43 @@ def _calculated(symbol: str, left: Value, right: Value) -> float | None:
 def _compared(symbol: str, left: Value, right: Value) -> bool:
     if left is None or right is None:
         return False
-    if isinstance(left, str) != isinstance(right, str):
-        return symbol == "!="
     return bool(COMPARISONS[symbol](left, right))
+
+
+def _kind(value: Value) -> str:
+    return _NULL if value is None else _TEXT if isinstance(value, str) else _NUMBER
+
+
+def _kinds(node: Node, of: _Kinds) -> frozenset[str]:
+    """What the values of a node are; nothing where that is not known, or all are null."""
+    if isinstance(node, Field):
+        return of.get(node.name, frozenset())
+    return frozenset({_kind(node.value) if isinstance(node, Constant) else _NUMBER})
+
+
+def _mismatch(node: Node, of: _Kinds) -> str:
+    """What a condition asks that fields of these kinds cannot answer; empty where there is nothing."""
+    if isinstance(node, (Field, Constant)):
+        return ""
+    if isinstance(node, (Arithmetic, Comparison)):
+        parts: tuple[Node, ...] = (node.left, node.right)
+    else:
+        parts = node.of if isinstance(node, (Every, Some)) else (node.of,)
+    kinds = frozenset().union(*(_kinds(part, of) for part in parts))
+    said = ", ".join(
+        f"{_shown(part)} is {' or '.join(sorted(_kinds(part, of)))}" for part in parts if _kinds(part, of)
+    )
+    if isinstance(node, Comparison) and len(kinds) > 1:
+        return f"a number and a text cannot be compared: {said}"
+    if isinstance(node, (Arithmetic, Magnitude)) and _TEXT in kinds:
+        return f"a text cannot be calculated with: {said}"
+    return next(filter(None, (_mismatch(part, of) for part in parts)), "")
+
+
+def _shown(node: Node) -> str:
+    if isinstance(node, Field):
+        return node.name
+    return repr(node.value) if isinstance(node, Constant) else "what is calculated"
 
 
 class _Reader:
@@ -209,6 +258,13 @@ class _Reader:
             return self._field(node)
         if isinstance(node, ast.Constant):
             return self._constant(node)
+        made = self._made(node)
+        # What the fields are, only the samples will tell.
+        if problem := _mismatch(made, {}):
+            raise self._error(problem, node)
+        return made
+
+    def _made(self, node: ast.expr) -> Node:
         if isinstance(node, ast.BoolOp):
             parts = tuple(map(self.read, node.values))
             return Every(parts) if isinstance(node.op, ast.And) else Some(parts)
@@ -257,8 +313,10 @@ class _Reader:
             if not finite:
                 raise self._error("the number is too large", node)
             return Constant(value)
-        if value is None or isinstance(value, (bool, str)):
+        if isinstance(value, (bool, str)):
             return Constant(value)
+        if value is None:
+            raise self._error("None can only be asked for: x is None, x is not None", node)
         raise self._error("this is neither number nor text", node)
 
     def _compare(self, node: ast.Compare) -> Node:
@@ -270,17 +328,16 @@ class _Reader:
         return parts[0] if len(parts) == 1 else Every(tuple(parts))
 
     def _pair(self, left: ast.expr, kind: ast.cmpop, right: ast.expr) -> Node:
+        if isinstance(kind, (ast.Is, ast.IsNot)) and not _is_none(right):
+            raise self._error("`is` asks for None alone; use ==", right)
+        if isinstance(kind, (ast.Is, ast.IsNot, ast.Eq, ast.NotEq)) and (_is_none(left) or _is_none(right)):
+            null = IsNull(self.read(left if _is_none(right) else right))
+            return null if isinstance(kind, (ast.Is, ast.Eq)) else Not(null)
         if type(kind) in _COMPARE:
             return Comparison(_COMPARE[type(kind)], self.read(left), self.read(right))
-        if isinstance(kind, (ast.Is, ast.IsNot)):
-            if not isinstance(right, ast.Constant) or right.value is not None:
-                raise self._error("`is` asks for None alone; use ==", right)
-            null = IsNull(self.read(left))
-            return null if isinstance(kind, ast.Is) else Not(null)
         if not isinstance(right, (ast.Tuple, ast.List)) or not right.elts:
             raise self._error("`in` needs values in brackets, such as in (1, 2)", right)
-        value = self.read(left)
-        within = Some(tuple(Comparison("==", value, self.read(item)) for item in right.elts))
+        within = Some(tuple(self._pair(left, ast.Eq(), item) for item in right.elts))
         return within if isinstance(kind, ast.In) else Not(within)
 
     def _call(self, node: ast.Call) -> Node:
@@ -293,3 +350,7 @@ class _Reader:
         # ast counts bytes of UTF-8.
         position = len(self._text.encode()[: node.col_offset].decode(errors="ignore"))
         return ExpressionError(problem, self._text, position)
+
+
+def _is_none(node: ast.expr) -> bool:
+    return isinstance(node, ast.Constant) and node.value is None

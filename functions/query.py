@@ -38,7 +38,7 @@ from contract import (
     parse_topic,
 )
 from functions import expression
-from functions.expression import ExpressionError, Node
+from functions.expression import ExpressionError, MismatchError, Node
 from functions.statistics import derive, without_absent
 from functions.tables import Tables, plain
 
@@ -143,24 +143,24 @@ class Found:
             self.reason = self.reason or str(error)
             return
         times = batch.times_us
-        inside = [request.start_us <= t_us < request.end_us for t_us in times]
-        if not any(inside):
+        chosen = [i for i, t_us in enumerate(times) if request.start_us <= t_us < request.end_us]
+        if not chosen:
             return
         known, absences = without_absent(batch.columns)
         columns = dict(known)
         for name in absences:
-            pairs = zip(batch.columns[name], columns[name], inside, strict=True)
-            self.absent[name] += sum(is_in and value != left for value, left, is_in in pairs)
+            self.absent[name] += sum(batch.columns[name][i] != columns[name][i] for i in chosen)
         if self._derived:
             made = derive(columns, self._vehicle)
             columns |= {name: made[name] for name in self._derived if name in made}
         self.there |= dict.fromkeys(columns)
         if request.condition is not None:
-            holds = expression.holds(request.condition, columns, len(times))
-            inside = [a and b for a, b in zip(inside, holds, strict=True)]
-        chosen = [i for i, is_in in enumerate(inside) if is_in]
-        if not chosen:
-            return
+            deciding = expression.names(request.condition) & columns.keys()
+            inside = {name: [columns[name][i] for i in chosen] for name in deciding}
+            holds = expression.holds(request.condition, inside, len(chosen))
+            chosen = [i for i, is_in in zip(chosen, holds, strict=True) if is_in]
+            if not chosen:
+                return
         names = batch.columns if request.fields is None else request.fields
         before = len(self.times_us)
         self.times_us += [times[i] for i in chosen]
@@ -185,8 +185,18 @@ def answer(
     says how much of the invocation's time is left."""
     try:
         request = Request.read(event, namespace)
+        return _answer(
+            request, tables, store, left_ms, max_values=max_values, max_inline_bytes=max_inline_bytes
+        )
     except RequestError as error:
         return {"error": str(error)}
+    except MismatchError as error:
+        return {"error": f"the condition cannot be answered: {error}"}
+
+
+def _answer(
+    request: Request, tables: Tables, store: Store, left_ms: Left, *, max_values: int, max_inline_bytes: int
+) -> dict[str, Any]:
     found = Found(request, tables)
     items = pages = 0
     token: Mapping[str, Any] | None = None

@@ -23,6 +23,8 @@ import boto3
 from contract import (
     EXPIRES_S,
     MAX_BATCH_SPAN_US,
+    RECOMPUTE_FROM_S,
+    RECOMPUTED,
     REPLAY,
     Batch,
     BatchId,
@@ -216,6 +218,28 @@ def process(
     return {"batchItemFailures": [{"itemIdentifier": refused.number} for refused in left]}
 
 
+def recompute(event: Mapping[str, Any], tables: Tables) -> dict[str, Any]:
+    """Summarise stored batches once more, with the vehicle's parameters as they are now: the operator has
+    corrected them. Seconds before ``event[RECOMPUTE_FROM_S]`` stay as they are.
+
+    Nothing is counted or put into quarantine a second time. The answer has the seconds that were written, and
+    the records of which nothing can be made.
+    """
+    tables.forget_vehicles()
+    decoded = decode_records(event["Records"])
+    written: dict[tuple[str, int], Mapping[str, Statistics]] = {}
+    for topic, summaries in _summarized(tables, decoded.batches, 1).items():
+        for second, summary in summaries.seconds.items():
+            if second >= event[RECOMPUTE_FROM_S]:
+                written[topic, second] = summary
+        decoded.refuse(topic, summaries.beyond, _BEYOND)
+    tables.put_seconds(written)
+    return {
+        RECOMPUTED: sorted(second for _, second in written),
+        "batchItemFailures": [{"itemIdentifier": refused.number} for refused in decoded.refused],
+    }
+
+
 def _summarized(tables: Tables, batches: Mapping[str, Sequence[Batch]], at_once: int) -> dict[str, Summaries]:
     if at_once == 1 or len(batches) == 1:
         return {topic: summarize_topic(tables, topic, several) for topic, several in batches.items()}
@@ -244,6 +268,8 @@ def _refusals() -> Refusals:
 
 
 def handler(event: dict[str, Any], _context: object) -> dict[str, Any]:
-    """Entry point of the telemetry table's stream mapping."""
+    """Entry point of the telemetry table's stream mapping, and of the operator's replays."""
+    if RECOMPUTE_FROM_S in event:
+        return recompute(event, _tables())
     by_robot = os.environ["ROBOT_METRICS"] == "true"
     return process(event, _tables(), _refusals().refuse, robot_metrics=by_robot, at_once=_AT_ONCE)

@@ -34,7 +34,8 @@ _WRITE_SIZE = 25
 _WRITE_ATTEMPTS = 8
 # Batches of a page, once it is known that many are wanted.
 _MANY = 100
-_VEHICLE_CACHE_S = 60.0
+# What the operator changes in the registry counts after this time at the latest.
+VEHICLE_CACHE_S = 60.0
 # "Limits", items: 400 KB with the names counted in; a little is left to how numbers are counted.
 _MAX_ITEM_BYTES = 380 * 1024
 # A float's longest text; as a number it is shorter.
@@ -142,11 +143,13 @@ class Tables:
         return page
 
     def vehicle(self, robot: str) -> Vehicle | None:
-        """The robot's parameters, read at most once a minute; None where none are registered."""
+        """The robot's parameters, read at most once in `VEHICLE_CACHE_S`; None where none are registered."""
         now = time.monotonic()
         cached = self._vehicles.get(robot)
-        if cached is None or now - cached[0] > _VEHICLE_CACHE_S:
-            answer = self._client.get_item(TableName=self._robots, Key={ROBOT: {"S": robot}})
+        if cached is None or now - cached[0] > VEHICLE_CACHE_S:
+            answer = self._client.get_item(
+                TableName=self._robots, Key={ROBOT: {"S": robot}}, ConsistentRead=True
+            )
             cached = self._vehicles[robot] = (now, _vehicle(plain(answer.get("Item", {}))))
         return cached[1]
 
@@ -168,6 +171,10 @@ class Tables:
             # It only helps those who look for streams; no summary waits for it.
             _log.info("the stream %s of %s is not noted: %s", stream, robot, error)
         self._noted.add((robot, stream))
+
+    def forget_vehicles(self) -> None:
+        """Read every robot's parameters anew the next time."""
+        self._vehicles.clear()
 
     def put_seconds(self, seconds: Mapping[tuple[str, int], Mapping[str, Statistics]]) -> None:
         """Write the summaries, keyed by topic and second; raises `TableError` if some stay unwritten."""

@@ -12,8 +12,8 @@ from station.audit import Audit, Run, Shortfall
 from station.cloud import Cloud
 from station.delivery import items
 
-# A run that has said nothing for so long, while the agent says something every half a minute, has ended.
-_SILENT_US = 180_000_000
+# A run that has said nothing for so long, while an agent says something every ten seconds, has ended.
+_SILENT_US = 60_000_000
 
 
 @dataclass
@@ -70,7 +70,7 @@ def held_against(one: Audit, found: Mapping[str, Account], now_us: int) -> Audit
 def _shortfalls(boot: str, said: StreamAccount, stored: Run | None, *, running: bool) -> Iterable[Shortfall]:
     if said.refused:
         yield Shortfall(boot, said.refused, "refused by the agent: no message can hold them")
-    if not said.ended and not running and said.taken:
+    if not said.ended and not running:
         yield Shortfall(boot, None, "the run did not end in good order: up to a second was in open batches")
     if stored is None:
         if said.stored:

@@ -20,21 +20,29 @@ from functions.expression import (
     Field,
     IsNull,
     Magnitude,
+    MismatchError,
     Node,
     Some,
 )
 from functions.statistics import Vehicle
+from station.errors import StationError
 
 Column: TypeAlias = NDArray[Any]
 Columns: TypeAlias = Mapping[str, Column]
 
 
 def holds(node: Node, columns: Columns, n: int) -> NDArray[np.bool_]:
-    """Where the condition is true; a field that is not there is null."""
+    """Where the condition is true; a field that is not there is null.
+
+    Raises `StationError` where numbers and texts would be compared.
+    """
     fields = {name: columns.get(name) for name in expression.names(node)}
     if _has_text(node) or any(column is not None and column.dtype == object for column in fields.values()):
         lists = {name: values(column) for name, column in fields.items() if column is not None}
-        return np.array(expression.holds(node, lists, n), dtype=np.bool_)
+        try:
+            return np.array(expression.holds(node, lists, n), dtype=np.bool_)
+        except MismatchError as error:
+            raise StationError(f"the condition cannot be answered: {error}") from error
     null = np.full(n, np.nan)
     numbers = {name: null if column is None else column.astype(float) for name, column in fields.items()}
     with np.errstate(all="ignore"):
@@ -88,7 +96,7 @@ def _evaluate(node: Node, numbers: Mapping[str, Column]) -> Any:
     if isinstance(node, Field):
         return numbers[node.name]
     if isinstance(node, Constant):
-        return np.nan if node.value is None else float(node.value)
+        return float(node.value)
     if isinstance(node, Arithmetic):
         left, right = (np.asarray(_evaluate(side, numbers), dtype=float) for side in (node.left, node.right))
         result = ARITHMETIC[node.symbol](left, right)

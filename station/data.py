@@ -11,14 +11,15 @@ A range includes its start and not its end, to the microsecond.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
+from functools import cache, partial
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from contract import DERIVED_UNITS
+from contract import DERIVED_UNITS, MessageType
 from station import inventory, reading, remote
 from station.blocks import Block, join
 from station.cloud import Cloud
@@ -45,7 +46,8 @@ class Result:
     field: float64 with NaN for null, bool for flags, objects for texts. ``refused`` counts stored items
     that are not batches, of which ``reason`` says what was wrong with the first. ``absent`` counts by
     field values that were taken for null because their sensor is not fitted. ``ros2`` where charge and
-    energy have the ROS 2 driver's units.
+    energy have the ROS 2 driver's units; ``kind_of`` tells the type of the stream's messages, where known,
+    once a unit asks.
     """
 
     robot: str
@@ -56,13 +58,14 @@ class Result:
     reason: str = ""
     ros2: bool = False
     absent: Mapping[str, int] = field(default_factory=dict)
+    kind_of: Callable[[], MessageType | None] = field(default=lambda: None, repr=False, compare=False)
 
     def __len__(self) -> int:
         return len(self.times_us)
 
     def unit(self, name: str) -> str:
         """The unit of a column, empty where none is known."""
-        return unit(self.stream, name, ros2=self.ros2)
+        return unit(self.stream, name, ros2=self.ros2, kind=self.kind_of())
 
     def frame(self) -> Any:
         """The same as a pandas DataFrame, indexed by time in UTC."""
@@ -128,6 +131,7 @@ def query(
         refused.reason,
         driver.ros2,
         sensors.absent,
+        cache(partial(inventory.kind_of, cloud, selection)),
     )
 
 

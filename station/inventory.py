@@ -3,9 +3,20 @@
 from __future__ import annotations
 
 from collections.abc import Set as AbstractSet
+from contextlib import suppress
 from dataclasses import replace
 
-from contract import ACCOUNT_STREAM, OWN_STREAMS, ROBOT, STREAMS, TYPES_STREAM, VESC_STREAM
+from contract import (
+    ACCOUNT_STREAM,
+    OWN_STREAMS,
+    ROBOT,
+    STREAMS,
+    TYPES_STREAM,
+    VESC_STREAM,
+    ContractError,
+    MessageType,
+    message_type,
+)
 from functions.statistics import Vehicle
 from station import reading, registry
 from station.cloud import Cloud
@@ -13,6 +24,10 @@ from station.errors import StationError
 from station.selection import MADE_OF, Selection
 from station.stored import ATTRIBUTES, Refused, blocks
 from station.times import iso
+from station.units import VESC_KIND
+
+# Every driver's VescState has them, and hardly anything else.
+_OF_A_VESC = frozenset({"voltage_input", "current_motor", "duty_cycle"})
 
 
 def vehicle_of(cloud: Cloud, robot: str) -> Vehicle | None:
@@ -48,9 +63,7 @@ def check_fields(cloud: Cloud, selection: Selection, there: AbstractSet[str]) ->
     unknown = sorted(selection.named() - there)
     if not unknown:
         return
-    whole = replace(selection, fields=None, condition=None)
-    page = next(reading.batches(cloud, whole, ATTRIBUTES), ())
-    stored = {name for block in blocks([page], Refused()) for name in block.columns}
+    stored = _fields(cloud, selection)
     possible = stored | {name for name, parts in MADE_OF.items() if stored.issuperset(parts)}
     if "speed_mps" in possible.intersection(unknown):
         raise StationError(
@@ -60,6 +73,28 @@ def check_fields(cloud: Cloud, selection: Selection, there: AbstractSet[str]) ->
         f"{selection.robot} has no {', '.join(unknown)} in {selection.stream} in this range; "
         f"it has {', '.join(sorted(possible))}"
     )
+
+
+def kind_of(cloud: Cloud, selection: Selection) -> MessageType | None:
+    """The type that a stream's messages have, by which their units are known: what the robot has said of it,
+    the last before the range ends, or else the first. A stream of which it has said nothing, as of a VESC's
+    log or serial port, is a VESC's where it has the fields of one."""
+    if selection.stream in {VESC_STREAM, *OWN_STREAMS}:
+        return None
+    kinds = []
+    types = reading.batches(cloud, Selection(robot=selection.robot, stream=TYPES_STREAM), ATTRIBUTES)
+    for block in blocks(types, Refused()):
+        names = block.columns.get("stream", ())
+        for i in [i for i, name in enumerate(names) if name == selection.stream]:
+            with suppress(ContractError):
+                sample = {name: column[i] for name, column in block.columns.items()}
+                kinds.append((int(block.times_us[i]), message_type(sample)))
+    end_us = selection.end_us
+    before = [kind for t_us, kind in kinds if end_us is None or t_us < end_us]
+    if kinds:
+        return before[-1] if before else kinds[0][1]
+    there = _fields(cloud, selection)
+    return MessageType(selection.stream, "", VESC_KIND, "", "") if there.issuperset(_OF_A_VESC) else None
 
 
 def streams_of(cloud: Cloud, robot: str) -> list[str]:
@@ -81,6 +116,13 @@ def known(cloud: Cloud, robot: str) -> list[str]:
         if isinstance(name, str)
     }
     return sorted({VESC_STREAM, *OWN_STREAMS, *seen, *said})
+
+
+def _fields(cloud: Cloud, selection: Selection) -> set[str]:
+    """The fields of the first samples stored in the selection's range."""
+    whole = replace(selection, fields=None, condition=None)
+    page = next(reading.batches(cloud, whole, ATTRIBUTES), ())
+    return {name for block in blocks([page], Refused()) for name in block.columns}
 
 
 def extent(cloud: Cloud, robot: str, stream: str) -> tuple[str, str] | None:

@@ -60,7 +60,7 @@ def made_of(stream: str, columns: Mapping[str, Any]) -> MessageType:
 
 
 def _plain(path: str) -> str:
-    return path.replace(".", "_").lower()
+    return path.replace(".", "_")
 
 
 class Maker:

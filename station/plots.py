@@ -19,6 +19,7 @@ from numpy.typing import NDArray
 
 from station.data import Result
 from station.errors import StationError
+from station.positions import Fields, fixes, local_metres, position_fields
 
 COLOURS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#000000", "#B8A800")
 _DASHES = ("-", "--", ":", "-.")
@@ -26,14 +27,6 @@ _DASHES = ("-", "--", ":", "-.")
 _POINTS = 4_000
 # A step this many times the usual one, and a second at least, is a hole that no line should bridge.
 _HOLE, _HOLE_US = 5, 1_000_000
-# Where the position is in the usual messages: Pose2D and Odometry, PoseStamped, Point.
-_POSITIONS = (
-    ("x", "y"),
-    ("position.x", "position.y"),
-    ("pose.position.x", "pose.position.y"),
-    ("pose.pose.position.x", "pose.pose.position.y"),
-    ("point.x", "point.y"),
-)
 
 
 class Run(NamedTuple):
@@ -68,12 +61,14 @@ def over_time(runs: Sequence[Run], fields: Sequence[str], *, from_start: bool = 
 def trajectory(runs: Sequence[Run]) -> Figure:
     """Where the robots went, seen from above; a ring is where each began, a dot where it ended.
 
+    Latitudes and longitudes are drawn as metres to the east and north of the first place known.
+
     Raises `StationError` for a run without a position: none is made up from speeds.
     """
     figure = _figure(7.0, 6.2)
     panel = figure.add_subplot()
-    for i, run in enumerate(runs):
-        x, y = (_column(run, name) for name in position_of(run.result))
+    tracks, labels, note = _tracks(runs)
+    for i, (run, (x, y)) in enumerate(zip(runs, tracks, strict=True)):
         style = _style(i)
         panel.plot(x, y, label=run.name, linewidth=1.4, **style)
         known = np.flatnonzero(~np.isnan(x) & ~np.isnan(y))
@@ -81,12 +76,35 @@ def trajectory(runs: Sequence[Run]) -> Figure:
             first, last = known[0], known[-1]
             panel.plot(x[first], y[first], "o", markerfacecolor="white", markersize=8, color=style["color"])
             panel.plot(x[last], y[last], "o", markersize=6, color=style["color"])
-    names = position_of(runs[0].result)
     panel.set_aspect("equal", adjustable="datalim")
-    panel.set_xlabel(f"{names[0]} (m)")
-    panel.set_ylabel(f"{names[1]} (m)")
+    panel.set_xlabel(f"{labels[0]} (m)")
+    panel.set_ylabel(f"{labels[1]} (m)")
     _dress(panel)
-    return _finished(figure, runs, "ring: start, dot: end")
+    return _finished(figure, runs, f"ring: start, dot: end{note}")
+
+
+def _tracks(
+    runs: Sequence[Run],
+) -> tuple[list[tuple[Any, Any]], tuple[str, str], str]:
+    """Each run's x and y in metres, what they are, and what more there is to say of them."""
+    fields = [position_of(run.result) for run in runs]
+    if len({each.degrees for each in fields}) > 1:
+        raise StationError(
+            "positions in metres and in degrees cannot be drawn together: "
+            + ", ".join(
+                f"{run.name} has {' and '.join(of.names)}" for run, of in zip(runs, fields, strict=True)
+            )
+        )
+    of = list(zip(runs, fields, strict=True))
+    if not fields[0].degrees:
+        metres = [(_column(run, x), _column(run, y)) for run, ((x, y), _) in of]
+        return metres, fields[0].names, ""
+    places = [fixes(run.result.columns, each) for run, each in of]
+    first = next(((la[i], lo[i]) for la, lo in places for i in np.flatnonzero(~np.isnan(la))[:1]), None)
+    if first is None:
+        raise StationError(f"{', '.join(fields[0].names)} hold no place: the receiver had no fix")
+    note = f"\n{', '.join(fields[0].names)} around {first[0]:.7f}, {first[1]:.7f}"
+    return [local_metres(*place, first) for place in places], ("east", "north"), note
 
 
 def distribution(runs: Sequence[Run], fields: Sequence[str]) -> Figure:
@@ -117,14 +135,15 @@ def save(figure: Figure, path: Path) -> None:
     figure.savefig(path, dpi=160, facecolor="white")
 
 
-def position_of(result: Result) -> tuple[str, str]:
+def position_of(result: Result) -> Fields:
     """The fields that say where a robot is; raises `StationError` where there are none."""
-    for names in _POSITIONS:
-        if all(name in result.columns and result.columns[name].dtype.kind == "f" for name in names):
-            return names
-    raise StationError(
-        f"{result.robot} {result.stream} has no position, such as x and y; it has {', '.join(result.columns)}"
-    )
+    fields = position_fields([name for name, column in result.columns.items() if column.dtype.kind == "f"])
+    if fields is None:
+        raise StationError(
+            f"{result.robot} {result.stream} has no position, such as x and y, or latitude and longitude; "
+            f"it has {', '.join(result.columns)}"
+        )
+    return fields
 
 
 def numeric(result: Result) -> list[str]:

@@ -97,6 +97,27 @@ def enter(cloud: Cloud, robot: str, row: Mapping[str, Any]) -> None:
         raise StationError(f"robot {robot} is already registered; remove it first") from error
 
 
+def set_vehicle(cloud: Cloud, robot: str, vehicle: Mapping[str, float]) -> dict[str, float]:
+    """Change these of a robot's vehicle parameters, and nothing else; what they were, those that it had.
+
+    Raises `StationError` where the robot is not registered.
+    """
+    dynamodb = cloud.client("dynamodb")
+    try:
+        answer = dynamodb.update_item(
+            TableName=_table(cloud),
+            Key=_key(checked(robot)),
+            UpdateExpression="SET " + ", ".join(f"#{name} = :{name}" for name in vehicle),
+            ConditionExpression="attribute_exists(#robot)",
+            ExpressionAttributeNames={"#robot": ROBOT, **{f"#{name}": name for name in vehicle}},
+            ExpressionAttributeValues={f":{name}": {"N": repr(value)} for name, value in vehicle.items()},
+            ReturnValues="UPDATED_OLD",
+        )
+    except dynamodb.exceptions.ConditionalCheckFailedException as error:
+        raise StationError(f"robot {robot} is not registered") from error
+    return {name: float(value) for name, value in plain(answer.get("Attributes", {})).items()}
+
+
 def open_name(cloud: Cloud, robot: str, *, for_s: float, claim: str | None) -> None:
     """Let one certificate be issued for a name: within the time, for the claim with this id or for any."""
     values = {":until": {"N": str(int(time.time() + for_s))}}

@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import threading
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from enum import Enum
 from functools import partial
@@ -174,21 +174,35 @@ def _stored(cloud: Cloud, topic: str, batch: Batch) -> bool:
 def _summarize(cloud: Cloud, entry: Entry) -> str:
     """Give the item to Lambda 2; what went wrong, or nothing."""
     image: dict[str, Any] = json.loads(entry.payload or b"{}")
-    keys = {name: image[name] for name in (TOPIC, BATCH)}
-    change = {"Keys": keys, "NewImage": image, "SequenceNumber": "0"}
-    event = {
-        REPLAY: True,
-        "Records": [{"eventID": f"replay-{entry.id}", "eventName": "INSERT", "dynamodb": change}],
-    }
+    try:
+        said = summarize(cloud, [image], {REPLAY: True})
+    except StationError as error:
+        return str(error)
+    return "Lambda 2 refuses it; is the current version deployed?" if said["batchItemFailures"] else ""
+
+
+def summarize(cloud: Cloud, items: Sequence[Mapping[str, Any]], event: Mapping[str, Any]) -> dict[str, Any]:
+    """Give stored items to Lambda 2, in an event that says what for; its answer.
+
+    Raises `StationError` where it fails.
+    """
+    changes = [
+        {
+            "Keys": {name: item[name] for name in (TOPIC, BATCH)},
+            "NewImage": item,
+            "SequenceNumber": str(number),
+        }
+        for number, item in enumerate(items)
+    ]
+    records = [{"eventID": "replay", "eventName": "INSERT", "dynamodb": change} for change in changes]
     answer = cloud.client("lambda").invoke(
-        FunctionName=cloud.output("processing", "SummarizeFunction"), Payload=json.dumps(event).encode()
+        FunctionName=cloud.output("processing", "SummarizeFunction"),
+        Payload=json.dumps({**event, "Records": records}).encode(),
     )
     said = json.loads(answer["Payload"].read() or b"null")
     if "FunctionError" in answer:
-        return f"Lambda 2 failed: {said.get('errorMessage', said)}"
-    if said.get("batchItemFailures"):
-        return "Lambda 2 refuses it; is the current version deployed?"
-    return ""
+        raise StationError(f"Lambda 2 failed: {said.get('errorMessage', said)}")
+    return {"batchItemFailures": [], **said}
 
 
 def _delete(cloud: Cloud, entry: Entry) -> None:

@@ -16,10 +16,29 @@ from station.cloud import Cloud
 from station.errors import StationError
 from station.registry import listed
 
-__all__ = ["F1TENTH", "Bundle", "add", "configure", "listed", "remove"]
+__all__ = ["F1TENTH", "Bundle", "add", "checked_vehicle", "configure", "listed", "remove"]
 
 # The F1TENTH stack's vesc.yaml: erpm = gain * m/s + offset.
-F1TENTH = {"speed_to_erpm_gain": 4614.0, "speed_to_erpm_offset": 0.0}
+GAIN = "speed_to_erpm_gain"
+F1TENTH = {GAIN: 4614.0, "speed_to_erpm_offset": 0.0}
+
+
+# A gain or an offset of more, or a gain of less, is a slip of the hand.
+_MOST, _LEAST = 1e9, 1e-9
+
+
+def checked_vehicle(vehicle: Mapping[str, float]) -> dict[str, float]:
+    """The vehicle parameters; raises `StationError` where one has another name or cannot be."""
+    for name, value in vehicle.items():
+        if name not in F1TENTH:
+            raise StationError(f"{name} is no vehicle parameter; allowed are {', '.join(F1TENTH)}")
+        # NaN is on no side of a bound.
+        if not abs(value) <= _MOST or (name == GAIN and abs(value) < _LEAST):
+            no_zero = " and not 0" if name == GAIN else ""
+            raise StationError(
+                f"{name} must be a number from {-_MOST:g} to {_MOST:g}{no_zero}, got {value:g}"
+            )
+    return dict(vehicle)
 
 
 def add(

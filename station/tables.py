@@ -11,8 +11,10 @@ from typing import IO, Any, NamedTuple
 import numpy as np
 from rich.table import Table
 
-from station.conditions import values
+from contract import EXACT
+from station.conditions import Column, values
 from station.data import Result
+from station.positions import in_degrees
 
 # Of a long result a terminal shows the beginning and the end.
 _SHOWN = 20
@@ -44,7 +46,7 @@ def terminal(result: Result, width: int | None = None) -> Shown:
     times = texts_of_time(Result(result.robot, result.stream, result.times_us[chosen], {}))
     stamps = [text[:-1].replace("T", " ") for text in times]
     columns = [
-        _Column(name, result.unit(name), [_cell(column[i]) for i in chosen])
+        _Column(name, result.unit(name), [_cell(column[i], 7 if in_degrees(name) else None) for i in chosen])
         for name, column in result.columns.items()
     ]
     room = None if width is None else width - len(_TIME_WIDE)
@@ -118,16 +120,33 @@ def to_parquet(result: Result, file: IO[bytes]) -> None:
 
 def _rows(result: Result) -> Iterator[list[Sequence[Any]]]:
     """Times and values, a chunk at a time: Python's values take ten times numpy's room."""
+    whole = {name for name, column in result.columns.items() if _is_whole(column)}
     for first in range(0, len(result), _CHUNK):
         chunk = slice(first, first + _CHUNK)
         part = Result(result.robot, result.stream, result.times_us[chunk], {})
-        columns = [values(column[chunk]) for column in result.columns.values()]
+        columns = [
+            [int(value) if isinstance(value, float) else value for value in values(column[chunk])]
+            if name in whole
+            else values(column[chunk])
+            for name, column in result.columns.items()
+        ]
         yield list(zip(texts_of_time(part), *columns, strict=True))
 
 
-def _cell(value: Any) -> str:
+def _is_whole(column: Column) -> bool:
+    """Whether all numbers of a column are integers: what a robot sends as such arrives as float64."""
+    if column.dtype.kind == "f":
+        known = column[~np.isnan(column)]
+        return bool((known == np.floor(known)).all() and (np.abs(known) < EXACT).all())
+    floats = [value for value in column.tolist() if isinstance(value, float)]
+    return all(value.is_integer() and abs(value) < EXACT for value in floats)
+
+
+def _cell(value: Any, digits: int | None) -> str:
     if value is None or value != value:  # noqa: PLR0124 - NaN is not itself
         return "-"
     if isinstance(value, float):
+        if digits is not None:
+            return f"{value:.{digits}f}"
         return f"{value:.6g}" if abs(value) < 1e6 or not value.is_integer() else f"{value:.0f}"
     return str(value)

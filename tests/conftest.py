@@ -27,6 +27,8 @@ GROUPS = {
     "tests/local/test_uplink.py": "faults",
     "tests/local/test_pubnub": "pubnub",
     "tests/local/": "cloud",
+    "tests/ros/test_mixed_robot.py": "faults",
+    "tests/ros/test_two_publishers.py": "faults",
     "tests/ros/test_two_robots.py": "cloud",
     "tests/stacks/": "app",
     **dict.fromkeys(

@@ -157,9 +157,11 @@ class Intake:
         self._heard = clock.monotonic()
         self._silent = False
 
-    def take(self, header: Mapping[str, str], data: bytes) -> None:
-        """Take a message with the header of the connection that it came by. Never raises."""
-        arrival_us = self._clock.now_us()
+    def take(self, header: Mapping[str, str], data: bytes, arrival_us: int | None = None) -> None:
+        """Take a message with the header of the connection that it came by; it came now, unless said. Never
+        raises."""
+        if arrival_us is None:
+            arrival_us = self._clock.now_us()
         if header.get("latching") == "1" and self._came_before(header, data):
             self._seldom.warn("latched_again", f"topic {self._topic}: a latched message came again; not sent")
             return

@@ -1,37 +1,36 @@
 """ROS topics over the rosbridge WebSocket protocol, which serves ROS 1 and ROS 2 robots alike.
 
-Why not roslibpy: it needs Python 3.9 and twelve packages around twisted, and its subscriptions are not
-always restored (its issues 108 and 114). The protocol is JSON with an operation each for subscribing,
-advertising and publishing; websocket-client carries it, without dependencies, and Debian packages it.
-
-Samples are those of `device.sources.flatten`, and a ROS 1 time is named as in ROS 2, so a topic gives
-the same fields live, from a bag and from here. JSON has no types: a ``uint8[]`` is a text here, not an
-array. As in the ROS 1 source, arrays of more than `MAX_ELEMENTS` and texts that the contract would
-refuse are left out, unless they are what `fields` selects.
+JSON has no types, so they are asked of the server's rosapi, and each message is made the ROS 1 message that
+it was; it then goes the way of the ROS 1 source. Where rosapi does not answer, a sample is made of the JSON,
+as `device.sources.flatten` does, and counted as ``structure_not_kept``: a ``uint8[]`` is a text there, arrays
+of more than `MAX_ELEMENTS` and texts that the contract would refuse are left out, unless they are what
+`fields` selects, and a ROS 1 time is named as in ROS 2.
 """
 
 from __future__ import annotations
 
-import contextlib
-import json
 import logging
-import random
 import threading
+from collections import deque
 from dataclasses import dataclass
-from socket import SHUT_RDWR
 from types import SimpleNamespace
-from typing import Any, Callable, Mapping, NamedTuple, Sequence
+from typing import Any, Mapping, Sequence
 from urllib.parse import urlsplit
 
 import contract
 from contract import Value
+from contract.limits import MessageError
 from device.clock import Clock
 from device.errors import SourceError
+from device.ros1_write import Writer
 from device.schema import Where, choice, items, number, pairs, section, setting, text
 from device.seldom import Seldom
-from device.sources import Emit
+from device.sources import Emit, ros1
+from device.sources.continuity import Numbers, Repeats
 from device.sources.flatten import HEADER as HEADER_FIELD
 from device.sources.flatten import flatten
+from device.sources.rosapi import AGAIN_S, Rosapi, Structure
+from device.sources.rosbridge_connection import TIMES, RosbridgeConnection, Times, Topic
 
 _log = logging.getLogger(__name__)
 
@@ -40,181 +39,8 @@ MAX_ELEMENTS = 64
 _MAX_TEXT = 4096
 # A stamp this far from the clock is a clock not yet set, or a simulation's.
 _BELIEVABLE_US = 3600 * 1_000_000
-
-_CONNECT_S = 5.0
-# A receive returns after this at the latest, so that a stop is noticed.
-_RECEIVE_S = 0.25
-# A ping after so long without a word; without one after that, the connection is dead.
-_PING_S = 5.0
-_DEAD_S = 15.0
-# A topic that has not been heard for so long is subscribed to afresh: it may not have existed, or its
-# server may have gone deaf when the ROS master was started again. Twice as long for each time after.
-_PATIENCE_S, _MAX_PATIENCE_S = 10.0, 320.0
-_BACKOFF_S = (0.25, 10.0)
-
-
-class Topic(NamedTuple):
-    """What is asked of the server: ``kind`` is the message's type; without it the topic must exist."""
-
-    name: str
-    kind: str | None = None
-    throttle_ms: int = 0
-
-
-# Takes a message: topic, the message with objects as `SimpleNamespace`, microseconds of its arrival.
-OnMessage = Callable[[str, Any, int], None]
-
-
-class RosbridgeConnection:
-    """A connection to a rosbridge server that comes back whenever it is lost, with its subscriptions.
-
-    `run` in a thread of its own; `publish` from any thread.
-    """
-
-    def __init__(self, url: str, clock: Clock, *, topics: Sequence[Topic], on_message: OnMessage) -> None:
-        self.connects = 0
-        self._url = url
-        self._clock = clock
-        self._topics = {topic.name: topic for topic in topics}
-        self._on_message = on_message
-        self._seldom = Seldom(_log, clock)
-        self._lock = threading.Lock()
-        self._socket: Any = None
-        self._advertised: dict[str, str] = {}
-        # How long each topic may be silent, and until when.
-        self._patience: dict[str, float] = {}
-        self._silent_until: dict[str, float] = {}
-
-    def run(self, stop: threading.Event) -> None:
-        """Be connected until ``stop`` is set. Raises `SourceError` without websocket-client."""
-        library = _load_websocket()
-        backoff = _BACKOFF_S[0]
-        while not stop.is_set():
-            began = self._clock.monotonic()
-            try:
-                self._session(library, stop)
-            except (OSError, library.WebSocketException) as error:
-                self._say(_why(error, library))
-            finally:
-                self._close()
-            if self._clock.monotonic() - began > _BACKOFF_S[1]:
-                backoff = _BACKOFF_S[0]
-            # Full jitter: a fleet must not come back in step.
-            self._clock.wait(stop, random.uniform(0, backoff))  # noqa: S311 - jitter, not secrets
-            backoff = min(_BACKOFF_S[1], backoff * 2)
-
-    def publish(self, topic: str, kind: str, message: Mapping[str, Any]) -> None:
-        """Publish a message. Raises `SourceError` while there is no connection; nothing is kept for later."""
-        try:
-            operation = json.dumps({"op": "publish", "topic": topic, "msg": message}, allow_nan=False)
-        except (TypeError, ValueError) as error:
-            raise SourceError(f"{self._url}: {topic} cannot be published: {error}") from error
-        with self._lock:
-            if self._socket is None:
-                raise SourceError(f"{self._url}: not connected, so nothing can be published on {topic}")
-            try:
-                if self._advertised.get(topic) != kind:
-                    self._socket.send(json.dumps({"op": "advertise", "topic": topic, "type": kind}))
-                    self._advertised[topic] = kind
-                self._socket.send(operation)
-            except Exception as error:
-                # Half a frame may be out; after that, nothing on this connection means anything.
-                with contextlib.suppress(OSError):
-                    self._socket.sock.shutdown(SHUT_RDWR)
-                raise SourceError(f"{self._url}: {topic} cannot be published: {error}") from error
-
-    def counts(self) -> dict[str, int]:
-        """What went wrong, by reason."""
-        return self._seldom.counts()
-
-    def _session(self, library: Any, stop: threading.Event) -> None:
-        socket = library.create_connection(
-            self._url, timeout=_CONNECT_S, enable_multithread=True, skip_utf8_validation=True
-        )
-        socket.settimeout(_RECEIVE_S)
-        with self._lock:
-            self._socket, self._advertised = socket, {}
-        self.connects += 1
-        _log.info("%s: connected", self._url)
-        now = self._clock.monotonic()
-        self._patience = dict.fromkeys(self._topics, _PATIENCE_S)
-        self._silent_until = dict.fromkeys(self._topics, now + _PATIENCE_S)
-        for topic in self._topics.values():
-            self._subscribe(topic)
-        last_word = last_look = now
-        while not stop.is_set():
-            try:
-                opcode, frame = socket.recv_data_frame(control_frame=True)
-            except library.WebSocketTimeoutException:
-                opcode, frame = None, None
-            arrival_us, now = self._clock.now_us(), self._clock.monotonic()
-            if opcode is not None:
-                last_word = now
-            if opcode in (library.ABNF.OPCODE_TEXT, library.ABNF.OPCODE_BINARY):
-                self._take(frame.data, arrival_us, now)
-            elif opcode == library.ABNF.OPCODE_CLOSE:
-                raise library.WebSocketConnectionClosedException("the server closed the connection")
-            if now - last_look >= 1.0:
-                last_look = now
-                self._look(socket, now, last_word)
-
-    def _look(self, socket: Any, now: float, last_word: float) -> None:
-        """Once a second: is the server still there, and does every topic speak?"""
-        if now - last_word >= _DEAD_S:
-            raise TimeoutError(f"no answer for {_DEAD_S:g} s")
-        if now - last_word >= _PING_S:
-            with self._lock:
-                socket.ping()
-        for name, due in self._silent_until.items():
-            if now >= due:
-                told = f"{self._url}: nothing comes on {name}: subscribing afresh"
-                self._seldom.warn(f"silent {name}", told)
-                self._patience[name] = min(_MAX_PATIENCE_S, self._patience[name] * 2)
-                self._silent_until[name] = now + self._patience[name]
-                self._send({"op": "unsubscribe", "id": f"iort:{name}", "topic": name})
-                self._subscribe(self._topics[name])
-
-    def _subscribe(self, topic: Topic) -> None:
-        wanted: dict[str, Any] = {"op": "subscribe", "id": f"iort:{topic.name}", "topic": topic.name}
-        if topic.kind is not None:
-            wanted["type"] = topic.kind
-        # Without a queue, a throttled topic gives its newest message, not one from a while ago.
-        self._send({**wanted, "throttle_rate": topic.throttle_ms, "queue_length": 0})
-
-    def _take(self, data: bytes, arrival_us: int, now: float) -> None:
-        try:
-            said = json.loads(data, object_hook=_namespace)
-            operation = said.op
-            if operation == "publish":
-                name, message = str(said.topic), said.msg
-        except (ValueError, AttributeError, RecursionError) as error:
-            self._seldom.warn("malformed", f"{self._url}: a message is no rosbridge message: {error!r}")
-            return
-        if operation == "publish":
-            if name in self._topics:
-                self._patience[name] = _PATIENCE_S
-                self._silent_until[name] = now + _PATIENCE_S
-                self._on_message(name, message, arrival_us)
-        elif operation == "status" and getattr(said, "level", "") in ("error", "warning"):
-            what = str(getattr(said, "msg", ""))[:500]
-            self._seldom.warn(f"server: {what[:80]}", f"{self._url}: the server says: {what}")
-
-    def _send(self, operation: Mapping[str, Any]) -> None:
-        with self._lock:
-            self._socket.send(json.dumps(operation))
-
-    def _close(self) -> None:
-        with self._lock:
-            socket, self._socket = self._socket, None
-        if socket is not None:
-            socket.shutdown()
-
-    def _say(self, what: str) -> None:
-        """What keeps the connection from being there, once a minute for as long as it is the same."""
-        self._seldom.warn(f"connection: {what[:80]}", f"{self._url}: {what}; trying again")
-
-
-# --- the source ------------------------------------------------------------------------------------
+# What is kept of a topic until its type is known.
+_MAX_HELD, _MAX_HELD_BYTES = 2_000, 8_000_000
 
 
 @dataclass(frozen=True)
@@ -273,27 +99,68 @@ class RosbridgeConfig:
 
 
 class RosbridgeSource:
-    """Emits each message of the topics."""
+    """Emits each message of the topics; the listener of its connection."""
 
-    def __init__(self, config: RosbridgeConfig, clock: Clock) -> None:
+    def __init__(self, config: RosbridgeConfig, clock: Clock, times: Times = TIMES) -> None:
         self._config = config
         self._clock = clock
         self._intakes: dict[str, Intake] = {}
         topics = [Topic(name, topic.type, topic.throttle_ms) for name, topic in config.topics]
-        self.connection = RosbridgeConnection(config.url, clock, topics=topics, on_message=self._take)
+        self.connection = RosbridgeConnection(config.url, clock, topics=topics, listener=self, times=times)
+        self._rosapi = Rosapi(self.connection.send, self._found, clock)
+        # Topic -> when its structure is asked for, once something has come; None while it is being asked for.
+        self._ask_at: dict[str, float | None] = {}
 
     def run(self, emit: Emit, stop: threading.Event) -> None:
         """Be subscribed until ``stop`` is set. Raises `SourceError` without websocket-client."""
         for name, topic in self._config.topics:
             self._intakes[name] = Intake(name, topic, emit=emit, clock=self._clock)
-        self.connection.run(stop)
+        try:
+            self.connection.run(stop)
+        finally:
+            for intake in self._intakes.values():
+                intake.structure(None)
 
     def report(self) -> dict[str, Any]:
         """What became of the messages, by topic."""
-        return {name: intake.report() for name, intake in self._intakes.items()}
+        return {
+            name: {**intake.report(), **self.connection.report(name)}
+            for name, intake in self._intakes.items()
+        }
 
-    def _take(self, topic: str, message: Any, arrival_us: int) -> None:
-        self._intakes[topic].take(message, arrival_us)
+    def connected(self) -> None:
+        """Another server may know other types: they are asked for again."""
+        self._rosapi.restart()
+        for intake in self._intakes.values():
+            intake.hold()
+        self._ask_at = dict.fromkeys(self._intakes, 0.0)
+
+    def subscribed(self, topic: str) -> None:
+        """A topic has been subscribed to."""
+        self._intakes[topic].subscribed()
+
+    def message(self, topic: str, message: Any, data: bytes, arrival_us: int) -> bool:
+        """Take a message; whether it is a new one."""
+        due = self._ask_at.get(topic)
+        if due is not None and self._clock.monotonic() >= due:
+            self._ask_at[topic] = None
+            self._rosapi.ask(topic, dict(self._config.topics)[topic].type)
+        return self._intakes[topic].take(message, data, arrival_us)
+
+    def answer(self, said: Mapping[str, Any]) -> None:
+        """Take an answer, which may be rosapi's."""
+        self._rosapi.answer(said)
+
+    def look(self) -> None:
+        """Called once a second or so."""
+        self._rosapi.look()
+
+    def _found(self, topic: str, structure: Structure | None) -> None:
+        if structure is None:
+            self._ask_at[topic] = self._clock.monotonic() + AGAIN_S
+        else:
+            self._ask_at.pop(topic, None)
+        self._intakes[topic].structure(structure)
 
 
 class Intake:
@@ -303,16 +170,103 @@ class Intake:
         self._topic = topic
         self._config = config
         self._emit = emit
+        self._clock = clock
         self._seldom = Seldom(_log, clock)
+        self._repeats = Repeats()
+        self._numbers = Numbers()
         self._messages = 0
+        # What came before the structure is known; None where nothing is held.
+        self._held: deque[tuple[Any, int]] | None = None
+        self._held_bytes = 0
+        self._writer: Writer | None = None
+        self._structure: Structure | None = None
+        self._header: Mapping[str, str] = {}
+        self._ros1 = ros1.Intake(
+            topic,
+            ros1.TopicConfig(stream=config.stream, time=config.time, fields=config.fields),
+            emit=emit,
+            clock=clock,
+        )
 
-    def take(self, message: Any, arrival_us: int) -> None:
-        """Take a message. Never raises."""
+    def subscribed(self) -> None:
+        """A subscription begins, with which a latched message may come again."""
+        self._repeats.subscribed(self._clock.monotonic())
+
+    def hold(self) -> None:
+        """Keep the messages until `structure` says what they consist of."""
+        self._held = deque() if self._held is None else self._held
+
+    def take(self, message: Any, data: bytes, arrival_us: int) -> bool:
+        """Take a message and the text that it came in; whether it is a new one. Never raises."""
+        stamp = _header(message).get("stamp")
+        stamped = isinstance(stamp, dict) and any(stamp.values())
+        if self._repeats.came_before(data, self._clock.monotonic(), stamped=stamped):
+            self._seldom.warn("latched_again", f"topic {self._topic}: a latched message came again; not sent")
+            return False
         self._messages += 1
-        if not isinstance(message, SimpleNamespace):
+        if not isinstance(message, dict):
             self._seldom.warn("malformed", f"topic {self._topic}: a message is {message!r:.60}, no object")
+            return True
+        seq = _header(message).get("seq")
+        if type(seq) is int and not self._config.throttle_ms:
+            self._numbers.take(seq)
+        if self._held is None:
+            self._emit_message(message, arrival_us)
+            return True
+        self._held.append((message, arrival_us))
+        self._held_bytes += len(data)
+        if len(self._held) > _MAX_HELD or self._held_bytes > _MAX_HELD_BYTES:
+            self.structure(None)
+        return True
+
+    def structure(self, structure: Structure | None) -> None:
+        """What the messages consist of; None where that is not known, and what was known before holds."""
+        if structure is not None and structure != self._structure:
+            self._structure, self._writer = structure, Writer(structure.definition)
+            self._header = {
+                "type": structure.kind, "md5sum": structure.md5sum, "message_definition": structure.text,
+            }  # fmt: skip
+        held, self._held, self._held_bytes = self._held, None, 0
+        for message, arrival_us in held or ():
+            self._emit_message(message, arrival_us)
+
+    def report(self) -> dict[str, Any]:
+        """What became of the messages."""
+        ros = {name: count for name, count in self._ros1.report().items() if count and name != "messages"}
+        counts = {**ros, **self._seldom.counts()}
+        if self._numbers.missed:
+            counts["missed"] = self._numbers.missed
+        return {"messages": self._messages, **counts}
+
+    def _emit_message(self, message: dict[str, Any], arrival_us: int) -> None:
+        data = self._bytes(message)
+        if data is None:
+            self._emit_flat(message, arrival_us)
             return
+        self._ros1.take(self._header, data, arrival_us)
+
+    def _bytes(self, message: dict[str, Any]) -> bytes | None:
+        """The message as ROS 1 had it; None where its type is not known, or another."""
+        writer = self._writer
+        if writer is None:
+            why = "the server does not say what its messages consist of"
+        else:
+            nulls = writer.nulls
+            try:
+                data = writer.write(message)
+            except MessageError as error:
+                why = str(error)
+            else:
+                if writer.nulls != nulls:
+                    why = "the server sends null for NaN and the infinities; NaN is stored"
+                    self._seldom.warn("not_a_number", f"topic {self._topic}: {why}")
+                return data
+        self._seldom.warn("structure_not_kept", f"topic {self._topic}: {why}; only single values are stored")
+        return None
+
+    def _emit_flat(self, plain: dict[str, Any], arrival_us: int) -> None:
         try:
+            message = _namespace(plain)
             values = self._values(message)
         except (SourceError, RecursionError) as error:
             self._seldom.warn("refused", f"topic {self._topic}: {error}")
@@ -322,10 +276,6 @@ class Intake:
             return
         t_us = arrival_us if self._config.time == ARRIVAL else self._stamp_us(message, arrival_us)
         self._emit(self._config.stream, t_us, values)
-
-    def report(self) -> dict[str, Any]:
-        """What became of the messages."""
-        return {"messages": self._messages, **self._seldom.counts()}
 
     def _values(self, message: Any) -> dict[str, Value]:
         wanted = self._config.fields
@@ -364,11 +314,21 @@ class Intake:
         return arrival_us
 
 
-def _namespace(members: dict[str, Any]) -> SimpleNamespace:
+def _header(message: Any) -> dict[str, Any]:
+    header = message.get(HEADER_FIELD) if isinstance(message, dict) else None
+    return header if isinstance(header, dict) else {}
+
+
+def _namespace(value: Any) -> Any:
+    """JSON's objects as `flatten` takes them."""
+    if isinstance(value, list):
+        return [_namespace(item) for item in value]
+    if not isinstance(value, dict):
+        return value
     # ROS 1 names a time's parts as nobody else does.
-    if members.keys() == {"secs", "nsecs"}:
-        members = {"sec": members["secs"], "nanosec": members["nsecs"]}
-    return SimpleNamespace(**members)
+    if value.keys() == {"secs", "nsecs"}:
+        return SimpleNamespace(sec=value["secs"], nanosec=value["nsecs"])
+    return SimpleNamespace(**{name: _namespace(member) for name, member in value.items()})
 
 
 def _fields_of(value: Any) -> list[str] | None:
@@ -386,27 +346,3 @@ def _without_long(value: Any) -> Any:
             if not (isinstance(member, list) and len(member) > MAX_ELEMENTS)
         }
     )
-
-
-def _load_websocket() -> Any:
-    try:
-        # Only a robot with rosbridge needs it: pip install iort[rosbridge].
-        import websocket  # noqa: PLC0415 - optional
-    except ImportError as error:
-        raise SourceError(
-            "rosbridge needs the package websocket-client: pip install 'iort[rosbridge]'"
-        ) from error
-    return websocket
-
-
-def _why(error: Exception, library: Any) -> str:
-    """What keeps the connection from being there, in words that help."""
-    if isinstance(error, ConnectionRefusedError):
-        return "nobody listens there: is rosbridge_server running?"
-    if isinstance(error, library.WebSocketBadStatusException):
-        return f"what listens there is no rosbridge server: {str(error)[:100]}"
-    if isinstance(error, library.WebSocketAddressException):
-        return f"the host is not known: {error}"
-    if isinstance(error, (library.WebSocketTimeoutException, TimeoutError)):
-        return f"no answer: {error}"
-    return f"connection lost: {error}"

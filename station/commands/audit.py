@@ -68,7 +68,7 @@ def audit_(
             # A part of a run cannot be held against what the whole of it took.
             if within == Range():
                 one = accounts.held_against(one, told, now_us)
-            if one.runs or one.refused or one.shortfalls or streams:
+            if one.runs or one.refused or one.taken is not None or streams:
                 found.append(one)
     in_car, dropped = (_count(figures.get(name)) for name in ("backlog_batches", "dropped_batches"))
     found = [replace(one, in_car=in_car, dropped=dropped) for one in found]

@@ -5,7 +5,6 @@ from __future__ import annotations
 import base64
 import json
 import sys
-import time
 from collections import Counter
 from dataclasses import asdict
 from datetime import datetime, timezone
@@ -17,9 +16,9 @@ from rich.markup import escape
 from rich.progress import Progress
 
 from station import quarantine, replay
+from station.commands.options import since_us
 from station.quarantine import Entry
 from station.replay import Fate
-from station.times import duration_us, time_us
 
 commands = typer.Typer()
 _out = Console(highlight=False)
@@ -106,12 +105,7 @@ def replay_errors(
 
 def _since_ms(text: str | None) -> int:
     """The time in ms since the epoch; raises `StationError` for what is none."""
-    if text is None:
-        return 0
-    now_us = time.time_ns() // 1000
-    if text[:1].isdigit() and text[-1:].isalpha() and "T" not in text:
-        return (now_us - duration_us(text)) // 1000
-    return time_us(text, now_us) // 1000
+    return 0 if text is None else since_us(text) // 1000
 
 
 def _print(entry: Entry) -> None:

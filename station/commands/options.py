@@ -32,6 +32,14 @@ def names(fields: str | None) -> list[str] | None:
     return [name.strip() for name in (fields or "").split(",") if name.strip()] or None
 
 
+def since_us(text: str) -> int:
+    """The time that ``10m`` (so long ago) or ISO 8601 names, in microseconds; raises `StationError`."""
+    now_us = time.time_ns() // 1000
+    if text[:1].isdigit() and text[-1:].isalpha() and "T" not in text:
+        return now_us - duration_us(text)
+    return time_us(text, now_us)
+
+
 def bounds(
     start: str | None, end: str | None, last: str | None, now_us: int
 ) -> tuple[int | None, int | None]:

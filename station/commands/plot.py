@@ -65,7 +65,8 @@ def plot(
 ) -> None:
     """Draw fields over time, the trajectory or the distribution, of one robot or several.
 
-    A trajectory needs a stream with a position: none is made up from speeds.
+    A trajectory needs a stream with a position: none is made up from speeds. Latitudes and longitudes are
+    drawn as metres to the east and north of the first place known.
     """
     # Together they take longer to load than most commands to run.
     from station import plots  # noqa: PLC0415 - see above

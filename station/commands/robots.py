@@ -27,7 +27,9 @@ from contract import (
     ROBOT,
 )
 from station import certificates, claims, registry, robots, rotation
+from station.commands.options import since_us
 from station.errors import StationError
+from station.progress import reading, say
 from station.times import iso_s, time_us
 
 commands = typer.Typer(no_args_is_help=True, help="The robots that may connect.")
@@ -122,6 +124,54 @@ def rotate(
         _out.print(f"{name} has settled with its new certificate; revoked: {len(old)}")
 
 
+@commands.command("set")
+def set_(
+    context: typer.Context,
+    name: str,
+    parameters: Annotated[
+        list[str], typer.Argument(metavar="PARAMETER=VALUE", help=f"{' or '.join(robots.F1TENTH)}.")
+    ],
+    since: Annotated[
+        str | None,
+        typer.Option(help="Recompute since 10m (ago), 2h, 3d, or ISO 8601; otherwise all that is stored."),
+    ] = None,
+    also: Annotated[
+        list[str] | None,
+        typer.Option("--stream", help="A stream with a speed that is not known by name; again for more."),
+    ] = None,
+    wait: Annotated[
+        bool, typer.Option(help="Wait a minute first; without it, for a robot that was silent for one.")
+    ] = True,
+) -> None:
+    """Correct a robot's vehicle parameters, and the speed in the summaries that were made with the old ones.
+
+    Queries of samples use the new ones for everything at once; summaries before --since stay as they are.
+    Doing it again changes nothing, also where it was stopped.
+    """
+    vehicle = robots.checked_vehicle(dict(_parameter(text) for text in parameters))
+    from_us = None if since is None else since_us(since)
+    cloud = context.obj.cloud()
+    before = registry.set_vehicle(cloud, name, vehicle)
+    for key, value in vehicle.items():
+        was = f"{before[key]:.12g}" if key in before else "not set"
+        _out.print(f"{name}: {key} {value:.12g}, was {was}", soft_wrap=True)
+    # What it reads with loads numpy, which takes longer than most commands to run.
+    from station import recompute  # noqa: PLC0415 - see above
+
+    if wait:
+        say(f"waiting {recompute.SETTLED_S:.0f} s, in which Lambda 2 may still know the old parameters")
+        recompute.wait_until_settled()
+    streams = dict.fromkeys([*recompute.streams(cloud, name, from_us), *(also or ())])
+    for stream in streams:
+        with reading(f"{name} {stream}", from_us, time.time_ns() // 1000) as progress:
+            done = recompute.recompute(cloud, name, stream, from_us, progress=progress)
+        _out.print(f"{name} {stream}: {done.seconds:,} seconds recomputed", soft_wrap=True)
+        if done.left_out:
+            say(f"{done.left_out} stored items are in no summary: no batches, or more than a second may hold")
+    if not streams:
+        _out.print(f"{name}: 0 seconds recomputed, since no summary has a speed", soft_wrap=True)
+
+
 @commands.command("list")
 def list_(
     context: typer.Context, as_json: Annotated[bool, typer.Option("--json", help="As JSON.")] = False
@@ -208,7 +258,15 @@ def revoke_claims(context: typer.Context) -> None:
 
 
 def _vehicle(speed_to_erpm_gain: float) -> dict[str, float]:
-    return {**robots.F1TENTH, "speed_to_erpm_gain": speed_to_erpm_gain}
+    return robots.checked_vehicle({**robots.F1TENTH, "speed_to_erpm_gain": speed_to_erpm_gain})
+
+
+def _parameter(text: str) -> tuple[str, float]:
+    name, _, value = text.partition("=")
+    try:
+        return name, float(value)
+    except ValueError as error:
+        raise StationError(f"must be PARAMETER=NUMBER, got {text!r}") from error
 
 
 def _connection(row: Mapping[str, Any]) -> str:

@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+import json
 import logging
 import sys
 import threading
 import time
 from collections.abc import Iterator
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import pytest
 
@@ -16,11 +17,11 @@ pytest.importorskip("aiohttp")
 pytest.importorskip("websocket")
 
 import contract
-from device.clock import SystemClock
+from device.clock import Clock, SystemClock
 from device.config import load_config
 from device.errors import ConfigError, SourceError
-from device.sources import rosbridge
-from device.sources.rosbridge import RosbridgeConfig, TopicConfig
+from device.sources.rosbridge import RosbridgeConfig, RosbridgeSource, TopicConfig
+from device.sources.rosbridge_connection import Times
 from tests.device.running import Running, eventually
 from tests.ports import free_port
 from tests.rosbridge_standin import RosbridgeStandin
@@ -41,14 +42,24 @@ def log(caplog: pytest.LogCaptureFixture) -> pytest.LogCaptureFixture:
     return caplog
 
 
-@pytest.fixture(autouse=True)
-def soon(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(rosbridge, "_BACKOFF_S", (0.05, 0.2))
+SOON = Times(backoff_s=(0.05, 0.2), look_s=0.1, ask_again_s=60.0)
 
 
-def config(server: RosbridgeStandin, topic: str = CORE, **settings: Any) -> RosbridgeConfig:
-    settings = {"stream": "vesc", "time": "arrival", **settings}
-    return RosbridgeConfig(url=server.url, topics=((topic, TopicConfig(**settings)),))
+class Quick(NamedTuple):
+    """A configuration whose source waits less."""
+
+    config: RosbridgeConfig
+    times: Times = SOON
+
+    def build(self, clock: Clock) -> RosbridgeSource:
+        return RosbridgeSource(self.config, clock, self.times)
+
+
+def config(server: RosbridgeStandin, *topics: str, times: Times = SOON, **settings: Any) -> Quick:
+    topic = TopicConfig(**{"stream": "vesc", "time": "arrival", **settings})
+    return Quick(
+        RosbridgeConfig(url=server.url, topics=tuple((name, topic) for name in topics or (CORE,))), times
+    )
 
 
 def state(n: float = 0, **stamp: int) -> dict[str, Any]:
@@ -58,12 +69,12 @@ def state(n: float = 0, **stamp: int) -> dict[str, Any]:
 
 def test_messages_become_samples(server: RosbridgeStandin, log: pytest.LogCaptureFixture) -> None:
     before = time.time_ns() // 1000
-    with Running(config(server, type=VESC, throttle_ms=20)) as running:
+    with Running(config(server, type=VESC)) as running:
         asked = server.wait_for("subscribe")
         for n in range(100):
             server.publish(CORE, state(n + 0.5, secs=1, nsecs=2))
         running.wait_for(100)
-    assert (asked["topic"], asked["type"], asked["throttle_rate"]) == (CORE, VESC, 20)
+    assert (asked["topic"], asked["type"], asked["throttle_rate"]) == (CORE, VESC, 0)
     assert [values for _, _, values in running.samples] == [
         {"speed": n + 0.5, "fault_code": 0} for n in range(100)
     ], "in order, and without the wrapper"
@@ -72,7 +83,9 @@ def test_messages_become_samples(server: RosbridgeStandin, log: pytest.LogCaptur
     frame = contract.FrameId("vesc", CORE, "base_link", times[0])
     assert [contract.frame_id(sample) for sample in running.said] == [frame]
     assert before < times[0] <= times[-1] < time.time_ns() // 1000
-    assert "WARNING" not in log.text
+    assert [record.getMessage()[:70] for record in log.records if record.levelname == "WARNING"] == [
+        f"topic {CORE}: the server does not say what its messages consist"
+    ]
 
 
 def test_what_a_message_may_hold(server: RosbridgeStandin) -> None:
@@ -89,7 +102,7 @@ def test_what_a_message_may_hold(server: RosbridgeStandin) -> None:
     with Running(config(server, "/odd")) as running:
         server.wait_for("subscribe")
         server.publish("/odd", message)
-        server.send('{"op": "publish", "topic": "/odd", "msg": {"a": NaN, "b": 1}}')
+        server.publish("/odd", {"a": float("nan"), "b": 1})
         running.wait_for(2)
     assert running.samples[0][2] == {
         "pose.position.x": 1.5,
@@ -144,7 +157,7 @@ def test_a_stamp_not_to_be_believed(
         running.wait_for(3)
     assert before < running.samples[0][1] < time.time_ns() // 1000
     assert log.text.count(words) == 1
-    assert running.source.report()[CORE] == {"messages": 3, reason: 3}
+    assert running.source.report()[CORE] == {"messages": 3, reason: 3, "structure_not_kept": 3}
 
 
 @pytest.mark.parametrize("how", ["closed", "cut"])
@@ -177,37 +190,148 @@ def test_started_before_the_server(log: pytest.LogCaptureFixture) -> None:
     assert log.text.count("nobody listens there") == 1
 
 
-def test_a_silent_topic_is_subscribed_to_afresh(
-    server: RosbridgeStandin, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr(rosbridge, "_PATIENCE_S", 0.5)
-    with Running(config(server)) as running:
-        server.wait_for("unsubscribe", topic=CORE)
-        server.wait_for("subscribe", 2)
-        server.publish(CORE, state())
-        running.wait_for(1)
-    assert running.source.connection.connects == 1
-
-
-def test_a_quiet_connection_is_held_with_pings(
-    server: RosbridgeStandin, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr(rosbridge, "_PING_S", 0.5)
-    monkeypatch.setattr(rosbridge, "_DEAD_S", 60.0)
-    with Running(config(server)) as running:
+def test_a_quiet_connection_is_held_with_pings(server: RosbridgeStandin) -> None:
+    with Running(config(server, times=SOON._replace(ping_s=0.5, dead_s=60.0))) as running:
         eventually(lambda: server.pings >= 4)
     assert running.source.connection.connects == 1
 
 
 def test_a_server_that_answers_nothing_is_left(
-    server: RosbridgeStandin, monkeypatch: pytest.MonkeyPatch, log: pytest.LogCaptureFixture
+    server: RosbridgeStandin, log: pytest.LogCaptureFixture
 ) -> None:
-    monkeypatch.setattr(rosbridge, "_PING_S", 0.5)
-    monkeypatch.setattr(rosbridge, "_DEAD_S", 2.0)
     server.deaf = True
-    with Running(config(server)):
-        server.wait_for("subscribe", 2)
+    with Running(config(server, times=SOON._replace(ping_s=0.5, dead_s=2.0))) as running:
+        eventually(lambda: running.source.connection.connects == 2)
     assert "no answer for 2 s" in log.text
+
+
+IMPATIENT = SOON._replace(patience_s=0.5)
+
+
+def numbered(seq: int, **members: Any) -> dict[str, Any]:
+    """A stamped message of ROS 1, whose publisher counts."""
+    return {"header": {"seq": seq, "stamp": {"secs": seq, "nsecs": 5}, "frame_id": ""}, "n": seq, **members}
+
+
+def test_a_slow_topic_keeps_its_subscription(server: RosbridgeStandin) -> None:
+    with Running(config(server, "/slow", "/fast", times=IMPATIENT)) as running:
+        server.wait_for("subscribe", 2)
+        server.publish("/slow", numbered(1))
+        began = time.monotonic()
+        while time.monotonic() - began < 2.0:
+            server.publish("/fast", {"n": time.monotonic()})
+            time.sleep(0.05)  # the pace of a publisher
+        server.publish("/slow", numbered(2))
+        eventually(lambda: running.source.report()["/slow"]["messages"] == 2)
+        # The pace is known after an interruption.
+        server.cut()
+        server.wait_for("subscribe", 4)
+        began = time.monotonic()
+        while time.monotonic() - began < 1.0:
+            server.publish("/fast", {"n": time.monotonic()})
+            time.sleep(0.05)  # the pace of a publisher
+    assert [op["op"] for op in server.operations if op["op"] == "unsubscribe"] == []
+    assert "resubscribed" not in running.source.report()["/slow"]
+
+
+@pytest.mark.parametrize("stamped", [True, False])
+def test_a_latched_message_is_stored_once(server: RosbridgeStandin, *, stamped: bool) -> None:
+    message = numbered(1) if stamped else {"data": "a map"}
+    server.publish("/map", message, latch="/map_server")
+    with Running(config(server, "/map", times=IMPATIENT)) as running:
+        running.wait_for(1)
+        server.wait_for("unsubscribe", 2)
+        server.cut()
+        eventually(lambda: running.source.connection.connects == 2)
+        eventually(lambda: running.source.report()["/map"].get("latched_again", 0) >= 3)
+        # What is latched does not prove the server deaf: the cut alone is one.
+        assert running.source.report()["/map"]["interruptions"] == 1
+        server.publish("/map", {**message, "changed": 1}, latch="/map_server")
+        running.wait_for(2)
+    assert len(running.samples) == 2
+    assert running.source.report()["/map"]["messages"] == 2
+
+
+def test_a_server_deaf_since_its_master_restarted(server: RosbridgeStandin) -> None:
+    with Running(config(server, times=IMPATIENT)) as running:
+        server.wait_for("subscribe")
+        server.publish(CORE, numbered(1))
+        running.wait_for(1)
+        server.restart_master()
+        for seq in range(2, 12):
+            server.publish(CORE, numbered(seq))
+        server.wait_for("unsubscribe")
+        server.wait_for("subscribe", 2)
+        server.publish(CORE, numbered(12))
+        running.wait_for(2)
+    report = running.source.report()[CORE]
+    assert (report["missed"], report["interruptions"], report["resubscribed"]) == (10, 1, 1)
+    assert report["dark_s"] >= 0.5
+
+
+@pytest.mark.parametrize("how", ["closed", "cut"])
+def test_what_is_lost_in_an_interruption_is_counted(server: RosbridgeStandin, how: str) -> None:
+    with Running(config(server, "/stamped", "/plain")) as running:
+        server.wait_for("subscribe", 2)
+        server.publish("/stamped", numbered(41))
+        server.publish("/plain", {"n": 41})
+        running.wait_for(2)
+        if how == "cut":
+            server.cut()
+        else:
+            server.__exit__()
+            # What is published now is lost: nobody serves it.
+            server.__enter__()
+        server.wait_for("subscribe", 4)
+        server.publish("/stamped", numbered(62))
+        server.publish("/plain", {"n": 62})
+        running.wait_for(4)
+    stamped, plain = (running.source.report()[name] for name in ("/stamped", "/plain"))
+    assert stamped["missed"] == 20
+    assert "missed" not in plain
+    for report in (stamped, plain):
+        assert report["interruptions"] == 1
+        assert report["dark_s"] > 0
+
+
+def test_an_interruption_that_lasts_is_told_while_it_lasts(server: RosbridgeStandin) -> None:
+    with Running(config(server)) as running:
+        server.wait_for("subscribe")
+        server.__exit__()
+        eventually(lambda: running.source.report()[CORE].get("dark_s", 0) >= 0.3)
+        server.__enter__()
+
+
+def test_a_topic_that_is_advertised_later_is_heard_soon() -> None:
+    times = SOON._replace(ask_again_s=0.2)
+    with RosbridgeStandin(advertised={}) as server, Running(config(server, times=times)) as running:
+        server.wait_for("subscribe", 2)
+        server.publish(CORE, state(1))
+        assert server.advertised is not None
+        server.advertised[CORE] = VESC
+        server.wait_for("subscribe", len(server.operations) + 2)
+        server.publish(CORE, state(2))
+        running.wait_for(1)
+        asked = len([op for op in server.operations if op["op"] == "subscribe"])
+    assert [values["speed"] for _, _, values in running.samples] == [2]
+    assert asked >= 4
+    assert not [op for op in server.operations if op["op"] == "unsubscribe"], "nothing is ended for it"
+
+
+def test_a_message_in_fragments_is_put_together(
+    server: RosbridgeStandin, log: pytest.LogCaptureFixture
+) -> None:
+    whole = json.dumps({"op": "publish", "topic": CORE, "msg": state(7)})
+    parts = [whole[at : at + 20] for at in range(0, len(whole), 20)]
+    with Running(config(server)) as running:
+        server.wait_for("subscribe")
+        server.send(json.dumps({"op": "fragment", "id": 0, "data": "lost", "num": 3, "total": 5}))
+        for number, part in enumerate(parts):
+            fragment = {"op": "fragment", "id": 0, "data": part, "num": number, "total": len(parts)}
+            server.send(json.dumps(fragment))
+        running.wait_for(1)
+    assert running.samples[0][2]["speed"] == 7
+    assert running.source.connection.counts()["malformed"] == 1
 
 
 @pytest.mark.parametrize(
@@ -244,7 +368,8 @@ def test_what_the_server_complains_of_is_told(
 def test_something_else_listens_there(log: pytest.LogCaptureFixture) -> None:
     with RosbridgeStandin() as server:
         url = f"{server.url}/elsewhere"
-        with Running(RosbridgeConfig(url=url, topics=((CORE, TopicConfig(stream="vesc", time="arrival")),))):
+        topics = ((CORE, TopicConfig(stream="vesc", time="arrival")),)
+        with Running(Quick(RosbridgeConfig(url=url, topics=topics))):
             eventually(lambda: "is no rosbridge server" in log.text)
 
 
@@ -255,7 +380,7 @@ def test_publishing(server: RosbridgeStandin) -> None:
         connection.publish("/drive", "std_msgs/Float64", {"data": 1.5})
         connection.publish("/drive", "std_msgs/Float64", {"data": 2.5})
         assert server.wait_for("publish", 2)["msg"] == {"data": 2.5}
-        assert [op["op"] for op in server.operations if op["op"] != "subscribe"] == [
+        assert [op["op"] for op in server.operations if op["op"] in ("advertise", "publish")] == [
             "advertise", "publish", "publish",
         ]  # fmt: skip
         with pytest.raises(SourceError, match="/drive cannot be published"):

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import os
 import shutil
+import signal
 import subprocess
 import threading
 import time
@@ -114,6 +115,11 @@ class Process:
         for reader in self._readers:
             reader.join(WAIT_S)
         return status
+
+    def interrupt(self) -> None:
+        """End it as Ctrl-C does."""
+        self._process.send_signal(signal.SIGINT)
+        self.wait()
 
     def kill(self) -> None:
         """End it at once."""

@@ -179,6 +179,7 @@ def test_use_sim_time_is_seen_while_running(cars: Cars) -> None:
     collector.until_said("/use_sim_time")
 
 
-def test_decoding_agrees_with_genpy(graph: Graph) -> None:
-    found = graph.run("against_genpy.py")
+@pytest.mark.parametrize("script", ["against_genpy.py", "rosbridge_against_genpy.py"])
+def test_decoding_and_writing_agree_with_genpy(graph: Graph, script: str) -> None:
+    found = graph.run(script)
     found.until(lambda: "agreed" in "".join(found.lines), "agreement")

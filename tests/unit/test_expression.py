@@ -8,8 +8,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from functions import expression
-from functions.expression import ExpressionError, parse
+from functions.expression import ExpressionError, MismatchError, parse
 from station import conditions
+from station.errors import StationError
 
 SAMPLES = {
     "speed": [0, 1.5, -2, None],
@@ -39,6 +40,15 @@ def both(text, samples=SAMPLES):
 @pytest.mark.parametrize(
     ("text", "expected"),
     [
+        ("speed == None", [0, 0, 0, 1]),
+        ("speed != None", [1, 1, 1, 0]),
+        ("None != name", [1, 1, 0, 1]),
+        ("not name == None and name != 'a'", [0, 1, 0, 0]),
+        ("speed in (0, None)", [1, 0, 0, 1]),
+        ("on == None", [0, 0, 0, 1]),
+        ("on is not None", [1, 1, 1, 0]),
+        ("missing != None", [0, 0, 0, 0]),
+        ("missing == 'a' or missing == 1", [0, 0, 0, 0]),
         ("speed > 1.2", [0, 1, 0, 0]),
         ("abs(speed) >= 1.5", [0, 1, 1, 0]),
         ("-2 <= speed < 1", [1, 0, 1, 0]),
@@ -95,9 +105,53 @@ def test_neither_depth_nor_length_breaks_it(text):
         parse(text)
 
 
+@pytest.mark.parametrize(
+    ("text", "position"),
+    [
+        ("speed > None", 8),
+        ("speed + None > 1", 8),
+        ("None", 0),
+        ("speed + 1 > '3'", 0),
+        ("fault_code == 0 and 2 == '2'", 20),
+        ("speed * '2' > 3", 0),
+        ("abs('x') > 3", 0),
+        ("-'x' > 3", 0),
+    ],
+)
+def test_refuses_at_once_what_no_field_could_answer(text, position):
+    with pytest.raises(ExpressionError) as refused:
+        parse(text)
+    assert refused.value.position == position
+
+
+@pytest.mark.parametrize(
+    ("text", "said"),
+    [
+        ("speed > '3'", "a number and a text cannot be compared: speed is a number, '3' is a text"),
+        ("fault_code == 7 and speed != '3'", "speed is a number, '3' is a text"),
+        ("speed in (1, '2')", "speed is a number, '2' is a text"),
+        ("on == 'true'", "on is a number, 'true' is a text"),
+        ("name == 3", "name is a text, 3 is a number"),
+        ("name == fault_code", "name is a text, fault_code is a number"),
+        ("mixed == 'a'", "mixed is a number or a text, 'a' is a text"),
+        ("name + 1 > 2", "a text cannot be calculated with: name is a text, 1 is a number"),
+        ("not abs(name) > 2", "a text cannot be calculated with: name is a text"),
+    ],
+)
+def test_a_number_compared_with_a_text_is_an_error_and_not_nothing_found(text, said):
+    samples = {**SAMPLES, "mixed": ["a", 1, None, None]}
+    node = parse(text)
+    with pytest.raises(MismatchError) as in_the_cloud:
+        expression.holds(node, samples, 4)
+    assert said in str(in_the_cloud.value)
+    with pytest.raises(StationError) as here:
+        conditions.holds(node, {name: column(values) for name, values in samples.items()}, 4)
+    assert str(here.value) == f"the condition cannot be answered: {in_the_cloud.value}"
+
+
 numbers = st.one_of(st.none(), st.integers(-5, 5), st.floats(-1e308, 1e308))
 terms = st.recursive(
-    st.sampled_from(["a", "b", "flag", "0", "1.5", "None", "True"]),
+    st.sampled_from(["a", "b", "flag", "0", "1.5", "True"]),
     lambda part: st.one_of(
         st.tuples(part, st.sampled_from("+-*/%"), part).map(lambda t: f"({t[0]} {t[1]} {t[2]})"),
         part.map("abs({})".format),
@@ -110,6 +164,8 @@ truths = st.recursive(
         terms,
         st.tuples(terms, st.sampled_from(["<", "<=", "==", "!=", ">", ">="]), terms).map(" ".join),
         terms.map("{} is None".format),
+        terms.map("{} == None".format),
+        terms.map("None != {}".format),
     ),
     lambda part: st.one_of(
         st.tuples(part, st.sampled_from(["and", "or"]), part).map(lambda t: f"({t[0]}) {t[1]} ({t[2]})"),
@@ -117,6 +173,37 @@ truths = st.recursive(
     ),
     max_leaves=5,
 )
+
+
+words = st.sampled_from(["a", "b", "s", "t", "'x'", "1"])
+over_texts = st.recursive(
+    st.one_of(
+        st.tuples(words, st.sampled_from(["<", "==", "!=", ">="]), words).map(" ".join),
+        words.map("{} != None".format),
+    ),
+    lambda part: st.one_of(
+        st.tuples(part, st.sampled_from(["and", "or"]), part).map(lambda t: f"({t[0]}) {t[1]} ({t[2]})"),
+        part.map("not ({})".format),
+    ),
+    max_leaves=4,
+)
+maybe_texts = st.one_of(st.none(), st.sampled_from(["", "x", "y"]))
+
+
+@given(over_texts, st.lists(st.tuples(numbers, numbers, maybe_texts, maybe_texts), min_size=1, max_size=4))
+def test_lists_and_arrays_agree_on_what_cannot_be_answered_too(text, rows):
+    samples = dict(zip("abst", map(list, zip(*rows, strict=True)), strict=True))
+    try:
+        node = parse(text)
+        lists = expression.holds(node, samples, len(rows))
+    except ExpressionError:
+        return
+    except MismatchError:
+        with pytest.raises(StationError):
+            conditions.holds(node, {name: column(values) for name, values in samples.items()}, len(rows))
+        return
+    arrays = conditions.holds(node, {name: column(values) for name, values in samples.items()}, len(rows))
+    assert arrays.tolist() == lists
 
 
 @given(truths, st.lists(st.tuples(numbers, numbers, st.booleans()), min_size=1, max_size=5))

@@ -148,6 +148,7 @@ def test_counts_what_is_no_batch():
         ({"start_us": "now"}, "integer of microseconds"),
         ({"fields": [1]}, "list of names"),
         ({"where": 7}, ""),
+        ({"where": "speed > '3'"}, "speed is a number, '3' is a text"),
     ],
 )
 def test_refuses_with_the_reason(request_, reason):
@@ -182,6 +183,7 @@ class Cloud:
         {},
         {"fields": ["speed_mps"]},
         {"where": "speed % 7 == 0", "start": START + 1, "end": START + 1_500_000},
+        {"where": "speed != None and name == 'x'"},
     ],
 )
 def test_all_four_ways_give_the_same(question, scan, left_ms):
@@ -230,6 +232,8 @@ def test_a_mistake_is_answered_from_there_as_from_here():
     cloud = Cloud(table(*ride()))
     for question, reason in (
         ({"fields": ["volts"]}, "car has no volts in vesc in this range; it has name, speed"),
+        ({"where": "speed > '3'"}, "a number and a text cannot be compared: speed is a number"),
+        ({"where": "speed > None"}, "None can only be asked for"),
         ({"summary": True}, "the summary is read from here"),
         ({"stream": "imu"}, "car has no stream imu"),
     ):

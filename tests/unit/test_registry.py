@@ -4,9 +4,12 @@ from __future__ import annotations
 
 from decimal import Decimal
 
+import pytest
+
 from station import registry
+from station.errors import StationError
 from tests.fakes import ROBOTS, serialize
-from tests.unit.test_station_data import cloud_of
+from tests.unit.test_station_data import FakeCloud, cloud_of
 
 
 def test_presence_says_since_when():
@@ -36,3 +39,19 @@ def test_vehicles_have_what_speed_is_derived_with():
         "plain": {"speed_to_erpm_gain": 4614.0, "speed_to_erpm_offset": 0.0},
         "shifted": {"speed_to_erpm_gain": 4000.0, "speed_to_erpm_offset": 12.5},
     }
+
+
+def test_vehicle_parameters_are_corrected_and_nothing_else(dynamodb):
+    cloud = FakeCloud(dynamodb)
+    registry.enter(cloud, "car", {"speed_to_erpm_gain": 4614.0, "serial": "s"})
+    assert registry.set_vehicle(cloud, "car", {"speed_to_erpm_gain": 1060.5}) == {"speed_to_erpm_gain": 4614}
+    assert registry.set_vehicle(cloud, "car", {"speed_to_erpm_offset": -1e-05}) == {}
+    assert registry.get(cloud, "car") == {
+        "robot": "car",
+        "serial": "s",
+        "speed_to_erpm_gain": Decimal("1060.5"),
+        "speed_to_erpm_offset": Decimal("-0.00001"),
+    }
+    with pytest.raises(StationError, match="robot nobody is not registered"):
+        registry.set_vehicle(cloud, "nobody", {"speed_to_erpm_gain": 1.0})
+    assert registry.find(cloud, "nobody") is None

@@ -9,7 +9,15 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from contract import MAX_BATCH_SPAN_US, Batch, build_topic, flat_second, packed_second
+from contract import (
+    MAX_BATCH_SPAN_US,
+    TYPES_STREAM,
+    Batch,
+    MessageType,
+    build_topic,
+    flat_second,
+    packed_second,
+)
 from functions.statistics import Vehicle
 from functions.statistics import derive as derive_lists
 from functions.tables import attribute
@@ -240,3 +248,57 @@ def test_a_selection_reads_only_what_it_needs():
     selection = select("car", "vesc", fields=["speed_mps"], where="duty_cycle > 0")
     names = ["speed", "duty_cycle", "voltage_input", "speed_mps"]
     assert [name for name in names if selection.needs(name)] == ["speed", "duty_cycle", "speed_mps"]
+
+
+# --- units by what the robot has said of a stream ---------------------------------------------------------
+
+
+def driven(stream, columns, *said):
+    """A cloud with a second of a stream, and what was said of streams, a second each from the start on."""
+    cloud = cloud_of()
+    put(cloud, stream, Batch("0badcafe", 0, [START], {name: [1.5] for name in columns}))
+    for i, kind in enumerate(said):
+        sample = {name: [value] for name, value in kind.sample().items()}
+        put(cloud, TYPES_STREAM, Batch("0badcafe", i, [START + i * 1_000_000], sample))
+    return cloud
+
+
+def put(cloud, stream, batch):
+    cloud.table.put(TELEMETRY, item_of(batch, build_topic("dt", "car", stream)))
+
+
+def test_a_stream_of_any_name_has_the_units_of_its_type():
+    state = "float64 speed\n"
+    vesc = MessageType("esc", "/sensors/core", "vesc_msgs/VescState", "", state)
+    other = MessageType("other", "/o", "lab/Other", "", state)
+    cloud = driven("esc", ["speed"], vesc, other)
+    assert data.query(cloud, "car", "esc").unit("speed") == "erpm"
+    assert data.query(cloud, "car", "esc", fields=["speed"], every="1s").unit("speed") == "erpm"
+    cloud = driven("other", ["speed", "voltage_input", "current_motor", "duty_cycle"], vesc, other)
+    assert data.query(cloud, "car", "other").unit("speed") == ""
+
+
+def test_a_type_counts_that_was_said_before_the_range_ended():
+    drive = MessageType("s", "/s", "ackermann_msgs/AckermannDrive", "", "float32 speed\n")
+    vesc = drive._replace(kind="vesc_msgs/VescState")
+    cloud = driven("s", ["speed"], drive, vesc)
+    assert data.query(cloud, "car", "s", START, START + 1_000_000).unit("speed") == "m/s"
+    assert data.query(cloud, "car", "s", START, START + 1_000_001).unit("speed") == "erpm"
+
+
+def test_a_log_of_a_vesc_has_its_units_under_any_name_and_others_do_not():
+    log = ["speed", "voltage_input", "current_motor", "duty_cycle", "gnss_lat"]
+    found = data.query(driven("ride", log), "car", "ride", fields=["speed", "gnss_lat"])
+    assert [found.unit(name) for name in found.columns] == ["erpm", "deg"]
+    assert data.query(driven("ride", ["speed"]), "car", "ride").unit("speed") == ""
+
+
+def test_types_are_read_only_when_a_unit_asks():
+    cloud = driven("ride", ["speed"])
+    found = data.query(cloud, "car", "ride")
+    before = cloud.table.calls["query"]
+    found.unit("speed")
+    asked = cloud.table.calls["query"]
+    assert asked > before
+    found.unit("speed")
+    assert cloud.table.calls["query"] == asked

@@ -134,6 +134,17 @@ def test_a_source_without_types_has_frames_all_the_same():
     assert said(has_said(frame, frame._replace(topic="/u")), all_of_it) == (None, ())
 
 
+def test_samples_without_a_type_keep_the_case_of_their_names():
+    columns = {"accX": column_of([1.5]), "accx": column_of([2.5])}
+    kind = made_of("log", columns)
+    maker = Maker(kind, list(columns), own=True)
+    ((_, raw),) = maker.messages(Block(np.array([T_US]), columns))
+    store = get_typestore(Stores.EMPTY)
+    store.register(get_types_from_msg(kind.definition, "iort_msgs/msg/Log"))
+    message = store.deserialize_ros1(raw, "iort_msgs/msg/Log")
+    assert (message.accX, message.accx) == (1.5, 2.5)
+
+
 def test_samples_without_a_type_get_one():
     columns = {"rule_ms": column_of([1.5]), "pose.x": column_of([2]), "ok": column_of([True])}
     kind = made_of("rtt-2", columns)

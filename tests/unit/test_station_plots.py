@@ -97,3 +97,56 @@ def test_pictures_are_written(tmp_path, name, begins):
     figure = plots.over_time([run(speed=nothing), run("b", speed=np.arange(100.0))], ["speed"])
     plots.save(figure, tmp_path / name)
     assert (tmp_path / name).read_bytes().startswith(begins)
+
+
+def degrees(latitude="latitude", longitude="longitude", **more):
+    """A hundred metres to the north, then as many to the east, from a receiver that needs its time."""
+    metre = 180 / (np.pi * 6_371_008.8)
+    north = np.append(np.arange(50) * 2, np.full(50, 100)) * metre
+    east = np.append(np.zeros(50), np.arange(50) * 2) * metre / np.cos(np.radians(52))
+    lat, lon = 52 + north, 13 + east
+    lat[:3] = lon[:3] = 0
+    return {latitude: lat, longitude: lon, **more}
+
+
+@pytest.mark.parametrize(
+    ("columns", "names"),
+    [
+        (degrees(), "latitude, longitude"),
+        (degrees("gnss_lat", "gnss_lon", speed=np.ones(100)), "gnss_lat, gnss_lon"),
+        (degrees("fix.latitude", "fix.longitude"), "fix.latitude, fix.longitude"),
+    ],
+)
+def test_latitude_and_longitude_are_drawn_as_metres_around_the_first_place_known(columns, names):
+    figure = plots.trajectory([run("a", **columns)])
+    (panel,) = figure.axes
+    (line,) = lines(panel)
+    x, y = line.get_xdata(), line.get_ydata()
+    assert np.isnan(x[:3]).all()
+    assert (x[3], y[3]) == (0, 0)
+    # It was 6 m to the north when it knew where it was.
+    assert (x[-1], y[-1]) == (pytest.approx(98, rel=1e-4), pytest.approx(94, rel=1e-4))
+    assert (panel.get_xlabel(), panel.get_ylabel()) == ("east (m)", "north (m)")
+    assert f"{names} around 52.0000540, 13.0000000" in figure.get_suptitle()
+
+
+def test_runs_share_the_place_that_they_are_drawn_around():
+    later = degrees()
+    later["latitude"] += 0.001
+    figure = plots.trajectory([run("a", **degrees()), run("b", **later)])
+    one, other = lines(figure.axes[0])
+    assert other.get_ydata()[-1] - one.get_ydata()[-1] == pytest.approx(111.2, abs=0.1)
+
+
+def test_a_place_without_a_fix_is_none_and_the_antimeridian_no_jump():
+    status = np.zeros(100)
+    status[-10:] = -1
+    (line,) = lines(plots.trajectory([run(**degrees(), **{"status.status": status})]).axes[0])
+    assert np.isnan(line.get_xdata()[-10:]).all()
+    lon = (np.linspace(179.9999, 180.0001, 100) + 180) % 360 - 180
+    (line,) = lines(plots.trajectory([run(latitude=np.full(100, 1e-6), longitude=lon)]).axes[0])
+    assert line.get_xdata()[-1] == pytest.approx(22.2, abs=0.1)
+    with pytest.raises(StationError, match="latitude, longitude hold no place: the receiver had no fix"):
+        plots.trajectory([run(latitude=np.zeros(100), longitude=np.zeros(100))])
+    with pytest.raises(StationError, match="a has x and y, b has latitude and longitude"):
+        plots.trajectory([run("a", x=np.ones(100), y=np.ones(100)), run("b", **degrees())])

@@ -130,3 +130,38 @@ def test_ranges(capsys):
 def test_ranges_that_make_no_sense(options):
     with pytest.raises(StationError):
         Range.of(*options)
+
+
+def written(to, found):
+    file = io.StringIO()
+    to(found, file)
+    return file.getvalue().splitlines()
+
+
+def test_integers_are_integers_and_fractions_keep_theirs():
+    mixed = np.empty(2, dtype=object)
+    mixed[:] = [2**63 + 1, -127.0]
+    columns = {"rssi": np.array([-127.0, np.nan]), "volts": np.array([12.0, 12.5]), "large": mixed}
+    found = Result("car", "radio", np.array([0, 1_000_000]), {**columns, "far": np.array([1e300, 1.0])})
+    assert [line.partition(",")[2] for line in written(tables.to_csv, found)] == [
+        "rssi,volts,large,far",
+        "-127,12.0,9223372036854775809,1e+300",
+        ",12.5,-127,1.0",
+    ]
+    first, second = written(tables.to_json_lines, found)
+    assert '"rssi": -127, "volts": 12.0, "large": 9223372036854775809' in first
+    assert '"rssi": null, "volts": 12.5, "large": -127' in second
+    many = Result("car", "radio", np.arange(20_000), {"n": np.arange(20_000.0)})
+    assert written(tables.to_csv, many)[-1].endswith(",19999")
+    # What is whole at first only, is written as what it is from the start.
+    many.columns["n"][-1] = 0.5
+    assert written(tables.to_csv, many)[1].endswith(",0.0")
+
+
+def test_a_latitude_is_shown_to_the_centimetre():
+    names = ["gnss_lat", "longitude_mean", "fix.latitude", "flat", "lon_velocity"]
+    columns = {name: np.array([52.12345678]) for name in names}
+    console = Console(width=200, file=io.StringIO())
+    console.print(tables.terminal(Result("car", "fix", np.array([0]), columns)).table)
+    shown = console.file.getvalue().splitlines()[-1].split()[2:]
+    assert shown == ["52.1234568"] * 3 + ["52.1235"] * 2

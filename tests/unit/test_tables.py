@@ -152,7 +152,7 @@ def test_a_robot_that_is_not_registered_has_no_vehicle(client):
     assert tables(client).vehicle("nobody") is None
 
 
-def test_the_registry_is_read_once_a_minute(monkeypatch):
+def test_the_registry_is_read_once_a_minute_or_when_it_is_told_to(monkeypatch):
     client, now = FakeDynamoDB(), [0.0]
     monkeypatch.setattr(tables_module.time, "monotonic", lambda: now[0])
     asked = tables(client)
@@ -162,7 +162,11 @@ def test_the_registry_is_read_once_a_minute(monkeypatch):
     put(client, ROBOTS, {"robot": {"S": "car"}, "speed_to_erpm_gain": {"N": "4614"}})
     now[0] = 60.1
     assert asked.vehicle("car") == Vehicle(4614.0)
-    assert client.calls["get_item"] == 2
+    put(client, ROBOTS, {"robot": {"S": "car"}, "speed_to_erpm_gain": {"N": "1060"}})
+    assert asked.vehicle("car") == Vehicle(4614.0)
+    asked.forget_vehicles()
+    assert asked.vehicle("car") == Vehicle(1060.0)
+    assert client.calls["get_item"] == 3
 
 
 # --- summary ----------------------------------------------------------------------------------------

@@ -1,0 +1,119 @@
+"""The rosbridge source where the server says what its messages consist of, and where it does not."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Iterator
+
+import pytest
+
+pytest.importorskip("aiohttp")
+pytest.importorskip("websocket")
+
+import contract
+from tests.device.running import Running, eventually
+from tests.device.test_rosbridge import CORE, VESC, config, state
+from tests.rosbridge_standin import RosbridgeStandin
+
+
+@pytest.fixture
+def server() -> Iterator[RosbridgeStandin]:
+    with RosbridgeStandin() as standin:
+        yield standin
+
+
+RULE = "=" * 80
+HEADER = f"{RULE}\nMSG: std_msgs/Header\nuint32 seq\ntime stamp\nstring frame_id\n"
+VESC_TEXT = (
+    f"Header header\nVescState state\n{HEADER}"
+    f"{RULE}\nMSG: vesc_msgs/VescState\nint32 FAULT_CODE_NONE=0  # fine\nfloat64 speed\nint32 fault_code\n"
+)
+SCAN_TEXT = f"Header header\nfloat32[] ranges\nuint8[] raw\ntime[] when\n{HEADER}"
+SERVED = {
+    "advertised": {CORE: VESC, "/scan": "a_msgs/Scan"},
+    "definitions": {VESC: VESC_TEXT, "a_msgs/Scan": SCAN_TEXT},
+}
+
+
+@pytest.mark.parametrize("old", [False, True])
+def test_messages_go_the_way_of_ros_1_where_their_type_is_known(*, old: bool) -> None:
+    sec = int(time.time()) - 60
+    with RosbridgeStandin(**SERVED, old=old) as server:
+        with Running(config(server, time="header")) as running:
+            server.wait_for("subscribe")
+            for seq in range(3):
+                message = state(seq + 0.5, secs=sec, nsecs=123_456_789)
+                message["header"]["seq"] = seq
+                server.publish(CORE, message)
+            running.wait_for(3)
+        assert len(running.source._intakes[CORE]._writer.write(message)) == 4 + 8 + 4 + 9 + 8 + 4
+    assert [values for _, _, values in running.samples] == [
+        {"speed": seq + 0.5, "fault_code": 0} for seq in range(3)
+    ]
+    assert {t_us for _, t_us, _ in running.samples} == {sec * 1_000_000 + 123_456}
+    kind = contract.message_type(running.said[0])
+    assert (kind.topic, kind.kind) == (CORE, VESC)
+    if not old:
+        # As genmsg of ROS computes it.
+        assert (kind.md5sum, kind.definition) == ("da885266203a97b33d0ad1d0fa9d1d9e", VESC_TEXT)
+    assert running.source.report()[CORE] == {"messages": 3}
+
+
+def test_structure_is_kept_where_the_plain_sample_loses_it() -> None:
+    with RosbridgeStandin(**SERVED) as server, Running(config(server, "/scan")) as running:
+        server.wait_for("subscribe")
+        header = {"seq": 1, "stamp": {"secs": 1, "nsecs": 2}, "frame_id": "laser"}
+        server.publish("/scan", {"header": header, "ranges": [1.5, None], "raw": "AQL/", "when": []})
+        running.wait_for(1)
+        intake = running.source._intakes["/scan"]
+        assert running.samples[0][2].keys() == {"ranges.0", "ranges.1"}
+        assert running.samples[0][2]["ranges.1"] != running.samples[0][2]["ranges.1"]
+        assert intake.report() == {"messages": 1, "not_a_number": 1, "left_out": {"raw": 1}}
+
+
+def test_without_rosapi_the_plain_sample_is_sent_and_counted(server: RosbridgeStandin) -> None:
+    with Running(config(server)) as running:
+        server.wait_for("subscribe")
+        server.publish(CORE, state(1))
+        running.wait_for(1)
+    assert running.source.report()[CORE] == {"messages": 1, "structure_not_kept": 1}
+
+
+def test_a_rosapi_that_does_not_answer_loses_nothing() -> None:
+    with RosbridgeStandin(**SERVED) as server:
+        server.silent_rosapi = True
+        with Running(config(server)) as running:
+            server.wait_for("subscribe")
+            for n in range(2_003):
+                server.publish(CORE, state(n))
+            running.wait_for(2_003)
+    assert [values["speed"] for _, _, values in running.samples] == list(range(2_003)), "in order"
+    assert running.source.report()[CORE]["structure_not_kept"] == 2_003
+
+
+def test_what_is_held_when_the_agent_ends_is_sent() -> None:
+    with RosbridgeStandin(**SERVED) as server:
+        server.silent_rosapi = True
+        with Running(config(server)) as running:
+            server.wait_for("subscribe")
+            server.publish(CORE, state(5))
+            eventually(lambda: running.source.report()[CORE]["messages"] == 1)
+    assert [values["speed"] for _, _, values in running.samples] == [5]
+
+
+def test_the_types_are_asked_for_again_after_a_reconnect() -> None:
+    with RosbridgeStandin(**SERVED) as server, Running(config(server)) as running:
+        server.wait_for("subscribe")
+        server.publish(CORE, {**state(1, secs=1, nsecs=2)})
+        running.wait_for(1)
+        server.__exit__()
+        assert server.definitions is not None
+        server.definitions[VESC] = VESC_TEXT + "float32 added\n"
+        server.__enter__()
+        server.wait_for("subscribe", 2)
+        message = state(2, secs=1, nsecs=2)
+        message["state"]["added"] = 0.25
+        server.publish(CORE, message)
+        running.wait_for(2)
+    assert running.samples[1][2] == {"speed": 2, "fault_code": 0, "added": 0.25}
+    assert running.source.report()[CORE].keys() == {"messages", "interruptions", "dark_s"}

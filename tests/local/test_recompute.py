@@ -1,0 +1,78 @@
+"""A car was registered with the wrong gain: it is corrected, and its summaries are, on the embedded cloud."""
+
+from __future__ import annotations
+
+import time
+
+import pytest
+
+import contract
+from contract import Batch, record_topic
+from station import data, delivery, inventory, recompute, registry
+from station.recompute import Recomputed
+from tests.local.conftest import until
+from tests.local.robot import Robot
+
+RUN = "0badcafe"
+SECONDS = 6
+
+
+def drive(embedded, car, stream="vesc"):
+    """Six seconds of one batch each, as they are summarised with the F1TENTH's gain; when they began."""
+    start_us = (int(time.time()) - 3600) * 1_000_000
+    with Robot(car.folder) as robot:
+        robot.online()
+        for i in range(SECONDS):
+            times = [start_us + i * 1_000_000 + k * 100_000 for k in range(10)]
+            batch = Batch(RUN, i, times, {"speed": [1060.0 * i] * 10, "duty_cycle": [0.1 * i] * 10})
+            topic = record_topic(car.robot, stream)
+            assert robot.publish(topic, contract.encode(batch)) == "SUCCESS"
+    until(lambda: delivery.samples_summarized(embedded.cloud, car.robot, stream) == 10 * SECONDS)
+    return start_us
+
+
+def speeds(embedded, robot, stream="vesc"):
+    found = data.query(embedded.cloud, robot, stream, summary=True, fields=["speed_mps"])
+    return found.columns["speed_mps_max"].tolist()
+
+
+def test_a_corrected_gain_is_in_queries_and_in_summaries(embedded, bundle, iort):
+    cloud, car = embedded.cloud, bundle()
+    start_us = drive(embedded, car)
+    old = [1060 * i / 4614 for i in range(SECONDS)]
+    assert speeds(embedded, car.robot) == pytest.approx(old)
+    at = time.strftime("%Y-%m-%dT%H:%M:%SZ", time.gmtime(start_us // 1_000_000 + 2))
+    done = iort("robots", "set", car.robot, "speed_to_erpm_gain=1060", "--since", at, "--no-wait")
+    assert done.exit_code == 0, done.output
+    assert "speed_to_erpm_gain 1060, was 4614" in done.stdout
+    assert "vesc: 4 seconds recomputed" in done.stdout
+    assert speeds(embedded, car.robot) == pytest.approx([*old[:2], 2, 3, 4, 5])
+    # Lambda 2 has answered with the new gain, whoever asks and how often.
+    for on in ("client", "lambda"):
+        found = data.query(cloud, car.robot, "vesc", fields=["speed_mps"], on=on)
+        assert found.columns["speed_mps"][::10].tolist() == pytest.approx(range(SECONDS))
+    for _ in range(2):
+        assert recompute.recompute(cloud, car.robot, "vesc", None) == Recomputed(SECONDS, 0)
+        assert speeds(embedded, car.robot) == pytest.approx(range(SECONDS))
+    assert inventory.vehicle_of(cloud, car.robot).speed_to_erpm_gain == 1060
+    # What comes afterwards has it too.
+    drive(embedded, car, "esc")
+    assert speeds(embedded, car.robot, "esc") == pytest.approx(range(SECONDS))
+
+
+@pytest.mark.parametrize(
+    ("parameter", "said"),
+    [
+        ("speed_to_erpm_gain=0", "not 0, got 0"),
+        ("speed_to_erpm_gain=fast", "must be PARAMETER=NUMBER, got 'speed_to_erpm_gain=fast'"),
+        ("online=1", "online is no vehicle parameter"),
+    ],
+)
+def test_what_cannot_be_changes_nothing(embedded, bundle, iort, parameter, said):
+    car = bundle()
+    before = registry.get(embedded.cloud, car.robot)
+    done = iort("robots", "set", car.robot, parameter)
+    assert done.exit_code == 1
+    assert said in str(done.exception)
+    assert registry.get(embedded.cloud, car.robot) == before
+    assert "not registered" in str(iort("robots", "set", "nobody", "speed_to_erpm_gain=1").exception)

@@ -1,0 +1,195 @@
+"""A robot of many topics: every shape of message that real ones have, and some that few expect.
+
+What `mixed_publisher.py` publishes, in processes under ROS' own Python, and the tests compare with.
+"""
+
+from __future__ import annotations
+
+import math
+import random
+import struct
+from collections.abc import Mapping
+from typing import NamedTuple
+
+from bench import ros_message
+from tests.ros1_types import SIZES, Message, serialize
+
+_VESC_STATE = "\n".join([*(f"float64 {name}" for name in ros_message.FIELDS), "int32 fault_code"])
+TEXTS = {
+    "std_msgs/Empty": "",
+    "std_msgs/String": "string data",
+    "std_msgs/Float32": "float32 data",
+    "std_msgs/MultiArrayDimension": "string label\nuint32 size\nuint32 stride",
+    "std_msgs/MultiArrayLayout": "MultiArrayDimension[] dim\nuint32 data_offset",
+    "std_msgs/ByteMultiArray": "MultiArrayLayout layout\nbyte[] data",
+    "std_msgs/UInt64MultiArray": "MultiArrayLayout layout\nuint64[] data",
+    "geometry_msgs/Point": "float64 x\nfloat64 y\nfloat64 z",
+    "geometry_msgs/PointStamped": "Header header\nPoint point",
+    "geometry_msgs/Vector3": "float64 x\nfloat64 y\nfloat64 z",
+    "geometry_msgs/Quaternion": "float64 x\nfloat64 y\nfloat64 z\nfloat64 w",
+    "geometry_msgs/Pose": "Point position\nQuaternion orientation",
+    "geometry_msgs/PoseStamped": "Header header\nPose pose",
+    "geometry_msgs/PoseWithCovariance": "Pose pose\nfloat64[36] covariance",
+    "geometry_msgs/Twist": "Vector3 linear\nVector3 angular",
+    "geometry_msgs/TwistWithCovariance": "Twist twist\nfloat64[36] covariance",
+    "geometry_msgs/Transform": "Vector3 translation\nQuaternion rotation",
+    "geometry_msgs/TransformStamped": "Header header\nstring child_frame_id\nTransform transform",
+    "tf2_msgs/TFMessage": "geometry_msgs/TransformStamped[] transforms",
+    "sensor_msgs/JointState": (
+        "Header header\nstring[] name\nfloat64[] position\nfloat64[] velocity\nfloat64[] effort"
+    ),
+    "sensor_msgs/Imu": (
+        "Header header\ngeometry_msgs/Quaternion orientation\nfloat64[9] orientation_covariance\n"
+        "geometry_msgs/Vector3 angular_velocity\nfloat64[9] angular_velocity_covariance\n"
+        "geometry_msgs/Vector3 linear_acceleration\nfloat64[9] linear_acceleration_covariance"
+    ),
+    "sensor_msgs/LaserScan": (
+        "Header header\nfloat32 angle_min\nfloat32 angle_max\nfloat32 angle_increment\n"
+        "float32 time_increment\nfloat32 scan_time\nfloat32 range_min\nfloat32 range_max\n"
+        "float32[] ranges\nfloat32[] intensities"
+    ),
+    "sensor_msgs/Image": (
+        "Header header\nuint32 height\nuint32 width\nstring encoding\nuint8 is_bigendian\n"
+        "uint32 step\nuint8[] data"
+    ),
+    "nav_msgs/Odometry": (
+        "Header header\nstring child_frame_id\ngeometry_msgs/PoseWithCovariance pose\n"
+        "geometry_msgs/TwistWithCovariance twist"
+    ),
+    "nav_msgs/Path": "Header header\ngeometry_msgs/PoseStamped[] poses",
+    "nav_msgs/MapMetaData": (
+        "time map_load_time\nfloat32 resolution\nuint32 width\nuint32 height\ngeometry_msgs/Pose origin"
+    ),
+    "nav_msgs/OccupancyGrid": "Header header\nMapMetaData info\nint8[] data",
+    "diagnostic_msgs/KeyValue": "string key\nstring value",
+    "diagnostic_msgs/DiagnosticStatus": (
+        "byte OK=0\nbyte WARN=1\nbyte ERROR=2\nbyte STALE=3\nbyte level\nstring name\nstring message\n"
+        "string hardware_id\nKeyValue[] values"
+    ),
+    "diagnostic_msgs/DiagnosticArray": "Header header\nDiagnosticStatus[] status",
+    "vesc_msgs/VescState": _VESC_STATE,
+    "vesc_msgs/VescStateStamped": "Header header\nVescState state",
+    # Types of a lab's own. A field called header need not be a std_msgs/Header, nor a header come first.
+    "lab_msgs/Packet": "uint16 id\nuint8 version\nstring note",
+    "lab_msgs/Reading": "Packet header\nfloat64 value\nstd_msgs/Header at",
+    "lab_msgs/Part": "Header header\nReading reading",
+    "lab_msgs/Envelope": "Packet header\nuint8[] payload\nPart[] parts\nPart[2] both",
+    "lab_msgs/Limits": (
+        "uint8 LEFT=0\nstring WHO=a # b\nbool on\nbyte low\nchar letter\nint64 least\nuint64 most\n"
+        "uint64[2] pair\nfloat32 f\nfloat64 d\nfloat64[] list\nbyte[] signed\nstring name\nstring[] names\n"
+        "time at\nduration took\nduration[] tooks"
+    ),
+    "lab_msgs/Empties": "std_msgs/Empty nothing\nstd_msgs/Empty[] many\nfloat64[] none\nPart[] parts",
+}
+
+
+class Topic(NamedTuple):
+    """A topic of one publisher. ``lengths`` are those of arrays, by the field's name; what is not named
+    has up to four elements, another number in each message. ``grid_us``: stamps lie on it; ``behind_us``: by
+    a clock that is so far behind."""
+
+    name: str
+    kind: str
+    rate_hz: float
+    lengths: Mapping[str, int] = {}
+    latched: bool = False
+    grid_us: int = 1
+    behind_us: int = 0
+
+    @property
+    def message(self) -> Message:
+        return MESSAGES[self.kind]
+
+    @property
+    def stream(self) -> str:
+        return self.name[1:].replace("/", "_")
+
+
+_ARM, _GRIPPER = (dict.fromkeys(("name", "position", "velocity", "effort"), n) for n in (6, 2))
+_BEACONS = Topic("/beacons", "geometry_msgs/PointStamped", 50, grid_us=20_000)
+_JOINTS = Topic("/joint_states", "sensor_msgs/JointState", 50, _ARM)
+# Node -> what it publishes: two publishers of a topic are two nodes.
+NODES: dict[str, list[Topic]] = {
+    "base": [
+        Topic("/sensors/core", "vesc_msgs/VescStateStamped", 50),
+        Topic("/tf", "tf2_msgs/TFMessage", 40),
+        Topic("/tf_static", "tf2_msgs/TFMessage", 0, {"transforms": 5}, latched=True),
+        Topic("/scan", "sensor_msgs/LaserScan", 10, {"ranges": 720, "intensities": 0}),
+        Topic("/odom", "nav_msgs/Odometry", 30),
+        Topic("/camera/small", "sensor_msgs/Image", 2, {"data": 64 * 48 * 3}),
+        Topic("/camera/large", "sensor_msgs/Image", 0.2, {"data": 640 * 480 * 3}),
+        Topic("/diagnostics", "diagnostic_msgs/DiagnosticArray", 2),
+        Topic("/heartbeat", "std_msgs/Empty", 5),
+        Topic("/map", "nav_msgs/OccupancyGrid", 0, {"data": 100 * 100}, latched=True),
+        Topic("/plan", "nav_msgs/Path", 2),
+        Topic("/battery", "std_msgs/Float32", 1),
+        Topic("/note", "std_msgs/String", 2),
+        Topic("/ticks", "std_msgs/UInt64MultiArray", 10),
+        Topic("/raw", "std_msgs/ByteMultiArray", 10),
+        Topic("/sync", "std_msgs/Header", 10),
+        Topic("/lab/envelope", "lab_msgs/Envelope", 5),
+        Topic("/lab/limits", "lab_msgs/Limits", 10),
+        Topic("/lab/empties", "lab_msgs/Empties", 5),
+        _BEACONS,
+        _JOINTS,
+    ],
+    "rear": [_BEACONS._replace(behind_us=2_000_000), _JOINTS._replace(rate_hz=20, lengths=_GRIPPER)],
+    "imu": [Topic("/imu", "sensor_msgs/Imu", 1000)],
+}
+TOPICS = {topic.name: topic for topics in NODES.values() for topic in topics}
+MESSAGES = {kind: Message(kind, TEXTS) for kind in sorted({*TEXTS, "std_msgs/Header"})}
+
+_EDGES = {
+    "float32": [math.nan, math.inf, -0.0],
+    "float64": [math.nan, -math.inf, -0.0, 5e-324],
+    "uint64": [2**53 + 1, 2**64 - 1],
+    "int64": [-(2**63), 2**53 + 1],
+}
+_WORDS = (b"", b"base_link", "grün".encode(), b"not UTF-8: \xff\xfe", b"\xc3", b"a\0b", b"joint_1")
+
+
+class Values:
+    """What sensors say: a few digits, now and then an edge; covariances that do not change."""
+
+    def __init__(self, seed: int, lengths: Mapping[str, int]) -> None:
+        self._random = random.Random(seed)
+        self._lengths = lengths
+
+    def number(self, kind: str, name: str) -> bytes:
+        if "covariance" in name:
+            return bytes(SIZES[kind])
+        chance = self._random
+        if kind in {"float32", "float64"}:
+            value = chance.choice(_EDGES[kind]) if chance.random() < 0.01 else round(chance.gauss(0, 3), 3)
+            return struct.pack("<f" if kind == "float32" else "<d", value)
+        if kind == "bool":
+            return bytes([chance.getrandbits(1)])
+        if kind in {"uint64", "int64"} and chance.random() < 0.3:
+            return struct.pack("<Q" if kind == "uint64" else "<q", chance.choice(_EDGES[kind]))
+        # Both halves of an int8's, byte's and uint8's range; whole seconds within an hour for a time.
+        return bytes([chance.getrandbits(8)]) + bytes(SIZES[kind] - 1)
+
+    def text(self, _name: str) -> bytes:
+        return self._random.choice(_WORDS)
+
+    def length(self, name: str) -> int:
+        return self._lengths.get(name, self._random.randrange(5))
+
+
+class Maker:
+    """The messages of one publisher, in order: the same for the same seed, but for the headers."""
+
+    def __init__(self, topic: Topic, seed: int) -> None:
+        self._topic, self._message = topic, topic.message
+        self._values = Values(seed, topic.lengths)
+        # A message of a header is told apart by it; the rest of it may come again.
+        again = self._message.stamped and topic.rate_hz > 20
+        self._bodies = [self._body() for _ in range(97)] if again else []
+
+    def made(self, n: int, header: bytes) -> bytes:
+        body = self._bodies[n % len(self._bodies)] if self._bodies else self._body()
+        return header + body if self._message.stamped else body
+
+    def _body(self) -> bytes:
+        headed = b"" if self._message.stamped else None
+        return serialize(self._message, self._values, headed=headed)

@@ -1,0 +1,76 @@
+"""Two publishers of one topic, each with a clock and a shape of its own: all is stored, in as few batches
+as if there were one."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+from device.errors import AgentError
+from device.status import SOCKET, fetch
+from local.cloud import EmbeddedCloud
+from station import delivery, robots
+from tests.local.conftest import embedded, until  # noqa: F401 - a fixture
+from tests.ros.conftest import Graph, ros_python  # noqa: F401 - a fixture
+from tests.ros.mixed_robot import TOPICS
+
+SECONDS = 10
+NAMES = ("/beacons", "/joint_states")
+SENT = {"beacons": 2 * 50 * SECONDS, "joint_states": (50 + 20) * SECONDS}
+# A batch is a second long, of the samples' time; two clocks are 2 s apart, and a second may be cut by both.
+MOST_PER_S = 1.3
+
+
+@pytest.fixture(scope="module")
+def stored(
+    embedded: EmbeddedCloud,  # noqa: F811 - the fixture
+    ros_python: str,  # noqa: F811 - the fixture
+    tmp_path_factory: pytest.TempPathFactory,
+) -> dict[str, delivery.Delivery]:
+    """What the table has of either stream."""
+    folder = tmp_path_factory.mktemp("two")
+    topics = {name: {"stream": TOPICS[name].stream, "time": "header"} for name in NAMES}
+    settings = {"sources": [{"type": "ros1", "topics": topics}], "queue": {"path": "spool.db"}}
+    car = robots.add(embedded.cloud, "two-publishers", out=folder, settings=settings)
+    graph = Graph(ros_python, folder)
+    try:
+        graph.start_master()
+        agent = graph.module("device.main", "run", "--config", car.config, "--drain-s", 60)
+        publishers = [_publisher(graph, node, folder) for node in ("base", "rear")]
+        for publisher in publishers:
+            publisher.until(lambda publisher=publisher: "ready" in publisher.lines, "connections")
+        for publisher in publishers:
+            publisher.say("begin")
+        for publisher in publishers:
+            publisher.until(lambda publisher=publisher: publisher.lines[-1].startswith("sent "), "end")
+
+        def taken() -> dict[str, int]:
+            try:
+                streams = fetch(car.folder / SOCKET)["streams"]
+            except AgentError:
+                return {}  # too busy to say
+            return {name: streams.get(name, {}).get("samples", 0) for name in SENT}
+
+        until(lambda: taken() == SENT)
+        assert agent.terminate() == 0, "\n".join(agent.errors)
+    finally:
+        graph.stop()
+    return {name: delivery.delivery(embedded.cloud, car.robot, name) for name in SENT}
+
+
+def _publisher(graph: Graph, node: str, folder: Path):
+    return graph.run(
+        "mixed_publisher.py", node, "--seconds", SECONDS, "--subscribers", 1,
+        "--ledger", folder / f"{node}.sent", "--topics", *NAMES,
+    )  # fmt: skip
+
+
+@pytest.mark.parametrize("stream", SENT)
+def test_every_message_is_stored(stored: dict[str, delivery.Delivery], stream: str) -> None:
+    assert stored[stream].samples_stored == SENT[stream]
+
+
+@pytest.mark.parametrize("stream", SENT)
+def test_there_are_as_few_batches_as_seconds(stored: dict[str, delivery.Delivery], stream: str) -> None:
+    assert stored[stream].batches_stored <= MOST_PER_S * (SECONDS + 2)

@@ -1,0 +1,227 @@
+"""ROS 1 message types put together by hand, and their messages' bytes: no ROS and no library is needed.
+
+A `Message` is a type with every type within it; it knows the text that a publisher sends and its checksum.
+`serialize` makes a message of what a `Chance` says, byte by byte; `fields` reads one as a flat list,
+`as_json` as rosbridge does.
+"""
+
+from __future__ import annotations
+
+import base64
+import hashlib
+import math
+import re
+import struct
+from collections.abc import Mapping
+from typing import Any, NamedTuple, Protocol
+
+SIZES = {
+    "bool": 1, "int8": 1, "uint8": 1, "byte": 1, "char": 1, "int16": 2, "uint16": 2, "int32": 4, "uint32": 4,
+    "int64": 8, "uint64": 8, "float32": 4, "float64": 8, "time": 8, "duration": 8,
+}  # fmt: skip
+_LETTERS = {
+    "bool": "?", "int8": "b", "uint8": "B", "byte": "b", "char": "B", "int16": "h", "uint16": "H",
+    "int32": "i", "uint32": "I", "int64": "q", "uint64": "Q", "float32": "f", "float64": "d",
+    "time": "II", "duration": "ii",
+}  # fmt: skip
+STRING, HEADER = "string", "std_msgs/Header"
+HEADER_TEXT = "uint32 seq\ntime stamp\nstring frame_id"
+VARIABLE = -1
+_FIELD = re.compile(r"(?P<base>[\w/]+?)(?P<array>\[(?P<length>\d*)\])?\s+(?P<name>\w+)\s*(=(?P<value>.*))?")
+
+
+class Field(NamedTuple):
+    """``kind`` is a full name; ``length`` is None for one value, `VARIABLE`, or of a fixed array."""
+
+    name: str
+    kind: str
+    length: int | None
+
+
+class Chance(Protocol):
+    """What the values of a message are."""
+
+    def number(self, kind: str, name: str) -> bytes:
+        """One number of a type of `SIZES`, as it is on the wire."""
+
+    def text(self, name: str) -> bytes:
+        """A text, which need not be UTF-8."""
+
+    def length(self, name: str) -> int:
+        """Of a variable array."""
+
+
+class Message:
+    """A type and those within, from each type's own text."""
+
+    def __init__(self, kind: str, texts: Mapping[str, str]) -> None:
+        self.kind = kind
+        self._texts = {HEADER: HEADER_TEXT, **texts}
+        self.types: dict[str, list[Field]] = {}
+        self._read(kind)
+        first, *others = self.types
+        rule = "=" * 80
+        self.definition = "\n".join(
+            [self._texts[first], *(f"{rule}\nMSG: {other}\n{self._texts[other]}" for other in others)]
+        )
+        self.md5sum = self._md5sum(kind)
+
+    def __repr__(self) -> str:
+        return f"{self.kind}:\n{self.definition}"
+
+    @property
+    def stamped(self) -> bool:
+        """Whether it begins with a header."""
+        return self.types[self.kind][:1] == [Field("header", HEADER, None)]
+
+    def _read(self, kind: str) -> None:
+        if kind in self.types:
+            return
+        found: list[Field] = []
+        self.types[kind] = found
+        for match in self._lines(kind):
+            if match["value"] is None:
+                length = None if match["array"] is None else int(match["length"] or VARIABLE)
+                found.append(Field(match["name"], self._full(kind, match["base"]), length))
+        for field in found:
+            if field.kind not in SIZES and field.kind != STRING:
+                self._read(field.kind)
+
+    def _lines(self, kind: str) -> list[re.Match[str]]:
+        found = [_FIELD.match(line) for line in self._texts[kind].splitlines() if line.strip()]
+        assert None not in found, self._texts[kind]
+        return [match for match in found if match is not None]
+
+    def _full(self, kind: str, name: str) -> str:
+        if name in SIZES or name == STRING or "/" in name:
+            return name
+        return HEADER if name == "Header" else f"{kind.partition('/')[0]}/{name}"
+
+    def _md5sum(self, kind: str) -> str:
+        """As genmsg computes it: the constants, then the fields, a nested type as its own checksum."""
+        constants, plain = [], []
+        for match in self._lines(kind):
+            base, name, full = match["base"], match["name"], self._full(kind, match["base"])
+            if match["value"] is not None:
+                constants.append(f"{base} {name}={match['value'].strip()}")
+            elif full in self.types:
+                plain.append(f"{self._md5sum(full)} {name}")
+            else:
+                plain.append(f"{base}{match['array'] or ''} {name}")
+        return hashlib.md5("\n".join(constants + plain).encode()).hexdigest()
+
+
+def header(seq: int, stamp_us: int, frame: bytes) -> bytes:
+    sec, us = divmod(stamp_us, 1_000_000)
+    return struct.pack("<IIII", seq % 2**32, sec, us * 1000, len(frame)) + frame
+
+
+def serialize(message: Message, chance: Chance, *, headed: bytes | None = None) -> bytes:
+    """A message of what chance says; ``headed`` is the header that it begins with."""
+    out: list[bytes] = []
+
+    def one(kind: str, name: str) -> None:
+        if kind in SIZES:
+            out.append(chance.number(kind, name))
+        elif kind == STRING:
+            text = chance.text(name)
+            out.append(struct.pack("<I", len(text)) + text)
+        else:
+            for field in message.types[kind]:
+                several(field)
+
+    def several(field: Field) -> None:
+        count = 1 if field.length is None else field.length
+        if count == VARIABLE:
+            count = chance.length(field.name)
+            out.append(struct.pack("<I", count))
+        for _ in range(count):
+            one(field.kind, field.name)
+
+    for i, field in enumerate(message.types[message.kind]):
+        if not i and headed is not None:
+            out.append(headed)
+        else:
+            several(field)
+    return b"".join(out)
+
+
+def fields(message: Message, data: bytes) -> list[tuple[str, object]]:
+    """Path and value of everything in a message, in the wire's order; the length of an array and a text,
+    as bytes, are values, too. What is cut short or too long ends with a path that says so."""
+    found: list[tuple[str, object]] = []
+
+    def one(kind: str, path: str, at: int) -> int:
+        if kind in SIZES:
+            # NaN equals nothing, and -0.0 equals 0.0: bytes and value both.
+            raw = data[at : at + SIZES[kind]]
+            found.append((path, (*struct.unpack(f"<{_LETTERS[kind]}", raw), raw.hex())))
+            return at + SIZES[kind]
+        if kind == STRING:
+            (length,) = struct.unpack_from("<I", data, at)
+            found.append((path, data[at + 4 : at + 4 + length]))
+            return int(at + 4 + length)
+        for field in message.types[kind]:
+            at = several(field, f"{path}.{field.name}" if path else field.name, at)
+        return at
+
+    def several(field: Field, path: str, at: int) -> int:
+        if field.length is None:
+            return one(field.kind, path, at)
+        count = field.length
+        if count == VARIABLE:
+            (count,) = struct.unpack_from("<I", data, at)
+            found.append((f"{path}.length", count))
+            at += 4
+        if field.kind in {"uint8", "int8", "byte", "char"}:
+            found.append((path, data[at : at + count]))
+            return at + count
+        for i in range(count):
+            at = one(field.kind, f"{path}.{i}", at)
+        return at
+
+    try:
+        end = one(message.kind, "", 0)
+    except struct.error:
+        found.append(("cut short", len(data)))
+    else:
+        if end != len(data):
+            found.append(("too long", len(data) - end))
+    return found
+
+
+def as_json(message: Message, data: bytes) -> dict[str, Any]:
+    """A message as a rosbridge server makes an object of it, which keeps less than all: NaN and the
+    infinities are null, and what is not UTF-8 in a text is replaced."""
+    at = 0
+
+    def one(kind: str) -> Any:
+        nonlocal at
+        start = at
+        if kind in SIZES:
+            at += SIZES[kind]
+            values = struct.unpack(f"<{_LETTERS[kind]}", data[start:at])
+            if len(values) == 2:
+                return {"secs": values[0], "nsecs": values[1]}
+            return None if kind.startswith("float") and not math.isfinite(values[0]) else values[0]
+        if kind == STRING:
+            (length,) = struct.unpack_from("<I", data, at)
+            at += 4 + length
+            return data[start + 4 : at].decode("utf-8", "replace")
+        return {field.name: several(field) for field in message.types[kind]}
+
+    def several(field: Field) -> Any:
+        nonlocal at
+        if field.length is None:
+            return one(field.kind)
+        count = field.length
+        if count == VARIABLE:
+            (count,) = struct.unpack_from("<I", data, at)
+            at += 4
+        if field.kind in {"uint8", "char"}:
+            at += count
+            return base64.b64encode(data[at - count : at]).decode()
+        return [one(field.kind) for _ in range(count)]
+
+    found: dict[str, Any] = one(message.kind)
+    return found
