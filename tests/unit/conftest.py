@@ -49,11 +49,7 @@ def dynamodb(aws, synthesized):
     nouns = {**NAMES, QUARANTINE: QUARANTINE, "batches": NAMES["telemetry"]}
     for logical, properties in synthesized.resources("AWS::DynamoDB::Table").items():
         client.create_table(
-            TableName=next(
-                name
-                for noun, name in nouns.items()
-                if logical.lower().startswith(noun)
-            ),
+            TableName=next(name for noun, name in nouns.items() if logical.lower().startswith(noun)),
             KeySchema=properties["KeySchema"],
             AttributeDefinitions=properties["AttributeDefinitions"],
             BillingMode=properties["BillingMode"],
