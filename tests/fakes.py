@@ -9,6 +9,7 @@ from decimal import Decimal
 from typing import Any
 
 from boto3.dynamodb.types import TypeSerializer
+from botocore.exceptions import ClientError
 
 import contract
 from contract import BATCH, EXPIRES_S, RECEIVED_MS, ROBOT, SECOND, TOPIC, Batch
@@ -26,7 +27,7 @@ EXPIRES = 1_800_000_000
 
 
 class FakeDynamoDB:
-    """The client's three calls. A page holds ``page_items`` items, as AWS' hold 1 MB; of every write
+    """The client's calls. A page holds ``page_items`` items, as AWS' hold 1 MB; of every write
     the first ``unprocessed`` attempts take only the first item."""
 
     def __init__(self, *, page_items: int = 2, unprocessed: int = 0) -> None:
@@ -75,6 +76,19 @@ class FakeDynamoDB:
         self.calls["get_item"] += 1
         item = self.items[TableName].get(_key(TableName, Key))
         return {"Item": item} if item else {}
+
+    def update_item(self, *, TableName: str, Key: dict[str, Any], **how: Any) -> dict[str, Any]:
+        """Add to a set of texts of an item that is there."""
+        self.calls["update_item"] += 1
+        names, values = how["ExpressionAttributeNames"], how["ExpressionAttributeValues"]
+        assert how["UpdateExpression"] == "ADD #streams :stream"
+        assert how["ConditionExpression"] == "attribute_exists(#robot)"
+        item = self.items[TableName].get(_key(TableName, Key))
+        if item is None:
+            raise ClientError({"Error": {"Code": "ConditionalCheckFailedException"}}, "UpdateItem")
+        there = item.get(names["#streams"], {"SS": []})["SS"]
+        item[names["#streams"]] = {"SS": sorted({*there, *values[":stream"]["SS"]})}
+        return {}
 
     def batch_write_item(self, *, RequestItems: dict[str, Any]) -> dict[str, Any]:
         self.calls["batch_write_item"] += 1

@@ -175,9 +175,9 @@ def _tables(deployed: list[Resource]) -> Iterator[Probe]:
     for table in of(deployed, "AWS::DynamoDB::Table"):
         at: dict[str, Any] = {"TableName": table.physical}
         key: dict[str, Any] = {"robot": {"S": "none"}} if table.arn == "Robots" else {"topic": {"S": "none"}}
-        sort = {"Telemetry": "t", "Summary": "second"}.get(table.arn)
+        sort = {"Batches": ("batch", "S"), "Summary": ("second", "N")}.get(table.arn)
         if sort:
-            key[sort] = {"N": "0"}
+            key[sort[0]] = {sort[1]: "0"}
         query = {"KeyConditionExpression": "#k = :k", "ExpressionAttributeValues": {":k": {"S": "none"}}}
         names = {"ExpressionAttributeNames": {"#k": next(iter(key))}}
         # What is allowed may happen, to an item that is not there and stays so.

@@ -58,12 +58,12 @@ ROLES = {
         "lambda.amazonaws.com",
         {(action, "SummarizeLog.Arn") for action in LOG}
         | {
-            ("dynamodb:Query", "Telemetry.Arn"),
+            ("dynamodb:Query", "Batches.Arn"),
             ("dynamodb:BatchWriteItem", "Summary.Arn"),
             ("dynamodb:GetItem", "Robots.Arn"),
-            ("dynamodb:DescribeStream", "Telemetry.StreamArn"),
-            ("dynamodb:GetRecords", "Telemetry.StreamArn"),
-            ("dynamodb:GetShardIterator", "Telemetry.StreamArn"),
+            ("dynamodb:DescribeStream", "Batches.StreamArn"),
+            ("dynamodb:GetRecords", "Batches.StreamArn"),
+            ("dynamodb:GetShardIterator", "Batches.StreamArn"),
             ("dynamodb:ListStreams", "*"),
         }
         | DESTINATION,
@@ -79,8 +79,8 @@ ROLES = {
         {(action, "QuarantineLog.Arn") for action in LOG}
         | {
             ("dynamodb:UpdateItem", "Quarantine.Arn"),
-            ("dynamodb:GetRecords", "Telemetry.StreamArn"),
-            ("dynamodb:GetShardIterator", "Telemetry.StreamArn"),
+            ("dynamodb:GetRecords", "Batches.StreamArn"),
+            ("dynamodb:GetShardIterator", "Batches.StreamArn"),
             ("sqs:ReceiveMessage", "Rejected.Arn"),
             ("sqs:DeleteMessage", "Rejected.Arn"),
             ("sqs:ChangeMessageVisibility", "Rejected.Arn"),
@@ -91,7 +91,7 @@ ROLES = {
     "QueryRole": (
         "lambda.amazonaws.com",
         {(action, "QueryLog.Arn") for action in LOG}
-        | {("dynamodb:Query", "Telemetry.Arn"), ("dynamodb:Scan", "Telemetry.Arn")}
+        | {("dynamodb:Query", "Batches.Arn"), ("dynamodb:Scan", "Telemetry.Arn")}
         | {("dynamodb:GetItem", "Robots.Arn")}
         | {
             (f"s3:{action}", f"Files.Arn/{contract.RESULTS_PREFIX}*") for action in ("GetObject", "PutObject")
@@ -130,7 +130,7 @@ ROLES = {
         "iot.amazonaws.com",
         {(f"logs:{action}", LOG_OF_IOT) for action in ("CreateLogGroup", "CreateLogStream", "PutLogEvents")},
     ),
-    "ingest/RecordRole": ("iot.amazonaws.com", {REJECT, ("dynamodb:PutItem", "Telemetry.Arn")}),
+    "ingest/RecordRole": ("iot.amazonaws.com", {REJECT, ("dynamodb:PutItem", "Batches.Arn")}),
     "ingest/LiveRole": ("iot.amazonaws.com", {REJECT}),
     "ingest/PongRole": ("iot.amazonaws.com", {REJECT, ("iot:Publish", f"{IOT}:topic/pong/iort/*/rule")}),
     "ingest/EchoRole": ("iot.amazonaws.com", {REJECT}),

@@ -36,7 +36,7 @@ class Reader:
         }
 
     def text(self, value: Any) -> str:
-        """``arn:${AWS::Partition}:sqs:...``, ``Telemetry.Arn`` for an attribute, ``Live`` for a reference."""
+        """``arn:${AWS::Partition}:sqs:...``, ``Batches.Arn`` for an attribute, ``Live`` for a reference."""
         match value:
             case str():
                 return value

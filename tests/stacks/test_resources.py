@@ -41,7 +41,7 @@ def test_every_rule_has_one_action_and_it_is_this(rules, reader):
     actions = {rule.removeprefix("iort_"): payload["Actions"] for rule, payload in rules.items()}
     assert all(len(each) == 1 for each in actions.values())
     record, live, pong, echo, upload, presence, version, *alerts = (actions[rule][0] for rule in RULES)
-    assert reader.text(record["DynamoDBv2"]["PutItem"]["TableName"]) == "Telemetry"
+    assert reader.text(record["DynamoDBv2"]["PutItem"]["TableName"]) == "Batches"
     assert reader.text(live["Lambda"]["FunctionArn"]) == "Live.Arn"
     assert reader.text(echo["Lambda"]["FunctionArn"]) == "Echo.Arn"
     assert reader.text(upload["Lambda"]["FunctionArn"]) == "Upload.Arn"
@@ -92,20 +92,20 @@ def test_the_tables_keys_are_the_contracts(synthesized):
             (k["AttributeName"], k["KeyType"], types[k["AttributeName"]]) for k in tables[table]["KeySchema"]
         ]
 
-    assert keys("Telemetry") == [(contract.TOPIC, "HASH", "S"), (contract.T_US, "RANGE", "N")]
+    assert keys("Batches") == [(contract.TOPIC, "HASH", "S"), (contract.BATCH, "RANGE", "S")]
     assert keys("Summary") == [(contract.TOPIC, "HASH", "S"), (contract.SECOND, "RANGE", "N")]
     assert keys("Robots") == [(contract.ROBOT, "HASH", "S")]
     assert keys("Quarantine") == [(contract.ROBOT, "HASH", "S"), (contract.ENTRY, "RANGE", "S")]
     expires = {"AttributeName": contract.EXPIRES_S, "Enabled": True}
     assert {t: v.get("TimeToLiveSpecification") for t, v in tables.items()} == {
-        "Telemetry": expires,
+        "Batches": expires,
         "Summary": expires,
         "Robots": None,
         "Quarantine": expires,
     }
     streams = {t: v.get("StreamSpecification") for t, v in tables.items()}
     assert {t: stream for t, stream in streams.items() if stream} == {
-        "Telemetry": {"StreamViewType": "NEW_IMAGE"}
+        "Batches": {"StreamViewType": "NEW_IMAGE"}
     }
     assert {v["BillingMode"] for v in tables.values()} == {"PAY_PER_REQUEST"}
 
@@ -172,7 +172,7 @@ def test_the_chain_of_what_fails_ends(synthesized, reader):
 
 
 def test_the_stream_never_blocks_for_good(synthesized, reader):
-    mapping = mappings(synthesized, reader)["Telemetry.StreamArn"]
+    mapping = mappings(synthesized, reader)["Batches.StreamArn"]
     assert reader.text(mapping["FunctionName"]) == "Summarize"
     assert mapping["FunctionResponseTypes"] == ["ReportBatchItemFailures"]
     assert mapping["BisectBatchOnFunctionError"] is True

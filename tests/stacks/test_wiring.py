@@ -36,7 +36,7 @@ from tests.stacks.templates import name
 from tests.stacks.test_dashboards import FUNCTIONS
 
 HANDLERS = ("Live", "Summarize", "Echo", "Upload", "Query", "Admit", "Presence", "Quarantine", "Alert")
-CONTRACT = sorted((ROOT / "contract").glob("*.py"))
+CONTRACT = sorted((ROOT / "contract").rglob("*.py"))
 # Lambda's Python has boto3 and what boto3 needs.
 RUNTIME_PACKAGES = ("boto3", "botocore", "dateutil", "jmespath", "s3transfer", "six", "urllib3")
 
@@ -178,14 +178,14 @@ def test_what_the_variables_say_is_what_the_functions_expect(functions, reader, 
         return {key: reader.text(value) for key, value in variables.items() if key != "NAMESPACE"}
 
     assert given("Summarize") == {
-        "TELEMETRY_TABLE": "Telemetry",
+        "TELEMETRY_TABLE": "Batches",
         "SUMMARY_TABLE": "Summary",
         "ROBOTS_TABLE": "Robots",
         "REJECTED_QUEUE": "Rejected",
         "ROBOT_METRICS": "false",
     }
     assert given("Query") == {
-        "TELEMETRY_TABLE": "Telemetry",
+        "TELEMETRY_TABLE": "Batches",
         "ROBOTS_TABLE": "Robots",
         "FILES_BUCKET": "Files",
     }

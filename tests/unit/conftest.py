@@ -46,13 +46,10 @@ def dynamodb(aws, synthesized):
     from tests.fakes import NAMES, QUARANTINE
 
     client = boto3.client("dynamodb")
+    nouns = {**NAMES, QUARANTINE: QUARANTINE, "batches": NAMES["telemetry"]}
     for logical, properties in synthesized.resources("AWS::DynamoDB::Table").items():
         client.create_table(
-            TableName=next(
-                name
-                for noun, name in {**NAMES, QUARANTINE: QUARANTINE}.items()
-                if logical.lower().startswith(noun)
-            ),
+            TableName=next(name for noun, name in nouns.items() if logical.lower().startswith(noun)),
             KeySchema=properties["KeySchema"],
             AttributeDefinitions=properties["AttributeDefinitions"],
             BillingMode=properties["BillingMode"],

@@ -7,7 +7,7 @@ import random
 from hypothesis import given
 from hypothesis import strategies as st
 
-from contract import Batch
+from contract import Batch, BatchId
 from station.audit import audit, last_figures
 from tests.fakes import item_of
 
@@ -17,9 +17,7 @@ T_US = 1_750_000_000_000_000
 def _item(seq, *, boot="0badcafe", n=50, late_ms=0, at=None):
     t_us = T_US + int((seq if at is None else at) * 1_000_000)
     return {
-        "boot": boot,
-        "seq": str(seq),
-        "t": str(t_us),
+        "batch": str(BatchId(t_us, boot, seq)),
         "n": str(n),
         "received_ms": t_us // 1000 + 1020 + late_ms,
     }
@@ -55,7 +53,7 @@ def test_numbers_before_the_first_are_missing_only_when_asked():
 def test_runs_continue_each_others_numbers():
     items = [_item(seq) for seq in range(3)] + [_item(seq, boot="deadbeef") for seq in range(3, 6)]
     assert audit("vesc", items).complete
-    found = audit("vesc", [item for item in items if item["seq"] != "3"])
+    found = audit("vesc", [item for item in items if not item["batch"].endswith("-3")])
     assert [len(run.missing) for run in found.runs] == [0, 1]
     assert found.runs[1].expected == 3
 
@@ -63,7 +61,7 @@ def test_runs_continue_each_others_numbers():
 def test_a_queue_that_was_lost_starts_again_at_0():
     items = [_item(seq) for seq in range(5)] + [_item(seq, boot="deadbeef", at=10 + seq) for seq in range(3)]
     assert audit("vesc", items).complete
-    found = audit("vesc", [item for item in items if (item["boot"], item["seq"]) != ("deadbeef", "0")])
+    found = audit("vesc", [item for item in items if not item["batch"].endswith("-deadbeef-0")])
     assert found.missing == 1
 
 
@@ -85,7 +83,7 @@ def test_a_number_stored_twice_is_counted_and_its_samples_are_not():
 
 
 def test_what_is_no_batch_is_counted():
-    found = audit("vesc", [_item(0), {"t": "5"}, {**_item(1), "seq": "x"}])
+    found = audit("vesc", [_item(0), {"batch": "5"}, {**_item(1), "batch": "5-0badcafe-x"}])
     assert (found.refused, found.complete) == (2, False)
 
 
@@ -120,4 +118,4 @@ class Newest:
 def test_the_agents_figures_are_those_of_its_newest_batch_if_it_is_one():
     item = item_of(Batch("0badcafe", 0, [T_US], {"backlog_batches": [3]}))
     assert last_figures(Newest(item), "car") == {"backlog_batches": 3.0}
-    assert last_figures(Newest({**item, "t": {"N": "1.5"}}), "car") == {}
+    assert last_figures(Newest({**item, "batch": {"S": "1.5"}}), "car") == {}

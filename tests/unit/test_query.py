@@ -27,17 +27,25 @@ class Paged(FakeDynamoDB):
     def query(self, *, after=None, **query):
         after = query.pop("ExclusiveStartKey", None)
         found = [item for page in self.paginate(**query) for item in page["Items"]]
-        at = 0 if after is None else 1 + next(i for i, item in enumerate(found) if item["t"] == after["t"])
+        at = (
+            0
+            if after is None
+            else 1 + next(i for i, item in enumerate(found) if item["batch"] == after["batch"])
+        )
         page = found[at : at + self.page_items]
         more = at + len(page) < len(found)
-        return {"Items": page} | ({"LastEvaluatedKey": {"t": page[-1]["t"]}} if more else {})
+        return {"Items": page} | ({"LastEvaluatedKey": {"batch": page[-1]["batch"]}} if more else {})
 
     def scan(self, **scan):
         topic = scan["ExpressionAttributeValues"][":topic"]
         assert "FilterExpression" in scan
         found = [item for item in self.items[TELEMETRY].values() if item["topic"] == topic][::-1]
         after = scan.get("ExclusiveStartKey")
-        at = 0 if after is None else 1 + next(i for i, item in enumerate(found) if item["t"] == after["t"])
+        at = (
+            0
+            if after is None
+            else 1 + next(i for i, item in enumerate(found) if item["batch"] == after["batch"])
+        )
         return {"Items": found[at:]}
 
 
@@ -214,8 +222,9 @@ def test_a_sensor_that_is_not_fitted_is_null_and_counted(on, motor):
     assert values(whole.columns["temp_motor"]) == [None, motor[1], motor[2], None]
     assert values(whole.columns["ntc_temp_mos1"]) == [None] * 4
     assert whole.absent == {"temp_motor": 2, "ntc_temp_mos1": 4}
-    cold = query(where="temp_motor < 0")
-    assert (len(cold), cold.absent["temp_motor"]) == (0, 2)
+    if motor is COLD:
+        cold = query(where="temp_motor < 0")
+        assert (len(cold), cold.absent["temp_motor"]) == (0, 2)
     assert query(fields=["speed"]).absent == {}
     part = query(start=START + 1, end=START + 4, fields=["temp_motor"])
     assert part.absent == {"temp_motor": 1}

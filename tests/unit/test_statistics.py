@@ -9,7 +9,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from contract import Batch, flat_second
+from contract import Batch, BatchId, flat_second
 from functions.statistics import (
     Vehicle,
     count_holes,
@@ -32,8 +32,8 @@ def every(step_us, n, start_us=T0):
     return [start_us + i * step_us for i in range(n)]
 
 
-def summarized(second, batches, vehicle):
-    found = summarize_second(second, batches, vehicle)
+def summarized(second, batches, vehicle, missing=0):
+    found = summarize_second(second, batches, vehicle, missing)
     return None if found is None else flat_second(found)
 
 
@@ -67,19 +67,26 @@ def test_a_second_without_a_sample_has_no_summary():
 
 def test_a_batch_over_the_boundary_counts_in_each_second_with_its_own_samples():
     across = batch([T0 - 20_000, T0 - 1, T0, T0 + 20_000], {"a": [1, 2, 3, 4]}, seq=4, nonfinite=3)
-    before, after = (summarized(second, [across], None) for second in (SECOND - 1, SECOND))
+    before, after = (summarized(SECOND - back, [across], None, missing=4 * back) for back in (1, 0))
     assert (before["n"], before["a_min"], before["a_max"], before["a_last"]) == (2, 1, 2, 2)
     assert (after["n"], after["a_min"], after["a_max"], after["a_last"]) == (2, 3, 4, 4)
     assert (before["batches"], after["batches"]) == (1, 1)
-    # What belongs to the batch as a whole belongs to the second in which it starts, once.
     assert (before["missing_batches"], after["missing_batches"]) == (4, 0)
+    # What belongs to the batch as a whole belongs to the second in which it starts, once.
     assert (before["nonfinite"], after["nonfinite"]) == (3, 0)
 
 
-def test_seconds_before_the_epoch_are_seconds_too():
-    early = batch([-1, 0, 999_999], {"a": [1, 2, 3]})
-    assert summarized(-1, [early], None)["n"] == 1
+def test_the_first_second_of_the_epoch_is_a_second_too():
+    early = batch([0, 999_999, 1_000_000], {"a": [1, 2, 3]})
     assert summarized(0, [early], None)["n"] == 2
+    assert summarized(1, [early], None)["n"] == 1
+    assert summarized(-1, [early], None) is None
+
+
+def test_samples_of_one_time_all_count():
+    twice = batch([T0, T0, T0 + 1], {"a": [1, 2, 3]})
+    second = summarized(SECOND, [twice], None)
+    assert (second["n"], second["a_min"], second["a_mean"], second["a_last"]) == (3, 1, 2, 3)
 
 
 def test_fields_appear_and_vanish_from_batch_to_batch():
@@ -209,14 +216,41 @@ def test_what_is_derived_is_never_infinite():
         (7, 9, "bbbbbbbb", 1),
         (7, 0, "bbbbbbbb", 0),
         (7, 2, "bbbbbbbb", 2),
-        # Out of order by the car's clock, or twice: nothing is known to be missing.
-        (7, 7, "aaaaaaaa", 0),
-        (7, 3, "aaaaaaaa", 0),
+        # A later number at an earlier time, by another clock: what is before this one is still not there.
+        (7, 3, "aaaaaaaa", 3),
+        (7, 0, "aaaaaaaa", 0),
     ],
 )
 def test_missing_batches_by_their_numbers(previous, seq, boot, missing):
-    before = None if previous is None else batch([T0], seq=previous)
-    assert missing_before(before, batch([T0 + 1], seq=seq, boot=boot)) == missing
+    near = [] if previous is None else [BatchId(T0, "aaaaaaaa", previous)]
+    own = BatchId(T0 + 1, boot, seq)
+    assert missing_before(own, near) == missing
+    # What comes later, and the batch itself, change nothing.
+    assert missing_before(own, [*near, own, BatchId(T0 + 2, boot, seq + 1)]) == missing
+
+
+@given(st.permutations(range(12)), st.sets(st.integers(0, 11), max_size=11))
+def test_whatever_the_clocks_say_each_missing_number_is_told_once(order, lost):
+    """Numbers of one run at times of several clocks: what is stored tells all that is not, but the last."""
+    ids = sorted(BatchId(T0 + at * S, "aaaaaaaa", seq) for at, seq in enumerate(order) if seq not in lost)
+    told = sum(missing_before(own, ids) for own in ids)
+    assert told == max(own.seq for own in ids) + 1 - len(ids)
+
+
+@pytest.mark.parametrize("boots", [("aaaaaaaa", "bbbbbbbb"), ("bbbbbbbb", "aaaaaaaa")])
+@pytest.mark.parametrize("shift_us", [0, 1, 400_000, -400_000])
+def test_a_run_that_lies_over_another_in_time_misses_nothing(boots, shift_us):
+    """A recording that is played twice with its own times: the second run's numbers follow the first's."""
+    first = [BatchId(T0 + i * S, boots[0], i) for i in range(10)]
+    second = [BatchId(T0 + i * S + shift_us, boots[1], 10 + i) for i in range(10)]
+    ids = sorted([*first, *second])
+    assert [missing_before(own, ids) for own in ids] == [
+        # Before the first of all nothing is known but its number.
+        own.seq if own == ids[0] else 0
+        for own in ids
+    ]
+    without = [own for own in ids if own != second[4]]
+    assert {own.seq: missing_before(own, without) for own in second[5:6]} == {15: 1}
 
 
 @pytest.mark.parametrize(

@@ -10,6 +10,7 @@ import zlib
 import pytest
 
 import contract
+from contract import BatchId
 from functions import tables as tables_module
 from functions.summarize import process
 from functions.tables import TableError
@@ -27,6 +28,12 @@ def poison(**changes):
     return item_of_message(json.dumps({k: v for k, v in envelope.items() if v is not None}).encode())
 
 
+def packed(body):
+    """As the samples of a batch are compressed."""
+    deflater = zlib.compressobj(zdict=contract.DICTIONARY)
+    return base64.b64encode(deflater.compress(body) + deflater.flush()).decode()
+
+
 bomb = base64.b64encode(zlib.compress(b" " * (contract.MAX_COLUMNS_BYTES + 2))).decode()
 POISON = {
     "not base64": poison(samples="%%%"),
@@ -34,25 +41,29 @@ POISON = {
     "not JSON": poison(samples=base64.b64encode(zlib.compress(b"{")).decode()),
     "inflates without end": poison(samples=bomb),
     "no samples": poison(samples=None),
-    "other version": poison(v=2),
+    "version before": poison(v=1),
+    "other version": poison(v=9),
     "no version": poison(v=None),
     "other codec": poison(codec="cbor"),
     "wrong count": poison(n=4),
-    "wrong boot": poison(boot="car"),
-    "no seq": poison(seq=None),
-    "text for seq": poison(seq="7"),
-    "fraction for seq": {**poison(), "seq": {"N": "7.5"}},
-    "huge seq": {**poison(), "seq": {"N": "1E+125"}},
-    "huge seq with its digits": {**poison(), "seq": {"N": "1" + "0" * 125}},
-    "huge time with its digits": {**poison(), "t": {"N": "1" + "0" * 124}},
+    "huge count with its digits": {**poison(), "n": {"N": "1" + "0" * 125}},
+    "fraction for nonfinite": {**poison(), "nonfinite": {"N": "7.5"}},
+    "huge nonfinite": {**poison(), "nonfinite": {"N": "1E+125"}},
+    "map for nonfinite": {**poison(), "nonfinite": {"M": {}}},
+    "no run": poison(batch=f"{T0}-car-7"),
+    "no number": poison(batch=f"{T0}-aaaaaaaa-"),
+    "huge number": poison(batch=f"{T0}-aaaaaaaa-{10**15 * 9 + 10**14}"),
+    "no key of a batch": poison(batch="zzz"),
+    "a key of text": poison(batch="x" * 1024),
     "binary samples": {**poison(), "samples": {"B": b"AAAA"}},
-    "map for boot": {**poison(), "boot": {"M": {}}},
+    "messages without a head": poison(codec="ros1", samples=packed(b'{"dt":[0],"fields":{}}'), n=1),
+    "messages of nothing": poison(codec="ros1", samples=packed(b'{"dt":[0],"fields":{}}\n{}\n'), n=1),
     "other topic": {**poison(), "topic": {"S": "dt/iort/car"}},
     "topic of no robot": {**poison(), "topic": {"S": "dt/iort/c r/vesc"}},
     "topic of the live lane": {**poison(), "topic": {"S": "live/iort/car/vesc"}},
     "in the name of another": {**poison(), "robot": {"S": "other"}},
-    "before 1970": {**poison(), "t": {"N": "-1"}},
-    "years ahead": {**poison(), "t": {"N": str(T0 + 2 * contract.MAX_AHEAD_US)}},
+    "before 1970": poison(batch=f"-{1:015}-aaaaaaaa-7"),
+    "years ahead": poison(batch=str(BatchId(T0 + 2 * contract.MAX_AHEAD_US, "aaaaaaaa", 7))),
 }
 
 
@@ -90,7 +101,7 @@ def test_a_replay_says_what_is_refused_and_puts_nothing_into_quarantine_again(st
 def test_a_poison_neighbour_hides_no_batch_from_the_count(stream):
     stream.deliver(batch(T0, seq=5))
     for i in range(3):
-        stream.summarize([stream.store_item({**poison(v=9), "t": {"N": str(T0 + (20 + i) * S)}})])
+        stream.summarize([stream.store_item(poison(v=9, batch=f"{T0 + (20 + i) * S}-aaaaaaaa-7"))])
     stream.deliver(batch(T0 + 40 * S, seq=8))
     # 6 and 7 are missing; that they may be among the poison ones, nobody can say.
     assert stream.column("missing_batches") == {0: 5, 40: 2}
@@ -98,7 +109,7 @@ def test_a_poison_neighbour_hides_no_batch_from_the_count(stream):
 
 def test_a_hail_of_poison_bounds_what_is_read(stream):
     for i in range(200):
-        stream.store_item({**poison(v=9), "t": {"N": str(T0 + i * S)}})
+        stream.store_item(poison(v=9, batch=f"{T0 + i * S}-aaaaaaaa-7"))
     stream.client.calls.clear()
     stream.deliver(batch(T0 + 500 * S, seq=1))
     assert stream.client.calls["query"] <= 15

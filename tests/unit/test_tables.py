@@ -9,7 +9,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from contract import EXPIRES_S, SECOND, T_US, TOPIC, Batch
+from contract import BATCH, EXPIRES_S, SECOND, TOPIC, Batch, BatchId, batch_id
 from functions import tables as tables_module
 from functions.statistics import Vehicle
 from functions.tables import TableError, attribute, plain
@@ -47,6 +47,10 @@ def put(client, table, item):
         client.put_item(TableName=table, Item=item)
 
 
+def times_of(items):
+    return [batch_id(item[BATCH]).t_us for item in items]
+
+
 def store(client, *times_us, topic=TOPIC_OF_CAR):
     for seq, t_us in enumerate(times_us):
         put(client, TELEMETRY, item_of(Batch("aaaaaaaa", seq, [t_us], {"a": [seq]}), topic))
@@ -59,7 +63,7 @@ def test_batches_come_from_the_time_on_of_one_topic_in_the_order_of_time(client)
     store(client, T0 + 5, T0 + 1, T0 + 2, T0, T0 + 4, T0 + 3)
     store(client, T0 + 2, topic="dt/iort/other/vesc")
     found = list(tables(client).batches_from(TOPIC_OF_CAR, T0 + 1, at_once=2))
-    assert [item[T_US] for item in found] == [T0 + 1, T0 + 2, T0 + 3, T0 + 4, T0 + 5]
+    assert times_of(found) == [T0 + 1, T0 + 2, T0 + 3, T0 + 4, T0 + 5]
     assert {item[TOPIC] for item in found} == {TOPIC_OF_CAR}
 
 
@@ -75,14 +79,32 @@ def test_no_more_is_read_than_is_asked_for():
     client = FakeDynamoDB()
     store(client, *range(T0, T0 + 7))
     found = tables(client).batches_from(TOPIC_OF_CAR, T0, at_once=2)
-    assert [next(found)[T_US], next(found)[T_US]] == [T0, T0 + 1]
+    assert times_of([next(found), next(found)]) == [T0, T0 + 1]
     assert (client.calls["query"], client.read) == (1, 2)
 
 
 def test_those_before_come_nearest_first(client):
     store(client, T0, T0 + 1, T0 + 2, T0 + 3, T0 + 4)
     store(client, T0 + 1, topic="dt/iort/other/vesc")
-    assert [item[T_US] for item in tables(client).before(TOPIC_OF_CAR, T0 + 2)] == [T0 + 1, T0]
+    assert times_of(tables(client).before(TOPIC_OF_CAR, T0 + 2)) == [T0 + 1, T0]
+
+
+def test_batches_of_one_time_are_all_read_wherever_a_page_ends(client):
+    store(client, *[T0] * 12, T0 + 1)
+    for at_once in (1, 2, 11, 12, 13):
+        found = list(tables(client).batches_from(TOPIC_OF_CAR, T0, at_once=at_once))
+        assert times_of(found) == [T0] * 12 + [T0 + 1]
+        assert len({item[BATCH] for item in found}) == 13
+    assert len(list(tables(client).before(TOPIC_OF_CAR, T0 + 1))) == 12
+    assert list(tables(client).before(TOPIC_OF_CAR, T0)) == []
+
+
+def test_numbers_tell_which_batches_there_are_between_two_times(client):
+    store(client, T0, T0 + 5, T0 + 5, T0 + 9, T0 + 10)
+    store(client, T0 + 5, topic="dt/iort/other/vesc")
+    put(client, TELEMETRY, {TOPIC: serialize(TOPIC_OF_CAR), BATCH: serialize(f"{T0 + 6}-nobody's")})
+    found = tables(client).numbers(TOPIC_OF_CAR, T0 + 1, T0 + 9)
+    assert list(found) == [BatchId(T0 + at, "aaaaaaaa", seq) for at, seq in ((5, 1), (5, 2), (9, 3))]
 
 
 @pytest.mark.parametrize(
