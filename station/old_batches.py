@@ -6,7 +6,7 @@ from collections.abc import Mapping
 from typing import Any
 
 from contract import BATCH, NONFINITE, T_US, BatchId, ContractError
-from contract.checks import check_header, integer
+from contract.checks import check_header, check_version, integer
 from contract.limits import BATCH_VERSION
 from station.items import plain
 
@@ -23,8 +23,10 @@ def is_old(envelope: Mapping[str, Any]) -> bool:
 def upgraded(envelope: Mapping[str, Any]) -> dict[str, Any]:
     """The message in this version, with all else that it holds; the samples are not looked at.
 
-    Raises `ContractError` where there is no id to make of it, as of a time before 1970.
+    Raises `ContractError` where it is none of version 1, and where there is no id to make of it, as of a time
+    before 1970.
     """
+    check_version(envelope, OLD_VERSION)
     t_us, seq, nonfinite = (integer(envelope, name) for name in (T_US, _SEQ, NONFINITE))
     boot = check_header(envelope.get(_BOOT), seq, nonfinite)
     if t_us < 0:

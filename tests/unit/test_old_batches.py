@@ -73,6 +73,7 @@ def test_an_item_keeps_all_that_no_batch_has_to_the_letter():
 @pytest.mark.parametrize(
     ("changes", "reason"),
     [
+        ({"v": 3}, "schema version 3"),
         ({"t": -5}, "time -5 us: before 1970"),
         ({"t": 1.5}, "t 1.5: expected an integer"),
         ({"t": None}, "t None: expected an integer"),
