@@ -1,4 +1,4 @@
-"""Stored batches of version 1, out of the table of before, into the telemetry table."""
+"""Stored batches out of another table into the telemetry table: an old one, or one restored from a backup."""
 
 from __future__ import annotations
 
@@ -7,12 +7,14 @@ from collections import Counter
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from decimal import Decimal
+from operator import itemgetter
 from typing import Any, NamedTuple
 
 from botocore.exceptions import ClientError
 
 from contract import (
     AGENT_STREAM,
+    BATCH,
     EXPIRES_S,
     RECEIVED_MS,
     RECORD,
@@ -28,27 +30,28 @@ from functions.tables import WRITE_SIZE, TableError, write
 from station.cloud import Cloud
 from station.errors import StationError
 from station.items import plain
-from station.old_batches import upgraded_item
+from station.old_batches import is_old, upgraded_item
 from station.reading import Item, ahead
 
 # A unit writes a kilobyte. AWS takes 1,000 a second of a partition, which all of a topic is in: half of them
 # leaves the other half to the robot itself.
 UNITS_PER_S = 500
 _UNIT_BYTES = 1024
-_KEY = [TOPIC, T_US]
+# Of version 1 and of today.
+_KEYS = ([TOPIC, T_US], [TOPIC, BATCH])
 
 
 class Left(NamedTuple):
     """An item that is not adopted: its key as the table has it, and why."""
 
     topic: str
-    t_us: str
+    key: str
     cause: str
 
 
 @dataclass
 class Adoption:
-    """What became of the old table's items. Batches and their samples are counted by robot and stream;
+    """What became of the table's items. Batches and their samples are counted by robot and stream;
     ``expired`` items are only not deleted yet."""
 
     batches: Counter[tuple[str, str]] = field(default_factory=Counter)
@@ -57,10 +60,10 @@ class Adoption:
     left: list[Left] = field(default_factory=list)
 
 
-def old_table(cloud: Cloud, name: str | None) -> tuple[str, int]:
+def source_table(cloud: Cloud, name: str | None) -> tuple[str, int]:
     """The table of that name, or the one that the deployment has kept, and about how many items it has.
 
-    Raises `StationError` where there is none, or it has other keys.
+    Raises `StationError` where there is none, or it has no batches, or is the telemetry table itself.
     """
     if name is None:
         try:
@@ -73,9 +76,12 @@ def old_table(cloud: Cloud, name: str | None) -> tuple[str, int]:
         if error.response["Error"]["Code"] != "ResourceNotFoundException":
             raise
         raise StationError(f"there is no table {name}") from error
-    keys = [key["AttributeName"] for key in table["KeySchema"]]
-    if keys != _KEY:
-        raise StationError(f"the table {name} has the keys {', '.join(keys)}: must be {', '.join(_KEY)}")
+    keys = [key["AttributeName"] for key in sorted(table["KeySchema"], key=itemgetter("KeyType"))]
+    if keys not in _KEYS:
+        allowed = " or ".join(", ".join(one) for one in _KEYS)
+        raise StationError(f"the table {name} has the keys {', '.join(keys)}: must be {allowed}")
+    if name == cloud.output("storage", "TelemetryTable"):
+        raise StationError(f"{name} is the telemetry table itself")
     return name, table["ItemCount"]
 
 
@@ -88,7 +94,7 @@ def adopt(
     dry_run: bool = False,
     progress: Callable[[int], None] = lambda _items: None,
 ) -> Adoption:
-    """Copy what the old table has, of one robot or of all, at so many write units a second. An item is copied
+    """Copy what a table has, of one robot or of all, at so many write units a second. An item is copied
     with all that it holds, so that doing it again changes nothing. ``progress`` hears how many were read.
 
     Raises `StationError` where DynamoDB does not take it; what was copied until then is good.
@@ -124,10 +130,10 @@ def _adoptable(items: Sequence[Item], namespace: str, done: Adoption) -> Iterato
             done.expired += 1
             continue
         try:
-            new = upgraded_item(item)
+            new = upgraded_item(item) if is_old(values) else dict(item)
             topic, batch = _checked(new, namespace)
         except ContractError as error:
-            done.left.append(Left(item[TOPIC]["S"], item[T_US]["N"], str(error)))
+            done.left.append(Left(item[TOPIC]["S"], str(values.get(BATCH, values.get(T_US))), str(error)))
             continue
         done.batches[topic.robot, topic.name] += 1
         done.samples[topic.robot, topic.name] += len(batch.times_us)

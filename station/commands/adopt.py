@@ -1,4 +1,4 @@
-"""`iort adopt`: what a deployment of before has stored, into the telemetry table."""
+"""`iort adopt`: batches of another table into the telemetry table."""
 
 from __future__ import annotations
 
@@ -41,17 +41,17 @@ def adopt_(
     dry_run: Annotated[bool, typer.Option("--dry-run", help="Only say what would be done.")] = False,
     as_json: Annotated[bool, typer.Option("--json", help="As JSON.")] = False,
 ) -> None:
-    """Copy the batches of a telemetry table from before batches had ids into the one of today.
+    """Copy batches from an old telemetry table, or from one restored from a backup, into the deployment's.
 
-    The old table stays as it is, and doing it again changes nothing. Lambda 2 makes the summaries again. Exit
-    status 1 if some items cannot be adopted, which are told with the reason. See docs/upgrading.md.
+    The other table stays as it is, and doing it again changes nothing. Lambda 2 makes the summaries again.
+    Exit status 1 if some items cannot be adopted; they are told with the reason. See docs/upgrading.md.
     """
     cloud = context.obj.cloud()
     try:
         name = None if robot is None else check_robot(robot)
     except ContractError as error:
         raise StationError(str(error)) from error
-    source, count = adopt.old_table(cloud, table)
+    source, count = adopt.source_table(cloud, table)
     with Progress(console=_notes, transient=True, disable=not _notes.is_terminal) as bar:
         task = bar.add_task(f"reading {source}", total=count or None)
         done = adopt.adopt(
@@ -76,7 +76,7 @@ def _show(done: Adoption, what: str) -> None:
         samples = done.samples[robot, stream]
         _out.print(escape(f"{robot} {stream}: {count:,} batches of {samples:,} samples {what}"))
     for left in done.left[:_LISTED]:
-        _out.print(f"[red]{escape(f'{left.topic} at {left.t_us}: {left.cause}')}[/]", soft_wrap=True)
+        _out.print(f"[red]{escape(f'{left.topic} at {left.key}: {left.cause}')}[/]", soft_wrap=True)
     if len(done.left) > _LISTED:
         _out.print(f"and {len(done.left) - _LISTED:,} more; --json has them all")
     total, cannot = done.batches.total(), len(done.left)

@@ -66,7 +66,7 @@ def test_an_old_table_is_adopted(embedded, bundle, iort, old_table):
         counts = {"robot": car.robot, "stream": "vesc", "batches": BATCHES, "samples": BATCHES * EACH}
         assert said["adopted"] == [counts]
         (left,) = said["left"]
-        assert (left["t_us"], left["cause"]) == ("-7", "time -7 us: before 1970")
+        assert (left["key"], left["cause"]) == ("-7", "time -7 us: before 1970")
 
     def there():
         items = sorted(delivery.items(cloud, car.robot, "vesc"), key=lambda item: item["batch"])

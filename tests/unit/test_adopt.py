@@ -9,7 +9,7 @@ import pytest
 
 import contract
 from contract import Batch, build_topic
-from station.adopt import Left, adopt, old_table
+from station.adopt import Left, adopt, source_table
 from station.errors import StationError
 from tests.fakes import TELEMETRY, item_of_message
 from tests.unit.old_messages import old_message
@@ -207,13 +207,28 @@ def test_no_more_is_written_a_second_than_a_stream_can_spare(dynamodb, old, slep
     assert sum(slept) == pytest.approx(100 / 5, abs=4)
 
 
+def test_a_table_restored_from_a_backup_is_copied_as_it_is(dynamodb):
+    layout = dynamodb.describe_table(TableName=TELEMETRY)["Table"]
+    dynamodb.create_table(
+        TableName="restored",
+        **{name: layout[name] for name in ("KeySchema", "AttributeDefinitions")},
+        BillingMode="PAY_PER_REQUEST",
+    )
+    bad = {**of_today(2), "samples": {"S": "AAAA"}}
+    for item in (of_today(0), of_today(1), bad):
+        dynamodb.put_item(TableName="restored", Item=item)
+    done = adopt(Cloud(dynamodb), "restored", units_per_s=FAST)
+    assert stored(dynamodb) == [of_today(0), of_today(1)]
+    assert [left.key for left in done.left] == [bad["batch"]["S"]]
+
+
 # --- which table ----------------------------------------------------------------------------------------
 
 
 def test_the_table_is_the_one_that_was_kept_or_that_is_named(dynamodb, old):
     old(old_message(batch(0)))
-    assert old_table(Cloud(dynamodb), None) == (OLD, 1)
-    assert old_table(Cloud(dynamodb, kept=False), OLD) == (OLD, 1)
+    assert source_table(Cloud(dynamodb), None) == (OLD, 1)
+    assert source_table(Cloud(dynamodb, kept=False), OLD) == (OLD, 1)
 
 
 @pytest.mark.parametrize(
@@ -221,10 +236,11 @@ def test_the_table_is_the_one_that_was_kept_or_that_is_named(dynamodb, old):
     [
         (None, "no output OldTelemetryTable.*old_telemetry=true, or name a table"),
         ("nowhere", "there is no table nowhere"),
-        (TELEMETRY, "telemetry has the keys topic, batch: must be topic, t"),
+        ("summary", "summary has the keys topic, second: must be topic, t or topic, batch"),
+        (TELEMETRY, "telemetry is the telemetry table itself"),
     ],
-    ids=["none kept", "none there", "of today"],
+    ids=["none kept", "none there", "summaries", "itself"],
 )
 def test_a_table_that_is_none_says_so(dynamodb, name, words):
     with pytest.raises(StationError, match=words):
-        old_table(Cloud(dynamodb, kept=False), name)
+        source_table(Cloud(dynamodb, kept=False), name)
