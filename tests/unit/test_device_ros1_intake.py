@@ -178,7 +178,7 @@ def test_a_changed_definition_is_another_decoder() -> None:
     [
         ("Unknown u", "the definition of a_msgs/Unknown is missing"),
         ("not a definition", "has the line"),
-        ("", "a_msgs"),
+        ("", "cannot import rospy"),
     ],
 )
 def test_what_cannot_be_looked_into_is_recorded_and_told(
