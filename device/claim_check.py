@@ -63,9 +63,12 @@ class ClaimCheck:
     def around(self, emit: Emit) -> Emit:
         """An `Emit` that puts claims in before the sample goes on."""
 
-        def emit_claims(stream: str, t_us: int, values: Mapping[str, Value]) -> None:
-            if isinstance(values, RosMessage) and values.large:
-                values = self.claim(stream, t_us, values)
+        def emit_claims(stream: str, t_us: int, values: Mapping[str, Any]) -> None:
+            if isinstance(values, RosMessage):
+                if values.large:
+                    values = self.claim(stream, t_us, values)
+            elif any(type(value) is bytes for value in values.values()):
+                values = self.claim_fields(stream, t_us, values)
             emit(stream, t_us, values)
 
         return emit_claims
@@ -78,12 +81,27 @@ class ClaimCheck:
         beside: dict[str, Value] = {}
         for field, content in message.large.items():
             raw, at = cut(raw, content)
-            claim = self._keep(stream, t_us, field, content) if keep else None
-            if claim is None:
-                self.left_out += 1
-                claim = dict.fromkeys(CLAIM_FIELDS)
-            beside.update((f"{field}.{name}", one) for name, one in {**claim, CLAIM_AT: at}.items())
+            beside.update(self._claim(stream, t_us, field, content, keep=keep))
+            beside[f"{field}.{CLAIM_AT}"] = at
         return RosMessage(raw, message.kind, beside=beside)
+
+    def claim_fields(self, stream: str, t_us: int, values: Mapping[str, Any]) -> dict[str, Value]:
+        """Selected fields with a claim for each of bytes; the others as they are."""
+        keep = self._is_due(stream, t_us)
+        sample: dict[str, Value] = {}
+        for field, value in values.items():
+            if type(value) is bytes:
+                sample.update(self._claim(stream, t_us, field, value, keep=keep))
+            else:
+                sample[field] = value
+        return sample
+
+    def _claim(self, stream: str, t_us: int, field: str, content: bytes, *, keep: bool) -> dict[str, Value]:
+        claim = self._keep(stream, t_us, field, content) if keep else None
+        if claim is None:
+            self.left_out += 1
+            claim = dict.fromkeys(CLAIM_FIELDS)
+        return {f"{field}.{name}": one for name, one in claim.items()}
 
     def wait_empty(self, timeout_s: float) -> bool:
         """Wait until the folder is uploaded; whether it is."""
