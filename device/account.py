@@ -31,11 +31,12 @@ class Accounts:
         spool: Spool,
         streams: Sequence[str],
         counted: Counted,
+        refused: Callable[[], int],
         reports: Reports,
         emit: Emit,
     ) -> None:
         self._clock, self._spool, self._streams = clock, spool, streams
-        self._counted, self._reports, self._emit = counted, reports, emit
+        self._counted, self._refused, self._reports, self._emit = counted, refused, reports, emit
         self._told = clock.monotonic()
         self._lost = 0
 
@@ -71,8 +72,7 @@ class Accounts:
                 self._emit(ACCOUNT_STREAM, now_us, SourceAccount(source, found).sample())
 
     def _losses(self) -> int:
-        refused = sum(counts.refused for counts, _ in self._counted().values())
-        return refused + self._spool.dropped().samples
+        return self._refused() + self._spool.dropped().samples
 
 
 def _counts(report: Mapping[str, Any], prefix: str) -> Iterator[tuple[str, int]]:

@@ -35,6 +35,8 @@ _LOOK_S = 1.0
 # A topic changes its definition when somebody rebuilds a package, not all the time.
 _MAX_KINDS = 32
 _MAX_PUBLISHERS = 32
+# Of a type without fields, whose definition is rightly empty.
+_MD5_OF_NOTHING = "d41d8cd98f00b204e9800998ecf8427e"
 
 _ROS_NAME = re.compile(r"(/[A-Za-z]\w*)(/\w+)*", re.ASCII)
 
@@ -287,11 +289,12 @@ class Intake:
         decoder, stamped = None, False
         try:
             # Some small clients send no definition; then only an installed class can tell.
-            definition = parse(kind, text) if text.strip() else definition_of(kind)[0]
+            said = text.strip() or md5sum == _MD5_OF_NOTHING
+            definition = parse(kind, text) if said else definition_of(kind)[0]
             stamped = definition.stamped()
             if config.fields or config.large == UPLOAD:
                 decoder = Decoder(definition, select=config.fields, large=config.large == UPLOAD)
-            text = text if text.strip() else layout(definition)
+            text = text if said else layout(definition)
         except (MessageError, SourceError) as error:
             self._seldom.warn(
                 "undecodable", f"topic {self._topic}: its messages cannot be looked into: {error}"

@@ -1,11 +1,13 @@
 """The agent's ros1 source alone, in a process of its own; each sample is a line of JSON on standard output.
 
+Behind stream, time and values of a message stand its bytes, and the SHA-256 of its large fields.
 ``collector.py CONFIG.json`` with the source's settings; ``quit`` on standard input ends it, and the
 source's report is the last line.
 """
 
 from __future__ import annotations
 
+import base64
 import json
 import logging
 import sys
@@ -13,6 +15,7 @@ import threading
 from hashlib import sha256
 from pathlib import Path
 
+from contract import RosMessage
 from device.clock import SystemClock
 from device.schema import Where, load
 from device.sources.ros1 import Ros1Config
@@ -36,12 +39,12 @@ def listen() -> None:
     stop.set()
 
 
-def digest(content):
-    return f"sha256 {sha256(content).hexdigest()}"
-
-
 def emit(stream, t_us, values):
-    say(json.dumps([stream, t_us, dict(values)], default=digest))
+    sample = [stream, t_us, dict(values)]
+    if isinstance(values, RosMessage):
+        large = {name: sha256(content).hexdigest() for name, content in values.large.items()}
+        sample += [base64.b64encode(values.raw).decode(), large]
+    say(json.dumps(sample))
 
 
 threading.Thread(target=listen, daemon=True).start()

@@ -111,8 +111,9 @@ def test_any_message_comes_back_as_it_was(made: tuple[Message, list[bytes]]) -> 
 
 def _comes_back(definition: Message, sent: list[bytes]) -> None:
     came = round_trip(definition, sent)
-    assert [fields(definition, one) for one in came] == [fields(definition, one) for one in sent]
-    assert came == sent
+    assert came == sent, [
+        (fields(definition, one), fields(definition, other)) for one, other in zip(came, sent, strict=False)
+    ]
 
 
 def test_the_types_put_together_by_hand_are_those_of_ros() -> None:
