@@ -6,6 +6,7 @@ import base64
 import itertools
 import json
 import re
+import struct
 import zlib
 
 import pytest
@@ -23,13 +24,20 @@ def test_field_table_is_the_contracts():
 @pytest.mark.parametrize("speeds", [[1, 2.5, None], [4614, 4613.5, 4620.25], [7, 9, -1]])
 def test_five_lines_decode_a_batch(speeds):
     code = next(block for block in re.findall(r"```python\n(.*?)```", README, re.DOTALL) if "zlib" in block)
-    batch = contract.Batch("0badcafe", 0, [10, 20, 35], {"speed": speeds})
-    names = {"json": json, "zlib": zlib, "base64": base64, "itertools": itertools}
-    names["batch"] = json.loads(contract.encode(batch))
-    names["DICTIONARY"] = contract.DICTIONARY
-    exec(code, names)
-    assert names["times_us"] == [10, 20, 35]
-    assert names["speed_erpm"] == speeds
+    times_us = [10, 20, 35]
+    samples = contract.Batch("0badcafe", 0, times_us, {"speed": speeds})
+    # Of ROS messages, what makes them again stands behind the columns.
+    kind = contract.RosType("/t", "a_msgs/A", "1", "float64 speed")
+    raws = [struct.pack("<d", speed or 0) for speed in speeds]
+    messages = contract.Messages(kind.id, kind.layout, raws)
+    for batch in (samples, contract.Batch("0badcafe", 0, times_us, {}, 0, messages)):
+        names = {"json": json, "zlib": zlib, "base64": base64, "itertools": itertools}
+        names["batch"] = json.loads(contract.encode(batch))
+        names["DICTIONARY"] = contract.DICTIONARY
+        assert names["batch"]["codec"] == "steps"
+        exec(code, names)
+        assert names["times_us"] == times_us
+        assert names["speed_erpm"] == (speeds if batch is samples else [speed or 0 for speed in speeds])
 
 
 def test_car_yaml_names_settings_that_the_agent_knows(tmp_path):
