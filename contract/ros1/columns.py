@@ -8,12 +8,11 @@ the numbers do not become steps, the messages are kept as they are.
 
 from __future__ import annotations
 
-import json
 import struct
 from functools import lru_cache
 from typing import Any, Iterable, Mapping, Sequence
 
-from contract.checks import COMPACT, wire_column
+from contract.checks import COMPACT, json_object, wire_column
 from contract.columns import CODEC, packed, unpacked
 from contract.limits import (
     MAX_BATCH_VALUES,
@@ -25,11 +24,11 @@ from contract.limits import (
 )
 from contract.ros1.decode import HEADER, Decoder
 from contract.ros1.definition import parse
-from contract.ros1.message import Messages
+from contract.ros1.message import MAX_LAYOUT, Messages
 
 _NS = 1_000_000_000
-# Of a layout in a message; the definitions of ROS have some thousand characters.
-MAX_LAYOUT = 64 * 1024
+# Of all frame_ids of a batch; messages of longer ones are kept as they are.
+_MAX_FRAMES = 256 * 1024
 # A batch of ours holds no more values; of what another packs, the rest is not looked into.
 _MAX_VIEWED = 2 * MAX_BATCH_VALUES
 
@@ -101,6 +100,8 @@ def as_columns(messages: Messages, times_us: Sequence[int]) -> tuple[dict[str, l
     if decoder.flat is None or bodies is None:
         return None
     columns: dict[str, list[Value]] = {}
+    if max(map(len, decoder.flat[1])) > MAX_FIELD_CHARACTERS:
+        return None
     for name, column in _columns(decoder, bodies).items():
         columns[name] = wire_column(name, column)[0]
         # What is no step is longer as text than its bytes are.
@@ -117,7 +118,7 @@ def as_columns(messages: Messages, times_us: Sequence[int]) -> tuple[dict[str, l
         except UnicodeDecodeError:
             return None
         offsets = [sec * _NS + ns - 1000 * t_us for t_us, (_, sec, ns, _) in zip(times_us, heads)]
-        if any(ns >= _NS for _, _, ns, _ in heads):
+        if any(ns >= _NS for _, _, ns, _ in heads) or sum(map(len, frames)) > _MAX_FRAMES:
             return None
         about["seq"] = packed([head[0] for head in heads])
         about["stamp"] = _digits(offsets) or packed(offsets)
@@ -134,7 +135,7 @@ def from_columns(
     """
     n = len(times_us)
     try:
-        said = json.loads(about)
+        said = json_object(about, "what makes messages of columns")
         name = said["type"]
         if name not in layouts:
             raise ContractError(f"the type {name} of the messages is not known")
@@ -154,21 +155,22 @@ def from_columns(
                 if isinstance(stamp, str)
                 else unpacked(CODEC, "stamp", stamp, n)
             )
+            # One stands for all: it is written once, and made so often.
             texts = frames * n if len(frames) == 1 else frames
+            if not isinstance(texts, list) or len(texts) != n or sum(map(len, texts)) > _MAX_FRAMES:
+                raise ContractError(f"frame_id: expected {n} texts of up to {_MAX_FRAMES} characters")
             heads = map(_head, seqs, times_us, offsets, texts)
             raw = [head + body for head, body in zip(heads, raw)]
     except (KeyError, TypeError, ValueError, struct.error) as error:
         if isinstance(error, ContractError):
             raise
         raise ContractError(f"the messages cannot be made again: {error}") from error
-    if len(raw) != n:
-        raise ContractError("the messages cannot be made again: not as many headers as samples")
     return Messages(name, layouts[name], raw)
 
 
 def _head(seq: Any, t_us: int, offset_ns: Any, frame: str) -> bytes:
     sec, nanosec = divmod(t_us * 1000 + offset_ns, _NS)
-    text = frame.encode()
+    text = str.encode(frame)
     return HEADER.pack(seq, sec, nanosec, len(text)) + text
 
 
