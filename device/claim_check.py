@@ -37,7 +37,8 @@ class ClaimCheck:
     """Takes bytes out of samples and puts claims in. Safe to use from several threads.
 
     Of each stream, at most one content every ``every_s`` of the samples' own time is kept, and no more
-    than ``max_bytes`` wait in the folder; what is not kept is counted, and its claim is null.
+    than ``max_bytes`` wait in the folder; what is not kept is counted, and its claim is null. What was not its
+    turn is counted apart from what there was no room for.
     """
 
     def __init__(
@@ -58,7 +59,7 @@ class ClaimCheck:
         self._lock = threading.Lock()
         self._last_us: dict[str, int] = {}
         self._bytes = self._measure()
-        self.kept = self.left_out = 0
+        self.kept = self.left_out = self.not_due = 0
 
     def around(self, emit: Emit) -> Emit:
         """An `Emit` that puts claims in before the sample goes on."""
@@ -115,7 +116,8 @@ class ClaimCheck:
 
     def report(self) -> dict[str, Any]:
         """What became of the contents."""
-        return {"kept": self.kept, "left_out": self.left_out, **self._seldom.counts()}
+        counts = {"kept": self.kept, "not_due": self.not_due, "left_out": self.left_out}
+        return {**counts, **self._seldom.counts()}
 
     def _is_due(self, stream: str, t_us: int) -> bool:
         with self._lock:

@@ -107,7 +107,7 @@ def test_a_content_of_selected_fields_is_claimed_too(tmp_path):
     ((_, _, sample),) = out
     assert sample.keys() == {"format", *(f"data.{name}" for name in CLAIM_FIELDS)}
     assert sample["data.sha256"] == hashlib.sha256(PICTURE).hexdigest()
-    assert claims.report() == {"kept": 1, "left_out": 0}
+    assert claims.report() == {"kept": 1, "not_due": 0, "left_out": 0}
 
 
 def test_at_most_one_content_in_so_long_and_the_fields_stay_the_same(tmp_path):
@@ -117,7 +117,7 @@ def test_at_most_one_content_in_so_long_and_the_fields_stay_the_same(tmp_path):
     assert {tuple(sample.beside) for sample in samples} == {
         tuple(f"data.{name}" for name in (*CLAIM_FIELDS, CLAIM_AT))
     }
-    assert claims.report() == {"kept": 3, "left_out": 6}
+    assert claims.report() == {"kept": 3, "not_due": 6, "left_out": 0}
     # Another stream has its own turn, and a recording that begins anew does too.
     assert claims.claim("rear", T_US, image())["data.key"]
     assert claims.claim("camera", T_US, image())["data.key"]
@@ -127,7 +127,7 @@ def test_a_full_folder_keeps_nothing_more_until_there_is_room(tmp_path):
     claims = claims_in(tmp_path, every_s=0, max_bytes=int(2.5 * len(PICTURE)))
     kept = [claims.claim("camera", T_US + i, image())["data.key"] for i in range(3)]
     assert [key is not None for key in kept] == [True, True, False]
-    assert claims.report() == {"kept": 2, "left_out": 1, "full": 1}
+    assert claims.report() == {"kept": 2, "not_due": 0, "left_out": 1, "full": 1}
     # Another run finds what waits.
     assert (
         claims_in(tmp_path, max_bytes=int(2.5 * len(PICTURE))).claim("camera", T_US, image())["data.key"]

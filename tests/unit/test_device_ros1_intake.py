@@ -88,7 +88,7 @@ def test_large_contents_are_handed_over_with_their_message() -> None:
     desk.take(raw[:5], message_definition=definition)
     messages = [values for _, _, values in desk.samples]
     assert [(message.raw, message.large) for message in messages] == [(raw, {"data": b"abc"}), (raw[:5], {})]
-    assert desk.intake.report()["malformed"] == 1
+    assert desk.intake.report()["undecodable"] == 1
     assert (dict(messages[0]), dict(messages[1])) == ({"u": 7}, {})
 
 

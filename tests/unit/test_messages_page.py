@@ -90,7 +90,7 @@ def test_its_reader_makes_messages_of_numbers_again(
     batch = batch_of({}, Messages(STAMPED.id, STAMPED.layout, raw))
     assert batch["codec"] == contract.CODEC
     times_us, columns, behind = page["opened"](batch)
-    assert json.loads(behind)["type"] == STAMPED.id
+    assert json.loads(behind)[0] == STAMPED.id
     assert list(page["made_again"](times_us, columns, behind, NUMBERS)) == raw
 
 
