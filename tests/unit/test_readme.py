@@ -2,16 +2,8 @@
 
 from __future__ import annotations
 
-import base64
-import itertools
-import json
 import re
-import struct
-import zlib
 
-import pytest
-
-import contract
 from scripts.fields import ROOT, filled
 
 README = (ROOT / "README.md").read_text()
@@ -19,25 +11,6 @@ README = (ROOT / "README.md").read_text()
 
 def test_field_table_is_the_contracts():
     assert filled(README) == README
-
-
-@pytest.mark.parametrize("speeds", [[1, 2.5, None], [4614, 4613.5, 4620.25], [7, 9, -1]])
-def test_five_lines_decode_a_batch(speeds):
-    code = next(block for block in re.findall(r"```python\n(.*?)```", README, re.DOTALL) if "zlib" in block)
-    times_us = [10, 20, 35]
-    samples = contract.Batch("0badcafe", 0, times_us, {"speed": speeds})
-    # Of ROS messages, what makes them again stands behind the columns.
-    kind = contract.RosType("/t", "a_msgs/A", "1", "float64 speed")
-    raws = [struct.pack("<d", speed or 0) for speed in speeds]
-    messages = contract.Messages(kind.id, kind.layout, raws)
-    for batch in (samples, contract.Batch("0badcafe", 0, times_us, {}, 0, messages)):
-        names = {"json": json, "zlib": zlib, "base64": base64, "itertools": itertools}
-        names["batch"] = json.loads(contract.encode(batch))
-        names["DICTIONARY"] = contract.DICTIONARY
-        assert names["batch"]["codec"] == "steps"
-        exec(code, names)
-        assert names["times_us"] == times_us
-        assert names["speed_erpm"] == (speeds if batch is samples else [speed or 0 for speed in speeds])
 
 
 def test_car_yaml_names_settings_that_the_agent_knows(tmp_path):
