@@ -159,7 +159,7 @@ def _packed_messages(
     if found is not None:
         columns, about = found
         return CODEC, packed_samples(dt, columns, about.encode())
-    return SERIALIZED_CODEC, packed_samples(dt, beside, pack(messages))
+    return SERIALIZED_CODEC, packed_samples(dt, beside, pack(messages), SERIALIZED_CODEC)
 
 
 def decode(message: bytes | str | Mapping[str, Any]) -> Batch:

@@ -45,7 +45,9 @@ EXACT = 2**53
 SCALES = tuple(float(f"1e{decimals}") for decimals in range(23))
 
 
-def packed_samples(dt: Sequence[int], fields: Mapping[str, Sequence[Value]], behind: bytes = b"") -> str:
+def packed_samples(
+    dt: Sequence[int], fields: Mapping[str, Sequence[Value]], behind: bytes = b"", codec: str = CODEC
+) -> str:
     """A batch's times and columns, of the values that `wire_column` has made, as `CODEC` has them; what
     comes ``behind`` follows a line's end.
 
@@ -57,6 +59,8 @@ def packed_samples(dt: Sequence[int], fields: Mapping[str, Sequence[Value]], beh
         raise ContractError(f"batch of {len(text)} bytes of columns: allowed is up to {_MOST_BYTES[CODEC]}")
     deflater = zlib.compressobj(6, zdict=DICTIONARY)
     body = text.encode() + (b"\n" + behind if behind else b"")
+    if len(body) > _MOST_BYTES[codec]:
+        raise ContractError(f"batch of {len(body)} bytes: allowed is up to {_MOST_BYTES[codec]}")
     return base64.b64encode(deflater.compress(body) + deflater.flush()).decode()
 
 

@@ -5,14 +5,14 @@ from __future__ import annotations
 from typing import Any, Callable, Iterator, Mapping, Sequence, Tuple
 
 from contract import ACCOUNT_STREAM
-from contract.account import SourceAccount, StreamAccount
+from contract.account import ACCOUNT_EVERY_S, SourceAccount, StreamAccount
 from device.batch import StreamCounts
 from device.clock import Clock
 from device.sources import Emit
 from device.spool import Spool
 
-# Losses are told within a second, all else once in ten: a run that is killed has told nearly everything.
-_EVERY_S, _LOSS_S = 10.0, 1.0
+# Losses are told within a second.
+_LOSS_S = 1.0
 # Counts of what was given: no cause of anything.
 _GIVEN = frozenset({"messages", "samples", "rows", "opened", "silent", "kept", "published"})
 
@@ -31,18 +31,19 @@ class Accounts:
         spool: Spool,
         streams: Sequence[str],
         counted: Counted,
+        refused: Callable[[], int],
         reports: Reports,
         emit: Emit,
     ) -> None:
         self._clock, self._spool, self._streams = clock, spool, streams
-        self._counted, self._reports, self._emit = counted, reports, emit
+        self._counted, self._refused, self._reports, self._emit = counted, refused, reports, emit
         self._told = clock.monotonic()
         self._lost = 0
 
     def tick(self) -> None:
         """Tell if it is time; call it several times a second."""
         passed = self._clock.monotonic() - self._told
-        if passed >= _EVERY_S or (passed >= _LOSS_S and self._losses() != self._lost):
+        if passed >= ACCOUNT_EVERY_S or (passed >= _LOSS_S and self._losses() != self._lost):
             self.tell()
 
     def tell(self, *, ended: bool = False) -> None:
@@ -71,8 +72,7 @@ class Accounts:
                 self._emit(ACCOUNT_STREAM, now_us, SourceAccount(source, found).sample())
 
     def _losses(self) -> int:
-        refused = sum(counts.refused for counts, _ in self._counted().values())
-        return refused + self._spool.dropped().samples
+        return self._refused() + self._spool.dropped().samples
 
 
 def _counts(report: Mapping[str, Any], prefix: str) -> Iterator[tuple[str, int]]:

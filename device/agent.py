@@ -119,6 +119,7 @@ class Agent:
             spool=spool,
             streams=[stream for source in config.sources for stream in source.streams()],
             counted=self._counted,
+            refused=lambda: sum(counts.refused for counts in self._counts.copy().values()),
             reports=[
                 *((what, source.report) for what, source in self._sources),
                 *([("contents", self._claims.report)] if self._claims is not None else []),

@@ -37,7 +37,8 @@ class ClaimCheck:
     """Takes bytes out of samples and puts claims in. Safe to use from several threads.
 
     Of each stream, at most one content every ``every_s`` of the samples' own time is kept, and no more
-    than ``max_bytes`` wait in the folder; what is not kept is counted, and its claim is null.
+    than ``max_bytes`` wait in the folder; what is not kept is counted, and its claim is null: what was not
+    due, and what there was no room for.
     """
 
     def __init__(
@@ -58,14 +59,17 @@ class ClaimCheck:
         self._lock = threading.Lock()
         self._last_us: dict[str, int] = {}
         self._bytes = self._measure()
-        self.kept = self.left_out = 0
+        self.kept = self.left_out = self.not_due = 0
 
     def around(self, emit: Emit) -> Emit:
         """An `Emit` that puts claims in before the sample goes on."""
 
-        def emit_claims(stream: str, t_us: int, values: Mapping[str, Value]) -> None:
-            if isinstance(values, RosMessage) and values.large:
-                values = self.claim(stream, t_us, values)
+        def emit_claims(stream: str, t_us: int, values: Mapping[str, Any]) -> None:
+            if isinstance(values, RosMessage):
+                if values.large:
+                    values = self.claim(stream, t_us, values)
+            elif any(type(value) is bytes for value in values.values()):
+                values = self.claim_fields(stream, t_us, values)
             emit(stream, t_us, values)
 
         return emit_claims
@@ -78,12 +82,28 @@ class ClaimCheck:
         beside: dict[str, Value] = {}
         for field, content in message.large.items():
             raw, at = cut(raw, content)
-            claim = self._keep(stream, t_us, field, content) if keep else None
-            if claim is None:
-                self.left_out += 1
-                claim = dict.fromkeys(CLAIM_FIELDS)
-            beside.update((f"{field}.{name}", one) for name, one in {**claim, CLAIM_AT: at}.items())
+            beside.update(self._claim(stream, t_us, field, content, keep=keep))
+            beside[f"{field}.{CLAIM_AT}"] = at
         return RosMessage(raw, message.kind, beside=beside)
+
+    def claim_fields(self, stream: str, t_us: int, values: Mapping[str, Any]) -> dict[str, Value]:
+        """Selected fields with a claim for each of bytes; the others as they are."""
+        keep = self._is_due(stream, t_us)
+        sample: dict[str, Value] = {}
+        for field, value in values.items():
+            if type(value) is bytes:
+                sample.update(self._claim(stream, t_us, field, value, keep=keep))
+            else:
+                sample[field] = value
+        return sample
+
+    def _claim(self, stream: str, t_us: int, field: str, content: bytes, *, keep: bool) -> dict[str, Value]:
+        claim = self._keep(stream, t_us, field, content) if keep else None
+        if claim is None:
+            self.left_out += keep
+            self.not_due += not keep
+            claim = dict.fromkeys(CLAIM_FIELDS)
+        return {f"{field}.{name}": one for name, one in claim.items()}
 
     def wait_empty(self, timeout_s: float) -> bool:
         """Wait until the folder is uploaded; whether it is."""
@@ -97,7 +117,8 @@ class ClaimCheck:
 
     def report(self) -> dict[str, Any]:
         """What became of the contents."""
-        return {"kept": self.kept, "left_out": self.left_out, **self._seldom.counts()}
+        counts = {"kept": self.kept, "not_due": self.not_due, "left_out": self.left_out}
+        return {**counts, **self._seldom.counts()}
 
     def _is_due(self, stream: str, t_us: int) -> bool:
         with self._lock:

@@ -39,10 +39,18 @@ def install() -> None:
     dynamodb._evaluate_condition = _evaluating(dynamodb._evaluate_condition)
 
 
+# Of a sort key, as DynamoDB orders it: a number by its value, a text by its characters.
+Place = Any
+
+
+def _place(kind: str, text: str) -> Place:
+    return Decimal(text) if kind == "N" else text
+
+
 class Bound(NamedTuple):
     """An end of a range of sort keys; ``open``, it is not in the range itself."""
 
-    at: Decimal
+    at: Place
     open: bool = False
 
 
@@ -56,16 +64,18 @@ class Wanted(NamedTuple):
 
 
 class Partition(dict[str, Item]):
-    """The items of one partition by the text of their sort key, a number; `between` knows its order."""
+    """The items of one partition by the text of their sort key, which is of this kind; `between` knows its
+    order."""
 
-    def __init__(self, items: Mapping[str, Item] | None = None) -> None:
+    def __init__(self, kind: str, items: Mapping[str, Item] | None = None) -> None:
         super().__init__(items or {})
-        self._order: list[Decimal] | None = None
+        self.kind = kind
+        self._order: list[Place] | None = None
         self._texts: list[str] = []
 
     def __setitem__(self, text: str, item: Item) -> None:
         if text not in self and self._order is not None:
-            place = Decimal(text)
+            place = _place(self.kind, text)
             if not self._order or place > self._order[-1]:
                 self._order.append(place)
                 self._texts.append(text)
@@ -84,7 +94,7 @@ class Partition(dict[str, Item]):
 
     def __reduce__(self) -> tuple[Any, ...]:
         # The emulator copies tables to keep and to restore them.
-        return Partition, (dict(self),)
+        return Partition, (self.kind, dict(self))
 
     def values(self) -> Iterable[Item]:  # type: ignore[override]  # a list, where a dict has a view
         """All items, or those that the Query that is running asks for."""
@@ -94,7 +104,7 @@ class Partition(dict[str, Item]):
     def between(self, wanted: Wanted) -> Sequence[Item]:
         """The items that are wanted, in order."""
         if self._order is None:
-            pairs = sorted((Decimal(text), text) for text in self)
+            pairs = sorted((_place(self.kind, text), text) for text in self)
             self._order, self._texts = [place for place, _ in pairs], [text for _, text in pairs]
         first, end = 0, len(self._order)
         if wanted.low is not None:
@@ -125,8 +135,8 @@ def _ordering(set_item: Callable[..., Any]) -> Callable[..., Any]:
     @wraps(set_item)
     def keep(table: Mapping[str, Any], partition: Any, place: str, item: Item) -> Any:
         items = table["items"]
-        if partition not in items and _numbered(table):
-            items[partition] = Partition()
+        if partition not in items and (kind := _sorted_by(table)):
+            items[partition] = Partition(kind)
         return set_item(table, partition, place, item)
 
     return keep
@@ -141,9 +151,11 @@ def _plainly(look: Callable[[Any], Any], answer: Callable[[str], Any]) -> Callab
     return number
 
 
-def _numbered(table: Mapping[str, Any]) -> bool:
+def _sorted_by(table: Mapping[str, Any]) -> str:
+    """The kind of the table's sort key, if it is one whose order is known here."""
     name = table.get("sk_name")
-    return bool(name) and dynamodb._get_attr_type(table, name) == "N"
+    kind = dynamodb._get_attr_type(table, name) if name else ""
+    return kind if kind in {"N", "S"} else ""
 
 
 def narrowing(query: Callable[..., Any]) -> Callable[..., Any]:
@@ -191,24 +203,27 @@ def _asked(data: Mapping[str, Any]) -> tuple[Partition, Wanted] | None:
         partition = table["items"].get(dynamodb._extract_key_val(value))
         if compared != "EQ" or not isinstance(partition, Partition):
             return None
-        low, high = _range(*conditions.get(table["sk_name"], ("", ())))
+        kind = partition.kind
+        low, high = _range(kind, *conditions.get(table["sk_name"], ("", ())))
         most, cursor = data.get("Limit"), data.get("ExclusiveStartKey")
         forward = data.get("ScanIndexForward", True) is not False
         if cursor and forward:
-            low = Bound(Decimal(cursor[table["sk_name"]]["N"]), open=True)
+            low = Bound(_place(kind, cursor[table["sk_name"]][kind]), open=True)
         elif cursor:
-            high = Bound(Decimal(cursor[table["sk_name"]]["N"]), open=True)
+            high = Bound(_place(kind, cursor[table["sk_name"]][kind]), open=True)
         return partition, Wanted(low, high, forward, None if most is None else int(most) + 1)
     except (KeyError, TypeError, ValueError, AttributeError, InvalidOperation):
         return None
 
 
-def _range(compared: str, values: Sequence[Mapping[str, Any]]) -> tuple[Bound | None, Bound | None]:
-    numbers = [Decimal(value["N"]) for value in values]
+def _range(
+    kind: str, compared: str, values: Sequence[Mapping[str, Any]]
+) -> tuple[Bound | None, Bound | None]:
+    places = [_place(kind, value[kind]) for value in values]
     if compared == "BETWEEN":
-        return Bound(numbers[0]), Bound(numbers[1])
-    low = Bound(numbers[0], compared == "GT") if compared in _LOW else None
-    high = Bound(numbers[0], compared == "LT") if compared in _HIGH else None
+        return Bound(places[0]), Bound(places[1])
+    low = Bound(places[0], compared == "GT") if compared in _LOW else None
+    high = Bound(places[0], compared == "LT") if compared in _HIGH else None
     return low, high
 
 

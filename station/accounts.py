@@ -7,13 +7,13 @@ from contextlib import suppress
 from dataclasses import dataclass, field, replace
 
 from contract import ACCOUNT_STREAM, ContractError, decode
-from contract.account import SourceAccount, StreamAccount, account, lost
+from contract.account import ACCOUNT_EVERY_S, SourceAccount, StreamAccount, account, lost
 from station.audit import Audit, Run, Shortfall
 from station.cloud import Cloud
 from station.delivery import items
 
-# A run that has said nothing for so long, while an agent says something every ten seconds, has ended.
-_SILENT_US = 60_000_000
+# A run that has said nothing for so long has ended.
+_SILENT_US = round(4e6 * ACCOUNT_EVERY_S)
 
 
 @dataclass
@@ -71,7 +71,9 @@ def _shortfalls(boot: str, said: StreamAccount, stored: Run | None, *, running: 
     if said.refused:
         yield Shortfall(boot, said.refused, "refused by the agent: no message can hold them")
     if not said.ended and not running:
-        yield Shortfall(boot, None, "the run did not end in good order: up to a second was in open batches")
+        yield Shortfall(
+            boot, None, "were in open batches, at most those of a second: the run did not end in good order"
+        )
     if stored is None:
         if said.stored:
             yield Shortfall(boot, said.stored, "in batches of which none is stored")

@@ -6,7 +6,7 @@ import hashlib
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from typing import Any, NamedTuple
 
-from contract import CLAIM_AT, Batch, ContractError, MessageType, messages_of
+from contract import CLAIM_AT, CLAIM_FIELDS, Batch, ContractError, MessageType, messages_of
 from contract.ros1.message import filled
 from station import reading
 from station.cloud import Cloud
@@ -66,14 +66,19 @@ class Export:
             stream = self._selection.stream
             self.types[messages.type_id] = MessageType(stream, f"/{stream}", kind, "", definition)
         name, raws = messages.type_id, messages.raw
-        return [Published(batch.times_us[i], name, self._filled(raws[i], batch, i)) for i in inside]
+        try:
+            return [Published(batch.times_us[i], name, self._filled(raws[i], batch, i)) for i in inside]
+        except ContractError as error:
+            self.refused.add(error)
+            return ()
 
     def _filled(self, raw: bytes, batch: Batch, i: int) -> bytes:
         """The message with what was kept as files; what was cut out last comes back first."""
         places = [name for name in batch.columns if name.endswith(f".{CLAIM_AT}")]
         for place in reversed(places):
             at, field = batch.columns[place][i], place[: -len(CLAIM_AT) - 1]
-            if type(at) is not int or f"{field}.key" not in batch.columns:
+            # A message may have a field of that name itself.
+            if type(at) is not int or not all(f"{field}.{part}" in batch.columns for part in CLAIM_FIELDS):
                 continue
             key, sha256 = (batch.columns[f"{field}.{part}"][i] for part in ("key", "sha256"))
             content = self._content(key) if isinstance(key, str) else None

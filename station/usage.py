@@ -6,6 +6,7 @@ from collections.abc import Iterator
 from dataclasses import dataclass, replace
 
 from contract import LIVE_BROKER_EVERY_S
+from contract.account import ACCOUNT_EVERY_S
 from station.errors import StationError
 from station.prices import MONTH_DAYS
 
@@ -84,9 +85,10 @@ class Usage:
 
     @property
     def own_batches_per_s(self) -> float:
-        """Batches of the agent's own streams: its figures, and round trips where it measures them."""
+        """Batches of the agent's own streams: its figures, its accounts, and round trips where it measures
+        them."""
         figures = 1 / self.agent_every_s if self.agent_every_s else 0.0
-        return figures + min(1.0, 3 * self.ping_hz)
+        return figures + 1 / ACCOUNT_EVERY_S + min(1.0, 3 * self.ping_hz)
 
     @property
     def live_at_broker_per_s(self) -> float:

@@ -7,7 +7,9 @@ from concurrent.futures import ThreadPoolExecutor
 
 from bench.probes.ground import Ground, No, equal, until
 from contract import (
+    BATCH,
     VESC_STREAM,
+    batches_between,
     build_topic,
 )
 from station import delivery
@@ -35,16 +37,17 @@ def stores(ground: Ground) -> str:
 def range_of_time(ground: Ground) -> str:
     """Of a drive, a range has the batches that begin in it."""
     sent = ground.drive()
+    first, last = batches_between(sent[1].t_us, sent[2].t_us - 1)
     answer = ground.cloud.client("dynamodb").query(
         TableName=ground.cloud.output("storage", "TelemetryTable"),
-        KeyConditionExpression="topic = :topic AND t BETWEEN :a AND :b",
+        KeyConditionExpression="topic = :topic AND batch BETWEEN :a AND :b",
         ExpressionAttributeValues={
             ":topic": {"S": build_topic("dt", ground.a, VESC_STREAM, ground.namespace)},
-            ":a": {"N": str(sent[1].t_us)},
-            ":b": {"N": str(sent[2].t_us - 1)},
+            ":a": {"S": first},
+            ":b": {"S": last},
         },
     )
-    equal([int(item["t"]["N"]) for item in answer["Items"]], [sent[1].t_us])
+    equal([item[BATCH]["S"] for item in answer["Items"]], [str(sent[1].id)])
     return "of three batches, a range gave the one in it"
 
 

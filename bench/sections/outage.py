@@ -19,7 +19,7 @@ from bench.errors import BenchError
 from bench.result import Plot, Ratio, Section, Table
 from bench.spread import spread
 from bench.target import Say, Target
-from contract import OWN_STREAMS, VESC_STREAM
+from contract import BATCH, OWN_STREAMS, VESC_STREAM, batch_id
 from device.config import load_config
 from local.proxy import PASS, REFUSE, Proxy
 from station import audit, delivery, robots
@@ -63,7 +63,7 @@ def run(target: Target, say: Say) -> Section:
     items = list(audit.headers(target.cloud, bundle.robot, VESC_STREAM, audit.Range()))
     found = audit.audit(VESC_STREAM, items, from_start=True)
     stored = sum(int(item["n"]) for item in items)
-    delayed = [i for i in items if cut_us <= int(i["t"]) < mended_us]
+    delayed = [i for i in items if cut_us <= batch_id(i[BATCH]).t_us < mended_us]
     drained_ms = max((int(item["received_ms"]) for item in delayed), default=mended_us // 1000)
     live = [(h.t_us, h.delay_ms) for h in heard if h.stream == VESC_STREAM]
     _report(

@@ -13,7 +13,7 @@ import struct
 from functools import lru_cache
 from typing import Any, Iterable, Mapping, Sequence
 
-from contract.checks import COMPACT, wire_column
+from contract.checks import COMPACT, shown, wire_column
 from contract.columns import CODEC, packed, unpacked
 from contract.limits import (
     MAX_BATCH_VALUES,
@@ -25,11 +25,11 @@ from contract.limits import (
 )
 from contract.ros1.decode import HEADER, Decoder
 from contract.ros1.definition import parse
-from contract.ros1.message import Messages
+from contract.ros1.message import MAX_LAYOUT, Messages
 
 _NS = 1_000_000_000
-# Of a layout in a message; the definitions of ROS have some thousand characters.
-MAX_LAYOUT = 64 * 1024
+# Of all frame_ids of a batch; messages of longer ones are kept as they are.
+_MAX_FRAMES = 256 * 1024
 # A batch of ours holds no more values; of what another packs, the rest is not looked into.
 _MAX_VIEWED = 2 * MAX_BATCH_VALUES
 
@@ -66,10 +66,11 @@ def view(messages: Messages) -> tuple[dict[str, list[Value]], int]:
     if decoder.flat is not None and bodies is not None:
         columns = _columns(decoder, bodies)
     else:
-        viewed = 0
+        viewed, walked = 0, decoder.walked
         for i, raw in enumerate(messages.raw):
+            enough = max(viewed, decoder.walked - walked) >= _MAX_VIEWED
             try:
-                values = decoder.decode(raw)[0] if viewed < _MAX_VIEWED else {}
+                values = {} if enough else decoder.decode(raw)[0]
             except MessageError:
                 values = {}
             viewed += len(values)
@@ -101,6 +102,8 @@ def as_columns(messages: Messages, times_us: Sequence[int]) -> tuple[dict[str, l
     if decoder.flat is None or bodies is None:
         return None
     columns: dict[str, list[Value]] = {}
+    if max(map(len, decoder.flat[1])) > MAX_FIELD_CHARACTERS:
+        return None
     for name, column in _columns(decoder, bodies).items():
         columns[name] = wire_column(name, column)[0]
         # What is no step is longer as text than its bytes are.
@@ -108,7 +111,7 @@ def as_columns(messages: Messages, times_us: Sequence[int]) -> tuple[dict[str, l
             return None
     if b"".join(bodies) != _rows(decoder, columns):
         return None
-    about: dict[str, Any] = {"type": messages.type_id}
+    about: list[Any] = [messages.type_id]
     if decoder.stamped:
         heads = [HEADER.unpack_from(raw) for raw in messages.raw]
         frames = [raw[HEADER.size : HEADER.size + head[3]] for raw, head in zip(messages.raw, heads)]
@@ -117,11 +120,12 @@ def as_columns(messages: Messages, times_us: Sequence[int]) -> tuple[dict[str, l
         except UnicodeDecodeError:
             return None
         offsets = [sec * _NS + ns - 1000 * t_us for t_us, (_, sec, ns, _) in zip(times_us, heads)]
-        if any(ns >= _NS for _, _, ns, _ in heads):
+        if any(ns >= _NS for _, _, ns, _ in heads) or sum(map(len, frames)) > _MAX_FRAMES:
             return None
-        about["seq"] = packed([head[0] for head in heads])
-        about["stamp"] = _digits(offsets) or packed(offsets)
-        about["frame_id"] = texts if len(set(texts)) > 1 else texts[:1]
+        seqs = [head[0] for head in heads]
+        about.append(seqs[0] if seqs == list(range(seqs[0], seqs[0] + len(seqs))) else packed(seqs))
+        about.append(_digits(offsets) or packed(offsets))
+        about.append(texts if len(set(texts)) > 1 else texts[0])
     return columns, COMPACT.encode(about)
 
 
@@ -134,10 +138,9 @@ def from_columns(
     """
     n = len(times_us)
     try:
-        said = json.loads(about)
-        name = said["type"]
-        if name not in layouts:
-            raise ContractError(f"the type {name} of the messages is not known")
+        name, *head = json.loads(about)
+        if not isinstance(name, str) or name not in layouts:
+            raise ContractError(f"the messages' type, {shown(name)}, is not known")
         decoder = decoder_of(layouts[name])
         if decoder.flat is None:
             raise ContractError(f"the type {name} is not of numbers alone")
@@ -147,28 +150,29 @@ def from_columns(
             raise ContractError(f"the columns are not of the type {name}")
         raw = [rows[i * size : (i + 1) * size] for i in range(n)]
         if decoder.stamped:
-            seqs = unpacked(CODEC, "seq", said["seq"], n)
-            stamp, frames = said["stamp"], said["frame_id"]
+            seq, stamp, frame = head
+            seqs = range(seq, seq + n) if type(seq) is int else unpacked(CODEC, "seq", seq, n)
             offsets: Sequence[Any] = (
                 [int(stamp[3 * i : 3 * i + 3]) for i in range(n)]
                 if isinstance(stamp, str)
                 else unpacked(CODEC, "stamp", stamp, n)
             )
-            texts = frames * n if len(frames) == 1 else frames
+            # One stands for all: it is written once, and made so often.
+            texts = [frame] * n if isinstance(frame, str) else frame
+            if not isinstance(texts, list) or len(texts) != n or sum(map(len, texts)) > _MAX_FRAMES:
+                raise ContractError(f"frame_id: expected {n} texts of up to {_MAX_FRAMES} characters")
             heads = map(_head, seqs, times_us, offsets, texts)
-            raw = [head + body for head, body in zip(heads, raw)]
-    except (KeyError, TypeError, ValueError, struct.error) as error:
+            raw = [start + body for start, body in zip(heads, raw)]
+    except (AttributeError, RecursionError, TypeError, ValueError, struct.error) as error:
         if isinstance(error, ContractError):
             raise
         raise ContractError(f"the messages cannot be made again: {error}") from error
-    if len(raw) != n:
-        raise ContractError("the messages cannot be made again: not as many headers as samples")
     return Messages(name, layouts[name], raw)
 
 
 def _head(seq: Any, t_us: int, offset_ns: Any, frame: str) -> bytes:
     sec, nanosec = divmod(t_us * 1000 + offset_ns, _NS)
-    text = frame.encode()
+    text = str.encode(frame)
     return HEADER.pack(seq, sec, nanosec, len(text)) + text
 
 

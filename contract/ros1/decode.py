@@ -73,9 +73,16 @@ class Decoder:
         except struct.error as error:
             raise MessageError(f"{self._kind}: no message is so large: {error}") from error
         self.unknown = sorted(set(select or ()) - compiler.used)
+        self._walked = compiler.walked
         self.flat: tuple[struct.Struct, list[str]] | None = None
         if len(self._steps) == 1:
             self.flat = compiler.fixed.get(self._steps[0])
+
+    @property
+    def walked(self) -> int:
+        """How many elements of variable size were walked so far, each field of theirs counted: what makes
+        a message dear to look into."""
+        return self._walked[0]
 
     def decode(self, data: bytes) -> Decoded:
         """The sample in a message. Raises `MessageError` where the bytes do not fit the definition."""
@@ -121,6 +128,7 @@ class _Compiler:
         self._skips: dict[str, list[Step]] = {}
         self._emitted = self._named = 0
         self.used: set[str] = set()
+        self.walked = [0]
         self.fixed: dict[Step, tuple[struct.Struct, list[str]]] = {}
 
     def message(self, *, headed: bool) -> list[Step]:
@@ -189,7 +197,7 @@ class _Compiler:
     def _variable(self, kind: str, path: str) -> Step:
         """An array whose length each message says."""
         size = self._size(kind)
-        left_out = self._left_out
+        left_out, walked = self._left_out, self.walked
         whole, few = self._wanted(path), self._indexes(path, None)
         blob = kind in _BLOBS
         if blob and whole and self._large:
@@ -232,6 +240,7 @@ class _Compiler:
                 return at + int(n) * size
             if n > _MAX_WALKED:
                 raise MessageError(f"{path}: {n} elements are too many to look into")
+            walked[0] += n * len(skip)
             for i in range(n):
                 at = _walk(steps(i) if all_of_it or i in few else skip, data, at, out)
             return at
@@ -248,7 +257,7 @@ class _Compiler:
     def _skip(self, run: _Run, field: Field) -> None:
         size = self._size(field.kind)
         if field.length == VARIABLE:
-            run.step(_skip_many(size, self._skipped(field.kind)))
+            run.step(_skip_many(size, self._skipped(field.kind), self.walked))
         elif size is not None:
             run.pad(size * (1 if field.length is None else field.length))
         elif field.length is None:
@@ -419,7 +428,7 @@ def _skip_bytes(size: int) -> Step:
     return lambda _data, at, _out: at + size
 
 
-def _skip_many(size: int | None, element: list[Step]) -> Step:
+def _skip_many(size: int | None, element: list[Step], walked: list[int]) -> Step:
     def step(data: bytes, at: int, out: dict[str, Value]) -> int:
         (n,) = _LENGTH.unpack_from(data, at)
         at += 4
@@ -427,6 +436,7 @@ def _skip_many(size: int | None, element: list[Step]) -> Step:
             return at + int(n) * size
         if n > _MAX_WALKED:
             raise MessageError(f"{n} elements are too many to look into")
+        walked[0] += n * len(element)
         for _ in range(n):
             at = _walk(element, data, at, out)
         return at

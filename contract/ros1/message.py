@@ -10,6 +10,8 @@ from contract.limits import MessageError, Value
 from contract.ros1.decode import Decoder
 from contract.ros1.definition import layout, parse
 
+# Of a layout in a batch; the definitions of ROS have some thousand characters.
+MAX_LAYOUT = 64 * 1024
 _LENGTH = struct.Struct("<I")
 
 
@@ -32,8 +34,12 @@ class RosType:
         self.layout = self.error = ""
         try:
             parsed = parse(kind, definition)
-            self.decoder = Decoder(parsed)
-            self.layout = f"{kind}\n{layout(parsed)}"
+            written = f"{kind}\n{layout(parsed)}"
+            if len(written) <= MAX_LAYOUT:
+                self.decoder = Decoder(parsed)
+                self.layout = written
+            else:
+                self.error = f"{kind}: its layout has over {MAX_LAYOUT} characters"
         except MessageError as error:
             self.error = str(error)
 

@@ -45,6 +45,10 @@ def unpack(body: bytes, n: int) -> Messages:
         raise ContractError("messages without a head")
     head = json_object(body[:end], "the messages' head")
     data = body[end + 1 :]
+    if n > 1 and len(data) > MAX_SERIALIZED_BYTES:
+        raise ContractError(
+            f"messages of {len(data)} bytes: allowed is up to {MAX_SERIALIZED_BYTES} in a batch"
+        )
     kind, layout, sizes = head.get("type"), head.get("layout"), head.get("sizes")
     if not isinstance(kind, str) or not isinstance(layout, str):
         raise ContractError("messages without a type and a layout")

@@ -197,8 +197,11 @@ class Intake:
         try:
             values = kind.decoder.decode(data)[0]
         except MessageError as error:
+            if not self._config.fields:
+                self._seldom.warn("undecodable", f"topic {self._topic}: kept as it is: {error}")
+                return stamp_us, RosMessage(data, kind.whole)
             self._seldom.warn("malformed", f"topic {self._topic}: {error}")
-            return stamp_us, None if self._config.fields else RosMessage(data, kind.whole)
+            return stamp_us, None
         if not self._config.fields:
             found: Mapping[str, Any] = values
             contents = {name: value for name, value in found.items() if isinstance(value, bytes) and value}
@@ -256,7 +259,8 @@ class Intake:
     def report(self) -> dict[str, Any]:
         """What became of the messages."""
         left_out: dict[str, int] = {}
-        for kind in list(self._kinds.values()):
+        # A message that is recorded whole has everything, whatever its view leaves out.
+        for kind in list(self._kinds.values()) if self._config.fields else ():
             for path, count in kind.decoder.left_out.items() if kind.decoder is not None else ():
                 left_out[path] = left_out.get(path, 0) + count
         return {

@@ -119,7 +119,7 @@ def _show(one: Audit) -> None:
             f"  the first stored number is {one.before_first:,}: before it is expired, out of range or lost"
         )
     for boot, samples, cause in one.shortfalls:
-        count = "samples" if samples is None else f"{samples:,} samples"
+        count = "an unknown number of samples" if samples is None else f"{samples:,} samples"
         _out.print(f"  [red]run {boot[:8]}: {count} {cause}[/]")
     if one.refused:
         _out.print(f"  [red]{one.refused:,} items are not batches[/]")

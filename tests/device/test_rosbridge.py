@@ -16,7 +16,6 @@ import pytest
 pytest.importorskip("aiohttp")
 pytest.importorskip("websocket")
 
-import contract
 from device.clock import Clock, SystemClock
 from device.config import load_config
 from device.errors import ConfigError, SourceError
@@ -80,8 +79,7 @@ def test_messages_become_samples(server: RosbridgeStandin, log: pytest.LogCaptur
     ], "in order, and without the wrapper"
     assert {stream for stream, _, _ in running.samples} == {"vesc"}
     times = [t_us for _, t_us, _ in running.samples]
-    frame = contract.FrameId("vesc", CORE, "base_link", times[0])
-    assert [contract.frame_id(sample) for sample in running.said] == [frame]
+    assert running.said == [], "of what type they are, only the server could say"
     assert before < times[0] <= times[-1] < time.time_ns() // 1000
     assert [record.getMessage()[:70] for record in log.records if record.levelname == "WARNING"] == [
         f"topic {CORE}: the server does not say what its messages consist"

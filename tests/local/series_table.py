@@ -7,8 +7,8 @@ from typing import Any
 from ministack.services import dynamodb
 
 
-def create(name: str, **more: Any) -> None:
-    """Topic by time; within a ``request_scope``."""
+def create(name: str, kind: str = "N", **more: Any) -> None:
+    """Topic by time, which is of this kind; within a ``request_scope``."""
     created = dynamodb._create_table(
         {
             "TableName": name,
@@ -18,7 +18,7 @@ def create(name: str, **more: Any) -> None:
             ],
             "AttributeDefinitions": [
                 {"AttributeName": "topic", "AttributeType": "S"},
-                {"AttributeName": "t", "AttributeType": "N"},
+                {"AttributeName": "t", "AttributeType": kind},
             ],
             "BillingMode": "PAY_PER_REQUEST",
             **more,

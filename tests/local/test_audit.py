@@ -1,4 +1,4 @@
-"""`iort audit` on the embedded cloud: complete after a drive, a gap when a batch is taken away."""
+"""`iort audit` on the embedded cloud: complete after a drive; otherwise what is missing, and why."""
 
 from __future__ import annotations
 
@@ -6,10 +6,14 @@ import json
 
 from typer.testing import CliRunner
 
-from contract import RECORD, T_US, TOPIC, build_topic
+from contract import ACCOUNT_STREAM, BATCH, RECORD, TOPIC, Batch, batch_id, build_topic, encode, record_topic
+from contract.account import SourceAccount, StreamAccount
 from station import audit
 from station.cli import app
-from tests.local.conftest import run_agent
+from tests.local.conftest import run_agent, until
+from tests.local.robot import Robot
+
+T0_US = 1_760_000_000_000_000
 
 
 def _run(embedded, *arguments):
@@ -17,28 +21,92 @@ def _run(embedded, *arguments):
     return CliRunner().invoke(app, [*where, "audit", *arguments, "--json"])
 
 
-def test_a_drive_is_proven_and_a_lost_batch_is_found(embedded, bundle):
+def _delete(embedded, robot, stream, item):
+    embedded.cloud.client("dynamodb").delete_item(
+        TableName=embedded.cloud.output("storage", "TelemetryTable"),
+        Key={
+            TOPIC: {"S": build_topic(RECORD, robot, stream, embedded.namespace)},
+            BATCH: {"S": item[BATCH]},
+        },
+    )
+
+
+def test_a_drive_is_proven_and_a_lost_batch_of_any_stream_is_found(embedded, bundle):
     car = bundle(
-        sources=[{"type": "sim", "stream": "vesc", "rate_hz": 100, "duration_s": 2}],
+        sources=[{"type": "sim", "stream": "wheels", "rate_hz": 100, "duration_s": 2}],
         record={"batch_s": 0.25},
         live={"enabled": False},
     )
     run_agent(car)
-    done = _run(embedded, car.robot, "--stream", "vesc", "--from-start")
+    done = _run(embedded, car.robot)
     assert done.exit_code == 0, done.output
-    (stream,) = json.loads(done.stdout)
-    assert (stream["complete"], sum(run["samples"] for run in stream["runs"])) == (True, 200)
-    found = list(audit.headers(embedded.cloud, car.robot, "vesc", audit.Range()))
+    streams = {one["stream"]: one for one in json.loads(done.stdout)["streams"]}
+    assert {"wheels", ACCOUNT_STREAM} <= streams.keys()
+    assert all(one["complete"] for one in streams.values())
+    wheels = streams["wheels"]
+    assert (wheels["taken"], sum(run["samples"] for run in wheels["runs"])) == (200, 200)
+    found = list(audit.headers(embedded.cloud, car.robot, "wheels", audit.Range()))
     assert all("samples" not in item for item in found)
-    embedded.cloud.client("dynamodb").delete_item(
-        TableName=embedded.cloud.output("storage", "TelemetryTable"),
-        Key={
-            TOPIC: {"S": build_topic(RECORD, car.robot, "vesc", embedded.namespace)},
-            T_US: {"N": found[3][T_US]},
-        },
-    )
-    done = _run(embedded, car.robot, "--stream", "vesc")
+    seq = batch_id(found[3][BATCH]).seq
+    samples = int(found[3]["n"])
+    _delete(embedded, car.robot, "wheels", found[3])
+    done = _run(embedded, car.robot)
     assert done.exit_code == 1
-    (gap,) = json.loads(done.stdout)[0]["runs"][0]["missing"]
-    assert gap["first"] == gap["last"] == int(found[3]["seq"])
+    (wheels,) = [one for one in json.loads(done.stdout)["streams"] if one["stream"] == "wheels"]
+    (gap,) = wheels["runs"][0]["missing"]
+    assert gap["first"] == gap["last"] == seq
+    (short,) = wheels["shortfalls"]
+    assert short["samples"] == samples
+    # The last batch of all leaves no gap in the numbers, but the agent's word that it was there.
+    for item in audit.headers(embedded.cloud, car.robot, "wheels", audit.Range()):
+        _delete(embedded, car.robot, "wheels", item)
+    (wheels,) = [
+        one for one in json.loads(_run(embedded, car.robot).stdout)["streams"] if one["stream"] == "wheels"
+    ]
+    assert (wheels["runs"], wheels["complete"]) == ([], False)
+    assert [short["samples"] for short in wheels["shortfalls"]] == [200]
     assert _run(embedded, "nobody-like-that").exit_code == 1
+
+
+def test_what_the_agent_did_not_record_is_told_by_cause(embedded, bundle):
+    car = bundle()
+    boot = "0badcafe0badcafe"
+    told = [
+        StreamAccount("scan", 10, 9, 1, 0, 0, 1, ended=True).sample(),
+        StreamAccount("quiet", 0, 0, 0, 0, 0, 0, ended=True).sample(),
+    ]
+    causes = SourceAccount("ROS 1 topics /scan", {"/scan.malformed": 3, "/scan.latched_again": 2}).sample()
+    with Robot(car.folder) as robot:
+        robot.online()
+        for seq, samples in enumerate((told, [causes])):
+            columns = {name: [sample[name] for sample in samples] for name in samples[0]}
+            batch = Batch(boot, seq, [T0_US] * len(samples), columns)
+            assert robot.publish(record_topic(car.robot, ACCOUNT_STREAM), encode(batch)) == "SUCCESS"
+        scan = Batch(boot, 0, [T0_US + i for i in range(9)], {"i": list(range(9))})
+        assert robot.publish(record_topic(car.robot, "scan"), encode(scan)) == "SUCCESS"
+    until(lambda: list(audit.headers(embedded.cloud, car.robot, "scan", audit.Range())))
+    done = _run(embedded, car.robot)
+    assert done.exit_code == 1
+    answer = json.loads(done.stdout)
+    streams = {one["stream"]: one for one in answer["streams"]}
+    assert streams["quiet"]["complete"]
+    assert [(s["samples"], s["cause"]) for s in streams["scan"]["shortfalls"]] == [
+        (1, "refused by the agent: no message can hold them")
+    ]
+    assert answer["not_recorded"] == {boot: {"ROS 1 topics /scan": {"/scan.malformed": 3}}}
+
+
+def test_a_stream_that_only_lambda_2_has_seen_is_audited(embedded, bundle):
+    car = bundle()
+    with Robot(car.folder) as robot:
+        robot.online()
+        batch = Batch("0badcafe", 2, [T0_US], {"i": [1]})
+        assert robot.publish(record_topic(car.robot, "strangers"), encode(batch)) == "SUCCESS"
+
+    def seen():
+        return [
+            one["stream"]
+            for one in json.loads(_run(embedded, car.robot).stdout or '{"streams":[]}')["streams"]
+        ]
+
+    until(lambda: "strangers" in seen())

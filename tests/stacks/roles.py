@@ -61,6 +61,7 @@ ROLES = {
             ("dynamodb:Query", "Batches.Arn"),
             ("dynamodb:BatchWriteItem", "Summary.Arn"),
             ("dynamodb:GetItem", "Robots.Arn"),
+            ("dynamodb:UpdateItem", "Robots.Arn"),
             ("dynamodb:DescribeStream", "Batches.StreamArn"),
             ("dynamodb:GetRecords", "Batches.StreamArn"),
             ("dynamodb:GetShardIterator", "Batches.StreamArn"),
@@ -91,7 +92,7 @@ ROLES = {
     "QueryRole": (
         "lambda.amazonaws.com",
         {(action, "QueryLog.Arn") for action in LOG}
-        | {("dynamodb:Query", "Batches.Arn"), ("dynamodb:Scan", "Telemetry.Arn")}
+        | {("dynamodb:Query", "Batches.Arn"), ("dynamodb:Scan", "Batches.Arn")}
         | {("dynamodb:GetItem", "Robots.Arn")}
         | {
             (f"s3:{action}", f"Files.Arn/{contract.RESULTS_PREFIX}*") for action in ("GetObject", "PutObject")
@@ -144,6 +145,7 @@ ROLES = {
 KEEPS = {
     "AlertRole": ("alert_*",),
     "PresenceRole": contract.PRESENCE,
+    "SummarizeRole": (contract.STREAMS,),
     "UploadRole": ("files_bytes", "files_day"),
 }
 # The only statements about every resource, each with why it cannot name one.

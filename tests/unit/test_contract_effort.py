@@ -45,11 +45,14 @@ def test_the_longest_texts_are_read_whatever_they_hold():
     assert contract.decode(contract.encode(batch)).columns == batch.columns
 
 
-def test_columns_that_somebody_indents_are_read():
+def test_columns_that_somebody_spaces_out_are_read():
     columns = {"dt": [0] + [1] * 9_999, "fields": {"a.b": [0.5] * 10_000, "c": ["x", None] * 5_000}}
-    body = json.dumps(columns, indent=8).encode()
+    body = json.dumps(columns, separators=("," + " " * 9, ": ")).encode()
     assert len(body) > 2 * MOST
     assert len(contract.decode(enveloped(body, 10_000)).times_us) == 10_000
+    # On one line: behind that is what makes messages of them.
+    with pytest.raises(ContractError, match="not JSON"):
+        contract.decode(enveloped(json.dumps(columns, indent=8).encode(), 10_000))
 
 
 @pytest.mark.parametrize(("samples", "fields"), [(MOST // 2 + 1, 2), (98, 512)])

@@ -42,29 +42,46 @@ def play_all(path: Path, clock: ManualClock | None = None, **settings: Any) -> l
 
 
 def test_the_first_message_of_a_topic_brings_its_type(tmp_path: Path) -> None:
-    first, frame, second, *rest = play_all(write_ros1(tmp_path / "a.bag"))
+    first, second, *rest = play_all(write_ros1(tmp_path / "a.bag"))
     kind = contract.message_type(first[2])
-    assert first[:2] == frame[:2] == (contract.TYPES_STREAM, second[1])
-    assert contract.frame_id(frame[2]) == contract.FrameId(second[0], "/sensors/core", "", second[1])
+    assert first[:2] == (contract.TYPES_STREAM, second[1])
     assert (kind.stream, kind.kind) == (second[0], "vesc_msgs/VescStateStamped")
+    assert kind.id == second[2].kind.id
     assert "float64 speed" in kind.definition
     assert len(kind.md5sum) == 32
     assert contract.TYPES_STREAM not in {sample[0] for sample in rest}
 
 
-@pytest.mark.parametrize("stamps", ["now", "original"])
-def test_a_frame_is_said_from_the_sample_on_that_has_it(tmp_path: Path, stamps: str) -> None:
+@pytest.mark.parametrize("speed", [0.0, 1.0])
+def test_what_is_played_is_what_was_recorded_byte_for_byte(tmp_path: Path, speed: float) -> None:
+    from rosbags.rosbag1 import Reader
+
     path = write_ros1(tmp_path / "a.bag", frames=["laser", "laser", "map"])
-    played = play_all(path, loop=True, duration_s=2.5, stamps=stamps)
-    times = [t_us for stream, t_us, _ in played if stream == contract.VESC_STREAM]
-    said = [contract.frame_id(v) for _, _, v in played if "frame_id" in v]
-    # Ten messages a round: nine in the frame map behind a laser, and so on.
-    assert [(f.frame_id, times.index(f.since_us)) for f in said[:4]] == [
-        ("laser", 0),
-        ("map", 2),
-        ("laser", 10),
-        ("map", 12),
-    ]
+    samples = play(path, topics=(("/servo", "servo"), ("/sensors/core", "car")), speed=speed)
+    with Reader(path) as reader:
+        recorded = [(connection.topic, bytes(raw)) for connection, _, raw in reader.messages()]
+        checksums = {connection.topic: connection.digest for connection in reader.connections}
+    streams = {"servo": "/servo", "car": "/sensors/core"}
+    assert [(streams[stream], values.raw) for stream, _, values in samples] == recorded
+    for stream, topic in streams.items():
+        (kind,) = {values.kind for name, _, values in samples if name == stream}
+        named = {"servo": "std_msgs/Float64", "car": "vesc_msgs/VescStateStamped"}[stream]
+        assert kind.id == contract.type_id(topic, named, checksums[topic])
+
+
+@pytest.mark.parametrize("storage", STORAGES)
+def test_what_ros_2_recorded_is_a_message_of_ros_1(tmp_path: Path, storage: str) -> None:
+    folder = write_ros2(tmp_path / "drive", storage)
+    said, *samples = play_all(folder)
+    kind = contract.message_type(said[2])
+    store = get_typestore(Stores.EMPTY)
+    store.register(get_types_from_msg(kind.definition, VESC_TYPE))
+    assert store.generate_msgdef(VESC_TYPE, ros_version=1)[1] == kind.md5sum
+    for i, (_, _, values) in enumerate(samples):
+        message = store.deserialize_ros1(values.raw, VESC_TYPE)
+        at = START + i * 100_000_000
+        assert (message.header.stamp.sec, message.header.stamp.nanosec) == divmod(at, 10**9)
+        assert {name: getattr(message.state, name) for name in values} == dict(values)
 
 
 STATE_ROS1 = "int32 FAULT_CODE_NONE=0\nfloat64 speed\nint32 fault_code\n"

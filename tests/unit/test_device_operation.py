@@ -384,7 +384,7 @@ def test_status_says_what_became_of_what_the_sources_read() -> None:
         "source    bag ride.csv: rows 168, clock_back 53, columns_left_out note gnss lat",
         "          skipped: columns 100, time 40",
         "source    ROS 1",
-        "          /tf: messages 7, silent, left_out (a.b 2)",
+        "topic     /tf: 7 messages, SILENT; 2 left out a.b",
         "source    VESC",
     ]
     assert "\n".join(lines) in render(state)

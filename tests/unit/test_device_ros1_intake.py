@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import struct
 import sys
 import threading
 from typing import Any
@@ -9,10 +10,11 @@ from typing import Any
 import pytest
 
 import contract
+from contract import RosMessage
 from device.clock import ManualClock
 from device.errors import SourceError
 from device.sources.ros1 import Intake, Ros1Config, TopicConfig
-from tests.unit.ros1_messages import STAMPED, header
+from tests.unit.ros1_messages import LINE, STAMPED, header, u32
 
 T0 = 1_700_000_000_000_000
 CONNECTION = {"type": "a_msgs/A", "md5sum": "1", "message_definition": STAMPED + "uint8 u"}
@@ -23,17 +25,14 @@ class Desk:
         self.clock = ManualClock(now_us=T0)
         self.samples: list[tuple[str, int, dict[str, Any]]] = []
         self.types: list[contract.MessageType] = []
-        self.frames: list[contract.FrameId] = []
         config = TopicConfig(**{"stream": "s", "time": "header", **settings})
         self.intake = Intake("/t", config, emit=self._emit, clock=self.clock)
 
     def _emit(self, stream: str, t_us: int, values: Any) -> None:
         if stream != contract.TYPES_STREAM:
             self.samples.append((stream, t_us, values))
-        elif "kind" in values:
-            self.types.append(contract.message_type(values))
         else:
-            self.frames.append(contract.frame_id(values))
+            self.types.append(contract.message_type(values))
 
     def take(self, data: bytes, **header: str) -> None:
         self.intake.take({**CONNECTION, **header}, data)
@@ -60,18 +59,37 @@ def test_a_type_is_said_once_a_connection_where_publishers_take_turns() -> None:
 
 
 @pytest.mark.parametrize("time", ["header", "arrival"])
-def test_a_frame_is_said_once_and_when_it_is_another(time: str) -> None:
+def test_a_message_is_recorded_as_it_was_published(time: str) -> None:
     desk = Desk(time=time)
-    for second, frame in enumerate(["laser", "laser", "map", "grün"]):
-        desk.take(header(T0 // 1_000_000 + second, 0, frame) + b"\x01")
-    desk.take(b"\x01", message_definition="uint8 u")
-    at = [t_us for _, t_us, _ in desk.samples]
-    assert [(f.frame_id, f.since_us) for f in desk.frames] == [
-        ("laser", at[0]),
-        ("map", at[2]),
-        ("grün", at[3]),
-    ]
-    assert {(f.stream, f.topic) for f in desk.frames} == {("s", "/t")}
+    raws = [header(T0 // 1_000_000, i, frame) + b"\x01" for i, frame in enumerate(["laser", "", "grün"])]
+    for raw in raws:
+        desk.take(raw)
+    messages = [values for _, _, values in desk.samples]
+    assert all(isinstance(message, RosMessage) for message in messages)
+    assert [message.raw for message in messages] == raws
+    (kind,) = {message.kind for message in messages}
+    assert kind.id == desk.types[0].id
+    assert kind.layout == desk.types[0].layout
+
+
+def test_selected_fields_are_a_sample_and_no_message() -> None:
+    desk = Desk(time="arrival", fields=("v",))
+    desk.take(b"\x01\x02", message_definition="uint8 u\nuint8 v")
+    assert [values for _, _, values in desk.samples] == [{"v": 2}]
+    assert not isinstance(desk.samples[0][2], RosMessage)
+
+
+def test_large_contents_are_handed_over_with_their_message() -> None:
+    definition = "uint8[] data\nuint8 u\nuint8[] none"
+    raw = u32(3) + b"abc" + b"\x07" + u32(0)
+    desk = Desk(time="arrival", large="upload")
+    desk.take(raw, message_definition=definition)
+    # What its definition does not fit is recorded all the same.
+    desk.take(raw[:5], message_definition=definition)
+    messages = [values for _, _, values in desk.samples]
+    assert [(message.raw, message.large) for message in messages] == [(raw, {"data": b"abc"}), (raw[:5], {})]
+    assert desk.intake.report()["undecodable"] == 1
+    assert (dict(messages[0]), dict(messages[1])) == ({"u": 7}, {})
 
 
 def test_a_believable_stamp_is_the_samples_time() -> None:
@@ -155,21 +173,59 @@ def test_a_changed_definition_is_another_decoder() -> None:
     assert [values for _, _, values in desk.samples] == [{"u": 1}, {"u": 1, "v": 2}, {"u": 3}]
 
 
-@pytest.mark.parametrize("definition", ["Unknown u", "not a definition", "float64[64] a\n" * 9, ""])
-def test_what_cannot_be_decoded_is_counted(definition: str, caplog: pytest.LogCaptureFixture) -> None:
+@pytest.mark.parametrize(
+    ("definition", "why"),
+    [
+        ("Unknown u", "the definition of a_msgs/Unknown is missing"),
+        ("not a definition", "has the line"),
+        ("", "cannot import rospy"),
+    ],
+)
+def test_what_cannot_be_looked_into_is_recorded_and_told(
+    definition: str, why: str, caplog: pytest.LogCaptureFixture
+) -> None:
     desk = Desk()
     for _ in range(3):
         desk.take(b"\x01", message_definition=definition)
-    assert desk.samples == []
-    assert desk.intake.report()["undecodable"] == 3
-    assert len(caplog.records) == 2, "why, and that"
+    messages = [values for _, _, values in desk.samples]
+    assert [(message.raw, dict(message)) for message in messages] == [(b"\x01", {})] * 3
+    told = [text for text in caplog.messages if "cannot be looked into" in text]
+    assert len(told) == 1
+    assert why in told[0]
 
 
-def test_malformed_messages_are_counted() -> None:
+def test_a_type_of_which_no_message_can_be_is_recorded_without_a_layout() -> None:
+    large = (
+        "B[16777216] b\n"
+        + LINE
+        + "MSG: a_msgs/B\nC[16777216] c\n"
+        + LINE
+        + "MSG: a_msgs/C\nfloat64[9999999] d"
+    )
     desk = Desk(time="arrival")
-    desk.take(b"\x01\x02", message_definition="uint8 u")
-    desk.take(b"\x01", message_definition="uint8 u")
-    assert (len(desk.samples), desk.intake.report()["malformed"]) == (1, 1)
+    desk.take(b"\x01", message_definition=large)
+    ((_, _, message),) = desk.samples
+    assert (message.raw, message.kind.layout) == (b"\x01", "")
+    assert "no message is so large" in message.kind.error
+
+
+def test_a_message_of_more_fields_than_a_sample_may_have_is_recorded_whole() -> None:
+    desk = Desk(time="arrival")
+    raw = struct.pack("<576d", *range(576))
+    desk.take(raw, message_definition="".join(f"float64[64] a{i}\n" for i in range(9)))
+    ((_, _, message),) = desk.samples
+    assert message.raw == raw
+    assert (len(message), message["a7.63"]) == (512, 511.0)
+
+
+def test_malformed_messages_are_counted_where_fields_are_selected_and_recorded_otherwise() -> None:
+    for fields, samples in ((("u",), 1), (None, 2)):
+        desk = Desk(time="arrival", fields=fields)
+        desk.take(b"\x01\x02", message_definition="uint8 u")
+        desk.take(b"\x01", message_definition="uint8 u")
+        assert len(desk.samples) == samples
+        assert desk.intake.report().get("malformed", 0) == 2 - samples
+        assert desk.samples[-1][2] == {"u": 1}
 
 
 def test_fields_that_do_not_exist_are_told(caplog: pytest.LogCaptureFixture) -> None:

@@ -49,7 +49,7 @@ def rule_error(payload=RAW, topic=TOPIC_OF_CAR, **changes):
 
 
 def image(n):
-    return {"topic": {"S": TOPIC_OF_CAR}, "t": {"N": str(n)}, "v": {"N": "9"}}
+    return {"topic": {"S": TOPIC_OF_CAR}, "batch": {"S": f"{n:016}-0badcafe-0"}, "v": {"N": "9"}}
 
 
 def failed_batch(condition="RetryAttemptsExhausted"):
@@ -370,6 +370,6 @@ def test_a_record_too_large_for_any_queue_is_told_by_its_key():
     assert len(body) <= 1024 * 1024
     (entry,) = entries(body, none)
     assert (entry.source, entry.topic, entry.robot) == (BY_STREAM, TOPIC_OF_CAR, "car")
-    assert json.loads(entry.payload) == {"topic": {"S": TOPIC_OF_CAR}, "t": {"N": "7"}}
+    assert json.loads(entry.payload) == {name: image(7)[name] for name in ("topic", "batch")}
     assert "telemetry table" in entry.reason
     assert "schema version 9" in entry.reason

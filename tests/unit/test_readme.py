@@ -2,15 +2,8 @@
 
 from __future__ import annotations
 
-import base64
-import itertools
-import json
 import re
-import zlib
 
-import pytest
-
-import contract
 from scripts.fields import ROOT, filled
 
 README = (ROOT / "README.md").read_text()
@@ -18,18 +11,6 @@ README = (ROOT / "README.md").read_text()
 
 def test_field_table_is_the_contracts():
     assert filled(README) == README
-
-
-@pytest.mark.parametrize("speeds", [[1, 2.5, None], [4614, 4613.5, 4620.25], [7, 9, -1]])
-def test_five_lines_decode_a_batch(speeds):
-    code = next(block for block in re.findall(r"```python\n(.*?)```", README, re.DOTALL) if "zlib" in block)
-    batch = contract.Batch("0badcafe", 0, [10, 20, 35], {"speed": speeds})
-    names = {"json": json, "zlib": zlib, "base64": base64, "itertools": itertools}
-    names["batch"] = json.loads(contract.encode(batch))
-    names["DICTIONARY"] = contract.DICTIONARY
-    exec(code, names)
-    assert names["times_us"] == [10, 20, 35]
-    assert names["speed_erpm"] == speeds
 
 
 def test_car_yaml_names_settings_that_the_agent_knows(tmp_path):

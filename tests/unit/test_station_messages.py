@@ -6,12 +6,11 @@ import numpy as np
 import pytest
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
-from contract import TYPES_STREAM, Batch, ContractError, FrameId, MessageType, build_topic, message_type
+from contract import TYPES_STREAM, Batch, ContractError, MessageType, build_topic, message_type
 from device.sources.flatten import flatten
 from station.blocks import Block, column_of
 from station.errors import StationError
-from station.messages import Maker, made_of, said
-from station.selection import select
+from station.messages import Maker, made_of, types
 from tests.fakes import TELEMETRY, item_of
 from tests.unit.test_station_data import cloud_of
 
@@ -60,10 +59,9 @@ def test_a_header_of_ros_2_becomes_one_of_ros_1():
     assert (message.header.seq, message.b.x) == (0, 1.5)
 
 
-def test_headers_are_numbered_and_have_the_frame_of_their_time():
+def test_headers_are_numbered_and_have_the_samples_time():
     path = "Header header\nB[2] parts\n" + HEADER + LINE + "MSG: a_msgs/B\nHeader header\nfloat64 x\n"
-    frames = [FrameId("s", "/t", name, T_US + since) for name, since in (("laser", 1), ("map", 3))]
-    maker = Maker(MessageType("s", "/t", "a_msgs/A", "", path), ["parts.0.x", "parts.1.x"], frames=frames)
+    maker = Maker(MessageType("s", "/t", "a_msgs/A", "", path), ["parts.0.x", "parts.1.x"])
     store = get_typestore(Stores.EMPTY)
     store.register(get_types_from_msg(path, "a_msgs/msg/A"))
     seen = []
@@ -73,16 +71,8 @@ def test_headers_are_numbered_and_have_the_frame_of_their_time():
             message = store.deserialize_ros1(raw, "a_msgs/msg/A")
             within = [part.header for part in message.parts]
             seen.append((t_ns // 1000 - T_US, message.header.seq, message.header.frame_id))
-            # What is further within came with the same message; whose frame it was in is not kept.
             assert [(header.seq, header.frame_id) for header in within] == [(message.header.seq, "")] * 2
-    assert seen == [
-        (0, 0, "laser"),
-        (1, 1, "laser"),
-        (2, 2, "laser"),
-        (3, 3, "map"),
-        (4, 4, "map"),
-        (5, 5, "map"),
-    ]
+    assert seen == [(i, i, "") for i in range(6)]
 
 
 def test_what_flattens_is_made_again():
@@ -116,33 +106,16 @@ def has_said(*samples):
 def test_what_a_robot_has_said_of_its_messages():
     first = MessageType("s", "/t", "a_msgs/A", "1" * 32, STAMPED)
     second, other = first._replace(md5sum="2" * 32), first._replace(stream="o", topic="/o")
-    frames = [FrameId("s", "/t", name, t) for name, t in (("laser", 10), ("map", 30), ("odom", 20))]
-    elsewhere = [FrameId("s", "/u", "wrong", 15), FrameId("o", "/o", "wrong", 15)]
-    cloud = has_said(first, other, *frames, second, *elsewhere)
-    ordered = [frames[0], frames[2], frames[1]]
-    assert said(cloud, select("car", "s", None, None)) == (second, ordered)
-    # A range that ends before the change has the type before it, and one before the first has the first.
-    assert said(cloud, select("car", "s", None, 5000)) == (first, ordered)
-    assert said(cloud, select("car", "s", None, 10)) == (first, ordered)
-    assert said(cloud, select("car", "nothing", None, None)) == (None, [])
-
-
-def test_a_source_without_types_has_frames_all_the_same():
-    frame, all_of_it = FrameId("s", "/t", "laser", 10), select("car", "s", None, None)
-    assert said(has_said(frame), all_of_it) == (None, [frame])
-    # Two topics in one stream, and nothing to tell which of them a sample is of.
-    assert said(has_said(frame, frame._replace(topic="/u")), all_of_it) == (None, ())
-
-
-def test_samples_without_a_type_keep_the_case_of_their_names():
-    columns = {"accX": column_of([1.5]), "accx": column_of([2.5])}
-    kind = made_of("log", columns)
-    maker = Maker(kind, list(columns), own=True)
-    ((_, raw),) = maker.messages(Block(np.array([T_US]), columns))
-    store = get_typestore(Stores.EMPTY)
-    store.register(get_types_from_msg(kind.definition, "iort_msgs/msg/Log"))
-    message = store.deserialize_ros1(raw, "iort_msgs/msg/Log")
-    assert (message.accX, message.accx) == (1.5, 2.5)
+    elsewhere = first._replace(topic="/u")
+    cloud = has_said(first, other, second, elsewhere, first)
+    # Each once, and since when; batches refer to them by their ids.
+    assert types(cloud, "car", "s") == {
+        first.id: (1000, first),
+        second.id: (3000, second),
+        elsewhere.id: (4000, elsewhere),
+    }
+    assert len({first.id, second.id, elsewhere.id}) == 3
+    assert types(cloud, "car", "nothing") == {}
 
 
 def test_samples_without_a_type_get_one():

@@ -5,6 +5,7 @@ from __future__ import annotations
 import base64
 import itertools
 import json
+import struct
 import zlib
 
 import pytest
@@ -15,12 +16,18 @@ import contract
 from contract import Batch
 from contract.checks import wire_column
 from station import reading
+from station.blocks import join
 from station.sizes import stored_bytes
 from station.stored import Refused, blocks
 from tests.fakes import item_of_message
 from tests.recordings import recording
+from tests.unit.ros1_messages import text, u32
 from tests.unit.summarizing import drive_of
 from tests.unit.test_contract_columns import BOOT, WRONG, columns, message_of, plain_message
+
+
+def id_at(second):
+    return f"{second * 1_000_000:016}-{BOOT}-0"
 
 
 def read(*messages):
@@ -63,7 +70,7 @@ def test_what_a_stranger_stored_is_refused_and_its_neighbours_are_read(body, cod
     deflated = deflater.compress(body.encode()) + deflater.flush()
     good = message_of([0, 1, 2])
     strange = {**good, "codec": codec, "samples": base64.b64encode(deflated).decode()}
-    found, refused = read({**good, "t": -1_000_000}, strange, {**good, "t": 1_000_000})
+    found, refused = read(good, {**strange, "batch": id_at(1)}, {**good, "batch": id_at(2)})
     assert refused.count == 1
     assert [value for block in found for value in block.columns["f0"].tolist()] == [1, 3, 1, 3]
 
@@ -71,18 +78,60 @@ def test_what_a_stranger_stored_is_refused_and_its_neighbours_are_read(body, cod
 def test_more_values_than_a_batch_may_hold_are_refused_and_its_neighbours_are_read():
     n, good = contract.MAX_BATCH_VALUES // 2 + 1, message_of([0, 1, 2])
     large = message_of([0] * (n + 1), [0] * (n + 1), n=n)
-    found, refused = read(good, {**large, "t": 1_000_000})
+    found, refused = read(good, {**large, "batch": id_at(1)})
     assert refused.count == 1
     assert [value for block in found for value in block.columns["f0"].tolist()] == [1, 3]
 
 
-def test_a_batch_at_a_fraction_of_a_microsecond_is_refused_and_its_neighbours_are_read():
+@pytest.mark.parametrize("key", ["", "7", f"{0:016}-{BOOT}-x", "~", f"{-1:016}-{BOOT}-0"])
+def test_an_item_whose_key_is_no_batchs_is_refused_and_its_neighbours_are_read(key):
     items = [item_of_message(json.dumps(message_of([0, 1, 2])).encode()) for _ in range(2)]
-    items[1]["t"] = {"N": "5000.5"}
+    items[1]["batch"] = {"S": key}
     refused, told = Refused(), []
-    pages = reading.told([items], lambda *seen: told.append(seen), "t")
+    pages = reading.told([items], lambda *seen: told.append(seen))
     (block,) = blocks(pages, refused)
-    assert (block.columns["f0"].tolist(), refused.count, told) == ([1, 3], 1, [(2, 5000)])
+    # When it begins nobody can tell, so what was read so far is not called later than it.
+    assert (block.columns["f0"].tolist(), refused.count, told) == ([1, 3], 1, [(2, 0)])
+
+
+def test_samples_of_one_time_are_all_given_in_the_order_of_their_batches():
+    parts = [Batch(BOOT, seq, [t, t, t + 5], {"a": [10 * seq, 10 * seq + 1, 10 * seq + 2]})
+             for seq, t in enumerate([1_000, 1_000, 1_005])]  # fmt: skip
+    items = [item_of_message(contract.encode(batch)) for batch in parts]
+    for pages in ([items], [items[:1], items[1:]], [[item] for item in items]):
+        found = list(blocks(pages, Refused()))
+        times = [t for block in found for t in block.times_us.tolist()]
+        values = [value for block in found for value in block.columns["a"].tolist()]
+        assert times == [1_000] * 4 + [1_005] * 4 + [1_010]
+        assert values == [0, 1, 10, 11, 2, 12, 20, 21, 22]
+
+
+FLAT = contract.RosType("/t", "a_msgs/A", "1", "float64 x\nuint8 n")
+TEXTS = contract.RosType("/u", "a_msgs/B", "2", "string[] s\nfloat64 x")
+
+
+def test_messages_are_samples_too_and_can_be_passed_over():
+    rows = [struct.pack("<dB", i / 2, i) for i in range(3)]
+    texts = [u32(1) + text("a") + struct.pack("<d", 0.5), u32(0) + struct.pack("<d", 1.5), b"odd"]
+    odd = [struct.pack("<dB", float("nan"), 7)] * 2
+    given = [
+        Batch(BOOT, 0, [10, 20, 30], {}, 0, contract.Messages(FLAT.id, FLAT.layout, rows)),
+        Batch(BOOT, 1, [110, 120, 130], {}, 0, contract.Messages(TEXTS.id, TEXTS.layout, texts)),
+        Batch(BOOT, 2, [210, 220], {}, 0, contract.Messages(FLAT.id, FLAT.layout, odd)),
+        Batch(BOOT, 3, [310], {"x": [9.5]}),
+    ]
+    items = [item_of_message(contract.encode(batch)) for batch in given]
+    refused = Refused()
+    whole = join(list(blocks([items], refused)))
+    assert whole.times_us.tolist() == [10, 20, 30, 110, 120, 130, 210, 220, 310]
+    assert list(map(as_read, whole.columns["x"].tolist())) == [
+        (0, 0), (0.5, 0), (1, 1), (0.5, 0), (1.5, 1), None, None, None, (9.5, 9),
+    ]  # fmt: skip
+    assert [value for value in whole.columns["s.0"].tolist() if value is not None] == ["a"]
+    assert refused.count == 0
+    alone = join(list(blocks([items], refused, messages=False)))
+    assert (alone.times_us.tolist(), alone.columns["x"].tolist()) == ([310], [9.5])
+    assert refused.count == 0
 
 
 @settings(max_examples=100)

@@ -33,7 +33,7 @@ DEPLOYED = Settings(
 
 
 def record(n, *, at_s=0.0):
-    keys = {"topic": {"S": "dt/iort/car/vesc"}, "t": {"N": str(n)}}
+    keys = {"topic": {"S": "dt/iort/car/vesc"}, "batch": {"S": f"{n:016}-0badcafe-0"}}
     return {
         "dynamodb": {"Keys": keys, "SequenceNumber": f"{n:06}", "ApproximateCreationDateTime": at_s},
         "n": n,

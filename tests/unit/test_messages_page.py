@@ -1,0 +1,108 @@
+"""docs/messages.md says what the code does: its reader reads what the agent writes."""
+
+from __future__ import annotations
+
+import json
+import re
+import struct
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import pytest
+
+import contract
+from contract import Batch, Messages
+from contract.ros1.message import RosType
+from scripts.fields import ROOT
+from tests.ros1_types import Message
+
+PAGE = (ROOT / "docs" / "messages.md").read_text()
+TIMES_US = [1_700_000_000_000_000, 1_700_000_000_020_000, 1_700_000_000_040_001]
+NUMBERS, BREAK = "<dI?", b"\n"
+MADE = Message("a_msgs/Made", {"a_msgs/Made": "Header header\nfloat64 speed\nuint32 count\nbool on"})
+STAMPED = RosType("/made", MADE.kind, MADE.md5sum, MADE.definition)
+TEXT = RosType("/text", "std_msgs/String", "1" * 32, "string data # a text\n")
+UNREADABLE = RosType("/text", "std_msgs/String", "1" * 32, "no definition at all")
+
+
+@pytest.fixture(scope="module")
+def page() -> Mapping[str, Any]:
+    """The names that the page's reader defines."""
+    names: dict[str, Any] = {"DICTIONARY": contract.DICTIONARY}
+    exec(re.findall(r"```python\n(.*?)```", PAGE, re.DOTALL)[0], names)
+    return names
+
+
+def batch_of(columns: Mapping[str, Sequence[Any]], messages: Messages | None = None) -> dict[str, Any]:
+    batch = Batch("0badcafe", 7, TIMES_US, columns, 0, messages)
+    return dict(json.loads(contract.encode(batch)))
+
+
+def made(offsets_ns: Sequence[int], frames: Sequence[bytes]) -> list[bytes]:
+    """Stamped messages of numbers, whose stamps are so many nanoseconds behind the samples' times."""
+    made = []
+    for i, (t_us, ns, frame) in enumerate(zip(TIMES_US, offsets_ns, frames, strict=True)):
+        sec, nanosec = divmod(t_us * 1000 + ns, 10**9)
+        head = struct.pack("<IIII", 5 + 2 * i, sec, nanosec, len(frame)) + frame
+        made.append(head + struct.pack(NUMBERS, 4613.5 + i / 4, 2**32 - 1 - i, i == 1))
+    return made
+
+
+def body_of(batch: Batch) -> bytes:
+    envelope = json.loads(contract.encode(batch))
+    return contract.inflate(envelope["samples"], envelope["codec"])
+
+
+def test_its_examples_are_bodies_of_batches() -> None:
+    times = [0, 20_000, 40_001]
+    whole = Batch("0badcafe", 7, times, {"speed": [25.2, 25.1, 25.4], "on": [True, None, "x"]})
+    assert f"    {body_of(whole).decode()}\n" in PAGE
+
+    lone = Message("a/X", {"a/X": "Header header\nint32 a"})
+    kind = RosType("/x", lone.kind, "0" * 32, lone.definition)
+    raw = [
+        struct.pack("<IIII3si", seq, 0, t_us * 1000 + ns, 3, b"map", 7)
+        for seq, t_us, ns in zip((5, 6, 7), times, (0, 3, 6), strict=True)
+    ]
+    body = body_of(Batch("0badcafe", 7, times, {}, 0, Messages(kind.id, kind.layout, raw)))
+    assert f"    {body.partition(BREAK)[2].decode()}\n" in PAGE
+
+    kind = RosType("/x", "std_msgs/String", "0" * 32, "string data\n")
+    raw = [b"\2\0\0\0ab"] * 3
+    body = body_of(Batch("0badcafe", 7, times, {}, 0, Messages(kind.id, kind.layout, raw)))
+    assert f"    {body.split(BREAK)[1].decode()}\n" in PAGE
+
+
+@pytest.mark.parametrize("speeds", [[1, 2.5, None], [4614, 4613.5, 4620.25], [7, 9, -1], ["x", True, 0.1]])
+def test_its_reader_reads_columns(page: Mapping[str, Any], speeds: list[Any]) -> None:
+    batch = batch_of({"speed": speeds})
+    assert page["opened"](batch) == (TIMES_US, {"speed": speeds}, b"")
+
+
+@pytest.mark.parametrize(
+    ("offsets_ns", "frames"),
+    [([0, 7, 999], [b"map"] * 3), ([-1, 5000, 0], [b"map", b"", b"odom"]), ([-17 * 10**17, 0, 0], [b""] * 3)],
+)
+def test_its_reader_makes_messages_of_numbers_again(
+    page: Mapping[str, Any], offsets_ns: list[int], frames: list[bytes]
+) -> None:
+    raw = made(offsets_ns, frames)
+    batch = batch_of({}, Messages(STAMPED.id, STAMPED.layout, raw))
+    assert batch["codec"] == contract.CODEC
+    times_us, columns, behind = page["opened"](batch)
+    assert json.loads(behind)[0] == STAMPED.id
+    assert list(page["made_again"](times_us, columns, behind, NUMBERS)) == raw
+
+
+@pytest.mark.parametrize("kind", [TEXT, UNREADABLE])
+@pytest.mark.parametrize("texts", [[b"ab", b"cd", b"\xff"], [b"ab", b"cd", b"ef"], [b"", b"abc", b""]])
+def test_its_reader_reads_messages_as_they_were_published(
+    page: Mapping[str, Any], kind: RosType, texts: list[bytes]
+) -> None:
+    raw = [struct.pack("<I", len(text)) + text for text in texts]
+    batch = batch_of({"data.key": ["a", None, "b"]}, Messages(kind.id, kind.layout, raw))
+    assert batch["codec"] == contract.SERIALIZED_CODEC
+    times_us, columns, behind = page["opened"](batch)
+    assert (times_us, columns) == (TIMES_US, {"data.key": ["a", None, "b"]})
+    assert page["as_published"](batch["n"], behind) == raw
+    assert json.loads(behind.partition(b"\n")[0])["layout"] == kind.layout
