@@ -9,12 +9,14 @@ from __future__ import annotations
 import gc
 import logging
 import os
+import time
 from bisect import bisect_left
 from collections import defaultdict
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from collections.abc import Set as AbstractSet
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field
+from decimal import Decimal
 from functools import cache, partial
 from typing import Any
 
@@ -23,6 +25,7 @@ import boto3
 from contract import (
     EXPIRES_S,
     MAX_BATCH_SPAN_US,
+    RECEIVED_MS,
     RECOMPUTE_FROM_S,
     RECOMPUTED,
     REPLAY,
@@ -49,6 +52,9 @@ _SECOND_US = 1_000_000
 # Seconds closer than this are read together, since a query costs as much as the batches between them; and
 # only so many of them, since they are held in memory.
 _NEAR_S, _READ_TOGETHER_S = 10, 60
+# A stream keeps its records for 24 hours. What was received before was put into the table by hand (`iort
+# adopt`, a replay), and is no news of its car.
+_NEWS_MS = 24 * 3_600_000
 _BEYOND = f"its second has {SECOND_BATCHES} batches of the stream before it, or too large ones"
 
 
@@ -65,6 +71,16 @@ class Decoded:
         self.batches[topic] = [batch for batch in self.batches[topic] if batch.id not in keys]
         for change in (self.records[topic, key] for key in sorted(keys)):
             self.refused.append(Refused(change["SequenceNumber"], reason, change["NewImage"]))
+
+    def news(self, since_ms: int) -> dict[str, list[Batch]]:
+        """The batches that the cloud received at that time or later, of topics that have some."""
+        found: dict[str, list[Batch]] = {}
+        for topic, batches in self.batches.items():
+            for batch in batches:
+                received = self.records[topic, batch.id]["NewImage"].get(RECEIVED_MS)
+                if received is None or Decimal(received["N"]) >= since_ms:
+                    found.setdefault(topic, []).append(batch)
+        return found
 
 
 def decode_records(records: Iterable[Mapping[str, Any]]) -> Decoded:
@@ -174,6 +190,7 @@ def process(
     *,
     robot_metrics: bool = False,
     at_once: int = 1,
+    news_since_ms: int = 0,
 ) -> dict[str, Any]:
     """Summarise the event's records. Those that cannot be decoded go to ``refuse``, since trying again
     would not change them; the answer names the ones that it could not take.
@@ -181,7 +198,8 @@ def process(
     The good records behind such a one are kept as well: the service sends them again, which changes
     nothing, and a second need not wait for retries to run out. Of a replay the answer names all that
     cannot be decoded: they are in quarantine already. ``at_once`` topics are read side by side, which have
-    nothing to do with each other and mostly wait for the table.
+    nothing to do with each other and mostly wait for the table. What was received before ``news_since_ms``
+    is summarised, and in no metric that an alarm is set on.
     """
     decoded = decode_records(event["Records"])
     topics = _summarized(tables, decoded.batches, at_once)
@@ -198,16 +216,17 @@ def process(
         decoded.refuse(topic, summaries.beyond, _BEYOND)
     left = decoded.refused if event.get(REPLAY) else refuse(decoded.refused)
     good = [batch for batches in decoded.batches.values() for batch in batches]
+    news = decoded.news(news_since_ms)
     emit(
         "summarize",
         BatchesSummarized=len(good),
         SamplesSummarized=sum(len(batch.times_us) for batch in good),
         BatchesRefused=len(decoded.refused),
-        BatchesMissing=sum(summaries.missing for summaries in topics.values()),
+        BatchesMissing=sum(summaries.missing for topic, summaries in topics.items() if topic in news),
     )
     measured = [
         (parse_topic(topic).robot, measure(parse_topic(topic).name, batches))
-        for topic, batches in decoded.batches.items()
+        for topic, batches in news.items()
     ]
     if robot_metrics:
         for robot, values in measured:
@@ -272,4 +291,12 @@ def handler(event: dict[str, Any], _context: object) -> dict[str, Any]:
     if RECOMPUTE_FROM_S in event:
         return recompute(event, _tables())
     by_robot = os.environ["ROBOT_METRICS"] == "true"
-    return process(event, _tables(), _refusals().refuse, robot_metrics=by_robot, at_once=_AT_ONCE)
+    since_ms = int(time.time() * 1000) - _NEWS_MS
+    return process(
+        event,
+        _tables(),
+        _refusals().refuse,
+        robot_metrics=by_robot,
+        at_once=_AT_ONCE,
+        news_since_ms=since_ms,
+    )

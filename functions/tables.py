@@ -30,7 +30,7 @@ from functions.statistics import Vehicle
 
 _log = logging.getLogger(__name__)
 # BatchWriteItem takes at most this many items a call.
-_WRITE_SIZE = 25
+WRITE_SIZE = 25
 _WRITE_ATTEMPTS = 8
 # Batches of a page, once it is known that many are wanted.
 _MANY = 100
@@ -182,22 +182,24 @@ class Tables:
             {"PutRequest": {"Item": self._second_item(topic, second, summary)}}
             for (topic, second), summary in seconds.items()
         )
-        while chunk := list(islice(requests, _WRITE_SIZE)):
-            self._write(chunk)
+        while chunk := list(islice(requests, WRITE_SIZE)):
+            write(self._client, self._summary, chunk)
 
     def _second_item(self, topic: str, second: int, summary: Mapping[str, Statistics]) -> dict[str, Any]:
         item = fitting({name: attribute(value) for name, value in summary.items()})
         return {**item, TOPIC: {"S": topic}, SECOND: {"N": str(second)}}
 
-    def _write(self, requests: Sequence[Mapping[str, Any]]) -> None:
-        for attempt in range(_WRITE_ATTEMPTS):
-            answer = self._client.batch_write_item(RequestItems={self._summary: requests})
-            requests = answer.get("UnprocessedItems", {}).get(self._summary, [])
-            if not requests:
-                return
-            # DynamoDB asks for exponential backoff before unprocessed items are sent again.
-            time.sleep(0.02 * 2**attempt)
-        raise TableError(f"{len(requests)} summaries not written after {_WRITE_ATTEMPTS} attempts")
+
+def write(client: Any, table: str, requests: Sequence[Mapping[str, Any]]) -> None:
+    """Have a table take at most `WRITE_SIZE` writes; raises `TableError` if some stay unwritten."""
+    for attempt in range(_WRITE_ATTEMPTS):
+        answer = client.batch_write_item(RequestItems={table: requests})
+        requests = answer.get("UnprocessedItems", {}).get(table, [])
+        if not requests:
+            return
+        # DynamoDB asks for exponential backoff before unprocessed items are sent again.
+        time.sleep(0.02 * 2**attempt)
+    raise TableError(f"{len(requests)} items of {table} not written after {_WRITE_ATTEMPTS} attempts")
 
 
 def fitting(item: dict[str, Any]) -> dict[str, Any]:

@@ -65,6 +65,7 @@ class Settings:
     stack, or prod, where what holds data stays and is protected; ``tags`` are put on every resource;
     ``customer_key`` encrypts what is kept with a key of the account's own; ``budget_usd`` is the
     account's monthly budget (0: none), and ``alarm_email`` who hears of it and of every alarm.
+    ``old_telemetry`` keeps the telemetry table of a deployment from before batches had ids.
     ``robot_metrics`` counts every robot's health by itself as well, which costs by the robot.
     ``retention_days`` is how long telemetry and summaries are kept; ``files_days`` is how long uploaded
     files are (0: for good), ``upload_gb_a_day`` what one robot may upload in a day, in 1e9 bytes;
@@ -82,6 +83,7 @@ class Settings:
     stage: str = DEV
     tags: Mapping[str, str] = field(default_factory=dict)
     customer_key: bool = False
+    old_telemetry: bool = False
     robot_metrics: bool = False
     budget_usd: int = 0
     alarm_email: str | None = None
@@ -243,6 +245,7 @@ _READ: Mapping[str, _Reader] = {
     "embedded": _boolean,
     "customer_key": _boolean,
     "device_defender": _boolean,
+    "old_telemetry": _boolean,
     "robot_metrics": _boolean,
     "site": _boolean,
     "iot_log_level": _log_level,

@@ -4,19 +4,21 @@ from __future__ import annotations
 
 from typing import Any
 
-from aws_cdk import CfnOutput, Duration, Stack
+from aws_cdk import CfnOutput, Duration, RemovalPolicy, Stack
 from aws_cdk import aws_dynamodb as dynamodb
 from aws_cdk import aws_iam as iam
 from aws_cdk import aws_s3 as s3
 from constructs import Construct
 
-from contract import BATCH, ENTRY, EXPIRES_S, FILES_PREFIX, RESULTS_PREFIX, ROBOT, SECOND, TOPIC
+from contract import BATCH, ENTRY, EXPIRES_S, FILES_PREFIX, RESULTS_PREFIX, ROBOT, SECOND, T_US, TOPIC
 from stacks.encryption import Encryption
 from stacks.settings import Settings
 
 # Half the price to keep, a cent a gigabyte to read; S3 allows it from this day on, and leaves objects
 # below 128 KB, for which it would cost more, where they are.
 _RARE_AFTER_DAYS = 30
+# The telemetry table's construct before batches had ids.
+OLD_TELEMETRY = "Telemetry"
 _TEXT = dynamodb.AttributeType.STRING
 
 
@@ -41,6 +43,8 @@ class Storage(Stack):
             expires=True,
             stream=dynamodb.StreamViewType.NEW_IMAGE,
         )
+        if settings.old_telemetry:
+            self._old_telemetry()
         self.summary = self._table("Summary", partition=TOPIC, sort=SECOND, expires=True)
         self.robots = self._table("Robots", partition=ROBOT)
         self.quarantine = self._table(
@@ -76,6 +80,25 @@ class Storage(Stack):
         )
         CfnOutput(self, output or f"{name}Table", value=table.table_name)
         return table
+
+    def _old_telemetry(self) -> None:
+        """The telemetry table of a deployment from before batches had ids, as it was. Nothing writes it any
+        more, and it stays in whatever stage; `iort adopt` copies from it.
+
+        The stacks that import its exports are updated after this one, and CloudFormation takes no export away
+        that is in use.
+        """
+        table = self._table(
+            OLD_TELEMETRY,
+            output="OldTelemetryTable",
+            partition=TOPIC,
+            sort=T_US,
+            expires=True,
+            stream=dynamodb.StreamViewType.NEW_IMAGE,
+        )
+        table.apply_removal_policy(RemovalPolicy.RETAIN)
+        for value in (table.table_name, table.table_arn, table.table_stream_arn):
+            self.export_value(value)
 
     def may_keep(self, role: iam.IGrantable, *attributes: str) -> None:
         """Let a role change these attributes of a robot's row, and no other: a name's admission and its

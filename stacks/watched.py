@@ -10,6 +10,8 @@ from aws_cdk import aws_dynamodb as dynamodb
 from aws_cdk import aws_lambda as lambda_
 from aws_cdk import aws_sqs as sqs
 
+from stacks.storage import OLD_TELEMETRY
+
 
 @dataclass(frozen=True)
 class Watched:
@@ -33,7 +35,9 @@ class Watched:
                 if isinstance(construct, lambda_.Function):
                     functions[construct.node.id] = construct
                 elif isinstance(construct, dynamodb.Table):
-                    tables[construct.node.id] = construct
+                    # Nothing writes the old one, and an alarm would keep it in its stack by what it imports.
+                    if construct.node.id != OLD_TELEMETRY:
+                        tables[construct.node.id] = construct
                 elif isinstance(construct, sqs.Queue):
                     queues[construct.node.id] = construct
                 elif isinstance(construct, lambda_.EventSourceMapping):

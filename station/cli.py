@@ -12,6 +12,7 @@ from botocore.exceptions import BotoCoreError, ClientError
 from contract import DEFAULT_NAMESPACE
 from station.cloud import EMBEDDED
 from station.commands import (
+    adopt,
     audit,
     config,
     cost,
@@ -45,6 +46,7 @@ app.add_typer(trace.commands)
 app.add_typer(watch.commands)
 app.add_typer(site.commands)
 app.add_typer(errors.commands)
+app.add_typer(adopt.commands)
 app.add_typer(send.commands)
 app.add_typer(config.commands)
 

@@ -7,6 +7,7 @@ import threading
 import time
 from collections.abc import Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
+from dataclasses import replace
 from enum import Enum
 from functools import partial
 from typing import Any, NamedTuple
@@ -29,9 +30,11 @@ from contract import (
     decode_item,
     parse_topic,
 )
+from contract.checks import COMPACT, json_object
 from station.cloud import Cloud
 from station.errors import StationError
 from station.items import plain
+from station.old_batches import is_old, upgraded, upgraded_item
 from station.quarantine import Entry, key, load
 
 # One that failed so often is for a person to look at.
@@ -74,7 +77,8 @@ def replay(
     arrived when the table holds its batch. One that Lambda 2 failed on or refused is given to Lambda 2
     again, which answers. Only then is the entry deleted. Every attempt is counted first, and after
     `MAX_REPLAYS` (unless ``again``) there are no more. Live messages, pings and events are of their
-    moment and are not replayed.
+    moment and are not replayed. A batch of version 1 goes back as one of this version: its agent had not
+    been updated when the stacks were.
     """
     one = partial(_outcome, cloud, dry_run=dry_run, again=again)
     with ThreadPoolExecutor(_AT_ONCE) as pool:
@@ -86,7 +90,9 @@ def _outcome(cloud: Cloud, listed: Entry, *, dry_run: bool, again: bool) -> Outc
     if entry is None:
         return Outcome(listed, Fate.GONE)
     try:
-        batch = _batch(entry)
+        _check_kind(entry)
+        current = _current(entry)
+        batch = _batch(current)
     except _NotForReplayError as error:
         return Outcome(listed, Fate.NOT_FOR_REPLAY, str(error))
     except ContractError as error:
@@ -97,7 +103,13 @@ def _outcome(cloud: Cloud, listed: Entry, *, dry_run: bool, again: bool) -> Outc
         return Outcome(entry, Fate.WOULD)
     try:
         _count(cloud, entry)
-        problem = _publish(cloud, entry, batch) if _is_rules(entry) else _summarize(cloud, entry)
+        if _is_rules(entry):
+            problem = _publish(cloud, current, batch)
+        elif current is not entry and not _stored(cloud, entry.topic, batch):
+            # Lambda 2 reads the table, and would find nothing to summarise.
+            problem = "it is in the old telemetry table: `iort adopt` comes first"
+        else:
+            problem = _summarize(cloud, current)
         if problem:
             return Outcome(entry, Fate.FAILED, problem)
         _delete(cloud, entry)
@@ -110,26 +122,37 @@ def _is_rules(entry: Entry) -> bool:
     return entry.source.startswith(f"{BY_RULE} ")
 
 
-def _batch(entry: Entry) -> Batch:
-    """The batch in an entry that can be replayed; raises `ContractError` where it is none."""
-    payload = entry.payload or b""
+def _check_kind(entry: Entry) -> None:
     if entry.source == BY_STREAM and entry.topic:
-        # An item that did not fit into the quarantine's was cut.
-        return decode_item(plain(_object(payload)))[1]
+        return
     if not _is_rules(entry) or not entry.topic.startswith(f"{RECORD}/"):
         raise _NotForReplayError("of its moment, or without a batch: only the record lane is replayed")
-    parse_topic(entry.topic)
-    return decode_item({**_object(payload), TOPIC: entry.topic, RECEIVED_MS: entry.first_ms})[1]
 
 
-def _object(payload: bytes) -> dict[str, Any]:
+def _current(entry: Entry) -> Entry:
+    """The entry as it is, or with a batch of this version where it has one of version 1; raises
+    `ContractError` where it has none of either."""
+    # An item that did not fit into the quarantine's was cut.
+    value = json_object(entry.payload or b"", "message")
+    if entry.source == BY_STREAM:
+        new = upgraded_item(value) if is_old(plain(value)) else None
+    else:
+        new = upgraded(value) if is_old(value) else None
+    if new is None:
+        return entry
     try:
-        value = json.loads(payload)
-    except (ValueError, RecursionError) as error:
-        raise ContractError(f"not JSON: {error}") from error
-    if not isinstance(value, dict):
-        raise ContractError("not a JSON object")
-    return value
+        return replace(entry, payload=COMPACT.encode(new).encode())
+    except ValueError as error:  # 1e400 can be read, and not be written
+        raise ContractError(f"message: {error}") from error
+
+
+def _batch(entry: Entry) -> Batch:
+    """The batch in an entry; raises `ContractError` where it is none."""
+    value = json_object(entry.payload or b"", "message")
+    if entry.source == BY_STREAM:
+        return decode_item(plain(value))[1]
+    parse_topic(entry.topic)
+    return decode_item({**value, TOPIC: entry.topic, RECEIVED_MS: entry.first_ms})[1]
 
 
 def _count(cloud: Cloud, entry: Entry) -> None:

@@ -36,6 +36,7 @@ GROUPS = {
             f"tests/unit/test_{name}.py"
             for name in (
                 "admit",
+                "adopt",
                 "alert",
                 "presence",
                 "quarantine",

@@ -10,14 +10,16 @@ import contract
 from contract import BY_RULE, BY_STREAM, Batch, build_topic
 from station.quarantine import Entry
 from station.replay import Fate, replay
-from tests.fakes import item_of
+from tests.fakes import item_of, item_of_message
+from tests.unit.old_messages import old_message
 
 TOPIC = build_topic(contract.RECORD, "car", "vesc")
+NOW_MS = 1_700_000_000_000
 GOOD = Batch("0123abcd", 0, [1_700_000_000_000_000], {"speed": [1.5]})
 
 
 class FakeCloud:
-    """A cloud with a quarantine of these payloads, by the entries' ids."""
+    """A cloud with a quarantine of these payloads, by the entries' ids, and an empty telemetry table."""
 
     def __init__(self, payloads):
         self._payloads = payloads
@@ -29,17 +31,27 @@ class FakeCloud:
         assert service == "dynamodb"
         return self
 
-    def get_item(self, *, TableName, Key, ConsistentRead):
-        assert (TableName, ConsistentRead) == ("QuarantineTable", True)
+    def get_item(self, *, TableName, Key, ConsistentRead, **_):
+        assert ConsistentRead
+        if TableName == "TelemetryTable":
+            return {}
+        assert TableName == "QuarantineTable"
         source, payload = self._payloads[Key["id"]["S"]]
         texts = {"robot": "car", "source": source, "topic": TOPIC, "reason": "some"}
         item = {name: {"S": text} for name, text in texts.items()} | Key | {"payload": {"B": payload}}
-        return {"Item": item | {name: {"N": "1"} for name in ("first_ms", "last_ms", "seen")}}
+        return {"Item": item | {name: {"N": str(NOW_MS)} for name in ("first_ms", "last_ms", "seen")}}
+
+    def update_item(self, *, TableName, Key, **_):
+        assert (TableName, Key["id"]["S"] in self._payloads) == ("QuarantineTable", True)
+
+
+def replayed(*, dry_run=True, **payloads):
+    listed = [Entry("car", name, source, TOPIC, "some", 1, 1, 1, 0) for name, (source, _) in payloads.items()]
+    return list(replay(FakeCloud(payloads), listed, dry_run=dry_run))
 
 
 def outcomes(**payloads):
-    listed = [Entry("car", name, source, TOPIC, "some", 1, 1, 1, 0) for name, (source, _) in payloads.items()]
-    return [outcome.fate for outcome in replay(FakeCloud(payloads), listed, dry_run=True)]
+    return [outcome.fate for outcome in replayed(**payloads)]
 
 
 whole = json.dumps(item_of(GOOD, TOPIC)).encode()
@@ -55,3 +67,50 @@ future = json.dumps(item_of(GOOD, TOPIC) | {"received_ms": {"N": "1"}}).encode()
 def test_an_entry_that_cannot_be_read_is_refused_and_the_next_one_is_not(odd, source):
     fates = outcomes(bad=(source, odd), good=(BY_STREAM, whole))
     assert fates == [Fate.REFUSED, Fate.WOULD]
+
+
+# --- what agents published before batches had ids -----------------------------------------------------
+
+
+def old_item(**changes):
+    return json.dumps(item_of_message(old_message(GOOD, **changes), TOPIC)).encode()
+
+
+@pytest.mark.parametrize(
+    ("source", "payload"),
+    [(f"{BY_RULE} iort_record", old_message(GOOD)), (BY_STREAM, old_item())],
+    ids=["rule", "stream"],
+)
+def test_a_batch_of_before_would_be_replayed(source, payload):
+    assert outcomes(old=(source, payload)) == [Fate.WOULD]
+
+
+@pytest.mark.parametrize(
+    ("changes", "reason"),
+    [
+        ({"t": -5}, "before 1970"),
+        ({"samples": "AAAA"}, "samples are not base64 of zlib"),
+        ({"v": 0}, "schema version 0"),
+    ],
+    ids=["1970", "samples", "version"],
+)
+@pytest.mark.parametrize("source", [BY_STREAM, f"{BY_RULE} iort_record"])
+def test_a_batch_of_before_that_is_none_is_refused(source, changes, reason):
+    payload = old_item(**changes) if source == BY_STREAM else old_message(GOOD, **changes)
+    (outcome,) = replayed(old=(source, payload))
+    assert outcome.fate is Fate.REFUSED
+    assert reason in outcome.detail
+
+
+def test_a_number_that_cannot_be_written_keeps_no_other_back():
+    odd = old_message(GOOD)[:-1] + b',"more":1e400}'
+    assert outcomes(odd=(f"{BY_RULE} iort_record", odd), good=(BY_STREAM, whole)) == [
+        Fate.REFUSED,
+        Fate.WOULD,
+    ]
+
+
+def test_what_is_in_the_old_table_alone_is_not_given_to_lambda_2():
+    """It would summarise nothing, and the entry would be deleted."""
+    (outcome,) = replayed(old=(BY_STREAM, old_item()), dry_run=False)
+    assert (outcome.fate, "iort adopt" in outcome.detail) == (Fate.FAILED, True)

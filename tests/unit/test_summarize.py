@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import json
 from collections import defaultdict
 from decimal import Decimal
 
 import pytest
 
-from contract import EXPIRES_S
+from contract import EXPIRES_S, RECEIVED_MS
+from functions.summarize import process
 from tests.fakes import (
     EXPIRES,
     ROBOTS,
@@ -68,6 +70,23 @@ def test_missing_batches_are_counted_once_in_the_metric(stream, capsys):
     for i in (0, 1, 5, 6, 7, 8, 9):
         stream.deliver(batch(T0 + i * 20_000, seq=i))
     assert counted(capsys) == {"BatchesSummarized": 7, "SamplesSummarized": 7, "BatchesMissing": 3}
+
+
+def test_what_was_received_long_ago_is_summarised_and_alarms_nobody(stream, capsys):
+    """Batches of an old table are put into the new one: their faults are no news, nor is what they lack."""
+    records = stream.store(batch(T0, seq=0, fault_code=[3]), batch(T0 + 2 * S, seq=2, voltage_input=[5.5]))
+    received_ms = int(records[0]["dynamodb"]["NewImage"][RECEIVED_MS]["N"])
+
+    def said(since_ms):
+        process({"Records": records}, stream.tables, stream.refuse, news_since_ms=since_ms)
+        lines = map(json.loads, capsys.readouterr().out.splitlines())
+        return {name: value for line in lines for name, value in line.items()}
+
+    silent = said(received_ms + 1)
+    assert (silent["BatchesSummarized"], stream.column("missing_batches")) == (2, {0: 0, 2: 1})
+    assert not silent.keys() & {"BatchesMissing", "FaultSamples", "BatteryVolts"}
+    news = said(received_ms)
+    assert (news["BatchesMissing"], news["FaultSamples"], news["BatteryVolts"]) == (1, 1, [5.5])
 
 
 def test_a_restart_begins_a_new_count(stream):

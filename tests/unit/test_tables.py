@@ -206,7 +206,7 @@ def test_what_dynamodb_did_not_process_is_sent_again_after_ever_longer_waits(sle
 
 def test_what_dynamodb_never_processes_is_an_error_in_the_time_there_is(slept):
     client = FakeDynamoDB(unprocessed=10**9)
-    with pytest.raises(TableError, match=r"12 summaries not written after 8 attempts"):
+    with pytest.raises(TableError, match=r"12 items of summary not written after 8 attempts"):
         tables(client).put_seconds({(TOPIC_OF_CAR, second): {"n": 1} for second in range(20)})
     # Lambda 2 has 60 s; a call takes a few milliseconds.
     assert sum(slept) < 10

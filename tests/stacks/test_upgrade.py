@@ -1,0 +1,92 @@
+"""A deployment from before batches had ids is updated in one `cdk deploy`, and keeps its telemetry.
+
+version1.json holds what such a deployment has, by stage: every export of its stacks, and the table.
+"""
+
+from __future__ import annotations
+
+import json
+import re
+from pathlib import Path
+
+import pytest
+
+BEFORE = json.loads((Path(__file__).parent / "version1.json").read_text())
+
+
+@pytest.fixture(scope="module", params=["dev", "prod"])
+def stage(request):
+    return request.param
+
+
+@pytest.fixture(scope="module")
+def updated(stage, tmp_path_factory):
+    """Every stack's template for such a deployment, with the setting or without."""
+    from aws_cdk import App
+
+    from app import build
+    from stacks.settings import Settings
+
+    layer = tmp_path_factory.mktemp("layer")
+    (layer / "nothing.py").touch()
+    more = {"customer_key": True, "budget_usd": 50, "alarm_email": "lab@example.org"}
+
+    def templates(old_telemetry):
+        app = App(outdir=str(tmp_path_factory.mktemp("cdk.out")))
+        settings = Settings(
+            stage=stage, layer=layer, old_telemetry=old_telemetry, **(more if stage == "prod" else {})
+        )
+        build(app, settings)
+        return {one.stack_name: one.template for one in app.synth().stacks}
+
+    return {setting: templates(setting) for setting in (True, False)}
+
+
+def exports(templates):
+    return {
+        output["Export"]["Name"]: output["Value"]
+        for template in templates.values()
+        for output in template.get("Outputs", {}).values()
+        if "Export" in output
+    }
+
+
+def old_tables(templates):
+    tables = templates["iort-storage"]["Resources"].items()
+    return {name: table for name, table in tables if name.startswith("Telemetry")}
+
+
+def test_no_export_that_a_stack_may_still_import_goes_or_changes(updated, stage):
+    before, after = BEFORE[stage]["exports"], exports(updated[True])
+    assert len(before) > 30
+    assert {name: after.get(name) for name in before} == before
+
+
+def test_without_the_setting_cloudformation_refuses_the_update(updated, stage):
+    """What goes is what the record rule and Lambda 2 of the deployment import."""
+    gone = BEFORE[stage]["exports"].keys() - exports(updated[False])
+    assert len(gone) == 3
+    assert all(name.startswith("iort-storage:") and "Telemetry" in name for name in gone)
+    assert not old_tables(updated[False])
+
+
+def test_the_old_table_is_neither_changed_nor_replaced_and_stays_in_every_stage(updated, stage):
+    before = BEFORE[stage]["telemetry"]
+    (table,) = old_tables(updated[True]).values()
+    assert table["Properties"] == before["Properties"]
+    assert (table["DeletionPolicy"], table["UpdateReplacePolicy"]) == ("Retain", "Retain")
+
+
+def test_no_stack_imports_anything_of_the_old_table(updated):
+    """Nothing reads or writes it, and the setting can be taken away again."""
+    for name, template in updated[True].items():
+        imported = json.dumps(template["Resources"])
+        assert "iort-storage:ExportsOutput" in imported or name in ("iort-storage", "iort-account"), name
+        assert "Telemetry" not in "".join(re.findall(r"iort-storage:(\w+)", imported)), name
+
+
+def test_both_tables_are_put_out_by_name(updated):
+    outputs = updated[True]["iort-storage"]["Outputs"]
+    (old,) = old_tables(updated[True])
+    assert outputs["OldTelemetryTable"]["Value"] == {"Ref": old}
+    assert outputs["TelemetryTable"]["Value"] != {"Ref": old}

@@ -1,0 +1,21 @@
+"""Batches of version 1, as agents published them before batches had ids."""
+
+from __future__ import annotations
+
+import json
+from typing import Any
+
+import contract
+from contract import BATCH, NONFINITE, Batch
+
+
+def old_envelope(batch: Batch, **changes: Any) -> dict[str, Any]:
+    """The batch as a message of version 1, with some of it changed. Samples were written as they are now."""
+    envelope = json.loads(contract.encode(batch))
+    del envelope[BATCH]
+    head = {"v": 1, "boot": batch.boot, "seq": batch.seq, "t": batch.t_us}
+    return {**envelope, **head, NONFINITE: envelope.get(NONFINITE, 0), **changes}
+
+
+def old_message(batch: Batch, **changes: Any) -> bytes:
+    return json.dumps(old_envelope(batch, **changes), separators=(",", ":")).encode()
