@@ -28,6 +28,8 @@ _ADVICE = (
     ("Invalid MCAP footer", _CUT_OFF),
     ("File magic is invalid", "it does not begin as a recording does: was it copied whole?"),
     ("Expected metadata file", f"a folder of ROS 2 has a metadata.yaml: {_REINDEX}"),
+    # The newest rosbags for Python 3.8 takes such a folder for a file.
+    ("Is a directory", f"a folder of ROS 2 has a metadata.yaml: {_REINDEX}"),
     ("Could not load YAML", _REINDEX),
     ("Could not read metadata", _REINDEX),
     ("metadata key is missing", _REINDEX),
