@@ -37,8 +37,8 @@ class ClaimCheck:
     """Takes bytes out of samples and puts claims in. Safe to use from several threads.
 
     Of each stream, at most one content every ``every_s`` of the samples' own time is kept, and no more
-    than ``max_bytes`` wait in the folder; what is not kept is counted, and its claim is null. What was not its
-    turn is counted apart from what there was no room for.
+    than ``max_bytes`` wait in the folder; what is not kept is counted, and its claim is null: what was not
+    due, and what there was no room for.
     """
 
     def __init__(
@@ -100,7 +100,8 @@ class ClaimCheck:
     def _claim(self, stream: str, t_us: int, field: str, content: bytes, *, keep: bool) -> dict[str, Value]:
         claim = self._keep(stream, t_us, field, content) if keep else None
         if claim is None:
-            self.left_out += 1
+            self.left_out += keep
+            self.not_due += not keep
             claim = dict.fromkeys(CLAIM_FIELDS)
         return {f"{field}.{name}": one for name, one in claim.items()}
 
