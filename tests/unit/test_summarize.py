@@ -220,3 +220,49 @@ def test_removals_are_passed_over(stream, capsys):
 def test_an_empty_event_is_nothing(stream):
     assert stream.summarize([]) == {"batchItemFailures": []}
     assert stream.client.calls == {}
+
+
+def interleaved(seconds, behind_s=2):
+    """Two publishers of one stream, one of which has a clock that is behind: batches in the order in which
+    the agent closes and numbers them."""
+    batches = []
+    for i in range(seconds):
+        for start_s in (i, i - behind_s):
+            batches.append(batch(T0 + start_s * S + 100, 10, step_us=1000, seq=len(batches)))
+    return batches
+
+
+@pytest.mark.parametrize("grouped", [1, 7, 100])
+def test_clocks_that_interleave_miss_nothing(stream, capsys, grouped):
+    drive = interleaved(20)
+    for i in range(0, len(drive), grouped):
+        stream.deliver(*drive[i : i + grouped])
+    assert set(stream.column("missing_batches").values()) == {0}
+    assert sum(stream.column("n").values()) == 10 * len(drive)
+    assert "BatchesMissing" not in counted(capsys)
+
+
+def test_of_clocks_that_interleave_what_is_missing_is_told_once(stream, capsys):
+    drive = interleaved(20)
+    lost = drive.pop(21)
+    for one in drive:
+        stream.deliver(one)
+    assert sum(stream.column("missing_batches").values()) == 1
+    assert counted(capsys)["BatchesMissing"] == 1
+    # Of its number the next one tells, which is of the other clock.
+    (told,) = [second for second, missing in stream.column("missing_batches").items() if missing]
+    assert told == drive[21].t_us // S - SECOND != lost.t_us // S - SECOND
+
+
+def test_a_recording_that_is_played_twice_is_stored_twice_and_misses_nothing(stream, capsys):
+    first = [batch(T0 + i * S, 10, step_us=1000, seq=i) for i in range(5)]
+    again = [batch(T0 + i * S, 10, step_us=1000, seq=5 + i, boot="bbbbbbbb") for i in range(5)]
+    stream.deliver(*first)
+    stream.deliver(*again)
+    assert stream.column("n") == dict.fromkeys(range(5), 20)
+    assert stream.column("batches") == dict.fromkeys(range(5), 2)
+    assert stream.column("missing_batches") == dict.fromkeys(range(5), 0)
+    assert "BatchesMissing" not in counted(capsys)
+    # The same batch again is still once.
+    stream.deliver(*again)
+    assert stream.column("n") == dict.fromkeys(range(5), 20)
