@@ -61,6 +61,9 @@ class Export:
         if messages is None:
             self.others += len(inside)
             return ()
+        if messages.type_id not in self.types and not messages.layout:
+            self.refused.add(ContractError(f"nobody has said what the type {messages.type_id} is"))
+            return ()
         if messages.type_id not in self.types:
             kind, _, definition = messages.layout.partition("\n")
             stream = self._selection.stream

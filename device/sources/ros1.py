@@ -299,15 +299,19 @@ class Intake:
             if config.fields or config.large == UPLOAD:
                 decoder = Decoder(definition, select=config.fields, large=config.large == UPLOAD)
             text = text if said else layout(definition)
-        except (MessageError, SourceError) as error:
-            self._seldom.warn(
-                "undecodable", f"topic {self._topic}: its messages cannot be looked into: {error}"
-            )
+        except MessageError:
+            pass  # the type itself says what is wrong with it
+        except SourceError as error:
+            _log.error("topic %s: its publisher sends no definition: %s", self._topic, error)
         _log.info("topic %s: %s, %s", self._topic, kind, md5sum)
         if decoder is not None and decoder.unknown:
             unknown = ", ".join(decoder.unknown)
             _log.warning("topic %s: %s has no field %s", self._topic, kind, unknown)
-        return _Kind(RosType(self._topic, kind, md5sum, text), decoder, stamped=stamped)
+        whole = RosType(self._topic, kind, md5sum, text)
+        if whole.error:
+            why = f"topic {self._topic}: its messages are kept, but cannot be looked into: {whole.error}"
+            self._seldom.warn("undecodable", why)
+        return _Kind(whole, decoder, stamped=stamped)
 
 
 class _Kind(NamedTuple):
