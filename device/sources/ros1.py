@@ -302,7 +302,8 @@ class Intake:
         except MessageError:
             pass  # the type itself says what is wrong with it
         except SourceError as error:
-            _log.error("topic %s: its publisher sends no definition: %s", self._topic, error)
+            why = f"topic {self._topic}: its messages are kept, but cannot be looked into: {error}"
+            self._seldom.warn("undecodable", why)
         _log.info("topic %s: %s, %s", self._topic, kind, md5sum)
         if decoder is not None and decoder.unknown:
             unknown = ", ".join(decoder.unknown)
