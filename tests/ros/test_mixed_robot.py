@@ -301,7 +301,7 @@ def differences(drive: Drive) -> list[Difference]:
 
 def to_be_named(drive: Drive, one: Difference) -> int:
     """In how many messages a topic differs beside those of the open batch of the agent that was killed. Of
-    messages that are all alike nobody can tell which ones are missing, but how many were on their way then."""
+    messages that are all alike nobody can tell which are missing, but how many were on their way then."""
     since_ns = drive.killed_ns - int(OPEN_S * 1e9)
     then = [m for m in drive.recorded.of(one.topic) if since_ns <= m.t_ns <= drive.killed_ns + 1e9]
     there = Counter(drive.same(one.topic, m.data) for m in then)
