@@ -21,6 +21,7 @@ import boto3
 import pytest
 from botocore.config import Config
 from PIL import Image
+from rosbags.rosbag1 import Reader
 
 from contract import (
     FILE,
@@ -144,7 +145,7 @@ def test_a_large_file_in_a_watched_folder_survives_the_agents_end(bundle, bucket
     assert (status["waiting"], status["uploaded"], status["last_error"]) == (0, 1, None)
 
 
-def test_pictures_of_a_recording_travel_as_claims(embedded, bundle, bucket, tmp_path):
+def test_pictures_of_a_recording_travel_as_claims(embedded, bundle, bucket, iort, tmp_path):
     pictures = [jpeg(seed) for seed in range(4)]
     assert min(map(len, pictures)) > AWS_MESSAGE_BYTES
     path = write_bag(tmp_path / "camera.bag", pictures, hz=2)
@@ -166,9 +167,21 @@ def test_pictures_of_a_recording_travel_as_claims(embedded, bundle, bucket, tmp_
         with Image.open(io.BytesIO(base64.b64decode(columns["data.thumbnail"][i]))) as small:
             assert small.size == (96, 72)
     assert sorted(bucket.keys(car.robot)) == sorted(filter(None, keys))
-    assert report["files"]["large"] == {"kept": 2, "left_out": 2}
+    assert report["files"]["large"] == {"kept": 2, "not_due": 2, "left_out": 0}
     assert report["streams"]["camera"]["refused"] == 0
     assert not list((car.folder / "large").glob("*/*"))
+    # An export puts the contents back where they were; a picture whose turn it was not has an empty one.
+    exported = tmp_path / "exported.bag"
+    done = iort("export", car.robot, "camera", "--output", str(exported))
+    assert done.exit_code == 0, done.output
+    went, came = raws(path), raws(exported)
+    assert [raw in came for raw in went] == [True, False, True, False]
+    assert sorted(map(len, came))[:2] == [len(went[i]) - len(pictures[i]) for i in (1, 3)]
+
+
+def raws(path: Path) -> list[bytes]:
+    with Reader(path) as reader:
+        return [bytes(raw) for _, _, raw in reader.messages()]
 
 
 # --- what a robot may not, with its own certificate and its own hands -------------------------------
