@@ -3,6 +3,7 @@ sources that are no ROS."""
 
 from __future__ import annotations
 
+import keyword
 import math
 import re
 from collections.abc import Iterator, Mapping, Sequence
@@ -120,7 +121,11 @@ class Maker:
 
         def builder(name: str, prefix: str) -> Any:
             made = store.types[name]
-            parts = {field: part(kind, f"{prefix}{field}") for field, kind in definitions[name][1] if field}
+            parts = {
+                _attribute(field): part(kind, f"{prefix}{field}")
+                for field, kind in definitions[name][1]
+                if field
+            }
             return lambda sample, t_us: made(**{field: of(sample, t_us) for field, of in parts.items()})
 
         def header(_sample: Mapping[str, Value], t_us: int) -> Any:
@@ -157,9 +162,14 @@ class Maker:
             inner = builder(lone[0][1][1], "")
             whole = store.types[self._name]
             return paths, lambda sample, t_us: whole(
-                **{"header": header(sample, t_us), lone[0][0]: inner(sample, t_us)}
+                **{"header": header(sample, t_us), _attribute(lone[0][0]): inner(sample, t_us)}
             )
         return paths, builder(self._name, "")
+
+
+def _attribute(field: str) -> str:
+    """What rosbags calls a field, which may be a word of Python's own."""
+    return f"{field}_" if keyword.iskeyword(field) else field
 
 
 def _known(definition: str, name: str) -> Any:

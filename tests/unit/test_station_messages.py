@@ -87,6 +87,12 @@ def test_what_flattens_is_made_again():
     assert maker.lacking == maker.foreign == []
 
 
+def test_fields_may_be_words_of_python():
+    _, _, message = made("float64 from\nB class\n" + LINE + "MSG: a_msgs/B\nint32 lambda\n",
+                         {"from": 1.5, "class.lambda": 3})  # fmt: skip
+    assert (message.from_, message.class_.lambda_) == (1.5, 3)
+
+
 def test_null_lacking_and_foreign_fields():
     maker, _, message = made(STAMPED, {"x": None, "y": 1})
     assert np.isnan(message.b.x)
