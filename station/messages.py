@@ -44,7 +44,9 @@ def types(cloud: Cloud, robot: str, stream: str) -> dict[str, tuple[int, Message
             if sample.get("stream") == stream:
                 with suppress(ContractError):
                     kind = message_type(sample)
-                    found.setdefault(kind.id, (t_us, kind))
+                    first_us, before = found.get(kind.id, (t_us, kind))
+                    # Some publishers send no definition.
+                    found[kind.id] = first_us, before if before.definition.strip() else kind
     return found
 
 

@@ -124,6 +124,12 @@ def test_what_a_robot_has_said_of_its_messages():
     assert types(cloud, "car", "nothing") == {}
 
 
+def test_a_definition_that_one_publisher_left_out_is_taken_from_another():
+    whole = MessageType("s", "/t", "a_msgs/A", "1" * 32, STAMPED)
+    cloud = has_said(whole._replace(definition=""), whole)
+    assert types(cloud, "car", "s") == {whole.id: (1000, whole)}
+
+
 def test_samples_without_a_type_get_one():
     columns = {"rule_ms": column_of([1.5]), "pose.x": column_of([2]), "ok": column_of([True])}
     kind = made_of("rtt-2", columns)
