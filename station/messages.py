@@ -8,6 +8,7 @@ import math
 import re
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import suppress
+from itertools import count
 from typing import Any
 
 import numpy as np
@@ -70,7 +71,7 @@ class Maker:
     """Makes messages of one type out of samples.
 
     ``definition`` and ``md5sum`` are the type's as ROS 1 knows them, whose headers have a seq, also where
-    the samples come from ROS 2. ``lacking`` are fields of the type
+    the samples come from ROS 2; ``numbers`` are for the seq of those. ``lacking`` are fields of the type
     that the samples do not have, which are zero or empty in the messages; ``foreign`` are fields of the
     samples that the type does not have. ``own`` is for a type of `made_of`.
 
@@ -83,9 +84,11 @@ class Maker:
         fields: Sequence[str],
         *,
         own: bool = False,
+        numbers: Iterator[int] | None = None,
     ) -> None:
         self.kind = kind
-        self._seq = -1
+        self._numbers = count() if numbers is None else numbers
+        self._seq = 0
         self._field = _plain if own else str
         fields = [self._field(name) for name in fields]
         self._name = kind.kind.replace("/", "/msg/") if "/msg/" not in kind.kind else kind.kind
@@ -111,7 +114,7 @@ class Maker:
         columns = {self._field(name): values(column) for name, column in block.columns.items()}
         for i, t_us in enumerate(block.times_us.tolist()):
             sample = {name: column[i] for name, column in columns.items()}
-            self._seq += 1
+            self._seq = next(self._numbers)
             message = self._build(sample, t_us)
             yield t_us * 1000, bytes(self._store.serialize_ros1(message, self._name))
 
