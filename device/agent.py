@@ -39,6 +39,8 @@ _log = logging.getLogger(__name__)
 # What a tick may be late by: the last sample of a stream that falls silent, live, and its batch.
 _TICK_S = 0.2
 _RATES_S = 1.0
+# How often types are said again, and of how many.
+_TYPES_S, _MOST_TYPES = 3600.0, 1024
 _CLOSE_S = 5.0
 # A Lambda function that is warm answers well within this.
 _LAST_PONGS_S = 2.0
@@ -105,6 +107,8 @@ class Agent:
         self._lock = threading.Lock()
         self._batchers: dict[str, Batcher] = {}
         self._counts: dict[str, StreamCounts] = {}
+        # What sources have said of their messages' types, under lock.
+        self._types: dict[tuple[Value, ...], Mapping[str, Value]] = {}
         self._fields: dict[str, Any] = {}
         self._failed: list[str] = []
         self._ended: list[int] = []
@@ -121,7 +125,8 @@ class Agent:
             counted=self._counted,
             refused=lambda: sum(counts.refused for counts in self._counts.copy().values()),
             reports=[
-                *((what, source.report) for what, source in self._sources),
+                # Two sources may be described alike.
+                *((f"{i}: {what}", source.report) for i, (what, source) in enumerate(self._sources)),
                 *([("contents", self._claims.report)] if self._claims is not None else []),
             ],
             emit=self.record,
@@ -139,12 +144,21 @@ class Agent:
         self._live.enabled = tuning.live_enabled
         self._live.set_rate(tuning.live_rate_hz)
         self._pings.set_rate(tuning.ping_rate_hz)
+        again = tuning.record_enabled and not self._tuning.record_enabled
         self._tuning = tuning
+        if again:
+            self._say_types()
 
     def emit(self, stream: str, t_us: int, values: Mapping[str, Value]) -> None:
         """Take a sample from a source, for both lanes. The live lane first: it is the one in a hurry."""
         if stream == contract.TYPES_STREAM:
             # What a message is made of is nothing to look at live.
+            with self._lock:
+                self._types[tuple(values.get(name) for name in ("stream", "topic", "kind", "md5sum"))] = (
+                    values
+                )
+                if len(self._types) > _MOST_TYPES:
+                    del self._types[next(iter(self._types))]
             self.record(stream, t_us, values)
             return
         if self._tuning.fields and stream in self._tuning.fields:
@@ -371,7 +385,7 @@ class Agent:
         self._stop.set()
 
     def _tick(self) -> None:
-        measured = looked = self._clock.monotonic()
+        measured = looked = said = self._clock.monotonic()
         self._accounts.tell()
         while not self._clock.wait(self._stop, _TICK_S):
             self.tick()
@@ -380,15 +394,25 @@ class Agent:
                 looked = now
                 self._rates.update(self._counts.copy())
             self._accounts.tick()
+            if now - said >= _TYPES_S:
+                said = now
+                self._say_types()
             if self._config.metrics.enabled and now - measured >= self._config.metrics.every_s:
                 measured = now
                 self._measure()
 
     def _counted(self) -> dict[str, tuple[StreamCounts, int]]:
-        return {
-            name: (batcher.counts(), self._spool.next_seq(name))
-            for name, batcher in list(self._batchers.items())
-        }
+        found = {name: batcher.counts() for name, batcher in list(self._batchers.items())}
+        # Not the spool's number of this moment, which may be a batch further than the counts.
+        return {name: (counts, counts.first_seq + counts.batches) for name, counts in found.items()}
+
+    def _say_types(self) -> None:
+        """Say once more what messages are made of. Batches of columns need it to become messages again, and
+        what was said before may have been dropped by the queue, or expired, or never recorded."""
+        with self._lock:
+            said = list(self._types.values())
+        for values in said:
+            self.record(contract.TYPES_STREAM, self._clock.now_us(), values)
 
     def _measure(self) -> None:
         """A sample of the agent's own stream."""

@@ -5,8 +5,9 @@ from __future__ import annotations
 from collections.abc import Iterable, Mapping
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
+from typing import Any
 
-from contract import ACCOUNT_STREAM, ContractError, decode
+from contract import ACCOUNT_STREAM, RECEIVED_MS, Batch, ContractError, decode
 from contract.account import ACCOUNT_EVERY_S, SourceAccount, StreamAccount, account, lost
 from station.audit import Audit, Run, Shortfall
 from station.cloud import Cloud
@@ -18,7 +19,7 @@ _SILENT_US = round(4e6 * ACCOUNT_EVERY_S)
 
 @dataclass
 class Account:
-    """The last that a run said: of its streams, of its sources, and when."""
+    """The last that a run said: of its streams, of its sources, and when the cloud heard it."""
 
     streams: dict[str, StreamAccount] = field(default_factory=dict)
     sources: dict[str, SourceAccount] = field(default_factory=dict)
@@ -32,17 +33,21 @@ class Account:
 
 def accounts(cloud: Cloud, robot: str) -> dict[str, Account]:
     """The last account of each run, by the run's name."""
+    return last_of(items(cloud, robot, ACCOUNT_STREAM))
+
+
+def last_of(stored: Iterable[Mapping[str, Any]]) -> dict[str, Account]:
+    """The last account of each run among the items of its stream: the last by the batches' numbers, since the
+    car's clock may have been set back while it drove."""
+    batches: list[tuple[Batch, int]] = []
+    for item in stored:
+        with suppress(ContractError):  # the audit of the stream itself counts those
+            batches.append((decode(item), int(item.get(RECEIVED_MS, 0)) * 1000))
     found: dict[str, Account] = {}
-    for item in items(cloud, robot, ACCOUNT_STREAM):
-        try:
-            batch = decode(item)
-        except ContractError:
-            continue  # the audit of the stream itself counts it
+    for batch, received_us in sorted(batches, key=lambda one: one[0].seq):
         run = found.setdefault(batch.boot, Account())
-        for i, t_us in enumerate(batch.times_us):
-            if t_us < run.told_us:
-                continue
-            run.told_us = t_us
+        run.told_us = max(run.told_us, received_us)
+        for i in range(len(batch.times_us)):
             sample = {name: column[i] for name, column in batch.columns.items()}
             with suppress(ContractError):
                 said = account(sample)
@@ -61,7 +66,7 @@ def held_against(one: Audit, found: Mapping[str, Account], now_us: int) -> Audit
     shortfalls: list[Shortfall] = []
     for boot, run in told.items():
         said = run.streams[one.stream]
-        running = run.told_us == newest and now_us - run.told_us < _SILENT_US
+        running = not said.ended and run.told_us == newest and now_us - run.told_us < _SILENT_US
         shortfalls += _shortfalls(boot, said, stored.get(boot), running=running)
     taken = sum(run.streams[one.stream].taken for run in told.values()) if told else None
     return replace(one, taken=taken, shortfalls=tuple(shortfalls))

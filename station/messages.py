@@ -3,10 +3,12 @@ sources that are no ROS."""
 
 from __future__ import annotations
 
+import keyword
 import math
 import re
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import suppress
+from itertools import count
 from typing import Any
 
 import numpy as np
@@ -43,7 +45,9 @@ def types(cloud: Cloud, robot: str, stream: str) -> dict[str, tuple[int, Message
             if sample.get("stream") == stream:
                 with suppress(ContractError):
                     kind = message_type(sample)
-                    found.setdefault(kind.id, (t_us, kind))
+                    first_us, before = found.get(kind.id, (t_us, kind))
+                    # Some publishers send no definition.
+                    found[kind.id] = first_us, before if before.definition.strip() else kind
     return found
 
 
@@ -67,7 +71,7 @@ class Maker:
     """Makes messages of one type out of samples.
 
     ``definition`` and ``md5sum`` are the type's as ROS 1 knows them, whose headers have a seq, also where
-    the samples come from ROS 2. ``lacking`` are fields of the type
+    the samples come from ROS 2; ``numbers`` are for the seq of those. ``lacking`` are fields of the type
     that the samples do not have, which are zero or empty in the messages; ``foreign`` are fields of the
     samples that the type does not have. ``own`` is for a type of `made_of`.
 
@@ -80,9 +84,11 @@ class Maker:
         fields: Sequence[str],
         *,
         own: bool = False,
+        numbers: Iterator[int] | None = None,
     ) -> None:
         self.kind = kind
-        self._seq = -1
+        self._numbers = count() if numbers is None else numbers
+        self._seq = 0
         self._field = _plain if own else str
         fields = [self._field(name) for name in fields]
         self._name = kind.kind.replace("/", "/msg/") if "/msg/" not in kind.kind else kind.kind
@@ -108,7 +114,7 @@ class Maker:
         columns = {self._field(name): values(column) for name, column in block.columns.items()}
         for i, t_us in enumerate(block.times_us.tolist()):
             sample = {name: column[i] for name, column in columns.items()}
-            self._seq += 1
+            self._seq = next(self._numbers)
             message = self._build(sample, t_us)
             yield t_us * 1000, bytes(self._store.serialize_ros1(message, self._name))
 
@@ -120,7 +126,11 @@ class Maker:
 
         def builder(name: str, prefix: str) -> Any:
             made = store.types[name]
-            parts = {field: part(kind, f"{prefix}{field}") for field, kind in definitions[name][1] if field}
+            parts = {
+                _attribute(field): part(kind, f"{prefix}{field}")
+                for field, kind in definitions[name][1]
+                if field
+            }
             return lambda sample, t_us: made(**{field: of(sample, t_us) for field, of in parts.items()})
 
         def header(_sample: Mapping[str, Value], t_us: int) -> Any:
@@ -157,9 +167,14 @@ class Maker:
             inner = builder(lone[0][1][1], "")
             whole = store.types[self._name]
             return paths, lambda sample, t_us: whole(
-                **{"header": header(sample, t_us), lone[0][0]: inner(sample, t_us)}
+                **{"header": header(sample, t_us), _attribute(lone[0][0]): inner(sample, t_us)}
             )
         return paths, builder(self._name, "")
+
+
+def _attribute(field: str) -> str:
+    """What rosbags calls a field, which may be a word of Python's own."""
+    return f"{field}_" if keyword.iskeyword(field) else field
 
 
 def _known(definition: str, name: str) -> Any:

@@ -162,7 +162,7 @@ class Recording:
         connections = [c for c in self._reader.connections if c.topic in streams]
         start_ns = int(self._reader.start_time)
         iterator = iter(self._reader.messages(connections=connections))
-        kinds: dict[tuple[str, str], _Kind] = {}
+        kinds: dict[tuple[str, str, str], _Kind] = {}
         while True:
             with self._wrapped("is damaged"):
                 found = next(iterator, None)
@@ -174,7 +174,8 @@ class Recording:
                 else:
                     raw = bytes(self._reader.typestore.cdr_to_ros1(raw, connection.msgtype))
             stream, at_ns = streams[connection.topic], recorded_ns - start_ns
-            named = (connection.topic, connection.msgtype)
+            # One name may have had two definitions, each with its own connection.
+            named = (connection.topic, connection.msgtype, connection.digest)
             kind = kinds.get(named)
             said = kind is not None
             if kind is None:
@@ -199,7 +200,8 @@ class Recording:
                 definition, md5sum = _with_seq(definition, md5sum, connection.msgtype)
             else:
                 # As it was recorded: with constants and comments.
-                definition = getattr(connection.msgdef, "data", connection.msgdef) or definition
+                said = getattr(connection.msgdef, "data", connection.msgdef)
+                definition, md5sum = (said, connection.digest) if said else (definition, md5sum)
         whole = RosType(connection.topic, kind, md5sum, definition)
         parsed = parse(kind, definition)
         sample = None

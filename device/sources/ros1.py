@@ -17,7 +17,7 @@ from contract import RosMessage, RosType, Value
 from contract.limits import MessageError
 from contract.ros1.decode import HEADER as HEADER_STRUCT
 from contract.ros1.decode import Decoder
-from contract.ros1.definition import layout, parse
+from contract.ros1.definition import parse
 from device.clock import Clock
 from device.errors import SourceError
 from device.ros1_node import ANY_TYPE, DEFAULT_NODE, Node, definition_of, shared
@@ -235,9 +235,9 @@ class Intake:
 
     def _say_type(self, header: Mapping[str, str], t_us: int) -> None:
         """Say what the messages are, whenever a publisher connects."""
-        config, definition = self._config, header.get("message_definition", "")
+        assert self._kind is not None
         kind, md5sum = header.get("type", ""), header.get("md5sum", "")
-        said = contract.MessageType(config.stream, self._topic, kind, md5sum, definition)
+        said = contract.MessageType(self._config.stream, self._topic, kind, md5sum, self._kind.text)
         try:
             self._emit(contract.TYPES_STREAM, t_us, said.sample())
         except contract.ContractError as error:
@@ -282,10 +282,12 @@ class Intake:
 
     def _kind_of(self, header: Mapping[str, str]) -> _Kind:
         key = (header.get("type", ""), header.get("md5sum", ""))
-        if key not in self._kinds or key[1] == ANY_TYPE:
+        known, text = self._kinds.get(key), header.get("message_definition", "")
+        # Of two publishers one may have sent no definition, and the other does.
+        if known is None or key[1] == ANY_TYPE or (not known.text.strip() and text.strip()):
             if len(self._kinds) >= _MAX_KINDS:
                 self._kinds.clear()
-            self._kinds[key] = self._made(*key, header.get("message_definition", ""))
+            self._kinds[key] = self._made(*key, text)
         return self._kinds[key]
 
     def _made(self, kind: str, md5sum: str, text: str) -> _Kind:
@@ -294,11 +296,14 @@ class Intake:
         try:
             # Some small clients send no definition; then only an installed class can tell.
             said = text.strip() or md5sum == _MD5_OF_NOTHING
-            definition = parse(kind, text) if said else definition_of(kind)[0]
+            if said:
+                definition = parse(kind, text)
+            else:
+                definition, installed = definition_of(kind)
+                text = installed._full_text  # noqa: SLF001 - rospy's own name for it
             stamped = definition.stamped()
             if config.fields or config.large == UPLOAD:
                 decoder = Decoder(definition, select=config.fields, large=config.large == UPLOAD)
-            text = text if said else layout(definition)
         except MessageError:
             pass  # the type itself says what is wrong with it
         except SourceError as error:
@@ -312,12 +317,14 @@ class Intake:
         if whole.error:
             why = f"topic {self._topic}: its messages are kept, but cannot be looked into: {whole.error}"
             self._seldom.warn("undecodable", why)
-        return _Kind(whole, decoder, stamped=stamped)
+        return _Kind(whole, text, decoder, stamped=stamped)
 
 
 class _Kind(NamedTuple):
-    """A type of the topic's messages; ``decoder`` where fields are selected, or bytes kept elsewhere."""
+    """A type of the topic's messages and its definition; ``decoder`` where fields are selected, or bytes kept
+    elsewhere."""
 
     whole: RosType
+    text: str
     decoder: Optional[Decoder]  # noqa: UP045 - a NamedTuple's types are evaluated, on Python 3.8 too
     stamped: bool

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Mapping
-from itertools import chain
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -98,21 +98,34 @@ def _make(cloud: Cloud, selection: Selection, file: Recording, said: Mapping[str
     first = next(blocks, None)
     if first is None:
         return 0
-    kind = next(iter(reversed(list(said.values()))), None)
-    maker = messages.Maker(
-        kind or messages.made_of(stream, first.columns), list(first.columns), own=kind is None
-    )
-    write = file.topic(maker.kind.topic, maker.kind.kind, maker.definition, maker.md5sum)
-    written = 0
-    for block in chain([first], blocks):
+    # Of topics that share a stream nobody can tell whose a selection of fields is.
+    shared = len({kind.topic for kind in said.values()}) > 1
+    kind = None if shared else next(iter(reversed(list(said.values()))), None)
+    makers: dict[tuple[tuple[str, str], ...], tuple[messages.Maker, Write]] = {}
+    numbers, written = itertools.count(), 0
+    for block in itertools.chain([first], blocks):
+        # Fields come and go while a robot drives, and what a field holds may change.
+        shape = tuple(sorted((name, column.dtype.kind) for name, column in block.columns.items()))
+        if shape not in makers:
+            made = kind or messages.made_of(stream, block.columns)
+            maker = messages.Maker(made, list(block.columns), own=kind is None, numbers=numbers)
+            topic = file.topic(maker.kind.topic, maker.kind.kind, maker.definition, maker.md5sum)
+            makers[shape] = maker, topic
+        maker, write = makers[shape]
         for t_ns, message in maker.messages(block):
             write(t_ns, message)
             written += 1
     say(f"{robot} {stream}: {written:,} messages of {maker.kind.kind} on {maker.kind.topic}, made of samples")
-    if kind is None:
+    if shared:
+        say(f"several topics of {robot} share {stream}, so the type is made of the fields selected")
+    elif kind is None:
         say(f"{robot} has not said what {stream} is made of, so the type is made of its fields")
-    if maker.lacking:
-        say(f"not in the samples, so zero or empty: {', '.join(maker.lacking)}")
-    if maker.foreign:
-        say(f"not in the type, so left out: {', '.join(maker.foreign)}")
+    if len(makers) > 1 and kind is None:
+        say(f"its fields changed, so there are {len(makers)} types of that name")
+    lacking = {name for maker, _ in makers.values() for name in maker.lacking}
+    foreign = {name for maker, _ in makers.values() for name in maker.foreign}
+    if lacking:
+        say(f"not in the samples, or not in all, so zero or empty: {', '.join(sorted(lacking))}")
+    if foreign:
+        say(f"not in the type, so left out: {', '.join(sorted(foreign))}")
     return written

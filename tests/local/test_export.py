@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import struct
 from pathlib import Path
 from typing import Any
 
@@ -12,11 +13,13 @@ from rosbags.highlevel import AnyReader
 from rosbags.rosbag1 import Writer
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
+from contract import Batch, encode, record_topic
 from contract.ros1.decode import HEADER
-from station import data
+from station import data, delivery
 from station.cloud import Cloud
 from tests.foxglove import flat, opened
-from tests.local.conftest import run_agent
+from tests.local.conftest import run_agent, until
+from tests.local.robot import Robot
 from tests.local.test_query import iort
 from tests.recordings import recording
 
@@ -150,3 +153,26 @@ def test_a_bag_comes_back_as_it_went_in(embedded, bundle, tmp_path):
     done = iort(*asked, str(exported), embedded=embedded)
     assert done.returncode == 1
     assert "exists" in done.stderr
+
+
+def test_fields_that_come_later_are_exported_too(embedded: Any, bundle: Any, tmp_path: Path) -> None:
+    car, noise = bundle(), np.random.default_rng(1)
+    t_us, n, batches = 1_760_000_000_000_000, 2000, 14
+    wide = [{f"x{i}": noise.random(n).tolist() for i in range(4)} for _ in range(batches)]
+    with Robot(car.folder) as robot:
+        robot.online()
+        # More than a page of the table, and then another field.
+        for seq, columns in enumerate([*wide, {"y": [1.5]}]):
+            times = [t_us + seq * 1_000_000 + i for i in range(len(next(iter(columns.values()))))]
+            batch = Batch("0badcafe", seq, times, columns)
+            assert robot.publish(record_topic(car.robot, "s"), encode(batch)) == "SUCCESS"
+    until(lambda: len(list(delivery.items(embedded.cloud, car.robot, "s"))) == batches + 1)
+    path = tmp_path / "s.bag"
+    done = iort("export", car.robot, "s", "--last", "all", "-o", str(path), embedded=embedded)
+    assert done.returncode == 0, done.stderr
+    with AnyReader([path]) as reader:
+        *_, (connection, _, raw) = reader.messages()
+        assert sum(1 for _ in reader.messages()) == n * batches + 1
+    assert "float64 y" in connection.msgdef.data
+    assert HEADER.unpack_from(raw)[0] == n * batches
+    assert raw.endswith(struct.pack("<d", 1.5))

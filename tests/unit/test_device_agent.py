@@ -258,6 +258,32 @@ def test_lanes_fields_and_rates_change_while_it_runs() -> None:
     ]  # fmt: skip
 
 
+def test_types_are_said_again_when_recording_begins() -> None:
+    said = contract.MessageType("vesc", "/vesc", "p/A", "0" * 32, "float64 speed\n")
+
+    def late(emit: Emit, stop: threading.Event) -> None:
+        emit(contract.TYPES_STREAM, T0, said.sample())
+        rig.agent.tune(replace(rig.agent._tuning, record_enabled=True))
+        emit("vesc", T0 + 1_000_000, {"speed": 1})
+
+    rig = Rig(late, record=RecordConfig(enabled=False))
+    assert rig.agent.run(drain_s=10) == 0
+    assert rig.recorded() == [1]
+    topic = "$aws/rules/iort_record/dt/iort/car1/types"
+    (batch,) = [contract.decode(m.payload) for m in rig.uplink.published if m.topic == topic]
+    sample = {name: column[0] for name, column in batch.columns.items()}
+    assert contract.message_type(sample) == said
+
+
+def test_an_account_is_of_one_moment() -> None:
+    rig = Rig(drive)
+    assert rig.agent.run(drain_s=10) == 0
+    # As a batch does that is stored between two looks.
+    rig.spool.put("vesc", rig.spool.next_seq("vesc"), b"", samples=50)
+    counts, next_seq = rig.agent._counted()["vesc"]
+    assert (counts.stored, next_seq) == (500, 10)
+
+
 def test_its_own_figures_are_a_stream() -> None:
     seen = threading.Event()
 

@@ -52,6 +52,26 @@ def test_the_first_message_of_a_topic_brings_its_type(tmp_path: Path) -> None:
     assert contract.TYPES_STREAM not in {sample[0] for sample in rest}
 
 
+def test_a_type_that_was_rebuilt_while_recording_is_two_types(tmp_path: Path) -> None:
+    path, kind = tmp_path / "a.bag", "lab_msgs/msg/State"
+    definitions = ["float32 x\n", "int32 x\nint32 more\n"]
+    with Writer1(path) as writer:
+        for i, definition in enumerate(definitions):
+            store = get_typestore(Stores.EMPTY)
+            store.register(get_types_from_msg(definition, kind))
+            md5sum = store.generate_msgdef(kind, ros_version=1)[1]
+            connection = writer.add_connection(
+                "/state", kind, msgdef=definition, md5sum=md5sum, callerid=f"/node_{i}"
+            )
+            writer.write(connection, START + i, (b"\0\0\x80?", bytes(range(8)))[i])
+    types, samples = [], []
+    for stream, _, values in play_all(path, topics=(("/state", "state"),)):
+        (types if stream == contract.TYPES_STREAM else samples).append(values)
+    assert [contract.message_type(said).definition for said in types] == definitions
+    assert [sample.kind.id for sample in samples] == [contract.message_type(said).id for said in types]
+    assert [dict(sample) for sample in samples] == [{"x": 1.0}, {"x": 0x03020100, "more": 0x07060504}]
+
+
 @pytest.mark.parametrize("speed", [0.0, 1.0])
 def test_what_is_played_is_what_was_recorded_byte_for_byte(tmp_path: Path, speed: float) -> None:
     from rosbags.rosbag1 import Reader

@@ -5,6 +5,7 @@ from __future__ import annotations
 import struct
 import sys
 import threading
+from types import SimpleNamespace
 from typing import Any
 
 import pytest
@@ -45,6 +46,27 @@ def test_a_publishers_type_is_said_when_it_connects() -> None:
         desk.intake.take(header, b"")
     said = contract.MessageType("s", "/t", "a_msgs/A", "1", CONNECTION["message_definition"])
     assert desk.types == [said]
+
+
+def test_a_definition_that_is_not_sent_is_the_installed_classes(monkeypatch: pytest.MonkeyPatch) -> None:
+    text = "# of the class\nuint8 N=3\nuint8 u\n"
+    installed = SimpleNamespace(get_message_class=lambda _kind: SimpleNamespace(_full_text=text))
+    monkeypatch.setitem(sys.modules, "roslib", SimpleNamespace(message=installed))
+    monkeypatch.setitem(sys.modules, "roslib.message", installed)
+    desk = Desk()
+    desk.take(b"\x01", message_definition="")
+    assert [said.definition for said in desk.types] == [text]
+    ((_, _, sample),) = desk.samples
+    assert (sample.kind.layout, dict(sample)) == (desk.types[0].layout, {"u": 1})
+
+
+def test_a_definition_that_the_first_publisher_left_out_comes_with_the_second() -> None:
+    desk = Desk()
+    desk.take(b"\x01", message_definition="", callerid="/small")
+    desk.take(b"\x02", message_definition="uint8 u", callerid="/whole")
+    desk.take(b"\x03", message_definition="", callerid="/small")
+    assert [dict(sample) for _, _, sample in desk.samples] == [{}, {"u": 2}, {"u": 3}]
+    assert [said.definition for said in desk.types] == ["", "uint8 u", "uint8 u"]
 
 
 def test_a_type_is_said_once_a_connection_where_publishers_take_turns() -> None:

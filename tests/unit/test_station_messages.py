@@ -87,6 +87,12 @@ def test_what_flattens_is_made_again():
     assert maker.lacking == maker.foreign == []
 
 
+def test_fields_may_be_words_of_python():
+    _, _, message = made("float64 from\nB class\n" + LINE + "MSG: a_msgs/B\nint32 lambda\n",
+                         {"from": 1.5, "class.lambda": 3})  # fmt: skip
+    assert (message.from_, message.class_.lambda_) == (1.5, 3)
+
+
 def test_null_lacking_and_foreign_fields():
     maker, _, message = made(STAMPED, {"x": None, "y": 1})
     assert np.isnan(message.b.x)
@@ -116,6 +122,12 @@ def test_what_a_robot_has_said_of_its_messages():
     }
     assert len({first.id, second.id, elsewhere.id}) == 3
     assert types(cloud, "car", "nothing") == {}
+
+
+def test_a_definition_that_one_publisher_left_out_is_taken_from_another():
+    whole = MessageType("s", "/t", "a_msgs/A", "1" * 32, STAMPED)
+    cloud = has_said(whole._replace(definition=""), whole)
+    assert types(cloud, "car", "s") == {whole.id: (1000, whole)}
 
 
 def test_samples_without_a_type_get_one():
