@@ -3,25 +3,41 @@
 from __future__ import annotations
 
 import json
+import logging
 from collections.abc import Mapping
 from functools import cache
 from typing import Any
 
 import boto3
 
-from contract import LAMBDA, PONG, TOPIC, build_topic, parse_topic
+from contract import (
+    LAMBDA,
+    PING_FIELDS,
+    PONG,
+    RECEIVED_MS,
+    TOPIC,
+    ContractError,
+    build_topic,
+    event_message,
+    json_object,
+    parse_topic,
+)
 from functions.metrics import emit
+
+_log = logging.getLogger(__name__)
+_log.setLevel(logging.INFO)
 
 
 def pong(event: Mapping[str, Any]) -> tuple[str, bytes]:
-    """The topic and payload of the answer: the ping's content and the cloud's ``received_ms``.
+    """The topic and payload of the answer: the ping's fields and the cloud's ``received_ms``.
 
-    Raises `contract.ContractError` for a topic that is not one of ours.
+    Raises `contract.ContractError` for a topic that is not one of ours, and for a message that is no ping.
     """
-    ping = parse_topic(event[TOPIC])
-    content = {key: value for key, value in event.items() if key != TOPIC}
-    topic = build_topic(PONG, ping.robot, LAMBDA, ping.namespace)
-    return topic, json.dumps(content, separators=(",", ":")).encode()
+    topic = parse_topic(event[TOPIC])
+    ping = json_object(event_message(event), "ping")
+    content = {name: ping[name] for name in PING_FIELDS if name in ping}
+    answer = json.dumps({**content, RECEIVED_MS: event[RECEIVED_MS]}, separators=(",", ":"))
+    return build_topic(PONG, topic.robot, LAMBDA, topic.namespace), answer.encode()
 
 
 @cache
@@ -31,6 +47,11 @@ def _iot_data() -> Any:
 
 def handler(event: dict[str, Any], _context: object) -> None:
     """Entry point of the echo rule's Lambda action."""
-    topic, payload = pong(event)
+    try:
+        topic, payload = pong(event)
+    except ContractError as error:
+        # Of its moment, and nobody can be told: not worth a failed invocation.
+        _log.warning("no answer to %s: %s", event[TOPIC], error)
+        return
     _iot_data().publish(topic=topic, qos=0, payload=payload)
     emit("echo", PongsSent=1)

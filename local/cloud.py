@@ -36,13 +36,12 @@ from contract import (
     LAMBDA,
     LIVE,
     PING,
-    RECEIVED_MS,
     TOPIC,
     LiveSample,
     build_topic,
     encode_live,
     encode_ping,
-    live_event,
+    rule_event,
 )
 from local.certificates import Identity
 from local.deployment import ROOT, deploy
@@ -233,7 +232,7 @@ class EmbeddedCloud:
             ("processing", "Summarize"): {"Records": []},
             ("processing", "Echo"): self._ping(),
             # No fault and no low voltage.
-            ("processing", "Alert"): {**self._ping(), RECEIVED_MS: 0},
+            ("processing", "Alert"): self._ping(),
             ("processing", "Upload"): {TOPIC: build_topic(PING, "warm-up", FILE, self.namespace)},
             ("fleet", "Admit"): {},
             ("fleet", "Presence"): {},
@@ -248,9 +247,9 @@ class EmbeddedCloud:
                 raise LocalError(f"function {name} does not start: {reason[:500]}")
 
     def _ping(self) -> dict[str, Any]:
-        return {TOPIC: build_topic(PING, "warm-up", LAMBDA, self.namespace), **json.loads(encode_ping(0, 0))}
+        return rule_event(encode_ping(0, 0), build_topic(PING, "warm-up", LAMBDA, self.namespace), 0)
 
     def _live(self) -> dict[str, Any]:
         """Stale since 1970, and dropped."""
         sample = LiveSample(boot="00000000", seq=0, t_us=0, sent_us=0, sample={}, offset_us=0)
-        return live_event(encode_live(sample), build_topic(LIVE, "warm-up", "warm-up", self.namespace), 0)
+        return rule_event(encode_live(sample), build_topic(LIVE, "warm-up", "warm-up", self.namespace), 0)

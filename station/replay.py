@@ -18,6 +18,7 @@ from contract import (
     BY_RULE,
     BY_STREAM,
     ENTRY,
+    ENVELOPE,
     LAST_MS,
     RECEIVED_MS,
     RECORD,
@@ -27,7 +28,6 @@ from contract import (
     Batch,
     ContractError,
     decode_item,
-    parse_topic,
 )
 from station.cloud import Cloud
 from station.errors import StationError
@@ -118,8 +118,9 @@ def _batch(entry: Entry) -> Batch:
         return decode_item(plain(_object(payload)))[1]
     if not _is_rules(entry) or not entry.topic.startswith(f"{RECORD}/"):
         raise _NotForReplayError("of its moment, or without a batch: only the record lane is replayed")
-    parse_topic(entry.topic)
-    return decode_item({**_object(payload), TOPIC: entry.topic, RECEIVED_MS: entry.first_ms})[1]
+    message = _object(payload)
+    item = {name: message[name] for name in ENVELOPE if name in message}
+    return decode_item({**item, TOPIC: entry.topic, RECEIVED_MS: entry.first_ms})[1]
 
 
 def _object(payload: bytes) -> dict[str, Any]:
