@@ -118,8 +118,10 @@ def handler(event: dict[str, Any], _context: object) -> None:
         _log.warning("refused a request of %s: %s", topic.robot, error)
         emit("upload", FilesRefused=1)
         request_id = envelope.get("id")
-        if isinstance(request_id, str):
-            _reply(topic.robot, topic.namespace, FileAnswer(request_id[:32], refused=str(error)))
+        if not isinstance(request_id, str):
+            # Nobody can be told; as a failed invocation it goes to the quarantine.
+            raise
+        _reply(topic.robot, topic.namespace, FileAnswer(request_id[:32], refused=str(error)))
         return
     given = answer(topic.robot, request, _bucket(), _allotment(), time.time())
     done = given.stored and request.parts_sha256 is not None

@@ -173,7 +173,10 @@ def _number(value: Any) -> int | float | None:
 
 def _operation(sign: str, left: Any, right: Any) -> Callable[[Message], Any]:
     def operate(message: Message) -> Any:
-        a, b = _number(left(message)), _number(right(message))
+        a, b = left(message), right(message)
+        if sign == "+" and str in (type(a), type(b)):
+            raise NotImplementedError("our rules put no texts together")
+        a, b = _number(a), _number(b)
         if a is None or b is None or (sign in "/%" and b == 0):
             return UNDEFINED
         if sign == "/":
@@ -188,11 +191,11 @@ def _compared(sign: str, a: Any, b: Any) -> Any:
     if a is UNDEFINED or b is UNDEFINED:
         return UNDEFINED
     if sign in ("=", "<>"):
-        return (a == b) == (sign == "=")
-    if not (isinstance(a, str) and isinstance(b, str)):
-        a, b = _number(a), _number(b)
-        if a is None or b is None:
-            return UNDEFINED
+        same = a == b and isinstance(a, bool) == isinstance(b, bool)
+        return same == (sign == "=")
+    a, b = _number(a), _number(b)
+    if a is None or b is None:
+        return UNDEFINED
     return {"<": a < b, ">": a > b, "<=": a <= b, ">=": a >= b}[sign]
 
 

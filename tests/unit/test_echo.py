@@ -42,10 +42,9 @@ def test_a_topic_that_is_not_ours_is_refused(topic):
 
 
 @pytest.mark.parametrize("message", [b"no JSON", b"\xff", b"[]", b"1", b"", b"[" * 100_000])
-def test_what_is_no_ping_has_no_answer_and_fails_no_invocation(message, monkeypatch, capsys):
-    monkeypatch.setattr(echo, "_iot_data", None)
-    assert echo.handler(contract.rule_event(message, build_topic(PING, "car", LAMBDA), 1), None) is None
-    assert "PongsSent" not in capsys.readouterr().out
+def test_what_is_no_ping_fails_and_so_goes_to_the_quarantine(message):
+    with pytest.raises(ContractError, match="ping is"):
+        echo.handler(contract.rule_event(message, build_topic(PING, "car", LAMBDA), 1), None)
 
 
 def test_the_handler_publishes_and_counts(monkeypatch, capsys):

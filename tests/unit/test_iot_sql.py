@@ -14,6 +14,7 @@ from tests.iot_sql import Message, evaluate
 
 RED = {"color": "red", "temperature": 50}
 COLORS = {"color": {"red": 255, "green": 0, "blue": 0}, "temperature": 50}
+THING = "things/myThings/thingOne"
 BUILDING = "Buildings/Building5/Floor2/Room201/Lights"
 NOW_MS = 1_481_825_251_155
 
@@ -56,7 +57,13 @@ def run(request, monkeypatch):
         ),
         ("SELECT *, 15 as speed FROM 'topic/subtopic'", RED, {**RED, "speed": 15}),
         ("SELECT color.red as red_value FROM 'topic/subtopic'", COLORS, {"red_value": 255}),
+        ("SELECT (temperature - 32) * 5 / 9 AS celsius FROM 'topic/subtopic'", RED, {"celsius": 10}),
         # "AWS IoT SQL reference" and "WHERE clause"
+        (
+            "SELECT color AS my_color FROM 'topic/subtopic' WHERE temperature > 50 AND color <> 'red'",
+            {"color": "red", "temperature": 40},
+            None,
+        ),
         (
             "SELECT color AS rgb FROM 'topic/subtopic' WHERE temperature > 50",
             {"color": "red", "temperature": 100},
@@ -80,6 +87,14 @@ def run(request, monkeypatch):
         ("SELECT a / b AS q, a % b AS r FROM 'a'", {"a": 7, "b": 2}, {"q": 3, "r": 1}),
         ("SELECT a FROM 'a' WHERE a > 1 AND a < 3", {"a": 2}, {"a": 2}),
         ("SELECT a FROM 'a' WHERE a > 1 AND a < 3", {"a": 4}, None),
+        # Both operands of > are converted to Decimal; another value, null too, leaves it Undefined.
+        ("SELECT a FROM 'a' WHERE a > 1", {"a": "1.5"}, {"a": "1.5"}),
+        ("SELECT a FROM 'a' WHERE a > 1", {"a": "x"}, None),
+        ("SELECT a FROM 'a' WHERE a > 1", {"a": None}, None),
+        ("SELECT a FROM 'a' WHERE a > 0", {"a": True}, None),
+        # <> of mismatched types is true, and of Undefined neither true nor false.
+        ("SELECT a FROM 'a' WHERE a <> ''", {"a": 7}, {"a": 7}),
+        ("SELECT a FROM 'a' WHERE a <> ''", {"a": ""}, None),
     ],
 )
 def test_an_example_of_a_statement(run, sql, payload, expected):
@@ -87,11 +102,17 @@ def test_an_example_of_a_statement(run, sql, payload, expected):
 
 
 @pytest.mark.parametrize(
-    ("call", "expected"), [("topic()", BUILDING), ("topic(1)", "Buildings"), ("topic(3)", "Floor2")]
+    ("topic", "call", "expected"),
+    [
+        (THING, "topic()", THING),
+        (THING, "topic(1)", "things"),
+        # Of Basic Ingest's topic, whose prefix is not available to the function.
+        (BUILDING, "topic()", BUILDING),
+        (BUILDING, "topic(3)", "Floor2"),
+    ],
 )
-def test_the_example_of_topic(run, call, expected):
-    """Of Basic Ingest's topic, whose prefix is not available to the function."""
-    assert run(f"SELECT {call} AS t FROM 'Buildings/#'", BUILDING, b"{}") == {"t": expected}
+def test_an_example_of_topic(run, topic, call, expected):
+    assert run(f"SELECT {call} AS t FROM '#'", topic, b"{}") == {"t": expected}
 
 
 @pytest.mark.parametrize("payload", [b'{"a": 1.50}', b"no JSON", b"\xff\x00", b"", b"[1, 2]"])

@@ -395,9 +395,10 @@ def test_the_handler_says_what_is_wrong_with_a_request(published, capsys):
     assert answer.refused == "part 9: allowed is 1 to 1"
     assert answer.again_s is None
     assert json.loads(capsys.readouterr().out.splitlines()[-1])["FilesRefused"] == 1
-    # Nobody can be told who has not said which request it is.
+    # Nobody can be told who has not said which request it is: to the quarantine with it.
     for message in (b"{}", b"no JSON", b"\xff", b"[]", b"[" * 100_000):
-        upload.handler(contract.rule_event(message, build_topic(PING, "car", FILE), 1), None)
+        with pytest.raises(ContractError):
+            upload.handler(contract.rule_event(message, build_topic(PING, "car", FILE), 1), None)
         assert json.loads(capsys.readouterr().out.splitlines()[-1])["FilesRefused"] == 1
     assert len(published) == 1
 
