@@ -20,7 +20,7 @@ from contract.batch import (
     messages_of,
     split,
 )
-from contract.checks import check_field
+from contract.checks import check_field, json_object
 from contract.cloud import (
     FILES_PREFIX,
     LOW_VOLTAGE_V,
@@ -50,6 +50,7 @@ from contract.commands import (
     encode_fleet,
 )
 from contract.effort import check_effort
+from contract.event import MESSAGE_BASE64, event_message, rule_event
 from contract.files import (
     CLAIM_AT,
     CLAIM_FIELDS,
@@ -94,15 +95,13 @@ from contract.limits import (
     Value,
 )
 from contract.live import (
-    MESSAGE_BASE64,
+    PING_FIELDS,
     LiveSample,
     Pong,
     decode_live,
     decode_pong,
     encode_live,
     encode_ping,
-    live_event,
-    live_message,
     live_update,
 )
 from contract.message_type import MessageType, message_type
@@ -127,6 +126,7 @@ from contract.tables import (
     DISCONNECT_REASON,
     DISCONNECTED_MS,
     ENTRY,
+    ENVELOPE,
     EXPIRES_S,
     FILES_BYTES,
     FILES_DAY,
@@ -186,6 +186,7 @@ from contract.topics import (
     SHADOW,
     TYPES_STREAM,
     Topic,
+    as_subscribed,
     build_topic,
     check_namespace,
     check_robot,
@@ -245,6 +246,7 @@ __all__ = [
     "DISCONNECTED_MS",
     "DISCONNECT_REASON",
     "ENTRY",
+    "ENVELOPE",
     "EXACT",
     "EXPIRES_S",
     "FAULTS",
@@ -299,6 +301,7 @@ __all__ = [
     "PART_BYTES",
     "PAYLOAD",
     "PING",
+    "PING_FIELDS",
     "PING_PATHS",
     "PLAIN_CODEC",
     "PONG",
@@ -359,6 +362,7 @@ __all__ = [
     "Topic",
     "Value",
     "absent",
+    "as_subscribed",
     "batch_id",
     "batches_between",
     "build_topic",
@@ -384,12 +388,12 @@ __all__ = [
     "encode_fleet",
     "encode_live",
     "encode_ping",
+    "event_message",
     "file_key",
     "flat_second",
     "fleet_name",
     "inflate",
-    "live_event",
-    "live_message",
+    "json_object",
     "live_topic",
     "live_update",
     "message_type",
@@ -401,6 +405,7 @@ __all__ = [
     "pong_template",
     "pubnub_parameter",
     "record_topic",
+    "rule_event",
     "rule_name",
     "rule_sql",
     "split",

@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 from contract.checks import shown
+from contract.event import MESSAGE_BASE64
 from contract.limits import DEFAULT_NAMESPACE, ContractError
-from contract.live import MESSAGE_BASE64
-from contract.tables import AGENT_VERSION, EXPIRES_S, RECEIVED_MS, ROBOT, TOPIC
+from contract.live import PING_FIELDS
+from contract.tables import AGENT_VERSION, ENVELOPE, EXPIRES_S, RECEIVED_MS, ROBOT, TOPIC
 from contract.topics import (
     FILE,
     LAMBDA,
@@ -71,24 +72,28 @@ def rule_sql(
     retention_s: int = 90 * 86_400,
     low_voltage_v: float = LOW_VOLTAGE_V,
 ) -> str:
-    """The SELECT of a topic rule. What only the cloud may say (whose message, when received, when
-    it expires) comes last, so that it overrides what the message claims."""
+    """The SELECT of a topic rule.
+
+    A rule that adds what only the cloud may say (whose message, when received, when it expires) never
+    selects ``*`` beside it: AWS does not say which of two keys of one name stays. It selects the message's
+    keys by name, or the message as one opaque value.
+    """
     name = check_namespace(namespace)
     received = f"timestamp() AS {RECEIVED_MS}"
+    # Byte by byte, whatever it is, JSON or not.
+    message = f"encode(*, 'base64') AS {MESSAGE_BASE64}, topic() AS {TOPIC}, {received}"
     if rule == "record":
         expires = f"floor(timestamp() / 1000) + {retention_s} AS {EXPIRES_S}"
-        return f"SELECT *, topic() AS {TOPIC}, {received}, {expires} FROM '{RECORD}/{name}/+/+'"
+        said = f"topic() AS {TOPIC}, {received}, {expires}"
+        return f"SELECT {', '.join(ENVELOPE)}, {said} FROM '{RECORD}/{name}/+/+'"
     if rule == "live":
-        # Byte by byte, whatever it is: a payload that is no JSON cannot go with others in SELECT *, and its
-        # bytes would be lost to the quarantine.
-        raw = f"encode(*, 'base64') AS {MESSAGE_BASE64}"
-        return f"SELECT {raw}, topic() AS {TOPIC}, {received} FROM '{LIVE}/{name}/+/+'"
+        return f"SELECT {message} FROM '{LIVE}/{name}/+/+'"
     if rule == "pong":
-        return f"SELECT *, {received} FROM '{PING}/{name}/+/{RULE}'"
+        return f"SELECT {', '.join(PING_FIELDS)}, {received} FROM '{PING}/{name}/+/{RULE}'"
     if rule == "echo":
-        return f"SELECT *, topic() AS {TOPIC}, {received} FROM '{PING}/{name}/+/{LAMBDA}'"
+        return f"SELECT {message} FROM '{PING}/{name}/+/{LAMBDA}'"
     if rule == "upload":
-        return f"SELECT *, topic() AS {TOPIC}, {received} FROM '{PING}/{name}/+/{FILE}'"
+        return f"SELECT {message} FROM '{PING}/{name}/+/{FILE}'"
     if rule == "presence":
         return f"SELECT * FROM '{_PRESENCE}/+/+' WHERE eventType <> 'connect_failed'"
     if rule == "version":
@@ -109,7 +114,7 @@ def rule_sql(
 
 def _alert_sql(field: str, namespace: str, condition: str) -> str:
     return (
-        f"SELECT t, sample.{field} AS {field}, topic() AS {TOPIC}, timestamp() AS {RECEIVED_MS} "
+        f"SELECT sample.{field} AS {field}, topic() AS {TOPIC}, timestamp() AS {RECEIVED_MS} "
         f"FROM '{LIVE}/{namespace}/+/+' WHERE {condition}"
     )
 

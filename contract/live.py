@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import base64
 import json
 from dataclasses import dataclass
 from typing import Any, Mapping, NamedTuple
@@ -22,10 +21,10 @@ from contract.checks import (
     wire_sample,
 )
 from contract.limits import MAX_FIELDS, SCHEMA_VERSION, ContractError, Value
-from contract.tables import NONFINITE, RECEIVED_MS, ROBOT, T_US, TOPIC
+from contract.tables import NONFINITE, RECEIVED_MS, ROBOT, T_US
 
-# Under this name the live rule hands the message over, so that its own bytes come through.
-MESSAGE_BASE64 = "message_base64"
+# What a ping says; the answer repeats it.
+PING_FIELDS = ("v", "id", "sent_us", "padding")
 
 
 @dataclass(frozen=True)
@@ -87,23 +86,6 @@ def decode_live(message: bytes | str) -> LiveSample:
     offset_us = integer(envelope, "offset_us") if "offset_us" in envelope else None
     offset_entry(offset_us)
     return LiveSample(boot, seq, t_us, sent_us, sample, nonfinite, offset_us)
-
-
-def live_event(message: bytes, topic: str, received_ms: int) -> dict[str, Any]:
-    """What the live rule makes of a message, and Lambda 1 is called with."""
-    return {MESSAGE_BASE64: base64.b64encode(message).decode(), TOPIC: topic, RECEIVED_MS: received_ms}
-
-
-def live_message(event: Mapping[str, Any]) -> bytes:
-    """The message that a `live_event` was made of, as it was sent; raises `ContractError` for an event of
-    another kind."""
-    encoded = event.get(MESSAGE_BASE64)
-    if not isinstance(encoded, str):
-        raise ContractError(f"{MESSAGE_BASE64}: expected text, not {shown(encoded)}")
-    try:
-        return base64.b64decode(encoded, validate=True)
-    except ValueError as error:
-        raise ContractError(f"{MESSAGE_BASE64}: no base64") from error
 
 
 def live_update(

@@ -17,6 +17,8 @@ STATS = ("min", "mean", "max", "last")
 # between samples, values that were not finite.
 SAMPLES, BATCHES, MISSING_BATCHES = "n", "batches", "missing_batches"
 GAPS, NONFINITE = "gaps", "nonfinite"
+# The keys of a batch's envelope: all that the record rule stores of a message.
+ENVELOPE = ("v", BATCH, SAMPLES, NONFINITE, "codec", "samples")
 # And, only where there are some, values of sensors that are not fitted (contract/vesc.py).
 ABSENT = "absent"
 # Of a second that would be larger than DynamoDB's 400 KB: attributes left out, the largest first.

@@ -97,6 +97,15 @@ def _straight_to(rule: str, topic: str, namespace: str) -> str:
     return f"$aws/rules/{rule_name(rule, namespace)}/{topic}"
 
 
+def as_subscribed(topic: str, rule: str) -> str:
+    """The topic without Basic Ingest's prefix to the rule of that physical name, if it has it.
+
+    ``topic()`` leaves it out; AWS does not say whether an error action's document does.
+    """
+    prefix = f"$aws/rules/{rule}/"
+    return topic[len(prefix) :] if topic.startswith(prefix) else topic
+
+
 RULES = ("record", "live", "pong", "echo", "upload", "presence", "version", "fault", "battery")
 
 

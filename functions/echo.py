@@ -9,19 +9,30 @@ from typing import Any
 
 import boto3
 
-from contract import LAMBDA, PONG, TOPIC, build_topic, parse_topic
+from contract import (
+    LAMBDA,
+    PING_FIELDS,
+    PONG,
+    RECEIVED_MS,
+    TOPIC,
+    build_topic,
+    event_message,
+    json_object,
+    parse_topic,
+)
 from functions.metrics import emit
 
 
 def pong(event: Mapping[str, Any]) -> tuple[str, bytes]:
-    """The topic and payload of the answer: the ping's content and the cloud's ``received_ms``.
+    """The topic and payload of the answer: the ping's fields and the cloud's ``received_ms``.
 
-    Raises `contract.ContractError` for a topic that is not one of ours.
+    Raises `contract.ContractError` for a topic that is not one of ours, and for a message that is no ping.
     """
-    ping = parse_topic(event[TOPIC])
-    content = {key: value for key, value in event.items() if key != TOPIC}
-    topic = build_topic(PONG, ping.robot, LAMBDA, ping.namespace)
-    return topic, json.dumps(content, separators=(",", ":")).encode()
+    topic = parse_topic(event[TOPIC])
+    ping = json_object(event_message(event), "ping")
+    content = {name: ping[name] for name in PING_FIELDS if name in ping}
+    answer = json.dumps({**content, RECEIVED_MS: event[RECEIVED_MS]}, separators=(",", ":"))
+    return build_topic(PONG, topic.robot, LAMBDA, topic.namespace), answer.encode()
 
 
 @cache
@@ -30,7 +41,7 @@ def _iot_data() -> Any:
 
 
 def handler(event: dict[str, Any], _context: object) -> None:
-    """Entry point of the echo rule's Lambda action."""
+    """Entry point of the echo rule's Lambda action; what it fails on goes to the quarantine."""
     topic, payload = pong(event)
     _iot_data().publish(topic=topic, qos=0, payload=payload)
     emit("echo", PongsSent=1)

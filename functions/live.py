@@ -20,7 +20,7 @@ from contract import (
     absent,
     channel,
     decode_live,
-    live_message,
+    event_message,
     live_update,
     parse_topic,
 )
@@ -82,7 +82,7 @@ def process(
     """
     try:
         topic = parse_topic(event[TOPIC])
-        live = decode_live(live_message(event))
+        live = decode_live(event_message(event))
         received_ms = int(event[RECEIVED_MS])
     except (ContractError, AttributeError, KeyError, TypeError, ValueError, OverflowError) as error:
         emit("live", LiveRefused=1)

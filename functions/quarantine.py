@@ -40,7 +40,8 @@ from contract import (
     SOURCE,
     TOPIC,
     ContractError,
-    live_message,
+    as_subscribed,
+    event_message,
 )
 from functions.metrics import emit
 
@@ -110,9 +111,10 @@ def entries(body: str, records: Records) -> list[Entry]:
 def _of_rule(document: Mapping[str, Any]) -> Entry:
     failures = document.get("failures") or []
     reason = "; ".join(f"{f.get('failedAction')}: {f.get('errorMessage')}" for f in failures)
+    rule = str(document["ruleName"])
     return Entry(
-        source=f"{BY_RULE} {document['ruleName']}",
-        topic=str(document.get("topic", "")),
+        source=f"{BY_RULE} {rule}",
+        topic=as_subscribed(str(document.get("topic", "")), rule),
         reason=reason or "no reason given",
         payload=base64.b64decode(document["base64OriginalPayload"], validate=True),
     )
@@ -138,9 +140,9 @@ def _of_invocation(document: Mapping[str, Any]) -> Entry:
 
 
 def _message(event: Any) -> bytes:
-    """What a function was called about: a live message's own bytes, or else the event."""
+    """What a function was called about: a message's own bytes, or else the event."""
     with suppress(ContractError, AttributeError):
-        return live_message(event)
+        return event_message(event)
     return _json(event)
 
 

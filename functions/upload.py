@@ -22,7 +22,9 @@ from contract import (
     build_topic,
     decode_file_request,
     encode_file_answer,
+    event_message,
     file_key,
+    json_object,
     parse_topic,
 )
 from functions.allotment import Allotment
@@ -108,14 +110,18 @@ def _iot_data() -> Any:
 def handler(event: dict[str, Any], _context: object) -> None:
     """Entry point of the upload rule's Lambda action."""
     topic = parse_topic(event[TOPIC])
+    envelope: dict[str, Any] = {}
     try:
-        request = decode_file_request(event)
+        envelope = json_object(event_message(event), "file request")
+        request = decode_file_request(envelope)
     except ContractError as error:
         _log.warning("refused a request of %s: %s", topic.robot, error)
         emit("upload", FilesRefused=1)
-        request_id = event.get("id")
-        if isinstance(request_id, str):
-            _reply(topic.robot, topic.namespace, FileAnswer(request_id[:32], refused=str(error)))
+        request_id = envelope.get("id")
+        if not isinstance(request_id, str):
+            # Nobody can be told; as a failed invocation it goes to the quarantine.
+            raise
+        _reply(topic.robot, topic.namespace, FileAnswer(request_id[:32], refused=str(error)))
         return
     given = answer(topic.robot, request, _bucket(), _allotment(), time.time())
     done = given.stored and request.parts_sha256 is not None

@@ -36,13 +36,11 @@ from contract import (
     LAMBDA,
     LIVE,
     PING,
-    RECEIVED_MS,
-    TOPIC,
     LiveSample,
     build_topic,
     encode_live,
     encode_ping,
-    live_event,
+    rule_event,
 )
 from local.certificates import Identity
 from local.deployment import ROOT, deploy
@@ -228,13 +226,16 @@ class EmbeddedCloud:
         message that waits for it is stale by then.
         """
         self._progress("functions")
+        # Stale since 1970, and dropped.
+        stale = LiveSample(boot="00000000", seq=0, t_us=0, sent_us=0, sample={}, offset_us=0)
         warm_up: dict[tuple[str, str], dict[str, Any]] = {
-            ("processing", "Live"): self._live(),
+            ("processing", "Live"): self._rule_event(encode_live(stale), LIVE, "warm-up"),
             ("processing", "Summarize"): {"Records": []},
-            ("processing", "Echo"): self._ping(),
+            ("processing", "Echo"): self._rule_event(encode_ping(0, 0), PING, LAMBDA),
             # No fault and no low voltage.
-            ("processing", "Alert"): {**self._ping(), RECEIVED_MS: 0},
-            ("processing", "Upload"): {TOPIC: build_topic(PING, "warm-up", FILE, self.namespace)},
+            ("processing", "Alert"): self._rule_event(b"", LIVE, "warm-up"),
+            # Refused, and nobody hears the answer.
+            ("processing", "Upload"): self._rule_event(b'{"id": "warm-up"}', PING, FILE),
             ("fleet", "Admit"): {},
             ("fleet", "Presence"): {},
             ("processing", "Query"): {},
@@ -247,10 +248,5 @@ class EmbeddedCloud:
                 reason = answer["Payload"].read().decode(errors="replace")
                 raise LocalError(f"function {name} does not start: {reason[:500]}")
 
-    def _ping(self) -> dict[str, Any]:
-        return {TOPIC: build_topic(PING, "warm-up", LAMBDA, self.namespace), **json.loads(encode_ping(0, 0))}
-
-    def _live(self) -> dict[str, Any]:
-        """Stale since 1970, and dropped."""
-        sample = LiveSample(boot="00000000", seq=0, t_us=0, sent_us=0, sample={}, offset_us=0)
-        return live_event(encode_live(sample), build_topic(LIVE, "warm-up", "warm-up", self.namespace), 0)
+    def _rule_event(self, message: bytes, lane: str, name: str) -> dict[str, Any]:
+        return rule_event(message, build_topic(lane, "warm-up", name, self.namespace), 0)

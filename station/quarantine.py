@@ -6,7 +6,20 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import Any
 
-from contract import ENTRY, FIRST_MS, LAST_MS, PAYLOAD, REASON, REPLAYS, ROBOT, SEEN, SOURCE, TOPIC
+from contract import (
+    BY_RULE,
+    ENTRY,
+    FIRST_MS,
+    LAST_MS,
+    PAYLOAD,
+    REASON,
+    REPLAYS,
+    ROBOT,
+    SEEN,
+    SOURCE,
+    TOPIC,
+    as_subscribed,
+)
 from station.cloud import Cloud
 from station.errors import StationError
 from station.items import plain
@@ -110,11 +123,12 @@ def _depth(cloud: Cloud, queue: str) -> int:
 
 def _entry(item: dict[str, Any]) -> Entry:
     values = plain(item)
+    source = values.get(SOURCE, "")
     return Entry(
         robot=values[ROBOT],
         id=values[ENTRY],
-        source=values.get(SOURCE, ""),
-        topic=values.get(TOPIC, ""),
+        source=source,
+        topic=as_subscribed(values.get(TOPIC, ""), source.removeprefix(f"{BY_RULE} ")),
         reason=values.get(REASON, ""),
         first_ms=int(values.get(FIRST_MS, 0)),
         last_ms=int(values.get(LAST_MS, 0)),

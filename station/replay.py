@@ -19,6 +19,7 @@ from contract import (
     BY_RULE,
     BY_STREAM,
     ENTRY,
+    ENVELOPE,
     LAST_MS,
     RECEIVED_MS,
     RECORD,
@@ -28,7 +29,6 @@ from contract import (
     Batch,
     ContractError,
     decode_item,
-    parse_topic,
 )
 from contract.checks import COMPACT, json_object
 from station.cloud import Cloud
@@ -151,8 +151,8 @@ def _batch(entry: Entry) -> Batch:
     value = json_object(entry.payload or b"", "message")
     if entry.source == BY_STREAM:
         return decode_item(plain(value))[1]
-    parse_topic(entry.topic)
-    return decode_item({**value, TOPIC: entry.topic, RECEIVED_MS: entry.first_ms})[1]
+    item = {name: value[name] for name in ENVELOPE if name in value}
+    return decode_item({**item, TOPIC: entry.topic, RECEIVED_MS: entry.first_ms})[1]
 
 
 def _count(cloud: Cloud, entry: Entry) -> None:

@@ -32,7 +32,7 @@ from contract import (
     LiveSample,
     build_topic,
     encode_live,
-    live_event,
+    rule_event,
 )
 from device.sources.vehicle import Vehicle, VehicleConfig
 from station import delivery
@@ -262,7 +262,7 @@ def _live_event(target: Target, i: int) -> dict[str, Any]:
     sample = Vehicle(VehicleConfig(), seed=1).sample()
     message = encode_live(LiveSample("0badcafe", i, now_us - 1000, now_us, sample))
     topic = build_topic(LIVE, target.name(ROBOT), VESC_STREAM, target.cloud.namespace)
-    return live_event(message, topic, now_us // 1000)
+    return rule_event(message, topic, now_us // 1000)
 
 
 def _cycle() -> dict[str, float]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import re
 
 import pytest
@@ -42,19 +43,32 @@ def test_rule_listens_to_its_own_topics_of_the_contract(rule, namespace):
     assert not matches(pattern, contract.build_topic(lane, "car", name, "other"))
 
 
-@pytest.mark.parametrize("rule", RULE_TOPICS)
-def test_what_the_cloud_says_overrides_the_message(rule):
+@pytest.mark.parametrize("rule", contract.RULES)
+def test_no_key_of_a_message_can_stand_where_the_cloud_s_own_stands(rule):
     sql = contract.rule_sql(rule)
-    # Lambda 1 alone is given the message as it came.
-    whole = f"encode(*, 'base64') AS {contract.MESSAGE_BASE64}" if rule == "live" else "*"
-    assert sql.startswith(f"SELECT {whole}, ")
-    selected = ["*", *sql[len(f"SELECT {whole}, ") : sql.index(" FROM ")].split(", ")]
-    named = [part.rsplit(" AS ", 1)[1] for part in selected[1:]]
-    assert contract.RECEIVED_MS in named
-    assert (contract.TOPIC in named) == (rule != "pong")
-    assert (contract.EXPIRES_S in named) == (rule == "record")
-    functions = set(re.findall(r"([a-zA-Z_]+)\(", sql))
-    assert functions <= {"topic", "timestamp", "floor", "encode"}
+    selected = re.sub(r"\bencode\(\*, 'base64'\)", "encode()", sql[len("SELECT ") : sql.index(" FROM ")])
+    names = [part.rsplit(" AS ", 1)[-1] for part in selected.split(", ")]
+    assert len(names) == len(set(names))
+    # The broker's own events alone are taken whole: no robot says anything in them, and nothing is added.
+    assert ("*" in selected) == (rule == "presence")
+    assert names == ["*"] or "*" not in names
+    assert (contract.RECEIVED_MS in names) == (rule not in ("presence", "version"))
+    assert (contract.TOPIC in names) == (rule not in ("pong", "presence", "version"))
+    assert (contract.EXPIRES_S in names) == (rule == "record")
+    assert (contract.MESSAGE_BASE64 in names) == (rule in ("live", "echo", "upload"))
+    for name, part in zip(names, selected.split(", ")):
+        if name in (contract.RECEIVED_MS, contract.TOPIC, contract.EXPIRES_S, contract.ROBOT):
+            assert re.match(r"(timestamp|topic|floor)\(", part), part
+
+
+def test_the_record_rule_stores_what_a_batch_says_and_a_pong_what_a_ping_says():
+    batch = contract.Batch("0badcafe", 0, [1], {"speed": [1.5]}, nonfinite=1)
+    assert tuple(json.loads(contract.encode(batch))) == contract.ENVELOPE
+    assert tuple(json.loads(contract.encode_ping(1, 1, "x"))) == contract.PING_FIELDS
+    assert contract.rule_sql("record").startswith(
+        f"SELECT {', '.join(contract.ENVELOPE)}, topic() AS topic, "
+    )
+    assert contract.rule_sql("pong").startswith(f"SELECT {', '.join(contract.PING_FIELDS)}, timestamp() AS ")
 
 
 def test_rule_names_are_allowed_by_aws():

@@ -43,14 +43,14 @@ def test_live_round_trip(live):
 
 def handed_over(message):
     """As the live rule gives it to Lambda 1, and Lambda 1 takes it."""
-    event = contract.live_event(message, "live/iort/car/vesc", 1_700_000_000_000)
-    return contract.live_message(json.loads(json.dumps(event)))
+    event = contract.rule_event(message, "live/iort/car/vesc", 1_700_000_000_000)
+    return contract.event_message(json.loads(json.dumps(event)))
 
 
 @pytest.mark.parametrize("event", [{}, {contract.MESSAGE_BASE64: 7}, {contract.MESSAGE_BASE64: "a%"}])
 def test_an_event_of_another_kind_holds_no_live_message(event):
     with pytest.raises(ContractError, match=contract.MESSAGE_BASE64):
-        contract.live_message(event)
+        contract.event_message(event)
 
 
 @given(st.dictionaries(names, anything, max_size=8))

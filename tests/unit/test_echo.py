@@ -17,8 +17,8 @@ robots = st.from_regex(r"[A-Za-z0-9_-]{1,64}", fullmatch=True)
 
 def event(robot="car", namespace="iort", ping_id=7, sent_us=1_700_000_000_000_000, padding=""):
     """What the echo rule makes of a ping."""
-    ping = json.loads(contract.encode_ping(ping_id, sent_us, padding))
-    return {**ping, TOPIC: build_topic(PING, robot, LAMBDA, namespace), RECEIVED_MS: 1_700_000_000_123}
+    ping = contract.encode_ping(ping_id, sent_us, padding)
+    return contract.rule_event(ping, build_topic(PING, robot, LAMBDA, namespace), 1_700_000_000_123)
 
 
 @given(
@@ -30,7 +30,7 @@ def test_the_pong_has_what_the_ping_had(robot, namespace, ping_id, padding):
     assert decode_pong(payload) == (ping_id, 1_700_000_000_000_000, 1_700_000_000_123)
     content = json.loads(payload)
     assert content.get("padding", "") == padding
-    assert TOPIC not in content
+    assert set(content) <= {*contract.PING_FIELDS, RECEIVED_MS}
 
 
 @pytest.mark.parametrize(
@@ -39,6 +39,12 @@ def test_the_pong_has_what_the_ping_had(robot, namespace, ping_id, padding):
 def test_a_topic_that_is_not_ours_is_refused(topic):
     with pytest.raises(ContractError, match=r"topic|robot"):
         echo.pong({**event(), TOPIC: topic})
+
+
+@pytest.mark.parametrize("message", [b"no JSON", b"\xff", b"[]", b"1", b"", b"[" * 100_000])
+def test_what_is_no_ping_fails_and_so_goes_to_the_quarantine(message):
+    with pytest.raises(ContractError, match="ping is"):
+        echo.handler(contract.rule_event(message, build_topic(PING, "car", LAMBDA), 1), None)
 
 
 def test_the_handler_publishes_and_counts(monkeypatch, capsys):

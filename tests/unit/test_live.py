@@ -34,7 +34,7 @@ def event(stream="vesc", robot="car", namespace="iort", **changes):
     ours = {name: changes.pop(name) for name in (TOPIC, RECEIVED_MS) if name in changes}
     message = json.loads(contract.encode_live(LiveSample("0123abcd", 3, T_US, SENT_US, sample)))
     raw = json.dumps({**message, **changes}).encode()
-    return {**contract.live_event(raw, build_topic(LIVE, robot, stream, namespace), RECEIVED), **ours}
+    return {**contract.rule_event(raw, build_topic(LIVE, robot, stream, namespace), RECEIVED), **ours}
 
 
 class Channels:
@@ -166,7 +166,7 @@ MESSAGE = contract.encode_live(LiveSample("0123abcd", 3, T_US, SENT_US, SAMPLE))
 
 def handed(message):
     """An event with any bytes in it."""
-    return contract.live_event(message, build_topic(LIVE, "car", "vesc"), RECEIVED)
+    return contract.rule_event(message, build_topic(LIVE, "car", "vesc"), RECEIVED)
 
 
 def saying(**changes):

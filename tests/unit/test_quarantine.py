@@ -117,6 +117,18 @@ def test_an_asynchronous_invocation_that_failed():
     assert entry.reason == "RetriesExhausted: boom"
 
 
+def test_basic_ingests_prefix_is_no_part_of_the_topic_whether_or_not_it_is_told():
+    """AWS' documentation of the error document does not say."""
+    (told,) = entries(rule_error(topic=f"$aws/rules/iort_record/{TOPIC_OF_CAR}"), none)
+    (not_told,) = entries(rule_error(), none)
+    assert told == not_told
+    assert (told.topic, told.robot, told.id) == (TOPIC_OF_CAR, "car", not_told.id)
+    # Of another rule it is no prefix, and only the first one is taken away.
+    for odd in ("$aws/rules/iort_live/", "$aws/rules/iort_record/$aws/rules/iort_record/"):
+        (entry,) = entries(rule_error(topic=odd + TOPIC_OF_CAR), none)
+        assert entry.robot == NO_ROBOT
+
+
 @pytest.mark.parametrize(
     "topic", ["", "dt", "dt/iort", "dt/iort//vesc", "$aws/events/presence/connected/car", "other/iort/car/a"]
 )

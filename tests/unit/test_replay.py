@@ -21,8 +21,8 @@ GOOD = Batch("0123abcd", 0, [1_700_000_000_000_000], {"speed": [1.5]})
 class FakeCloud:
     """A cloud with a quarantine of these payloads, by the entries' ids, and an empty telemetry table."""
 
-    def __init__(self, payloads):
-        self._payloads = payloads
+    def __init__(self, payloads, topic=TOPIC):
+        self._payloads, self._topic = payloads, topic
 
     def output(self, _stack, name):
         return name
@@ -37,7 +37,7 @@ class FakeCloud:
             return {}
         assert TableName == "QuarantineTable"
         source, payload = self._payloads[Key["id"]["S"]]
-        texts = {"robot": "car", "source": source, "topic": TOPIC, "reason": "some"}
+        texts = {"robot": "car", "source": source, "topic": self._topic, "reason": "some"}
         item = {name: {"S": text} for name, text in texts.items()} | Key | {"payload": {"B": payload}}
         return {"Item": item | {name: {"N": str(NOW_MS)} for name in ("first_ms", "last_ms", "seen")}}
 
@@ -114,3 +114,17 @@ def test_what_is_in_the_old_table_alone_is_not_given_to_lambda_2():
     """It would summarise nothing, and the entry would be deleted."""
     (outcome,) = replayed(old=(BY_STREAM, old_item()), dry_run=False)
     assert (outcome.fate, "iort adopt" in outcome.detail) == (Fate.FAILED, True)
+
+
+@pytest.mark.parametrize("prefix", ["", "$aws/rules/iort_record/"])
+def test_a_batch_is_replayed_whether_or_not_its_topic_has_basic_ingests_prefix(prefix):
+    payload = contract.encode(GOOD)
+    cloud = FakeCloud({"a": (f"{BY_RULE} iort_record", payload)}, topic=prefix + TOPIC)
+    listed = Entry("car", "a", f"{BY_RULE} iort_record", prefix + TOPIC, "some", 2_000_000_000_000, 1, 1, 0)
+    (outcome,) = replay(cloud, [listed], dry_run=True)
+    assert (outcome.fate, outcome.entry.topic) == (Fate.WOULD, TOPIC), outcome.detail
+
+
+def test_keys_that_the_rule_would_not_store_keep_no_batch_from_replay():
+    odd = {**json.loads(contract.encode(GOOD)), "robot": "another", "topic": "dt/iort/another/vesc"}
+    assert outcomes(odd=(f"{BY_RULE} iort_record", json.dumps(odd).encode())) == [Fate.WOULD]

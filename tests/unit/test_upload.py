@@ -20,7 +20,6 @@ from contract import (
     PART_BYTES,
     PING,
     PONG,
-    TOPIC,
     Address,
     ContractError,
     File,
@@ -65,12 +64,10 @@ SMALL = asking(b"small", 1)
 # --- the contract -----------------------------------------------------------------------------------
 
 
-def test_a_request_survives_the_wire_and_the_rule():
+def test_a_request_survives_the_wire():
     for request in (SMALL, asking(bytes(PART_BYTES + 1), 1, 2, done=True)):
         wire = contract.encode_file_request(request)
         assert contract.decode_file_request(wire) == request
-        through_rule = {**json.loads(wire), TOPIC: "x", "received_ms": 1}
-        assert contract.decode_file_request(through_rule) == request
 
 
 @pytest.mark.parametrize(
@@ -370,8 +367,10 @@ def published(monkeypatch, s3, dynamodb):
     return sent
 
 
-def event(request, robot="car"):
-    return {**json.loads(contract.encode_file_request(request)), TOPIC: build_topic(PING, robot, FILE)}
+def event(request, robot="car", **changes):
+    """What the upload rule makes of a request with some of it changed."""
+    message = json.dumps({**json.loads(contract.encode_file_request(request)), **changes}).encode()
+    return contract.rule_event(message, build_topic(PING, robot, FILE), 1_700_000_000_123)
 
 
 def test_the_handler_answers_the_robot_of_the_topic_and_counts(published, capsys, s3):
@@ -390,14 +389,17 @@ def test_the_handler_answers_the_robot_of_the_topic_and_counts(published, capsys
 
 
 def test_the_handler_says_what_is_wrong_with_a_request(published, capsys):
-    upload.handler({**event(SMALL), "parts": {"9": "x"}}, None)
+    upload.handler(event(SMALL, parts={"9": "x"}), None)
     (answer,) = (contract.decode_file_answer(one["payload"]) for one in published)
     assert answer.id == ID
     assert answer.refused == "part 9: allowed is 1 to 1"
     assert answer.again_s is None
     assert json.loads(capsys.readouterr().out.splitlines()[-1])["FilesRefused"] == 1
-    # Nobody can be told who has not said which request it is.
-    upload.handler({TOPIC: build_topic(PING, "car", FILE)}, None)
+    # Nobody can be told who has not said which request it is: to the quarantine with it.
+    for message in (b"{}", b"no JSON", b"\xff", b"[]", b"[" * 100_000):
+        with pytest.raises(ContractError):
+            upload.handler(contract.rule_event(message, build_topic(PING, "car", FILE), 1), None)
+        assert json.loads(capsys.readouterr().out.splitlines()[-1])["FilesRefused"] == 1
     assert len(published) == 1
 
 

@@ -1,0 +1,152 @@
+"""Whatever a robot's message says in the cloud's place, no rule takes it for what the cloud says: neither
+where the rule's keys stay beside the payload's of the same name, nor where the payload's do."""
+
+from __future__ import annotations
+
+import json
+
+import pytest
+
+import contract
+from contract import (
+    AGENT_VERSION,
+    EXPIRES_S,
+    FAULT_FIELD,
+    FILE,
+    LAMBDA,
+    LIVE,
+    MESSAGE_BASE64,
+    PING,
+    RECEIVED_MS,
+    RECORD,
+    ROBOT,
+    RULE,
+    RULES,
+    SHADOW,
+    TOPIC,
+    VOLTAGE_FIELD,
+    Batch,
+    LiveSample,
+    build_topic,
+    rule_sql,
+)
+from functions import alert, echo, presence
+from tests.iot_sql import Message, evaluate
+from tests.spoofing import spoofed
+
+NOW_MS = 1_700_000_000_123
+T_US = 1_700_000_000_000_000
+RETENTION_S = 3600
+BATCH = contract.encode(Batch("0badcafe", 3, [T_US], {"speed": [1.5]}, nonfinite=2))
+SAMPLE = {FAULT_FIELD: 3, VOLTAGE_FIELD: 9.5}
+LIVE_MESSAGE = contract.encode_live(LiveSample("0badcafe", 3, T_US, T_US, SAMPLE))
+PING_MESSAGE = contract.encode_ping(7, T_US, "padding")
+REPORT = json.dumps({"state": {"reported": {AGENT_VERSION: "1.2.3", ROBOT: "b"}}}).encode()
+CONNECTED = json.dumps(
+    {"clientId": "a", "eventType": "connected", "timestamp": NOW_MS, "versionNumber": 1}
+    | {"principalIdentifier": "f" * 64}
+).encode()
+
+# By rule: lane and name of the topic of robot a, and the honest message.
+SENT = {
+    "record": (RECORD, "vesc", BATCH),
+    "live": (LIVE, "vesc", LIVE_MESSAGE),
+    "fault": (LIVE, "vesc", LIVE_MESSAGE),
+    "battery": (LIVE, "vesc", LIVE_MESSAGE),
+    "pong": (PING, RULE, PING_MESSAGE),
+    "echo": (PING, LAMBDA, PING_MESSAGE),
+    "upload": (PING, FILE, PING_MESSAGE),
+}
+WHOSE = {rule: build_topic(lane, "a", name) for rule, (lane, name, _) in SENT.items()}
+
+
+@pytest.fixture(params=[False, True], ids=["rule-wins", "payload-wins"])
+def of_rule(request):
+    """What a rule makes of a message on a topic."""
+
+    def run(rule, topic, payload):
+        sql = rule_sql(rule, retention_s=RETENTION_S)
+        return evaluate(sql, Message(topic, payload, NOW_MS), payload_wins=request.param)
+
+    return run
+
+
+def test_every_rule_is_tried():
+    assert {*SENT, "presence", "version"} == set(RULES)
+
+
+@pytest.mark.parametrize("rule", SENT)
+def test_a_rule_makes_of_a_spoofed_message_what_it_makes_of_an_honest_one(of_rule, rule):
+    lane, name, message = SENT[rule]
+    honest = of_rule(rule, WHOSE[rule], message)
+    told = of_rule(rule, WHOSE[rule], spoofed(message, "b", lane, name))
+    if MESSAGE_BASE64 in honest:
+        assert contract.event_message(honest) == message
+        # The message itself may say what it likes.
+        assert contract.event_message(told) == spoofed(message, "b", lane, name)
+        honest, told = ({**one, MESSAGE_BASE64: ""} for one in (honest, told))
+    assert told == honest
+    assert told[RECEIVED_MS] == NOW_MS
+    assert told.get(TOPIC, WHOSE[rule]) == WHOSE[rule]
+    assert told.get(EXPIRES_S) == (NOW_MS // 1000 + RETENTION_S if rule == "record" else None)
+
+
+def test_lambda_2_gets_the_robot_of_the_topic_and_its_batch(of_rule):
+    item = of_rule("record", WHOSE["record"], spoofed(BATCH, "b", RECORD, "vesc"))
+    topic, batch = contract.decode_item(item)
+    assert (topic.robot, batch) == ("a", contract.decode(BATCH))
+    assert set(item) == {*contract.ENVELOPE, TOPIC, RECEIVED_MS, EXPIRES_S}
+
+
+def test_a_batch_without_nonfinite_has_none_in_the_table(of_rule):
+    message = contract.encode(Batch("0badcafe", 3, [T_US], {"speed": [1.5]}))
+    item = of_rule("record", WHOSE["record"], message)
+    assert contract.NONFINITE not in item
+    assert contract.decode_item(item)[1] == contract.decode(message)
+
+
+def test_the_echo_goes_to_the_robot_of_the_topic_with_the_clouds_time(of_rule):
+    event = of_rule("echo", WHOSE["echo"], spoofed(PING_MESSAGE, "b", PING, LAMBDA))
+    topic, payload = echo.pong(event)
+    assert topic == build_topic(contract.PONG, "a", LAMBDA)
+    assert contract.decode_pong(payload) == (7, T_US, NOW_MS)
+    assert json.loads(payload) == {**json.loads(PING_MESSAGE), RECEIVED_MS: NOW_MS}
+
+
+def test_the_rules_pong_has_the_clouds_time(of_rule):
+    answer = of_rule("pong", WHOSE["pong"], spoofed(PING_MESSAGE, "b", PING, RULE))
+    assert contract.decode_pong(json.dumps(answer)) == (7, T_US, NOW_MS)
+
+
+@pytest.mark.parametrize("rule", ["fault", "battery"])
+def test_an_alert_names_the_robot_of_the_topic(of_rule, rule):
+    event = of_rule(rule, WHOSE[rule], spoofed(LIVE_MESSAGE, "b", LIVE, "vesc"))
+    told = []
+
+    class Everything:
+        def take(self, robot, _key, _now_s):
+            return robot == "a"
+
+    def notify(*mail):
+        told.append(mail)
+
+    alert.process(event, 10.5, Everything(), notify, NOW_MS // 1000)
+    ((subject, text),) = told
+    assert subject.startswith("iort: a, ")
+    assert "2023-11-14 22:13:20 UTC" in text
+
+
+def test_a_version_is_the_robots_of_the_shadows_topic(of_rule):
+    topic = f"$aws/things/a/shadow/name/{SHADOW}/update/accepted"
+    document = json.loads(spoofed(REPORT, "b", LIVE, "vesc"))
+    event = of_rule("version", topic, json.dumps(document).encode())
+    assert event == {AGENT_VERSION: "1.2.3", ROBOT: "a"}
+    assert presence.change(event)["Key"] == {ROBOT: {"S": "a"}}
+    assert of_rule("version", topic, b'{"state": {"reported": {}}}') is None
+
+
+def test_an_event_of_the_brokers_own_is_taken_as_it_is(of_rule):
+    event = of_rule("presence", "$aws/events/presence/connected/a", CONNECTED)
+    assert event == json.loads(CONNECTED)
+    assert presence.change(event)["Key"] == {ROBOT: {"S": "a"}}
+    assert of_rule("presence", "$aws/events/presence/x/a", b'{"eventType": "connect_failed"}') is None
