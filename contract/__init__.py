@@ -68,6 +68,7 @@ from contract.files import (
     encode_file_answer,
     encode_file_request,
     file_key,
+    file_request_id,
     parse_file_key,
     part_range,
 )
@@ -385,6 +386,7 @@ __all__ = [
     "encode_live",
     "encode_ping",
     "file_key",
+    "file_request_id",
     "flat_second",
     "fleet_name",
     "inflate",

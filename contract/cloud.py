@@ -38,6 +38,7 @@ METRICS = {
         "LivePublished",
         "LiveStale",
         "LiveRefused",
+        "LiveCutOff",
         "PubNubFailed",
         "InCarMs",
         "UplinkMs",

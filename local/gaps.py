@@ -17,6 +17,8 @@ local/cut_sessions.py; here, in order:
 - a stream's mapping tries a failed batch again until it succeeds, and a role's grant on a stream's ARN is
   not seen (local/stream_gap.py);
 - a Query takes time with every item of its partition (local/table_gap.py);
+- a message that is sent to a queue while another thread takes some out of it is lost
+  (local/queue_gap.py);
 - an invocation that logs nothing takes 50 ms more, and what is logged has no level (local/log_gap.py).
 """
 
@@ -38,7 +40,7 @@ from typing import Any
 from ministack.core import iam_actions, iam_evaluator
 from ministack.services import iot, lambda_svc
 
-from local import cut_sessions, log_gap, stream_gap, table_gap
+from local import cut_sessions, log_gap, queue_gap, stream_gap, table_gap
 
 # "Message size" in AWS IoT Core's service quotas.
 AWS_MESSAGE_BYTES = 128 * 1024
@@ -66,6 +68,7 @@ def install() -> None:
     iot._dispatch_rule_to_lambda = AsyncInvocations().dispatch
     stream_gap.install()
     table_gap.install()
+    queue_gap.install()
     log_gap.install()
 
 
@@ -238,7 +241,10 @@ def _invoke(account: str, region: str, record: dict[str, Any], event: Any, queue
     for _ in range(1 + (2 if retries is None else int(retries))):
         if time.monotonic() - queued_s > (21_600 if age_s is None else int(age_s)):
             break
-        result = lambda_svc._execute_function_with_config_scope(record, event)
+        try:
+            result = lambda_svc._execute_function_with_config_scope(record, event)
+        except Exception as error:  # noqa: BLE001 - whatever it is, the event is not lost with the thread
+            result = {"error": True, "body": {"errorMessage": f"{type(error).__name__}: {error}"}}
         if not result.get("error"):
             return
     destination = ((settings.get("DestinationConfig") or {}).get("OnFailure") or {}).get("Destination")
