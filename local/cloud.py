@@ -234,7 +234,11 @@ class EmbeddedCloud:
             ("processing", "Echo"): self._ping(),
             # No fault and no low voltage.
             ("processing", "Alert"): {**self._ping(), RECEIVED_MS: 0},
-            ("processing", "Upload"): {TOPIC: build_topic(PING, "warm-up", FILE, self.namespace)},
+            # Without an id it would be kept in quarantine.
+            ("processing", "Upload"): {
+                TOPIC: build_topic(PING, "warm-up", FILE, self.namespace),
+                "id": "00000000",
+            },
             ("fleet", "Admit"): {},
             ("fleet", "Presence"): {},
             ("processing", "Query"): {},
