@@ -33,14 +33,15 @@ import re
 import secrets
 import time
 from collections.abc import Callable
-from concurrent.futures import ThreadPoolExecutor
 from functools import wraps
 from typing import Any
 
 from ministack.core import iam_actions, iam_evaluator
 from ministack.services import iot, lambda_svc
 
+from contract import TOPIC
 from local import cut_sessions, log_gap, queue_gap, stream_gap, table_gap
+from local.turns import Turns
 
 # "Message size" in AWS IoT Core's service quotas.
 AWS_MESSAGE_BYTES = 128 * 1024
@@ -208,10 +209,13 @@ def _json_object(payload: bytes) -> dict[str, Any]:
 
 class AsyncInvocations:
     """A queue of asynchronous events for each function, served by as many threads as the function
-    may run at once: its reserved concurrency, and no more than this machine has cores."""
+    may run at once: its reserved concurrency, and no more than this machine has cores.
+
+    AWS has an environment for each of many events, and no robot waits for another. Here the robots take
+    turns."""
 
     def __init__(self) -> None:
-        self._pools: dict[str, ThreadPoolExecutor] = {}
+        self._pools: dict[str, Turns] = {}
 
     def dispatch(self, account: str, region: str, function_arn: str, event: Any) -> None:
         """Queue one event; raises `LookupError` for a function that is not there."""
@@ -225,9 +229,16 @@ class AsyncInvocations:
         if pool is None:
             reserved = lambda_svc._reserved_concurrency(function, config)
             cores = os.cpu_count() or 1
-            pool = ThreadPoolExecutor(cores if reserved is None else max(1, min(cores, reserved)))
+            pool = Turns(cores if reserved is None else max(1, min(cores, reserved)))
             self._pools[function_arn] = pool
-        pool.submit(_invoke, account, region, record, event, time.monotonic())
+        pool.submit(_robot(event), _invoke, account, region, record, event, time.monotonic())
+
+
+def _robot(event: Any) -> str:
+    """Whose message an event is of, by its topic; "" where it has none."""
+    topic = event.get(TOPIC) if isinstance(event, dict) else None
+    levels = topic.split("/") if isinstance(topic, str) else []
+    return levels[2] if len(levels) > 2 else ""
 
 
 def _invoke(account: str, region: str, record: dict[str, Any], event: Any, queued_s: float) -> None:

@@ -101,4 +101,4 @@ def report(section: Section, found: dict[str, list[list[float]]]) -> None:
             section.ratios.append(Ratio(name, round(one.p95 / alone.p95, 2), _MOST, tolerance=4.0))
             name = f"updates of the car beside {RATE_HZ} {kind} a second / alone"
             section.ratios.append(Ratio(name, round(one.n / alone.n, 2), 0.9, at_least=True))
-    section.raw = {kind: delays for kind, delays in found.items()}
+    section.raw = dict(found)
