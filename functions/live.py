@@ -122,7 +122,7 @@ def process(
 
 def serve(
     event: Any,
-    process: Callable[[], None],
+    show: Callable[[], None],
     keep: Callable[[str], bool],
     *,
     cut_off: CutOff,
@@ -130,7 +130,7 @@ def serve(
     function_arn: str,
     now_s: float,
 ) -> None:
-    """Have a live message processed; one that is refused goes to the quarantine's queue, by ``keep``.
+    """Have ``show`` process a live message; one that it refuses goes to the quarantine's queue, by ``keep``.
 
     An invocation that fails may cost its environment, and every robot waits for the next one. So this fails
     only where the queue does not take the message: Lambda then sends it to the same queue.
@@ -140,7 +140,7 @@ def serve(
         counted.add(now_s, LiveCutOff=1)
         return
     try:
-        process()
+        show()
     except RefusedError as error:
         reason = str(error)
         if cut_off.refused(robot, now_s):
@@ -190,12 +190,12 @@ def handler(event: dict[str, Any], context: Any) -> None:
     """Entry point of the live rule's Lambda action."""
     now_us = time.time_ns() // 1000
 
-    def one() -> None:
+    def show() -> None:
         process(event, _settings(), _publisher().publish, legs=_legs(), counted=_counted(), now_us=now_us)
 
     serve(
         event,
-        one,
+        show,
         lambda body: _refusals().keep(body),
         cut_off=_cut_off(),
         counted=_counted(),
