@@ -69,6 +69,7 @@ from contract.files import (
     encode_file_answer,
     encode_file_request,
     file_key,
+    file_request_id,
     parse_file_key,
     part_range,
 )
@@ -390,6 +391,7 @@ __all__ = [
     "encode_ping",
     "event_message",
     "file_key",
+    "file_request_id",
     "flat_second",
     "fleet_name",
     "inflate",

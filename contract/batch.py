@@ -8,9 +8,11 @@ from itertools import accumulate
 from typing import Any, Mapping, NamedTuple, Sequence
 
 from contract.checks import (
+    BOOT,
     COMPACT,
     check_field,
     check_header,
+    check_time,
     check_times,
     check_version,
     integer,
@@ -35,7 +37,7 @@ from contract.ros1.serialized import pack, unpack
 from contract.tables import BATCH, NONFINITE, RECEIVED_MS, ROBOT, SAMPLES, TOPIC
 from contract.topics import RECORD, Topic, parse_topic
 
-_BATCH_ID = re.compile(r"(\d{16})-([0-9a-f]{8,32})-(0|[1-9]\d{0,15})", re.ASCII)
+_BATCH_ID = re.compile(rf"(\d{{16}})-({BOOT.pattern})-(0|[1-9]\d{{0,15}})", re.ASCII)
 _MAX_BATCH_ID_US = 10**16
 
 
@@ -58,7 +60,10 @@ def batch_id(text: Any) -> BatchId:
     match = _BATCH_ID.fullmatch(text) if isinstance(text, str) else None
     if match is None:
         raise ContractError(f"{BATCH} {shown(text)}: expected <16 digits of microseconds>-<run>-<number>")
-    return BatchId(int(match.group(1)), match.group(2), int(match.group(3)))
+    found = BatchId(int(match.group(1)), match.group(2), int(match.group(3)))
+    check_time(found.t_us, BATCH)
+    check_header(found.boot, found.seq, 0)
+    return found
 
 
 def batches_between(first_us: int | None, last_us: int | None) -> tuple[str, str]:

@@ -39,6 +39,7 @@ METRICS = {
         "LivePublished",
         "LiveStale",
         "LiveRefused",
+        "LiveCutOff",
         "PubNubFailed",
         "InCarMs",
         "UplinkMs",

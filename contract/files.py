@@ -185,6 +185,12 @@ def decode_file_request(message: bytes | str | Mapping[str, Any]) -> FileRequest
     return request
 
 
+def file_request_id(message: Mapping[str, Any]) -> str | None:
+    """The id of a request, whatever else it says; None where it has none that an answer could repeat."""
+    given = message.get("id")
+    return given if isinstance(given, str) and BOOT.fullmatch(given) else None
+
+
 def encode_file_answer(answer: FileAnswer) -> bytes:
     """The answer as JSON, without what it does not say."""
     envelope: dict[str, Any] = {"v": SCHEMA_VERSION, "id": answer.id}

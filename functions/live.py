@@ -24,9 +24,11 @@ from contract import (
     live_update,
     parse_topic,
 )
+from functions.cut_off import CutOff
 from functions.legs import Legs
 from functions.metrics import Gathered, emit
 from functions.pubnub_client import PublishError, PubNubPublisher
+from functions.refusals import Refusals, refused_event
 
 _log = logging.getLogger(__name__)
 _log.setLevel(logging.INFO)
@@ -63,7 +65,7 @@ def age_ms(robot: str, live: LiveSample, received_ms: int, now_us: int, legs: Le
 
 
 class RefusedError(Exception):
-    """A live message that no robot of ours sends; as a failed invocation it goes to the quarantine."""
+    """A live message that no robot of ours sends."""
 
 
 def process(
@@ -118,6 +120,42 @@ def process(
     )
 
 
+def serve(
+    event: Any,
+    show: Callable[[], None],
+    keep: Callable[[str], bool],
+    *,
+    cut_off: CutOff,
+    counted: Gathered,
+    function_arn: str,
+    now_s: float,
+) -> None:
+    """Have ``show`` process a live message; one that it refuses goes to the quarantine's queue, by ``keep``.
+
+    An invocation that fails may cost its environment, and every robot waits for the next one. So this fails
+    only where the queue does not take the message: Lambda then sends it to the same queue.
+    """
+    robot = _robot(event)
+    if cut_off.closed(robot, now_s):
+        counted.add(now_s, LiveCutOff=1)
+        return
+    try:
+        show()
+    except RefusedError as error:
+        reason = str(error)
+        if cut_off.refused(robot, now_s):
+            reason += "; so many were refused that the next are not looked at, metric LiveCutOff"
+            _log.warning("the live messages of %s are not looked at for a while", robot)
+        if not keep(refused_event(function_arn, event, reason)):
+            raise
+
+
+def _robot(event: Any) -> str:
+    topic = event.get(TOPIC) if isinstance(event, Mapping) else None
+    levels = topic.split("/") if isinstance(topic, str) else []
+    return levels[2] if len(levels) > 2 else ""
+
+
 @cache
 def _settings() -> LiveSettings:
     return LiveSettings.from_environment()
@@ -138,13 +176,29 @@ def _counted() -> Gathered:
     return Gathered("live")
 
 
-def handler(event: dict[str, Any], _context: object) -> None:
+@cache
+def _cut_off() -> CutOff:
+    return CutOff()
+
+
+@cache
+def _refusals() -> Refusals:
+    return Refusals.at_once(os.environ["REJECTED_QUEUE"])
+
+
+def handler(event: dict[str, Any], context: Any) -> None:
     """Entry point of the live rule's Lambda action."""
-    process(
+    now_us = time.time_ns() // 1000
+
+    def show() -> None:
+        process(event, _settings(), _publisher().publish, legs=_legs(), counted=_counted(), now_us=now_us)
+
+    serve(
         event,
-        _settings(),
-        _publisher().publish,
-        legs=_legs(),
+        show,
+        lambda body: _refusals().keep(body),
+        cut_off=_cut_off(),
         counted=_counted(),
-        now_us=time.time_ns() // 1000,
+        function_arn=context.invoked_function_arn,
+        now_s=now_us / 1e6,
     )

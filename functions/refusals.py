@@ -1,4 +1,4 @@
-"""The adapter to the queue of what Lambda 2 refuses."""
+"""The adapter to the queue before the quarantine, for what a function refuses by itself."""
 
 from __future__ import annotations
 
@@ -8,6 +8,8 @@ import logging
 from collections.abc import Iterator, Mapping, Sequence
 from typing import Any, NamedTuple
 
+import boto3
+from botocore.config import Config
 from botocore.exceptions import BotoCoreError, ClientError
 
 from contract import BATCH, ITEM_BASE64, REASON, TOPIC
@@ -28,14 +30,30 @@ class Refused(NamedTuple):
 
 
 class Refusals:
-    """Sends refused records to the queue before the quarantine; ``client`` is a boto3 SQS client."""
+    """Sends what was refused to the queue before the quarantine; ``client`` is a boto3 SQS client."""
 
     def __init__(self, client: Any, *, queue_url: str) -> None:
         self._client, self._queue_url = client, queue_url
 
+    @classmethod
+    def at_once(cls, queue_url: str) -> Refusals:
+        """With a client that does not wait for a queue that does not answer: where a function fails, Lambda
+        itself sends there what it was called with."""
+        config = Config(connect_timeout=2, read_timeout=5, retries={"total_max_attempts": 1})
+        return cls(boto3.client("sqs", config=config), queue_url=queue_url)
+
     def refuse(self, refused: Sequence[Refused]) -> list[Refused]:
         """Send each, as many at a time as a call may carry; those that the queue did not take come back."""
         return [one for several in _calls(refused) for one in self._left(several)]
+
+    def keep(self, body: str) -> bool:
+        """Send one message, as `message` or `refused_event` writes it; whether the queue took it."""
+        try:
+            self._client.send_message(QueueUrl=self._queue_url, MessageBody=body)
+        except (BotoCoreError, ClientError) as error:
+            _log.warning("the queue did not take a refused message: %s", error)
+            return False
+        return True
 
     def _left(self, several: Mapping[str, tuple[Refused, str]]) -> list[Refused]:
         entries = [{"Id": name, "MessageBody": body} for name, (_, body) in several.items()]
@@ -76,6 +94,19 @@ def message(refused: Refused) -> str:
         key = {name: refused.image[name] for name in (TOPIC, BATCH) if name in refused.image}
         body = _body(f"too large for the queue, see the telemetry table; {refused.reason}", key)
     return body
+
+
+def refused_event(function_arn: str, event: Any, reason: str) -> str:
+    """The queue's message about an event that a function was called with and refused, without failing.
+
+    Its form is that of Lambda's own record of an invocation that failed ("Destination event format")."""
+    return json.dumps(
+        {
+            "requestContext": {"functionArn": function_arn, "condition": "Refused"},
+            "requestPayload": event,
+            "responsePayload": {"errorMessage": reason[:1000]},
+        }
+    )
 
 
 def _body(reason: str, item: Mapping[str, Any]) -> str:

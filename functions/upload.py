@@ -19,17 +19,20 @@ from contract import (
     ContractError,
     FileAnswer,
     FileRequest,
+    Topic,
     build_topic,
     decode_file_request,
     encode_file_answer,
     event_message,
     file_key,
+    file_request_id,
     json_object,
     parse_topic,
 )
 from functions.allotment import Allotment
 from functions.bucket import Bucket, parts_sha256
 from functions.metrics import emit
+from functions.refusals import Refusals, refused_event
 
 _log = logging.getLogger(__name__)
 _log.setLevel(logging.INFO)
@@ -107,7 +110,12 @@ def _iot_data() -> Any:
     return boto3.client("iot-data")
 
 
-def handler(event: dict[str, Any], _context: object) -> None:
+@cache
+def _refusals() -> Refusals:
+    return Refusals.at_once(os.environ["REJECTED_QUEUE"])
+
+
+def handler(event: dict[str, Any], context: Any) -> None:
     """Entry point of the upload rule's Lambda action."""
     topic = parse_topic(event[TOPIC])
     envelope: dict[str, Any] = {}
@@ -115,13 +123,7 @@ def handler(event: dict[str, Any], _context: object) -> None:
         envelope = json_object(event_message(event), "file request")
         request = decode_file_request(envelope)
     except ContractError as error:
-        _log.warning("refused a request of %s: %s", topic.robot, error)
-        emit("upload", FilesRefused=1)
-        request_id = envelope.get("id")
-        if not isinstance(request_id, str):
-            # Nobody can be told; as a failed invocation it goes to the quarantine.
-            raise
-        _reply(topic.robot, topic.namespace, FileAnswer(request_id[:32], refused=str(error)))
+        _refuse(event, envelope, topic, error, context)
         return
     given = answer(topic.robot, request, _bucket(), _allotment(), time.time())
     done = given.stored and request.parts_sha256 is not None
@@ -133,6 +135,20 @@ def handler(event: dict[str, Any], _context: object) -> None:
         StoredBytes=request.file.size if done else 0,
     )
     _reply(topic.robot, topic.namespace, given)
+
+
+def _refuse(
+    event: Mapping[str, Any], said: Mapping[str, Any], topic: Topic, error: ContractError, context: Any
+) -> None:
+    """Tell the robot why; where it has not said which request it is, the quarantine. Raises `error` where
+    that does not take it, so that Lambda tries."""
+    _log.warning("refused a request of %s: %s", topic.robot, error)
+    emit("upload", FilesRefused=1)
+    request_id = file_request_id(said)
+    if request_id is not None:
+        _reply(topic.robot, topic.namespace, FileAnswer(request_id, refused=str(error)))
+    elif not _refusals().keep(refused_event(context.invoked_function_arn, event, str(error))):
+        raise error
 
 
 def _reply(robot: str, namespace: str, given: FileAnswer) -> None:

@@ -234,8 +234,8 @@ class EmbeddedCloud:
             ("processing", "Echo"): self._rule_event(encode_ping(0, 0), PING, LAMBDA),
             # No fault and no low voltage.
             ("processing", "Alert"): self._rule_event(b"", LIVE, "warm-up"),
-            # Refused, and nobody hears the answer.
-            ("processing", "Upload"): self._rule_event(b'{"id": "warm-up"}', PING, FILE),
+            # Refused, and nobody hears the answer; without an id it would be kept in quarantine.
+            ("processing", "Upload"): self._rule_event(b'{"id": "00000000"}', PING, FILE),
             ("fleet", "Admit"): {},
             ("fleet", "Presence"): {},
             ("processing", "Query"): {},

@@ -17,6 +17,8 @@ local/cut_sessions.py; here, in order:
 - a stream's mapping tries a failed batch again until it succeeds, and a role's grant on a stream's ARN is
   not seen (local/stream_gap.py);
 - a Query takes time with every item of its partition (local/table_gap.py);
+- a message that is sent to a queue while another thread takes some out of it is lost
+  (local/queue_gap.py);
 - an invocation that logs nothing takes 50 ms more, and what is logged has no level (local/log_gap.py).
 """
 
@@ -31,14 +33,15 @@ import re
 import secrets
 import time
 from collections.abc import Callable
-from concurrent.futures import ThreadPoolExecutor
 from functools import wraps
 from typing import Any
 
 from ministack.core import iam_actions, iam_evaluator
 from ministack.services import iot, lambda_svc
 
-from local import cut_sessions, log_gap, stream_gap, table_gap
+from contract import TOPIC
+from local import cut_sessions, log_gap, queue_gap, stream_gap, table_gap
+from local.turns import Turns
 
 # "Message size" in AWS IoT Core's service quotas.
 AWS_MESSAGE_BYTES = 128 * 1024
@@ -66,6 +69,7 @@ def install() -> None:
     iot._dispatch_rule_to_lambda = AsyncInvocations().dispatch
     stream_gap.install()
     table_gap.install()
+    queue_gap.install()
     log_gap.install()
 
 
@@ -205,10 +209,13 @@ def _json_object(payload: bytes) -> dict[str, Any]:
 
 class AsyncInvocations:
     """A queue of asynchronous events for each function, served by as many threads as the function
-    may run at once: its reserved concurrency, and no more than this machine has cores."""
+    may run at once: its reserved concurrency, and no more than this machine has cores.
+
+    AWS has an environment for each of many events, and no robot waits for another. Here the robots take
+    turns."""
 
     def __init__(self) -> None:
-        self._pools: dict[str, ThreadPoolExecutor] = {}
+        self._pools: dict[str, Turns] = {}
 
     def dispatch(self, account: str, region: str, function_arn: str, event: Any) -> None:
         """Queue one event; raises `LookupError` for a function that is not there."""
@@ -222,9 +229,16 @@ class AsyncInvocations:
         if pool is None:
             reserved = lambda_svc._reserved_concurrency(function, config)
             cores = os.cpu_count() or 1
-            pool = ThreadPoolExecutor(cores if reserved is None else max(1, min(cores, reserved)))
+            pool = Turns(cores if reserved is None else max(1, min(cores, reserved)))
             self._pools[function_arn] = pool
-        pool.submit(_invoke, account, region, record, event, time.monotonic())
+        pool.submit(_robot(event), _invoke, account, region, record, event, time.monotonic())
+
+
+def _robot(event: Any) -> str:
+    """Whose message an event is of, by its topic; "" where it has none."""
+    topic = event.get(TOPIC) if isinstance(event, dict) else None
+    levels = topic.split("/") if isinstance(topic, str) else []
+    return levels[2] if len(levels) > 2 else ""
 
 
 def _invoke(account: str, region: str, record: dict[str, Any], event: Any, queued_s: float) -> None:
@@ -238,7 +252,10 @@ def _invoke(account: str, region: str, record: dict[str, Any], event: Any, queue
     for _ in range(1 + (2 if retries is None else int(retries))):
         if time.monotonic() - queued_s > (21_600 if age_s is None else int(age_s)):
             break
-        result = lambda_svc._execute_function_with_config_scope(record, event)
+        try:
+            result = lambda_svc._execute_function_with_config_scope(record, event)
+        except Exception as error:  # noqa: BLE001 - whatever it is, the event is not lost with the thread
+            result = {"error": True, "body": {"errorMessage": f"{type(error).__name__}: {error}"}}
         if not result.get("error"):
             return
     destination = ((settings.get("DestinationConfig") or {}).get("OnFailure") or {}).get("Destination")

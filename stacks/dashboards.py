@@ -130,7 +130,7 @@ class Dashboards(Construct):
             _graph(
                 "PubNub: live samples published",
                 self._ours("live", "LivePublished"),
-                right=self._ours("live", "PubNubFailed", "LiveStale", "LiveRefused"),
+                right=self._ours("live", "PubNubFailed", "LiveStale", "LiveRefused", "LiveCutOff"),
             )
         ]
 

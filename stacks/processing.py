@@ -64,7 +64,11 @@ class Processing(Stack):
             settings=self._settings,
             encryption=self._encryption,
             memory_mb=256,
-            environment={"PUBNUB_PARAMETER": name, "LIVE_FIELDS": json.dumps(self._settings.live_fields)},
+            environment={
+                "PUBNUB_PARAMETER": name,
+                "LIVE_FIELDS": json.dumps(self._settings.live_fields),
+                "REJECTED_QUEUE": self._rejected.queue_url,
+            },
             layers=[
                 lambda_.LayerVersion(
                     self,
@@ -203,6 +207,7 @@ class Processing(Stack):
             environment={
                 "FILES_BUCKET": storage.files.bucket_name,
                 "ROBOTS_TABLE": storage.robots.table_name,
+                "REJECTED_QUEUE": self._rejected.queue_url,
                 "UPLOAD_BYTES_A_DAY": str(self._settings.upload_gb_a_day * 10**9),
             },
         )
@@ -232,7 +237,8 @@ class Processing(Stack):
 
     def _invoked_once(self, called: lambda_.Function) -> None:
         """A rule calls it and does not wait. What it answers is about now: late after 2 s (the shortest
-        age that Lambda allows is a minute), and never worth a second attempt."""
+        age that Lambda allows is a minute), and never worth a second attempt. It may send to the queue, so
+        that what it refuses need not fail."""
         called.configure_async_invoke(
             max_event_age=Duration.minutes(1),
             retry_attempts=0,

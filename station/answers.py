@@ -114,8 +114,13 @@ def _rows(of: tuple[Column, Column, Column], starts: Any, n: int, *, several: bo
         return {"mean": values(mean)}
     known = ~np.isnan(mean)
     number = np.add.reduceat(known.astype(float), starts)
-    with np.errstate(invalid="ignore"):
-        average = np.add.reduceat(np.where(known, mean, 0.0), starts) / np.where(number == 0, np.nan, number)
+    number[number == 0] = np.nan
+    valued = np.where(known, mean, 0.0)
+    with np.errstate(invalid="ignore", over="ignore"):
+        average = np.add.reduceat(valued, starts) / number
+        # The sum of a few numbers may be beyond what a number holds, their mean is not.
+        parts = valued / np.repeat(number, np.diff(np.append(starts, n)))
+        average = np.where(np.isinf(average), np.add.reduceat(parts, starts), average)
     return {
         "mean": values(average),
         "least": values(np.fmin.reduceat(least, starts)),

@@ -65,10 +65,10 @@ def derive(columns: Columns, vehicle: Vehicle | None) -> dict[str, Column]:
 
 
 def values(column: Column) -> list[Value]:
-    """A column as Python's values: None where it is null."""
+    """A column as Python's values: None where it is null, or beyond what a number holds."""
     plain: list[Value] = column.tolist()
-    if column.dtype.kind == "f" and np.isnan(column).any():
-        return [None if value != value else value for value in plain]  # noqa: PLR0124 - NaN is not itself
+    if column.dtype.kind == "f" and not (finite := np.isfinite(column)).all():
+        return [value if is_finite else None for value, is_finite in zip(plain, finite, strict=True)]
     return plain
 
 

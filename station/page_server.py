@@ -13,6 +13,7 @@ import errno
 import gzip
 import ipaddress
 import json
+import math
 import re
 import socket
 import socketserver
@@ -230,7 +231,20 @@ def _load(built: Path) -> dict[str, _File]:
 
 
 def _json_file(value: Mapping[str, Any], level: int = 6) -> _File:
-    return _file(TYPES[".json"], json.dumps(value, allow_nan=False, separators=(",", ":")).encode(), level)
+    try:
+        text = json.dumps(value, allow_nan=False, separators=(",", ":"))
+    except ValueError:
+        text = json.dumps(_finite(value), allow_nan=False, separators=(",", ":"))
+    return _file(TYPES[".json"], text.encode(), level)
+
+
+def _finite(value: Any) -> Any:
+    """The same, with null for each number that JSON does not have."""
+    if isinstance(value, Mapping):
+        return {name: _finite(one) for name, one in value.items()}
+    if isinstance(value, (list, tuple)):
+        return [_finite(one) for one in value]
+    return None if isinstance(value, float) and not math.isfinite(value) else value
 
 
 def _file(kind: str, body: bytes, level: int = 6) -> _File:

@@ -20,6 +20,7 @@ from contract import (
     MAX_BATCH_VALUES,
     MAX_FIELDS,
     MAX_SAMPLES,
+    NONFINITE,
     PLAIN_CODEC,
     SAMPLES,
     SCALES,
@@ -38,7 +39,7 @@ from station.conditions import Column
 from station.reading import time_of
 
 # What of a stored item is needed to read its samples.
-ATTRIBUTES = ("v", BATCH, SAMPLES, "nonfinite", "codec", "samples")
+ATTRIBUTES = ("v", BATCH, SAMPLES, NONFINITE, "codec", "samples")
 _SCALES = np.array(SCALES)
 _OF_64_BITS = 2.0**63
 Item = Mapping[str, Any]
@@ -151,7 +152,8 @@ def _open(item: Item) -> _Open:
     """
     try:
         n, codec = int(item[SAMPLES]["N"]), item["codec"]["S"]
-        if item["v"]["N"] == str(BATCH_VERSION) and codec in {CODEC, PLAIN_CODEC} and 1 <= n <= MAX_SAMPLES:
+        known = item["v"]["N"] == str(BATCH_VERSION) and codec in {CODEC, PLAIN_CODEC}
+        if known and _is_count(item.get(NONFINITE)) and 1 <= n <= MAX_SAMPLES:
             t_us = batch_id(item[BATCH]["S"]).t_us
             # What stands behind the columns is for those who make messages of them.
             body = inflate(item["samples"]["S"], codec).partition(b"\n")[0]
@@ -163,6 +165,11 @@ def _open(item: Item) -> _Open:
         # Including the contract's errors: its own decoder says it better.
         pass
     return _Open(item, None, (), {})
+
+
+def _is_count(value: Mapping[str, str] | None) -> bool:
+    """Whether it is none, or one that the contract need not look at."""
+    return value is None or (value["N"].isdecimal() and len(value["N"]) < 6)
 
 
 def _columns(body: bytes, n: int, codec: str) -> tuple[list[int], dict[str, list[Any]]] | None:

@@ -9,6 +9,7 @@ from bench.sections import (
     abilities,
     cost,
     dashboard,
+    fairness,
     mixed,
     outage,
     query,
@@ -30,4 +31,5 @@ SECTIONS: dict[str, Run] = {
     "outage": outage.run,
     "scale": scale.run,
     "mixed": mixed.run,
+    "fairness": fairness.run,
 }

@@ -15,8 +15,7 @@ from typing_extensions import Self
 from contract import LIVE, LiveSample, encode_live
 
 WAIT_S = 60.0
-# A live message that Lambda 1 drops without failing: after a failure the emulator starts the function anew,
-# and the live messages of the next test are stale before it is there.
+# A live message that Lambda 1 drops: what it refuses is kept, and costs the robot its allowance.
 STALE = encode_live(LiveSample("0" * 8, 0, 0, 0, {}, offset_us=0))
 
 

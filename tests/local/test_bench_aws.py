@@ -80,7 +80,7 @@ def test_nobody_there_to_agree_means_that_nothing_is_spent(embedded, tmp_path, c
 
 def test_every_section_that_sends_something_has_its_price(embedded):
     dollars = spending.estimate(embedded.cloud, list(SECTIONS))
-    assert set(SECTIONS) - dollars.keys() == {"cost", "scale", "mixed"}
+    assert set(SECTIONS) - dollars.keys() == {"cost", "scale", "mixed", "fairness"}
     assert all(0 < usd < 1 for usd in dollars.values())
 
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import asyncio
 import inspect
 import json
+import time
 
 import pytest
 from ministack.core import iam_actions
@@ -98,3 +99,19 @@ def test_large_publish_is_refused_before_anything_happens():
     refuse = gaps._refusing_large(publish)
     with pytest.raises(gaps.MessageTooLargeError):
         asyncio.run(refuse("0", "r", "t", b"x" * (gaps.AWS_MESSAGE_BYTES + 1)))
+
+
+def test_an_event_whose_invocation_breaks_the_emulator_goes_to_its_destination(monkeypatch):
+    def broken(*_arguments):
+        raise OSError("no space left on device")
+
+    told = []
+    monkeypatch.setattr(lambda_svc, "_execute_function_with_config_scope", broken)
+    monkeypatch.setattr(lambda_svc, "_route_async_failure", lambda *arguments: told.append(arguments))
+    settings = {"MaximumRetryAttempts": 0, "DestinationConfig": {"OnFailure": {"Destination": "arn:queue"}}}
+    monkeypatch.setattr(lambda_svc, "_event_invoke_config", lambda *_: settings)
+    record = {"config": {"FunctionName": "live"}}
+    gaps._invoke("000000000000", "eu-west-1", record, {"n": 1}, time.monotonic())
+    ((destination, name, event, result),) = told
+    assert (destination, name, event) == ("arn:queue", "live", {"n": 1})
+    assert result["body"]["errorMessage"] == "OSError: no space left on device"

@@ -170,6 +170,7 @@ def test_what_the_variables_say_is_what_the_functions_expect(functions, reader, 
     monkeypatch.setenv("LIVE_FIELDS", live["LIVE_FIELDS"])
     assert LiveSettings.from_environment().fields == {contract.VESC_STREAM: frozenset(contract.VESC_FIELDS)}
     assert live["PUBNUB_PARAMETER"] == contract.pubnub_parameter()
+    assert reader.text(live["REJECTED_QUEUE"]) == "Rejected"
     assert live["NAMESPACE"] == contract.DEFAULT_NAMESPACE
 
     def given(function):
@@ -192,6 +193,7 @@ def test_what_the_variables_say_is_what_the_functions_expect(functions, reader, 
     assert given("Upload") == {
         "FILES_BUCKET": "Files",
         "ROBOTS_TABLE": "Robots",
+        "REJECTED_QUEUE": "Rejected",
         "UPLOAD_BYTES_A_DAY": str(50 * 10**9),
     }
 

@@ -9,6 +9,7 @@ import pytest
 
 from contract import Batch
 from station.answers import MAX_ROWS, answers, history
+from station.conditions import values
 from station.errors import StationError
 from tests.unit.test_station_data import START, cloud_of, ride
 
@@ -75,6 +76,25 @@ def test_the_fields_of_a_claim_are_of_one_sample():
     assert found["fields"] == {
         f"data.{part}": {"mean": [values[1], values[3]]} for part, values in parts.items()
     }
+
+
+def test_the_mean_of_numbers_near_the_largest_is_one_of_them():
+    times = [START + 20_000 * i for i in range(6)]
+    columns = {"x": [1e308, 1.5e308, -1e308, None, 1.7e308, -1.7e308]}
+    found = history(cloud_of(Batch("0badcafe", 0, times, columns)), {**ASKED, "rows": "2"})
+    assert found["fields"]["x"] == {
+        "mean": [pytest.approx(0.5e308), pytest.approx(0)],
+        "least": [-1e308, -1.7e308],
+        "most": [1.5e308, 1.7e308],
+    }
+    found = history(cloud_of(Batch("0badcafe", 0, times, {"x": [1.7e308] * 6})), {**ASKED, "rows": "2"})
+    assert found["fields"]["x"]["mean"] == pytest.approx([1.7e308] * 2)
+    json.dumps(found, allow_nan=False)
+
+
+def test_a_number_that_json_does_not_have_is_null():
+    column = np.array([np.inf, 1.5, -np.inf, np.nan])
+    assert values(column) == [None, 1.5, None, None]
 
 
 def test_an_empty_range_is_no_error():

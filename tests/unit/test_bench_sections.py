@@ -11,7 +11,7 @@ from bench.invocations import Measured
 from bench.lines import RAW
 from bench.probes.ground import No
 from bench.result import Section
-from bench.sections import SECTIONS, abilities, mixed, outage, query, utilisation
+from bench.sections import SECTIONS, abilities, fairness, mixed, outage, query, utilisation
 from bench.sections.utilisation import BATCHES
 from contract import BROKER, LAMBDA, RULE, Batch, encode, live_topic, record_topic
 from contract.ros1.definition import parse
@@ -219,6 +219,15 @@ def test_mixed_robot_is_held_to_what_it_lost_and_left_out():
     assert values["bytes published / bytes of the bag"].value == round(len(sent) / 4000, 3)
     assert any("not sent" in note for note in section.notes)
     json.dumps(section.as_json())
+
+
+def test_fairness_is_held_to_twice_the_delay_of_a_car_alone():
+    section = Section("fairness", "")
+    found = {"nothing": [[10.0] * 80], "bad messages": [[19.0] * 80], "good messages": [[21.0] * 40]}
+    fairness.report(section, found)
+    values = [(ratio.value, ratio.reached) for ratio in section.ratios]
+    assert values == [(1.9, True), (1.0, True), (2.1, False), (0.5, False)]
+    assert section.tables[0].rows[1][:2] == ["bad messages", "80"]
 
 
 def test_every_section_of_the_documentation_is_one_that_runs():

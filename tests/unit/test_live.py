@@ -1,4 +1,4 @@
-"""Lambda 1: the chosen fields go to the car's channel, and whatever is wrong is counted, never raised."""
+"""Lambda 1: the chosen fields go to the car's channel; whatever is wrong is counted and fails nothing."""
 
 from __future__ import annotations
 
@@ -15,10 +15,12 @@ from hypothesis import strategies as st
 import contract
 from contract import LIVE, LIVE_MAX_AGE_MS, RECEIVED_MS, TOPIC, LiveSample, build_topic
 from functions import live
+from functions.cut_off import BURST, CutOff
 from functions.legs import Legs
 from functions.live import LiveSettings, RefusedError, age_ms, process
 from functions.metrics import Gathered
 from functions.pubnub_client import PublishError, PubNubPublisher
+from functions.quarantine import entries
 
 T_US = 1_700_000_000_000_000
 SENT_US = T_US + 4_000
@@ -65,7 +67,9 @@ def counted(capsys):
             (directive,) = entry["_aws"]["CloudWatchMetrics"]
             for metric in directive["Metrics"]:
                 assert metric["Name"] in contract.METRICS["live"]
-                totals[metric["Name"]] = totals.get(metric["Name"], 0) + entry[metric["Name"]]
+                value = entry[metric["Name"]]
+                value = sum(value) if isinstance(value, list) else value
+                totals[metric["Name"]] = totals.get(metric["Name"], 0) + value
         return totals
 
     return read
@@ -215,7 +219,7 @@ MALFORMED = [
 
 
 @pytest.mark.parametrize("malformed", MALFORMED, ids=range(len(MALFORMED)))
-def test_a_malformed_event_is_counted_and_fails_the_invocation_so_that_it_is_kept(malformed, counted):
+def test_a_malformed_event_is_counted_and_refused(malformed, counted):
     channels = Channels()
     with pytest.raises(RefusedError) as raised:
         show(malformed, channels)
@@ -257,14 +261,142 @@ def test_the_settings_come_from_the_environment(monkeypatch):
     assert LiveSettings.from_environment() == LiveSettings({"vesc": frozenset({"speed"}), "imu": frozenset()})
 
 
-def test_the_handler_wires_settings_publisher_and_clock(monkeypatch, counted):
-    channels = Channels()
+ARN = "arn:aws:lambda:eu-west-1:000000000000:function:iort-processing-Live-1"
+
+
+class Queue:
+    """Stands for the queue before the quarantine: what it took, or that it takes nothing."""
+
+    def __init__(self, *, takes=True):
+        self.kept, self.takes = [], takes
+
+    def __call__(self, body):
+        if self.takes:
+            self.kept.append(body)
+        return self.takes
+
+
+class Served:
+    """One environment of the function, and what it did with each event."""
+
+    def __init__(self, *, takes=True):
+        self.channels, self.queue, self.cut_off = Channels(), Queue(takes=takes), CutOff()
+        self.legs, self.counted, self.now_us = Legs(), Gathered("live"), NOW_US
+
+    def __call__(self, message):
+        def one():
+            process(
+                message,
+                SETTINGS,
+                self.channels,
+                legs=self.legs,
+                counted=self.counted,
+                now_us=self.now_us,
+            )
+
+        live.serve(
+            message,
+            one,
+            self.queue,
+            cut_off=self.cut_off,
+            counted=self.counted,
+            function_arn=ARN,
+            now_s=self.now_us / 1e6,
+        )
+
+
+@pytest.mark.parametrize("malformed", MALFORMED, ids=range(len(MALFORMED)))
+def test_what_is_refused_goes_to_the_queue_and_fails_no_invocation(malformed, counted):
+    served = Served()
+    served(malformed)
+    (entry,) = entries(served.queue.kept[0], lambda _info: [])
+    assert len(served.queue.kept) == 1
+    assert entry.source == f"{contract.BY_FUNCTION} iort-processing-Live-1"
+    assert entry.reason.startswith("Refused: ")
+    with contextlib.suppress(AttributeError, contract.ContractError):
+        assert entry.payload == contract.live_message(malformed)
+    assert counted() == {"LiveRefused": 1}
+
+
+def test_what_the_queue_does_not_take_fails_the_invocation_so_that_lambda_sends_it_there():
+    with pytest.raises(RefusedError, match="not JSON"):
+        Served(takes=False)(handed(b"not JSON"))
+
+
+def test_a_robot_that_is_refused_over_and_over_is_cut_off_and_no_other_is(counted):
+    served = Served()
+    for _ in range(BURST + 30):
+        served({**handed(b"x"), TOPIC: build_topic(LIVE, "bad", "vesc")})
+    # Its good ones are not looked at either, and every other robot's are.
+    served(event(robot="bad"))
+    for i in range(40):
+        served(event(robot=f"good{i}"))
+    assert len(served.queue.kept) == BURST
+    assert [entries(body, list)[0].reason.count("LiveCutOff") for body in served.queue.kept] == [
+        *[0] * (BURST - 1),
+        1,
+    ]
+    assert [message["robot"] for _, message in served.channels.sent] == [f"good{i}" for i in range(40)]
+    served.now_us += 11_000_000
+    # And once it is mended it is seen again.
+    mended = event(robot="bad", t=served.now_us, sent_us=served.now_us)
+    served({**mended, RECEIVED_MS: served.now_us // 1000})
+    assert served.channels.sent[-1][1]["robot"] == "bad"
+    totals = counted()
+    assert (totals["LiveRefused"], totals["LiveCutOff"]) == (BURST, 31)
+    assert totals["LivePublished"] == 41
+
+
+def test_an_allowance_is_had_again_with_time_and_whatever_the_clock_does():
+    cut_off = CutOff()
+    assert [cut_off.refused("car", 0.0) for _ in range(BURST)] == [False] * (BURST - 1) + [True]
+    assert cut_off.closed("car", 0.9)
+    assert not cut_off.closed("car", 1.1)
+    assert not cut_off.closed("other", 0.0)
+    # One refused message a second is never cut off.
+    steady = CutOff()
+    assert not any(steady.refused("car", float(second)) for second in range(1000))
+    assert cut_off.closed("car", -3600.0)
+
+
+def test_allowances_are_of_a_bounded_number_of_robots():
+    cut_off = CutOff()
+    for i in range(3000):
+        cut_off.refused(f"car{i}", 0.0)
+    assert len(cut_off._left) == 1000
+    assert "car2999" in cut_off._left
+
+
+def test_the_queue_is_that_of_the_environment(aws, monkeypatch):
+    client = boto3.client("sqs")
+    url = client.create_queue(QueueName="rejected")["QueueUrl"]
+    monkeypatch.setenv("REJECTED_QUEUE", url)
+    live._refusals.cache_clear()
+    try:
+        assert live._refusals().keep("body")
+        (message,) = client.receive_message(QueueUrl=url)["Messages"]
+        assert message["Body"] == "body"
+        client.delete_queue(QueueUrl=url)
+        assert not live._refusals().keep("body")
+    finally:
+        live._refusals.cache_clear()
+
+
+class Context:
+    invoked_function_arn = ARN
+
+
+def test_the_handler_wires_settings_publisher_queue_and_clock(monkeypatch, counted):
+    channels, queue = Channels(), Queue()
+    monkeypatch.setattr(live, "_refusals", lambda: type("Refusals", (), {"keep": staticmethod(queue)}))
     monkeypatch.setattr(live, "_settings", lambda: SETTINGS)
     monkeypatch.setattr(
         live, "_publisher", lambda: type("Publisher", (), {"publish": staticmethod(channels)})
     )
     monkeypatch.setattr(live.time, "time_ns", lambda: NOW_US * 1000)
-    assert live.handler(event(), None) is None
+    assert live.handler(event(), Context) is None
+    assert live.handler(handed(b"x"), Context) is None
+    assert len(queue.kept) == 1
     assert channels.sent[0][1]["hops"]["lambda_us"] == NOW_US
     assert counted()["LivePublished"] == 1
 

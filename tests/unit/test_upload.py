@@ -11,6 +11,8 @@ from urllib.parse import parse_qs, urlsplit
 import boto3
 import pytest
 from botocore.config import Config
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
 
 import contract
 from contract import (
@@ -30,6 +32,7 @@ from contract import (
 from functions import upload
 from functions.allotment import Allotment
 from functions.bucket import Bucket
+from functions.quarantine import entries
 
 NAME, ROBOTS = "files", "robots"
 NOW_S = 1_700_000_000.0
@@ -352,6 +355,29 @@ def test_a_robot_that_is_not_registered_gets_no_address(ask, dynamodb):
     assert "Item" not in dynamodb.get_item(TableName=ROBOTS, Key={contract.ROBOT: {"S": "stranger"}})
 
 
+class Context:
+    invoked_function_arn = "arn:aws:lambda:eu-west-1:000000000000:function:upload"
+
+
+class Queue:
+    """Stands for the queue before the quarantine."""
+
+    def __init__(self):
+        self.bodies, self.takes = [], True
+
+    def keep(self, body):
+        if self.takes:
+            self.bodies.append(body)
+        return self.takes
+
+
+@pytest.fixture
+def queue(monkeypatch):
+    made = Queue()
+    monkeypatch.setattr(upload, "_refusals", lambda: made)
+    return made
+
+
 @pytest.fixture
 def published(monkeypatch, s3, dynamodb):
     sent = []
@@ -374,10 +400,10 @@ def event(request, robot="car", **changes):
 
 
 def test_the_handler_answers_the_robot_of_the_topic_and_counts(published, capsys, s3):
-    upload.handler(event(SMALL), None)
+    upload.handler(event(SMALL), Context)
     key = contract.file_key("car", SMALL.file)
     s3.put_object(Bucket=NAME, Key=key, Body=b"small")
-    upload.handler(event(asking(b"small", done=True)), None)
+    upload.handler(event(asking(b"small", done=True)), Context)
     asked, stored = (contract.decode_file_answer(one["payload"]) for one in published)
     assert {(one["topic"], one["qos"]) for one in published} == {(build_topic(PONG, "car", FILE), 1)}
     assert (asked.key, asked.stored, stored.stored) == (key, False, True)
@@ -389,18 +415,42 @@ def test_the_handler_answers_the_robot_of_the_topic_and_counts(published, capsys
 
 
 def test_the_handler_says_what_is_wrong_with_a_request(published, capsys):
-    upload.handler(event(SMALL, parts={"9": "x"}), None)
+    upload.handler(event(SMALL, parts={"9": "x"}), Context)
     (answer,) = (contract.decode_file_answer(one["payload"]) for one in published)
     assert answer.id == ID
     assert answer.refused == "part 9: allowed is 1 to 1"
     assert answer.again_s is None
     assert json.loads(capsys.readouterr().out.splitlines()[-1])["FilesRefused"] == 1
-    # Nobody can be told who has not said which request it is: to the quarantine with it.
-    for message in (b"{}", b"no JSON", b"\xff", b"[]", b"[" * 100_000):
-        with pytest.raises(ContractError):
-            upload.handler(contract.rule_event(message, build_topic(PING, "car", FILE), 1), None)
-        assert json.loads(capsys.readouterr().out.splitlines()[-1])["FilesRefused"] == 1
-    assert len(published) == 1
+
+
+json_values = st.recursive(
+    st.none() | st.booleans() | st.integers() | st.floats() | st.text(max_size=10),
+    lambda inner: st.lists(inner, max_size=3) | st.dictionaries(st.text(max_size=5), inner, max_size=3),
+    max_leaves=8,
+)
+requests = st.dictionaries(st.sampled_from(["v", "id", "file", "parts", "parts_sha256", "x"]), json_values)
+
+
+@settings(suppress_health_check=[HealthCheck.function_scoped_fixture])
+@given(requests.map(lambda said: json.dumps(said).encode()) | st.binary(max_size=20))
+def test_every_malformed_request_is_answered_or_kept(published, queue, message):
+    published.clear()
+    queue.bodies.clear()
+    upload.handler(contract.rule_event(message, build_topic(PING, "car", FILE), 1), Context)
+    assert (len(published), len(queue.bodies)) in {(1, 0), (0, 1)}
+    for one in published:
+        # The robot knows it for the answer to what it asked.
+        assert contract.decode_file_answer(one["payload"]).id == json.loads(message)["id"]
+    for body in queue.bodies:
+        (entry,) = entries(body, list)
+        assert (entry.source, entry.robot, entry.payload) == ("function upload", "car", message)
+        assert entry.reason.startswith("Refused: ")
+
+
+def test_what_the_queue_does_not_take_fails_the_invocation(published, queue):
+    queue.takes = False
+    with pytest.raises(ContractError):
+        upload.handler(contract.rule_event(b"{}", build_topic(PING, "car", FILE), 1), Context)
 
 
 def test_the_clients_are_those_of_the_environment(aws, monkeypatch):

@@ -113,6 +113,14 @@ def test_the_page_is_told_where_to_listen_and_nothing_more(built: Path) -> None:
     assert told == {**TOLD, "vehicles": vehicles, "token": "", "answers": False}
 
 
+def test_an_answer_with_numbers_that_json_does_not_have_comes_with_null(built: Path) -> None:
+    answered = {"mean": [1.5, float("inf"), None], "of": {"x": float("nan")}, "n": 3}
+    with PageServer(**TOLD, answers={"history": lambda _asked: answered}, built=built) as page:
+        answer, body = ask(page, "/history.json")
+    assert answer.status == 200
+    assert json.loads(body) == {"mean": [1.5, None, None], "of": {"x": None}, "n": 3}
+
+
 def test_the_page_reads_the_contracts_fields(built: Path) -> None:
     with PageServer(**TOLD, built=built) as page:
         table = json.loads(ask(page, "/fields.json")[1])

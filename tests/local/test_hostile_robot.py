@@ -1,0 +1,123 @@
+"""A robot whose messages are refused over and over costs the others nothing, and nothing of it is lost."""
+
+from __future__ import annotations
+
+import os
+import time
+from pathlib import Path
+
+import pytest
+
+import contract
+from bench.usage import descendants
+from contract import FILE, LIVE, PING, VESC_STREAM, LiveSample, build_topic, record_topic
+from functions.cut_off import BURST
+from station import quarantine
+from station.listener import Listener
+from tests.local.conftest import until
+from tests.local.robot import Robot
+
+BAD, GOOD = 80, 20
+
+
+def environments(embedded):
+    """The processes of Lambda 1."""
+    function = embedded.cloud.output("processing", "LiveFunction")
+    found = set()
+    for pid in descendants(embedded.emulator.pid):
+        try:
+            command = Path(f"/proc/{pid}/cmdline").read_bytes().decode(errors="replace")
+        except OSError:
+            continue
+        if f"ministack-lambda-{function}-" in command:
+            found.add(pid)
+    return found
+
+
+def kept(embedded, robot):
+    """The messages of a robot in quarantine, and how often each came."""
+    listed = quarantine.entries(embedded.cloud, robot=robot)
+    return {quarantine.load(embedded.cloud, one).payload: one.seen for one in listed}
+
+
+def test_a_robot_refused_over_and_over_leaves_the_others_their_live_lane(embedded, bundle):
+    bad, good = bundle("bad"), bundle("good")
+    # Of a time to come, so that a slow machine makes none of them stale.
+    t_us = (int(time.time()) + 3600) * 1_000_000
+    topics = {car: build_topic(LIVE, car.robot, VESC_STREAM) for car in (bad, good)}
+    before = environments(embedded)
+    assert before
+    with (
+        Listener(robot=good.robot, namespace=embedded.namespace, **embedded.keys.reading()) as listener,
+        Robot(bad.folder) as hostile,
+        Robot(good.folder) as other,
+    ):
+        hostile.online()
+        other.online()
+        for n in range(BAD):
+            hostile.publish(topics[bad], b"no JSON %d" % n)
+            if n % (BAD // GOOD) == 0:
+                sample = LiveSample("0badcafe", n, t_us, t_us, {"speed": n}, offset_us=0)
+                other.publish(topics[good], contract.encode_live(sample))
+        until(lambda: len(listener.heard) == GOOD)
+    assert sorted(heard.seq for heard in listener.heard) == list(range(0, BAD, BAD // GOOD))
+    # A refusal ended none: there may be one more, since several run at once.
+    after = environments(embedded)
+    assert before <= after
+    assert len(after) <= (os.cpu_count() or 1)
+    found = until(lambda: (now := kept(embedded, bad.robot)) and len(now) >= BURST and now)
+    assert set(found) <= {b"no JSON %d" % n for n in range(BAD)}
+    assert set(found.values()) == {1}
+    assert kept(embedded, good.robot) == {}
+
+
+def test_each_of_a_thousand_messages_that_no_rule_takes_is_kept_once(embedded, bundle):
+    car = bundle()
+    sent = {b"no JSON %d" % n for n in range(1000)}
+    with Robot(car.folder) as robot:
+        robot.online()
+        for message in sent:
+            robot.publish(record_topic(car.robot, VESC_STREAM), message)
+    until(
+        lambda: sum(1 for _ in quarantine.entries(embedded.cloud, robot=car.robot)) == len(sent), seconds=300
+    )
+    assert kept(embedded, car.robot) == dict.fromkeys(sent, 1)
+
+
+MALFORMED = [
+    b"",
+    b"[]",
+    b"5",
+    b"\xff\x00",
+    b"no JSON",
+    b"{}",
+    b'{"id": 5}',
+    b'{"id": "no-run"}',
+    b'{"id": NaN}',
+    b'{"id": null, "file": []}',
+    b'{"id": {"a": 1}, "v": 1}',
+]
+
+
+@pytest.mark.parametrize("asked", [b'{"id": "0badcafe"}', b'{"id": "0badcafe", "v": 1, "file": 7}'])
+def test_a_malformed_request_with_an_id_is_answered(bundle, asked):
+    car = bundle()
+    with Robot(car.folder) as robot:
+        robot.online().subscribe(build_topic(contract.PONG, car.robot, FILE))
+        robot.publish(build_topic(PING, car.robot, FILE), asked)
+        _, answer = robot.next_message()
+    found = contract.decode_file_answer(answer)
+    assert (found.id, found.refused is not None) == ("0badcafe", True)
+
+
+def test_a_malformed_request_without_an_id_is_kept(embedded, bundle):
+    car = bundle()
+    with Robot(car.folder) as robot:
+        robot.online()
+        for asked in MALFORMED:
+            robot.publish(build_topic(PING, car.robot, FILE), asked)
+    until(
+        lambda: sum(one.seen for one in quarantine.entries(embedded.cloud, robot=car.robot)) == len(MALFORMED)
+    )
+    entries = list(quarantine.entries(embedded.cloud, robot=car.robot))
+    assert all("-Upload" in one.source and one.reason.startswith("Refused: ") for one in entries)

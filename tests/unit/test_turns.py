@@ -1,0 +1,34 @@
+"""Whoever submits many calls makes nobody wait for them."""
+
+from __future__ import annotations
+
+import threading
+
+from local.turns import Turns
+
+
+def test_who_has_calls_waiting_takes_turns_with_the_others():
+    turns, begun, go, done = Turns(1), threading.Event(), threading.Event(), threading.Event()
+    called = []
+
+    def first():
+        begun.set()
+        assert go.wait(60)
+
+    turns.submit("many", first)
+    assert begun.wait(60)
+    for n in range(5):
+        turns.submit("many", called.append, f"many {n}")
+    turns.submit("few", called.append, "few 0")
+    turns.submit("few", called.append, "few 1")
+    turns.submit("many", done.set)
+    go.set()
+    assert done.wait(60)
+    assert called == ["many 0", "few 0", "many 1", "few 1", "many 2", "many 3", "many 4"]
+
+
+def test_a_call_that_fails_ends_no_thread():
+    turns, done = Turns(1), threading.Event()
+    turns.submit("a", [].pop)
+    turns.submit("a", done.set)
+    assert done.wait(60)
