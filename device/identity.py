@@ -15,7 +15,7 @@ import threading
 import time
 import uuid
 from dataclasses import dataclass
-from pathlib import Path
+from pathlib import Path, PurePath
 from typing import Any, Iterable, Mapping
 
 import yaml
@@ -24,6 +24,7 @@ import contract
 from device.certificate import parse_certificate
 from device.config import Config, load_config
 from device.errors import AgentError, ConfigError, IdentityError
+from device.private_files import write_below
 from device.schema import Where, any_path, existing_path, load, number, read_yaml, setting, text
 from device.status import fetch
 
@@ -287,18 +288,10 @@ def _keep_previous(paths: Iterable[Path]) -> None:
             _write_private(_previous(path), path.read_text(encoding="utf-8"))
 
 
-def _write_private(path: Path, content: str) -> None:
+def _write_private(path: Path, content: str, mode: int = 0o600) -> None:
     """Replace the file as a whole, readable by its owner alone from its first moment on."""
     path.parent.mkdir(parents=True, exist_ok=True, mode=0o700)
-    beside = path.with_name(f".{path.name}.{os.getpid()}")
-    try:
-        with os.fdopen(os.open(beside, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o600), "w") as file:
-            file.write(content)
-            file.flush()
-            os.fsync(file.fileno())
-        beside.replace(path)
-    finally:
-        beside.unlink(missing_ok=True)
+    write_below(path.parent, PurePath(path.name), content.encode(), mode=mode, sync=True)
 
 
 def _update_config(file: Path, settings: Mapping[str, Any]) -> None:
@@ -323,5 +316,4 @@ def _update_config(file: Path, settings: Mapping[str, Any]) -> None:
     if any(written.get(name) != value for name, value in settings.items()):
         raise ConfigError(f"{file}: cannot be updated, set by hand: {dict(settings)}")
     mode = file.stat().st_mode & 0o777
-    _write_private(file, text_)
-    file.chmod(mode)
+    _write_private(file, text_, mode)
