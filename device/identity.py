@@ -16,7 +16,7 @@ import time
 import uuid
 from dataclasses import dataclass
 from pathlib import Path, PurePath
-from typing import Any, Iterable, Mapping
+from typing import Any, Callable, Iterable, Mapping
 
 import yaml
 
@@ -33,6 +33,8 @@ _log = logging.getLogger(__name__)
 _WAIT_S = 30.0
 _SWITCH_S = 60.0
 _LOOK_S = 0.5
+# Before each further try to register.
+_AGAIN_S = (1.0, 4.0)
 # Where Linux says which machine this is; the first that there is.
 _SERIALS = (Path("/proc/device-tree/serial-number"), Path("/etc/machine-id"))
 # What RegisterThing takes as a parameter and a thing as an attribute.
@@ -124,10 +126,30 @@ def _register(claim: Claim, robot: str) -> tuple[str, str]:
     key, request = make_key(robot)
     with _Exchange(claim) as exchange:
         certificate, token = exchange.certify(request)
-        thing = exchange.register(token, {contract.ROBOT_PARAMETER: robot, contract.SERIAL_PARAMETER: serial})
+        parameters = {contract.ROBOT_PARAMETER: robot, contract.SERIAL_PARAMETER: serial}
+        thing = register_again(lambda: exchange.register(token, parameters), wait=time.sleep)
     if thing != robot:
         raise IdentityError(f"the cloud registered {thing}, not {robot}: its template is not ours")
     return key, certificate
+
+
+def register_again(register: Callable[[], str], *, wait: Callable[[float], None]) -> str:
+    """Register; where that fails, once more with the same certificate and token, and again.
+
+    AWS IoT gives the fleet's hook 5 s, and a hook that was too late has spent the admission on this
+    certificate: no other one would be admitted. Raises the first `IdentityError` in the end.
+    """
+    first: IdentityError | None = None
+    for wait_s in (*_AGAIN_S, None):
+        try:
+            return register()
+        except IdentityError as error:  # noqa: PERF203 - it waits for seconds
+            first = first or error
+            if wait_s is not None:
+                _log.warning("%s; trying again in %g s", error, wait_s)
+                wait(wait_s)
+    assert first is not None
+    raise first
 
 
 def make_key(robot: str) -> tuple[str, str]:

@@ -34,9 +34,9 @@ _PARAMETER = re.compile(r"_[^_]")
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run a command; the exit status: 0 good, 1 something failed or was lost, 2 wrong use."""
-    # Whatever is written is this user's alone; who is to read it is given the right to.
-    os.umask(0o077)
     options = _parse(list(sys.argv[1:] if arguments is None else arguments))
+    # Whatever a command writes is its user's alone; who else is to read it is given the right to.
+    before = os.umask(0o077)
     try:
         status: int = options.command(options)
         sys.stdout.flush()
@@ -57,6 +57,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
         return 1
     else:
         return status
+    finally:
+        os.umask(before)
 
 
 def _parse(arguments: list[str]) -> argparse.Namespace:

@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
+import contextlib
+import io
 import os
 import stat
-import subprocess
-import sys
 import threading
-from pathlib import Path, PurePath
+from pathlib import PurePath
 
 import pytest
 
@@ -15,6 +15,7 @@ from contract import VESC_STREAM
 from device.claim_check import ClaimCheck
 from device.clock import ManualClock
 from device.errors import AgentError, UploadError
+from device.main import main
 from device.private_files import make_private, open_below, write_below
 from device.reservation import Reservation
 from device.spool import PROCESS
@@ -22,6 +23,7 @@ from device.spool_file import SpoolFile
 from device.sqlite_spool import SqliteSpool
 from device.upload_file import from_json, read, to_json
 from device.upload_folder import STATE, Folder
+from tests.unit.test_device_agent import config_file
 
 SECRET = b"another's, and not for the bucket"
 
@@ -199,16 +201,23 @@ def test_a_file_is_whole_or_not_there(folder):
     assert (folder / "a" / "b").read_bytes() == b"1"
 
 
-def test_the_commands_write_for_their_user_alone(folder):
-    """Whatever they write; here what a file of theirs is made with."""
-    program = (
-        "import os; os.umask(0)\n"
-        "from device.main import main\n"
-        "main(['status', '--config', 'none.yaml'])\n"
-        "open('made', 'w').close()"
-    )
-    environment = {**os.environ, "PYTHONPATH": os.pathsep.join(filter(None, sys.path))}
-    subprocess.run(
-        [sys.executable, "-c", program], cwd=folder, env=environment, check=True, capture_output=True
-    )
-    assert stat.S_IMODE(Path(folder / "made").stat().st_mode) == 0o600
+class Asking(io.StringIO):
+    """Standard output that notes with which umask it is written to."""
+
+    def __init__(self):
+        super().__init__()
+        self.umasks = set()
+
+    def write(self, text):
+        umask = os.umask(0o077)
+        os.umask(umask)
+        self.umasks.add(umask)
+        return super().write(text)
+
+
+def test_whatever_a_command_writes_is_its_users_alone(tmp_path, open_umask):
+    asking = Asking()
+    with contextlib.redirect_stdout(asking):
+        assert main(["--config", str(config_file(tmp_path, "{type: sim}")), "--check-config"]) == 0
+    assert asking.umasks == {0o077}
+    assert os.umask(0) == 0
