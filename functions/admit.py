@@ -138,6 +138,6 @@ def _admit(event: Mapping[str, Any]) -> bool:
     return True
 
 
-if os.environ.get("AWS_LAMBDA_INITIALIZATION_TYPE"):
+if "AWS_LAMBDA_INITIALIZATION_TYPE" in os.environ:
     # In Lambda, where the client is made before the first request waits for it.
     _dynamodb()
