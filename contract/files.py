@@ -226,8 +226,10 @@ def decode_file_answer(message: bytes | str) -> FileAnswer:
             Address(int(one["part"]), str(one["url"]), {str(k): str(v) for k, v in one["headers"].items()})
             for one in envelope.get("addresses", ())
         )
-    except (AttributeError, KeyError, TypeError, ValueError) as error:
+    except (ArithmeticError, AttributeError, KeyError, TypeError, ValueError) as error:
         raise ContractError(f"have or addresses are not what they should be: {error}") from error
+    if any(later[0] <= earlier[1] for earlier, later in zip(have, have[1:])):
+        raise ContractError("have: expected ranges in order, of which none overlap")
     return FileAnswer(given_id, key, stored, have, addresses)
 
 

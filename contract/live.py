@@ -129,4 +129,6 @@ def decode_pong(message: bytes | str) -> Pong:
     """Read a pong, or a ping that came straight back; raises `ContractError` otherwise."""
     envelope = json_object(message, "pong")
     received = integer(envelope, RECEIVED_MS) if RECEIVED_MS in envelope else None
+    if received is not None:
+        check_time(received * 1000, RECEIVED_MS)
     return Pong(integer(envelope, "id"), integer(envelope, "sent_us"), received)

@@ -60,7 +60,9 @@ PRESENCE = (
 # Of its provisioning: the machine that has the name, until when a certificate may be issued for it and
 # for which claim alone, and the certificate that was issued last.
 SERIAL, ADMIT_UNTIL_S, ADMIT_CLAIM = "serial", "admit_until_s", "admit_claim"
+# The SHA-256 of the claim's certificate, in hex: what AWS calls a certificate, computed by us.
+ADMIT_FINGERPRINT = "admit_fingerprint"
 ADMITTED_CERTIFICATE, ADMITTED_MS = "admitted_certificate", "admitted_ms"
-ADMISSION = (SERIAL, ADMIT_UNTIL_S, ADMIT_CLAIM, ADMITTED_CERTIFICATE, ADMITTED_MS)
+ADMISSION = (SERIAL, ADMIT_UNTIL_S, ADMIT_CLAIM, ADMIT_FINGERPRINT, ADMITTED_CERTIFICATE, ADMITTED_MS)
 # The provisioning template's parameters.
 ROBOT_PARAMETER, SERIAL_PARAMETER = "Robot", "Serial"

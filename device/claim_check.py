@@ -9,15 +9,15 @@ from __future__ import annotations
 
 import hashlib
 import logging
-import os
 import threading
-from pathlib import Path
+from pathlib import Path, PurePath
 from typing import Any, Callable, Mapping
 
 import contract
 from contract import CLAIM_AT, CLAIM_FIELDS, File, RosMessage, Value
 from contract.ros1.message import cut
 from device.clock import Clock
+from device.private_files import write_below
 from device.seldom import Seldom
 from device.sources import Emit
 from device.thumbnail import thumbnail
@@ -131,18 +131,18 @@ class ClaimCheck:
 
     def _keep(self, stream: str, t_us: int, field: str, content: bytes) -> dict[str, Value] | None:
         suffix = next((end for begin, end in _BEGINNINGS if content.startswith(begin)), ".bin")
-        name = Path(stream) / f"{t_us}-{field}{suffix}"
+        name = PurePath(stream) / f"{t_us}-{field}{suffix}"
         if not self._has_room(len(content)):
             self._seldom.warn("full", f"{self._folder} is full: contents of {stream} are not kept")
             return None
         try:
-            written_us = self._write(name, content, t_us)
+            written_ns = write_below(self._folder, name, content, mtime_ns=max(0, t_us) * 1000)
         except OSError as error:
             self._seldom.warn("disk", f"{self._folder}: {error.strerror or error}")
             return None
         kind, content_type = kind_of(name)
         sha256 = hashlib.sha256(content).hexdigest()
-        file = File(wire_name(name), kind, content_type, len(content), sha256, written_us)
+        file = File(wire_name(name), kind, content_type, len(content), sha256, written_ns // 1000)
         self.kept += 1
         self._stored()
         return {
@@ -152,17 +152,6 @@ class ClaimCheck:
             "content_type": content_type,
             "thumbnail": self._thumbnail(content, content_type),
         }
-
-    def _write(self, name: Path, content: bytes, t_us: int) -> int:
-        """Write a file that is whole when it has its name; its time, as the file system keeps it."""
-        path = self._folder / name
-        path.parent.mkdir(parents=True, exist_ok=True)
-        beside = path.with_name(f".{path.name}")
-        beside.write_bytes(content)
-        os.utime(beside, ns=(max(0, t_us) * 1000, max(0, t_us) * 1000))
-        written_us = beside.stat().st_mtime_ns // 1000
-        beside.replace(path)
-        return written_us
 
     def _has_room(self, size: int) -> bool:
         with self._lock:

@@ -15,8 +15,8 @@ import threading
 import time
 import uuid
 from dataclasses import dataclass
-from pathlib import Path
-from typing import Any, Iterable, Mapping
+from pathlib import Path, PurePath
+from typing import Any, Callable, Iterable, Mapping
 
 import yaml
 
@@ -24,6 +24,7 @@ import contract
 from device.certificate import parse_certificate
 from device.config import Config, load_config
 from device.errors import AgentError, ConfigError, IdentityError
+from device.private_files import write_below
 from device.schema import Where, any_path, existing_path, load, number, read_yaml, setting, text
 from device.status import fetch
 
@@ -32,6 +33,8 @@ _log = logging.getLogger(__name__)
 _WAIT_S = 30.0
 _SWITCH_S = 60.0
 _LOOK_S = 0.5
+# Before each further try to register.
+_AGAIN_S = (1.0, 4.0)
 # Where Linux says which machine this is; the first that there is.
 _SERIALS = (Path("/proc/device-tree/serial-number"), Path("/etc/machine-id"))
 # What RegisterThing takes as a parameter and a thing as an attribute.
@@ -123,10 +126,30 @@ def _register(claim: Claim, robot: str) -> tuple[str, str]:
     key, request = make_key(robot)
     with _Exchange(claim) as exchange:
         certificate, token = exchange.certify(request)
-        thing = exchange.register(token, {contract.ROBOT_PARAMETER: robot, contract.SERIAL_PARAMETER: serial})
+        parameters = {contract.ROBOT_PARAMETER: robot, contract.SERIAL_PARAMETER: serial}
+        thing = register_again(lambda: exchange.register(token, parameters), wait=time.sleep)
     if thing != robot:
         raise IdentityError(f"the cloud registered {thing}, not {robot}: its template is not ours")
     return key, certificate
+
+
+def register_again(register: Callable[[], str], *, wait: Callable[[float], None]) -> str:
+    """Register; where that fails, once more with the same certificate and token, and again.
+
+    AWS IoT gives the fleet's hook 5 s, and a hook that was too late has spent the admission on this
+    certificate: no other one would be admitted. Raises the first `IdentityError` in the end.
+    """
+    first: IdentityError | None = None
+    for wait_s in (*_AGAIN_S, None):
+        try:
+            return register()
+        except IdentityError as error:  # noqa: PERF203 - it waits for seconds
+            first = first or error
+            if wait_s is not None:
+                _log.warning("%s; trying again in %g s", error, wait_s)
+                wait(wait_s)
+    assert first is not None
+    raise first
 
 
 def make_key(robot: str) -> tuple[str, str]:
@@ -287,18 +310,10 @@ def _keep_previous(paths: Iterable[Path]) -> None:
             _write_private(_previous(path), path.read_text(encoding="utf-8"))
 
 
-def _write_private(path: Path, content: str) -> None:
+def _write_private(path: Path, content: str, mode: int = 0o600) -> None:
     """Replace the file as a whole, readable by its owner alone from its first moment on."""
     path.parent.mkdir(parents=True, exist_ok=True, mode=0o700)
-    beside = path.with_name(f".{path.name}.{os.getpid()}")
-    try:
-        with os.fdopen(os.open(beside, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o600), "w") as file:
-            file.write(content)
-            file.flush()
-            os.fsync(file.fileno())
-        beside.replace(path)
-    finally:
-        beside.unlink(missing_ok=True)
+    write_below(path.parent, PurePath(path.name), content.encode(), mode=mode, sync=True)
 
 
 def _update_config(file: Path, settings: Mapping[str, Any]) -> None:
@@ -323,5 +338,4 @@ def _update_config(file: Path, settings: Mapping[str, Any]) -> None:
     if any(written.get(name) != value for name, value in settings.items()):
         raise ConfigError(f"{file}: cannot be updated, set by hand: {dict(settings)}")
     mode = file.stat().st_mode & 0o777
-    _write_private(file, text_)
-    file.chmod(mode)
+    _write_private(file, text_, mode)

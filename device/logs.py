@@ -13,6 +13,14 @@ _SYSLOG = ((logging.CRITICAL, 2), (logging.ERROR, 3), (logging.WARNING, 4), (log
 _KEPT = 5
 
 
+def neutral(text: str) -> str:
+    """The text on one line: line ends, a terminal's escapes and other characters that show as nothing are
+    written as escapes. Names and answers from elsewhere may hold any."""
+    if text.isprintable():
+        return text
+    return "".join(c if c.isprintable() else c.encode("unicode_escape").decode() for c in text)
+
+
 class Troubles(logging.Handler):
     """Keeps the last few warnings, and the last few errors, which no warning displaces."""
 
@@ -24,16 +32,27 @@ class Troubles(logging.Handler):
     def emit(self, record: logging.LogRecord) -> None:
         """Keep a record's text."""
         lines = self._errors if record.levelno >= logging.ERROR else self._warnings
-        lines.append(
-            {"at_s": round(record.created, 3), "level": record.levelname.lower(), "text": record.getMessage()}
-        )
+        text = neutral(record.getMessage())
+        lines.append({"at_s": round(record.created, 3), "level": record.levelname.lower(), "text": text})
 
     def last(self) -> list[dict[str, Any]]:
         """The newest last."""
         return sorted([*self._errors, *self._warnings], key=lambda line: float(line["at_s"]))
 
 
-class JournalFormatter(logging.Formatter):
+class LineFormatter(logging.Formatter):
+    """A line a record, and below it, indented, those of its traceback: no text of elsewhere can begin one."""
+
+    def formatMessage(self, record: logging.LogRecord) -> str:  # noqa: N802 - the library's name
+        """The record's line."""
+        return neutral(super().formatMessage(record))
+
+    def formatException(self, ei: Any) -> str:  # noqa: N802 - the library's name
+        """The traceback's lines."""
+        return "\n".join(f"  {neutral(line)}" for line in super().formatException(ei).split("\n"))
+
+
+class JournalFormatter(LineFormatter):
     """Lines as journald reads them from a service: the level in front, no time; every line of a
     traceback has the level."""
 
@@ -49,7 +68,7 @@ def set_up(level: str) -> Troubles:
     lines.setFormatter(
         JournalFormatter("%(message)s")
         if is_journal()
-        else logging.Formatter("%(asctime)s %(levelname)-7s %(message)s")
+        else LineFormatter("%(asctime)s %(levelname)-7s %(message)s")
     )
     logging.basicConfig(handlers=[lines, troubles])
     set_level(level)

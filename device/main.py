@@ -18,7 +18,7 @@ from device.agent import Agent
 from device.clock import SystemClock
 from device.config import LOG_LEVELS, Config, load_config
 from device.errors import AgentError, ConfigError
-from device.logs import set_up
+from device.logs import neutral, set_up
 from device.sqlite_spool import make_spool
 from device.status import SOCKET, StatusServer, fetch
 from device.status import render as render_status
@@ -35,6 +35,8 @@ _PARAMETER = re.compile(r"_[^_]")
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run a command; the exit status: 0 good, 1 something failed or was lost, 2 wrong use."""
     options = _parse(list(sys.argv[1:] if arguments is None else arguments))
+    # Whatever a command writes is its user's alone; who else is to read it is given the right to.
+    before = os.umask(0o077)
     try:
         status: int = options.command(options)
         sys.stdout.flush()
@@ -49,12 +51,14 @@ def main(arguments: Sequence[str] | None = None) -> int:
         return 1
     except AgentError as error:
         if options.command is not run:
-            print(f"iort-agent: {error}", file=sys.stderr)
+            print(f"iort-agent: {neutral(str(error))}", file=sys.stderr)
         else:
             _log.error("%s", error)
         return 1
     else:
         return status
+    finally:
+        os.umask(before)
 
 
 def _parse(arguments: list[str]) -> argparse.Namespace:
@@ -186,9 +190,9 @@ def upload(options: argparse.Namespace) -> int:
         failed |= result.error is not None
         found.append({**result._asdict(), "path": str(result.path)})
         if result.error is not None:
-            print(f"iort-agent: {result.error}", file=sys.stderr)
+            print(f"iort-agent: {neutral(result.error)}", file=sys.stderr)
         elif not options.json:
-            print(result.key, flush=True)
+            print(neutral(str(result.key)), flush=True)
     if options.json:
         print(json.dumps(found, indent=2))
     return 1 if failed else 0

@@ -35,7 +35,7 @@ class Reservation:
 
     def __init__(self, path: Path) -> None:
         self._state: dict[str, Any] = {}
-        self._fd = os.open(path, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o600)
+        self._fd = os.open(path, os.O_RDWR | os.O_CREAT | os.O_NOFOLLOW | os.O_CLOEXEC, 0o600)
         # Whether there has been a spool of ours here, whatever has become of it.
         self.existed = os.fstat(self._fd).st_size > 0
         self._folder = path.parent

@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import Collection, Iterable, Mapping, NamedTuple
 
 from device.errors import AgentError
+from device.private_files import make_private
 from device.spool import FULL, Dropped, Entry
 
 _APPLICATION_ID = 0x696F7274  # "iort"
@@ -54,6 +55,11 @@ class SpoolFile:
     """An open database. Every method may raise `sqlite3.Error`; used by one thread at a time."""
 
     def __init__(self, path: Path, *, durability: str, max_file_bytes: int | None = None) -> None:
+        # SQLite gives its log the file's permissions.
+        make_private(path)
+        for suffix in _SUFFIXES[1:]:
+            if Path(f"{path}{suffix}").is_symlink():
+                raise OSError(f"{path}{suffix} is a link, which is not followed: remove it")
         self._db = sqlite3.connect(str(path), timeout=_BUSY_S, isolation_level=None, check_same_thread=False)
         self._path = path
         try:

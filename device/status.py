@@ -13,6 +13,7 @@ from pathlib import Path
 from typing import Any, Callable, Iterator, Mapping
 
 from device.errors import AgentError
+from device.logs import neutral
 
 _log = logging.getLogger(__name__)
 
@@ -64,7 +65,6 @@ class StatusServer:
                     self._refuse_second()
                     self._path.unlink(missing_ok=True)
                     listening.bind(address)
-            self._path.chmod(0o600)
             listening.listen(4)
         except BaseException:
             listening.close()
@@ -188,7 +188,7 @@ def render(state: Mapping[str, Any]) -> str:
     for trouble in state["troubles"]:
         at = time.strftime("%H:%M:%SZ", time.gmtime(trouble["at_s"]))
         lines.append(f"{trouble['level']:<9} {at} {trouble['text']}")
-    return "\n".join(lines)
+    return "\n".join(map(neutral, lines))
 
 
 def _told(counts: Mapping[str, Any], before: str = "") -> str:

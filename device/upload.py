@@ -151,9 +151,9 @@ class Uploader:
         for address in answer.addresses:
             local = transfer.local
             first, size = _range(local, address)
-            if look_at(local.path) != local.look:
+            if look_at(local.root, local.name) != local.look:
                 raise changed(local.path)
-            put = self._sender.put(address, local.path, first, size, stop)
+            put = self._sender.put(address, local, first, size, stop)
             if put.outcome is Outcome.CHANGED:
                 raise changed(local.path)
             if put.outcome is not Outcome.STORED:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import signal
 import sys
 import threading
@@ -65,7 +66,9 @@ def upload_files(config: Config, paths: Sequence[Path], *, status_socket: Path) 
 def _upload(uploader: Uploader, path: Path, stop: threading.Event) -> Result:
     show = _Progress(path)
     try:
-        local = read(path, PurePath(path.name), stop=stop)
+        # Who gives the command may name a link.
+        file = Path(os.path.realpath(path))
+        local = read(file.parent, PurePath(file.name), stop=stop)
         show.of(local.look.size)
         return Result(path, key=uploader.upload(local, stop, show))
     except UploadError as error:

@@ -3,18 +3,22 @@
 from __future__ import annotations
 
 import hashlib
+import os
 import re
+import stat
 import threading
 from pathlib import Path, PurePath
-from typing import Any, Mapping, NamedTuple, Sequence
+from typing import Any, BinaryIO, Mapping, NamedTuple, Sequence
 
 import contract
 from contract import PART_BYTES, File
 from device.errors import UploadError
+from device.private_files import folder_of, open_below
 
 _CHUNK_BYTES = 256 * 1024
 _AGAIN_S = 10.0
 _LEVELS, _LEVEL_CHARACTERS = 4, 100
+_PART = re.compile(r"[0-9a-f]{64}")
 
 # What the robots' files are; anything else is "other", of no type in particular.
 _SUFFIXES = {
@@ -42,25 +46,39 @@ class Look(NamedTuple):
 
 
 class Local(NamedTuple):
-    """A file that was read once: what it is to the contract, and the SHA-256 of each part of it."""
+    """A file that was read once: what it is to the contract, and the SHA-256 of each part of it. Below
+    ``root`` no link is followed."""
 
-    path: Path
+    root: Path
+    name: PurePath
     look: Look
     file: File
     parts: Sequence[str]
+
+    @property
+    def path(self) -> Path:
+        """Where it is."""
+        return self.root / self.name
 
     @property
     def parts_sha256(self) -> str:
         """The SHA-256 of the parts' SHA-256, in order."""
         return hashlib.sha256(b"".join(bytes.fromhex(part) for part in self.parts)).hexdigest()
 
+    def open(self) -> BinaryIO:
+        """The file, to be read again. Raises `OSError`."""
+        return open_below(self.root, self.name)
 
-def look_at(path: Path) -> Look:
-    """Size and time of a file. Raises `UploadError` where it cannot be seen."""
+
+def look_at(root: Path, name: PurePath) -> Look:
+    """Size and time of a file. Raises `UploadError` where there is none, or a link in its place."""
     try:
-        status = path.stat()
+        with folder_of(root, name) as folder:
+            status = os.stat(name.name, dir_fd=folder, follow_symlinks=False)
     except OSError as error:
-        raise UploadError(f"{path}: {error.strerror or error}", again_s=None) from error
+        raise UploadError(f"{root / name}: {error.strerror or error}", again_s=None) from error
+    if not stat.S_ISREG(status.st_mode):
+        raise UploadError(f"{root / name}: is no regular file", again_s=None)
     return Look(status.st_size, status.st_mtime_ns)
 
 
@@ -83,19 +101,19 @@ def kind_of(path: PurePath) -> tuple[str, str]:
     return _SUFFIXES.get(path.suffix.lower(), ("other", "application/octet-stream"))
 
 
-def read(path: Path, name: PurePath, *, stop: threading.Event) -> Local:
+def read(root: Path, name: PurePath, *, stop: threading.Event) -> Local:
     """Read the file once for what it holds.
 
     Raises `UploadError` where it cannot be read, changes meanwhile, is too large, or ``stop`` is set.
     """
-    look = look_at(path)
+    path, look = root / name, look_at(root, name)
     if look.size > contract.MAX_FILE_BYTES:
         raise UploadError(
             f"{path}: has {look.size} bytes; allowed is up to {contract.MAX_FILE_BYTES}", again_s=None
         )
     whole, parts, read_bytes = hashlib.sha256(), [], 0
     try:
-        with path.open("rb") as file:
+        with open_below(root, name) as file:
             part = hashlib.sha256()
             while chunk := file.read(_CHUNK_BYTES):
                 if stop.is_set():
@@ -111,7 +129,7 @@ def read(path: Path, name: PurePath, *, stop: threading.Event) -> Local:
                 parts.append(part.hexdigest())
     except OSError as error:
         raise UploadError(f"{path}: {error.strerror or error}", again_s=_AGAIN_S) from error
-    if read_bytes != look.size or look_at(path) != look:
+    if read_bytes != look.size or look_at(root, name) != look:
         raise changed(path)
     kind, content_type = kind_of(path)
     file_ = File(
@@ -122,7 +140,7 @@ def read(path: Path, name: PurePath, *, stop: threading.Event) -> Local:
         sha256=whole.hexdigest(),
         t_us=max(0, look.mtime_ns // 1000),
     )
-    return Local(path, look, file_, parts)
+    return Local(root, name, look, file_, parts)
 
 
 def changed(path: Path) -> UploadError:
@@ -131,20 +149,21 @@ def changed(path: Path) -> UploadError:
 
 
 def to_json(local: Local) -> dict[str, Any]:
-    """What `from_json` needs of a file that was read, except its path."""
+    """What `from_json` needs of a file that was read, except where it is."""
     return {"look": list(local.look), "file": vars(local.file), "parts": "".join(local.parts)}
 
 
-def from_json(path: Path, saved: Mapping[str, Any]) -> Local | None:
+def from_json(root: Path, name: PurePath, saved: Mapping[str, Any]) -> Local | None:
     """The file as it was read before; None if it is not the same any more, or nothing was saved."""
     try:
         look = Look(*saved["look"])
         parts = [saved["parts"][i : i + 64] for i in range(0, len(saved["parts"]), 64)]
-        local = Local(path, look, File(**saved["file"]), parts)
+        local = Local(root, name, look, File(**saved["file"]), parts)
+        whole = len(parts) == local.file.parts and all(map(_PART.fullmatch, parts))
     except (KeyError, TypeError):
         return None
     try:
-        same = look_at(path) == look and len(parts) == local.file.parts
+        same = whole and look_at(root, name) == look
     except UploadError:
         return None
     return local if same else None

@@ -11,25 +11,30 @@ import logging
 import os
 import threading
 from dataclasses import dataclass
-from pathlib import Path
-from typing import Any, Iterator, NamedTuple
+from pathlib import Path, PurePath
+from typing import Any, Iterable, Iterator, NamedTuple
 
 from device.allowance import Allowance
 from device.clock import Clock
 from device.errors import UploadError
+from device.private_files import folder_of, open_below, write_below
 from device.schema import Where, any_path, number, setting
 from device.uplink import Uplink
 from device.upload import Uploader, make_uploader
-from device.upload_file import Local, Look, from_json, read, to_json
+from device.upload_file import Local, Look, from_json, look_at, read, to_json
 
 _log = logging.getLogger(__name__)
 
 STATE = ".iort-uploads.json"
+_STATE = PurePath(STATE)
 _SCAN_S = 2.0
 _DEPTH = 6
 # A file that cannot be uploaded as it is, is looked at again when it has changed; this only bounds
 # how long a rule of the cloud's may hold it.
 _REFUSED_AGAIN_S = 86_400.0
+# Whatever the cloud says, a file that could not be uploaded waits so long the first time, twice as long the
+# next, and so on up to the most.
+_HELD_S, _MOST_HELD_S = 5.0, 300.0
 # Of what is still being written: rosbag and rosbag2 rename when they are done.
 _UNFINISHED = (".active", ".tmp", ".part", "-wal", "-shm", "-journal")
 # Between the lanes and this thread, the kernel is to prefer the lanes.
@@ -70,6 +75,13 @@ class Counts(NamedTuple):
     sent_bytes: int
 
 
+class _Held(NamedTuple):
+    look: Look
+    until: float
+    # How often in a row.
+    times: int
+
+
 class Folder:
     """One watched folder. Only its thread calls it; `waiting` may be read from any."""
 
@@ -79,7 +91,7 @@ class Folder:
         self._state = path / STATE
         # By path below the folder: what it was and since when, by the monotonic clock.
         self._seen: dict[Path, tuple[Look, float]] = {}
-        self._held: dict[Path, tuple[Look, float]] = {}
+        self._held: dict[Path, _Held] = {}
         self._read: dict[str, Any] = {}
         self._done: dict[str, Any] = {}
         self.waiting = 0
@@ -102,17 +114,16 @@ class Folder:
                 continue
             waiting += 1
             held = self._held.get(name)
-            if now - seen[1] >= self._settle_s and (held is None or held[0] != look or now >= held[1]):
+            if now - seen[1] >= self._settle_s and (held is None or held.look != look or now >= held.until):
                 ready.append((look.mtime_ns, name))
         self.waiting = waiting
         return min(ready)[1] if ready else None
 
     def local(self, name: Path, stop: threading.Event) -> Local:
         """The file as it was read, now or before. Raises `UploadError`."""
-        path = self.path / name
-        local = from_json(path, self._read.get(str(name), {}))
+        local = from_json(self.path, name, self._read.get(str(name), {}))
         if local is None:
-            local = read(path, name, stop=stop)
+            local = read(self.path, name, stop=stop)
             self._read[str(name)] = to_json(local)
             self._save()
         return local
@@ -121,17 +132,23 @@ class Folder:
         """The bucket has it."""
         self._read.pop(str(name), None)
         at_s = self._clock.now_us() // 1_000_000
-        self._done[str(name)] = {"look": list(local.look), "key": key, "at_s": at_s}
+        self._done[str(name)] = _done(local.look, key, at_s)
         self.waiting = max(0, self.waiting - 1)
         self._save()
         self._remove_if_due(name, self._done[str(name)])
 
     def hold(self, name: Path, again_s: float | None) -> None:
-        """It could not be uploaded: not before then, unless it changes."""
+        """It could not be uploaded: not before then, unless it changes, and later each time in a row."""
         seen = self._seen.get(name)
-        if seen is not None:
-            until = self._clock.monotonic() + (_REFUSED_AGAIN_S if again_s is None else again_s)
-            self._held[name] = (seen[0], until)
+        if seen is None:
+            return
+        held = self._held.get(name)
+        times = held.times + 1 if held is not None and held.look == seen[0] else 1
+        wait_s = max(
+            _REFUSED_AGAIN_S if again_s is None else again_s,
+            min(_MOST_HELD_S, _HELD_S * 2.0 ** min(times - 1, 20)),
+        )
+        self._held[name] = _Held(seen[0], self._clock.monotonic() + wait_s, times)
 
     def _files(self) -> Iterator[tuple[Path, Look]]:
         todo = [(self.path, 0)]
@@ -171,31 +188,37 @@ class Folder:
             return
         if self._clock.now_us() / 1e6 - done["at_s"] < self._remove_after_s:
             return
-        path = self.path / name
         try:
-            status = path.stat()
-            if [status.st_size, status.st_mtime_ns] == list(done["look"]):
-                path.unlink()
-        except OSError as error:
-            _log.warning("files: %s cannot be removed: %s", path, error.strerror or error)
+            if look_at(self.path, name) == tuple(done["look"]):
+                with folder_of(self.path, name) as folder:
+                    os.unlink(name.name, dir_fd=folder)
+        except (OSError, UploadError) as error:
+            _log.warning("files: %s cannot be removed: %s", self.path / name, error)
 
     def _load(self) -> None:
         try:
-            saved = json.loads(self._state.read_text(encoding="utf-8"))
-            self._read, self._done = dict(saved["read"]), dict(saved["done"])
+            with open_below(self.path, _STATE) as file:
+                saved = json.load(file)
+            self._read = dict(saved["read"])
+            self._done = {name: _done(**done) for name, done in dict(saved["done"]).items()}
         except FileNotFoundError:
             pass
-        except (OSError, ValueError, KeyError, TypeError) as error:
+        except (OSError, ValueError, LookupError, TypeError, ArithmeticError, RecursionError) as error:
+            self._read, self._done = {}, {}
             # The cloud knows what it has: all that is lost is the time to read the files again.
             _log.warning("files: %s cannot be used and is begun anew: %s", self._state, error)
 
     def _save(self) -> None:
-        beside = self._state.with_name(f"{STATE}.tmp")
+        content = json.dumps({"read": self._read, "done": self._done}).encode()
         try:
-            beside.write_text(json.dumps({"read": self._read, "done": self._done}), encoding="utf-8")
-            beside.replace(self._state)
+            write_below(self.path, _STATE, content)
         except OSError as error:
             _log.warning("files: %s: %s", self._state, error.strerror or error)
+
+
+def _done(look: Iterable[int], key: str, at_s: float) -> dict[str, Any]:
+    """What is kept of a file that was uploaded."""
+    return {"look": [int(number) for number in look], "key": str(key), "at_s": int(at_s)}
 
 
 class Uploads:
@@ -266,6 +289,10 @@ class Uploads:
                 self._last_error = str(error)
                 _log.warning("files: %s", error)
                 folder.hold(name, error.again_s)
+        except Exception:
+            # Nobody thought of it, and the others wait.
+            folder.hold(name, _HELD_S)
+            raise
         else:
             self._uploaded += 1
             _log.info("files: %s is uploaded as %s", folder.path / name, key)
@@ -294,7 +321,7 @@ def make_uploads(
     folders = []
     if files.large_folder is not None:
         try:
-            files.large_folder.mkdir(parents=True, exist_ok=True)
+            files.large_folder.mkdir(mode=0o700, parents=True, exist_ok=True)
         except OSError as error:
             raise UploadError(f"{files.large_folder}: {error.strerror or error}", again_s=None) from error
         folders.append(Folder(files.large_folder, clock=clock, settle_s=0.0, remove_after_s=0.0))

@@ -15,6 +15,7 @@ from urllib.parse import urlsplit
 from contract import Address
 from device.clock import Clock
 from device.errors import UploadError
+from device.upload_file import Local
 
 _CHUNK_BYTES = 64 * 1024
 _TIMEOUT_S = 30.0
@@ -65,25 +66,30 @@ class Sender:
         self._trust, self._pace = trust, pace
         self.sent_bytes = 0
 
-    def put(self, address: Address, path: Path, first: int, size: int, stop: threading.Event) -> Put:
+    def put(self, address: Address, local: Local, first: int, size: int, stop: threading.Event) -> Put:
         """Send ``size`` bytes of the file from ``first`` on. Raises `UploadError` where ``stop`` is set,
         the file cannot be read, or the address is not one to send anything to."""
-        url = urlsplit(address.url)
-        if url.scheme != "https" or not url.hostname:
+        try:
+            url = urlsplit(address.url)
+            host, port = url.hostname, url.port
+        except ValueError as error:
+            raise _no_address(error) from error
+        if url.scheme != "https" or not host:
             raise UploadError(f"the cloud gave an address that is not https: {url.scheme}", again_s=None)
         if stop.is_set():
-            raise UploadError(f"{path}: stopped", again_s=0)
-        connection = http.client.HTTPSConnection(
-            url.hostname, url.port, timeout=_TIMEOUT_S, context=self._trust
-        )
+            raise UploadError(f"{local.path}: stopped", again_s=0)
+        connection = http.client.HTTPSConnection(host, port, timeout=_TIMEOUT_S, context=self._trust)
         with contextlib.closing(connection):
             try:
                 connection.connect()
-                self._request(connection, url.path, url.query, address, _Piece(path, first, size, stop))
+                self._request(connection, url.path, url.query, address, _Piece(local, first, size, stop))
             except (OSError, http.client.HTTPException) as error:
                 # A server may refuse before it has read everything; what it says is worth more.
                 said = _answer(connection)
                 return said or Put(Outcome.FAILED, f"{type(error).__name__}: {error}")
+            except ValueError as error:
+                # A host that no name can be, a header that no header can be.
+                raise _no_address(error) from error
             return _answer(connection) or Put(Outcome.FAILED, "the connection closed without an answer")
 
     def _request(
@@ -102,25 +108,29 @@ class Sender:
 class _Piece:
     """A piece of a file, chunk by chunk."""
 
-    def __init__(self, path: Path, first: int, size: int, stop: threading.Event) -> None:
-        self._path, self._first, self._size, self.stop = path, first, size, stop
+    def __init__(self, local: Local, first: int, size: int, stop: threading.Event) -> None:
+        self._local, self._first, self._size, self.stop = local, first, size, stop
 
     def __iter__(self) -> Iterator[bytes]:
         left = self._size
         try:
-            file = self._path.open("rb")
+            file = self._local.open()
         except OSError as error:
-            raise UploadError(f"{self._path}: {error.strerror or error}", again_s=None) from error
+            raise UploadError(f"{self._local.path}: {error.strerror or error}", again_s=None) from error
         with file:
             file.seek(self._first)
             while left:
                 if self.stop.is_set():
-                    raise UploadError(f"{self._path}: stopped", again_s=0)
+                    raise UploadError(f"{self._local.path}: stopped", again_s=0)
                 chunk = file.read(min(_CHUNK_BYTES, left))
                 if not chunk:
-                    raise UploadError(f"{self._path}: became shorter", again_s=10.0)
+                    raise UploadError(f"{self._local.path}: became shorter", again_s=10.0)
                 left -= len(chunk)
                 yield chunk
+
+
+def _no_address(error: ValueError) -> UploadError:
+    return UploadError(f"the cloud gave an address that is none: {error}", again_s=None)
 
 
 def _answer(connection: http.client.HTTPSConnection) -> Put | None:

@@ -1,5 +1,5 @@
 """Admit: says which claims become robots. The provisioning template's hook, which AWS IoT asks before it
-registers a thing, and which must answer within 5 s.
+registers a thing, and which must answer within 5 s, a cold start included.
 
 The operator opens a name, for one certificate and for a time (`iort robots claim`, `register`); what
 was not opened is refused, and so is everything when something goes wrong here.
@@ -14,11 +14,12 @@ from collections.abc import Mapping
 from functools import cache
 from typing import Any
 
-import boto3
+import botocore.session
 from botocore.config import Config
 
 from contract import (
     ADMIT_CLAIM,
+    ADMIT_FINGERPRINT,
     ADMIT_UNTIL_S,
     ADMITTED_CERTIFICATE,
     ADMITTED_MS,
@@ -42,21 +43,23 @@ def admission(event: Mapping[str, Any], now_ms: int) -> dict[str, Any]:
     """Take the admission that is open for the robot: UpdateItem's arguments but for the table.
 
     The update does it in one step, so that of two claims for one name one is refused. The same
-    certificate may ask again, because an answer may be lost. Raises `ContractError` for a request
-    that is not complete.
+    certificate may ask again, because an answer may be lost or come too late. AWS does not say that a
+    claim has here the id with which it was made, so the SHA-256 of its certificate is taken too. Raises
+    `ContractError` for a request that is not complete.
     """
     parameters = event.get("parameters")
     if not isinstance(parameters, Mapping):
         raise ContractError("a request without parameters")
     robot, serial = check_robot(parameters.get(ROBOT_PARAMETER, "")), _text(parameters, SERIAL_PARAMETER)
-    certificate, claim = _text(event, "certificateId"), _text(event, "claimCertificateId")
-    opened = f"{ADMIT_UNTIL_S} >= :now_s AND (attribute_not_exists({ADMIT_CLAIM}) OR {ADMIT_CLAIM} = :claim)"
+    certificate, claim = _text(event, "certificateId"), _claim_id(event)
+    its = f"attribute_not_exists({ADMIT_CLAIM}) OR {ADMIT_CLAIM} = :claim OR {ADMIT_FINGERPRINT} = :claim"
+    opened = f"{ADMIT_UNTIL_S} >= :now_s AND ({its})"
     machine = f"(attribute_not_exists({SERIAL}) OR {SERIAL} = :serial)"
     return {
         "Key": {ROBOT: {"S": robot}},
         "UpdateExpression": (
             f"SET {SERIAL} = :serial, {ADMITTED_CERTIFICATE} = :certificate, {ADMITTED_MS} = :now_ms "
-            f"REMOVE {ADMIT_UNTIL_S}, {ADMIT_CLAIM}"
+            f"REMOVE {ADMIT_UNTIL_S}, {ADMIT_CLAIM}, {ADMIT_FINGERPRINT}"
         ),
         "ConditionExpression": (
             f"attribute_exists({ROBOT}) AND {machine}"
@@ -83,7 +86,14 @@ def reason(row: Mapping[str, Any], event: Mapping[str, Any], now_ms: int) -> str
         return "no certificate may be issued for it: `iort robots claim` opens it"
     if float(row[ADMIT_UNTIL_S]["N"]) < now_ms // 1000:
         return "the time in which a certificate could be issued for it is over"
-    return "it is open for another claim"
+    ids = sorted({row[name]["S"] for name in (ADMIT_CLAIM, ADMIT_FINGERPRINT) if name in row})
+    return f"it is open for another claim: for {' or '.join(ids)}, asked with {event['claimCertificateId']}"
+
+
+def _claim_id(event: Mapping[str, Any]) -> str:
+    """The claim's id, as `station.claims` writes it: AWS allows 0x before the hex, and capitals in it."""
+    claim = _text(event, "claimCertificateId")
+    return claim.lower().removeprefix("0x")
 
 
 def _text(values: Mapping[str, Any], name: str) -> str:
@@ -95,7 +105,8 @@ def _text(values: Mapping[str, Any], name: str) -> str:
 
 @cache
 def _dynamodb() -> Any:
-    return boto3.client("dynamodb", config=_CONFIG)
+    # botocore alone: boto3 brings what moves files to S3, a fifth of the time until the first answer.
+    return botocore.session.get_session().create_client("dynamodb", config=_CONFIG)
 
 
 def handler(event: dict[str, Any], _context: object) -> dict[str, bool]:
@@ -120,4 +131,13 @@ def _admit(event: Mapping[str, Any]) -> bool:
         robot = event["parameters"][ROBOT_PARAMETER]
         _log.warning("%s refused: %s", robot, reason(error.response.get("Item", {}), event, now_ms))
         return False
+    _log.info(
+        "%s admitted: certificate %s, claim %s",
+        *(event["parameters"][ROBOT_PARAMETER], event["certificateId"], event["claimCertificateId"]),
+    )
     return True
+
+
+if "AWS_LAMBDA_INITIALIZATION_TYPE" in os.environ:
+    # In Lambda, where the client is made before the first request waits for it.
+    _dynamodb()

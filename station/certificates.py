@@ -52,6 +52,11 @@ def make(iot: Any, name: str) -> Made:
     return Made(answer["certificateId"], answer["certificateArn"], answer["certificatePem"], private.decode())
 
 
+def fingerprint(pem: str) -> str:
+    """The SHA-256 of a certificate, in hex."""
+    return x509.load_pem_x509_certificate(pem.encode()).fingerprint(hashes.SHA256()).hex()
+
+
 def attached(cloud: Cloud, robot: str) -> list[Certificate]:
     """The certificates of the robot's thing, the oldest first; none where there is no thing."""
     iot = cloud.client("iot")

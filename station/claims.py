@@ -63,7 +63,8 @@ def claim(
         raise StationError(f"no claim can be made; are the current stacks deployed? {error}") from error
     if robot is not None:
         for_s = DAYS * _DAY_S if lasting else _CLAIM_S
-        registry.open_name(cloud, robot, for_s=for_s, claim=number)
+        known_by = registry.ClaimId(number, certificates.fingerprint(certificate))
+        registry.open_name(cloud, robot, for_s=for_s, claim=known_by)
     out.mkdir(parents=True, exist_ok=True, mode=0o700)
     settings.update(connection(cloud, out, certificate, key, prefix="claim-"))
     path = out / "claim.yaml"

@@ -5,12 +5,13 @@ from __future__ import annotations
 import time
 from collections.abc import Iterator, Mapping
 from decimal import Decimal
-from typing import Any
+from typing import Any, NamedTuple
 
 from boto3.dynamodb.types import TypeSerializer
 
 from contract import (
     ADMIT_CLAIM,
+    ADMIT_FINGERPRINT,
     ADMIT_UNTIL_S,
     CONNECTED_MS,
     DISCONNECTED_MS,
@@ -118,15 +119,23 @@ def set_vehicle(cloud: Cloud, robot: str, vehicle: Mapping[str, float]) -> dict[
     return {name: float(value) for name, value in plain(answer.get("Attributes", {})).items()}
 
 
-def open_name(cloud: Cloud, robot: str, *, for_s: float, claim: str | None) -> None:
-    """Let one certificate be issued for a name: within the time, for the claim with this id or for any."""
+class ClaimId(NamedTuple):
+    """What a claim's certificate is known by: AWS' id of it, and its SHA-256 in hex."""
+
+    id: str
+    fingerprint: str
+
+
+def open_name(cloud: Cloud, robot: str, *, for_s: float, claim: ClaimId | None) -> None:
+    """Let one certificate be issued for a name: within the time, for this claim or for any."""
     values = {":until": {"N": str(int(time.time() + for_s))}}
     update = f"SET {ADMIT_UNTIL_S} = :until"
     if claim is None:
-        update += f" REMOVE {ADMIT_CLAIM}"
+        update += f" REMOVE {ADMIT_CLAIM}, {ADMIT_FINGERPRINT}"
     else:
-        update += f", {ADMIT_CLAIM} = :claim"
-        values[":claim"] = {"S": claim}
+        update += f", {ADMIT_CLAIM} = :claim, {ADMIT_FINGERPRINT} = :fingerprint"
+        values[":claim"] = {"S": claim.id.lower().removeprefix("0x")}
+        values[":fingerprint"] = {"S": claim.fingerprint}
     cloud.client("dynamodb").update_item(
         TableName=_table(cloud),
         Key=_key(robot),
@@ -141,7 +150,7 @@ def close_name(cloud: Cloud, robot: str) -> None:
     cloud.client("dynamodb").update_item(
         TableName=_table(cloud),
         Key=_key(robot),
-        UpdateExpression=f"REMOVE {ADMIT_UNTIL_S}, {ADMIT_CLAIM}",
+        UpdateExpression=f"REMOVE {ADMIT_UNTIL_S}, {ADMIT_CLAIM}, {ADMIT_FINGERPRINT}",
         ConditionExpression=f"attribute_exists({ROBOT})",
     )
 

@@ -45,7 +45,9 @@ class Rig:
         )
 
     def upload(self, path):
-        return self.uploader.upload(read(path, path.relative_to(path.parent), stop=self.stop), self.stop)
+        return self.uploader.upload(
+            read(path.parent, path.relative_to(path.parent), stop=self.stop), self.stop
+        )
 
     def folder(self, path, *, settle_s=10.0, remove_after_s=None):
         watched = Folder(path, clock=self.clock, settle_s=settle_s, remove_after_s=remove_after_s)
@@ -106,7 +108,7 @@ def test_a_file_is_hashed_whole_and_by_part(tmp_path, size):
     content = os.urandom(size)
     path = tmp_path / "f.bag"
     path.write_bytes(content)
-    local = read(path, path.relative_to(tmp_path), stop=threading.Event())
+    local = read(tmp_path, path.relative_to(tmp_path), stop=threading.Event())
     assert (local.file.size, local.file.sha256) == (size, hashlib.sha256(content).hexdigest())
     pieces = [content[i : i + PART_BYTES] for i in range(0, max(1, size), PART_BYTES)]
     assert list(local.parts) == [hashlib.sha256(piece).hexdigest() for piece in pieces]
@@ -196,7 +198,7 @@ def test_a_server_that_always_fails_is_given_up_for_now(rig, small):
 
 
 def test_a_file_that_changes_meanwhile_is_not_mixed(rig, large):
-    local = read(large, large.relative_to(large.parent), stop=rig.stop)
+    local = read(large.parent, large.relative_to(large.parent), stop=rig.stop)
     with large.open("r+b") as file:
         file.write(b"changed")
     with pytest.raises(UploadError, match="changes while") as caught:
@@ -212,14 +214,60 @@ def test_a_file_that_changes_meanwhile_is_not_mixed(rig, large):
 
 def test_nothing_is_sent_in_the_clear_or_to_whom_we_do_not_trust(rig, small):
     sender = Sender(trust=trusting(None), pace=Pace(rig.clock, 0))
+    local = read(small.parent, small.relative_to(small.parent), stop=rig.stop)
     url = rig.store._url
     address = contract.Address(1, f"{url}/1", {"content-length": "11"})
-    put = sender.put(address, small, 0, 11, rig.stop)
+    put = sender.put(address, local, 0, 11, rig.stop)
     assert put.outcome is Outcome.FAILED
     assert "CERTIFICATE_VERIFY_FAILED" in put.text
     with pytest.raises(UploadError, match="not https"):
-        sender.put(address._replace(url=url.replace("https", "http")), small, 0, 11, rig.stop)
+        sender.put(address._replace(url=url.replace("https", "http")), local, 0, 11, rig.stop)
     assert rig.store.puts == []
+
+
+@pytest.mark.parametrize(
+    ("url", "headers"),
+    [
+        ("https://localhost:99999/1", {}),
+        ("https://[::1/1", {}),
+        ("https://localhost:x/1", {}),
+        (f"https://{'a' * 64}.example/1", {}),
+        ("https:///1", {}),
+        ("HOST/1", {"x-amz-meta": "a\r\nhost: other"}),
+    ],
+)
+def test_an_address_that_is_none_is_a_file_that_is_not_uploaded(rig, small, url, headers):
+    sender = Sender(trust=trusting(rig.certificate), pace=Pace(rig.clock, 0))
+    local = read(small.parent, small.relative_to(small.parent), stop=rig.stop)
+    address = contract.Address(1, url.replace("HOST", rig.store._url), headers)
+    with pytest.raises(UploadError, match=r"an address that is"):
+        sender.put(address, local, 0, 11, rig.stop)
+
+
+@pytest.mark.parametrize(
+    "odd",
+    [
+        '"have": [[1, 1e999]]',
+        '"have": [[1, 5], [5, 9]]',
+        '"have": [[9, 9], [1, 1]]',
+        '"addresses": [{"part": 1e999, "url": "https://localhost/1", "headers": {}}]',
+        '"refused": "no", "again_s": 1e999',
+    ],
+)
+def test_an_answer_that_is_none_is_said_and_waited_past(rig, small, odd, caplog):
+    answer, faults = rig.store._answer, [odd]
+
+    def on_request(message):
+        request = contract.decode_file_request(message.payload)
+        if faults:
+            said = f'{{"v": {contract.SCHEMA_VERSION}, "id": "{request.id}", "key": "k", "stored": false, '
+            rig.uplink.deliver(rig.store._answers, (said + faults.pop() + "}").encode())
+        else:
+            rig.uplink.deliver(rig.store._answers, contract.encode_file_answer(answer(request)))
+
+    rig.uplink.subscribe(contract.build_topic(contract.PING, "car", contract.FILE), on_request)
+    assert rig.store.objects[rig.upload(small)] == b"driven well"
+    assert "an answer about a file is not one" in caplog.text
 
 
 def test_no_faster_than_it_may(tmp_path):
@@ -285,7 +333,20 @@ def test_a_new_process_neither_uploads_again_nor_reads_again(rig, bags, monkeypa
     assert [key.rsplit("/", 2)[-2:] for key in rig.store.objects][1] == ["drive", "large.db3"]
 
 
-@pytest.mark.parametrize("damage", [b"", b"{", b"[]", b'{"read": {}}', b"\xff"])
+@pytest.mark.parametrize(
+    "damage",
+    [
+        b"",
+        b"{",
+        b"[]",
+        b'{"read": {}}',
+        b"\xff",
+        pytest.param(b"[" * 100_000, id="deep"),
+        b'{"read": {"a.bag": {"look": 1}}, "done": {"a.bag": {"look": [1, Infinity], "key": "", "at_s": 1}}}',
+        b'{"read": {}, "done": {"a.bag": 1}}',
+        b'{"read": {}, "done": [["a.bag", {"look": 1}]]}',
+    ],
+)
 def test_a_damaged_state_costs_time_and_nothing_else(rig, bags, damage):
     (bags / "a.bag").write_bytes(b"1")
     assert rig.folder(bags, settle_s=0).step(rig.stop)
@@ -334,6 +395,43 @@ def test_one_refused_file_holds_up_no_other(rig, bags):
     rig.clock.advance(61)
     assert uploads.step(rig.stop)
     assert b"first.bag" in rig.store.objects.values()
+
+
+def test_a_file_refused_again_and_again_is_asked_for_less_and_less(rig, bags):
+    (bags / "a.bag").write_bytes(b"1")
+    uploads = rig.folder(bags, settle_s=0)
+    rig.store.refusals = [("again at once", 0)] * 10_000
+    tried_s = []
+    for second in range(1000):
+        if uploads.step(rig.stop):
+            tried_s.append(second)
+            assert not uploads.step(rig.stop)
+        rig.clock.advance(1)
+    assert tried_s == [0, 5, 15, 35, 75, 155, 315, 615, 915]
+    # It is another one when it has changed.
+    (bags / "a.bag").write_bytes(b"12")
+    assert uploads.step(rig.stop)
+    rig.clock.advance(5)
+    assert uploads.step(rig.stop)
+
+
+def test_a_file_that_nobody_thought_of_holds_up_no_other(rig, bags):
+    for name, age in (("first.bag", 100), ("second.bag", 200)):
+        (bags / name).write_bytes(name.encode())
+        os.utime(bags / name, (age, age))
+    uploads = rig.folder(bags, settle_s=0)
+    upload = rig.uploader.upload
+
+    def odd(local, *rest):
+        if local.path.name == "first.bag":
+            raise RuntimeError("odd")
+        return upload(local, *rest)
+
+    rig.uploader.upload = odd
+    with pytest.raises(RuntimeError):
+        uploads.step(rig.stop)
+    assert uploads.step(rig.stop)
+    assert list(rig.store.objects.values()) == [b"second.bag"]
 
 
 def test_an_error_that_nobody_thought_of_does_not_end_it(rig, bags, caplog):

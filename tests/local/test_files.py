@@ -13,7 +13,7 @@ import subprocess
 import sys
 import threading
 import uuid
-from pathlib import Path
+from pathlib import Path, PurePath
 from typing import Any
 from urllib.parse import urlsplit
 
@@ -39,6 +39,7 @@ from contract import (
     file_key,
 )
 from device.clock import SystemClock
+from device.upload_file import read
 from device.upload_http import Outcome, Pace, Sender, trusting
 from local.deployment import ROOT
 from local.gaps import AWS_MESSAGE_BYTES
@@ -314,12 +315,13 @@ def test_an_address_that_has_expired_is_one_to_ask_for_again(embedded, bucket, r
     )
     path = tmp_path / "notes.txt"
     path.write_bytes(CONTENT)
+    local = read(tmp_path, PurePath(path.name), stop=threading.Event())
     clock = SystemClock()
     sender = Sender(trust=trusting(Path(cloud.ca_bundle)), pace=Pace(clock, 0))
     address = Address(1, url, {"content-length": str(len(CONTENT))})
 
     def sent():
-        return sender.put(address, path, 0, len(CONTENT), threading.Event())
+        return sender.put(address, local, 0, len(CONTENT), threading.Event())
 
     put = until(lambda: (one := sent()).outcome is not Outcome.STORED and one, seconds=60)
     assert put.outcome is Outcome.STALE

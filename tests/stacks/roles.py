@@ -7,22 +7,62 @@ import contract
 IOT = "arn:${AWS::Partition}:iot:${AWS::Region}:${AWS::AccountId}"
 THINGS, CERTIFICATES = f"{IOT}:thing/*", f"{IOT}:cert/*"
 GROUP, KIND = f"{IOT}:thinggroup/iort-robot", f"{IOT}:thingtype/iort-robot"
+# Of what provisioning does, these have no resource type, or a certificate's before it is made.
+ANY_PROVISIONING = (
+    *("ListAttachedPolicies", "ListPolicyPrincipals", "ListPrincipalPolicies", "ListPrincipalThings"),
+    "RegisterThing",
+)
 PROVISIONING = (
     {
         (f"iot:{action}", resource)
-        for action in ("CreateThing", "DescribeThing", "ListThingGroupsForThing", "ListThingPrincipals")
+        for action in (
+            *("CreateThing", "DescribeThing", "ListThingGroupsForThing", "ListThingPrincipals"),
+            "UpdateThing",
+        )
         for resource in (THINGS, KIND)
     }
     | {
         (f"iot:{action}", CERTIFICATES)
-        for action in ("AttachPolicy", "DescribeCertificate", "UpdateCertificate")
+        for action in (
+            *("AttachPolicy", "AttachPrincipalPolicy", "DescribeCertificate", "DetachPolicy"),
+            "UpdateCertificate",
+        )
     }
-    | {("iot:AddThingToThingGroup", THINGS), ("iot:AddThingToThingGroup", GROUP)}
-    | {("iot:AttachThingPrincipal", THINGS), ("iot:AttachThingPrincipal", CERTIFICATES)}
+    | {
+        (f"iot:{action}", resource)
+        for action in ("AddThingToThingGroup", "RemoveThingFromThingGroup", "UpdateThingGroupsForThing")
+        for resource in (THINGS, GROUP)
+    }
+    | {
+        (f"iot:{action}", resource)
+        for action in ("AttachThingPrincipal", "DetachThingPrincipal")
+        for resource in (THINGS, CERTIFICATES)
+    }
     | {("iot:DescribeThingType", KIND), ("iot:DescribeThingGroup", GROUP)}
-    | {("iot:GetPolicy", f"{IOT}:policy/iort-robot")}
-    | {(f"iot:{action}", "*") for action in ("ListAttachedPolicies", "ListPrincipalThings", "RegisterThing")}
+    | {(f"iot:{action}", f"{IOT}:policy/iort-robot") for action in ("GetPolicy", "ListTargetsForPolicy")}
+    | {(f"iot:{action}", "*") for action in ANY_PROVISIONING}
 )
+# AWS' managed policy for whoever registers things, version 3 of 2020-10-05, which allows all of it on "*":
+# "AWS managed policies", AWSIoTThingsRegistration.
+THINGS_REGISTRATION = {
+    *("AddThingToBillingGroup", "AddThingToThingGroup", "AttachPolicy", "AttachPrincipalPolicy"),
+    *("AttachThingPrincipal", "CreateCertificateFromCsr", "CreatePolicy", "CreateThing"),
+    *("DescribeBillingGroup", "DescribeCertificate", "DescribeThing", "DescribeThingGroup"),
+    *("DescribeThingType", "DetachPolicy", "DetachThingPrincipal", "GetPolicy", "ListAttachedPolicies"),
+    *("ListPolicyPrincipals", "ListPrincipalPolicies", "ListPrincipalThings", "ListTargetsForPolicy"),
+    *("ListThingGroupsForThing", "ListThingPrincipals", "RegisterCertificate", "RegisterThing"),
+    *("RemoveThingFromBillingGroup", "RemoveThingFromThingGroup", "UpdateCertificate", "UpdateThing"),
+    "UpdateThingGroupsForThing",
+}
+# What our role lacks of it, and why that can be.
+NOT_REGISTERED = {
+    "AddThingToBillingGroup": "the template names no billing group",
+    "CreateCertificateFromCsr": "a robot asks for it itself, by MQTT; this is for tasks of many things",
+    "CreatePolicy": "the template names a policy that exists; who makes one could allow everything",
+    "DescribeBillingGroup": "the template names no billing group",
+    "RegisterCertificate": "the certificates are AWS' own, registered when they are made",
+    "RemoveThingFromBillingGroup": "the template names no billing group",
+}
 
 # What the checks of the audit read: certificates and policies, whoever's they are.
 AUDIT_READS = (
@@ -153,10 +193,7 @@ EVERY_RESOURCE = {
     # "Actions, resources, and condition keys for Amazon DynamoDB": ListStreams has no resource type.
     ("SummarizeRole", "dynamodb:ListStreams"),
     # "Actions defined by AWS IoT": these have no resource type.
-    *(
-        ("ProvisioningRole", f"iot:{a}")
-        for a in ("ListAttachedPolicies", "ListPrincipalThings", "RegisterThing")
-    ),
+    *(("ProvisioningRole", f"iot:{a}") for a in ANY_PROVISIONING),
     # An audit is of everything.
     *(("AuditRole", f"iot:{a}") for a in AUDIT_READS),
 }

@@ -10,7 +10,18 @@ import contract
 from functions.alert import Notices, causes
 from functions.allotment import Allotment
 from functions.presence import change
-from tests.stacks.roles import CERTIFICATES, EVERY_RESOURCE, IOT, KEEPS, ROLES, THINGS
+from stacks.documents import provisioning_template
+from tests.stacks.roles import (
+    CERTIFICATES,
+    EVERY_RESOURCE,
+    IOT,
+    KEEPS,
+    NOT_REGISTERED,
+    PROVISIONING,
+    ROLES,
+    THINGS,
+    THINGS_REGISTRATION,
+)
 from tests.stacks.templates import qualified
 
 
@@ -36,6 +47,16 @@ def test_every_role_may_do_exactly_this(synthesized, reader):
     # Whoever else changes a row of the registry decides who may join.
     others = {role for role, actions in granted.items() if ("dynamodb:UpdateItem", "Robots.Arn") in actions}
     assert conditional == KEEPS.keys() == others - {"AdmitRole"}
+
+
+def test_provisioning_may_do_what_aws_managed_policy_says_but_for_what_has_a_reason():
+    granted = {action.split(":")[1] for action, _ in PROVISIONING}
+    template = json.dumps(provisioning_template("iort"))
+    assert "BillingGroup" not in template
+    assert "PolicyDocument" not in template
+    assert granted <= THINGS_REGISTRATION
+    assert THINGS_REGISTRATION - granted == NOT_REGISTERED.keys()
+    assert all(NOT_REGISTERED.values())
 
 
 def test_no_function_that_keeps_a_robots_row_can_open_its_name():

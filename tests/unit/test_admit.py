@@ -3,12 +3,15 @@
 from __future__ import annotations
 
 import json
+import os
+import subprocess
+import sys
 import time
 
 import pytest
 from botocore.stub import Stubber
 
-from contract import ADMIT_CLAIM, ADMIT_UNTIL_S, ADMITTED_CERTIFICATE, SERIAL
+from contract import ADMIT_CLAIM, ADMIT_FINGERPRINT, ADMIT_UNTIL_S, ADMITTED_CERTIFICATE, SERIAL
 from functions import admit
 from functions.tables import plain
 from tests.fakes import ROBOTS
@@ -78,6 +81,55 @@ def test_an_opened_name_is_admitted_once(robots, capsys):
         (True, False),
         (False, True),
     ]
+
+
+def test_a_certificate_that_asks_again_is_admitted_also_when_the_time_is_over(robots):
+    robots.put(until_s=LATER_S, **{ADMIT_CLAIM: "claim", ADMIT_FINGERPRINT: "digits"})
+    assert robots.ask(request()) is True
+    row = robots.row()
+    assert not {ADMIT_UNTIL_S, ADMIT_CLAIM, ADMIT_FINGERPRINT} & row.keys()
+    # The answer came too late for AWS IoT; the robot asks again, and only this certificate may.
+    for _ in range(3):
+        assert robots.ask(request()) is True
+        assert robots.ask(request(certificate="another")) is False
+    assert robots.row()[ADMITTED_CERTIFICATE] == "new"
+
+
+def test_a_claim_is_known_by_its_id_and_by_what_its_certificate_is(robots, caplog):
+    caplog.set_level("INFO")
+    for claim in ("ab12", "cd34", "CD34", "0xAB12"):
+        robots.clear()
+        caplog.clear()
+        robots.put(**{ADMIT_CLAIM: "ab12", ADMIT_FINGERPRINT: "cd34"})
+        assert robots.ask(request(claim=claim)) is True, claim
+        assert f"car admitted: certificate new, claim {claim}" in caplog.text
+    for claim in ("ab", "0xab1", "0x", "ef56"):
+        robots.clear()
+        caplog.clear()
+        robots.put(**{ADMIT_CLAIM: "ab12", ADMIT_FINGERPRINT: "cd34"})
+        assert robots.ask(request(claim=claim)) is False, claim
+        assert f"for ab12 or cd34, asked with {claim}" in caplog.text
+
+
+def test_it_is_ready_when_lambda_has_imported_it_and_carries_little():
+    program = (
+        "import sys; from functions import admit; "
+        "print('boto3' in sys.modules, 's3transfer' in sys.modules, admit._dynamodb.cache_info().currsize)"
+    )
+    environment = {
+        **os.environ,
+        "PYTHONPATH": os.pathsep.join(filter(None, sys.path)),
+        "AWS_DEFAULT_REGION": "eu-west-1",
+    }
+    for lambda_, made in (({}, 0), ({"AWS_LAMBDA_INITIALIZATION_TYPE": "on-demand"}, 1)):
+        said = subprocess.run(
+            [sys.executable, "-c", program],
+            env={**environment, **lambda_},
+            capture_output=True,
+            text=True,
+            check=True,
+        )
+        assert said.stdout.split() == ["False", "False", str(made)]
 
 
 REFUSED = [

@@ -261,5 +261,5 @@ def test_where_bytes_wait_must_be_said(tmp_path):
 def test_what_the_folder_has_read_is_what_the_claim_says(tmp_path):
     claims_in(tmp_path).claim("camera", T_US, image())
     (path,) = tmp_path.glob("camera/*.jpg")
-    local = read(path, path.relative_to(tmp_path), stop=threading.Event())
+    local = read(tmp_path, path.relative_to(tmp_path), stop=threading.Event())
     assert local.file.t_us == T_US

@@ -24,7 +24,7 @@ from device.clock import ManualClock, SystemClock
 from device.config import load_config
 from device.dispatch import Dispatcher
 from device.errors import AgentError
-from device.logs import JournalFormatter, Troubles, is_journal
+from device.logs import JournalFormatter, LineFormatter, Troubles, is_journal
 from device.loopback import Loopback
 from device.main import main
 from device.metrics import AgentMetrics, Rates, rss_mb
@@ -43,7 +43,32 @@ def record(level: int, text: str) -> logging.LogRecord:
     [(logging.ERROR, "<3>"), (logging.WARNING, "<4>"), (logging.INFO, "<6>"), (10, "<7>")],
 )
 def test_journald_reads_the_level_of_every_line(level: int, prefix: str) -> None:
-    assert JournalFormatter("%(message)s").format(record(level, "a\nb")) == f"{prefix}a\n{prefix}b"
+    failed = record(level, "a")
+    error = ValueError("one\ntwo")
+    failed.exc_info = (ValueError, error, None)
+    lines = JournalFormatter("%(message)s").format(failed).split("\n")
+    assert lines[0] == f"{prefix}a"
+    assert all(line.startswith(f"{prefix}  ") for line in lines[1:])
+    assert lines[-2:] == [f"{prefix}  ValueError: one", f"{prefix}  two"]
+
+
+HOSTILE = "refused\n<3>forged\r\x1b]52;c;cm0=\x07 \x9b2J \u202e\u2028\udc80 Straße"
+
+
+def test_no_text_of_elsewhere_is_a_line_of_its_own_or_speaks_to_the_terminal() -> None:
+    shown = r"refused\n<3>forged\r\x1b]52;c;cm0=\x07 \x9b2J \u202e\u2028\udc80 Straße"
+    said = record(logging.WARNING, HOSTILE)
+    assert JournalFormatter("%(message)s").format(said) == f"<4>{shown}"
+    assert LineFormatter("%(message)s").format(said) == shown
+    troubles = Troubles()
+    troubles.emit(said)
+    assert troubles.last()[0]["text"] == shown
+    # As the agent sets it up, for whatever is logged by whom.
+    program = f"from device.logs import set_up; import logging; set_up('info'); logging.warning({HOSTILE!r})"
+    command = [sys.executable, "-X", "utf8", "-c", program]
+    done = subprocess.run(command, capture_output=True, encoding="utf-8", check=True)
+    assert done.stderr.count("\n") == 1
+    assert done.stderr.endswith(f"WARNING {shown}\n")
 
 
 def test_the_journal_is_known_by_its_stream(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
@@ -189,7 +214,11 @@ def test_rates_and_silence() -> None:
 def test_the_socket_is_the_owners_alone_and_goes_with_the_agent(tmp_path: Path) -> None:
     path = tmp_path / "agent.sock"
     server = StatusServer(path, lambda: {"pid": 7})
-    server.start()
+    before = os.umask(0)
+    try:
+        server.start()
+    finally:
+        os.umask(before)
     assert stat.S_IMODE(path.stat().st_mode) == 0o600
     assert fetch(path) == fetch(path) == {"pid": 7}
     second = StatusServer(path, dict)
