@@ -6,14 +6,14 @@ import threading
 from typing import Annotated
 
 import typer
-from rich.console import Console
 
 from station import keys, registry
 from station.answers import answers
+from station.console import Console
 from station.page_server import PageServer
 
 commands = typer.Typer()
-_out = Console(highlight=False)
+_out = Console()
 
 
 @commands.command("dashboard")
