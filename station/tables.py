@@ -25,7 +25,7 @@ _GAP = 2
 _TEXT_WIDE = 40
 _CHUNK = 10_000
 # What a spreadsheet takes for a formula's beginning: OWASP, "CSV Injection"; some know them in full width.
-_FORMULA = ("=", "+", "-", "@", "＝", "＋", "－", "＠")  # noqa: RUF001 - as above
+_FORMULA = ("=", "+", "-", "@", "\uff1d", "\uff0b", "\uff0d", "\uff20")
 
 
 def texts_of_time(result: Result) -> list[str]:

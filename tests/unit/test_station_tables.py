@@ -44,7 +44,7 @@ def test_csv_is_what_spreadsheets_and_grafana_read():
     assert len(rows) == 3
 
 
-@pytest.mark.parametrize("text", ["=cmd|' /C calc'!A0", "+1", "-1+2", "@SUM(1)", " =1", "\t=1", "＝1"])
+@pytest.mark.parametrize("text", ["=cmd|' /C calc'!A0", "+1", "-1+2", "@SUM(1)", " =1", "\t=1", "\uff1d1"])
 def test_csv_has_no_formulas_but_where_they_are_asked_for(text):
     values = np.array([text, "a=b"], dtype=object)
     found = Result("car", "notes", np.arange(2, dtype=np.int64), {text: values, "x": np.array([-1.5, 2])})
