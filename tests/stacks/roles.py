@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contract
+from stacks.checks import EVERY_RESOURCE
 
 IOT = "arn:${AWS::Partition}:iot:${AWS::Region}:${AWS::AccountId}"
 THINGS, CERTIFICATES = f"{IOT}:thing/*", f"{IOT}:cert/*"
@@ -25,16 +26,7 @@ PROVISIONING = (
 )
 
 # What the checks of the audit read: certificates and policies, whoever's they are.
-AUDIT_READS = (
-    *(
-        "DescribeCACertificate",
-        "DescribeCertificate",
-        "GetEffectivePolicies",
-        "GetLoggingOptions",
-        "GetPolicy",
-    ),
-    *("GetV2LoggingOptions", "ListCACertificates", "ListCertificates", "ListPolicies"),
-)
+AUDIT_READS = {action for role, action in EVERY_RESOURCE if role == "AuditRole"}
 LOG_OF_IOT = "arn:${AWS::Partition}:logs:${AWS::Region}:${AWS::AccountId}:log-group:AWSIotLogsV2:*"
 
 LOG = {"logs:CreateLogStream", "logs:PutLogEvents"}
@@ -126,7 +118,7 @@ ROLES = {
         | {("dynamodb:UpdateItem", "Robots.Arn"), ("sns:Publish", "Alarms")},
     ),
     "ProvisioningRole": ("iot.amazonaws.com", PROVISIONING),
-    "AuditRole": ("iot.amazonaws.com", {(f"iot:{action}", "*") for action in AUDIT_READS}),
+    "AuditRole": ("iot.amazonaws.com", {(action, "*") for action in AUDIT_READS}),
     "LogRole": (
         "iot.amazonaws.com",
         {(f"logs:{action}", LOG_OF_IOT) for action in ("CreateLogGroup", "CreateLogStream", "PutLogEvents")},
@@ -147,16 +139,4 @@ KEEPS = {
     "PresenceRole": contract.PRESENCE,
     "SummarizeRole": (contract.STREAMS,),
     "UploadRole": ("files_bytes", "files_day"),
-}
-# The only statements about every resource, each with why it cannot name one.
-EVERY_RESOURCE = {
-    # "Actions, resources, and condition keys for Amazon DynamoDB": ListStreams has no resource type.
-    ("SummarizeRole", "dynamodb:ListStreams"),
-    # "Actions defined by AWS IoT": these have no resource type.
-    *(
-        ("ProvisioningRole", f"iot:{a}")
-        for a in ("ListAttachedPolicies", "ListPrincipalThings", "RegisterThing")
-    ),
-    # An audit is of everything.
-    *(("AuditRole", f"iot:{a}") for a in AUDIT_READS),
 }
