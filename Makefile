@@ -68,7 +68,7 @@ diff: layer ## what a deploy would change, resource by resource
 	@$(CDK) diff $(ARGS)
 
 destroy: layer ## remove everything from it again, the data included
-	@$(CDK) destroy --all $(ARGS)
+	@$(BIN)/python scripts/destroy.py $(CDK) destroy --all $(ARGS)
 
 lock: setup ## compile requirements/*.in to the locked *.txt
 	@$(BIN)/uv pip compile --quiet --universal --generate-hashes --no-emit-index-url --python-version 3.10 \

@@ -11,7 +11,7 @@ import sys
 from typing import Any
 
 try:
-    from aws_cdk import App, CliCredentialsStackSynthesizer, Tags
+    from aws_cdk import App, CliCredentialsStackSynthesizer, Stack, Tags
 except ModuleNotFoundError as missing:
     sys.exit(
         f"app.py: {missing.name} is not there for {sys.executable}: `make layer` sets up .venv/bin/python"
@@ -65,10 +65,13 @@ def build(app: App, settings: Settings) -> list[Acknowledged]:
         stacks=(storage, quarantine, fleet, processing),
         topic=processing.alarms,
     )
-    if settings.account_wide:
-        Account(app, **stack("account"), settings=settings)
     if settings.site:
         Site(app, **stack("site"), settings=settings)
+    if settings.account_wide:
+        others = [one for one in app.node.children if isinstance(one, Stack)]
+        account = Account(app, **stack("account"), settings=settings)
+        for other in others:
+            account.add_stack_dependency(other)
     for key, value in {"project": name, "stage": settings.stage, **settings.tags}.items():
         Tags.of(app).add(key, value)
     refuse_what_the_embedded_cloud_drops(app)

@@ -2,13 +2,16 @@
 
 ministack is pinned, and each gap is one wrapper around one of its functions; tests/local/test_gaps.py
 fails when a release changes what is wrapped or closes the gap itself. Sessions that AWS would end are in
-local/cut_sessions.py; here, in order:
+local/cut_sessions.py, where it listens and how long it waits for a CONNECT in local/listener_gap.py; here, in
+order:
 
 - a republish action's topic is not expanded: ``${topic(3)}`` stays literal;
 - the SQL function floor() gives nothing;
-- a payload nested deeper than Python reads ends the session, whose messages are never acknowledged again;
+- a payload nested deeper than Python reads, or with an integer of more digits, ends the session, whose
+  messages are never acknowledged again;
 - a message above 128 KB is taken from an MQTT 3.1.1 client or by HTTP (AWS refuses it);
-- on Python 3.10 the MQTT listener pauses reading too early, loses the ClientHello and never answers;
+- on Python 3.10 the MQTT listener pauses reading too early, loses the ClientHello and never answers
+  (local/listener_gap.py);
 - a rule's SQS action counts as plain HTTP, which the queues' policies refuse (AWS calls itself by TLS);
 - SendMessageBatch asks for a permission of its own (AWS asks for sqs:SendMessage);
 - fleet provisioning has no CreateCertificateFromCsr over MQTT, only keys made in the cloud;
@@ -24,7 +27,6 @@ local/cut_sessions.py; here, in order:
 
 from __future__ import annotations
 
-import asyncio
 import contextvars
 import json
 import math
@@ -40,7 +42,7 @@ from ministack.core import iam_actions, iam_evaluator
 from ministack.services import iot, lambda_svc
 
 from contract import TOPIC
-from local import cut_sessions, log_gap, queue_gap, stream_gap, table_gap
+from local import cut_sessions, listener_gap, log_gap, queue_gap, stream_gap, table_gap
 from local.turns import Turns
 
 # "Message size" in AWS IoT Core's service quotas.
@@ -56,12 +58,12 @@ class MessageTooLargeError(ConnectionError):
 def install() -> None:
     """Close the gaps in this process, before the emulator starts."""
     cut_sessions.install()
+    listener_gap.install()
     iot._run_rule_actions = _expanding_republish(iot._run_rule_actions)
     iot._eval_select_function = _with_floor(iot._eval_select_function)
-    iot._rule_message = as_text_if_deep(iot._rule_message)
+    iot._rule_message = as_text_if_unreadable(iot._rule_message)
     iot._IMPLEMENTED_SQL_FUNCS |= {"floor"}
     iot.broker_publish = _refusing_large(iot.broker_publish)
-    iot._MtlsAcceptor.connection_made = _once_reading(iot._MtlsAcceptor.connection_made)
     iot._dispatch_rule_sqs = _over_tls(iot._dispatch_rule_sqs)
     iam_actions.extract_iam_action = _as_one_message(iam_actions.extract_iam_action)
     iot._parse_fleet_provisioning_topic = _with_csr(iot._parse_fleet_provisioning_topic)
@@ -115,14 +117,15 @@ def _with_floor(evaluate: Callable[..., Any]) -> Callable[..., Any]:
     return evaluate_function
 
 
-def as_text_if_deep(read: Callable[[bytes], Any]) -> Callable[[bytes], Any]:
-    """A payload as rules see it; one that is nested too deeply as any other that is no JSON."""
+def as_text_if_unreadable(read: Callable[[bytes], Any]) -> Callable[[bytes], Any]:
+    """A payload as rules see it; one that Python does not read as any other that is no JSON."""
 
     @wraps(read)
     def message(payload: bytes) -> Any:
         try:
             return read(payload)
-        except RecursionError:
+        # Python's limits: levels of nesting, and digits of an integer (sys.set_int_max_str_digits).
+        except (RecursionError, ValueError):
             return payload.decode()
 
     return message
@@ -136,15 +139,6 @@ def _refusing_large(publish: Callable[..., Any]) -> Callable[..., Any]:
         await publish(account, region, topic, payload, **rest)
 
     return broker_publish
-
-
-def _once_reading(connection_made: Callable[..., None]) -> Callable[..., None]:
-    @wraps(connection_made)
-    def made(self: Any, transport: Any) -> None:
-        # Up to Python 3.10 the loop starts to read after this call, whether or not it was paused here.
-        asyncio.get_running_loop().call_soon(connection_made, self, transport)
-
-    return made
 
 
 def _over_tls(dispatch: Callable[..., None]) -> Callable[..., None]:
@@ -202,7 +196,7 @@ def _certifying(reply: Callable[..., Any]) -> Callable[..., Any]:
 def _json_object(payload: bytes) -> dict[str, Any]:
     try:
         value = json.loads(payload)
-    except ValueError:
+    except (RecursionError, ValueError):
         value = None
     return value if isinstance(value, dict) else {}
 

@@ -1,10 +1,10 @@
-"""Runs the independent checkers over the stacks of both stages: cfn-lint, cdk-nag and checkov.
+"""Runs the independent checkers over the stacks of both stages: cfn-lint, cdk-nag and checkov; and our own.
 
     python scripts/check_stacks.py [--checkov build/checkov/bin/checkov] [--write]
 
 Needs no credentials and no network. What the stacks deliberately do otherwise is in
 stacks/acknowledged.py, where what no checker finds any more is a finding too; --write makes
-docs/acknowledged.md from it.
+docs/acknowledged.md from it. Our own, stacks/checks.py, has nothing to acknowledge.
 """
 
 from __future__ import annotations
@@ -31,6 +31,7 @@ from cdk_nag import AwsSolutionsChecks, ServerlessChecks
 from app import build
 from contract import DEFAULT_NAMESPACE
 from stacks.acknowledged import Acknowledged, short
+from stacks.checks import broken
 from stacks.settings import Settings
 
 DOCUMENT = ROOT / "docs" / "acknowledged.md"
@@ -43,6 +44,8 @@ STAGES: dict[str, dict[str, Any]] = {
         "alarm_email": "lab@example.org",
         "tags": {"team": "lab"},
         "site": True,
+        "device_defender": True,
+        "iot_log_level": "error",
     },
 }
 
@@ -75,6 +78,7 @@ def main() -> None:
             known[stage] = synthesize(settings, out)
             found += nag(out)
             print(f"check: stage {stage} synthesized, cdk-nag ({time.monotonic() - began:.0f} s)", flush=True)
+        found += own(Path(folder))
         began = time.monotonic()
         found += lint(Path(folder))
         print(f"check: cfn-lint ({time.monotonic() - began:.0f} s)", flush=True)
@@ -121,6 +125,14 @@ def nag(out: Path) -> Iterator[Finding]:
         for violation in packs[name].get("suppressedViolations", []):
             rule = violation["acknowledgedId"].removeprefix(f"{name}::")
             yield Finding(rule, violation["acknowledgedAt"], "", acknowledged=True)
+
+
+def own(folder: Path) -> Iterator[Finding]:
+    """What does not hold of the templates below ``folder`` of what must."""
+    for template in sorted(folder.rglob("*.template.json")):
+        for one in broken(json.loads(template.read_text())):
+            path = _paths(template)[one.logical_id]
+            yield Finding(one.check, path, f"iort {one.check} on {path}: {one.text}", acknowledged=False)
 
 
 def lint(folder: Path) -> Iterator[Finding]:

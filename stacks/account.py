@@ -1,7 +1,8 @@
 """What holds for the whole account: Device Defender's audit, and what AWS IoT logs.
 
-An account has one of each, so a second deployment in it, or one that brings its own, leaves them out
-(`device_defender`, `iot_log_level`). The embedded cloud has neither.
+An account has one of each in a region, and where they are configured this stack fails. So it is there only
+where it is asked for (`device_defender`, `iot_log_level`), and the last to be deployed: nothing waits for it.
+The embedded cloud has neither.
 """
 
 from __future__ import annotations

@@ -26,7 +26,12 @@ class Encryption:
     """
 
     def __init__(self, scope: Construct, *, settings: Settings) -> None:
-        self.key: kms.Key | None = _key(scope, settings) if settings.customer_key else None
+        self.key: kms.Key | None = None
+        if settings.customer_key or settings.keep_customer_key:
+            key = _key(scope, settings)
+            # The other stacks import it until they are updated, which is after this one.
+            Stack.of(scope).export_value(key.key_arn)
+            self.key = key if settings.customer_key else None
 
     @property
     def table(self) -> dict[str, Any]:
@@ -71,7 +76,7 @@ class Encryption:
 
 def _key(scope: Construct, settings: Settings) -> kms.Key:
     """Rotated every year. The account's own principals use it through the services named, and the
-    services that act by themselves only for this account's resources."""
+    services that act by themselves only for this account's resources, but for CloudWatch's alarms."""
     stack = Stack.of(scope)
     key = kms.Key(
         scope,
@@ -82,7 +87,9 @@ def _key(scope: Construct, settings: Settings) -> kms.Key:
         removal_policy=settings.removal_policy,
     )
 
-    def let(sid: str, principal: iam.IPrincipal, actions: list[str], conditions: dict[str, Any]) -> None:
+    def let(
+        sid: str, principal: iam.IPrincipal, actions: list[str], conditions: dict[str, Any] | None = None
+    ) -> None:
         key.add_to_resource_policy(
             iam.PolicyStatement(
                 sid=sid, principals=[principal], actions=actions, resources=["*"], conditions=conditions
@@ -101,10 +108,8 @@ def _key(scope: Construct, settings: Settings) -> kms.Key:
     )
     of_a_group = {"ArnLike": {"kms:EncryptionContext:aws:logs:arn": groups}}
     let("Logs", iam.ServicePrincipal(f"logs.{stack.region}.{Aws.URL_SUFFIX}"), use, of_a_group)
-    let(
-        "Alarms",
-        iam.ServicePrincipal("cloudwatch.amazonaws.com"),
-        ["kms:Decrypt", "kms:GenerateDataKey*"],
-        {"StringEquals": {"aws:SourceAccount": stack.account}},
-    )
+    # Without a condition, as in AWS' example: AWS does not say that an alarm's request has aws:SourceAccount.
+    # https://repost.aws/knowledge-center/cloudwatch-configure-alarm-sns
+    alarms = iam.ServicePrincipal("cloudwatch.amazonaws.com")
+    let("Alarms", alarms, ["kms:Decrypt", "kms:GenerateDataKey*"])
     return key

@@ -63,7 +63,8 @@ class Settings:
 
     ``namespace`` prefixes topics, rules and stacks; ``stage`` is dev, where everything goes with the
     stack, or prod, where what holds data stays and is protected; ``tags`` are put on every resource;
-    ``customer_key`` encrypts what is kept with a key of the account's own; ``budget_usd`` is the
+    ``customer_key`` encrypts what is kept with a key of the account's own, and ``keep_customer_key``
+    keeps that key without it, for what is encrypted already; ``budget_usd`` is the
     account's monthly budget (0: none), and ``alarm_email`` who hears of it and of every alarm.
     ``old_telemetry`` keeps the telemetry table of a deployment from before batches had ids.
     ``robot_metrics`` counts every robot's health by itself as well, which costs by the robot.
@@ -83,6 +84,7 @@ class Settings:
     stage: str = DEV
     tags: Mapping[str, str] = field(default_factory=dict)
     customer_key: bool = False
+    keep_customer_key: bool = False
     old_telemetry: bool = False
     robot_metrics: bool = False
     budget_usd: int = 0
@@ -94,8 +96,8 @@ class Settings:
     live_concurrency: int | None = None
     live_fields: Mapping[str, list[str]] = field(default_factory=lambda: {VESC_STREAM: list(VESC_FIELDS)})
     layer: Path = ROOT / "build" / "layer" / "lambda"
-    device_defender: bool = True
-    iot_log_level: str = "error"
+    device_defender: bool = False
+    iot_log_level: str = ""
     function_logs: str = OWN_LOGS
     site: bool = False
     embedded: bool = False
@@ -244,6 +246,7 @@ _READ: Mapping[str, _Reader] = {
     "budget_usd": _whole(0, 1_000_000),
     "embedded": _boolean,
     "customer_key": _boolean,
+    "keep_customer_key": _boolean,
     "device_defender": _boolean,
     "old_telemetry": _boolean,
     "robot_metrics": _boolean,

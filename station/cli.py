@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import sys
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, NoReturn
 
 import typer
 from botocore.exceptions import BotoCoreError, ClientError
@@ -29,6 +29,7 @@ from station.commands import (
     trace,
     watch,
 )
+from station.console import visible
 from station.errors import StationError
 from station.where import Where
 
@@ -80,12 +81,16 @@ def main() -> None:
     try:
         app()
     except StationError as error:
-        sys.exit(f"iort: {error}")
+        _end(str(error))
     except ClientError as error:
-        sys.exit(f"iort: AWS refused a call: {error}")
+        _end(f"AWS refused a call: {error}")
     except BotoCoreError as error:
-        sys.exit(f"iort: AWS could not be asked: {error}")
+        _end(f"AWS could not be asked: {error}")
     except OSError as error:
-        sys.exit(f"iort: {said(error)}")
+        _end(said(error))
     except KeyboardInterrupt:
         sys.exit(130)
+
+
+def _end(text: str) -> NoReturn:
+    sys.exit(visible(f"iort: {text}"))

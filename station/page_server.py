@@ -18,7 +18,7 @@ import re
 import socket
 import socketserver
 import threading
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from http import HTTPStatus
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from pathlib import Path
@@ -46,8 +46,7 @@ Answer = Callable[[Mapping[str, str]], Mapping[str, Any]]
 
 # An open connection without a request is given up after this long.
 IDLE_S = 30.0
-_IP = re.compile(r"[0-9.]+|[0-9A-Fa-f:]+")
-_LOOPBACK = re.compile(r"(localhost|127\.[0-9.]+|\[::1\])(:[0-9]+)?")
+_HOST = re.compile(r"(\[[0-9A-Fa-f:.]+\]|[^:\[\]]+)(:[0-9]*)?")
 
 
 class _File(NamedTuple):
@@ -60,7 +59,8 @@ class PageServer:
     """The page's web server, in threads of its own, until the ``with`` block ends.
 
     It listens on loopback unless told otherwise; ``port=0`` takes a free port. ``answers`` maps a name to
-    what answers ``/<name>.json`` from the parameters of the request. Raises `StationError`
+    what answers ``/<name>.json`` from the parameters of the request. It answers to localhost, to addresses
+    and to ``names``, by which else it is reached, and to no other Host. Raises `StationError`
     when the page is not built, when the port is taken, and for a configuration it must not serve.
     """
 
@@ -76,6 +76,7 @@ class PageServer:
         answers: Mapping[str, Answer] | None = None,
         host: str = "127.0.0.1",
         port: int = 0,
+        names: Iterable[str] = (),
         built: Path = BUILT,
     ) -> None:
         told = config(
@@ -89,6 +90,7 @@ class PageServer:
         )
         self._answers = dict(answers or {})
         self.host, self.port = host, port
+        self._names = frozenset(name.lower() for name in ("localhost", host, *names))
         self._files = _load(built)
         self._files["/config.json"] = _json_file(told)
         self._files["/fields.json"] = _json_file(field_table())
@@ -107,7 +109,9 @@ class PageServer:
         if self._server is not None:
             raise StationError("the page is being served already")
         try:
-            self._server = _Server((self.host, self.port), self._files, self._answers, self._policy)
+            self._server = _Server(
+                (self.host, self.port), self._names, self._files, self._answers, self._policy
+            )
         except (OSError, OverflowError) as error:
             where = f"{self.host} port {self.port}"
             if isinstance(error, OSError) and error.errno == errno.EADDRINUSE:
@@ -146,19 +150,31 @@ class _Server(ThreadingHTTPServer):
     def __init__(
         self,
         address: tuple[str, int],
+        names: frozenset[str],
         files: Mapping[str, _File],
         answers: Mapping[str, Answer],
         policy: str,
     ) -> None:
         if ":" in address[0]:
             self.address_family = socket.AF_INET6
-        self.files, self.answers, self.policy = files, answers, policy
-        self.loopback = ipaddress.ip_address(address[0]).is_loopback if _IP.fullmatch(address[0]) else False
+        self.names, self.files, self.answers, self.policy = names, files, answers, policy
         super().__init__(address, _Handler)
 
     def server_bind(self) -> None:
         # HTTPServer's own asks the name service who we are, which can take seconds.
         socketserver.TCPServer.server_bind(self)
+
+    def answers_to(self, host: str) -> bool:
+        """Whether a request's Host is ours. An address is: a page elsewhere that has its own name point here,
+        and would read the keys and the fleet's data, comes with that name."""
+        found = _HOST.fullmatch(host)
+        if found is None:
+            return False
+        try:
+            ipaddress.ip_address(found[1].strip("[]"))
+        except ValueError:
+            return found[1].lower() in self.names
+        return True
 
     def handle_error(self, request: socket.socket | tuple[bytes, socket.socket], client_address: Any) -> None:
         """A browser that went away in the middle of an answer is no error of ours."""
@@ -173,6 +189,10 @@ class _Handler(BaseHTTPRequestHandler):
     error_message_format = "%(code)d %(message)s\n"
 
     def do_GET(self) -> None:
+        if not self.server.answers_to(self.headers.get("Host", "")):
+            refused = "this server answers to localhost, to addresses and to what --name says"
+            self._send(HTTPStatus.FORBIDDEN, _json_file({"error": refused}))
+            return
         path, _, query = self.path.partition("?")
         answer = self.server.answers.get(path.removeprefix("/").removesuffix(".json"))
         if answer is not None and path.endswith(".json"):
@@ -185,10 +205,6 @@ class _Handler(BaseHTTPRequestHandler):
         self._send(HTTPStatus.OK, file)
 
     def _answer(self, answer: Answer, parameters: Mapping[str, str]) -> None:
-        # A page elsewhere that has its own name point here would otherwise read the fleet's data.
-        if self.server.loopback and not _LOOPBACK.fullmatch(self.headers.get("Host", "")):
-            self._send(HTTPStatus.FORBIDDEN, _json_file({"error": "this server answers to localhost only"}))
-            return
         try:
             status, value = HTTPStatus.OK, answer(parameters)
         except (StationError, contract.ContractError) as error:

@@ -7,8 +7,9 @@ import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 
-from rich.console import Console
 from rich.progress import BarColumn, Progress, TextColumn
+
+from station.console import Console, visible
 
 # Hears how many items a page had, and the microseconds at which the last of them starts.
 Told = Callable[[int, int], None]
@@ -20,7 +21,7 @@ def reading(what: str, start_us: int | None, end_us: int | None) -> Iterator[Tol
     """What a reader tells of its pages, shown as the part of the range that has been read."""
     console = Console(stderr=True)
     bar = Progress(
-        TextColumn("{task.description}"),
+        TextColumn("{task.description}", markup=False),
         BarColumn(),
         TextColumn("{task.fields[items]:,} items"),
         console=console,
@@ -52,4 +53,4 @@ def reading(what: str, start_us: int | None, end_us: int | None) -> Iterator[Tol
 
 def say(text: str) -> None:
     """A line on standard error, where it does not get into what is piped on."""
-    print(f"iort: {text}", file=sys.stderr, flush=True)
+    print(visible(f"iort: {text}"), file=sys.stderr, flush=True)

@@ -13,6 +13,7 @@ from rich.table import Table
 
 from contract import EXACT
 from station.conditions import Column, values
+from station.console import visible
 from station.data import Result
 from station.positions import in_degrees
 
@@ -23,6 +24,8 @@ _GAP = 2
 # Longer texts are folded.
 _TEXT_WIDE = 40
 _CHUNK = 10_000
+# What a spreadsheet takes for a formula's beginning: OWASP, "CSV Injection"; some know them in full width.
+_FORMULA = ("=", "+", "-", "@", "\uff1d", "\uff0b", "\uff0d", "\uff20")
 
 
 def texts_of_time(result: Result) -> list[str]:
@@ -46,7 +49,11 @@ def terminal(result: Result, width: int | None = None) -> Shown:
     times = texts_of_time(Result(result.robot, result.stream, result.times_us[chosen], {}))
     stamps = [text[:-1].replace("T", " ") for text in times]
     columns = [
-        _Column(name, result.unit(name), [_cell(column[i], 7 if in_degrees(name) else None) for i in chosen])
+        _Column(
+            visible(name),
+            result.unit(name),
+            [_cell(column[i], 7 if in_degrees(name) else None) for i in chosen],
+        )
         for name, column in result.columns.items()
     ]
     room = None if width is None else width - len(_TIME_WIDE)
@@ -83,12 +90,24 @@ class _Column(NamedTuple):
         return min(_TEXT_WIDE, max(map(len, [*self.heading.split("\n"), *self.cells])))
 
 
-def to_csv(result: Result, file: IO[str]) -> None:
-    """A header and a line a sample; what is null is empty."""
+def to_csv(result: Result, file: IO[str], *, raw: bool = False) -> None:
+    """A header and a line a sample; what is null is empty.
+
+    Names and texts are `harmless`, since whoever reads CSV by a spreadsheet runs what they hold; ``raw``
+    leaves them as they were sent.
+    """
     writer = csv.writer(file, lineterminator="\n")
-    writer.writerow(["time", *result.columns])
+    writer.writerow(["time", *(result.columns if raw else map(harmless, result.columns))])
     for rows in _rows(result):
-        writer.writerows(rows)
+        writer.writerows(rows if raw else ([harmless(value) for value in row] for row in rows))
+
+
+def harmless(value: Any) -> Any:
+    """A text that is no formula to a spreadsheet, nor a control sequence to a terminal; else the value."""
+    if not isinstance(value, str):
+        return value
+    text = visible(value)
+    return f"'{text}" if text.lstrip().startswith(_FORMULA) else text
 
 
 def to_json_lines(result: Result, file: IO[str]) -> None:
@@ -149,4 +168,4 @@ def _cell(value: Any, digits: int | None) -> str:
         if digits is not None:
             return f"{value:.{digits}f}"
         return f"{value:.6g}" if abs(value) < 1e6 or not value.is_integer() else f"{value:.0f}"
-    return str(value)
+    return visible(str(value))

@@ -49,7 +49,7 @@ class Usage:
     dashboards: int = 2
     recoverable: bool = False
     customer_key: bool = False
-    device_defender: bool = True
+    device_defender: bool = False
 
     def check(self) -> Usage:
         """Itself; raises `StationError` for what no fleet can do."""

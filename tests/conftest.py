@@ -126,8 +126,8 @@ class Synthesized:
 
 @pytest.fixture(scope="session")
 def synthesized(tmp_path_factory: pytest.TempPathFactory) -> Synthesized:
-    """app.build with default settings: stage dev."""
-    return _synthesize(tmp_path_factory)
+    """app.build for stage dev, with what is set for the account as a whole."""
+    return _synthesize(tmp_path_factory, device_defender=True, iot_log_level="error")
 
 
 @pytest.fixture(scope="session")
@@ -140,6 +140,8 @@ def production(tmp_path_factory: pytest.TempPathFactory) -> Synthesized:
         budget_usd=50,
         alarm_email="lab@example.org",
         tags={"team": "lab"},
+        device_defender=True,
+        iot_log_level="error",
     )
 
 

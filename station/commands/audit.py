@@ -8,20 +8,20 @@ from dataclasses import asdict, replace
 from typing import Annotated, Any
 
 import typer
-from rich.console import Console
-from rich.markup import escape
 from rich.table import Table
+from rich.text import Text
 
 from contract import ContractError, check_robot, check_stream
 from station import accounts, audit, inventory
 from station.audit import Audit, Range
 from station.commands.options import bounds
+from station.console import Console
 from station.errors import StationError
 from station.times import duration_us, iso, iso_s
 
 commands = typer.Typer()
-_out = Console(highlight=False)
-_errors = Console(stderr=True, highlight=False)
+_out = Console()
+_errors = Console(stderr=True)
 # How many gaps of a run are listed one by one.
 _LISTED = 20
 
@@ -83,9 +83,9 @@ def audit_(
             _show(one)
         for boot, sources in causes.items():
             for source, counts in sources.items():
-                _out.print(f"[red]run {boot[:8]}, {escape(source)}: not recorded[/]")
+                _out.print(f"run {boot[:8]}, {source}: not recorded", style="red")
                 for cause, count in counts.items():
-                    _out.print(f"  {count:,} {escape(cause)}")
+                    _out.print(f"  {count:,} {cause}")
     complete = found and not causes and all(one.complete for one in found)
     raise typer.Exit(0 if complete else 1)
 
@@ -103,9 +103,9 @@ def _counting(items: Any, name: str, status: Any) -> Any:
 
 def _show(one: Audit) -> None:
     if not one.runs:
-        _out.print(f"{one.stream}: [bold red]nothing stored in this range[/]")
+        _out.print(Text.assemble(f"{one.stream}: ", ("nothing stored in this range", "bold red")))
     else:
-        _out.print(f"{one.stream}: {_said(one)}")
+        _out.print(Text.assemble(f"{one.stream}: ", *_said(one)))
         _out.print(_table(one))
     for run in one.runs:
         for gap in run.missing[:_LISTED]:
@@ -120,21 +120,24 @@ def _show(one: Audit) -> None:
         )
     for boot, samples, cause in one.shortfalls:
         count = "an unknown number of samples" if samples is None else f"{samples:,} samples"
-        _out.print(f"  [red]run {boot[:8]}: {count} {cause}[/]")
+        _out.print(f"  run {boot[:8]}: {count} {cause}", style="red")
     if one.refused:
-        _out.print(f"  [red]{one.refused:,} items are not batches[/]")
+        _out.print(f"  {one.refused:,} items are not batches", style="red")
     if one.in_car:
         _out.print(f"  the car's queue held {one.in_car:,} batches when it last said so")
     if one.dropped:
-        _out.print(f"  [red]the car has dropped {one.dropped:,} batches: its queue was full, or damaged[/]")
+        _out.print(
+            f"  the car has dropped {one.dropped:,} batches: its queue was full, or damaged", style="red"
+        )
 
 
-def _said(one: Audit) -> str:
+def _said(one: Audit) -> tuple[tuple[str, str], str]:
+    """What is said of it, with the style of it, and what is told besides."""
     told = "" if one.taken is None else f" ({one.taken:,} samples taken by the agent)"
     if one.complete:
-        return f"[green]complete[/]{told}"
+        return ("complete", "green"), told
     what = f"{one.missing:,} batches missing" if one.missing else "not complete"
-    return f"[bold red]{what}[/]{told}"
+    return (what, "bold red"), told
 
 
 def _table(one: Audit) -> Table:

@@ -8,14 +8,14 @@ from collections.abc import Set as AbstractSet
 from typing import Annotated, Any
 
 import typer
-from rich.console import Console
 
+from station.console import Console
 from station.errors import StationError
 from station.shadow import Shadow, State, answered
 
 commands = typer.Typer()
-_out = Console(highlight=False)
-_errors = Console(stderr=True, highlight=False)
+_out = Console()
+_errors = Console(stderr=True)
 # How long a robot that is there may take to have the file's value in force again.
 _WITHDRAWN_S = 3.0
 
@@ -62,12 +62,11 @@ def config(
     else:
         _show(robot, state, wishes, {refusal.name for refusal in refused})
         for refusal in refused:
-            _errors.print(f"refused: {refusal.reason}", style="red", markup=False)
+            _errors.print(f"refused: {refusal.reason}", style="red")
         if refused:
             options = " ".join(f"--unset {refusal.name}" for refusal in refused)
             _errors.print(
                 f"what is refused stays wished for; `iort config {robot} {options}` withdraws it",
-                markup=False,
                 soft_wrap=True,
             )
     if late:
@@ -105,4 +104,4 @@ def _show(robot: str, state: State, wishes: Mapping[str, Any], refused: Abstract
     } | dict.fromkeys(refused, "  (car.yaml's: the wish is refused)")
     for name, value in state.settings().items():
         shown = ",".join(value) if isinstance(value, list) else json.dumps(value).strip('"')
-        _out.print(f"{name}={shown}{said.get(name, '')}", markup=False)
+        _out.print(f"{name}={shown}{said.get(name, '')}")

@@ -10,7 +10,6 @@ from statistics import mean
 from typing import Annotated, Any
 
 import typer
-from rich.console import Console
 from rich.table import Table
 
 from device.config import Config, load_config
@@ -18,12 +17,13 @@ from device.errors import AgentError
 from station import cost, cost_tables, scale
 from station.at_rest import deployment_dollars_per_month
 from station.cloud import Cloud
+from station.console import Console
 from station.errors import StationError
 from station.prices import AS_OF, REGION
 from station.usage import Usage
 
 commands = typer.Typer()
-_out = Console(highlight=False)
+_out = Console()
 _DEFAULT = Usage()
 
 

@@ -6,14 +6,14 @@ import threading
 from typing import Annotated
 
 import typer
-from rich.console import Console
 
 from station import keys, registry
 from station.answers import answers
+from station.console import Console
 from station.page_server import PageServer
 
 commands = typer.Typer()
-_out = Console(highlight=False)
+_out = Console()
 
 
 @commands.command("dashboard")
@@ -23,6 +23,10 @@ def dashboard(
     host: Annotated[
         str, typer.Option(help="The address to listen on. Whoever reaches it can read the cars' past.")
     ] = "127.0.0.1",
+    name: Annotated[
+        list[str] | None,
+        typer.Option(help="Another name by which the page is reached than localhost; again for more."),
+    ] = None,
     token: Annotated[
         str,
         typer.Option(
@@ -41,6 +45,7 @@ def dashboard(
         answers=answers(cloud),
         host=host,
         port=port,
+        names=name or (),
         **pubnub_keys.reading(),
     ) as page:
         _out.print(f"{page.url}  (Ctrl-C stops)")

@@ -11,18 +11,18 @@ from datetime import datetime, timezone
 from typing import Annotated, Any
 
 import typer
-from rich.console import Console
-from rich.markup import escape
 from rich.progress import Progress
+from rich.text import Text
 
 from station import quarantine, replay
 from station.commands.options import since_us
+from station.console import Console
 from station.quarantine import Entry
 from station.replay import Fate
 
 commands = typer.Typer()
-_out = Console(highlight=False)
-_notes = Console(stderr=True, highlight=False)
+_out = Console()
+_notes = Console(stderr=True)
 _HEX_WIDTH = 16
 
 Robot = Annotated[str | None, typer.Option(help="Of this robot alone.")]
@@ -96,7 +96,7 @@ def replay_errors(
             if outcome.fate not in (Fate.REPLAYED, Fate.NOT_FOR_REPLAY):
                 detail = f": {outcome.detail}" if outcome.detail else ""
                 line = f"{outcome.entry.id}  {outcome.entry.robot}  {outcome.fate.value}{detail}"
-                _out.print(escape(_one_line(line)), soft_wrap=True)
+                _out.print(_one_line(line), soft_wrap=True)
         counts = Counter(outcome.fate for outcome in outcomes)
         _out.print(", ".join(f"{n} {fate.value}" for fate, n in counts.items()) or "nothing in quarantine")
     if any(outcome.fate is Fate.FAILED for outcome in outcomes):
@@ -111,10 +111,10 @@ def _since_ms(text: str | None) -> int:
 def _print(entry: Entry) -> None:
     """Two lines, which no terminal is too narrow for: reasons are long."""
     times = f"{entry.seen} times" + (f", {entry.replays} replays" if entry.replays else "")
-    head = f"[bold]{entry.id}[/bold]  {_utc(entry.last_ms)}  {escape(entry.robot)}  {times}"
-    _out.print(head, soft_wrap=True)
+    head = f"  {_utc(entry.last_ms)}  {entry.robot}  {times}"
+    _out.print(Text.assemble((entry.id, "bold"), head), soft_wrap=True)
     where = " ".join(filter(None, (entry.source, entry.topic)))
-    _out.print(f"    {escape(where)}: {escape(_one_line(entry.reason))}", soft_wrap=True)
+    _out.print(f"    {where}: {_one_line(entry.reason)}", soft_wrap=True)
 
 
 def _one_line(text: str) -> str:
@@ -137,9 +137,9 @@ def _show(entry: Entry, *, as_json: bool) -> None:
         ("last", f"{_utc(entry.last_ms)}, {entry.seen} times, {entry.replays} replays"),
         ("bytes", str(len(payload))),
     ):
-        _out.print(f"[bold]{name:<11}[/bold]{escape(value)}", soft_wrap=True)
+        _out.print(Text.assemble((f"{name:<11}", "bold"), value), soft_wrap=True)
     _out.print()
-    _out.print(as_text(payload), markup=False, soft_wrap=True)
+    _out.print(as_text(payload), soft_wrap=True)
 
 
 def as_text(payload: bytes) -> str:

@@ -12,20 +12,20 @@ from pathlib import Path
 from typing import Annotated
 
 import typer
-from rich.console import Console
 from rich.progress import BarColumn, DownloadColumn, Progress, TextColumn, TransferSpeedColumn
 
 from station import files
 from station.cloud import Cloud
 from station.commands.options import bounds
+from station.console import Console
 from station.errors import StationError
 from station.files import StoredFile, Told
 from station.inventory import check_registered
 from station.times import iso_s
 
 commands = typer.Typer(no_args_is_help=True, help="Bags, images and what else robots have uploaded.")
-_out = Console(highlight=False, soft_wrap=True)
-_errors = Console(stderr=True, highlight=False, soft_wrap=True)
+_out = Console(soft_wrap=True)
+_errors = Console(stderr=True, soft_wrap=True)
 
 _Start = Annotated[str | None, typer.Option("--from", help="Written from here on: ISO 8601, now or -10m.")]
 _End = Annotated[str | None, typer.Option("--to", help="Written up to here.")]
@@ -52,11 +52,11 @@ def list_(
     for one in _chosen(context.obj.cloud(), robot, name, start, end, last):
         none = False
         if as_json:
-            _out.print(json.dumps(asdict(one)), markup=False)
+            _out.print(json.dumps(asdict(one)))
         else:
-            _out.print(f"{iso_s(one.second * 1_000_000)}  {one.size:>15,}  {one.name}", markup=False)
+            _out.print(f"{iso_s(one.second * 1_000_000)}  {one.size:>15,}  {one.name}")
     if none:
-        _errors.print(f"no file of {robot} is like this", markup=False)
+        _errors.print(f"no file of {robot} is like this")
 
 
 @commands.command("get")
@@ -89,9 +89,9 @@ def get(
         with _bar(one.name, one.size) as told:
             path = files.download(cloud, one, folder, told)
         if as_json:
-            _out.print(json.dumps({**asdict(one), "path": str(path)}), markup=False)
+            _out.print(json.dumps({**asdict(one), "path": str(path)}))
         else:
-            _out.print(str(path), markup=False)
+            _out.print(str(path))
 
 
 @commands.command("empty")
@@ -139,7 +139,12 @@ def _newest(found: list[StoredFile], robot: str, which: str) -> StoredFile:
 def _bar(name: str, size: int) -> Iterator[Told]:
     """A bar of the bytes, on standard error, where somebody looks."""
     console = Console(stderr=True)
-    columns = (TextColumn("{task.description}"), BarColumn(), DownloadColumn(), TransferSpeedColumn())
+    columns = (
+        TextColumn("{task.description}", markup=False),
+        BarColumn(),
+        DownloadColumn(),
+        TransferSpeedColumn(),
+    )
     with Progress(*columns, console=console, transient=True, disable=not console.is_terminal) as bar:
         task = bar.add_task(name, total=size)
         yield lambda more: bar.advance(task, more)

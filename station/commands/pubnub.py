@@ -5,13 +5,13 @@ from __future__ import annotations
 from typing import Annotated
 
 import typer
-from rich.console import Console
 
 from station import keys
+from station.console import Console
 from station.errors import StationError
 
 commands = typer.Typer()
-_out = Console(highlight=False)
+_out = Console()
 
 
 @commands.command("pubnub")

@@ -10,10 +10,10 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import typer
-from rich.console import Console
 
 from contract import NO_SENSOR_DEGC
 from station.commands.options import Every, From, Last, Range, Robot, Stream, To, names
+from station.console import Console
 from station.errors import StationError
 from station.progress import reading, say
 
@@ -58,6 +58,9 @@ def query(
     summary: Annotated[bool, typer.Option("--summary", help="The summary's seconds, not samples.")] = False,
     form: Annotated[Format, typer.Option("--format", help="How to write them.")] = Format.table,
     as_json: Annotated[bool, typer.Option("--json", help="The same as --format jsonl.")] = False,
+    raw: Annotated[
+        bool, typer.Option("--raw", help="In CSV, texts as they were sent: formulas and control characters.")
+    ] = False,
     output: Annotated[
         Path | None, typer.Option("--output", "-o", help="A file; otherwise standard output.")
     ] = None,
@@ -96,7 +99,7 @@ def query(
             progress=progress,
         )
     took_s = time.monotonic() - began
-    _write(result, Format.jsonl if as_json else form, output)
+    _write(result, Format.jsonl if as_json else form, output, raw=raw)
     if result.refused:
         say(f"{result.refused} stored items are no batches and were left out; the first: {result.reason}")
     if result.absent:
@@ -107,7 +110,7 @@ def query(
         say(f"none in this range; {robot} has {stream} from {extent[0]} to {extent[1]}")
 
 
-def _write(result: Result, form: Format, output: Path | None) -> None:
+def _write(result: Result, form: Format, output: Path | None, *, raw: bool) -> None:
     from station import tables  # noqa: PLC0415 - as above
 
     if form is Format.parquet:
@@ -119,13 +122,13 @@ def _write(result: Result, form: Format, output: Path | None) -> None:
         return
     with output.open("w", encoding="utf-8", newline="") if output else nullcontext(sys.stdout) as text:
         if form is Format.csv:
-            tables.to_csv(result, text)
+            tables.to_csv(result, text, raw=raw)
         elif form is Format.jsonl:
             tables.to_json_lines(result, text)
         else:
             # A terminal's width is its own; in a file nothing needs to fit.
             width = None if text.isatty() else 32 + 24 * len(result.columns)
-            console = Console(file=text, highlight=False, width=width)
+            console = Console(file=text, width=width)
             shown = tables.terminal(result, console.width)
             console.print(shown.table)
             if shown.left_out:

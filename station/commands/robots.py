@@ -9,7 +9,6 @@ from pathlib import Path
 from typing import Annotated, Any
 
 import typer
-from rich.console import Console
 from rich.table import Table
 
 from contract import (
@@ -28,12 +27,13 @@ from contract import (
 )
 from station import certificates, claims, registry, robots, rotation
 from station.commands.options import since_us
+from station.console import Console
 from station.errors import StationError
 from station.progress import reading, say
 from station.times import iso_s, time_us
 
 commands = typer.Typer(no_args_is_help=True, help="The robots that may connect.")
-_out, _errors = Console(highlight=False), Console(stderr=True, highlight=False)
+_out, _errors = Console(), Console(stderr=True)
 
 _WIDEST = 10_000
 
@@ -192,7 +192,7 @@ def list_(
     for row in rows:
         table.add_row(row[ROBOT], _connection(row), row.get(AGENT_VERSION, ""), _parameters(row))
     # What reads a pipe has no edge at which a line must end.
-    out = _out if _out.is_terminal else Console(width=_WIDEST, highlight=False)
+    out = _out if _out.is_terminal else Console(width=_WIDEST)
     out.print(table)
 
 

@@ -8,16 +8,16 @@ import time
 from typing import Annotated, Any
 
 import typer
-from rich.console import Console
 
 import contract
 from contract import ACCEPTED, CMD, MAX_LEASE_MS, MAX_VALID_MS, Command, ContractError
+from station.console import Console
 from station.errors import StationError
 from station.shadow import Shadow, outcome
 
 commands = typer.Typer()
-_out = Console(highlight=False)
-_errors = Console(stderr=True, highlight=False)
+_out = Console()
+_errors = Console(stderr=True)
 
 
 @commands.command("send")

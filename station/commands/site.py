@@ -5,14 +5,14 @@ from __future__ import annotations
 from typing import Annotated
 
 import typer
-from rich.console import Console
 
 from station import keys, registry
+from station.console import Console
 from station.page import config
 from station.site import publish, upload
 
 commands = typer.Typer()
-_out = Console(highlight=False)
+_out = Console()
 
 
 @commands.command("site")

@@ -9,19 +9,19 @@ from dataclasses import asdict
 from typing import Annotated, Any
 
 import typer
-from rich.console import Console
 from rich.table import Table
 
 from contract import RTT_STREAM, VESC_STREAM
 from station import audit, keys, trace
+from station.console import Console
 from station.errors import StationError
 from station.inventory import check_registered
 from station.listener import Listener
 from station.page import PUBNUB_ORIGIN
 
 commands = typer.Typer()
-_out = Console(highlight=False)
-_errors = Console(stderr=True, highlight=False)
+_out = Console()
+_errors = Console(stderr=True)
 # Characters of the other columns, and of the longest and shortest whole bar.
 _OTHERS, _LONGEST, _SHORTEST = 64, 30, 8
 

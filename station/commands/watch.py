@@ -10,13 +10,14 @@ import time
 from typing import Annotated, Any
 
 import typer
-from rich.console import Console, Group
+from rich.console import Group
 from rich.live import Live
 from rich.text import Text
 
 from contract import ROBOT, T_US, ContractError
 from functions.statistics import Vehicle
 from station import keys, registry
+from station.console import Console
 from station.listener import Listener
 from station.progress import say
 from station.watch import FleetWatch, read
@@ -80,7 +81,7 @@ class _Lines:
 
 
 def _show(fleet: FleetWatch, seconds: float | None, namespace: str) -> None:
-    console = Console(highlight=False)
+    console = Console()
     end = None if seconds is None else time.monotonic() + seconds
     tick = threading.Event()
     with Live(console=console, auto_refresh=False, transient=False) as live:

@@ -47,6 +47,22 @@ def test_error_says_what_is_wrong(iort, tmp_path, arguments, said):
     assert said in str(outcome.exception)
 
 
+def test_no_command_passes_on_what_a_robot_would_have_the_terminal_do(embedded, iort, bundle):
+    """What is reported by a shadow, or as a reason, may be any text."""
+    robot = bundle().robot
+    embedded.cloud.client("dynamodb").update_item(
+        TableName=embedded.cloud.output("storage", "RobotsTable"),
+        Key={"robot": {"S": robot}},
+        UpdateExpression="SET agent_version = :hostile",
+        ExpressionAttributeValues={":hostile": {"S": "\x1b]52;c;YQ==\x07[/]"}},
+    )
+    for arguments in (("list",), ("show", robot)):
+        outcome = iort("robots", *arguments)
+        assert outcome.exit_code == 0, outcome.exception
+        assert "\\u001b]52;c;YQ==\\u0007[/]" in outcome.output
+        assert "\x1b" not in outcome.output
+
+
 def test_a_robot_without_files_has_none_and_one_that_is_gone_keeps_them(embedded, iort, bundle):
     robot = bundle().robot
     none = iort("files", "list", robot)

@@ -68,6 +68,9 @@ def test_gaps_are_still_gaps():
     assert "_connected_clients" not in inspect.getsource(iot._handle_certificate)
     assert "/connections/" not in inspect.getsource(iot_data)
     assert iot._mtls_resolve_identity(None) is not None
+    # local/listener_gap.py
+    assert 'host="0.0.0.0"' in inspect.getsource(iot._mtls_start_locked)
+    assert "timeout" not in inspect.getsource(iot._mtls_serve_conn) + inspect.getsource(iot._MtlsAcceptor)
     assert "Bisect" not in inspect.getsource(lambda_svc._poll_dynamodb_streams)
     asked = json.dumps({"StreamArn": "arn:stream"}).encode()
     request = ("dynamodbstreams", "POST", "/", {}, asked, {}, "r", "0")
@@ -82,12 +85,20 @@ def test_floor():
     assert evaluate("topic", ["1"], "a/b", b"", {}) == "a"
 
 
-def test_a_payload_nested_too_deeply_is_a_text_to_the_rules():
-    deep = b'{"t":1,"a":' + b"[" * 50_000 + b"]" * 50_000 + b"}"
-    with pytest.raises(RecursionError):
-        iot._rule_message(deep)
-    read = gaps.as_text_if_deep(iot._rule_message)
-    assert read(deep) == deep.decode()
+@pytest.mark.parametrize(
+    "payload",
+    [
+        b'{"t":1,"a":' + b"[" * 50_000 + b"]" * 50_000 + b"}",
+        b'{"t":1,"a":' + b"9" * 5_000 + b"}",
+        b'{"t":1,"a":-1' + b"0" * 100_000 + b"}",
+    ],
+    ids=["nested", "digits", "negative"],
+)
+def test_a_payload_that_python_does_not_read_is_a_text_to_the_rules(payload):
+    with pytest.raises((RecursionError, ValueError)):
+        iot._rule_message(payload)
+    read = gaps.as_text_if_unreadable(iot._rule_message)
+    assert read(payload) == payload.decode()
     assert read(b'{"t":1}') == {"t": 1}
     assert read(b"\xff") is iot._MISSING
 

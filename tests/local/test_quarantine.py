@@ -70,8 +70,9 @@ def batch(seq=0, **changes):
         b'{"batch": 5}',
         b"",
         b'{"batch": "1", "a": ' + b"[" * 50_000 + b"]" * 50_000 + b"}",
+        b'{"batch": "1", "a": ' + b"9" * 5_000 + b"}",
     ],
-    ids=["text", "not-utf8", "no-key", "array", "key-of-another-type", "empty", "nested"],
+    ids=["text", "not-utf8", "no-key", "array", "key-of-another-type", "empty", "nested", "digits"],
 )
 def test_what_the_rule_cannot_store_is_kept_byte_by_byte(bundle, entry_of, payload):
     car = bundle()

@@ -3,15 +3,13 @@
 from __future__ import annotations
 
 import contract
+from stacks.checks import EVERY_RESOURCE
 
 IOT = "arn:${AWS::Partition}:iot:${AWS::Region}:${AWS::AccountId}"
 THINGS, CERTIFICATES = f"{IOT}:thing/*", f"{IOT}:cert/*"
 GROUP, KIND = f"{IOT}:thinggroup/iort-robot", f"{IOT}:thingtype/iort-robot"
 # Of what provisioning does, these have no resource type, or a certificate's before it is made.
-ANY_PROVISIONING = (
-    *("ListAttachedPolicies", "ListPolicyPrincipals", "ListPrincipalPolicies", "ListPrincipalThings"),
-    "RegisterThing",
-)
+ANY_PROVISIONING = {action[4:] for role, action in EVERY_RESOURCE if role == "ProvisioningRole"}
 PROVISIONING = (
     {
         (f"iot:{action}", resource)
@@ -65,16 +63,7 @@ NOT_REGISTERED = {
 }
 
 # What the checks of the audit read: certificates and policies, whoever's they are.
-AUDIT_READS = (
-    *(
-        "DescribeCACertificate",
-        "DescribeCertificate",
-        "GetEffectivePolicies",
-        "GetLoggingOptions",
-        "GetPolicy",
-    ),
-    *("GetV2LoggingOptions", "ListCACertificates", "ListCertificates", "ListPolicies"),
-)
+AUDIT_READS = {action for role, action in EVERY_RESOURCE if role == "AuditRole"}
 LOG_OF_IOT = "arn:${AWS::Partition}:logs:${AWS::Region}:${AWS::AccountId}:log-group:AWSIotLogsV2:*"
 
 LOG = {"logs:CreateLogStream", "logs:PutLogEvents"}
@@ -166,7 +155,7 @@ ROLES = {
         | {("dynamodb:UpdateItem", "Robots.Arn"), ("sns:Publish", "Alarms")},
     ),
     "ProvisioningRole": ("iot.amazonaws.com", PROVISIONING),
-    "AuditRole": ("iot.amazonaws.com", {(f"iot:{action}", "*") for action in AUDIT_READS}),
+    "AuditRole": ("iot.amazonaws.com", {(action, "*") for action in AUDIT_READS}),
     "LogRole": (
         "iot.amazonaws.com",
         {(f"logs:{action}", LOG_OF_IOT) for action in ("CreateLogGroup", "CreateLogStream", "PutLogEvents")},
@@ -187,13 +176,4 @@ KEEPS = {
     "PresenceRole": contract.PRESENCE,
     "SummarizeRole": (contract.STREAMS,),
     "UploadRole": ("files_bytes", "files_day"),
-}
-# The only statements about every resource, each with why it cannot name one.
-EVERY_RESOURCE = {
-    # "Actions, resources, and condition keys for Amazon DynamoDB": ListStreams has no resource type.
-    ("SummarizeRole", "dynamodb:ListStreams"),
-    # "Actions defined by AWS IoT": these have no resource type.
-    *(("ProvisioningRole", f"iot:{a}") for a in ANY_PROVISIONING),
-    # An audit is of everything.
-    *(("AuditRole", f"iot:{a}") for a in AUDIT_READS),
 }

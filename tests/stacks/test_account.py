@@ -1,4 +1,4 @@
-"""What is set for the whole account: on by default, off by option, and never on the embedded cloud."""
+"""What is set for the whole account: only by option, never on the embedded cloud, and after all the rest."""
 
 from __future__ import annotations
 
@@ -38,23 +38,44 @@ def test_iot_logs_errors(synthesized, reader):
     assert reader.text(log["RoleArn"]) == "LogRole.Arn"
 
 
-def test_each_is_off_by_option():
-    assert kinds() == KINDS
-    assert kinds(device_defender=False) == {"AWS::IoT::Logging"}
-    assert kinds(iot_log_level="") == KINDS - {"AWS::IoT::Logging"}
-    assert not Settings(device_defender=False, iot_log_level="").account_wide
+def test_each_is_on_by_option():
+    """An account may have them configured, at which this stack would fail."""
+    assert kinds() == set()
+    assert kinds(iot_log_level="error") == {"AWS::IoT::Logging"}
+    assert kinds(device_defender=True) == KINDS - {"AWS::IoT::Logging"}
+    assert not Settings().account_wide
     # ministack knows neither.
-    assert not Settings(embedded=True).account_wide
+    assert not Settings(embedded=True, device_defender=True, iot_log_level="error").account_wide
 
 
-def test_the_embedded_cloud_has_none_of_it(tmp_path):
+@pytest.fixture
+def built(tmp_path):
     from app import build
 
     (tmp_path / "layer").mkdir()
-    app = App(outdir=str(tmp_path / "out"))
-    build(app, Settings(layer=tmp_path / "layer", embedded=True))
-    resources = [one for stack in app.synth().stacks for one in stack.template["Resources"].values()]
-    assert not KINDS & {one["Type"] for one in resources}
+
+    def build_with(**settings):
+        app = App(outdir=str(tmp_path / "out"))
+        build(app, Settings(layer=tmp_path / "layer", **settings))
+        return app.synth().stacks
+
+    return build_with
+
+
+def test_nothing_waits_for_it(built):
+    """It is deployed after all the others, so that where it fails, they are there."""
+    found = {stack.stack_name: stack for stack in built(device_defender=True, site=True)}
+    before = {
+        name: {one.id for one in stack.dependencies if not one.id.endswith(".assets")}
+        for name, stack in found.items()
+    }
+    assert before.pop("iort-account") == found.keys() - {"iort-account"}
+    assert not any("iort-account" in each for each in before.values())
+
+
+def test_the_embedded_cloud_has_none_of_it(built):
+    stacks = built(embedded=True, device_defender=True, iot_log_level="error")
+    assert not KINDS & {one["Type"] for stack in stacks for one in stack.template["Resources"].values()}
 
 
 @pytest.mark.parametrize(("given", "level"), [("off", ""), ("debug", "debug")])

@@ -205,7 +205,8 @@ def test_two_stages_share_an_account(tmp_path_factory, synthesized):
     layer = tmp_path_factory.mktemp("layer")
     (layer / "nothing.py").touch()
     app = App(outdir=str(tmp_path_factory.mktemp("cdk.out")))
-    build(app, Settings(namespace="lab2", layer=layer, retention_days=7))
+    account = {"device_defender": True, "iot_log_level": "error"}
+    build(app, Settings(namespace="lab2", layer=layer, retention_days=7, **account))
     stacks = app.synth().stacks
     assert {stack.stack_name for stack in stacks} == {f"lab2-{noun}" for noun in synthesized.templates}
     text = json.dumps([stack.template for stack in stacks])

@@ -73,9 +73,9 @@ def test_a_deployment_at_rest_pays_for_what_polls_watches_and_keeps():
     assert rest["dashboards"] == 0, "three are free"
     assert "key" not in rest
     assert deployment_dollars_per_month(replace(_ONE, customer_key=True))["key"] == 1.0
-    fleet = deployment_dollars_per_month(replace(_ONE, robots=1000))
+    fleet = deployment_dollars_per_month(replace(_ONE, robots=1000, device_defender=True))
     assert fleet["audit of the robots"] == pytest.approx(1.1)
-    assert "audit of the robots" not in deployment_dollars_per_month(replace(_ONE, device_defender=False))
+    assert "audit of the robots" not in deployment_dollars_per_month(_ONE)
 
 
 def test_recovery_to_a_point_in_time_is_billed_by_what_is_kept():

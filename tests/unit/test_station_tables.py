@@ -44,6 +44,33 @@ def test_csv_is_what_spreadsheets_and_grafana_read():
     assert len(rows) == 3
 
 
+@pytest.mark.parametrize("text", ["=cmd|' /C calc'!A0", "+1", "-1+2", "@SUM(1)", " =1", "\t=1", "\uff1d1"])
+def test_csv_has_no_formulas_but_where_they_are_asked_for(text):
+    values = np.array([text, "a=b"], dtype=object)
+    found = Result("car", "notes", np.arange(2, dtype=np.int64), {text: values, "x": np.array([-1.5, 2])})
+    file = io.StringIO()
+    tables.to_csv(found, file)
+    head, first, second = csv.reader(io.StringIO(file.getvalue()))
+    assert head == ["time", f"'{text}", "x"]
+    assert first[1:] == [f"'{text}", "-1.5"]
+    assert second[1] == "a=b"
+    raw = io.StringIO()
+    tables.to_csv(found, raw, raw=True)
+    head, first, _ = csv.reader(io.StringIO(raw.getvalue()))
+    assert (head[1], first[1]) == (text, text)
+
+
+def test_neither_csv_nor_a_table_has_what_a_terminal_obeys():
+    escape = "\x1b]52;c;YQ==\x07"
+    values = np.array([escape], dtype=object)
+    found = Result("car", "notes", np.zeros(1, dtype=np.int64), {escape: values})
+    file = io.StringIO()
+    tables.to_csv(found, file)
+    Console(file=file, width=200).print(tables.terminal(found).table)
+    assert "\x1b" not in file.getvalue()
+    assert file.getvalue().count("\\u001b]52;c;YQ==\\u0007") == 4
+
+
 def test_json_lines_keep_null_text_and_microseconds():
     file = io.StringIO()
     tables.to_json_lines(result(25_000), file)

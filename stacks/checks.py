@@ -1,0 +1,104 @@
+"""What must hold of every template, whoever adds to the stacks: `make check` and tests/stacks both ask.
+
+What the independent checkers (scripts/check_stacks.py) let through: a wildcard on the actions of a service
+that they do not know, a rule whose failures go nowhere, a secret in a function's environment. Unlike their
+findings, these cannot be acknowledged, but for `EVERY_RESOURCE` and `FAMILIES`.
+"""
+
+from __future__ import annotations
+
+import json
+import re
+from collections.abc import Iterator, Mapping
+from typing import Any, NamedTuple
+
+# The role and the action of each statement about every resource, with why it cannot name one.
+EVERY_RESOURCE = {
+    # "Actions, resources, and condition keys for Amazon DynamoDB": ListStreams has no resource type.
+    ("SummarizeRole", "dynamodb:ListStreams"),
+    # "Actions defined by AWS IoT": these have no resource type.
+    *(
+        ("ProvisioningRole", f"iot:{action}")
+        for action in (
+            *("ListAttachedPolicies", "ListPolicyPrincipals", "ListPrincipalPolicies"),
+            *("ListPrincipalThings", "RegisterThing"),
+        )
+    ),
+    # An audit is of everything: certificates and policies, whoever's they are.
+    *(
+        ("AuditRole", f"iot:{action}")
+        for action in (
+            *("DescribeCACertificate", "DescribeCertificate", "GetEffectivePolicies", "GetLoggingOptions"),
+            *("GetPolicy", "GetV2LoggingOptions", "ListCACertificates", "ListCertificates", "ListPolicies"),
+        )
+    ),
+}
+# What the CDK grants whoever may use a key: each is one action's forms, on the key alone.
+FAMILIES = {"kms:GenerateDataKey*", "kms:ReEncrypt*"}
+_SECRET_NAME = re.compile(r"KEY|SECRET|TOKEN|PASSWORD|PASSWD|CREDENTIAL", re.IGNORECASE)
+# AWS' access keys, PubNub's keys, a private key's PEM.
+_SECRET = re.compile(r"\b(?:AKIA|ASIA)[A-Z0-9]{16}\b|\b(?:pub|sub|sec)-c-[0-9a-f]|BEGIN [A-Z ]*PRIVATE KEY")
+# The CDK ends a logical id with one.
+_HASH = re.compile(r"[0-9A-F]{8}$")
+
+
+class Broken(NamedTuple):
+    """A check that a resource of a template does not meet."""
+
+    check: str
+    logical_id: str
+    text: str
+
+
+def broken(template: Mapping[str, Any]) -> Iterator[Broken]:
+    """What does not hold of a template."""
+    for logical_id, resource in template.get("Resources", {}).items():
+        kind, properties = resource["Type"], resource.get("Properties", {})
+        for role, statement in _granted(logical_id, kind, properties):
+            yield from _too_much(logical_id, role, statement)
+        if kind == "AWS::IAM::Role" and properties.get("ManagedPolicyArns"):
+            yield Broken(
+                "managed-policy", logical_id, "a role has a managed policy, whose actions AWS changes"
+            )
+        if kind == "AWS::IoT::TopicRule" and not properties["TopicRulePayload"].get("ErrorAction"):
+            yield Broken("error-action", logical_id, "a rule has no error action: what fails is lost")
+        if kind == "AWS::Lambda::Function":
+            for name in properties.get("Environment", {}).get("Variables", {}):
+                if _SECRET_NAME.search(name):
+                    text = f"the environment variable {name} is named like a secret"
+                    yield Broken("secret", logical_id, text)
+        if found := _SECRET.search(json.dumps(resource)):
+            yield Broken("secret", logical_id, f"a secret: {found[0][:8]}...")
+
+
+def _granted(
+    logical_id: str, kind: str, properties: Mapping[str, Any]
+) -> Iterator[tuple[str, dict[str, Any]]]:
+    """Role, or the policy's own name, and statement of what a principal is granted."""
+    documents: list[tuple[str, Any]] = []
+    if kind in {"AWS::IAM::Policy", "AWS::IAM::ManagedPolicy"}:
+        roles = [role.get("Ref", logical_id) for role in properties.get("Roles", [])]
+        documents += [(role, properties["PolicyDocument"]) for role in roles or [logical_id]]
+    elif kind == "AWS::IoT::Policy":
+        documents.append((logical_id, properties["PolicyDocument"]))
+    elif kind in {"AWS::IAM::Role", "AWS::IAM::User", "AWS::IAM::Group"}:
+        documents += [(logical_id, one["PolicyDocument"]) for one in properties.get("Policies", [])]
+    for role, document in documents:
+        content = json.loads(document) if isinstance(document, str) else document
+        for statement in _several(content["Statement"]):
+            if statement["Effect"] == "Allow":
+                yield _HASH.sub("", role), statement
+
+
+def _too_much(logical_id: str, role: str, statement: Mapping[str, Any]) -> Iterator[Broken]:
+    if "NotAction" in statement or "NotResource" in statement:
+        yield Broken("all-but", logical_id, f"{role} may do everything but what it names")
+    for action in _several(statement.get("Action", [])):
+        if re.search(r"[*?]", action) and action not in FAMILIES:
+            yield Broken("wildcard-action", logical_id, f"{role} may do {action}")
+        if "*" in _several(statement.get("Resource", [])) and (role, action) not in EVERY_RESOURCE:
+            yield Broken("every-resource", logical_id, f"{role} may do {action} on every resource")
+
+
+def _several(value: Any) -> list[Any]:
+    return value if isinstance(value, list) else [value]

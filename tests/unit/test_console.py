@@ -1,0 +1,75 @@
+"""Nothing that a robot says is obeyed by the operator's terminal, or by a spreadsheet."""
+
+from __future__ import annotations
+
+import ast
+import io
+import json
+from pathlib import Path
+
+import pytest
+from rich.table import Table
+from rich.text import Text
+
+import station
+from station.console import Console, visible
+
+# Writes the clipboard; the same in C1; moves the cursor, and rings; turns a line around.
+HOSTILE = ["\x1b]52;c;cm0gLXJmIH4=\x07", "\x9d52;c;YQ==\x9c", "\x1b[2J\x7f\x08", "a\u202eb\u2066", "\ud800"]
+
+
+@pytest.mark.parametrize("text", HOSTILE)
+def test_what_a_terminal_obeys_is_shown_as_its_code(text):
+    shown = visible(text)
+    assert shown.isprintable()
+    assert json.loads(f'"{shown}"') == text
+
+
+def test_what_it_does_not_stays():
+    text = "Käfer\t1\n日本 🚗 [bold] :car: \\x1b"
+    assert visible(text) == text
+
+
+@pytest.mark.parametrize("terminal", [True, False])
+@pytest.mark.parametrize("text", HOSTILE)
+def test_no_way_to_print_lets_it_through(terminal, text):
+    file = io.StringIO()
+    console = Console(file=file, force_terminal=terminal, width=200, color_system=None)
+    table = Table(title=text)
+    table.add_column(text)
+    table.add_row(text)
+    table.add_row(Text(text))
+    for one in (text, Text(text), Text.assemble((text, "bold")), table):
+        console.print(one)
+        console.print(one, soft_wrap=True)
+    console.print_json(json.dumps([text], ensure_ascii=False))
+    said = file.getvalue()
+    # A `Text` has left out the bell and the backspace by itself.
+    assert said.count(visible(Text(text).plain)) == 15
+    assert not [one for one in said if not one.isprintable() and one != "\n"]
+
+
+def test_a_text_is_no_markup_and_no_picture():
+    file = io.StringIO()
+    console, table = Console(file=file, width=200), Table("[link=https://example.org]here[/link]")
+    table.add_row("[/]")
+    console.print("[/bold] :car:")
+    console.print(table)
+    for text in ("[/bold] :car:", "[link=https://example.org]here[/link]", "[/]"):
+        assert text in file.getvalue()
+
+
+def test_every_command_prints_by_it():
+    """What prints otherwise is listed: a line of JSON, and the one that makes its text visible."""
+    folder, printing = Path(station.__file__).parent, set()
+    for path in folder.rglob("*.py"):
+        name, tree = str(path.relative_to(folder)), ast.parse(path.read_text())
+        for node in ast.walk(tree):
+            if isinstance(node, ast.ImportFrom) and node.module == "rich.console":
+                assert "Console" not in {alias.name for alias in node.names}, name
+            if isinstance(node, ast.Call) and ast.unparse(node.func) in {"print", "typer.echo", "click.echo"}:
+                printing.add((name, ast.unparse(node.args[0])))
+    assert printing == {
+        ("progress.py", "visible(f'iort: {text}')"),
+        ("commands/watch.py", "json.dumps({**line, 'sample': sample})"),
+    }
