@@ -6,19 +6,18 @@ import json
 from typing import Annotated
 
 import typer
-from rich.console import Console
-from rich.markup import escape
 from rich.progress import Progress
 
 from contract import ContractError, check_robot
 from station import adopt
 from station.adopt import Adoption
+from station.console import Console
 from station.errors import StationError
 from station.progress import say
 
 commands = typer.Typer()
-_out = Console(highlight=False)
-_notes = Console(stderr=True, highlight=False)
+_out = Console()
+_notes = Console(stderr=True)
 # How many of the items that are left are listed.
 _LISTED = 20
 
@@ -74,9 +73,9 @@ def adopt_(
 def _show(done: Adoption, what: str) -> None:
     for (robot, stream), count in sorted(done.batches.items()):
         samples = done.samples[robot, stream]
-        _out.print(escape(f"{robot} {stream}: {count:,} batches of {samples:,} samples {what}"))
+        _out.print(f"{robot} {stream}: {count:,} batches of {samples:,} samples {what}")
     for left in done.left[:_LISTED]:
-        _out.print(f"[red]{escape(f'{left.topic} at {left.key}: {left.cause}')}[/]", soft_wrap=True)
+        _out.print(f"{left.topic} at {left.key}: {left.cause}", style="red", soft_wrap=True)
     if len(done.left) > _LISTED:
         _out.print(f"and {len(done.left) - _LISTED:,} more; --json has them all")
     total, cannot = done.batches.total(), len(done.left)

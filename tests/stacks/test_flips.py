@@ -82,7 +82,9 @@ def troubles(before: Templates, after: Templates) -> Iterator[str]:
             if replaced and identity(one) is not None and identity(one) == identity(new[logical_id]):
                 yield f"{stack}: {logical_id} is replaced under its own name"
             gone = logical_id not in new or replaced
-            if gone and one["Type"] in HOLDS_DATA and one["Type"] != "AWS::KMS::Key":
+            # What is kept when it leaves its stack is not lost.
+            kept = logical_id not in new and one.get("DeletionPolicy") == "Retain"
+            if gone and not kept and one["Type"] in HOLDS_DATA and one["Type"] != "AWS::KMS::Key":
                 yield f"{stack}: {logical_id} is lost"
 
 

@@ -179,7 +179,7 @@ def test_samples_that_are_not_text_are_refused(samples):
         ({"n": Decimal("NaN")}, "n Decimal"),
         ({"n": Decimal("sNaN")}, "n Decimal"),
         ({"n": 10**5000}, "n <int>"),
-        ({"batch": f"{2**53:016}-{BOOT}-4"}, "sample time"),
+        ({"batch": f"{2**53:016}-{BOOT}-4"}, "batch 9007199254740992"),
         ({"batch": f"{0:016}-{BOOT}-{2**53 + 1}"}, "seq 9007199254740993"),
         ({"batch": f"{0:016}-{'0' * 33}-4"}, "batch '0000000000000000-0000"),
         ({"nonfinite": b"0"}, "nonfinite b'0'"),
