@@ -39,7 +39,12 @@ def listed(cloud: Cloud) -> Iterator[dict[str, Any]]:
     """Every row of the registry, in no order."""
     for page in cloud.client("dynamodb").get_paginator("scan").paginate(TableName=_table(cloud)):
         for item in page["Items"]:
-            yield plain(item)
+            yield _row(item)
+
+
+def _row(item: Mapping[str, Any]) -> dict[str, Any]:
+    """A row as JSON can have it: a set is a list in order."""
+    return {name: sorted(value) if isinstance(value, set) else value for name, value in plain(item).items()}
 
 
 def vehicles(cloud: Cloud) -> dict[str, dict[str, float]]:
@@ -68,7 +73,7 @@ def find(cloud: Cloud, robot: str) -> dict[str, Any] | None:
     answer = cloud.client("dynamodb").get_item(
         TableName=_table(cloud), Key=_key(checked(robot)), ConsistentRead=True
     )
-    return plain(answer["Item"]) if "Item" in answer else None
+    return _row(answer["Item"]) if "Item" in answer else None
 
 
 def get(cloud: Cloud, robot: str) -> dict[str, Any]:

@@ -24,6 +24,7 @@ from contract import (
     ONLINE,
     PRESENCE,
     ROBOT,
+    STREAMS,
 )
 from station import certificates, claims, registry, robots, rotation
 from station.commands.options import since_us
@@ -282,7 +283,7 @@ def _connection(row: Mapping[str, Any]) -> str:
 
 
 def _parameters(row: Mapping[str, Any]) -> str:
-    known = {ROBOT, FILES_DAY, FILES_BYTES, *PRESENCE, *ADMISSION}
+    known = {ROBOT, FILES_DAY, FILES_BYTES, STREAMS, *PRESENCE, *ADMISSION}
     return ", ".join(
         f"{key} {value}"
         for key, value in sorted(row.items())

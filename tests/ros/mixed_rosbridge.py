@@ -48,6 +48,10 @@ class GraphServer(RosbridgeStandin):
             for line in lines:
                 name, content = line.split(" ")
                 topic, data = TOPICS[name], base64.b64decode(content)
-                if name not in self._subscribers and not topic.latched:
+                heard = name in self._subscribers
+                try:
+                    self.publish(name, as_json(topic.message, data), latch="/base" if topic.latched else None)
+                except ConnectionResetError:
+                    heard = False  # its client has just gone
+                if not heard and not topic.latched:
                     self.unheard[name].append(data)
-                self.publish(name, as_json(topic.message, data), latch="/base" if topic.latched else None)
