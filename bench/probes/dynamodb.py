@@ -40,7 +40,9 @@ def range_of_time(ground: Ground) -> str:
     first, last = batches_between(sent[1].t_us, sent[2].t_us - 1)
     answer = ground.cloud.client("dynamodb").query(
         TableName=ground.cloud.output("storage", "TelemetryTable"),
-        KeyConditionExpression="topic = :topic AND batch BETWEEN :a AND :b",
+        KeyConditionExpression="topic = :topic AND #batch BETWEEN :a AND :b",
+        # A word of DynamoDB's own.
+        ExpressionAttributeNames={"#batch": BATCH},
         ExpressionAttributeValues={
             ":topic": {"S": build_topic("dt", ground.a, VESC_STREAM, ground.namespace)},
             ":a": {"S": first},
