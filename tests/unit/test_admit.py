@@ -302,7 +302,7 @@ def test_one_that_came_through_keeps_the_name(robots, iot, caplog):
 
 
 @pytest.mark.parametrize(
-    ("asked", "change"),
+    "case",
     [
         ({"claim": "another"}, None),
         ({"serial": "s2"}, None),
@@ -311,7 +311,8 @@ def test_one_that_came_through_keeps_the_name(robots, iot, caplog):
         ({}, (ADMITTED_MS, time.time_ns() // 1_000_000 + 3_600_000)),
     ],
 )
-def test_nobody_else_gets_it_and_aws_iot_is_not_even_asked(robots, iot, monkeypatch, caplog, asked, change):
+def test_nobody_else_gets_it_and_aws_iot_is_not_even_asked(robots, iot, monkeypatch, caplog, case):
+    asked, change = case
     spent(robots, iot("PENDING_ACTIVATION"))
     if change is not None:
         robots.change(*change)
