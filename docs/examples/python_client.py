@@ -19,6 +19,7 @@ from queue import Queue
 from typing import Any
 
 import paho.mqtt.client as mqtt
+from paho.mqtt.enums import CallbackAPIVersion
 
 
 def now_us() -> int:
@@ -49,16 +50,18 @@ class Robot:
         tls.load_cert_chain(bundle / car["certificate"], bundle / car["private_key"])
         if car["port"] == "443":
             tls.set_alpn_protocols(["x-amzn-mqtt-ca"])
-        self.mqtt = mqtt.Client(mqtt.CallbackAPIVersion.VERSION2, client_id=self.name, protocol=mqtt.MQTTv5)
+        self.mqtt = mqtt.Client(CallbackAPIVersion.VERSION2, client_id=self.name, protocol=mqtt.MQTTv5)
         self.mqtt.tls_set_context(tls)
-        # A clean session has no subscriptions: they are made on each connection.
-        filters = [(f"{lane}/{self.mine}/+", 1) for lane in ("cmd", "pong")]
-        self.mqtt.on_connect = lambda *_: self.mqtt.subscribe(filters)
+        self.mqtt.on_connect = self.connected
         self.mqtt.on_subscribe = lambda *_: self.subscribed.put(True)
         self.mqtt.on_message = lambda _client, _data, message: self.receive(message)
         self.mqtt.connect(car["endpoint"], int(car["port"]), keepalive=30)
         self.mqtt.loop_start()
         self.subscribed.get(timeout=30)
+
+    def connected(self, *_: object) -> None:
+        """Subscribe on each connection: a clean session has forgotten what the one before had."""
+        self.mqtt.subscribe([(f"{lane}/{self.mine}/+", 1) for lane in ("cmd", "pong")])
 
     def publish(self, topic: str, message: dict[str, Any], qos: int = 1) -> mqtt.MQTTMessageInfo:
         """Hand a message to the network's thread."""
@@ -95,7 +98,7 @@ class Robot:
         sent_us = now_us()
         pong = self.ask("rule", {"v": 1, "id": next(self.numbers["ping"]), "sent_us": sent_us})
         trip_us = now_us() - sent_us
-        self.offset_us = pong["received_ms"] * 1000 - sent_us - trip_us // 2
+        self.offset_us = pong["received_ms"] * 1000 + 500 - sent_us - trip_us // 2
         return trip_us / 1000
 
     def upload(self, file: Path) -> str:
@@ -149,7 +152,7 @@ def main(bundle: Path) -> None:
     """Store a batch and a file, then show a sample a second until a command comes."""
     robot, start_us = Robot(bundle), now_us()
     print(json.dumps({"round_trip_ms": robot.ping(), "offset_us": robot.offset_us}), flush=True)
-    columns = {"angle": [0.5, 1.5, None], "grip": [True, False, "x"]}
+    columns: dict[str, list[Any]] = {"angle": [0.5, 1.5, None], "grip": [True, False, "x"]}
     batch = robot.record("arm", [start_us, start_us + 20_000, start_us + 40_000], columns)
     print(json.dumps({"batch": batch, "key": robot.upload(bundle / "car.yaml")}), flush=True)
     while robot.commands.empty():
