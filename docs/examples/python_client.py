@@ -27,14 +27,37 @@ def now_us() -> int:
     return time.time_ns() // 1000
 
 
+def settings(file: Path) -> dict[str, str]:
+    """The lines `key: value` of car.yaml or claim.yaml; a parser of YAML does it as well."""
+    lines = (line for line in file.read_text().splitlines() if ": " in line and line[0] not in " -")
+    return dict(line.replace("'", "").split(": ", 1) for line in lines)
+
+
+def trusting(car: dict[str, str], folder: Path) -> ssl.SSLContext:
+    """The authorities of the system and, for the embedded cloud, its own."""
+    context = ssl.create_default_context()
+    if "root_ca" in car:
+        context.load_verify_locations(folder / car["root_ca"])
+    return context
+
+
+def connecting(car: dict[str, str], folder: Path, client_id: str) -> mqtt.Client:
+    """A client that is about to connect; it begins with `loop_start`."""
+    tls = trusting(car, folder)
+    tls.load_cert_chain(folder / car["certificate"], folder / car["private_key"])
+    if car["port"] == "443":
+        tls.set_alpn_protocols(["x-amzn-mqtt-ca"])
+    client = mqtt.Client(CallbackAPIVersion.VERSION2, client_id=client_id, protocol=mqtt.MQTTv5)
+    client.tls_set_context(tls)
+    client.connect_async(car["endpoint"], int(car["port"]), keepalive=30)
+    return client
+
+
 class Robot:
     """The connection of one robot, and what it can say and hear."""
 
     def __init__(self, bundle: Path) -> None:
-        lines = (bundle / "car.yaml").read_text().splitlines()
-        car = dict(
-            line.replace("'", "").split(": ", 1) for line in lines if ": " in line and line[0] not in " -"
-        )
+        car = settings(bundle / "car.yaml")
         self.name, self.mine = car["robot"], f"{car['namespace']}/{car['robot']}"
         self.rules = f"$aws/rules/{car['namespace']}"
         # Names this run. Batches, live messages and pings are numbered from 0 in each.
@@ -44,24 +67,23 @@ class Robot:
         self.subscribed: Queue[bool] = Queue()
         self.answers: Queue[dict[str, Any]] = Queue()
         self.commands: Queue[dict[str, Any]] = Queue()
-        self.trust, tls = ssl.create_default_context(), ssl.create_default_context()
-        for context in (self.trust, tls) if "root_ca" in car else ():
-            context.load_verify_locations(bundle / car["root_ca"])
-        tls.load_cert_chain(bundle / car["certificate"], bundle / car["private_key"])
-        if car["port"] == "443":
-            tls.set_alpn_protocols(["x-amzn-mqtt-ca"])
-        self.mqtt = mqtt.Client(CallbackAPIVersion.VERSION2, client_id=self.name, protocol=mqtt.MQTTv5)
-        self.mqtt.tls_set_context(tls)
+        self.trust = trusting(car, bundle)
+        self.mqtt = connecting(car, bundle, self.name)
         self.mqtt.on_connect = self.connected
+        self.mqtt.on_publish = self.acknowledged
         self.mqtt.on_subscribe = lambda *_: self.subscribed.put(True)
         self.mqtt.on_message = lambda _client, _data, message: self.receive(message)
-        self.mqtt.connect(car["endpoint"], int(car["port"]), keepalive=30)
         self.mqtt.loop_start()
         self.subscribed.get(timeout=30)
 
     def connected(self, *_: object) -> None:
         """Subscribe on each connection: a clean session has forgotten what the one before had."""
         self.mqtt.subscribe([(f"{lane}/{self.mine}/+", 1) for lane in ("cmd", "pong")])
+
+    def acknowledged(self, _client: object, _data: object, _id: int, reason: Any, _more: object) -> None:
+        """Say so where the broker has refused a message: it is nowhere then."""
+        if reason.is_failure:
+            print(f"refused: {reason}", file=sys.stderr)
 
     def publish(self, topic: str, message: dict[str, Any], qos: int = 1) -> mqtt.MQTTMessageInfo:
         """Hand a message to the network's thread."""
@@ -74,7 +96,10 @@ class Robot:
         batch = f"{times_us[0]:016d}-{self.run}-{next(self.numbers[stream])}"
         samples = base64.b64encode(zlib.compress(body.encode())).decode()
         envelope = {"v": 2, "batch": batch, "n": len(dt), "codec": "steps", "samples": samples}
-        self.publish(f"{self.rules}_record/dt/{self.mine}/{stream}", envelope).wait_for_publish(30)
+        sent = self.publish(f"{self.rules}_record/dt/{self.mine}/{stream}", envelope)
+        sent.wait_for_publish(30)
+        if not sent.is_published():
+            raise TimeoutError(f"no PUBACK for {batch}: publish it again")
         return batch
 
     def live(self, stream: str, t_us: int, sample: dict[str, Any]) -> None:
