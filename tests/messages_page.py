@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import re
-from typing import Any
+from typing import Any, NamedTuple
 
 from scripts.fields import ROOT
 
@@ -28,10 +28,17 @@ def section(title: str) -> str:
     return re.split(rf"^#{{1,{title.count('#')}}} ", PAGE.split(f"\n{title}\n")[1], flags=re.MULTILINE)[0]
 
 
-def keys_after(name: str) -> dict[str, bool]:
-    """The keys in the table behind an example: by dotted path, whether they are needed."""
+class Key(NamedTuple):
+    """What a table says of a message's key."""
+
+    what: str
+    needed: bool
+
+
+def keys_after(name: str) -> dict[str, Key]:
+    """The keys in the table behind an example, by dotted path."""
     behind = next(rest for one, _, rest in _EXAMPLE.findall(PAGE) if one == name)
-    return {key: row[-1] == "yes" for row in rows(behind) for key in named(row[0])}
+    return {key: Key(row[2], row[3] == "yes") for row in rows(behind) for key in named(row[0])}
 
 
 def named(cell: str) -> list[str]:

@@ -1,4 +1,4 @@
-"""docs/messages.md as a reference: each example, table of keys, topic and limit is the code's own."""
+"""docs/messages.md as a reference: each example and table of keys is the code's own."""
 
 from __future__ import annotations
 
@@ -28,14 +28,10 @@ from contract import (
     LiveSample,
     MessageType,
     build_topic,
-    limits,
 )
 from contract import account as accounts
-from contract.ros1.message import MAX_LAYOUT
 from device.tuning import FIELDS, RULES, Tuning, overlay
-from functions import cut_off, stored
 from functions.echo import pong
-from stacks.settings import Settings
 from station.shadow import State, outcome
 from tests.messages_page import EXAMPLES, PAGE, keys_after, named, rows, section
 
@@ -130,7 +126,7 @@ def test_the_table_has_each_key_and_says_which_are_needed(name: str) -> None:
     assert paths(EXAMPLES[name]) <= needed.keys()
     for path in needed:
         message = without(EXAMPLES[name], path)
-        if needed[path]:
+        if needed[path].needed:
             with pytest.raises(ContractError):
                 read(message)
         else:
@@ -145,10 +141,73 @@ def paths(message: dict[str, Any]) -> set[str]:
 
 def without(message: dict[str, Any], path: str) -> dict[str, Any]:
     less = copy.deepcopy(message)
-    *above, last = path.split(".")
-    inner = less[above[0]] if above else less
-    inner.pop(last, None)
+    inner, key = place(less, path)
+    inner.pop(key, None)
     return less
+
+
+def with_value(message: dict[str, Any], path: str, value: Any) -> dict[str, Any]:
+    other = copy.deepcopy(message)
+    inner, key = place(other, path)
+    inner[key] = value
+    return other
+
+
+def place(message: dict[str, Any], path: str) -> tuple[dict[str, Any], str]:
+    """The object that a path's last key is in, and that key."""
+    *above, key = path.split(".")
+    return (message[above[0]] if above else message), key
+
+
+@pytest.mark.parametrize("name", WRITTEN)
+def test_a_key_that_the_page_does_not_name_is_ignored(name: str) -> None:
+    _, read, meant = WRITTEN[name]
+    assert read({**EXAMPLES[name], "unknown": [1]}) == meant
+
+
+# The message, the key, the last value that is allowed, the first that is not, and how the page says it.
+BOUNDS = [
+    ("batch", "v", 2, 3, "2"),
+    ("batch", "nonfinite", 25_600_000, 25_600_001, "25,600,000"),
+    ("live", "v", 1, 2, "1"),
+    ("command", "session", "f" * 32, "F" * 32, "`boot`"),
+    ("command", "valid_ms", 60_000, 60_001, "1 to 60,000"),
+    ("command", "valid_ms", 1, 0, "1 to 60,000"),
+    ("command", "lease_ms", 10_000, 10_001, "1 to 10,000"),
+    ("command", "lease_ms", 1, 0, "1 to 10,000"),
+    ("command", "seq", 2**53, 2**53 + 1, "0 to 2<sup>53</sup>"),
+    ("command", "seq", 0, -1, "0 to 2<sup>53</sup>"),
+    ("command", "started_us", COMMAND.sent_us, COMMAND.sent_us + 1, "not after `sent_us`"),
+    ("fleet", "v", 1, 2, "1"),
+    ("file", "file.name", "a/b/c/d", "a/b/c/d/e", "up to 4 levels"),
+    ("file", "file.name", "a" * 100, "a" * 101, "each up to 100"),
+    ("file", "file.name", "0.txt", ".txt", "beginning with a letter or digit"),
+    ("file", "file.kind", "other", "film", "`recording`, `image`, `log`, `message` or `other`"),
+    ("file", "file.content_type", "image/jpeg", "image/JPEG", "type/subtype in lower case"),
+    ("file", "file.size", 64 * 2**30, 64 * 2**30 + 1, "0 to 64 GiB"),
+    ("file", "file.t", 0, -1, "from 1970 on"),
+    ("file", "parts", {}, {"2": HASH}, "from 1"),
+    ("refused", "again_s", 86_400, 86_401, "0 to 86,400"),
+]
+
+
+@pytest.mark.parametrize(("name", "path", "good", "bad", "told"), BOUNDS)
+def test_a_bound_of_a_key_is_where_the_page_says(
+    name: str, path: str, good: Any, bad: Any, told: str
+) -> None:
+    assert told in keys_after(name)[path].what
+    read = WRITTEN[name][1]
+    read(with_value(EXAMPLES[name], path, good))
+    with pytest.raises(ContractError):
+        read(with_value(EXAMPLES[name], path, bad))
+
+
+def test_boot_is_what_the_page_says() -> None:
+    assert "8 to 32 of `0-9a-f`" in section("## What all messages share")
+    for good, bad in (("0" * 8, "0" * 7), ("f" * 32, "f" * 33), ("a" * 8, "A" * 8)):
+        assert contract.decode_live(json.dumps({**EXAMPLES["live"], "boot": good})).boot == good
+        with pytest.raises(ContractError):
+            contract.decode_live(json.dumps({**EXAMPLES["live"], "boot": bad}))
 
 
 @pytest.mark.parametrize(("name", "sample"), SAMPLES.items())
@@ -205,56 +264,3 @@ def test_the_messages_of_provisioning_are_those_of_aws_client() -> None:
 def camel(name: str) -> str:
     first, *rest = name.split("_")
     return first + "".join(map(str.capitalize, rest))
-
-
-# Limits that are written with their unit; all others are written as they are.
-UNITS = {
-    "MAX_MESSAGE_BYTES": (1024, "KiB"),
-    "MAX_PUBNUB_BYTES": (1024, "KiB"),
-    "MAX_COLUMNS_BYTES": (2**20, "MiB"),
-    "MAX_SERIALIZED_BYTES": (2**20, "MiB"),
-    "PART_BYTES": (2**20, "MiB"),
-    "MAX_FILE_BYTES": (2**30, "GiB"),
-    "MAX_BATCH_SPAN_US": (1_000_000, "s"),
-    "MAX_AHEAD_US": (86_400_000_000, "days"),
-    "LIVE_BROKER_EVERY_S": (1, "s"),
-    "UPLOAD_URL_S": (1, "s"),
-    **dict.fromkeys(("LIVE_MAX_AGE_MS", "CLOCK_MAX_UNCERTAINTY_MS", "FLEET_MAX_AGE_MS"), (1, "ms")),
-    **dict.fromkeys(("MAX_VALID_MS", "MAX_LEASE_MS"), (1, "ms")),
-    "upload_gb_a_day": (1, "GB"),
-}
-
-
-def test_each_limit_is_told_as_it_is() -> None:
-    table = {name: row for row in rows(section("### Of this project")) for name in named(row[2])}
-    told = {
-        "MAX_LAYOUT": MAX_LAYOUT,
-        "SECOND_BATCHES": stored.SECOND_BATCHES,
-        "BURST": cut_off.BURST,
-        "A_SECOND": cut_off.A_SECOND,
-        "upload_gb_a_day": Settings.__dataclass_fields__["upload_gb_a_day"].default,
-        **{name: getattr(of, name) for of in (limits, contract) for name in table if hasattr(of, name)},
-    }
-    assert table.keys() == told.keys()
-    for name, value in told.items():
-        scale, unit = UNITS.get(name, (1, ""))
-        number = value / scale
-        plain, grouped = f"{number:g}" if number < 10_000 else f"{number:.0f}", f"{number:,.0f}"
-        cell = table[name][1].split(", ") if "_SECOND" in name or name == "BURST" else [table[name][1]]
-        assert any(f"{text} {unit}".strip() in cell for text in (plain, grouped)), (name, value, cell)
-
-
-def test_no_limit_of_the_contract_is_left_out() -> None:
-    text = section("## Limits")
-    every = {name for name in vars(limits) if name.isupper() and not name.startswith("_")}
-    every |= {name for name in contract.__all__ if name.startswith("MAX_")}
-    assert {name for name in every if f"`{name}`" not in text} == set()
-
-
-def test_every_text_and_link_of_the_table_of_contents_is_there() -> None:
-    titles = {
-        line[3:].lower().replace(" ", "-").replace("'", "") for line in PAGE.splitlines() if line[:3] == "## "
-    }
-    linked = {link.split(")")[0] for link in PAGE.split("](#")[1:]}
-    assert linked <= titles
-    assert titles <= linked | {"limits"}
