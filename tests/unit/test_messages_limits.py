@@ -66,7 +66,6 @@ def test_the_brokers_limits_are_those_that_the_agent_and_the_embedded_cloud_keep
 
 
 def test_every_heading_is_in_the_table_of_contents_and_every_link_leads_to_one() -> None:
-    titles = {
-        line[3:].lower().replace(" ", "-").replace("'", "") for line in PAGE.split("\n") if line[:3] == "## "
-    }
+    headings = [line[3:] for line in PAGE.splitlines() if line.startswith("## ")]
+    titles = {heading.lower().replace(" ", "-").replace("'", "") for heading in headings}
     assert titles == {link.split(")")[0] for link in PAGE.split("](#")[1:]}
