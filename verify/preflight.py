@@ -3,7 +3,7 @@
     python -m verify.preflight [-c key=value ...] [--profile NAME] [--json]
 
 Settings are read as app.py reads them; other options of the CDK's are ignored. Exit status 1 where something
-stops the deployment. `make deploy` asks first (SKIP_PREFLIGHT=1: not); `look` is for other reports.
+stops the deployment. `make deploy` asks first (SKIP_PREFLIGHT=1: not); `make verify-aws` too, for its report.
 """
 
 from __future__ import annotations
@@ -58,6 +58,12 @@ def context(given: Sequence[str]) -> Mapping[str, Any]:
     in_file: dict[str, Any] = json.loads((ROOT / "cdk.json").read_text()).get("context", {})
     pairs = (pair.partition("=") for pair in given)
     return {**in_file, **{key: value for key, _, value in pairs}}
+
+
+def line(finding: Finding) -> str:
+    """A finding in one line."""
+    done = f" -> {finding.do}" if finding.do else ""
+    return f"{finding.verdict.value}: {finding.item}: {finding.found}{done}"
 
 
 def show(findings: Sequence[Finding], console: Console) -> None:

@@ -17,7 +17,8 @@ from contract import (
     encode,
     record_topic,
 )
-from verify.check import Basis, Check
+from verify.assumption import Basis
+from verify.check import Check
 from verify.robot import Robot
 from verify.spoofing import spoofed
 from verify.waiting import until
