@@ -43,6 +43,7 @@ class Check:
     of JSON; ``source`` names AWS' page for what is documented; ``relied_on_by`` are files of the repository.
     ``ask`` returns what was seen, in the form of ``expected``, without secrets and without names or times
     that change from run to run. It cleans up what it makes, and raises `CannotAskError` where it cannot ask.
+    ``informational`` are keys of the answer that are told and not judged, because nothing rests on them.
     ``not_embedded`` says why the embedded cloud cannot be asked; "" where it can.
     """
 
@@ -54,6 +55,7 @@ class Check:
     relied_on_by: tuple[str, ...]
     ask: Callable[[Target], Mapping[str, Any]]
     phase: str = FIRST
+    informational: tuple[str, ...] = ()
     not_embedded: str = ""
 
 
@@ -80,5 +82,6 @@ def ask(check: Check, target: Target, clock: Callable[[], float]) -> Answer:
     except (VerifyError, StationError, BenchError, BotoCoreError, ClientError, OSError) as error:
         reason = f"{type(error).__name__}: {error}"
         return Answer(check=check, verdict=Verdict.FAILED, reason=reason, took_s=clock() - began)
-    verdict = Verdict.AS_ASSUMED if seen == check.expected else Verdict.DIFFERS
+    judged = {name: value for name, value in seen.items() if name not in check.informational}
+    verdict = Verdict.AS_ASSUMED if judged == check.expected else Verdict.DIFFERS
     return Answer(check=check, verdict=verdict, seen=seen, took_s=clock() - began)
