@@ -4,11 +4,13 @@ from __future__ import annotations
 
 import json
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
+from pathlib import Path
 from typing import Any, NamedTuple
 
 from bench.target import Target
 from contract import PING, PONG, RECORD, build_topic, record_topic
+from station import robots
 from station.errors import StationError
 from station.listener import Listener
 from station.robots import Bundle
@@ -22,6 +24,18 @@ def registered(target: Target, base: str) -> Bundle:
     name = target.name(base)
     folder = target.folder / "robots" / name
     return Bundle(name, folder) if folder.exists() else target.robot(base)
+
+
+@contextmanager
+def removed_after(target: Target, base: str) -> Iterator[tuple[str, Path]]:
+    """The name of a robot that a question registers, and a folder for it; it is removed at the end."""
+    name = target.name(base)
+    try:
+        yield name, target.folder / "claims" / name
+    finally:
+        # It may not have come so far that it is registered, or be removed already.
+        with suppress(StationError):
+            robots.remove(target.cloud, name)
 
 
 def listener(target: Target, robot: str) -> Listener:

@@ -43,7 +43,6 @@ class Check:
     of JSON; ``source`` names AWS' page for what is documented; ``relied_on_by`` are files of the repository.
     ``ask`` returns what was seen, in the form of ``expected``, without secrets and without names or times
     that change from run to run. It cleans up what it makes, and raises `CannotAskError` where it cannot ask.
-    ``informational`` are keys of the answer that are told and not judged, because nothing rests on them.
     ``not_embedded`` says why the embedded cloud cannot be asked; "" where it can.
     """
 
@@ -55,7 +54,6 @@ class Check:
     relied_on_by: tuple[str, ...]
     ask: Callable[[Target], Mapping[str, Any]]
     phase: str = FIRST
-    informational: tuple[str, ...] = ()
     not_embedded: str = ""
 
 
@@ -82,6 +80,5 @@ def ask(check: Check, target: Target, clock: Callable[[], float]) -> Answer:
     except (VerifyError, StationError, BenchError, BotoCoreError, ClientError, OSError) as error:
         reason = f"{type(error).__name__}: {error}"
         return Answer(check=check, verdict=Verdict.FAILED, reason=reason, took_s=clock() - began)
-    judged = {name: value for name, value in seen.items() if name not in check.informational}
-    verdict = Verdict.AS_ASSUMED if judged == check.expected else Verdict.DIFFERS
+    verdict = Verdict.AS_ASSUMED if compared(seen) == check.expected else Verdict.DIFFERS
     return Answer(check=check, verdict=verdict, seen=seen, took_s=clock() - began)

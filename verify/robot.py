@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import queue
 import threading
+import time
 from concurrent.futures import Future
 from pathlib import Path
 from typing import Any
@@ -15,8 +16,11 @@ from typing_extensions import Self
 
 from contract import LIVE, LiveSample, encode_live
 from verify.errors import VerifyError
+from verify.waiting import until
 
 WAIT_S = 60.0
+# AWS takes one CONNECT a second of a client id ("Connect requests per second per client ID").
+CONNECT_AGAIN_S = 1.2
 # A live message that Lambda 1 drops: what it refuses is kept, and costs the robot its allowance.
 STALE = encode_live(LiveSample("0" * 8, 0, 0, 0, {}, offset_us=0))
 
@@ -112,3 +116,25 @@ class Robot:
         if packet is not None:
             self.reason = str(packet.reason_code.name)
         what.set()
+
+
+def refusal(folder: Path, *, client_id: str | None = None) -> str | None:
+    """The name of the code with which a connection is refused, "" where there is none; None for one that
+    is accepted."""
+    with Robot(folder, client_id=client_id) as robot:
+        until(lambda: robot.connected.is_set() or robot.refused.is_set(), "the broker's answer to a CONNECT")
+        return None if robot.connected.is_set() else robot.reason
+
+
+def soon_refused(folder: Path) -> str | None:
+    """The same, where the broker may need some seconds until it knows."""
+
+    def refused() -> list[str]:
+        time.sleep(CONNECT_AGAIN_S)
+        code = refusal(folder)
+        return [] if code is None else [code]
+
+    try:
+        return until(refused, "a refusal of the certificate", within_s=50)[0]
+    except VerifyError:
+        return None

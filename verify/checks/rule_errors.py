@@ -1,4 +1,4 @@
-"""What rules make of messages that fail, are no JSON, or are as large as AWS takes."""
+"""What rules of this package's own make of an action that fails, and of a star beside a key."""
 
 from __future__ import annotations
 
@@ -10,43 +10,34 @@ from typing import Any
 
 from bench.target import Target
 from contract import (
-    FLEET,
-    LIVE,
-    MAX_MESSAGE_BYTES,
     PING,
     PONG,
-    RECEIVED_MS,
-    RECORD,
     RULE,
     TOPIC,
-    VESC_STREAM,
     build_topic,
-    encode_ping,
-    live_topic,
-    record_topic,
     rule_name,
 )
 from functions.quarantine import entries
-from station import quarantine
-from station.quarantine import Entry
 from verify.bundles import Pair, pair_of
 from verify.check import Basis, Check
 from verify.errors import VerifyError
-from verify.robot import Robot
 from verify.waiting import until
 
 _GUIDE = "https://docs.aws.amazon.com/iot/latest/developerguide"
-_QUOTAS = "https://docs.aws.amazon.com/general/latest/gr/iot-core.html"
-# No JSON, and no UTF-8 either.
-_BYTES = b"\xff\x00 no JSON"
-_AWS_MESSAGE_BYTES = 128 * 1024
 
 
 @contextmanager
-def _rule(target: Target, sql: str, action: Mapping[str, Any], error: Mapping[str, Any]) -> Iterator[str]:
+def _rule(
+    target: Target, select: str, topic: str, *, action: Mapping[str, Any], error: Mapping[str, Any]
+) -> Iterator[str]:
     """A rule of this question's own; its name."""
     iot, name = target.cloud.client("iot"), f"{target.cloud.namespace}_verify_{uuid.uuid4().hex[:8]}"
-    payload = {"sql": sql, "awsIotSqlVersion": "2016-03-23", "actions": [action], "errorAction": error}
+    payload = {
+        "sql": f"{select} FROM '{topic}'",
+        "awsIotSqlVersion": "2016-03-23",
+        "actions": [action],
+        "errorAction": error,
+    }
     iot.create_topic_rule(ruleName=name, topicRulePayload=payload)
     try:
         yield name
@@ -81,9 +72,11 @@ def _error_document(target: Target) -> dict[str, Any]:
         heard_on = build_topic(PONG, pair.robot.name, RULE, cloud.namespace)
         pair.robot.subscribe(heard_on)
         topic = build_topic(PING, pair.robot.name, "error", cloud.namespace)
-        forbidden = _republishing(target, build_topic(FLEET, pair.robot.name, "error", cloud.namespace))
         told = _republishing(target, heard_on)
-        with _rule(target, f"SELECT * FROM '{topic}'", forbidden, told) as name:
+        # Neither may the role of the rule pong write to the table, nor has the message the table's key.
+        table = {"tableName": cloud.output("storage", "TelemetryTable")}
+        fails = {"dynamoDBv2": {"roleArn": told["republish"]["roleArn"], "putItem": table}}
+        with _rule(target, "SELECT *", topic, action=fails, error=told) as name:
             body = _heard(pair, f"$aws/rules/{name}/{topic}", b'{"v": 1}').decode()
     document = json.loads(body)
     (entry,) = entries(body, lambda _: ())
@@ -93,9 +86,9 @@ def _error_document(target: Target) -> dict[str, Any]:
         "topic_as_published": entry.topic == topic,
         "payload_as_published": entry.payload == b'{"v": 1}',
         "says_why": entry.reason != "no reason given",
-        "keys": sorted(document),
-        "keys_of_a_failure": sorted(document["failures"][0]),
-        "topic_has_the_prefix": document["topic"] != topic,
+        "note_keys": sorted(document),
+        "note_keys_of_a_failure": sorted(document["failures"][0]),
+        "note_topic_has_the_prefix": document["topic"] != topic,
     }
 
 
@@ -105,93 +98,45 @@ def _star(target: Target) -> dict[str, Any]:
         pair.robot.subscribe(heard_on)
         topic = build_topic(PING, pair.robot.name, "star", target.cloud.namespace)
         told = _republishing(target, heard_on)
-        with _rule(target, f"SELECT *, topic() AS {TOPIC} FROM '{topic}'", told, told):
+        with _rule(target, f"SELECT *, topic() AS {TOPIC}", topic, action=told, error=told):
             body = _heard(pair, topic, json.dumps({TOPIC: "the message's", "kept": 1}).encode())
     stays = {"the message's": "the message's", topic: "the rule's"}
     members: list[tuple[str, Any]] = json.loads(body, object_pairs_hook=list)
     return {
         "other_keys_stay": ("kept", 1) in members,
-        "topic_is": [stays.get(value, "another") for name, value in members if name == TOPIC],
+        "note_topic_is": [stays.get(value, "another") for name, value in members if name == TOPIC],
     }
 
 
-def _refused(target: Target, robot: str) -> list[Entry]:
-    """What is in quarantine of the robot."""
-    return list(quarantine.entries(target.cloud, robot=robot))
-
-
-def _kept(target: Target, entry: Entry) -> bytes | None:
-    loaded = quarantine.load(target.cloud, entry)
-    return loaded.payload if loaded else None
-
-
-def _live_no_json(target: Target) -> dict[str, Any]:
-    with pair_of(target, "verify-live-no-json") as pair:
-        robot = pair.robot.name
-        pair.publish(live_topic(robot, VESC_STREAM, target.cloud.namespace), _BYTES)
-        (entry,) = until(lambda: _refused(target, robot), "the message in quarantine", within_s=60)
-    return {
-        "refused_by": entry.source.split()[0],
-        "topic_as_subscribed": entry.topic == build_topic(LIVE, robot, VESC_STREAM, target.cloud.namespace),
-        "byte_by_byte": _kept(target, entry) == _BYTES,
-    }
-
-
-def _record_no_json(target: Target) -> dict[str, Any]:
-    cloud = target.cloud
-    with pair_of(target, "verify-record-no-json") as pair:
-        robot = pair.robot.name
-        pair.publish(record_topic(robot, VESC_STREAM, cloud.namespace), _BYTES)
-        # A batch without its key: it is refused later than the other, where the other is.
-        pair.publish(record_topic(robot, VESC_STREAM, cloud.namespace), b'{"v": 1}')
-
-        def of_the_batch() -> list[Entry]:
-            found = _refused(target, robot)
-            return found if any(_kept(target, entry) == b'{"v": 1}' for entry in found) else []
-
-        found = until(of_the_batch, "the batch without a key in quarantine", within_s=60)
-    stored = cloud.client("dynamodb").query(
-        TableName=cloud.output("storage", "TelemetryTable"),
-        KeyConditionExpression=f"{TOPIC} = :topic",
-        ExpressionAttributeValues={
-            ":topic": {"S": build_topic(RECORD, robot, VESC_STREAM, cloud.namespace)},
+CHECKS = (
+    Check(
+        name="rule_errors.document",
+        assumed=(
+            "A rule whose action fails hands its error action the topic, the original payload in base64 and "
+            "the reasons. The quarantine reads that, with Basic Ingest's prefix before the topic or without."
+        ),
+        expected={
+            "source": "rule NAME",
+            "robot_is_the_topics": True,
+            "topic_as_published": True,
+            "payload_as_published": True,
+            "says_why": True,
         },
-        Select="COUNT",
-    )
-    return {
-        "stored": stored["Count"],
-        "refused_by": sorted({entry.source.split()[0] for entry in found}),
-        "no_json_is_in_quarantine": any(_kept(target, entry) == _BYTES for entry in found),
-    }
-
-
-def _pong_no_json(target: Target) -> dict[str, Any]:
-    cloud = target.cloud
-    with pair_of(target, "verify-pong-no-json") as pair:
-        robot = pair.robot.name
-        pair.robot.subscribe(build_topic(PONG, robot, RULE, cloud.namespace))
-        topic = build_topic(PING, robot, RULE, cloud.namespace)
-        pair.publish(topic, _BYTES)
-        pair.publish(topic, encode_ping(7, 1))
-        answers: list[dict[str, Any]] = []
-        while not answers or answers[-1].get("id") != 7:
-            answers.append(json.loads(pair.robot.next_message()[1]))
-    return {
-        "the_next_ping_is_answered": True,
-        "answered_to_no_json": [sorted(answer) for answer in answers[:-1]],
-    }
-
-
-def _largest(target: Target) -> dict[str, Any]:
-    def attempt(robot: Robot, size: int) -> str:
-        topic = build_topic(FLEET, robot.name, "size", target.cloud.namespace)
-        try:
-            return robot.publish(topic, b"x" * size)
-        except VerifyError:
-            return "no answer"
-
-    with pair_of(target, "verify-size") as pair:
-        ours = attempt(pair.robot, MAX_MESSAGE_BYTES)
-        exactly = attempt(pair.robot, _AWS_MESSAGE_BYTES)
-        ended = pair.robot.lost.is_set()
-    return {"ours": ours, "exactly_128_kib": exactly, "exactly_128_kib_ends_the_session": ended}
+        basis=Basis.DOCUMENTED,
+        source=f"{_GUIDE}/rule-error-handling.html and {_GUIDE}/iot-basic-ingest.html",
+        relied_on_by=("functions/quarantine.py", "contract/topics.py"),
+        ask=_error_document,
+    ),
+    Check(
+        name="rule_errors.star_beside_a_key",
+        assumed=(
+            "SELECT * with a key beside it adds the key to the payload. AWS does not say which one stays "
+            "where the payload has the same key; no rule of this project depends on it."
+        ),
+        expected={"other_keys_stay": True},
+        basis=Basis.DOCUMENTED,
+        source=f"{_GUIDE}/iot-sql-select.html",
+        relied_on_by=("docs/decisions/0033-no-star-beside-a-key.md",),
+        ask=_star,
+    ),
+)
