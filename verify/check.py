@@ -13,17 +13,13 @@ from botocore.exceptions import BotoCoreError, ClientError
 from bench.errors import BenchError
 from bench.target import EMBEDDED, Target
 from station.errors import StationError
+from verify.assumption import Assumption
 from verify.errors import CannotAskError, VerifyError
 
+# What a question tells beside the answer, because nothing rests on it: in the report, and not compared.
+NOTE = "note_"
 # The deployment as it is made first, and after it was changed to a key of the account's own.
 FIRST, WITH_KEY = "first deployment", "with customer_key"
-
-
-class Basis(enum.Enum):
-    """Why we believe an assumption, as long as nobody has measured it on AWS."""
-
-    DOCUMENTED = "documented"
-    ASSUMED = "assumed"
 
 
 class Verdict(enum.Enum):
@@ -36,22 +32,16 @@ class Verdict(enum.Enum):
 
 
 @dataclass(frozen=True, kw_only=True)
-class Check:
-    """An assumption about AWS, and how to ask for it.
+class Check(Assumption):
+    """An assumption, and how to ask a deployment for it.
 
-    ``name`` is ``subject.detail``; ``assumed`` is one or two sentences; ``expected`` says the same in values
-    of JSON; ``source`` names AWS' page for what is documented; ``relied_on_by`` are files of the repository.
-    ``ask`` returns what was seen, in the form of ``expected``, without secrets and without names or times
-    that change from run to run. It cleans up what it makes, and raises `CannotAskError` where it cannot ask.
+    ``expected`` says the assumption in values of JSON. ``ask`` returns what was seen, in the form of
+    ``expected``, without secrets and without names or times that change from run to run; keys that begin
+    with `NOTE` are not compared. It cleans up what it makes, and raises `CannotAskError` where it cannot ask.
     ``not_embedded`` says why the embedded cloud cannot be asked; "" where it can.
     """
 
-    name: str
-    assumed: str
     expected: Mapping[str, Any]
-    basis: Basis
-    source: str = ""
-    relied_on_by: tuple[str, ...]
     ask: Callable[[Target], Mapping[str, Any]]
     phase: str = FIRST
     not_embedded: str = ""
@@ -68,8 +58,18 @@ class Answer:
     took_s: float = 0.0
 
 
-def ask(check: Check, target: Target, clock: Callable[[], float]) -> Answer:
-    """Ask one question; an error of the services is an answer as well, and never ends the run."""
+def compared(answer: Mapping[str, Any]) -> dict[str, Any]:
+    """What decides about an answer: all but its notes."""
+    return {name: value for name, value in answer.items() if not name.startswith(NOTE)}
+
+
+def ask(
+    check: Check, target: Target, clock: Callable[[], float], expected: Mapping[str, Any] | None = None
+) -> Answer:
+    """Ask one question; an error of the services is an answer as well, and never ends the run.
+
+    ``expected`` takes the place of the check's own where AWS has been measured.
+    """
     if target.kind == EMBEDDED and check.not_embedded:
         return Answer(check=check, verdict=Verdict.NOT_ASKED, reason=check.not_embedded)
     began = clock()
@@ -80,5 +80,6 @@ def ask(check: Check, target: Target, clock: Callable[[], float]) -> Answer:
     except (VerifyError, StationError, BenchError, BotoCoreError, ClientError, OSError) as error:
         reason = f"{type(error).__name__}: {error}"
         return Answer(check=check, verdict=Verdict.FAILED, reason=reason, took_s=clock() - began)
-    verdict = Verdict.AS_ASSUMED if compared(seen) == check.expected else Verdict.DIFFERS
+    same = compared(seen) == compared(check.expected if expected is None else expected)
+    verdict = Verdict.AS_ASSUMED if same else Verdict.DIFFERS
     return Answer(check=check, verdict=verdict, seen=seen, took_s=clock() - began)

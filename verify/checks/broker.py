@@ -8,8 +8,9 @@ from typing import Any
 
 from bench.target import Target
 from contract import CMD, FLEET, build_topic
+from verify.assumption import Basis
 from verify.bundles import pair_of, registered
-from verify.check import Basis, Check
+from verify.check import Check
 from verify.errors import VerifyError
 from verify.robot import CONNECT_AGAIN_S, Robot, refusal
 
@@ -79,17 +80,19 @@ def _burst(robot: Robot, topic: str, per_s: int) -> dict[str, Any]:
     return {
         "answers": sorted(codes),
         "unanswered": bool(waiting),
-        "note_session_ended": robot.lost.is_set(),
+        "session_ended": robot.lost.is_set(),
     }
 
 
 def _rate(target: Target) -> dict[str, Any]:
     with Robot(registered(target, "verify-rate").folder, paced=False) as robot:
         topic = build_topic(FLEET, robot.online().name, "rate", target.cloud.namespace)
-        return {f"at_{per_s}_a_second": _burst(robot, topic, per_s) for per_s in (90, 100, 150)}
+        ours = _burst(robot, topic, 90)
+        beyond = {f"note_at_{per_s}_a_second": _burst(robot, topic, per_s) for per_s in (100, 150)}
+        return {"at_90_a_second": ours, **beyond}
 
 
-_ALL_TAKEN = {"answers": ["SUCCESS"], "unanswered": False, "note_session_ended": False}
+_ALL_TAKEN = {"answers": ["SUCCESS"], "unanswered": False, "session_ended": False}
 CHECKS = (
     Check(
         name="broker.session_taken_over",

@@ -23,8 +23,9 @@ from contract import (
 )
 from station import quarantine
 from station.quarantine import Entry
+from verify.assumption import Basis
 from verify.bundles import pair_of
-from verify.check import Basis, Check
+from verify.check import Check
 from verify.errors import VerifyError
 from verify.robot import Robot
 from verify.waiting import until

@@ -22,8 +22,9 @@ from contract import (
 from device import identity
 from device.errors import IdentityError
 from station import certificates, claims, registry
+from verify.assumption import Basis
 from verify.bundles import removed_after
-from verify.check import Basis, Check
+from verify.check import Check
 from verify.errors import VerifyError
 from verify.robot import refusal
 

@@ -7,8 +7,9 @@ from typing import Any
 
 from bench.target import Target
 from station import certificates, robots
+from verify.assumption import Basis
 from verify.bundles import registered, removed_after
-from verify.check import Basis, Check
+from verify.check import Check
 from verify.robot import Robot, refusal, soon_refused
 from verify.waiting import until
 

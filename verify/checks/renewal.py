@@ -10,8 +10,9 @@ from bench.target import Target
 from device import identity
 from device.errors import IdentityError
 from station import certificates, claims, rotation
+from verify.assumption import Basis
 from verify.bundles import registered
-from verify.check import Basis, Check
+from verify.check import Check
 from verify.errors import VerifyError
 from verify.robot import CONNECT_AGAIN_S, Robot, soon_refused
 

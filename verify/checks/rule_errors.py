@@ -18,8 +18,9 @@ from contract import (
     rule_name,
 )
 from functions.quarantine import entries
+from verify.assumption import Basis
 from verify.bundles import Pair, pair_of
-from verify.check import Basis, Check
+from verify.check import Check
 from verify.errors import VerifyError
 from verify.waiting import until
 

@@ -38,8 +38,9 @@ from contract import (
     file_key,
 )
 from station import registry
+from verify.assumption import Basis
 from verify.bundles import listener, pair_of
-from verify.check import Basis, Check
+from verify.check import Check
 from verify.spoofing import spoofed
 from verify.waiting import until
 
