@@ -71,6 +71,19 @@ def test_a_kept_report_is_read_again(tmp_path):
     assert "| one | 1 | 2 |" in text
 
 
+def test_a_note_is_told_and_not_compared(tmp_path):
+    told = verdict(check({"one": 1, "note_how": "so"}))
+    assert told.verdict is Verdict.AS_ASSUMED
+    wrong = verdict(check({"one": 2, "note_how": "so"}, name="b.question"))
+    report.write(tmp_path, RUN, [told, wrong])
+    text = (tmp_path / "report.md").read_text()
+    assert 'how: "so"' in text
+    assert "| note_how |" not in text
+    assert measured.load(tmp_path / "report.json").seen["a.question"] == {"one": 1, "note_how": "so"}
+    kept = {"one": 1, "note_how": "otherwise"}
+    assert verdict(check({"one": 1, "note_how": "so"}), expected=kept).verdict is Verdict.AS_ASSUMED
+
+
 def test_a_file_of_another_form_is_refused(tmp_path):
     (tmp_path / "report.json").write_text("[]")
     with pytest.raises(VerifyError, match="no report of verify"):
