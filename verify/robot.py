@@ -92,6 +92,15 @@ class Robot:
         published: Future[Any] = self._client.publish(packet)
         return published
 
+    def attempt(self, topic: str, payload: bytes) -> str:
+        """Publish at QoS 1; the name of the broker's reason code, "DISCONNECTED" where it ends the session,
+        "NOT_SENT" where the library does not take what the broker would refuse."""
+        sent = self.send(topic, payload)
+        until(lambda: sent.done() or self.lost.is_set(), f"an answer to a message on {topic}")
+        if not sent.done():
+            return "DISCONNECTED"
+        return "NOT_SENT" if sent.exception() else str(sent.result().puback.reason_code.name)
+
     def subscribe(self, topic_filter: str) -> str:
         """Subscribe at QoS 1; the name of the broker's reason code. Raises `VerifyError` where none comes."""
         subscription = mqtt5.Subscription(topic_filter=topic_filter, qos=mqtt5.QoS.AT_LEAST_ONCE)
