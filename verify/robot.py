@@ -97,9 +97,9 @@ class Robot:
         "NOT_SENT" where the library does not take what the broker would refuse."""
         sent = self.send(topic, payload)
         until(lambda: sent.done() or self.lost.is_set(), f"an answer to a message on {topic}")
-        if not sent.done():
-            return "DISCONNECTED"
-        return "NOT_SENT" if sent.exception() else str(sent.result().puback.reason_code.name)
+        if sent.done() and not sent.exception():
+            return str(sent.result().puback.reason_code.name)
+        return "DISCONNECTED" if self.lost.is_set() else "NOT_SENT"
 
     def subscribe(self, topic_filter: str) -> str:
         """Subscribe at QoS 1; the name of the broker's reason code. Raises `VerifyError` where none comes."""
