@@ -68,7 +68,8 @@ def _table(assumptions: Sequence[Assumption], known: Measured) -> Iterator[str]:
 def _basis(one: Assumption, known: Measured) -> str:
     if one.name in known.seen:
         same = isinstance(one, Check) and compared(known.seen[one.name]) == one.expected
-        return f"measured ({'as assumed' if same else 'differs'})"
+        seen = "as assumed" if same else "differs"
+        return f"measured ({seen})"
     if one.basis is Basis.DOCUMENTED:
         return f"documented: {one.source}"
     return "assumed"

@@ -106,15 +106,17 @@ def differences(answer: Answer) -> list[tuple[str, str, str]]:
     return [(key, _cell(want), _cell(got)) for key, want, got in rows if want != got]
 
 
-def _notes(answer: Answer) -> str:
-    notes = {key: value for key, value in (answer.seen or {}).items() if key.startswith(NOTE)}
-    return "; ".join(f"{key[len(NOTE) :]}: {json.dumps(value)}" for key, value in notes.items())
-
-
 def summary(answers: Sequence[Answer]) -> str:
     """``12 as assumed, 1 differs``."""
     counted = Counter(answer.verdict for answer in answers)
     return ", ".join(f"{counted[verdict]} {verdict.value}" for verdict in Verdict if counted[verdict])
+
+
+def _notes(answer: Answer) -> str:
+    seen = answer.seen or {}
+    return ", ".join(
+        f"{name.removeprefix(NOTE)} {json.dumps(seen[name])}" for name in seen if name.startswith(NOTE)
+    )
 
 
 def _cell(text: str) -> str:

@@ -46,7 +46,21 @@ def test_what_aws_has_answered_takes_the_assumptions_place():
     assert verdict(check({"one": 1}), expected={"one": 2}).verdict is Verdict.DIFFERS
 
 
-@pytest.mark.parametrize("error", [VerifyError("no answer"), OSError("connection reset")])
+def test_a_note_is_reported_and_not_compared(tmp_path):
+    noted = verdict(check({"one": 1, "note_version": "1.2"}))
+    assert noted.verdict is Verdict.AS_ASSUMED
+    known = {"one": 1, "note_version": "1.1"}
+    assert verdict(check({"one": 1, "note_version": "1.2"}), expected=known).verdict is Verdict.AS_ASSUMED
+    other = verdict(check({"one": 2, "note_version": "1.2"}))
+    assert other.verdict is Verdict.DIFFERS
+    assert report.differences(other) == [("one", "1", "2")]
+    report.write(tmp_path, RUN, [noted])
+    assert 'version "1.2"' in (tmp_path / "report.md").read_text()
+
+
+@pytest.mark.parametrize(
+    "error", [VerifyError("no answer"), OSError("connection reset"), KeyError("another form")]
+)
 def test_an_error_is_an_answer(error):
     answer = verdict(check(error))
     assert answer.verdict is Verdict.FAILED
@@ -69,19 +83,6 @@ def test_a_kept_report_is_read_again(tmp_path):
     text = (tmp_path / "report.md").read_text()
     assert "1 differs, 1 failed" in text
     assert "| one | 1 | 2 |" in text
-
-
-def test_a_note_is_told_and_not_compared(tmp_path):
-    told = verdict(check({"one": 1, "note_how": "so"}))
-    assert told.verdict is Verdict.AS_ASSUMED
-    wrong = verdict(check({"one": 2, "note_how": "so"}, name="b.question"))
-    report.write(tmp_path, RUN, [told, wrong])
-    text = (tmp_path / "report.md").read_text()
-    assert 'how: "so"' in text
-    assert "| note_how |" not in text
-    assert measured.load(tmp_path / "report.json").seen["a.question"] == {"one": 1, "note_how": "so"}
-    kept = {"one": 1, "note_how": "otherwise"}
-    assert verdict(check({"one": 1, "note_how": "so"}), expected=kept).verdict is Verdict.AS_ASSUMED
 
 
 def test_a_file_of_another_form_is_refused(tmp_path):
