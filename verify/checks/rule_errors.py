@@ -1,4 +1,4 @@
-"""What rules of this package's own make of an action that fails, and of a star beside a key."""
+"""Rules of this file's own: what AWS hands to an error action, and what a star beside a key keeps."""
 
 from __future__ import annotations
 
