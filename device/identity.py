@@ -124,7 +124,7 @@ def _register(claim: Claim, robot: str) -> tuple[str, str]:
     if not _SERIAL.fullmatch(serial):
         raise IdentityError(f"serial {serial!r}: allowed is A-Z a-z 0-9 _ . , @ / : # -")
     key, request = make_key(robot)
-    with _Exchange(claim) as exchange:
+    with Exchange(claim) as exchange:
         certificate, token = exchange.certify(request)
         parameters = {contract.ROBOT_PARAMETER: robot, contract.SERIAL_PARAMETER: serial}
         thing = register_again(lambda: exchange.register(token, parameters), wait=time.sleep)
@@ -184,7 +184,7 @@ def _openssl(arguments: list[str], given: str | None = None) -> str:
     return done.stdout
 
 
-class _Exchange:
+class Exchange:
     """A connection with the claim, and the two requests."""
 
     def __init__(self, claim: Claim) -> None:
@@ -213,7 +213,7 @@ class _Exchange:
         )
         self._requests: Any = None
 
-    def __enter__(self) -> _Exchange:  # noqa: PYI034 - Self came with Python 3.11
+    def __enter__(self) -> Exchange:  # noqa: PYI034 - Self came with Python 3.11
         from awscrt import mqtt_request_response  # noqa: PLC0415 - the network's library
         from awsiot import iotidentity  # noqa: PLC0415 - the network's library
 
