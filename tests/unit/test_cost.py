@@ -8,13 +8,21 @@ from dataclasses import replace
 import pytest
 from typer.testing import CliRunner
 
+from contract import METRICS
 from device.pings import CLOCK_EVERY_S
 from device.sources.vehicle import Vehicle, VehicleConfig
 from functions.health import measure
 from functions.metrics import Gathered, emit
 from scripts.costs import FILES, ROOT, filled
 from station import cost, cost_items, cost_tables, scale, sizes
-from station.at_rest import PAGE_REFRESH_S, deployment_dollars_per_month
+from station.at_rest import (
+    FREE_ALARMS,
+    FREE_DASHBOARD_METRICS,
+    FREE_DASHBOARDS,
+    FREE_METRICS,
+    PAGE_REFRESH_S,
+    deployment_dollars_per_month,
+)
 from station.cli import app
 from station.errors import StationError
 from station.prices import PRICES
@@ -223,6 +231,20 @@ def test_quota_that_breaks_first_is_the_one_that_fewest_robots_use_up():
     assert paper.breaks_first.robots_at_quota == 5 / (10 * 0.020)
     unreserved = scale.on_paper(Usage(robots=10_000))
     assert unreserved.breaks_first.name.startswith("IoT Core")
+
+
+def test_the_documents_count_what_is_watched_as_the_model_does():
+    text = (ROOT / "docs" / "cloud.md").read_text()
+    platform, robots = _ONE.dashboards
+    for line in (
+        f"| {sum(map(len, METRICS.values()))} | $0.30 each | {FREE_METRICS} |",
+        f"| {_ONE.alarms} | $0.10 each | {FREE_ALARMS} |",
+        f"| 4, of up to {_ONE.insights_metrics} metrics | $0.10 for each",
+        f"| 2, of {platform} and {robots} metrics | $3 each |"
+        f" {FREE_DASHBOARDS}, of up to {FREE_DASHBOARD_METRICS} metrics each |",
+        f"| {platform} metrics every {PAGE_REFRESH_S} s | $0.01 for 1,000 metrics | none |",
+    ):
+        assert line in text
 
 
 def test_documents_hold_the_tables_that_the_model_makes():
