@@ -4,7 +4,7 @@ BIN := .venv/bin
 # cdk.json runs `python app.py`.
 bootstrap deploy diff destroy: export PATH := $(CURDIR)/$(BIN):$(PATH)
 
-.PHONY: help demo test test-oldest check setup prove-mixed bench bench-guard bench-agent bench-page screenshots bench-fleet layer bootstrap deploy diff destroy lock clean
+.PHONY: help demo test test-oldest check setup prove-mixed bench bench-guard bench-agent bench-page screenshots bench-fleet verify-aws layer bootstrap deploy diff destroy lock clean
 
 help: ## show this
 	@grep -hE '^[a-z-]+:.*## ' Makefile | sed -E 's/^([a-z-]+):.*## /\1\t/' | expand -t 14
@@ -26,7 +26,7 @@ test-oldest: setup ## run the robot's tests on its oldest Python, 3.8, which ROS
 
 check: setup ## run the linters, the type checkers, and cfn-lint, cdk-nag and checkov over the stacks
 	@$(PYTHON) scripts/setup.py --checkov
-	@$(BIN)/ruff check . && $(BIN)/ruff format --check . && $(BIN)/mypy app.py contract scripts device functions stacks station local bench && $(BIN)/npm run --silent check
+	@$(BIN)/ruff check . && $(BIN)/ruff format --check . && $(BIN)/mypy app.py contract scripts device functions stacks station local bench verify docs/examples && $(BIN)/npm run --silent check
 	@PATH="$(CURDIR)/$(BIN):$$PATH" $(BIN)/python scripts/check_stacks.py --checkov build/checkov/bin/checkov
 
 prove-mixed: setup ## drive a robot of every shape of message beside rosbag record: DURATION=300
@@ -52,6 +52,10 @@ bench-page: setup ## measure what the page costs its browser, 20 cars at 10 Hz: 
 
 screenshots: setup ## take the pictures of docs/images anew
 	@$(BIN)/python -m bench.screenshots
+
+verify-aws: layer ## ask your AWS account what the design rests on: ONLY=rules,files YES=1 KEEP=1 BY=name
+	@$(BIN)/python -m verify.run $(if $(ONLY),--only $(ONLY)) $(if $(TARGET),--target $(TARGET)) \
+		$(if $(YES),--yes) $(if $(KEEP),--keep) $(if $(BY),--by "$(BY)") $(if $(OUT),--out $(OUT))
 
 layer: ## build Lambda 1's layer for AWS
 	@$(PYTHON) scripts/setup.py --layer lambda

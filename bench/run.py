@@ -12,12 +12,9 @@ what was changed and removes what was made.
 from __future__ import annotations
 
 import argparse
-import signal
 import sys
 import time
 import traceback
-from collections.abc import Iterator
-from contextlib import contextmanager
 from pathlib import Path
 
 from botocore.exceptions import BotoCoreError, ClientError
@@ -27,6 +24,7 @@ from rich.prompt import Confirm
 from rich.table import Table
 
 from bench import machine, report, spending
+from bench.interrupts import wound_up
 from bench.result import Section
 from bench.sections import SECTIONS
 from bench.target import AWS, EMBEDDED, Target, open_target
@@ -36,7 +34,6 @@ from station.cloud import Cloud
 from station.errors import StationError
 from station.prices import AS_OF, REGION
 
-_INTERRUPTS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
 OUT = machine.ROOT / "build" / "bench"
 
 
@@ -61,7 +58,7 @@ def run(options: argparse.Namespace, cloud: Cloud | None = None) -> None:
     failed: list[str] = []
     try:
         with (
-            _wound_up(console),
+            wound_up(console),
             open_target(options.target, namespace=options.namespace, cloud=cloud, say=say) as target,
         ):
             dollars = spending.estimate(target.cloud, options.only) if target.kind == AWS else {}
@@ -85,27 +82,6 @@ def run(options: argparse.Namespace, cloud: Cloud | None = None) -> None:
         console.print(f"not measured: {', '.join(failed)}", style="red")
         sys.exit(2)
     sys.exit(1 if any(r.reached is False for s in sections for r in s.ratios) else 0)
-
-
-@contextmanager
-def _wound_up(console: Console) -> Iterator[None]:
-    """An interrupt ends what runs now, in good order; another one does not end the putting in order."""
-    asked = False
-
-    def interrupt(_number: int, _frame: object) -> None:
-        nonlocal asked
-        if asked:
-            console.print("still putting back what was changed", style="yellow")
-            return
-        asked = True
-        raise KeyboardInterrupt
-
-    before = {number: signal.signal(number, interrupt) for number in _INTERRUPTS}
-    try:
-        yield
-    finally:
-        for number, handler in before.items():
-            signal.signal(number, handler)
 
 
 def _confirm(console: Console, dollars: dict[str, float]) -> None:

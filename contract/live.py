@@ -31,8 +31,8 @@ PING_FIELDS = ("v", "id", "sent_us", "padding")
 class LiveSample:
     """The newest sample of a stream, as the live lane carries it.
 
-    ``seq`` numbers the run's live messages; ``t_us`` is the sample's time, ``sent_us`` the time it
-    left the car; ``sample`` maps field to value. Fields stand in an object of their own, so that no
+    ``seq`` numbers the stream's live messages of a run; ``t_us`` is the sample's time, ``sent_us`` the time
+    it left the car; ``sample`` maps field to value. Fields stand in an object of their own, so that no
     ROS field can be taken for one of ours; a rule filters on ``sample.fault_code``. ``offset_us`` is what
     to add to the car's clock to have the cloud's, where the car knows it to within
     `CLOCK_MAX_UNCERTAINTY_MS`.

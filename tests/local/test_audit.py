@@ -11,7 +11,7 @@ from contract.account import SourceAccount, StreamAccount
 from station import audit
 from station.cli import app
 from tests.local.conftest import run_agent, until
-from tests.local.robot import Robot
+from verify.robot import Robot
 
 T0_US = 1_760_000_000_000_000
 

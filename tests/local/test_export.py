@@ -19,9 +19,9 @@ from station import data, delivery
 from station.cloud import Cloud
 from tests.foxglove import flat, opened
 from tests.local.conftest import run_agent, until
-from tests.local.robot import Robot
 from tests.local.test_query import iort
 from tests.recordings import recording
+from verify.robot import Robot
 
 VESC, SERVO = "/sensors/core", "/sensors/servo_position_command"
 

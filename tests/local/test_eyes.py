@@ -11,7 +11,7 @@ import contract
 from contract import Batch, LiveSample, build_topic, encode, encode_live, record_topic
 from station import cloudwatch, cloudwatch_logs
 from tests.local.conftest import run_agent, until
-from tests.local.robot import Robot
+from verify.robot import Robot
 
 FAULT, LOW_V = 5, 9.5
 

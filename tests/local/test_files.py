@@ -47,7 +47,7 @@ from station import delivery, files, robots
 from tests.images import TOPIC, jpeg, write_bag
 from tests.local.conftest import until
 from tests.local.drives import Agent
-from tests.local.robot import Robot
+from verify.robot import Robot
 
 CONTENT = b"a small file"
 T_US = 1_700_000_000_000_000

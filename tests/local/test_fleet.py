@@ -29,7 +29,7 @@ from station.cli import app
 from station.cloud import EMBEDDED
 from station.errors import StationError
 from tests.local.conftest import until
-from tests.local.robot import STALE, Robot
+from verify.robot import STALE, Robot
 
 AGENT = Path(sys.executable).parent / "iort-agent"
 WAIT_S = 60

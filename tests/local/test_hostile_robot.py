@@ -15,7 +15,7 @@ from functions.cut_off import BURST
 from station import quarantine
 from station.listener import Listener
 from tests.local.conftest import until
-from tests.local.robot import Robot
+from verify.robot import Robot
 
 BAD, GOOD = 80, 20
 

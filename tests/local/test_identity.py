@@ -16,7 +16,7 @@ from contract import ROBOT, claim_name
 from local.cloud import ROOT
 from station import claims, delivery, robots
 from tests.local.conftest import run_agent, until
-from tests.local.robot import WAIT_S, Robot
+from verify.robot import WAIT_S, Robot
 
 AGENT = Path(sys.executable).parent / "iort-agent"
 

@@ -16,7 +16,7 @@ from contract import CMD, FLEET, MAX_MESSAGE_BYTES, PING, PONG, RULE, build_topi
 from local.gaps import AWS_MESSAGE_BYTES
 from station import claims, robots
 from tests.isolation import CLAIM, CONNECT, PUBLISH, RECEIVE, ROBOT, ROWS, SUBSCRIBE, A, B, Row
-from tests.local.robot import Robot, payload_for
+from verify.robot import Robot, payload_for
 
 WAIT_S = 60
 # What a broker answers to what it lets pass.

@@ -17,8 +17,8 @@ from station import data, delivery
 from station.listener import Listener
 from tests.local.conftest import run_agent, until
 from tests.local.drives import Agent
-from tests.local.robot import Robot
 from tests.recordings import recording
+from verify.robot import Robot
 
 
 def _listener(embedded: EmbeddedCloud, robot: str) -> Listener:

@@ -16,7 +16,7 @@ from station.cli import app
 from station.cloud import EMBEDDED
 from station.items import of_topic
 from tests.local.conftest import until
-from tests.local.robot import Robot
+from verify.robot import Robot
 
 RUN = "0badcafe"
 

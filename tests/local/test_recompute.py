@@ -11,7 +11,7 @@ from contract import Batch, record_topic
 from station import data, delivery, inventory, recompute, registry
 from station.recompute import Recomputed
 from tests.local.conftest import until
-from tests.local.robot import Robot
+from verify.robot import Robot
 
 RUN = "0badcafe"
 SECONDS = 6

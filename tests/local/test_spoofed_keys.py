@@ -30,8 +30,8 @@ from station.items import plain
 from station.listener import Listener
 from station.robots import Bundle
 from tests.local.conftest import until
-from tests.local.robot import Robot
-from tests.spoofing import spoofed
+from verify.robot import Robot
+from verify.spoofing import spoofed
 
 
 class Pair(NamedTuple):

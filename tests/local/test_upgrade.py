@@ -11,8 +11,8 @@ from boto3.dynamodb.types import TypeSerializer
 from contract import EXPIRES_S, RECEIVED_MS, RECORD, TOPIC, Batch, build_topic, record_topic
 from station import data, delivery, quarantine
 from tests.local.conftest import until
-from tests.local.robot import Robot
 from tests.unit.old_messages import old_envelope, old_message
+from verify.robot import Robot
 
 RUN = "0badcafe"
 BATCHES, EACH = 30, 10

@@ -24,7 +24,7 @@ from local.cloud import EmbeddedCloud
 from local.proxy import FREEZE, PASS, REFUSE, Proxy
 from station import robots
 from tests.local.conftest import until
-from tests.local.robot import Robot
+from verify.robot import Robot
 
 
 @pytest.fixture

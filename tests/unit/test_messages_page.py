@@ -1,10 +1,12 @@
-"""docs/messages.md says what the code does: its reader reads what the agent writes."""
+"""docs/messages.md says what the code does: each side reads what the other writes."""
 
 from __future__ import annotations
 
+import base64
 import json
 import re
 import struct
+import zlib
 from collections.abc import Mapping, Sequence
 from typing import Any
 
@@ -13,10 +15,9 @@ import pytest
 import contract
 from contract import Batch, Messages
 from contract.ros1.message import RosType
-from scripts.fields import ROOT
+from tests.messages_page import EXAMPLES, PAGE
 from tests.ros1_types import Message
 
-PAGE = (ROOT / "docs" / "messages.md").read_text()
 TIMES_US = [1_700_000_000_000_000, 1_700_000_000_020_000, 1_700_000_000_040_001]
 NUMBERS, BREAK = "<dI?", b"\n"
 MADE = Message("a_msgs/Made", {"a_msgs/Made": "Header header\nfloat64 speed\nuint32 count\nbool on"})
@@ -27,9 +28,10 @@ UNREADABLE = RosType("/text", "std_msgs/String", "1" * 32, "no definition at all
 
 @pytest.fixture(scope="module")
 def page() -> Mapping[str, Any]:
-    """The names that the page's reader defines."""
+    """The names that the page's writer and reader define."""
     names: dict[str, Any] = {"DICTIONARY": contract.DICTIONARY}
-    exec(re.findall(r"```python\n(.*?)```", PAGE, re.DOTALL)[0], names)
+    for block in re.findall(r"```python\n(.*?)```", PAGE, re.DOTALL):
+        exec(block, names)
     return names
 
 
@@ -55,8 +57,8 @@ def body_of(batch: Batch) -> bytes:
 
 def test_its_examples_are_bodies_of_batches() -> None:
     times = [0, 20_000, 40_001]
-    whole = Batch("0badcafe", 7, times, {"speed": [25.2, 25.1, 25.4], "on": [True, None, "x"]})
-    assert f"    {body_of(whole).decode()}\n" in PAGE
+    example = EXAMPLES["batch"]
+    assert f"    {contract.inflate(example['samples'], example['codec']).decode()}\n" in PAGE
 
     lone = Message("a/X", {"a/X": "Header header\nint32 a"})
     kind = RosType("/x", lone.kind, "0" * 32, lone.definition)
@@ -71,6 +73,27 @@ def test_its_examples_are_bodies_of_batches() -> None:
     raw = [b"\2\0\0\0ab"] * 3
     body = body_of(Batch("0badcafe", 7, times, {}, 0, Messages(kind.id, kind.layout, raw)))
     assert f"    {body.split(BREAK)[1].decode()}\n" in PAGE
+
+
+def test_its_dictionary_is_the_codecs() -> None:
+    (text,) = re.findall(r"<!-- dictionary -->\n```text\n(.*?)```", PAGE, re.DOTALL)
+    assert text.replace("\n", "").encode() == contract.DICTIONARY
+
+
+@pytest.mark.parametrize(
+    "values", [[1, 2.5, None], [7, 9, -1], ["x", True, 0.1], ["\u00e9", 2**64 - 1, -(2**63)]]
+)
+def test_what_its_writer_writes_is_a_batch(page: Mapping[str, Any], values: list[Any]) -> None:
+    written = page["written"]("0badcafe", 7, TIMES_US, {"speed": values, "on": [True] * 3})
+    assert contract.decode(written) == Batch("0badcafe", 7, TIMES_US, {"speed": values, "on": [True] * 3})
+    assert page["opened"](json.loads(written))[1]["speed"] == values
+
+
+def test_a_writer_may_leave_the_dictionary_out() -> None:
+    batch = batch_of({"speed": [1, 2, 3]})
+    body = contract.inflate(batch["samples"], batch["codec"])
+    plain = {**batch, "samples": base64.b64encode(zlib.compress(body)).decode()}
+    assert contract.decode(json.dumps(plain)) == contract.decode(json.dumps(batch))
 
 
 @pytest.mark.parametrize("speeds", [[1, 2.5, None], [4614, 4613.5, 4620.25], [7, 9, -1], ["x", True, 0.1]])

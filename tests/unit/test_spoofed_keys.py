@@ -32,7 +32,7 @@ from contract import (
 )
 from functions import alert, echo, presence
 from tests.iot_sql import Message, evaluate
-from tests.spoofing import spoofed
+from verify.spoofing import spoofed
 
 NOW_MS = 1_700_000_000_123
 T_US = 1_700_000_000_000_000

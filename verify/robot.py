@@ -13,6 +13,7 @@ from awsiot import mqtt5_client_builder
 from typing_extensions import Self
 
 from contract import LIVE, LiveSample, encode_live
+from verify.errors import VerifyError
 
 WAIT_S = 60.0
 # A live message that Lambda 1 drops: what it refuses is kept, and costs the robot its allowance.
@@ -38,7 +39,8 @@ class Robot:
             str(folder / "private.key"),
             endpoint=config["endpoint"],
             port=config["port"],
-            ca_filepath=str(folder / "root-ca.pem"),
+            # AWS' own root is in the system's store.
+            ca_filepath=str(folder / config["root_ca"]) if "root_ca" in config else None,
             client_id=client_id or self.name,
             ack_timeout_sec=60,
             min_reconnect_delay_ms=60_000,
@@ -58,11 +60,13 @@ class Robot:
 
     def __exit__(self, *_: object) -> None:
         self._client.stop()
-        assert self._stopped.wait(WAIT_S)
+        if not self._stopped.wait(WAIT_S):
+            raise VerifyError(f"{self.name}: the client did not stop")
 
     def online(self) -> Robot:
-        """Wait until the broker has accepted the connection."""
-        assert self.connected.wait(WAIT_S), "the broker did not accept the connection"
+        """Wait until the broker has accepted the connection; raises `VerifyError` if it does not."""
+        if not self.connected.wait(WAIT_S):
+            raise VerifyError(f"{self.name}: the broker did not accept the connection")
         return self
 
     def publish(self, topic: str, payload: bytes) -> str:

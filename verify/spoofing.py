@@ -7,6 +7,7 @@ import json
 
 from contract import (
     AGENT_VERSION,
+    DEFAULT_NAMESPACE,
     EXPIRES_S,
     MESSAGE_BASE64,
     RECEIVED_MS,
@@ -19,10 +20,10 @@ from contract import (
 LONG_AGO_MS, FAR_AHEAD_S = 7, 10**10
 
 
-def spoofed(message: bytes, victim: str, lane: str, name: str) -> bytes:
+def spoofed(message: bytes, victim: str, lane: str, name: str, namespace: str = DEFAULT_NAMESPACE) -> bytes:
     """The message with every such key, first and last (a reader of JSON may take either)."""
     keys = {
-        TOPIC: build_topic(lane, victim, name),
+        TOPIC: build_topic(lane, victim, name, namespace),
         RECEIVED_MS: LONG_AGO_MS,
         EXPIRES_S: FAR_AHEAD_S,
         ROBOT: victim,

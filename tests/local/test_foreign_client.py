@@ -1,0 +1,80 @@
+"""A robot that is none of our agents, written from docs/messages.md alone, on the embedded cloud."""
+
+from __future__ import annotations
+
+import ast
+import json
+import subprocess
+import sys
+
+import pytest
+
+from local.deployment import ROOT
+from station import claims, data, quarantine, registry, robots
+from station.listener import Listener
+from tests.local.conftest import until
+
+EXAMPLES = ROOT / "docs" / "examples"
+CLIENT, PROVISION = EXAMPLES / "python_client.py", EXAMPLES / "python_provision.py"
+
+
+@pytest.mark.parametrize("example", [CLIENT, PROVISION])
+def test_the_examples_know_none_of_our_code(example):
+    imported = set()
+    for node in ast.walk(ast.parse(example.read_text())):
+        if isinstance(node, ast.Import):
+            imported |= {name.name.split(".")[0] for name in node.names}
+        elif isinstance(node, ast.ImportFrom):
+            imported.add(str(node.module).split(".")[0])
+    assert imported - sys.stdlib_module_names <= {"paho", CLIENT.stem}
+
+
+@pytest.fixture(params=["added", "claimed"])
+def car(request, bundle, embedded, tmp_path):
+    if request.param == "added":
+        return bundle()
+    name, folder = f"foreign-{request.param}", tmp_path / "claim"
+    claims.claim(embedded.cloud, name, out=folder)
+    subprocess.run([sys.executable, PROVISION, folder, name], check=True, timeout=120)
+    return robots.Bundle(name, folder)
+
+
+def test_a_claim_is_good_for_its_own_name_alone(embedded, tmp_path):
+    claims.claim(embedded.cloud, "foreign-own", out=tmp_path)
+    command = [sys.executable, PROVISION, tmp_path, "foreign-other"]
+    done = subprocess.run(command, capture_output=True, text=True, timeout=120, check=False)
+    assert done.returncode == 1
+    assert "PermissionError: AccessDenied" in done.stderr
+    assert not (tmp_path / "car.yaml").exists()
+
+
+def test_it_is_a_robot_as_any_other(embedded, car, iort):
+    listening = Listener(robot=car.robot, namespace=embedded.namespace, **embedded.keys.reading())
+    # What it has to say of an error stands among pytest's captured output.
+    with (
+        listening as listener,
+        subprocess.Popen([sys.executable, CLIENT, car.folder], stdout=subprocess.PIPE, text=True) as client,
+    ):
+        said = [json.loads(client.stdout.readline()) for _ in range(2)]
+        live = until(lambda: listener.heard)
+        sent = iort("send", car.robot, "grip", '{"close": true}', "--valid-ms", "60000", "--seconds", "60")
+        out, _ = client.communicate(timeout=120)
+    assert client.returncode == 0
+    assert sent.exit_code == 0, sent.output
+    assert json.loads(out) == {"command": {"grip": {"close": True}}}
+    ping, stored = said
+    assert ping["round_trip_ms"] > 0
+
+    found = until(lambda: data.query(embedded.cloud, car.robot, "arm", "-1h", "now"))
+    assert found.columns["angle"].tolist()[:2] == [0.5, 1.5]
+    assert found.columns["grip"].tolist() == [True, False, "x"]
+    first_us, run, number = stored["batch"].split("-")
+    assert (int(first_us), number) == (found.times_us[0], "0")
+    assert (live[0].robot, live[0].stream, live[0].boot) == (car.robot, "arm", run)
+    assert live[0].hops["offset_us"] == ping["offset_us"]
+    body = embedded.cloud.client("s3").get_object(
+        Bucket=embedded.cloud.output("storage", "FilesBucket"), Key=stored["key"]
+    )["Body"]
+    assert body.read() == car.config.read_bytes()
+    assert not list(quarantine.entries(embedded.cloud, robot=car.robot))
+    until(lambda: registry.get(embedded.cloud, car.robot)["online"] is False)

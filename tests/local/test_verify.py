@@ -1,0 +1,93 @@
+"""Every question of `make verify-aws`: the embedded cloud answers as is assumed of AWS, or as AWS did."""
+
+from __future__ import annotations
+
+import argparse
+import json
+import time
+from dataclasses import replace
+
+import pytest
+
+from bench.target import AWS, EMBEDDED, Target
+from verify import measured, price, run
+from verify.check import WITH_KEY, Verdict, ask
+from verify.checks import ALL, rules
+from verify.errors import VerifyError
+
+
+@pytest.fixture(scope="module")
+def target(embedded, tmp_path_factory):
+    target = Target(EMBEDDED, embedded.cloud, tmp_path_factory.mktemp("verify"), embedded, run="verify")
+    yield target
+    target.remove_robots(print)
+
+
+@pytest.mark.parametrize("check", [one for one in ALL if not one.not_embedded], ids=lambda check: check.name)
+def test_the_embedded_cloud_answers_as_assumed_or_measured(target, check):
+    answer = ask(check, target, time.monotonic, measured.load().expected(check.name))
+    assert answer.verdict is Verdict.AS_ASSUMED, (answer.reason, answer.seen)
+
+
+class Recorder:
+    """A deployment that is there already, and says what it was told."""
+
+    def __init__(self) -> None:
+        self.told = []
+
+    def deploy(self, settings):
+        self.told.append(dict(settings))
+
+    def destroy(self):
+        self.told.append("destroyed")
+        return []
+
+
+def options(out, **given):
+    return argparse.Namespace(
+        **{
+            "target": AWS,
+            "only": rules.CHECKS,
+            "namespace": "iort",
+            "out": out,
+            "by": "",
+            "yes": True,
+            "keep": False,
+            **given,
+        }
+    )
+
+
+def test_a_run_deploys_asks_reports_and_destroys(embedded, tmp_path):
+    recorder = Recorder()
+    assert run.run(options(tmp_path), embedded.cloud, recorder) == 0
+    assert recorder.told == [{}, "destroyed"]
+    report = json.loads((tmp_path / "report.json").read_text())
+    assert {one["verdict"] for one in report["answers"]} == {"as assumed"}
+    assert measured.load(tmp_path / "report.json").seen.keys() == {one.name for one in rules.CHECKS}
+
+
+def test_without_a_yes_nothing_is_made(embedded, tmp_path):
+    recorder = Recorder()
+    with pytest.raises(VerifyError, match="nobody can be asked"):
+        run.run(options(tmp_path, yes=False), embedded.cloud, recorder)
+    assert recorder.told == []
+
+
+def test_what_fails_is_taken_down_and_what_was_answered_is_reported(embedded, tmp_path):
+    class Failing(Recorder):
+        def deploy(self, settings):
+            super().deploy(settings)
+            if settings:
+                raise VerifyError("cdk deploy failed")
+
+    recorder, first = Failing(), rules.CHECKS[0]
+    with_key = replace(first, name="a.question", phase=WITH_KEY)
+    with pytest.raises(VerifyError, match="cdk deploy failed"):
+        run.run(options(tmp_path, only=(first, with_key)), embedded.cloud, recorder)
+    assert recorder.told == [{}, {"customer_key": "true"}, "destroyed"]
+    assert len(json.loads((tmp_path / "report.json").read_text())["answers"]) == 1
+
+
+def test_the_price_is_told_before(capsys):
+    assert price.told(price.estimate()).startswith("about $0.")

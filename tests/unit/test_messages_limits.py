@@ -1,0 +1,71 @@
+"""docs/messages.md has every limit of the contract, as it is, and every link of its own leads somewhere."""
+
+from __future__ import annotations
+
+import contract
+from contract import limits
+from contract.ros1.message import MAX_LAYOUT
+from device import allowance
+from functions import cut_off, stored
+from local import gaps, listener_gap
+from stacks.settings import Settings
+from tests.messages_page import PAGE, named, rows, section
+
+# Limits that are written with their unit; all others are written as they are.
+UNITS = {
+    "MAX_MESSAGE_BYTES": (1024, "KiB"),
+    "MAX_PUBNUB_BYTES": (1024, "KiB"),
+    "MAX_COLUMNS_BYTES": (2**20, "MiB"),
+    "MAX_SERIALIZED_BYTES": (2**20, "MiB"),
+    "PART_BYTES": (2**20, "MiB"),
+    "MAX_FILE_BYTES": (2**30, "GiB"),
+    "MAX_BATCH_SPAN_US": (1_000_000, "s"),
+    "MAX_AHEAD_US": (86_400_000_000, "days"),
+    "LIVE_BROKER_EVERY_S": (1, "s"),
+    "UPLOAD_URL_S": (1, "s"),
+    **dict.fromkeys(("LIVE_MAX_AGE_MS", "CLOCK_MAX_UNCERTAINTY_MS", "FLEET_MAX_AGE_MS"), (1, "ms")),
+    **dict.fromkeys(("MAX_VALID_MS", "MAX_LEASE_MS"), (1, "ms")),
+    "upload_gb_a_day": (1, "GB"),
+}
+
+
+def test_each_limit_is_told_as_it_is() -> None:
+    table = {name: row for row in rows(section("### Of this project")) for name in named(row[2])}
+    told = {
+        "MAX_LAYOUT": MAX_LAYOUT,
+        "SECOND_BATCHES": stored.SECOND_BATCHES,
+        "BURST": cut_off.BURST,
+        "A_SECOND": cut_off.A_SECOND,
+        "upload_gb_a_day": Settings.__dataclass_fields__["upload_gb_a_day"].default,
+        **{name: getattr(of, name) for of in (limits, contract) for name in table if hasattr(of, name)},
+    }
+    assert table.keys() == told.keys()
+    for name, value in told.items():
+        scale, unit = UNITS.get(name, (1, ""))
+        number = value / scale
+        plain, grouped = f"{number:g}" if number < 10_000 else f"{number:.0f}", f"{number:,.0f}"
+        assert table[name][1] in {f"{text} {unit}".strip() for text in (plain, grouped)}, name
+
+
+def test_no_limit_of_the_contract_is_left_out() -> None:
+    text = section("## Limits")
+    every = {name for name in vars(limits) if name.isupper() and not name.startswith("_")}
+    every |= {name for name in contract.__all__ if name.startswith("MAX_")}
+    assert {name for name in every if f"`{name}`" not in text} == set()
+
+
+def test_the_brokers_limits_are_those_that_the_agent_and_the_embedded_cloud_keep_to() -> None:
+    table = {row[0]: row[1:] for row in rows(section("### Of AWS IoT, and of the embedded cloud"))}
+    told = {name: row[0] for name, row in table.items()}
+    assert told["a message's payload"] == f"{gaps.AWS_MESSAGE_BYTES // 1024} KiB"
+    assert told["publishes a second of a connection, each way"] == str(allowance.PUBLISHES_PER_S)
+    assert told["bytes a second of a connection, each way"] == f"{allowance.BYTES_PER_S // 1024} KiB"
+    connect = table["time from the connection to CONNECT"][2]
+    assert connect.startswith(f"{listener_gap.CONNECT_S:g} s,")
+    assert f"below {allowance.PUBLISHES_PER_S * allowance.SHARE:g} publishes" in PAGE
+
+
+def test_every_heading_is_in_the_table_of_contents_and_every_link_leads_to_one() -> None:
+    headings = [line[3:] for line in PAGE.splitlines() if line.startswith("## ")]
+    titles = {heading.lower().replace(" ", "-").replace("'", "") for heading in headings}
+    assert titles == {link.split(")")[0] for link in PAGE.split("](#")[1:]}

@@ -1,0 +1,266 @@
+"""docs/messages.md as a reference: each example and table of keys is the code's own."""
+
+from __future__ import annotations
+
+import copy
+import json
+from collections.abc import Callable
+from typing import Any
+
+import pytest
+from awsiot import iotidentity
+
+import contract
+from contract import (
+    AGENT_FIELDS,
+    AGENT_VERSION,
+    COMMANDS,
+    ROBOT_PARAMETER,
+    SERIAL_PARAMETER,
+    Address,
+    Batch,
+    Command,
+    ContractError,
+    File,
+    FileAnswer,
+    FileRequest,
+    FleetMessage,
+    LiveSample,
+    MessageType,
+    build_topic,
+)
+from contract import account as accounts
+from device.tuning import FIELDS, RULES, Tuning, overlay
+from functions.echo import pong
+from station.shadow import State, outcome
+from tests.messages_page import EXAMPLES, PAGE, keys_after, named, rows, section
+
+RUN, T_US = "3f2a9c01d4e5b678", 1_767_261_600_000_000
+SAMPLE = {"speed": 25.2, "voltage_input": 11.9, "fault_code": 0}
+LIVE = LiveSample(RUN, 12, T_US, T_US + 4_000, SAMPLE, offset_us=-1_500)
+HASH = "a591a6d40bf420404a011733cfb7b190d62c65bf0bcda32b57b277d9ad9f146e"
+FILE = File("notes.txt", "log", "text/plain", 12, HASH, T_US)
+ASKED, KEY = "5f0c2b7a9e1d4c38", contract.file_key("car7", FILE)
+URL = f"https://iort-files.s3.eu-west-1.amazonaws.com/{KEY}?X-Amz-Signature=0"
+ADDRESS = Address(1, URL, {"content-type": "text/plain", "content-length": "12"})
+BATCH = Batch(
+    RUN, 41, [T_US, T_US + 20_000, T_US + 40_001], {"speed": [25.2, 25.1, 25.4], "on": [None, True, "x"]}
+)
+COMMAND = Command(
+    session="9b1deb4d3b7d4bad",
+    started_us=T_US - 10_000_000,
+    seq=3,
+    sent_us=T_US,
+    valid_ms=2_000,
+    message={"speed": 1.0, "steering_angle": 0.1},
+    lease_ms=500,
+    answer=True,
+)
+SAID = FleetMessage(RUN, 7, T_US, {"pose": {"position": {"x": 1.5, "y": 0.0, "z": 0.0}}}, -1_500)
+PING = contract.encode_ping(17, T_US)
+PONG = pong(contract.rule_event(PING, build_topic("ping", "car7", "lambda"), T_US // 1000 + 30))[1]
+REFUSED = FileAnswer(
+    ASKED, refused="no more than 50000000000 bytes a day, and only of registered robots", again_s=3600
+)
+UPDATE = json.dumps(contract.live_update("car7", "vesc", LIVE, T_US // 1000 + 30, T_US + 41_000)).encode()
+
+
+def as_object(decode: Callable[[str], Any]) -> Callable[[dict[str, Any]], Any]:
+    return lambda message: decode(json.dumps(message))
+
+
+# The example's name: what the code writes, what reads it, and what it then reads.
+WRITTEN: dict[str, tuple[bytes, Callable[[dict[str, Any]], Any], Any]] = {
+    "batch": (contract.encode(BATCH), as_object(contract.decode), BATCH),
+    "live": (contract.encode_live(LIVE), as_object(contract.decode_live), LIVE),
+    "ping": (PING, as_object(contract.decode_pong), contract.Pong(17, T_US, None)),
+    "pong": (PONG, as_object(contract.decode_pong), contract.Pong(17, T_US, T_US // 1000 + 30)),
+    "command": (contract.encode_command(COMMAND), as_object(contract.decode_command), COMMAND),
+    "fleet": (contract.encode_fleet(SAID), as_object(contract.decode_fleet), SAID),
+    "file": (
+        contract.encode_file_request(FileRequest(ASKED, FILE, {1: HASH})),
+        as_object(contract.decode_file_request),
+        FileRequest(ASKED, FILE, {1: HASH}),
+    ),
+    "answer": (
+        contract.encode_file_answer(FileAnswer(ASKED, KEY, addresses=[ADDRESS])),
+        as_object(contract.decode_file_answer),
+        FileAnswer(ASKED, KEY, addresses=(ADDRESS,)),
+    ),
+    "refused": (contract.encode_file_answer(REFUSED), as_object(contract.decode_file_answer), REFUSED),
+}
+SAMPLES: dict[str, accounts.Account | MessageType] = {
+    "account": accounts.StreamAccount("vesc", 1500, 1450, 0, 0, 0, 29, ended=False),
+    "lost": accounts.SourceAccount("ros1", {"/tf.malformed": 3}),
+    "type": MessageType(
+        "imu", "/imu", "sensor_msgs/Imu", "6a62c6daae103f4ff57a132d6f95cec2", "Header header\n"
+    ),
+}
+SHADOW = ("desired", "reported")
+PROVISIONING = ("csr", "certificate", "register", "registered", "denied")
+
+
+def test_each_example_is_held_to_the_code() -> None:
+    assert EXAMPLES.keys() == {*WRITTEN, *SAMPLES, *SHADOW, *PROVISIONING, "update"}
+    assert PAGE.count("```json\n") == len(EXAMPLES)
+
+
+@pytest.mark.parametrize("name", WRITTEN)
+def test_an_example_is_what_the_code_writes_and_reads(name: str) -> None:
+    written, read, meant = WRITTEN[name]
+    example, of_code = EXAMPLES[name], json.loads(written)
+    if name == "batch":  # another zlib packs as well in other bytes
+        example, of_code = ({**one, "samples": None} for one in (example, of_code))
+    assert example == of_code
+    assert read(EXAMPLES[name]) == meant
+
+
+def test_the_live_update_is_what_the_function_sends() -> None:
+    assert EXAMPLES["update"] == json.loads(UPDATE)
+
+
+@pytest.mark.parametrize("name", sorted(WRITTEN.keys() - {"ping"}))
+def test_the_table_has_each_key_and_says_which_are_needed(name: str) -> None:
+    _, read, _ = WRITTEN[name]
+    needed = keys_after(name)
+    assert paths(EXAMPLES[name]) <= needed.keys()
+    for path in needed:
+        message = without(EXAMPLES[name], path)
+        if needed[path].needed:
+            with pytest.raises(ContractError):
+                read(message)
+        else:
+            read(message)
+
+
+def paths(message: dict[str, Any]) -> set[str]:
+    """The keys of a message, and of the file in it."""
+    file = {f"file.{key}" for key in message.get("file", {})}
+    return message.keys() - {"file"} | file
+
+
+def without(message: dict[str, Any], path: str) -> dict[str, Any]:
+    less = copy.deepcopy(message)
+    inner, key = place(less, path)
+    inner.pop(key, None)
+    return less
+
+
+def with_value(message: dict[str, Any], path: str, value: Any) -> dict[str, Any]:
+    other = copy.deepcopy(message)
+    inner, key = place(other, path)
+    inner[key] = value
+    return other
+
+
+def place(message: dict[str, Any], path: str) -> tuple[dict[str, Any], str]:
+    """The object that a path's last key is in, and that key."""
+    *above, key = path.split(".")
+    return (message[above[0]] if above else message), key
+
+
+@pytest.mark.parametrize("name", WRITTEN)
+def test_a_key_that_the_page_does_not_name_is_ignored(name: str) -> None:
+    _, read, meant = WRITTEN[name]
+    assert read({**EXAMPLES[name], "unknown": [1]}) == meant
+
+
+# The message, the key, the last value that is allowed, the first that is not, and how the page says it.
+BOUNDS = [
+    ("batch", "v", 2, 3, "2"),
+    ("batch", "nonfinite", 25_600_000, 25_600_001, "25,600,000"),
+    ("live", "v", 1, 2, "1"),
+    ("command", "session", "f" * 32, "F" * 32, "`boot`"),
+    ("command", "valid_ms", 60_000, 60_001, "1 to 60,000"),
+    ("command", "valid_ms", 1, 0, "1 to 60,000"),
+    ("command", "lease_ms", 10_000, 10_001, "1 to 10,000"),
+    ("command", "lease_ms", 1, 0, "1 to 10,000"),
+    ("command", "seq", 2**53, 2**53 + 1, "0 to 2<sup>53</sup>"),
+    ("command", "seq", 0, -1, "0 to 2<sup>53</sup>"),
+    ("command", "started_us", COMMAND.sent_us, COMMAND.sent_us + 1, "not after `sent_us`"),
+    ("fleet", "v", 1, 2, "1"),
+    ("file", "file.name", "a/b/c/d", "a/b/c/d/e", "up to 4 levels"),
+    ("file", "file.name", "a" * 100, "a" * 101, "each up to 100"),
+    ("file", "file.name", "0.txt", ".txt", "beginning with a letter or digit"),
+    ("file", "file.kind", "other", "film", "`recording`, `image`, `log`, `message` or `other`"),
+    ("file", "file.content_type", "image/jpeg", "image/JPEG", "type/subtype in lower case"),
+    ("file", "file.size", 64 * 2**30, 64 * 2**30 + 1, "0 to 64 GiB"),
+    ("file", "file.t", 0, -1, "from 1970 on"),
+    ("file", "parts", {}, {"2": HASH}, "from 1"),
+    ("refused", "again_s", 86_400, 86_401, "0 to 86,400"),
+]
+
+
+@pytest.mark.parametrize(("name", "path", "good", "bad", "told"), BOUNDS)
+def test_a_bound_of_a_key_is_where_the_page_says(
+    name: str, path: str, good: Any, bad: Any, told: str
+) -> None:
+    assert told in keys_after(name)[path].what
+    read = WRITTEN[name][1]
+    read(with_value(EXAMPLES[name], path, good))
+    with pytest.raises(ContractError):
+        read(with_value(EXAMPLES[name], path, bad))
+
+
+def test_boot_is_what_the_page_says() -> None:
+    assert "8 to 32 of `0-9a-f`" in section("## What all messages share")
+    for good, bad in (("0" * 8, "0" * 7), ("f" * 32, "f" * 33), ("a" * 8, "A" * 8)):
+        assert contract.decode_live(json.dumps({**EXAMPLES["live"], "boot": good})).boot == good
+        with pytest.raises(ContractError):
+            contract.decode_live(json.dumps({**EXAMPLES["live"], "boot": bad}))
+
+
+@pytest.mark.parametrize(("name", "sample"), SAMPLES.items())
+def test_the_samples_of_a_robots_own_streams(name: str, sample: accounts.Account | MessageType) -> None:
+    assert EXAMPLES[name] == sample.sample()
+    read = contract.message_type if name == "type" else accounts.account
+    assert read(EXAMPLES[name]) == sample
+    if name == "account":
+        text = section("## A robot's own streams")
+        assert {key for row in rows(text) for key in named(row[0])} == EXAMPLES[name].keys()
+
+
+def test_the_agents_own_figures_are_all_told() -> None:
+    text = section("## A robot's own streams").split("**`agent`**")[1]
+    assert {named(row[0])[0]: row[1] for row in rows(text)} == AGENT_FIELDS
+
+
+def test_the_shadows_documents_are_what_the_agent_takes_and_says() -> None:
+    base = Tuning(True, True, 10.0, 0, "info")
+    tuning, rejected = overlay(base, EXAMPLES["desired"]["state"]["desired"], {})
+    assert rejected == {}
+    reported = EXAMPLES["reported"]["state"]["reported"]
+    assert {key: reported[key] for key in tuning.as_document()} == tuning.as_document()
+    assert reported.keys() == {*tuning.as_document(), "rejected", COMMANDS, AGENT_VERSION}
+    state = State(1, {}, reported)
+    assert outcome(state, "drive", COMMAND.session, COMMAND.seq) == contract.ACCEPTED
+    assert [refusal.name for refusal in state.refusals()] == ["live.rate_hz"]
+    wishes, said = section("## The shadow").split("<!-- example: reported -->")
+    assert {name for row in rows(wishes) for name in named(row[0])} == {*RULES, f"{FIELDS}.<stream>"}
+    assert {name for row in rows(said) for name in named(row[0])} == reported.keys()
+
+
+def test_the_messages_of_provisioning_are_those_of_aws_client() -> None:
+    found = {name: EXAMPLES[name] for name in PROVISIONING}
+    csr = iotidentity.CreateCertificateFromCsrRequest(
+        certificate_signing_request=found["csr"]["certificateSigningRequest"]
+    )
+    assert csr.to_payload() == found["csr"]
+    register = iotidentity.RegisterThingRequest(
+        certificate_ownership_token=found["register"]["certificateOwnershipToken"],
+        parameters=found["register"]["parameters"],
+    )
+    assert register.to_payload() == found["register"]
+    assert found["register"]["parameters"].keys() == {ROBOT_PARAMETER, SERIAL_PARAMETER}
+    for name, kind in (
+        ("certificate", iotidentity.CreateCertificateFromCsrResponse),
+        ("registered", iotidentity.RegisterThingResponse),
+        ("denied", iotidentity.V2ErrorResponse),
+    ):
+        read = kind.from_payload(found[name])
+        assert {camel(key): getattr(read, key) for key in read.__slots__} == found[name]
+
+
+def camel(name: str) -> str:
+    first, *rest = name.split("_")
+    return first + "".join(map(str.capitalize, rest))

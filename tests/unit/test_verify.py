@@ -1,0 +1,123 @@
+"""The instrument itself: its verdicts, its report, and the page of assumptions."""
+
+from __future__ import annotations
+
+import itertools
+import json
+
+import pytest
+
+from bench.target import AWS, EMBEDDED, Target
+from local.deployment import ROOT
+from station.cloud import Cloud
+from verify import measured, page, report
+from verify.assumption import Basis
+from verify.check import Check, Verdict, ask
+from verify.checks import ALL
+from verify.errors import CannotAskError, VerifyError
+from verify.unasked import UNASKED
+
+RUN = report.Run(target="AWS", region="eu-west-1", by="A. Tester", date="2026-01-01", version="abc")
+
+
+def check(answer, **given):
+    def asked(_target):
+        if isinstance(answer, Exception):
+            raise answer
+        return answer
+
+    usual = {"name": "a.question", "assumed": "One is one.", "expected": {"one": 1}, "basis": Basis.ASSUMED}
+    return Check(**{**usual, "relied_on_by": ("app.py",), "ask": asked, **given})
+
+
+def verdict(check, kind=AWS, expected=None):
+    clock = itertools.count().__next__
+    return ask(check, Target(kind, Cloud(), ROOT), clock, expected)
+
+
+def test_an_answer_is_compared_with_the_assumption():
+    assert verdict(check({"one": 1})).verdict is Verdict.AS_ASSUMED
+    assert verdict(check({"one": 2})).verdict is Verdict.DIFFERS
+    assert verdict(check({"one": 1, "two": 2})).verdict is Verdict.DIFFERS
+
+
+def test_what_aws_has_answered_takes_the_assumptions_place():
+    assert verdict(check({"one": 2}), expected={"one": 2}).verdict is Verdict.AS_ASSUMED
+    assert verdict(check({"one": 1}), expected={"one": 2}).verdict is Verdict.DIFFERS
+
+
+@pytest.mark.parametrize("error", [VerifyError("no answer"), OSError("connection reset")])
+def test_an_error_is_an_answer(error):
+    answer = verdict(check(error))
+    assert answer.verdict is Verdict.FAILED
+    assert str(error) in answer.reason
+
+
+def test_what_cannot_be_asked_says_why():
+    assert verdict(check(CannotAskError("no keys"))).reason == "no keys"
+    answer = verdict(check({"one": 1}, not_embedded="no KMS"), kind=EMBEDDED)
+    assert (answer.verdict, answer.reason) == (Verdict.NOT_ASKED, "no KMS")
+    assert verdict(check({"one": 1}, not_embedded="no KMS")).verdict is Verdict.AS_ASSUMED
+
+
+def test_a_kept_report_is_read_again(tmp_path):
+    report.write(
+        tmp_path, RUN, [verdict(check({"one": 2})), verdict(check(VerifyError("x"), name="b.question"))]
+    )
+    known = measured.load(tmp_path / "report.json")
+    assert (known.by, known.seen) == ("A. Tester", {"a.question": {"one": 2}})
+    text = (tmp_path / "report.md").read_text()
+    assert "1 differs, 1 failed" in text
+    assert "| one | 1 | 2 |" in text
+
+
+def test_a_file_of_another_form_is_refused(tmp_path):
+    (tmp_path / "report.json").write_text("[]")
+    with pytest.raises(VerifyError, match="no report of verify"):
+        measured.load(tmp_path / "report.json")
+
+
+@pytest.mark.parametrize(
+    "secret",
+    [
+        "123456789012",
+        "AKIAIOSFODNN7EXAMPLE",
+        "sub-c-12345678-abcd-4321",
+        "-----BEGIN RSA PRIVATE KEY-----\nMIIE\n-----END RSA PRIVATE KEY-----",
+        "X-Amz-Signature=0123abcd",
+    ],
+)
+def test_no_report_has_a_secret(tmp_path, secret):
+    answers = [verdict(check({"one": f"a {secret} b"})), verdict(check(VerifyError(f"a {secret} b")))]
+    report.write(tmp_path, RUN, answers)
+    for name in ("report.json", "report.md"):
+        text = (tmp_path / name).read_text()
+        assert secret.split("\n")[-1] not in text
+        assert json.dumps(secret)[1:-1] not in text
+
+
+def test_names_are_unique_and_every_file_is_there():
+    names = [one.name for one in (*ALL, *UNASKED)]
+    assert len(names) == len(set(names))
+    for one in (*ALL, *UNASKED):
+        assert one.relied_on_by
+        assert all((ROOT / path).is_file() for path in one.relied_on_by), one.name
+        assert (one.basis is Basis.DOCUMENTED) == one.source.startswith("https://"), one.name
+
+
+def test_every_gap_of_the_emulator_is_an_assumption():
+    relied = {path for one in (*ALL, *UNASKED) for path in one.relied_on_by}
+    gaps = {str(path.relative_to(ROOT)) for path in (ROOT / "local").glob("*gap*.py")}
+    assert gaps <= relied
+
+
+def test_the_page_is_of_these_assumptions():
+    assert page.PAGE.read_text() == page.text(measured.load()), "run `python -m verify.page`"
+
+
+def test_the_page_says_who_has_measured():
+    known = measured.Measured(
+        by="B", date="2026-02-02", region="eu-west-1", seen={ALL[0].name: ALL[0].expected}
+    )
+    assert "measured by B on 2026-02-02" in page.text(known)
+    assert "measured (as assumed)" in page.text(known)

@@ -1,0 +1,78 @@
+"""One question to a deployment: what the design assumes, what was seen, and the verdict."""
+
+from __future__ import annotations
+
+import enum
+import json
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from typing import Any
+
+from botocore.exceptions import BotoCoreError, ClientError
+
+from bench.errors import BenchError
+from bench.target import EMBEDDED, Target
+from station.errors import StationError
+from verify.assumption import Assumption
+from verify.errors import CannotAskError, VerifyError
+
+# The deployment as it is made first, and after it was changed to a key of the account's own.
+FIRST, WITH_KEY = "first deployment", "with customer_key"
+
+
+class Verdict(enum.Enum):
+    """The outcome of a question."""
+
+    AS_ASSUMED = "as assumed"
+    DIFFERS = "differs"
+    NOT_ASKED = "not asked"
+    FAILED = "failed"
+
+
+@dataclass(frozen=True, kw_only=True)
+class Check(Assumption):
+    """An assumption, and how to ask a deployment for it.
+
+    ``expected`` says the assumption in values of JSON. ``ask`` returns what was seen, in the form of
+    ``expected``, without secrets and without names or times that change from run to run. It cleans up what
+    it makes, and raises `CannotAskError` where it cannot ask. ``not_embedded`` says why the embedded cloud
+    cannot be asked; "" where it can.
+    """
+
+    expected: Mapping[str, Any]
+    ask: Callable[[Target], Mapping[str, Any]]
+    phase: str = FIRST
+    not_embedded: str = ""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Answer:
+    """A question's outcome; ``reason`` says why it was not asked, or how it failed."""
+
+    check: Check
+    verdict: Verdict
+    seen: Mapping[str, Any] | None = None
+    reason: str = ""
+    took_s: float = 0.0
+
+
+def ask(
+    check: Check, target: Target, clock: Callable[[], float], expected: Mapping[str, Any] | None = None
+) -> Answer:
+    """Ask one question; an error of the services is an answer as well, and never ends the run.
+
+    ``expected`` takes the place of the check's own where AWS has been measured.
+    """
+    if target.kind == EMBEDDED and check.not_embedded:
+        return Answer(check=check, verdict=Verdict.NOT_ASKED, reason=check.not_embedded)
+    began = clock()
+    try:
+        seen = json.loads(json.dumps(check.ask(target)))
+    except CannotAskError as error:
+        return Answer(check=check, verdict=Verdict.NOT_ASKED, reason=str(error), took_s=clock() - began)
+    except (VerifyError, StationError, BenchError, BotoCoreError, ClientError, OSError) as error:
+        reason = f"{type(error).__name__}: {error}"
+        return Answer(check=check, verdict=Verdict.FAILED, reason=reason, took_s=clock() - began)
+    same = seen == (check.expected if expected is None else expected)
+    verdict = Verdict.AS_ASSUMED if same else Verdict.DIFFERS
+    return Answer(check=check, verdict=verdict, seen=seen, took_s=clock() - began)

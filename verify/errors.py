@@ -1,0 +1,9 @@
+"""What can go wrong while a deployment is verified."""
+
+
+class VerifyError(Exception):
+    """The root of this package's errors."""
+
+
+class CannotAskError(VerifyError):
+    """A question cannot be asked here; the text says why."""

@@ -1,0 +1,184 @@
+"""`make verify-aws`: asks an AWS account everything that the design takes for granted about AWS.
+
+    python -m verify.run [--target aws|embedded] [--only rules,files] [--yes] [--out build/verify] [--keep]
+
+It looks first, says what it costs and asks; makes the stacks under a namespace of their own; asks; changes
+them to a key of the account's own and asks what depends on it; takes everything down again, also after
+Ctrl-C. Writes report.json and report.md. Exit status 1 if an answer is not as assumed, 2 if a question failed
+or something was left over.
+"""
+
+from __future__ import annotations
+
+import argparse
+import getpass
+import secrets
+import shutil
+import sys
+import time
+from collections.abc import Callable, Iterator, Sequence
+from pathlib import Path
+
+from botocore.exceptions import BotoCoreError, ClientError
+from rich.console import Console
+from rich.markup import escape
+from rich.prompt import Confirm
+
+from bench import machine
+from bench.interrupts import wound_up
+from bench.target import AWS, EMBEDDED, Target, open_target
+from local.deployment import ROOT
+from local.errors import LocalError
+from station.cloud import Cloud
+from station.errors import StationError
+from station.prices import AS_OF
+from verify import measured, price, report
+from verify.check import FIRST, WITH_KEY, Answer, Check, Verdict, ask
+from verify.checks import ALL
+from verify.deployment import Deployment
+from verify.errors import VerifyError
+
+OUT = ROOT / "build" / "verify"
+_STYLES = {
+    Verdict.AS_ASSUMED: "green",
+    Verdict.DIFFERS: "red",
+    Verdict.NOT_ASKED: "yellow",
+    Verdict.FAILED: "red",
+}
+
+Say = Callable[[str], None]
+
+
+def main() -> None:
+    """Ask, write and say."""
+    try:
+        sys.exit(run(_options()))
+    except KeyboardInterrupt:
+        sys.exit(130)
+    except (LocalError, StationError, VerifyError, BotoCoreError, ClientError) as error:
+        Console(stderr=True).print(f"verify: {error}", style="red", markup=False)
+        sys.exit(2)
+
+
+def run(options: argparse.Namespace, cloud: Cloud | None = None, deployment: Deployment | None = None) -> int:
+    """The exit status; on ``cloud`` and with ``deployment`` where they are not made from the options."""
+    console = Console()
+    began = time.monotonic()
+
+    def say(text: str) -> None:
+        console.print(f"{time.monotonic() - began:6.1f} s    {escape(text)}", highlight=False, style="dim")
+
+    answers: list[Answer] = []
+    region = ""
+    leftovers: list[str] = []
+    findings: list[str] = []
+    with wound_up(console):
+        if options.target == AWS:
+            cloud = (cloud or Cloud(namespace=options.namespace)).check()
+            options.out.mkdir(parents=True, exist_ok=True)
+            deployment = deployment or Deployment(cloud, options.out, say)
+            if not options.yes:
+                _confirm(console, cloud)
+        try:
+            if deployment:
+                deployment.deploy({})
+            with open_target(options.target, namespace=options.namespace, cloud=cloud, say=say) as target:
+                region = target.cloud.client("iot").meta.region_name
+                # One by one: what was answered before an interrupt is in the report.
+                answers.extend(_asked(options.only, FIRST, target, console))
+                if deployment and any(check.phase == WITH_KEY for check in options.only):
+                    deployment.deploy({"customer_key": "true"})
+                answers.extend(_asked(options.only, WITH_KEY, target, console))
+        finally:
+            if deployment:
+                leftovers = deployment.destroy()
+            if answers:
+                report.write(options.out, _described(options, region, findings, leftovers), answers)
+    for line in leftovers:
+        console.print(f"left over: {line}", style="red", markup=False)
+    console.print(f"{report.summary(answers)}: {options.out / 'report.md'}", highlight=False)
+    if options.keep:
+        shutil.copyfile(options.out / "report.json", measured.KEPT)
+        console.print(
+            f"kept in {measured.KEPT.relative_to(ROOT)}: `python -m verify.page` writes docs/assumptions.md"
+        )
+    verdicts = {answer.verdict for answer in answers}
+    return 2 if Verdict.FAILED in verdicts or leftovers else int(Verdict.DIFFERS in verdicts)
+
+
+def _asked(checks: Sequence[Check], phase: str, target: Target, console: Console) -> Iterator[Answer]:
+    """Ask the questions of a phase, one after the other; each is said with its verdict."""
+    # The embedded cloud is held to what AWS has answered.
+    known = measured.load() if target.kind == EMBEDDED else measured.Measured()
+    these = [check for check in checks if check.phase == phase]
+    for number, check in enumerate(these, 1):
+        answer = ask(check, target, time.monotonic, known.expected(check.name))
+        console.print(
+            f"  {number:2d} of {len(these)}  [bold]{check.name}[/]  "
+            f"[{_STYLES[answer.verdict]}]{answer.verdict.value}[/]  {answer.took_s:.1f} s",
+            highlight=False,
+        )
+        for key, want, got in report.differences(answer) if answer.verdict is Verdict.DIFFERS else ():
+            console.print(report.redacted(f"      {key}: expected {want}, got {got}"), markup=False)
+        if answer.reason:
+            console.print(report.redacted(f"      {answer.reason}"), markup=False)
+        yield answer
+
+
+def _confirm(console: Console, cloud: Cloud) -> None:
+    """Ask before money is spent. Raises `VerifyError` where nobody can be asked, or the answer is no."""
+    console.print(
+        f"This takes about 15 minutes and costs {price.told(price.estimate())} at the list prices of "
+        f"{AS_OF}. "
+        f"It makes the stacks of namespace {cloud.namespace}, asks them, and removes them with all they "
+        "hold. A key of the account's own is scheduled for deletion, which AWS does not charge for.",
+        highlight=False,
+    )
+    if not sys.stdin.isatty():
+        raise VerifyError("nobody can be asked whether to go on: --yes (`make verify-aws YES=1`) says so")
+    if not Confirm.ask("Go on?", console=console, default=False):
+        raise VerifyError("nothing was made")
+
+
+def _described(
+    options: argparse.Namespace, region: str, findings: Sequence[str], leftovers: Sequence[str]
+) -> report.Run:
+    here = machine.describe()
+    return report.Run(
+        target="AWS" if options.target == AWS else "the embedded cloud",
+        region=region,
+        by=options.by,
+        date=here["date"],
+        version=here["commit"],
+        findings=findings,
+        leftovers=leftovers,
+    )
+
+
+def _options() -> argparse.Namespace:
+    parser = argparse.ArgumentParser(prog="verify", description=(__doc__ or "").splitlines()[0])
+    parser.add_argument("--target", choices=(AWS, EMBEDDED), default=AWS)
+    parser.add_argument("--only", type=_selected, default=ALL, help="subjects or questions, with commas")
+    parser.add_argument("--namespace", default=f"verify{secrets.token_hex(3)}")
+    parser.add_argument("--out", type=Path, default=OUT, help="folder of the report (build/verify)")
+    parser.add_argument("--by", default=getpass.getuser(), help="who asks, for the report")
+    parser.add_argument("--yes", action="store_true", help="do not ask before money is spent")
+    parser.add_argument("--keep", action="store_true", help="keep the answers in the repository")
+    options = parser.parse_args()
+    if options.keep and options.target != AWS:
+        parser.error("--keep: only answers of AWS are kept")
+    return options
+
+
+def _selected(text: str) -> tuple[Check, ...]:
+    wanted = set(text.split(","))
+    chosen = tuple(check for check in ALL if {check.name, check.name.split(".")[0]} & wanted)
+    known = {check.name for check in chosen} | {check.name.split(".")[0] for check in chosen}
+    if unknown := sorted(wanted - known):
+        names = ", ".join(dict.fromkeys(check.name.split(".")[0] for check in ALL))
+        raise argparse.ArgumentTypeError(f"no question {', '.join(unknown)}; subjects are {names}")
+    return chosen
+
+
+if __name__ == "__main__":
+    main()
