@@ -9,9 +9,9 @@ from math import ceil
 from bench.sections import dashboard, outage, query, round_trips, utilisation
 from contract import PING_PATHS
 from device.allowance import BYTES_PER_S
-from station import cost
+from station import cost, cost_items
 from station.cloud import Cloud
-from station.cost import Item
+from station.cost_items import Item
 from station.usage import Usage
 
 # AWS' units: a message and an action are metered by 5 KB, writes by 1 KB, reads by 4 KB and by half where
@@ -33,7 +33,7 @@ def estimate(cloud: Cloud, sections: Sequence[str]) -> dict[str, float]:
         "abilities": _abilities,
         "outage": lambda: _driven(outage.BEFORE_S + outage.CUT_S + outage.AFTER_S),
     }
-    return {key: cost.total(counted[key]()) for key in sections if key in counted}
+    return {key: cost_items.total(counted[key]()) for key in sections if key in counted}
 
 
 def _round_trips() -> list[Item]:

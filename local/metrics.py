@@ -4,9 +4,10 @@ ministack keeps and serves metrics, but nothing feeds them except synchronous in
 only when somebody puts data. Each wrapper here is around one of its functions, as in local/gaps.py:
 
 - an EMF line in a function's log becomes metrics;
-- AWS/Lambda counts every invocation, AWS/IoT connections, messages, rules and their actions, AWS/SQS what
-  waits in queues. AWS/DynamoDB's units are not counted: the emulator has no notion of them;
-- GetMetricData answers `SEARCH(...)`, alone and within `SUM(...)` where one metric is found;
+- AWS/Lambda counts every invocation, of each function and of all, AWS/IoT connections, messages, rules and
+  their actions, AWS/SQS what waits in queues. AWS/DynamoDB's units are not counted: the emulator has no
+  notion of them;
+- GetMetricData answers `SEARCH(...)`;
 - an alarm looks at its own dimensions, every few seconds, and takes missing data for no alarm.
 """
 
@@ -114,6 +115,7 @@ def _counting_invocations(dispatch: Callable[..., Any]) -> Callable[..., Any]:
         name = config.get("FunctionName", "unknown")
         _running[name] += 1
         record("AWS/Lambda", "ConcurrentExecutions", _running[name], "Count", FunctionName=name)
+        record("AWS/Lambda", "ConcurrentExecutions", sum(list(_running.values())), "Count")
         if (age_ms := _age_ms(event)) is not None:
             record("AWS/Lambda", "IteratorAge", age_ms, "Milliseconds", FunctionName=name)
         try:
@@ -122,7 +124,9 @@ def _counting_invocations(dispatch: Callable[..., Any]) -> Callable[..., Any]:
             _running[name] -= 1
         took_ms = (time.time() - started) * 1000
         record("AWS/Lambda", "Invocations", 1, "Count", FunctionName=name)
-        record("AWS/Lambda", "Errors", 1 if result.get("error") else 0, "Count", FunctionName=name)
+        failed = 1 if result.get("error") else 0
+        record("AWS/Lambda", "Errors", failed, "Count", FunctionName=name)
+        record("AWS/Lambda", "Errors", failed, "Count")
         record("AWS/Lambda", "Duration", took_ms, "Milliseconds", FunctionName=name)
         record_log(result.get("log") or "")
         return result
@@ -142,6 +146,7 @@ def _age_ms(event: Any) -> float | None:
 def _throttles(function_name: str, **counts: Any) -> None:
     if counts.get("throttle"):
         record("AWS/Lambda", "Throttles", 1, "Count", FunctionName=function_name)
+        record("AWS/Lambda", "Throttles", 1, "Count")
 
 
 def _counting_matches(run_rule_actions: Callable[..., Any]) -> Callable[..., Any]:

@@ -1,4 +1,9 @@
-"""The two dashboards: the platform, a row a service in the order of a message's path, and the robots."""
+"""The two dashboards: the platform, a row a service in the order of a message's path, and the robots.
+
+A dashboard of up to fifty metrics is free, three an account. So what has an alarm of its own and is zero on a
+good day is not drawn again, and nothing is searched for that is not there by itself
+(docs/decisions/0034-dashboards-of-fifty-metrics.md).
+"""
 
 from __future__ import annotations
 
@@ -13,8 +18,8 @@ from stacks import metrics
 from stacks.settings import Settings
 from stacks.watched import Watched
 
-# Shown on the robots' dashboard; the platform's shows the rest of what the functions emit.
-_OF_ROBOTS = ("health", "summarize")
+# What every sample passes.
+_FUNCTIONS_OF_SAMPLES, _TABLES_OF_SAMPLES = ("Live", "Summarize"), ("Batches", "Summary")
 _HOPS = ("InCarMs", "UplinkMs", "ToLambdaMs", "CarToLambdaMs")
 _ROUND_TRIPS = ("RoundTripBrokerMs", "RoundTripRuleMs", "RoundTripLambdaMs")
 
@@ -37,15 +42,15 @@ class Dashboards(Construct):
         status = cloudwatch.AlarmStatusWidget(title="Alarms", alarms=list(alarms), width=24, height=4)
         platform.add_widgets(status)
         platform.add_widgets(_warnings(watched))
-        platform.add_widgets(*self._iot())
-        platform.add_widgets(*self._tables(watched))
+        platform.add_widgets(*self._iot(), self._tables(watched))
         platform.add_widgets(*self._functions(watched))
         platform.add_widgets(*self._streams_and_queues(watched))
-        platform.add_widgets(*self._live(), *self._rest())
+        platform.add_widgets(self._live())
         robots = self._dashboard("Robots")
         robots.add_widgets(*self._seen())
         robots.add_widgets(*self._delays())
         robots.add_widgets(*self._health())
+        robots.add_widgets(*self._asked())
         if settings.robot_metrics:
             robots.add_widgets(*self._one_by_one())
 
@@ -64,14 +69,7 @@ class Dashboards(Construct):
     # --- platform ----------------------------------------------------------------------------------
 
     def _iot(self) -> list[cloudwatch.GraphWidget]:
-        rules = {rule: rule_name(rule, self._namespace) for rule in RULES}
-        matched = [metrics.rule("TopicMatch", name, label=rule) for rule, name in rules.items()]
-        failed: list[cloudwatch.IMetric] = []
-        for rule, name in rules.items():
-            failed.append(metrics.rule_actions("Failure", name, label=f"{rule}: action failed"))
-            failed.append(metrics.rule("ParseError", name, label=f"{rule}: no JSON"))
-            failed.append(metrics.rule("RuleMessageThrottled", name, label=f"{rule}: throttled"))
-            failed.append(metrics.rule_actions("ErrorActionFailure", name, label=f"{rule}: lost"))
+        matched = [metrics.rule("TopicMatch", rule_name(rule, self._namespace), label=rule) for rule in RULES]
         refused = [metrics.broker(f"{what}.AuthError") for what in ("Connect", "PublishIn", "Subscribe")]
         return [
             _graph(
@@ -80,40 +78,45 @@ class Dashboards(Construct):
                 right=[*refused, metrics.broker("PublishIn.Throttle")],
             ),
             _graph("Rules: messages matched", matched),
-            _graph("Rules: failures", failed),
         ]
 
     @staticmethod
-    def _tables(watched: Watched) -> list[cloudwatch.GraphWidget]:
-        def each(name: str, what: str) -> list[cloudwatch.IMetric]:
-            return [metrics.table(name, table, label=f"{t} {what}") for t, table in watched.tables.items()]
-
-        return [
-            _graph(
-                "Tables: capacity units",
-                [*each("ConsumedWriteCapacityUnits", "written"), *each("ConsumedReadCapacityUnits", "read")],
-            ),
-            _graph(
-                "Tables: throttled",
-                [*each("WriteThrottleEvents", "writes"), *each("ReadThrottleEvents", "reads")],
-            ),
-        ]
+    def _tables(watched: Watched) -> cloudwatch.GraphWidget:
+        units = {"ConsumedWriteCapacityUnits": "written", "ConsumedReadCapacityUnits": "read"}
+        return _graph(
+            "Tables: capacity units",
+            [
+                metrics.table(name, watched.tables[table], label=f"{table} {what}")
+                for name, what in units.items()
+                for table in _TABLES_OF_SAMPLES
+            ],
+        )
 
     @staticmethod
     def _functions(watched: Watched) -> list[cloudwatch.GraphWidget]:
-        def each(title: str, name: str) -> cloudwatch.GraphWidget:
-            lines = [metrics.function(name, of, label=label) for label, of in watched.functions.items()]
-            return _graph(title, lines)
-
+        running = "ConcurrentExecutions"
         return [
-            each("Functions: duration p95, ms", "Duration"),
-            each("Functions: concurrency", "ConcurrentExecutions"),
-            each("Functions: errors", "Errors"),
-            each("Functions: throttles", "Throttles"),
+            _graph(
+                "Functions: duration p95, ms",
+                [metrics.function("Duration", of, label=label) for label, of in watched.functions.items()],
+            ),
+            _graph(
+                "Functions: concurrency",
+                [
+                    metrics.all_functions(running, label="all of the account"),
+                    *(
+                        metrics.function(running, watched.functions[name], label=name)
+                        for name in _FUNCTIONS_OF_SAMPLES
+                    ),
+                ],
+            ),
+            _graph(
+                "Functions: errors and throttles, all of the account",
+                [metrics.all_functions("Errors"), metrics.all_functions("Throttles")],
+            ),
         ]
 
-    @staticmethod
-    def _streams_and_queues(watched: Watched) -> list[cloudwatch.GraphWidget]:
+    def _streams_and_queues(self, watched: Watched) -> list[cloudwatch.GraphWidget]:
         return [
             _graph(
                 "Streams: iterator age, ms",
@@ -122,24 +125,16 @@ class Dashboards(Construct):
             _graph(
                 "Quarantine: messages waiting",
                 [metrics.waiting(queue, label=label) for label, queue in watched.queues.items()],
+                right=self._ours("quarantine", "Quarantined"),
             ),
         ]
 
-    def _live(self) -> list[cloudwatch.GraphWidget]:
-        return [
-            _graph(
-                "PubNub: live samples published",
-                self._ours("live", "LivePublished"),
-                right=self._ours("live", "PubNubFailed", "LiveStale", "LiveRefused", "LiveCutOff"),
-            )
-        ]
-
-    def _rest(self) -> list[cloudwatch.GraphWidget]:
-        return [
-            _graph(f"Function {function}", self._ours(function, *names))
-            for function, names in METRICS.items()
-            if function not in (*_OF_ROBOTS, "live")
-        ]
+    def _live(self) -> cloudwatch.GraphWidget:
+        return _graph(
+            "PubNub: live samples published",
+            self._ours("live", "LivePublished"),
+            right=self._ours("live", "PubNubFailed", "LiveStale", "LiveRefused", "LiveCutOff"),
+        )
 
     # --- robots ------------------------------------------------------------------------------------
 
@@ -173,8 +168,20 @@ class Dashboards(Construct):
             _graph(
                 "Samples with a fault code, and alerts sent",
                 self._ours("health", "FaultSamples"),
-                right=self._ours("alert", "AlertsSent"),
+                right=self._ours("alert", *METRICS["alert"]),
             ),
+        ]
+
+    def _asked(self) -> list[cloudwatch.GraphWidget]:
+        """What robots ask of the cloud: who comes and goes, files, and round trips through a function."""
+        return [
+            _graph("Robots: who comes and goes", self._ours("presence", *METRICS["presence"])),
+            _graph(
+                "Robots: admitted and refused, and pongs sent",
+                self._ours("admit", *METRICS["admit"]),
+                right=self._ours("echo", *METRICS["echo"]),
+            ),
+            _graph("Robots: files", self._ours("upload", *METRICS["upload"])),
         ]
 
     def _one_by_one(self) -> list[cloudwatch.GraphWidget]:

@@ -17,6 +17,7 @@ from contract import METRIC_DEPLOYMENT, METRIC_FUNCTION, METRIC_NAMESPACE, METRI
 PERIOD = Duration.minutes(1)
 # Of the worst car, where the mean of all would hide it.
 _STATISTICS = {"BatteryVolts": "Minimum", "TemperatureDegC": "Maximum", "BacklogBatches": "Maximum"}
+_FUNCTION_STATISTICS = {"Duration": "p95", "ConcurrentExecutions": "Maximum", "IteratorAge": "Maximum"}
 
 
 def ours(function: str, name: str, *, namespace: str, label: str | None = None) -> cloudwatch.Metric:
@@ -38,7 +39,12 @@ def each_robot(function: str, name: str, *, namespace: str) -> cloudwatch.MathEx
         raise KeyError(name)
     schema = f"{METRIC_NAMESPACE},{METRIC_DEPLOYMENT},{METRIC_FUNCTION},{METRIC_ROBOT}"
     wanted = f'MetricName="{name}" {METRIC_DEPLOYMENT}="{namespace}" {METRIC_FUNCTION}="{function}"'
-    return _search(schema, wanted, statistic(name), label="")
+    return cloudwatch.MathExpression(
+        expression=f"SEARCH('{{{schema}}} {wanted}', '{statistic(name)}', {PERIOD.to_seconds():.0f})",
+        using_metrics={},
+        period=PERIOD,
+        label="",
+    )
 
 
 def statistic(name: str) -> str:
@@ -51,15 +57,6 @@ def rule(name: str, rule_name: str, *, label: str) -> cloudwatch.Metric:
     return _metric("AWS/IoT", name, label=label, dimensions={"RuleName": rule_name})
 
 
-def rule_actions(name: str, rule_name: str, *, label: str) -> cloudwatch.MathExpression:
-    """A metric of a rule's actions, all together. The values of their dimension ActionType are documented
-    nowhere, so that none is named here."""
-    expression = _search("AWS/IoT,ActionType,RuleName", f'MetricName="{name}" RuleName="{rule_name}"', "Sum")
-    return cloudwatch.MathExpression(
-        expression=f"SUM({expression.expression})", using_metrics={}, period=PERIOD, label=label
-    )
-
-
 def broker(name: str) -> cloudwatch.Metric:
     """A metric of the account's message broker."""
     return _metric("AWS/IoT", name, dimensions={"Protocol": "MQTT"})
@@ -67,10 +64,16 @@ def broker(name: str) -> cloudwatch.Metric:
 
 def function(name: str, of: lambda_.IFunction, *, label: str | None = None) -> cloudwatch.Metric:
     """A metric of a Lambda function."""
-    how = {"Duration": "p95", "ConcurrentExecutions": "Maximum", "IteratorAge": "Maximum"}.get(name, "Sum")
+    how = _FUNCTION_STATISTICS.get(name, "Sum")
     return _metric(
         "AWS/Lambda", name, label=label, statistic=how, dimensions={"FunctionName": of.function_name}
     )
+
+
+def all_functions(name: str, *, label: str | None = None) -> cloudwatch.Metric:
+    """A metric of all Lambda functions of the account, which has no dimensions."""
+    how = _FUNCTION_STATISTICS.get(name, "Sum")
+    return _metric("AWS/Lambda", name, label=label, statistic=how, dimensions={})
 
 
 def table(name: str, of: dynamodb.ITable, *, label: str | None = None) -> cloudwatch.Metric:
@@ -112,17 +115,6 @@ def _metric(
         metric_name=name,
         dimensions_map=dimensions,
         statistic=statistic,
-        period=PERIOD,
-        label=label,
-    )
-
-
-def _search(
-    schema: str, wanted: str, statistic: str, *, label: str | None = None
-) -> cloudwatch.MathExpression:
-    return cloudwatch.MathExpression(
-        expression=f"SEARCH('{{{schema}}} {wanted}', '{statistic}', {PERIOD.to_seconds():.0f})",
-        using_metrics={},
         period=PERIOD,
         label=label,
     )

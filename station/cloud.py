@@ -95,19 +95,33 @@ class Cloud:
         return self
 
     @cached_property
-    def _clients(self) -> dict[str, Any]:
+    def _clients(self) -> dict[tuple[str, str | None], Any]:
         return {}
 
-    def client(self, service: str) -> Any:
-        """A boto3 client, made once; raises `StationError` where region or credentials are missing."""
-        if service not in self._clients:
+    def client(self, service: str, region: str | None = None) -> Any:
+        """A boto3 client, made once; of another ``region`` for a service that is in few.
+
+        Raises `StationError` where region or credentials are missing.
+        """
+        key = service, region
+        if key not in self._clients:
             try:
-                self._clients[service] = self._session.client(
-                    service, endpoint_url=self.endpoint_url, verify=self.ca_bundle, config=_CONFIG
+                self._clients[key] = self._session.client(
+                    service,
+                    region_name=region,
+                    endpoint_url=self.endpoint_url,
+                    verify=self.ca_bundle,
+                    config=_CONFIG,
                 )
             except BotoCoreError as error:
                 raise StationError(f"no AWS client for {service}: {error}") from error
-        return self._clients[service]
+        return self._clients[key]
+
+    @property
+    def region_name(self) -> str | None:
+        """The region by AWS' usual chain."""
+        found = self._session.region_name
+        return None if found is None else str(found)
 
     @cached_property
     def mqtt_endpoint(self) -> str:

@@ -11,7 +11,7 @@ import time
 from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
 from datetime import datetime, timezone
-from typing import Any
+from typing import Any, NamedTuple
 
 from botocore.exceptions import ClientError
 
@@ -21,6 +21,8 @@ from station.errors import StationError
 _PERIOD_S = 300
 # GetMetricData's own limit of queries a call.
 _MAX_QUERIES = 500
+# A metric is named by its namespace and its name at least.
+_LEAST_PARTS = 2
 # And DescribeAlarms' of names.
 _MAX_NAMES = 100
 
@@ -86,6 +88,21 @@ def metrics(rows: Sequence[Sequence[Any]]) -> Iterator[tuple[list[str], dict[str
         if parts:
             before = parts
         yield parts, options
+
+
+class Counted(NamedTuple):
+    """What dashboards are billed by: metrics that are named, and searches, which each find any number."""
+
+    metrics: int
+    searches: int
+
+
+def count(widgets: Sequence[Mapping[str, Any]]) -> Counted:
+    """How many metrics a dashboard's widgets show, each as often as it is shown."""
+    rows = [row for widget in widgets for row in widget.get("properties", {}).get("metrics", [])]
+    named = sum(len(parts) >= _LEAST_PARTS for parts, _ in metrics(rows))
+    searches = sum("SEARCH(" in str(options.get("expression", "")) for _, options in metrics(rows))
+    return Counted(named, searches)
 
 
 def _widget(client: Any, widget: Mapping[str, Any], from_s: int, to_s: int) -> dict[str, Any]:
@@ -176,7 +193,7 @@ def _queries(
                 "Expression": str(options["expression"]),
                 "Period": int(options.get("period", period_s)),
             }
-        elif len(parts) >= 2:
+        elif len(parts) >= _LEAST_PARTS:
             names = iter(parts[2:])
             dimensions = [{"Name": name, "Value": value} for name, value in zip(names, names, strict=False)]
             metric = {"Namespace": parts[0], "MetricName": parts[1], "Dimensions": dimensions}

@@ -2,12 +2,18 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from typing import NamedTuple
 
-from station import cost
+from station import cost, cost_items
 from station.at_rest import deployment_dollars_per_month
+from station.price_list import PRODUCTS, Listed
+from station.prices import AS_OF, PRICES, REGION, Price
 from station.scale import Scale
 from station.usage import Usage, variations
+
+# A line of the robot-hour's table begins here, as its numbers do; what is below is in the totals alone.
+_LEAST_DOLLARS = 0.00005
 
 
 class Rows(NamedTuple):
@@ -22,10 +28,10 @@ class Rows(NamedTuple):
         return "\n".join(f"| {' | '.join(line)} |" for line in lines)
 
 
-def robot_hour(usage: Usage) -> Rows:
+def robot_hour(usage: Usage, prices: Mapping[str, Price] = PRICES) -> Rows:
     """Dollars a robot-hour by service and lane, thesis' layout beside ours, PubNub apart."""
-    ours, thesis = cost.bill(usage), cost.thesis_bill(usage)
-    pubnub = cost.pubnub_bill(usage), cost.pubnub_bill(usage, thesis=True)
+    ours, thesis = cost.bill(usage, prices), cost.thesis_bill(usage, prices)
+    pubnub = cost.pubnub_bill(usage, prices), cost.pubnub_bill(usage, prices, thesis=True)
     body: list[tuple[str, ...]] = []
     services = sorted({item.service for item in [*ours, *thesis]})
     for service in services:
@@ -34,27 +40,31 @@ def robot_hour(usage: Usage) -> Rows:
             if item.service == service and item.lane not in lanes:
                 lanes.append(item.lane)
         body.extend(
-            (f"{service}, {lane}", _sum(thesis, service, lane), _sum(ours, service, lane), "")
+            (f"{service}, {lane}", *(_shown(items, service, lane) for items in (thesis, ours)), "")
             for lane in lanes
+            if max(_sum(thesis, service, lane), _sum(ours, service, lane)) >= _LEAST_DOLLARS
         )
-    whole = cost.total(thesis), cost.total(ours)
+    whole = cost_items.total(thesis), cost_items.total(ours)
     body.append(("total AWS", _dollars(whole[0]), _dollars(whole[1]), f"1/{whole[0] / whole[1]:.1f}"))
     unlogged = [sum(i.dollars for i in items if i.price != "logs") for items in (thesis, ours)]
     body.append(("of it without log lines", *map(_dollars, unlogged), _ratio((unlogged[0], unlogged[1]))))
-    both = cost.total(pubnub[1]), cost.total(pubnub[0])
+    both = cost_items.total(pubnub[1]), cost_items.total(pubnub[0])
     body.append(("PubNub, plan by transactions", _dollars(both[0]), _dollars(both[1]), _ratio(both)))
     return Rows(("dollars a robot-hour", "a message a sample", "iort", "ratio"), body)
 
 
-def month(usage: Usage) -> Rows:
+def month(usage: Usage, prices: Mapping[str, Price] = PRICES) -> Rows:
     """Dollars a month for the fleet, and what a deployment costs whoever drives."""
-    aws = cost.dollars_per_month(cost.bill(usage), usage)
-    thesis = cost.dollars_per_month(cost.thesis_bill(usage), usage)
-    transactions = cost.dollars_per_month(cost.pubnub_bill(usage), usage)
+    aws = cost_items.dollars_per_month(cost.bill(usage, prices), usage)
+    thesis = cost_items.dollars_per_month(cost.thesis_bill(usage, prices), usage)
+    transactions = cost_items.dollars_per_month(cost.pubnub_bill(usage, prices), usage)
     users = cost.pubnub_mau_dollars_per_month(usage)
     body: list[tuple[str, ...]] = [
         ("AWS, the driving", f"{aws:,.2f}"),
-        *((f"AWS, {name}", f"{dollars:,.2f}") for name, dollars in _deployment(usage)),
+        *(
+            (f"AWS, {name}", f"{dollars:,.2f}")
+            for name, dollars in deployment_dollars_per_month(usage, prices).items()
+        ),
         ("AWS, the same driving a message a sample", f"{thesis:,.2f}"),
         ("PubNub, plan by transactions", f"{transactions:,.2f}"),
         ("PubNub, plan by monthly active users", "ask PubNub" if users is None else f"{users:,.2f}"),
@@ -62,12 +72,24 @@ def month(usage: Usage) -> Rows:
     return Rows((f"dollars a month, {usage.robots:,} robot{'s' * (usage.robots != 1)}", ""), body)
 
 
-def what_if(usage: Usage) -> Rows:
+def differences(listed: Listed) -> Rows:
+    """What AWS' price list says otherwise than the built-in prices."""
+    body: list[tuple[str, ...]] = [
+        (f"{name}: {PRICES[name].per:,.0f} x {PRICES[name].unit}", f"{ours:g}", f"{aws:g}")
+        for name, (ours, aws) in listed.changed().items()
+    ]
+    same = len(listed.each) - len(body)
+    body.append((f"as built in: {same} of {len(PRODUCTS)}", "", ""))
+    return Rows(("dollars", f"{AS_OF}, {REGION}", f"{listed.read_on}, {listed.region}"), body)
+
+
+def what_if(usage: Usage, prices: Mapping[str, Price] = PRICES) -> Rows:
     """One setting changed at a time: dollars a robot-hour, and the share of the thesis' layout."""
     body: list[tuple[str, ...]] = []
     for name, other in variations(usage):
-        ours, thesis = cost.total(cost.bill(other)), cost.total(cost.thesis_bill(other))
-        pubnub = cost.total(cost.pubnub_bill(other))
+        ours, thesis, pubnub = (
+            cost_items.total(made(other, prices)) for made in (cost.bill, cost.thesis_bill, cost.pubnub_bill)
+        )
         body.append((name, _dollars(ours), f"1/{thesis / ours:.1f}", _dollars(pubnub)))
     return Rows(("dollars a robot-hour", "AWS", "of a message a sample", "PubNub by transactions"), body)
 
@@ -121,13 +143,13 @@ def _first(scale: Scale) -> str:
     return scale.breaks_first.name if scale.breaks_first.times > 1 else "none"
 
 
-def _deployment(usage: Usage) -> list[tuple[str, float]]:
-    return list(deployment_dollars_per_month(usage).items())
+def _sum(items: list[cost_items.Item], service: str, lane: str) -> float:
+    return sum(item.dollars for item in items if (item.service, item.lane) == (service, lane))
 
 
-def _sum(items: list[cost.Item], service: str, lane: str) -> str:
-    found = [item.dollars for item in items if (item.service, item.lane) == (service, lane)]
-    return _dollars(sum(found)) if found else ""
+def _shown(items: list[cost_items.Item], service: str, lane: str) -> str:
+    dollars = _sum(items, service, lane)
+    return _dollars(dollars) if dollars >= _LEAST_DOLLARS else ""
 
 
 def _dollars(dollars: float) -> str:

@@ -2,7 +2,7 @@
 
 They are public list prices in US dollars for `REGION`, without tax, free tier, volume tiers or
 anybody's discount, copied by hand from the pages named below. A bill is made from AWS' page, not from
-this one: look there before a decision hangs on it.
+this one: `iort cost --refresh` reads AWS' own list (station/price_list.py).
 """
 
 from __future__ import annotations
@@ -53,6 +53,7 @@ PRICES = {
     "message": Price(1.00, 1e6, "message of up to 5 KB", _IOT, _IRELAND_EXAMPLE),
     "rule": Price(0.15, 1e6, "rule triggered, up to 5 KB", _IOT),
     "action": Price(0.15, 1e6, "action executed, up to 5 KB", _IOT),
+    "shadow": Price(1.25, 1e6, "shadow operation, up to 1 KB", _IOT),
     "audit": Price(1.10, 1000, "robot a month", _DEFENDER, "the page's example, as read 2026-09-20"),
     # us-east-1: 0.625 and 0.125 since November 2024 (airbyte.com, 2025-07-21), the same ratio as of storage.
     "write": Price(0.705, 1e6, "write request unit, up to 1 KB", _DYNAMODB),
@@ -64,7 +65,9 @@ PRICES = {
     "compute_x86": Price(0.0000166667, 1, "GB-second, x86", _LAMBDA, _ARTILLERY),
     "logs": Price(0.57, 1, "GB of log lines", _CLOUDWATCH),
     "metric": Price(0.30, 1, "metric a month", _CLOUDWATCH, "signoz.io, 2026-02-15"),
+    "metric_request": Price(0.01, 1000, "metric asked for by GetMetricData", _CLOUDWATCH),
     "alarm": Price(0.10, 1, "alarm a month", _CLOUDWATCH),
+    "insights_alarm": Price(0.10, 1, "metric a month that a Metrics Insights alarm analyses", _CLOUDWATCH),
     "dashboard": Price(3.00, 1, "dashboard a month", _CLOUDWATCH, "factualminds.com, 2026-06-13"),
     "queue_request": Price(0.40, 1e6, "request", _SQS),
     "key": Price(1.00, 1, "key a month", _KMS, _KMS_COPY),
@@ -102,13 +105,18 @@ _SCALING = "docs.aws.amazon.com/lambda/latest/dg/services-sqs-scaling.html, unda
 
 QUOTAS = {
     "IoT Core: connections": Quota(500_000, "connections", True, _IOT_QUOTAS, _RAINMAKER),
-    "IoT Core: connects in a minute after an outage": Quota(3_000 * 60, "connects", True, _IOT_QUOTAS),
+    # The lower of two: AWS' pages of 2019 to 2023 say 500 a second, later ones 3,000 in most regions. Service
+    # Quotas tells an account's own.
+    "IoT Core: connects in a minute after an outage": Quota(
+        500 * 60, "connects", True, _IOT_QUOTAS, "the page in two copies, undated: 500 and 3,000 a second"
+    ),
     "IoT Core: subscriptions": Quota(500_000, "subscriptions", True, _IOT_QUOTAS),
     "IoT Core: publishes in": Quota(20_000, "1/s", True, _IOT_QUOTAS),
     "IoT Core: rule evaluations": Quota(20_000, "1/s", True, _IOT_QUOTAS),
     "IoT Core: publishes of one connection": Quota(
         100, "1/s", False, _IOT_QUOTAS, "repost.aws, question QUshJCmEV8SOSkAJ00SWfQ4Q, undated copy"
     ),
+    "IoT Core: connects of one client id": Quota(1, "1/s", False, _IOT_QUOTAS, _PAGE),
     "DynamoDB: writes to table telemetry": Quota(40_000, "units/s", True, _DYNAMODB_QUOTAS, _PAGE),
     "DynamoDB: writes to table summary": Quota(40_000, "units/s", True, _DYNAMODB_QUOTAS, _PAGE),
     "DynamoDB: writes to one partition": Quota(1_000, "units/s", False, _PARTITIONS),

@@ -2,16 +2,16 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import replace
 from typing import NamedTuple
 
-from station.cost import bill, dollars_per_month, pubnub_bill, total
-from station.prices import QUOTAS, Quota
+from device.reconnect import SHORTEST_S
+from station.cost import SUBSCRIPTIONS, bill, pubnub_bill
+from station.cost_items import dollars_per_month, total
+from station.prices import PRICES, QUOTAS, Price, Quota
 from station.sizes import measure
 from station.usage import Usage
-
-# A robot listens to its shadow's four answers, the pong that sets its clock, and its commands.
-_SUBSCRIPTIONS = 6
 
 
 class Need(NamedTuple):
@@ -43,7 +43,7 @@ class Scale(NamedTuple):
         return self.needs[0]
 
 
-def on_paper(usage: Usage) -> Scale:
+def on_paper(usage: Usage, prices: Mapping[str, Price] = PRICES) -> Scale:
     """What the fleet needs, all robots driving at once."""
     one = _per_robot(usage)
     quotas = dict(QUOTAS)
@@ -63,8 +63,8 @@ def on_paper(usage: Usage) -> Scale:
     return Scale(
         usage.robots,
         needs,
-        dollars_per_month(bill(usage), usage),
-        total(pubnub_bill(usage)) * usage.robot_hours_per_month,
+        dollars_per_month(bill(usage, prices), usage),
+        total(pubnub_bill(usage, prices)) * usage.robot_hours_per_month,
         usage.live_hz * usage.robots,
     )
 
@@ -76,7 +76,13 @@ def fleets(usage: Usage, sizes: tuple[int, ...] = (1, 100, 10_000, 1_000_000)) -
 
 _RESERVED = "Lambda 1: concurrency reserved by this deployment"
 # What does not grow with the fleet: each robot has a connection and partition keys of its own.
-_ONE_ROBOTS = frozenset({"IoT Core: publishes of one connection", "DynamoDB: writes to one partition"})
+_ONE_ROBOTS = frozenset(
+    {
+        "IoT Core: publishes of one connection",
+        "IoT Core: connects of one client id",
+        "DynamoDB: writes to one partition",
+    }
+)
 
 
 def _per_robot(usage: Usage) -> dict[str, float]:
@@ -93,7 +99,8 @@ def _per_robot(usage: Usage) -> dict[str, float]:
         _RESERVED: usage.live_hz * usage.live_ms / 1000,
         "IoT Core: connections": 1,
         "IoT Core: connects in a minute after an outage": 1,
-        "IoT Core: subscriptions": _SUBSCRIPTIONS,
+        "IoT Core: connects of one client id": 1 / SHORTEST_S,
+        "IoT Core: subscriptions": SUBSCRIPTIONS,
         # Basic Ingest is counted in: it passes the same gateway.
         "IoT Core: publishes in": publishes,
         "IoT Core: rule evaluations": batches + live_rules + 2 * usage.ping_hz + usage.clock_pings_per_s,

@@ -22,7 +22,10 @@ class Usage:
     of them and ``ping_hz`` the pings a path, a second and robot; a batch spans ``batch_s``;
     ``agent_every_s`` between the agent's own figures; robots drive ``hours_per_day``; each of ``viewers``
     watches the whole fleet all that time; items are kept ``retention_days``, ``recoverable`` to a point in
-    time in stage prod.
+    time in stage prod. A robot connects ``connects_per_hour`` and is sent ``command_hz`` commands a second.
+    ``alarms`` watch a metric each; those by Metrics Insights analyse up to ``insights_metrics`` together.
+    ``dashboards`` are the metrics on each; ``robot_metrics``, a deployment's parameter, adds to the last.
+    Somebody has them open on the live page ``dashboard_hours`` a month.
     ``function_logs`` is the deployment's parameter: "all" adds Lambda's own lines about every invocation.
     What only AWS can say, the billed milliseconds of an invocation, and of each batch that Lambda 2 finds
     in one, are assumptions and named so.
@@ -35,6 +38,8 @@ class Usage:
     batch_s: float = 1.0
     ping_hz: float = 0.0
     agent_every_s: float = 10.0
+    connects_per_hour: float = 1.0
+    command_hz: float = 0.0
     hours_per_day: float = 2.0
     viewers: int = 1
     retention_days: int = 90
@@ -45,8 +50,11 @@ class Usage:
     summarize_ms: float = 20.0
     summarize_batch_ms: float = 5.0
     function_logs: str = "own"
-    alarms: int = 28
-    dashboards: int = 2
+    alarms: int = 24
+    insights_metrics: int = 46
+    dashboards: tuple[int, ...] = (43, 29)
+    dashboard_hours: float = 20.0
+    robot_metrics: bool = False
     recoverable: bool = False
     customer_key: bool = False
     device_defender: bool = False
@@ -54,7 +62,7 @@ class Usage:
     def check(self) -> Usage:
         """Itself; raises `StationError` for what no fleet can do."""
         for name, value in vars(self).items():
-            if not isinstance(value, str) and value < 0:
+            if isinstance(value, (int, float)) and value < 0:
                 raise StationError(f"{name} {value}: allowed is 0 or more")
         if self.robots < 1:
             raise StationError(f"robots {self.robots}: allowed is 1 or more")
@@ -117,6 +125,8 @@ def variations(usage: Usage) -> Iterator[tuple[str, Usage]]:
         name = f"batches of {batch_s:g} s" if batch_s else "one sample a batch"
         yield name, replace(usage, batch_s=batch_s)
     yield "round trips measured at 1 Hz", replace(usage, ping_hz=1.0)
+    yield "commands at 10 Hz", replace(usage, command_hz=10.0)
+    yield "connecting anew every minute", replace(usage, connects_per_hour=60.0)
     yield "with Lambda's own log lines", replace(usage, function_logs="all")
     yield "kept for 30 days", replace(usage, retention_days=30)
     yield "tables recoverable to a point in time (`prod`)", replace(usage, recoverable=True)

@@ -4,9 +4,11 @@ from __future__ import annotations
 
 import os
 import socket
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from urllib.parse import urlsplit
+
+from botocore.exceptions import BotoCoreError
 
 from station.cloud import Cloud
 from station.errors import StationError
@@ -47,6 +49,20 @@ class Where:
             raise StationError(
                 f"{error}. No embedded cloud runs here either; `make demo` starts one"
             ) from error
+
+    def account(self, *, region: str) -> Cloud:
+        """An AWS account, whatever runs here; in the ``region`` where nothing says another.
+
+        Raises `StationError` where the embedded cloud is asked for, or credentials are missing.
+        """
+        if self.local:
+            raise StationError("only AWS has this, and --local means the embedded cloud")
+        cloud = Cloud(namespace=self.namespace, profile=self.profile, region=self.region)
+        try:
+            named = cloud.region_name
+        except BotoCoreError as error:
+            raise StationError(f"AWS: {error}") from error
+        return replace(cloud, region=named or region).check()
 
 
 def _alive(cloud: Cloud, path: Path) -> Cloud:

@@ -142,6 +142,7 @@ def production(tmp_path_factory: pytest.TempPathFactory) -> Synthesized:
         tags={"team": "lab"},
         device_defender=True,
         iot_log_level="error",
+        robot_metrics=True,
     )
 
 

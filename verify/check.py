@@ -8,14 +8,12 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import Any
 
-from botocore.exceptions import BotoCoreError, ClientError
-
-from bench.errors import BenchError
 from bench.target import EMBEDDED, Target
-from station.errors import StationError
 from verify.assumption import Assumption
-from verify.errors import CannotAskError, VerifyError
+from verify.errors import CannotAskError
 
+# What a question tells beside the answer, such as a version: in the report, and not compared.
+NOTE = "note_"
 # The deployment as it is made first, and after it was changed to a key of the account's own.
 FIRST, WITH_KEY = "first deployment", "with customer_key"
 
@@ -34,9 +32,9 @@ class Check(Assumption):
     """An assumption, and how to ask a deployment for it.
 
     ``expected`` says the assumption in values of JSON. ``ask`` returns what was seen, in the form of
-    ``expected``, without secrets and without names or times that change from run to run. It cleans up what
-    it makes, and raises `CannotAskError` where it cannot ask. ``not_embedded`` says why the embedded cloud
-    cannot be asked; "" where it can.
+    ``expected``, without secrets and without names or times that change from run to run; keys that begin with
+    `NOTE` are not compared. It cleans up what it makes, and raises `CannotAskError` where it cannot ask.
+    ``not_embedded`` says why the embedded cloud cannot be asked; "" where it can.
     """
 
     expected: Mapping[str, Any]
@@ -70,9 +68,14 @@ def ask(
         seen = json.loads(json.dumps(check.ask(target)))
     except CannotAskError as error:
         return Answer(check=check, verdict=Verdict.NOT_ASKED, reason=str(error), took_s=clock() - began)
-    except (VerifyError, StationError, BenchError, BotoCoreError, ClientError, OSError) as error:
+    except Exception as error:  # noqa: BLE001 - an answer of another form is one too, and the next are asked
         reason = f"{type(error).__name__}: {error}"
         return Answer(check=check, verdict=Verdict.FAILED, reason=reason, took_s=clock() - began)
-    same = seen == (check.expected if expected is None else expected)
+    same = compared(seen) == compared(check.expected if expected is None else expected)
     verdict = Verdict.AS_ASSUMED if same else Verdict.DIFFERS
     return Answer(check=check, verdict=verdict, seen=seen, took_s=clock() - began)
+
+
+def compared(answer: Mapping[str, Any]) -> dict[str, Any]:
+    """An answer without its notes."""
+    return {name: value for name, value in answer.items() if not name.startswith(NOTE)}

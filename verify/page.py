@@ -7,7 +7,7 @@ from collections.abc import Iterator, Sequence
 from local.deployment import ROOT
 from verify import measured
 from verify.assumption import Assumption, Basis
-from verify.check import Check
+from verify.check import Check, compared
 from verify.checks import ALL
 from verify.measured import Measured
 from verify.unasked import UNASKED
@@ -67,7 +67,8 @@ def _table(assumptions: Sequence[Assumption], known: Measured) -> Iterator[str]:
 
 def _basis(one: Assumption, known: Measured) -> str:
     if one.name in known.seen:
-        seen = "as assumed" if isinstance(one, Check) and known.seen[one.name] == one.expected else "differs"
+        same = isinstance(one, Check) and compared(known.seen[one.name]) == one.expected
+        seen = "as assumed" if same else "differs"
         return f"measured ({seen})"
     if one.basis is Basis.DOCUMENTED:
         return f"documented: {one.source}"

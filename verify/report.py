@@ -10,7 +10,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from verify.check import Answer, Verdict
+from verify.check import NOTE, Answer, Verdict, compared
 
 # An account's number, an access key's id, PubNub's keys, a private key, a session's token.
 _SECRETS = (
@@ -88,7 +88,7 @@ def as_markdown(run: Run, answers: Sequence[Answer]) -> str:
     lines += [f"- left over: {name}" for name in run.leftovers]
     lines += ["", "| question | verdict | took | note |", "|---|---|---|---|"]
     for one in answers:
-        row = (one.check.name, one.verdict.value, f"{one.took_s:.1f} s", _cell(one.reason))
+        row = (one.check.name, one.verdict.value, f"{one.took_s:.1f} s", _cell(one.reason or _notes(one)))
         lines.append(f"| {' | '.join(row)} |")
     for one in answers:
         if one.verdict is Verdict.DIFFERS:
@@ -100,7 +100,7 @@ def as_markdown(run: Run, answers: Sequence[Answer]) -> str:
 
 def differences(answer: Answer) -> list[tuple[str, str, str]]:
     """Each key of an answer that is not as expected: its name, the expected and the seen value."""
-    expected, seen = answer.check.expected, answer.seen or {}
+    expected, seen = answer.check.expected, compared(answer.seen or {})
     keys = [*expected, *(key for key in seen if key not in expected)]
     rows = [(key, json.dumps(expected.get(key)), json.dumps(seen.get(key))) for key in keys]
     return [(key, _cell(want), _cell(got)) for key, want, got in rows if want != got]
@@ -110,6 +110,13 @@ def summary(answers: Sequence[Answer]) -> str:
     """``12 as assumed, 1 differs``."""
     counted = Counter(answer.verdict for answer in answers)
     return ", ".join(f"{counted[verdict]} {verdict.value}" for verdict in Verdict if counted[verdict])
+
+
+def _notes(answer: Answer) -> str:
+    seen = answer.seen or {}
+    return ", ".join(
+        f"{name.removeprefix(NOTE)} {json.dumps(seen[name])}" for name in seen if name.startswith(NOTE)
+    )
 
 
 def _cell(text: str) -> str:

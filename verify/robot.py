@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import queue
 import threading
+import time
+from concurrent.futures import Future
 from pathlib import Path
 from typing import Any
 
@@ -14,8 +16,11 @@ from typing_extensions import Self
 
 from contract import LIVE, LiveSample, encode_live
 from verify.errors import VerifyError
+from verify.waiting import until
 
 WAIT_S = 60.0
+# AWS takes one CONNECT a second of a client id ("Connect requests per second per client ID").
+CONNECT_AGAIN_S = 1.2
 # A live message that Lambda 1 drops: what it refuses is kept, and costs the robot its allowance.
 STALE = encode_live(LiveSample("0" * 8, 0, 0, 0, {}, offset_us=0))
 
@@ -26,14 +31,20 @@ def payload_for(topic: str) -> bytes:
 
 
 class Robot:
-    """Connects as `name`, or as another client id, with the bundle of a registered robot."""
+    """Connects as `name`, or as another client id, with the bundle of a registered robot.
 
-    def __init__(self, folder: Path, *, client_id: str | None = None) -> None:
+    ``paced``, the library keeps to AWS' quotas of a connection. `reason` is the name of the reason code with
+    which the broker refused or ended the connection; "" where it gave none.
+    """
+
+    def __init__(self, folder: Path, *, client_id: str | None = None, paced: bool = True) -> None:
         config: dict[str, Any] = yaml.safe_load((folder / "car.yaml").read_text())
         self.name = config["robot"]
         self.messages: queue.Queue[tuple[str, bytes]] = queue.Queue()
         self.connected, self.refused, self.lost = threading.Event(), threading.Event(), threading.Event()
+        self.reason = ""
         self._stopped = threading.Event()
+        flow = mqtt5.ExtendedValidationAndFlowControlOptions
         self._client = mqtt5_client_builder.mtls_from_path(
             str(folder / "certificate.pem"),
             str(folder / "private.key"),
@@ -45,12 +56,13 @@ class Robot:
             ack_timeout_sec=60,
             min_reconnect_delay_ms=60_000,
             max_reconnect_delay_ms=60_000,
+            extended_validation_and_flow_control_options=(flow.AWS_IOT_CORE_DEFAULTS if paced else flow.NONE),
             on_publish_received=lambda data: self.messages.put(
                 (data.publish_packet.topic, data.publish_packet.payload)
             ),
             on_lifecycle_connection_success=lambda _data: self.connected.set(),
-            on_lifecycle_connection_failure=lambda _data: self.refused.set(),
-            on_lifecycle_disconnection=lambda _data: self.lost.set(),
+            on_lifecycle_connection_failure=lambda data: self._ended(data.connack_packet, self.refused),
+            on_lifecycle_disconnection=lambda data: self._ended(data.disconnect_packet, self.lost),
             on_lifecycle_stopped=lambda _data: self._stopped.set(),
         )
 
@@ -70,17 +82,68 @@ class Robot:
         return self
 
     def publish(self, topic: str, payload: bytes) -> str:
-        """Publish at QoS 1; the name of the broker's reason code."""
-        packet = mqtt5.PublishPacket(topic=topic, payload=payload, qos=mqtt5.QoS.AT_LEAST_ONCE)
-        answer = self._client.publish(packet).result(WAIT_S)
+        """Publish at QoS 1; the name of the broker's reason code. Raises `VerifyError` where none comes."""
+        answer = self._answer(self.send(topic, payload))
         return str(answer.puback.reason_code.name)
 
+    def send(self, topic: str, payload: bytes) -> Future[Any]:
+        """Publish at QoS 1 without waiting; the library's future."""
+        packet = mqtt5.PublishPacket(topic=topic, payload=payload, qos=mqtt5.QoS.AT_LEAST_ONCE)
+        published: Future[Any] = self._client.publish(packet)
+        return published
+
+    def attempt(self, topic: str, payload: bytes) -> str:
+        """Publish at QoS 1; the name of the broker's reason code, "DISCONNECTED" where it ends the session,
+        "NOT_SENT" where the library does not take what the broker would refuse."""
+        sent = self.send(topic, payload)
+        until(lambda: sent.done() or self.lost.is_set(), f"an answer to a message on {topic}")
+        if sent.done() and not sent.exception():
+            return str(sent.result().puback.reason_code.name)
+        return "DISCONNECTED" if self.lost.is_set() else "NOT_SENT"
+
     def subscribe(self, topic_filter: str) -> str:
-        """Subscribe at QoS 1; the name of the broker's reason code."""
+        """Subscribe at QoS 1; the name of the broker's reason code. Raises `VerifyError` where none comes."""
         subscription = mqtt5.Subscription(topic_filter=topic_filter, qos=mqtt5.QoS.AT_LEAST_ONCE)
-        answer = self._client.subscribe(mqtt5.SubscribePacket(subscriptions=[subscription])).result(WAIT_S)
+        packet = mqtt5.SubscribePacket(subscriptions=[subscription])
+        answer = self._answer(self._client.subscribe(packet))
         return str(answer.reason_codes[0].name)
 
-    def next_message(self) -> tuple[str, bytes]:
-        """The next message that comes in."""
-        return self.messages.get(timeout=WAIT_S)
+    def next_message(self, within_s: float = WAIT_S) -> tuple[str, bytes]:
+        """The next message that comes in. Raises `VerifyError` where none comes in time."""
+        try:
+            return self.messages.get(timeout=within_s)
+        except queue.Empty:
+            raise VerifyError(f"{self.name}: no message within {within_s:g} s") from None
+
+    def _answer(self, asked: Future[Any]) -> Any:
+        try:
+            return asked.result(WAIT_S)
+        except Exception as error:  # AwsCrtError, CancelledError, TimeoutError and others
+            raise VerifyError(f"{self.name}: the broker did not answer: {error!r}") from error
+
+    def _ended(self, packet: Any, what: threading.Event) -> None:
+        if packet is not None:
+            self.reason = str(packet.reason_code.name)
+        what.set()
+
+
+def refusal(folder: Path, *, client_id: str | None = None) -> str | None:
+    """The name of the code with which a connection is refused, "" where there is none; None for one that
+    is accepted."""
+    with Robot(folder, client_id=client_id) as robot:
+        until(lambda: robot.connected.is_set() or robot.refused.is_set(), "the broker's answer to a CONNECT")
+        return None if robot.connected.is_set() else robot.reason
+
+
+def soon_refused(folder: Path) -> str | None:
+    """The same, where the broker may need some seconds until it knows."""
+
+    def refused() -> list[str]:
+        time.sleep(CONNECT_AGAIN_S)
+        code = refusal(folder)
+        return [] if code is None else [code]
+
+    try:
+        return until(refused, "a refusal of the certificate", within_s=50)[0]
+    except VerifyError:
+        return None

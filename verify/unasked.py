@@ -100,13 +100,6 @@ UNASKED = (
         f"{_IOT}/fleet-provision-api.html",
         "device/identity.py",
     ),
-    # A session's hour is longer than the run.
-    _documented(
-        "broker.persistent_session",
-        "A persistent session keeps subscriptions and QoS 1 messages for one hour without a connection.",
-        f"{_IOT}/mqtt.html#mqtt-persistent-sessions",
-        "device/iotcore.py",
-    ),
     _documented(
         "broker.presence_order",
         "Presence events may come late and in another order; versionNumber orders those of one client.",
@@ -152,6 +145,12 @@ UNASKED = (
         "A lifecycle rule deletes the parts of an upload that was never completed.",
         "https://docs.aws.amazon.com/AmazonS3/latest/userguide/mpu-abort-incomplete-mpu-lifecycle-config.html",
         "stacks/storage.py",
+    ),
+    _documented(
+        "iot.rule_roles",
+        "A rule's action runs as the role that the rule names; the emulator runs it without.",
+        f"{_IOT}/iot-create-role.html",
+        "stacks/ingest.py",
     ),
     # CloudFormation's console lines are not an interface.
     _assumed(

@@ -7,7 +7,7 @@ from dataclasses import asdict, replace
 from bench import plots
 from bench.result import Plot, Ratio, Section, Table
 from bench.target import Say, Target
-from station import cost, cost_tables, scale
+from station import cost, cost_items, cost_tables, scale
 from station.prices import AS_OF, REGION
 from station.usage import Usage
 
@@ -33,9 +33,9 @@ def run(target: Target, say: Say) -> Section:
         ("On paper: needs of AWS' default quotas", cost_tables.fleets(scale.fleets(usage))),
     ):
         section.tables.append(Table(title, list(rows.head), [list(row) for row in rows.body]))
-    thesis = cost.total(cost.thesis_bill(usage))
+    thesis = cost_items.total(cost.thesis_bill(usage))
     rates = (10.0, 5.0, 2.0, 1.0, 0.0)
-    ours = {rate: cost.total(cost.bill(replace(usage, live_hz=rate))) for rate in rates}
+    ours = {rate: cost_items.total(cost.bill(replace(usage, live_hz=rate))) for rate in rates}
     # The thesis pays for its live view with every sample; ours is given for both ends of the live rate.
     section.ratios += [
         Ratio(f"cost {what} / a message a sample", round(ours[rate] / thesis, 4), 0.05, tolerance=_COMPUTED)

@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import json
 import math
+import os
 from dataclasses import asdict, replace
+from datetime import datetime, timezone
 from pathlib import Path
 from statistics import mean
 from typing import Annotated, Any
@@ -14,13 +16,15 @@ from rich.table import Table
 
 from device.config import Config, load_config
 from device.errors import AgentError
-from station import cost, cost_tables, scale
+from station import cost, cost_items, cost_tables, scale
 from station.at_rest import deployment_dollars_per_month
-from station.cloud import Cloud
 from station.console import Console
+from station.deployed import as_deployed
 from station.errors import StationError
-from station.prices import AS_OF, REGION
+from station.price_list import API_REGION, Listed, keep, kept_at, load, read
+from station.prices import AS_OF, PRICES, REGION
 from station.usage import Usage
+from station.where import Where
 
 commands = typer.Typer()
 _out = Console()
@@ -47,21 +51,38 @@ def cost_(
     summarize_ms: Annotated[
         float, typer.Option(help="Billed milliseconds of Lambda 2.")
     ] = _DEFAULT.summarize_ms,
+    connects_per_hour: Annotated[
+        float, typer.Option(help="How often a robot connects in an hour.")
+    ] = _DEFAULT.connects_per_hour,
+    command_hz: Annotated[float, typer.Option(help="Commands a second to a robot.")] = _DEFAULT.command_hz,
+    dashboard_hours: Annotated[
+        float, typer.Option(help="Hours a month that somebody looks at CloudWatch on the live page.")
+    ] = _DEFAULT.dashboard_hours,
     config: Annotated[
         Path | None, typer.Option(help="A car.yaml: its rates, where no option says another.")
     ] = None,
     deployed: Annotated[
         bool,
         typer.Option(
-            "--deployed", help="Memory, concurrency, logs, alarms, recovery and key as they are deployed."
+            "--deployed",
+            help="Memory, concurrency, logs, alarms, dashboards, recovery and key as they are deployed.",
+        ),
+    ] = False,
+    refresh: Annotated[
+        bool,
+        typer.Option(
+            "--refresh",
+            help="Read AWS' price list with your credentials, say what differs, and keep it for later calls.",
         ),
     ] = False,
     as_json: Annotated[bool, typer.Option("--json", help="As JSON.")] = False,
 ) -> None:
     """What a fleet costs, by service and lane, beside the thesis' layout; list prices of one date."""
     usage = _configured(_DEFAULT, config)
+    listed = _prices(context.obj, refresh=refresh)
+    prices = PRICES if listed is None else listed.prices()
     if deployed:
-        usage = _as_deployed(usage, context.obj.cloud())
+        usage = as_deployed(usage, context.obj.cloud())
     said: dict[str, Any] = {
         "rate_hz": rate_hz,
         "streams": streams,
@@ -77,22 +98,29 @@ def cost_(
         retention_days=retention_days,
         live_ms=live_ms,
         summarize_ms=summarize_ms,
+        connects_per_hour=connects_per_hour,
+        command_hz=command_hz,
+        dashboard_hours=dashboard_hours,
         **{name: value for name, value in said.items() if value is not None},
     ).check()
     if as_json:
-        _out.print_json(json.dumps(_as_json(usage)))
+        _out.print_json(json.dumps(_as_json(usage, listed)))
         return
+    if refresh and listed is not None:
+        _out.print(_table("AWS' price list", cost_tables.differences(listed)))
+        for name, why in listed.kept.items():
+            _out.print(f"{name}: the built-in price is kept. {why}")
     _out.print(
-        f"List prices of {AS_OF} in US dollars, {REGION}: "
+        f"{_dated(listed)}: "
         f"{usage.robots:,} robot{'s' * (usage.robots != 1)} at {usage.rate_hz:g} Hz"
         f"{f' in each of {usage.streams} streams' if usage.streams > 1 else ''}, "
         f"live {usage.live_hz:g} Hz, {usage.hours_per_day:g} h a day, kept {usage.retention_days} days.\n"
     )
     for title, rows in (
-        ("A robot-hour", cost_tables.robot_hour(usage)),
-        ("A month", cost_tables.month(usage)),
-        ("What if", cost_tables.what_if(usage)),
-        ("What it needs of the default quotas", cost_tables.quotas(scale.on_paper(usage))),
+        ("A robot-hour", cost_tables.robot_hour(usage, prices)),
+        ("A month", cost_tables.month(usage, prices)),
+        ("What if", cost_tables.what_if(usage, prices)),
+        ("What it needs of the default quotas", cost_tables.quotas(scale.on_paper(usage, prices))),
     ):
         _out.print(_table(title, rows))
 
@@ -126,45 +154,47 @@ def _rates(car: Config) -> dict[str, Any]:
     }
 
 
-def _as_deployed(usage: Usage, cloud: Cloud) -> Usage:
-    found: dict[str, Any] = {}
-    client = cloud.client("lambda")
-    for name, key in (("Live", "live_memory_mb"), ("Summarize", "summarize_memory_mb")):
-        function = cloud.output("processing", f"{name}Function")
-        configured = client.get_function_configuration(FunctionName=function)
-        found[key] = configured["MemorySize"]
-        if name == "Live":
-            reserved = client.get_function_concurrency(FunctionName=function)
-            level = configured.get("LoggingConfig", {}).get("SystemLogLevel")
-            found["function_logs"] = "own" if level == "WARN" else "all"
-            found["live_concurrency"] = reserved.get("ReservedConcurrentExecutions", 0)
-    pages = cloud.client("cloudwatch").get_paginator("describe_alarms").paginate()
-    found["alarms"] = sum(len(page.get("MetricAlarms", [])) for page in pages)
-    table, dynamodb = cloud.output("storage", "TelemetryTable"), cloud.client("dynamodb")
-    encryption = dynamodb.describe_table(TableName=table)["Table"].get("SSEDescription", {})
-    found["customer_key"] = encryption.get("SSEType") == "KMS"
-    backups = dynamodb.describe_continuous_backups(TableName=table)["ContinuousBackupsDescription"]
-    recovery = backups.get("PointInTimeRecoveryDescription", {})
-    found["recoverable"] = recovery.get("PointInTimeRecoveryStatus") == "ENABLED"
-    return replace(usage, **found)
+def _prices(where: Where, *, refresh: bool) -> Listed | None:
+    """AWS' price list as it is now, or as it was when it was last asked for; None for the built-in prices."""
+    path = kept_at(os.environ)
+    if not refresh:
+        return load(path)
+    cloud = where.account(region=REGION)
+    listed = read(
+        cloud.client("pricing", API_REGION), str(cloud.region_name), datetime.now(timezone.utc).date()
+    )
+    keep(listed, path)
+    return listed
 
 
-def _as_json(usage: Usage) -> dict[str, Any]:
-    paper = scale.on_paper(usage)
+def _dated(listed: Listed | None) -> str:
+    """Of when and of where the prices are."""
+    if listed is None:
+        return f"List prices of {AS_OF} in US dollars, {REGION}"
+    kept = f"; of {AS_OF} as they were: {', '.join(listed.kept)}" if listed.kept else ""
+    return f"AWS' price list as read on {listed.read_on}, {listed.region}{kept}; PubNub's prices of {AS_OF}"
 
-    def items(found: list[cost.Item]) -> list[dict[str, Any]]:
+
+def _as_json(usage: Usage, listed: Listed | None) -> dict[str, Any]:
+    prices = PRICES if listed is None else listed.prices()
+    paper = scale.on_paper(usage, prices)
+    ours, thesis = cost.bill(usage, prices), cost.thesis_bill(usage, prices)
+
+    def items(found: list[cost_items.Item]) -> list[dict[str, Any]]:
         return [{**item._asdict(), "dollars_per_robot_hour": item.dollars} for item in found]
 
     return {
-        "prices_as_of": AS_OF,
-        "region": REGION,
+        "prices_as_of": AS_OF if listed is None else listed.read_on,
+        "prices_kept": {} if listed is None else listed.kept,
+        "prices_changed": {} if listed is None else listed.changed(),
+        "region": REGION if listed is None else listed.region,
         "usage": asdict(usage),
-        "items": items(cost.bill(usage)),
-        "thesis_items": items(cost.thesis_bill(usage)),
-        "pubnub_items": items(cost.pubnub_bill(usage)),
-        "dollars_per_robot_hour": cost.total(cost.bill(usage)),
-        "thesis_dollars_per_robot_hour": cost.total(cost.thesis_bill(usage)),
-        "deployment_dollars_per_month": deployment_dollars_per_month(usage),
+        "items": items(ours),
+        "thesis_items": items(thesis),
+        "pubnub_items": items(cost.pubnub_bill(usage, prices)),
+        "dollars_per_robot_hour": cost_items.total(ours),
+        "thesis_dollars_per_robot_hour": cost_items.total(thesis),
+        "deployment_dollars_per_month": deployment_dollars_per_month(usage, prices),
         "fleet_dollars_per_month": paper.aws_dollars_per_month,
         "pubnub_mau_dollars_per_month": cost.pubnub_mau_dollars_per_month(usage),
         "quotas": [

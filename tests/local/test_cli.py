@@ -11,6 +11,7 @@ from typer.testing import CliRunner
 from contract import File, file_key
 from station.cli import app
 from station.cloud import Cloud
+from station.usage import Usage
 from tests.ports import free_port
 
 
@@ -89,7 +90,10 @@ def test_the_cost_of_what_is_deployed(iort):
     usage = json.loads(iort("cost", "--deployed", "--json").output)["usage"]
     assert (usage["live_concurrency"], usage["live_memory_mb"], usage["summarize_memory_mb"]) == (0, 256, 512)
     assert (usage["recoverable"], usage["customer_key"]) == (False, False)
-    assert usage["alarms"] > 20
+    # The embedded cloud has no alarms by Metrics Insights, and other tests' dashboards.
+    assert (usage["alarms"], usage["insights_metrics"]) == (Usage().alarms, 0)
+    assert set(usage["dashboards"]) >= set(Usage().dashboards)
+    assert usage["dashboards"][-1] == Usage().dashboards[-1]
 
 
 def test_robot_is_not_added_twice(iort, tmp_path):

@@ -21,6 +21,8 @@ AWS_METRICS = {
         "IteratorAge",
         "DestinationDeliveryFailures",
     },
+    # "Across all functions".
+    ("AWS/Lambda",): {"ConcurrentExecutions", "Errors", "Throttles"},
     ("AWS/DynamoDB", "TableName"): {
         "ConsumedReadCapacityUnits",
         "ConsumedWriteCapacityUnits",

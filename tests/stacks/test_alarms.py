@@ -41,8 +41,14 @@ def test_what_can_be_lost_beside_the_quarantine_has_an_alarm(alarms):
     }
 
 
-def test_the_cost_model_counts_every_alarm(alarms):
-    assert Usage().alarms == len(alarms)
+def test_the_cost_model_counts_every_alarm(synthesized, alarms):
+    """Those by Metrics Insights apart, by what they analyse if everything had failed: a metric a rule, and of
+    Lambda's one a function, one a function with its qualifier, and one of all."""
+    insights = [alarm["Metrics"][0]["Expression"] for alarm in alarms.values() if "Metrics" in alarm]
+    assert Usage().alarms == len(alarms) - len(insights)
+    of_lambda = 2 * len(synthesized.resources("AWS::Lambda::Function")) + 1
+    most = [len(contract.RULES) if "AWS/IoT" in query else of_lambda for query in insights]
+    assert Usage().insights_metrics == sum(most)
 
 
 def test_every_alarm_tells_the_topic_and_is_explained(alarms, reader):

@@ -13,6 +13,9 @@ from contract import rule_name
 from functions.health import measure
 from stacks.metrics import statistic
 from stacks.settings import ROOT
+from station import cloudwatch
+from station.at_rest import FREE_DASHBOARD_METRICS, FREE_DASHBOARDS, ROBOT_SEARCHES, dashboard_metrics
+from station.usage import Usage
 from tests.stacks.aws_metrics import AWS_METRICS
 
 FUNCTIONS = sorted((ROOT / "functions").glob("*.py"))
@@ -25,7 +28,7 @@ def shown(synthesized):
     for body in dashboards(synthesized).values():
         for widget in body["widgets"]:
             rows = widget["properties"].get("metrics", [])
-            metrics += [of_expression(row[0]) if isinstance(row[0], dict) else of_row(row) for row in rows]
+            metrics += [of_row(row) for row in rows]
     return metrics
 
 
@@ -59,21 +62,32 @@ def dashboards(app):
     return found
 
 
+def counted(app):
+    """What of the dashboards is billed, by name."""
+    return {name: cloudwatch.count(body["widgets"]) for name, body in dashboards(app).items()}
+
+
+def test_the_dashboards_are_free_and_the_cost_model_counts_their_metrics(synthesized):
+    shown = counted(synthesized)
+    assert list(shown) == ["iort-platform", "iort-robots"]
+    assert tuple(one.metrics for one in shown.values()) == Usage().dashboards
+    assert not any(one.searches for one in shown.values())
+    assert all(one.metrics <= FREE_DASHBOARD_METRICS for one in shown.values())
+    assert len(shown) <= FREE_DASHBOARDS
+
+
+def test_metrics_of_every_robot_are_searched_for_on_the_last_dashboard(synthesized, production):
+    searches = [one.searches for one in counted(production).values()]
+    assert searches == [0, ROBOT_SEARCHES]
+    assert [one.metrics for one in counted(production).values()] == list(Usage().dashboards)
+    with_five = dashboard_metrics(Usage(robot_metrics=True, robots=5))
+    assert with_five[-1] == Usage().dashboards[-1] + 5 * ROBOT_SEARCHES <= FREE_DASHBOARD_METRICS
+
+
 def of_row(row):
     namespace, metric, *rest = row
     options = rest.pop() if isinstance(rest[-1], dict) else {}
     return namespace, metric, dict(zip(rest[::2], rest[1::2], strict=True)), options
-
-
-def of_expression(options):
-    """What `SEARCH('{namespace,dimension,...} MetricName="..." dimension="..."', 'Sum', 60)` searches."""
-    schema, wanted, stat = re.search(
-        r"SEARCH\('\{([^}]+)\} ([^']+)', '(\w+)', 60\)", options["expression"]
-    ).groups()
-    namespace, *dimensions = schema.split(",")
-    values = dict(re.findall(r'(\w+)="([^"]+)"', wanted))
-    metric = values.pop("MetricName")
-    return namespace, metric, {name: values.get(name, "*") for name in dimensions}, {"stat": stat}
 
 
 def emitted():

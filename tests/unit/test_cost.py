@@ -8,13 +8,21 @@ from dataclasses import replace
 import pytest
 from typer.testing import CliRunner
 
+from contract import METRICS
 from device.pings import CLOCK_EVERY_S
 from device.sources.vehicle import Vehicle, VehicleConfig
 from functions.health import measure
 from functions.metrics import Gathered, emit
-from scripts.costs import FILES, filled
-from station import cost, cost_tables, scale, sizes
-from station.at_rest import deployment_dollars_per_month
+from scripts.costs import FILES, ROOT, filled
+from station import cost, cost_items, cost_tables, scale, sizes
+from station.at_rest import (
+    FREE_ALARMS,
+    FREE_DASHBOARD_METRICS,
+    FREE_DASHBOARDS,
+    FREE_METRICS,
+    PAGE_REFRESH_S,
+    deployment_dollars_per_month,
+)
 from station.cli import app
 from station.errors import StationError
 from station.prices import PRICES
@@ -32,7 +40,8 @@ def test_record_lane_is_a_rule_an_action_and_its_units_a_batch():
     assert _units(items, "record", "message") == 0, "Basic Ingest has no messaging charge"
     assert _units(items, "record", "rule") == _units(items, "record", "action") == 3600
     assert _units(items, "record", "write") == 3600 * (1 + 1), "each item fits in a unit"
-    assert next(i for i in items if i.what == "rules triggered").dollars == pytest.approx(3600 * 0.15e-6)
+    rules = next(i for i in items if (i.lane, i.what) == ("record", "rules triggered"))
+    assert rules.dollars == pytest.approx(3600 * 0.15e-6)
 
 
 def test_live_lane_is_a_rule_an_action_and_an_invocation_each_and_a_message_in_ten_seconds():
@@ -69,13 +78,38 @@ def test_a_deployment_at_rest_pays_for_what_polls_watches_and_keeps():
     rest = deployment_dollars_per_month(_ONE)
     # Five long polls of 20 s around the clock.
     assert rest["polling the quarantine's queue"] == pytest.approx(657_000 * 0.40e-6)
-    assert rest["alarms"] == pytest.approx(2.8)
-    assert rest["dashboards"] == 0, "three are free"
+    assert rest["alarms"] == pytest.approx(1.4), "ten of 24 are free"
+    assert rest["alarms by Metrics Insights, at most"] == pytest.approx(4.6), "and none of those"
+    assert rest["metrics"] == pytest.approx((35 - 10) * 0.30)
+    # Twenty hours, twice a minute, 43 metrics each.
+    assert rest["metrics asked for by the live page"] == pytest.approx(20 * 120 * 43 * 0.00001)
     assert "key" not in rest
     assert deployment_dollars_per_month(replace(_ONE, customer_key=True))["key"] == 1.0
     fleet = deployment_dollars_per_month(replace(_ONE, robots=1000, device_defender=True))
     assert fleet["audit of the robots"] == pytest.approx(1.1)
     assert "audit of the robots" not in deployment_dollars_per_month(_ONE)
+
+
+@pytest.mark.parametrize(
+    ("dashboards", "billed"),
+    [((), 0), ((50, 50, 50), 0), ((51,), 1), ((50, 1, 2, 3), 1), ((106, 18), 1), ((51, 50, 50, 50, 50), 2)],
+)
+def test_three_dashboards_of_up_to_fifty_metrics_are_free(dashboards, billed):
+    rest = deployment_dollars_per_month(replace(_ONE, dashboards=dashboards))
+    assert rest["dashboards"] == billed * 3.0
+
+
+def test_metrics_of_every_robot_are_billed_by_the_robot():
+    for robots, billed in ((5, 0), (6, 1)):
+        usage = replace(_ONE, robots=robots, robot_metrics=True)
+        rest = deployment_dollars_per_month(usage)
+        assert rest["dashboards"] == billed * 3.0, "29 metrics and four a robot"
+        assert rest["metrics"] == pytest.approx((35 + 9 * robots - 10) * 0.30)
+
+
+def test_the_live_page_asks_as_often_as_the_model_says():
+    source = (ROOT / "station/web/src/views/cloudwatch.ts").read_text()
+    assert f"const REFRESH_S = {PAGE_REFRESH_S};" in source
 
 
 def test_recovery_to_a_point_in_time_is_billed_by_what_is_kept():
@@ -91,12 +125,12 @@ def test_thesis_layout_pays_for_every_sample():
     assert _units(items, "record", "message") == 50 * 3600
     assert _units(items, "record", "write") == 2 * 50 * 3600
     assert _units(items, "live", "invocation") == 50 * 3600
-    assert 0.6 < cost.total(items) < 0.8
+    assert 0.6 < cost_items.total(items) < 0.8
 
 
 def test_without_a_live_lane_we_cost_less_than_a_twentieth():
-    ours = cost.total(cost.bill(replace(_ONE, live_hz=0.0)))
-    assert ours < cost.total(cost.thesis_bill(_ONE)) / 20
+    ours = cost_items.total(cost.bill(replace(_ONE, live_hz=0.0)))
+    assert ours < cost_items.total(cost.thesis_bill(_ONE)) / 20
 
 
 def test_a_batch_of_one_sample_costs_as_much_as_the_thesis_record_lane():
@@ -151,7 +185,7 @@ def test_an_hour_of_lambda_1_logs_about_as_much_as_it_writes(capsys):
     written = len(capsys.readouterr().out)
     assert written == pytest.approx(_units(cost.bill(_ONE), "live", "logs") * 1e9, rel=0.1)
     whole = _units(cost.bill(replace(_ONE, function_logs="all")), "live", "logs") * 1e9
-    assert whole - 36_000 * len(cost._PLATFORM_LINES) == pytest.approx(written, rel=0.1)
+    assert whole - 36_000 * len(cost_items.PLATFORM_LINES) == pytest.approx(written, rel=0.1)
 
 
 def test_environments_gather_each_for_itself():
@@ -199,13 +233,29 @@ def test_quota_that_breaks_first_is_the_one_that_fewest_robots_use_up():
     assert unreserved.breaks_first.name.startswith("IoT Core")
 
 
+def test_the_documents_count_what_is_watched_as_the_model_does():
+    text = (ROOT / "docs" / "cloud.md").read_text()
+    platform, robots = _ONE.dashboards
+    for line in (
+        f"| {sum(map(len, METRICS.values()))} | $0.30 each | {FREE_METRICS} |",
+        f"| {_ONE.alarms} | $0.10 each | {FREE_ALARMS} |",
+        f"| 4, of up to {_ONE.insights_metrics} metrics | $0.10 for each",
+        f"| 2, of {platform} and {robots} metrics | $3 each | {FREE_DASHBOARDS}, of up to",
+        f"of up to {FREE_DASHBOARD_METRICS} metrics each |",
+        f"| {platform} metrics every {PAGE_REFRESH_S} s | $0.01 for 1,000 metrics | none |",
+    ):
+        assert line in text
+
+
 def test_documents_hold_the_tables_that_the_model_makes():
     for path in FILES:
         assert filled(path.read_text()) == path.read_text(), f"{path.name}: run python scripts/costs.py"
 
 
-def test_command_prints_json_that_adds_up():
-    done = CliRunner().invoke(app, ["cost", "--live-hz", "2", "--json"])
+def test_command_prints_json_that_adds_up(tmp_path):
+    done = CliRunner().invoke(
+        app, ["cost", "--live-hz", "2", "--json"], env={"XDG_CACHE_HOME": str(tmp_path)}
+    )
     assert done.exit_code == 0, done.output
     answer = json.loads(done.output)
     assert answer["usage"]["live_hz"] == 2.0
@@ -222,7 +272,8 @@ def usage_of_a_car(folder, settings):
         "robot: car7\nendpoint: example.org\ncertificate: certificate.pem\nprivate_key: private.key\n"
         f"{settings}"
     )
-    done = CliRunner().invoke(app, ["cost", "--config", str(config), "--json"])
+    given = ["cost", "--config", str(config), "--json"]
+    done = CliRunner().invoke(app, given, env={"XDG_CACHE_HOME": str(folder)})
     assert done.exit_code == 0, done.output
     return json.loads(done.output)["usage"]
 
@@ -256,7 +307,7 @@ def test_streams_are_billed_each_by_itself(batch_s):
         assert times["record", what] == pytest.approx(3), what
     # How often Lambda 2 is called hangs on the window, until its events are full.
     assert times["record", "Lambda 2 invoked"] <= 3
-    assert times["all", "connection"] == times["agent, rtt", "kept"] == 1
+    assert times["connection", "minutes"] == times["agent, rtt", "kept"] == 1
     messages = [next(i.units for i in cost.thesis_bill(usage) if i.what == "messages") for usage in USAGES]
     assert messages[1] == 3 * messages[0]
 

@@ -46,7 +46,21 @@ def test_what_aws_has_answered_takes_the_assumptions_place():
     assert verdict(check({"one": 1}), expected={"one": 2}).verdict is Verdict.DIFFERS
 
 
-@pytest.mark.parametrize("error", [VerifyError("no answer"), OSError("connection reset")])
+def test_a_note_is_reported_and_not_compared(tmp_path):
+    noted = verdict(check({"one": 1, "note_version": "1.2"}))
+    assert noted.verdict is Verdict.AS_ASSUMED
+    known = {"one": 1, "note_version": "1.1"}
+    assert verdict(check({"one": 1, "note_version": "1.2"}), expected=known).verdict is Verdict.AS_ASSUMED
+    other = verdict(check({"one": 2, "note_version": "1.2"}))
+    assert other.verdict is Verdict.DIFFERS
+    assert report.differences(other) == [("one", "1", "2")]
+    report.write(tmp_path, RUN, [noted])
+    assert 'version "1.2"' in (tmp_path / "report.md").read_text()
+
+
+@pytest.mark.parametrize(
+    "error", [VerifyError("no answer"), OSError("connection reset"), KeyError("another form")]
+)
 def test_an_error_is_an_answer(error):
     answer = verdict(check(error))
     assert answer.verdict is Verdict.FAILED

@@ -3,6 +3,14 @@
 from __future__ import annotations
 
 from verify.check import Check
-from verify.checks import rules
+from verify.checks import broker, payloads, provisioning, removal, renewal, rule_errors, rules
 
-ALL: tuple[Check, ...] = (*rules.CHECKS,)
+ALL: tuple[Check, ...] = (
+    *rules.CHECKS,
+    *payloads.CHECKS,
+    *rule_errors.CHECKS,
+    *broker.CHECKS,
+    *provisioning.CHECKS,
+    *renewal.CHECKS,
+    *removal.CHECKS,
+)

@@ -2,29 +2,52 @@
 
 from __future__ import annotations
 
+import hashlib
+import itertools
+import json
 import time
+import uuid
+from collections.abc import Callable, Mapping
 from typing import Any
 
 from bench.target import Target
 from contract import (
+    AGENT_VERSION,
+    ALERT_PREFIX,
     EXPIRES_S,
+    FAULT_FIELD,
+    FILE,
+    LAMBDA,
+    LIVE,
     RECEIVED_MS,
     RECORD,
+    RULE,
+    SHADOW,
     TOPIC,
     VESC_STREAM,
+    VOLTAGE_FIELD,
     Batch,
+    File,
+    FileRequest,
+    LiveSample,
     build_topic,
     encode,
-    record_topic,
+    encode_file_request,
+    encode_live,
+    encode_ping,
+    file_key,
 )
+from station import registry
 from verify.assumption import Basis
+from verify.bundles import listener, pair_of
 from verify.check import Check
-from verify.robot import Robot
 from verify.spoofing import spoofed
 from verify.waiting import until
 
-_SQL = "https://docs.aws.amazon.com/iot/latest/developerguide/iot-sql-select.html"
-_DYNAMODB_V2 = "https://docs.aws.amazon.com/iot/latest/developerguide/dynamodb-v2-rule-action.html"
+_GUIDE = "https://docs.aws.amazon.com/iot/latest/developerguide"
+_SQL = f"{_GUIDE}/iot-sql-select.html"
+_DYNAMODB_V2 = f"{_GUIDE}/dynamodb-v2-rule-action.html"
+_BINARY = f"{_GUIDE}/binary-payloads.html"
 _RUN = "0badcafe"
 # A batch without `nonfinite`, as DynamoDB types it.
 _STORED = {
@@ -50,34 +73,128 @@ def _items(target: Target, robot: str) -> list[dict[str, Any]]:
     return list(answer["Items"])
 
 
-def _spoofed_record(target: Target) -> dict[str, Any]:
-    bundle, victim = target.robot("verify-spoofing"), target.robot("verify-victim").robot
-    message = encode(Batch(_RUN, 0, [int(time.time()) * 1_000_000], {"speed": [1.5]}))
-    with Robot(bundle.folder) as robot:
-        robot.online()
-        topic = record_topic(robot.name, VESC_STREAM, target.cloud.namespace)
-        robot.publish(topic, spoofed(message, victim, RECORD, VESC_STREAM, target.cloud.namespace))
-        (item,) = until(lambda: _items(target, robot.name), "the batch in the telemetry table")
-    now_s = time.time()
+def _recent(received_ms: float) -> bool:
+    return abs(received_ms / 1000 - time.time()) < 3600
+
+
+def _record(target: Target) -> dict[str, Any]:
+    with pair_of(target, "verify-spoofs-record") as pair:
+        message = encode(Batch(_RUN, 0, [int(time.time()) * 1_000_000], {"speed": [1.5]}))
+        pair.send(RECORD, VESC_STREAM, message)
+        (item,) = until(lambda: _items(target, pair.robot.name), "the batch in the telemetry table")
+        return {
+            "own_partition": 1,
+            "victims_partition": len(_items(target, pair.victim)),
+            "keys": sorted(item),
+            "received_by_the_clouds_clock": _recent(int(item[RECEIVED_MS]["N"])),
+            "expires_by_the_clouds_clock": abs(int(item[EXPIRES_S]["N"]) - time.time()) < 4000 * 86_400,
+            "types": {name: next(iter(value)) for name, value in sorted(item.items())},
+        }
+
+
+def _live(target: Target) -> dict[str, Any]:
+    with (
+        pair_of(target, "verify-spoofs-live") as pair,
+        listener(target, pair.robot.name) as own,
+        listener(target, pair.victim) as others,
+    ):
+        seqs = itertools.count()
+
+        def shown() -> list[Any]:
+            # One that waits for a function's first environment is stale before it is shown.
+            now_us = time.time_ns() // 1000
+            live = LiveSample(_RUN, next(seqs), now_us, now_us, {"speed": 3}, offset_us=0)
+            pair.send(LIVE, VESC_STREAM, encode_live(live))
+            return own.heard
+
+        heard = until(shown, "the live message on the robot's channel", within_s=60)[-1]
+        return {
+            "as_its_own": heard.robot == pair.robot.name,
+            "received_by_the_clouds_clock": _recent(heard.hops[RECEIVED_MS]),
+            "as_the_victims": len(others.heard),
+        }
+
+
+def _ping(path: str) -> Callable[[Target], Mapping[str, Any]]:
+    def ask(target: Target) -> dict[str, Any]:
+        ping = encode_ping(7, 1_700_000_000_000_000, "padding")
+        with pair_of(target, f"verify-spoofs-ping-{path}") as pair:
+            answer = pair.asked(path, ping)
+        received_ms = answer.pop(RECEIVED_MS)
+        return {
+            "received_by_the_clouds_clock": _recent(received_ms),
+            "the_rest_as_sent": answer == json.loads(ping),
+        }
+
+    return ask
+
+
+def _upload(target: Target) -> dict[str, Any]:
+    content = b"content"
+    sha256 = hashlib.sha256(content).hexdigest()
+    file = File("notes.txt", "log", "text/plain", len(content), sha256, time.time_ns() // 1000)
+    request = encode_file_request(FileRequest(uuid.uuid4().hex, file, {1: sha256}))
+    with pair_of(target, "verify-spoofs-upload") as pair:
+        answer = pair.asked(FILE, request)
     return {
-        "own_partition": 1,
-        "victims_partition": len(_items(target, victim)),
-        "keys": sorted(item),
-        "received_by_the_clouds_clock": abs(int(item[RECEIVED_MS]["N"]) / 1000 - now_s) < 3600,
-        "expires_by_the_clouds_clock": abs(int(item[EXPIRES_S]["N"]) - now_s) < 4000 * 86_400,
-        "types": {name: next(iter(value)) for name, value in sorted(item.items())},
+        "key_is_its_own": answer.get("key") == file_key(pair.robot.name, file),
+        "names_the_victim": pair.victim in json.dumps(answer),
     }
 
 
+def _alerts(target: Target) -> dict[str, Any]:
+    now_us = time.time_ns() // 1000
+    live = LiveSample(_RUN, 0, now_us, now_us, {FAULT_FIELD: 5, VOLTAGE_FIELD: 9.5}, offset_us=0)
+
+    def alerts(robot: str) -> list[str]:
+        return [name for name in registry.get(target.cloud, robot) if name.startswith(ALERT_PREFIX)]
+
+    with pair_of(target, "verify-spoofs-alerts") as pair:
+        pair.send(LIVE, VESC_STREAM, encode_live(live))
+        until(lambda: len(alerts(pair.robot.name)) == 2, "the alerts of both rules", within_s=60)
+        return {"own_alerts": 2, "victims_alerts": len(alerts(pair.victim))}
+
+
+def _version(target: Target) -> dict[str, Any]:
+    def version(robot: str) -> Any:
+        return registry.get(target.cloud, robot).get(AGENT_VERSION)
+
+    with pair_of(target, "verify-spoofs-version") as pair:
+        reported = json.loads(
+            spoofed(b'{"agent_version": ""}', pair.victim, LIVE, VESC_STREAM, target.cloud.namespace)
+        )
+        document = {"state": {"reported": {**reported, AGENT_VERSION: "9.9.9"}}}
+        topic = f"$aws/things/{pair.robot.name}/shadow/name/{SHADOW}/update"
+        pair.publish(topic, json.dumps(document).encode())
+        until(lambda: version(pair.robot.name) == "9.9.9", "the version in the registry", within_s=60)
+        return {"own": "9.9.9", "victims": version(pair.victim)}
+
+
+def _spoofed(
+    rule: str,
+    ask: Callable[[Target], Mapping[str, Any]],
+    expected: Mapping[str, Any],
+    assumed: str,
+    *files: str,
+    source: str = f"{_SQL} and {_BINARY}",
+) -> Check:
+    return Check(
+        name=f"rules.{rule}_spoofed",
+        assumed=assumed,
+        expected=expected,
+        basis=Basis.DOCUMENTED,
+        source=source,
+        relied_on_by=("contract/cloud.py", *files),
+        ask=ask,
+    )
+
+
+_PONG = {"received_by_the_clouds_clock": True, "the_rest_as_sent": True}
 CHECKS = (
-    Check(
-        name="rules.record_spoofed",
-        assumed=(
-            "The rule record stores the keys of a batch and the cloud's three, each by name. A key of the "
-            "message with the name of one of the cloud's is not stored. A key that the message lacks is "
-            "absent. A text becomes S, a number N."
-        ),
-        expected={
+    _spoofed(
+        "record",
+        _record,
+        {
             "own_partition": 1,
             "victims_partition": 0,
             "keys": sorted(_STORED),
@@ -85,9 +202,56 @@ CHECKS = (
             "expires_by_the_clouds_clock": True,
             "types": dict(sorted(_STORED.items())),
         },
-        basis=Basis.DOCUMENTED,
+        "The rule record stores the keys of a batch and the cloud's three, each by name. A key of the "
+        "message with the name of one of the cloud's is not stored. A key that the message lacks is "
+        "absent. A text becomes S, a number N.",
+        "functions/stored.py",
         source=f"{_SQL} and {_DYNAMODB_V2}",
-        relied_on_by=("contract/cloud.py", "functions/stored.py"),
-        ask=_spoofed_record,
+    ),
+    _spoofed(
+        "live",
+        _live,
+        {"as_its_own": True, "received_by_the_clouds_clock": True, "as_the_victims": 0},
+        "The rule live hands the message over as one value in base64. What Lambda 1 publishes is the "
+        "robot's of the topic, whatever the message says.",
+        "functions/live.py",
+    ),
+    _spoofed(
+        "pong",
+        _ping(RULE),
+        _PONG,
+        "The rule pong answers to the robot of the topic, with the ping's four fields and the cloud's time.",
+        "stacks/ingest.py",
+        source=f"{_SQL} and {_GUIDE}/republish-rule-action.html",
+    ),
+    _spoofed(
+        "echo",
+        _ping(LAMBDA),
+        _PONG,
+        "The function echo answers to the robot of the topic, with the ping's fields and the cloud's time.",
+        "functions/echo.py",
+    ),
+    _spoofed(
+        "upload",
+        _upload,
+        {"key_is_its_own": True, "names_the_victim": False},
+        "The function upload answers to the robot of the topic, with addresses below its own prefix.",
+        "functions/upload.py",
+    ),
+    _spoofed(
+        "alerts",
+        _alerts,
+        {"own_alerts": 2, "victims_alerts": 0},
+        "The rules fault and battery alert of the robot of the topic.",
+        "functions/alert.py",
+        source=_SQL,
+    ),
+    _spoofed(
+        "version",
+        _version,
+        {"own": "9.9.9", "victims": None},
+        "The rule version takes the robot from the shadow's topic.",
+        "functions/presence.py",
+        source=f"{_SQL} and {_GUIDE}/reserved-topics.html",
     ),
 )

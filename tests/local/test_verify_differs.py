@@ -1,0 +1,89 @@
+"""The questions of `make verify-aws` notice a cloud that is not as assumed: the embedded one, changed."""
+
+from __future__ import annotations
+
+import json
+import time
+
+import pytest
+
+from bench.target import EMBEDDED, Target
+from contract import RECORD, TOPIC, fleet_name, rule_name
+from verify.check import Verdict, ask
+from verify.checks import broker, provisioning, rules
+
+
+@pytest.fixture(scope="module")
+def target(embedded, tmp_path_factory):
+    return Target(EMBEDDED, embedded.cloud, tmp_path_factory.mktemp("differs"), embedded, run="differs")
+
+
+@pytest.fixture(scope="module")
+def iot(embedded):
+    return embedded.cloud.client("iot")
+
+
+@pytest.fixture
+def asked(target):
+    """The answer to a question, by its name."""
+    checks = {check.name: check for check in (*rules.CHECKS, *broker.CHECKS, *provisioning.CHECKS)}
+    return lambda name: ask(checks[name], target, time.monotonic)
+
+
+@pytest.fixture
+def rule_with_a_star(iot):
+    """The rule record stores whatever a message has beside the cloud's keys."""
+    name = rule_name("record")
+    rule = iot.get_topic_rule(ruleName=name)["rule"]
+    names = ("sql", "awsIotSqlVersion", "actions", "errorAction")
+    before = {key: rule[key] for key in names if key in rule}
+    added = before["sql"].partition(f"topic() AS {TOPIC}")
+    with_star = {**before, "sql": f"SELECT *, {added[1]}{added[2]}"}
+    assert f"FROM '{RECORD}/" in with_star["sql"]
+    iot.replace_topic_rule(ruleName=name, topicRulePayload=with_star)
+    yield
+    iot.replace_topic_rule(ruleName=name, topicRulePayload=before)
+
+
+@pytest.fixture
+def policy_that_allows_all(iot):
+    name = fleet_name()
+    before = iot.get_policy(policyName=name)["defaultVersionId"]
+    statement = {"Effect": "Allow", "Action": "iot:*", "Resource": "*"}
+    document = json.dumps({"Version": "2012-10-17", "Statement": [statement]})
+    made = iot.create_policy_version(policyName=name, policyDocument=document, setAsDefault=True)
+    yield
+    iot.set_default_policy_version(policyName=name, policyVersionId=before)
+    iot.delete_policy_version(policyName=name, policyVersionId=made["policyVersionId"])
+
+
+@pytest.fixture
+def template_without_hook(iot):
+    name = fleet_name()
+    before = iot.describe_provisioning_template(templateName=name)["preProvisioningHook"]
+    iot.update_provisioning_template(templateName=name, removePreProvisioningHook=True)
+    yield
+    iot.update_provisioning_template(templateName=name, preProvisioningHook=before)
+
+
+@pytest.mark.usefixtures("rule_with_a_star")
+def test_a_rule_that_stores_what_nobody_named(asked):
+    answer = asked("rules.record_spoofed")
+    assert answer.verdict is Verdict.DIFFERS, answer.reason
+    assert "unknown" in answer.seen["keys"]
+
+
+@pytest.mark.usefixtures("policy_that_allows_all")
+def test_a_policy_that_allows_all(asked):
+    answer = asked("broker.foreign_topic")
+    assert answer.verdict is Verdict.DIFFERS, answer.reason
+    assert answer.seen["neighbour_heard"] == 1
+    answer = asked("broker.another_client_id")
+    assert answer.verdict is Verdict.DIFFERS, answer.reason
+
+
+@pytest.mark.usefixtures("template_without_hook")
+def test_a_template_without_its_hook(asked):
+    answer = asked("provisioning.name_taken")
+    assert answer.verdict is Verdict.DIFFERS, answer.reason
+    assert answer.seen["certificates"] == 2

@@ -1,0 +1,103 @@
+"""What AWS meters of a connection, held to what the agent does when it connects."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+
+from contract import SHADOW
+from device.agent import Agent
+from device.clock import ManualClock
+from device.config import Config
+from device.dispatch import Dispatcher
+from device.loopback import Loopback
+from device.spool import MemorySpool
+from functions.metrics import emit
+from station import cost, scale
+from station.prices import QUOTAS
+from station.usage import Usage
+
+_ONE = Usage()
+# AWS IoT Core, "Additional metering details".
+_METER, _SHADOW_METER = 5 * 1024, 1024
+
+
+def messages(usage):
+    """Messages that are metered in an hour, by what they are."""
+    return {item.what: item.units for item in cost.bill(usage) if item.price == "message"}
+
+
+class Counting(Loopback):
+    """Knows what was subscribed to."""
+
+    def __init__(self, *given, **named):
+        super().__init__(*given, **named)
+        self.filters = []
+
+    def subscribe(self, topic_filter, handler):
+        self.filters.append(topic_filter)
+        super().subscribe(topic_filter, handler)
+
+
+def test_an_agent_asks_for_as_much_as_the_model_says():
+    clock, dispatcher = ManualClock(), Dispatcher()
+    uplink = Counting(clock, dispatcher)
+    config = Config("car1", "host", Path(), Path(), ())
+    agent = Agent(config, uplink=uplink, spool=MemorySpool(max_bytes=10**6), clock=clock)
+    assert len(uplink.filters) + 1 == cost.SUBSCRIPTIONS, "and a command"
+    assert all(len(topic) < _METER for topic in uplink.filters)
+    uplink.connect()
+    dispatcher.run_pending()
+    agent.tick()
+    asked = [message for message in uplink.published if f"/name/{SHADOW}/" in message.topic]
+    assert [(message.topic.rpartition("/")[2], message.payload) for message in asked] == [("get", b"")]
+    # Nobody has wished for anything: what it reports is all that a shadow then holds.
+    uplink.deliver(f"{asked[0].topic}/rejected", b'{"code": 404}')
+    dispatcher.run_pending()
+    agent.tick()
+    assert uplink.published[-1].topic.endswith("/update")
+    assert len(json.dumps(json.loads(uplink.published[-1].payload)["state"])) < _SHADOW_METER
+
+
+def test_an_hour_with_a_connect_has_these_messages_more_than_one_without():
+    more, less = messages(_ONE), messages(replace(_ONE, connects_per_hour=0.0))
+    assert {what: more[what] - less[what] for what in more if more[what] != less[what]} == {
+        "CONNECT and SUBSCRIBE": 1 + cost.SUBSCRIPTIONS,
+        "the shadow's question, answer and PUBACK": 3,
+    }
+
+
+def test_an_hour_with_a_connect_has_two_events_of_presence():
+    items = cost.bill(replace(_ONE, connects_per_hour=3.0))
+    units = {item.price: item.units for item in items if item.lane == "connection"}
+    for price in ("rule", "action", "invocation", "write"):
+        assert units[price] == 2 * 3, price
+    assert units["shadow"] == 3
+    assert units["connection"] == 60, "minutes, however often"
+
+
+def test_a_command_is_sent_received_and_acknowledged():
+    commanded = messages(replace(_ONE, command_hz=10.0))
+    assert commanded["sent, received, acknowledged"] == 3 * 10 * 3600
+    assert messages(_ONE)["sent, received, acknowledged"] == 0
+
+
+def test_the_thesis_connects_too_and_subscribes_to_nothing():
+    items = {item.what: item.units for item in cost.thesis_bill(replace(_ONE, connects_per_hour=2.0))}
+    assert items["CONNECT"] == 2
+
+
+def test_a_line_of_presence_is_about_as_long_as_it_is_written(capsys, monkeypatch):
+    monkeypatch.setenv("NAMESPACE", "iort")
+    emit("presence", RobotsConnected=True, RobotsDisconnected=False)
+    assert len(capsys.readouterr().out) == pytest.approx(cost._PRESENCE_LINE, rel=0.1)
+
+
+def test_an_outage_is_held_to_the_lower_of_what_awss_pages_say():
+    assert QUOTAS["IoT Core: connects in a minute after an outage"].value == 500 * 60
+    paper = {need.name: need.times for need in scale.on_paper(Usage(robots=60_000)).needs}
+    assert paper["IoT Core: connects in a minute after an outage"] == 2
+    assert paper["IoT Core: connects of one client id"] == 1, "the agent waits a second at least"

@@ -1,0 +1,37 @@
+"""Every question can be answered otherwise. tests/local/test_verify_differs.py has clouds that do."""
+
+from __future__ import annotations
+
+import itertools
+from dataclasses import replace
+
+import pytest
+
+from bench.target import EMBEDDED, Target
+from station.cloud import Cloud
+from verify.check import NOTE, Verdict, ask, compared
+from verify.checks import ALL
+
+
+@pytest.fixture
+def verdict(tmp_path):
+    """The verdict on an answer."""
+
+    def judge(check, seen):
+        asked = replace(check, ask=lambda _target: seen, not_embedded="")
+        return ask(asked, Target(EMBEDDED, Cloud(), tmp_path), itertools.count().__next__).verdict
+
+    return judge
+
+
+@pytest.mark.parametrize("check", ALL, ids=lambda check: check.name)
+def test_every_expected_value_decides_and_a_note_does_not(check, verdict):
+    assert check.expected
+    assert compared(check.expected) == check.expected
+    assert verdict(check, {**check.expected, f"{NOTE}beside": "whatever"}) is Verdict.AS_ASSUMED
+    for name in check.expected:
+        wrong = {**check.expected, name: "another value"}
+        assert verdict(check, wrong) is Verdict.DIFFERS, name
+        del wrong[name]
+        assert verdict(check, wrong) is Verdict.DIFFERS, name
+    assert verdict(check, {**check.expected, "a key more": 1}) is Verdict.DIFFERS

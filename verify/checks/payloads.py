@@ -1,0 +1,161 @@
+"""What the topic rules make of payloads that are no JSON, and how large a payload may be."""
+
+from __future__ import annotations
+
+import json
+from typing import Any
+
+from bench.target import Target
+from contract import (
+    FLEET,
+    LIVE,
+    MAX_MESSAGE_BYTES,
+    PING,
+    PONG,
+    RECORD,
+    RULE,
+    TOPIC,
+    VESC_STREAM,
+    build_topic,
+    encode_ping,
+    live_topic,
+    record_topic,
+)
+from station import quarantine
+from station.quarantine import Entry
+from verify.assumption import Basis
+from verify.bundles import pair_of
+from verify.check import Check
+from verify.waiting import until
+
+_GUIDE = "https://docs.aws.amazon.com/iot/latest/developerguide"
+_QUOTAS = "https://docs.aws.amazon.com/general/latest/gr/iot-core.html"
+# No JSON, and no UTF-8 either.
+_BYTES = b"\xff\x00 no JSON"
+_AWS_MESSAGE_BYTES = 128 * 1024
+
+
+def _refused(target: Target, robot: str) -> list[Entry]:
+    """What is in quarantine of the robot."""
+    return list(quarantine.entries(target.cloud, robot=robot))
+
+
+def _kept(target: Target, entry: Entry) -> bytes | None:
+    loaded = quarantine.load(target.cloud, entry)
+    return loaded.payload if loaded else None
+
+
+def _live_no_json(target: Target) -> dict[str, Any]:
+    with pair_of(target, "verify-live-no-json") as pair:
+        robot = pair.robot.name
+        pair.publish(live_topic(robot, VESC_STREAM, target.cloud.namespace), _BYTES)
+        (entry,) = until(lambda: _refused(target, robot), "the message in quarantine", within_s=60)
+    return {
+        "refused_by": entry.source.split()[0],
+        "topic_as_subscribed": entry.topic == build_topic(LIVE, robot, VESC_STREAM, target.cloud.namespace),
+        "byte_by_byte": _kept(target, entry) == _BYTES,
+    }
+
+
+def _record_no_json(target: Target) -> dict[str, Any]:
+    cloud = target.cloud
+    with pair_of(target, "verify-record-no-json") as pair:
+        robot = pair.robot.name
+        pair.publish(record_topic(robot, VESC_STREAM, cloud.namespace), _BYTES)
+        # A batch without its key: it is refused later than the other, where the other is.
+        pair.publish(record_topic(robot, VESC_STREAM, cloud.namespace), b'{"v": 1}')
+
+        def of_the_batch() -> list[Entry]:
+            found = _refused(target, robot)
+            return found if any(_kept(target, entry) == b'{"v": 1}' for entry in found) else []
+
+        found = until(of_the_batch, "the batch without a key in quarantine", within_s=60)
+    stored = cloud.client("dynamodb").query(
+        TableName=cloud.output("storage", "TelemetryTable"),
+        KeyConditionExpression=f"{TOPIC} = :topic",
+        ExpressionAttributeValues={
+            ":topic": {"S": build_topic(RECORD, robot, VESC_STREAM, cloud.namespace)},
+        },
+        Select="COUNT",
+    )
+    return {
+        "stored": stored["Count"],
+        "refused_by": sorted({entry.source.split()[0] for entry in found}),
+        "note_no_json_is_in_quarantine": any(_kept(target, entry) == _BYTES for entry in found),
+    }
+
+
+def _pong_no_json(target: Target) -> dict[str, Any]:
+    cloud = target.cloud
+    with pair_of(target, "verify-pong-no-json") as pair:
+        robot = pair.robot.name
+        pair.robot.subscribe(build_topic(PONG, robot, RULE, cloud.namespace))
+        topic = build_topic(PING, robot, RULE, cloud.namespace)
+        pair.publish(topic, _BYTES)
+        pair.publish(topic, encode_ping(7, 1))
+        answers: list[dict[str, Any]] = []
+        while not answers or answers[-1].get("id") != 7:
+            answers.append(json.loads(pair.robot.next_message()[1]))
+    return {
+        "the_next_ping_is_answered": True,
+        "note_answered_to_no_json": [sorted(answer) for answer in answers[:-1]],
+    }
+
+
+def _largest(target: Target) -> dict[str, Any]:
+    with pair_of(target, "verify-size") as pair:
+        topic = build_topic(FLEET, pair.robot.name, "size", target.cloud.namespace)
+        ours, exactly = (
+            pair.robot.attempt(topic, b"x" * size) for size in (MAX_MESSAGE_BYTES, _AWS_MESSAGE_BYTES)
+        )
+    return {"ours": ours, "note_exactly_128_kib": exactly}
+
+
+CHECKS = (
+    Check(
+        name="payloads.live_no_json",
+        assumed=(
+            "encode(*, 'base64') takes a payload that is no JSON. Lambda 1 refuses it, and the quarantine "
+            "has it byte by byte."
+        ),
+        expected={"refused_by": "function", "topic_as_subscribed": True, "byte_by_byte": True},
+        basis=Basis.DOCUMENTED,
+        source=f"{_GUIDE}/binary-payloads.html",
+        relied_on_by=("contract/cloud.py", "functions/live.py"),
+        ask=_live_no_json,
+    ),
+    Check(
+        name="payloads.record_no_json",
+        assumed=(
+            "Of a payload that is no JSON the rule record stores nothing, nor of a batch without a key. The "
+            "batch is in quarantine. AWS does not say whether the other one is: the alarm ParseError tells."
+        ),
+        expected={"stored": 0, "refused_by": ["rule"]},
+        basis=Basis.ASSUMED,
+        relied_on_by=("stacks/ingest.py", "stacks/alarms.py"),
+        ask=_record_no_json,
+    ),
+    Check(
+        name="payloads.pong_no_json",
+        assumed=(
+            "A ping that is no JSON does no harm to the next one. AWS does not say whether the rule pong "
+            "answers to it, without the ping's fields."
+        ),
+        expected={"the_next_ping_is_answered": True},
+        basis=Basis.ASSUMED,
+        relied_on_by=("device/pings.py",),
+        ask=_pong_no_json,
+    ),
+    Check(
+        name="payloads.largest_message",
+        assumed=(
+            "A message of 127 KiB is taken. AWS takes payloads of 128 KB, and an MQTT 5 client counts topic "
+            "and header in."
+        ),
+        expected={"ours": "SUCCESS"},
+        basis=Basis.DOCUMENTED,
+        source=f"{_QUOTAS} and {_GUIDE}/mqtt.html",
+        relied_on_by=("contract/limits.py",),
+        ask=_largest,
+    ),
+)

@@ -1,0 +1,217 @@
+"""Provisioning: from a claim to a robot's certificate, by the agent's own code."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import yaml
+
+from bench.target import Target
+from contract import (
+    ADMIT_CLAIM,
+    ADMIT_FINGERPRINT,
+    ADMITTED_CERTIFICATE,
+    ROBOT_PARAMETER,
+    SERIAL_PARAMETER,
+    fleet_name,
+)
+from device import identity
+from device.claim import load_claim
+from device.errors import IdentityError
+from device.exchange import Exchange
+from device.machine_key import make_key
+from station import certificates, claims, registry
+from verify.assumption import Basis
+from verify.bundles import removed_after
+from verify.check import Check
+from verify.errors import VerifyError
+from verify.robot import refusal
+
+_GUIDE = "https://docs.aws.amazon.com/iot/latest/developerguide"
+_HOOK = f"{_GUIDE}/pre-provisioning-hook.html"
+_PROVISION = f"{_GUIDE}/provision-wo-cert.html"
+_REFUSED = re.compile(r"RegisterThing was refused: (\w+)")
+_OPEN_S = 600
+_SERIAL = "verify"
+
+
+class _RefusedError(VerifyError):
+    """RegisterThing was refused, with the code that is this error's text."""
+
+
+@contextmanager
+def _agent() -> Iterator[None]:
+    """Runs the agent's code; what it raises is this package's error."""
+    try:
+        yield
+    except IdentityError as error:
+        if code := _REFUSED.search(str(error)):
+            raise _RefusedError(code[1]) from error
+        raise VerifyError(str(error)) from error
+
+
+def _provision(file: Path, robot: str | None = None) -> str:
+    """The code with which RegisterThing is refused; "" where it is not."""
+    try:
+        with _agent():
+            identity.provision(file, robot=robot)
+    except _RefusedError as error:
+        return str(error)
+    return ""
+
+
+def _claim(target: Target, robot: str | None, folder: Path, *, lasting: bool = False) -> Path:
+    """A claim's file, which says what machine this is: not every machine that asks has a number."""
+    file = claims.claim(target.cloud, robot, out=folder, lasting=lasting)
+    file.write_text(file.read_text() + yaml.safe_dump({"serial": _SERIAL}))
+    return file
+
+
+def _made(target: Target, robot: str, folder: Path, file: Path) -> dict[str, Any]:
+    """What provisioning makes of a robot."""
+    if refused := _provision(file, robot):
+        return {"refused": refused}
+    thing = target.cloud.client("iot").describe_thing(thingName=robot)
+    return {
+        "refused": "",
+        "thing_type_is_the_fleets": thing.get("thingTypeName") == fleet_name(target.cloud.namespace),
+        "attributes": sorted(thing["attributes"]),
+        "certificates": [one.status for one in certificates.attached(target.cloud, robot)],
+        "name_is_closed_again": ADMITTED_CERTIFICATE in registry.get(target.cloud, robot),
+        "connects": refusal(folder) is None,
+    }
+
+
+def _own_claim(target: Target) -> dict[str, Any]:
+    with removed_after(target, "verify-own-claim") as (name, folder):
+        return _made(target, name, folder, _claim(target, name, folder))
+
+
+def _lasting_claim(target: Target) -> dict[str, Any]:
+    with removed_after(target, "verify-lasting-claim") as (name, folder):
+        file = _claim(target, None, folder, lasting=True)
+        try:
+            claims.register(target.cloud, name, days=1)
+            return _made(target, name, folder, file)
+        finally:
+            claims.revoke_all(target.cloud)
+
+
+def _known_by(target: Target) -> dict[str, Any]:
+    """Open a name for the claim's id alone, and another one for its fingerprint alone."""
+    nobody, seen = "0" * 64, {}
+    for which in (ADMIT_CLAIM, ADMIT_FINGERPRINT):
+        with removed_after(target, f"verify-by-{which}") as (name, folder):
+            file = _claim(target, name, folder)
+            row = registry.get(target.cloud, name)
+            known = {ADMIT_CLAIM: nobody, ADMIT_FINGERPRINT: nobody, which: row[which]}
+            by = registry.ClaimId(known[ADMIT_CLAIM], known[ADMIT_FINGERPRINT])
+            registry.open_name(target.cloud, name, for_s=_OPEN_S, claim=by)
+            seen[which] = not _provision(file)
+    return {
+        "by_one_of_both": any(seen.values()),
+        "note_by_the_id": seen[ADMIT_CLAIM],
+        "note_by_the_fingerprint": seen[ADMIT_FINGERPRINT],
+    }
+
+
+def _registered_again(target: Target) -> dict[str, Any]:
+    """RegisterThing twice, as the agent does where the first answer was lost."""
+    with removed_after(target, "verify-again") as (name, folder):
+        claim = load_claim(_claim(target, name, folder))
+        _, request = make_key(name)
+        parameters = {ROBOT_PARAMETER: name, SERIAL_PARAMETER: _SERIAL}
+        with _agent(), Exchange(claim) as exchange:
+            _, token = exchange.certify(request)
+            first = exchange.register(token, parameters)
+            code = ""
+            try:
+                with _agent():
+                    exchange.register(token, parameters)
+            except _RefusedError as error:
+                code = str(error)
+        held = certificates.attached(target.cloud, name)
+    return {
+        "first_is_its_own": first == name,
+        "again_refused": code,
+        "certificates": [one.status for one in held],
+    }
+
+
+def _name_taken(target: Target) -> dict[str, Any]:
+    with removed_after(target, "verify-taken") as (name, folder):
+        file = _claim(target, name, folder)
+        first, second = _provision(file), _provision(file)
+        held = certificates.attached(target.cloud, name)
+    return {"first": first, "second_is_refused": bool(second), "certificates": len(held), "note_code": second}
+
+
+_MADE = {
+    "refused": "",
+    "thing_type_is_the_fleets": True,
+    "attributes": ["serial", "vehicle"],
+    "certificates": ["ACTIVE"],
+    "name_is_closed_again": True,
+    "connects": True,
+}
+CHECKS = (
+    Check(
+        name="provisioning.claim_for_minutes",
+        assumed=(
+            "A claim of CreateProvisioningClaim is exchanged for a certificate of the robot's own key. The "
+            "hook admits it, and the template makes the thing and attaches certificate and policy."
+        ),
+        expected=_MADE,
+        basis=Basis.DOCUMENTED,
+        source=f"{_PROVISION} and {_HOOK}",
+        relied_on_by=("station/claims.py", "functions/admit.py", "device/identity.py", "stacks/fleet.py"),
+        ask=_own_claim,
+    ),
+    Check(
+        name="provisioning.claim_that_lasts",
+        assumed="A claim certificate with the fleet's claim policy is exchanged in the same way.",
+        expected=_MADE,
+        basis=Basis.DOCUMENTED,
+        source=f"{_PROVISION} and {_HOOK}",
+        relied_on_by=("station/claims.py", "functions/admit.py", "stacks/documents.py"),
+        ask=_lasting_claim,
+    ),
+    Check(
+        name="provisioning.claim_known_by",
+        assumed=(
+            "The hook's claimCertificateId is the id of CreateProvisioningClaim or the SHA-256 of its "
+            "certificate. AWS does not say which; both are taken."
+        ),
+        expected={"by_one_of_both": True},
+        basis=Basis.ASSUMED,
+        relied_on_by=("functions/admit.py", "station/registry.py"),
+        ask=_known_by,
+    ),
+    Check(
+        name="provisioning.registered_again",
+        assumed=(
+            "RegisterThing with the same certificate and token succeeds again: the agent tries again where "
+            "the first answer was lost."
+        ),
+        expected={"first_is_its_own": True, "again_refused": "", "certificates": ["ACTIVE"]},
+        basis=Basis.ASSUMED,
+        relied_on_by=("device/identity.py", "functions/admit.py"),
+        ask=_registered_again,
+    ),
+    Check(
+        name="provisioning.name_taken",
+        assumed=(
+            "A second certificate for a name that is taken is refused by the hook, and RegisterThing with "
+            "it; the certificate is not attached."
+        ),
+        expected={"first": "", "second_is_refused": True, "certificates": 1},
+        basis=Basis.DOCUMENTED,
+        source=_HOOK,
+        relied_on_by=("functions/admit.py",),
+        ask=_name_taken,
+    ),
+)
