@@ -2,9 +2,9 @@
 PYTHON ?= python3
 BIN := .venv/bin
 # cdk.json runs `python app.py`.
-bootstrap deploy diff destroy: export PATH := $(CURDIR)/$(BIN):$(PATH)
+bootstrap preflight deploy diff destroy: export PATH := $(CURDIR)/$(BIN):$(PATH)
 
-.PHONY: help demo test test-oldest check setup prove-mixed bench bench-guard bench-agent bench-page screenshots bench-fleet verify-aws layer bootstrap deploy diff destroy lock clean
+.PHONY: help demo test test-oldest check setup prove-mixed bench bench-guard bench-agent bench-page screenshots bench-fleet verify-aws layer bootstrap preflight deploy diff destroy lock clean
 
 help: ## show this
 	@grep -hE '^[a-z-]+:.*## ' Makefile | sed -E 's/^([a-z-]+):.*## /\1\t/' | expand -t 14
@@ -65,7 +65,11 @@ CDK := $(BIN)/node node_modules/aws-cdk/bin/cdk
 bootstrap: layer ## prepare an AWS account and region for the CDK, once
 	@$(CDK) bootstrap
 
-deploy: layer ## deploy to the AWS account of your credentials; ARGS="-c key=value" sets parameters
+preflight: layer ## ask your AWS account what would make a deploy fail, and change nothing; ARGS as for deploy
+	@$(BIN)/python -m verify.preflight $(ARGS)
+
+deploy: layer ## deploy to the AWS account of your credentials: ARGS="-c key=value", SKIP_PREFLIGHT=1
+	@$(if $(SKIP_PREFLIGHT),:,$(BIN)/python -m verify.preflight $(ARGS))
 	@$(CDK) deploy --all $(ARGS)
 
 diff: layer ## what a deploy would change, resource by resource

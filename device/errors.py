@@ -5,6 +5,7 @@ ConfigError    the configuration file says something it may not
 SourceError    a source cannot give samples (a bag unreadable, a type unknown)
 UplinkError    the broker cannot be reached, or refused a message
 IdentityError  certificate or key cannot be read, do not belong together, or cannot be had
+ RefusedError  AWS IoT refuses to issue or register a certificate
 UploadError    a file cannot be uploaded
 """
 
@@ -29,6 +30,14 @@ class UplinkError(AgentError):
 
 class IdentityError(AgentError):
     """Certificate or key cannot be used or obtained; the text says which file, or who refused."""
+
+
+class RefusedError(IdentityError):
+    """AWS IoT refused to issue or register a certificate; ``code`` is its own."""
+
+    def __init__(self, text: str, code: str) -> None:
+        super().__init__(text)
+        self.code = code
 
 
 class UploadError(AgentError):

@@ -2,7 +2,8 @@
 registers a thing, and which must answer within 5 s, a cold start included.
 
 The operator opens a name, for one certificate and for a time (`iort robots claim`, `register`); what
-was not opened is refused, and so is everything when something goes wrong here.
+was not opened is refused, and so is everything when something goes wrong here. The one certificate is the one
+that comes through: one that was admitted and never registered gives way to another (docs/decisions/0039).
 """
 
 from __future__ import annotations
@@ -12,7 +13,7 @@ import os
 import time
 from collections.abc import Mapping
 from functools import cache
-from typing import Any
+from typing import Any, NamedTuple
 
 import botocore.session
 from botocore.config import Config
@@ -23,6 +24,7 @@ from contract import (
     ADMIT_UNTIL_S,
     ADMITTED_CERTIFICATE,
     ADMITTED_MS,
+    CONNECTED_MS,
     ROBOT,
     ROBOT_PARAMETER,
     SERIAL,
@@ -37,10 +39,24 @@ _log = logging.getLogger(__name__)
 # Both attempts fit, at their slowest, into the function's own time-out, and that into AWS' 5 s.
 _CONFIG = Config(connect_timeout=1, read_timeout=1, retries={"mode": "standard", "total_max_attempts": 2})
 _MAX_TEXT = 800
+SPENT = "another certificate has its admission: `iort robots claim` opens it again"
+# AWS IoT waits 5 s for this function and registers then. What was admitted so long ago is through, or is not.
+SETTLED_MS = 60_000
+# "Lifecycle events": the broker's clocks, by which connections are timed, may be so far apart.
+_CLOCKS_APART_MS = 120_000
 
 
-def admission(event: Mapping[str, Any], now_ms: int) -> dict[str, Any]:
+class Earlier(NamedTuple):
+    """The certificate that has the admission, and since when."""
+
+    certificate: str
+    admitted_ms: int
+
+
+def admission(event: Mapping[str, Any], now_ms: int, instead_of: Earlier | None = None) -> dict[str, Any]:
     """Take the admission that is open for the robot: UpdateItem's arguments but for the table.
+
+    It may be taken ``instead_of`` a certificate that did not come through, as long as that has it still.
 
     The update does it in one step, so that of two claims for one name one is refused. The same
     certificate may ask again, because an answer may be lost or come too late. AWS does not say that a
@@ -53,13 +69,15 @@ def admission(event: Mapping[str, Any], now_ms: int) -> dict[str, Any]:
     robot, serial = check_robot(parameters.get(ROBOT_PARAMETER, "")), _text(parameters, SERIAL_PARAMETER)
     certificate, claim = _text(event, "certificateId"), _claim_id(event)
     its = f"attribute_not_exists({ADMIT_CLAIM}) OR {ADMIT_CLAIM} = :claim OR {ADMIT_FINGERPRINT} = :claim"
-    opened = f"{ADMIT_UNTIL_S} >= :now_s AND ({its})"
+    unspent = f"attribute_not_exists({ADMITTED_CERTIFICATE})"
+    if instead_of is not None:
+        unspent = f"{ADMITTED_CERTIFICATE} = :earlier AND {ADMITTED_MS} = :earlier_ms"
+    opened = f"{ADMIT_UNTIL_S} >= :now_s AND ({its}) AND {unspent}"
     machine = f"(attribute_not_exists({SERIAL}) OR {SERIAL} = :serial)"
     return {
         "Key": {ROBOT: {"S": robot}},
         "UpdateExpression": (
-            f"SET {SERIAL} = :serial, {ADMITTED_CERTIFICATE} = :certificate, {ADMITTED_MS} = :now_ms "
-            f"REMOVE {ADMIT_UNTIL_S}, {ADMIT_CLAIM}, {ADMIT_FINGERPRINT}"
+            f"SET {SERIAL} = :serial, {ADMITTED_CERTIFICATE} = :certificate, {ADMITTED_MS} = :now_ms"
         ),
         "ConditionExpression": (
             f"attribute_exists({ROBOT}) AND {machine}"
@@ -71,13 +89,44 @@ def admission(event: Mapping[str, Any], now_ms: int) -> dict[str, Any]:
             ":claim": {"S": claim},
             ":now_s": {"N": str(now_ms // 1000)},
             ":now_ms": {"N": str(now_ms)},
+            **_earlier_values(instead_of),
         },
         "ReturnValuesOnConditionCheckFailure": "ALL_OLD",
     }
 
 
+def _earlier_values(instead_of: Earlier | None) -> dict[str, Any]:
+    if instead_of is None:
+        return {}
+    return {":earlier": {"S": instead_of.certificate}, ":earlier_ms": {"N": str(instead_of.admitted_ms)}}
+
+
+def earlier(row: Mapping[str, Any]) -> Earlier | None:
+    """Which certificate has the admission of a row; None where none has."""
+    if ADMITTED_CERTIFICATE not in row or ADMITTED_MS not in row:
+        return None
+    return Earlier(row[ADMITTED_CERTIFICATE]["S"], int(row[ADMITTED_MS]["N"]))
+
+
+def gives_way(row: Mapping[str, Any], status: str | None) -> bool:
+    """Whether the certificate that has the admission never came through, by its ``status`` at AWS IoT.
+
+    A new certificate is PENDING_ACTIVATION until it is registered, and after an hour AWS IoT deletes it
+    ("Device provisioning MQTT API"). One that is gone (None) may also have come through and been
+    deleted by the operator: then the robot may have connected since.
+    """
+    if status is not None:
+        return status == "PENDING_ACTIVATION"
+    has = earlier(row)
+    connected_ms = int(row.get(CONNECTED_MS, {}).get("N", "0"))
+    return has is not None and connected_ms < has.admitted_ms - _CLOCKS_APART_MS
+
+
 def reason(row: Mapping[str, Any], event: Mapping[str, Any], now_ms: int) -> str:
-    """Why a row's robot was not admitted, for the log; the row as DynamoDB returns it, empty for none."""
+    """Why a row's robot was not admitted, for the log; the row as DynamoDB returns it, empty for none.
+
+    `SPENT` where nothing but another certificate stands against it.
+    """
     if not row:
         return "it is not registered"
     if row.get(SERIAL, {}).get("S") not in (None, event["parameters"][SERIAL_PARAMETER]):
@@ -87,6 +136,8 @@ def reason(row: Mapping[str, Any], event: Mapping[str, Any], now_ms: int) -> str
     if float(row[ADMIT_UNTIL_S]["N"]) < now_ms // 1000:
         return "the time in which a certificate could be issued for it is over"
     ids = sorted({row[name]["S"] for name in (ADMIT_CLAIM, ADMIT_FINGERPRINT) if name in row})
+    if not ids or _claim_id(event) in ids:
+        return SPENT
     return f"it is open for another claim: for {' or '.join(ids)}, asked with {event['claimCertificateId']}"
 
 
@@ -109,6 +160,18 @@ def _dynamodb() -> Any:
     return botocore.session.get_session().create_client("dynamodb", config=_CONFIG)
 
 
+def _status(certificate: str) -> str | None:
+    """A certificate's status at AWS IoT; None where it is gone."""
+    # Its model is large and seldom needed. Answered once or not at all: the robot asks again.
+    config = _CONFIG.merge(Config(retries={"total_max_attempts": 1}))
+    iot = botocore.session.get_session().create_client("iot", config=config)
+    try:
+        answer = iot.describe_certificate(certificateId=certificate)
+    except iot.exceptions.ResourceNotFoundException:
+        return None
+    return str(answer["certificateDescription"]["status"])
+
+
 def handler(event: dict[str, Any], _context: object) -> dict[str, bool]:
     """Entry point of the template's pre-provisioning hook."""
     try:
@@ -121,21 +184,38 @@ def handler(event: dict[str, Any], _context: object) -> dict[str, bool]:
 
 
 def _admit(event: Mapping[str, Any]) -> bool:
-    now_ms, dynamodb = time.time_ns() // 1_000_000, _dynamodb()
+    now_ms = time.time_ns() // 1_000_000
     try:
-        dynamodb.update_item(TableName=os.environ["ROBOTS_TABLE"], **admission(event, now_ms))
+        row = _take(admission(event, now_ms))
+        if row is not None:
+            why, has = reason(row, event, now_ms), earlier(row)
+            if why == SPENT and has is not None and now_ms - has.admitted_ms >= SETTLED_MS:
+                status = _status(has.certificate)
+                if gives_way(row, status):
+                    _log.warning("certificate %s was admitted and never registered", has.certificate)
+                    row = _take(admission(event, now_ms, has))
     except ContractError as error:
         _log.warning("refused: %s", error)
         return False
-    except dynamodb.exceptions.ConditionalCheckFailedException as error:
-        robot = event["parameters"][ROBOT_PARAMETER]
-        _log.warning("%s refused: %s", robot, reason(error.response.get("Item", {}), event, now_ms))
+    robot = event["parameters"][ROBOT_PARAMETER]
+    if row is not None:
+        _log.warning("%s refused: %s", robot, reason(row, event, now_ms))
         return False
     _log.info(
-        "%s admitted: certificate %s, claim %s",
-        *(event["parameters"][ROBOT_PARAMETER], event["certificateId"], event["claimCertificateId"]),
+        "%s admitted: certificate %s, claim %s", robot, event["certificateId"], event["claimCertificateId"]
     )
     return True
+
+
+def _take(update: Mapping[str, Any]) -> Mapping[str, Any] | None:
+    """Do the update; where its condition is not met, the row against which it was held, empty for none."""
+    dynamodb = _dynamodb()
+    try:
+        dynamodb.update_item(TableName=os.environ["ROBOTS_TABLE"], **update)
+    except dynamodb.exceptions.ConditionalCheckFailedException as error:
+        row: Mapping[str, Any] = error.response.get("Item", {})
+        return row
+    return None
 
 
 if "AWS_LAMBDA_INITIALIZATION_TYPE" in os.environ:

@@ -144,6 +144,9 @@ def single(settings: Settings) -> dict[str, dict[str, str]]:
             wide(f"{iot}:cert/*"): "a certificate's id is made when it is",
             wide("*"): "RegisterThing and two lists know no resources",
         },
+        "fleet/AdmitRole/DefaultPolicy": {
+            wide(f"{iot}:cert/*"): "a certificate's id is made when it is; its status alone is read"
+        },
         "fleet/Provisioning": {"W3005": "RegisterThing tries role and policy, which must be there first"},
         "fleet/PresenceRole/DefaultPolicy": {**to_a_queue},
         "ingest/PongRole/DefaultPolicy": {wide(f"{iot}:topic/pong/{settings.namespace}/*/rule"): a_robot},

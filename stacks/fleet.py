@@ -99,6 +99,11 @@ class Fleet(Stack):
             environment={"ROBOTS_TABLE": storage.robots.table_name},
         )
         storage.robots.grant(admit, "dynamodb:UpdateItem")
+        # Whether the certificate that it admitted came through; whose that will be, nobody knows before.
+        certificates = self.format_arn(service="iot", resource="cert", resource_name="*")
+        admit.add_to_role_policy(
+            iam.PolicyStatement(actions=["iot:DescribeCertificate"], resources=[certificates])
+        )
         return admit
 
     def _presence(self, storage: Storage, quarantine: Quarantine) -> lambda_.Function:

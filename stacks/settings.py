@@ -132,7 +132,11 @@ class Settings:
     @classmethod
     def from_context(cls, app: App) -> Settings:
         """Read ``-c key=value`` and cdk.json; raises `SettingsError` for a value that is not allowed."""
-        context = app.node.try_get_context
+        return cls.read(app.node.try_get_context)
+
+    @classmethod
+    def read(cls, context: Callable[[str], Any]) -> Settings:
+        """The same of ``context``, which says a key's value, or None; raises `SettingsError`."""
         given: dict[str, Any] = {
             key: read(key, value) for key, read in _READ.items() if (value := context(key)) is not None
         }

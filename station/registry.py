@@ -13,6 +13,8 @@ from contract import (
     ADMIT_CLAIM,
     ADMIT_FINGERPRINT,
     ADMIT_UNTIL_S,
+    ADMITTED_CERTIFICATE,
+    ADMITTED_MS,
     CONNECTED_MS,
     DISCONNECTED_MS,
     ONLINE,
@@ -132,13 +134,14 @@ class ClaimId(NamedTuple):
 
 
 def open_name(cloud: Cloud, robot: str, *, for_s: float, claim: ClaimId | None) -> None:
-    """Let one certificate be issued for a name: within the time, for this claim or for any."""
+    """Let one certificate be issued for a name: within the time, for this claim or for any. Which one was
+    issued before is forgotten."""
     values = {":until": {"N": str(int(time.time() + for_s))}}
-    update = f"SET {ADMIT_UNTIL_S} = :until"
+    update, before = f"SET {ADMIT_UNTIL_S} = :until", f"{ADMITTED_CERTIFICATE}, {ADMITTED_MS}"
     if claim is None:
-        update += f" REMOVE {ADMIT_CLAIM}, {ADMIT_FINGERPRINT}"
+        update += f" REMOVE {before}, {ADMIT_CLAIM}, {ADMIT_FINGERPRINT}"
     else:
-        update += f", {ADMIT_CLAIM} = :claim, {ADMIT_FINGERPRINT} = :fingerprint"
+        update += f", {ADMIT_CLAIM} = :claim, {ADMIT_FINGERPRINT} = :fingerprint REMOVE {before}"
         values[":claim"] = {"S": claim.id.lower().removeprefix("0x")}
         values[":fingerprint"] = {"S": claim.fingerprint}
     cloud.client("dynamodb").update_item(

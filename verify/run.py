@@ -29,10 +29,11 @@ from bench.interrupts import wound_up
 from bench.target import AWS, EMBEDDED, Target, open_target
 from local.deployment import ROOT
 from local.errors import LocalError
+from stacks.settings import Settings
 from station.cloud import Cloud
 from station.errors import StationError
 from station.prices import AS_OF
-from verify import measured, price, report
+from verify import measured, preflight, price, report
 from verify.check import FIRST, WITH_KEY, Answer, Check, Verdict, ask
 from verify.checks import ALL
 from verify.deployment import Deployment
@@ -77,6 +78,7 @@ def run(options: argparse.Namespace, cloud: Cloud | None = None, deployment: Dep
             cloud = (cloud or Cloud(namespace=options.namespace)).check()
             options.out.mkdir(parents=True, exist_ok=True)
             deployment = deployment or Deployment(cloud, options.out, say)
+            findings.extend(_looked(cloud, console))
             if not options.yes:
                 _confirm(console, cloud)
         try:
@@ -123,6 +125,17 @@ def _asked(checks: Sequence[Check], phase: str, target: Target, console: Console
         if answer.reason:
             console.print(report.redacted(f"      {answer.reason}"), markup=False)
         yield answer
+
+
+def _looked(cloud: Cloud, console: Console) -> list[str]:
+    """The preflight's lines for the report. Raises `VerifyError` where the deployment would fail."""
+    found = preflight.look(cloud, Settings(namespace=cloud.namespace))
+    lines = [preflight.line(finding) for finding in found]
+    for text in lines:
+        console.print(report.redacted(text), markup=False, highlight=False)
+    if preflight.stopped(found):
+        raise VerifyError("nothing was made: the preflight says what to do")
+    return lines
 
 
 def _confirm(console: Console, cloud: Cloud) -> None:

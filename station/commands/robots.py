@@ -14,6 +14,7 @@ from rich.table import Table
 from contract import (
     ADMISSION,
     ADMIT_UNTIL_S,
+    ADMITTED_CERTIFICATE,
     AGENT_VERSION,
     ALERT_PREFIX,
     CONNECTED_MS,
@@ -276,7 +277,7 @@ def _connection(row: Mapping[str, Any]) -> str:
     if DISCONNECTED_MS in row:
         reason = row.get(DISCONNECT_REASON, "")
         return f"offline since {_value(DISCONNECTED_MS, row[DISCONNECTED_MS])} {reason}".rstrip()
-    if ADMIT_UNTIL_S in row:
+    if ADMIT_UNTIL_S in row and ADMITTED_CERTIFICATE not in row:
         late = float(row[ADMIT_UNTIL_S]) < time.time()
         return f"{'was expected' if late else 'expected'} until {_value(ADMIT_UNTIL_S, row[ADMIT_UNTIL_S])}"
     return "never connected"

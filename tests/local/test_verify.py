@@ -64,6 +64,8 @@ def test_a_run_deploys_asks_reports_and_destroys(embedded, tmp_path):
     assert recorder.told == [{}, "destroyed"]
     report = json.loads((tmp_path / "report.json").read_text())
     assert {one["verdict"] for one in report["answers"]} == {"as assumed"}
+    assert "fine: stacks: 6 of 8 are there, each can be updated" in report["preflight"]
+    assert "000000000000" not in json.dumps(report["preflight"])
     assert measured.load(tmp_path / "report.json").seen.keys() == {one.name for one in rules.CHECKS}
 
 

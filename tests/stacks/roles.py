@@ -140,7 +140,8 @@ ROLES = {
     ),
     "AdmitRole": (
         "lambda.amazonaws.com",
-        {(action, "AdmitLog.Arn") for action in LOG} | {("dynamodb:UpdateItem", "Robots.Arn")},
+        {(action, "AdmitLog.Arn") for action in LOG}
+        | {("dynamodb:UpdateItem", "Robots.Arn"), ("iot:DescribeCertificate", f"{IOT}:cert/*")},
     ),
     "PresenceRole": (
         "lambda.amazonaws.com",

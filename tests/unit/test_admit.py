@@ -11,7 +11,15 @@ import time
 import pytest
 from botocore.stub import Stubber
 
-from contract import ADMIT_CLAIM, ADMIT_FINGERPRINT, ADMIT_UNTIL_S, ADMITTED_CERTIFICATE, SERIAL
+from contract import (
+    ADMIT_CLAIM,
+    ADMIT_FINGERPRINT,
+    ADMIT_UNTIL_S,
+    ADMITTED_CERTIFICATE,
+    ADMITTED_MS,
+    CONNECTED_MS,
+    SERIAL,
+)
 from functions import admit
 from functions.tables import plain
 from tests.fakes import ROBOTS
@@ -47,6 +55,16 @@ def robots(dynamodb, monkeypatch):
             dynamodb.put_item(TableName=ROBOTS, Item=item)
 
         @staticmethod
+        def change(name, value):
+            dynamodb.update_item(
+                TableName=ROBOTS,
+                Key={"robot": {"S": "car"}},
+                UpdateExpression="SET #name = :value",
+                ExpressionAttributeNames={"#name": name},
+                ExpressionAttributeValues={":value": {"N": str(value)}},
+            )
+
+        @staticmethod
         def clear():
             for item in dynamodb.scan(TableName=ROBOTS)["Items"]:
                 dynamodb.delete_item(TableName=ROBOTS, Key={"robot": item["robot"]})
@@ -70,7 +88,6 @@ def test_an_opened_name_is_admitted_once(robots, capsys):
     assert robots.ask(request()) is True
     row = robots.row()
     assert (row[SERIAL], row[ADMITTED_CERTIFICATE]) == ("s1", "new")
-    assert ADMIT_UNTIL_S not in row
     # The answer may have been lost; another certificate is another robot's.
     assert robots.ask(request()) is True
     assert robots.ask(request(certificate="second")) is False
@@ -86,8 +103,7 @@ def test_an_opened_name_is_admitted_once(robots, capsys):
 def test_a_certificate_that_asks_again_is_admitted_also_when_the_time_is_over(robots):
     robots.put(until_s=LATER_S, **{ADMIT_CLAIM: "claim", ADMIT_FINGERPRINT: "digits"})
     assert robots.ask(request()) is True
-    row = robots.row()
-    assert not {ADMIT_UNTIL_S, ADMIT_CLAIM, ADMIT_FINGERPRINT} & row.keys()
+    robots.change(ADMIT_UNTIL_S, 1)
     # The answer came too late for AWS IoT; the robot asks again, and only this certificate may.
     for _ in range(3):
         assert robots.ask(request()) is True
@@ -161,7 +177,7 @@ def test_what_it_was_opened_for_is_admitted(robots):
     for row in [{ADMIT_CLAIM: "claim"}, {SERIAL: "s1"}, {SERIAL: "s1", ADMIT_CLAIM: "claim"}]:
         robots.put(**row)
         assert robots.ask(request()) is True
-        assert ADMIT_CLAIM not in robots.row()
+        assert robots.row()[ADMITTED_CERTIFICATE] == "new"
 
 
 INCOMPLETE = [
@@ -216,3 +232,116 @@ def test_its_slowest_answer_is_in_time(synthesized):
     # botocore waits up to a second, at random, before a second attempt.
     slowest_s = attempts * max(config.connect_timeout, config.read_timeout) + (attempts - 1)
     assert slowest_s < timeout_s < 5
+
+
+NOW_MS = 1_800_000_000_000
+ITS_ROW = {ADMITTED_CERTIFICATE: {"S": "first"}, ADMITTED_MS: {"N": str(NOW_MS)}}
+
+
+@pytest.mark.parametrize(
+    ("status", "connected_ms", "gives_way"),
+    [
+        ("PENDING_ACTIVATION", None, True),
+        # A robot that drives with an older certificate while it is renewed.
+        ("PENDING_ACTIVATION", NOW_MS + 1, True),
+        ("ACTIVE", None, False),
+        ("INACTIVE", None, False),
+        ("REVOKED", None, False),
+        (None, None, True),
+        (None, NOW_MS - 3_600_000, True),
+        (None, NOW_MS - 60_000, False),
+        (None, NOW_MS + 3_600_000, False),
+    ],
+)
+def test_only_a_certificate_that_never_came_through_gives_way(status, connected_ms, gives_way):
+    row = dict(ITS_ROW)
+    if connected_ms is not None:
+        row[CONNECTED_MS] = {"N": str(connected_ms)}
+    assert admit.gives_way(row, status) is gives_way
+
+
+@pytest.fixture
+def iot(monkeypatch):
+    """moto's AWS IoT, of which only the status of certificates is asked: `made` in a status."""
+    import boto3
+
+    monkeypatch.setenv("AWS_DEFAULT_REGION", "eu-west-1")
+    client = boto3.client("iot", region_name="eu-west-1")
+
+    def made(status):
+        number = client.create_keys_and_certificate(setAsActive=True)["certificateId"]
+        client.update_certificate(certificateId=number, newStatus=status)
+        return number
+
+    return made
+
+
+def spent(robots, certificate, *, ago_ms=admit.SETTLED_MS, **row):
+    """A name that a certificate was admitted to, so long ago."""
+    robots.clear()
+    robots.put(**{SERIAL: "s1", ADMIT_CLAIM: "claim", ADMIT_FINGERPRINT: "digits", **row})
+    assert robots.ask(request(certificate=certificate, claim=row.get(ADMIT_CLAIM, "claim"))) is True
+    robots.change(ADMITTED_MS, time.time_ns() // 1_000_000 - ago_ms)
+
+
+def test_a_certificate_that_was_admitted_and_never_registered_gives_way_to_another(robots, iot):
+    first = iot("PENDING_ACTIVATION")
+    spent(robots, first)
+    assert robots.ask(request(certificate="second")) is True
+    assert robots.row()[ADMITTED_CERTIFICATE] == "second"
+    # The first one lost the name with that.
+    assert robots.ask(request(certificate=first)) is False
+
+
+def test_one_that_came_through_keeps_the_name(robots, iot, caplog):
+    spent(robots, iot("ACTIVE"))
+    before = robots.row()
+    assert robots.ask(request(certificate="second")) is False
+    assert "another certificate has its admission" in caplog.text
+    assert robots.row() == before
+
+
+@pytest.mark.parametrize(
+    "case",
+    [
+        ({"claim": "another"}, None),
+        ({"serial": "s2"}, None),
+        ({}, (ADMIT_UNTIL_S, 1)),
+        # AWS IoT may still be registering it.
+        ({}, (ADMITTED_MS, time.time_ns() // 1_000_000 + 3_600_000)),
+    ],
+)
+def test_nobody_else_gets_it_and_aws_iot_is_not_even_asked(robots, iot, monkeypatch, caplog, case):
+    asked, change = case
+    spent(robots, iot("PENDING_ACTIVATION"))
+    if change is not None:
+        robots.change(*change)
+    before = robots.row()
+    # Whoever asked AWS IoT would have no answer, and fail.
+    monkeypatch.setenv("AWS_ENDPOINT_URL_IOT", "http://127.0.0.1:9")
+    assert robots.ask(request(certificate="second", **asked)) is False
+    assert "could not be decided" not in caplog.text
+    assert robots.row() == before
+
+
+def test_where_aws_iot_does_not_answer_nothing_gives_way(robots, iot, monkeypatch, caplog):
+    spent(robots, iot("PENDING_ACTIVATION"))
+    monkeypatch.setenv("AWS_ENDPOINT_URL_IOT", "http://127.0.0.1:9")
+    assert robots.ask(request(certificate="second")) is False
+    assert "could not be decided" in caplog.text
+
+
+def test_of_two_that_take_over_one_has_it(robots, iot):
+    first = iot("PENDING_ACTIVATION")
+    spent(robots, first)
+    # Both have read the row; the second one's condition is no longer met.
+    now_ms = time.time_ns() // 1_000_000
+    has = admit.Earlier(first, int(robots.row()[ADMITTED_MS]))
+    assert admit._take(admit.admission(request(certificate="second"), now_ms, has)) is None
+    assert admit._take(admit.admission(request(certificate="third"), now_ms, has)) is not None
+    assert robots.row()[ADMITTED_CERTIFICATE] == "second"
+
+
+def test_a_row_from_before_admissions_were_kept_is_closed(robots):
+    robots.put(until_s=None, **{SERIAL: "s1", ADMITTED_CERTIFICATE: "old"})
+    assert robots.ask(request()) is False

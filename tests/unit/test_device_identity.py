@@ -1,11 +1,17 @@
-"""Provisioning: what is tried again, and with what."""
+"""Provisioning: what is tried again, and with what; also by a run after the one that ended."""
 
 from __future__ import annotations
 
+import time
+from pathlib import Path
+from typing import Mapping
+
 import pytest
 
-from device.errors import IdentityError
-from device.identity import register_again
+import contract
+from device.errors import IdentityError, RefusedError
+from device.identity import Run, provision, register_again
+from device.pending import TOKEN_S, Pending, keep, kept
 
 
 class Cloud:
@@ -36,3 +42,194 @@ def test_what_is_refused_for_good_is_said_as_it_was_said_first() -> None:
     with pytest.raises(IdentityError, match=r"^not expected$"):
         register_again(cloud.register, wait=cloud.waited.append)
     assert (cloud.asked, cloud.waited) == (3, [1.0, 4.0])
+
+
+class Exchange:
+    """AWS IoT, as far as it is asked. ``tokens`` are good; a certificate in ``registered`` connects."""
+
+    def __init__(self) -> None:
+        self.issued: list[str] = []
+        self.tokens: set[str] = set()
+        self.registered: set[str] = set()
+        self.refusal: IdentityError | None = None
+        self.claim_is_good = True
+        self.asked: list[str] = []
+        self.waited: list[float] = []
+
+    @property
+    def run(self) -> Run:
+        return Run(lambda _claim: self, self.waited.append)
+
+    def __enter__(self) -> Exchange:  # noqa: PYI034 - Self came with Python 3.11
+        if not self.claim_is_good:
+            raise IdentityError("the claim does not connect")
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        pass
+
+    def certify(self, _request: str) -> tuple[str, str]:
+        number = len(self.issued)
+        self.issued.append(f"certificate {number}")
+        self.tokens.add(f"token {number}")
+        return f"certificate {number}", f"token {number}"
+
+    def register(self, token: str, parameters: Mapping[str, str]) -> str:
+        self.asked.append(token)
+        if self.refusal is not None:
+            raise self.refusal
+        if token not in self.tokens:
+            raise RefusedError("refused", "InvalidCertificateOwnershipToken")
+        self.registered.add(token.replace("token", "certificate"))
+        return parameters["Robot"]
+
+    def connects(self, _robot: str, certificate: str, _private_key: str) -> bool:
+        return certificate in self.registered
+
+
+@pytest.fixture
+def aws() -> Exchange:
+    return Exchange()
+
+
+@pytest.fixture
+def claim(tmp_path: Path) -> Path:
+    for name in ("c.pem", "k.pem"):
+        (tmp_path / name).touch()
+    file = tmp_path / "claim.yaml"
+    file.write_text("endpoint: here\ncertificate: c.pem\nprivate_key: k.pem\nserial: s1\n")
+    return file
+
+
+def earlier(folder: Path, *, asked_s: float | None = None, **other: str) -> Pending:
+    """What a run left that was issued the first certificate."""
+    values = {
+        "robot": "car",
+        "serial": "s1",
+        "endpoint": "here",
+        "namespace": contract.DEFAULT_NAMESPACE,
+        "private_key": "key 0",
+        "certificate": "certificate 0",
+        "token": "token 0",
+    }
+    pending = Pending(**{**values, **other}, asked_s=time.time() if asked_s is None else asked_s)
+    keep(folder, pending)
+    return pending
+
+
+def taken_up(claim: Path, aws: Exchange) -> str:
+    """The certificate with which the robot then stands there."""
+    provision(claim, robot="car", run=aws.run)
+    assert kept(claim.parent) is None
+    return (claim.parent / "certificate.pem").read_text()
+
+
+@pytest.mark.parametrize("at", ["registering", "writing"])
+def test_a_run_that_ends_anywhere_is_taken_up_by_the_next(claim: Path, aws: Exchange, at: str) -> None:
+    class Ended(BaseException):
+        """As if the process ended."""
+
+    def register(token: str, parameters: Mapping[str, str]) -> str:
+        if at == "writing":
+            Exchange.register(aws, token, parameters)
+        raise Ended
+
+    aws.register = register
+    with pytest.raises(Ended):
+        provision(claim, robot="car", run=aws.run)
+    del aws.register
+    assert taken_up(claim, aws) == "certificate 0"
+    assert aws.issued == ["certificate 0"]
+
+
+def test_what_aws_says_to_a_token_that_was_used_does_not_matter(claim: Path, aws: Exchange) -> None:
+    for refusal in (
+        RefusedError("used", "InvalidCertificateOwnershipToken"),
+        RefusedError("no", "AccessDenied"),
+    ):
+        earlier(claim.parent)
+        aws.registered, aws.refusal = {"certificate 0"}, refusal
+        assert taken_up(claim, aws) == "certificate 0"
+    assert not aws.issued
+
+
+def test_one_that_was_registered_needs_no_claim(claim: Path, aws: Exchange) -> None:
+    earlier(claim.parent)
+    aws.registered, aws.claim_is_good = {"certificate 0"}, False
+    assert taken_up(claim, aws) == "certificate 0"
+
+
+def test_a_token_that_is_no_longer_good_is_let_go(claim: Path, aws: Exchange) -> None:
+    aws.issued.append("certificate 0")
+    earlier(claim.parent)
+    assert taken_up(claim, aws) == "certificate 1"
+    assert aws.asked == ["token 0", "token 1"]
+
+
+@pytest.mark.parametrize("off_s", [-TOKEN_S, 60.0])
+def test_one_that_is_too_old_by_the_clock_is_not_even_asked_for(
+    claim: Path, aws: Exchange, off_s: float
+) -> None:
+    aws.issued.append("certificate 0")
+    earlier(claim.parent, asked_s=time.time() + off_s)
+    assert taken_up(claim, aws) == "certificate 1"
+    assert aws.asked == ["token 1"]
+
+
+@pytest.mark.parametrize(
+    "refusal", [RefusedError("not expected", "AccessDenied"), IdentityError("no answer")]
+)
+def test_what_may_be_admitted_later_is_kept(claim: Path, aws: Exchange, refusal: IdentityError) -> None:
+    left = earlier(claim.parent)
+    aws.refusal = refusal
+    with pytest.raises(IdentityError, match=str(refusal)):
+        provision(claim, robot="car", run=aws.run)
+    assert kept(claim.parent) == left
+    assert not aws.issued
+
+
+@pytest.mark.parametrize(
+    "other", [{"robot": "bike"}, {"serial": "s2"}, {"endpoint": "there"}, {"namespace": "a"}]
+)
+def test_another_robots_is_left_alone(claim: Path, aws: Exchange, other: dict[str, str]) -> None:
+    earlier(claim.parent, certificate="certificate of another", **other)
+    assert taken_up(claim, aws) == "certificate 0"
+
+
+@pytest.mark.parametrize("content", ["", "[]", "{}", '{"robot": "car", "asked_s": "x"}', "null", "\\x00"])
+def test_what_cannot_be_read_is_left_aside(claim: Path, aws: Exchange, content: str) -> None:
+    (claim.parent / ".provisioning.json").write_text(content)
+    assert taken_up(claim, aws) == "certificate 0"
+
+
+def test_a_link_in_its_place_is_not_followed(claim: Path, aws: Exchange, tmp_path: Path) -> None:
+    elsewhere = tmp_path / "elsewhere"
+    elsewhere.mkdir()
+    earlier(elsewhere, certificate="certificate of another")
+    before = (elsewhere / ".provisioning.json").read_bytes()
+    (claim.parent / ".provisioning.json").symlink_to(elsewhere / ".provisioning.json")
+    assert taken_up(claim, aws) == "certificate 0"
+    assert (elsewhere / ".provisioning.json").read_bytes() == before
+
+
+def test_what_was_there_before_is_kept_however_often_it_ends(claim: Path, aws: Exchange) -> None:
+    (claim.parent / "private.key").write_text("old key")
+    (claim.parent / "certificate.pem").write_text("old certificate")
+    left = earlier(claim.parent)
+    aws.tokens.add("token 0")
+    # It ended between its two files.
+    (claim.parent / "private.key.previous").write_text("old key")
+    (claim.parent / "private.key").write_text(left.private_key)
+    assert taken_up(claim, aws) == "certificate 0"
+    assert (claim.parent / "private.key.previous").read_text() == "old key"
+    assert (claim.parent / "certificate.pem.previous").read_text() == "old certificate"
+
+
+def test_an_answer_that_was_lost_is_no_refusal(claim: Path, aws: Exchange) -> None:
+    def register(token: str, parameters: Mapping[str, str]) -> str:
+        Exchange.register(aws, token, parameters)
+        raise IdentityError("no answer")
+
+    aws.register = register
+    assert taken_up(claim, aws) == "certificate 0"
+    assert aws.waited == [1.0, 4.0]

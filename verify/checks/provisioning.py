@@ -14,13 +14,16 @@ from bench.target import Target
 from contract import (
     ADMIT_CLAIM,
     ADMIT_FINGERPRINT,
-    ADMIT_UNTIL_S,
+    ADMITTED_CERTIFICATE,
     ROBOT_PARAMETER,
     SERIAL_PARAMETER,
     fleet_name,
 )
 from device import identity
+from device.claim import load_claim
 from device.errors import IdentityError
+from device.exchange import Exchange
+from device.machine_key import make_key
 from station import certificates, claims, registry
 from verify.assumption import Basis
 from verify.bundles import removed_after
@@ -78,7 +81,7 @@ def _made(target: Target, robot: str, folder: Path, file: Path) -> dict[str, Any
         "thing_type_is_the_fleets": thing.get("thingTypeName") == fleet_name(target.cloud.namespace),
         "attributes": sorted(thing["attributes"]),
         "certificates": [one.status for one in certificates.attached(target.cloud, robot)],
-        "name_is_closed_again": ADMIT_UNTIL_S not in registry.get(target.cloud, robot),
+        "name_is_closed_again": ADMITTED_CERTIFICATE in registry.get(target.cloud, robot),
         "connects": refusal(folder) is None,
     }
 
@@ -119,10 +122,10 @@ def _known_by(target: Target) -> dict[str, Any]:
 def _registered_again(target: Target) -> dict[str, Any]:
     """RegisterThing twice, as the agent does where the first answer was lost."""
     with removed_after(target, "verify-again") as (name, folder):
-        claim = identity.load_claim(_claim(target, name, folder))
-        _, request = identity.make_key(name)
+        claim = load_claim(_claim(target, name, folder))
+        _, request = make_key(name)
         parameters = {ROBOT_PARAMETER: name, SERIAL_PARAMETER: _SERIAL}
-        with _agent(), identity.Exchange(claim) as exchange:
+        with _agent(), Exchange(claim) as exchange:
             _, token = exchange.certify(request)
             first = exchange.register(token, parameters)
             code = ""

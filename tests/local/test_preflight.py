@@ -1,0 +1,26 @@
+"""The preflight on the embedded cloud, which is deployed: it answers what it can, and nothing stops."""
+
+from __future__ import annotations
+
+from stacks.settings import Settings
+from verify import preflight
+from verify.preflight_finding import Verdict
+
+
+def test_the_embedded_cloud_stops_nothing(embedded):
+    findings = {one.item: one for one in preflight.look(embedded.cloud, Settings(embedded=True))}
+    assert not preflight.stopped(list(findings.values())), findings
+    said = {item: one.found for item, one in findings.items() if one.verdict is Verdict.FINE}
+    assert "account 000000000000" in said["credentials"]
+    assert said["stacks"] == "6 of 8 are there, each can be updated"
+    assert said["names"] == "free, or this deployment's own"
+    assert said["kept data"] == "none of an earlier deployment"
+    assert said["changed settings"] == "none that must not be"
+
+
+def test_another_namespace_is_a_first_deployment(embedded):
+    settings = Settings(namespace="another", embedded=True)
+    findings = {one.item: one for one in preflight.look(embedded.cloud, settings)}
+    assert not preflight.stopped(list(findings.values())), findings
+    assert findings["stacks"].found == "none: a first one"
+    assert findings["changed settings"].found == "nothing is deployed"

@@ -1,0 +1,97 @@
+"""Asks an account what makes a deployment fail, before it is tried; read-only.
+
+    python -m verify.preflight [-c key=value ...] [--profile NAME] [--json]
+
+Settings are read as app.py reads them; other options of the CDK's are ignored. Exit status 1 where something
+stops the deployment. `make deploy` asks first (SKIP_PREFLIGHT=1: not); `make verify-aws` too, for its report.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import sys
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict
+from typing import Any
+
+from stacks.settings import ROOT, Settings, SettingsError
+from station.cloud import Cloud
+from station.console import Console
+from verify import preflight_account, preflight_deployed
+from verify.preflight_finding import Clients, Finding, Verdict
+
+_STYLES = {Verdict.FINE: "green", Verdict.WARNING: "yellow", Verdict.STOPS: "red"}
+
+
+def look(clients: Clients, settings: Settings) -> list[Finding]:
+    """Every finding, in the order in which a deployment would meet it."""
+    who = preflight_account.credentials(clients, settings)
+    if who.verdict is Verdict.STOPS:
+        # Every other question would get this answer.
+        return [who]
+    return [who, *(ask(clients, settings) for ask in (*preflight_account.ITEMS, *preflight_deployed.ITEMS))]
+
+
+def stopped(findings: Sequence[Finding]) -> bool:
+    """Whether any of them stops the deployment."""
+    return any(finding.verdict is Verdict.STOPS for finding in findings)
+
+
+def as_json(findings: Sequence[Finding]) -> list[dict[str, str]]:
+    """The findings as a report has them."""
+    return [{**asdict(finding), "verdict": finding.verdict.value} for finding in findings]
+
+
+def options(arguments: Sequence[str]) -> argparse.Namespace:
+    """The command line's, as `make deploy` hands ARGS on to the CDK and to this."""
+    parser = argparse.ArgumentParser(prog="verify.preflight", description=(__doc__ or "").splitlines()[0])
+    parser.add_argument("-c", "--context", action="append", default=[], metavar="KEY=VALUE")
+    parser.add_argument("--profile", help="of AWS' configuration")
+    parser.add_argument("--json", action="store_true", help="print the findings as JSON")
+    known, _others = parser.parse_known_args(arguments)
+    return known
+
+
+def context(given: Sequence[str]) -> Mapping[str, Any]:
+    """What the CDK would hand to app.py: cdk.json's values and, over them, ``key=value``."""
+    in_file: dict[str, Any] = json.loads((ROOT / "cdk.json").read_text()).get("context", {})
+    pairs = (pair.partition("=") for pair in given)
+    return {**in_file, **{key: value for key, _, value in pairs}}
+
+
+def line(finding: Finding) -> str:
+    """A finding in one line."""
+    done = f" -> {finding.do}" if finding.do else ""
+    return f"{finding.verdict.value}: {finding.item}: {finding.found}{done}"
+
+
+def show(findings: Sequence[Finding], console: Console) -> None:
+    """A line a finding, and below it what to do."""
+    for finding in findings:
+        style = _STYLES[finding.verdict]
+        console.print(
+            f"{finding.verdict.value:8} {finding.item}: {finding.found}", style=style, soft_wrap=True
+        )
+        if finding.do:
+            console.print(f"{'':8} -> {finding.do}", soft_wrap=True)
+
+
+def main() -> None:
+    """Look, say, and exit with 1 where the deployment would fail."""
+    asked = options(sys.argv[1:])
+    try:
+        settings = Settings.read(context(asked.context).get)
+    except SettingsError as error:
+        sys.exit(f"preflight: {error}")
+    findings = look(Cloud(namespace=settings.namespace, profile=asked.profile), settings)
+    if asked.json:
+        sys.stdout.write(json.dumps(as_json(findings), indent=2) + "\n")
+    else:
+        show(findings, Console())
+    if stopped(findings):
+        sys.exit("preflight: nothing was deployed; SKIP_PREFLIGHT=1 deploys all the same")
+
+
+if __name__ == "__main__":
+    main()

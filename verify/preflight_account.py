@@ -1,0 +1,179 @@
+"""What a deployment needs of the account and region, whatever is deployed there."""
+
+from __future__ import annotations
+
+from botocore.exceptions import BotoCoreError, ClientError
+
+from contract import RULES, rule_name
+from stacks.settings import Settings
+from station.errors import StationError
+from station.scale import on_paper
+from station.usage import Usage
+from verify.preflight_deployed import resources
+from verify.preflight_finding import Clients, Found, code, fine, item, stops, warning
+
+# What the CDK's default synthesizer asks of the bootstrap stack; a test holds it to the app's manifest.
+BOOTSTRAP = 6
+BOOTSTRAP_PARAMETER = "/cdk-bootstrap/hnb659fds/version"
+# "PutFunctionConcurrency": a reservation must leave so many executions to everything else.
+UNRESERVED = 100
+# A fleet for which the quotas should do.
+ROBOTS = 100
+# Service Quotas' name of AWS IoT Core, and of each quota with what a fleet needs of it (station/scale.py).
+IOT_CORE = "iotcore"
+RULES_QUOTA = "Maximum number of rules per AWS account"
+QUOTAS = {
+    "Maximum concurrent client connections per account": "IoT Core: connections",
+    "Inbound publish requests per second per account": "IoT Core: publishes in",
+    "Rule evaluations per second per AWS account": "IoT Core: rule evaluations",
+}
+CONNECTS_QUOTA = "Connect requests per second per account"
+
+
+@item("credentials", "sts GetCallerIdentity")
+def credentials(clients: Clients, _settings: Settings) -> Found:
+    """Whether there are credentials that AWS takes, and a region."""
+    try:
+        sts = clients.client("sts")
+        answer = sts.get_caller_identity()
+    except (BotoCoreError, ClientError, StationError) as error:
+        return stops(
+            str(error), "set AWS_PROFILE or AWS_ACCESS_KEY_ID and AWS_SECRET_ACCESS_KEY, and AWS_REGION"
+        )
+    return fine(f"account {answer['Account']}, region {sts.meta.region_name}, as {answer['Arn']}")
+
+
+@item("bootstrap", f"ssm GetParameter {BOOTSTRAP_PARAMETER}")
+def bootstrap(clients: Clients, _settings: Settings) -> Found:
+    """Whether the CDK's own stack is there, and new enough for our templates."""
+    try:
+        answer = clients.client("ssm").get_parameter(Name=BOOTSTRAP_PARAMETER)
+    except ClientError as error:
+        if code(error) != "ParameterNotFound":
+            raise
+        return stops("this account and region are not bootstrapped", "`make bootstrap`, once")
+    version = int(answer["Parameter"]["Value"])
+    if version < BOOTSTRAP:
+        return stops(f"version {version}, needed is {BOOTSTRAP}", "`make bootstrap` again")
+    return fine(f"version {version}, needed is {BOOTSTRAP}")
+
+
+@item("AWS IoT's log", "iot GetV2LoggingOptions")
+def iot_log(clients: Clients, settings: Settings) -> Found:
+    """Whether the region's one setting is free where `iot_log_level` wants it."""
+    iot = clients.client("iot")
+    try:
+        options = iot.get_v2_logging_options()
+    except ClientError as error:
+        if code(error) != "NotConfiguredException":
+            raise
+        options = {}
+    # CloudFormation's handler takes a log that is disabled for none.
+    configured = bool(options.get("roleArn")) and not options.get("disableAllLogs")
+    said = f"configured ({options.get('defaultLogLevel', 'no level')})" if configured else "not configured"
+    if not configured or not settings.iot_log_level or settings.embedded:
+        return fine(f"{said}; iot_log_level is {settings.iot_log_level or 'off'}")
+    if _ours(clients, settings, "AWS::IoT::Logging"):
+        return fine(f"{said}, by this deployment")
+    return stops(
+        f"{said}, not by this deployment: the stack account would fail with 'already exists'",
+        "leave `iot_log_level` off, or disable it first: `aws iot set-v2-logging-options --disable-all-logs`",
+    )
+
+
+@item("Device Defender's audit", "iot DescribeAccountAuditConfiguration")
+def audit(clients: Clients, settings: Settings) -> Found:
+    """Whether the region's one configuration is free where `device_defender` wants it."""
+    # CloudFormation's handler tells by the role, too: where nothing is configured AWS answers without one.
+    configured = bool(clients.client("iot").describe_account_audit_configuration().get("roleArn"))
+    said = "configured" if configured else "not configured"
+    wanted = "wanted" if settings.device_defender else "not wanted (device_defender=false)"
+    if not configured or not settings.device_defender or settings.embedded:
+        return fine(f"{said}; {wanted}")
+    if _ours(clients, settings, "AWS::IoT::AccountAuditConfiguration"):
+        return fine(f"{said}, by this deployment")
+    return stops(
+        f"{said}, not by this deployment: the stack account would fail with 'already exists'",
+        "leave `device_defender` off: the account has its audit",
+    )
+
+
+@item("Lambda's concurrency", "lambda GetAccountSettings")
+def concurrency(clients: Clients, settings: Settings) -> Found:
+    """Whether what is reserved for Lambda 1 leaves enough for the others."""
+    lambda_ = clients.client("lambda")
+    limit = lambda_.get_account_settings()["AccountLimit"]
+    total, unreserved = limit["ConcurrentExecutions"], limit["UnreservedConcurrentExecutions"]
+    wanted, held = settings.reserved_for_live, 0
+    if wanted and unreserved - wanted < UNRESERVED:
+        # An update may hold the reservation already.
+        deployed = resources(clients, f"{settings.namespace}-processing")
+        for one in deployed:
+            if one.kind == "AWS::Lambda::Function" and one.logical_id.startswith("Live"):
+                answer = lambda_.get_function_concurrency(FunctionName=one.physical_id)
+                held = answer.get("ReservedConcurrentExecutions", 0)
+    text = f"{total} executions at once, {unreserved} of them unreserved; {wanted} are to be reserved"
+    if wanted and unreserved + held - wanted < UNRESERVED:
+        return stops(
+            f"{text}, and Lambda wants {UNRESERVED} to be left",
+            "ask for more ('Service Quotas', AWS Lambda, 'Concurrent executions'), or -c live_concurrency=0",
+        )
+    if total < UNRESERVED:
+        return warning(text, "ask for more before the fleet grows: docs/cloud.md, Lambda's limit")
+    return fine(text)
+
+
+@item("CloudFront", "cloudfront ListDistributions, where `site` is set")
+def cloudfront(clients: Clients, settings: Settings) -> Found:
+    """Whether CloudFront answers; whether it would make a distribution, nothing read-only says."""
+    if not settings.site:
+        return fine("not wanted (site=false)")
+    if resources(clients, f"{settings.namespace}-site"):
+        return fine("the stack site is deployed")
+    clients.client("cloudfront").list_distributions(MaxItems="1")
+    return warning(
+        "it answers; that the account is verified for it cannot be read",
+        "if the stack site fails with 'Your account must be verified', ask AWS Support",
+    )
+
+
+@item(
+    "AWS IoT's quotas", "service-quotas ListServiceQuotas and ListAWSDefaultServiceQuotas, iot ListTopicRules"
+)
+def quotas(clients: Clients, settings: Settings) -> Found:
+    """For how many robots the quotas do, and whether our rules fit."""
+    service = clients.client("service-quotas")
+    values: dict[str, float] = {}
+    for operation in ("list_aws_default_service_quotas", "list_service_quotas"):
+        for page in service.get_paginator(operation).paginate(ServiceCode=IOT_CORE):
+            values.update((one["QuotaName"], one["Value"]) for one in page["Quotas"])
+    ours = {rule_name(rule, settings.namespace) for rule in RULES}
+    pages = clients.client("iot").get_paginator("list_topic_rules").paginate()
+    others = {rule["ruleName"] for page in pages for rule in page["rules"]} - ours
+    if RULES_QUOTA in values and len(others) + len(ours) > values[RULES_QUOTA]:
+        return stops(
+            f"{len(others)} rules of others and {len(ours)} of ours, allowed are {values[RULES_QUOTA]:g}",
+            "remove rules, or ask for more ('Service Quotas', AWS IoT Core)",
+        )
+    needs = {need.name: need.needed for need in on_paper(Usage()).needs}
+    robots = {name: values[name] / needs[need] for name, need in QUOTAS.items() if name in values}
+    if CONNECTS_QUOTA in values:
+        # After an outage the whole fleet is back within a minute.
+        robots[CONNECTS_QUOTA] = values[CONNECTS_QUOTA] * 60
+    missing = (QUOTAS.keys() | {CONNECTS_QUOTA}) - robots.keys()
+    if not robots:
+        return warning("AWS names none of the quotas", "see 'Service Quotas', AWS IoT Core, in the console")
+    scarce = min(robots, key=lambda name: robots[name])
+    text = f"for {robots[scarce]:,.0f} robots that drive at once; first: {scarce}, {values[scarce]:g}"
+    if missing:
+        text += f"; not told: {', '.join(sorted(missing))}"
+    if robots[scarce] < ROBOTS:
+        return warning(text, "ask for more ('Service Quotas', AWS IoT Core) before the fleet grows")
+    return fine(text)
+
+
+def _ours(clients: Clients, settings: Settings, kind: str) -> bool:
+    return any(one.kind == kind for one in resources(clients, f"{settings.namespace}-account"))
+
+
+ITEMS = (bootstrap, iot_log, audit, concurrency, cloudfront, quotas)

@@ -1,0 +1,244 @@
+"""What is deployed under the namespace already: its stacks, what others of that name are in the way, and
+which settings may not be changed in one step."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from typing import Any, NamedTuple
+
+from botocore.exceptions import ClientError
+
+from contract import RULES, claim_name, fleet_name, rule_name
+from stacks.settings import PROD, Settings
+from stacks.storage import OLD_TELEMETRY
+from verify.preflight_finding import Clients, Found, code, fine, item, stops, warning
+
+# Every stack that app.py may make, in the order of deployment; a test holds it to the app.
+STACKS = ("storage", "quarantine", "fleet", "processing", "ingest", "monitoring", "site", "account")
+# States from which CloudFormation, or the CDK, does not go on by itself.
+_STUCK = {
+    "ROLLBACK_COMPLETE": "its first deployment failed: delete it (`aws cloudformation delete-stack`)",
+    "ROLLBACK_FAILED": "its first deployment failed: delete it (`aws cloudformation delete-stack`)",
+    "CREATE_FAILED": "its first deployment failed: delete it (`aws cloudformation delete-stack`)",
+    "DELETE_FAILED": "it was not deleted to the end: its events say what stayed; delete it again",
+    "REVIEW_IN_PROGRESS": "a change set was made and never executed: delete the stack, it is empty",
+    "UPDATE_ROLLBACK_FAILED": "`aws cloudformation continue-update-rollback`, then deploy again",
+}
+
+
+class Resource(NamedTuple):
+    """A resource of a deployed stack."""
+
+    kind: str
+    logical_id: str
+    physical_id: str
+
+
+def stack(clients: Clients, name: str) -> dict[str, Any] | None:
+    """A stack as CloudFormation describes it; None where there is none."""
+    try:
+        answer = clients.client("cloudformation").describe_stacks(StackName=name)
+    except ClientError as error:
+        if code(error) != "ValidationError":
+            raise
+        return None
+    found: dict[str, Any] = answer["Stacks"][0]
+    return found
+
+
+def resources(clients: Clients, name: str) -> list[Resource]:
+    """What a stack has made; nothing where there is none."""
+    pages = clients.client("cloudformation").get_paginator("list_stack_resources").paginate(StackName=name)
+    try:
+        return [
+            Resource(one["ResourceType"], one["LogicalResourceId"], one["PhysicalResourceId"])
+            for page in pages
+            for one in page["StackResourceSummaries"]
+            if "PhysicalResourceId" in one and one["ResourceStatus"] != "DELETE_COMPLETE"
+        ]
+    except ClientError as error:
+        if code(error) != "ValidationError":
+            raise
+        return []
+
+
+@item("stacks", "cloudformation DescribeStacks of every stack of the namespace")
+def stacks(clients: Clients, settings: Settings) -> Found:
+    """Whether every stack that is there can be updated."""
+    states = {}
+    for noun in STACKS:
+        name = f"{settings.namespace}-{noun}"
+        found = stack(clients, name)
+        if found is not None:
+            states[name] = found["StackStatus"]
+    stuck = {name: state for name, state in states.items() if _todo(state)}
+    if stuck:
+        return stops(
+            ", ".join(f"{name} is {state}" for name, state in stuck.items()),
+            "; ".join(dict.fromkeys(f"{state}: {_todo(state)}" for state in stuck.values())),
+        )
+    return fine(
+        f"{len(states)} of {len(STACKS)} are there, each can be updated" if states else "none: a first one"
+    )
+
+
+def _todo(state: str) -> str:
+    if state in _STUCK:
+        return _STUCK[state]
+    return "somebody else's deployment is running: wait for its end" if state.endswith("IN_PROGRESS") else ""
+
+
+@item(
+    "names",
+    "iot Describe.../GetPolicy/ListTopicRules, cloudwatch ListDashboards: names that are part of the design",
+)
+def names(clients: Clients, settings: Settings) -> Found:
+    """Whether what has a fixed name is free, where the stack that makes it is not there."""
+    taken: list[str] = []
+    if stack(clients, f"{settings.namespace}-fleet") is None:
+        taken += _taken_of_the_fleet(clients, settings)
+    if stack(clients, f"{settings.namespace}-ingest") is None:
+        ours = {rule_name(rule, settings.namespace) for rule in RULES}
+        pages = clients.client("iot").get_paginator("list_topic_rules").paginate()
+        taken += sorted(
+            f"rule {one['ruleName']}" for page in pages for one in page["rules"] if one["ruleName"] in ours
+        )
+    if stack(clients, f"{settings.namespace}-monitoring") is None:
+        ours = {f"{settings.namespace}-{name}" for name in ("platform", "robots")}
+        paginator = clients.client("cloudwatch").get_paginator("list_dashboards")
+        pages = paginator.paginate(DashboardNamePrefix=f"{settings.namespace}-")
+        entries = [one["DashboardName"] for page in pages for one in page.get("DashboardEntries", [])]
+        taken += sorted(f"dashboard {name}" for name in entries if name in ours)
+    if taken:
+        return stops(
+            f"there without their stack: {', '.join(taken)}",
+            "delete them, or deploy under another name: -c namespace=...",
+        )
+    return fine("free, or this deployment's own")
+
+
+def _taken_of_the_fleet(clients: Clients, settings: Settings) -> Iterator[str]:
+    iot, fleet, claim = clients.client("iot"), fleet_name(settings.namespace), claim_name(settings.namespace)
+    asked: dict[str, Callable[[], Any]] = {
+        f"thing type {fleet}": lambda: iot.describe_thing_type(thingTypeName=fleet),
+        f"thing group {fleet}": lambda: iot.describe_thing_group(thingGroupName=fleet),
+        f"policy {fleet}": lambda: iot.get_policy(policyName=fleet),
+        f"policy {claim}": lambda: iot.get_policy(policyName=claim),
+        f"provisioning template {fleet}": lambda: iot.describe_provisioning_template(templateName=fleet),
+    }
+    for name, ask in asked.items():
+        try:
+            ask()
+        except ClientError as error:  # noqa: PERF203 - each waits for an answer
+            if code(error) != "ResourceNotFoundException":
+                raise
+        else:
+            yield name
+
+
+@item("kept data", "dynamodb ListTables, s3 ListBuckets, sqs ListQueues, logs DescribeLogGroups")
+def kept(clients: Clients, settings: Settings) -> Found:
+    """What an earlier deployment left. The CDK's names end in chance, so nothing of it collides."""
+    known = {one.physical_id for noun in STACKS for one in resources(clients, f"{settings.namespace}-{noun}")}
+    known |= {name.rsplit("/", 1)[-1] for name in known if name.startswith("http")}
+    left = sorted(name for name in _holders(clients, settings.namespace) if name not in known)
+    if not left:
+        return fine("none of an earlier deployment")
+    shown = ", ".join(left[:10]) + (f" and {len(left) - 10} more" if len(left) > 10 else "")
+    return warning(
+        f"of an earlier deployment, in nobody's way: {shown}",
+        "a new deployment begins empty: `iort adopt TABLE` copies batches into it; or delete them, they cost",
+    )
+
+
+def _holders(clients: Clients, namespace: str) -> Iterator[str]:
+    """Names of tables, buckets, queues and log groups as the CDK gives them to our stacks."""
+    prefixes = tuple(f"{namespace}-{noun}-" for noun in STACKS)
+    for page in clients.client("dynamodb").get_paginator("list_tables").paginate():
+        yield from (name for name in page["TableNames"] if name.startswith(prefixes))
+    for bucket in clients.client("s3").list_buckets()["Buckets"]:
+        if bucket["Name"].startswith(prefixes):
+            yield bucket["Name"]
+    for page in clients.client("sqs").get_paginator("list_queues").paginate(QueueNamePrefix=f"{namespace}-"):
+        for name in (url.rsplit("/", 1)[-1] for url in page.get("QueueUrls", [])):
+            if name.startswith(prefixes):
+                yield name
+    pages = (
+        clients.client("logs")
+        .get_paginator("describe_log_groups")
+        .paginate(logGroupNamePrefix=f"{namespace}-")
+    )
+    for page in pages:
+        yield from (
+            one["logGroupName"] for one in page["logGroups"] if one["logGroupName"].startswith(prefixes)
+        )
+
+
+@item("changed settings", "cloudformation ListExports, ListImports and DescribeStacks, against the settings")
+def changes(clients: Clients, settings: Settings) -> Found:
+    """Whether the settings may follow those of what is deployed."""
+    storage = f"{settings.namespace}-storage"
+    deployed = stack(clients, storage)
+    if deployed is None:
+        return fine("nothing is deployed")
+    used = _used_exports(clients, storage)
+    if used["Key"] and not (settings.customer_key or settings.keep_customer_key):
+        return stops(
+            f"customer_key was true and is false now: {_used_by(used['Key'])} the key, whose "
+            "export CloudFormation does not remove, and what is encrypted already would have no key",
+            "in two steps: first -c keep_customer_key=true, later without it (docs/cloud.md)",
+        )
+    if used[OLD_TELEMETRY] and not settings.old_telemetry:
+        return stops(
+            f"deployed is the telemetry table of before batches had ids: {_used_by(used[OLD_TELEMETRY])} it",
+            "in two steps: deploy with -c old_telemetry=true, then `iort adopt` (docs/upgrading.md)",
+        )
+    tags = {tag["Key"]: tag["Value"] for tag in deployed.get("Tags", [])}
+    if tags.get("stage") == PROD != settings.stage:
+        return warning(
+            "deployed is stage prod, now it is to be dev: data is no longer protected",
+            "give -c stage=prod, as always; leave it away only to take the deployment down",
+        )
+    wanted = {"site": settings.site, "account": settings.account_wide}
+    gone = [f"{settings.namespace}-{noun}" for noun, want in wanted.items() if not want]
+    gone = [name for name in gone if stack(clients, name) is not None]
+    if gone:
+        return warning(
+            f"deployed, and not among the settings: {', '.join(gone)} (stays as it is)",
+            "give the parameter as before, or delete the stack: `aws cloudformation delete-stack`",
+        )
+    return fine("none that must not be")
+
+
+def _used_exports(clients: Clients, storage: str) -> dict[str, list[str]]:
+    """Which stacks import the key, or the old telemetry table, of the storage stack."""
+    cloudformation = clients.client("cloudformation")
+    used: dict[str, list[str]] = {"Key": [], OLD_TELEMETRY: []}
+    exports = [
+        one["Name"]
+        for page in cloudformation.get_paginator("list_exports").paginate()
+        for one in page["Exports"]
+    ]
+    for what, importers in used.items():
+        for name in exports:
+            # The CDK's name of an export: how it is read, the construct, and a hash.
+            if not name.startswith(
+                tuple(f"{storage}:ExportsOutput{how}{what}" for how in ("FnGetAtt", "Ref"))
+            ):
+                continue
+            try:
+                pages = cloudformation.get_paginator("list_imports").paginate(ExportName=name)
+                importers += [one for page in pages for one in page["Imports"]]
+            except ClientError as error:
+                # AWS calls it an error where nobody does.
+                if "not imported" not in str(error):
+                    raise
+    return used
+
+
+def _used_by(importers: list[str]) -> str:
+    names = sorted(set(importers))
+    return f"{', '.join(names)} {'imports' if len(names) == 1 else 'import'}"
+
+
+ITEMS = (stacks, names, kept, changes)
