@@ -12,6 +12,7 @@ import argparse
 import hashlib
 import importlib.util
 import os
+import re
 import shutil
 import subprocess
 import sys
@@ -28,10 +29,6 @@ OLDEST = (3, 10)
 # The robot's: ROS Noetic's.
 OLDEST_OF_ROBOT = "3.8"
 LEAST_FREE_BYTES = 3 * 1024**3
-# Where `cdk deploy` sends it: stacks/processing.py names the same runtime and architecture.
-# Amazon Linux 2023 has glibc 2.34; the newest platform that a package was built for is taken.
-LAMBDA_PLATFORMS = ("manylinux_2_28_aarch64", "manylinux_2_17_aarch64", "manylinux2014_aarch64")
-LAMBDA_PYTHON = "3.13"
 # No compiler is needed: pubnub, which publishes no wheel, is Python alone.
 # It is built with the locked setuptools of .venv, not with whatever is newest today.
 LOCKED = (
@@ -64,10 +61,11 @@ def main() -> None:
         step("CDK and page packages", [ROOT / "package-lock.json"], install_node, stamp="node")
         page = [*sorted((ROOT / "station" / "web").rglob("*")), ROOT / "package-lock.json"]
         step("live page", page, build_page, stamp="page")
-        layer = ROOT / "requirements" / "layer.txt"
-        step("Lambda layer, this machine", [layer], lambda: build_layer("local"), stamp="layer-local")
+        names = ("requirements/layer.txt", "scripts/layer.py", "stacks/target.py")
+        layer = [ROOT / name for name in names]
+        step("Lambda layer, this machine", layer, lambda: build_layer("local"), stamp="layer-local")
         if asked.layer:
-            step("Lambda layer, AWS", [layer], lambda: build_layer("lambda"), stamp="layer-lambda")
+            step("Lambda layer, AWS", layer, build_layer_for_aws, stamp="layer-lambda")
         if asked.checkov:
             locked = [ROOT / "requirements" / "checkov.txt"]
             step("checkov, in an environment of its own", locked, install_checkov, stamp="checkov")
@@ -149,18 +147,22 @@ def build_page() -> None:
     run([VENV / "bin" / "npm", "run", "build"])
 
 
-def build_layer(target: str) -> None:
-    """Build Lambda 1's layer for this machine or for the platform that AWS runs it on."""
-    folder = BUILD / "layer" / target
-    shutil.rmtree(folder, ignore_errors=True)
-    platform: list[str] = []
-    if target == "lambda":
-        platform = [part for name in LAMBDA_PLATFORMS for part in ("--platform", name)]
-        platform += ["--python-version", LAMBDA_PYTHON]
-    pip(
-        "install", *LOCKED, "--no-compile", *platform,
-        "--target", str(folder / "python"), "-r", "requirements/layer.txt",
-    )  # fmt: skip
+def build_layer(target: str, *more: str) -> None:
+    """Build Lambda 1's layer for this machine or for AWS: scripts/layer.py, which runs in .venv."""
+    run([PYTHON, "-m", "scripts.layer", target, *more])
+
+
+def build_layer_for_aws() -> None:
+    """With bytecode, where there is a Python of Lambda's version to make it."""
+    version = re.findall(r'^PYTHON = "(.+)"', (ROOT / "stacks" / "target.py").read_text(), re.MULTILINE)[0]
+    try:
+        compiler = ["--compiler", python_of(version)]
+    except SetupError:
+        compiler = []
+        print(f" without bytecode: there is no Python {version} here to make it, and uv could not")
+        print("setup: fetch one. Cold starts take longer. Install it and remove build/setup/layer-lambda")
+        print("setup: to have it ...", end="", flush=True)
+    build_layer("lambda", *compiler)
 
 
 def install_checkov() -> None:
@@ -171,43 +173,43 @@ def install_checkov() -> None:
 
 def install_oldest(given: str | None) -> None:
     """Install the agent and what its tests need for the oldest Python that a robot has, into build/oldest."""
-    run([oldest_python(given), "-m", "venv", "--clear", BUILD / "oldest"])
-    python = BUILD / "oldest" / "bin" / "python"
-    pip("install", *LOCKED[:2], "--only-binary", ":all:", "-r", "requirements/oldest.txt", python=python)
-
-
-def oldest_python(given: str | None) -> str:
-    """The interpreter: the one given, one that this machine has, or one that uv fetches into build/."""
-    installed = (Path(os.environ.get("PYENV_ROOT") or Path.home() / ".pyenv") / "versions").glob(
-        f"{OLDEST_OF_ROBOT}.*/bin/python"
-    )
-    found = shutil.which(f"python{OLDEST_OF_ROBOT}")
-    candidates = [given] if given else [*([found] if found else []), *map(str, sorted(installed))]
-    for candidate in candidates:
-        if is_oldest(candidate):
-            return candidate
-    if given:
+    if given and not is_python(given, OLDEST_OF_ROBOT):
         raise SetupError(f"{given} is not Python {OLDEST_OF_ROBOT} with the venv module")
-    os.environ["UV_PYTHON_INSTALL_DIR"] = str(BUILD / "python")
     try:
-        run([VENV / "bin" / "uv", "python", "install", "--no-bin", OLDEST_OF_ROBOT])
+        python = given or python_of(OLDEST_OF_ROBOT)
     except SetupError as error:
         raise SetupError(
             f"there is no Python {OLDEST_OF_ROBOT} here, and uv could not fetch one: install it, or name it "
             f"with `make test-oldest OLDEST=/path/to/python{OLDEST_OF_ROBOT}`\n{error}"
         ) from error
-    fetched = (BUILD / "python").glob(f"cpython-{OLDEST_OF_ROBOT}.*/bin/python{OLDEST_OF_ROBOT}")
-    return str(next(fetched))
+    run([python, "-m", "venv", "--clear", BUILD / "oldest"])
+    installed = BUILD / "oldest" / "bin" / "python"
+    pip("install", *LOCKED[:2], "--only-binary", ":all:", "-r", "requirements/oldest.txt", python=installed)
 
 
-def is_oldest(python: str) -> bool:
+def python_of(version: str) -> str:
+    """An interpreter of a version: one that this machine has, or one that uv fetches into build/. Raises
+    `SetupError`."""
+    installed = (Path(os.environ.get("PYENV_ROOT") or Path.home() / ".pyenv") / "versions").glob(
+        f"{version}.*/bin/python"
+    )
+    found = shutil.which(f"python{version}")
+    for candidate in [*([found] if found else []), *map(str, sorted(installed))]:
+        if is_python(candidate, version):
+            return candidate
+    os.environ["UV_PYTHON_INSTALL_DIR"] = str(BUILD / "python")
+    run([VENV / "bin" / "uv", "python", "install", "--no-bin", version])
+    return str(next((BUILD / "python").glob(f"cpython-{version}.*/bin/python{version}")))
+
+
+def is_python(python: str, version: str) -> bool:
     """Whether the file is what it is called, and can make a virtual environment."""
     ask = "import ensurepip, sys, venv; print('%d.%d' % sys.version_info[:2])"
     try:
         done = subprocess.run([python, "-c", ask], capture_output=True, text=True, check=False)
     except OSError:
         return False
-    return done.stdout.strip() == OLDEST_OF_ROBOT
+    return done.stdout.strip() == version
 
 
 def pip(*arguments: str, python: Path = PYTHON) -> None:
