@@ -1,4 +1,4 @@
-"""The layer: what is in it follows from what it is for, not from what builds it; its bytecode is the same twice."""
+"""The layer: what is in it follows from what it is for; its bytecode is the same from two builds."""
 
 from __future__ import annotations
 
