@@ -22,7 +22,7 @@ from pathlib import Path
 
 ROOT = Path(__file__).resolve().parent.parent
 VENV, BUILD = ROOT / ".venv", ROOT / "build"
-PYTHON = VENV / "bin" / "python"
+PYTHON, UV = VENV / "bin" / "python", VENV / "bin" / "uv"
 # The interpreter itself, also when this runs in a virtual environment, even in the one made here.
 BASE_PYTHON = Path(getattr(sys, "_base_executable", sys.executable)).resolve()
 OLDEST = (3, 10)
@@ -36,7 +36,7 @@ LOCKED = (
     *("--no-binary", "pubnub", "--no-build-isolation"),
 )
 STARTED = time.monotonic()
-# npm's and pip's caches are theirs to keep elsewhere; nothing of ours goes outside the checkout.
+# npm's and uv's caches are theirs to keep elsewhere; nothing of ours goes outside the checkout.
 CACHES = {"npm_config_cache": str(BUILD / "npm-cache"), "npm_config_update_notifier": "false"}
 
 
@@ -128,13 +128,15 @@ def install_python() -> None:
     Python compiles a module when it first imports it. Compiling all of them here took longer than
     everything else, and most are never imported.
     """
-    pip("install", *LOCKED, "--no-compile", "-r", "requirements/build.txt")
-    pip("install", *LOCKED, "--no-compile", "-r", "requirements/dev.txt")
+    # What uv installs with; pip comes with Python.
+    pip = ("-m", "pip", "--disable-pip-version-check", "--quiet", "install", "--no-compile")
+    run([PYTHON, *pip, *LOCKED[:4], "-r", "requirements/build.txt"])
+    install(VENV, *LOCKED, "-r", "requirements/dev.txt")
 
 
 def install_project() -> None:
     """Put iort-agent and iort into .venv/bin, reading the checkout itself."""
-    pip("install", "--no-deps", "--no-build-isolation", "--editable", ".", "--editable", "station")
+    install(VENV, "--no-deps", "--no-build-isolation", "--editable", ".", "--editable", "station")
 
 
 def install_node() -> None:
@@ -167,14 +169,12 @@ def build_layer_for_aws() -> None:
 
 def install_checkov() -> None:
     """Install checkov, whose requirements contradict ours, into build/checkov."""
-    run([BASE_PYTHON, "-m", "venv", "--clear", BUILD / "checkov"])
-    pip("install", *LOCKED, "-r", "requirements/checkov.txt", python=BUILD / "checkov" / "bin" / "python")
+    run([UV, "venv", "--clear", "--python", BASE_PYTHON, BUILD / "checkov"])
+    install(BUILD / "checkov", *LOCKED, "-r", "requirements/checkov.txt")
 
 
 def install_oldest(given: str | None) -> None:
     """Install the agent and what its tests need for the oldest Python that a robot has, into build/oldest."""
-    if given and not is_python(given, OLDEST_OF_ROBOT):
-        raise SetupError(f"{given} is not Python {OLDEST_OF_ROBOT} with the venv module")
     try:
         python = given or python_of(OLDEST_OF_ROBOT)
     except SetupError as error:
@@ -182,43 +182,48 @@ def install_oldest(given: str | None) -> None:
             f"there is no Python {OLDEST_OF_ROBOT} here, and uv could not fetch one: install it, or name it "
             f"with `make test-oldest OLDEST=/path/to/python{OLDEST_OF_ROBOT}`\n{error}"
         ) from error
-    run([python, "-m", "venv", "--clear", BUILD / "oldest"])
-    installed = BUILD / "oldest" / "bin" / "python"
-    pip("install", *LOCKED[:2], "--only-binary", ":all:", "-r", "requirements/oldest.txt", python=installed)
+    if version_of(python) != OLDEST_OF_ROBOT:
+        raise SetupError(f"{python} is not Python {OLDEST_OF_ROBOT}")
+    run([UV, "venv", "--clear", "--python", python, BUILD / "oldest"])
+    install(BUILD / "oldest", *LOCKED[:4], "-r", "requirements/oldest.txt")
 
 
 def python_of(version: str) -> str:
     """An interpreter of a version: one that this machine has, or one that uv fetches into build/. Raises
     `SetupError`."""
-    installed = (Path(os.environ.get("PYENV_ROOT") or Path.home() / ".pyenv") / "versions").glob(
-        f"{version}.*/bin/python"
-    )
-    found = shutil.which(f"python{version}")
-    for candidate in [*([found] if found else []), *map(str, sorted(installed))]:
-        if is_python(candidate, version):
-            return candidate
+    pyenv = Path(os.environ.get("PYENV_ROOT") or Path.home() / ".pyenv") / "versions"
+    # pyenv's own before what it has on the path: programs that fail for a version that is not switched on.
+    places = [*map(str, sorted(pyenv.glob("*/bin"))), os.environ.get("PATH", os.defpath)]
+    os.environ["UV_PYTHON_SEARCH_PATH"] = os.pathsep.join(places)
     os.environ["UV_PYTHON_INSTALL_DIR"] = str(BUILD / "python")
-    run([VENV / "bin" / "uv", "python", "install", "--no-bin", version])
-    return str(next((BUILD / "python").glob(f"cpython-{version}.*/bin/python{version}")))
-
-
-def is_python(python: str, version: str) -> bool:
-    """Whether the file is what it is called, and can make a virtual environment."""
-    ask = "import ensurepip, sys, venv; print('%d.%d' % sys.version_info[:2])"
+    find: list[str | Path] = [UV, "python", "find", "--system", "--no-python-downloads", version]
     try:
-        done = subprocess.run([python, "-c", ask], capture_output=True, text=True, check=False)
-    except OSError:
-        return False
-    return done.stdout.strip() == version
+        return last_line(run(find))
+    except SetupError:
+        run([UV, "python", "install", "--no-bin", version])
+        return last_line(run(find))
 
 
-def pip(*arguments: str, python: Path = PYTHON) -> None:
-    """Run an environment's pip, .venv's unless another is named."""
-    run([python, "-m", "pip", "--disable-pip-version-check", "--quiet", *arguments])
+def version_of(python: str) -> str:
+    """A Python's version, as 3.8; empty for what is none."""
+    try:
+        return last_line(run([python, "-c", "import sys; print('%d.%d' % sys.version_info[:2])"]))
+    except (OSError, SetupError):
+        return ""
 
 
-def run(command: Sequence[str | Path]) -> None:
-    """Run a command; raises `SetupError` with the end of its output if it fails."""
+def last_line(text: str) -> str:
+    """What a program says behind its warnings."""
+    return text.rstrip().rpartition("\n")[2]
+
+
+def install(environment: Path, *arguments: str) -> None:
+    """Install into a virtual environment, with uv."""
+    run([UV, "pip", "install", "--quiet", "--python", environment / "bin" / "python", *arguments])
+
+
+def run(command: Sequence[str | Path]) -> str:
+    """Run a command and give its output; raises `SetupError` with the end of it if it fails."""
     log = BUILD / "setup" / "log"
     log.parent.mkdir(parents=True, exist_ok=True)
     # The venv's own node and npm come before any that the machine may have.
@@ -233,10 +238,12 @@ def run(command: Sequence[str | Path]) -> None:
             stderr=subprocess.STDOUT,
             check=False,
         )
+    said = log.read_text(errors="replace")
     if done.returncode:
-        tail = "\n".join(log.read_text(errors="replace").splitlines()[-15:])
+        tail = "\n".join(said.splitlines()[-15:])
         shown = " ".join(map(str, command))
         raise SetupError(f"`{shown}` failed:\n{tail}\nIs the package registry reachable? Log: {log}")
+    return said
 
 
 if __name__ == "__main__":
