@@ -35,7 +35,7 @@ from stacks.settings import Settings
 
 LAYER = ROOT / "build" / "layer" / "local"
 # What has bytecode: what is deployed is the second.
-NOTHING, LAYER_ALONE, ALL = "nothing", "layer", "layer and code"
+NOTHING, LAYER_ALONE, ALL = "none", "layer", "all"
 
 
 @dataclass(frozen=True)
@@ -73,7 +73,7 @@ def main() -> None:
     for title in (
         "function",
         "memory",
-        "bytecode of",
+        "bytecode",
         "start",
         "first event",
         "at its share",

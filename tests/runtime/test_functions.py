@@ -12,7 +12,7 @@ import pytest
 
 pytest.importorskip("awslambdaric", reason="it has wheels for Linux alone")
 
-from bench.runtime.api import ERROR, RESPONSE
+from bench.runtime.api import ERROR, PUBNUB_KEY, RESPONSE
 from bench.runtime.deployed import functions
 from bench.runtime.environment import RuntimeFailedError, started
 from bench.runtime.events import events
@@ -78,7 +78,8 @@ def test_it_answers_its_event_within_its_memory(deployed, tmp_path, name):
 
 
 def check_log(environment):
-    """Records are JSON with a level; what is printed is a metric, as CloudWatch reads one."""
+    """Records are JSON with a level, what is printed is a metric as CloudWatch reads it; no line has keys."""
+    assert not [line for line in [*environment.printed, *environment.logged] if PUBNUB_KEY in line]
     records = [json.loads(line) for line in environment.logged]
     assert all(record.keys() >= {"timestamp", "level", "message", "requestId"} for record in records)
     assert {record["level"] for record in records} <= {"INFO", "WARNING"}
