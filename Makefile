@@ -4,7 +4,7 @@ BIN := .venv/bin
 # cdk.json runs `python app.py`.
 bootstrap preflight deploy diff destroy: export PATH := $(CURDIR)/$(BIN):$(PATH)
 
-.PHONY: help demo test test-oldest check setup prove-mixed bench bench-guard bench-agent bench-page screenshots bench-fleet verify-aws layer bootstrap preflight deploy diff destroy lock clean
+.PHONY: help demo test test-oldest check setup prove-mixed bench bench-guard bench-agent bench-page screenshots bench-fleet bench-cold verify-aws layer bootstrap preflight deploy diff destroy lock clean
 
 help: ## show this
 	@grep -hE '^[a-z-]+:.*## ' Makefile | sed -E 's/^([a-z-]+):.*## /\1\t/' | expand -t 14
@@ -49,6 +49,9 @@ bench-fleet: setup ## measure many robots on the embedded cloud: ROBOTS="10 200"
 
 bench-page: setup ## measure what the page costs its browser, 20 cars at 10 Hz: SOAK=300 REPORT=figures.json
 	@$(BIN)/python -m bench.page $(if $(SOAK),--soak $(SOAK)) $(if $(REPORT),--json "$(REPORT)")
+
+bench-cold: setup ## measure a cold start of every function, under AWS' runtime client: ROUNDS=5 REPORT=figures.json
+	@$(BIN)/python -m bench.cold_start $(if $(ROUNDS),--rounds $(ROUNDS)) $(if $(REPORT),--json "$(REPORT)")
 
 screenshots: setup ## take the pictures of docs/images anew
 	@$(BIN)/python -m bench.screenshots

@@ -106,7 +106,8 @@ class Gathered:
 
 
 def _bounded(value: float) -> float:
-    return max(-_MOST, min(_MOST, value))
+    # A truth value counts as the number that it is in Python: JSON's true is no metric value.
+    return +max(-_MOST, min(_MOST, value))
 
 
 def _unit(name: str) -> str:

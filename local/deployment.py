@@ -18,7 +18,7 @@ ROOT = Path(__file__).resolve().parent.parent
 _ACCOUNT = "000000000000"
 _STEP_S = 180.0
 # What a synthesized assembly is made of: the same again is deployed as it is.
-_MADE_OF = ("app.py", "cdk.json", "requirements/dev.txt", "requirements/layer.txt")
+_MADE_OF = ("app.py", "cdk.json", "requirements/dev.txt", "requirements/layer.txt", "scripts/layer.py")
 _MADE_OF_FOLDERS = ("stacks", "functions", "contract")
 _KEPT = 4
 

@@ -12,6 +12,7 @@ import argparse
 import hashlib
 import importlib.util
 import os
+import re
 import shutil
 import subprocess
 import sys
@@ -21,17 +22,13 @@ from pathlib import Path
 
 ROOT = Path(__file__).resolve().parent.parent
 VENV, BUILD = ROOT / ".venv", ROOT / "build"
-PYTHON = VENV / "bin" / "python"
+PYTHON, UV = VENV / "bin" / "python", VENV / "bin" / "uv"
 # The interpreter itself, also when this runs in a virtual environment, even in the one made here.
 BASE_PYTHON = Path(getattr(sys, "_base_executable", sys.executable)).resolve()
 OLDEST = (3, 10)
 # The robot's: ROS Noetic's.
 OLDEST_OF_ROBOT = "3.8"
 LEAST_FREE_BYTES = 3 * 1024**3
-# Where `cdk deploy` sends it: stacks/processing.py names the same runtime and architecture.
-# Amazon Linux 2023 has glibc 2.34; the newest platform that a package was built for is taken.
-LAMBDA_PLATFORMS = ("manylinux_2_28_aarch64", "manylinux_2_17_aarch64", "manylinux2014_aarch64")
-LAMBDA_PYTHON = "3.13"
 # No compiler is needed: pubnub, which publishes no wheel, is Python alone.
 # It is built with the locked setuptools of .venv, not with whatever is newest today.
 LOCKED = (
@@ -39,7 +36,7 @@ LOCKED = (
     *("--no-binary", "pubnub", "--no-build-isolation"),
 )
 STARTED = time.monotonic()
-# npm's and pip's caches are theirs to keep elsewhere; nothing of ours goes outside the checkout.
+# npm's and uv's caches are theirs to keep elsewhere; nothing of ours goes outside the checkout.
 CACHES = {"npm_config_cache": str(BUILD / "npm-cache"), "npm_config_update_notifier": "false"}
 
 
@@ -64,10 +61,11 @@ def main() -> None:
         step("CDK and page packages", [ROOT / "package-lock.json"], install_node, stamp="node")
         page = [*sorted((ROOT / "station" / "web").rglob("*")), ROOT / "package-lock.json"]
         step("live page", page, build_page, stamp="page")
-        layer = ROOT / "requirements" / "layer.txt"
-        step("Lambda layer, this machine", [layer], lambda: build_layer("local"), stamp="layer-local")
+        names = ("requirements/layer.txt", "scripts/layer.py", "stacks/target.py")
+        layer = [ROOT / name for name in names]
+        step("Lambda layer, this machine", layer, lambda: build_layer("local"), stamp="layer-local")
         if asked.layer:
-            step("Lambda layer, AWS", [layer], lambda: build_layer("lambda"), stamp="layer-lambda")
+            step("Lambda layer, AWS", layer, build_layer_for_aws, stamp="layer-lambda")
         if asked.checkov:
             locked = [ROOT / "requirements" / "checkov.txt"]
             step("checkov, in an environment of its own", locked, install_checkov, stamp="checkov")
@@ -130,13 +128,15 @@ def install_python() -> None:
     Python compiles a module when it first imports it. Compiling all of them here took longer than
     everything else, and most are never imported.
     """
-    pip("install", *LOCKED, "--no-compile", "-r", "requirements/build.txt")
-    pip("install", *LOCKED, "--no-compile", "-r", "requirements/dev.txt")
+    # What uv installs with; pip comes with Python.
+    pip = ("-m", "pip", "--disable-pip-version-check", "--quiet", "install", "--no-compile")
+    run([PYTHON, *pip, *LOCKED[:4], "-r", "requirements/build.txt"])
+    install(VENV, *LOCKED, "-r", "requirements/dev.txt")
 
 
 def install_project() -> None:
     """Put iort-agent and iort into .venv/bin, reading the checkout itself."""
-    pip("install", "--no-deps", "--no-build-isolation", "--editable", ".", "--editable", "station")
+    install(VENV, "--no-deps", "--no-build-isolation", "--editable", ".", "--editable", "station")
 
 
 def install_node() -> None:
@@ -149,74 +149,81 @@ def build_page() -> None:
     run([VENV / "bin" / "npm", "run", "build"])
 
 
-def build_layer(target: str) -> None:
-    """Build Lambda 1's layer for this machine or for the platform that AWS runs it on."""
-    folder = BUILD / "layer" / target
-    shutil.rmtree(folder, ignore_errors=True)
-    platform: list[str] = []
-    if target == "lambda":
-        platform = [part for name in LAMBDA_PLATFORMS for part in ("--platform", name)]
-        platform += ["--python-version", LAMBDA_PYTHON]
-    pip(
-        "install", *LOCKED, "--no-compile", *platform,
-        "--target", str(folder / "python"), "-r", "requirements/layer.txt",
-    )  # fmt: skip
+def build_layer(target: str, *more: str) -> None:
+    """Build Lambda 1's layer for this machine or for AWS: scripts/layer.py, which runs in .venv."""
+    run([PYTHON, "-m", "scripts.layer", target, *more])
+
+
+def build_layer_for_aws() -> None:
+    """With bytecode, where there is a Python of Lambda's version to make it."""
+    version = re.findall(r'^PYTHON = "(.+)"', (ROOT / "stacks" / "target.py").read_text(), re.MULTILINE)[0]
+    try:
+        compiler = ["--compiler", python_of(version)]
+    except SetupError:
+        compiler = []
+        print(f" without bytecode: there is no Python {version} here to make it, and uv could not")
+        print("setup: fetch one. Cold starts take longer. Install it and remove build/setup/layer-lambda")
+        print("setup: to have it ...", end="", flush=True)
+    build_layer("lambda", *compiler)
 
 
 def install_checkov() -> None:
     """Install checkov, whose requirements contradict ours, into build/checkov."""
-    run([BASE_PYTHON, "-m", "venv", "--clear", BUILD / "checkov"])
-    pip("install", *LOCKED, "-r", "requirements/checkov.txt", python=BUILD / "checkov" / "bin" / "python")
+    run([UV, "venv", "--clear", "--python", BASE_PYTHON, BUILD / "checkov"])
+    install(BUILD / "checkov", *LOCKED, "-r", "requirements/checkov.txt")
 
 
 def install_oldest(given: str | None) -> None:
     """Install the agent and what its tests need for the oldest Python that a robot has, into build/oldest."""
-    run([oldest_python(given), "-m", "venv", "--clear", BUILD / "oldest"])
-    python = BUILD / "oldest" / "bin" / "python"
-    pip("install", *LOCKED[:2], "--only-binary", ":all:", "-r", "requirements/oldest.txt", python=python)
-
-
-def oldest_python(given: str | None) -> str:
-    """The interpreter: the one given, one that this machine has, or one that uv fetches into build/."""
-    installed = (Path(os.environ.get("PYENV_ROOT") or Path.home() / ".pyenv") / "versions").glob(
-        f"{OLDEST_OF_ROBOT}.*/bin/python"
-    )
-    found = shutil.which(f"python{OLDEST_OF_ROBOT}")
-    candidates = [given] if given else [*([found] if found else []), *map(str, sorted(installed))]
-    for candidate in candidates:
-        if is_oldest(candidate):
-            return candidate
-    if given:
-        raise SetupError(f"{given} is not Python {OLDEST_OF_ROBOT} with the venv module")
-    os.environ["UV_PYTHON_INSTALL_DIR"] = str(BUILD / "python")
     try:
-        run([VENV / "bin" / "uv", "python", "install", "--no-bin", OLDEST_OF_ROBOT])
+        python = given or python_of(OLDEST_OF_ROBOT)
     except SetupError as error:
         raise SetupError(
             f"there is no Python {OLDEST_OF_ROBOT} here, and uv could not fetch one: install it, or name it "
             f"with `make test-oldest OLDEST=/path/to/python{OLDEST_OF_ROBOT}`\n{error}"
         ) from error
-    fetched = (BUILD / "python").glob(f"cpython-{OLDEST_OF_ROBOT}.*/bin/python{OLDEST_OF_ROBOT}")
-    return str(next(fetched))
+    if version_of(python) != OLDEST_OF_ROBOT:
+        raise SetupError(f"{python} is not Python {OLDEST_OF_ROBOT}")
+    run([UV, "venv", "--clear", "--python", python, BUILD / "oldest"])
+    install(BUILD / "oldest", *LOCKED[:4], "-r", "requirements/oldest.txt")
 
 
-def is_oldest(python: str) -> bool:
-    """Whether the file is what it is called, and can make a virtual environment."""
-    ask = "import ensurepip, sys, venv; print('%d.%d' % sys.version_info[:2])"
+def python_of(version: str) -> str:
+    """An interpreter of a version: one that this machine has, or one that uv fetches into build/. Raises
+    `SetupError`."""
+    pyenv = Path(os.environ.get("PYENV_ROOT") or Path.home() / ".pyenv") / "versions"
+    # pyenv's own before what it has on the path: programs that fail for a version that is not switched on.
+    places = [*map(str, sorted(pyenv.glob("*/bin"))), os.environ.get("PATH", os.defpath)]
+    os.environ["UV_PYTHON_SEARCH_PATH"] = os.pathsep.join(places)
+    os.environ["UV_PYTHON_INSTALL_DIR"] = str(BUILD / "python")
+    find: list[str | Path] = [UV, "python", "find", "--system", "--no-python-downloads", version]
     try:
-        done = subprocess.run([python, "-c", ask], capture_output=True, text=True, check=False)
-    except OSError:
-        return False
-    return done.stdout.strip() == OLDEST_OF_ROBOT
+        return last_line(run(find))
+    except SetupError:
+        run([UV, "python", "install", "--no-bin", version])
+        return last_line(run(find))
 
 
-def pip(*arguments: str, python: Path = PYTHON) -> None:
-    """Run an environment's pip, .venv's unless another is named."""
-    run([python, "-m", "pip", "--disable-pip-version-check", "--quiet", *arguments])
+def version_of(python: str) -> str:
+    """A Python's version, as 3.8; empty for what is none."""
+    try:
+        return last_line(run([python, "-c", "import sys; print('%d.%d' % sys.version_info[:2])"]))
+    except (OSError, SetupError):
+        return ""
 
 
-def run(command: Sequence[str | Path]) -> None:
-    """Run a command; raises `SetupError` with the end of its output if it fails."""
+def last_line(text: str) -> str:
+    """What a program says behind its warnings."""
+    return text.rstrip().rpartition("\n")[2]
+
+
+def install(environment: Path, *arguments: str) -> None:
+    """Install into a virtual environment, with uv."""
+    run([UV, "pip", "install", "--quiet", "--python", environment / "bin" / "python", *arguments])
+
+
+def run(command: Sequence[str | Path]) -> str:
+    """Run a command and give its output; raises `SetupError` with the end of it if it fails."""
     log = BUILD / "setup" / "log"
     log.parent.mkdir(parents=True, exist_ok=True)
     # The venv's own node and npm come before any that the machine may have.
@@ -231,10 +238,12 @@ def run(command: Sequence[str | Path]) -> None:
             stderr=subprocess.STDOUT,
             check=False,
         )
+    said = log.read_text(errors="replace")
     if done.returncode:
-        tail = "\n".join(log.read_text(errors="replace").splitlines()[-15:])
+        tail = "\n".join(said.splitlines()[-15:])
         shown = " ".join(map(str, command))
         raise SetupError(f"`{shown}` failed:\n{tail}\nIs the package registry reachable? Log: {log}")
+    return said
 
 
 if __name__ == "__main__":

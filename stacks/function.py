@@ -9,12 +9,13 @@ from aws_cdk import aws_iam as iam
 from aws_cdk import aws_lambda as lambda_
 from aws_cdk import aws_logs as logs
 
+from stacks import target
 from stacks.encryption import Encryption
 from stacks.settings import ALL_LOGS, ROOT, Settings
 
-RUNTIME = lambda_.Runtime.PYTHON_3_13
+RUNTIME = lambda_.Runtime(f"python{target.PYTHON}", lambda_.RuntimeFamily.PYTHON)
 # The emulator runs the functions on the machine it stands on, so the architecture means nothing there.
-ARCHITECTURE = lambda_.Architecture.ARM_64
+ARCHITECTURE = lambda_.Architecture.custom(target.ARCHITECTURE)
 # Exactly what a function imports; see the wiring tests.
 CODE_EXCLUDES = ["/*", "!/contract", "!/functions", "__pycache__", ".mypy_cache", ".ruff_cache"]
 

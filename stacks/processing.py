@@ -73,7 +73,7 @@ class Processing(Stack):
                 lambda_.LayerVersion(
                     self,
                     "PubNub",
-                    code=lambda_.Code.from_asset(str(self._settings.layer), exclude=["**/__pycache__"]),
+                    code=lambda_.Code.from_asset(str(self._settings.layer)),
                     compatible_runtimes=[RUNTIME],
                 )
             ],

@@ -37,6 +37,15 @@ def test_every_metric_of_the_contract_is_a_valid_line(capsys):
             assert line[metric["Name"]] == 2.5
 
 
+def test_a_truth_value_is_written_as_a_number(capsys):
+    """CloudWatch takes numbers; JSON's true is none."""
+    emit("admit", RobotsAdmitted=True, RobotsRefused=False)
+    line = json.loads(capsys.readouterr().out)
+    assert type(line["RobotsAdmitted"]) is int
+    assert line["RobotsAdmitted"] == 1
+    assert "RobotsRefused" not in line
+
+
 def test_a_list_is_values_and_a_robot_a_metric_of_its_own(capsys):
     emit("health", robot="car7", BatteryVolts=[11.5, 11.25], TemperatureDegC=[])
     line = json.loads(capsys.readouterr().out)

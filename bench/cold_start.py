@@ -1,0 +1,141 @@
+"""`make bench-cold`: what a cold start of every function costs, with bytecode and without, in turns.
+
+    python -m bench.cold_start [--rounds 5] [--json FILE]
+
+Each function is started by AWS' own runtime interface client on a Runtime API of this machine, with the
+layer, and answers one event; the services that it calls are stood in for, and answer at once. Processor time
+is the operating system's, of all threads. A function has the share of a processor that its memory brings:
+so long does the same work take there, if the processor is as fast as this one. Nothing is throttled here.
+"""
+
+from __future__ import annotations
+
+import argparse
+import compileall
+import json
+import platform
+import shutil
+import sys
+from collections.abc import Iterator
+from dataclasses import asdict, dataclass, replace
+from pathlib import Path
+from statistics import median
+from tempfile import TemporaryDirectory
+
+from rich.console import Console
+from rich.table import Table
+
+from bench.machine import ROOT
+from bench.runtime.deployed import functions
+from bench.runtime.environment import Function, RuntimeFailedError, link_runtime, started
+from bench.runtime.events import events
+from bench.sections.utilisation import ONE_VCPU_MB
+from scripts.layer import compile_all
+from stacks.settings import Settings
+
+LAYER = ROOT / "build" / "layer" / "local"
+# What has bytecode: what is deployed is the second.
+NOTHING, LAYER_ALONE, ALL = "none", "layer", "all"
+
+
+@dataclass(frozen=True)
+class Start:
+    """Medians of one function: processor time until it asked for an event, and for the first one, with the
+    bytecode of ``compiled``; the most memory resident."""
+
+    function: str
+    compiled: str
+    memory_mb: int
+    start_cpu_ms: float
+    first_cpu_ms: float
+    peak_mb: float
+
+    @property
+    def cold_ms(self) -> float:
+        """From nothing to the first answer, with the share of a processor that its memory brings."""
+        return (self.start_cpu_ms + self.first_cpu_ms) / min(1.0, self.memory_mb / ONE_VCPU_MB)
+
+
+def main() -> None:
+    """Measure and print."""
+    parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
+    parser.add_argument("--rounds", type=int, default=5, help="starts of each kind")
+    parser.add_argument("--json", type=Path, metavar="FILE", help="write the figures as JSON too")
+    asked = parser.parse_args()
+    console = Console()
+    if not LAYER.is_dir():
+        sys.exit(f"bench-cold: {LAYER} is not there: run `make setup`")
+    try:
+        found = list(measure(asked.rounds, console))
+    except RuntimeFailedError as error:
+        sys.exit(f"bench-cold: {error}")
+    table = Table(title=f"Cold starts, Python {platform.python_version()}, {platform.machine()}")
+    for title in (
+        "function",
+        "memory",
+        "bytecode",
+        "start",
+        "first event",
+        "at its share",
+        "resident",
+    ):
+        table.add_column(title, justify="left" if title == "function" else "right")
+    for one in found:
+        table.add_row(
+            *(one.function, f"{one.memory_mb} MB", one.compiled),
+            *(f"{one.start_cpu_ms:.0f} ms", f"{one.first_cpu_ms:.0f} ms"),
+            *(f"{one.cold_ms / 1000:.2f} s", f"{one.peak_mb:.0f} MB"),
+        )
+    console.print(table)
+    if asked.json:
+        figures = [{**asdict(one), "cold_ms": one.cold_ms} for one in found]
+        asked.json.write_text(json.dumps(figures, indent=1) + "\n")
+
+
+def measure(rounds: int, console: Console) -> Iterator[Start]:
+    """Every function, each kind of bytecode in turns."""
+    with TemporaryDirectory() as name:
+        folder = Path(name)
+        # AWS' own packages are taken to be compiled there, as those of a Python are that has run once.
+        for package in link_runtime(folder / "runtime"):
+            compile_ = compileall.compile_dir if package.is_dir() else compileall.compile_file
+            compile_(package, quiet=2)
+        for function in functions(folder / "app", Settings(layer=LAYER)).values():
+            console.print(f"{function.name} ...", style="dim")
+            kinds = _kinds(function, folder)
+            figures: dict[str, list[tuple[float, float, float]]] = {kind: [] for kind in kinds}
+            for _ in range(rounds):
+                for kind, one in kinds.items():
+                    figures[kind].append(_start(one))
+            for kind, several in figures.items():
+                start, first, peak = (median(values) for values in zip(*several, strict=True))
+                yield Start(function.name, kind, function.memory_mb, start, first, peak)
+
+
+def _kinds(function: Function, folder: Path) -> dict[str, Function]:
+    bare, code = folder / "layer", folder / "code"
+    if function.layer is not None and not bare.exists():
+        shutil.copytree(function.layer, bare, ignore=shutil.ignore_patterns("__pycache__"))
+    if not code.exists():
+        shutil.copytree(function.code, code)
+        compile_all(code, sys.executable)
+    if function.layer is None:
+        return {NOTHING: function, ALL: replace(function, code=code)}
+    return {
+        NOTHING: replace(function, layer=bare),
+        LAYER_ALONE: function,
+        ALL: replace(function, code=code),
+    }
+
+
+def _start(function: Function) -> tuple[float, float, float]:
+    with TemporaryDirectory() as folder, started(function, Path(folder)) as environment:
+        answer = environment.invoke(events()[function.name])
+        if answer.error_type:
+            raise RuntimeFailedError(f"{function.name}: {answer.document}")
+        first_ms = environment.cpu_ms() - environment.start_cpu_ms
+        return environment.start_cpu_ms, first_ms, environment.peak_mb()
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,1 @@
+"""What sets the checkout up, checks it and writes its generated pages: `python scripts/NAME.py` or `-m`."""

@@ -1,0 +1,160 @@
+"""Every deployed function under AWS' own runtime interface client: it starts, answers, fails and logs as
+Lambda expects."""
+
+from __future__ import annotations
+
+import json
+import sys
+from dataclasses import replace
+from typing import Any
+
+import pytest
+
+pytest.importorskip("awslambdaric", reason="it has wheels for Linux alone")
+
+from bench.runtime.api import ERROR, PUBNUB_KEY, RESPONSE
+from bench.runtime.deployed import functions
+from bench.runtime.environment import RuntimeFailedError, started
+from bench.runtime.events import events
+from scripts.layer import compile_all
+from stacks.settings import ROOT, Settings
+
+LAYER = ROOT / "build" / "layer" / "local"
+# By function: the answer to its event, and the services that it asked for it.
+ANSWERS: dict[str, tuple[Any, set[str]]] = {
+    "admit": ({"allowProvisioning": True}, {"UpdateItem"}),
+    "alert": (None, {"UpdateItem", "Mail"}),
+    "echo": (None, {"Topic"}),
+    "live": (None, {"GetParameter", "PubNub"}),
+    "presence": (None, {"UpdateItem"}),
+    "quarantine": ({"batchItemFailures": []}, {"UpdateItem"}),
+    "query": ({"n": 0, "token": None}, {"Query"}),
+    "summarize": ({"batchItemFailures": []}, {"GetItem", "Query", "BatchWriteItem", "UpdateItem"}),
+    "upload": (None, {"Objects", "UpdateItem", "Topic"}),
+}
+# What makes of an event that is none: Lambda's error document, or an answer all the same.
+RAISES = {
+    "alert": "KeyError",
+    "echo": "KeyError",
+    "quarantine": "KeyError",
+    "summarize": "KeyError",
+    "upload": "KeyError",
+}
+TAKES = {
+    "admit": {"allowProvisioning": False},
+    "live": None,
+    "presence": None,
+    "query": {"error": "the request has no robot"},
+}
+
+
+@pytest.fixture(scope="module")
+def deployed(tmp_path_factory):
+    if not LAYER.is_dir():
+        pytest.skip(f"{LAYER} is not there: run `make setup`")
+    return functions(tmp_path_factory.mktemp("app"), Settings(layer=LAYER))
+
+
+def test_every_function_is_started_here(deployed):
+    assert deployed.keys() == ANSWERS.keys() == events().keys() == RAISES.keys() | TAKES.keys()
+
+
+@pytest.mark.parametrize("name", ANSWERS)
+def test_it_answers_its_event_within_its_memory(deployed, tmp_path, name):
+    expected, asked = ANSWERS[name]
+    with started(deployed[name], tmp_path) as environment:
+        answer = environment.invoke(events()[name])
+        assert (answer.kind, answer.error_type) == (RESPONSE, None), answer.document
+        if isinstance(expected, dict):
+            assert answer.document.items() >= expected.items()
+        else:
+            assert answer.document is expected
+        # Python alone takes ten.
+        assert 10 < environment.peak_mb() < deployed[name].memory_mb
+        # A second one in the same environment.
+        assert environment.invoke(events()[name]).kind == RESPONSE
+    assert set(environment.services.asked) == asked
+    check_log(environment)
+
+
+def check_log(environment):
+    """Records are JSON with a level, what is printed is a metric as CloudWatch reads it; no line has keys."""
+    assert not [line for line in [*environment.printed, *environment.logged] if PUBNUB_KEY in line]
+    records = [json.loads(line) for line in environment.logged]
+    assert all(record.keys() >= {"timestamp", "level", "message", "requestId"} for record in records)
+    assert {record["level"] for record in records} <= {"INFO", "WARNING"}
+    for line in environment.printed:
+        metric = json.loads(line)
+        assert "level" not in metric
+        (directive,) = metric["_aws"]["CloudWatchMetrics"]
+        for named in directive["Metrics"]:
+            values = metric[named["Name"]]
+            # "MetricValue": a number or a list of numbers; JSON's true is neither.
+            listed = values if isinstance(values, list) else [values]
+            assert {type(value) for value in listed} <= {int, float}
+        for dimension in {one for several in directive["Dimensions"] for one in several}:
+            assert isinstance(metric[dimension], str)
+
+
+@pytest.mark.parametrize("name", RAISES)
+def test_its_failure_is_an_error_document_and_a_record_of_level_error(deployed, tmp_path, name):
+    with started(deployed[name], tmp_path) as environment:
+        answer = environment.invoke({})
+        # An error costs no environment.
+        assert environment.invoke(events()[name]).kind == RESPONSE
+    assert answer.kind == ERROR
+    document = answer.document
+    assert document.keys() == {"errorMessage", "errorType", "requestId", "stackTrace"}
+    assert document["errorType"] == RAISES[name]
+    assert document["stackTrace"]
+    (record,) = [one for one in map(json.loads, environment.logged) if one["level"] == "ERROR"]
+    assert record.items() >= document.items()
+
+
+@pytest.mark.parametrize("name", TAKES)
+def test_it_answers_even_an_event_that_is_none(deployed, tmp_path, name):
+    with started(deployed[name], tmp_path) as environment:
+        answer = environment.invoke({})
+    assert (answer.kind, answer.document) == (RESPONSE, TAKES[name])
+
+
+def test_a_function_that_cannot_be_imported_says_so_at_its_start(deployed, tmp_path):
+    bare = replace(deployed["live"], layer=None)
+    with pytest.raises(RuntimeFailedError, match="No module named 'pubnub'"), started(bare, tmp_path):
+        pass
+
+
+def test_the_layers_bytecode_is_deployed_and_enough(deployed, tmp_path):
+    """A module whose source would fail is imported from its bytecode, which is not compared with it."""
+    packages = deployed["live"].layer / "python"
+    assert len(list(packages.rglob("*.pyc"))) > 200
+    code = tmp_path / "code"
+    code.mkdir()
+    (code / "one.py").write_text("def handler(event, context):\n    return 'compiled'\n")
+    compile_all(code, sys.executable)
+    (code / "one.py").write_text("raise AssertionError('compiled again')\n")
+    with started(replace(deployed["echo"], handler="one.handler", code=code), tmp_path) as environment:
+        assert environment.invoke({}).document == "compiled"
+
+
+@pytest.mark.parametrize("log_format", ["JSON", "Text"])
+def test_a_printed_line_reaches_lambda_as_it_is_and_a_logged_one_does_not(deployed, tmp_path, log_format):
+    """Why metrics are printed: with logs in JSON, what `logging` writes stands inside a record, where
+    CloudWatch looks for no metric."""
+    code = tmp_path / "code"
+    code.mkdir()
+    line = '{"_aws":{"Timestamp":1,"CloudWatchMetrics":[]},"One":1}'
+    (code / "one.py").write_text(
+        "import logging\n\n\ndef handler(event, context):\n"
+        "    print(event['line'])\n    logging.getLogger().warning(event['line'])\n"
+    )
+    function = replace(deployed["echo"], handler="one.handler", code=code, log_format=log_format)
+    with started(function, tmp_path) as environment:
+        environment.invoke({"line": line})
+    assert environment.printed == [line]
+    (logged,) = environment.logged
+    if log_format == "JSON":
+        assert json.loads(logged)["message"] == line
+        assert "_aws" not in json.loads(logged)
+    else:
+        assert logged.startswith("[WARNING]\t")

@@ -1,0 +1,103 @@
+"""The layer: what is in it follows from what it is for; its bytecode is the same from two builds."""
+
+from __future__ import annotations
+
+import hashlib
+import importlib.util
+import re
+import struct
+import subprocess
+import sys
+import zipfile
+
+import pytest
+
+from scripts.layer import LAMBDA, LOCAL, build
+
+# What an unchecked-hash .pyc has in its second word: PEP 552.
+UNCHECKED_HASH = 0b01
+CODE = "import sys\n\nSETS = {'a', 'b', 'c'}\nanswer = lambda text: text in {'x', 'y', 'z'}\n"
+
+
+def wheel(folder, name):
+    """A package of one module, as a registry has it; gives its SHA-256."""
+    path = folder / f"{name}-1.0-py3-none-any.whl"
+    info = f"{name}-1.0.dist-info"
+    with zipfile.ZipFile(path, "w") as archive:
+        archive.writestr(f"{name}/__init__.py", CODE)
+        archive.writestr(f"{info}/METADATA", f"Metadata-Version: 2.1\nName: {name}\nVersion: 1.0\n")
+        archive.writestr(f"{info}/WHEEL", "Wheel-Version: 1.0\nRoot-Is-Purelib: true\nTag: py3-none-any\n")
+        archive.writestr(f"{info}/entry_points.txt", f"[console_scripts]\n{name} = {name}:answer\n")
+        archive.writestr(
+            f"{info}/RECORD",
+            "".join(f"{one},,\n" for one in [*archive.namelist(), f"{info}/RECORD"]),
+        )
+    return hashlib.sha256(path.read_bytes()).hexdigest()
+
+
+@pytest.fixture
+def requirements(tmp_path, monkeypatch):
+    """A locked file of packages that only Lambda's Python, its machine or this one has."""
+    host = "{}.{}".format(*sys.version_info)
+    markers = {
+        "everywhere": "python_version >= '3'",
+        "lambda_python": f"python_version == '{LAMBDA.python}'",
+        "lambda_full": f"python_full_version >= '{LAMBDA.python}.0' and python_version <= '{LAMBDA.python}'",
+        "lambda_machine": "platform_machine == 'aarch64' and sys_platform == 'linux'",
+        "this_python": f"python_version == '{host}'",
+        "never": "sys_platform == 'win32'",
+    }
+    wheels = tmp_path / "wheels"
+    wheels.mkdir()
+    # No registry is asked.
+    monkeypatch.setenv("UV_NO_INDEX", "1")
+    monkeypatch.setenv("UV_FIND_LINKS", str(wheels))
+    locked = tmp_path / "layer.txt"
+    locked.write_text(
+        "".join(f"{n}==1.0 ; {m} \\\n    --hash=sha256:{wheel(wheels, n)}\n" for n, m in markers.items())
+    )
+    return locked
+
+
+def names(layer):
+    return {path.name for path in (layer / "python").iterdir() if not path.name.endswith(".dist-info")}
+
+
+def test_markers_are_those_of_the_target(requirements, tmp_path):
+    build(tmp_path / "layer", requirements, LAMBDA, None)
+    expected = {"everywhere", "lambda_python", "lambda_full", "lambda_machine"}
+    if LAMBDA.python == LOCAL.python:
+        expected.add("this_python")
+    assert names(tmp_path / "layer") == expected
+    build(tmp_path / "here", requirements, LOCAL, None)
+    assert names(tmp_path / "here") >= {"everywhere", "this_python"}
+    assert ("lambda_python" in names(tmp_path / "here")) == (LAMBDA.python == LOCAL.python)
+
+
+def test_a_file_that_is_not_the_locked_one_is_refused(requirements, tmp_path):
+    other = "0" * 64
+    requirements.write_text(
+        re.sub("sha256:[0-9a-f]{64}", f"sha256:{other}", requirements.read_text(), count=1)
+    )
+    with pytest.raises(subprocess.CalledProcessError):
+        build(tmp_path / "layer", requirements, LAMBDA, None)
+
+
+def test_bytecode_is_believed_and_the_same_from_two_builds(requirements, tmp_path):
+    first, second = tmp_path / "layer", tmp_path / "elsewhere" / "deeper"
+    build(first, requirements, LAMBDA, sys.executable)
+    build(second, requirements, LAMBDA, sys.executable)
+    files = {path.relative_to(first): path.read_bytes() for path in first.rglob("*") if path.is_file()}
+    assert files == {p.relative_to(second): p.read_bytes() for p in second.rglob("*") if p.is_file()}
+    modules = [path for path in files if path.suffix == ".py"]
+    compiled = [path for path in files if path.suffix == ".pyc"]
+    assert len(compiled) == len(modules) > 0
+    for path in compiled:
+        assert files[path][:4] == importlib.util.MAGIC_NUMBER
+        assert struct.unpack("<I", files[path][4:8]) == (UNCHECKED_HASH,)
+        assert str(tmp_path).encode() not in files[path]
+
+
+def test_without_a_compiler_there_is_no_bytecode(requirements, tmp_path):
+    build(tmp_path / "layer", requirements, LAMBDA, None)
+    assert not list((tmp_path / "layer").rglob("*.pyc"))
