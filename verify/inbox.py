@@ -11,6 +11,7 @@ from typing import Any
 from bench.target import Target
 from verify.waiting import until
 
+_PROBE = "verify: does this arrive?"
 Message = dict[str, Any]
 # The first message for which it is true. Raises `VerifyError` where none comes in time.
 Receive = Callable[[Callable[[Message], bool], str], Message]
@@ -28,6 +29,8 @@ def inbox(target: Target, topic: str) -> Iterator[Receive]:
         sqs.set_queue_attributes(QueueUrl=url, Attributes={"Policy": _policy(arn, topic)})
         subscription = sns.subscribe(TopicArn=topic, Protocol="sqs", Endpoint=arn)["SubscriptionArn"]
         try:
+            # A queue's policy takes up to 60 s to be known everywhere, and what comes before is lost.
+            until(lambda: _probed(sns, topic, sqs, url), "a message of the topic at its new subscriber")
             yield lambda wanted, what: until(lambda: _received(sqs, url, wanted), what)
         finally:
             sns.unsubscribe(SubscriptionArn=subscription)
@@ -44,6 +47,11 @@ def _policy(arn: str, topic: str) -> str:
         "Condition": {"ArnEquals": {"aws:SourceArn": topic}},
     }
     return json.dumps({"Version": "2012-10-17", "Statement": [statement]})
+
+
+def _probed(sns: Any, topic: str, sqs: Any, url: str) -> Message | None:
+    sns.publish(TopicArn=topic, Message=_PROBE)
+    return _received(sqs, url, lambda message: message["Message"] == _PROBE)
 
 
 def _received(sqs: Any, url: str, wanted: Callable[[Message], bool]) -> Message | None:

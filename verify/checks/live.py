@@ -3,13 +3,25 @@
 from __future__ import annotations
 
 import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import replace
 from functools import partial
 from itertools import count
 from typing import Any
 
 from bench.target import Target
-from contract import RECEIVED_MS, VESC_STREAM, LiveSample, encode_live, live_topic
+from contract import (
+    DEFAULT_NAMESPACE,
+    RECEIVED_MS,
+    VESC_STREAM,
+    LiveSample,
+    encode_live,
+    live_topic,
+    pubnub_parameter,
+)
 from station import keys
+from station.cloud import Cloud
 from station.errors import StationError
 from station.listener import Listener
 from verify.assumption import Basis
@@ -31,13 +43,33 @@ def _sent(robot: Robot, target: Target, number: int, age_s: float = 0.0) -> Live
     return live
 
 
-def _live(target: Target) -> dict[str, Any]:
+@contextmanager
+def keys_lent(target: Target) -> Iterator[None]:
+    """Have PubNub's keys stored: where the deployment has none of its own, those of the namespace iort."""
+    cloud = target.cloud
+    own = _stored(cloud)
+    if own is None:
+        others = _stored(replace(cloud, namespace=DEFAULT_NAMESPACE))
+        if others is None:
+            raise CannotAskError(f"no PubNub keys: `iort pubnub` stores them for {DEFAULT_NAMESPACE}")
+        keys.store(cloud, others)
     try:
-        keys.load(target.cloud)
-    except StationError as error:
-        raise CannotAskError(f"{error}; then ask again") from error
+        yield
+    finally:
+        if own is None:
+            cloud.client("ssm").delete_parameter(Name=pubnub_parameter(cloud.namespace))
+
+
+def _stored(cloud: Cloud) -> keys.PubNubKeys | None:
+    try:
+        return keys.load(cloud)
+    except StationError:
+        return None
+
+
+def _live(target: Target) -> dict[str, Any]:
     bundle = target.robot("verify-live")
-    with target.listener(bundle.robot) as listener, Robot(bundle.folder) as robot:
+    with keys_lent(target), target.listener(bundle.robot) as listener, Robot(bundle.folder) as robot:
         robot.online()
         _sent(robot, target, _STALE, age_s=60)
         numbers = count(_STALE + 1)
