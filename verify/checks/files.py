@@ -5,37 +5,15 @@ from __future__ import annotations
 import hashlib
 import http.client
 import json
-import re
 import time
-import uuid
-from collections.abc import Iterator, Mapping
-from contextlib import closing, contextmanager
-from pathlib import Path
 from typing import Any
-from urllib.parse import urlsplit
 
 from bench import borrowed
 from bench.target import Target
-from contract import (
-    FILE,
-    FILES_PREFIX,
-    PART_BYTES,
-    PING,
-    PONG,
-    Address,
-    File,
-    FileAnswer,
-    FileRequest,
-    build_topic,
-    decode_file_answer,
-    encode_file_request,
-    file_key,
-    part_range,
-)
-from device.upload_http import trusting
+from contract import FILES_PREFIX, PART_BYTES, File, part_range
 from verify.assumption import Basis
 from verify.check import Check
-from verify.robot import Robot
+from verify.uploading import asking, sent, trust
 from verify.waiting import until
 
 _GUIDE = "https://docs.aws.amazon.com/AmazonS3/latest/userguide"
@@ -51,57 +29,6 @@ def handler(event, context):
     config = Config(signature_version="s3v4", s3={"addressing_style": "virtual"})
     return boto3.client("s3", config=config).generate_presigned_url("put_object", Params=event, ExpiresIn=1)
 """
-_CODE = re.compile(r"<Code>([^<]+)</Code>")
-
-
-class _Asking:
-    """A robot that asks for addresses and puts bodies there."""
-
-    def __init__(self, target: Target, robot: Robot) -> None:
-        self._robot, self._namespace = robot, target.cloud.namespace
-        self._trust = _trust(target)
-        robot.subscribe(build_topic(PONG, robot.name, FILE, self._namespace))
-
-    def ask(self, file: File, parts: Mapping[int, bytes], parts_sha256: str | None = None) -> FileAnswer:
-        digests = {number: hashlib.sha256(body).hexdigest() for number, body in parts.items()}
-        request = FileRequest(uuid.uuid4().hex, file, digests, parts_sha256)
-        topic = build_topic(PING, self._robot.name, FILE, self._namespace)
-        self._robot.publish(topic, encode_file_request(request))
-        while (answer := decode_file_answer(self._robot.next_message()[1])).id != request.id:
-            pass
-        return answer
-
-    def put(self, address: Address, body: bytes) -> tuple[int, str]:
-        """The status, and the code of S3's error."""
-        return _sent(self._trust, "PUT", address.url, body, address.headers)
-
-
-def _trust(target: Target) -> Any:
-    bundle = target.cloud.ca_bundle
-    return trusting(Path(bundle) if bundle else None)
-
-
-def _sent(
-    trust: Any, method: str, url: str, body: bytes = b"", headers: Mapping[str, str] | None = None
-) -> tuple[int, str]:
-    parts = urlsplit(url)
-    with closing(http.client.HTTPSConnection(parts.netloc, context=trust, timeout=60)) as connection:
-        connection.request(method, f"{parts.path}?{parts.query}", body, dict(headers or {}))
-        answer = connection.getresponse()
-        found = _CODE.search(answer.read().decode(errors="replace"))
-    return answer.status, found[1] if found else ""
-
-
-@contextmanager
-def _asking(target: Target, base: str, file: File) -> Iterator[tuple[_Asking, str]]:
-    """A new robot and the key of its file; the file is deleted in the end."""
-    bundle, bucket = target.robot(base), target.cloud.output("storage", "FilesBucket")
-    key = file_key(bundle.robot, file)
-    with Robot(bundle.folder) as robot:
-        try:
-            yield _Asking(target, robot.online()), key
-        finally:
-            target.cloud.client("s3").delete_object(Bucket=bucket, Key=key)
 
 
 def _file(content: bytes, name: str) -> File:
@@ -111,7 +38,7 @@ def _file(content: bytes, name: str) -> File:
 
 def _in_one(target: Target) -> dict[str, Any]:
     file = _file(_SMALL, "verify.txt")
-    with _asking(target, "verify-file", file) as (robot, key):
+    with asking(target, "verify-file", file) as (robot, key):
         (address,) = robot.ask(file, {1: _SMALL}).addresses
         longer = {**address.headers, "content-length": str(file.size + 1)}
         twice = {name: value for name, value in address.headers.items() if name != "if-none-match"}
@@ -138,7 +65,7 @@ def _in_parts(target: Target) -> dict[str, Any]:
     ranges = {number: part_range(file, number) for number in (1, 2)}
     parts = {number: content[first : first + size] for number, (first, size) in ranges.items()}
     together = hashlib.sha256(b"".join(hashlib.sha256(body).digest() for body in parts.values())).hexdigest()
-    with _asking(target, "verify-parts", file) as (robot, key):
+    with asking(target, "verify-parts", file) as (robot, key):
         addresses = {address.part: address for address in robot.ask(file, parts).addresses}
         other_bytes, _ = robot.put(addresses[2], _REST[::-1])
         second = robot.put(addresses[2], _REST)
@@ -160,7 +87,7 @@ def _in_parts(target: Target) -> dict[str, Any]:
 
 def _closed(target: Target) -> dict[str, Any]:
     """Signed for a second, with the upload function's role: robots' addresses are good for 15 minutes."""
-    cloud, trust = target.cloud, _trust(target)
+    cloud, context = target.cloud, trust(target)
     s3, client = cloud.client("s3"), cloud.client("lambda")
     place = {"Bucket": cloud.output("storage", "FilesBucket"), "Key": f"{FILES_PREFIX}verify/expired"}
     with borrowed.function(target, "signing", _SIGNING, memory_mb=256, timeout_s=30, like="Upload") as name:
@@ -168,11 +95,11 @@ def _closed(target: Target) -> dict[str, Any]:
     try:
 
         def refused() -> tuple[int, str] | None:
-            answer = _sent(trust, "PUT", url, _SMALL)
+            answer = sent(context, "PUT", url, _SMALL)
             return None if answer[0] == http.client.OK else answer
 
         expired, code = until(refused, "the end of an address that was signed for a second")
-        unsigned = {method: _sent(trust, method, url.split("?")[0])[0] for method in ("GET", "PUT")}
+        unsigned = {method: sent(context, method, url.split("?")[0])[0] for method in ("GET", "PUT")}
     finally:
         s3.delete_object(**place)
     blocked = s3.get_public_access_block(Bucket=place["Bucket"])["PublicAccessBlockConfiguration"]
