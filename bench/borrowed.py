@@ -11,24 +11,28 @@ from bench.target import Target
 
 
 @contextmanager
-def function(target: Target, name: str, source: str, *, memory_mb: int, timeout_s: int = 3) -> Iterator[str]:
+def function(
+    target: Target, name: str, source: str, *, memory_mb: int, timeout_s: int = 3, like: str = "Echo"
+) -> Iterator[str]:
     """The name of a deployed function whose ``source`` has a `handler`, with runtime, role, architecture
-    and log of the function echo; it is deleted in the end."""
+    and log of the function ``like``; it is deleted in the end."""
     client = target.cloud.client("lambda")
     whole = target.name(f"{target.cloud.namespace}-bench-{name}")
-    like = client.get_function_configuration(FunctionName=target.cloud.output("processing", "EchoFunction"))
+    model = target.cloud.output("processing", f"{like}Function")
+    configuration = client.get_function_configuration(FunctionName=model)
+    logging = configuration.get("LoggingConfig")
     packed = io.BytesIO()
     with zipfile.ZipFile(packed, "w") as archive:
         archive.writestr(f"{name}.py", source)
     client.create_function(
         FunctionName=whole,
-        Runtime=like["Runtime"],
-        Role=like["Role"],
+        Runtime=configuration["Runtime"],
+        Role=configuration["Role"],
         Handler=f"{name}.handler",
-        Architectures=like.get("Architectures", ["arm64"]),
+        Architectures=configuration.get("Architectures", ["arm64"]),
         MemorySize=memory_mb,
         Timeout=timeout_s,
-        LoggingConfig={"LogGroup": like["LoggingConfig"]["LogGroup"]} if like.get("LoggingConfig") else {},
+        LoggingConfig={"LogGroup": logging["LogGroup"]} if logging else {},
         Code={"ZipFile": packed.getvalue()},
     )
     try:

@@ -10,9 +10,11 @@ from dataclasses import replace
 import pytest
 
 from bench.target import AWS, EMBEDDED, Target
+from station import keys
+from station.errors import StationError
 from verify import measured, price, run
 from verify.check import WITH_KEY, Verdict, ask
-from verify.checks import ALL, rules
+from verify.checks import ALL, live, rules
 from verify.errors import VerifyError
 
 
@@ -27,6 +29,17 @@ def target(embedded, tmp_path_factory):
 def test_the_embedded_cloud_answers_as_assumed_or_measured(target, check):
     answer = ask(check, target, time.monotonic, measured.load().expected(check.name))
     assert answer.verdict is Verdict.AS_ASSUMED, (answer.reason, answer.seen)
+
+
+def test_pubnubs_keys_are_lent_to_a_deployment_without_and_taken_back(embedded, tmp_path):
+    cloud = replace(embedded.cloud, namespace="other")
+    with live.keys_lent(Target(EMBEDDED, cloud, tmp_path)):
+        assert keys.load(cloud) == keys.load(embedded.cloud)
+    with pytest.raises(StationError, match="not stored yet"):
+        keys.load(cloud)
+    with live.keys_lent(Target(EMBEDDED, embedded.cloud, tmp_path)):
+        pass
+    assert keys.load(embedded.cloud)
 
 
 class Recorder:

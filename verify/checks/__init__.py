@@ -3,7 +3,23 @@
 from __future__ import annotations
 
 from verify.check import Check
-from verify.checks import broker, payloads, provisioning, removal, renewal, rule_errors, rules
+from verify.checks import (
+    alarms,
+    broker,
+    dynamodb,
+    files,
+    functions,
+    live,
+    logs,
+    payloads,
+    provisioning,
+    quarantine,
+    removal,
+    renewal,
+    rule_errors,
+    rules,
+    stream,
+)
 
 ALL: tuple[Check, ...] = (
     *rules.CHECKS,
@@ -13,4 +29,12 @@ ALL: tuple[Check, ...] = (
     *provisioning.CHECKS,
     *renewal.CHECKS,
     *removal.CHECKS,
+    *stream.CHECKS,
+    *quarantine.CHECKS,
+    *dynamodb.CHECKS,
+    *functions.CHECKS,
+    *logs.CHECKS,
+    *files.CHECKS,
+    *live.CHECKS,
+    *alarms.CHECKS,
 )

@@ -1,0 +1,92 @@
+"""No expression names an attribute that is one of DynamoDB's reserved words: only a request would say so."""
+
+from __future__ import annotations
+
+import ast
+import importlib
+import re
+
+import pytest
+from ministack.services._dynamodb_keywords import AWS_KEYWORDS
+
+from local.deployment import ROOT
+
+# What the language of expressions is made of; two of them are reserved as names for that reason.
+LANGUAGE = {
+    *("set", "add", "remove", "delete", "and", "or", "not", "between", "in"),
+    *("attribute_exists", "attribute_not_exists", "attribute_type", "begins_with", "contains", "size"),
+    *("if_not_exists", "list_append"),
+}
+WORD = re.compile(r"[#:]?[A-Za-z_]\w*")
+# An expression, told from other text by what no sentence has.
+EXPRESSION = re.compile(r"attribute_(not_)?exists\(|(=|<|>|BETWEEN|ADD \S+) :\w|^\s*REMOVE [#\w]")
+PLACEHOLDER = "#unknown"
+
+
+def text_of(node, module):
+    """A string with what constants of its module put into it; None for any other node."""
+    if isinstance(node, ast.Constant) and isinstance(node.value, str):
+        return node.value
+    if not isinstance(node, ast.JoinedStr):
+        return None
+    return "".join(
+        part.value if isinstance(part, ast.Constant) else _constant(part, module) for part in node.values
+    )
+
+
+def _constant(part, module):
+    value = getattr(module, part.value.id, None) if isinstance(part.value, ast.Name) else None
+    return value if isinstance(value, str) else PLACEHOLDER
+
+
+def named(expression):
+    """The attributes that an expression names without a placeholder."""
+    words = set(WORD.findall(expression))
+    return {word for word in words if word[0] not in "#:" and word.lower() not in LANGUAGE}
+
+
+def expressions(folder):
+    for path in sorted((ROOT / folder).glob("**/*.py")):
+        tree = ast.parse(path.read_text())
+        dotted = ".".join(path.relative_to(ROOT).with_suffix("").parts)
+        inside = {
+            id(part) for node in ast.walk(tree) if isinstance(node, ast.JoinedStr) for part in node.values
+        }
+        for node in ast.walk(tree):
+            if id(node) in inside or not isinstance(node, (ast.Constant, ast.JoinedStr)):
+                continue
+            literal = text_of(node, None)
+            if literal is not None and EXPRESSION.search(literal):
+                yield (
+                    f"{path.relative_to(ROOT)}:{node.lineno}",
+                    text_of(node, importlib.import_module(dotted)),
+                )
+
+
+FOUND = [one for folder in ("functions", "station", "verify") for one in expressions(folder)]
+
+
+def test_the_projects_expressions_are_found():
+    assert {where.split(":")[0] for where, _ in FOUND} >= {
+        "functions/admit.py",
+        "functions/alert.py",
+        "functions/allotment.py",
+        "functions/presence.py",
+        "functions/quarantine.py",
+        "functions/tables.py",
+        "station/audit.py",
+        "station/registry.py",
+        "station/replay.py",
+    }
+
+
+@pytest.mark.parametrize(("where", "expression"), FOUND, ids=[where for where, _ in FOUND])
+def test_no_expression_names_a_reserved_word(where, expression):
+    assert {word for word in named(expression) if word.upper() in AWS_KEYWORDS} == set(), where
+
+
+def test_a_reserved_word_would_be_found():
+    in_expressions = set().union(*(named(expression) for _, expression in FOUND))
+    assert {"robot", "agent_version", "admit_until_s"} <= in_expressions, "constants are looked up"
+    assert named("SET batch = :batch, #n = :n") == {"batch"}
+    assert named("attribute_exists(robot) AND #online = :was") == {"robot"}

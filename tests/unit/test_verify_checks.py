@@ -1,0 +1,132 @@
+"""Questions differ where a cloud answers otherwise: some of them, against clouds that answer so or so."""
+
+from __future__ import annotations
+
+import io
+import itertools
+import json
+from types import SimpleNamespace
+
+import pytest
+from botocore.exceptions import ClientError
+
+from bench.target import AWS
+from verify.check import Verdict, ask
+from verify.checks import ALL
+
+CHECKS = {check.name: check for check in ALL}
+
+
+class Cloud:
+    """Answers by what it is given: a function for each operation of whichever service."""
+
+    namespace = "iort"
+
+    def __init__(self, **operations):
+        self.operations = SimpleNamespace(**operations)
+
+    def client(self, _service):
+        return self.operations
+
+    def output(self, noun, name):
+        return f"{noun}-{name}"
+
+
+def verdict(name, cloud):
+    target = SimpleNamespace(kind=AWS, cloud=cloud, name=str, robot=lambda base: SimpleNamespace(robot=base))
+    answer = ask(CHECKS[name], target, itertools.count().__next__)
+    return answer.verdict, answer.seen or answer.reason
+
+
+def refuse(code, **more):
+    metadata = {"HTTPStatusCode": 400}
+    raise ClientError({"Error": {"Code": code}, "ResponseMetadata": metadata, **more}, "Operation")
+
+
+@pytest.mark.parametrize(
+    ("reserved", "expected"),
+    [
+        ({"batch", "online"}, Verdict.AS_ASSUMED),
+        ({"batch"}, Verdict.DIFFERS),
+        ({"batch", "online", "serial"}, Verdict.DIFFERS),
+    ],
+)
+def test_reserved_words(reserved, expected):
+    def get_item(*, ProjectionExpression, **_):
+        if ProjectionExpression in reserved:
+            refuse("ValidationException")
+
+    assert verdict("dynamodb.reserved_words", Cloud(get_item=get_item))[0] is expected
+
+
+def test_another_error_than_asked_for_is_no_answer():
+    cloud = Cloud(get_item=lambda **_: refuse("AccessDeniedException"))
+    assert verdict("dynamodb.reserved_words", cloud)[0] is Verdict.FAILED
+
+
+@pytest.mark.parametrize(("row", "expected"), [(True, Verdict.AS_ASSUMED), (False, Verdict.DIFFERS)])
+def test_a_failed_condition(row, expected):
+    def update_item(*, Key, **_):
+        refuse("ConditionalCheckFailedException", **({"Item": Key} if row else {}))
+
+    assert verdict("dynamodb.failed_condition", Cloud(update_item=update_item))[0] is expected
+
+
+@pytest.mark.parametrize(
+    ("status", "expected"),
+    [("ENABLED", Verdict.AS_ASSUMED), ("ENABLING", Verdict.AS_ASSUMED), ("DISABLED", Verdict.DIFFERS)],
+)
+def test_expiry(status, expected):
+    told = {"TimeToLiveDescription": {"TimeToLiveStatus": status, "AttributeName": "expires_s"}}
+    cloud = Cloud(describe_time_to_live=lambda **_: told)
+    assert verdict("dynamodb.expiry", cloud)[0] is expected
+
+
+def insights(code="Complete", count=4, **alarm):
+    """A CloudWatch with so many alarms that ask by Metrics Insights."""
+
+    def describe_alarms(*, AlarmNames):
+        metrics = [{"Expression": 'SELECT SUM(ParseError) FROM "AWS/IoT"'}]
+        return {
+            "MetricAlarms": [
+                {"AlarmName": name, "StateValue": "OK", "Metrics": metrics, **alarm}
+                for name in AlarmNames[:count]
+            ]
+        }
+
+    def get_metric_data(*, MetricDataQueries, **_):
+        assert all(query["Period"] == 60 for query in MetricDataQueries)
+        return {"MetricDataResults": [{"StatusCode": code} for _ in MetricDataQueries]}
+
+    return Cloud(describe_alarms=describe_alarms, get_metric_data=get_metric_data)
+
+
+@pytest.mark.parametrize(
+    ("cloud", "expected"),
+    [
+        (insights(), Verdict.AS_ASSUMED),
+        (insights(StateValue="ALARM"), Verdict.AS_ASSUMED),
+        (insights(EvaluationState="EVALUATION_ERROR"), Verdict.DIFFERS),
+        (insights(code="InternalError"), Verdict.DIFFERS),
+        (insights(count=3), Verdict.DIFFERS),
+    ],
+)
+def test_metrics_insights(cloud, expected):
+    assert verdict("alarms.metrics_insights", cloud)[0] is expected
+
+
+@pytest.mark.parametrize(
+    ("runs", "expected"), [("python3.13", Verdict.AS_ASSUMED), ("python3.12", Verdict.DIFFERS)]
+)
+def test_the_runtime(runs, expected):
+    deleted = []
+    configuration = {"Runtime": "python3.13", "Role": "role"}
+    cloud = Cloud(
+        get_function_configuration=lambda **_: configuration,
+        create_function=lambda **_: None,
+        get_waiter=lambda _: SimpleNamespace(wait=lambda **_: None),
+        invoke=lambda **_: {"Payload": io.BytesIO(json.dumps(runs).encode())},
+        delete_function=lambda **named: deleted.append(named),
+    )
+    assert verdict("functions.python", cloud)[0] is expected
+    assert len(deleted) == 1

@@ -1,0 +1,183 @@
+"""Alarms and alerts: what reaches a human, and that CloudWatch takes what the alarms ask."""
+
+from __future__ import annotations
+
+import json
+import time
+from dataclasses import replace
+from datetime import datetime, timedelta, timezone
+from typing import Any
+
+from bench.target import Target
+from contract import FAULT_FIELD, LIVE, VESC_STREAM, LiveSample, build_topic, encode_live
+from verify.assumption import Basis
+from verify.check import WITH_KEY, Check
+from verify.errors import VerifyError
+from verify.inbox import inbox
+from verify.robot import Robot
+from verify.waiting import until
+
+_REASON = "verify: is it told?"
+_ALARM = "ALARM"
+_RUN = "0badcafe"
+_FAULT = 5
+# The alarms that ask by Metrics Insights: stacks/alarms.py.
+_INSIGHTS = ("ParseError", "ErrorActionFailure", "RuleMessageThrottled", "DestinationDeliveryFailures")
+
+
+def _quiet_alarm(target: Target) -> dict[str, Any]:
+    """An alarm of the deployment that does not say ALARM: only a change of state is told."""
+    pages = target.cloud.client("cloudwatch").get_paginator("describe_alarms")
+    for page in pages.paginate(AlarmNamePrefix=f"{target.cloud.namespace}-", AlarmTypes=["MetricAlarm"]):
+        for alarm in page["MetricAlarms"]:
+            if alarm["StateValue"] != _ALARM:
+                return dict(alarm)
+    raise VerifyError("no alarm of the deployment is quiet")
+
+
+def _set_state(target: Target) -> dict[str, Any]:
+    cloud = target.cloud
+    topic, alarm = cloud.output("processing", "AlarmTopic"), _quiet_alarm(target)
+    name, cloudwatch = alarm["AlarmName"], cloud.client("cloudwatch")
+
+    def ours(mail: dict[str, Any]) -> bool:
+        return mail.get("Subject", "").startswith(_ALARM) and _REASON in mail["Message"]
+
+    with inbox(target, topic) as receive:
+        cloudwatch.set_alarm_state(AlarmName=name, StateValue=_ALARM, StateReason=_REASON)
+        try:
+            mail = receive(ours, "the alarm at the topic's subscriber")
+        finally:
+            cloudwatch.set_alarm_state(
+                AlarmName=name, StateValue=alarm["StateValue"], StateReason=alarm.get("StateReason", "")
+            )
+    told = json.loads(mail["Message"])
+    attributes = cloud.client("sns").get_topic_attributes(TopicArn=topic)["Attributes"]
+    return {
+        "topic_has_key": bool(attributes.get("KmsMasterKeyId")),
+        "type": mail["Type"],
+        "subject_names_alarm": name in mail["Subject"],
+        "alarm": told["AlarmName"] == name,
+        "description": told["AlarmDescription"] == alarm["AlarmDescription"],
+        "new_state": told["NewStateValue"],
+        "old_state": told["OldStateValue"] == alarm["StateValue"],
+        "reason": told["NewStateReason"],
+    }
+
+
+def _insights(target: Target) -> dict[str, Any]:
+    cloudwatch = target.cloud.client("cloudwatch")
+    names = [f"{target.cloud.namespace}-{name}" for name in _INSIGHTS]
+
+    def alarms() -> list[dict[str, Any]] | None:
+        """The alarms, once CloudWatch has looked at each."""
+        found = list(cloudwatch.describe_alarms(AlarmNames=names)["MetricAlarms"])
+        looked = all(alarm["StateValue"] != "INSUFFICIENT_DATA" for alarm in found)
+        return found if looked and found else None
+
+    found = until(alarms, "the alarms' first state", within_s=180)
+    now = datetime.now(timezone.utc)
+    queries = [
+        {"Id": f"q{i}", "Expression": alarm["Metrics"][0]["Expression"], "Period": 60}
+        for i, alarm in enumerate(found)
+    ]
+    answer = cloudwatch.get_metric_data(
+        MetricDataQueries=queries, StartTime=now - timedelta(hours=1), EndTime=now
+    )
+    return {
+        "alarms": len(found),
+        "evaluation": sorted({alarm.get("EvaluationState", "as it should") for alarm in found}),
+        "queries": sorted(result["StatusCode"] for result in answer["MetricDataResults"]),
+        "messages": [message["Code"] for message in answer.get("Messages", [])],
+        "note_states": {alarm["AlarmName"]: alarm["StateValue"] for alarm in found},
+    }
+
+
+def _alert(target: Target) -> dict[str, Any]:
+    bundle, namespace = target.robot("verify-alert"), target.cloud.namespace
+    topic = target.cloud.output("processing", "AlarmTopic")
+    with inbox(target, topic) as receive, Robot(bundle.folder) as robot:
+        robot.online()
+        now_us = time.time_ns() // 1000
+        live = encode_live(LiveSample(_RUN, 0, now_us, now_us, {FAULT_FIELD: _FAULT}))
+        # Not by Basic Ingest, which comes to the live rule alone.
+        robot.publish(build_topic(LIVE, robot.name, VESC_STREAM, namespace), live)
+        mail = receive(lambda mail: robot.name in mail["Message"], "the alert at the topic's subscriber")
+    lines = mail["Message"].replace(bundle.robot, "ROBOT").replace(namespace, "NAMESPACE").splitlines()
+    return {
+        "subject": mail["Subject"].replace(bundle.robot, "ROBOT").replace(namespace, "NAMESPACE"),
+        "first_line": lines[0],
+        "says": [line.split()[0] for line in lines if line.startswith(("when ", "stream "))],
+    }
+
+
+_SET_STATE = Check(
+    name="alarms.set_state",
+    assumed=(
+        "An alarm whose state is set to ALARM tells the alarm topic, and the topic its subscribers, with "
+        "name, description, both states and the reason."
+    ),
+    expected={
+        "topic_has_key": False,
+        "type": "Notification",
+        "subject_names_alarm": True,
+        "alarm": True,
+        "description": True,
+        "new_state": _ALARM,
+        "old_state": True,
+        "reason": _REASON,
+    },
+    basis=Basis.DOCUMENTED,
+    source="https://docs.aws.amazon.com/AmazonCloudWatch/latest/APIReference/API_SetAlarmState.html",
+    relied_on_by=("stacks/alarms.py", "stacks/processing.py"),
+    ask=_set_state,
+)
+CHECKS = (
+    _SET_STATE,
+    replace(
+        _SET_STATE,
+        name="alarms.set_state_with_key",
+        assumed=(
+            "The same where the topic is encrypted with the account's own key, which lets CloudWatch in "
+            "without a condition."
+        ),
+        expected={**_SET_STATE.expected, "topic_has_key": True},
+        source="https://repost.aws/knowledge-center/cloudwatch-configure-alarm-sns",
+        relied_on_by=("stacks/encryption.py",),
+        phase=WITH_KEY,
+        not_embedded="the embedded cloud is deployed without a key: its topics encrypt nothing",
+    ),
+    Check(
+        name="alarms.metrics_insights",
+        assumed=(
+            "An alarm may sum a metric over all of its dimensions by Metrics Insights. Where the metric has "
+            "no data, the query is complete, and the alarm is no longer in its first state."
+        ),
+        expected={
+            "alarms": len(_INSIGHTS),
+            "evaluation": ["as it should"],
+            "queries": ["Complete"] * len(_INSIGHTS),
+            "messages": [],
+        },
+        basis=Basis.DOCUMENTED,
+        source="https://docs.aws.amazon.com/AmazonCloudWatch/latest/monitoring/alarm-evaluation.html",
+        relied_on_by=("stacks/alarms.py", "stacks/metrics.py"),
+        ask=_insights,
+        not_embedded="the embedded cloud has no Metrics Insights, and is deployed without these alarms",
+    ),
+    Check(
+        name="alarms.alert",
+        assumed=(
+            "A car's fault goes from the rule fault to the alert function, which may note it in the car's "
+            "row, and from there to the alarm topic's subscribers."
+        ),
+        expected={
+            "subject": "NAMESPACE: ROBOT, fault 5, MOSFET over-temperature",
+            "first_line": "ROBOT: fault 5, MOSFET over-temperature",
+            "says": ["when", "stream"],
+        },
+        basis=Basis.ASSUMED,
+        relied_on_by=("functions/alert.py", "stacks/storage.py", "contract/cloud.py"),
+        ask=_alert,
+    ),
+)

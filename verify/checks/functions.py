@@ -1,0 +1,155 @@
+"""Lambda: what the runtime brings, and how the failure of an invocation that nobody waits for is told."""
+
+from __future__ import annotations
+
+import json
+import time
+from typing import Any
+
+from bench import borrowed
+from bench.target import Target
+from contract import BY_FUNCTION, LAMBDA, PING, TOPIC, build_topic, rule_event
+from station import quarantine
+from verify.assumption import Basis
+from verify.check import Check
+from verify.errors import VerifyError
+from verify.waiting import until
+
+_GUIDE = "https://docs.aws.amazon.com/lambda/latest/dg"
+_MEMORY_MB = 256
+_WITHIN_S = 180.0
+# What functions/ gives boto3's clients beyond what is years old.
+_PARAMETERS = {
+    "CompleteMultipartUpload": ["IfNoneMatch", "MpuObjectSize"],
+    "PutObject": ["ChecksumSHA256", "IfNoneMatch"],
+    "UploadPart": ["ChecksumSHA256"],
+}
+_ENVIRONMENT = ("AWS_LAMBDA_FUNCTION_MEMORY_SIZE", "AWS_LAMBDA_FUNCTION_NAME", "AWS_REGION")
+_RUNTIME = f"""
+import os, sys
+import boto3
+
+def handler(event, context):
+    model = boto3.client("s3", region_name="eu-central-1").meta.service_model
+    return {{
+        "python": list(sys.version_info[:2]),
+        "boto3": boto3.__version__,
+        "unknown": [
+            f"{{operation}}.{{name}}"
+            for operation, names in {_PARAMETERS!r}.items()
+            for name in names
+            if name not in model.operation_model(operation).input_shape.members
+        ],
+        "environment": [name for name in {_ENVIRONMENT!r} if os.environ.get(name)],
+        "memory_mb": int(os.environ["AWS_LAMBDA_FUNCTION_MEMORY_SIZE"]),
+        "remaining_ms": context.get_remaining_time_in_millis(),
+        "arn": context.invoked_function_arn.split(":")[5],
+        "cores": os.cpu_count(),
+        "log_format": os.environ.get("AWS_LAMBDA_LOG_FORMAT"),
+    }}
+"""
+
+
+def _runtime(target: Target) -> dict[str, Any]:
+    client = target.cloud.client("lambda")
+    with borrowed.function(target, "runtime", _RUNTIME, memory_mb=_MEMORY_MB, timeout_s=30) as name:
+        answer = client.invoke(FunctionName=name, Payload=b"{}")
+        found = json.loads(answer["Payload"].read())
+        if "FunctionError" in answer:
+            raise VerifyError(f"the function failed: {found}")
+        named = client.get_function_configuration(FunctionName=name)["Runtime"]
+    return {
+        "parameters_that_boto3_does_not_know": found["unknown"],
+        "environment": found["environment"],
+        "memory_mb": found["memory_mb"],
+        "time_is_limited": 0 < found["remaining_ms"] <= 30_000,
+        "arn_is_a_functions": found["arn"] == "function",
+        "note_runtime": named,
+        "note_python": ".".join(map(str, found["python"])),
+        "note_boto3": found["boto3"],
+        "note_cores": found["cores"],
+        "note_log_format": found["log_format"],
+    }
+
+
+def _python(target: Target) -> dict[str, Any]:
+    source = "import sys\n\ndef handler(event, context):\n    return 'python%d.%d' % sys.version_info[:2]\n"
+    client = target.cloud.client("lambda")
+    with borrowed.function(target, "python", source, memory_mb=_MEMORY_MB, timeout_s=30) as name:
+        named = client.get_function_configuration(FunctionName=name)["Runtime"]
+        runs = json.loads(client.invoke(FunctionName=name, Payload=b"{}")["Payload"].read())
+    return {"runs_as_named": runs == named, "note_python": runs}
+
+
+def _failure(target: Target) -> dict[str, Any]:
+    """The function echo is called with a ping that is none, by nobody who waits."""
+    bundle, cloud = target.robot("verify-failure"), target.cloud
+    name, message = cloud.output("processing", "EchoFunction"), b"\xff no ping"
+    event = rule_event(
+        message, build_topic(PING, bundle.robot, LAMBDA, cloud.namespace), int(time.time() * 1000)
+    )
+    cloud.client("lambda").invoke(FunctionName=name, InvocationType="Event", Payload=json.dumps(event))
+    (listed,) = until(
+        lambda: list(quarantine.entries(cloud, robot=bundle.robot)),
+        "the failed invocation in the quarantine",
+        within_s=_WITHIN_S,
+    )
+    entry = quarantine.load(cloud, listed)
+    if entry is None:
+        raise VerifyError("the entry has gone")
+    return {
+        "source": entry.source == f"{BY_FUNCTION} {name}",
+        "topic": entry.topic == event[TOPIC],
+        "condition": entry.reason.split(":")[0],
+        "says_why": "not JSON" in entry.reason,
+        "message_as_sent": entry.payload == message,
+    }
+
+
+CHECKS = (
+    Check(
+        name="functions.runtime",
+        assumed=(
+            "boto3 of Lambda's runtime knows every parameter that the functions use, and the environment and "
+            "the context say memory, name and time left."
+        ),
+        expected={
+            "parameters_that_boto3_does_not_know": [],
+            "environment": list(_ENVIRONMENT),
+            "memory_mb": _MEMORY_MB,
+            "time_is_limited": True,
+            "arn_is_a_functions": True,
+        },
+        basis=Basis.ASSUMED,
+        relied_on_by=("functions/bucket.py", "stacks/function.py", "functions/live.py"),
+        ask=_runtime,
+    ),
+    Check(
+        name="functions.python",
+        assumed="The runtime python3.13 runs Python 3.13, for which the layer is built.",
+        expected={"runs_as_named": True},
+        basis=Basis.DOCUMENTED,
+        source=f"{_GUIDE}/lambda-runtimes.html",
+        relied_on_by=("stacks/function.py", "scripts/setup.py"),
+        ask=_python,
+        not_embedded="the embedded cloud runs the functions with the Python of the machine it stands on",
+    ),
+    Check(
+        name="functions.failed_invocation",
+        assumed=(
+            "An asynchronous invocation that fails, and is not tried again, comes to the destination with "
+            "its event, the function's ARN, the condition RetriesExhausted and the error's message."
+        ),
+        expected={
+            "source": True,
+            "topic": True,
+            "condition": "RetriesExhausted",
+            "says_why": True,
+            "message_as_sent": True,
+        },
+        basis=Basis.DOCUMENTED,
+        source=f"{_GUIDE}/invocation-async-retain-records.html",
+        relied_on_by=("functions/quarantine.py", "stacks/processing.py"),
+        ask=_failure,
+    ),
+)

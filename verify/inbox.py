@@ -1,0 +1,60 @@
+"""What a topic sends to its subscribers: a queue that subscribes for a while, since a mail needs a human."""
+
+from __future__ import annotations
+
+import json
+import uuid
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from typing import Any
+
+from bench.target import Target
+from verify.waiting import until
+
+_PROBE = "verify: does this arrive?"
+Message = dict[str, Any]
+# The first message for which it is true. Raises `VerifyError` where none comes in time.
+Receive = Callable[[Callable[[Message], bool], str], Message]
+
+
+@contextmanager
+def inbox(target: Target, topic: str) -> Iterator[Receive]:
+    """A queue that is subscribed to the topic; subscription and queue are removed in the end."""
+    sqs, sns = target.cloud.client("sqs"), target.cloud.client("sns")
+    # SQS refuses a name for 60 s after its queue was deleted.
+    name = f"{target.cloud.namespace}-verify-{uuid.uuid4().hex[:8]}"
+    url = sqs.create_queue(QueueName=name)["QueueUrl"]
+    try:
+        arn = sqs.get_queue_attributes(QueueUrl=url, AttributeNames=["QueueArn"])["Attributes"]["QueueArn"]
+        sqs.set_queue_attributes(QueueUrl=url, Attributes={"Policy": _policy(arn, topic)})
+        subscription = sns.subscribe(TopicArn=topic, Protocol="sqs", Endpoint=arn)["SubscriptionArn"]
+        try:
+            # A queue's policy takes up to 60 s to be known everywhere, and what comes before is lost.
+            until(lambda: _probed(sns, topic, sqs, url), "a message of the topic at its new subscriber")
+            yield lambda wanted, what: until(lambda: _received(sqs, url, wanted), what)
+        finally:
+            sns.unsubscribe(SubscriptionArn=subscription)
+    finally:
+        sqs.delete_queue(QueueUrl=url)
+
+
+def _policy(arn: str, topic: str) -> str:
+    statement = {
+        "Effect": "Allow",
+        "Principal": {"Service": "sns.amazonaws.com"},
+        "Action": "sqs:SendMessage",
+        "Resource": arn,
+        "Condition": {"ArnEquals": {"aws:SourceArn": topic}},
+    }
+    return json.dumps({"Version": "2012-10-17", "Statement": [statement]})
+
+
+def _probed(sns: Any, topic: str, sqs: Any, url: str) -> Message | None:
+    sns.publish(TopicArn=topic, Message=_PROBE)
+    return _received(sqs, url, lambda message: message["Message"] == _PROBE)
+
+
+def _received(sqs: Any, url: str, wanted: Callable[[Message], bool]) -> Message | None:
+    answer = sqs.receive_message(QueueUrl=url, MaxNumberOfMessages=10, WaitTimeSeconds=5)
+    bodies = [json.loads(message["Body"]) for message in answer.get("Messages", [])]
+    return next(filter(wanted, bodies), None)
