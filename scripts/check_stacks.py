@@ -34,6 +34,7 @@ from app import build
 from contract import DEFAULT_NAMESPACE
 from stacks.acknowledged import Acknowledged, short
 from stacks.checks import broken
+from stacks.grants import unfit
 from stacks.settings import Settings
 from stacks.variations import VARIATIONS
 
@@ -148,7 +149,9 @@ def templates_below(*folders: Path) -> list[Path]:
 def own(*folders: Path) -> Iterator[Finding]:
     """What does not hold of the templates below ``folders`` of what must."""
     for template in templates_below(*folders):
-        for one in broken(json.loads(template.read_text())):
+        content = json.loads(template.read_text())
+        app = [json.loads(one.read_text()) for one in template.parent.glob("*.template.json")]
+        for one in (*broken(content), *unfit(content, app)):
             path = _paths(template)[one.logical_id]
             yield Finding(one.check, path, f"iort {one.check} on {path}: {one.text}", acknowledged=False)
 
