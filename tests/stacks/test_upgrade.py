@@ -90,3 +90,26 @@ def test_both_tables_are_put_out_by_name(updated):
     (old,) = old_tables(updated[True])
     assert outputs["OldTelemetryTable"]["Value"] == {"Ref": old}
     assert outputs["TelemetryTable"]["Value"] != {"Ref": old}
+
+
+# "AWS::IoT::ThingType ThingTypeProperties": of both, "Update requires: Replacement", which the schema does
+# not say; and CloudFormation cannot make a second one of a name.
+THING_TYPE = {
+    "ThingTypeDescription": "A robot that runs the iort agent",
+    "SearchableAttributes": ["vehicle"],
+}
+
+
+def test_the_thing_types_properties_are_frozen(updated):
+    (kind,) = (
+        one["Properties"]
+        for one in updated[True]["iort-fleet"]["Resources"].values()
+        if one["Type"] == "AWS::IoT::ThingType"
+    )
+    assert kind["ThingTypeName"] == "iort-robot"
+    assert kind["ThingTypeProperties"] == THING_TYPE, (
+        "CloudFormation replaces a thing type whose description or searchable attributes change, and cannot "
+        "while the first has its name: every deployment's update would fail. Make a second thing type with a "
+        "logical id and a name of its own, which provisioning gives to new things, and keep the first, which "
+        "things have. A search needs no searchable attribute: fleet indexing finds attributes and shadows."
+    )
