@@ -20,9 +20,9 @@ from stacks.variations import VARIATIONS
 from station.cloud import Cloud, without_proxy
 from tests.stacks.moto_gaps import ACCOUNT, REGION, UNKNOWN, passed_over, unknown, without_gaps
 
-# The default, a key that is kept for what is encrypted already, and prod with all that can be asked for: its
-# own key, mail, budget, site, robot metrics, the account's audit and log, the old table.
-DEPLOYED = ("default", "kept key", "everything")
+# Dev with the defaults, and prod with all that can be asked for: its own key, mail, budget, site, robot
+# metrics, the account's audit and log, the old table.
+DEPLOYED = ("default", "everything")
 
 
 @pytest.fixture(scope="module")
@@ -63,8 +63,7 @@ def test_the_cdk_deploys_every_stack_into_moto(cloud, deployment, tmp_path, name
     tables = cloud.client("dynamodb").list_tables()["TableNames"]
     assert len(tables) == len(_resources(made, "AWS::DynamoDB::Table"))
     for stack, key in _resources(made, "AWS::KMS::Key"):
-        if VARIATIONS[name].get("customer_key"):
-            _assert_queues_are_encrypted_with(cloud, stack, key)
+        _assert_queues_are_encrypted_with(cloud, stack, key)
 
 
 def _resources(made, kind):
@@ -102,7 +101,7 @@ def _assert_queues_are_encrypted_with(cloud: Cloud, stack: str, key: str) -> Non
         assert attributes["Attributes"]["KmsMasterKeyId"] == arn
 
 
-@pytest.mark.parametrize("name", ["default", "everything"])
+@pytest.mark.parametrize("name", DEPLOYED)
 def test_topic_rules_are_what_the_api_takes(cloud, deployment, name):
     """CloudFormation hands a rule on to IoT's own API, of which botocore knows every shape."""
     iot = cloud.client("iot")

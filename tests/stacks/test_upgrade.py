@@ -20,26 +20,11 @@ def stage(request):
 
 
 @pytest.fixture(scope="module")
-def updated(stage, tmp_path_factory):
+def updated(stage, deployment):
     """Every stack's template for such a deployment, with the setting or without."""
-    from aws_cdk import App
-
-    from app import build
-    from stacks.settings import Settings
-
-    layer = tmp_path_factory.mktemp("layer")
-    (layer / "nothing.py").touch()
-    more = {"customer_key": True, "budget_usd": 50, "alarm_email": "lab@example.org"}
-
-    def templates(old_telemetry):
-        app = App(outdir=str(tmp_path_factory.mktemp("cdk.out")))
-        settings = Settings(
-            stage=stage, layer=layer, old_telemetry=old_telemetry, **(more if stage == "prod" else {})
-        )
-        build(app, settings)
-        return {one.stack_name: one.template for one in app.synth().stacks}
-
-    return {setting: templates(setting) for setting in (True, False)}
+    prod = {"stage": "prod", "customer_key": True, "budget_usd": 50, "alarm_email": "lab@example.org"}
+    given = prod if stage == "prod" else {}
+    return {True: deployment(**given, old_telemetry=True).templates, False: deployment(**given).templates}
 
 
 def exports(templates):
