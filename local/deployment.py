@@ -25,64 +25,63 @@ _KEPT = 4
 
 def deploy(cloud: Cloud, folder: Path, progress: Callable[[str], None]) -> None:
     """Bootstrap and deploy every stack; logs go into ``folder``. Raises `LocalError` where that fails."""
-    cdk = ROOT / "node_modules" / "aws-cdk" / "bin" / "cdk"
-    path = f"{Path(sys.executable).parent}{os.pathsep}{os.environ.get('PATH', os.defpath)}"
-    node = shutil.which("node", path=path)
-    if node is None or not cdk.exists():
-        raise LocalError("the CDK command line is not installed: run `make setup`")
-    environment = {
-        "PATH": path,
-        "HOME": str(folder),
-        "AWS_ENDPOINT_URL": cloud.endpoint_url or "",
-        "AWS_CA_BUNDLE": cloud.ca_bundle or "",
-        "NODE_EXTRA_CA_CERTS": cloud.ca_bundle or "",
-        "AWS_ACCESS_KEY_ID": cloud.access_key_id or "",
-        "AWS_SECRET_ACCESS_KEY": cloud.secret_access_key or "",
-        "AWS_REGION": cloud.region or "",
-        "AWS_EC2_METADATA_DISABLED": "true",
-        "CDK_DISABLE_VERSION_CHECK": "1",
-        "CDK_DISABLE_CLI_TELEMETRY": "true",
-        "JSII_RUNTIME_PACKAGE_CACHE_ROOT": str(ROOT / "build" / "jsii-cache"),
-    }
-
-    def step(name: str, *arguments: str) -> None:
-        progress(name)
-        run(
-            name,
-            [node, str(cdk), *arguments, "--no-color"],
-            environment=environment,
-            cwd=ROOT,
-            log=folder / f"{name.replace(' ', '-')}.log",
-            timeout_s=_STEP_S,
-        )
+    cdk = CommandLine(cloud, folder, progress)
 
     def synthesize(output: Path) -> None:
         settings = {"embedded": "true", "namespace": cloud.namespace, "layer": "build/layer/local"}
         context = [part for key, value in settings.items() for part in ("-c", f"{key}={value}")]
-        step(
-            "cdk synth",
-            "synth",
-            "--app",
-            f"{shlex.quote(sys.executable)} app.py",
-            "--output",
-            str(output),
-            "--quiet",
-            *context,
-        )
+        app = f"{shlex.quote(sys.executable)} app.py"
+        cdk.run("synth", "--app", app, "--output", str(output), "--quiet", *context)
 
     kept = assembly(ROOT, ROOT / "build" / "assembly", namespace=cloud.namespace, synthesize=synthesize)
-    step("cdk bootstrap", "bootstrap", f"aws://{_ACCOUNT}/{cloud.region}", "--app", str(kept))
-    step(
-        "cdk deploy",
-        "deploy",
-        "--all",
-        "--app",
-        str(kept),
-        "--require-approval",
-        "never",
-        "--method",
-        "direct",
-    )
+    cdk.put(kept, account=_ACCOUNT)
+
+
+class CommandLine:
+    """The pinned CDK command line, for an emulator; what it says goes into logs in ``folder``."""
+
+    def __init__(self, cloud: Cloud, folder: Path, progress: Callable[[str], None]) -> None:
+        self._folder, self._progress, self._region = folder, progress, cloud.region or ""
+        cdk = ROOT / "node_modules" / "aws-cdk" / "bin" / "cdk"
+        path = f"{Path(sys.executable).parent}{os.pathsep}{os.environ.get('PATH', os.defpath)}"
+        node = shutil.which("node", path=path)
+        if node is None or not cdk.exists():
+            raise LocalError("the CDK command line is not installed: run `make setup`")
+        self._command = (node, str(cdk))
+        self._environment = {
+            "PATH": path,
+            "HOME": str(folder),
+            "AWS_ENDPOINT_URL": cloud.endpoint_url or "",
+            "AWS_CA_BUNDLE": cloud.ca_bundle or "",
+            "NODE_EXTRA_CA_CERTS": cloud.ca_bundle or "",
+            "AWS_ACCESS_KEY_ID": cloud.access_key_id or "",
+            "AWS_SECRET_ACCESS_KEY": cloud.secret_access_key or "",
+            "AWS_REGION": self._region,
+            "AWS_EC2_METADATA_DISABLED": "true",
+            "CDK_DISABLE_VERSION_CHECK": "1",
+            "CDK_DISABLE_CLI_TELEMETRY": "true",
+            "JSII_RUNTIME_PACKAGE_CACHE_ROOT": str(ROOT / "build" / "jsii-cache"),
+        }
+
+    def put(self, assembly: Path, *, account: str) -> None:
+        """Bootstrap the account and deploy every stack of an assembly."""
+        self.run("bootstrap", f"aws://{account}/{self._region}", "--app", str(assembly))
+        self.run(
+            *("deploy", "--all", "--app", str(assembly)),
+            *("--require-approval", "never", "--method", "direct"),
+        )
+
+    def run(self, verb: str, *arguments: str) -> None:
+        """One verb, to its end; raises `LocalError` where it fails."""
+        self._progress(f"cdk {verb}")
+        run(
+            f"cdk {verb}",
+            [*self._command, verb, *arguments, "--no-color"],
+            environment=self._environment,
+            cwd=ROOT,
+            log=self._folder / f"cdk-{verb}.log",
+            timeout_s=_STEP_S,
+        )
 
 
 def assembly(root: Path, folder: Path, *, namespace: str, synthesize: Callable[[Path], None]) -> Path:

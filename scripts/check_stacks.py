@@ -1,5 +1,7 @@
 """Runs the independent checkers over the stacks of both stages: cfn-lint, cdk-nag and checkov; and our own.
 
+cfn-lint and our own also read every variation of the parameters (stacks/variations.py).
+
     python scripts/check_stacks.py [--checkov build/checkov/bin/checkov] [--write]
 
 Needs no credentials and no network. What the stacks deliberately do otherwise is in
@@ -32,7 +34,9 @@ from app import build
 from contract import DEFAULT_NAMESPACE
 from stacks.acknowledged import Acknowledged, short
 from stacks.checks import broken
+from stacks.grants import unfit
 from stacks.settings import Settings
+from stacks.variations import VARIATIONS
 
 DOCUMENT = ROOT / "docs" / "acknowledged.md"
 STAGES: dict[str, dict[str, Any]] = {
@@ -68,7 +72,7 @@ def main() -> None:
     asked = parser.parse_args()
     found: list[Finding] = []
     known: dict[str, list[Acknowledged]] = {}
-    with TemporaryDirectory() as folder:
+    with TemporaryDirectory() as folder, TemporaryDirectory() as others:
         layer = Path(folder) / "layer"
         (layer / "python").mkdir(parents=True)
         for stage, given in STAGES.items():
@@ -78,9 +82,18 @@ def main() -> None:
             known[stage] = synthesize(settings, out)
             found += nag(out)
             print(f"check: stage {stage} synthesized, cdk-nag ({time.monotonic() - began:.0f} s)", flush=True)
-        found += own(Path(folder))
         began = time.monotonic()
-        found += lint(Path(folder))
+        # What cdk-nag and checkov ask for depends on no other parameter than what the stages have.
+        for name, given in VARIATIONS.items():
+            app = App(outdir=str(Path(others) / name))
+            build(app, Settings(layer=layer, **given))
+            app.synth()
+        print(
+            f"check: {len(VARIATIONS)} variations synthesized ({time.monotonic() - began:.0f} s)", flush=True
+        )
+        found += own(Path(folder), Path(others))
+        began = time.monotonic()
+        found += lint(Path(folder), Path(others))
         print(f"check: cfn-lint ({time.monotonic() - began:.0f} s)", flush=True)
         if asked.checkov:
             began = time.monotonic()
@@ -127,21 +140,29 @@ def nag(out: Path) -> Iterator[Finding]:
             yield Finding(rule, violation["acknowledgedAt"], "", acknowledged=True)
 
 
-def own(folder: Path) -> Iterator[Finding]:
-    """What does not hold of the templates below ``folder`` of what must."""
-    for template in sorted(folder.rglob("*.template.json")):
-        for one in broken(json.loads(template.read_text())):
+def templates_below(*folders: Path) -> list[Path]:
+    """The templates below the folders, one of each content: most variations are of one stack."""
+    found = [template for folder in folders for template in sorted(folder.rglob("*.template.json"))]
+    return list({template.read_bytes(): template for template in reversed(found)}.values())[::-1]
+
+
+def own(*folders: Path) -> Iterator[Finding]:
+    """What does not hold of the templates below ``folders`` of what must."""
+    for template in templates_below(*folders):
+        content = json.loads(template.read_text())
+        app = [json.loads(one.read_text()) for one in template.parent.glob("*.template.json")]
+        for one in (*broken(content), *unfit(content, app)):
             path = _paths(template)[one.logical_id]
             yield Finding(one.check, path, f"iort {one.check} on {path}: {one.text}", acknowledged=False)
 
 
-def lint(folder: Path) -> Iterator[Finding]:
-    """What cfn-lint has against the templates below ``folder``.
+def lint(*folders: Path) -> Iterator[Finding]:
+    """What cfn-lint has against the templates below ``folders``.
 
     It does not report what a resource's metadata tells it to ignore, so it reads the templates a second
     time without that.
     """
-    templates = sorted(folder.rglob("*.template.json"))
+    templates = templates_below(*folders)
     with TemporaryDirectory() as elsewhere:
         bare = {}
         for i, template in enumerate(templates):

@@ -54,7 +54,7 @@ def broken(template: Mapping[str, Any]) -> Iterator[Broken]:
     """What does not hold of a template."""
     for logical_id, resource in template.get("Resources", {}).items():
         kind, properties = resource["Type"], resource.get("Properties", {})
-        for role, statement in _granted(logical_id, kind, properties):
+        for role, statement in granted(logical_id, kind, properties):
             yield from _too_much(logical_id, role, statement)
         if kind == "AWS::IAM::Role" and properties.get("ManagedPolicyArns"):
             yield Broken(
@@ -71,7 +71,7 @@ def broken(template: Mapping[str, Any]) -> Iterator[Broken]:
             yield Broken("secret", logical_id, f"a secret: {found[0][:8]}...")
 
 
-def _granted(
+def granted(
     logical_id: str, kind: str, properties: Mapping[str, Any]
 ) -> Iterator[tuple[str, dict[str, Any]]]:
     """Role, or the policy's own name, and statement of what a principal is granted."""
@@ -85,7 +85,7 @@ def _granted(
         documents += [(logical_id, one["PolicyDocument"]) for one in properties.get("Policies", [])]
     for role, document in documents:
         content = json.loads(document) if isinstance(document, str) else document
-        for statement in _several(content["Statement"]):
+        for statement in several(content["Statement"]):
             if statement["Effect"] == "Allow":
                 yield _HASH.sub("", role), statement
 
@@ -93,12 +93,13 @@ def _granted(
 def _too_much(logical_id: str, role: str, statement: Mapping[str, Any]) -> Iterator[Broken]:
     if "NotAction" in statement or "NotResource" in statement:
         yield Broken("all-but", logical_id, f"{role} may do everything but what it names")
-    for action in _several(statement.get("Action", [])):
+    for action in several(statement.get("Action", [])):
         if re.search(r"[*?]", action) and action not in FAMILIES:
             yield Broken("wildcard-action", logical_id, f"{role} may do {action}")
-        if "*" in _several(statement.get("Resource", [])) and (role, action) not in EVERY_RESOURCE:
+        if "*" in several(statement.get("Resource", [])) and (role, action) not in EVERY_RESOURCE:
             yield Broken("every-resource", logical_id, f"{role} may do {action} on every resource")
 
 
-def _several(value: Any) -> list[Any]:
+def several(value: Any) -> list[Any]:
+    """A policy's value as a list, which it may be or not."""
     return value if isinstance(value, list) else [value]

@@ -140,11 +140,8 @@ class Fleet(Stack):
 
         group, kind, policy = ("thinggroup", name), ("thingtype", name), ("policy", name)
         things, certificates = ("thing", "*"), ("cert", "*")
-        allow(
-            ["CreateThing", "DescribeThing", "ListThingGroupsForThing", "ListThingPrincipals", "UpdateThing"],
-            things,
-            kind,
-        )
+        allow(["CreateThing", "UpdateThing"], things, kind)
+        allow(["DescribeThing", "ListThingGroupsForThing", "ListThingPrincipals"], things)
         allow(["DescribeThingType"], kind)
         allow(["DescribeThingGroup"], group)
         allow(

@@ -11,13 +11,10 @@ GROUP, KIND = f"{IOT}:thinggroup/iort-robot", f"{IOT}:thingtype/iort-robot"
 # Of what provisioning does, these have no resource type, or a certificate's before it is made.
 ANY_PROVISIONING = {action[4:] for role, action in EVERY_RESOURCE if role == "ProvisioningRole"}
 PROVISIONING = (
-    {
-        (f"iot:{action}", resource)
-        for action in (
-            *("CreateThing", "DescribeThing", "ListThingGroupsForThing", "ListThingPrincipals"),
-            "UpdateThing",
-        )
-        for resource in (THINGS, KIND)
+    {(f"iot:{action}", resource) for action in ("CreateThing", "UpdateThing") for resource in (THINGS, KIND)}
+    | {
+        (f"iot:{action}", THINGS)
+        for action in ("DescribeThing", "ListThingGroupsForThing", "ListThingPrincipals")
     }
     | {
         (f"iot:{action}", CERTIFICATES)

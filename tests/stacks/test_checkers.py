@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import importlib.util
+import json
 
 import pytest
 
@@ -81,3 +82,16 @@ def test_what_nobody_finds_any_more_is_stale_by_name(check_stacks, tmp_path):
 
     assert gone(unjudged=("CKV",)) == ["AwsSolutions-SQS3 on bad/End", "W3005 on bad/Early"]
     assert "CKV_AWS_27 on bad/Lone" in gone()
+
+
+def test_a_template_of_several_folders_is_read_once_and_what_differs_too(check_stacks, tmp_path):
+    for folder, queue in (("a", {}), ("b", {}), ("c", {"DelaySeconds": "soon"})):
+        (tmp_path / folder).mkdir()
+        resource = {"Type": "AWS::SQS::Queue", "Properties": queue}
+        (tmp_path / folder / "one.template.json").write_text(json.dumps({"Resources": {"Queue": resource}}))
+    metadata = {"/One/Queue": [{"type": "aws:cdk:logicalId", "data": "Queue"}]}
+    (tmp_path / "c" / "one.metadata.json").write_text(json.dumps(metadata))
+    read = check_stacks.templates_below(tmp_path / "a", tmp_path / "b", tmp_path / "c")
+    assert [template.parent.name for template in read] == ["a", "c"]
+    found = check_stacks.lint(tmp_path / "a", tmp_path / "b", tmp_path / "c")
+    assert [one.path for one in found] == ["One/Queue"]

@@ -71,6 +71,7 @@ def test_make_check_finds_it_by_its_path(check_stacks, tmp_path):  # noqa: F811 
     assert [one.text for one in found] == [
         "iort wildcard-action on Bad/Role/DefaultPolicy/Resource: Role may do iort:*",
         "iort every-resource on Bad/Role/DefaultPolicy/Resource: Role may do iort:* on every resource",
+        "iort no-such-action on Bad/Role/DefaultPolicy/Resource: there is no action iort:*",
     ]
     assert not any(one.acknowledged for one in found)
 

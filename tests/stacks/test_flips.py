@@ -3,64 +3,21 @@ data."""
 
 from __future__ import annotations
 
+import json
+from collections import defaultdict
 from collections.abc import Iterator
 from typing import Any
 
 import pytest
-from cfnlint.schema.manager import PROVIDER_SCHEMA_MANAGER
 
-from stacks.settings import _READ, Settings, Thresholds
+from stacks.settings import _READ
+from stacks.variations import FLIPS, KEY, NOT_FLIPPED, VARIATIONS
+from tests.stacks.cloudformation import given_once_for_all, identity, is_replaced
 
 Templates = dict[str, dict[str, Any]]
 
-# Parameters and the values that they are changed to and back from; the base has every default. What only
-# changes properties, each of another resource, is changed at once: an app takes seconds to synthesize.
-FLIPS: dict[str, dict[str, Any]] = {
-    "stage": {"stage": "prod"},
-    "mail": {"alarm_email": "lab@example.org"},
-    "budget": {"budget_usd": 50, "alarm_email": "lab@example.org"},
-    "kept key": {"keep_customer_key": True},
-    "account": {"device_defender": True, "iot_log_level": "error"},
-    "site": {"site": True},
-    "old table": {"old_telemetry": True},
-    "properties": {
-        "retention_days": 7,
-        "files_days": 30,
-        "upload_gb_a_day": 5,
-        "live_concurrency": 5,
-        "robot_metrics": True,
-        "function_logs": "all",
-        "tags": {"team": "lab"},
-        "thresholds": Thresholds(low_voltage_v=13.2, stream_behind_s=30),
-    },
-}
-KEY = {"customer_key": True}
-# Another namespace is another deployment, and so is the embedded cloud; the layer is a folder.
-NOT_FLIPPED = {"namespace", "embedded", "layer"}
-
 # What holds data, and is lost with it where it is replaced or goes.
 HOLDS_DATA = {"AWS::DynamoDB::Table", "AWS::S3::Bucket", "AWS::SQS::Queue", "AWS::KMS::Key"}
-
-
-@pytest.fixture(scope="module")
-def templates(tmp_path_factory):
-    """The templates of a deployment with these settings, synthesized once each."""
-    from aws_cdk import App
-
-    from app import build
-
-    layer, made = tmp_path_factory.mktemp("layer"), {}
-    (layer / "nothing.py").touch()
-
-    def synthesized(**given: Any) -> Templates:
-        key = repr(sorted(given.items()))
-        if key not in made:
-            app = App(outdir=str(tmp_path_factory.mktemp("cdk.out")))
-            build(app, Settings(layer=layer, **given))
-            made[key] = {stack.stack_name: stack.template for stack in app.synth().stacks}
-        return made[key]
-
-    return synthesized
 
 
 def troubles(before: Templates, after: Templates) -> Iterator[str]:
@@ -103,54 +60,36 @@ def imports(value: Any) -> Iterator[str]:
             yield from imports(one)
 
 
-def schema(kind: str) -> dict[str, Any]:
-    return dict(PROVIDER_SCHEMA_MANAGER.get_resource_schema("us-east-1", kind).schema)
-
-
-def identity(resource: dict[str, Any]) -> str | None:
-    """Type and name of what has a name of ours, by which there can be one only."""
-    kind, properties = resource["Type"], resource.get("Properties", {})
-    if kind.startswith(("Custom::", "AWS::CDK::")):
-        return None
-    own = [key.split("/")[2] for key in schema(kind)["primaryIdentifier"]]
-    if not all(name in properties for name in own):
-        # Its identifier is AWS', and may be made of a name: a queue's address, a topic's ARN.
-        own = [f"{kind.split('::')[-1]}Name"]
-    given = {name: properties[name] for name in own if name in properties}
-    return f"{kind} {given}" if given else None
-
-
-def is_replaced(old: dict[str, Any], new: dict[str, Any]) -> bool:
-    """Whether a property changes that is given once for all."""
-    if old["Type"] != new["Type"]:
-        return True
-    if old["Type"].startswith(("Custom::", "AWS::CDK::")):
-        return False
-    paths = schema(old["Type"]).get("createOnlyProperties", [])
-
-    def at(resource: dict[str, Any], path: str) -> Any:
-        value: Any = resource.get("Properties", {})
-        for step in path.split("/")[2:]:
-            value = value.get(step) if isinstance(value, dict) else None
-        return value
-
-    return any(at(old, path) != at(new, path) for path in paths)
-
-
 def test_every_parameter_is_flipped():
     flipped = {name for flip in FLIPS.values() for name in flip}
     assert flipped | KEY.keys() | NOT_FLIPPED == _READ.keys() | {"thresholds"}
 
 
 @pytest.mark.parametrize("flip", FLIPS)
-def test_a_parameter_may_be_changed_and_changed_back(templates, flip):
-    base, changed = templates(), templates(**FLIPS[flip])
+def test_a_parameter_may_be_changed_and_changed_back(deployment, flip):
+    base, changed = deployment().templates, deployment(**FLIPS[flip]).templates
     assert base != changed
     assert list(troubles(base, changed)) == []
     assert list(troubles(changed, base)) == []
 
 
-def test_a_key_of_ones_own_comes_at_once_and_goes_in_two_steps(templates):
+def test_what_has_a_name_is_never_replaced(deployment):
+    """Of any two deployments of a namespace, whatever their parameters."""
+    given: dict[str, set[str]] = defaultdict(set)
+    for settings in VARIATIONS.values():
+        if "namespace" not in settings:
+            for template in deployment(**settings).templates.values():
+                for one in template["Resources"].values():
+                    if identity(one) is not None:
+                        given[str(identity(one))].add(json.dumps(given_once_for_all(one), sort_keys=True))
+    assert {name: values for name, values in given.items() if len(values) > 1} == {}
+    assert any(name.startswith("AWS::IoT::TopicRule") for name in given)
+
+
+def test_a_key_of_ones_own_comes_at_once_and_goes_in_two_steps(deployment):
+    def templates(**given):
+        return deployment(**given).templates
+
     base, kept, used = templates(), templates(keep_customer_key=True), templates(**KEY)
     assert list(troubles(base, used)) == []
     assert list(troubles(used, kept)) == []
@@ -166,6 +105,15 @@ def test_a_key_of_ones_own_comes_at_once_and_goes_in_two_steps(templates):
 
 TABLE = {"Type": "AWS::DynamoDB::Table", "Properties": {"TableName": "a", "BillingMode": "x"}}
 RULE = {"Type": "AWS::IoT::TopicRule", "Properties": {"RuleName": "r"}}
+MAPPING = {
+    "Type": "AWS::Lambda::EventSourceMapping",
+    "Properties": {"FunctionName": "f", "EventSourceArn": "a", "StartingPosition": "LATEST"},
+}
+NAMED_WITHIN = {
+    "Type": "AWS::CloudFront::ResponseHeadersPolicy",
+    "Properties": {"ResponseHeadersPolicyConfig": {"Name": "h"}},
+}
+DURABLE = {"Type": "AWS::Lambda::Function", "Properties": {"FunctionName": "f", "DurableConfig": {}}}
 QUEUE = {"Type": "AWS::SQS::Queue", "Properties": {"FifoQueue": True, "QueueName": "q"}}
 
 
@@ -185,6 +133,18 @@ def of(**resources: Any) -> Templates:
             of(Q=QUEUE),
             of(Q={**QUEUE, "Properties": {**QUEUE["Properties"], "FifoQueue": False}}),
             "s: Q is replaced under its own name",
+        ),
+        (of(M=MAPPING), of(Other=MAPPING), "s: Other is made while M has its name"),
+        (
+            of(M=MAPPING),
+            of(M={**MAPPING, "Properties": {**MAPPING["Properties"], "StartingPosition": "TRIM_HORIZON"}}),
+            "s: M is replaced under its own name",
+        ),
+        (of(H=NAMED_WITHIN), of(Other=NAMED_WITHIN), "s: Other is made while H has its name"),
+        (
+            of(F=DURABLE),
+            of(F={**DURABLE, "Properties": {"FunctionName": "f", "DurableConfig": {"ExecutionTimeout": 1}}}),
+            "s: F is replaced under its own name",
         ),
     ],
 )

@@ -1,150 +1,116 @@
-"""A second reader of the templates: moto's CloudFormation, which makes every resource that it knows."""
+"""A second opinion on the templates: the CDK deploys them into moto's server, which others wrote.
+
+What moto does not do of them is in moto_gaps.py.
+"""
 
 from __future__ import annotations
 
-import io
 import json
-import os
-import zipfile
-from collections.abc import Mapping
-from pathlib import Path
+import shutil
+import urllib.request
 from typing import Any
 
 import boto3
 import pytest
 from moto import mock_aws
+from moto.server import ThreadedMotoServer
 
-_REGION, _ACCOUNT = "eu-west-1", "123456789012"
-_BUCKET = f"cdk-hnb659fds-assets-{_ACCOUNT}-{_REGION}"
-# What moto passes over with a warning. When it learns one, take it off: the test says so.
-_UNKNOWN_TO_MOTO = {
-    "AWS::CloudWatch::Alarm",
-    "AWS::IoT::AccountAuditConfiguration",
-    "AWS::IoT::Logging",
-    "AWS::IoT::ProvisioningTemplate",
-    "AWS::IoT::ScheduledAudit",
-    "AWS::IoT::ThingGroup",
-    "AWS::IoT::TopicRule",
-    "AWS::Lambda::EventInvokeConfig",
-    "AWS::S3::BucketPolicy",
-    "AWS::SNS::TopicPolicy",
-    "AWS::SQS::QueuePolicy",
-}
-# And what only a production stage has.
-_UNKNOWN_OF_PRODUCTION = {"AWS::Budgets::Budget", "AWS::SNS::Subscription"}
+from local.deployment import CommandLine
+from stacks.variations import VARIATIONS
+from station.cloud import Cloud, without_proxy
+from tests.stacks.moto_gaps import ACCOUNT, REGION, UNKNOWN, passed_over, unknown, without_gaps
+
+# Dev with the defaults, and prod with all that can be asked for: its own key, mail, budget, site, robot
+# metrics, the account's audit and log, the old table.
+DEPLOYED = ("default", "everything")
 
 
-@pytest.fixture(params=["synthesized", "production"])
-def stage(request):
-    """The app of either stage, production with a key of the customer's and all that can be asked for."""
-    return request.getfixturevalue(request.param)
+@pytest.fixture(scope="module")
+def server():
+    """moto's server. It takes a bucket's name for a path, as the CDK has it, of localhost alone."""
+    server = ThreadedMotoServer(ip_address="127.0.0.1", port=0, verbose=False)
+    server.start()
+    yield f"http://localhost:{server.get_host_and_port()[1]}"
+    server.stop()
 
 
 @pytest.fixture
-def account(monkeypatch, stage):
-    """An account in moto, bootstrapped for the CDK, with the app's assets."""
-    for name in [name for name in os.environ if name.startswith("AWS_")]:
-        monkeypatch.delenv(name)
-    monkeypatch.setenv("AWS_DEFAULT_REGION", _REGION)
-    with mock_aws():
-        boto3.client("ssm").put_parameter(Name="/cdk-bootstrap/hnb659fds/version", Value="30", Type="String")
-        s3 = boto3.client("s3")
-        s3.create_bucket(Bucket=_BUCKET, CreateBucketConfiguration={"LocationConstraint": _REGION})
-        for asset in stage.folder.glob("asset.*"):
-            if asset.is_dir():
-                s3.put_object(
-                    Bucket=_BUCKET, Key=f"{asset.name.removeprefix('asset.')}.zip", Body=_zipped(asset)
-                )
-        yield
-
-
-def _zipped(folder: Path) -> bytes:
-    buffer = io.BytesIO()
-    with zipfile.ZipFile(buffer, "w") as archive:
-        for file in filter(Path.is_file, folder.rglob("*")):
-            archive.write(file, file.relative_to(folder))
-    return buffer.getvalue()
+def cloud(server):
+    """An empty account in it."""
+    without_proxy("localhost")
+    urllib.request.urlopen(urllib.request.Request(f"{server}/moto-api/reset", method="POST")).close()
+    # The CDK keeps the account of an access key in the user's home: no other emulator's key.
+    return Cloud(endpoint_url=server, region=REGION, access_key_id="moto", secret_access_key="moto")
 
 
 @pytest.mark.filterwarnings("ignore:Tried to parse")
-def test_moto_makes_every_stack(account, stage):
-    cloudformation = boto3.client("cloudformation")
-    unknown = _UNKNOWN_TO_MOTO | (_UNKNOWN_OF_PRODUCTION if stage.protected else set())
-    passed_over = set()
-    for noun, template in stage.templates.items():
-        body = json.dumps(_without_tags_of_keys(_without_references_to(unknown, template)))
-        key = f"{noun}.json"
-        boto3.client("s3").put_object(Bucket=_BUCKET, Key=key, Body=body)
-        stack = f"iort-{noun}"
-        cloudformation.create_stack(
-            StackName=stack,
-            TemplateURL=f"https://{_BUCKET}.s3.{_REGION}.amazonaws.com/{key}",
-            Capabilities=["CAPABILITY_NAMED_IAM"],
-        )
-        (description,) = cloudformation.describe_stacks(StackName=stack)["Stacks"]
+@pytest.mark.parametrize("name", DEPLOYED)
+def test_the_cdk_deploys_every_stack_into_moto(cloud, deployment, tmp_path, name):
+    made = deployment(**VARIATIONS[name])
+    shutil.copytree(made.folder, tmp_path / "assembly")
+    for stack, template in made.templates.items():
+        file = tmp_path / "assembly" / f"{stack}.template.json"
+        assert json.loads(file.read_text()) == template
+        file.write_text(json.dumps(without_gaps(template)))
+    CommandLine(cloud, tmp_path, lambda _step: None).put(tmp_path / "assembly", account=ACCOUNT)
+    formation = cloud.client("cloudformation")
+    without = set()
+    for stack, template in made.templates.items():
+        (description,) = formation.describe_stacks(StackName=stack)["Stacks"]
         assert description["StackStatus"] == "CREATE_COMPLETE"
-        made = {
-            resource["LogicalResourceId"]
-            for page in cloudformation.get_paginator("list_stack_resources").paginate(StackName=stack)
-            for resource in page["StackResourceSummaries"]
-        }
-        passed_over |= {
-            resource["Type"]
-            for logical_id, resource in template["Resources"].items()
-            if logical_id not in made and resource["Type"] != "AWS::CDK::Metadata"
-        }
-    assert passed_over == unknown
-    tables = boto3.client("dynamodb").list_tables()["TableNames"]
-    assert len(tables) == len(stage.resources("AWS::DynamoDB::Table"))
-    for key in stage.resources("AWS::KMS::Key"):
-        _assert_queues_are_encrypted_with("iort-storage", key)
+        without |= passed_over(formation, stack, template)
+    assert without == unknown(made.templates)
+    tables = cloud.client("dynamodb").list_tables()["TableNames"]
+    assert len(tables) == len(_resources(made, "AWS::DynamoDB::Table"))
+    for stack, key in _resources(made, "AWS::KMS::Key"):
+        _assert_queues_are_encrypted_with(cloud, stack, key)
 
 
-def _assert_queues_are_encrypted_with(stack: str, key: str) -> None:
+def _resources(made, kind):
+    """Stack's name and logical id to properties of every resource of a type."""
+    return {
+        (stack, logical_id): one.get("Properties", {})
+        for stack, template in made.templates.items()
+        for logical_id, one in template["Resources"].items()
+        if one["Type"] == kind
+    }
+
+
+def test_every_gap_of_moto_is_met_by_some_template(deployment):
+    met = {kind for name in DEPLOYED for kind in unknown(deployment(**VARIATIONS[name]).templates)}
+    assert met == UNKNOWN.keys()
+    assert all(UNKNOWN.values())
+
+
+def test_moto_still_misreads_a_keys_tags():
+    """When it does not, `without_gaps` need not take them off."""
+    key = {"Type": "AWS::KMS::Key", "Properties": {"KeyPolicy": {}, "Tags": [{"Key": "a", "Value": "b"}]}}
+    create = {"StackName": "s", "TemplateBody": json.dumps({"Resources": {"Key": key}})}
+    with mock_aws(), pytest.raises(KeyError, match="TagKey"):
+        boto3.client("cloudformation", region_name=REGION).create_stack(**create)
+
+
+def _assert_queues_are_encrypted_with(cloud: Cloud, stack: str, key: str) -> None:
     """Of tables, moto passes the key over."""
-    resource = boto3.client("cloudformation").describe_stack_resource(StackName=stack, LogicalResourceId=key)
+    resource = cloud.client("cloudformation").describe_stack_resource(StackName=stack, LogicalResourceId=key)
     number = resource["StackResourceDetail"]["PhysicalResourceId"]
-    (arn,) = (one["KeyArn"] for one in boto3.client("kms").list_keys()["Keys"] if one["KeyId"] == number)
-    sqs = boto3.client("sqs")
+    (arn,) = (one["KeyArn"] for one in cloud.client("kms").list_keys()["Keys"] if one["KeyId"] == number)
+    sqs = cloud.client("sqs")
     for url in sqs.list_queues()["QueueUrls"]:
         attributes = sqs.get_queue_attributes(QueueUrl=url, AttributeNames=["KmsMasterKeyId"])
         assert attributes["Attributes"]["KmsMasterKeyId"] == arn
 
 
-def test_topic_rules_are_what_the_api_takes(account, stage):
+@pytest.mark.parametrize("name", DEPLOYED)
+def test_topic_rules_are_what_the_api_takes(cloud, deployment, name):
     """CloudFormation hands a rule on to IoT's own API, of which botocore knows every shape."""
-    iot = boto3.client("iot")
-    rules = stage.resources("AWS::IoT::TopicRule")
+    iot = cloud.client("iot")
+    rules = _resources(deployment(**VARIATIONS[name]), "AWS::IoT::TopicRule")
     for properties in rules.values():
         payload = _literal(_camel_case(properties["TopicRulePayload"]))
         iot.create_topic_rule(ruleName=properties["RuleName"], topicRulePayload=payload)
     kept = {rule["ruleName"] for rule in iot.list_topic_rules()["rules"]}
     assert kept == {properties["RuleName"] for properties in rules.values()}
-
-
-def _without_references_to(kinds: set[str], template: Mapping[str, Any]) -> Any:
-    """The template with a literal where it refers to a resource that will not be there."""
-    absent = {logical_id for logical_id, r in template["Resources"].items() if r["Type"] in kinds}
-
-    def replaced(value: Any) -> Any:
-        match value:
-            case {"Fn::GetAtt": [logical_id, _]} | {"Ref": logical_id} if logical_id in absent:
-                return f"arn:aws:iot:{_REGION}:{_ACCOUNT}:rule/{logical_id}"
-            case dict():
-                return {key: replaced(one) for key, one in value.items()}
-            case list():
-                return [replaced(one) for one in value]
-        return value
-
-    return replaced(template)
-
-
-def _without_tags_of_keys(template: dict[str, Any]) -> dict[str, Any]:
-    """moto reads a key's tags as KMS' own API spells them, and not as CloudFormation does."""
-    for resource in template["Resources"].values():
-        if resource["Type"] == "AWS::KMS::Key":
-            resource["Properties"].pop("Tags", None)
-    return template
 
 
 def _camel_case(value: Any) -> Any:

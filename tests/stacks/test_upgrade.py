@@ -20,26 +20,11 @@ def stage(request):
 
 
 @pytest.fixture(scope="module")
-def updated(stage, tmp_path_factory):
+def updated(stage, deployment):
     """Every stack's template for such a deployment, with the setting or without."""
-    from aws_cdk import App
-
-    from app import build
-    from stacks.settings import Settings
-
-    layer = tmp_path_factory.mktemp("layer")
-    (layer / "nothing.py").touch()
-    more = {"customer_key": True, "budget_usd": 50, "alarm_email": "lab@example.org"}
-
-    def templates(old_telemetry):
-        app = App(outdir=str(tmp_path_factory.mktemp("cdk.out")))
-        settings = Settings(
-            stage=stage, layer=layer, old_telemetry=old_telemetry, **(more if stage == "prod" else {})
-        )
-        build(app, settings)
-        return {one.stack_name: one.template for one in app.synth().stacks}
-
-    return {setting: templates(setting) for setting in (True, False)}
+    prod = {"stage": "prod", "customer_key": True, "budget_usd": 50, "alarm_email": "lab@example.org"}
+    given = prod if stage == "prod" else {}
+    return {True: deployment(**given, old_telemetry=True).templates, False: deployment(**given).templates}
 
 
 def exports(templates):
@@ -90,3 +75,26 @@ def test_both_tables_are_put_out_by_name(updated):
     (old,) = old_tables(updated[True])
     assert outputs["OldTelemetryTable"]["Value"] == {"Ref": old}
     assert outputs["TelemetryTable"]["Value"] != {"Ref": old}
+
+
+# "AWS::IoT::ThingType ThingTypeProperties": of both, "Update requires: Replacement", which the schema does
+# not say; and CloudFormation cannot make a second one of a name.
+THING_TYPE = {
+    "ThingTypeDescription": "A robot that runs the iort agent",
+    "SearchableAttributes": ["vehicle"],
+}
+
+
+def test_the_thing_types_properties_are_frozen(updated):
+    (kind,) = (
+        one["Properties"]
+        for one in updated[True]["iort-fleet"]["Resources"].values()
+        if one["Type"] == "AWS::IoT::ThingType"
+    )
+    assert kind["ThingTypeName"] == "iort-robot"
+    assert kind["ThingTypeProperties"] == THING_TYPE, (
+        "CloudFormation replaces a thing type whose description or searchable attributes change, and cannot "
+        "while the first has its name: every deployment's update would fail. Make a second thing type with a "
+        "logical id and a name of its own, which provisioning gives to new things, and keep the first, which "
+        "things have. A search needs no searchable attribute: fleet indexing finds attributes and shadows."
+    )

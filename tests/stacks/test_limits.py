@@ -1,0 +1,181 @@
+"""What AWS has room for: of a stack, and of a name, with the longest namespace that the contract allows."""
+
+from __future__ import annotations
+
+import json
+import re
+from collections.abc import Iterator
+from typing import Any
+
+import pytest
+
+import contract
+from stacks.variations import LONGEST_NAMESPACE, VARIATIONS
+from tests.stacks.cloudformation import has_schema, names, schema
+
+# "CloudFormation quotas". The CDK hands every template over by S3: in a request there is room for 51,200.
+TEMPLATE_BYTES = 1_000_000
+SECTIONS = {"Resources": 500, "Outputs": 200, "Parameters": 200, "Mappings": 200}
+LOGICAL_ID, EXPORT_NAME, STACK_NAME = 255, 255, r"[A-Za-z][A-Za-z0-9-]{0,127}"
+# "IAM and AWS STS quotas": the policies within a role, white space not counted.
+ROLE_POLICIES_CHARACTERS = 10_240
+
+# The names that the schemas say too little of: Type and path to what the service's own API says.
+NAMES = {
+    # PutDashboard
+    ("AWS::CloudWatch::Dashboard", "/properties/DashboardName"): r"[A-Za-z0-9_-]{1,255}",
+    # CreateQueue
+    ("AWS::SQS::Queue", "/properties/QueueName"): r"[A-Za-z0-9_-]{1,80}",
+    # CreateTopic
+    ("AWS::SNS::Topic", "/properties/TopicName"): r"[A-Za-z0-9_-]{1,256}",
+    # CreateTable
+    ("AWS::DynamoDB::Table", "/properties/TableName"): r"[A-Za-z0-9_.-]{3,255}",
+    # PutMetricAlarm: no control characters.
+    ("AWS::CloudWatch::Alarm", "/properties/AlarmName"): r"[\x20-\x7e]{1,255}",
+    # PutRolePolicy
+    ("AWS::IAM::Policy", "/properties/PolicyName"): r"[\w+=,.@-]{1,128}",
+    # PutFunctionEventInvokeConfig
+    ("AWS::Lambda::EventInvokeConfig", "/properties/Qualifier"): r"\$LATEST|[A-Za-z0-9$_-]{1,128}",
+    # CreateOriginAccessControl and CreateResponseHeadersPolicy
+    (
+        "AWS::CloudFront::OriginAccessControl",
+        "/properties/OriginAccessControlConfig/Name",
+    ): r"[\x20-\x7e]{1,64}",
+    (
+        "AWS::CloudFront::ResponseHeadersPolicy",
+        "/properties/ResponseHeadersPolicyConfig/Name",
+    ): r"[A-Za-z0-9_-]{1,128}",
+}
+
+
+def too_much(stack: str, template: dict[str, Any]) -> Iterator[str]:
+    """What CloudFormation or IAM has no room for in a template."""
+    if not re.fullmatch(STACK_NAME, stack):
+        yield f"{stack}: not a stack's name"
+    if (size := len(json.dumps(template, indent=1).encode())) > TEMPLATE_BYTES:
+        yield f"{stack}: {size} bytes"
+    for section, limit in SECTIONS.items():
+        if (count := len(template.get(section, {}))) > limit:
+            yield f"{stack}: {count} {section}"
+        yield from (
+            f"{stack}: {one} is too long" for one in template.get(section, {}) if len(one) > LOGICAL_ID
+        )
+    for output in template.get("Outputs", {}).values():
+        if len(name := output.get("Export", {}).get("Name", "")) > EXPORT_NAME:
+            yield f"{stack}: {name} is too long"
+    granted: dict[str, int] = {}
+    for one in template.get("Resources", {}).values():
+        if one["Type"] == "AWS::IAM::Policy":
+            text = json.dumps(one["Properties"]["PolicyDocument"], separators=(",", ":"))
+            for role in map(str, one["Properties"]["Roles"]):
+                granted[role] = granted.get(role, 0) + len(text)
+    yield from (f"{stack}: {role} {n}" for role, n in granted.items() if n > ROLE_POLICIES_CHARACTERS)
+
+
+def misnamed(template: dict[str, Any]) -> Iterator[str]:
+    """The physical names that AWS does not take, and those that nothing is known of."""
+    for logical_id, one in template["Resources"].items():
+        if not has_schema(one):
+            continue
+        for path, value in names(one).items():
+            where = f"{one['Type']} {logical_id} {path}"
+            if not isinstance(value, str):
+                # A reference to what has a name itself.
+                if value.keys() - {"Ref", "Fn::GetAtt", "Fn::ImportValue"}:
+                    yield f"{where}: a name is made of {value}"
+                continue
+            known = _at(schema(one["Type"]), path)
+            pattern = NAMES.get((one["Type"], path), known.get("pattern"))
+            longest = known.get("maxLength")
+            if pattern is None or (longest is None and (one["Type"], path) not in NAMES):
+                yield f"{where}: nothing is known of how it may be named"
+            elif len(value) > (longest or len(value)) or not re.fullmatch(pattern, value):
+                yield f"{where}: {value}"
+
+
+def _at(known: dict[str, Any], path: str) -> dict[str, Any]:
+    """The schema of a property, through the definitions that it refers to."""
+    found = known
+    for step in path.split("/")[1:]:
+        if reference := found.get("$ref"):
+            found = known["definitions"][reference.rsplit("/", 1)[-1]].get("properties", {})
+        elif "properties" in found and step != "properties":
+            found = found["properties"]
+        found = found.get(step, {})
+    return found
+
+
+@pytest.mark.parametrize("name", VARIATIONS)
+def test_every_stack_has_room(deployment, name):
+    for stack, template in deployment(**VARIATIONS[name]).templates.items():
+        assert list(too_much(stack, template)) == []
+
+
+@pytest.mark.parametrize("name", ["everything", "longest names"])
+def test_every_name_is_one_that_aws_takes(deployment, name):
+    templates = deployment(**VARIATIONS[name]).templates
+    for template in templates.values():
+        assert list(misnamed(template)) == []
+    given = {path for t in templates.values() for one in t["Resources"].values() for path in named(one)}
+    # Of 36 characters that a provisioning template's name may have, the longest has 22.
+    assert "/properties/TemplateName" in given
+
+
+def named(resource):
+    return names(resource) if has_schema(resource) else {}
+
+
+def test_the_longest_namespace_is_the_contracts():
+    assert contract.check_namespace(LONGEST_NAMESPACE) == LONGEST_NAMESPACE
+    with pytest.raises(contract.ContractError):
+        contract.check_namespace(f"{LONGEST_NAMESPACE}n")
+
+
+def resource(kind, **properties):
+    return {"Resources": {"One": {"Type": f"AWS::{kind}", "Properties": properties}}}
+
+
+@pytest.mark.parametrize(
+    ("template", "found"),
+    [
+        (resource("IoT::ProvisioningTemplate", TemplateName="n" * 36), []),
+        (resource("IoT::ProvisioningTemplate", TemplateName="n" * 37), ["TemplateName"]),
+        (resource("IoT::TopicRule", RuleName="a_rule"), []),
+        (resource("IoT::TopicRule", RuleName="a-rule"), ["RuleName"]),
+        (resource("IAM::Role", RoleName="r" * 65), ["RoleName"]),
+        (resource("Lambda::Function", FunctionName="f" * 65), ["nothing is known"]),
+        (resource("S3::Bucket", BucketName="A"), ["BucketName"]),
+        (resource("SQS::Queue", QueueName="q" * 81), ["QueueName"]),
+        (resource("SNS::Topic", TopicName="t" * 257), ["TopicName"]),
+        (resource("CloudWatch::Dashboard", DashboardName="a b"), ["DashboardName"]),
+        (resource("CloudWatch::Alarm", AlarmName="a" * 256), ["AlarmName"]),
+        (resource("IoT::ThingType", ThingTypeName="a b"), ["ThingTypeName"]),
+        (resource("IoT::ThingGroup", ThingGroupName="g" * 129), ["ThingGroupName"]),
+        (resource("IoT::Policy", PolicyName="p" * 129), ["PolicyName"]),
+        (resource("Logs::LogGroup", LogGroupName="l" * 513), ["LogGroupName"]),
+        (resource("SSM::Parameter", Name="a" * 2049), ["nothing is known"]),
+        (resource("SQS::Queue", QueueName={"Fn::Join": ["", ["a", "b"]]}), ["a name is made of"]),
+        (resource("SQS::Queue", QueueName={"Ref": "Other"}), []),
+    ],
+)
+def test_a_name_that_does_not_fit_is_found(template, found):
+    assert len(texts := list(misnamed(template))) == len(found)
+    assert all(part in text for part, text in zip(found, texts, strict=True))
+
+
+@pytest.mark.parametrize(
+    ("stack", "template", "found"),
+    [
+        ("iort-storage", {"Resources": {}}, 0),
+        ("iort_storage", {}, 1),
+        ("s", {"Resources": {f"R{i}": {"Type": ""} for i in range(501)}}, 1),
+        ("s", {"Outputs": {f"O{i}": {} for i in range(201)}}, 1),
+        ("s", {"Parameters": {f"P{i}": {} for i in range(201)}}, 1),
+        ("s", {"Outputs": {"O" * 256: {}}}, 1),
+        ("s", {"Outputs": {"O": {"Export": {"Name": "e" * 256}}}}, 1),
+        ("s", {"Description": "d" * 1_000_000}, 1),
+        ("s", resource("IAM::Policy", Roles=["r"], PolicyDocument={"Statement": ["x" * 10_240]}), 1),
+    ],
+)
+def test_what_does_not_fit_is_found(stack, template, found):
+    assert len(list(too_much(stack, template))) == found
