@@ -25,7 +25,9 @@ NOT_ASKED = {
     "AWS::CloudWatch::Alarm",
     "AWS::IAM::Policy",
     "AWS::Lambda::EventInvokeConfig",
+    "AWS::Lambda::EventSourceMapping",
     "AWS::S3::BucketPolicy",
+    "AWS::SNS::Subscription",
 }
 
 
