@@ -11,9 +11,9 @@ from station.prices import MONTH_HOURS, PRICES
 from station.usage import Usage
 
 # Lambda asks a queue with five long polls of at most 20 s around the clock. Without a bound on the
-# concurrency it goes down to two; the quarantine's mapping has one ("Configuring scaling behavior for SQS
-# event source mappings").
-_POLLERS, _POLL_S = 5, 20
+# concurrency it goes down to two; our mappings have one ("Configuring scaling behavior for SQS event source
+# mappings"): the quarantine's, and that of the batches which were put off.
+_QUEUES, _POLLERS, _POLL_S = 2, 5, 20
 # SQS asks for the queue's key anew after five minutes (KmsDataKeyReusePeriodSeconds).
 _KEYS_AN_HOUR = 12
 _FREE_DASHBOARDS = 3
@@ -21,14 +21,14 @@ _FREE_DASHBOARDS = 3
 
 def deployment_dollars_per_month(usage: Usage) -> dict[str, float]:
     """Dollars by what they are for: metrics that functions emit, alarms, dashboards above three, the polls
-    of the quarantine's queue, and where the settings have them Device Defender's audit and the account's
+    of the queues, and where the settings have them Device Defender's audit and the account's
     own key."""
     hours = MONTH_HOURS
     counts = {
         "metrics": ("metric", sum(map(len, METRICS.values()))),
         "alarms": ("alarm", usage.alarms),
         "dashboards": ("dashboard", max(0, usage.dashboards - _FREE_DASHBOARDS)),
-        "polling the quarantine's queue": ("queue_request", _POLLERS * hours * 3600 / _POLL_S),
+        "polling the queues": ("queue_request", _QUEUES * _POLLERS * hours * 3600 / _POLL_S),
     }
     if usage.device_defender:
         counts["audit of the robots"] = ("audit", usage.robots)

@@ -45,7 +45,7 @@ class Usage:
     summarize_ms: float = 20.0
     summarize_batch_ms: float = 5.0
     function_logs: str = "own"
-    alarms: int = 28
+    alarms: int = 30
     dashboards: int = 2
     recoverable: bool = False
     customer_key: bool = False

@@ -123,7 +123,8 @@ def test_no_statement_is_about_every_resource_or_action(synthesized, reader):
                 # A wildcard within an ARN stands for the robot's name, in the bucket for its keys, in a log
                 # for its streams.
                 # Things and certificates have no names before they are provisioned.
-                named = re.sub(r":topic/pong/iort/\*/|/(robots|results)/\*$|:AWSIotLogsV2:\*$", "", resource)
+                known = r":topic/pong/iort/\*/|:thing/\*/agent$|/(robots|results)/\*$|:AWSIotLogsV2:\*$"
+                named = re.sub(known, "", resource)
                 assert "*" not in named or (role == "ProvisioningRole" and named in {THINGS, CERTIFICATES})
     assert wild == EVERY_RESOURCE
     # And nothing grants that is not a role's policy or a robot's, such as a policy of its own.
@@ -159,7 +160,7 @@ def test_only_its_rule_or_template_may_call_a_function(synthesized, reader):
 
 def test_queues_are_encrypted_and_refuse_what_is_not_tls(synthesized, reader):
     queues = {name: properties for name, _, _, properties in qualified(synthesized, "AWS::SQS::Queue")}
-    assert queues.keys() == {"Rejected", "Last"}
+    assert queues.keys() == {"Rejected", "Last", "PutOff"}
     for properties in queues.values():
         assert properties["SqsManagedSseEnabled"] is True
         assert properties["MessageRetentionPeriod"] == 14 * 86_400
@@ -170,7 +171,7 @@ def test_queues_are_encrypted_and_refuse_what_is_not_tls(synthesized, reader):
         assert statement["Condition"] == {"Bool": {"aws:SecureTransport": "false"}}
         assert statement["Principal"] == {"AWS": "*"}
         closed |= {reader.text(statement["Resource"])}
-    assert closed == {"Rejected.Arn", "Last.Arn"}
+    assert closed == {"Rejected.Arn", "Last.Arn", "PutOff.Arn"}
 
 
 def test_no_template_holds_a_password_an_account_or_a_path_of_this_machine(synthesized):

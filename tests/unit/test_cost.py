@@ -67,9 +67,9 @@ def test_the_ratio_is_given_without_log_lines_too():
 
 def test_a_deployment_at_rest_pays_for_what_polls_watches_and_keeps():
     rest = deployment_dollars_per_month(_ONE)
-    # Five long polls of 20 s around the clock.
-    assert rest["polling the quarantine's queue"] == pytest.approx(657_000 * 0.40e-6)
-    assert rest["alarms"] == pytest.approx(2.8)
+    # Five long polls of 20 s around the clock, of each of two queues.
+    assert rest["polling the queues"] == pytest.approx(2 * 657_000 * 0.40e-6)
+    assert rest["alarms"] == pytest.approx(3.0)
     assert rest["dashboards"] == 0, "three are free"
     assert "key" not in rest
     assert deployment_dollars_per_month(replace(_ONE, customer_key=True))["key"] == 1.0
