@@ -108,7 +108,7 @@ def entries(body: str, records: Records) -> list[Entry]:
         if PUT_OFF in document:
             topic, _ = waiting(body)[0]
             return [Entry(BY_LATER, topic, "put off, and not summarised in five attempts", body.encode())]
-    except (KeyError, TypeError, ValueError, AttributeError, RecursionError, binascii.Error) as error:
+    except (LookupError, TypeError, ValueError, AttributeError, RecursionError, binascii.Error) as error:
         reason = f"a message that the quarantine does not know: {type(error).__name__}: {error}"
     else:
         reason = "a message that the quarantine does not know"

@@ -30,7 +30,7 @@ _WARM_UP_S = 30.0
 DEAR_HZ = (15, 100)
 DEAR_S = 20
 _LOOK_S = 0.05
-_DRAINED_S = 600.0
+_BEGUN_S = 10.0
 
 Message = Callable[[int], bytes]
 
@@ -89,7 +89,7 @@ def run(target: Target, say: Say) -> Section:
                 kind = _dear(rate_hz) if rate_hz else _ALONE
                 say(f"the other robot sends {kind}")
                 summaries[kind].append(_summary_delays(target, car.robot, client, other.robot, rate_hz))
-                _drain(target, say)
+                _forget(target)
     report(section, found)
     report_summaries(section, summaries)
     return section
@@ -135,19 +135,12 @@ def _summary_delays(target: Target, car: str, client: RawClient, other: str, rat
     return [delay for second, delay in sorted(seen.items()) if began_s < second <= began_s + DEAR_S]
 
 
-def _drain(target: Target, say: Say) -> None:
-    """Wait until what was put off is summarised: it would take its part of this machine from what follows."""
-    names = ["ApproximateNumberOfMessages", "ApproximateNumberOfMessagesNotVisible"]
+def _forget(target: Target) -> None:
+    """Throw away what was put off, and let what is begun end: it would take its part of this machine from the
+    next stretch."""
     queue = target.cloud.output("processing", "PutOffQueue")
-    deadline = time.monotonic() + _DRAINED_S
-    while time.monotonic() < deadline:
-        answer = target.cloud.client("sqs").get_queue_attributes(QueueUrl=queue, AttributeNames=names)
-        waiting = sum(int(answer["Attributes"][name]) for name in names)
-        if not waiting:
-            return
-        say(f"{waiting} messages of batches put off wait")
-        threading.Event().wait(1.0)
-    raise BenchError("what was put off is not summarised")
+    target.cloud.client("sqs").purge_queue(QueueUrl=queue)
+    threading.Event().wait(_BEGUN_S)
 
 
 def _stretch(client: RawClient, topic: str, message: Message | None, seconds: int) -> None:
