@@ -26,7 +26,7 @@ from functions.allowances import Allowances
 
 _log = logging.getLogger(__name__)
 # Seconds of a processor that a robot may take: of each second, and at once. A good car takes a hundredth.
-A_SECOND, BURST_S = 0.1, 1.0
+A_SECOND, BURST_S = 0.1, 0.3
 # What the requests for a topic, or for a batch that is refused, cost beside the processor.
 REQUESTS_S = 0.002
 # The keys of a message: of the dearest batches, so many take a tenth of the later function's time.

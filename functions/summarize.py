@@ -39,5 +39,7 @@ def handler(event: dict[str, Any], _context: object) -> dict[str, Any]:
     """Entry point of the telemetry table's stream mapping, and of the operator's replays."""
     if RECOMPUTE_FROM_S in event:
         return recompute(event, stored_tables())
-    # What the operator puts back is no robot's doing.
-    return processed(event, bounds=None if event.get(REPLAY) else _bounds())
+    if event.get(REPLAY):
+        # What the operator puts back is no robot's doing, and the stream goes on meanwhile.
+        return processed(event, beside_others=True)
+    return processed(event, bounds=_bounds())

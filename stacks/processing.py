@@ -135,7 +135,9 @@ class Processing(Stack):
         )
 
     def _later(self, storage: Storage) -> lambda_.Function:
-        later = self._summarizing("Later", storage)
+        # On the embedded cloud all functions share this machine's cores.
+        alone = 1 if self._settings.embedded else 0
+        later = self._summarizing("Later", storage, reserved_concurrency=alone)
         storage.telemetry.grant(later, "dynamodb:GetItem")
         self._rejected.grant_send_messages(later)
         self.put_off.grant_consume_messages(later)
@@ -150,7 +152,9 @@ class Processing(Stack):
         )
         return later
 
-    def _summarizing(self, name: str, storage: Storage, **environment: str) -> lambda_.Function:
+    def _summarizing(
+        self, name: str, storage: Storage, *, reserved_concurrency: int = 0, **environment: str
+    ) -> lambda_.Function:
         """A function that reads batches and writes seconds."""
         made = function(
             self,
@@ -159,6 +163,7 @@ class Processing(Stack):
             encryption=self._encryption,
             memory_mb=512,
             timeout_s=_SUMMARIZE_S,
+            reserved_concurrency=reserved_concurrency,
             environment={
                 "TELEMETRY_TABLE": storage.telemetry.table_name,
                 "SUMMARY_TABLE": storage.summary.table_name,
