@@ -21,11 +21,13 @@ from rich.console import Console
 from rich.table import Table
 
 from contract import (
+    BATCH,
     CODEC,
     DICTIONARY,
     MAX_BATCH_VALUES,
     PLAIN_CODEC,
     Batch,
+    BatchId,
     ContractError,
     decode,
     encode,
@@ -34,6 +36,8 @@ from functions.statistics import summarize_second
 
 _BOOT, _T_US = "0badcafe", 1_700_000_000_000_000
 _TIMES = 5
+# Of those in the codec of today.
+_DEAREST = f"{MAX_BATCH_VALUES:,} texts full of escapes"
 
 
 class Case(NamedTuple):
@@ -51,6 +55,15 @@ class Cost(NamedTuple):
     refused: str
 
 
+def dearest(count: int, *, first_us: int = _T_US) -> Iterator[bytes]:
+    """So many batches of a stream, each as dear as the contract allows and of another second."""
+    (message,) = (case.message for case in cases() if case.what == _DEAREST)
+    envelope = json.loads(message)
+    for number in range(count):
+        envelope[BATCH] = str(BatchId(first_us + number * 1_000_000, _BOOT, number))
+        yield json.dumps(envelope).encode()
+
+
 def cases() -> Iterator[Case]:
     """The dearest that were thought of, and the largest batch of a good car."""
     n, fields = 4000, 500
@@ -66,7 +79,7 @@ def cases() -> Iterator[Case]:
         f"{n:,} texts full of escapes, in the codec of before", _message(PLAIN_CODEC, n, _columns(n, texts))
     )
     texts = [b"[null%s]" % ((b',"' + rb"\n" * 36 + b'"') * n)]
-    yield Case(f"{n:,} texts full of escapes", _message(CODEC, n, _columns(n, texts)))
+    yield Case(_DEAREST, _message(CODEC, n, _columns(n, texts)))
     numbers = [b"[3,1000%s]" % (b",500" * (n - 1))]
     yield Case(f"{n:,} numbers of one field", _message(CODEC, n, _columns(n, numbers)))
     chance = random.Random(1)  # noqa: S311 - a noise, not a secret

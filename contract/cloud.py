@@ -46,7 +46,13 @@ METRICS = {
         "ToLambdaMs",
         "CarToLambdaMs",
     ),
-    "summarize": ("BatchesSummarized", "SamplesSummarized", "BatchesRefused", "BatchesMissing"),
+    "summarize": (
+        "BatchesSummarized",
+        "SamplesSummarized",
+        "BatchesRefused",
+        "BatchesMissing",
+        "BatchesPutOff",
+    ),
     "health": (
         "AgentReports",
         "SampleGaps",

@@ -29,12 +29,17 @@ OMITTED = "omitted"
 ENTRY, SOURCE, REASON, PAYLOAD = "id", "source", "reason", "payload"
 FIRST_MS, LAST_MS, SEEN, REPLAYS = "first_ms", "last_ms", "seen", "replays"
 NO_ROBOT = "-"
-# Where it was refused: by a rule's action, by Lambda 2 or on the way to it, by another function.
-BY_RULE, BY_STREAM, BY_FUNCTION = "rule", "stream", "function"
+# Where it was refused: by a rule's action, by Lambda 2 or on the way to it, by another function; or what
+# Lambda 2 put off could not be summarised later.
+BY_RULE, BY_STREAM, BY_FUNCTION, BY_LATER = "rule", "stream", "function", "later"
 # In an event for Lambda 2: a replay, whose records are answered for and not put into quarantine again.
 REPLAY = "replay"
 # Or the second from which stored batches are summarised again, whose answer says as `RECOMPUTED` which were.
 RECOMPUTE_FROM_S, RECOMPUTED = "recompute_from_s", "recomputed"
+# What a robot's shadow says, as desired, once batches of it had to wait for their summary: since when, when
+# last, how many; the last is also what the queue of their keys has them under.
+OVER_SHARE = "over_share"
+PUT_OFF_SINCE_MS, PUT_OFF_LAST_MS, PUT_OFF = "since_ms", "last_ms", "batches"
 # What a queue's message of Lambda 2's carries: the stored item as DynamoDB JSON, in base64.
 ITEM_BASE64 = "base64Item"
 

@@ -301,6 +301,7 @@ class Agent:
             "files": self._files_status() if self._uploads is not None else None,
             "clock": offset._asdict() if offset is not None else None,
             "pings": {path: report._asdict() for path, report in self._pings.report().items()},
+            "over_share": self._remote.over_share,
             "alarms": alarms,
             "troubles": self._troubles.last() if self._troubles is not None else [],
         }

@@ -12,7 +12,17 @@ import json
 import logging
 from typing import Any, Callable, Mapping
 
-from contract import ACCEPTED, AGENT_VERSION, COMMANDS, SHADOW, Command
+from contract import (
+    ACCEPTED,
+    AGENT_VERSION,
+    COMMANDS,
+    OVER_SHARE,
+    PUT_OFF,
+    PUT_OFF_LAST_MS,
+    PUT_OFF_SINCE_MS,
+    SHADOW,
+    Command,
+)
 from device.allowance import Allowance
 from device.clock import Clock
 from device.errors import UplinkError
@@ -25,11 +35,14 @@ _AGAIN_S = 30.0
 # AWS' limit of a shadow document is 8 KB; a value that was refused is quoted up to here.
 _MAX_VALUE_CHARS = 200
 _NOT_FOUND = 404
+# No count and no time that a calendar has is as large.
+_MOST = 10**15
 
 
 class Remote:
     """Follows the shadow, and says there which version of the agent does so. `tick` is called now and
-    then, the rest by the uplink."""
+    then, the rest by the uplink. ``over_share`` is what the cloud said last of batches that it put off:
+    since when and when last, in its own milliseconds, and how many."""
 
     def __init__(
         self,
@@ -58,6 +71,7 @@ class Remote:
             f"{self._update}/accepted": self._on_change,
             f"{self._update}/rejected": self._on_report_refused,
         }
+        self.over_share: dict[str, int] | None = None
         self._desired: dict[str, Any] = {}
         self._rejected: dict[str, dict[str, Any]] = {}
         self._answers: dict[str, dict[str, Any]] = {}
@@ -144,7 +158,9 @@ class Remote:
 
     def _follow(self) -> None:
         """Bring into force what is allowed of the wishes, and report."""
-        tuning, rejected = overlay(self._base, self._desired, self._known_fields())
+        self._hear(self._desired.get(OVER_SHARE))
+        wishes = {name: value for name, value in self._desired.items() if name != OVER_SHARE}
+        tuning, rejected = overlay(self._base, wishes, self._known_fields())
         for name, refusal in rejected.items():
             if self._rejected.get(name) != refusal:
                 _log.warning("refused: %s", refusal["reason"])
@@ -154,6 +170,19 @@ class Remote:
             self.tuning = tuning
             self._apply(tuning)
         self._report_at = self._clock.monotonic()
+
+    def _hear(self, said: Any) -> None:
+        """Note what the cloud says of the robot's share, and log it once."""
+        said = _mapping(said)
+        names = (PUT_OFF_SINCE_MS, PUT_OFF_LAST_MS, PUT_OFF)
+        if not all(type(said.get(name)) is int and 0 <= said[name] < _MOST for name in names):
+            return
+        before, self.over_share = self.over_share, {name: said[name] for name in names}
+        if before is None or before[PUT_OFF_SINCE_MS] != said[PUT_OFF_SINCE_MS]:
+            _log.warning(
+                "more is recorded than this robot's share of the cloud: summaries are made later, "
+                "and nothing is lost"
+            )
 
     def _state(self) -> dict[str, Any]:
         rejected = {

@@ -184,10 +184,15 @@ def render(state: Mapping[str, Any]) -> str:
     if clock is not None:
         offset, uncertainty = clock["offset_ms"], clock["uncertainty_ms"]
         lines.append(f"clock     the cloud's is {offset:+.1f} ms from ours, to within {uncertainty:.1f} ms")
+    over = state.get("over_share")
+    if over is not None:
+        lines.append(
+            f"share     {over['batches']} batch(es) over this robot's share of the cloud, the last at "
+            f"{_clock(over['last_ms'] / 1000)}: their summaries are made later"
+        )
     lines += [f"ALARM     {alarm}" for alarm in state["alarms"]]
     for trouble in state["troubles"]:
-        at = time.strftime("%H:%M:%SZ", time.gmtime(trouble["at_s"]))
-        lines.append(f"{trouble['level']:<9} {at} {trouble['text']}")
+        lines.append(f"{trouble['level']:<9} {_clock(trouble['at_s'])} {trouble['text']}")
     return "\n".join(map(neutral, lines))
 
 
@@ -224,6 +229,10 @@ def _not_recorded(source: Mapping[str, Any]) -> Iterator[tuple[str, str]]:
 
 def _on(lane: Mapping[str, Any]) -> str:
     return "on" if lane["enabled"] else "off"
+
+
+def _clock(at_s: float) -> str:
+    return time.strftime("%H:%M:%SZ", time.gmtime(at_s))
 
 
 def _duration(seconds: float) -> str:

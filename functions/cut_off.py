@@ -2,12 +2,11 @@
 
 from __future__ import annotations
 
-from collections import OrderedDict
+from functions.allowances import Allowances
 
 # So many messages of a robot may be refused at once, and one more with every second that passes.
 BURST = 20
 A_SECOND = 1.0
-_ROBOTS = 1000
 
 
 class CutOff:
@@ -19,27 +18,16 @@ class CutOff:
 
     One environment of the function keeps one, and environments do not know of each other. So a robot is
     refused at most `A_SECOND` times as many messages a second as there are environments, and each of these
-    loses no more time to it than that of one refusal a second. Kept are the thousand robots that were
-    refused a message last: of the others, none has used up anything worth mentioning.
+    loses no more time to it than that of one refusal a second.
     """
 
     def __init__(self) -> None:
-        self._left: OrderedDict[str, tuple[float, float]] = OrderedDict()
+        self._refusals = Allowances(burst=BURST, a_second=A_SECOND)
 
     def closed(self, robot: str, now_s: float) -> bool:
         """Whether the robot has used up its allowance."""
-        return self._now(robot, now_s) < 1
+        return self._refusals.left(robot, now_s) < 1
 
     def refused(self, robot: str, now_s: float) -> bool:
         """Note a refused message; whether the robot's next ones are not looked at."""
-        left = self._now(robot, now_s) - 1
-        self._left[robot] = (left, now_s)
-        self._left.move_to_end(robot)
-        if len(self._left) > _ROBOTS:
-            self._left.popitem(last=False)
-        return left < 1
-
-    def _now(self, robot: str, now_s: float) -> float:
-        left, at_s = self._left.get(robot, (float(BURST), now_s))
-        # A clock that is set back takes nothing away.
-        return min(BURST, left + A_SECOND * max(0.0, now_s - at_s))
+        return self._refusals.spend(robot, now_s, 1) < 1

@@ -24,6 +24,7 @@ from botocore.exceptions import BotoCoreError, ClientError
 
 from contract import (
     BY_FUNCTION,
+    BY_LATER,
     BY_RULE,
     BY_STREAM,
     ENTRY,
@@ -34,6 +35,7 @@ from contract import (
     LAST_MS,
     NO_ROBOT,
     PAYLOAD,
+    PUT_OFF,
     REASON,
     ROBOT,
     SEEN,
@@ -44,6 +46,7 @@ from contract import (
     event_message,
 )
 from functions.metrics import emit
+from functions.share import waiting
 
 _log = logging.getLogger(__name__)
 _log.setLevel(logging.INFO)
@@ -81,7 +84,8 @@ class Entry:
 def entries(body: str, records: Records) -> list[Entry]:
     """The messages in one message of the queue, which is one of these: a rule's error document, a record
     that Lambda 2 refused, an asynchronous invocation that failed, a batch of the stream that failed
-    (whose records must be fetched with ``records``). Whatever else comes is kept as it is."""
+    (whose records must be fetched with ``records``), the keys of batches that were put off and failed since.
+    Whatever else comes is kept as it is."""
     try:
         document = json.loads(body)
         if "base64OriginalPayload" in document:
@@ -101,7 +105,10 @@ def entries(body: str, records: Records) -> list[Entry]:
             ]
         if "requestPayload" in document:
             return [_of_invocation(document)]
-    except (KeyError, TypeError, ValueError, AttributeError, RecursionError, binascii.Error) as error:
+        if PUT_OFF in document:
+            topic, _ = waiting(body)[0]
+            return [Entry(BY_LATER, topic, "put off, and not summarised in five attempts", body.encode())]
+    except (LookupError, TypeError, ValueError, AttributeError, RecursionError, binascii.Error) as error:
         reason = f"a message that the quarantine does not know: {type(error).__name__}: {error}"
     else:
         reason = "a message that the quarantine does not know"

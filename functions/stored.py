@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from itertools import islice
 from typing import Any, NamedTuple
@@ -44,12 +44,13 @@ class Stored(NamedTuple):
 
 @dataclass
 class Reader:
-    """Reads one topic; what is ``known`` need not be decoded again. ``full`` are the seconds that it found to
-    hold more than they may."""
+    """Reads one topic; what is ``known`` need not be decoded again. ``check`` is called before anything else
+    is, and may raise. ``full`` are the seconds that it found to hold more than they may."""
 
     tables: Tables
     topic: str
     known: Mapping[BatchId, Batch]
+    check: Callable[[], None]
     full: set[int] = field(default_factory=set)
 
     def read(self, first: int, last: int) -> list[Stored]:
@@ -120,11 +121,15 @@ class Reader:
         here it only must not stop its neighbours."""
         for item in items:
             try:
-                batch = self.known.get(batch_id(item[BATCH])) or decode_item(item)[1]
+                batch = self.known.get(batch_id(item[BATCH])) or self._decoded(item)
                 expires_s = int(item[EXPIRES_S]) if EXPIRES_S in item else None
             except (ContractError, KeyError, TypeError, ValueError, OverflowError):
                 continue
             yield Stored(batch, expires_s)
+
+    def _decoded(self, item: Mapping[str, Any]) -> Batch:
+        self.check()
+        return decode_item(item)[1]
 
 
 def _time_of(item: Mapping[str, Any], otherwise: int) -> int:

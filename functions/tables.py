@@ -128,6 +128,13 @@ class Tables:
         for page in pages:
             yield from map(plain, page["Items"])
 
+    def item(self, topic: str, batch: str) -> dict[str, Any] | None:
+        """A batch as DynamoDB stores it, by its key; None where it is not there, or no longer."""
+        key = {TOPIC: {"S": topic}, BATCH: {"S": batch}}
+        answer = self._client.get_item(TableName=self._telemetry, Key=key, ConsistentRead=True)
+        found: dict[str, Any] | None = answer.get("Item")
+        return found
+
     def page(
         self, condition: Mapping[str, Any], after: Mapping[str, Any] | None, *, scan: bool
     ) -> dict[str, Any]:

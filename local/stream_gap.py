@@ -35,7 +35,7 @@ _AHEAD = 2_000
 def install() -> None:
     """Close the gap in this process, before the emulator starts."""
     lambda_svc._poll_dynamodb_streams = StreamMappings().poll
-    iam_actions.extract_resource_arn = _knowing_streams(iam_actions.extract_resource_arn)
+    iam_actions.extract_resource_arn = _knowing_shadows(_knowing_streams(iam_actions.extract_resource_arn))
 
 
 def _knowing_streams(resource_arn: Callable[..., str]) -> Callable[..., str]:
@@ -51,6 +51,22 @@ def _knowing_streams(resource_arn: Callable[..., str]) -> Callable[..., str]:
             asked = {}
         iterator = dynamodb_streams._decode_iterator(asked.get("ShardIterator") or "") or {}
         return str(asked.get("StreamArn") or iterator.get("arn") or "*")
+
+    return extract
+
+
+def _knowing_shadows(resource_arn: Callable[..., str]) -> Callable[..., str]:
+    """A named shadow, which ministack takes for its thing. AWS IoT, "AWS IoT Core action resources"."""
+
+    @wraps(resource_arn)
+    def extract(service: str, *request: Any) -> str:
+        found = resource_arn(service, *request)
+        path, asked = request[1], request[4] or {}
+        if service not in {"iot", "iot-data"} or not path.endswith("/shadow") or ":thing/" not in found:
+            return found
+        name = asked.get("name") or ""
+        name = name[0] if isinstance(name, list) else name
+        return f"{found}/{name}" if name else found
 
     return extract
 

@@ -123,7 +123,7 @@ class Dashboards(Construct):
                 [metrics.function("IteratorAge", of, label=label) for label, of in watched.readers.items()],
             ),
             _graph(
-                "Quarantine: messages waiting",
+                "Queues: messages waiting",
                 [metrics.waiting(queue, label=label) for label, queue in watched.queues.items()],
                 right=self._ours("quarantine", "Quarantined"),
             ),
@@ -149,7 +149,7 @@ class Dashboards(Construct):
                 "Gaps: holes between samples, missing and refused batches",
                 [
                     *self._ours("health", "SampleGaps"),
-                    *self._ours("summarize", "BatchesMissing", "BatchesRefused"),
+                    *self._ours("summarize", "BatchesMissing", "BatchesRefused", "BatchesPutOff"),
                 ],
             ),
             _graph("Backlog: batches waiting in the fullest car", self._ours("health", "BacklogBatches")),

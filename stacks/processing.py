@@ -1,4 +1,5 @@
-"""What is computed: Lambda 1 live, Lambda 2 summarize, echo and upload, each with its own role and log."""
+"""What is computed: Lambda 1 live, Lambda 2 summarize and later, echo and upload, each with its own role and
+log."""
 
 from __future__ import annotations
 
@@ -12,6 +13,7 @@ from aws_cdk import aws_lambda_destinations as destinations
 from aws_cdk import aws_lambda_event_sources as sources
 from aws_cdk import aws_sns as sns
 from aws_cdk import aws_sns_subscriptions as subscriptions
+from aws_cdk import aws_sqs as sqs
 from constructs import Construct
 
 from contract import (
@@ -23,13 +25,17 @@ from contract import (
     LAMBDA,
     PONG,
     RESULTS_PREFIX,
+    SHADOW,
     STREAMS,
     pubnub_parameter,
 )
 from stacks.function import RUNTIME, function
 from stacks.quarantine import Quarantine
+from stacks.queue import queue
 from stacks.settings import Settings
 from stacks.storage import Storage
+
+_SUMMARIZE_S = 60
 
 
 class Processing(Stack):
@@ -49,7 +55,9 @@ class Processing(Stack):
         self._settings, self._encryption = settings, storage.encryption
         self._rejected = quarantine.rejected
         self.live = self._live()
+        self.put_off = self._put_off()
         self.summarize = self._summarize(storage)
+        self.later = self._later(storage)
         self.echo = self._echo()
         self.upload = self._upload(storage)
         self.query = self._query(storage)
@@ -85,25 +93,11 @@ class Processing(Stack):
         return live
 
     def _summarize(self, storage: Storage) -> lambda_.Function:
-        summarize = function(
-            self,
-            "Summarize",
-            settings=self._settings,
-            encryption=self._encryption,
-            memory_mb=512,
-            timeout_s=60,
-            environment={
-                "TELEMETRY_TABLE": storage.telemetry.table_name,
-                "SUMMARY_TABLE": storage.summary.table_name,
-                "ROBOTS_TABLE": storage.robots.table_name,
-                "REJECTED_QUEUE": self._rejected.queue_url,
-                "ROBOT_METRICS": str(self._settings.robot_metrics).lower(),
-            },
-        )
-        storage.telemetry.grant(summarize, "dynamodb:Query")
-        storage.summary.grant(summarize, "dynamodb:BatchWriteItem")
-        storage.robots.grant(summarize, "dynamodb:GetItem")
-        storage.may_keep(summarize, STREAMS)
+        summarize = self._summarizing("Summarize", storage, PUT_OFF_QUEUE=self.put_off.queue_url)
+        self._allow(summarize, ["sqs:SendMessage"], self.put_off.queue_arn)
+        # It tells a robot in its shadow that it is over its share. AWS IoT: "Action resources".
+        shadow = self.format_arn(service="iot", resource="thing", resource_name=f"*/{SHADOW}")
+        self._allow(summarize, ["iot:UpdateThingShadow"], shadow)
         summarize.add_event_source(
             sources.DynamoEventSource(
                 storage.telemetry,
@@ -127,6 +121,63 @@ class Processing(Stack):
             )
         )
         return summarize
+
+    def _put_off(self) -> sqs.Queue:
+        """The keys of batches that wait, since their robot is over its share of Lambda 2."""
+        return queue(
+            self,
+            "PutOff",
+            settings=self._settings,
+            encryption=self._encryption,
+            # AWS advises six times the function's time.
+            visibility_timeout=Duration.seconds(6 * _SUMMARIZE_S),
+            dead_letter_queue=sqs.DeadLetterQueue(max_receive_count=5, queue=self._rejected),
+        )
+
+    def _later(self, storage: Storage) -> lambda_.Function:
+        # On the embedded cloud all functions share this machine's cores.
+        alone = 1 if self._settings.embedded else 0
+        later = self._summarizing("Later", storage, reserved_concurrency=alone)
+        storage.telemetry.grant(later, "dynamodb:GetItem")
+        self._rejected.grant_send_messages(later)
+        self.put_off.grant_consume_messages(later)
+        # The fewest at once that AWS allows: what waits takes no other function's environments.
+        lambda_.EventSourceMapping(
+            self,
+            "PutOffs",
+            target=later,
+            event_source_arn=self.put_off.queue_arn,
+            batch_size=1,
+            max_concurrency=2,
+        )
+        return later
+
+    def _summarizing(
+        self, name: str, storage: Storage, *, reserved_concurrency: int = 0, **environment: str
+    ) -> lambda_.Function:
+        """A function that reads batches and writes seconds."""
+        made = function(
+            self,
+            name,
+            settings=self._settings,
+            encryption=self._encryption,
+            memory_mb=512,
+            timeout_s=_SUMMARIZE_S,
+            reserved_concurrency=reserved_concurrency,
+            environment={
+                "TELEMETRY_TABLE": storage.telemetry.table_name,
+                "SUMMARY_TABLE": storage.summary.table_name,
+                "ROBOTS_TABLE": storage.robots.table_name,
+                "REJECTED_QUEUE": self._rejected.queue_url,
+                "ROBOT_METRICS": str(self._settings.robot_metrics).lower(),
+                **environment,
+            },
+        )
+        storage.telemetry.grant(made, "dynamodb:Query")
+        storage.summary.grant(made, "dynamodb:BatchWriteItem")
+        storage.robots.grant(made, "dynamodb:GetItem")
+        storage.may_keep(made, STREAMS)
+        return made
 
     def _query(self, storage: Storage) -> lambda_.Function:
         query = function(

@@ -10,12 +10,13 @@ from __future__ import annotations
 
 from typing import Any
 
-from aws_cdk import CfnOutput, Duration, Stack
+from aws_cdk import Duration, Stack
 from aws_cdk import aws_lambda as lambda_
 from aws_cdk import aws_sqs as sqs
 from constructs import Construct
 
 from stacks.function import function
+from stacks.queue import queue
 from stacks.settings import Settings
 from stacks.storage import Storage
 
@@ -32,10 +33,12 @@ class Quarantine(Stack):
         self, scope: Construct, construct_id: str, *, settings: Settings, storage: Storage, **kwargs: Any
     ) -> None:
         super().__init__(scope, construct_id, **kwargs)
-        self._settings, self._storage = settings, storage
-        self.last = self._queue("Last")
-        self.rejected = self._queue(
+        self.last = queue(self, "Last", settings=settings, encryption=storage.encryption)
+        self.rejected = queue(
+            self,
             "Rejected",
+            settings=settings,
+            encryption=storage.encryption,
             # AWS advises six times the function's time.
             visibility_timeout=Duration.seconds(6 * _TIMEOUT_S),
             dead_letter_queue=sqs.DeadLetterQueue(max_receive_count=_ATTEMPTS, queue=self.last),
@@ -65,17 +68,3 @@ class Quarantine(Stack):
             max_concurrency=_CONCURRENCY,
             report_batch_item_failures=True,
         )
-
-    def _queue(self, name: str, **properties: Any) -> sqs.Queue:
-        queue = sqs.Queue(
-            self,
-            name,
-            enforce_ssl=True,
-            # The longest there is.
-            retention_period=Duration.days(14),
-            removal_policy=self._settings.removal_policy,
-            **properties,
-            **self._storage.encryption.queue,
-        )
-        CfnOutput(self, f"{name}Queue", value=queue.queue_url)
-        return queue

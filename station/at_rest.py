@@ -16,9 +16,9 @@ from station.prices import MONTH_HOURS, PRICES, Price
 from station.usage import Usage
 
 # Lambda asks a queue with five long polls of at most 20 s around the clock. Without a bound on the
-# concurrency it goes down to two; the quarantine's mapping has one ("Configuring scaling behavior for SQS
-# event source mappings").
-_POLLERS, _POLL_S = 5, 20
+# concurrency it goes down to two; our mappings have one ("Configuring scaling behavior for SQS event source
+# mappings"): the quarantine's, and that of the batches which were put off.
+_QUEUES, _POLLERS, _POLL_S = 2, 5, 20
 # SQS asks for the queue's key anew after five minutes (KmsDataKeyReusePeriodSeconds).
 _KEYS_AN_HOUR = 12
 # "Amazon CloudWatch pricing", free tier: three dashboards of up to fifty metrics each, ten custom metrics,
@@ -33,7 +33,7 @@ ROBOT_SEARCHES = 4
 
 def deployment_dollars_per_month(usage: Usage, prices: Mapping[str, Price] = PRICES) -> dict[str, float]:
     """Dollars by what they are for: metrics that functions emit, alarms, dashboards and asking for their
-    metrics, the polls of the quarantine's queue, and where the settings have them Device Defender's audit and
+    metrics, the polls of the queues, and where the settings have them Device Defender's audit and
     the account's own key."""
     hours, robots = MONTH_HOURS, usage.robots if usage.robot_metrics else 0
     metrics = sum(map(len, METRICS.values())) + robots * len(METRICS["health"])
@@ -48,7 +48,7 @@ def deployment_dollars_per_month(usage: Usage, prices: Mapping[str, Price] = PRI
             "metric_request",
             usage.dashboard_hours * 3600 / PAGE_REFRESH_S * max(dashboards, default=0),
         ),
-        "polling the quarantine's queue": ("queue_request", _POLLERS * hours * 3600 / _POLL_S),
+        "polling the queues": ("queue_request", _QUEUES * _POLLERS * hours * 3600 / _POLL_S),
     }
     if usage.device_defender:
         counts["audit of the robots"] = ("audit", usage.robots)

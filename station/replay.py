@@ -16,6 +16,7 @@ from botocore.exceptions import BotoCoreError, ClientError
 
 from contract import (
     BATCH,
+    BY_LATER,
     BY_RULE,
     BY_STREAM,
     ENTRY,
@@ -77,7 +78,8 @@ def replay(
     arrived when the table holds its batch. One that Lambda 2 failed on or refused is given to Lambda 2
     again, which answers. Only then is the entry deleted. Every attempt is counted first, and after
     `MAX_REPLAYS` (unless ``again``) there are no more. Live messages, pings and events are of their
-    moment and are not replayed. A batch of version 1 goes back as one of this version: its agent had not
+    moment and are not replayed. What was put off
+    waits once more. A batch of version 1 goes back as one of this version: its agent had not
     been updated when the stacks were.
     """
     one = partial(_outcome, cloud, dry_run=dry_run, again=again)
@@ -89,10 +91,12 @@ def _outcome(cloud: Cloud, listed: Entry, *, dry_run: bool, again: bool) -> Outc
     entry = load(cloud, listed)
     if entry is None:
         return Outcome(listed, Fate.GONE)
+    current, batch = entry, None
     try:
         _check_kind(entry)
-        current = _current(entry)
-        batch = _batch(current)
+        if entry.source != BY_LATER:
+            current = _current(entry)
+            batch = _batch(current)
     except _NotForReplayError as error:
         return Outcome(listed, Fate.NOT_FOR_REPLAY, str(error))
     except ContractError as error:
@@ -103,7 +107,9 @@ def _outcome(cloud: Cloud, listed: Entry, *, dry_run: bool, again: bool) -> Outc
         return Outcome(entry, Fate.WOULD)
     try:
         _count(cloud, entry)
-        if _is_rules(entry):
+        if batch is None:
+            problem = _put_off(cloud, entry)
+        elif _is_rules(entry):
             problem = _publish(cloud, current, batch)
         elif current is not entry and not _stored(cloud, entry.topic, batch):
             # Lambda 2 reads the table, and would find nothing to summarise.
@@ -123,7 +129,7 @@ def _is_rules(entry: Entry) -> bool:
 
 
 def _check_kind(entry: Entry) -> None:
-    if entry.source == BY_STREAM and entry.topic:
+    if entry.source in (BY_STREAM, BY_LATER) and entry.topic:
         return
     if not _is_rules(entry) or not entry.topic.startswith(f"{RECORD}/"):
         raise _NotForReplayError("of its moment, or without a batch: only the record lane is replayed")
@@ -181,6 +187,14 @@ def _publish(cloud: Cloud, entry: Entry, batch: Batch) -> str:
             return now.reason
         threading.Event().wait(_POLL_S)
     return f"not in the telemetry table after {_CONFIRM_S:.0f} s"
+
+
+def _put_off(cloud: Cloud, entry: Entry) -> str:
+    """Have the batches that Lambda 2 put off wait once more: what fails comes back."""
+    queue = cloud.output("processing", "PutOffQueue")
+    body = (entry.payload or b"").decode()
+    cloud.client("sqs").send_message(QueueUrl=queue, MessageBody=body, MessageGroupId=entry.robot)
+    return ""
 
 
 def _stored(cloud: Cloud, topic: str, batch: Batch) -> bool:

@@ -11,13 +11,25 @@ from collections.abc import Callable, Iterator, Mapping
 from email.utils import parsedate_to_datetime
 from typing import Any, NamedTuple, TypeVar
 
-from contract import AGENT_VERSION, COMMANDS, SHADOW, ContractError, check_robot
+from contract import (
+    AGENT_VERSION,
+    COMMANDS,
+    OVER_SHARE,
+    PUT_OFF,
+    PUT_OFF_LAST_MS,
+    PUT_OFF_SINCE_MS,
+    SHADOW,
+    ContractError,
+    check_robot,
+)
 from station.cloud import Cloud
 from station.errors import StationError
 
 _POLL_S = 0.3
 # HTTP's Date is a whole second: a clock more than this off it is off.
 _CLOCK_S = 2.0
+# No count and no time that a calendar has is as large.
+_MOST = 10**14
 _Found = TypeVar("_Found")
 
 
@@ -43,7 +55,7 @@ class State(NamedTuple):
 
     def wished(self) -> dict[str, Any]:
         """What is desired: dotted name to value."""
-        return dict(_flat(self.desired))
+        return dict(_flat({name: value for name, value in self.desired.items() if name != OVER_SHARE}))
 
     def refusals(self) -> list[Refusal]:
         """The wishes that the robot refuses."""
@@ -98,6 +110,32 @@ class Shadow:
             # A shadow tells its reader nothing by itself.
             time.sleep(_POLL_S)
         return value
+
+
+class OverShare(NamedTuple):
+    """What the cloud said of batches that it put off: how many, since when and when last."""
+
+    batches: int
+    since_ms: int
+    last_ms: int
+
+
+def over_share(cloud: Cloud, robot: str) -> OverShare | None:
+    """What Lambda 2 said last of a robot that was over its share; None where it said nothing."""
+    data = cloud.client("iot-data")
+    try:
+        answer = data.get_thing_shadow(thingName=robot, shadowName=SHADOW)
+    except data.exceptions.ResourceNotFoundException:
+        return None
+    desired = json.loads(answer["payload"].read()).get("state", {}).get("desired") or {}
+    said = desired.get(OVER_SHARE)
+    names = (PUT_OFF, PUT_OFF_SINCE_MS, PUT_OFF_LAST_MS)
+    # The robot may write there as well.
+    if not isinstance(said, dict) or not all(
+        type(said.get(name)) is int and 0 <= said[name] < _MOST for name in names
+    ):
+        return None
+    return OverShare(*(said[name] for name in names))
 
 
 def answered(wishes: Mapping[str, Any], state: State) -> bool | None:

@@ -50,9 +50,9 @@ class Usage:
     summarize_ms: float = 20.0
     summarize_batch_ms: float = 5.0
     function_logs: str = "own"
-    alarms: int = 24
-    insights_metrics: int = 46
-    dashboards: tuple[int, ...] = (43, 29)
+    alarms: int = 26
+    insights_metrics: int = 48
+    dashboards: tuple[int, ...] = (45, 30)
     dashboard_hours: float = 20.0
     robot_metrics: bool = False
     recoverable: bool = False

@@ -256,6 +256,8 @@ OBJECTS = ("robots/isolated-b/x", "results/x", "x")
 PARAMETER_ACTIONS = ("GetParameter", "PutParameter", "DeleteParameter")
 FUNCTION_ACTIONS = ("InvokeFunction", "UpdateFunctionConfiguration")
 LOG_ACTIONS = ("CreateLogStream", "PutLogEvents", "GetLogEvents")
+# Of a thing: the shadow of the settings, another, and the one without a name.
+SHADOWS = {f"{A}/{SHADOW}": SHADOW, f"{A}/other": "other", A: None}
 TOPICS = (
     build_topic(CMD, B, "drive"),
     build_topic(LIVE, B, "vesc"),

@@ -1,4 +1,5 @@
-"""Fairness: what one robot at the limit of its connection costs the live lane of another.
+"""Fairness: what one robot at the limit of its connection costs another's live lane, and what its dearest
+batches cost another's summaries.
 
 Only on the embedded cloud: on AWS other sections would share Lambda 1 with what is refused here.
 """
@@ -7,15 +8,17 @@ from __future__ import annotations
 
 import threading
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 
+from bench.dear import dearest
 from bench.driving import Driving
 from bench.errors import BenchError
 from bench.raw_mqtt import RawClient
 from bench.result import Ratio, Section, Table
 from bench.spread import Spread, spread
 from bench.target import Say, Target
-from contract import LIVE, VESC_STREAM, LiveSample, build_topic, encode_live
+from contract import LIVE, SECOND, VESC_STREAM, LiveSample, build_topic, encode_live, record_topic
+from station.items import of_topic
 
 # AWS IoT takes so many publishes a second from a connection.
 RATE_HZ = 100
@@ -23,6 +26,11 @@ STRETCH_S = 8
 _REPEATS = 2
 _MOST = 2.0
 _WARM_UP_S = 30.0
+# The dearest batches that are allowed: of what a robot may well send, and of all that it can.
+DEAR_HZ = (15, 100)
+DEAR_S = 20
+_LOOK_S = 0.05
+_BEGUN_S = 10.0
 
 Message = Callable[[int], bytes]
 
@@ -38,7 +46,8 @@ def good(number: int) -> bytes:
     return encode_live(LiveSample("0badcafe", number, now_us, now_us, {"speed": number}))
 
 
-KINDS: dict[str, Message | None] = {"nothing": None, "bad messages": bad, "good messages": good}
+_ALONE = "nothing"
+KINDS: dict[str, Message | None] = {_ALONE: None, "bad messages": bad, "good messages": good}
 
 
 def run(target: Target, say: Say) -> Section:
@@ -72,16 +81,80 @@ def run(target: Target, say: Say) -> Section:
                 heard = len(listener.heard)
                 _stretch(client, topic, message, STRETCH_S)
                 found[kind].append([one.delay_ms for one in listener.heard[heard:]])
+    say("summaries")
+    summaries: dict[str, list[list[float]]] = {kind: [] for kind in (_ALONE, *map(_dear, DEAR_HZ))}
+    with Driving(car), RawClient(other.folder) as client:
+        for _ in range(_REPEATS):
+            for rate_hz in (0, *DEAR_HZ):
+                kind = _dear(rate_hz) if rate_hz else _ALONE
+                say(f"the other robot sends {kind}")
+                summaries[kind].append(_summary_delays(target, car.robot, client, other.robot, rate_hz))
+                _forget(target)
     report(section, found)
+    report_summaries(section, summaries)
     return section
 
 
+def _dear(rate_hz: int) -> str:
+    return f"{rate_hz} dear batches a second"
+
+
+def _summary_delays(target: Target, car: str, client: RawClient, other: str, rate_hz: int) -> list[float]:
+    """How long after its end each second of the car is in the summary table, in ms, while the other robot
+    sends the dearest batches, if any."""
+    topic = record_topic(other, VESC_STREAM, target.cloud.namespace)
+    messages = dearest(rate_hz * DEAR_S, first_us=time.time_ns() // 10**9 * 10**6)
+    newest = of_topic(target.cloud, "SummaryTable", car, VESC_STREAM, SECOND)
+    seen: dict[int, float] = {}
+    over = threading.Event()
+
+    def watch() -> None:
+        while not over.wait(_LOOK_S):
+            answer = target.cloud.client("dynamodb").query(**newest, ScanIndexForward=False, Limit=DEAR_S)
+            now_s = time.time()
+            for item in answer["Items"]:
+                second = int(item[SECOND]["N"])
+                # The one after it has come too, or a second may not be over.
+                seen.setdefault(second, (now_s - second - 1) * 1000)
+
+    began_s = time.time()
+    watcher = threading.Thread(target=watch)
+    watcher.start()
+    try:
+        if rate_hz:
+            _paced(client, topic, messages, rate_hz)
+        else:
+            over.wait(DEAR_S)
+        # Of the last seconds, too, the summary is waited for.
+        deadline = time.monotonic() + _WARM_UP_S
+        while int(began_s) + DEAR_S not in seen and time.monotonic() < deadline:
+            over.wait(_LOOK_S)
+    finally:
+        over.set()
+        watcher.join()
+    return [delay for second, delay in sorted(seen.items()) if began_s < second <= began_s + DEAR_S]
+
+
+def _forget(target: Target) -> None:
+    """Throw away what was put off, and let what is begun end: it would take its part of this machine from the
+    next stretch."""
+    queue = target.cloud.output("processing", "PutOffQueue")
+    target.cloud.client("sqs").purge_queue(QueueUrl=queue)
+    threading.Event().wait(_BEGUN_S)
+
+
 def _stretch(client: RawClient, topic: str, message: Message | None, seconds: int) -> None:
+    if message is None:
+        threading.Event().wait(seconds)
+    else:
+        _paced(client, topic, map(message, range(seconds * RATE_HZ)), RATE_HZ)
+
+
+def _paced(client: RawClient, topic: str, messages: Iterable[bytes], rate_hz: int) -> None:
     began, waiting = time.monotonic(), threading.Event()
-    for number in range(seconds * RATE_HZ):
-        if message is not None:
-            client.publish(topic, message(number))
-        waiting.wait(max(0.0, began + (number + 1) / RATE_HZ - time.monotonic()))
+    for number, message in enumerate(messages):
+        client.publish(topic, message)
+        waiting.wait(max(0.0, began + (number + 1) / rate_hz - time.monotonic()))
 
 
 def report(section: Section, found: dict[str, list[list[float]]]) -> None:
@@ -94,7 +167,7 @@ def report(section: Section, found: dict[str, list[list[float]]]) -> None:
             [[kind, str(one.n), one.text()] if one else [kind, "0", "-"] for kind, one in spreads.items()],
         )
     )
-    alone = spreads["nothing"]
+    alone = spreads[_ALONE]
     for kind, one in spreads.items():
         if one and alone and one is not alone:
             name = f"a car's p95 beside a robot of {RATE_HZ} {kind} a second / alone"
@@ -102,3 +175,23 @@ def report(section: Section, found: dict[str, list[list[float]]]) -> None:
             name = f"updates of the car beside {RATE_HZ} {kind} a second / alone"
             section.ratios.append(Ratio(name, round(one.n / alone.n, 2), 0.9, at_least=True))
     section.raw = dict(found)
+
+
+def report_summaries(section: Section, found: dict[str, list[list[float]]]) -> None:
+    """The table and the ratios of how late summaries are in ms, a list a stretch, by what the other sent."""
+    spreads: dict[str, Spread | None] = {kind: spread(delays) for kind, delays in found.items()}
+    section.tables.append(
+        Table(
+            "From the end of a car's second to its summary",
+            ["the other robot sends", "seconds", "median (p95, p99; range of the medians)"],
+            [[kind, str(one.n), one.text()] if one else [kind, "0", "-"] for kind, one in spreads.items()],
+        )
+    )
+    alone = spreads[_ALONE]
+    for kind, one in spreads.items():
+        if one and alone and one is not alone:
+            name = f"p95 of a car's summaries beside a robot of {kind} / alone"
+            section.ratios.append(Ratio(name, round(one.p95 / alone.p95, 2), _MOST, tolerance=2.0))
+            name = f"seconds summarised of the car beside {kind} / alone"
+            section.ratios.append(Ratio(name, round(one.n / alone.n, 2), 0.9, at_least=True))
+    section.raw = {**section.raw, **{f"summaries, {kind}": delays for kind, delays in found.items()}}

@@ -23,11 +23,12 @@ from contract import (
     FILES_BYTES,
     FILES_DAY,
     ONLINE,
+    OVER_SHARE,
     PRESENCE,
     ROBOT,
     STREAMS,
 )
-from station import certificates, claims, registry, robots, rotation
+from station import certificates, claims, registry, robots, rotation, shadow
 from station.commands.options import since_us
 from station.console import Console
 from station.errors import StationError
@@ -204,20 +205,26 @@ def show(
     name: str,
     as_json: Annotated[bool, typer.Option("--json", help="As JSON.")] = False,
 ) -> None:
-    """Show what is known of a robot: its connection, its provisioning, its certificates."""
+    """Show what is known of a robot: its connection, its share, its provisioning, its certificates."""
     cloud = context.obj.cloud()
     row, held = registry.get(cloud, name), certificates.attached(cloud, name)
+    over = shadow.over_share(cloud, name)
     if as_json:
         described = [
             {**one._asdict(), "created": _time(one.created), "expires": _time(one.expires)} for one in held
         ]
-        _out.print_json(json.dumps({**row, "certificates": described}, default=float))
+        said = {OVER_SHARE: over and over._asdict(), "certificates": described}
+        _out.print_json(json.dumps({**row, **said}, default=float))
         return
     table = Table(show_header=False, box=None, pad_edge=False)
     table.add_column(no_wrap=True)
     # Half an identifier is of no use to who copies it.
     table.add_column(overflow="fold")
     table.add_row("connection", _connection(row))
+    if over is not None:
+        since, last = (iso_s(at_ms * 1000) for at_ms in (over.since_ms, over.last_ms))
+        text = f"over: {over.batches} batches put off since {since}, the last at {last}"
+        table.add_row("share", text)
     for key, value in sorted(row.items()):
         if key != ROBOT:
             table.add_row(key, _value(key, value))

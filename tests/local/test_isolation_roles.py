@@ -159,6 +159,12 @@ def probes(deployed: list[Resource]) -> Iterator[Probe]:
             yield Probe(f"logs:{action}", f"{log.arn}.Arn", "logs", *each[action])
     for topic in isolation.TOPICS:
         yield Probe("iot:Publish", f"{IOT}:topic/{topic}", "iot-data", "publish", {"topic": topic})
+    for resource, shadow in isolation.SHADOWS.items():
+        said: dict[str, Any] = {"thingName": isolation.A, "payload": b'{"state": {}}'}
+        said |= {"shadowName": shadow} if shadow else {}
+        yield Probe(
+            "iot:UpdateThingShadow", f"{IOT}:thing/{resource}", "iot-data", "update_thing_shadow", said
+        )
     # What no role of ours has to do with anything of.
     yield Probe("iam:ListRoles", "none", "iam", "list_roles", {})
     yield Probe("iot:ListCertificates", "none", "iot", "list_certificates", {})
@@ -245,6 +251,7 @@ def test_what_is_declared_is_not_refused(deployed, taken):
         "ssm:GetParameter",
         "s3:ListBucket",
         "iot:Publish",
+        "iot:UpdateThingShadow",
         "sqs:GetQueueAttributes",
     }
     asked = [probe for probe in probes(deployed) if probe.action in harmless]

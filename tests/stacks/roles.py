@@ -67,6 +67,13 @@ LOG = {"logs:CreateLogStream", "logs:PutLogEvents"}
 REJECT = ("sqs:SendMessage", "Rejected.Arn")
 # What the CDK gives whoever may send to a queue as a destination.
 DESTINATION = {REJECT, ("sqs:GetQueueAttributes", "Rejected.Arn"), ("sqs:GetQueueUrl", "Rejected.Arn")}
+# Who reads batches and writes seconds.
+SUMMARIZES = {
+    ("dynamodb:Query", "Batches.Arn"),
+    ("dynamodb:BatchWriteItem", "Summary.Arn"),
+    ("dynamodb:GetItem", "Robots.Arn"),
+    ("dynamodb:UpdateItem", "Robots.Arn"),
+}
 # Of every role, each action on each resource, and who may take the role.
 ROLES = {
     "LiveRole": (
@@ -83,15 +90,28 @@ ROLES = {
     "SummarizeRole": (
         "lambda.amazonaws.com",
         {(action, "SummarizeLog.Arn") for action in LOG}
+        | SUMMARIZES
         | {
-            ("dynamodb:Query", "Batches.Arn"),
-            ("dynamodb:BatchWriteItem", "Summary.Arn"),
-            ("dynamodb:GetItem", "Robots.Arn"),
-            ("dynamodb:UpdateItem", "Robots.Arn"),
             ("dynamodb:DescribeStream", "Batches.StreamArn"),
             ("dynamodb:GetRecords", "Batches.StreamArn"),
             ("dynamodb:GetShardIterator", "Batches.StreamArn"),
             ("dynamodb:ListStreams", "*"),
+            ("sqs:SendMessage", "PutOff.Arn"),
+            ("iot:UpdateThingShadow", f"{IOT}:thing/*/{contract.SHADOW}"),
+        }
+        | DESTINATION,
+    ),
+    "LaterRole": (
+        "lambda.amazonaws.com",
+        {(action, "LaterLog.Arn") for action in LOG}
+        | SUMMARIZES
+        | {("dynamodb:GetItem", "Batches.Arn")}
+        | {
+            (f"sqs:{action}", "PutOff.Arn")
+            for action in (
+                *("ReceiveMessage", "DeleteMessage", "ChangeMessageVisibility"),
+                *("GetQueueAttributes", "GetQueueUrl"),
+            )
         }
         | DESTINATION,
     ),
@@ -172,6 +192,7 @@ ROLES = {
 KEEPS = {
     "AlertRole": ("alert_*",),
     "PresenceRole": contract.PRESENCE,
+    "LaterRole": (contract.STREAMS,),
     "SummarizeRole": (contract.STREAMS,),
     "UploadRole": ("files_bytes", "files_day"),
 }

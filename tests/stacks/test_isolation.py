@@ -96,6 +96,7 @@ def test_every_role_on_every_resource_is_declared_or_refused(synthesized, reader
         for a in isolation.PARAMETER_ACTIONS
     ]
     wanted += [("iot:Publish", f"{IOT}:topic/{topic}") for topic in isolation.TOPICS]
+    wanted += [("iot:UpdateThingShadow", f"{IOT}:thing/{shadow}") for shadow in isolation.SHADOWS]
     for kind, asked in ASKED.items():
         for name, *_ in qualified(synthesized, kind):
             wanted += [(action, arn.format(name.removeprefix("ingest/"))) for action, arn in asked]

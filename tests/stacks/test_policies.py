@@ -124,7 +124,8 @@ def test_no_statement_is_about_every_resource_or_action(synthesized, reader):
                 # for its streams.
                 # Things and certificates have no names before they are provisioned; the hook reads of a
                 # certificate whether it came through.
-                named = re.sub(r":topic/pong/iort/\*/|/(robots|results)/\*$|:AWSIotLogsV2:\*$", "", resource)
+                known = r":topic/pong/iort/\*/|:thing/\*/agent$|/(robots|results)/\*$|:AWSIotLogsV2:\*$"
+                named = re.sub(known, "", resource)
                 of_provisioning = role == "ProvisioningRole" and named in {THINGS, CERTIFICATES}
                 of_the_hook = (role, action, named) == ("AdmitRole", "iot:DescribeCertificate", CERTIFICATES)
                 assert "*" not in named or of_provisioning or of_the_hook
@@ -162,7 +163,7 @@ def test_only_its_rule_or_template_may_call_a_function(synthesized, reader):
 
 def test_queues_are_encrypted_and_refuse_what_is_not_tls(synthesized, reader):
     queues = {name: properties for name, _, _, properties in qualified(synthesized, "AWS::SQS::Queue")}
-    assert queues.keys() == {"Rejected", "Last"}
+    assert queues.keys() == {"Rejected", "Last", "PutOff"}
     for properties in queues.values():
         assert properties["SqsManagedSseEnabled"] is True
         assert properties["MessageRetentionPeriod"] == 14 * 86_400
@@ -173,7 +174,7 @@ def test_queues_are_encrypted_and_refuse_what_is_not_tls(synthesized, reader):
         assert statement["Condition"] == {"Bool": {"aws:SecureTransport": "false"}}
         assert statement["Principal"] == {"AWS": "*"}
         closed |= {reader.text(statement["Resource"])}
-    assert closed == {"Rejected.Arn", "Last.Arn"}
+    assert closed == {"Rejected.Arn", "Last.Arn", "PutOff.Arn"}
 
 
 def test_no_template_holds_a_password_an_account_or_a_path_of_this_machine(synthesized):

@@ -171,6 +171,18 @@ def test_the_chain_of_what_fails_ends(synthesized, reader):
     assert queues["Rejected"]["VisibilityTimeout"] >= 6 * 10
 
 
+def test_what_is_put_off_is_tried_again_and_then_quarantined(synthesized, reader):
+    mapping = mappings(synthesized, reader)["PutOff.Arn"]
+    assert reader.text(mapping["FunctionName"]) == "Later"
+    # A message has what one robot may take of an invocation; more of them would wait for each other.
+    assert (mapping["BatchSize"], mapping["ScalingConfig"]) == (1, {"MaximumConcurrency": 2})
+    queues = {name(k): v for k, v in synthesized.resources("AWS::SQS::Queue").items()}
+    redrive = queues["PutOff"]["RedrivePolicy"]
+    assert (reader.text(redrive["deadLetterTargetArn"]), redrive["maxReceiveCount"]) == ("Rejected.Arn", 5)
+    functions = {name(k): v for k, v in synthesized.resources("AWS::Lambda::Function").items()}
+    assert queues["PutOff"]["VisibilityTimeout"] >= 6 * functions["Later"]["Timeout"]
+
+
 def test_the_stream_never_blocks_for_good(synthesized, reader):
     mapping = mappings(synthesized, reader)["Batches.StreamArn"]
     assert reader.text(mapping["FunctionName"]) == "Summarize"

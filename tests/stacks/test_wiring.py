@@ -186,13 +186,14 @@ def test_what_the_variables_say_is_what_the_functions_expect(functions, reader, 
         assert variables["NAMESPACE"] == contract.DEFAULT_NAMESPACE
         return {key: reader.text(value) for key, value in variables.items() if key != "NAMESPACE"}
 
-    assert given("Summarize") == {
+    assert given("Later") == {
         "TELEMETRY_TABLE": "Batches",
         "SUMMARY_TABLE": "Summary",
         "ROBOTS_TABLE": "Robots",
         "REJECTED_QUEUE": "Rejected",
         "ROBOT_METRICS": "false",
     }
+    assert given("Summarize") == {**given("Later"), "PUT_OFF_QUEUE": "PutOff"}
     assert given("Query") == {
         "TELEMETRY_TABLE": "Batches",
         "ROBOTS_TABLE": "Robots",

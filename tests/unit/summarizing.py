@@ -7,7 +7,7 @@ from collections import defaultdict
 
 import contract
 from contract import Batch
-from functions.summarize import process
+from functions.processing import process
 from tests.fakes import (
     TELEMETRY,
     TOPIC_OF_CAR,
@@ -65,6 +65,9 @@ class Stream:
 
     def column(self, name):
         return {second - SECOND: item.get(name) for second, item in sorted(self.summary().items())}
+
+    def column_of(self, topic, name):
+        return [item.get(name) for _, item in sorted(self.summary(topic).items())]
 
 
 def counted(capsys):

@@ -230,6 +230,16 @@ def test_fairness_is_held_to_twice_the_delay_of_a_car_alone():
     assert section.tables[0].rows[1][:2] == ["bad messages", "80"]
 
 
+def test_summaries_beside_dear_batches_are_held_to_twice_the_delay_of_a_car_alone():
+    section = Section("fairness", "")
+    kinds = ("15 dear batches a second", "100 dear batches a second")
+    delays = ([[2000.0] * 40], [[3000.0] * 40], [[5000.0] * 20])
+    fairness.report_summaries(section, dict(zip(("nothing", *kinds), delays, strict=True)))
+    values = [(ratio.value, ratio.reached) for ratio in section.ratios]
+    assert values == [(1.5, True), (1.0, True), (2.5, False), (0.5, False)]
+    assert section.tables[0].rows[2][:2] == [kinds[1], "20"]
+
+
 def test_every_section_of_the_documentation_is_one_that_runs():
     from bench.machine import ROOT
 

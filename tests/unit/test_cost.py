@@ -76,13 +76,13 @@ def test_the_ratio_is_given_without_log_lines_too():
 
 def test_a_deployment_at_rest_pays_for_what_polls_watches_and_keeps():
     rest = deployment_dollars_per_month(_ONE)
-    # Five long polls of 20 s around the clock.
-    assert rest["polling the quarantine's queue"] == pytest.approx(657_000 * 0.40e-6)
-    assert rest["alarms"] == pytest.approx(1.4), "ten of 24 are free"
-    assert rest["alarms by Metrics Insights, at most"] == pytest.approx(4.6), "and none of those"
-    assert rest["metrics"] == pytest.approx((35 - 10) * 0.30)
-    # Twenty hours, twice a minute, 43 metrics each.
-    assert rest["metrics asked for by the live page"] == pytest.approx(20 * 120 * 43 * 0.00001)
+    # Five long polls of 20 s around the clock, of each of two queues.
+    assert rest["polling the queues"] == pytest.approx(2 * 657_000 * 0.40e-6)
+    assert rest["alarms"] == pytest.approx(1.6), "ten of 26 are free"
+    assert rest["alarms by Metrics Insights, at most"] == pytest.approx(4.8), "and none of those"
+    assert rest["metrics"] == pytest.approx((36 - 10) * 0.30)
+    # Twenty hours, twice a minute, 45 metrics each.
+    assert rest["metrics asked for by the live page"] == pytest.approx(20 * 120 * 45 * 0.00001)
     assert "key" not in rest
     assert deployment_dollars_per_month(replace(_ONE, customer_key=True))["key"] == 1.0
     fleet = deployment_dollars_per_month(replace(_ONE, robots=1000, device_defender=True))
@@ -104,7 +104,7 @@ def test_metrics_of_every_robot_are_billed_by_the_robot():
         usage = replace(_ONE, robots=robots, robot_metrics=True)
         rest = deployment_dollars_per_month(usage)
         assert rest["dashboards"] == billed * 3.0, "29 metrics and four a robot"
-        assert rest["metrics"] == pytest.approx((35 + 9 * robots - 10) * 0.30)
+        assert rest["metrics"] == pytest.approx((36 + 9 * robots - 10) * 0.30)
 
 
 def test_the_live_page_asks_as_often_as_the_model_says():

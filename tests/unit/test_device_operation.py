@@ -397,6 +397,19 @@ def test_status_of_an_agent_for_a_person() -> None:
     assert "last error: drive.bag: refused: not today" in text
 
 
+def test_status_says_that_the_robot_is_over_its_share() -> None:
+    from tests.unit.test_device_agent import Rig, drive
+
+    rig = Rig(drive)
+    assert rig.agent.run(drain_s=10) == 0
+    state = rig.agent.status()
+    assert "\nshare " not in render(state)
+    state["over_share"] = {"since_ms": 1_700_000_000_000, "last_ms": 1_700_000_060_000, "batches": 40}
+    assert "share     40 batch(es) over this robot's share of the cloud, the last at 22:14:20Z" in render(
+        state
+    )
+
+
 def test_status_says_what_became_of_what_the_sources_read() -> None:
     from tests.unit.test_device_agent import Rig, drive
 

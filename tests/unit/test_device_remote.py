@@ -194,6 +194,28 @@ def test_old_and_odd_messages_change_nothing() -> None:
     assert rig.applied[0].live_rate_hz == 3
 
 
+def test_a_robot_over_its_share_logs_it_once_and_takes_it_for_no_wish(
+    caplog: pytest.LogCaptureFixture,
+) -> None:
+    rig = Rig()
+    for batches in (1, 40):
+        rig.wish(over_share={"since_ms": 1000, "last_ms": 1000 + batches, "batches": batches})
+    assert rig.remote.over_share == {"since_ms": 1000, "last_ms": 1040, "batches": 40}
+    assert rig.shadow["reported"].get("rejected", {}) == {}
+    assert caplog.text.count("summaries are made later") == 1
+    rig.wish(over_share={"since_ms": 90_000, "last_ms": 90_000, "batches": 1})
+    assert caplog.text.count("summaries are made later") == 2
+
+
+@pytest.mark.parametrize(
+    "said",
+    [5, [], {"batches": 3}, {"since_ms": 1, "last_ms": 1e3, "batches": 1}]
+    + [{"since_ms": 1, "last_ms": last_ms, "batches": 1} for last_ms in (-1, 10**15, True)],
+)
+def test_odd_words_about_its_share_are_passed_over(said: Any) -> None:
+    assert Rig(over_share=said).remote.over_share is None
+
+
 def test_a_report_that_gets_no_answer_is_sent_again() -> None:
     rig = Rig()
     rig.uplink.verdict = lambda message: "no" if message.topic.endswith("/update") else None

@@ -359,14 +359,6 @@ def test_an_allowance_is_had_again_with_time_and_whatever_the_clock_does():
     assert cut_off.closed("car", -3600.0)
 
 
-def test_allowances_are_of_a_bounded_number_of_robots():
-    cut_off = CutOff()
-    for i in range(3000):
-        cut_off.refused(f"car{i}", 0.0)
-    assert len(cut_off._left) == 1000
-    assert "car2999" in cut_off._left
-
-
 def test_the_queue_is_that_of_the_environment(aws, monkeypatch):
     client = boto3.client("sqs")
     url = client.create_queue(QueueName="rejected")["QueueUrl"]

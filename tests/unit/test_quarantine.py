@@ -10,7 +10,7 @@ from botocore.exceptions import ClientError
 from hypothesis import given
 from hypothesis import strategies as st
 
-from contract import BY_FUNCTION, BY_RULE, BY_STREAM, NO_ROBOT, build_topic
+from contract import BY_FUNCTION, BY_LATER, BY_RULE, BY_STREAM, NO_ROBOT, PUT_OFF, RECORD, build_topic
 from functions.quarantine import Entry, Store, Stream, entries, process
 from functions.refusals import Refusals, Refused, message
 from tests.fakes import QUARANTINE, TOPIC_OF_CAR
@@ -385,3 +385,13 @@ def test_a_record_too_large_for_any_queue_is_told_by_its_key():
     assert json.loads(entry.payload) == {name: image(7)[name] for name in ("topic", "batch")}
     assert "telemetry table" in entry.reason
     assert "schema version 9" in entry.reason
+
+
+def test_batches_that_could_not_be_summarised_later_are_kept_by_their_keys():
+    topic = build_topic(RECORD, "car", "vesc")
+    body = json.dumps({PUT_OFF: [[topic, "0000000000000001-0badcafe-0"]]})
+    (entry,) = entries(body, list)
+    assert (entry.source, entry.robot, entry.payload) == (BY_LATER, "car", body.encode())
+    for odd in ({PUT_OFF: []}, {PUT_OFF: 5}, {PUT_OFF: [["a"]]}):
+        (entry,) = entries(json.dumps(odd), list)
+        assert "does not know" in entry.reason

@@ -8,8 +8,8 @@ import json
 import pytest
 
 from contract import Batch
-from functions.summarize import process
-from functions.summarize import recompute as summarize_again
+from functions.processing import process
+from functions.processing import recompute as summarize_again
 from station import recompute, robots
 from station.errors import StationError
 from station.recompute import Recomputed

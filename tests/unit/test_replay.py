@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 import json
+from types import SimpleNamespace
 
 import pytest
 
 import contract
-from contract import BY_RULE, BY_STREAM, Batch, build_topic
+from contract import BY_LATER, BY_RULE, BY_STREAM, Batch, build_topic
 from station.quarantine import Entry
 from station.replay import Fate, replay
 from tests.fakes import item_of, item_of_message
@@ -48,6 +49,34 @@ class FakeCloud:
 def replayed(*, dry_run=True, **payloads):
     listed = [Entry("car", name, source, TOPIC, "some", 1, 1, 1, 0) for name, (source, _) in payloads.items()]
     return list(replay(FakeCloud(payloads), listed, dry_run=dry_run))
+
+
+class Queues(FakeCloud):
+    """With the queue of what was put off."""
+
+    def __init__(self, payloads):
+        super().__init__(payloads)
+        self.sent, self.deleted = [], []
+        self.exceptions = SimpleNamespace(ConditionalCheckFailedException=KeyError)
+
+    def client(self, service):
+        assert service in {"dynamodb", "sqs"}
+        return self
+
+    def send_message(self, **message):
+        self.sent.append(message)
+
+    def delete_item(self, *, Key, **_):
+        self.deleted.append(Key["id"]["S"])
+
+
+def test_what_was_put_off_and_failed_waits_once_more():
+    body = json.dumps({contract.PUT_OFF: [[TOPIC, str(GOOD.id)]]})
+    cloud = Queues({"late": (BY_LATER, body.encode())})
+    listed = [Entry("car", "late", BY_LATER, TOPIC, "some", 1, 1, 1, 0)]
+    assert [outcome.fate for outcome in replay(cloud, listed)] == [Fate.REPLAYED]
+    assert cloud.sent == [{"QueueUrl": "PutOffQueue", "MessageBody": body, "MessageGroupId": "car"}]
+    assert cloud.deleted == ["late"]
 
 
 def outcomes(**payloads):

@@ -2,10 +2,14 @@
 
 from __future__ import annotations
 
+import io
+import json
+from types import SimpleNamespace
+
 import pytest
 
 from station.errors import StationError
-from station.shadow import State, _check_clock, answered, outcome
+from station.shadow import OverShare, State, _check_clock, answered, outcome, over_share
 
 REPORTED = {
     "live": {"enabled": True, "rate_hz": 10},
@@ -26,6 +30,39 @@ def test_what_is_in_force_and_what_is_refused():
     assert State(1, {"live": {"rate_hz": 5}, "log_level": "debug"}, {}).wished() == {
         "live.rate_hz": 5, "log_level": "debug",
     }  # fmt: skip
+
+
+class ShadowMissingError(Exception):
+    """The thing has no such shadow."""
+
+
+class Data:
+    """A cloud with one shadow, or none."""
+
+    exceptions = SimpleNamespace(ResourceNotFoundException=ShadowMissingError)
+
+    def __init__(self, desired):
+        self.desired = desired
+
+    def client(self, service):
+        assert service == "iot-data"
+        return self
+
+    def get_thing_shadow(self, *, thingName, shadowName):
+        assert (thingName, shadowName) == ("car", "agent")
+        if self.desired is None:
+            raise ShadowMissingError
+        return {"payload": io.BytesIO(json.dumps({"state": {"desired": self.desired}}).encode())}
+
+
+def test_what_the_cloud_said_of_a_share_is_no_wish():
+    said = {"since_ms": 1, "last_ms": 2, "batches": 3}
+    assert State(1, {"over_share": said, "log_level": "debug"}, {}).wished() == {"log_level": "debug"}
+    assert over_share(Data({"over_share": said}), "car") == OverShare(batches=3, since_ms=1, last_ms=2)
+    assert over_share(Data(None), "car") is None
+    # The robot can write there, too.
+    for odd in (None, [], {}, said | {"last_ms": 10**30}, said | {"batches": "3"}, said | {"since_ms": -1}):
+        assert over_share(Data({"over_share": odd}), "car") is None
 
 
 @pytest.mark.parametrize(

@@ -5,8 +5,8 @@ from __future__ import annotations
 import pytest
 
 from contract import Batch
+from functions.processing import process
 from functions.stored import SECOND_BATCHES, Reader
-from functions.summarize import process
 from tests.fakes import TOPIC_OF_CAR
 from tests.unit.summarizing import SECOND, T0, S, Stream, batch
 
@@ -101,7 +101,7 @@ def test_other_seconds_and_streams_are_as_ever(stream):
 
 def test_a_reader_says_which_seconds_are_full(stream):
     stream.store(*packed(MANY))
-    reader = Reader(stream.tables, TOPIC_OF_CAR, {})
+    reader = Reader(stream.tables, TOPIC_OF_CAR, {}, list)
     assert len(reader.read(SECOND, SECOND)) == SECOND_BATCHES + 1
     assert reader.full == {SECOND}
 

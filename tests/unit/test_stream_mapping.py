@@ -14,7 +14,7 @@ from hypothesis import strategies as st
 
 from contract import Batch
 from functions import tables as tables_module
-from functions.summarize import process
+from functions.processing import process
 from functions.tables import TableError
 from local.stream_mapping import Answer, Condition, Settings, Shard
 from tests.fakes import TELEMETRY, FakeDynamoDB, item_of, record_of, summary_of, tables

@@ -9,7 +9,7 @@ from decimal import Decimal
 import pytest
 
 from contract import EXPIRES_S, RECEIVED_MS
-from functions.summarize import process
+from functions.processing import process
 from tests.fakes import (
     EXPIRES,
     ROBOTS,

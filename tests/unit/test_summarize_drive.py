@@ -8,7 +8,7 @@ import pytest
 
 import contract
 from contract import Batch
-from functions import summarize
+from functions import processing, summarize
 from functions.tables import plain
 from tests.fakes import (
     NAMES,
@@ -31,15 +31,15 @@ def test_the_handler_against_the_tables_of_the_template(dynamodb, monkeypatch, c
     ]
     order = list(drive)
     random.Random(1).shuffle(order)
-    summarize._tables.cache_clear()
-    summarize._refusals.cache_clear()
+    processing.stored_tables.cache_clear()
+    processing._refusals.cache_clear()
     try:
         for start in range(0, len(order), 13):
             records = stream.store(*order[start : start + 13])
             assert summarize.handler({"Records": records}, None) == {"batchItemFailures": []}
     finally:
-        summarize._tables.cache_clear()
-        summarize._refusals.cache_clear()
+        processing.stored_tables.cache_clear()
+        processing._refusals.cache_clear()
     items = [contract.flat_second(plain(item)) for item in dynamodb.scan(TableName=SUMMARY)["Items"]]
     assert sum(item["n"] for item in items) == 39 * 50
     by_second = {int(item["second"]) - SECOND: item for item in items}

@@ -12,7 +12,7 @@ import pytest
 import contract
 from contract import BatchId
 from functions import tables as tables_module
-from functions.summarize import process
+from functions.processing import process
 from functions.tables import TableError
 from tests.fakes import (
     ROBOTS,

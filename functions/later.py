@@ -1,0 +1,42 @@
+"""Batches that Lambda 2 put off, since their robot was over its share: summarised here, beside the others.
+
+A message says which batches, and the telemetry table has them. What becomes of them is what Lambda 2 would
+have made of them; a message that fails comes again.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+from contract import BATCH, TOPIC
+from functions.processing import processed, stored_tables
+from functions.share import waiting
+from functions.tables import Tables
+
+
+class LaterError(Exception):
+    """Batches that can be neither summarised nor put into quarantine now."""
+
+
+def records(tables: Tables, body: str) -> list[dict[str, Any]]:
+    """The stream's records of the batches that a message names, as far as the table still has them."""
+    found: list[dict[str, Any]] = []
+    for number, (topic, batch) in enumerate(waiting(body)):
+        item = tables.item(topic, batch)
+        if item is not None:
+            change: dict[str, Mapping[str, Any] | str] = {
+                "Keys": {name: item[name] for name in (TOPIC, BATCH)},
+                "NewImage": item,
+                "SequenceNumber": str(number),
+            }
+            found.append({"eventID": "later", "eventName": "INSERT", "dynamodb": change})
+    return found
+
+
+def handler(event: dict[str, Any], _context: object) -> None:
+    """Entry point of the queue's mapping, which gives one message at a time."""
+    for message in event["Records"]:
+        again = {"Records": records(stored_tables(), message["body"])}
+        if failed := processed(again, beside_others=True)["batchItemFailures"]:
+            raise LaterError(f"the quarantine's queue did not take {len(failed)} batches")

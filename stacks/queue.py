@@ -1,0 +1,29 @@
+"""A queue of ours: encrypted, over TLS alone, and for as long as AWS keeps messages."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from aws_cdk import CfnOutput, Duration, Stack
+from aws_cdk import aws_sqs as sqs
+
+from stacks.encryption import Encryption
+from stacks.settings import Settings
+
+
+def queue(
+    stack: Stack, name: str, *, settings: Settings, encryption: Encryption, **properties: Any
+) -> sqs.Queue:
+    """The stack puts its address out as ``<name>Queue``."""
+    made = sqs.Queue(
+        stack,
+        name,
+        enforce_ssl=True,
+        # The longest there is.
+        retention_period=Duration.days(14),
+        removal_policy=settings.removal_policy,
+        **properties,
+        **encryption.queue,
+    )
+    CfnOutput(stack, f"{name}Queue", value=made.queue_url)
+    return made

@@ -1,0 +1,65 @@
+"""A robot over its share of Lambda 2: no other robot waits for it, nothing of it is lost, and it is told."""
+
+from __future__ import annotations
+
+import json
+import threading
+import time
+
+import pytest
+
+import contract
+from bench.dear import dearest
+from contract import SECOND, VESC_STREAM, Batch, record_topic
+from station import delivery, shadow
+from station.items import of_topic
+from tests.local.conftest import until
+from tests.local.robot import Robot
+
+S = 1_000_000
+GOOD = 8
+
+
+def seconds_of(embedded, robot):
+    """The summarised seconds of a robot, in the order in which they are read."""
+    pages = (
+        embedded.cloud.client("dynamodb")
+        .get_paginator("query")
+        .paginate(**of_topic(embedded.cloud, "SummaryTable", robot, VESC_STREAM, SECOND), ConsistentRead=True)
+    )
+    return [int(item[SECOND]["N"]) for page in pages for item in page["Items"]]
+
+
+@pytest.mark.parametrize(("rate_hz", "count"), [(15, 40), (100, 80)])
+def test_dear_batches_of_one_robot_wait_and_those_of_the_others_do_not(
+    embedded, bundle, iort, rate_hz, count
+):
+    bad, good = bundle("bad"), bundle("good")
+    messages = list(dearest(count))
+    topics = {car: record_topic(car.robot, VESC_STREAM, embedded.namespace) for car in (bad, good)}
+    t_us = int(time.time()) * S
+    with Robot(bad.folder) as hostile, Robot(good.folder) as other:
+        hostile.online()
+        other.online()
+        began, waiting = time.monotonic(), threading.Event()
+        for n, message in enumerate(messages):
+            hostile.publish(topics[bad], message)
+            if n % (count // GOOD) == 0:
+                seq = n // (count // GOOD)
+                batch = Batch("0badcafe", seq, [t_us + seq * S], {"speed": [seq]})
+                other.publish(topics[good], contract.encode(batch))
+            waiting.wait(max(0.0, began + (n + 1) / rate_hz - time.monotonic()))
+    first = t_us // S
+    expected = list(range(first, first + len(range(0, count, count // GOOD))))
+    until(lambda: len(seconds_of(embedded, good.robot)) == len(expected))
+    assert seconds_of(embedded, good.robot) == expected
+    over = until(lambda: shadow.over_share(embedded.cloud, bad.robot))
+    assert over.batches > 0
+    assert shadow.over_share(embedded.cloud, good.robot) is None
+    shown = json.loads(iort("robots", "show", bad.robot, "--json").stdout)
+    assert shown[contract.OVER_SHARE]["batches"] >= over.batches
+    stored = list(delivery.batches(embedded.cloud, bad.robot, VESC_STREAM))
+    assert [batch.seq for batch in stored] == list(range(count))
+    # It has stopped: what waited is summarised without anybody's doing.
+    until(lambda: len(seconds_of(embedded, bad.robot)) >= count, seconds=600)
+    assert [s - first for s in seconds_of(embedded, good.robot)] == list(range(len(expected)))
