@@ -147,6 +147,19 @@ UNASKED = (
         "stacks/storage.py",
     ),
     _documented(
+        "iot.shadow_resource",
+        "A policy names a named shadow as a level of its thing: thing/<thing>/<shadow>.",
+        f"{_IOT}/iot-action-resources.html",
+        "stacks/processing.py",
+        "local/stream_gap.py",
+    ),
+    _documented(
+        "sqs.fair_queues",
+        "In a standard queue no group of messages (MessageGroupId) waits long behind another.",
+        "https://docs.aws.amazon.com/AWSSimpleQueueService/latest/SQSDeveloperGuide/sqs-fair-queues.html",
+        "functions/share.py",
+    ),
+    _documented(
         "iot.rule_roles",
         "A rule's action runs as the role that the rule names; the emulator runs it without.",
         f"{_IOT}/iot-create-role.html",

@@ -264,3 +264,11 @@ def test_the_messages_of_provisioning_are_those_of_aws_client() -> None:
 def camel(name: str) -> str:
     first, *rest = name.split("_")
     return first + "".join(map(str.capitalize, rest))
+
+
+@pytest.mark.parametrize(
+    "name", [contract.OVER_SHARE, contract.PUT_OFF, contract.PUT_OFF_SINCE_MS, contract.PUT_OFF_LAST_MS]
+)
+def test_what_the_cloud_writes_into_the_shadow_is_on_the_page(name: str) -> None:
+    section = PAGE.split("\n## The shadow\n")[1].split("\n## ")[0]
+    assert f"`{name}`" in section
