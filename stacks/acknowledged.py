@@ -13,6 +13,7 @@ from typing import Any
 from aws_cdk import Acknowledgment, App, CfnResource, Stack, Validations
 from constructs import IConstruct
 
+from contract import SHADOW
 from stacks.settings import Settings
 
 _NAG_PACKS = ("AwsSolutions", "Serverless")
@@ -174,7 +175,13 @@ def single(settings: Settings) -> dict[str, dict[str, str]]:
         },
         "processing/SummarizeRole/DefaultPolicy": {
             wide("*"): "dynamodb:ListStreams knows no resources; the CDK grants it with the stream",
+            wide(f"{iot}:thing/*/{SHADOW}"): f"{a_robot}; of its shadows this one alone",
             **to_a_queue,
+        },
+        "processing/LaterRole/DefaultPolicy": {**to_a_queue},
+        "processing/PutOffs": {
+            "Serverless-LambdaEventSourceMappingDestination": "as quarantine/Rejections: its dead-letter "
+            "queue is the quarantine's"
         },
         "quarantine/Rejections": {
             "Serverless-LambdaEventSourceMappingDestination": "a queue's mapping knows none; what fails five "
