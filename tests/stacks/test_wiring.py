@@ -35,7 +35,18 @@ from stacks.settings import ROOT, Settings, SettingsError
 from tests.stacks.templates import name
 from tests.stacks.test_dashboards import FUNCTIONS
 
-HANDLERS = ("Live", "Summarize", "Echo", "Upload", "Query", "Admit", "Presence", "Quarantine", "Alert")
+HANDLERS = (
+    "Live",
+    "Summarize",
+    "Echo",
+    "Upload",
+    "Query",
+    "Admit",
+    "Presence",
+    "Quarantine",
+    "Alert",
+    "Later",
+)
 CONTRACT = sorted((ROOT / "contract").rglob("*.py"))
 # Lambda's Python has boto3 and what boto3 needs.
 RUNTIME_PACKAGES = ("boto3", "botocore", "dateutil", "jmespath", "s3transfer", "six", "urllib3")
