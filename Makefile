@@ -91,8 +91,8 @@ lock: setup ## compile requirements/*.in to the locked *.txt
 	@$(BIN)/uv pip compile --quiet --universal --generate-hashes --no-emit-index-url --python-version 3.10 \
 		requirements/checkov.in -o requirements/checkov.txt
 	@$(BIN)/uv pip compile --quiet --generate-hashes --no-emit-index-url --python-version 3.8.10 \
-		requirements/oldest.in -o requirements/oldest.txt
+		--no-emit-package iort-agent --no-emit-package iort-contract requirements/oldest.in -o requirements/oldest.txt
 
 clean: ## remove what was made
 	find . -name __pycache__ -type d -prune -exec rm -rf {} +
-	rm -rf .venv node_modules build cdk.out *.egg-info station/*.egg-info .mypy_cache .ruff_cache .pytest_cache .hypothesis
+	rm -rf .venv node_modules build cdk.out */*.egg-info */build station/iort_station/page/built .mypy_cache .ruff_cache .pytest_cache .hypothesis

@@ -30,10 +30,11 @@ from rich.table import Table
 from bench import live_lane, mosquitto, usage
 from bench.errors import BenchError
 from bench.ros_graph import RosError, RosGraph, python_with_rospy
+from iort_station.cloud import Cloud
+from iort_station.fleet import robots
+from iort_station.operations import delivery
 from local.cloud import EmbeddedCloud
 from local.errors import LocalError
-from station import delivery, robots
-from station.cloud import Cloud
 
 TOPIC = "/sensors/core"
 RATES_HZ = (50, 1000)
@@ -97,7 +98,7 @@ def _measure(cloud: Cloud, python: str, rate_hz: int, seconds: int) -> Run:
         bundle = robots.add(
             cloud, robot, out=folder, settings={"sources": [source], "queue": {"path": "spool.db"}}
         )
-        agent = graph.start("device.main", "run", "--config", bundle.config)
+        agent = graph.start("iort_agent.cli", "run", "--config", bundle.config)
         floor = graph.start("bench.ros_floor", TOPIC)
         publisher = graph.publisher(TOPIC, rate_hz, count)
         publisher.begin()

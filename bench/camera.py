@@ -6,12 +6,12 @@ import base64
 import io
 import math
 
-import contract
+import iort_contract
 
 _WIDTH, _HEIGHT, _HORIZON = 96, 54, 20
 
 
-def claim(robot: str, driven_m: float, yaw_rate_rad_s: float) -> dict[str, contract.Value]:
+def claim(robot: str, driven_m: float, yaw_rate_rad_s: float) -> dict[str, iort_contract.Value]:
     """A sample of a camera topic with ``large: upload``; the key is one that the agent would give."""
     content = _jpeg(driven_m, yaw_rate_rad_s)
     return {

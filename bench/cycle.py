@@ -17,14 +17,14 @@ from pathlib import Path
 from statistics import quantiles
 
 from bench.ros_message import DEFINITION, TYPE, body
-from device.agent import Agent
-from device.clock import SystemClock
-from device.config import Config, QueueConfig
-from device.dispatch import Dispatcher
-from device.loopback import Loopback
-from device.sources.ros1 import Intake, TopicConfig
-from device.sources.sim import SimConfig
-from device.sqlite_spool import make_spool
+from iort_agent.agent import Agent
+from iort_agent.clock import SystemClock
+from iort_agent.config.file import Config, QueueConfig
+from iort_agent.dispatch import Dispatcher
+from iort_agent.mqtt.loopback import Loopback
+from iort_agent.sources.ros1 import Intake, TopicConfig
+from iort_agent.sources.sim import SimConfig
+from iort_agent.spool.sqlite import make_spool
 
 
 def main() -> None:

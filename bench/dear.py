@@ -20,7 +20,7 @@ from typing import NamedTuple
 from rich.console import Console
 from rich.table import Table
 
-from contract import (
+from iort_contract import (
     BATCH,
     CODEC,
     DICTIONARY,
@@ -32,7 +32,7 @@ from contract import (
     decode,
     encode,
 )
-from functions.statistics import summarize_second
+from iort_contract.statistics import summarize_second
 
 _BOOT, _T_US = "0badcafe", 1_700_000_000_000_000
 _TIMES = 5

@@ -10,8 +10,18 @@ from typing import Any
 from boto3.dynamodb.types import TypeSerializer
 
 from bench.target import Target
-from contract import EXPIRES_S, RECEIVED_MS, RECORD, TOPIC, VESC_STREAM, Batch, Value, build_topic, encode
-from device.sources.vehicle import Vehicle, VehicleConfig
+from iort_agent.sources.vehicle import Vehicle, VehicleConfig
+from iort_contract import (
+    EXPIRES_S,
+    RECEIVED_MS,
+    RECORD,
+    TOPIC,
+    VESC_STREAM,
+    Batch,
+    Value,
+    build_topic,
+    encode,
+)
 
 RATE_HZ = 50
 _KEPT_S = 86_400

@@ -14,7 +14,7 @@ from typing_extensions import Self
 
 from bench.errors import BenchError
 from bench.machine import ROOT
-from station.robots import Bundle
+from iort_station.fleet.robots import Bundle
 
 _COMMAND = str(Path(sys.executable).parent / "iort-agent")
 _END_S = 120.0

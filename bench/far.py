@@ -19,12 +19,12 @@ from bench.result import NOT_MEASURED, Plot, Ratio, Section, Table
 from bench.spread import ratio, spread
 from bench.target import Say, Target
 from bench.thesis import PING_MS, SOURCE
-from contract import BROKER, PING_PATHS, T_US, VESC_STREAM
+from iort_contract import BROKER, PING_PATHS, T_US, VESC_STREAM
+from iort_station.fleet.robots import Bundle
+from iort_station.page import keys
+from iort_station.page.listener import Listener
 from local.figures import THESIS, THESIS_MS
 from local.proxy import Proxy
-from station import keys
-from station.listener import Listener
-from station.robots import Bundle
 
 ONE_WAY_S = PING_MS / 2 / 1000
 WITH = f"with {ONE_WAY_S * 1000:.0f} ms each way"

@@ -9,9 +9,9 @@ from dataclasses import dataclass
 from typing import Any
 
 from bench.fleet_load import SAMPLES as BATCH_SAMPLES
-from contract import BATCH, RECEIVED_MS, SAMPLES, SECOND, VESC_STREAM, batch_id
-from station.cloud import Cloud
-from station.items import of_topic, plain
+from iort_contract import BATCH, RECEIVED_MS, SAMPLES, SECOND, VESC_STREAM, batch_id
+from iort_station.cloud import Cloud
+from iort_station.data.items import of_topic, plain
 
 # Hears the share done, and of what.
 Tell = Callable[[float, str], None]

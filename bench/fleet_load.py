@@ -20,8 +20,8 @@ from typing import Any
 from awscrt import mqtt5
 from awsiot import mqtt5_client_builder
 
-from contract import VESC_STREAM, Batch, Value, encode, record_topic
-from device.sources.vehicle import Vehicle, VehicleConfig
+from iort_agent.sources.vehicle import Vehicle, VehicleConfig
+from iort_contract import VESC_STREAM, Batch, Value, encode, record_topic
 
 Columns = dict[str, list[Value]]
 SAMPLES = 50

@@ -21,13 +21,13 @@ from bench.errors import BenchError
 from bench.fleet_arrivals import Tell, stored, summarized
 from bench.fleet_load import SAMPLES as BATCH_SAMPLES
 from bench.fleet_load import Load
-from contract import SECOND, VESC_STREAM
+from iort_contract import SECOND, VESC_STREAM
+from iort_station.cloud import Cloud
+from iort_station.data.items import of_topic
+from iort_station.fleet import robots
 from local.cloud import EmbeddedCloud
 from local.deployment import ROOT
 from local.figures import Spread
-from station import robots
-from station.cloud import Cloud
-from station.items import of_topic
 
 
 @dataclass(frozen=True)

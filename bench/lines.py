@@ -12,14 +12,14 @@ from typing_extensions import Self
 
 from bench.errors import BenchError
 from bench.raw_mqtt import RawClient
-from contract import BROKER, PING, PONG, RTT_FIELDS, Value, build_topic, encode_ping
-from device.allowance import Allowance
-from device.clock import SystemClock
-from device.config import load_config
-from device.dispatch import Dispatcher
-from device.iotcore import IotCore
-from device.pings import Pings
-from station.robots import Bundle
+from iort_agent.clock import SystemClock
+from iort_agent.config.file import load_config
+from iort_agent.dispatch import Dispatcher
+from iort_agent.lanes.pings import Pings
+from iort_agent.lanes.rate_limiter import Allowance
+from iort_agent.mqtt.aws import IotCore
+from iort_contract import BROKER, PING, PONG, RTT_FIELDS, Value, build_topic, encode_ping
+from iort_station.fleet.robots import Bundle
 
 RAW = "raw client"
 # What a ping has besides its padding, about.

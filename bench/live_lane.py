@@ -16,7 +16,7 @@ import yaml
 from bench.mosquitto import HOST, Mosquitto
 from bench.ros_graph import RosGraph
 from bench.watcher import listening, live_us
-from contract import LIVE, LIVE_MAX_RATE_HZ, VESC_STREAM, build_topic, live_topic
+from iort_contract import LIVE, LIVE_MAX_RATE_HZ, VESC_STREAM, build_topic, live_topic
 from local.figures import Spread
 
 TOPIC = "/sensors/core"
@@ -56,7 +56,7 @@ def measure(program: str, python: str, rate_hz: int, seconds: int) -> Lane:
             ca=broker.ca,
             took_us={**dict.fromkeys(_AGENT, live_us), _FLOOR: _stamp_us},
         ) as heard:
-            graph.start("device.main", "run", "--config", _car(broker, Path(name)))
+            graph.start("iort_agent.cli", "run", "--config", _car(broker, Path(name)))
             every = max(1, round(rate_hz / LIVE_MAX_RATE_HZ))
             graph.start("bench.mqtt_floor", TOPIC, every, broker.port, *broker.identity("floor"), broker.ca,
                         _FLOOR)  # fmt: skip

@@ -27,9 +27,9 @@ from rich.table import Table
 
 from bench import chromium
 from bench.errors import BenchError
+from iort_station.fleet.robots import F1TENTH
+from iort_station.page.server import PageServer
 from local.pubnub_standin import PubNubStandIn
-from station.page_server import PageServer
-from station.robots import F1TENTH
 
 # Of a processor: the page is to leave the rest to whoever looks at it.
 MAX_BUSY = 0.30

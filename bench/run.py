@@ -28,11 +28,11 @@ from bench.interrupts import wound_up
 from bench.result import Section
 from bench.sections import SECTIONS
 from bench.target import AWS, EMBEDDED, Target, open_target
-from contract import DEFAULT_NAMESPACE
+from iort_contract import DEFAULT_NAMESPACE
+from iort_station.cloud import Cloud
+from iort_station.cost.prices import AS_OF, REGION
+from iort_station.errors import StationError
 from local.errors import LocalError
-from station.cloud import Cloud
-from station.errors import StationError
-from station.prices import AS_OF, REGION
 
 OUT = machine.ROOT / "build" / "bench"
 

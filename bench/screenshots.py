@@ -22,11 +22,11 @@ from typing import Any, Literal
 from bench import chromium
 from bench.cars import Publisher, SimulatedCar, drive
 from bench.errors import BenchError
+from iort_station.fleet import robots
+from iort_station.page.answers import answers
+from iort_station.page.server import PageServer
 from local.cloud import EmbeddedCloud
 from local.deployment import ROOT
-from station import robots
-from station.answers import answers
-from station.page_server import PageServer
 
 OUT = ROOT / "docs" / "images"
 DRIVE_S = 100

@@ -7,12 +7,12 @@ from itertools import product
 from math import ceil
 
 from bench.sections import dashboard, outage, query, round_trips, utilisation
-from contract import PING_PATHS
-from device.allowance import BYTES_PER_S
-from station import cost, cost_items
-from station.cloud import Cloud
-from station.cost_items import Item
-from station.usage import Usage
+from iort_agent.lanes.rate_limiter import BYTES_PER_S
+from iort_contract import PING_PATHS
+from iort_station.cloud import Cloud
+from iort_station.cost import line_items, model
+from iort_station.cost.line_items import Item
+from iort_station.cost.usage import Usage
 
 # AWS' units: a message and an action are metered by 5 KB, writes by 1 KB, reads by 4 KB and by half where
 # they need not be consistent.
@@ -33,7 +33,7 @@ def estimate(cloud: Cloud, sections: Sequence[str]) -> dict[str, float]:
         "abilities": _abilities,
         "outage": lambda: _driven(outage.BEFORE_S + outage.CUT_S + outage.AFTER_S),
     }
-    return {key: cost_items.total(counted[key]()) for key in sections if key in counted}
+    return {key: line_items.total(counted[key]()) for key in sections if key in counted}
 
 
 def _round_trips() -> list[Item]:
@@ -57,7 +57,7 @@ def _round_trips() -> list[Item]:
 
 def _driven(seconds: float) -> list[Item]:
     hours = seconds / 3600
-    items = cost.bill(Usage(ping_hz=1, agent_every_s=1))
+    items = model.bill(Usage(ping_hz=1, agent_every_s=1))
     return [item._replace(units=item.units * hours) for item in items]
 
 

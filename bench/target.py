@@ -12,12 +12,13 @@ from typing import Any
 
 from botocore.exceptions import BotoCoreError, ClientError
 
-from contract import DEFAULT_NAMESPACE
+from iort_contract import DEFAULT_NAMESPACE
+from iort_station.cloud import Cloud
+from iort_station.errors import StationError
+from iort_station.fleet import robots
+from iort_station.page import keys
+from iort_station.page.listener import Listener
 from local.cloud import EmbeddedCloud
-from station import keys, robots
-from station.cloud import Cloud
-from station.errors import StationError
-from station.listener import Listener
 
 EMBEDDED, AWS = "embedded", "aws"
 Say = Callable[[str], None]

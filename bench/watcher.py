@@ -12,8 +12,8 @@ from awscrt import mqtt5
 from awsiot import mqtt5_client_builder
 
 from bench.errors import BenchError
-from contract import decode_live
-from device.uplink import matches
+from iort_agent.mqtt.uplink import matches
+from iort_contract import decode_live
 
 NAME = "bench-watcher"
 _WAIT_S = 20.0

@@ -18,7 +18,8 @@ from typing import Any, NamedTuple
 import botocore.session
 from botocore.config import Config
 
-from contract import (
+from functions.shared.metrics import emit
+from iort_contract import (
     ADMIT_CLAIM,
     ADMIT_FINGERPRINT,
     ADMIT_UNTIL_S,
@@ -32,7 +33,6 @@ from contract import (
     ContractError,
     check_robot,
 )
-from functions.metrics import emit
 
 _log = logging.getLogger(__name__)
 
@@ -142,7 +142,7 @@ def reason(row: Mapping[str, Any], event: Mapping[str, Any], now_ms: int) -> str
 
 
 def _claim_id(event: Mapping[str, Any]) -> str:
-    """The claim's id, as `station.claims` writes it: AWS allows 0x before the hex, and capitals in it."""
+    """The claim's id, as the station writes it: AWS allows 0x before the hex, and capitals in it."""
     claim = _text(event, "claimCertificateId")
     return claim.lower().removeprefix("0x")
 

@@ -17,7 +17,8 @@ from typing import Any, TypeGuard
 
 import boto3
 
-from contract import (
+from functions.shared.metrics import emit
+from iort_contract import (
     ALERT_PREFIX,
     FAULT_FIELD,
     FAULTS,
@@ -27,7 +28,6 @@ from contract import (
     VOLTAGE_FIELD,
     parse_topic,
 )
-from functions.metrics import emit
 
 QUIET_S = 900
 
@@ -112,7 +112,7 @@ def process(
 ) -> None:
     """Tell of each cause that it is time for. Raises what ``notify`` raises, and leaves no trace of it.
 
-    Raises `contract.ContractError` for a topic that is not one of ours.
+    Raises `iort_contract.ContractError` for a topic that is not one of ours.
     """
     topic = parse_topic(event[TOPIC])
     when = datetime.fromtimestamp(int(event[RECEIVED_MS]) / 1000, timezone.utc)

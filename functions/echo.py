@@ -9,7 +9,8 @@ from typing import Any
 
 import boto3
 
-from contract import (
+from functions.shared.metrics import emit
+from iort_contract import (
     LAMBDA,
     PING_FIELDS,
     PONG,
@@ -20,13 +21,12 @@ from contract import (
     json_object,
     parse_topic,
 )
-from functions.metrics import emit
 
 
 def pong(event: Mapping[str, Any]) -> tuple[str, bytes]:
     """The topic and payload of the answer: the ping's fields and the cloud's ``received_ms``.
 
-    Raises `contract.ContractError` for a topic that is not one of ours, and for a message that is no ping.
+    Raises `ContractError` for a topic that is not one of ours, and for a message that is no ping.
     """
     topic = parse_topic(event[TOPIC])
     ping = json_object(event_message(event), "ping")

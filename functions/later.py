@@ -9,10 +9,10 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any
 
-from contract import BATCH, TOPIC
-from functions.processing import processed, stored_tables
-from functions.share import waiting
-from functions.tables import Tables
+from functions.shared.processing import processed, stored_tables
+from functions.shared.share import waiting
+from functions.shared.tables import Tables
+from iort_contract import BATCH, TOPIC
 
 
 class LaterError(Exception):

@@ -11,7 +11,12 @@ from dataclasses import dataclass, replace
 from functools import cache
 from typing import Any
 
-from contract import (
+from functions.shared.cut_off import CutOff
+from functions.shared.dead_letter import Refusals, refused_event
+from functions.shared.delay_estimator import Legs
+from functions.shared.metrics import Gathered, emit
+from functions.shared.pubnub_client import PublishError, PubNubPublisher
+from iort_contract import (
     LIVE_MAX_AGE_MS,
     RECEIVED_MS,
     TOPIC,
@@ -24,11 +29,6 @@ from contract import (
     live_update,
     parse_topic,
 )
-from functions.cut_off import CutOff
-from functions.legs import Legs
-from functions.metrics import Gathered, emit
-from functions.pubnub_client import PublishError, PubNubPublisher
-from functions.refusals import Refusals, refused_event
 
 _log = logging.getLogger(__name__)
 _log.setLevel(logging.INFO)

@@ -15,7 +15,8 @@ from typing import Any
 
 import boto3
 
-from contract import (
+from functions.shared.metrics import emit
+from iort_contract import (
     AGENT_VERSION,
     CERTIFICATE_ID,
     CONNECTED_MS,
@@ -28,7 +29,6 @@ from contract import (
     ContractError,
     check_robot,
 )
-from functions.metrics import emit
 
 _log = logging.getLogger(__name__)
 

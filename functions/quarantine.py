@@ -22,7 +22,9 @@ from typing import Any
 import boto3
 from botocore.exceptions import BotoCoreError, ClientError
 
-from contract import (
+from functions.shared.metrics import emit
+from functions.shared.share import waiting
+from iort_contract import (
     BY_FUNCTION,
     BY_LATER,
     BY_RULE,
@@ -45,8 +47,6 @@ from contract import (
     as_subscribed,
     event_message,
 )
-from functions.metrics import emit
-from functions.share import waiting
 
 _log = logging.getLogger(__name__)
 _log.setLevel(logging.INFO)
@@ -70,7 +70,7 @@ class Entry:
 
     @property
     def robot(self) -> str:
-        """The robot that the topic names; `contract.NO_ROBOT` where it names none."""
+        """The robot that the topic names; `iort_contract.NO_ROBOT` where it names none."""
         levels = self.topic.split("/")
         return levels[2] if len(levels) >= 3 and levels[0] in LANES and levels[2] else NO_ROBOT
 

@@ -22,7 +22,8 @@ from typing import Any
 import boto3
 from botocore.config import Config
 
-from contract import (
+from functions.shared.tables import Tables, plain
+from iort_contract import (
     BATCH,
     DERIVED_UNITS,
     MAX_BATCH_SPAN_US,
@@ -35,12 +36,11 @@ from contract import (
     batches_between,
     build_topic,
     decode,
+    expression,
     parse_topic,
 )
-from functions import expression
-from functions.expression import ExpressionError, MismatchError, Node
-from functions.statistics import derive, without_absent
-from functions.tables import Tables, plain
+from iort_contract.expression import ExpressionError, MismatchError, Node
+from iort_contract.statistics import derive, without_absent
 
 # Lambda's synchronous answer holds 6 MB; the envelope around the samples is some hundred bytes.
 MAX_INLINE_BYTES = 5_500_000

@@ -12,9 +12,9 @@ from typing import Any
 import boto3
 from botocore.config import Config
 
-from contract import RECOMPUTE_FROM_S, REPLAY
-from functions.processing import Bounds, processed, recompute, stored_tables
-from functions.share import PutOff, Share, Told
+from functions.shared.processing import Bounds, processed, recompute, stored_tables
+from functions.shared.share import PutOff, Share, Told
+from iort_contract import RECOMPUTE_FROM_S, REPLAY
 
 
 # Most environments never put anything off, and need no client for it.

@@ -12,7 +12,11 @@ from typing import Any
 import boto3
 from botocore.config import Config
 
-from contract import (
+from functions.shared.bucket import Bucket, parts_sha256
+from functions.shared.dead_letter import Refusals, refused_event
+from functions.shared.metrics import emit
+from functions.shared.upload_quota import Allotment
+from iort_contract import (
     FILE,
     PONG,
     TOPIC,
@@ -29,10 +33,6 @@ from contract import (
     json_object,
     parse_topic,
 )
-from functions.allotment import Allotment
-from functions.bucket import Bucket, parts_sha256
-from functions.metrics import emit
-from functions.refusals import Refusals, refused_event
 
 _log = logging.getLogger(__name__)
 _log.setLevel(logging.INFO)

@@ -30,7 +30,7 @@ from typing import Any
 
 from typing_extensions import Self
 
-from contract import (
+from iort_contract import (
     DEFAULT_NAMESPACE,
     FILE,
     LAMBDA,
@@ -42,14 +42,14 @@ from contract import (
     encode_ping,
     rule_event,
 )
+from iort_station.cloud import EMBEDDED, Cloud, without_proxy
+from iort_station.page import keys
+from iort_station.page.keys import PubNubKeys
 from local.certificates import Identity
 from local.deployment import ROOT, deploy
 from local.errors import LocalError
 from local.processes import Child
 from local.pubnub_standin import PubNubStandIn
-from station import keys
-from station.cloud import EMBEDDED, Cloud, without_proxy
-from station.keys import PubNubKeys
 
 FOLDER = EMBEDDED.parent
 

@@ -20,20 +20,21 @@ from typing import Any, NoReturn
 from botocore.exceptions import BotoCoreError, ClientError
 from rich.console import Console
 
-from contract import OWN_STREAMS, PING_PATHS, RTT_STREAM, VESC_STREAM
-from device.clock import SystemClock
-from device.errors import SourceError
-from device.sources.bag import BagConfig, BagSource
+from iort_agent.clock import SystemClock
+from iort_agent.errors import SourceError
+from iort_agent.sources.recording.bag import BagConfig, BagSource
+from iort_contract import OWN_STREAMS, PING_PATHS, RTT_STREAM, VESC_STREAM
+from iort_station.errors import StationError
+from iort_station.fleet import robots
+from iort_station.operations import delivery
+from iort_station.page.answers import answers
+from iort_station.page.listener import Listener
+from iort_station.page.server import PageServer
 from local.cloud import FOLDER, EmbeddedCloud
 from local.deployment import ROOT
 from local.errors import LocalError
 from local.figures import Figures, Spread, round_trips
 from local.processes import Child
-from station import delivery, robots
-from station.answers import answers
-from station.errors import StationError
-from station.listener import Listener
-from station.page_server import PageServer
 
 ROBOT = "car1"
 _SOURCE_RATE_HZ = 50

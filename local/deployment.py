@@ -10,16 +10,16 @@ import sys
 from collections.abc import Callable
 from pathlib import Path
 
+from iort_station.cloud import Cloud
 from local.errors import LocalError
 from local.processes import run
-from station.cloud import Cloud
 
 ROOT = Path(__file__).resolve().parent.parent
 _ACCOUNT = "000000000000"
 _STEP_S = 180.0
 # What a synthesized assembly is made of: the same again is deployed as it is.
 _MADE_OF = ("app.py", "cdk.json", "requirements/dev.txt", "requirements/layer.txt", "scripts/layer.py")
-_MADE_OF_FOLDERS = ("stacks", "functions", "contract")
+_MADE_OF_FOLDERS = ("stacks", "functions", "contract/iort_contract")
 _KEPT = 4
 
 

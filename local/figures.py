@@ -9,7 +9,7 @@ from typing import Any
 
 from rich.table import Table
 
-from contract import BROKER, LAMBDA, PING_PATHS, RTT_FIELDS, RULE, Batch
+from iort_contract import BROKER, LAMBDA, PING_PATHS, RTT_FIELDS, RULE, Batch
 
 # Round trips and the way to the dashboard in ms, measured in 2018 from a car in Stockholm to AWS in Dublin,
 # a ping of 50 ms away (KTH thesis of 2018, table 6.4).

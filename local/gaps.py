@@ -41,7 +41,7 @@ from typing import Any
 from ministack.core import iam_actions, iam_evaluator
 from ministack.services import iot, lambda_svc
 
-from contract import TOPIC
+from iort_contract import TOPIC
 from local import cut_sessions, listener_gap, log_gap, queue_gap, stream_gap, table_gap
 from local.turns import Turns
 

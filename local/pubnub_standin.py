@@ -21,7 +21,7 @@ from urllib.parse import quote, unquote
 
 from aiohttp import web
 
-import contract
+import iort_contract
 from local.pubnub_history import History, Message, Subscription
 
 if TYPE_CHECKING:
@@ -36,7 +36,7 @@ POLL_S = 280.0
 WRITE_S = 10.0
 MAX_POLLS = 1_000
 # Above what the SDKs can send, so that a message too large is told so by us.
-MAX_LINE_BYTES = 4 * contract.MAX_PUBNUB_BYTES
+MAX_LINE_BYTES = 4 * iort_contract.MAX_PUBNUB_BYTES
 
 # PubNub features that change what is delivered and to whom: without them the answer would be wrong.
 UNSUPPORTED = ("custom_message_type", "filter-expr", "meta", "norep")
@@ -220,7 +220,7 @@ class PubNubStandIn:
         if not channel or any(c in ",*/:\\" or c < " " for c in channel):
             raise Refusal(400, "Invalid Channel")
         # PubNub's own formula: both, as they would stand in an URL, and 100 bytes.
-        if len(quote(channel + payload, safe="!~*'()")) + 100 > contract.MAX_PUBNUB_BYTES:
+        if len(quote(channel + payload, safe="!~*'()")) + 100 > iort_contract.MAX_PUBNUB_BYTES:
             raise Refusal(413, "Message Too Large")
         try:
             json.loads(payload, parse_constant=_refuse_constant)
@@ -294,7 +294,7 @@ async def _read(request: web.BaseRequest) -> str:
         if request.headers.get("Content-Encoding") == "gzip":
             # 47: gzip's header or zlib's, as the Python SDK says the one and sends the other.
             inflater = zlib.decompressobj(47)
-            body = inflater.decompress(body, contract.MAX_PUBNUB_BYTES)
+            body = inflater.decompress(body, iort_contract.MAX_PUBNUB_BYTES)
             if inflater.unconsumed_tail:
                 raise Refusal(413, "Message Too Large")
             if not inflater.eof:

@@ -1,4 +1,4 @@
-"""Writes the cost tables of station/cost.py into README.md and docs/cost.md: `python scripts/costs.py`."""
+"""Writes the cost model's tables into README.md and docs/cost.md: `python scripts/costs.py`."""
 
 from __future__ import annotations
 
@@ -9,9 +9,9 @@ from pathlib import Path
 ROOT = Path(__file__).resolve().parent.parent
 sys.path.insert(0, str(ROOT))
 
-from station import cost_tables, scale
-from station.prices import AS_OF, REGION
-from station.usage import Usage
+from iort_station.cost import report, scale
+from iort_station.cost.prices import AS_OF, REGION
+from iort_station.cost.usage import Usage
 
 _BLOCK = re.compile(r"(<!-- cost (\w+):.*?-->\n).*?(\n<!-- /cost -->)", re.DOTALL)
 FILES = (ROOT / "README.md", ROOT / "docs" / "cost.md")
@@ -22,9 +22,9 @@ def tables() -> dict[str, str]:
     usage = Usage()
     dated = f"List prices of {AS_OF}, {REGION}, in US dollars; one robot, {usage.rate_hz:g} Hz.\n\n"
     return {
-        "hour": dated + cost_tables.robot_hour(usage).markdown(),
-        "whatif": dated + cost_tables.what_if(usage).markdown(),
-        "scale": cost_tables.fleets(scale.fleets(usage)).markdown(),
+        "hour": dated + report.robot_hour(usage).markdown(),
+        "whatif": dated + report.what_if(usage).markdown(),
+        "scale": report.fleets(scale.fleets(usage)).markdown(),
     }
 
 

@@ -13,7 +13,7 @@ sys.path.insert(0, str(ROOT))
 
 import typer
 
-from station.cli import app
+from iort_station.cli.main import app
 
 PAGE = ROOT / "docs" / "iort.md"
 _INTRODUCTION = """# iort

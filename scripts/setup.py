@@ -35,6 +35,8 @@ LOCKED = (
     *("--require-hashes", "--no-deps", "--only-binary", ":all:"),
     *("--no-binary", "pubnub", "--no-build-isolation"),
 )
+# Each is installed from its folder.
+DISTRIBUTIONS = ("contract", "device", "station")
 STARTED = time.monotonic()
 # npm's and uv's caches are theirs to keep elsewhere; nothing of ours goes outside the checkout.
 CACHES = {"npm_config_cache": str(BUILD / "npm-cache"), "npm_config_update_notifier": "false"}
@@ -56,7 +58,7 @@ def main() -> None:
         step("virtual environment", [], make_venv, stamp="venv")
         locked = [ROOT / "requirements" / name for name in ("build.txt", "dev.txt")]
         step("Python packages", locked, install_python, stamp="python")
-        installed = [ROOT / "pyproject.toml", ROOT / "station" / "pyproject.toml"]
+        installed = [ROOT / folder / "pyproject.toml" for folder in DISTRIBUTIONS]
         step("the project itself", installed, install_project, stamp="project")
         step("CDK and page packages", [ROOT / "package-lock.json"], install_node, stamp="node")
         page = [*sorted((ROOT / "station" / "web").rglob("*")), ROOT / "package-lock.json"]
@@ -70,7 +72,7 @@ def main() -> None:
             locked = [ROOT / "requirements" / "checkov.txt"]
             step("checkov, in an environment of its own", locked, install_checkov, stamp="checkov")
         if asked.oldest:
-            locked = [ROOT / "requirements" / "oldest.txt", ROOT / "pyproject.toml"]
+            locked = [ROOT / "requirements" / "oldest.txt", *installed]
             given = None if asked.oldest == "any" else asked.oldest
             title = f"the robot's tests, for Python {OLDEST_OF_ROBOT}"
             step(title, locked, lambda: install_oldest(given), stamp="oldest")
@@ -136,7 +138,8 @@ def install_python() -> None:
 
 def install_project() -> None:
     """Put iort-agent and iort into .venv/bin, reading the checkout itself."""
-    install(VENV, "--no-deps", "--no-build-isolation", "--editable", ".", "--editable", "station")
+    editable = [part for folder in DISTRIBUTIONS for part in ("--editable", folder)]
+    install(VENV, "--no-deps", "--no-build-isolation", *editable)
 
 
 def install_node() -> None:
@@ -145,7 +148,7 @@ def install_node() -> None:
 
 
 def build_page() -> None:
-    """Bundle the live page into build/web."""
+    """Bundle the live page into the station."""
     run([VENV / "bin" / "npm", "run", "build"])
 
 
@@ -186,6 +189,8 @@ def install_oldest(given: str | None) -> None:
         raise SetupError(f"{python} is not Python {OLDEST_OF_ROBOT}")
     run([UV, "venv", "--clear", "--python", python, BUILD / "oldest"])
     install(BUILD / "oldest", *LOCKED[:4], "-r", "requirements/oldest.txt")
+    robot = ("--editable", "contract", "--editable", "device")
+    install(BUILD / "oldest", "--no-deps", "--no-build-isolation", *robot)
 
 
 def python_of(version: str) -> str:

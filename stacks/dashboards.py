@@ -13,7 +13,7 @@ from aws_cdk import Duration
 from aws_cdk import aws_cloudwatch as cloudwatch
 from constructs import Construct
 
-from contract import METRICS, RULES, rule_name
+from iort_contract import METRICS, RULES, rule_name
 from stacks import metrics
 from stacks.settings import Settings
 from stacks.watched import Watched

@@ -6,7 +6,7 @@ from typing import Any
 
 from aws_cdk import Stack
 
-from contract import (
+from iort_contract import (
     CMD,
     FLEET,
     LIVE,

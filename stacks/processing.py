@@ -16,7 +16,7 @@ from aws_cdk import aws_sns_subscriptions as subscriptions
 from aws_cdk import aws_sqs as sqs
 from constructs import Construct
 
-from contract import (
+from iort_contract import (
     ALERT_PREFIX,
     FILE,
     FILES_BYTES,

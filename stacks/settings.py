@@ -12,7 +12,7 @@ from typing import Any
 
 from aws_cdk import App, RemovalPolicy
 
-from contract import (
+from iort_contract import (
     DEFAULT_NAMESPACE,
     LOW_VOLTAGE_V,
     VESC_FIELDS,

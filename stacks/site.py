@@ -15,8 +15,8 @@ from aws_cdk import aws_cloudfront_origins as origins
 from aws_cdk import aws_s3 as s3
 from constructs import Construct
 
+from iort_station.page.page import HEADERS, PUBNUB_ORIGIN, security_policy
 from stacks.settings import Settings
-from station.page import HEADERS, PUBNUB_ORIGIN, security_policy
 
 _HSTS = Duration.days(365)
 

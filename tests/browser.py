@@ -17,7 +17,7 @@ if TYPE_CHECKING:
 @pytest.fixture(scope="module")
 def browser() -> Iterator[Browser]:
     # Imported here: every test loads this file, the robot's on Python 3.8, where the station does not run.
-    from station.page import BUILT
+    from iort_station.page.page import BUILT
 
     playwright_api = pytest.importorskip("playwright.sync_api", reason="playwright is not installed")
     program = chromium.found()

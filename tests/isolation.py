@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from typing import NamedTuple
 
-from contract import (
+from iort_contract import (
     BROKER,
     CMD,
     FLEET,

@@ -20,7 +20,7 @@ from typing import Any, Mapping
 from aiohttp import WSMsgType, web
 from typing_extensions import Self
 
-from contract.ros1.definition import DURATION, TIME, Field, parse
+from iort_contract.ros1.definition import DURATION, TIME, Field, parse
 from tests.ports import free_port
 
 

@@ -11,10 +11,10 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
-import contract
-from contract import FILE, PING, PONG, Address, FileAnswer, FileRequest, build_topic
-from device.loopback import Loopback
-from device.uplink import Message
+import iort_contract
+from iort_agent.mqtt.loopback import Loopback
+from iort_agent.mqtt.uplink import Message
+from iort_contract import FILE, PING, PONG, Address, FileAnswer, FileRequest, build_topic
 from local.certificates import Identity
 
 
@@ -40,15 +40,15 @@ class Store:
         uplink.subscribe(build_topic(PING, robot, FILE), self._on_request)
 
     def _on_request(self, message: Message) -> None:
-        request = contract.decode_file_request(message.payload)
+        request = iort_contract.decode_file_request(message.payload)
         self.requests.append(request)
         if self.silent:
             self.silent -= 1
             return
-        self._uplink.deliver(self._answers, contract.encode_file_answer(self._answer(request)))
+        self._uplink.deliver(self._answers, iort_contract.encode_file_answer(self._answer(request)))
 
     def _answer(self, request: FileRequest) -> FileAnswer:
-        key = contract.file_key(self.robot, request.file)
+        key = iort_contract.file_key(self.robot, request.file)
         if self.refusals:
             refused, again_s = self.refusals.pop(0)
             return FileAnswer(request.id, refused=refused, again_s=again_s)
@@ -68,7 +68,7 @@ class Store:
 
     @staticmethod
     def _size(request: FileRequest, part: int) -> int:
-        return contract.part_range(request.file, part)[1]
+        return iort_contract.part_range(request.file, part)[1]
 
     def put(self, part: int, content: bytes) -> int:
         """Take a part, if it is what was announced; the HTTP status."""

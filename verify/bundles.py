@@ -9,11 +9,11 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from bench.target import Target
-from contract import PING, PONG, RECORD, build_topic, record_topic
-from station import robots
-from station.errors import StationError
-from station.listener import Listener
-from station.robots import Bundle
+from iort_contract import PING, PONG, RECORD, build_topic, record_topic
+from iort_station.errors import StationError
+from iort_station.fleet import robots
+from iort_station.fleet.robots import Bundle
+from iort_station.page.listener import Listener
 from verify.errors import CannotAskError, VerifyError
 from verify.robot import Robot
 from verify.spoofing import spoofed

@@ -10,13 +10,13 @@ from pathlib import Path
 
 from botocore.exceptions import BotoCoreError, ClientError
 
-from contract import ROBOT
+from iort_contract import ROBOT
+from iort_station.cloud import Cloud
+from iort_station.errors import StationError
+from iort_station.fleet import claims, robots
 from local.deployment import ROOT
 from local.errors import LocalError
 from local.processes import run
-from station import claims, robots
-from station.cloud import Cloud
-from station.errors import StationError
 from verify.errors import VerifyError
 
 # The distribution apart, a stage takes five minutes; AWS keeps a policy for five more after its robots.

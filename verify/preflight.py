@@ -15,9 +15,9 @@ from collections.abc import Mapping, Sequence
 from dataclasses import asdict
 from typing import Any
 
+from iort_station.cli.console import Console
+from iort_station.cloud import Cloud
 from stacks.settings import ROOT, Settings, SettingsError
-from station.cloud import Cloud
-from station.console import Console
 from verify import preflight_account, preflight_deployed
 from verify.preflight_finding import Clients, Finding, Verdict
 

@@ -4,11 +4,11 @@ from __future__ import annotations
 
 from botocore.exceptions import BotoCoreError, ClientError
 
-from contract import RULES, rule_name
+from iort_contract import RULES, rule_name
+from iort_station.cost.scale import on_paper
+from iort_station.cost.usage import Usage
+from iort_station.errors import StationError
 from stacks.settings import Settings
-from station.errors import StationError
-from station.scale import on_paper
-from station.usage import Usage
 from verify.preflight_deployed import resources
 from verify.preflight_finding import Clients, Found, code, fine, item, stops, warning
 
@@ -19,7 +19,7 @@ BOOTSTRAP_PARAMETER = "/cdk-bootstrap/hnb659fds/version"
 UNRESERVED = 100
 # A fleet for which the quotas should do.
 ROBOTS = 100
-# Service Quotas' name of AWS IoT Core, and of each quota with what a fleet needs of it (station/scale.py).
+# Service Quotas' name of AWS IoT Core, and of each quota with what a fleet needs of it (cost/scale.py).
 IOT_CORE = "iotcore"
 RULES_QUOTA = "Maximum number of rules per AWS account"
 QUOTAS = {

@@ -11,8 +11,8 @@ from typing import Any, NamedTuple, Protocol
 
 from botocore.exceptions import BotoCoreError, ClientError
 
+from iort_station.errors import StationError
 from stacks.settings import Settings
-from station.errors import StationError
 
 _DENIED = {"AccessDenied", "AccessDeniedException", "UnauthorizedOperation", "UnauthorizedException"}
 _ACTION = re.compile(r"not authorized to perform:? ([a-z0-9-]+:\w+)", re.IGNORECASE)
@@ -27,7 +27,7 @@ class Verdict(enum.Enum):
 
 
 class Clients(Protocol):
-    """Makes clients of AWS' services; `station.cloud.Cloud` is one."""
+    """Makes clients of AWS' services; `iort_station.cloud.Cloud` is one."""
 
     def client(self, service: str) -> Any:
         """A boto3 client."""

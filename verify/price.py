@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from math import ceil
 
-from station.prices import MONTH_HOURS, PRICES
+from iort_station.cost.prices import MONTH_HOURS, PRICES
 
 # A run takes about a quarter of an hour; what is metered by the hour is counted for a whole one.
 _HOURS = 1.0

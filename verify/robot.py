@@ -14,7 +14,7 @@ from awscrt import mqtt5
 from awsiot import mqtt5_client_builder
 from typing_extensions import Self
 
-from contract import LIVE, LiveSample, encode_live
+from iort_contract import LIVE, LiveSample, encode_live
 from verify.errors import VerifyError
 from verify.waiting import until
 

@@ -27,12 +27,12 @@ from rich.prompt import Confirm
 from bench import machine
 from bench.interrupts import wound_up
 from bench.target import AWS, EMBEDDED, Target, open_target
+from iort_station.cloud import Cloud
+from iort_station.cost.prices import AS_OF
+from iort_station.errors import StationError
 from local.deployment import ROOT
 from local.errors import LocalError
 from stacks.settings import Settings
-from station.cloud import Cloud
-from station.errors import StationError
-from station.prices import AS_OF
 from verify import measured, preflight, price, report
 from verify.check import FIRST, WITH_KEY, Answer, Check, Verdict, ask
 from verify.checks import ALL

@@ -5,7 +5,7 @@ from __future__ import annotations
 import base64
 import json
 
-from contract import (
+from iort_contract import (
     AGENT_VERSION,
     DEFAULT_NAMESPACE,
     EXPIRES_S,

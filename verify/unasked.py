@@ -76,7 +76,7 @@ UNASKED = (
         "dynamodb.query",
         "A Query reads at most 1 MB of one partition, in the order of the sort key.",
         f"{_DYNAMODB}/Query.Pagination.html",
-        "station/reading.py",
+        "station/iort_station/data/reading.py",
         "local/table_gap.py",
     ),
     _documented(
@@ -98,7 +98,7 @@ UNASKED = (
         "provisioning.ownership_token",
         "The ownership token of a new certificate is valid for one hour.",
         f"{_IOT}/fleet-provision-api.html",
-        "device/identity.py",
+        "device/iort_agent/identity/provision.py",
     ),
     _documented(
         "broker.presence_order",
@@ -110,7 +110,7 @@ UNASKED = (
         "broker.certificate_deactivated",
         "A session whose certificate is deactivated is ended within minutes.",
         f"{_IOT}/device-certs-create.html",
-        "station/robots.py",
+        "station/iort_station/fleet/robots.py",
         "local/cut_sessions.py",
     ),
     _documented(
@@ -124,8 +124,8 @@ UNASKED = (
         "billing.basic_ingest",
         "A message on $aws/rules/<rule>/... is not metered as a message, and reaches no subscriber.",
         f"{_IOT}/iot-basic-ingest.html",
-        "contract/topics.py",
-        "station/cost.py",
+        "contract/iort_contract/topics.py",
+        "station/iort_station/cost/model.py",
     ),
     _documented(
         "cloudformation.export_in_use",
@@ -157,7 +157,7 @@ UNASKED = (
         "sqs.fair_queues",
         "In a standard queue no group of messages (MessageGroupId) waits long behind another.",
         "https://docs.aws.amazon.com/AWSSimpleQueueService/latest/SQSDeveloperGuide/sqs-fair-queues.html",
-        "functions/share.py",
+        "functions/shared/share.py",
     ),
     _documented(
         "iot.rule_roles",

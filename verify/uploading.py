@@ -13,7 +13,8 @@ from pathlib import Path
 from urllib.parse import urlsplit
 
 from bench.target import Target
-from contract import (
+from iort_agent.files.http import trusting
+from iort_contract import (
     FILE,
     PING,
     PONG,
@@ -26,7 +27,6 @@ from contract import (
     encode_file_request,
     file_key,
 )
-from device.upload_http import trusting
 from verify.robot import Robot
 
 _CODE = re.compile(r"<Code>([^<]+)</Code>")

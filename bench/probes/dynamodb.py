@@ -6,13 +6,8 @@ import uuid
 from concurrent.futures import ThreadPoolExecutor
 
 from bench.probes.ground import Ground, No, equal, until
-from contract import (
-    BATCH,
-    VESC_STREAM,
-    batches_between,
-    build_topic,
-)
-from station import delivery
+from iort_contract import BATCH, VESC_STREAM, batches_between, build_topic
+from iort_station.operations import delivery
 
 WRITERS = 8
 

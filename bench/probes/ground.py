@@ -16,7 +16,7 @@ from bench import borrowed
 from bench.errors import BenchError
 from bench.raw_mqtt import RawClient
 from bench.target import Target
-from contract import (
+from iort_contract import (
     LIVE,
     PING,
     PONG,
@@ -29,7 +29,7 @@ from contract import (
     encode_ping,
     record_topic,
 )
-from station import delivery
+from iort_station.operations import delivery
 
 WAIT_S = 30.0
 _WHO = """

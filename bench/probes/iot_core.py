@@ -9,7 +9,7 @@ from contextlib import ExitStack
 
 from bench.probes.ground import Ground, No, equal, until
 from bench.raw_mqtt import RawClient
-from contract import (
+from iort_contract import (
     BROKER,
     CMD,
     FLEET,
@@ -21,7 +21,7 @@ from contract import (
     VESC_STREAM,
     record_topic,
 )
-from station import quarantine
+from iort_station.operations import quarantine
 
 CLIENTS = 20
 

@@ -10,9 +10,7 @@ from datetime import datetime, timedelta, timezone
 from typing import Any
 
 from bench.probes.ground import WAIT_S, Ground, No, equal, until
-from contract import (
-    LAMBDA,
-)
+from iort_contract import LAMBDA
 
 LISTENERS = 4
 

@@ -10,7 +10,7 @@ from typing import Any
 
 from boto3.dynamodb.types import TypeSerializer
 
-from contract import (
+from iort_contract import (
     BATCH,
     FILE,
     LAMBDA,

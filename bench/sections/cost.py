@@ -7,9 +7,9 @@ from dataclasses import asdict, replace
 from bench import plots
 from bench.result import Plot, Ratio, Section, Table
 from bench.target import Say, Target
-from station import cost, cost_items, cost_tables, scale
-from station.prices import AS_OF, REGION
-from station.usage import Usage
+from iort_station.cost import line_items, model, report, scale
+from iort_station.cost.prices import AS_OF, REGION
+from iort_station.cost.usage import Usage
 
 # Nothing is measured here: the same settings have the same cost, to the last digit shown.
 _COMPUTED = 1.01
@@ -28,14 +28,14 @@ def run(target: Target, say: Say) -> Section:
     usage = Usage(live_memory_mb=memory["Live"], summarize_memory_mb=memory["Summarize"])
     section = Section("cost", "Cost a robot-hour, and scale on paper")
     for title, rows in (
-        (f"Dollars a robot-hour, list prices of {AS_OF} in {REGION}", cost_tables.robot_hour(usage)),
-        ("What each setting does", cost_tables.what_if(usage)),
-        ("On paper: needs of AWS' default quotas", cost_tables.fleets(scale.fleets(usage))),
+        (f"Dollars a robot-hour, list prices of {AS_OF} in {REGION}", report.robot_hour(usage)),
+        ("What each setting does", report.what_if(usage)),
+        ("On paper: needs of AWS' default quotas", report.fleets(scale.fleets(usage))),
     ):
         section.tables.append(Table(title, list(rows.head), [list(row) for row in rows.body]))
-    thesis = cost_items.total(cost.thesis_bill(usage))
+    thesis = line_items.total(model.thesis_bill(usage))
     rates = (10.0, 5.0, 2.0, 1.0, 0.0)
-    ours = {rate: cost_items.total(cost.bill(replace(usage, live_hz=rate))) for rate in rates}
+    ours = {rate: line_items.total(model.bill(replace(usage, live_hz=rate))) for rate in rates}
     # The thesis pays for its live view with every sample; ours is given for both ends of the live rate.
     section.ratios += [
         Ratio(f"cost {what} / a message a sample", round(ours[rate] / thesis, 4), 0.05, tolerance=_COMPUTED)

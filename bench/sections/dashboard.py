@@ -15,12 +15,13 @@ from bench.errors import BenchError
 from bench.result import Plot, Ratio, Section, Table
 from bench.spread import spread
 from bench.target import Say, Target
-from contract import VESC_STREAM
+from iort_contract import VESC_STREAM
+from iort_station.operations import audit, trace
+from iort_station.page import keys
+from iort_station.page.listener import Listener
+from iort_station.page.page import BUILT, PUBNUB_ORIGIN
+from iort_station.page.server import PageServer
 from local.figures import THESIS
-from station import audit, keys, trace
-from station.listener import Listener
-from station.page import BUILT, PUBNUB_ORIGIN
-from station.page_server import PageServer
 
 ROBOT = "bench-dashboard"
 SECONDS = 24

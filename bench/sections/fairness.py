@@ -17,8 +17,8 @@ from bench.raw_mqtt import RawClient
 from bench.result import Ratio, Section, Table
 from bench.spread import Spread, spread
 from bench.target import Say, Target
-from contract import LIVE, SECOND, VESC_STREAM, LiveSample, build_topic, encode_live, record_topic
-from station.items import of_topic
+from iort_contract import LIVE, SECOND, VESC_STREAM, LiveSample, build_topic, encode_live, record_topic
+from iort_station.data.items import of_topic
 
 # AWS IoT takes so many publishes a second from a connection.
 RATE_HZ = 100

@@ -31,7 +31,7 @@ from bench.result import NOT_MEASURED, Plot, Ratio, Section, Table
 from bench.ros_graph import PACKAGES, SYSTEM_PYTHON, Publisher, RosGraph, python_with_rospy
 from bench.target import Say, Target
 from bench.watcher import subscribed
-from contract import LIVE, RECORD, decode, parse_topic
+from iort_contract import LIVE, RECORD, decode, parse_topic
 
 SECONDS = 30
 RECORDER, AGENT, FLOOR = "rosbag record", "agent", "bare rospy subscriber"
@@ -108,7 +108,7 @@ def measure(program: str, python: str, seconds: int, say: Say) -> Found:
         processes = {
             RECORDER: graph.run([*rosbag, "record", "--quiet", "-O", str(bag), *topics()]),
             AGENT: graph.start(
-                "device.main", "run", "--config", config, "--report", written, "--drain-s", _CATCH_UP_S
+                "iort_agent.cli", "run", "--config", config, "--report", written, "--drain-s", _CATCH_UP_S
             ),
             FLOOR: graph.start("bench.ros_floor", *topics()),
         }

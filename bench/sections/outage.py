@@ -19,11 +19,12 @@ from bench.errors import BenchError
 from bench.result import Plot, Ratio, Section, Table
 from bench.spread import spread
 from bench.target import Say, Target
-from contract import BATCH, OWN_STREAMS, VESC_STREAM, batch_id
-from device.config import load_config
+from iort_agent.config.file import load_config
+from iort_contract import BATCH, OWN_STREAMS, VESC_STREAM, batch_id
+from iort_station.fleet import robots
+from iort_station.fleet.robots import Bundle
+from iort_station.operations import audit, delivery
 from local.proxy import PASS, REFUSE, Proxy
-from station import audit, delivery, robots
-from station.robots import Bundle
 
 ROBOT = "bench-outage"
 RATE_HZ = 50

@@ -19,9 +19,10 @@ from bench.errors import BenchError
 from bench.result import NOT_MEASURED, Plot, Ratio, Section, Table
 from bench.spread import ratio, spread
 from bench.target import Say, Target
-from contract import RECEIVED_MS, RECORD, TOPIC, VESC_STREAM, build_topic
-from station import data, delivery
-from station.sizes import item_bytes
+from iort_contract import RECEIVED_MS, RECORD, TOPIC, VESC_STREAM, build_topic
+from iort_station.cost.sizes import item_bytes
+from iort_station.data import data
+from iort_station.operations import delivery
 
 POINTS = 14_368
 ROBOT, HOUR_ROBOT = "bench-query", "bench-hour"

@@ -17,8 +17,8 @@ from bench.raw_mqtt import RawClient, tcp_connect_s
 from bench.result import NOT_MEASURED, Plot, Ratio, Section, Table
 from bench.spread import ratio, spread
 from bench.target import Say, Target
-from contract import BROKER, LAMBDA, PING_PATHS, RULE
-from device.allowance import BYTES_PER_S
+from iort_agent.lanes.rate_limiter import BYTES_PER_S
+from iort_contract import BROKER, LAMBDA, PING_PATHS, RULE
 from local.figures import THESIS
 
 SIZES = {"0.5 KB": 512, "5 KB": 5 * 1024, "50 KB": 50 * 1024, "127 KB": 127 * 1024 - 200}

@@ -24,7 +24,8 @@ from bench.machine import ROOT
 from bench.result import NOT_MEASURED, Plot, Ratio, Section, Table
 from bench.spread import spread
 from bench.target import Say, Target
-from contract import (
+from iort_agent.sources.vehicle import Vehicle, VehicleConfig
+from iort_contract import (
     BATCH,
     LIVE,
     REPLAY,
@@ -35,8 +36,7 @@ from contract import (
     encode_live,
     rule_event,
 )
-from device.sources.vehicle import Vehicle, VehicleConfig
-from station import delivery
+from iort_station.operations import delivery
 
 SIZES_MB = (128, 256, 512, 1024, 1769)
 # "At 1,769 MB, a function has the equivalent of one vCPU": Lambda, "Configure memory".

@@ -1,4 +1,4 @@
-// Bundles the page into build/web: `npm run build`, or `npm run build -- --watch`.
+// Bundles the page into station/iort_station/page/built: `npm run build`, or `npm run build -- --watch`.
 import { build, context } from "esbuild";
 import { cpSync, mkdirSync, readFileSync, rmSync, statSync, writeFileSync } from "node:fs";
 import { dirname, join, relative } from "node:path";
@@ -7,7 +7,7 @@ import { fileURLToPath } from "node:url";
 const here = dirname(fileURLToPath(import.meta.url));
 const root = join(here, "..", "..");
 const modules = join(root, "node_modules");
-const out = join(root, "build", "web");
+const out = join(root, "station", "iort_station", "page", "built");
 const watch = process.argv.includes("--watch");
 
 const options = {

@@ -11,18 +11,18 @@ from pathlib import PurePath
 
 import pytest
 
-from contract import VESC_STREAM
-from device.claim_check import ClaimCheck
-from device.clock import ManualClock
-from device.errors import AgentError, UploadError
-from device.main import main
-from device.private_files import make_private, open_below, write_below
-from device.reservation import Reservation
-from device.spool import PROCESS
-from device.spool_file import SpoolFile
-from device.sqlite_spool import SqliteSpool
-from device.upload_file import from_json, read, to_json
-from device.upload_folder import STATE, Folder
+from iort_agent.cli import main
+from iort_agent.clock import ManualClock
+from iort_agent.errors import AgentError, UploadError
+from iort_agent.files.file import from_json, read, to_json
+from iort_agent.files.folder import STATE, Folder
+from iort_agent.lanes.attachment import ClaimCheck
+from iort_agent.private_files import make_private, open_below, write_below
+from iort_agent.spool.file import SpoolFile
+from iort_agent.spool.memory import PROCESS
+from iort_agent.spool.reservation import Reservation
+from iort_agent.spool.sqlite import SqliteSpool
+from iort_contract import VESC_STREAM
 from tests.unit.test_device_agent import config_file
 
 SECRET = b"another's, and not for the bucket"

@@ -16,11 +16,11 @@ import pytest
 pytest.importorskip("aiohttp")
 pytest.importorskip("websocket")
 
-from device.clock import Clock, SystemClock
-from device.config import load_config
-from device.errors import ConfigError, SourceError
-from device.sources.rosbridge import RosbridgeConfig, RosbridgeSource, TopicConfig
-from device.sources.rosbridge_connection import Times
+from iort_agent.clock import Clock, SystemClock
+from iort_agent.config.file import load_config
+from iort_agent.errors import ConfigError, SourceError
+from iort_agent.sources.rosbridge.connection import Times
+from iort_agent.sources.rosbridge.source import RosbridgeConfig, RosbridgeSource, TopicConfig
 from tests.device.running import Running, eventually
 from tests.ports import free_port
 from tests.rosbridge_standin import RosbridgeStandin
@@ -37,7 +37,7 @@ def server() -> Iterator[RosbridgeStandin]:
 
 @pytest.fixture
 def log(caplog: pytest.LogCaptureFixture) -> pytest.LogCaptureFixture:
-    caplog.set_level(logging.INFO, "device")
+    caplog.set_level(logging.INFO, "iort_agent")
     return caplog
 
 
@@ -398,7 +398,7 @@ def test_without_websocket_client_it_says_what_to_install(
     server: RosbridgeStandin, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setitem(sys.modules, "websocket", None)
-    with pytest.raises(SourceError, match=r"pip install 'iort\[rosbridge\]'"):
+    with pytest.raises(SourceError, match=r"pip install 'iort-agent\[rosbridge\]'"):
         config(server).build(SystemClock()).run(lambda *_: None, threading.Event())
 
 

@@ -8,20 +8,20 @@ import threading
 
 import pytest
 
-import contract
-from contract import PART_BYTES
-from device.allowance import Allowance
-from device.clock import ManualClock
-from device.config import load_config
-from device.dispatch import Dispatcher
-from device.errors import UploadError
-from device.loopback import Loopback
-from device.status import SOCKET, StatusServer
-from device.upload import make_uploader
-from device.upload_command import upload_files
-from device.upload_file import kind_of, read, wire_name
-from device.upload_folder import STATE, Folder, Uploads
-from device.upload_http import Outcome, Pace, Sender, trusting
+import iort_contract
+from iort_agent.clock import ManualClock
+from iort_agent.config.file import load_config
+from iort_agent.dispatch import Dispatcher
+from iort_agent.errors import UploadError
+from iort_agent.files.command import upload_files
+from iort_agent.files.file import kind_of, read, wire_name
+from iort_agent.files.folder import STATE, Folder, Uploads
+from iort_agent.files.http import Outcome, Pace, Sender, trusting
+from iort_agent.files.upload import make_uploader
+from iort_agent.lanes.rate_limiter import Allowance
+from iort_agent.mqtt.loopback import Loopback
+from iort_agent.status import SOCKET, StatusServer
+from iort_contract import PART_BYTES
 from tests.store_standin import store
 
 
@@ -113,7 +113,7 @@ def test_a_file_is_hashed_whole_and_by_part(tmp_path, size):
     pieces = [content[i : i + PART_BYTES] for i in range(0, max(1, size), PART_BYTES)]
     assert list(local.parts) == [hashlib.sha256(piece).hexdigest() for piece in pieces]
     assert local.file.parts == len(local.parts)
-    assert contract.file_key("car", local.file).endswith("/f.bag")
+    assert iort_contract.file_key("car", local.file).endswith("/f.bag")
 
 
 @pytest.mark.parametrize(
@@ -216,7 +216,7 @@ def test_nothing_is_sent_in_the_clear_or_to_whom_we_do_not_trust(rig, small):
     sender = Sender(trust=trusting(None), pace=Pace(rig.clock, 0))
     local = read(small.parent, small.relative_to(small.parent), stop=rig.stop)
     url = rig.store._url
-    address = contract.Address(1, f"{url}/1", {"content-length": "11"})
+    address = iort_contract.Address(1, f"{url}/1", {"content-length": "11"})
     put = sender.put(address, local, 0, 11, rig.stop)
     assert put.outcome is Outcome.FAILED
     assert "CERTIFICATE_VERIFY_FAILED" in put.text
@@ -239,7 +239,7 @@ def test_nothing_is_sent_in_the_clear_or_to_whom_we_do_not_trust(rig, small):
 def test_an_address_that_is_none_is_a_file_that_is_not_uploaded(rig, small, url, headers):
     sender = Sender(trust=trusting(rig.certificate), pace=Pace(rig.clock, 0))
     local = read(small.parent, small.relative_to(small.parent), stop=rig.stop)
-    address = contract.Address(1, url.replace("HOST", rig.store._url), headers)
+    address = iort_contract.Address(1, url.replace("HOST", rig.store._url), headers)
     with pytest.raises(UploadError, match=r"an address that is"):
         sender.put(address, local, 0, 11, rig.stop)
 
@@ -258,14 +258,16 @@ def test_an_answer_that_is_none_is_said_and_waited_past(rig, small, odd, caplog)
     answer, faults = rig.store._answer, [odd]
 
     def on_request(message):
-        request = contract.decode_file_request(message.payload)
+        request = iort_contract.decode_file_request(message.payload)
         if faults:
-            said = f'{{"v": {contract.SCHEMA_VERSION}, "id": "{request.id}", "key": "k", "stored": false, '
+            said = (
+                f'{{"v": {iort_contract.SCHEMA_VERSION}, "id": "{request.id}", "key": "k", "stored": false, '
+            )
             rig.uplink.deliver(rig.store._answers, (said + faults.pop() + "}").encode())
         else:
-            rig.uplink.deliver(rig.store._answers, contract.encode_file_answer(answer(request)))
+            rig.uplink.deliver(rig.store._answers, iort_contract.encode_file_answer(answer(request)))
 
-    rig.uplink.subscribe(contract.build_topic(contract.PING, "car", contract.FILE), on_request)
+    rig.uplink.subscribe(iort_contract.build_topic(iort_contract.PING, "car", iort_contract.FILE), on_request)
     assert rig.store.objects[rig.upload(small)] == b"driven well"
     assert "an answer about a file is not one" in caplog.text
 
@@ -325,7 +327,7 @@ def test_a_new_process_neither_uploads_again_nor_reads_again(rig, bags, monkeypa
     rig.store.put = put
     assert list(rig.store.parts) == [1]
     rig.stop.clear()
-    monkeypatch.setattr("device.upload_folder.read", None)
+    monkeypatch.setattr("iort_agent.files.folder.read", None)
     again = rig.folder(bags, settle_s=0)
     assert again.step(rig.stop)
     assert not again.step(rig.stop)

@@ -13,10 +13,10 @@ from typing import Any
 import pytest
 import serial
 
-from device.clock import SystemClock
-from device.config import load_config
-from device.errors import SourceError
-from device.sources.vesc_serial import VescConfig, _why
+from iort_agent.clock import SystemClock
+from iort_agent.config.file import load_config
+from iort_agent.errors import SourceError
+from iort_agent.sources.vesc.serial_line import VescConfig, _why
 from tests.device.running import Running, eventually
 from tests.vesc_standin import FIRMWARE, VescStandin, framed, values
 
@@ -33,7 +33,7 @@ def vesc(tmp_path: Path) -> Iterator[VescStandin]:
 
 @pytest.fixture
 def log(caplog: pytest.LogCaptureFixture) -> pytest.LogCaptureFixture:
-    caplog.set_level(logging.DEBUG, "device")
+    caplog.set_level(logging.DEBUG, "iort_agent")
     return caplog
 
 
@@ -248,7 +248,7 @@ def test_stops_at_once(vesc: VescStandin, trouble: str) -> None:
 
 def test_without_pyserial_it_says_what_to_install(vesc: VescStandin, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "serial", None)
-    with pytest.raises(SourceError, match=r"pip install 'iort\[serial\]'"):
+    with pytest.raises(SourceError, match=r"pip install 'iort-agent\[serial\]'"):
         config(vesc).build(SystemClock()).run(lambda *_: None, threading.Event())
 
 

@@ -15,12 +15,12 @@ import pytest
 from pubnub.pubnub import PubNub
 from typer.testing import CliRunner
 
+from iort_station.cli.main import app
+from iort_station.cloud import EMBEDDED
+from iort_station.fleet import robots
 from local.cloud import EmbeddedCloud
 from local.deployment import ROOT
 from local.pubnub_standin import PubNubStandIn
-from station import robots
-from station.cli import app
-from station.cloud import EMBEDDED
 from tests.local.pubnub_sdk import sdk
 from tests.ports import free_port
 

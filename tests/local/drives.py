@@ -11,9 +11,10 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
+from iort_station.fleet import robots
+from iort_station.operations import delivery
 from local.cloud import EmbeddedCloud
 from local.deployment import ROOT
-from station import delivery, robots
 
 RATE_HZ = 50
 # The log's column and the contract's field in which the counter is.

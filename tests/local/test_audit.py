@@ -6,10 +6,20 @@ import json
 
 from typer.testing import CliRunner
 
-from contract import ACCOUNT_STREAM, BATCH, RECORD, TOPIC, Batch, batch_id, build_topic, encode, record_topic
-from contract.account import SourceAccount, StreamAccount
-from station import audit
-from station.cli import app
+from iort_contract import (
+    ACCOUNT_STREAM,
+    BATCH,
+    RECORD,
+    TOPIC,
+    Batch,
+    batch_id,
+    build_topic,
+    encode,
+    record_topic,
+)
+from iort_contract.messages.account import SourceAccount, StreamAccount
+from iort_station.cli.main import app
+from iort_station.operations import audit
 from tests.local.conftest import run_agent, until
 from verify.robot import Robot
 

@@ -12,7 +12,7 @@ from botocore.exceptions import ClientError
 from bench import run, spending
 from bench.sections import SECTIONS, utilisation
 from bench.target import AWS, open_target
-from station import certificates, robots
+from iort_station.fleet import certificates, robots
 
 
 def memory_mb(cloud) -> int:

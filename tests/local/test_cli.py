@@ -8,10 +8,10 @@ import stat
 import pytest
 from typer.testing import CliRunner
 
-from contract import File, file_key
-from station.cli import app
-from station.cloud import Cloud
-from station.usage import Usage
+from iort_contract import File, file_key
+from iort_station.cli.main import app
+from iort_station.cloud import Cloud
+from iort_station.cost.usage import Usage
 from tests.ports import free_port
 
 

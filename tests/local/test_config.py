@@ -6,7 +6,7 @@ import json
 
 import pytest
 
-from station.errors import StationError
+from iort_station.errors import StationError
 from tests.local.test_shadow import driving
 
 

@@ -13,10 +13,11 @@ from rosbags.highlevel import AnyReader
 from rosbags.rosbag1 import Writer
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
-from contract import Batch, encode, record_topic
-from contract.ros1.decode import HEADER
-from station import data, delivery
-from station.cloud import Cloud
+from iort_contract import Batch, encode, record_topic
+from iort_contract.ros1.decode import HEADER
+from iort_station.cloud import Cloud
+from iort_station.data import data
+from iort_station.operations import delivery
 from tests.foxglove import flat, opened
 from tests.local.conftest import run_agent, until
 from tests.local.test_query import iort

@@ -7,9 +7,9 @@ import time
 
 import pytest
 
-import contract
-from contract import Batch, LiveSample, build_topic, encode, encode_live, record_topic
-from station import cloudwatch, cloudwatch_logs
+import iort_contract
+from iort_contract import Batch, LiveSample, build_topic, encode, encode_live, record_topic
+from iort_station.operations import cloudwatch, cloudwatch_logs
 from tests.local.conftest import run_agent, until
 from verify.robot import Robot
 
@@ -53,7 +53,7 @@ def test_a_fault_reaches_a_human_and_the_dashboards(embedded, bundle, inbox):
     sample = {"fault_code": FAULT, "voltage_input": LOW_V, "temperature_pcb": 40.0}
     with Robot(bundle.folder) as robot:
         robot.online()
-        live = build_topic(contract.LIVE, robot.name, "vesc")
+        live = build_topic(iort_contract.LIVE, robot.name, "vesc")
         for seq in range(5):
             message = encode_live(LiveSample("0" * 8, seq, now_us + seq, now_us + seq, sample))
             assert robot.publish(live, message) == "SUCCESS"
@@ -112,7 +112,7 @@ def test_a_fault_reaches_a_human_and_the_dashboards(embedded, bundle, inbox):
 def test_what_a_function_warns_of_stands_on_the_platforms_dashboard(embedded, bundle):
     bundle, name = bundle(), f"{embedded.namespace}-platform"
     with Robot(bundle.folder) as robot:
-        robot.publish(build_topic(contract.PING, robot.name, contract.FILE), b"[]")
+        robot.publish(build_topic(iort_contract.PING, robot.name, iort_contract.FILE), b"[]")
     widgets = cloudwatch.dashboard(embedded.cloud, name, minutes=30)["widgets"]
     (number,) = [widget["number"] for widget in widgets if widget["kind"] == "log"]
 

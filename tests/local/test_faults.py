@@ -19,10 +19,11 @@ from pathlib import Path
 
 import pytest
 
-import contract
+import iort_contract
+from iort_station.fleet import robots
+from iort_station.operations import audit, delivery
 from local.cloud import EmbeddedCloud
 from local.proxy import FREEZE, PASS, REFUSE, Proxy
-from station import audit, delivery, robots
 from tests.local.conftest import until
 from tests.local.drives import RATE_HZ, Agent, counted, counter_log
 from tests.local.test_uplink import set_status
@@ -120,7 +121,7 @@ def test_fault_of_the_network_loses_nothing(embedded, drives, name):
 
 
 def test_live_lane_shows_now_while_the_backlog_drains(embedded, bundle, proxy, tmp_path):
-    from station.listener import Listener
+    from iort_station.page.listener import Listener
 
     log = counter_log(tmp_path / "counter.csv", 600)
     car = bundle(**_settings(log, proxy.port))
@@ -138,7 +139,7 @@ def test_live_lane_shows_now_while_the_backlog_drains(embedded, bundle, proxy, t
         agent.stop()
         driven = agent.report()["streams"]["vesc"]["samples"]
     # What was heard was new when it left the car, and nothing of the outage was shown.
-    oldest_us = 1000 * contract.LIVE_MAX_AGE_MS
+    oldest_us = 1000 * iort_contract.LIVE_MAX_AGE_MS
     assert min(heard.hops["sent_us"] for heard in listener.heard) > passed_us
     assert max(heard.hops["sent_us"] - heard.t_us for heard in listener.heard) < oldest_us
     assert counted(embedded, car.robot) == list(range(driven))
@@ -190,7 +191,7 @@ def test_clock_set_back_an_hour(embedded, bundle, tmp_path):
     values = [int(v) for batch in sorted(batches, key=lambda b: b.seq) for v in batch.columns["speed"]]
     assert values == list(range(10 * RATE_HZ))
     # The clock was set indeed, and the car knew by how much.
-    own = delivery.batches(embedded.cloud, car.robot, contract.AGENT_STREAM)
+    own = delivery.batches(embedded.cloud, car.robot, iort_contract.AGENT_STREAM)
     offsets_ms = [value for batch in own for value in batch.columns["clock_offset_ms"] if value is not None]
     assert max(offsets_ms) > 3_590_000, offsets_ms
     assert report["spool"]["left_samples"] == 0

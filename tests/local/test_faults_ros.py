@@ -6,10 +6,11 @@ import functools
 import json
 from collections.abc import Callable
 
-from device.errors import AgentError
-from device.status import SOCKET, fetch
+from iort_agent.errors import AgentError
+from iort_agent.status import SOCKET, fetch
+from iort_station.fleet import robots
+from iort_station.operations import delivery
 from local.cloud import EmbeddedCloud
-from station import delivery, robots
 from tests.local.conftest import until
 from tests.ros.conftest import Graph, graph, ros_python  # noqa: F401 - fixtures
 from tests.ros.test_source import WHEEL
@@ -28,7 +29,9 @@ def test_ros_master_restarted(
     car = bundle(queue={"path": "spool.db"}, sources=[{"type": "ros1", "topics": topics}])
     definition, written = graph.folder / "wheel.msg", car.folder / "report.json"
     definition.write_text(WHEEL)
-    agent = graph.module("device.main", "run", "--config", car.config, "--report", written, "--drain-s", 60)
+    agent = graph.module(
+        "iort_agent.cli", "run", "--config", car.config, "--report", written, "--drain-s", 60
+    )
     publisher = functools.partial(graph.run, "publisher.py")
     of_type = ["strange_msgs/Wheel", definition, "--field", "state.turns"]
     publisher("first", "/wheel", *of_type)

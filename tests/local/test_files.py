@@ -23,7 +23,10 @@ from botocore.config import Config
 from PIL import Image
 from rosbags.rosbag1 import Reader
 
-from contract import (
+from iort_agent.clock import SystemClock
+from iort_agent.files.file import read
+from iort_agent.files.http import Outcome, Pace, Sender, trusting
+from iort_contract import (
     FILE,
     FILES_PREFIX,
     PART_BYTES,
@@ -38,12 +41,10 @@ from contract import (
     encode_file_request,
     file_key,
 )
-from device.clock import SystemClock
-from device.upload_file import read
-from device.upload_http import Outcome, Pace, Sender, trusting
+from iort_station.fleet import files, robots
+from iort_station.operations import delivery
 from local.deployment import ROOT
 from local.gaps import AWS_MESSAGE_BYTES
-from station import delivery, files, robots
 from tests.images import TOPIC, jpeg, write_bag
 from tests.local.conftest import until
 from tests.local.drives import Agent

@@ -12,7 +12,7 @@ from pathlib import Path
 import pytest
 from typer.testing import CliRunner
 
-from contract import (
+from iort_contract import (
     ADMITTED_CERTIFICATE,
     AGENT_VERSION,
     CERTIFICATE_ID,
@@ -22,11 +22,11 @@ from contract import (
     ONLINE,
     SERIAL,
 )
+from iort_station.cli.main import app
+from iort_station.cloud import EMBEDDED
+from iort_station.errors import StationError
+from iort_station.fleet import certificates, claims, registry, robots, rotation
 from local.cloud import ROOT
-from station import certificates, claims, registry, robots, rotation
-from station.cli import app
-from station.cloud import EMBEDDED
-from station.errors import StationError
 from tests.local.conftest import until
 from verify.robot import STALE, Robot
 

@@ -9,9 +9,11 @@ import sys
 
 import pytest
 
+from iort_station.data import data
+from iort_station.fleet import claims, registry, robots
+from iort_station.operations import quarantine
+from iort_station.page.listener import Listener
 from local.deployment import ROOT
-from station import claims, data, quarantine, registry, robots
-from station.listener import Listener
 from tests.local.conftest import until
 
 EXAMPLES = ROOT / "docs" / "examples"

@@ -12,9 +12,10 @@ from typing import Any
 import pytest
 import yaml
 
-from contract import ROBOT, claim_name
+from iort_contract import ROBOT, claim_name
+from iort_station.fleet import claims, robots
+from iort_station.operations import delivery
 from local.cloud import ROOT
-from station import claims, delivery, robots
 from tests.local.conftest import run_agent, until
 from verify.robot import WAIT_S, Robot
 
@@ -118,8 +119,8 @@ def test_renewal_without_an_agent(embedded, bundle, tmp_path):
 
 
 def test_renewal_that_does_not_connect_leaves_the_old_certificate(embedded, bundle, tmp_path, monkeypatch):
-    from device import identity
-    from device.errors import IdentityError
+    from iort_agent.errors import IdentityError
+    from iort_agent.identity import provision
 
     car = bundle()
     before = (car.folder / "certificate.pem").read_text(), (car.folder / "private.key").read_text()
@@ -128,9 +129,9 @@ def test_renewal_that_does_not_connect_leaves_the_old_certificate(embedded, bund
     def fails(*_: object) -> None:
         raise IdentityError("no")
 
-    monkeypatch.setattr(identity, "_try_alone", fails)
+    monkeypatch.setattr(provision, "_try_alone", fails)
     with pytest.raises(IdentityError):
-        identity.renew(car.config, claim, status_socket=tmp_path / "none.sock")
+        provision.renew(car.config, claim, status_socket=tmp_path / "none.sock")
     assert before == (
         (car.folder / "certificate.pem").read_text(),
         (car.folder / "private.key").read_text(),

@@ -14,11 +14,11 @@ from typing import Any
 
 import pytest
 
-from contract import ADMIT_CLAIM, ADMITTED_CERTIFICATE, ADMITTED_MS, ROBOT, SERIAL
-from device.certificate import parse_certificate
 from functions.admit import SETTLED_MS
+from iort_agent.identity.certificate import parse_certificate
+from iort_contract import ADMIT_CLAIM, ADMITTED_CERTIFICATE, ADMITTED_MS, ROBOT, SERIAL
+from iort_station.fleet import claims, registry
 from local.cloud import ROOT
-from station import claims, registry
 from tests.local.test_identity import certificates, command
 from verify.robot import Robot
 
@@ -27,7 +27,7 @@ KILLED = """
 import os, signal, sys
 from pathlib import Path
 from device import identity
-from device.exchange import Exchange
+from iort_agent.identity.exchange import Exchange
 
 class Killed(Exchange):
     def register(self, token, parameters):

@@ -9,7 +9,7 @@ import time
 import pytest
 from ministack.services import cloudwatch, iot, lambda_svc
 
-from functions.metrics import emit
+from functions.shared.metrics import emit
 from local import metrics
 
 

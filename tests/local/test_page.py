@@ -11,13 +11,13 @@ from contextlib import contextmanager, suppress
 from datetime import datetime, timezone
 from pathlib import Path
 
-from contract import VESC_STREAM
+from iort_contract import VESC_STREAM
+from iort_station.cloud import EMBEDDED
+from iort_station.page.answers import answers
+from iort_station.page.listener import Listener
+from iort_station.page.server import PageServer
 from local.cloud import EmbeddedCloud
 from local.deployment import ROOT
-from station.answers import answers
-from station.cloud import EMBEDDED
-from station.listener import Listener
-from station.page_server import PageServer
 from tests.browser import plain, shown, until
 from tests.images import TOPIC, jpeg, write_bag
 from tests.local.conftest import run_agent

@@ -9,12 +9,12 @@ import time
 import pytest
 from typer.testing import CliRunner
 
-import contract
-from contract import ENTRY, LIVE, VESC_STREAM, Batch, build_topic, record_topic
-from station import delivery, quarantine
-from station.cli import app
-from station.cloud import EMBEDDED
-from station.items import of_topic
+import iort_contract
+from iort_contract import ENTRY, LIVE, VESC_STREAM, Batch, build_topic, record_topic
+from iort_station.cli.main import app
+from iort_station.cloud import EMBEDDED
+from iort_station.data.items import of_topic
+from iort_station.operations import delivery, quarantine
 from tests.local.conftest import until
 from verify.robot import Robot
 
@@ -53,7 +53,7 @@ def send(car, *messages, stream=VESC_STREAM, namespace="iort"):
 def batch(seq=0, **changes):
     """A batch of now as its message, with some of the envelope changed."""
     t_us = (int(time.time()) + seq) * 1_000_000
-    envelope = json.loads(contract.encode(Batch(RUN, seq, [t_us], {"speed": [1.5]})))
+    envelope = json.loads(iort_contract.encode(Batch(RUN, seq, [t_us], {"speed": [1.5]})))
     return json.dumps({**envelope, **changes}).encode()
 
 
@@ -102,7 +102,7 @@ def test_what_the_table_takes_and_lambda_2_cannot_is_kept(bundle, entry_of, chan
     message = batch(**changes)
     send(car, message, stream=stream)
     entry = entry_of(car.robot)
-    assert entry.source == contract.BY_STREAM
+    assert entry.source == iort_contract.BY_STREAM
     assert reason in entry.reason
     kept = json.loads(entry.payload)
     for name, value in json.loads(message).items():
@@ -123,18 +123,18 @@ def test_a_live_message_that_no_robot_of_ours_sends_is_kept_byte_by_byte(bundle,
         robot.online().publish(build_topic(LIVE, car.robot, VESC_STREAM), message)
     entry = entry_of(car.robot)
     assert entry.payload == message
-    assert entry.source.startswith(f"{contract.BY_FUNCTION} iort-processing-Live")
+    assert entry.source.startswith(f"{iort_contract.BY_FUNCTION} iort-processing-Live")
     assert entry.reason.startswith("Refused: ContractError: ")
 
 
-@pytest.mark.parametrize("path", [contract.LAMBDA, contract.FILE])
+@pytest.mark.parametrize("path", [iort_contract.LAMBDA, iort_contract.FILE])
 def test_a_ping_that_is_no_json_is_kept_byte_by_byte(bundle, entry_of, path):
     car = bundle()
     with Robot(car.folder) as robot:
-        robot.online().publish(build_topic(contract.PING, car.robot, path), b"\xff\x00 no JSON")
+        robot.online().publish(build_topic(iort_contract.PING, car.robot, path), b"\xff\x00 no JSON")
     entry = entry_of(car.robot)
     assert entry.payload == b"\xff\x00 no JSON"
-    assert entry.source.startswith(f"{contract.BY_FUNCTION} iort-processing-")
+    assert entry.source.startswith(f"{iort_contract.BY_FUNCTION} iort-processing-")
     assert "not JSON" in entry.reason
 
 
@@ -144,7 +144,7 @@ def test_a_ping_that_is_no_json_is_kept_byte_by_byte(bundle, entry_of, path):
 def rejected(embedded, robot, message):
     """What the record rule's error action sends when the table is throttled."""
     document = {
-        "ruleName": contract.rule_name("record"),
+        "ruleName": iort_contract.rule_name("record"),
         "topic": f"dt/iort/{robot}/{VESC_STREAM}",
         "base64OriginalPayload": base64.b64encode(message).decode(),
         "failures": [{"failedAction": "DynamoDBv2Action", "errorMessage": "throttled"}],
@@ -262,4 +262,4 @@ def test_a_hail_of_nonsense_leaves_the_others_their_summaries(bundle, embedded):
     send(good, batch())
     items = of_topic(cloud, "SummaryTable", good.robot, VESC_STREAM)
     (second,) = until(lambda: cloud.client("dynamodb").query(**items)["Items"])
-    assert second[contract.SAMPLES] == {"N": "1"}
+    assert second[iort_contract.SAMPLES] == {"N": "1"}

@@ -12,10 +12,10 @@ import numpy as np
 import pytest
 from boto3.dynamodb.types import TypeSerializer
 
-from contract import RESULTS_PREFIX, Batch, build_topic, encode
+from iort_contract import RESULTS_PREFIX, Batch, build_topic, encode
+from iort_station.data import data
 from local.cloud import EmbeddedCloud
 from local.deployment import ROOT
-from station import data
 
 START = 1_700_000_000_000_000
 BATCHES, EACH, FIELDS = 80, 150, 50

@@ -8,10 +8,10 @@ import pytest
 from botocore.exceptions import ClientError
 from typer.testing import CliRunner
 
-from contract import FILES_PREFIX
+from iort_contract import FILES_PREFIX
+from iort_station.cli.main import app
+from iort_station.fleet import certificates, claims, registry, robots
 from local.deployment import deploy
-from station import certificates, claims, registry, robots
-from station.cli import app
 from tests.local.conftest import until
 
 

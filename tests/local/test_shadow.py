@@ -10,9 +10,9 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
-from contract import SHADOW
+from iort_contract import SHADOW
+from iort_station.operations import delivery
 from local.cloud import ROOT
-from station import delivery
 from tests.local.conftest import until
 
 

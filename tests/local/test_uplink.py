@@ -14,15 +14,15 @@ from typing import Any
 
 import pytest
 
-import contract
-from device import iotcore, subscriptions
-from device.clock import SystemClock
-from device.dispatch import Dispatcher
-from device.iotcore import IotCore
-from device.reconnect import SLOW_SHORTEST_S
+import iort_contract
+from iort_agent.clock import SystemClock
+from iort_agent.dispatch import Dispatcher
+from iort_agent.mqtt import aws, subscriptions
+from iort_agent.mqtt.aws import IotCore
+from iort_agent.mqtt.reconnect import SLOW_SHORTEST_S
+from iort_station.fleet import robots
 from local.cloud import EmbeddedCloud
 from local.proxy import FREEZE, PASS, REFUSE, Proxy
-from station import robots
 from tests.local.conftest import until
 from verify.robot import Robot
 
@@ -39,7 +39,7 @@ class Told:
     def __init__(self, uplink: IotCore, robot: str) -> None:
         self.connections: list[bool] = []
         self.messages: list[bytes] = []
-        self.topic = contract.build_topic(contract.PING, robot, contract.BROKER)
+        self.topic = iort_contract.build_topic(iort_contract.PING, robot, iort_contract.BROKER)
         self.uplink = uplink
         uplink.on_connection(self.connections.append)
         uplink.subscribe(self.topic, lambda message: self.messages.append(message.payload))
@@ -138,7 +138,7 @@ def test_a_broker_that_is_stopped_and_started(bundle, embedded):
 
 
 def test_a_frozen_broker_is_noticed(bundle, proxy):
-    assert iotcore.KEEP_ALIVE_S + iotcore.PING_TIMEOUT_S <= 45
+    assert aws.KEEP_ALIVE_S + aws.PING_TIMEOUT_S <= 45
     with connecting(bundle(), proxy, keep_alive_s=2, ping_timeout_s=1) as told:
         told.echo(b"before")
         proxy.mode = FREEZE
@@ -253,6 +253,6 @@ def test_a_subscription_made_while_connected(bundle, proxy):
     with connecting(car, proxy) as told:
         told.echo(b"before")
         heard: list[bytes] = []
-        topic = contract.build_topic(contract.CMD, car.robot, "drive")
+        topic = iort_contract.build_topic(iort_contract.CMD, car.robot, "drive")
         told.uplink.subscribe(topic, lambda message: heard.append(message.payload))
         until(lambda: told.uplink.subscribed(topic))

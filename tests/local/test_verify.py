@@ -10,8 +10,8 @@ from dataclasses import replace
 import pytest
 
 from bench.target import AWS, EMBEDDED, Target
-from station import keys
-from station.errors import StationError
+from iort_station.errors import StationError
+from iort_station.page import keys
 from verify import measured, price, run
 from verify.check import WITH_KEY, Verdict, ask
 from verify.checks import ALL, live, rules

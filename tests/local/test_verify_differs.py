@@ -8,7 +8,7 @@ import time
 import pytest
 
 from bench.target import EMBEDDED, Target
-from contract import RECORD, TOPIC, fleet_name, rule_name
+from iort_contract import RECORD, TOPIC, fleet_name, rule_name
 from verify.check import Verdict, ask
 from verify.checks import broker, provisioning, rules
 

@@ -11,8 +11,9 @@ from typing import Any
 import pytest
 from rosbags.rosbag1 import Writer
 
+from iort_station.fleet import robots
+from iort_station.operations import delivery
 from local.cloud import EmbeddedCloud
-from station import delivery, robots
 from tests.local.conftest import run_agent
 from tests.local.drives import Agent
 from tests.ros.mixed_compare import compare, read

@@ -11,9 +11,9 @@ import sys
 import genpy
 import genpy.dynamic
 
-from contract.ros1.decode import Decoder
-from contract.ros1.definition import LETTERS, parse
-from device.sources.flatten import flatten
+from iort_agent.sources.flatten import flatten
+from iort_contract.ros1.decode import Decoder
+from iort_contract.ros1.definition import LETTERS, parse
 
 RULE = "=" * 80
 KINDS = [*LETTERS, "string", "time", "duration"]

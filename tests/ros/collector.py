@@ -15,10 +15,10 @@ import threading
 from hashlib import sha256
 from pathlib import Path
 
-from contract import RosMessage
-from device.clock import SystemClock
-from device.schema import Where, load
-from device.sources.ros1 import Ros1Config
+from iort_agent.clock import SystemClock
+from iort_agent.config.schema import Where, load
+from iort_agent.sources.ros1 import Ros1Config
+from iort_contract import RosMessage
 
 
 def say(line: str) -> None:

@@ -14,17 +14,17 @@ import sys
 import time
 from pathlib import Path
 
-import contract
-from device.allowance import Allowance
-from device.clock import SystemClock
-from device.dispatch import Dispatcher
-from device.downlink import make_downlink
-from device.downlink_config import DownlinkConfig, share_rule
-from device.loopback import Loopback
-from device.offset import Offset
-from device.ros1_node import DEFAULT_NODE
-from device.ros1_publish import Ros1Graph
-from device.schema import Where, load
+import iort_contract
+from iort_agent.clock import SystemClock
+from iort_agent.config.downlink import DownlinkConfig, share_rule
+from iort_agent.config.schema import Where, load
+from iort_agent.control.downlink import make_downlink
+from iort_agent.dispatch import Dispatcher
+from iort_agent.lanes.clock_offset import Offset
+from iort_agent.lanes.rate_limiter import Allowance
+from iort_agent.mqtt.loopback import Loopback
+from iort_agent.ros1.node import DEFAULT_NODE
+from iort_agent.ros1.publish import Ros1Graph
 
 
 def say(line: str) -> None:
@@ -71,15 +71,15 @@ for seq, line in zip(itertools.count(), sys.stdin):
         say("heard")
     elif verb == "pose":
         robot, _, message = rest.partition(" ")
-        fleet = contract.FleetMessage("1badcafe", seq, clock.now_us(), json.loads(message))
-        uplink.deliver(f"fleet/iort/{robot}/pose", contract.encode_fleet(fleet))
+        fleet = iort_contract.FleetMessage("1badcafe", seq, clock.now_us(), json.loads(message))
+        uplink.deliver(f"fleet/iort/{robot}/pose", iort_contract.encode_fleet(fleet))
     else:
         lease, _, message = rest.partition(" ")
         now_us = clock.now_us()
-        command = contract.Command(
+        command = iort_contract.Command(
             "feedbeef", started_us, seq, now_us, 60_000, json.loads(message), int(lease)
         )
-        uplink.deliver("cmd/iort/car1/drive", contract.encode_command(command))
+        uplink.deliver("cmd/iort/car1/drive", iort_contract.encode_command(command))
 downlink.halt()
 uplink.stop(1)
 downlink.close()

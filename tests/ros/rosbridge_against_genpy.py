@@ -14,9 +14,9 @@ import sys
 import genpy
 import genpy.dynamic
 
-from contract.ros1.definition import LETTERS, parse
-from device.ros1_write import Writer
-from device.sources.rosapi import md5sum
+from iort_agent.ros1.write import Writer
+from iort_agent.sources.rosbridge.rosapi import md5sum
+from iort_contract.ros1.definition import LETTERS, parse
 from tests.rosbridge_json import as_rosbridge
 
 RULE = "=" * 80

@@ -23,11 +23,11 @@ from typing import Any
 
 import pytest
 
-from device.errors import AgentError
-from device.status import SOCKET, fetch
+from iort_agent.errors import AgentError
+from iort_agent.status import SOCKET, fetch
+from iort_station.fleet import robots
 from local.cloud import EmbeddedCloud
 from local.proxy import PASS, REFUSE, Proxy
-from station import robots
 from tests.local.conftest import embedded, iort, until  # noqa: F401 - fixtures
 from tests.ros.conftest import Graph, Process, ros_python  # noqa: F401 - a fixture
 from tests.ros.mixed_compare import Bag, Difference, Recorded, compare, read
@@ -100,7 +100,7 @@ class Mixed:
         self.agents += 1
         # A robot of rosbridge needs no ROS, and has a Python of its own.
         python = self.graph.python if self.server is None else sys.executable
-        command = ["-m", "device.main", "run", "--config", str(config), "--drain-s", "60"]
+        command = ["-m", "iort_agent.cli", "run", "--config", str(config), "--drain-s", "60"]
         return self.graph.start([python, *command])
 
     def same(self, topic: str, data: bytes) -> object:

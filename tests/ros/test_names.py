@@ -9,8 +9,8 @@ from typing import Any, NamedTuple
 
 import yaml
 
-from device.errors import AgentError
-from device.status import fetch
+from iort_agent.errors import AgentError
+from iort_agent.status import fetch
 from tests.local.conftest import until
 from tests.local.test_uplink import self_signed
 from tests.ros.conftest import Graph, Process
@@ -137,7 +137,7 @@ def agent_of(graph: Graph, folder: Path, *sources: dict[str, Any], arguments: tu
     for made, named in (("private.key", "key.pem"), ("certificate.pem", "cert.pem")):
         (folder / made).replace(folder / named)
     (folder / "ca.pem").write_bytes((folder / "cert.pem").read_bytes())
-    command = ("device.main", "run", "--config", config, "--drain-s", 0, *arguments)
+    command = ("iort_agent.cli", "run", "--config", config, "--drain-s", 0, *arguments)
     return Agent(graph.module(*map(str, command)), folder)
 
 

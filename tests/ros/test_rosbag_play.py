@@ -11,10 +11,10 @@ from typing import Any
 
 import pytest
 
-from contract import MessageType, RosMessage, message_type
-from device.clock import SystemClock
-from device.sources.bag import BagConfig
-from station import recordings
+from iort_agent.clock import SystemClock
+from iort_agent.sources.recording.bag import BagConfig
+from iort_contract import MessageType, RosMessage, message_type
+from iort_station.recordings import recordings
 from tests.recordings import recording
 from tests.ros.conftest import Graph
 

@@ -9,8 +9,8 @@ from typing import Any
 import pytest
 import yaml
 
-from device.errors import AgentError
-from device.status import SOCKET, fetch
+from iort_agent.errors import AgentError
+from iort_agent.status import SOCKET, fetch
 from tests.local.conftest import until
 from tests.local.test_uplink import self_signed
 from tests.ros.conftest import Graph, Process
@@ -35,7 +35,7 @@ class Car:
         for made, named in (("private.key", "key.pem"), ("certificate.pem", "cert.pem")):
             (folder / made).replace(folder / named)
         (folder / "ca.pem").write_bytes((folder / "cert.pem").read_bytes())
-        self.process = graph.module("device.main", "run", "--config", config, "--drain-s", 0)
+        self.process = graph.module("iort_agent.cli", "run", "--config", config, "--drain-s", 0)
 
     def status(self) -> dict[str, Any]:
         found: dict[str, Any] = until(self._answer, seconds=WAIT_S)

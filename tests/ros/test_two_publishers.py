@@ -7,10 +7,11 @@ from pathlib import Path
 
 import pytest
 
-from device.errors import AgentError
-from device.status import SOCKET, fetch
+from iort_agent.errors import AgentError
+from iort_agent.status import SOCKET, fetch
+from iort_station.fleet import robots
+from iort_station.operations import delivery
 from local.cloud import EmbeddedCloud
-from station import delivery, robots
 from tests.local.conftest import embedded, until  # noqa: F401 - a fixture
 from tests.ros.conftest import Graph, ros_python  # noqa: F401 - a fixture
 from tests.ros.mixed_robot import TOPICS
@@ -36,7 +37,7 @@ def stored(
     graph = Graph(ros_python, folder)
     try:
         graph.start_master()
-        agent = graph.module("device.main", "run", "--config", car.config, "--drain-s", 60)
+        agent = graph.module("iort_agent.cli", "run", "--config", car.config, "--drain-s", 60)
         publishers = [_publisher(graph, node, folder) for node in ("base", "rear")]
         for publisher in publishers:
             publisher.until(lambda publisher=publisher: "ready" in publisher.lines, "connections")

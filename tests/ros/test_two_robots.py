@@ -11,9 +11,9 @@ from typing import Any
 
 import pytest
 
-import contract
+import iort_contract
+from iort_station.fleet import robots
 from local.cloud import EmbeddedCloud
-from station import robots
 from tests.local.conftest import bundle, embedded, iort  # noqa: F401 - fixtures
 from tests.ros.conftest import Graph, Process
 from tests.unit.downlink_rig import POSE
@@ -66,7 +66,7 @@ def test_two_robots_see_each_others_poses_and_take_commands(
     }
     cars = [bundle(name, **settings) for name in ("-a", "-b")]
     agents = [
-        graph.module("device.main", "run", "--config", car.config, "--drain-s", 10)
+        graph.module("iort_agent.cli", "run", "--config", car.config, "--drain-s", 10)
         for graph, car in zip(graphs, cars, strict=True)
     ]
     for i, graph in enumerate(graphs):
@@ -91,12 +91,12 @@ def test_two_robots_see_each_others_poses_and_take_commands(
     driver = graphs[0].run("listener.py", "driver", "/speed", "std_msgs/Float64")
     driver.until(lambda: "connected" in driver.lines, "connection")
     operator, started_us, seq = embedded.cloud.client("iot-data"), time.time_ns() // 1000, 0
-    topic = contract.build_topic(contract.CMD, cars[0].robot, "drive", embedded.namespace)
+    topic = iort_contract.build_topic(iort_contract.CMD, cars[0].robot, "drive", embedded.namespace)
     while 1.5 not in [m["data"] for m in messages(driver)]:
-        command = contract.Command(
+        command = iort_contract.Command(
             "feedbeef", started_us, seq, time.time_ns() // 1000, 60_000, {"data": 1.5}, 2000
         )
-        operator.publish(topic=topic, qos=1, payload=contract.encode_command(command))
+        operator.publish(topic=topic, qos=1, payload=iort_contract.encode_command(command))
         seq += 1
         assert seq < 1000, "\n".join(agents[0].errors)
         time.sleep(0.1)  # an operator's stick

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-import contract
+import iort_contract
 from stacks.checks import EVERY_RESOURCE
 
 IOT = "arn:${AWS::Partition}:iot:${AWS::Region}:${AWS::AccountId}"
@@ -97,7 +97,7 @@ ROLES = {
             ("dynamodb:GetShardIterator", "Batches.StreamArn"),
             ("dynamodb:ListStreams", "*"),
             ("sqs:SendMessage", "PutOff.Arn"),
-            ("iot:UpdateThingShadow", f"{IOT}:thing/*/{contract.SHADOW}"),
+            ("iot:UpdateThingShadow", f"{IOT}:thing/*/{iort_contract.SHADOW}"),
         }
         | DESTINATION,
     ),
@@ -141,7 +141,8 @@ ROLES = {
         | {("dynamodb:Query", "Batches.Arn"), ("dynamodb:Scan", "Batches.Arn")}
         | {("dynamodb:GetItem", "Robots.Arn")}
         | {
-            (f"s3:{action}", f"Files.Arn/{contract.RESULTS_PREFIX}*") for action in ("GetObject", "PutObject")
+            (f"s3:{action}", f"Files.Arn/{iort_contract.RESULTS_PREFIX}*")
+            for action in ("GetObject", "PutObject")
         },
     ),
     "UploadRole": (
@@ -149,7 +150,7 @@ ROLES = {
         {(action, "UploadLog.Arn") for action in LOG}
         | DESTINATION
         | {
-            (f"s3:{action}", f"Files.Arn/{contract.FILES_PREFIX}*")
+            (f"s3:{action}", f"Files.Arn/{iort_contract.FILES_PREFIX}*")
             for action in ("AbortMultipartUpload", "ListMultipartUploadParts", "PutObject")
         }
         | {(f"s3:{action}", "Files.Arn") for action in ("ListBucket", "ListBucketMultipartUploads")}
@@ -191,8 +192,8 @@ ROLES = {
 # Of the functions that keep something in a robot's row: which attributes.
 KEEPS = {
     "AlertRole": ("alert_*",),
-    "PresenceRole": contract.PRESENCE,
-    "LaterRole": (contract.STREAMS,),
-    "SummarizeRole": (contract.STREAMS,),
+    "PresenceRole": iort_contract.PRESENCE,
+    "LaterRole": (iort_contract.STREAMS,),
+    "SummarizeRole": (iort_contract.STREAMS,),
     "UploadRole": ("files_bytes", "files_day"),
 }

@@ -9,8 +9,8 @@ import sys
 
 import pytest
 
+from iort_station.cost.usage import Usage
 from stacks.settings import ROOT, Settings, SettingsError
-from station.usage import Usage
 
 
 def run(tmp_path, name, **context):

@@ -8,17 +8,22 @@ import re
 
 import pytest
 
-import contract
-from contract import rule_name
-from functions.health import measure
+import iort_contract
+from functions.shared.health import measure
+from iort_contract import rule_name
+from iort_station.cost.fixed_costs import (
+    FREE_DASHBOARD_METRICS,
+    FREE_DASHBOARDS,
+    ROBOT_SEARCHES,
+    dashboard_metrics,
+)
+from iort_station.cost.usage import Usage
+from iort_station.operations import cloudwatch
 from stacks.metrics import statistic
 from stacks.settings import ROOT
-from station import cloudwatch
-from station.at_rest import FREE_DASHBOARD_METRICS, FREE_DASHBOARDS, ROBOT_SEARCHES, dashboard_metrics
-from station.usage import Usage
 from tests.stacks.aws_metrics import AWS_METRICS
 
-FUNCTIONS = sorted((ROOT / "functions").glob("*.py"))
+FUNCTIONS = sorted((ROOT / "functions").rglob("*.py"))
 
 
 @pytest.fixture(scope="module")
@@ -102,8 +107,8 @@ def emitted():
             if isinstance(node, ast.Call) and ast.unparse(node.func) == "counted.add":
                 found.setdefault(path.stem, set()).update(keyword.arg for keyword in node.keywords)
     # These have their names computed.
-    batch = contract.Batch("0" * 8, 0, [1], {"voltage_input": [12.0]})
-    for stream in ("vesc", contract.RTT_STREAM, contract.AGENT_STREAM):
+    batch = iort_contract.Batch("0" * 8, 0, [1], {"voltage_input": [12.0]})
+    for stream in ("vesc", iort_contract.RTT_STREAM, iort_contract.AGENT_STREAM):
         found["health"] |= measure(stream, [batch]).keys()
     return found
 
@@ -111,12 +116,12 @@ def emitted():
 def test_the_dashboards_show_what_the_functions_emit_and_nothing_else(shown):
     by_function = {}
     for namespace, metric, dimensions, options in shown:
-        if namespace == contract.METRIC_NAMESPACE:
+        if namespace == iort_contract.METRIC_NAMESPACE:
             assert dimensions.keys() == {"Deployment", "Function"}
-            assert dimensions["Deployment"] == contract.DEFAULT_NAMESPACE
+            assert dimensions["Deployment"] == iort_contract.DEFAULT_NAMESPACE
             by_function.setdefault(dimensions["Function"], set()).add(metric)
             assert options["stat"] == statistic(metric)
-    assert by_function == {function: set(names) for function, names in contract.METRICS.items()}
+    assert by_function == {function: set(names) for function, names in iort_contract.METRICS.items()}
     assert emitted() == by_function
 
 
@@ -126,10 +131,10 @@ def test_the_dashboards_cover_every_service_of_the_path(shown):
         "AWS/DynamoDB",
         "AWS/Lambda",
         "AWS/SQS",
-        contract.METRIC_NAMESPACE,
+        iort_contract.METRIC_NAMESPACE,
     }
     rules = {dimensions["RuleName"] for _, _, dimensions, _ in shown if "RuleName" in dimensions}
-    assert rules == {rule_name(rule) for rule in contract.RULES}
+    assert rules == {rule_name(rule) for rule in iort_contract.RULES}
 
 
 def test_every_metric_of_aws_is_one_that_aws_has(shown, alarms):
@@ -139,7 +144,7 @@ def test_every_metric_of_aws_is_one_that_aws_has(shown, alarms):
         if "Metrics" not in a
     ]
     for namespace, metric, dimensions in [*(one[:3] for one in shown), *of_alarms]:
-        if namespace != contract.METRIC_NAMESPACE:
+        if namespace != iort_contract.METRIC_NAMESPACE:
             assert metric in AWS_METRICS[(namespace, *sorted(dimensions))]
-        elif metric not in contract.METRICS[dimensions["Function"]]:
+        elif metric not in iort_contract.METRICS[dimensions["Function"]]:
             raise AssertionError(f"nothing emits {metric}")

@@ -9,7 +9,7 @@ from typing import Any
 
 import pytest
 
-import contract
+import iort_contract
 from stacks.variations import LONGEST_NAMESPACE, VARIATIONS
 from tests.stacks.cloudformation import has_schema, names, schema
 
@@ -126,9 +126,9 @@ def named(resource):
 
 
 def test_the_longest_namespace_is_the_contracts():
-    assert contract.check_namespace(LONGEST_NAMESPACE) == LONGEST_NAMESPACE
-    with pytest.raises(contract.ContractError):
-        contract.check_namespace(f"{LONGEST_NAMESPACE}n")
+    assert iort_contract.check_namespace(LONGEST_NAMESPACE) == LONGEST_NAMESPACE
+    with pytest.raises(iort_contract.ContractError):
+        iort_contract.check_namespace(f"{LONGEST_NAMESPACE}n")
 
 
 def resource(kind, **properties):

@@ -6,7 +6,7 @@ import re
 
 from aws_cdk import Stack
 
-from contract import (
+from iort_contract import (
     CMD,
     FILE,
     FLEET,

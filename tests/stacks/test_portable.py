@@ -10,7 +10,7 @@ from pathlib import Path
 
 import pytest
 
-from contract import RULES, pong_template, rule_sql
+from iort_contract import RULES, pong_template, rule_sql
 from stacks.portable import RULE_ACTIONS, SQL_FUNCTIONS, rule_problems, sql_functions
 from stacks.settings import ROOT
 

@@ -6,9 +6,9 @@ import json
 
 import pytest
 
-import contract
-from contract import RULES, pong_template, rule_name, rule_sql
-from station.cost import RECORDS_A_CALL, WINDOW_S
+import iort_contract
+from iort_contract import RULES, pong_template, rule_name, rule_sql
+from iort_station.cost.model import RECORDS_A_CALL, WINDOW_S
 from tests.stacks.templates import name
 
 
@@ -92,11 +92,11 @@ def test_the_tables_keys_are_the_contracts(synthesized):
             (k["AttributeName"], k["KeyType"], types[k["AttributeName"]]) for k in tables[table]["KeySchema"]
         ]
 
-    assert keys("Batches") == [(contract.TOPIC, "HASH", "S"), (contract.BATCH, "RANGE", "S")]
-    assert keys("Summary") == [(contract.TOPIC, "HASH", "S"), (contract.SECOND, "RANGE", "N")]
-    assert keys("Robots") == [(contract.ROBOT, "HASH", "S")]
-    assert keys("Quarantine") == [(contract.ROBOT, "HASH", "S"), (contract.ENTRY, "RANGE", "S")]
-    expires = {"AttributeName": contract.EXPIRES_S, "Enabled": True}
+    assert keys("Batches") == [(iort_contract.TOPIC, "HASH", "S"), (iort_contract.BATCH, "RANGE", "S")]
+    assert keys("Summary") == [(iort_contract.TOPIC, "HASH", "S"), (iort_contract.SECOND, "RANGE", "N")]
+    assert keys("Robots") == [(iort_contract.ROBOT, "HASH", "S")]
+    assert keys("Quarantine") == [(iort_contract.ROBOT, "HASH", "S"), (iort_contract.ENTRY, "RANGE", "S")]
+    expires = {"AttributeName": iort_contract.EXPIRES_S, "Enabled": True}
     assert {t: v.get("TimeToLiveSpecification") for t, v in tables.items()} == {
         "Batches": expires,
         "Summary": expires,
@@ -241,9 +241,12 @@ def test_the_files_bucket_is_private_encrypted_and_cleans_up_after_itself(synthe
     assert rules.keys() == {"abandoned", "results", "rare"}
     assert rules["abandoned"]["AbortIncompleteMultipartUpload"] == {"DaysAfterInitiation": 7}
     assert "Prefix" not in rules["abandoned"]
-    assert (rules["results"]["Prefix"], rules["results"]["ExpirationInDays"]) == (contract.RESULTS_PREFIX, 1)
+    assert (rules["results"]["Prefix"], rules["results"]["ExpirationInDays"]) == (
+        iort_contract.RESULTS_PREFIX,
+        1,
+    )
     # Without a setting, what robots have uploaded is kept for good.
-    assert rules["rare"]["Prefix"] == contract.FILES_PREFIX
+    assert rules["rare"]["Prefix"] == iort_contract.FILES_PREFIX
     assert "ExpirationInDays" not in rules["rare"]
     (policy,) = synthesized.resources("AWS::S3::BucketPolicy").values()
     statements = policy["PolicyDocument"]["Statement"]

@@ -6,8 +6,8 @@ from typing import Any
 
 import pytest
 
+from iort_station.page.page import HEADERS, PUBNUB_ORIGIN, security_policy
 from stacks.settings import Settings
-from station.page import HEADERS, PUBNUB_ORIGIN, security_policy
 
 
 @pytest.fixture(scope="module")

@@ -14,8 +14,8 @@ from pathlib import Path
 import pytest
 from aws_cdk import App, Stack
 
-import contract
-from contract import (
+import iort_contract
+from iort_contract import (
     BROKER,
     FILE,
     LAMBDA,
@@ -47,7 +47,7 @@ HANDLERS = (
     "Alert",
     "Later",
 )
-CONTRACT = sorted((ROOT / "contract").rglob("*.py"))
+CONTRACT = sorted((ROOT / "contract" / "iort_contract").rglob("*"))
 # Lambda's Python has boto3 and what boto3 needs.
 RUNTIME_PACKAGES = ("boto3", "botocore", "dateutil", "jmespath", "s3transfer", "six", "urllib3")
 
@@ -63,8 +63,13 @@ def test_the_asset_holds_exactly_the_contract_and_the_functions(synthesized, fun
     packaged = {
         str(path.relative_to(asset)): path.read_bytes() for path in asset.rglob("*") if path.is_file()
     }
-    expected = {*CONTRACT, *FUNCTIONS}
-    assert packaged == {str(path.relative_to(ROOT)): path.read_bytes() for path in expected}
+    # Side by side, as they are imported.
+    expected = dict.fromkeys(FUNCTIONS, ROOT) | dict.fromkeys(CONTRACT, ROOT / "contract")
+    assert packaged == {
+        str(path.relative_to(home)): path.read_bytes()
+        for path, home in expected.items()
+        if path.is_file() and "__pycache__" not in path.parts
+    }
 
 
 @pytest.fixture(scope="module")
@@ -115,9 +120,11 @@ print(json.dumps(files))
     assert done.returncode == 0, done.stderr
     files = json.loads(done.stdout)
     own = {
-        module: file for module, file in files.items() if module.split(".")[0] in ("functions", "contract")
+        module: file
+        for module, file in files.items()
+        if module.split(".")[0] in ("functions", "iort_contract")
     }
-    assert {"contract", "functions", properties["Handler"].rpartition(".")[0]} <= own.keys()
+    assert {"iort_contract", "functions", properties["Handler"].rpartition(".")[0]} <= own.keys()
     for file in own.values():
         assert Path(file).is_relative_to(asset)
     assert not [
@@ -132,6 +139,18 @@ def test_every_function_module_with_a_handler_is_deployed(functions):
     assert {function["Handler"] for function in functions.values()} == modules
 
 
+def source(module):
+    """The text of a module of functions/, by its dotted name."""
+    return (ROOT / f"{module.replace('.', '/')}.py").read_text()
+
+
+def modules_of(node):
+    """What an import from functions/ loads: the module that it names, or the modules out of a package."""
+    if (ROOT / f"{node.module.replace('.', '/')}.py").is_file():
+        return [node.module]
+    return [f"{node.module}.{alias.name}" for alias in node.names]
+
+
 def imported(module):
     """The modules of functions/ that one of them loads, itself included."""
     found, todo = set(), [module]
@@ -141,9 +160,10 @@ def imported(module):
             continue
         found.add(one)
         todo += [
-            node.module.split(".")[1]
-            for node in ast.walk(ast.parse((ROOT / "functions" / f"{one}.py").read_text()))
+            module
+            for node in ast.walk(ast.parse(source(one)))
             if isinstance(node, ast.ImportFrom) and (node.module or "").startswith("functions.")
+            for module in modules_of(node)
         ]
     return found
 
@@ -151,7 +171,7 @@ def imported(module):
 def variables_read(module):
     read = set()
     for one in imported(module):
-        tree = ast.parse((ROOT / "functions" / f"{one}.py").read_text())
+        tree = ast.parse(source(one))
         uses = [n for n in ast.walk(tree) if isinstance(n, ast.Attribute) and n.attr in ("environ", "getenv")]
         known = [
             n
@@ -169,7 +189,7 @@ def variables_read(module):
             and n.left.value == "AWS_LAMBDA_INITIALIZATION_TYPE"
         ]
         assert len(uses) == len(known) + len(asked), (
-            f'functions/{one}.py reads the environment other than by os.environ["X"]'
+            f'{one} reads the environment other than by os.environ["X"]'
         )
         read |= {ast.literal_eval(n.slice) for n in known}
     return read
@@ -179,7 +199,7 @@ def variables_read(module):
 def test_a_function_reads_exactly_the_variables_that_it_is_given(functions, function):
     properties = functions[function]
     given = set(properties.get("Environment", {}).get("Variables", {}))
-    assert variables_read(properties["Handler"].split(".")[1]) == given
+    assert variables_read(properties["Handler"].rpartition(".")[0]) == given
 
 
 def test_what_the_variables_say_is_what_the_functions_expect(functions, reader, monkeypatch):
@@ -187,14 +207,16 @@ def test_what_the_variables_say_is_what_the_functions_expect(functions, reader, 
 
     live = functions["Live"]["Environment"]["Variables"]
     monkeypatch.setenv("LIVE_FIELDS", live["LIVE_FIELDS"])
-    assert LiveSettings.from_environment().fields == {contract.VESC_STREAM: frozenset(contract.VESC_FIELDS)}
-    assert live["PUBNUB_PARAMETER"] == contract.pubnub_parameter()
+    assert LiveSettings.from_environment().fields == {
+        iort_contract.VESC_STREAM: frozenset(iort_contract.VESC_FIELDS)
+    }
+    assert live["PUBNUB_PARAMETER"] == iort_contract.pubnub_parameter()
     assert reader.text(live["REJECTED_QUEUE"]) == "Rejected"
-    assert live["NAMESPACE"] == contract.DEFAULT_NAMESPACE
+    assert live["NAMESPACE"] == iort_contract.DEFAULT_NAMESPACE
 
     def given(function):
         variables = functions[function]["Environment"]["Variables"]
-        assert variables["NAMESPACE"] == contract.DEFAULT_NAMESPACE
+        assert variables["NAMESPACE"] == iort_contract.DEFAULT_NAMESPACE
         return {key: reader.text(value) for key, value in variables.items() if key != "NAMESPACE"}
 
     assert given("Later") == {
@@ -279,13 +301,13 @@ def test_every_topic_of_the_agent_meets_exactly_the_rule_that_it_is_for(filters)
         build_topic(PONG, "car", RULE): set(),
         build_topic(PONG, "car", LAMBDA): set(),
         build_topic(PONG, "car", FILE): set(),
-        build_topic(contract.FLEET, "car", "pose"): set(),
-        build_topic(contract.CMD, "car", "stop"): set(),
+        build_topic(iort_contract.FLEET, "car", "pose"): set(),
+        build_topic(iort_contract.CMD, "car", "stop"): set(),
         build_topic(LIVE, "car", "vesc", "lab2"): set(),
         "$aws/events/presence/connected/car": {"iort_presence"},
         "$aws/events/presence/disconnected/car": {"iort_presence"},
-        f"$aws/things/car/shadow/name/{contract.SHADOW}/update/accepted": {"iort_version"},
-        f"$aws/things/car/shadow/name/{contract.SHADOW}/update/documents": set(),
+        f"$aws/things/car/shadow/name/{iort_contract.SHADOW}/update/accepted": {"iort_version"},
+        f"$aws/things/car/shadow/name/{iort_contract.SHADOW}/update/documents": set(),
         "$aws/things/car/shadow/update/accepted": set(),
     }
     for one, rules in expected.items():

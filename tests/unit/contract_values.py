@@ -7,8 +7,8 @@ import math
 
 from hypothesis import strategies as st
 
-import contract
-from contract import Batch, ContractError, LiveSample
+import iort_contract
+from iort_contract import Batch, ContractError, LiveSample
 
 LIMIT_US = 2**53 - 1
 BOOT = "0123abcd"
@@ -27,8 +27,10 @@ values = st.none() | st.booleans() | integers | finite | st.text(max_size=20)
 @st.composite
 def batches(draw, kinds=values):
     # Of one time there may be several.
-    offsets = draw(st.lists(st.integers(0, contract.MAX_BATCH_SPAN_US - 1) | st.integers(0, 3), max_size=12))
-    first = draw(st.integers(0, LIMIT_US - contract.MAX_BATCH_SPAN_US) | st.just(0))
+    offsets = draw(
+        st.lists(st.integers(0, iort_contract.MAX_BATCH_SPAN_US - 1) | st.integers(0, 3), max_size=12)
+    )
+    first = draw(st.integers(0, LIMIT_US - iort_contract.MAX_BATCH_SPAN_US) | st.just(0))
     n = 1 + len(offsets)
     # Columns as recordings have them, of one kind, and of any mixture.
     column = st.one_of(
@@ -65,7 +67,7 @@ anything = st.floats() | st.sampled_from([math.nan, math.inf, -math.inf]) | valu
 
 GOOD = Batch(BOOT, 4, [0, 5], {"speed": [1.5, 2.5]}, 0)
 GOOD_LIVE = LiveSample(BOOT, 4, 0, 5, {"speed": 1.5}, 0)
-MOST_NONFINITE = contract.MAX_SAMPLES * contract.MAX_FIELDS
+MOST_NONFINITE = iort_contract.MAX_SAMPLES * iort_contract.MAX_FIELDS
 
 BAD_HEADERS = [
     ({"boot": "0123ABCD"}, "boot"),
@@ -91,9 +93,9 @@ def decode_or_refuse(decoder, message):
         str(error).encode()  # it can be logged, whatever was in the message
         return
     if isinstance(taken, Batch):
-        assert contract.decode(contract.encode(taken)) == taken
+        assert iort_contract.decode(iort_contract.encode(taken)) == taken
     elif isinstance(taken, LiveSample):
-        assert contract.decode_live(contract.encode_live(taken)) == taken
+        assert iort_contract.decode_live(iort_contract.encode_live(taken)) == taken
 
 
 json_values = st.recursive(

@@ -9,18 +9,18 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-import contract
-from contract import Command
-from contract.ros1.definition import Definition, parse
-from device.allowance import Allowance
-from device.clock import ManualClock
-from device.dispatch import Dispatcher
-from device.downlink import Downlink
-from device.downlink_config import DownlinkConfig, share_rule
-from device.errors import SourceError
-from device.loopback import Loopback
-from device.offset import Offset
-from device.schema import Where, load
+import iort_contract
+from iort_agent.clock import ManualClock
+from iort_agent.config.downlink import DownlinkConfig, share_rule
+from iort_agent.config.schema import Where, load
+from iort_agent.control.downlink import Downlink
+from iort_agent.dispatch import Dispatcher
+from iort_agent.errors import SourceError
+from iort_agent.lanes.clock_offset import Offset
+from iort_agent.lanes.rate_limiter import Allowance
+from iort_agent.mqtt.loopback import Loopback
+from iort_contract import Command
+from iort_contract.ros1.definition import Definition, parse
 
 RULE = "=" * 80
 HEADER = f"{RULE}\nMSG: std_msgs/Header\nuint32 seq\ntime stamp\nstring frame_id\n"
@@ -143,7 +143,7 @@ class Rig:
         now_us = self.clock.now_us()
         command = Command("feedbeef", now_us - 10, self.seq, now_us, 500, message, 300)
         self.seq += 1
-        payload = raw if raw is not None else contract.encode_command(replace(command, **changes))
+        payload = raw if raw is not None else iort_contract.encode_command(replace(command, **changes))
         self.uplink.deliver(f"cmd/iort/car1/{name}", payload)
         self.dispatcher.run_pending()
 

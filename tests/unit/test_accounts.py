@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import json
 
-from contract import Batch, encode
-from contract.account import SourceAccount, StreamAccount
-from station.accounts import held_against, last_of
-from station.audit import audit
+from iort_contract import Batch, encode
+from iort_contract.messages.account import SourceAccount, StreamAccount
+from iort_station.operations.accounts import held_against, last_of
+from iort_station.operations.audit import audit
 
 T_US, BOOT = 1_750_000_000_000_000, "0badcafe"
 HOUR_US = 3_600_000_000

@@ -11,7 +11,9 @@ import time
 import pytest
 from botocore.stub import Stubber
 
-from contract import (
+from functions import admit
+from functions.shared.tables import plain
+from iort_contract import (
     ADMIT_CLAIM,
     ADMIT_FINGERPRINT,
     ADMIT_UNTIL_S,
@@ -20,8 +22,6 @@ from contract import (
     CONNECTED_MS,
     SERIAL,
 )
-from functions import admit
-from functions.tables import plain
 from tests.fakes import ROBOTS
 
 LATER_S = int(time.time()) + 3600

@@ -8,8 +8,8 @@ import math
 import boto3
 import pytest
 
-from contract import ContractError
 from functions.alert import QUIET_S, Notices, causes, process
+from iort_contract import ContractError
 from tests.fakes import NAMES
 
 NOW_S = 1_700_000_000

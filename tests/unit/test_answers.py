@@ -7,10 +7,10 @@ import json
 import numpy as np
 import pytest
 
-from contract import Batch
-from station.answers import MAX_ROWS, answers, history
-from station.conditions import values
-from station.errors import StationError
+from iort_contract import Batch
+from iort_station.data.conditions import values
+from iort_station.errors import StationError
+from iort_station.page.answers import MAX_ROWS, answers, history
 from tests.unit.test_station_data import START, cloud_of, ride
 
 ASKED = {

@@ -13,7 +13,7 @@ def checkout(tmp_path):
         (tmp_path / name).parent.mkdir(parents=True, exist_ok=True)
         (tmp_path / name).write_text(name)
     for name in deployment._MADE_OF_FOLDERS:
-        (tmp_path / name).mkdir()
+        (tmp_path / name).mkdir(parents=True)
         (tmp_path / name / "one.py").write_text("1")
     return tmp_path
 
@@ -40,7 +40,7 @@ def test_same_again_is_not_synthesized_again(assembly):
 
 
 @pytest.mark.parametrize(
-    "changed", ["app.py", "contract/one.py", "cdk.json", "stacks/one.py", "functions/one.py"]
+    "changed", ["app.py", "contract/iort_contract/one.py", "cdk.json", "stacks/one.py", "functions/one.py"]
 )
 def test_any_change_is_synthesized(assembly, checkout, changed):
     assembly()

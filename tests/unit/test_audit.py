@@ -7,8 +7,8 @@ import random
 from hypothesis import given
 from hypothesis import strategies as st
 
-from contract import Batch, BatchId
-from station.audit import audit, last_figures
+from iort_contract import Batch, BatchId
+from iort_station.operations.audit import audit, last_figures
 from tests.fakes import item_of
 
 T_US = 1_750_000_000_000_000
@@ -98,7 +98,7 @@ def test_expected_is_stored_and_missing_in_any_order(seqs, seed):
 
 
 class Newest:
-    """A `station.cloud.Cloud` and its table's client, which know one item."""
+    """A `iort_station.cloud.Cloud` and its table's client, which know one item."""
 
     namespace = "iort"
 

@@ -13,8 +13,8 @@ from bench.probes.ground import No
 from bench.result import Section
 from bench.sections import SECTIONS, abilities, fairness, mixed, outage, query, utilisation
 from bench.sections.utilisation import BATCHES
-from contract import BROKER, LAMBDA, RULE, Batch, encode, live_topic, record_topic
-from contract.ros1.definition import parse
+from iort_contract import BROKER, LAMBDA, RULE, Batch, encode, live_topic, record_topic
+from iort_contract.ros1.definition import parse
 
 
 def test_report_lines_of_lambda_are_read():

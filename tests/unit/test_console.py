@@ -11,8 +11,8 @@ import pytest
 from rich.table import Table
 from rich.text import Text
 
-import station
-from station.console import Console, visible
+import iort_station
+from iort_station.cli.console import Console, visible
 
 # Writes the clipboard; the same in C1; moves the cursor, and rings; turns a line around.
 HOSTILE = ["\x1b]52;c;cm0gLXJmIH4=\x07", "\x9d52;c;YQ==\x9c", "\x1b[2J\x7f\x08", "a\u202eb\u2066", "\ud800"]
@@ -61,7 +61,7 @@ def test_a_text_is_no_markup_and_no_picture():
 
 def test_every_command_prints_by_it():
     """What prints otherwise is listed: a line of JSON, and the one that makes its text visible."""
-    folder, printing = Path(station.__file__).parent, set()
+    folder, printing = Path(iort_station.__file__).parent, set()
     for path in folder.rglob("*.py"):
         name, tree = str(path.relative_to(folder)), ast.parse(path.read_text())
         for node in ast.walk(tree):
@@ -70,6 +70,6 @@ def test_every_command_prints_by_it():
             if isinstance(node, ast.Call) and ast.unparse(node.func) in {"print", "typer.echo", "click.echo"}:
                 printing.add((name, ast.unparse(node.args[0])))
     assert printing == {
-        ("progress.py", "visible(f'iort: {text}')"),
-        ("commands/watch.py", "json.dumps({**line, 'sample': sample})"),
+        ("cli/progress.py", "visible(f'iort: {text}')"),
+        ("cli/verbs/watch.py", "json.dumps({**line, 'sample': sample})"),
     }

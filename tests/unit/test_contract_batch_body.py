@@ -13,8 +13,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-import contract
-from contract import ContractError
+import iort_contract
+from iort_contract import ContractError
 from tests.unit.contract_values import BOOT, DEEP, GOOD, GOOD_LIVE, decode_or_refuse, json_values
 
 
@@ -22,12 +22,14 @@ def enveloped(body, **changed):
     """A good envelope of two samples around any body, in the codec whose columns are their values alone;
     tests/unit/test_contract_columns.py has the other."""
     packed = base64.b64encode(zlib.compress(body)).decode()
-    return dict(json.loads(contract.encode(GOOD)), codec=contract.PLAIN_CODEC, samples=packed, **changed)
+    return dict(
+        json.loads(iort_contract.encode(GOOD)), codec=iort_contract.PLAIN_CODEC, samples=packed, **changed
+    )
 
 
 @given(st.binary(max_size=100) | json_values.map(lambda value: json.dumps(value).encode()))
 def test_any_body(body):
-    decode_or_refuse(contract.decode, enveloped(body))
+    decode_or_refuse(iort_contract.decode, enveloped(body))
 
 
 @settings(max_examples=300)
@@ -44,7 +46,7 @@ def test_body_with_one_part_replaced(data, value):
     else:
         target = body["dt"] if where.startswith("dt") else body["fields"]["a"]
         target[int(where[-1])] = value
-    decode_or_refuse(contract.decode, enveloped(json.dumps(body).encode()))
+    decode_or_refuse(iort_contract.decode, enveloped(json.dumps(body).encode()))
 
 
 BODIES = [
@@ -87,45 +89,47 @@ BODIES = [
 def test_body_refused(body, named):
     # Of time 1, so that a step of 4,300 nines makes a number too long for Python to print.
     with pytest.raises(ContractError, match=named):
-        contract.decode(enveloped(body, batch=f"{1:016}-{BOOT}-4"))
+        iort_contract.decode(enveloped(body, batch=f"{1:016}-{BOOT}-4"))
 
 
 def test_too_many_fields_are_refused():
     body = json.dumps({"dt": [0, 5], "fields": {f"f{i}": [1, 2] for i in range(513)}})
     with pytest.raises(ContractError, match="513 fields"):
-        contract.decode(enveloped(body.encode()))
+        iort_contract.decode(enveloped(body.encode()))
     with pytest.raises(ContractError, match="sample"):
-        contract.decode_live(
+        iort_contract.decode_live(
             json.dumps(
-                dict(json.loads(contract.encode_live(GOOD_LIVE)), sample={f"f{i}": 1 for i in range(513)})
+                dict(
+                    json.loads(iort_contract.encode_live(GOOD_LIVE)), sample={f"f{i}": 1 for i in range(513)}
+                )
             )
         )
 
 
 def test_the_last_of_duplicate_keys_counts():
     body = b'{"dt":[9],"fields":{"b":[1]},"dt":[0,5],"fields":{"a":[9,9],"a":[1,2]}}'
-    assert contract.decode(enveloped(body)).columns == {"a": [1, 2]}
+    assert iort_contract.decode(enveloped(body)).columns == {"a": [1, 2]}
 
 
 def test_body_of_the_greatest_size_is_read_and_no_larger():
     n = 8_388_608 // 4096
     times = {"dt": [0] + [1] * (n - 1)}
-    room = contract.MAX_COLUMNS_BYTES - len(json.dumps({**times, "fields": {"a": [""] * n}}))
+    room = iort_contract.MAX_COLUMNS_BYTES - len(json.dumps({**times, "fields": {"a": [""] * n}}))
     texts = ["x" * (room // n + (i < room % n)) for i in range(n)]
     body = json.dumps({**times, "fields": {"a": texts}}).encode()
-    assert contract.decode(enveloped(body, n=n)).columns == {"a": texts}
+    assert iort_contract.decode(enveloped(body, n=n)).columns == {"a": texts}
     with pytest.raises(ContractError, match="over 8388608 bytes"):
-        contract.decode(enveloped(body + b" ", n=n))
+        iort_contract.decode(enveloped(body + b" ", n=n))
 
 
 def test_zip_bomb_is_not_inflated():
     message = json.dumps(enveloped(b" " * 64 * 1024 * 1024)).encode()
-    assert len(message) < contract.MAX_MESSAGE_BYTES
+    assert len(message) < iort_contract.MAX_MESSAGE_BYTES
     tracemalloc.start()
     try:
         with pytest.raises(ContractError, match="over 8388608 bytes"):
-            contract.decode(message)
-        assert tracemalloc.get_traced_memory()[1] < 3 * contract.MAX_COLUMNS_BYTES
+            iort_contract.decode(message)
+        assert tracemalloc.get_traced_memory()[1] < 3 * iort_contract.MAX_COLUMNS_BYTES
     finally:
         tracemalloc.stop()
 
@@ -149,19 +153,19 @@ PACKED = zlib.compress(b'{"dt":[0,5],"fields":{}}')
 def test_packed_samples_refused(packed, named):
     envelope = dict(enveloped(b""), samples=base64.b64encode(packed).decode())
     with pytest.raises(ContractError, match=named):
-        contract.decode(envelope)
+        iort_contract.decode(envelope)
 
 
 @pytest.mark.parametrize("text", ["é", "a", "====", "eJ\n", "eJ y", "-_-_", "\ud800", "eA==eA=="])
 def test_samples_that_are_not_base64_are_refused(text):
     with pytest.raises(ContractError, match="samples"):
-        contract.decode(dict(enveloped(b""), samples=text))
+        iort_contract.decode(dict(enveloped(b""), samples=text))
 
 
 @pytest.mark.parametrize("samples", [None, 7, [], {}, True, Decimal(1)])
 def test_samples_that_are_not_text_are_refused(samples):
     with pytest.raises(ContractError, match="expected base64 text"):
-        contract.decode(dict(enveloped(b""), samples=samples))
+        iort_contract.decode(dict(enveloped(b""), samples=samples))
 
 
 @pytest.mark.parametrize(
@@ -174,7 +178,7 @@ def test_samples_that_are_not_text_are_refused(samples):
         ({"codec": "columns"}, "codec 'columns'"),
         ({"n": 0}, "0 samples"),
         ({"n": 3}, "expected 3 dt"),
-        ({"n": contract.MAX_SAMPLES + 1}, "50001 samples"),
+        ({"n": iort_contract.MAX_SAMPLES + 1}, "50001 samples"),
         ({"n": Decimal("1E+125")}, "n Decimal"),
         ({"n": Decimal("NaN")}, "n Decimal"),
         ({"n": Decimal("sNaN")}, "n Decimal"),
@@ -188,4 +192,4 @@ def test_samples_that_are_not_text_are_refused(samples):
 )
 def test_envelope_refused(changed, named):
     with pytest.raises(ContractError, match=re.escape(named)):
-        contract.decode(dict(json.loads(contract.encode(GOOD)), **changed))
+        iort_contract.decode(dict(json.loads(iort_contract.encode(GOOD)), **changed))

@@ -8,8 +8,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-import contract
-from contract import BatchId, ContractError, batch_id, batches_between
+import iort_contract
+from iort_contract import BatchId, ContractError, batch_id, batches_between
 from tests.unit.contract_values import BOOT, LIMIT_US, boots, seqs
 
 times = st.integers(0, LIMIT_US)
@@ -82,7 +82,9 @@ def test_what_is_no_id_is_refused(text):
 def test_batches_of_one_time_have_keys_of_their_own():
     """Two publishers, or a recording that is played twice: the same time, another number or another run."""
     same_time = [
-        contract.Batch(boot, seq, [7], {}) for boot in ("0badcafe", "deadbeef") for seq in (0, 9, 10)
+        iort_contract.Batch(boot, seq, [7], {}) for boot in ("0badcafe", "deadbeef") for seq in (0, 9, 10)
     ]
     assert len({str(batch.id) for batch in same_time}) == len(same_time)
-    assert {contract.decode(contract.encode(batch)).id for batch in same_time} == {b.id for b in same_time}
+    assert {iort_contract.decode(iort_contract.encode(batch)).id for batch in same_time} == {
+        b.id for b in same_time
+    }

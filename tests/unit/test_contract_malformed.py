@@ -11,11 +11,11 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-import contract
-from contract import ContractError
+import iort_contract
+from iort_contract import ContractError
 from tests.unit.contract_values import DEEP, GOOD, GOOD_LIVE, batches, decode_or_refuse, json_values
 
-DECODERS = [contract.decode, contract.decode_live, contract.decode_pong]
+DECODERS = [iort_contract.decode, iort_contract.decode_live, iort_contract.decode_pong]
 decoders = st.sampled_from(DECODERS)
 
 
@@ -50,7 +50,7 @@ awkward = st.sampled_from(
 
 
 def envelopes():
-    return st.sampled_from([contract.encode(GOOD), contract.encode_live(GOOD_LIVE)]).map(json.loads)
+    return st.sampled_from([iort_contract.encode(GOOD), iort_contract.encode_live(GOOD_LIVE)]).map(json.loads)
 
 
 @given(decoders, st.binary(max_size=200))
@@ -93,10 +93,10 @@ def test_one_key_replaced_in_text(data, value):
 
 
 @pytest.mark.parametrize(
-    "good", [contract.encode(GOOD), contract.encode_live(GOOD_LIVE)], ids=["batch", "live"]
+    "good", [iort_contract.encode(GOOD), iort_contract.encode_live(GOOD_LIVE)], ids=["batch", "live"]
 )
 def test_one_key_removed(good):
-    decoder = contract.decode if b"codec" in good else contract.decode_live
+    decoder = iort_contract.decode if b"codec" in good else iort_contract.decode_live
     for key in json.loads(good):
         envelope = json.loads(good)
         del envelope[key]
@@ -107,21 +107,21 @@ def test_one_key_removed(good):
 @settings(max_examples=300)
 @given(batches(), st.data())
 def test_message_damaged_anywhere(batch, data):
-    message = bytearray(contract.encode(batch))
+    message = bytearray(iort_contract.encode(batch))
     at = data.draw(st.integers(0, len(message) - 1))
     message[at] = data.draw(st.integers(0, 255))
-    decode_or_refuse(contract.decode, bytes(message))
-    decode_or_refuse(contract.decode, bytes(message[:at]))
+    decode_or_refuse(iort_contract.decode, bytes(message))
+    decode_or_refuse(iort_contract.decode, bytes(message[:at]))
 
 
 @settings(max_examples=200)
 @given(st.data())
 def test_compressed_samples_damaged(data):
-    envelope = json.loads(contract.encode(GOOD))
+    envelope = json.loads(iort_contract.encode(GOOD))
     packed = bytearray(base64.b64decode(envelope["samples"]))
     at = data.draw(st.integers(0, len(packed) - 1))
     packed[at] ^= data.draw(st.integers(1, 255))
-    decode_or_refuse(contract.decode, dict(envelope, samples=base64.b64encode(packed).decode()))
+    decode_or_refuse(iort_contract.decode, dict(envelope, samples=base64.b64encode(packed).decode()))
 
 
 @pytest.mark.parametrize("decoder", DECODERS)
@@ -151,7 +151,7 @@ def test_message_refused(decoder, message):
 
 def test_error_of_a_long_value_is_short():
     with pytest.raises(ContractError) as caught:
-        contract.decode(dict(json.loads(contract.encode(GOOD)), codec="x" * 10_000))
+        iort_contract.decode(dict(json.loads(iort_contract.encode(GOOD)), codec="x" * 10_000))
     assert len(str(caught.value)) < 200
 
 

@@ -13,10 +13,10 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from contract.limits import MessageError
-from contract.ros1.decode import MAX_ELEMENTS, MAX_TEXT, Decoder
-from contract.ros1.definition import VARIABLE, parse
-from device.sources.flatten import flatten
+from iort_agent.sources.flatten import flatten
+from iort_contract.limits import MessageError
+from iort_contract.ros1.decode import MAX_ELEMENTS, MAX_TEXT, Decoder
+from iort_contract.ros1.definition import VARIABLE, parse
 from tests.recordings import recording
 from tests.unit.ros1_messages import HEADER, LINE, STAMPED, header, text, u32
 

@@ -8,14 +8,14 @@ from dataclasses import replace
 import pytest
 from typer.testing import CliRunner
 
-from contract import METRICS
-from device.pings import CLOCK_EVERY_S
-from device.sources.vehicle import Vehicle, VehicleConfig
-from functions.health import measure
-from functions.metrics import Gathered, emit
-from scripts.costs import FILES, ROOT, filled
-from station import cost, cost_items, cost_tables, scale, sizes
-from station.at_rest import (
+from functions.shared.health import measure
+from functions.shared.metrics import Gathered, emit
+from iort_agent.lanes.pings import CLOCK_EVERY_S
+from iort_agent.sources.vehicle import Vehicle, VehicleConfig
+from iort_contract import METRICS
+from iort_station.cli.main import app
+from iort_station.cost import line_items, model, report, scale, sizes
+from iort_station.cost.fixed_costs import (
     FREE_ALARMS,
     FREE_DASHBOARD_METRICS,
     FREE_DASHBOARDS,
@@ -23,10 +23,10 @@ from station.at_rest import (
     PAGE_REFRESH_S,
     deployment_dollars_per_month,
 )
-from station.cli import app
-from station.errors import StationError
-from station.prices import PRICES
-from station.usage import CLOCK_PING_S, Usage
+from iort_station.cost.prices import PRICES
+from iort_station.cost.usage import CLOCK_PING_S, Usage
+from iort_station.errors import StationError
+from scripts.costs import FILES, ROOT, filled
 
 _ONE = Usage()
 
@@ -36,7 +36,7 @@ def _units(items, lane, price):
 
 
 def test_record_lane_is_a_rule_an_action_and_its_units_a_batch():
-    items = cost.bill(_ONE)
+    items = model.bill(_ONE)
     assert _units(items, "record", "message") == 0, "Basic Ingest has no messaging charge"
     assert _units(items, "record", "rule") == _units(items, "record", "action") == 3600
     assert _units(items, "record", "write") == 3600 * (1 + 1), "each item fits in a unit"
@@ -45,22 +45,22 @@ def test_record_lane_is_a_rule_an_action_and_its_units_a_batch():
 
 
 def test_live_lane_is_a_rule_an_action_and_an_invocation_each_and_a_message_in_ten_seconds():
-    items = cost.bill(replace(_ONE, live_hz=4.0))
+    items = model.bill(replace(_ONE, live_hz=4.0))
     assert _units(items, "live", "invocation") == 4 * 3600
     assert _units(items, "live", "message") == 360
     # At the broker two more rules look at it.
     assert _units(items, "live", "rule") == _units(items, "live", "action") == 4 * 3600 + 2 * 360
-    seldom = cost.bill(replace(_ONE, live_hz=0.05))
+    seldom = model.bill(replace(_ONE, live_hz=0.05))
     assert _units(seldom, "live", "message") == _units(seldom, "live", "invocation") == 180
-    assert _units(cost.bill(replace(_ONE, live_hz=0.0)), "live", "invocation") == 0
+    assert _units(model.bill(replace(_ONE, live_hz=0.0)), "live", "invocation") == 0
 
 
 def test_a_car_that_measures_nothing_still_pings_for_the_clock():
     assert CLOCK_PING_S == CLOCK_EVERY_S
-    items = cost.bill(_ONE)
+    items = model.bill(_ONE)
     assert _units(items, "ping", "message") == 2 * 120, "a ping and a pong"
     assert _units(items, "ping", "rule") == _units(items, "ping", "action") == 120
-    measured = cost.bill(replace(_ONE, ping_hz=1.0))
+    measured = model.bill(replace(_ONE, ping_hz=1.0))
     assert _units(measured, "ping", "message") == 6 * 3600, "those of the path rule tell the clock, too"
 
 
@@ -68,9 +68,9 @@ def test_the_ratio_is_given_without_log_lines_too():
     """Lambda's own lines are in the thesis' column, which left them as they are, and not in ours."""
     unlogged = [
         sum(item.dollars for item in items if item.service != "CloudWatch")
-        for items in (cost.thesis_bill(_ONE), cost.bill(_ONE))
+        for items in (model.thesis_bill(_ONE), model.bill(_ONE))
     ]
-    (row,) = (row for row in cost_tables.robot_hour(_ONE).body if row[0] == "of it without log lines")
+    (row,) = (row for row in report.robot_hour(_ONE).body if row[0] == "of it without log lines")
     assert row[-1] == f"1/{unlogged[0] / unlogged[1]:.1f}"
 
 
@@ -114,48 +114,50 @@ def test_the_live_page_asks_as_often_as_the_model_says():
 
 def test_recovery_to_a_point_in_time_is_billed_by_what_is_kept():
     def kept(usage, price):
-        return sum(item.units for item in cost.bill(usage) if item.price == price)
+        return sum(item.units for item in model.bill(usage) if item.price == price)
 
     assert kept(_ONE, "recovery") == 0
     assert kept(replace(_ONE, recoverable=True), "recovery") == kept(_ONE, "storage") > 0
 
 
 def test_thesis_layout_pays_for_every_sample():
-    items = cost.thesis_bill(_ONE)
+    items = model.thesis_bill(_ONE)
     assert _units(items, "record", "message") == 50 * 3600
     assert _units(items, "record", "write") == 2 * 50 * 3600
     assert _units(items, "live", "invocation") == 50 * 3600
-    assert 0.6 < cost_items.total(items) < 0.8
+    assert 0.6 < line_items.total(items) < 0.8
 
 
 def test_without_a_live_lane_we_cost_less_than_a_twentieth():
-    ours = cost_items.total(cost.bill(replace(_ONE, live_hz=0.0)))
-    assert ours < cost_items.total(cost.thesis_bill(_ONE)) / 20
+    ours = line_items.total(model.bill(replace(_ONE, live_hz=0.0)))
+    assert ours < line_items.total(model.thesis_bill(_ONE)) / 20
 
 
 def test_a_batch_of_one_sample_costs_as_much_as_the_thesis_record_lane():
-    single = cost.bill(replace(_ONE, batch_s=0.0, live_hz=0.0))
+    single = model.bill(replace(_ONE, batch_s=0.0, live_hz=0.0))
     assert _units(single, "record", "rule") == 50 * 3600
 
 
 def test_lambda_2_is_shared_by_a_fleet():
-    calls = {robots: cost.summarize_calls_per_s(Usage(robots=robots)) / robots for robots in (1, 100, 10_000)}
+    calls = {
+        robots: model.summarize_calls_per_s(Usage(robots=robots)) / robots for robots in (1, 100, 10_000)
+    }
     assert calls[1] > calls[100] > calls[10_000]
-    assert calls[1] == 1 / cost.WINDOW_S
+    assert calls[1] == 1 / model.WINDOW_S
     records = 10_000 * (_ONE.batches_per_s + _ONE.own_batches_per_s)
     assert calls[10_000] * 10_000 == pytest.approx(records / 500), "a call takes five hundred records at most"
 
 
 def test_pubnub_counts_publishes_and_receipts_or_users():
-    items = cost.pubnub_bill(replace(_ONE, viewers=3))
+    items = model.pubnub_bill(replace(_ONE, viewers=3))
     assert [item.units for item in items] == [36_000, 108_000]
     assert items[0].dollars == pytest.approx(36_000 * 0.000123)
-    assert cost.pubnub_mau_dollars_per_month(_ONE) == 98.0
-    assert cost.pubnub_mau_dollars_per_month(replace(_ONE, viewers=10**6)) is None
+    assert model.pubnub_mau_dollars_per_month(_ONE) == 98.0
+    assert model.pubnub_mau_dollars_per_month(replace(_ONE, viewers=10**6)) is None
 
 
 def test_every_item_has_a_price_and_every_price_names_its_page():
-    for items in (cost.bill(replace(_ONE, ping_hz=1.0)), cost.thesis_bill(_ONE), cost.pubnub_bill(_ONE)):
+    for items in (model.bill(replace(_ONE, ping_hz=1.0)), model.thesis_bill(_ONE), model.pubnub_bill(_ONE)):
         assert all(item.price in PRICES and item.units >= 0 for item in items)
     assert all(price.page.startswith("https://") and price.usd > 0 for price in PRICES.values())
 
@@ -165,7 +167,7 @@ def test_every_item_has_a_price_and_every_price_names_its_page():
 )
 def test_refuses_what_no_fleet_can_do(wrong):
     with pytest.raises(StationError):
-        cost.bill(replace(_ONE, **wrong))
+        model.bill(replace(_ONE, **wrong))
 
 
 def test_a_second_s_items_fit_in_one_write_unit_each():
@@ -183,16 +185,16 @@ def test_an_hour_of_lambda_1_logs_about_as_much_as_it_writes(capsys):
         delays = dict.fromkeys(("InCarMs", "UplinkMs", "ToLambdaMs", "CarToLambdaMs"), 2.34 + i % 97)
         counted.add(1_700_000_000 + i / 10, LivePublished=1, **delays)
     written = len(capsys.readouterr().out)
-    assert written == pytest.approx(_units(cost.bill(_ONE), "live", "logs") * 1e9, rel=0.1)
-    whole = _units(cost.bill(replace(_ONE, function_logs="all")), "live", "logs") * 1e9
-    assert whole - 36_000 * len(cost_items.PLATFORM_LINES) == pytest.approx(written, rel=0.1)
+    assert written == pytest.approx(_units(model.bill(_ONE), "live", "logs") * 1e9, rel=0.1)
+    whole = _units(model.bill(replace(_ONE, function_logs="all")), "live", "logs") * 1e9
+    assert whole - 36_000 * len(line_items.PLATFORM_LINES) == pytest.approx(written, rel=0.1)
 
 
 def test_environments_gather_each_for_itself():
-    assert cost._live_lines_per_s(_ONE) == 0.1
+    assert model._live_lines_per_s(_ONE) == 0.1
     # Twenty milliseconds each: two at a time, and more than a hundred in ten seconds.
-    assert cost._live_lines_per_s(replace(_ONE, robots=10)) == 1.0
-    assert cost._live_lines_per_s(replace(_ONE, live_hz=0.01)) == 0.01
+    assert model._live_lines_per_s(replace(_ONE, robots=10)) == 1.0
+    assert model._live_lines_per_s(replace(_ONE, live_hz=0.01)) == 0.01
 
 
 def test_the_other_lines_are_about_as_long_as_they_are_written(capsys):
@@ -201,8 +203,8 @@ def test_the_other_lines_are_about_as_long_as_they_are_written(capsys):
     emit("health", **measure("vesc", [batch]))
     emit("echo", PongsSent=1)
     lengths = [len(line) for line in capsys.readouterr().out.splitlines()]
-    model = [cost._SUMMARIZE_LINE, cost._HEALTH_LINE, cost._PONG_LINE]
-    assert lengths == pytest.approx(model, rel=0.1)
+    modelled = [model._SUMMARIZE_LINE, model._HEALTH_LINE, model._PONG_LINE]
+    assert lengths == pytest.approx(modelled, rel=0.1)
 
 
 def test_a_drive_is_a_vesc_drive():
@@ -299,7 +301,7 @@ def test_command_counts_the_live_messages_of_every_stream(tmp_path):
 @pytest.mark.parametrize("batch_s", [0.0, 0.2, 1.0])
 def test_streams_are_billed_each_by_itself(batch_s):
     one, three = (
-        {(item.lane, item.what): item.units for item in cost.bill(Usage(streams=streams, batch_s=batch_s))}
+        {(item.lane, item.what): item.units for item in model.bill(Usage(streams=streams, batch_s=batch_s))}
         for streams in (1, 3)
     )
     times = {what: three[what] / units for what, units in one.items() if units}
@@ -308,7 +310,7 @@ def test_streams_are_billed_each_by_itself(batch_s):
     # How often Lambda 2 is called hangs on the window, until its events are full.
     assert times["record", "Lambda 2 invoked"] <= 3
     assert times["connection", "minutes"] == times["agent, rtt", "kept"] == 1
-    messages = [next(i.units for i in cost.thesis_bill(usage) if i.what == "messages") for usage in USAGES]
+    messages = [next(i.units for i in model.thesis_bill(usage) if i.what == "messages") for usage in USAGES]
     assert messages[1] == 3 * messages[0]
 
 

@@ -8,17 +8,17 @@ from pathlib import Path
 
 import pytest
 
-from contract import SHADOW
-from device.agent import Agent
-from device.clock import ManualClock
-from device.config import Config
-from device.dispatch import Dispatcher
-from device.loopback import Loopback
-from device.spool import MemorySpool
-from functions.metrics import emit
-from station import cost, scale
-from station.prices import QUOTAS
-from station.usage import Usage
+from functions.shared.metrics import emit
+from iort_agent.agent import Agent
+from iort_agent.clock import ManualClock
+from iort_agent.config.file import Config
+from iort_agent.dispatch import Dispatcher
+from iort_agent.mqtt.loopback import Loopback
+from iort_agent.spool.memory import MemorySpool
+from iort_contract import SHADOW
+from iort_station.cost import model, scale
+from iort_station.cost.prices import QUOTAS
+from iort_station.cost.usage import Usage
 
 _ONE = Usage()
 # AWS IoT Core, "Additional metering details".
@@ -27,7 +27,7 @@ _METER, _SHADOW_METER = 5 * 1024, 1024
 
 def messages(usage):
     """Messages that are metered in an hour, by what they are."""
-    return {item.what: item.units for item in cost.bill(usage) if item.price == "message"}
+    return {item.what: item.units for item in model.bill(usage) if item.price == "message"}
 
 
 class Counting(Loopback):
@@ -47,7 +47,7 @@ def test_an_agent_asks_for_as_much_as_the_model_says():
     uplink = Counting(clock, dispatcher)
     config = Config("car1", "host", Path(), Path(), ())
     agent = Agent(config, uplink=uplink, spool=MemorySpool(max_bytes=10**6), clock=clock)
-    assert len(uplink.filters) + 1 == cost.SUBSCRIPTIONS, "and a command"
+    assert len(uplink.filters) + 1 == model.SUBSCRIPTIONS, "and a command"
     assert all(len(topic) < _METER for topic in uplink.filters)
     uplink.connect()
     dispatcher.run_pending()
@@ -65,13 +65,13 @@ def test_an_agent_asks_for_as_much_as_the_model_says():
 def test_an_hour_with_a_connect_has_these_messages_more_than_one_without():
     more, less = messages(_ONE), messages(replace(_ONE, connects_per_hour=0.0))
     assert {what: more[what] - less[what] for what in more if more[what] != less[what]} == {
-        "CONNECT and SUBSCRIBE": 1 + cost.SUBSCRIPTIONS,
+        "CONNECT and SUBSCRIBE": 1 + model.SUBSCRIPTIONS,
         "the shadow's question, answer and PUBACK": 3,
     }
 
 
 def test_an_hour_with_a_connect_has_two_events_of_presence():
-    items = cost.bill(replace(_ONE, connects_per_hour=3.0))
+    items = model.bill(replace(_ONE, connects_per_hour=3.0))
     units = {item.price: item.units for item in items if item.lane == "connection"}
     for price in ("rule", "action", "invocation", "write"):
         assert units[price] == 2 * 3, price
@@ -86,14 +86,14 @@ def test_a_command_is_sent_received_and_acknowledged():
 
 
 def test_the_thesis_connects_too_and_subscribes_to_nothing():
-    items = {item.what: item.units for item in cost.thesis_bill(replace(_ONE, connects_per_hour=2.0))}
+    items = {item.what: item.units for item in model.thesis_bill(replace(_ONE, connects_per_hour=2.0))}
     assert items["CONNECT"] == 2
 
 
 def test_a_line_of_presence_is_about_as_long_as_it_is_written(capsys, monkeypatch):
     monkeypatch.setenv("NAMESPACE", "iort")
     emit("presence", RobotsConnected=True, RobotsDisconnected=False)
-    assert len(capsys.readouterr().out) == pytest.approx(cost._PRESENCE_LINE, rel=0.1)
+    assert len(capsys.readouterr().out) == pytest.approx(model._PRESENCE_LINE, rel=0.1)
 
 
 def test_an_outage_is_held_to_the_lower_of_what_awss_pages_say():

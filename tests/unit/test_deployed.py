@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import json
 
-from station.at_rest import deployment_dollars_per_month
-from station.deployed import _watching
-from station.usage import Usage
+from iort_station.cost.deployed import _watching
+from iort_station.cost.fixed_costs import deployment_dollars_per_month
+from iort_station.cost.usage import Usage
 
 ROWS = [["AWS/IoT", "TopicMatch", "RuleName", "a"], ["...", "b"]]
 SEARCH = [[{"expression": "SEARCH('{iort,Robot} MetricName=\"BatteryVolts\"', 'Sum', 60)"}]]

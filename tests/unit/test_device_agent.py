@@ -9,18 +9,18 @@ from typing import Any
 
 import pytest
 
-import contract
-from device.agent import Agent
-from device.clock import Clock, SystemClock
-from device.config import Config, MetricsConfig, PingConfig, RecordConfig
-from device.dispatch import Dispatcher
-from device.errors import SourceError
-from device.loopback import Loopback, Published
-from device.main import main
-from device.sources import Emit
-from device.sources.bag import BagConfig
-from device.spool import REJECT_NEW, MemorySpool
-from device.uplink import matches
+import iort_contract
+from iort_agent.agent import Agent
+from iort_agent.cli import main
+from iort_agent.clock import Clock, SystemClock
+from iort_agent.config.file import Config, MetricsConfig, PingConfig, RecordConfig
+from iort_agent.dispatch import Dispatcher
+from iort_agent.errors import SourceError
+from iort_agent.mqtt.loopback import Loopback, Published
+from iort_agent.mqtt.uplink import matches
+from iort_agent.sources import Emit
+from iort_agent.sources.recording.bag import BagConfig
+from iort_agent.spool.memory import REJECT_NEW, MemorySpool
 
 T0 = 1_700_000_000_000_000
 
@@ -61,7 +61,7 @@ class Rig:
 
     def recorded(self, stream: str = "vesc") -> list[Any]:
         topic = f"$aws/rules/iort_record/dt/iort/car1/{stream}"
-        batches = [contract.decode(m.payload) for m in self.uplink.published if m.topic == topic]
+        batches = [iort_contract.decode(m.payload) for m in self.uplink.published if m.topic == topic]
         self.seqs = [batch.seq for batch in batches]
         return [value for batch in batches for value in batch.columns["speed"]]
 
@@ -76,7 +76,7 @@ def test_every_sample_is_recorded_and_the_report_says_so() -> None:
         "samples": 500, "stored": 500, "batches": 10, "refused": 0, "nulled": 0, "first_seq": 0,
     }  # fmt: skip
     assert report["spool"]["left_batches"] == report["spool"]["dropped_batches"] == 0
-    assert report["boot"] == contract.decode(rig.uplink.published[-1].payload).boot
+    assert report["boot"] == iort_contract.decode(rig.uplink.published[-1].payload).boot
     live = [m for m in rig.uplink.published if m.topic == "live/iort/car1/vesc"]
     assert report["live_published"] == len(live) > 0
     assert rig.uplink.stopped
@@ -125,7 +125,7 @@ def test_dropped_samples_are_not_a_success(caplog: pytest.LogCaptureFixture) -> 
     assert 0 < len(rig.recorded()) < 1500
     assert rig.seqs == sorted(set(rig.seqs)), "the numbers of those dropped are missing"
     assert len(rig.seqs) < report["streams"]["vesc"]["batches"] == 30
-    delivered = [contract.decode(m.payload) for m in rig.uplink.published if "/dt/" in m.topic]
+    delivered = [iort_contract.decode(m.payload) for m in rig.uplink.published if "/dt/" in m.topic]
     stored = sum(stream["stored"] for stream in report["streams"].values())
     assert sum(len(batch.times_us) for batch in delivered) == stored - report["spool"]["dropped_samples"]
 
@@ -152,7 +152,7 @@ def give_nothing(emit: Emit, stop: threading.Event) -> None:
 
 def give_too_wide(emit: Emit, stop: threading.Event) -> None:
     for i in range(3):
-        emit("vesc", T0 + i, dict.fromkeys((f"x{i}" for i in range(contract.MAX_FIELDS + 1)), 1.0))
+        emit("vesc", T0 + i, dict.fromkeys((f"x{i}" for i in range(iort_contract.MAX_FIELDS + 1)), 1.0))
 
 
 @pytest.mark.parametrize(
@@ -216,7 +216,7 @@ def test_round_trips_are_recorded_like_any_stream() -> None:
     rig.uplink.verdict = count
     assert rig.agent.run(drain_s=10) == 0
     batches = [
-        contract.decode(m.payload) for m in seen if m.topic == "$aws/rules/iort_record/dt/iort/car1/rtt"
+        iort_contract.decode(m.payload) for m in seen if m.topic == "$aws/rules/iort_record/dt/iort/car1/rtt"
     ]
     values = [value for batch in batches for value in batch.columns["broker_ms"]]
     ping = rig.agent.report()["pings"]["broker"]
@@ -252,17 +252,17 @@ def test_lanes_fields_and_rates_change_while_it_runs() -> None:
     assert rig.clock.monotonic() - began < 10, "it waited for something that does not come"
     assert rig.recorded() == [1, 2, 4]
     topic = "$aws/rules/iort_record/dt/iort/car1/vesc"
-    batches = [contract.decode(m.payload) for m in rig.uplink.published if m.topic == topic]
+    batches = [iort_contract.decode(m.payload) for m in rig.uplink.published if m.topic == topic]
     assert [sorted(batch.columns) for batch in batches] == [
         ["speed", "voltage_input"], ["speed"], ["speed", "voltage_input"],
     ]  # fmt: skip
 
 
 def test_types_are_said_again_when_recording_begins() -> None:
-    said = contract.MessageType("vesc", "/vesc", "p/A", "0" * 32, "float64 speed\n")
+    said = iort_contract.MessageType("vesc", "/vesc", "p/A", "0" * 32, "float64 speed\n")
 
     def late(emit: Emit, stop: threading.Event) -> None:
-        emit(contract.TYPES_STREAM, T0, said.sample())
+        emit(iort_contract.TYPES_STREAM, T0, said.sample())
         rig.agent.tune(replace(rig.agent._tuning, record_enabled=True))
         emit("vesc", T0 + 1_000_000, {"speed": 1})
 
@@ -270,9 +270,9 @@ def test_types_are_said_again_when_recording_begins() -> None:
     assert rig.agent.run(drain_s=10) == 0
     assert rig.recorded() == [1]
     topic = "$aws/rules/iort_record/dt/iort/car1/types"
-    (batch,) = [contract.decode(m.payload) for m in rig.uplink.published if m.topic == topic]
+    (batch,) = [iort_contract.decode(m.payload) for m in rig.uplink.published if m.topic == topic]
     sample = {name: column[0] for name, column in batch.columns.items()}
-    assert contract.message_type(sample) == said
+    assert iort_contract.message_type(sample) == said
 
 
 def test_an_account_is_of_one_moment() -> None:
@@ -295,8 +295,8 @@ def test_its_own_figures_are_a_stream() -> None:
     topic = "$aws/rules/iort_record/dt/iort/car1/agent"
     rig.uplink.verdict = lambda message: seen.set() if message.topic == topic else None
     assert rig.agent.run(drain_s=10) == 0
-    batch = next(contract.decode(m.payload) for m in rig.uplink.published if m.topic == topic)
-    assert list(batch.columns) == list(contract.AGENT_FIELDS)
+    batch = next(iort_contract.decode(m.payload) for m in rig.uplink.published if m.topic == topic)
+    assert list(batch.columns) == list(iort_contract.AGENT_FIELDS)
     assert not [m for m in rig.uplink.published if m.topic == "live/iort/car1/agent"]
 
 

@@ -15,8 +15,8 @@ from cryptography.x509.oid import NameOID
 from hypothesis import given
 from hypothesis import strategies as st
 
-from device.certificate import check_pair, parse_certificate, read_certificate, stamp
-from device.errors import IdentityError
+from iort_agent.errors import IdentityError
+from iort_agent.identity.certificate import check_pair, parse_certificate, read_certificate, stamp
 
 
 def made(before: dt.datetime, after: dt.datetime, subject: str = "car") -> tuple[x509.Certificate, str]:

@@ -6,10 +6,10 @@ from pathlib import Path
 
 import pytest
 
-from device.config import load_config
-from device.errors import ConfigError
-from device.sources.bag import BagConfig
-from device.sources.sim import SimConfig
+from iort_agent.config.file import load_config
+from iort_agent.errors import ConfigError
+from iort_agent.sources.recording.bag import BagConfig
+from iort_agent.sources.sim import SimConfig
 
 GOOD = """\
 robot: car1

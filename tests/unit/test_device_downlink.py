@@ -6,8 +6,8 @@ from typing import Any
 
 import pytest
 
-from device.clock import SystemClock
-from device.offset import Offset
+from iort_agent.clock import SystemClock
+from iort_agent.lanes.clock_offset import Offset
 from tests.unit.downlink_rig import T0, Rig, doubles
 
 

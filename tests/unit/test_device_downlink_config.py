@@ -6,7 +6,7 @@ from typing import Any
 
 import pytest
 
-from device.errors import ConfigError, SourceError
+from iort_agent.errors import ConfigError, SourceError
 from tests.unit.downlink_rig import CONFIG, Rig
 
 

@@ -4,15 +4,15 @@ from __future__ import annotations
 
 from typing import Any
 
-import contract
-from contract import FleetMessage
-from contract.ros1.definition import parse
-from device.clock import ManualClock
-from device.dispatch import Dispatcher
-from device.loopback import Loopback
-from device.offset import Offset
-from device.ros1_json import encode
-from device.uplink import Message
+import iort_contract
+from iort_agent.clock import ManualClock
+from iort_agent.dispatch import Dispatcher
+from iort_agent.lanes.clock_offset import Offset
+from iort_agent.mqtt.loopback import Loopback
+from iort_agent.mqtt.uplink import Message
+from iort_agent.ros1.json_message import encode
+from iort_contract import FleetMessage
+from iort_contract.ros1.definition import parse
 from tests.unit.downlink_rig import POSE, POSE_MESSAGE, T0, Rig, doubles
 
 SHARE = {"/pose": {"name": "pose", "rate_hz": 5}}
@@ -57,7 +57,7 @@ def fleet(
     offset_us: int | None = None,
 ) -> None:
     sent_us = rig.clock.now_us() - age_us
-    payload = contract.encode_fleet(FleetMessage(boot, seq, sent_us, message or POSE_MESSAGE, offset_us))
+    payload = iort_contract.encode_fleet(FleetMessage(boot, seq, sent_us, message or POSE_MESSAGE, offset_us))
     rig.uplink.deliver(f"fleet/iort/{robot}/pose", payload)
     rig.dispatcher.run_pending()
 
@@ -103,7 +103,9 @@ def test_another_robots_nonsense_is_refused() -> None:
 def shared(rig: Rig) -> list[FleetMessage]:
     rig.dispatcher.run_pending()
     return [
-        contract.decode_fleet(m.payload) for m in rig.uplink.published if m.topic == "fleet/iort/car1/pose"
+        iort_contract.decode_fleet(m.payload)
+        for m in rig.uplink.published
+        if m.topic == "fleet/iort/car1/pose"
     ]
 
 

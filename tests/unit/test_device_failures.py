@@ -8,8 +8,8 @@ from typing import Any
 import pytest
 from awscrt import mqtt5
 
-from device.certificate import Certificate
-from device.failures import why_not_connected
+from iort_agent.identity.certificate import Certificate
+from iort_agent.mqtt.failures import why_not_connected
 
 NOW_S = 1_700_000_000
 GOOD = Certificate(id="c", not_before_s=NOW_S - 10, not_after_s=NOW_S + 10)

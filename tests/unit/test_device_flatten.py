@@ -7,8 +7,8 @@ from typing import Any
 
 import pytest
 
-from device.errors import SourceError
-from device.sources.flatten import flatten
+from iort_agent.errors import SourceError
+from iort_agent.sources.flatten import flatten
 
 
 class Numbers:

@@ -8,10 +8,10 @@ from typing import Mapping
 
 import pytest
 
-import contract
-from device.errors import IdentityError, RefusedError
-from device.identity import Run, provision, register_again
-from device.pending import TOKEN_S, Pending, keep, kept
+import iort_contract
+from iort_agent.errors import IdentityError, RefusedError
+from iort_agent.identity.pending import TOKEN_S, Pending, keep, kept
+from iort_agent.identity.provision import Run, provision, register_again
 
 
 class Cloud:
@@ -107,7 +107,7 @@ def earlier(folder: Path, *, asked_s: float | None = None, **other: str) -> Pend
         "robot": "car",
         "serial": "s1",
         "endpoint": "here",
-        "namespace": contract.DEFAULT_NAMESPACE,
+        "namespace": iort_contract.DEFAULT_NAMESPACE,
         "private_key": "key 0",
         "certificate": "certificate 0",
         "token": "token 0",

@@ -13,17 +13,17 @@ from typing import Any, NamedTuple
 
 import pytest
 
-import contract
-from device.agent import Agent
-from device.allowance import URGENT, Allowance
-from device.clock import Clock, ManualClock, SystemClock
-from device.config import Config, PingConfig, RecordConfig
-from device.dispatch import Dispatcher
-from device.loopback import Loopback, Published
-from device.production import Production, Rate
-from device.record import too_many
-from device.spool import MemorySpool
-from device.status import render
+import iort_contract
+from iort_agent.agent import Agent
+from iort_agent.clock import Clock, ManualClock, SystemClock
+from iort_agent.config.file import Config, PingConfig, RecordConfig
+from iort_agent.dispatch import Dispatcher
+from iort_agent.lanes.production import Production, Rate
+from iort_agent.lanes.rate_limiter import URGENT, Allowance
+from iort_agent.lanes.record import too_many
+from iort_agent.mqtt.loopback import Loopback, Published
+from iort_agent.spool.memory import MemorySpool
+from iort_agent.status import render
 
 T0 = 1_700_000_000_000_000
 TICK_MS = 200
@@ -97,7 +97,7 @@ class Drive:
             if sources:
                 self._offer()
             if self._is_due(pings_hz):
-                self.agent._pings.send(contract.BROKER)
+                self.agent._pings.send(iort_contract.BROKER)
             if self._ms % TICK_MS == 0:
                 self.agent.tick()
             ready = bisect.bisect_right(self._acks, self.clock.monotonic())
@@ -136,7 +136,7 @@ class Drive:
         found = dict.fromkeys(self.topics, 0)
         for sent in self.sent:
             levels = sent.topic.split("/")
-            if levels[-4] == contract.LIVE and sent.at >= self.clock.monotonic() - seconds:
+            if levels[-4] == iort_contract.LIVE and sent.at >= self.clock.monotonic() - seconds:
                 found[levels[-1]] += 1
         return found
 
@@ -150,7 +150,7 @@ class Drive:
         arrived = dict.fromkeys(taken, 0)
         for message in self.uplink.published:
             if message.topic.startswith("$aws/rules/iort_record/"):
-                batch = contract.decode(message.payload)
+                batch = iort_contract.decode(message.payload)
                 arrived[message.topic.split("/")[-1]] += len(batch.times_us)
         assert arrived == taken
         self.check_limits()
@@ -270,12 +270,12 @@ def test_another_fault_goes_soon_whatever_else_there_is() -> None:
 
 
 def test_pings_have_what_recordings_leave_and_live_what_pings_leave() -> None:
-    drive = Drive(topics(50, 20), ping=PingConfig(rate_hz=20, paths=(contract.BROKER,)))
+    drive = Drive(topics(50, 20), ping=PingConfig(rate_hz=20, paths=(iort_contract.BROKER,)))
     drive.run(SETTLE_S, pings_hz=20)
-    before = drive.agent.report()["pings"][contract.BROKER]["sent"]
+    before = drive.agent.report()["pings"][iort_contract.BROKER]["sent"]
     held_back = drive.agent.status()["lanes"]["ping"]["held_back"]
     drive.run(10, pings_hz=20)
-    assert drive.agent.report()["pings"][contract.BROKER]["sent"] - before == 200
+    assert drive.agent.report()["pings"][iort_contract.BROKER]["sent"] - before == 200
     assert drive.agent.status()["lanes"]["ping"]["held_back"] == held_back
     assert 10 * 15 <= sum(drive.live(10).values()) <= 10 * 20
     assert drive.backlog() <= 3

@@ -8,8 +8,7 @@ import pytest
 from hypothesis import example, given
 from hypothesis import strategies as st
 
-from contract import Command
-from device.leases import (
+from iort_agent.control.leases import (
     CLOSED,
     EARLY,
     LEASE_OVER,
@@ -22,6 +21,7 @@ from device.leases import (
     Leases,
     Limits,
 )
+from iort_contract import Command
 
 T0 = 1_700_000_000_000_000
 LIMITS = Limits(max_age_s=1.0, max_ahead_s=0.5, lease_s=0.5)

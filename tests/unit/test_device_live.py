@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-import contract
-from device.allowance import Allowance
-from device.clock import ManualClock
-from device.dispatch import Dispatcher
-from device.live import LiveLane
-from device.loopback import Loopback
+import iort_contract
+from iort_agent.clock import ManualClock
+from iort_agent.dispatch import Dispatcher
+from iort_agent.lanes.live import LiveLane
+from iort_agent.lanes.rate_limiter import Allowance
+from iort_agent.mqtt.loopback import Loopback
 
 T0 = 1_700_000_000_000_000
 
@@ -39,9 +39,11 @@ class Rig:
         self.lane.tick()
         self.dispatcher.run_pending()
 
-    def sent(self, stream: str = "vesc") -> list[contract.LiveSample]:
+    def sent(self, stream: str = "vesc") -> list[iort_contract.LiveSample]:
         topic = f"live/iort/car1/{stream}"
-        return [contract.decode_live(m.payload) for m in self.uplink.published if m.topic.endswith(topic)]
+        return [
+            iort_contract.decode_live(m.payload) for m in self.uplink.published if m.topic.endswith(topic)
+        ]
 
     def speeds(self) -> list[object]:
         return [live.sample["speed"] for live in self.sent()]
@@ -157,7 +159,7 @@ def test_what_is_too_large_for_a_message_never_reaches_the_broker() -> None:
     texts = {f"f{i:02}": "x" * 4096 for i in range(31)}
     rig.lane.offer("vesc", T0, {**texts, "last": ""})
     rig.dispatcher.run_pending()
-    room = contract.MAX_MESSAGE_BYTES - len(rig.uplink.published.pop().payload)
+    room = iort_contract.MAX_MESSAGE_BYTES - len(rig.uplink.published.pop().payload)
     rig.clock.advance(1)
     rig.lane.offer("vesc", T0, {**texts, "last": "x" * (room + 1)})
     rig.dispatcher.run_pending()
@@ -165,7 +167,7 @@ def test_what_is_too_large_for_a_message_never_reaches_the_broker() -> None:
     rig.clock.advance(1)
     rig.lane.offer("vesc", T0, {**texts, "last": "x" * room})
     (message,) = rig.uplink.published
-    assert len(message.payload) == contract.MAX_MESSAGE_BYTES, "one byte more is one too many"
+    assert len(message.payload) == iort_contract.MAX_MESSAGE_BYTES, "one byte more is one too many"
     rig.dispatcher.run_pending()
     assert (rig.lane.refused, rig.lane.published) == (1, 2)
 

@@ -17,21 +17,21 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-import contract
-from device.batch import StreamCounts
-from device.check import FAIL, check
-from device.clock import ManualClock, SystemClock
-from device.config import load_config
-from device.dispatch import Dispatcher
-from device.errors import AgentError
-from device.logs import JournalFormatter, LineFormatter, Troubles, is_journal
-from device.loopback import Loopback
-from device.main import main
-from device.metrics import AgentMetrics, Rates, rss_mb
-from device.offset import ClockOffset
-from device.spool import MemorySpool
-from device.sqlite_spool import make_spool
-from device.status import StatusServer, fetch, render
+import iort_contract
+from iort_agent.check import FAIL, check
+from iort_agent.cli import main
+from iort_agent.clock import ManualClock, SystemClock
+from iort_agent.config.file import load_config
+from iort_agent.dispatch import Dispatcher
+from iort_agent.errors import AgentError
+from iort_agent.lanes.batch import StreamCounts
+from iort_agent.lanes.clock_offset import ClockOffset
+from iort_agent.logs import JournalFormatter, LineFormatter, Troubles, is_journal
+from iort_agent.metrics import AgentMetrics, Rates, rss_mb
+from iort_agent.mqtt.loopback import Loopback
+from iort_agent.spool.memory import MemorySpool
+from iort_agent.spool.sqlite import make_spool
+from iort_agent.status import StatusServer, fetch, render
 
 
 def record(level: int, text: str) -> logging.LogRecord:
@@ -64,7 +64,9 @@ def test_no_text_of_elsewhere_is_a_line_of_its_own_or_speaks_to_the_terminal() -
     troubles.emit(said)
     assert troubles.last()[0]["text"] == shown
     # As the agent sets it up, for whatever is logged by whom.
-    program = f"from device.logs import set_up; import logging; set_up('info'); logging.warning({HOSTILE!r})"
+    program = (
+        f"from iort_agent.logs import set_up; import logging; set_up('info'); logging.warning({HOSTILE!r})"
+    )
     command = [sys.executable, "-X", "utf8", "-c", program]
     done = subprocess.run(command, capture_output=True, encoding="utf-8", check=True)
     assert done.stderr.count("\n") == 1
@@ -161,7 +163,7 @@ def test_an_offset_not_known_well_enough_is_not_judged_by() -> None:
         assert (offset.known_us() is not None) == known
     known_us = offset.known_us()
     assert known_us is not None
-    assert abs(known_us - 60_000_000) <= contract.CLOCK_MAX_UNCERTAINTY_MS * 1000
+    assert abs(known_us - 60_000_000) <= iort_contract.CLOCK_MAX_UNCERTAINTY_MS * 1000
     clock.advance(86_400)
     assert offset.known_us() is None, "two oscillators drift apart"
 
@@ -189,7 +191,7 @@ def test_a_sample_of_the_agent_has_the_contracts_fields() -> None:
     uplink.connect()
     clock.advance(2)
     values = metrics.sample(100)
-    assert list(values) == list(contract.AGENT_FIELDS)
+    assert list(values) == list(iort_contract.AGENT_FIELDS)
     assert values["samples_per_s"] == 50
     assert (values["backlog_batches"], values["backlog_bytes"], values["connects"]) == (1, 100, 1)
     assert values["clock_offset_ms"] is None
@@ -307,7 +309,7 @@ def test_a_reader_that_has_seen_enough_is_no_error(tmp_path: Path) -> None:
     reading, writing = os.pipe()
     os.close(reading)
     with os.fdopen(writing) as output:
-        command = [sys.executable, "-m", "device.main", "status", "--config", str(config)]
+        command = [sys.executable, "-m", "iort_agent.cli", "status", "--config", str(config)]
         done = subprocess.run(command, stdout=output, stderr=subprocess.PIPE, text=True, check=False)
     server.stop()
     assert (done.stderr, done.returncode) == ("", 1)

@@ -11,15 +11,15 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-import contract
-from device.allowance import Allowance
-from device.clock import ManualClock
-from device.config import PingConfig
-from device.dispatch import Dispatcher
-from device.errors import ConfigError
-from device.loopback import Loopback
-from device.pings import CLOCK_EVERY_S, CLOCK_FIRST_EVERY_S, TIMEOUT_S, Pings, percentile
-from device.schema import Where, load
+import iort_contract
+from iort_agent.clock import ManualClock
+from iort_agent.config.file import PingConfig
+from iort_agent.config.schema import Where, load
+from iort_agent.dispatch import Dispatcher
+from iort_agent.errors import ConfigError
+from iort_agent.lanes.pings import CLOCK_EVERY_S, CLOCK_FIRST_EVERY_S, TIMEOUT_S, Pings, percentile
+from iort_agent.lanes.rate_limiter import Allowance
+from iort_agent.mqtt.loopback import Loopback
 
 T0 = 1_700_000_000_000_000
 
@@ -30,7 +30,7 @@ class Rig:
         *,
         rate_hz: float = 1,
         padding_bytes: int = 0,
-        paths: tuple[str, ...] = contract.PING_PATHS,
+        paths: tuple[str, ...] = iort_contract.PING_PATHS,
     ) -> None:
         self.clock = ManualClock(now_us=T0)
         self.dispatcher = Dispatcher()
@@ -54,7 +54,7 @@ class Rig:
     def answer(self, path: str, message: int = -1) -> None:
         """The cloud's answer to one of the pings sent."""
         ping = json.loads(self.uplink.published[message].payload)
-        payload = json.dumps({**ping, contract.RECEIVED_MS: 5}).encode()
+        payload = json.dumps({**ping, iort_contract.RECEIVED_MS: 5}).encode()
         self.uplink.deliver(f"pong/iort/car1/{path}", payload)
         self.dispatcher.run_pending()
 
@@ -79,7 +79,7 @@ def test_the_cloud_answers_on_the_pong_topic(path: str) -> None:
     assert rig.pings.report()[path] == (1, 1, 0, 12.5, 12.5)
     ((stream, t_us, values),) = rig.samples
     assert (stream, t_us) == ("rtt", T0 + 12_500)
-    others = {f"{name}_ms": None for name in contract.PING_PATHS if name != path}
+    others = {f"{name}_ms": None for name in iort_contract.PING_PATHS if name != path}
     assert values == {**others, f"{path}_ms": 12.5}
 
 
@@ -144,8 +144,8 @@ def test_the_largest_ping_that_may_be_asked_for_fits_into_a_message_and_so_does_
     rig.pings.send("rule")
     (ping,) = rig.uplink.published
     assert len(ping.payload) > largest
-    pong = {**json.loads(ping.payload), contract.RECEIVED_MS: rig.clock.now_us() // 1000}
-    assert len(json.dumps(pong)) <= contract.MAX_MESSAGE_BYTES
+    pong = {**json.loads(ping.payload), iort_contract.RECEIVED_MS: rig.clock.now_us() // 1000}
+    assert len(json.dumps(pong)) <= iort_contract.MAX_MESSAGE_BYTES
 
 
 def test_the_end_waits_for_answers_but_not_for_ever() -> None:
@@ -167,7 +167,7 @@ def test_percentile_is_a_value_with_that_share_below(values: list[float], percen
 
 
 @pytest.mark.parametrize(
-    ("rate_hz", "paths"), [(0, contract.PING_PATHS), (0, ("broker",)), (5, ("broker", "lambda"))]
+    ("rate_hz", "paths"), [(0, iort_contract.PING_PATHS), (0, ("broker",)), (5, ("broker", "lambda"))]
 )
 def test_where_no_trip_through_a_rule_is_measured_a_ping_now_and_then_finds_the_clocks_offset(
     rate_hz: float, paths: tuple[str, ...]

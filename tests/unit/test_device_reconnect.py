@@ -8,7 +8,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from device.reconnect import HANGUPS, Backoff, Cause, Causes
+from iort_agent.mqtt.reconnect import HANGUPS, Backoff, Cause, Causes
 
 
 class Least(random.Random):

@@ -8,12 +8,12 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from device.allowance import Allowance
-from device.clock import ManualClock
-from device.dispatch import Dispatcher
-from device.loopback import Loopback
-from device.record import RecordLane
-from device.spool import MemorySpool
+from iort_agent.clock import ManualClock
+from iort_agent.dispatch import Dispatcher
+from iort_agent.lanes.rate_limiter import Allowance
+from iort_agent.lanes.record import RecordLane
+from iort_agent.mqtt.loopback import Loopback
+from iort_agent.spool.memory import MemorySpool
 
 
 class Rig:

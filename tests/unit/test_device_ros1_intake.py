@@ -10,11 +10,11 @@ from typing import Any
 
 import pytest
 
-import contract
-from contract import RosMessage
-from device.clock import ManualClock
-from device.errors import SourceError
-from device.sources.ros1 import Intake, Ros1Config, TopicConfig
+import iort_contract
+from iort_agent.clock import ManualClock
+from iort_agent.errors import SourceError
+from iort_agent.sources.ros1 import Intake, Ros1Config, TopicConfig
+from iort_contract import RosMessage
 from tests.unit.ros1_messages import LINE, STAMPED, header, u32
 
 T0 = 1_700_000_000_000_000
@@ -25,15 +25,15 @@ class Desk:
     def __init__(self, **settings: Any) -> None:
         self.clock = ManualClock(now_us=T0)
         self.samples: list[tuple[str, int, dict[str, Any]]] = []
-        self.types: list[contract.MessageType] = []
+        self.types: list[iort_contract.MessageType] = []
         config = TopicConfig(**{"stream": "s", "time": "header", **settings})
         self.intake = Intake("/t", config, emit=self._emit, clock=self.clock)
 
     def _emit(self, stream: str, t_us: int, values: Any) -> None:
-        if stream != contract.TYPES_STREAM:
+        if stream != iort_contract.TYPES_STREAM:
             self.samples.append((stream, t_us, values))
         else:
-            self.types.append(contract.message_type(values))
+            self.types.append(iort_contract.message_type(values))
 
     def take(self, data: bytes, **header: str) -> None:
         self.intake.take({**CONNECTION, **header}, data)
@@ -44,7 +44,7 @@ def test_a_publishers_type_is_said_when_it_connects() -> None:
     header = {**CONNECTION}
     for _ in range(3):
         desk.intake.take(header, b"")
-    said = contract.MessageType("s", "/t", "a_msgs/A", "1", CONNECTION["message_definition"])
+    said = iort_contract.MessageType("s", "/t", "a_msgs/A", "1", CONNECTION["message_definition"])
     assert desk.types == [said]
 
 

@@ -8,9 +8,9 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from contract.limits import MessageError
-from contract.ros1.definition import parse
-from device.ros1_json import decode, encode
+from iort_agent.ros1.json_message import decode, encode
+from iort_contract.limits import MessageError
+from iort_contract.ros1.definition import parse
 from tests.unit.downlink_rig import POSE, POSE_MESSAGE, RULE, T0
 
 MIXED = f"""bool b

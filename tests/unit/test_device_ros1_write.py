@@ -10,10 +10,10 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from contract.limits import MessageError
-from contract.ros1.definition import Definition, parse
-from device.ros1_json import decode
-from device.ros1_write import Writer
+from iort_agent.ros1.json_message import decode
+from iort_agent.ros1.write import Writer
+from iort_contract.limits import MessageError
+from iort_contract.ros1.definition import Definition, parse
 from tests.rosbridge_json import as_rosbridge
 from tests.unit.ros1_values import HEADER, by_rosbags, definitions, values
 

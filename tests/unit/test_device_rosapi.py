@@ -7,10 +7,10 @@ from typing import Any
 import pytest
 from hypothesis import given, settings
 
-from contract.limits import MessageError
-from contract.ros1.definition import Definition
-from device.clock import ManualClock
-from device.sources.rosapi import ANSWER_S, Rosapi, Structure, from_text, from_typedefs, md5sum
+from iort_agent.clock import ManualClock
+from iort_agent.sources.rosbridge.rosapi import ANSWER_S, Rosapi, Structure, from_text, from_typedefs, md5sum
+from iort_contract.limits import MessageError
+from iort_contract.ros1.definition import Definition
 from tests.unit.downlink_rig import POSE
 from tests.unit.ros1_values import HEADER, definitions, text_of
 

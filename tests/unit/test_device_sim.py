@@ -9,10 +9,10 @@ from typing import Any
 
 import pytest
 
-import contract
-from device.clock import ManualClock
-from device.sources.sim import SimConfig
-from device.sources.vehicle import VehicleConfig
+import iort_contract
+from iort_agent.clock import ManualClock
+from iort_agent.sources.sim import SimConfig
+from iort_agent.sources.vehicle import VehicleConfig
 
 T0 = 1_700_000_000_000_000
 
@@ -57,7 +57,7 @@ def test_stops_when_asked() -> None:
 
 
 def test_the_fields_are_those_of_the_ros_1_driver() -> None:
-    expected = [name for name, field in contract.VESC_FIELDS.items() if 1 in field.ros]
+    expected = [name for name, field in iort_contract.VESC_FIELDS.items() if 1 in field.ros]
     for stream, _, values in drive(duration_s=1):
         assert stream == "vesc"
         assert sorted(values) == sorted(expected)

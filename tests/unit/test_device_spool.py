@@ -8,9 +8,9 @@ from typing import TYPE_CHECKING, Any
 
 import pytest
 
-from device.clock import ManualClock
-from device.spool import OVERWRITE_OLDEST, REJECT_NEW, MemorySpool, Spool
-from device.sqlite_spool import SqliteSpool
+from iort_agent.clock import ManualClock
+from iort_agent.spool.memory import OVERWRITE_OLDEST, REJECT_NEW, MemorySpool, Spool
+from iort_agent.spool.sqlite import SqliteSpool
 
 if TYPE_CHECKING:
     MakeSpool = Callable[..., Spool]

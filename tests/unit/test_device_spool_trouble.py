@@ -12,10 +12,10 @@ from typing import Any
 
 import pytest
 
-from device.clock import ManualClock
-from device.errors import AgentError
-from device.reservation import BLOCK, BLOCK_ADRIFT
-from device.spool_file import SpoolFile
+from iort_agent.clock import ManualClock
+from iort_agent.errors import AgentError
+from iort_agent.spool.file import SpoolFile
+from iort_agent.spool.reservation import BLOCK, BLOCK_ADRIFT
 from tests.unit.test_device_spool import fill, following, kept
 from tests.unit.test_device_sqlite_spool import MB, ROOT, all_kept, crash, running, spool_at
 
@@ -92,8 +92,8 @@ def test_a_disk_that_fails_at_the_start_is_taken_into_use_when_it_works(path: Pa
 LIMITED = """
 import resource, sys
 from pathlib import Path
-from device.clock import SystemClock
-from device.sqlite_spool import SqliteSpool
+from iort_agent.clock import SystemClock
+from iort_agent.spool.sqlite import SqliteSpool
 
 spool = SqliteSpool(Path(sys.argv[1]), max_bytes=2**30, clock=SystemClock())
 spool.start()
@@ -311,8 +311,8 @@ def test_a_newer_format_is_refused(path: Path) -> None:
 def test_a_second_agent_is_refused_and_told_what_to_do(path: Path) -> None:
     with running(path):
         code = (
-            "import sys; from pathlib import Path; from device.clock import SystemClock\n"
-            "from device.sqlite_spool import SqliteSpool\n"
+            "import sys; from pathlib import Path; from iort_agent.clock import SystemClock\n"
+            "from iort_agent.spool.sqlite import SqliteSpool\n"
             "SqliteSpool(Path(sys.argv[1]), max_bytes=1000, clock=SystemClock())"
         )
         second = subprocess.run(

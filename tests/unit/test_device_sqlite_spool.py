@@ -19,14 +19,14 @@ from hypothesis import settings
 from hypothesis import strategies as st
 from hypothesis.stateful import RuleBasedStateMachine, invariant, precondition, rule
 
-from device import spool_disk
-from device.clock import ManualClock, SystemClock
-from device.config import QueueConfig
-from device.ledger import Ledger
-from device.reservation import BLOCK, Reservation
-from device.spool import FULL, PROCESS, REJECT_NEW, Entry, MemorySpool
-from device.spool_file import SpoolFile
-from device.sqlite_spool import SqliteSpool, make_spool
+from iort_agent.clock import ManualClock, SystemClock
+from iort_agent.config.file import QueueConfig
+from iort_agent.spool import disk
+from iort_agent.spool.file import SpoolFile
+from iort_agent.spool.ledger import Ledger
+from iort_agent.spool.memory import FULL, PROCESS, REJECT_NEW, Entry, MemorySpool
+from iort_agent.spool.reservation import BLOCK, Reservation
+from iort_agent.spool.sqlite import SqliteSpool, make_spool
 from tests.unit.test_device_spool import fill, following, kept
 
 ROOT = Path(__file__).parent.parent.parent
@@ -119,13 +119,13 @@ def test_durability_is_sqlites(path: Path, durability: str, synchronous: int) ->
 def test_after_a_power_cut_numbers_that_may_have_been_used_are_not(
     path: Path, tmp_path: Path, durability: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(spool_disk, "_machine", lambda: "first")
+    monkeypatch.setattr(disk, "_machine", lambda: "first")
     spool = spool_at(path, durability=durability)
     fill(spool, 5)
     spool.flush()
     # With PROCESS, the kernel may not have written what the database says it has: go back in time.
     survived = crash(spool, tmp_path)
-    monkeypatch.setattr(spool_disk, "_machine", lambda: "second")
+    monkeypatch.setattr(disk, "_machine", lambda: "second")
     if durability == PROCESS:
         for file in survived.parent.glob("spool.db-wal"):
             file.write_bytes(b"")
@@ -133,7 +133,7 @@ def test_after_a_power_cut_numbers_that_may_have_been_used_are_not(
         assert spool.next_seq("vesc") == (5 if durability == FULL else 5 + BLOCK)
         assert spool.alarm is None
         fill(spool, 1)
-    monkeypatch.setattr(spool_disk, "_machine", lambda: "third")
+    monkeypatch.setattr(disk, "_machine", lambda: "third")
     with running(survived, durability=durability) as spool:
         assert spool.next_seq("vesc") == (6 if durability == FULL else 6 + BLOCK), "it was closed"
 
@@ -289,8 +289,8 @@ TestLife.settings = settings(max_examples=150, stateful_step_count=40, deadline=
 VICTIM = """
 import os, sys, threading
 from pathlib import Path
-from device.clock import SystemClock
-from device.sqlite_spool import SqliteSpool
+from iort_agent.clock import SystemClock
+from iort_agent.spool.sqlite import SqliteSpool
 
 path, run = Path(sys.argv[1]), sys.argv[2]
 spool = SqliteSpool(path, max_bytes=2**30, clock=SystemClock())

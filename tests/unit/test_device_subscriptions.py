@@ -6,8 +6,8 @@ from concurrent.futures import Future
 from types import SimpleNamespace
 from typing import Any, Callable
 
-from device.dispatch import Dispatcher
-from device.subscriptions import Subscriptions
+from iort_agent.dispatch import Dispatcher
+from iort_agent.mqtt.subscriptions import Subscriptions
 
 FILTER = "cmd/iort/car/#"
 

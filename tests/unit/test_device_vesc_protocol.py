@@ -8,9 +8,9 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-import contract
-from device.sources import vesc_protocol
-from device.sources.vesc_protocol import FrameParser, ProtocolError, decode_firmware, decode_values, frame
+import iort_contract
+from iort_agent.sources.vesc import protocol
+from iort_agent.sources.vesc.protocol import FrameParser, ProtocolError, decode_firmware, decode_values, frame
 from tests.vesc_standin import FIRMWARE, framed, values
 
 payloads = st.one_of(
@@ -68,8 +68,8 @@ def test_memory_is_bounded(chunks: list[bytes]) -> None:
     parser = FrameParser()
     for chunk in chunks:
         parser.feed(chunk)
-        assert parser.pending <= len(parser._buffer) <= vesc_protocol._MAX_BUFFER
-        assert sum(map(len, parser._ends.values())) <= 2 * vesc_protocol._MAX_FRAME
+        assert parser.pending <= len(parser._buffer) <= protocol._MAX_BUFFER
+        assert sum(map(len, parser._ends.values())) <= 2 * protocol._MAX_FRAME
 
 
 def test_a_frame_after_a_megabyte_of_start_bytes() -> None:
@@ -81,7 +81,7 @@ def test_a_frame_after_a_megabyte_of_start_bytes() -> None:
 
 
 def test_no_length_of_garbage_hides_the_frame_after_it() -> None:
-    for length in range(1, 2 * vesc_protocol._MAX_BUFFER, 13):
+    for length in range(1, 2 * protocol._MAX_BUFFER, 13):
         parser = FrameParser()
         for at in range(0, length, 61):
             parser.feed(b"\xaa" * min(61, length - at))
@@ -132,9 +132,9 @@ def test_a_frame_is_what_the_description_says(payload: bytes) -> None:
 
 def test_known_frames() -> None:
     """As every description of the protocol has them."""
-    assert vesc_protocol.request(vesc_protocol.COMM_GET_VALUES) == bytes.fromhex("02 01 04 40 84 03")
-    assert vesc_protocol.request(vesc_protocol.COMM_FW_VERSION) == bytes.fromhex("02 01 00 00 00 03")
-    forwarded = vesc_protocol.request(vesc_protocol.COMM_GET_VALUES, 17)
+    assert protocol.request(protocol.COMM_GET_VALUES) == bytes.fromhex("02 01 04 40 84 03")
+    assert protocol.request(protocol.COMM_FW_VERSION) == bytes.fromhex("02 01 00 00 00 03")
+    forwarded = protocol.request(protocol.COMM_GET_VALUES, 17)
     assert FrameParser().feed(forwarded) == [bytes((34, 17, 4))]
 
 
@@ -171,7 +171,7 @@ def test_the_values_of_current_firmware_are_the_contracts() -> None:
         "avg_vq": 24.842,
         "status": 1,
     }
-    ros2 = {name for name, field in contract.VESC_FIELDS.items() if 2 in field.ros}
+    ros2 = {name for name, field in iort_contract.VESC_FIELDS.items() if 2 in field.ros}
     assert set(decode_values(values())) == ros2 | {"status"}
 
 
@@ -192,7 +192,7 @@ def test_firmware_2_has_a_layout_of_its_own() -> None:
     )  # fmt: skip
     assert len(payload) == 56
     decoded = decode_values(payload)
-    expected = {name for name, field in contract.VESC_FIELDS.items() if 1 in field.ros}
+    expected = {name for name, field in iort_contract.VESC_FIELDS.items() if 1 in field.ros}
     assert expected <= set(decoded)
     assert (decoded["temperature_pcb"], decoded["ntc_temp_mos1"], decoded["ntc_temp_mos6"]) == (30.5, 21, 26)
     assert (decoded["current_motor"], decoded["duty_cycle"], decoded["speed"]) == (-12.34, -0.305, 8123)
@@ -200,7 +200,7 @@ def test_firmware_2_has_a_layout_of_its_own() -> None:
     assert (decoded["displacement"], decoded["distance_traveled"]) == (-5, 6)
 
 
-@given(st.binary(min_size=1, max_size=300).filter(lambda payload: len(payload) not in vesc_protocol.LAYOUTS))
+@given(st.binary(min_size=1, max_size=300).filter(lambda payload: len(payload) not in protocol.LAYOUTS))
 def test_an_unknown_length_is_refused(payload: bytes) -> None:
     with pytest.raises(ProtocolError, match=f"values of {len(payload)} bytes"):
         decode_values(b"\x04" + payload[1:])

@@ -7,10 +7,10 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from functions import expression
-from functions.expression import ExpressionError, MismatchError, parse
-from station import conditions
-from station.errors import StationError
+from iort_contract import expression
+from iort_contract.expression import ExpressionError, MismatchError, parse
+from iort_station.data import conditions
+from iort_station.errors import StationError
 
 SAMPLES = {
     "speed": [0, 1.5, -2, None],

@@ -8,10 +8,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from contract import MessageType, Value
-from station import recordings
-from station.blocks import Block, column_of
-from station.messages import Maker, made_of
+from iort_contract import MessageType, Value
+from iort_station.data.blocks import Block, column_of
+from iort_station.recordings import recordings
+from iort_station.recordings.messages import Maker, made_of
 from tests.foxglove import flat, opened
 from tests.unit.test_station_messages import RICH, STAMPED
 

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import pytest
 
-from contract import AGENT_STREAM, METRICS, RTT_STREAM, Batch
-from functions.health import measure, together
-from functions.metrics import MOST_VALUES
+from functions.shared.health import measure, together
+from functions.shared.metrics import MOST_VALUES
+from iort_contract import AGENT_STREAM, METRICS, RTT_STREAM, Batch
 
 
 def batch(columns, *, times_us=None):

@@ -14,7 +14,17 @@ SOURCES = [
     ROOT / "app.py",
     *(
         path
-        for folder in ("bench", "contract", "device", "functions", "local", "scripts", "stacks", "station")
+        for folder in (
+            "bench",
+            "contract",
+            "device",
+            "functions",
+            "local",
+            "scripts",
+            "stacks",
+            "station",
+            "verify",
+        )
         for path in sorted((ROOT / folder).rglob("*.py"))
     ),
     *sorted((ROOT / "tests").rglob("*.py")),

@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-import contract
-from contract import limits
-from contract.ros1.message import MAX_LAYOUT
-from device import allowance
-from functions import cut_off, stored
+import iort_contract
+from functions.shared import cut_off, stored
+from iort_agent.lanes import rate_limiter
+from iort_contract import limits
+from iort_contract.ros1.message import MAX_LAYOUT
 from local import gaps, listener_gap
 from stacks.settings import Settings
 from tests.messages_page import PAGE, named, rows, section
@@ -37,7 +37,7 @@ def test_each_limit_is_told_as_it_is() -> None:
         "BURST": cut_off.BURST,
         "A_SECOND": cut_off.A_SECOND,
         "upload_gb_a_day": Settings.__dataclass_fields__["upload_gb_a_day"].default,
-        **{name: getattr(of, name) for of in (limits, contract) for name in table if hasattr(of, name)},
+        **{name: getattr(of, name) for of in (limits, iort_contract) for name in table if hasattr(of, name)},
     }
     assert table.keys() == told.keys()
     for name, value in told.items():
@@ -50,7 +50,7 @@ def test_each_limit_is_told_as_it_is() -> None:
 def test_no_limit_of_the_contract_is_left_out() -> None:
     text = section("## Limits")
     every = {name for name in vars(limits) if name.isupper() and not name.startswith("_")}
-    every |= {name for name in contract.__all__ if name.startswith("MAX_")}
+    every |= {name for name in iort_contract.__all__ if name.startswith("MAX_")}
     assert {name for name in every if f"`{name}`" not in text} == set()
 
 
@@ -58,11 +58,11 @@ def test_the_brokers_limits_are_those_that_the_agent_and_the_embedded_cloud_keep
     table = {row[0]: row[1:] for row in rows(section("### Of AWS IoT, and of the embedded cloud"))}
     told = {name: row[0] for name, row in table.items()}
     assert told["a message's payload"] == f"{gaps.AWS_MESSAGE_BYTES // 1024} KiB"
-    assert told["publishes a second of a connection, each way"] == str(allowance.PUBLISHES_PER_S)
-    assert told["bytes a second of a connection, each way"] == f"{allowance.BYTES_PER_S // 1024} KiB"
+    assert told["publishes a second of a connection, each way"] == str(rate_limiter.PUBLISHES_PER_S)
+    assert told["bytes a second of a connection, each way"] == f"{rate_limiter.BYTES_PER_S // 1024} KiB"
     connect = table["time from the connection to CONNECT"][2]
     assert connect.startswith(f"{listener_gap.CONNECT_S:g} s,")
-    assert f"below {allowance.PUBLISHES_PER_S * allowance.SHARE:g} publishes" in PAGE
+    assert f"below {rate_limiter.PUBLISHES_PER_S * rate_limiter.SHARE:g} publishes" in PAGE
 
 
 def test_every_heading_is_in_the_table_of_contents_and_every_link_leads_to_one() -> None:

@@ -9,10 +9,10 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-import contract
-from contract import Batch, ContractError, decode
-from station.items import plain
-from station.old_batches import is_old, upgraded, upgraded_item
+import iort_contract
+from iort_contract import Batch, ContractError, decode
+from iort_station.data.items import plain
+from iort_station.recordings.old_batches import is_old, upgraded, upgraded_item
 from tests.fakes import item_of_message
 from tests.unit.old_messages import old_envelope, old_message
 
@@ -51,7 +51,7 @@ def test_what_the_agent_of_before_wrote_is_read_as_it_was():
 )
 def test_any_batch_is_the_same_after_it(seq, t_us, speeds):
     times = [t_us] * len(speeds)
-    sent = contract.encode(Batch("0123456789abcdef", seq, times, {"speed": speeds}))
+    sent = iort_contract.encode(Batch("0123456789abcdef", seq, times, {"speed": speeds}))
     new = upgraded(old_envelope(decode(sent)))
     assert new == json.loads(sent)
 
@@ -67,7 +67,7 @@ def test_an_item_keeps_all_that_no_batch_has_to_the_letter():
         "v": {"N": "2"},
         "batch": {"S": f"{T0:016}-0badcafe-7"},
     }
-    assert decode(plain(new)) == decode(contract.encode(BATCH))
+    assert decode(plain(new)) == decode(iort_contract.encode(BATCH))
 
 
 @pytest.mark.parametrize(

@@ -1,4 +1,4 @@
-"""What a robot installs holds every package of the contract and of the agent."""
+"""What is installed holds every package of its folder."""
 
 from __future__ import annotations
 
@@ -6,18 +6,20 @@ import json
 import re
 from pathlib import Path
 
+import pytest
 from setuptools import find_packages
 
 ROOT = Path(__file__).parents[2]
 
 
-def test_every_package_of_the_robot_is_installed() -> None:
-    include = re.search(r"^include = (\[.*\])$", (ROOT / "pyproject.toml").read_text(), re.MULTILINE)
+@pytest.mark.parametrize("folder", ["contract", "device", "station"])
+def test_every_package_of_a_distribution_is_installed(folder: str) -> None:
+    home = ROOT / folder
+    include = re.search(r"^include = (\[.*\])$", (home / "pyproject.toml").read_text(), re.MULTILINE)
     assert include
-    found = find_packages(str(ROOT), include=json.loads(include[1]))
+    found = find_packages(str(home), include=json.loads(include[1]))
     there = {
-        ".".join(init.parent.relative_to(ROOT).parts)
-        for name in ("contract", "device")
-        for init in (ROOT / name).rglob("__init__.py")
+        ".".join(init.parent.relative_to(home).parts)
+        for init in (home / f"iort_{folder.replace('device', 'agent')}").rglob("__init__.py")
     }
     assert set(found) == there

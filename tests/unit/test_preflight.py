@@ -11,9 +11,9 @@ import pytest
 from botocore.config import Config
 from botocore.exceptions import NoCredentialsError
 
+from iort_station.cli.console import Console
+from iort_station.errors import StationError
 from stacks.settings import Settings, SettingsError
-from station.console import Console
-from station.errors import StationError
 from verify import preflight, preflight_account, preflight_deployed
 from verify.preflight_finding import Verdict
 

@@ -9,10 +9,10 @@ from decimal import Decimal
 import boto3
 import pytest
 
-import contract
-from contract import ContractError
+import iort_contract
 from functions import presence
-from functions.tables import plain
+from functions.shared.tables import plain
+from iort_contract import ContractError
 from tests.fakes import ROBOTS
 
 MINUTE_MS = 60_000
@@ -186,7 +186,9 @@ def test_what_dynamodb_refuses_is_tried_again_by_lambda(table, monkeypatch):
 def test_counts(table, capsys):
     table(connected(), disconnected(), disconnected())
     lines = [json.loads(line) for line in capsys.readouterr().out.splitlines()]
-    counted = [{name: line[name] for name in contract.METRICS["presence"] if name in line} for line in lines]
+    counted = [
+        {name: line[name] for name in iort_contract.METRICS["presence"] if name in line} for line in lines
+    ]
     assert counted == [{"RobotsConnected": 1}, {"RobotsDisconnected": 1}, {"PresenceIgnored": 1}]
 
 

@@ -11,13 +11,13 @@ from botocore.exceptions import ClientError
 from botocore.stub import Stubber
 from typer.testing import CliRunner
 
-from station import cost, cost_items, cost_tables
-from station.at_rest import deployment_dollars_per_month
-from station.cli import app
-from station.errors import StationError
-from station.price_list import API_REGION, PRODUCTS, Listed, keep, kept_at, load, read
-from station.prices import PRICES
-from station.usage import Usage
+from iort_station.cli.main import app
+from iort_station.cost import line_items, model, report
+from iort_station.cost.fixed_costs import deployment_dollars_per_month
+from iort_station.cost.price_list import API_REGION, PRODUCTS, Listed, keep, kept_at, load, read
+from iort_station.cost.prices import PRICES
+from iort_station.cost.usage import Usage
+from iort_station.errors import StationError
 
 TODAY = date(2026, 11, 22)
 REGION = "eu-west-1"
@@ -113,9 +113,7 @@ def test_what_is_as_built_in_changes_nothing():
     assert (listed.read_on, listed.region, listed.kept) == ("2026-11-22", REGION, {})
     assert listed.each.keys() == PRODUCTS.keys()
     assert listed.changed() == {}
-    assert cost_tables.differences(listed).body == [
-        (f"as built in: {len(PRODUCTS)} of {len(PRODUCTS)}", "", "")
-    ]
+    assert report.differences(listed).body == [(f"as built in: {len(PRODUCTS)} of {len(PRODUCTS)}", "", "")]
 
 
 def test_it_is_asked_as_awss_own_client_asks():
@@ -153,12 +151,12 @@ def test_a_price_that_differs_is_told_and_counts():
     products = as_built_in() | {"rule": product("AWSIoT", USAGES["rule"], (0, 0.30e-6))}
     listed = read(Pricing(products.values()), REGION, TODAY)
     assert listed.changed() == {"rule": (0.15, pytest.approx(0.30))}
-    line, rest = cost_tables.differences(listed).body
+    line, rest = report.differences(listed).body
     assert line[1:] == ("0.15", "0.3")
     assert rest[0].startswith(f"as built in: {len(PRODUCTS) - 1} of")
-    dearer, before = (cost.bill(Usage(), prices) for prices in (listed.prices(), PRICES))
+    dearer, before = (model.bill(Usage(), prices) for prices in (listed.prices(), PRICES))
     more = sum(item.units for item in before if item.price == "rule") * 0.15e-6
-    assert cost_items.total(dearer) == pytest.approx(cost_items.total(before) + more)
+    assert line_items.total(dearer) == pytest.approx(line_items.total(before) + more)
     assert "2026-11-22" in listed.prices()["rule"].seen
 
 
@@ -272,7 +270,7 @@ def test_later_calls_use_what_was_kept_and_say_of_when(tmp_path):
     told = json.loads(run("--json", **environment).output)
     assert (told["prices_as_of"], told["region"]) == ("2026-11-22", "eu-north-1")
     assert told["prices_changed"] == {"rule": [0.15, pytest.approx(0.3)]}
-    expected = cost_items.total(cost.bill(Usage(), listed.prices()))
+    expected = line_items.total(model.bill(Usage(), listed.prices()))
     assert told["dollars_per_robot_hour"] == pytest.approx(expected)
     kept_at(environment).unlink()
     assert "List prices of 2025-06-01" in run(**environment).output

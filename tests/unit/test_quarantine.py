@@ -10,9 +10,9 @@ from botocore.exceptions import ClientError
 from hypothesis import given
 from hypothesis import strategies as st
 
-from contract import BY_FUNCTION, BY_LATER, BY_RULE, BY_STREAM, NO_ROBOT, PUT_OFF, RECORD, build_topic
 from functions.quarantine import Entry, Store, Stream, entries, process
-from functions.refusals import Refusals, Refused, message
+from functions.shared.dead_letter import Refusals, Refused, message
+from iort_contract import BY_FUNCTION, BY_LATER, BY_RULE, BY_STREAM, NO_ROBOT, PUT_OFF, RECORD, build_topic
 from tests.fakes import QUARANTINE, TOPIC_OF_CAR
 
 RAW = b"\xff\x00not JSON, not even text"

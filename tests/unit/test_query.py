@@ -9,12 +9,12 @@ import zlib
 
 import pytest
 
-from contract import Batch
 from functions.query import answer
-from station import data
-from station.conditions import values
-from station.errors import StationError
-from station.stored import Refused
+from iort_contract import Batch
+from iort_station.data import data
+from iort_station.data.conditions import values
+from iort_station.data.stored import Refused
+from iort_station.errors import StationError
 from tests.fakes import ROBOTS, TELEMETRY, FakeDynamoDB, item_of, serialize, tables
 
 START = 1_700_000_000_000_000
@@ -164,7 +164,7 @@ def test_refuses_with_the_reason(request_, reason):
 
 
 class Cloud:
-    """A `station.cloud.Cloud` whose functions run here."""
+    """A `iort_station.cloud.Cloud` whose functions run here."""
 
     namespace, ca_bundle = "iort", None
 

@@ -8,8 +8,9 @@ from pathlib import Path
 
 import pytest
 
-import contract
-from contract import (
+import iort_contract
+from functions.shared.tables import plain
+from iort_contract import (
     Batch,
     Command,
     ContractError,
@@ -23,9 +24,8 @@ from contract import (
     decode_live,
     messages_of,
 )
-from functions.tables import plain
-from station.audit import audit
-from station.stored import Refused, blocks
+from iort_station.data.stored import Refused, blocks
+from iort_station.operations.audit import audit
 from tests.fakes import item_of, serialize
 
 T_US = 1_700_000_000_000_000
@@ -99,9 +99,9 @@ def saying(message, **changes):
 
 
 def test_one_form_of_a_runs_name_holds_in_every_lane_and_on_the_page():
-    live = contract.encode_live(LiveSample(RUN, 1, T_US, T_US, {}))
-    fleet = contract.encode_fleet(FleetMessage(RUN, 1, T_US, {}))
-    command = contract.encode_command(Command(RUN, T_US, 1, T_US, 100, {}))
+    live = iort_contract.encode_live(LiveSample(RUN, 1, T_US, T_US, {}))
+    fleet = iort_contract.encode_fleet(FleetMessage(RUN, 1, T_US, {}))
+    command = iort_contract.encode_command(Command(RUN, T_US, 1, T_US, 100, {}))
     page = re.search(r"^const BOOT = /\^(.*)\$/;$", PAGE.read_text(), re.MULTILINE)
     assert page is not None
     for name, allowed in [(RUN, True), ("0" * 32, True)] + [(one, False) for one in NO_RUNS]:

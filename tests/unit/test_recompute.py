@@ -7,12 +7,13 @@ import json
 
 import pytest
 
-from contract import Batch
-from functions.processing import process
-from functions.processing import recompute as summarize_again
-from station import recompute, robots
-from station.errors import StationError
-from station.recompute import Recomputed
+from functions.shared.processing import process
+from functions.shared.processing import recompute as summarize_again
+from iort_contract import Batch
+from iort_station.errors import StationError
+from iort_station.fleet import robots
+from iort_station.operations import recompute
+from iort_station.operations.recompute import Recomputed
 from tests.fakes import ROBOTS, TELEMETRY, item_of, record_of, serialize, summary_of, tables
 from tests.unit.test_station_data import START, FakeCloud, cloud_of, ride
 

@@ -6,8 +6,8 @@ from decimal import Decimal
 
 import pytest
 
-from station import registry
-from station.errors import StationError
+from iort_station.errors import StationError
+from iort_station.fleet import registry
 from tests.fakes import ROBOTS, serialize
 from tests.unit.test_station_data import FakeCloud, cloud_of
 

@@ -70,13 +70,13 @@ def test_the_projects_expressions_are_found():
     assert {where.split(":")[0] for where, _ in FOUND} >= {
         "functions/admit.py",
         "functions/alert.py",
-        "functions/allotment.py",
+        "functions/shared/upload_quota.py",
         "functions/presence.py",
         "functions/quarantine.py",
-        "functions/tables.py",
-        "station/audit.py",
-        "station/registry.py",
-        "station/replay.py",
+        "functions/shared/tables.py",
+        "station/iort_station/operations/audit.py",
+        "station/iort_station/fleet/registry.py",
+        "station/iort_station/operations/replay.py",
     }
 
 

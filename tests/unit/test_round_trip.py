@@ -13,15 +13,15 @@ from hypothesis import strategies as st
 from rosbags.rosbag1 import Reader
 from rosbags.typesys import Stores, get_typestore
 
-from contract import RECORD, build_topic
-from device.batch import Batcher, StreamCounts
-from device.clock import ManualClock
-from device.pack import Packer
-from device.sources.ros1 import Intake, TopicConfig
-from device.spool import MemorySpool
-from station import recordings
-from station.commands.export import _write
-from station.selection import select
+from iort_agent.clock import ManualClock
+from iort_agent.lanes.batch import Batcher, StreamCounts
+from iort_agent.lanes.batch_encoder import Packer
+from iort_agent.sources.ros1 import Intake, TopicConfig
+from iort_agent.spool.memory import MemorySpool
+from iort_contract import RECORD, build_topic
+from iort_station.cli.verbs.export import _write
+from iort_station.data.selection import select
+from iort_station.recordings import recordings
 from tests.fakes import TELEMETRY, item_of_message
 from tests.ros.mixed_robot import MESSAGES
 from tests.ros1_strategies import definitions, messages

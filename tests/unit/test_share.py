@@ -7,11 +7,12 @@ import json
 import pytest
 from botocore.exceptions import ClientError
 
-from contract import OVER_SHARE, PUT_OFF, RECORD, SHADOW, VESC_STREAM, build_topic
-from functions import allowances, later, share
-from functions.allowances import Allowances
-from functions.processing import Bounds, process
-from functions.share import KEYS, OverShareError, PutOff, Share, Told, waiting
+from functions import later
+from functions.shared import allowances, share
+from functions.shared.allowances import Allowances
+from functions.shared.processing import Bounds, process
+from functions.shared.share import KEYS, OverShareError, PutOff, Share, Told, waiting
+from iort_contract import OVER_SHARE, PUT_OFF, RECORD, SHADOW, VESC_STREAM, build_topic
 from tests.unit.summarizing import T0, S, Stream, batch, counted
 
 GOOD, BAD = (build_topic(RECORD, robot, VESC_STREAM) for robot in ("good", "bad"))

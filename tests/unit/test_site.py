@@ -8,9 +8,9 @@ import boto3
 import pytest
 from moto import mock_aws
 
-from station.errors import StationError
-from station.page import config
-from station.site import files, upload
+from iort_station.errors import StationError
+from iort_station.page.page import config
+from iort_station.page.site import files, upload
 
 TOLD = config(namespace="iort", subscribe_key="sub-c-1", token="abc_DEF-1=")
 

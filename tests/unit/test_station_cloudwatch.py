@@ -9,14 +9,14 @@ from datetime import datetime, timezone
 import boto3
 import pytest
 
-from station import cloudwatch
-from station.errors import StationError
+from iort_station.errors import StationError
+from iort_station.operations import cloudwatch
 
 NOW_S = 1_700_000_000
 
 
 class FakeCloud:
-    """A `station.cloud.Cloud` with CloudWatch alone."""
+    """A `iort_station.cloud.Cloud` with CloudWatch alone."""
 
     namespace = "iort"
 

@@ -7,8 +7,8 @@ from typing import Any
 
 import pytest
 
-from station import cloudwatch_logs
-from station.errors import StationError
+from iort_station.errors import StationError
+from iort_station.operations import cloudwatch_logs
 
 NOW_S = 1_700_000_000
 NAME = "iort-platform"

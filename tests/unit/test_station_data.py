@@ -9,7 +9,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from contract import (
+from functions.shared.tables import attribute
+from iort_contract import (
     MAX_BATCH_SPAN_US,
     TYPES_STREAM,
     Batch,
@@ -18,12 +19,11 @@ from contract import (
     flat_second,
     packed_second,
 )
-from functions.statistics import Vehicle
-from functions.statistics import derive as derive_lists
-from functions.tables import attribute
-from station import conditions, data
-from station.data import select
-from station.errors import StationError
+from iort_contract.statistics import Vehicle
+from iort_contract.statistics import derive as derive_lists
+from iort_station.data import conditions, data
+from iort_station.data.data import select
+from iort_station.errors import StationError
 from tests.fakes import ROBOTS, SUMMARY, TELEMETRY, FakeDynamoDB, item_of, serialize
 
 TOPIC = build_topic("dt", "car", "vesc")
@@ -31,7 +31,7 @@ START = 1_700_000_000_000_000
 
 
 class FakeCloud:
-    """A `station.cloud.Cloud` whose only service is the table in memory."""
+    """A `iort_station.cloud.Cloud` whose only service is the table in memory."""
 
     namespace = "iort"
 

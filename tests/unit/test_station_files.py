@@ -10,12 +10,12 @@ import boto3
 import pytest
 from typer.testing import CliRunner
 
-from contract import File, file_key
-from station import files
-from station.cli import app
-from station.cloud import Cloud
-from station.errors import StationError
-from station.where import Where
+from iort_contract import File, file_key
+from iort_station.cli.main import app
+from iort_station.cli.where import Where
+from iort_station.cloud import Cloud
+from iort_station.errors import StationError
+from iort_station.fleet import files
 
 NAME = "files"
 # 2023-11-14T22:13:20Z

@@ -6,11 +6,11 @@ import numpy as np
 import pytest
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
-from contract import TYPES_STREAM, Batch, ContractError, MessageType, build_topic, message_type
-from device.sources.flatten import flatten
-from station.blocks import Block, column_of
-from station.errors import StationError
-from station.messages import Maker, made_of, types
+from iort_agent.sources.flatten import flatten
+from iort_contract import TYPES_STREAM, Batch, ContractError, MessageType, build_topic, message_type
+from iort_station.data.blocks import Block, column_of
+from iort_station.errors import StationError
+from iort_station.recordings.messages import Maker, made_of, types
 from tests.fakes import TELEMETRY, item_of
 from tests.unit.test_station_data import cloud_of
 

@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 from matplotlib.dates import date2num
 
-from station import plots
-from station.data import Result
-from station.errors import StationError
-from station.plots import Run
+from iort_station.cli import plots
+from iort_station.cli.plots import Run
+from iort_station.data.data import Result
+from iort_station.errors import StationError
 
 START = 1_700_000_000_000_000
 

@@ -6,10 +6,10 @@ import hashlib
 
 import pytest
 
-from contract import CLAIM_FIELDS, Batch, Messages, MessageType, RosType
-from contract.ros1.message import cut
-from station.published import Export
-from station.selection import select
+from iort_contract import CLAIM_FIELDS, Batch, Messages, MessageType, RosType
+from iort_contract.ros1.message import cut
+from iort_station.data.selection import select
+from iort_station.recordings.published import Export
 from tests.fakes import TELEMETRY, item_of, serialize
 from tests.unit.ros1_messages import LINE, text, u32
 from tests.unit.test_station_data import START, cloud_of

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import pytest
 
-from station import recordings
-from station.errors import StationError
+from iort_station.errors import StationError
+from iort_station.recordings import recordings
 
 
 @pytest.mark.parametrize("ending", recordings.KINDS)

@@ -8,8 +8,8 @@ from types import SimpleNamespace
 
 import pytest
 
-from station.errors import StationError
-from station.shadow import OverShare, State, _check_clock, answered, outcome, over_share
+from iort_station.errors import StationError
+from iort_station.fleet.shadow import OverShare, State, _check_clock, answered, outcome, over_share
 
 REPORTED = {
     "live": {"enabled": True, "rate_hz": 10},

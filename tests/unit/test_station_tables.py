@@ -11,10 +11,10 @@ import pyarrow.parquet as pq
 import pytest
 from rich.console import Console
 
-from station import tables
-from station.commands.options import Range
-from station.data import Result
-from station.errors import StationError
+from iort_station.cli import tables
+from iort_station.cli.verbs.options import Range
+from iort_station.data.data import Result
+from iort_station.errors import StationError
 
 
 def result(n=3):

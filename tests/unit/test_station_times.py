@@ -6,8 +6,8 @@ from datetime import datetime, timezone
 
 import pytest
 
-from station.errors import StationError
-from station.times import duration_us, has_zone, iso, iso_s, time_us
+from iort_station.cli.times import duration_us, has_zone, iso, iso_s, time_us
+from iort_station.errors import StationError
 
 NOW = 1_700_000_000_123_456
 

@@ -8,11 +8,11 @@ from urllib.request import proxy_bypass
 import pytest
 from typer.testing import CliRunner
 
-from station import keys
-from station.cli import app, said
-from station.cloud import Cloud
-from station.errors import StationError
-from station.where import Where
+from iort_station.cli.main import app, said
+from iort_station.cli.where import Where
+from iort_station.cloud import Cloud
+from iort_station.errors import StationError
+from iort_station.page import keys
 
 
 @pytest.fixture(autouse=True)

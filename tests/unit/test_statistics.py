@@ -9,14 +9,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from contract import Batch, BatchId, flat_second
-from functions.statistics import (
-    Vehicle,
-    count_holes,
-    derive,
-    missing_before,
-    summarize_second,
-)
+from iort_contract import Batch, BatchId, flat_second
+from iort_contract.statistics import Vehicle, count_holes, derive, missing_before, summarize_second
 
 S = 1_000_000
 SECOND = 1_700_000_000

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import pytest
 
-from contract import Batch
-from functions.processing import process
-from functions.stored import SECOND_BATCHES, Reader
+from functions.shared.processing import process
+from functions.shared.stored import SECOND_BATCHES, Reader
+from iort_contract import Batch
 from tests.fakes import TOPIC_OF_CAR
 from tests.unit.summarizing import SECOND, T0, S, Stream, batch
 

@@ -12,10 +12,10 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from contract import Batch
-from functions import tables as tables_module
-from functions.processing import process
-from functions.tables import TableError
+from functions.shared import tables as tables_module
+from functions.shared.processing import process
+from functions.shared.tables import TableError
+from iort_contract import Batch
 from local.stream_mapping import Answer, Condition, Settings, Shard
 from tests.fakes import TELEMETRY, FakeDynamoDB, item_of, record_of, summary_of, tables
 

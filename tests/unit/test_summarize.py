@@ -8,8 +8,8 @@ from decimal import Decimal
 
 import pytest
 
-from contract import EXPIRES_S, RECEIVED_MS
-from functions.processing import process
+from functions.shared.processing import process
+from iort_contract import EXPIRES_S, RECEIVED_MS
 from tests.fakes import (
     EXPIRES,
     ROBOTS,

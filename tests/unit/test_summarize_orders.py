@@ -9,8 +9,8 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from contract import split
-from functions.statistics import missing_before
+from iort_contract import split
+from iort_contract.statistics import missing_before
 from tests.fakes import (
     ROBOTS,
     FakeDynamoDB,

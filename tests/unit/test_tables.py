@@ -9,10 +9,10 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from contract import BATCH, EXPIRES_S, SECOND, TOPIC, Batch, BatchId, batch_id
-from functions import tables as tables_module
-from functions.statistics import Vehicle
-from functions.tables import TableError, attribute, plain
+from functions.shared import tables as tables_module
+from functions.shared.tables import TableError, attribute, plain
+from iort_contract import BATCH, EXPIRES_S, SECOND, TOPIC, Batch, BatchId, batch_id
+from iort_contract.statistics import Vehicle
 from tests.fakes import (
     ROBOTS,
     SUMMARY,

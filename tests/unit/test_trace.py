@@ -6,9 +6,20 @@ import itertools
 
 import pytest
 
-from contract import Batch, LiveSample, live_update
-from station.commands.trace import bar
-from station.trace import CAR, HERE, LAMBDA, PUBNUB, RULE, Clock, clock_of, round_trips_ms, times, trace
+from iort_contract import Batch, LiveSample, live_update
+from iort_station.cli.verbs.trace import bar
+from iort_station.operations.trace import (
+    CAR,
+    HERE,
+    LAMBDA,
+    PUBNUB,
+    RULE,
+    Clock,
+    clock_of,
+    round_trips_ms,
+    times,
+    trace,
+)
 
 T_US = 1_750_000_000_000_000
 # What each hop takes, in microseconds of true time.

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import pytest
 
-from contract import AGENT_STREAM, RTT_STREAM, VESC_STREAM, MessageType
-from station.units import unit
+from iort_contract import AGENT_STREAM, RTT_STREAM, VESC_STREAM, MessageType
+from iort_station.data.units import unit
 
 
 @pytest.mark.parametrize(

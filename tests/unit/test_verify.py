@@ -8,8 +8,8 @@ import json
 import pytest
 
 from bench.target import AWS, EMBEDDED, Target
+from iort_station.cloud import Cloud
 from local.deployment import ROOT
-from station.cloud import Cloud
 from verify import measured, page, report
 from verify.assumption import Basis
 from verify.check import Check, Verdict, ask

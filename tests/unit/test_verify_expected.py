@@ -8,7 +8,7 @@ from dataclasses import replace
 import pytest
 
 from bench.target import EMBEDDED, Target
-from station.cloud import Cloud
+from iort_station.cloud import Cloud
 from verify.check import NOTE, Verdict, ask, compared
 from verify.checks import ALL
 

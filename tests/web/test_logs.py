@@ -6,7 +6,7 @@ import threading
 from collections.abc import Callable
 from typing import TYPE_CHECKING, Any
 
-from station.page_server import PageServer
+from iort_station.page.server import PageServer
 from tests.browser import until
 from tests.web.cars import SUBSCRIBE_KEY
 

@@ -8,9 +8,9 @@ from typing import TYPE_CHECKING, Any, Literal
 
 import pytest
 
-import contract
+import iort_contract
+from iort_station.page.server import PageServer
 from local.pubnub_standin import PubNubStandIn
-from station.page_server import PageServer
 from tests.browser import drawn, plain, show, shown, until
 from tests.web.cars import GAIN, SAMPLE, SUBSCRIBE_KEY, Car
 
@@ -75,7 +75,7 @@ def test_every_newer_message_is_shown(page: Page, car: Car) -> None:
 
 
 def test_any_field_of_any_stream_is_shown(page: Page, car: Car) -> None:
-    sample: dict[str, contract.Value] = {
+    sample: dict[str, iort_contract.Value] = {
         "pose.x": -1.25,
         "armed": True,
         "frame": "map",

@@ -13,10 +13,10 @@ from urllib.parse import urlsplit
 
 import pytest
 
-import contract
-from station.errors import StationError
-from station.page import BUILT, config, field_table
-from station.page_server import PageServer
+import iort_contract
+from iort_station.errors import StationError
+from iort_station.page.page import BUILT, config, field_table
+from iort_station.page.server import PageServer
 
 TOLD: dict[str, Any] = {
     "namespace": "iort",
@@ -124,9 +124,9 @@ def test_the_page_reads_the_contracts_fields(built: Path) -> None:
     with PageServer(**TOLD, built=built) as page:
         table = json.loads(ask(page, "/fields.json")[1])
     assert table == field_table()
-    assert table["fields"].keys() >= contract.VESC_FIELDS.keys() | contract.DERIVED_UNITS.keys()
+    assert table["fields"].keys() >= iort_contract.VESC_FIELDS.keys() | iort_contract.DERIVED_UNITS.keys()
     assert table["fields"]["speed"]["unit"] == "erpm"
-    assert table["faults"]["5"] == contract.FAULTS[5]
+    assert table["faults"]["5"] == iort_contract.FAULTS[5]
 
 
 @pytest.mark.parametrize(
@@ -239,7 +239,7 @@ def test_answers_come_as_json_with_the_words_of_what_failed(built: Path) -> None
 
 
 def test_pubnubs_sdk_is_passed_on_unmodified_and_with_its_licence() -> None:
-    modules = BUILT.parent.parent / "node_modules" / "pubnub"
+    modules = BUILT.parents[3] / "node_modules" / "pubnub"
     if not (BUILT / "index.html").is_file():
         pytest.skip("the live page is not built: npm run build")
     published = (modules / "dist" / "web" / "pubnub.min.js").read_bytes()

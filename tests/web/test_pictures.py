@@ -9,8 +9,8 @@ from typing import TYPE_CHECKING, Any
 
 import pytest
 
-from device.thumbnail import thumbnail
-from station.page_server import PageServer
+from iort_agent.lanes.thumbnail import thumbnail
+from iort_station.page.server import PageServer
 from tests.browser import drawn, show, until
 from tests.images import jpeg
 from tests.web.cars import SAMPLE, SUBSCRIBE_KEY, Car

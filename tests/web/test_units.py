@@ -10,9 +10,9 @@ from typing import TYPE_CHECKING, Any
 
 import pytest
 
-from contract import VESC_STREAM
+from iort_contract import VESC_STREAM
+from iort_station.page.server import PageServer
 from local.deployment import ROOT
-from station.page_server import PageServer
 from tests.browser import drawn, plain, show, shown, until
 from tests.web.cars import GAIN, SAMPLE, SUBSCRIBE_KEY, Car
 

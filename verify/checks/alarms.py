@@ -9,7 +9,7 @@ from datetime import datetime, timedelta, timezone
 from typing import Any
 
 from bench.target import Target
-from contract import FAULT_FIELD, LIVE, VESC_STREAM, LiveSample, build_topic, encode_live
+from iort_contract import FAULT_FIELD, LIVE, VESC_STREAM, LiveSample, build_topic, encode_live
 from verify.assumption import Basis
 from verify.check import WITH_KEY, Check
 from verify.errors import VerifyError
@@ -177,7 +177,7 @@ CHECKS = (
             "says": ["when", "stream"],
         },
         basis=Basis.ASSUMED,
-        relied_on_by=("functions/alert.py", "stacks/storage.py", "contract/cloud.py"),
+        relied_on_by=("functions/alert.py", "stacks/storage.py", "contract/iort_contract/cloud.py"),
         ask=_alert,
     ),
 )

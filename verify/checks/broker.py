@@ -7,7 +7,7 @@ import time
 from typing import Any
 
 from bench.target import Target
-from contract import CMD, FLEET, build_topic
+from iort_contract import CMD, FLEET, build_topic
 from verify.assumption import Basis
 from verify.bundles import pair_of, registered
 from verify.check import Check
@@ -101,7 +101,7 @@ CHECKS = (
         },
         basis=Basis.DOCUMENTED,
         source=_MQTT,
-        relied_on_by=("device/iotcore.py",),
+        relied_on_by=("device/iort_agent/mqtt/aws.py",),
         ask=_session_taken_over,
     ),
     Check(
@@ -110,7 +110,7 @@ CHECKS = (
         expected={"neighbours": True, "one_that_nobody_has": True},
         basis=Basis.DOCUMENTED,
         source="https://docs.aws.amazon.com/iot/latest/developerguide/thing-policy-variables.html",
-        relied_on_by=("stacks/documents.py", "device/failures.py"),
+        relied_on_by=("stacks/documents.py", "device/iort_agent/mqtt/failures.py"),
         ask=_another_client_id,
     ),
     Check(
@@ -123,7 +123,7 @@ CHECKS = (
         expected={"subscribe": "NOT_AUTHORIZED", "publish_is_refused": True, "neighbour_heard": 0},
         basis=Basis.DOCUMENTED,
         source=_MQTT,
-        relied_on_by=("stacks/documents.py", "device/subscriptions.py"),
+        relied_on_by=("stacks/documents.py", "device/iort_agent/mqtt/subscriptions.py"),
         ask=_foreign_topic,
     ),
     Check(
@@ -135,7 +135,7 @@ CHECKS = (
         expected={"at_90_a_second": _ALL_TAKEN},
         basis=Basis.DOCUMENTED,
         source=_QUOTAS,
-        relied_on_by=("device/allowance.py",),
+        relied_on_by=("device/iort_agent/lanes/rate_limiter.py",),
         ask=_rate,
     ),
 )

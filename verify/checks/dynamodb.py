@@ -7,7 +7,7 @@ from typing import Any
 from botocore.exceptions import ClientError
 
 from bench.target import Target
-from contract import ADMISSION, BATCH, ENVELOPE, EXPIRES_S, PRESENCE, RECEIVED_MS, ROBOT, STREAMS, TOPIC
+from iort_contract import ADMISSION, BATCH, ENVELOPE, EXPIRES_S, PRESENCE, RECEIVED_MS, ROBOT, STREAMS, TOPIC
 from verify.assumption import Basis
 from verify.check import Check
 from verify.errors import VerifyError
@@ -83,7 +83,11 @@ CHECKS = (
         expected={"refused": [BATCH, "online"]},
         basis=Basis.DOCUMENTED,
         source=f"{_GUIDE}/ReservedWords.html",
-        relied_on_by=("functions/presence.py", "functions/admit.py", "station/registry.py"),
+        relied_on_by=(
+            "functions/presence.py",
+            "functions/admit.py",
+            "station/iort_station/fleet/registry.py",
+        ),
         ask=_reserved,
     ),
     Check(
@@ -92,7 +96,7 @@ CHECKS = (
         expected={"code": "ConditionalCheckFailedException", "status": 400, "row": True},
         basis=Basis.DOCUMENTED,
         source=f"{_API}/API_UpdateItem.html",
-        relied_on_by=("functions/admit.py", "functions/allotment.py", "functions/alert.py"),
+        relied_on_by=("functions/admit.py", "functions/shared/upload_quota.py", "functions/alert.py"),
         ask=_condition,
     ),
 )

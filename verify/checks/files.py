@@ -10,7 +10,7 @@ from typing import Any
 
 from bench import borrowed
 from bench.target import Target
-from contract import FILES_PREFIX, PART_BYTES, File, part_range
+from iort_contract import FILES_PREFIX, PART_BYTES, File, part_range
 from verify.assumption import Basis
 from verify.check import Check
 from verify.uploading import asking, sent, trust
@@ -136,7 +136,7 @@ CHECKS = (
             f"{_GUIDE}/using-presigned-url.html, {_GUIDE}/conditional-requests.html and "
             "https://repost.aws/knowledge-center/s3-presigned-url-signature-mismatch"
         ),
-        relied_on_by=("functions/bucket.py", "functions/upload.py", "device/upload_http.py"),
+        relied_on_by=("functions/shared/bucket.py", "functions/upload.py", "device/iort_agent/files/http.py"),
         ask=_in_one,
     ),
     Check(
@@ -156,7 +156,7 @@ CHECKS = (
         },
         basis=Basis.DOCUMENTED,
         source=f"{_API}/API_CompletedPart.html and {_GUIDE}/checking-object-integrity.html",
-        relied_on_by=("functions/bucket.py", "functions/upload.py"),
+        relied_on_by=("functions/shared/bucket.py", "functions/upload.py"),
         ask=_in_parts,
     ),
     Check(
@@ -169,7 +169,7 @@ CHECKS = (
         },
         basis=Basis.DOCUMENTED,
         source=f"{_GUIDE}/using-presigned-url.html and {_GUIDE}/access-control-block-public-access.html",
-        relied_on_by=("stacks/storage.py", "device/upload_http.py"),
+        relied_on_by=("stacks/storage.py", "device/iort_agent/files/http.py"),
         ask=_closed,
     ),
 )

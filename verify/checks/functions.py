@@ -8,8 +8,8 @@ from typing import Any
 
 from bench import borrowed
 from bench.target import Target
-from contract import BY_FUNCTION, LAMBDA, PING, TOPIC, build_topic, rule_event
-from station import quarantine
+from iort_contract import BY_FUNCTION, LAMBDA, PING, TOPIC, build_topic, rule_event
+from iort_station.operations import quarantine
 from verify.assumption import Basis
 from verify.check import Check
 from verify.errors import VerifyError
@@ -121,7 +121,7 @@ CHECKS = (
             "arn_is_a_functions": True,
         },
         basis=Basis.ASSUMED,
-        relied_on_by=("functions/bucket.py", "stacks/function.py", "functions/live.py"),
+        relied_on_by=("functions/shared/bucket.py", "stacks/function.py", "functions/live.py"),
         ask=_runtime,
     ),
     Check(

@@ -11,7 +11,7 @@ from itertools import count
 from typing import Any
 
 from bench.target import Target
-from contract import (
+from iort_contract import (
     DEFAULT_NAMESPACE,
     RECEIVED_MS,
     VESC_STREAM,
@@ -20,10 +20,10 @@ from contract import (
     live_topic,
     pubnub_parameter,
 )
-from station import keys
-from station.cloud import Cloud
-from station.errors import StationError
-from station.listener import Listener
+from iort_station.cloud import Cloud
+from iort_station.errors import StationError
+from iort_station.page import keys
+from iort_station.page.listener import Listener
 from verify.assumption import Basis
 from verify.check import Check
 from verify.errors import CannotAskError
@@ -121,7 +121,11 @@ CHECKS = (
             "at_rule_before_lambda": True,
         },
         basis=Basis.ASSUMED,
-        relied_on_by=("functions/live.py", "functions/pubnub_client.py", "contract/cloud.py"),
+        relied_on_by=(
+            "functions/live.py",
+            "functions/shared/pubnub_client.py",
+            "contract/iort_contract/cloud.py",
+        ),
         ask=_live,
     ),
 )

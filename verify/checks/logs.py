@@ -10,7 +10,7 @@ from typing import Any
 from bench import borrowed
 from bench.invocations import configure
 from bench.target import Target
-from contract import (
+from iort_contract import (
     METRIC_DEPLOYMENT,
     METRIC_FUNCTION,
     METRIC_NAMESPACE,
@@ -122,7 +122,7 @@ CHECKS = (
             f"{_CLOUDWATCH}/CloudWatch_Embedded_Metric_Format_Specification.html and "
             f"{_GUIDE}/monitoring-cloudwatchlogs-log-level.html"
         ),
-        relied_on_by=("functions/metrics.py", "stacks/function.py", "stacks/alarms.py"),
+        relied_on_by=("functions/shared/metrics.py", "stacks/function.py", "stacks/alarms.py"),
         ask=_metric,
     ),
     Check(
@@ -133,7 +133,7 @@ CHECKS = (
         ),
         expected={"printed_as_it_is": True, "warning_is_shown": True, "failure_is_shown": True},
         basis=Basis.ASSUMED,
-        relied_on_by=("stacks/dashboards.py", "functions/metrics.py"),
+        relied_on_by=("stacks/dashboards.py", "functions/shared/metrics.py"),
         ask=_lines,
     ),
 )

@@ -6,7 +6,7 @@ import json
 from typing import Any
 
 from bench.target import Target
-from contract import (
+from iort_contract import (
     FLEET,
     LIVE,
     MAX_MESSAGE_BYTES,
@@ -21,8 +21,8 @@ from contract import (
     live_topic,
     record_topic,
 )
-from station import quarantine
-from station.quarantine import Entry
+from iort_station.operations import quarantine
+from iort_station.operations.quarantine import Entry
 from verify.assumption import Basis
 from verify.bundles import pair_of
 from verify.check import Check
@@ -121,7 +121,7 @@ CHECKS = (
         expected={"refused_by": "function", "topic_as_subscribed": True, "byte_by_byte": True},
         basis=Basis.DOCUMENTED,
         source=f"{_GUIDE}/binary-payloads.html",
-        relied_on_by=("contract/cloud.py", "functions/live.py"),
+        relied_on_by=("contract/iort_contract/cloud.py", "functions/live.py"),
         ask=_live_no_json,
     ),
     Check(
@@ -143,7 +143,7 @@ CHECKS = (
         ),
         expected={"the_next_ping_is_answered": True},
         basis=Basis.ASSUMED,
-        relied_on_by=("device/pings.py",),
+        relied_on_by=("device/iort_agent/lanes/pings.py",),
         ask=_pong_no_json,
     ),
     Check(
@@ -155,7 +155,7 @@ CHECKS = (
         expected={"ours": "SUCCESS"},
         basis=Basis.DOCUMENTED,
         source=f"{_QUOTAS} and {_GUIDE}/mqtt.html",
-        relied_on_by=("contract/limits.py",),
+        relied_on_by=("contract/iort_contract/limits.py",),
         ask=_largest,
     ),
 )

@@ -11,7 +11,12 @@ from typing import Any
 import yaml
 
 from bench.target import Target
-from contract import (
+from iort_agent.errors import IdentityError
+from iort_agent.identity import provision
+from iort_agent.identity.claim import load_claim
+from iort_agent.identity.exchange import Exchange
+from iort_agent.identity.machine_key import make_key
+from iort_contract import (
     ADMIT_CLAIM,
     ADMIT_FINGERPRINT,
     ADMITTED_CERTIFICATE,
@@ -19,12 +24,7 @@ from contract import (
     SERIAL_PARAMETER,
     fleet_name,
 )
-from device import identity
-from device.claim import load_claim
-from device.errors import IdentityError
-from device.exchange import Exchange
-from device.machine_key import make_key
-from station import certificates, claims, registry
+from iort_station.fleet import certificates, claims, registry
 from verify.assumption import Basis
 from verify.bundles import removed_after
 from verify.check import Check
@@ -58,7 +58,7 @@ def _provision(file: Path, robot: str | None = None) -> str:
     """The code with which RegisterThing is refused; "" where it is not."""
     try:
         with _agent():
-            identity.provision(file, robot=robot)
+            provision.provision(file, robot=robot)
     except _RefusedError as error:
         return str(error)
     return ""
@@ -168,7 +168,12 @@ CHECKS = (
         expected=_MADE,
         basis=Basis.DOCUMENTED,
         source=f"{_PROVISION} and {_HOOK}",
-        relied_on_by=("station/claims.py", "functions/admit.py", "device/identity.py", "stacks/fleet.py"),
+        relied_on_by=(
+            "station/iort_station/fleet/claims.py",
+            "functions/admit.py",
+            "device/iort_agent/identity/provision.py",
+            "stacks/fleet.py",
+        ),
         ask=_own_claim,
     ),
     Check(
@@ -177,7 +182,7 @@ CHECKS = (
         expected=_MADE,
         basis=Basis.DOCUMENTED,
         source=f"{_PROVISION} and {_HOOK}",
-        relied_on_by=("station/claims.py", "functions/admit.py", "stacks/documents.py"),
+        relied_on_by=("station/iort_station/fleet/claims.py", "functions/admit.py", "stacks/documents.py"),
         ask=_lasting_claim,
     ),
     Check(
@@ -188,7 +193,7 @@ CHECKS = (
         ),
         expected={"by_one_of_both": True},
         basis=Basis.ASSUMED,
-        relied_on_by=("functions/admit.py", "station/registry.py"),
+        relied_on_by=("functions/admit.py", "station/iort_station/fleet/registry.py"),
         ask=_known_by,
     ),
     Check(
@@ -199,7 +204,7 @@ CHECKS = (
         ),
         expected={"first_is_its_own": True, "again_refused": "", "certificates": ["ACTIVE"]},
         basis=Basis.ASSUMED,
-        relied_on_by=("device/identity.py", "functions/admit.py"),
+        relied_on_by=("device/iort_agent/identity/provision.py", "functions/admit.py"),
         ask=_registered_again,
     ),
     Check(

@@ -8,10 +8,20 @@ import time
 from typing import Any
 
 from bench.target import Target
-from contract import BATCH, RECORD, VESC_STREAM, Batch, batch_id, build_topic, encode, record_topic, rule_name
-from station import delivery, quarantine
-from station.quarantine import Entry
-from station.replay import replay
+from iort_contract import (
+    BATCH,
+    RECORD,
+    VESC_STREAM,
+    Batch,
+    batch_id,
+    build_topic,
+    encode,
+    record_topic,
+    rule_name,
+)
+from iort_station.operations import delivery, quarantine
+from iort_station.operations.quarantine import Entry
+from iort_station.operations.replay import replay
 from verify.assumption import Basis
 from verify.check import Check
 from verify.errors import VerifyError
@@ -96,7 +106,7 @@ CHECKS = (
             "seen": 1,
         },
         basis=Basis.ASSUMED,
-        relied_on_by=("functions/summarize.py", "functions/refusals.py", "functions/quarantine.py"),
+        relied_on_by=("functions/summarize.py", "functions/shared/dead_letter.py", "functions/quarantine.py"),
         ask=_refused,
     ),
     Check(
@@ -108,7 +118,7 @@ CHECKS = (
         expected={"before": 0, "fate": "replayed", "summarized": 1, "left": 0},
         basis=Basis.DOCUMENTED,
         source="https://docs.aws.amazon.com/iot/latest/developerguide/iot-basic-ingest.html",
-        relied_on_by=("station/replay.py", "functions/quarantine.py"),
+        relied_on_by=("station/iort_station/operations/replay.py", "functions/quarantine.py"),
         ask=_replayed,
     ),
 )

@@ -6,7 +6,7 @@ import json
 from typing import Any
 
 from bench.target import Target
-from station import certificates, robots
+from iort_station.fleet import certificates, robots
 from verify.assumption import Basis
 from verify.bundles import registered, removed_after
 from verify.check import Check
@@ -86,7 +86,7 @@ CHECKS = (
         expected={"session_ended": True, "connects_again": False},
         basis=Basis.DOCUMENTED,
         source=f"{_MQTT} and {_API}/API_DeleteCertificate.html",
-        relied_on_by=("station/robots.py", "station/certificates.py"),
+        relied_on_by=("station/iort_station/fleet/robots.py", "station/iort_station/fleet/certificates.py"),
         ask=_removed,
     ),
     Check(
@@ -95,7 +95,7 @@ CHECKS = (
         expected={"connects_before": True, "connects_after": False},
         basis=Basis.DOCUMENTED,
         source=f"{_API}/API_UpdateCertificate.html",
-        relied_on_by=("station/rotation.py", "device/failures.py"),
+        relied_on_by=("station/iort_station/fleet/rotation.py", "device/iort_agent/mqtt/failures.py"),
         ask=_deactivated,
     ),
 )

@@ -7,9 +7,9 @@ import time
 from typing import Any
 
 from bench.target import Target
-from device import identity
-from device.errors import IdentityError
-from station import certificates, claims, rotation
+from iort_agent.errors import IdentityError
+from iort_agent.identity import provision
+from iort_station.fleet import certificates, claims, rotation
 from verify.assumption import Basis
 from verify.bundles import registered
 from verify.check import Check
@@ -25,7 +25,7 @@ def _rotated(target: Target) -> dict[str, Any]:
     shutil.copytree(bundle.folder, before)
     claim = claims.claim(target.cloud, bundle.robot, out=target.folder / "claims" / bundle.robot)
     try:
-        identity.renew(bundle.config, claim, status_socket=bundle.folder / "none.sock")
+        provision.renew(bundle.config, claim, status_socket=bundle.folder / "none.sock")
     except IdentityError as error:
         raise VerifyError(str(error)) from error
     renewed = len(certificates.attached(target.cloud, bundle.robot))
@@ -59,7 +59,11 @@ CHECKS = (
         },
         basis=Basis.DOCUMENTED,
         source=f"{_GUIDE}/provision-wo-cert.html and {_GUIDE}/life-cycle-events.html",
-        relied_on_by=("device/identity.py", "station/rotation.py", "functions/presence.py"),
+        relied_on_by=(
+            "device/iort_agent/identity/provision.py",
+            "station/iort_station/fleet/rotation.py",
+            "functions/presence.py",
+        ),
         ask=_rotated,
     ),
 )

@@ -9,15 +9,8 @@ from contextlib import contextmanager
 from typing import Any
 
 from bench.target import Target
-from contract import (
-    PING,
-    PONG,
-    RULE,
-    TOPIC,
-    build_topic,
-    rule_name,
-)
 from functions.quarantine import entries
+from iort_contract import PING, PONG, RULE, TOPIC, build_topic, rule_name
 from verify.assumption import Basis
 from verify.bundles import Pair, pair_of
 from verify.check import Check
@@ -125,7 +118,7 @@ CHECKS = (
         },
         basis=Basis.DOCUMENTED,
         source=f"{_GUIDE}/rule-error-handling.html and {_GUIDE}/iot-basic-ingest.html",
-        relied_on_by=("functions/quarantine.py", "contract/topics.py"),
+        relied_on_by=("functions/quarantine.py", "contract/iort_contract/topics.py"),
         ask=_error_document,
     ),
     Check(

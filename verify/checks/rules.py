@@ -11,7 +11,7 @@ from collections.abc import Callable, Mapping
 from typing import Any
 
 from bench.target import Target
-from contract import (
+from iort_contract import (
     AGENT_VERSION,
     ALERT_PREFIX,
     EXPIRES_S,
@@ -37,7 +37,7 @@ from contract import (
     encode_ping,
     file_key,
 )
-from station import registry
+from iort_station.fleet import registry
 from verify.assumption import Basis
 from verify.bundles import listener, pair_of
 from verify.check import Check
@@ -184,7 +184,7 @@ def _spoofed(
         expected=expected,
         basis=Basis.DOCUMENTED,
         source=source,
-        relied_on_by=("contract/cloud.py", *files),
+        relied_on_by=("contract/iort_contract/cloud.py", *files),
         ask=ask,
     )
 
@@ -205,7 +205,7 @@ CHECKS = (
         "The rule record stores the keys of a batch and the cloud's three, each by name. A key of the "
         "message with the name of one of the cloud's is not stored. A key that the message lacks is "
         "absent. A text becomes S, a number N.",
-        "functions/stored.py",
+        "functions/shared/stored.py",
         source=f"{_SQL} and {_DYNAMODB_V2}",
     ),
     _spoofed(

@@ -10,9 +10,9 @@ from typing import Any
 
 from bench import borrowed
 from bench.target import Target
-from contract import BATCH, RECORD, VESC_STREAM, Batch, batch_id, build_topic, encode, record_topic
-from station import quarantine
-from station.replay import replay
+from iort_contract import BATCH, RECORD, VESC_STREAM, Batch, batch_id, build_topic, encode, record_topic
+from iort_station.operations import quarantine
+from iort_station.operations.replay import replay
 from verify.assumption import Basis
 from verify.check import Check
 from verify.robot import Robot

@@ -1,4 +1,4 @@
-// What the server that serves the page answers about the past; see station/answers.py.
+// What the server that serves the page answers about the past; see station/iort_station/page/answers.py.
 
 export interface Drive {
   readonly times_s: readonly number[];

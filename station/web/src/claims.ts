@@ -3,7 +3,7 @@
 
 import type { Value } from "./message";
 
-/** The end of a claim's fields' names, as in contract/files.py. */
+/** The end of a claim's fields' names, as in contract/iort_contract/messages/files.py. */
 const PARTS = ["key", "sha256", "size", "content_type", "thumbnail"] as const;
 
 export interface Claim {

@@ -1,4 +1,4 @@
-// The live update as Lambda 1 sends it (contract.live_update), checked field by field: whatever else
+// The live update as Lambda 1 sends it (iort_contract.live_update), checked field by field: whatever else
 // arrives on the channel is refused with a reason.
 
 export type Value = null | boolean | number | string;

@@ -6,7 +6,7 @@ import { bytes, type Claim } from "./claims";
 import { el, setAttribute, Text } from "./dom";
 import { age } from "./format";
 
-// The cars' are of 96 pixels; see device/thumbnail.py.
+// The cars' are of 96 pixels; see device/iort_agent/lanes/thumbnail.py.
 const MOST_PIXELS = 256;
 // Of a frame, whatever it is coded by; the three of the range that are none are tables (ITU T.81, table B.1).
 const START_OF_FRAME = (marker: number): boolean => marker >= 0xc0 && marker <= 0xcf && ![0xc4, 0xc8, 0xcc].includes(marker);

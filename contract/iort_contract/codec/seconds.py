@@ -1,0 +1,56 @@
+"""A second of the summary table: a field's statistics are one list, since its name would be half of each.
+
+Outside of the table a second is flat, ``<field>_min`` and so on. Items were once stored so, and some
+attributes are still.
+"""
+
+from __future__ import annotations
+
+from functools import lru_cache
+from typing import Any, List, Mapping, Union
+
+from iort_contract.limits import Value
+from iort_contract.tables import EXPIRES_S, OMITTED, SECOND, STATS, TOPIC
+
+# What a second holds of a field: `STATS`, or one value where all four are that; of what are no numbers the
+# last, by itself.
+Statistics = Union[List[Value], Value]
+_TAKEN = frozenset({TOPIC, SECOND, EXPIRES_S, OMITTED})
+_SUFFIXES = tuple(f"_{statistic}" for statistic in STATS)
+
+
+def packed_second(counts: Mapping[str, Value], fields: Mapping[str, Statistics]) -> dict[str, Statistics]:
+    """The second as it is stored: what is known of it as a whole, and each field's statistics by its name.
+
+    What is no list becomes ``<field>_last``. A field whose name the second has for something else is flat.
+    """
+    packed: dict[str, Statistics] = dict(fields)
+    taken = _TAKEN.union(counts)
+    flat: dict[str, Statistics] = dict(counts)
+    while odd := [name for name, found in packed.items() if name in taken or type(found) is not list]:
+        for name in odd:
+            flat.update(_flat(name, packed.pop(name)))
+        # A field may be called as the statistic of another is now.
+        taken |= flat.keys()
+    return {**flat, **packed}
+
+
+def flat_second(packed: Mapping[str, Any]) -> dict[str, Any]:
+    """The second with ``<field>_min``, ``_mean``, ``_max`` and ``_last``, whatever types the attributes'
+    values were read as."""
+    flat: dict[str, Any] = {}
+    for name, value in packed.items():
+        flat.update(_flat(name, value) if isinstance(value, list) else {name: value})
+    return flat
+
+
+def _flat(name: str, statistics: Any) -> dict[str, Any]:
+    if not isinstance(statistics, list):
+        return {name + _SUFFIXES[-1]: statistics}
+    values = statistics * len(STATS) if len(statistics) == 1 else statistics
+    return dict(zip(_names(name), values))
+
+
+@lru_cache(maxsize=4096)
+def _names(field: str) -> tuple[str, ...]:
+    return tuple([field + suffix for suffix in _SUFFIXES])

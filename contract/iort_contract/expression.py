@@ -1,0 +1,357 @@
+"""A condition on samples, such as ``speed_mps > 1.2 and fault_code == 0``: parsed, never evaluated by Python.
+
+The language is a part of Python's own syntax: fields (a dotted path, ``covariance[0]`` for an element),
+numbers, texts, ``+ - * / %``, ``abs()``, comparisons (also chained and ``in (...)``), ``is None`` and
+``is not None`` (also written ``== None`` and ``!= None``), ``and``, ``or``, ``not`` and brackets. What is
+null makes arithmetic null and every comparison false; division by zero is null. A field by itself is true
+where it is neither null, zero nor empty. A number compared with a text is an error, as is calculating with
+a text: no sample could ever answer it.
+
+The query function evaluates over lists; iort_station.data.conditions does over numpy's
+columns, with the same answers.
+"""
+
+from __future__ import annotations
+
+import ast
+import math
+import operator
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any, NamedTuple, TypeAlias
+
+from iort_contract import ContractError, Value, check_field
+
+MAX_LENGTH = 1000
+# Deeper than anybody writes, and far from the interpreter's own limit.
+_MAX_DEPTH = 40
+# What a value is, as far as comparing goes; a flag is 0 or 1.
+_NULL, _NUMBER, _TEXT = "null", "a number", "a text"
+_Kinds: TypeAlias = Mapping[str, frozenset[str]]
+
+
+class MismatchError(ValueError):
+    """A condition that compares a number with a text, or calculates with a text; the text says which."""
+
+
+class ExpressionError(ValueError):
+    """An expression that is not in the language; the text shows the place."""
+
+    def __init__(self, problem: str, expression: str, position: int) -> None:
+        super().__init__(f"{problem}\n  {expression}\n  {' ' * position}^")
+        self.position = position
+
+
+class Field(NamedTuple):
+    """The value of a field."""
+
+    name: str
+
+
+class Constant(NamedTuple):
+    """A number, text, True or False."""
+
+    value: float | str
+
+
+class Arithmetic(NamedTuple):
+    """Two numbers make one; null where either is."""
+
+    symbol: str
+    left: Node
+    right: Node
+
+
+class Magnitude(NamedTuple):
+    """A number without its sign."""
+
+    of: Node
+
+
+class Comparison(NamedTuple):
+    """Two values compared; false where either is null."""
+
+    symbol: str
+    left: Node
+    right: Node
+
+
+class IsNull(NamedTuple):
+    """Whether a value is missing."""
+
+    of: Node
+
+
+class Every(NamedTuple):
+    """True where all of them are."""
+
+    of: tuple[Node, ...]
+
+
+class Some(NamedTuple):
+    """True where any of them is."""
+
+    of: tuple[Node, ...]
+
+
+class Not(NamedTuple):
+    """True where the other is not."""
+
+    of: Node
+
+
+Node: TypeAlias = Field | Constant | Arithmetic | Magnitude | Comparison | IsNull | Every | Some | Not
+
+ARITHMETIC: Mapping[str, Callable[[Any, Any], Any]] = {
+    "+": operator.add,
+    "-": operator.sub,
+    "*": operator.mul,
+    "/": operator.truediv,
+    "%": operator.mod,
+}
+COMPARISONS: Mapping[str, Callable[[Any, Any], Any]] = {
+    "==": operator.eq,
+    "!=": operator.ne,
+    "<": operator.lt,
+    "<=": operator.le,
+    ">": operator.gt,
+    ">=": operator.ge,
+}
+_BINARY = {ast.Add: "+", ast.Sub: "-", ast.Mult: "*", ast.Div: "/", ast.Mod: "%"}
+_COMPARE = {ast.Eq: "==", ast.NotEq: "!=", ast.Lt: "<", ast.LtE: "<=", ast.Gt: ">", ast.GtE: ">="}
+
+
+def parse(expression: str) -> Node:
+    """The tree of an expression; raises `ExpressionError` for what is not in the language."""
+    if len(expression) > MAX_LENGTH:
+        raise ExpressionError(f"the expression has over {MAX_LENGTH} characters", expression[:60] + "...", 0)
+    # Spaces in front are an indentation to Python, and a line's end is an end.
+    text = " ".join(expression.splitlines()).strip()
+    try:
+        tree = ast.parse(text, mode="eval")
+    except SyntaxError as error:
+        # The end of the text has no place of its own.
+        position = min(len(text), (error.offset or len(text) + 1) - 1)
+        raise ExpressionError(f"this is no expression: {error.msg}", text, position) from error
+    except (ValueError, MemoryError, RecursionError) as error:
+        raise ExpressionError("this is no expression", text[:60], 0) from error
+    return _Reader(text).read(tree.body)
+
+
+def names(node: Node) -> frozenset[str]:
+    """The fields that a tree refers to."""
+    if isinstance(node, Field):
+        return frozenset({node.name})
+    if isinstance(node, Constant):
+        return frozenset()
+    if isinstance(node, (Arithmetic, Comparison)):
+        return names(node.left) | names(node.right)
+    parts = node.of if isinstance(node, (Every, Some)) else (node.of,)
+    return frozenset().union(*map(names, parts))
+
+
+def holds(node: Node, columns: Mapping[str, Sequence[Value]], n: int) -> list[bool]:
+    """Where the condition is true, a value a sample; a field that is not there is null.
+
+    Raises `MismatchError` where numbers and texts would be compared.
+    """
+    fields = {name: columns.get(name) or [None] * n for name in names(node)}
+    kinds = {name: frozenset(map(_kind, column)) - {_NULL} for name, column in fields.items()}
+    if problem := _mismatch(node, kinds):
+        raise MismatchError(problem)
+    return [_is_true(_value(node, {name: column[i] for name, column in fields.items()})) for i in range(n)]
+
+
+def _value(node: Node, sample: Mapping[str, Value]) -> Value:
+    if isinstance(node, Field):
+        return sample[node.name]
+    if isinstance(node, Constant):
+        return node.value
+    if isinstance(node, Arithmetic):
+        return _calculated(node.symbol, _value(node.left, sample), _value(node.right, sample))
+    if isinstance(node, Magnitude):
+        value = _value(node.of, sample)
+        return abs(float(value)) if isinstance(value, (int, float)) else None
+    if isinstance(node, Comparison):
+        return _compared(node.symbol, _value(node.left, sample), _value(node.right, sample))
+    if isinstance(node, IsNull):
+        return _value(node.of, sample) is None
+    if isinstance(node, Every):
+        return all(_is_true(_value(part, sample)) for part in node.of)
+    if isinstance(node, Some):
+        return any(_is_true(_value(part, sample)) for part in node.of)
+    return not _is_true(_value(node.of, sample))
+
+
+def _is_true(value: Value) -> bool:
+    return bool(value)
+
+
+def _calculated(symbol: str, left: Value, right: Value) -> float | None:
+    if not isinstance(left, (int, float)) or not isinstance(right, (int, float)):
+        return None
+    try:
+        number = float(ARITHMETIC[symbol](float(left), float(right)))
+    except (ArithmeticError, ValueError):
+        return None
+    return None if math.isnan(number) else number
+
+
+def _compared(symbol: str, left: Value, right: Value) -> bool:
+    if left is None or right is None:
+        return False
+    return bool(COMPARISONS[symbol](left, right))
+
+
+def _kind(value: Value) -> str:
+    return _NULL if value is None else _TEXT if isinstance(value, str) else _NUMBER
+
+
+def _kinds(node: Node, of: _Kinds) -> frozenset[str]:
+    """What the values of a node are; nothing where that is not known, or all are null."""
+    if isinstance(node, Field):
+        return of.get(node.name, frozenset())
+    return frozenset({_kind(node.value) if isinstance(node, Constant) else _NUMBER})
+
+
+def _mismatch(node: Node, of: _Kinds) -> str:
+    """What a condition asks that fields of these kinds cannot answer; empty where there is nothing."""
+    if isinstance(node, (Field, Constant)):
+        return ""
+    if isinstance(node, (Arithmetic, Comparison)):
+        parts: tuple[Node, ...] = (node.left, node.right)
+    else:
+        parts = node.of if isinstance(node, (Every, Some)) else (node.of,)
+    kinds = frozenset().union(*(_kinds(part, of) for part in parts))
+    said = ", ".join(
+        f"{_shown(part)} is {' or '.join(sorted(_kinds(part, of)))}" for part in parts if _kinds(part, of)
+    )
+    if isinstance(node, Comparison) and len(kinds) > 1:
+        return f"a number and a text cannot be compared: {said}"
+    if isinstance(node, (Arithmetic, Magnitude)) and _TEXT in kinds:
+        return f"a text cannot be calculated with: {said}"
+    return next(filter(None, (_mismatch(part, of) for part in parts)), "")
+
+
+def _shown(node: Node) -> str:
+    if isinstance(node, Field):
+        return node.name
+    return repr(node.value) if isinstance(node, Constant) else "what is calculated"
+
+
+class _Reader:
+    """Turns Python's tree into ours, and refuses everything that ours does not have."""
+
+    def __init__(self, text: str) -> None:
+        self._text = text
+        self._depth = 0
+
+    def read(self, node: ast.expr) -> Node:
+        self._depth += 1
+        if self._depth > _MAX_DEPTH:
+            raise self._error("the expression is nested too deeply", node)
+        try:
+            return self._read(node)
+        finally:
+            self._depth -= 1
+
+    def _read(self, node: ast.expr) -> Node:
+        if isinstance(node, (ast.Name, ast.Attribute, ast.Subscript)):
+            return self._field(node)
+        if isinstance(node, ast.Constant):
+            return self._constant(node)
+        made = self._made(node)
+        # What the fields are, only the samples will tell.
+        if problem := _mismatch(made, {}):
+            raise self._error(problem, node)
+        return made
+
+    def _made(self, node: ast.expr) -> Node:
+        if isinstance(node, ast.BoolOp):
+            parts = tuple(map(self.read, node.values))
+            return Every(parts) if isinstance(node.op, ast.And) else Some(parts)
+        if isinstance(node, ast.UnaryOp):
+            if isinstance(node.op, ast.Not):
+                return Not(self.read(node.operand))
+            if isinstance(node.op, ast.USub):
+                return Arithmetic("-", Constant(0), self.read(node.operand))
+            if isinstance(node.op, ast.UAdd):
+                return self.read(node.operand)
+        if isinstance(node, ast.BinOp) and type(node.op) in _BINARY:
+            return Arithmetic(_BINARY[type(node.op)], self.read(node.left), self.read(node.right))
+        if isinstance(node, ast.Compare):
+            return self._compare(node)
+        if isinstance(node, ast.Call):
+            return self._call(node)
+        raise self._error("this is not part of the language: fields, numbers, texts, + - * / %, "
+                          "abs(), comparisons, and, or, not", node)  # fmt: skip
+
+    def _field(self, node: ast.expr) -> Field:
+        path: list[str] = []
+        at = node
+        while not isinstance(at, ast.Name):
+            if isinstance(at, ast.Attribute):
+                path.append(at.attr)
+            elif isinstance(at, ast.Subscript) and isinstance(at.slice, ast.Constant):
+                if type(at.slice.value) is not int:
+                    raise self._error("an element has a number", at.slice)
+                path.append(str(at.slice.value))
+            else:
+                raise self._error("this is not a field", node)
+            at = at.value
+        name = ".".join([at.id, *reversed(path)])
+        try:
+            return Field(check_field(name))
+        except ContractError as error:
+            raise self._error(str(error), node) from error
+
+    def _constant(self, node: ast.Constant) -> Constant:
+        value = node.value
+        if isinstance(value, (int, float)) and not isinstance(value, bool):
+            try:
+                finite = math.isfinite(value)
+            except OverflowError:
+                finite = False
+            if not finite:
+                raise self._error("the number is too large", node)
+            return Constant(value)
+        if isinstance(value, (bool, str)):
+            return Constant(value)
+        if value is None:
+            raise self._error("None can only be asked for: x is None, x is not None", node)
+        raise self._error("this is neither number nor text", node)
+
+    def _compare(self, node: ast.Compare) -> Node:
+        parts: list[Node] = []
+        left = node.left
+        for kind, right in zip(node.ops, node.comparators, strict=True):
+            parts.append(self._pair(left, kind, right))
+            left = right
+        return parts[0] if len(parts) == 1 else Every(tuple(parts))
+
+    def _pair(self, left: ast.expr, kind: ast.cmpop, right: ast.expr) -> Node:
+        if isinstance(kind, (ast.Is, ast.IsNot)) and not _is_none(right):
+            raise self._error("`is` asks for None alone; use ==", right)
+        if isinstance(kind, (ast.Is, ast.IsNot, ast.Eq, ast.NotEq)) and (_is_none(left) or _is_none(right)):
+            null = IsNull(self.read(left if _is_none(right) else right))
+            return null if isinstance(kind, (ast.Is, ast.Eq)) else Not(null)
+        if type(kind) in _COMPARE:
+            return Comparison(_COMPARE[type(kind)], self.read(left), self.read(right))
+        if not isinstance(right, (ast.Tuple, ast.List)) or not right.elts:
+            raise self._error("`in` needs values in brackets, such as in (1, 2)", right)
+        within = Some(tuple(self._pair(left, ast.Eq(), item) for item in right.elts))
+        return within if isinstance(kind, ast.In) else Not(within)
+
+    def _call(self, node: ast.Call) -> Node:
+        known = isinstance(node.func, ast.Name) and node.func.id == "abs"
+        if not known or len(node.args) != 1 or node.keywords:
+            raise self._error("the one function is abs(x)", node)
+        return Magnitude(self.read(node.args[0]))
+
+    def _error(self, problem: str, node: ast.expr) -> ExpressionError:
+        # ast counts bytes of UTF-8.
+        position = len(self._text.encode()[: node.col_offset].decode(errors="ignore"))
+        return ExpressionError(problem, self._text, position)
+
+
+def _is_none(node: ast.expr) -> bool:
+    return isinstance(node, ast.Constant) and node.value is None

@@ -1,0 +1,286 @@
+"""The record lane: samples of a stream in one message, which is stored as it is."""
+
+from __future__ import annotations
+
+import re
+from dataclasses import dataclass
+from itertools import accumulate
+from typing import Any, Mapping, NamedTuple, Sequence
+
+from iort_contract.checks import (
+    BOOT,
+    COMPACT,
+    check_field,
+    check_header,
+    check_time,
+    check_times,
+    check_version,
+    integer,
+    json_object,
+    shown,
+    wire_column,
+)
+from iort_contract.codec.columns import (
+    CODEC,
+    PLAIN_CODEC,
+    SERIALIZED_CODEC,
+    inflate,
+    packed_samples,
+    unpacked,
+)
+from iort_contract.codec.complexity_guard import check_effort
+from iort_contract.limits import (
+    BATCH_VERSION,
+    MAX_AHEAD_US,
+    MAX_BATCH_VALUES,
+    MAX_FIELDS,
+    MAX_SAMPLES,
+    ContractError,
+    Value,
+)
+from iort_contract.ros1.columns import as_columns, from_columns, values_a_message, view
+from iort_contract.ros1.message import Messages
+from iort_contract.ros1.serialized import pack, unpack
+from iort_contract.tables import BATCH, NONFINITE, RECEIVED_MS, ROBOT, SAMPLES, TOPIC
+from iort_contract.topics import RECORD, Topic, parse_topic
+
+_BATCH_ID = re.compile(rf"(\d{{16}})-({BOOT.pattern})-(0|[1-9]\d{{0,15}})", re.ASCII)
+_MAX_BATCH_ID_US = 10**16
+
+
+class BatchId(NamedTuple):
+    """What no two batches of a topic share: the time of the first sample, the agent's run, and the number.
+
+    As a text it sorts by time, so that a range of times is a range of keys.
+    """
+
+    t_us: int
+    boot: str
+    seq: int
+
+    def __str__(self) -> str:
+        return f"{self.t_us:016d}-{self.boot}-{self.seq}"
+
+
+def batch_id(text: Any) -> BatchId:
+    """The id in a text; raises `ContractError`."""
+    match = _BATCH_ID.fullmatch(text) if isinstance(text, str) else None
+    if match is None:
+        raise ContractError(f"{BATCH} {shown(text)}: expected <16 digits of microseconds>-<run>-<number>")
+    found = BatchId(int(match.group(1)), match.group(2), int(match.group(3)))
+    check_time(found.t_us, BATCH)
+    check_header(found.boot, found.seq, 0)
+    return found
+
+
+def batches_between(first_us: int | None, last_us: int | None) -> tuple[str, str]:
+    """The least and the greatest key of batches that start at these times or between; None is open."""
+    first = min(max(0, first_us or 0), _MAX_BATCH_ID_US - 1)
+    last = _MAX_BATCH_ID_US - 1 if last_us is None else min(max(-1, last_us), _MAX_BATCH_ID_US - 1)
+    # Behind all that begins with the time: "~" is greater than what an id has.
+    return (f"{first:016d}", f"{last:016d}~") if last >= 0 else ("~", "~")
+
+
+@dataclass(frozen=True)
+class Batch:
+    """Samples of one stream.
+
+    ``boot`` names the agent's run; ``seq`` numbers the stream's batches without a hole, across
+    restarts where the spool is durable; ``times_us`` are microseconds since the epoch, one a sample, in
+    order and within `MAX_BATCH_SPAN_US`; ``columns`` holds a list of equal length a field; ``nonfinite``
+    counts the NaNs and infinities that became None. ``messages`` are the ROS messages that the samples
+    are a view of, where the batch has them as they were published; to be encoded, ``columns`` then hold
+    what stands beside them.
+    """
+
+    boot: str
+    seq: int
+    times_us: Sequence[int]
+    columns: Mapping[str, Sequence[Value]]
+    nonfinite: int = 0
+    messages: Messages | None = None
+
+    @property
+    def t_us(self) -> int:
+        """The first sample's time."""
+        return self.times_us[0]
+
+    @property
+    def id(self) -> BatchId:
+        """What the batch is told by from others of its topic."""
+        return BatchId(self.t_us, self.boot, self.seq)
+
+
+def encode(batch: Batch) -> bytes:
+    """The envelope as JSON. NaN and infinities become null and are added to ``nonfinite``.
+
+    Raises `ContractError` where the batch is not allowed; a batch too large for one message is encoded all
+    the same: compare with `MAX_MESSAGE_BYTES` and use `split`.
+    """
+    check_header(batch.boot, batch.seq, batch.nonfinite)
+    times, n = batch.times_us, len(batch.times_us)
+    if not 1 <= n <= MAX_SAMPLES:
+        raise ContractError(f"batch of {n} samples: allowed is 1 to {MAX_SAMPLES}")
+    check_times(times)
+    if times[0] < 0:
+        raise ContractError(f"time {times[0]} us: before 1970")
+    dt = [0] + [b - a for a, b in zip(times, times[1:])]
+    fields, nonfinite = _wire_columns(batch, n)
+    codec, samples = CODEC, ""
+    if batch.messages is None:
+        samples = packed_samples(dt, fields)
+    else:
+        codec, samples = _packed_messages(batch.messages, times, dt, fields)
+    check_header(batch.boot, batch.seq, nonfinite)
+    envelope = {
+        "v": BATCH_VERSION,
+        BATCH: str(batch.id),
+        SAMPLES: n,
+        **({NONFINITE: nonfinite} if nonfinite else {}),
+        "codec": codec,
+        "samples": samples,
+    }
+    return COMPACT.encode(envelope).encode()
+
+
+def _wire_columns(batch: Batch, n: int) -> tuple[dict[str, list[Value]], int]:
+    """The columns as they are written, and how many values are not finite with those known."""
+    if len(batch.columns) > MAX_FIELDS:
+        raise ContractError(f"batch of {len(batch.columns)} fields: allowed is up to {MAX_FIELDS}")
+    _check_values(n, len(batch.columns))
+    nonfinite = batch.nonfinite
+    fields: dict[str, list[Value]] = {}
+    for name, column in batch.columns.items():
+        check_field(name)
+        if len(column) != n:
+            raise ContractError(f"field {name}: {len(column)} values for {n} samples")
+        fields[name], nulled = wire_column(name, column)
+        nonfinite += nulled
+    return fields, nonfinite
+
+
+def _packed_messages(
+    messages: Messages, times: Sequence[int], dt: Sequence[int], beside: Mapping[str, Sequence[Value]]
+) -> tuple[str, str]:
+    """Codec and samples of messages: as columns where those say all, or else as they are."""
+    n = len(dt)
+    if len(messages.raw) != n:
+        raise ContractError(f"{len(messages.raw)} messages for {n} samples")
+    _check_values(n, len(beside) + values_a_message(messages))
+    found = None if beside else as_columns(messages, times)
+    if found is not None:
+        columns, about = found
+        return CODEC, packed_samples(dt, columns, about.encode())
+    return SERIALIZED_CODEC, packed_samples(dt, beside, pack(messages), SERIALIZED_CODEC)
+
+
+def decode(message: bytes | str | Mapping[str, Any]) -> Batch:
+    """The batch in an envelope: the message as sent, or the attributes of a stored item.
+
+    Messages that are kept as columns stay columns: `messages_of` makes them again. Raises `ContractError`,
+    naming what is wrong, for anything that `encode` cannot have written.
+    """
+    return _read(message)[0]
+
+
+def messages_of(
+    message: bytes | str | Mapping[str, Any], layouts: Mapping[str, str]
+) -> tuple[Batch, Messages | None]:
+    """The batch in an envelope, and its ROS messages byte for byte; None where they were never messages.
+
+    ``layouts`` has each type's layout by its id. Raises `ContractError` as `decode`, and where the type is
+    not among them.
+    """
+    batch, about = _read(message)
+    if batch.messages is not None or not about:
+        return batch, batch.messages
+    return batch, from_columns(batch.columns, about, batch.times_us, layouts)
+
+
+def _read(message: bytes | str | Mapping[str, Any]) -> tuple[Batch, str]:
+    """The batch, and what stands behind its columns."""
+    envelope = message if isinstance(message, Mapping) else json_object(message, "envelope")
+    check_version(envelope, BATCH_VERSION)
+    codec = envelope.get("codec")
+    if codec not in (CODEC, SERIALIZED_CODEC, PLAIN_CODEC):
+        raise ContractError(
+            f"codec {shown(codec)}: this side knows {CODEC}, {SERIALIZED_CODEC}, {PLAIN_CODEC}"
+        )
+    first_us, boot, seq = batch_id(envelope.get(BATCH))
+    n = integer(envelope, SAMPLES)
+    nonfinite = integer(envelope, NONFINITE) if NONFINITE in envelope else 0
+    check_header(boot, seq, nonfinite)
+    if not 1 <= n <= MAX_SAMPLES:
+        raise ContractError(f"envelope says {n} samples: allowed is 1 to {MAX_SAMPLES}")
+    text, _, behind = inflate(envelope.get("samples"), codec).partition(b"\n")
+    check_effort(text)
+    body = json_object(text, "samples")
+    dt, fields = body.get("dt"), body.get("fields")
+    if not isinstance(dt, list) or len(dt) != n or not isinstance(fields, dict):
+        raise ContractError(f"samples: expected {n} dt and an object of fields")
+    if len(fields) > MAX_FIELDS:
+        raise ContractError(f"samples of {len(fields)} fields: allowed is up to {MAX_FIELDS}")
+    _check_values(n, len(fields))
+    if dt[0] != 0 or not set(map(type, dt)) <= {int}:
+        raise ContractError("samples: dt must be integers, the first 0")
+    times = list(accumulate(dt, initial=first_us))[1:]
+    check_times(times)
+    columns: dict[str, list[Value]] = {}
+    for name, column in fields.items():
+        check_field(name)
+        columns[name] = unpacked(CODEC if codec == SERIALIZED_CODEC else codec, name, column, n)
+    if codec == SERIALIZED_CODEC:
+        messages = unpack(behind, n)
+        viewed, nulled = view(messages)
+        return Batch(boot, seq, times, {**viewed, **columns}, nonfinite + nulled, messages), ""
+    return Batch(boot, seq, times, columns, nonfinite), _text(behind)
+
+
+def _text(behind: bytes) -> str:
+    try:
+        return behind.decode()
+    except UnicodeDecodeError as error:
+        raise ContractError(f"what stands behind the columns is no text: {error}") from error
+
+
+def _check_values(samples: int, fields: int) -> None:
+    if samples * fields > MAX_BATCH_VALUES:
+        raise ContractError(
+            f"{samples} samples of {fields} fields: allowed is up to {MAX_BATCH_VALUES} values in a batch"
+        )
+
+
+def decode_item(item: Mapping[str, Any]) -> tuple[Topic, Batch]:
+    """Whose a stored item is, and its batch.
+
+    Raises `ContractError` for one that is no batch, that is not of the record lane, whose body names
+    another robot than its topic, or whose time is `MAX_AHEAD_US` after its receipt.
+    """
+    topic = parse_topic(item[TOPIC]) if TOPIC in item else None
+    if topic is None or topic.lane != RECORD:
+        raise ContractError(f"topic {shown(item.get(TOPIC))}: expected {RECORD}/<namespace>/<robot>/<stream>")
+    if item.get(ROBOT, topic.robot) != topic.robot:
+        raise ContractError(f"sent by {topic.robot} in the name of {shown(item[ROBOT])}")
+    batch = decode(item)
+    if RECEIVED_MS in item and batch.t_us > integer(item, RECEIVED_MS) * 1000 + MAX_AHEAD_US:
+        raise ContractError(f"time {batch.t_us} us: over a year after its receipt; the car's clock is wrong")
+    return topic, batch
+
+
+def split(batch: Batch) -> tuple[Batch, Batch]:
+    """The two halves of a batch, the second with the next ``seq``.
+
+    Raises `ContractError` for a single sample, which cannot be made smaller.
+    """
+    half = len(batch.times_us) // 2
+    if half == 0:
+        raise ContractError(f"one sample of {len(batch.columns)} fields does not fit in a message")
+
+    def part(which: slice, seq: int, nonfinite: int) -> Batch:
+        columns = {name: column[which] for name, column in batch.columns.items()}
+        messages = batch.messages
+        if messages is not None:
+            messages = messages._replace(raw=messages.raw[which])
+        return Batch(batch.boot, seq, batch.times_us[which], columns, nonfinite, messages)
+
+    return part(slice(half), batch.seq, batch.nonfinite), part(slice(half, None), batch.seq + 1, 0)

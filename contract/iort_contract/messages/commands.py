@@ -1,0 +1,160 @@
+"""Commands to a robot, and what robots tell each other."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import dataclass
+from typing import Any, Mapping
+
+from iort_contract.checks import (
+    BOOT,
+    check_header,
+    check_time,
+    check_version,
+    checked,
+    integer,
+    json_object,
+    offset_entry,
+    shown,
+    text,
+)
+from iort_contract.limits import MAX_MESSAGE_BYTES, SCHEMA_VERSION, ContractError
+
+# However long an operator asks for: a command is for now, and a motion must not go on by itself.
+MAX_VALID_MS, MAX_LEASE_MS = 60_000, 10_000
+# A message for others to act on is worth nothing later; LIVE_MAX_AGE_MS is for eyes.
+FLEET_MAX_AGE_MS = 2_000
+
+
+@dataclass(frozen=True)
+class Command:
+    """A ROS message for a robot to publish.
+
+    Commands are in the order of ``started_us``, ``session``, ``seq``: ``session`` names an operator's
+    session, which began at ``started_us``, and ``seq`` numbers its commands; a later session takes
+    over. After ``valid_ms`` from ``sent_us``, by the cloud's clock, the command is stale. ``lease_ms``,
+    without which a motion is refused, is how long from ``sent_us`` it may go on. ``message`` is the
+    ROS message. With ``answer`` the robot says in its shadow what became of it: `COMMANDS`, name,
+    ``session``, ``seq`` and ``outcome``, `ACCEPTED` or why not.
+    """
+
+    session: str
+    started_us: int
+    seq: int
+    sent_us: int
+    valid_ms: int
+    message: Mapping[str, Any]
+    lease_ms: int | None = None
+    answer: bool = False
+
+    @property
+    def order(self) -> tuple[int, str, int]:
+        """What of two commands the later one has more of."""
+        return (self.started_us, self.session, self.seq)
+
+
+def encode_command(command: Command) -> bytes:
+    """The command as JSON. Raises `ContractError` for one that is not allowed."""
+    _check_command(command)
+    envelope: dict[str, Any] = {
+        "v": SCHEMA_VERSION,
+        "session": command.session,
+        "started_us": command.started_us,
+        "seq": command.seq,
+        "sent_us": command.sent_us,
+        "valid_ms": command.valid_ms,
+    }
+    if command.lease_ms is not None:
+        envelope["lease_ms"] = command.lease_ms
+    if command.answer:
+        envelope["answer"] = True
+    return _message_json({**envelope, "message": command.message})
+
+
+def decode_command(payload: bytes | str) -> Command:
+    """Read a command; raises `ContractError` for what `encode_command` cannot have written."""
+    envelope = _message_envelope(payload, "command")
+    command = Command(
+        session=text(envelope, "session"),
+        started_us=integer(envelope, "started_us"),
+        seq=integer(envelope, "seq"),
+        sent_us=integer(envelope, "sent_us"),
+        valid_ms=integer(envelope, "valid_ms"),
+        message=envelope["message"],
+        lease_ms=integer(envelope, "lease_ms") if "lease_ms" in envelope else None,
+        answer=envelope.get("answer", False),
+    )
+    _check_command(command)
+    return command
+
+
+@dataclass(frozen=True)
+class FleetMessage:
+    """A robot's ROS message for other robots: the newest only, ``seq`` growing within a ``boot``.
+    ``offset_us`` is what to add to ``sent_us`` to have the cloud's time, where the robot knows it."""
+
+    boot: str
+    seq: int
+    sent_us: int
+    message: Mapping[str, Any]
+    offset_us: int | None = None
+
+
+def encode_fleet(fleet: FleetMessage) -> bytes:
+    """The message as JSON. Raises `ContractError` for one that is not allowed."""
+    envelope = {
+        "v": SCHEMA_VERSION,
+        "boot": check_header(fleet.boot, fleet.seq, 0),
+        "seq": fleet.seq,
+        "sent_us": check_time(fleet.sent_us, "sent_us"),
+        **offset_entry(fleet.offset_us),
+    }
+    return _message_json({**envelope, "message": fleet.message})
+
+
+def decode_fleet(payload: bytes | str) -> FleetMessage:
+    """Read another robot's message; raises `ContractError` for what `encode_fleet` cannot write."""
+    envelope = _message_envelope(payload, "fleet message")
+    seq = integer(envelope, "seq")
+    boot = check_header(envelope.get("boot"), seq, 0)
+    sent_us = check_time(integer(envelope, "sent_us"), "sent_us")
+    offset_us = integer(envelope, "offset_us") if "offset_us" in envelope else None
+    offset_entry(offset_us)
+    return FleetMessage(boot, seq, sent_us, envelope["message"], offset_us)
+
+
+def _check_command(command: Command) -> None:
+    checked(BOOT, command.session, "session", "8 to 32 of 0-9 a-f")
+    check_header(command.session, command.seq, 0)
+    if not isinstance(command.answer, bool):
+        raise ContractError(f"answer {shown(command.answer)}: allowed is true or false")
+    if check_time(command.started_us, "started_us") > check_time(command.sent_us, "sent_us"):
+        raise ContractError("the command was sent before its session started")
+    for name, value, most in (
+        ("valid_ms", command.valid_ms, MAX_VALID_MS),
+        ("lease_ms", command.lease_ms, MAX_LEASE_MS),
+    ):
+        if value is None and name == "lease_ms":
+            continue
+        if type(value) is not int or not 1 <= value <= most:
+            raise ContractError(f"{name} {shown(value)}: allowed is an integer from 1 to {most}")
+
+
+def _message_json(envelope: Mapping[str, Any]) -> bytes:
+    if not isinstance(envelope["message"], dict):
+        raise ContractError(f"message {shown(envelope['message'])}: expected an object")
+    try:
+        payload = json.dumps(envelope, separators=(",", ":"), allow_nan=False).encode()
+    except (TypeError, ValueError, RecursionError) as error:
+        raise ContractError(f"the message is not JSON: {error}") from error
+    if len(payload) > MAX_MESSAGE_BYTES:
+        raise ContractError(f"the message would have {len(payload)} of {MAX_MESSAGE_BYTES} bytes")
+    return payload
+
+
+def _message_envelope(payload: bytes | str, what: str) -> dict[str, Any]:
+    envelope = json_object(payload, what)
+    check_version(envelope)
+    if not isinstance(envelope.get("message"), dict):
+        raise ContractError(f"message {shown(envelope.get('message'))}: expected an object")
+    return envelope

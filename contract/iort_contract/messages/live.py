@@ -1,0 +1,134 @@
+"""The live lane, the newest sample; and pings, which measure the way."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import dataclass
+from typing import Any, Mapping, NamedTuple
+
+from iort_contract.checks import (
+    COMPACT,
+    MAX_SEQ,
+    check_field,
+    check_header,
+    check_time,
+    check_version,
+    integer,
+    json_object,
+    offset_entry,
+    shown,
+    wire_column,
+    wire_sample,
+)
+from iort_contract.limits import MAX_FIELDS, SCHEMA_VERSION, ContractError, Value
+from iort_contract.tables import NONFINITE, RECEIVED_MS, ROBOT, T_US
+
+# What a ping says; the answer repeats it.
+PING_FIELDS = ("v", "id", "sent_us", "padding")
+
+
+@dataclass(frozen=True)
+class LiveSample:
+    """The newest sample of a stream, as the live lane carries it.
+
+    ``seq`` numbers the stream's live messages of a run; ``t_us`` is the sample's time, ``sent_us`` the time
+    it left the car; ``sample`` maps field to value. Fields stand in an object of their own, so that no
+    ROS field can be taken for one of ours; a rule filters on ``sample.fault_code``. ``offset_us`` is what
+    to add to the car's clock to have the cloud's, where the car knows it to within
+    `CLOCK_MAX_UNCERTAINTY_MS`.
+    """
+
+    boot: str
+    seq: int
+    t_us: int
+    sent_us: int
+    sample: Mapping[str, Value]
+    nonfinite: int = 0
+    offset_us: int | None = None
+
+
+def encode_live(live: LiveSample) -> bytes:
+    """The live message as JSON; NaN and infinities become null and are counted."""
+    check_header(live.boot, live.seq, live.nonfinite)
+    if len(live.sample) > MAX_FIELDS:
+        raise ContractError(f"sample of {len(live.sample)} fields: allowed is up to {MAX_FIELDS}")
+    sample, nulled = wire_sample(live.sample)
+    nonfinite = live.nonfinite + nulled
+    check_header(live.boot, live.seq, nonfinite)
+    message = {
+        "v": SCHEMA_VERSION,
+        "boot": live.boot,
+        "seq": live.seq,
+        T_US: check_time(live.t_us, "sample time"),
+        "sent_us": check_time(live.sent_us, "sent_us"),
+        NONFINITE: nonfinite,
+        **offset_entry(live.offset_us),
+        "sample": sample,
+    }
+    return COMPACT.encode(message).encode()
+
+
+def decode_live(message: bytes | str) -> LiveSample:
+    """The sample in a live message; raises `ContractError` for what `encode_live` cannot write."""
+    envelope = json_object(message, "live message")
+    check_version(envelope)
+    seq, nonfinite = integer(envelope, "seq"), integer(envelope, NONFINITE)
+    boot = check_header(envelope.get("boot"), seq, nonfinite)
+    sample = envelope.get("sample")
+    if not isinstance(sample, dict) or len(sample) > MAX_FIELDS:
+        raise ContractError(f"sample: expected an object of up to {MAX_FIELDS} fields")
+    for name, value in sample.items():
+        check_field(name)
+        if wire_column(name, (value,))[1]:
+            raise ContractError(f"field {name}: the number is not finite")
+    t_us = check_time(integer(envelope, T_US), "sample time")
+    sent_us = check_time(integer(envelope, "sent_us"), "sent_us")
+    offset_us = integer(envelope, "offset_us") if "offset_us" in envelope else None
+    offset_entry(offset_us)
+    return LiveSample(boot, seq, t_us, sent_us, sample, nonfinite, offset_us)
+
+
+def live_update(
+    robot: str, stream: str, live: LiveSample, received_ms: int, lambda_us: int
+) -> dict[str, Any]:
+    """What Lambda 1 sends to PubNub: the sample, the time of every hop it has passed and, where the car
+    knows it, what to add to the car's times to have the cloud's."""
+    hops = {"sent_us": live.sent_us, RECEIVED_MS: received_ms, "lambda_us": lambda_us}
+    return {
+        "v": SCHEMA_VERSION,
+        ROBOT: robot,
+        "stream": stream,
+        "boot": live.boot,
+        "seq": live.seq,
+        T_US: live.t_us,
+        "hops": {**hops, **offset_entry(live.offset_us)},
+        "sample": dict(live.sample),
+    }
+
+
+def encode_ping(ping_id: int, sent_us: int, padding: str = "") -> bytes:
+    """A ping; the pong has the same content, and the cloud's ``received_ms``."""
+    if type(ping_id) is not int or not 0 <= ping_id <= MAX_SEQ:
+        raise ContractError(f"ping id {shown(ping_id)}: allowed is an integer from 0")
+    ping: dict[str, Any] = {"v": SCHEMA_VERSION, "id": ping_id}
+    ping["sent_us"] = check_time(sent_us, "sent_us")
+    if padding:
+        ping["padding"] = padding
+    return json.dumps(ping, separators=(",", ":")).encode()
+
+
+class Pong(NamedTuple):
+    """The answer to a ping; ``received_ms`` is None on the broker path, which the cloud never sees."""
+
+    id: int
+    sent_us: int
+    received_ms: int | None
+
+
+def decode_pong(message: bytes | str) -> Pong:
+    """Read a pong, or a ping that came straight back; raises `ContractError` otherwise."""
+    envelope = json_object(message, "pong")
+    received = integer(envelope, RECEIVED_MS) if RECEIVED_MS in envelope else None
+    if received is not None:
+        check_time(received * 1000, RECEIVED_MS)
+    return Pong(integer(envelope, "id"), integer(envelope, "sent_us"), received)

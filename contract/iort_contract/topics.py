@@ -1,0 +1,116 @@
+"""Names, and the topics that are made of them."""
+
+from __future__ import annotations
+
+import re
+from typing import NamedTuple
+
+from iort_contract.checks import checked, shown
+from iort_contract.limits import DEFAULT_NAMESPACE, ContractError
+
+_NAME = re.compile(r"[A-Za-z0-9_-]{1,64}")
+# Rule names allow no dash and start the names of two stages apart, so the namespace is stricter.
+_NAMESPACE = re.compile(r"[a-z][a-z0-9]{0,15}")
+
+RECORD, LIVE, FLEET, CMD, PING, PONG = "dt", "live", "fleet", "cmd", "ping", "pong"
+LANES = (RECORD, LIVE, FLEET, CMD, PING, PONG)
+BROKER, RULE, LAMBDA = "broker", "rule", "lambda"
+# What else is asked and answered on the lanes ping and pong: where a file may be uploaded to.
+FILE = "file"
+PING_PATHS = (BROKER, RULE, LAMBDA)
+# Round trips are a stream like any other: one sample a pong, the other paths' fields None.
+RTT_STREAM = "rtt"
+RTT_FIELDS = {path: f"{path}_ms" for path in PING_PATHS}
+# What the agent says of itself; the fields are AGENT_FIELDS.
+AGENT_STREAM = "agent"
+# What the messages were that a stream's samples are made of: `MessageType`.
+TYPES_STREAM = "types"
+# What the agent took, stored and did not record: contract/iort_contract/messages/account.py.
+ACCOUNT_STREAM = "account"
+# The streams that every robot may have and no source's configuration names.
+OWN_STREAMS = frozenset({RTT_STREAM, AGENT_STREAM, TYPES_STREAM, ACCOUNT_STREAM})
+# The named shadow of a robot's thing that carries the agent's settings.
+SHADOW = "agent"
+# Where the shadow says what became of the commands that asked for an answer.
+COMMANDS, ACCEPTED = "commands", "accepted"
+
+
+class Topic(NamedTuple):
+    """A parsed topic, ``<lane>/<namespace>/<robot>/<name>``.
+
+    ``name`` is the stream (record, live), the path (ping, pong) or the message's own (fleet, cmd).
+    """
+
+    lane: str
+    namespace: str
+    robot: str
+    name: str
+
+    def __str__(self) -> str:
+        return "/".join(self)
+
+
+def check_robot(name: str) -> str:
+    """Return ``name`` if it may name a robot: thing name, client id and topic level alike."""
+    return checked(_NAME, name, "robot name", "1 to 64 of A-Z a-z 0-9 _ -")
+
+
+def check_stream(name: str) -> str:
+    """Return ``name`` if it may name a stream or be the last level of any topic."""
+    return checked(_NAME, name, "stream name", "1 to 64 of A-Z a-z 0-9 _ -")
+
+
+def check_namespace(name: str) -> str:
+    """Return ``name`` if it may be a deployment's namespace."""
+    return checked(_NAMESPACE, name, "namespace", "a lower-case letter, then up to 15 of a-z 0-9")
+
+
+def build_topic(lane: str, robot: str, name: str, namespace: str = DEFAULT_NAMESPACE) -> str:
+    """The topic of a robot's message; raises `ContractError` where a level is not allowed."""
+    if lane not in LANES:
+        raise ContractError(f"lane {shown(lane)}: allowed is one of {', '.join(LANES)}")
+    return str(Topic(lane, check_namespace(namespace), check_robot(robot), check_stream(name)))
+
+
+def parse_topic(topic: str) -> Topic:
+    """Take a topic apart; raises `ContractError` for one that `build_topic` cannot have built."""
+    levels = topic.split("/") if isinstance(topic, str) else []
+    if len(levels) != 4:
+        raise ContractError(f"topic {shown(topic)}: expected <lane>/<namespace>/<robot>/<name>")
+    build_topic(levels[0], levels[2], levels[3], levels[1])
+    return Topic(*levels)
+
+
+def record_topic(robot: str, stream: str, namespace: str = DEFAULT_NAMESPACE) -> str:
+    """Where a robot publishes its batches: straight to the rule, by Basic Ingest, which costs no
+    messaging. The rule's ``topic()`` sees ``dt/<namespace>/<robot>/<stream>``."""
+    return _straight_to("record", build_topic(RECORD, robot, stream, namespace), namespace)
+
+
+def live_topic(robot: str, stream: str, namespace: str = DEFAULT_NAMESPACE) -> str:
+    """Where a robot publishes a live message that only the live rule shall see: by Basic Ingest, as
+    `record_topic`. Every other one goes to ``live/<namespace>/<robot>/<stream>``."""
+    return _straight_to("live", build_topic(LIVE, robot, stream, namespace), namespace)
+
+
+def _straight_to(rule: str, topic: str, namespace: str) -> str:
+    return f"$aws/rules/{rule_name(rule, namespace)}/{topic}"
+
+
+def as_subscribed(topic: str, rule: str) -> str:
+    """The topic without Basic Ingest's prefix to the rule of that physical name, if it has it.
+
+    ``topic()`` leaves it out; AWS does not say whether an error action's document does.
+    """
+    prefix = f"$aws/rules/{rule}/"
+    return topic[len(prefix) :] if topic.startswith(prefix) else topic
+
+
+RULES = ("record", "live", "pong", "echo", "upload", "presence", "version", "fault", "battery")
+
+
+def rule_name(rule: str, namespace: str = DEFAULT_NAMESPACE) -> str:
+    """The physical name of a topic rule; robots need two of them for Basic Ingest."""
+    if rule not in RULES:
+        raise ContractError(f"rule {shown(rule)}: allowed is one of {', '.join(RULES)}")
+    return f"{check_namespace(namespace)}_{rule}"

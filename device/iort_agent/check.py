@@ -1,0 +1,334 @@
+"""`iort-agent check`: what would not work, before it does not. Changes nothing, and leaves a running
+agent its connection."""
+
+from __future__ import annotations
+
+import http.client
+import importlib.util
+import os
+import shutil
+import socket
+import ssl
+import stat
+import time
+import urllib.parse
+import xmlrpc.client
+from contextlib import closing
+from email.utils import parsedate_to_datetime
+from pathlib import Path
+from typing import Any, Iterator, NamedTuple
+
+from iort_agent.clock import SystemClock
+from iort_agent.config.file import Config
+from iort_agent.errors import AgentError, IdentityError
+from iort_agent.identity.certificate import Certificate, check_pair, read_certificate
+from iort_agent.lanes.record import TODO, too_many
+from iort_agent.sources.recording.check import look_into
+from iort_agent.status import fetch
+
+OK, WARN, FAIL = "ok", "warn", "fail"
+
+_TIMEOUT_S = 5.0
+# A recording is looked into for so long.
+_LOOK_S = 10.0
+_EXPIRES_SOON_S = 30 * 86_400
+# An agent of this age cannot run earlier than this: 2026-01-01.
+_EARLIEST_S = 1_767_225_600
+_CLOCK_OFF_S = 5.0
+_LEAST_FREE_BYTES = 50_000_000
+_TLS_PORT_WITH_ALPN = 443
+# What a CONNACK of MQTT 5 says, as far as a robot hears it.
+_CONNACK = {0x00: "accepted", 0x85: "client id not valid", 0x87: "not authorized", 0x89: "server busy"}
+
+
+class Finding(NamedTuple):
+    """One line of the answer; ``todo`` says what to do unless all is well."""
+
+    what: str
+    level: str
+    text: str
+    todo: str = ""
+
+
+def check(config: Config, status_socket: Path) -> Iterator[Finding]:
+    """Look at everything that the configuration names, one finding after another."""
+    running = _running(status_socket)
+    yield from _identity(config)
+    yield from _clock(config, running)
+    yield from _endpoint(config, running)
+    for i, source in enumerate(config.sources):
+        yield from source_findings(f"source {i}", source)
+    yield from _queue(config)
+    yield _lanes(config)
+    if running is None:
+        yield Finding("agent", OK, "not running")
+    else:
+        yield Finding("agent", OK, f"running, process {running['pid']}: see `iort-agent status`")
+
+
+def render(finding: Finding) -> str:
+    """A line for a person."""
+    todo = f"\n      -> {finding.todo}" if finding.todo and finding.level != OK else ""
+    return f"{finding.level:<5} {finding.what}: {finding.text}{todo}"
+
+
+def broker_findings(config: Config) -> Iterator[Finding]:
+    """Whether the broker takes the robot, as it stands; it takes the connection of an agent that runs."""
+    yield from _endpoint(config, None)
+
+
+def _running(status_socket: Path) -> dict[str, Any] | None:
+    try:
+        return fetch(status_socket)
+    except AgentError:
+        return None
+
+
+def _identity(config: Config) -> Iterator[Finding]:
+    try:
+        certificate = read_certificate(config.certificate)
+    except IdentityError as error:
+        yield Finding("certificate", FAIL, str(error), "`iort robots add` or `iort-agent provision` gets one")
+    else:
+        yield _validity(certificate)
+        try:
+            check_pair(config.certificate, config.private_key)
+        except IdentityError as error:
+            yield Finding("private key", FAIL, str(error), "put the two files of one bundle side by side")
+        else:
+            yield Finding("private key", OK, "is the certificate's")
+    mode = stat.S_IMODE(config.private_key.stat().st_mode)
+    if mode & 0o077:
+        todo = f"chmod 600 {config.private_key}"
+        yield Finding("key's mode", WARN, f"{mode:03o}: others may read it", todo)
+    else:
+        yield Finding("key's mode", OK, f"{mode:03o}")
+
+
+def _validity(certificate: Certificate) -> Finding:
+    now_s = time.time()
+    day = time.strftime("%Y-%m-%d", time.gmtime(certificate.not_after_s))
+    if now_s > certificate.not_after_s:
+        return Finding("certificate", FAIL, f"expired on {day}", "get a new one: `iort-agent renew`")
+    if now_s < certificate.not_before_s:
+        return Finding("certificate", FAIL, "not valid yet, by this machine's clock", "set the clock")
+    if certificate.not_after_s - now_s < _EXPIRES_SOON_S:
+        return Finding("certificate", WARN, f"expires on {day}", "get a new one: `iort-agent renew`")
+    return Finding("certificate", OK, f"{certificate.id[:16]}..., valid until {day}")
+
+
+def _clock(config: Config, running: dict[str, Any] | None) -> Iterator[Finding]:
+    now_s = time.time()
+    shown = time.strftime("%Y-%m-%d %H:%M:%SZ", time.gmtime(now_s))
+    todo = "set the clock: `timedatectl set-ntp true`, or `sudo date -s ...`"
+    if now_s < _EARLIEST_S:
+        yield Finding("clock", FAIL, f"says {shown}, which is long past", todo)
+        return
+    offset_s, by = None, ""
+    if running is not None and running.get("clock"):
+        offset_s, by = running["clock"]["offset_ms"] / 1000, "the running agent's pings"
+    elif config.endpoint.endswith(".amazonaws.com"):
+        offset_s, by = _http_offset_s(config.endpoint), "AWS' answer over HTTPS"
+    if offset_s is None:
+        yield Finding("clock", OK, f"says {shown}, which is plausible; a running agent knows it better")
+    elif abs(offset_s) > _CLOCK_OFF_S:
+        yield Finding("clock", WARN, f"is {-offset_s:+.1f} s off, by {by}: samples are stamped wrong", todo)
+    else:
+        yield Finding("clock", OK, f"is {-offset_s:+.3f} s off, by {by}")
+
+
+def _http_offset_s(endpoint: str) -> float | None:
+    """The cloud's clock minus ours, to the second; None where it cannot be had."""
+    connection = http.client.HTTPSConnection(endpoint, 443, timeout=_TIMEOUT_S)
+    try:
+        with closing(connection):
+            connection.request("HEAD", "/")
+            date = connection.getresponse().getheader("Date")
+        return None if date is None else parsedate_to_datetime(date).timestamp() + 0.5 - time.time()
+    except (OSError, http.client.HTTPException, TypeError, ValueError):
+        return None
+
+
+def _endpoint(config: Config, running: dict[str, Any] | None) -> Iterator[Finding]:
+    where = f"{config.endpoint}:{config.port}"
+    try:
+        found = socket.getaddrinfo(config.endpoint, config.port, type=socket.SOCK_STREAM)
+    except OSError as error:
+        todo = "is there a network, and is `endpoint` spelled right?"
+        yield Finding("endpoint", FAIL, f"{config.endpoint} does not resolve: {error}", todo)
+        return
+    yield Finding("endpoint", OK, f"{config.endpoint} is {found[0][4][0]}")
+    try:
+        raw = socket.create_connection((config.endpoint, config.port), _TIMEOUT_S)
+    except OSError as error:
+        todo = "is the port open in the firewall? AWS also listens on 443: set `port: 443`"
+        yield Finding("connection", FAIL, f"{where}: {error}", todo)
+        return
+    yield Finding("connection", OK, where)
+    with closing(raw):
+        try:
+            context = ssl.create_default_context(cafile=config.root_ca)
+            context.load_cert_chain(config.certificate, config.private_key)
+            if config.port == _TLS_PORT_WITH_ALPN:
+                context.set_alpn_protocols(["x-amzn-mqtt-ca"])
+            secure = context.wrap_socket(raw, server_hostname=config.endpoint)
+        except ssl.SSLCertVerificationError as error:
+            todo = (
+                "does `root_ca` belong to this broker? For AWS leave it out. If the certificate is not yet "
+                "valid or expired, the clock is wrong"
+            )
+            yield Finding("TLS", FAIL, f"the broker's certificate: {error.verify_message}", todo)
+            return
+        except (OSError, ValueError) as error:
+            yield Finding("TLS", FAIL, str(error), "see the certificate and the key above")
+            return
+        yield Finding("TLS", OK, f"{secure.version()}, the broker's certificate is good")
+        if running is not None:
+            connection = running["connection"]
+            if connection["connected"]:
+                yield Finding("broker", OK, "the running agent is connected")
+            else:
+                yield Finding(
+                    "broker", FAIL, f"the running agent is not connected: {connection['last_error']}"
+                )
+            return
+        yield _connack(secure, config.robot)
+
+
+def _connack(secure: socket.socket, robot: str) -> Finding:
+    """What the broker says to the robot; only while no agent runs, whose connection it would take."""
+    todo = (
+        f"the certificate is not active, not attached to the thing {robot}, or its policy refuses: "
+        "see `iort robots list`"
+    )
+    name = robot.encode()
+    # MQTT 5: protocol, clean start, keep-alive 30 s, no properties, client id.
+    body = b"\x00\x04MQTT\x05\x02\x00\x1e\x00" + len(name).to_bytes(2, "big") + name
+    try:
+        with closing(secure):
+            secure.sendall(bytes([0x10, len(body)]) + body)
+            answer = secure.recv(4)
+            if len(answer) == 4 and answer[0] == 0x20 and answer[3] == 0:
+                secure.sendall(b"\xe0\x00")
+                return Finding("broker", OK, f"accepts {robot}")
+    except OSError as error:
+        return Finding("broker", FAIL, f"gives {robot} no answer: {error}", todo)
+    if len(answer) < 4:
+        return Finding("broker", FAIL, f"hangs up on {robot}", todo)
+    said = _CONNACK.get(answer[3], f"reason {answer[3]:#x}")
+    return Finding("broker", FAIL, f"refuses {robot}: {said}", todo)
+
+
+def source_findings(what: str, source: Any) -> Iterator[Finding]:
+    """Whether one source of a configuration would give samples."""
+    kind = type(source).__name__
+    title = f"{what} ({source.describe()})"
+    if kind == "Ros1Config":
+        yield from _ros_master(title)
+    elif kind == "VescConfig":
+        yield from _serial_port(title, Path(source.port))
+    elif kind == "RosbridgeConfig":
+        yield _listener(title, source.url)
+    elif kind == "BagConfig":
+        yield from _recording(title, source)
+    else:
+        yield Finding(title, OK, "needs nothing")
+
+
+def _ros_master(title: str) -> Iterator[Finding]:
+    if importlib.util.find_spec("rospy") is None:
+        todo = "source /opt/ros/noetic/setup.bash, in an environment made with --system-site-packages"
+        yield Finding(title, FAIL, "Python finds no rospy", todo)
+    uri = os.environ.get("ROS_MASTER_URI", "http://localhost:11311")
+    todo = "start `roscore`, or set ROS_MASTER_URI (in the unit: /etc/iort/environment)"
+    try:
+        parts = urllib.parse.urlsplit(uri)
+        connection = http.client.HTTPConnection(parts.hostname or "", parts.port or 11311, timeout=_TIMEOUT_S)
+        with closing(connection):
+            body = xmlrpc.client.dumps(("/iort_check",), "getPid")
+            connection.request("POST", "/RPC2", body, {"Content-Type": "text/xml"})
+            answer: Any = xmlrpc.client.loads(connection.getresponse().read())[0]
+        code, said, pid = answer[0]
+    except (OSError, http.client.HTTPException, xmlrpc.client.Error, ValueError, TypeError) as error:
+        yield Finding(title, FAIL, f"no ROS master at {uri}: {error}", todo)
+        return
+    except Exception as error:  # noqa: BLE001 - what XML parsers raise is their own
+        yield Finding(title, FAIL, f"what answers at {uri} is no ROS master: {error}", todo)
+        return
+    level, text = (OK, f"ROS master at {uri}, process {pid}") if code == 1 else (FAIL, f"{uri}: {said}")
+    yield Finding(title, level, text, todo)
+
+
+def _serial_port(title: str, port: Path) -> Iterator[Finding]:
+    if importlib.util.find_spec("serial") is None:
+        yield Finding(title, FAIL, "Python finds no pyserial", "pip install 'iort-agent[serial]'")
+    if not port.exists():
+        todo = "is the VESC plugged in and switched on? The agent waits for it. `ls /dev/serial/by-id`"
+        yield Finding(title, FAIL, f"{port} is not there", todo)
+    elif not stat.S_ISCHR(port.stat().st_mode):
+        yield Finding(title, FAIL, f"{port} is no serial port")
+    elif not os.access(port, os.R_OK | os.W_OK):
+        todo = "sudo usermod -aG dialout $USER, then log in again"
+        yield Finding(title, FAIL, f"{port} may not be opened", todo)
+    else:
+        yield Finding(title, OK, f"{port} is there")
+
+
+def _listener(title: str, url: str) -> Finding:
+    parts = urllib.parse.urlsplit(url)
+    try:
+        port = parts.port or (443 if parts.scheme == "wss" else 80)
+        socket.create_connection((parts.hostname or "", port), _TIMEOUT_S).close()
+    except (OSError, ValueError) as error:
+        return Finding(title, FAIL, f"{url}: {error}", "start rosbridge_server there")
+    return Finding(title, OK, f"{url} listens")
+
+
+def _recording(title: str, config: Any) -> Iterator[Finding]:
+    path: Path = config.path
+    if not path.exists():
+        yield Finding(title, FAIL, f"{path} is not there")
+        return
+    if not os.access(path, os.R_OK):
+        yield Finding(title, FAIL, f"{path} may not be read", f"chmod a+r {path}")
+        return
+    wanted = set(config.streams())
+    looked = look_into(config.build(SystemClock()), wanted, _LOOK_S)
+    if looked.error:
+        yield Finding(title, FAIL, looked.error)
+        return
+    if looked.streams:
+        yield Finding(title, OK, f"has messages of {', '.join(looked.streams)}")
+    missing = ", ".join(sorted(wanted.difference(looked.streams)))
+    if missing and looked.ended:
+        yield Finding(title, FAIL, f"there is no message of {missing} in it", "see `topics`")
+    elif missing:
+        yield Finding(title, WARN, f"no message of {missing} was found within {_LOOK_S:g} s")
+
+
+def _queue(config: Config) -> Iterator[Finding]:
+    path: Path | None = config.queue.path
+    if path is None:
+        todo = "set queue.path to a file, for the batches to survive a restart"
+        yield Finding("queue", WARN, "in memory: what is not delivered ends with the agent", todo)
+        return
+    target = path if path.exists() else path.parent
+    if not os.access(target, os.W_OK) or not os.access(path.parent, os.W_OK):
+        yield Finding("queue", FAIL, f"{target} may not be written", f"chown it to {os.environ.get('USER')}")
+        return
+    free = shutil.disk_usage(path.parent).free
+    used = path.stat().st_size if path.exists() else 0
+    text = f"{path}, {used / 1e6:.1f} MB used of {config.queue.max_bytes / 1e6:.0f}, {free / 1e6:.0f} MB free"
+    if free < _LEAST_FREE_BYTES:
+        yield Finding("queue", FAIL, text, "free some of the disk: batches will be dropped")
+    elif free < config.queue.max_bytes - used:
+        yield Finding("queue", WARN, text, "the disk is full before the queue is: lower queue.max_bytes")
+    else:
+        yield Finding("queue", OK, text)
+
+
+def _lanes(config: Config) -> Finding:
+    problem = too_many(config)
+    if problem is not None:
+        return Finding("record lane", WARN, problem, TODO)
+    return Finding("record lane", OK, "the streams named are few enough for one connection")

@@ -1,0 +1,244 @@
+"""The command `iort-agent`."""
+
+from __future__ import annotations
+
+import argparse
+import dataclasses
+import json
+import logging
+import os
+import re
+import signal
+import sys
+import time
+from pathlib import Path
+from typing import Any, Callable, Sequence
+
+from iort_agent.agent import Agent
+from iort_agent.clock import SystemClock
+from iort_agent.config.file import LOG_LEVELS, Config, load_config
+from iort_agent.errors import AgentError, ConfigError
+from iort_agent.logs import neutral, set_up
+from iort_agent.spool.sqlite import make_spool
+from iort_agent.status import SOCKET, StatusServer, fetch
+from iort_agent.status import render as render_status
+
+_log = logging.getLogger("iort-agent")
+
+# A terminal signals the whole group and a supervisor passes it on: that is one wish, not two.
+_SAME_SIGNAL_S = 1.0
+# ROS' NAME:=VALUE, which roslaunch adds to every command; those of one underscore are parameters.
+_REMAPPING = re.compile(r"(?:~|/|[A-Za-z]|__?)[\w/]*:=(?!.*:=).*", re.ASCII)
+_PARAMETER = re.compile(r"_[^_]")
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Run a command; the exit status: 0 good, 1 something failed or was lost, 2 wrong use."""
+    options = _parse(list(sys.argv[1:] if arguments is None else arguments))
+    # Whatever a command writes is its user's alone; who else is to read it is given the right to.
+    before = os.umask(0o077)
+    try:
+        status: int = options.command(options)
+        sys.stdout.flush()
+    except ConfigError as error:
+        print(f"iort-agent: {error}", file=sys.stderr)
+        return 2
+    except BrokenPipeError:
+        if options.command is run:
+            raise
+        # Whoever read our output has seen enough. Python would complain at its end, when it flushes.
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        return 1
+    except AgentError as error:
+        if options.command is not run:
+            print(f"iort-agent: {neutral(str(error))}", file=sys.stderr)
+        else:
+            _log.error("%s", error)
+        return 1
+    else:
+        return status
+    finally:
+        os.umask(before)
+
+
+def _parse(arguments: list[str]) -> argparse.Namespace:
+    parser = argparse.ArgumentParser(
+        prog="iort-agent",
+        description="Sends a robot's data to AWS IoT: every sample recorded, the newest one live. "
+        "Without a command, it runs.",
+    )
+    commands = parser.add_subparsers(metavar="COMMAND", required=True)
+
+    def command(name: str, function: Callable[[argparse.Namespace], int], text: str) -> Any:
+        added = commands.add_parser(name, help=text, description=text[0].upper() + text[1:] + ".")
+        added.set_defaults(command=function)
+        added.add_argument("--config", type=Path, required=True, metavar="FILE", help="the agent's YAML file")
+        return added
+
+    running = command("run", run, "run the agent until its sources end or a signal comes")
+    running.add_argument("--check-config", action="store_true", help="read the file, say whether it is good")
+    running.add_argument(
+        "--report", type=Path, metavar="FILE", help="write what became of it as JSON at the end"
+    )
+    running.add_argument(
+        "--drain-s",
+        type=_seconds,
+        default=10.0,
+        metavar="S",
+        help="how long to wait at the end until everything is delivered (default 10)",
+    )
+    running.add_argument("--log-level", choices=LOG_LEVELS, help="instead of the file's log_level")
+    checking = command("check", check, "say what would not work, and what to do about it")
+    checking.add_argument("--json", action="store_true", help="as JSON")
+    uploading = command("upload", upload, "upload files, and say under which keys they are kept")
+    uploading.add_argument("files", type=Path, nargs="+", metavar="FILE", help="what to upload")
+    uploading.add_argument("--json", action="store_true", help="as JSON")
+    status = command("status", show_status, "show what the running agent does")
+    status.add_argument("--json", action="store_true", help="as JSON")
+    claiming = command("provision", provision, "exchange a claim for a certificate of the robot's own")
+    claiming.add_argument("--robot", metavar="NAME", help="the robot's name, instead of the claim's")
+    renewing = command("renew", renew, "replace the robot's key and certificate, with a new claim")
+    renewing.add_argument("--claim", type=Path, required=True, metavar="FILE", help="the claim's YAML file")
+    if arguments and arguments[0] not in commands.choices and arguments[0] not in ("-h", "--help"):
+        arguments = ["run", *arguments]
+    remappings = []
+    if arguments and arguments[0] == "run":
+        # The ROS node reads them where every ROS node does, in sys.argv.
+        remappings = [argument for argument in arguments if _REMAPPING.fullmatch(argument)]
+        arguments = [argument for argument in arguments if argument not in remappings]
+    options = parser.parse_args(arguments)
+    options.ignored = [argument for argument in remappings if _PARAMETER.match(argument)]
+    return options
+
+
+def _seconds(value: str) -> float:
+    seconds = float(value)
+    if not 0 <= seconds <= 86_400:
+        raise argparse.ArgumentTypeError(f"{value}: allowed is 0 to 86400")
+    return seconds
+
+
+def run(options: argparse.Namespace) -> int:
+    """`iort-agent run`."""
+    config = load_config(options.config)
+    if options.check_config:
+        print(f"{options.config}: good, robot {config.robot}, {len(config.sources)} source(s)")
+        return 0
+    if options.log_level is not None:
+        config = dataclasses.replace(config, log_level=options.log_level)
+    troubles = set_up(config.log_level)
+    for argument in options.ignored:
+        _log.warning("%s is ignored: the agent has no ROS parameters, %s has its settings", argument,
+                     options.config)  # fmt: skip
+    # Reading a configuration must not need the network's library.
+    from iort_agent.mqtt.aws import make_uplink  # noqa: PLC0415 - it loads the library
+
+    clock = SystemClock()
+    uplink = make_uplink(config, clock)
+    spool = make_spool(config, clock)
+    try:
+        agent = Agent(config, uplink=uplink, spool=spool, clock=clock, troubles=troubles)
+        server = StatusServer(_socket(options, config), agent.status)
+        server.start()
+        _end_on_signals(agent)
+        try:
+            status = agent.run(drain_s=options.drain_s)
+        finally:
+            server.stop()
+    finally:
+        spool.close()
+    report = agent.report()
+    if options.report is not None:
+        options.report.write_text(json.dumps(report, indent=2) + "\n", encoding="utf-8")
+    samples = sum(counts["samples"] for counts in report["streams"].values())
+    _log.info("ended: %d samples, %d live messages", samples, report["live_published"])
+    return status
+
+
+def check(options: argparse.Namespace) -> int:
+    """`iort-agent check`: status 1 if something would not work."""
+    from iort_agent.check import FAIL, render  # noqa: PLC0415 - it loads the network's library
+    from iort_agent.check import check as findings_of  # noqa: PLC0415 - as above
+
+    config = load_config(options.config)
+    findings = []
+    for finding in findings_of(config, _socket(options, config)):
+        findings.append(finding)
+        if not options.json:
+            print(render(finding), flush=True)
+    if options.json:
+        print(json.dumps([finding._asdict() for finding in findings], indent=2))
+    return 1 if any(finding.level == FAIL for finding in findings) else 0
+
+
+def show_status(options: argparse.Namespace) -> int:
+    """`iort-agent status`."""
+    state = fetch(_socket(options, load_config(options.config)))
+    print(json.dumps(state, indent=2) if options.json else render_status(state))
+    return 0
+
+
+def upload(options: argparse.Namespace) -> int:
+    """`iort-agent upload`: status 1 if a file is not in the bucket now."""
+    from iort_agent.files.command import upload_files  # noqa: PLC0415 - as above
+
+    config = load_config(options.config)
+    results = upload_files(config, options.files, status_socket=_socket(options, config))
+    failed = False
+    found = []
+    for result in results:
+        failed |= result.error is not None
+        found.append({**result._asdict(), "path": str(result.path)})
+        if result.error is not None:
+            print(f"iort-agent: {neutral(result.error)}", file=sys.stderr)
+        elif not options.json:
+            print(neutral(str(result.key)), flush=True)
+    if options.json:
+        print(json.dumps(found, indent=2))
+    return 1 if failed else 0
+
+
+def provision(options: argparse.Namespace) -> int:
+    """`iort-agent provision`."""
+    from iort_agent.identity import provision  # noqa: PLC0415 - as above
+
+    written = provision.provision(options.config, robot=options.robot)
+    print(f"{written} and its certificate are ready: `iort-agent check --config {written}`")
+    return 0
+
+
+def renew(options: argparse.Namespace) -> int:
+    """`iort-agent renew`."""
+    from iort_agent.identity import provision  # noqa: PLC0415 - as above
+
+    config = load_config(options.config)
+    provision.renew(options.config, options.claim, status_socket=_socket(options, config))
+    print(f"{config.robot} has a new certificate; the operator should revoke the one before")
+    return 0
+
+
+def _socket(options: argparse.Namespace, config: Config) -> Path:
+    file: Path = options.config
+    return config.status_socket or file.absolute().parent / SOCKET
+
+
+def _end_on_signals(agent: Agent) -> None:
+    """The first signal ends the agent in good order, a second one at once."""
+    first: float | None = None
+
+    def on_signal(number: int, _frame: Any) -> None:
+        nonlocal first
+        now = time.monotonic()
+        if first is None:
+            first = now
+        elif now - first > _SAME_SIGNAL_S:
+            os._exit(128 + number)
+        # No logging here: the signal may have interrupted it, and its lock is not ours to wait for.
+        agent.stop()
+
+    for number in (signal.SIGINT, signal.SIGTERM):
+        signal.signal(number, on_signal)
+
+
+if __name__ == "__main__":
+    sys.exit(main())

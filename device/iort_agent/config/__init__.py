@@ -1,0 +1,1 @@
+"""car.yaml, read once into frozen dataclasses, and the settings that change while the agent runs."""

@@ -1,0 +1,1 @@
+"""Uploads of finished files by signed addresses."""

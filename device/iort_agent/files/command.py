@@ -1,0 +1,124 @@
+"""`iort-agent upload`: files, now, by a connection of its own."""
+
+from __future__ import annotations
+
+import os
+import signal
+import sys
+import threading
+from pathlib import Path, PurePath
+from typing import Any, Iterator, NamedTuple, Sequence
+
+from iort_agent.clock import SystemClock
+from iort_agent.config.file import Config
+from iort_agent.errors import AgentError, UploadError
+from iort_agent.files.file import read
+from iort_agent.files.upload import Uploader, make_uploader
+from iort_agent.lanes.rate_limiter import Allowance
+from iort_agent.logs import set_up
+from iort_agent.status import fetch
+
+_CONNECT_S = 30.0
+_LOOK_S = 0.05
+
+
+class Result(NamedTuple):
+    """What became of a file: its key in the bucket, or why it is not there."""
+
+    path: Path
+    key: str | None = None
+    error: str | None = None
+
+
+def upload_files(config: Config, paths: Sequence[Path], *, status_socket: Path) -> Iterator[Result]:
+    """Upload one file after the other, with progress on a terminal.
+
+    Raises `UploadError` where an agent runs, whose connection this one would take away, and where
+    there is no connection.
+    """
+    _refuse_beside_agent(config, status_socket)
+    # Reading a configuration must not need the network's library.
+    from iort_agent.mqtt.aws import make_uplink  # noqa: PLC0415 - it loads the library
+
+    set_up("warning")
+    clock, stop = SystemClock(), threading.Event()
+    uplink = make_uplink(config, clock)
+    uploader = make_uploader(
+        robot=config.robot,
+        namespace=config.namespace,
+        uplink=uplink,
+        clock=clock,
+        allowance=Allowance(clock),
+        root_ca=config.root_ca,
+        rate_kb_s=config.files.rate_kb_s,
+    )
+    before = signal.signal(signal.SIGINT, lambda _number, _frame: stop.set())
+    uplink.start()
+    try:
+        _wait_ready(uploader, uplink, clock, stop)
+        for path in paths:
+            yield _upload(uploader, path, stop)
+    finally:
+        uplink.stop(5.0)
+        signal.signal(signal.SIGINT, before)
+
+
+def _upload(uploader: Uploader, path: Path, stop: threading.Event) -> Result:
+    show = _Progress(path)
+    try:
+        # Who gives the command may name a link.
+        file = Path(os.path.realpath(path))
+        local = read(file.parent, PurePath(file.name), stop=stop)
+        show.of(local.look.size)
+        return Result(path, key=uploader.upload(local, stop, show))
+    except UploadError as error:
+        return Result(path, error=str(error))
+    finally:
+        show.end()
+
+
+class _Progress:
+    """A line on a terminal, written over; nothing where there is none."""
+
+    def __init__(self, path: Path) -> None:
+        self._path, self._size = path, 0
+        self._shows = sys.stderr.isatty()
+
+    def of(self, size: int) -> None:
+        """The file was read, and has so many bytes."""
+        self._size = size
+        self(0)
+
+    def __call__(self, there: int) -> None:
+        if self._shows:
+            share = 100 * there // max(1, self._size)
+            print(f"\r{self._path.name}  {share:3d} % of {self._size:,} bytes", end="", file=sys.stderr)
+
+    def end(self) -> None:
+        """Leave the line."""
+        if self._shows:
+            print(file=sys.stderr)
+
+
+def _wait_ready(uploader: Uploader, uplink: Any, clock: SystemClock, stop: threading.Event) -> None:
+    until = clock.monotonic() + _CONNECT_S
+    while not uploader.ready():
+        if stop.is_set() or clock.monotonic() > until:
+            why = uplink.status().last_error or "no answer"
+            raise UploadError(f"no connection to the cloud: {why}", again_s=None)
+        # The connection tells whoever asked before it was made; this looks for one that is.
+        clock.wait(stop, _LOOK_S)
+
+
+def _refuse_beside_agent(config: Config, status_socket: Path) -> None:
+    try:
+        running = fetch(status_socket)
+    except AgentError:
+        return
+    folder = config.files.folder
+    what = f"copy the files into {folder}, and it uploads them" if folder else "stop it, or set files.folder"
+    raise UploadError(
+        f"an agent is running with this configuration (process {running.get('pid')}), and a robot has one "
+        f"connection: {what}",
+        again_s=None,
+    )

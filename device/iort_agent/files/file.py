@@ -1,0 +1,169 @@
+"""A file of the robot's, as the contract describes it: name, kind, type, size and what it holds."""
+
+from __future__ import annotations
+
+import hashlib
+import os
+import re
+import stat
+import threading
+from pathlib import Path, PurePath
+from typing import Any, BinaryIO, Mapping, NamedTuple, Sequence
+
+import iort_contract
+from iort_agent.errors import UploadError
+from iort_agent.private_files import folder_of, open_below
+from iort_contract import PART_BYTES, File
+
+_CHUNK_BYTES = 256 * 1024
+_AGAIN_S = 10.0
+_LEVELS, _LEVEL_CHARACTERS = 4, 100
+_PART = re.compile(r"[0-9a-f]{64}")
+
+# What the robots' files are; anything else is "other", of no type in particular.
+_SUFFIXES = {
+    ".bin": ("message", "application/octet-stream"),
+    ".bag": ("recording", "application/x-rosbag"),
+    ".mcap": ("recording", "application/x-mcap"),
+    ".db3": ("recording", "application/vnd.sqlite3"),
+    ".csv": ("log", "text/csv"),
+    ".json": ("other", "application/json"),
+    ".yaml": ("other", "application/yaml"),
+    ".log": ("log", "text/plain"),
+    ".txt": ("log", "text/plain"),
+    ".jpg": ("image", "image/jpeg"),
+    ".jpeg": ("image", "image/jpeg"),
+    ".png": ("image", "image/png"),
+    ".mp4": ("recording", "video/mp4"),
+}
+
+
+class Look(NamedTuple):
+    """What tells that a file is still the one it was."""
+
+    size: int
+    mtime_ns: int
+
+
+class Local(NamedTuple):
+    """A file that was read once: what it is to the contract, and the SHA-256 of each part of it. Below
+    ``root`` no link is followed."""
+
+    root: Path
+    name: PurePath
+    look: Look
+    file: File
+    parts: Sequence[str]
+
+    @property
+    def path(self) -> Path:
+        """Where it is."""
+        return self.root / self.name
+
+    @property
+    def parts_sha256(self) -> str:
+        """The SHA-256 of the parts' SHA-256, in order."""
+        return hashlib.sha256(b"".join(bytes.fromhex(part) for part in self.parts)).hexdigest()
+
+    def open(self) -> BinaryIO:
+        """The file, to be read again. Raises `OSError`."""
+        return open_below(self.root, self.name)
+
+
+def look_at(root: Path, name: PurePath) -> Look:
+    """Size and time of a file. Raises `UploadError` where there is none, or a link in its place."""
+    try:
+        with folder_of(root, name) as folder:
+            status = os.stat(name.name, dir_fd=folder, follow_symlinks=False)
+    except OSError as error:
+        raise UploadError(f"{root / name}: {error.strerror or error}", again_s=None) from error
+    if not stat.S_ISREG(status.st_mode):
+        raise UploadError(f"{root / name}: is no regular file", again_s=None)
+    return Look(status.st_size, status.st_mtime_ns)
+
+
+def wire_name(path: PurePath) -> str:
+    """The name of a file as the contract allows it: other characters become ``_``, what is deeper than
+    four levels moves up."""
+    levels = [_level(part) for part in path.parts]
+    if len(levels) > _LEVELS:
+        levels = [*levels[: _LEVELS - 1], "_".join(levels[_LEVELS - 1 :])]
+    return "/".join(level[-_LEVEL_CHARACTERS:].lstrip("._-") or "file" for level in levels)
+
+
+def _level(part: str) -> str:
+    clean = re.sub(r"[^A-Za-z0-9._-]", "_", part)
+    return clean if clean[0].isalnum() else f"x{clean}"
+
+
+def kind_of(path: PurePath) -> tuple[str, str]:
+    """Kind and content type, by the end of the name."""
+    return _SUFFIXES.get(path.suffix.lower(), ("other", "application/octet-stream"))
+
+
+def read(root: Path, name: PurePath, *, stop: threading.Event) -> Local:
+    """Read the file once for what it holds.
+
+    Raises `UploadError` where it cannot be read, changes meanwhile, is too large, or ``stop`` is set.
+    """
+    path, look = root / name, look_at(root, name)
+    if look.size > iort_contract.MAX_FILE_BYTES:
+        raise UploadError(
+            f"{path}: has {look.size} bytes; allowed is up to {iort_contract.MAX_FILE_BYTES}", again_s=None
+        )
+    whole, parts, read_bytes = hashlib.sha256(), [], 0
+    try:
+        with open_below(root, name) as file:
+            part = hashlib.sha256()
+            while chunk := file.read(_CHUNK_BYTES):
+                if stop.is_set():
+                    raise UploadError(f"{path}: stopped", again_s=0)
+                # A part is a whole number of chunks, and a regular file gives whole chunks.
+                whole.update(chunk)
+                part.update(chunk)
+                read_bytes += len(chunk)
+                if read_bytes % PART_BYTES == 0:
+                    parts.append(part.hexdigest())
+                    part = hashlib.sha256()
+            if read_bytes % PART_BYTES or not parts:
+                parts.append(part.hexdigest())
+    except OSError as error:
+        raise UploadError(f"{path}: {error.strerror or error}", again_s=_AGAIN_S) from error
+    if read_bytes != look.size or look_at(root, name) != look:
+        raise changed(path)
+    kind, content_type = kind_of(path)
+    file_ = File(
+        name=wire_name(name),
+        kind=kind,
+        content_type=content_type,
+        size=look.size,
+        sha256=whole.hexdigest(),
+        t_us=max(0, look.mtime_ns // 1000),
+    )
+    return Local(root, name, look, file_, parts)
+
+
+def changed(path: Path) -> UploadError:
+    """The error for a file that is not what it was when it was read."""
+    return UploadError(f"{path}: changes while it is uploaded; it is tried again", again_s=_AGAIN_S)
+
+
+def to_json(local: Local) -> dict[str, Any]:
+    """What `from_json` needs of a file that was read, except where it is."""
+    return {"look": list(local.look), "file": vars(local.file), "parts": "".join(local.parts)}
+
+
+def from_json(root: Path, name: PurePath, saved: Mapping[str, Any]) -> Local | None:
+    """The file as it was read before; None if it is not the same any more, or nothing was saved."""
+    try:
+        look = Look(*saved["look"])
+        parts = [saved["parts"][i : i + 64] for i in range(0, len(saved["parts"]), 64)]
+        local = Local(root, name, look, File(**saved["file"]), parts)
+        whole = len(parts) == local.file.parts and all(map(_PART.fullmatch, parts))
+    except (KeyError, TypeError):
+        return None
+    try:
+        same = whole and look_at(root, name) == look
+    except UploadError:
+        return None
+    return local if same else None

@@ -1,0 +1,1 @@
+"""The robot's certificate: how it is got, renewed and checked."""

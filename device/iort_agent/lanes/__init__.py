@@ -1,0 +1,1 @@
+"""From samples to messages: batches, live samples and pings, within what the broker allows."""

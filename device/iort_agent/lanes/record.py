@@ -1,0 +1,224 @@
+"""The record lane: every batch, in order, at QoS 1, until the broker has it.
+
+Batches are published from the spool, up to ``window`` unacknowledged ones at a time, and leave the
+spool with their PUBACK only. After a failure nothing more is sent until every publish on its way has
+succeeded or failed; then what is left in the spool is sent again from the oldest on. After a lost
+connection the same, once it is back. A batch may therefore arrive twice, which downstream does no
+harm: it has the same key and the same content.
+
+It goes first on its connection: it tells the `Allowance` what it needs, and the others share the rest.
+"""
+
+from __future__ import annotations
+
+import functools
+import logging
+import math
+import random
+import threading
+
+import iort_contract
+from iort_agent.clock import Clock
+from iort_agent.config.file import Config
+from iort_agent.errors import UplinkError
+from iort_agent.lanes.production import Production, Rate
+from iort_agent.lanes.rate_limiter import PUBLISHES_PER_S, SHARE, Allowance
+from iort_agent.mqtt.uplink import Uplink
+from iort_agent.spool.memory import Entry, Spool
+
+_log = logging.getLogger(__name__)
+
+# As many a round trip can be sent: with 0.5 s of it, 100 a second. AWS allows 100.
+WINDOW = 50
+# What to do where more is recorded than one connection may send.
+TODO = (
+    "record fewer topics or fields, let topics of one type share a stream, or give some of them to a second "
+    "agent with a robot name of its own"
+)
+_MIN_RETRY_S, _MAX_RETRY_S = 0.5, 30.0
+
+
+def too_many(config: Config) -> str | None:
+    """Why the streams of a configuration are too many for one connection, in a line; None where they are not.
+
+    It is about streams that bring samples all the time; where every sample goes by itself (``batch_s`` 0),
+    nobody knows how many that are.
+    """
+    if not config.record.enabled:
+        return None
+    batch_s, most = config.record.batch_s, PUBLISHES_PER_S * SHARE
+    streams = sum(len(source.streams()) for source in config.sources)
+    # A batch lies within a second.
+    made = streams * math.ceil(1 / batch_s) if batch_s else streams
+    if made <= most:
+        return None
+    return f"{streams} streams are up to {made} batches a second, and one connection takes {most:.0f}"
+
+
+class RecordLane:
+    """Empties the spool into the uplink."""
+
+    def __init__(
+        self,
+        *,
+        robot: str,
+        namespace: str,
+        spool: Spool,
+        uplink: Uplink,
+        clock: Clock,
+        allowance: Allowance,
+        window: int = WINDOW,
+        chance: random.Random | None = None,
+    ) -> None:
+        self._robot = robot
+        self._namespace = namespace
+        self._spool = spool
+        self._uplink = uplink
+        self._clock = clock
+        self._allowance = allowance
+        self._window = window
+        self._chance = chance or random.Random()  # noqa: S311 - jitter, not secrets
+        self._wake = threading.Event()
+        self._changed = threading.Condition()
+        # Under _changed: what is on its way, the last entry sent, and since when a failure holds it up.
+        # A new epoch begins with each rewind, so that late news of the one before are told apart.
+        self._in_flight: set[int] = set()
+        self._sent_id = 0
+        self._epoch = 0
+        self._failures = 0
+        self._failed = False
+        self._hold_until = 0.0
+        self._acked = Rate(0, 0)
+        self._production = Production()
+        # What the operator should know and do, in a line; None while all that is recorded gets away.
+        self.alarm: str | None = None
+        uplink.on_connection(self._on_connection)
+        spool.on_stored(self.wake)
+
+    def wake(self) -> None:
+        """Look at the spool again: something was put."""
+        self._wake.set()
+
+    def run(self, stop: threading.Event) -> None:
+        """Publish until ``stop`` is set; call `wake` after setting it."""
+        while not stop.is_set():
+            self._wake.clear()
+            self._clock.wait(self._wake, self.step())
+
+    def step(self) -> float | None:
+        """Publish what may be published now; seconds until there may be more, None for: on `wake`."""
+        while self._uplink.connected():
+            with self._changed:
+                if self._failed and not self._in_flight:
+                    self._rewind()
+                if self._failed or len(self._in_flight) >= self._window:
+                    return None
+                hold_s = self._hold_until - self._clock.monotonic()
+                if hold_s > 0:
+                    return hold_s
+                entry = self._spool.next(self._sent_id)
+                if entry is None:
+                    return None
+                topic = iort_contract.record_topic(self._robot, entry.stream, self._namespace)
+                delay_s = self._allowance.record(topic, entry.payload)
+                if delay_s > 0:
+                    return delay_s
+                self._in_flight.add(entry.id)
+                self._sent_id = entry.id
+                done = functools.partial(self._done, self._epoch, entry)
+            self._uplink.publish(topic, entry.payload, qos=1, done=done)
+        return None
+
+    def tick(self) -> None:
+        """Learn how much is recorded, tell the allowance, and see whether all of it gets away."""
+        with self._changed:
+            acked, left = self._acked, self._spool.backlog()
+        made = Rate(
+            left.batches + acked.batches + self._spool.dropped().batches,
+            left.payload_bytes + acked.payload_bytes,
+        )
+        production, (publishes, payloads) = self._production, self._allowance.rates
+        production.note(
+            self._clock.monotonic(),
+            made=made,
+            sent=acked,
+            backlog=left.batches,
+            connected=self._uplink.connected(),
+        )
+        self._allowance.expect(
+            production.made, backlog=left.batches > publishes or left.payload_bytes > payloads
+        )
+        was, self.alarm = self.alarm, self._alarm(left.batches) if production.behind else None
+        if self.alarm and not was:
+            _log.warning("record: %s", self.alarm)
+        elif was and not self.alarm and self._uplink.connected():
+            _log.info("record: the queue no longer grows")
+
+    def wait_empty(self, timeout_s: float) -> bool:
+        """Wait until everything in the spool is acknowledged; whether it is."""
+        with self._changed:
+            return self._changed.wait_for(lambda: self._spool.backlog().batches == 0, timeout_s)
+
+    def _done(self, epoch: int, entry: Entry, error: UplinkError | None) -> None:
+        with self._changed:
+            if error is None:
+                # Whenever it comes, an acknowledgement means that the broker has the batch.
+                self._spool.ack(entry.id)
+                acked = self._acked
+                self._acked = Rate(acked.batches + 1, acked.payload_bytes + len(entry.payload))
+                self._changed.notify_all()
+            was_full = len(self._in_flight) >= self._window
+            if epoch == self._epoch:
+                self._in_flight.discard(entry.id)
+                if error is None:
+                    self._failures = 0 if not self._failed else self._failures
+                elif not self._failed:
+                    self._failed = True
+                    # A lost connection is told of elsewhere, and not a reason to wait.
+                    if self._uplink.connected():
+                        self._hold(entry, error)
+            waits = self._failed or was_full
+        # Otherwise the lane waits for the spool, which wakes it.
+        if waits:
+            self._wake.set()
+
+    def _hold(self, entry: Entry, error: UplinkError) -> None:
+        """Wait longer after each failure in a row, with full jitter above a floor."""
+        ceiling = min(_MAX_RETRY_S, _MIN_RETRY_S * 2**self._failures)
+        self._failures += 1
+        delay = _MIN_RETRY_S + self._chance.random() * (ceiling - _MIN_RETRY_S)
+        self._hold_until = self._clock.monotonic() + delay
+        _log.warning(
+            "record: batch %d of %s was not accepted, sending again in %.1f s: %s",
+            entry.seq, entry.stream, delay, error,
+        )  # fmt: skip
+
+    def _alarm(self, left: int) -> str:
+        made, sent, limit = self._production.made, self._production.sent, Rate(*self._allowance.rates)
+        if made.batches > limit.batches or made.payload_bytes > limit.payload_bytes:
+            todo = f"the limit allows {_text(limit)}: {TODO}"
+        else:
+            todo = f"the limit would allow {_text(limit)}: the network is too slow or loses messages"
+        return (
+            f"more is recorded than is sent: {left} batches wait, {_text(made)} are made, "
+            f"{_text(sent)} were sent; {todo}"
+        )
+
+    def _rewind(self) -> None:
+        self._epoch += 1
+        self._in_flight.clear()
+        self._sent_id = 0
+        self._failed = False
+
+    def _on_connection(self, connected: bool) -> None:  # noqa: FBT001 - the uplink's signature
+        with self._changed:
+            if not connected:
+                # What was on its way failed with the connection, not by itself.
+                self._rewind()
+                self._failures = 0
+                self._hold_until = 0.0
+        self._wake.set()
+
+
+def _text(rate: Rate) -> str:
+    return f"{rate.batches:.0f} batches/s ({rate.payload_bytes / 1024:.0f} KB/s)"

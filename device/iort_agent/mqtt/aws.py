@@ -1,0 +1,389 @@
+"""The uplink to AWS IoT Core: MQTT 5 over mTLS, with AWS' own client.
+
+The client could reconnect by itself, but knows no shortest wait (measured: 0.25 s between attempts)
+and would never notice a new certificate. So it is stopped after every failure and every loss, and a
+thread of ours starts it again when `iort_agent.mqtt.reconnect` says so. It is told to fail publishes with the
+connection instead of keeping them, because the spool is the only place that keeps batches; and to
+begin a clean session each time, because a broker that lost the session would otherwise leave the
+robot deaf.
+"""
+
+from __future__ import annotations
+
+import functools
+import logging
+import threading
+from concurrent.futures import Future
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Callable
+
+from awscrt import io, mqtt5
+from awsiot import mqtt5_client_builder
+
+from iort_agent.clock import Clock
+from iort_agent.dispatch import Dispatcher
+from iort_agent.errors import IdentityError, UplinkError
+from iort_agent.identity.certificate import Certificate, read_certificate, stamp
+from iort_agent.mqtt.failures import error_name, explain, said, why_not_connected
+from iort_agent.mqtt.native_thread import keep_state
+from iort_agent.mqtt.nodelay import send_at_once
+from iort_agent.mqtt.reconnect import SETTLED_S, SHORTEST_S, Backoff, Causes
+from iort_agent.mqtt.subscriptions import Subscriptions
+from iort_agent.mqtt.uplink import Done, Message, OnConnection, OnMessage, UplinkStatus
+
+if TYPE_CHECKING:
+    from iort_agent.config.file import Config
+
+_log = logging.getLogger(__name__)
+
+# A frozen broker shows within the keep-alive and the wait for the answer to it.
+KEEP_ALIVE_S = 30
+PING_TIMEOUT_S = 10
+_ACK_TIMEOUT_S = 20
+# The client's own reconnects: so late that ours always come first.
+_NEVER_MS = 24 * 3600 * 1000
+# How often to look whether certificate, key or root_ca were replaced.
+_LOOK_S = 2.0
+_CLIENT_STOPS_S = 15.0
+_QOS = (mqtt5.QoS.AT_MOST_ONCE, mqtt5.QoS.AT_LEAST_ONCE)
+_OUR_WISH = "AWS_ERROR_MQTT5_USER_REQUESTED_STOP"
+
+
+class IotCore:
+    """An `iort_agent.mqtt.uplink.Uplink` to one endpoint, as one robot. Without a ``root_ca`` the broker's
+    certificate is held against the system's trust store, which knows AWS'."""
+
+    def __init__(
+        self,
+        *,
+        endpoint: str,
+        port: int,
+        client_id: str,
+        certificate: Path,
+        private_key: Path,
+        root_ca: Path | None,
+        clock: Clock,
+        dispatcher: Dispatcher,
+        backoff: Backoff | None = None,
+        keep_alive_s: int = KEEP_ALIVE_S,
+        ping_timeout_s: float = PING_TIMEOUT_S,
+    ) -> None:
+        self._endpoint, self._port = f"{endpoint}:{port}", port
+        self._client_id = client_id
+        self._clock = clock
+        self._dispatcher = dispatcher
+        self._certificate_file = certificate
+        self._files = (certificate, private_key, root_ca)
+        self._build = functools.partial(
+            mqtt5_client_builder.mtls_from_path,
+            str(certificate),
+            str(private_key),
+            endpoint=endpoint,
+            port=port,
+            ca_filepath=None if root_ca is None else str(root_ca),
+            client_id=client_id,
+            keep_alive_interval_sec=keep_alive_s,
+            ping_timeout_ms=round(ping_timeout_s * 1000),
+            ack_timeout_sec=_ACK_TIMEOUT_S,
+            session_behavior=mqtt5.ClientSessionBehaviorType.CLEAN,
+            offline_queue_behavior=mqtt5.ClientOperationQueueBehaviorType.FAIL_ALL_ON_DISCONNECT,
+            retry_jitter_mode=mqtt5.ExponentialBackoffJitterMode.NONE,
+            min_reconnect_delay_ms=_NEVER_MS,
+            max_reconnect_delay_ms=_NEVER_MS,
+        )
+        self._bootstrap: Any = None
+        self._client: Any = None
+        self._generation = 0
+        self._stamp = stamp(*self._files)
+        self._certificate: Certificate | None = None
+        self._thread = threading.Thread(target=self._keep_connected, name="uplink", daemon=True)
+        self._backoff = backoff or Backoff()
+        self._causes = Causes()
+        # Set when the attempt or the connection is over, or somebody wants it to be.
+        self._down, self._client_stopped = threading.Event(), threading.Event()
+        self._stop = threading.Event()
+        self._slow = False
+        self._connected = False
+        self._connects = 0
+        self._since = clock.monotonic()
+        self._last_error: str | None = None
+        self._handlers: list[OnConnection] = []
+        self._subscriptions = Subscriptions(
+            dispatcher,
+            subscribe=self._subscribe,
+            usable=lambda: self._connected and not self._stop.is_set(),
+            refused=self._note_error,
+        )
+
+    def on_connection(self, handler: OnConnection) -> None:
+        """Tell the handler of every connect and loss."""
+        self._handlers.append(handler)
+
+    def subscribe(self, topic_filter: str, handler: OnMessage) -> None:
+        """Receive what matches the filter, from now or the next connect on."""
+        self._subscriptions.add(topic_filter, handler)
+
+    def subscribed(self, topic_filter: str) -> bool:
+        """Whether the broker has confirmed the subscription on this connection."""
+        return topic_filter in self._subscriptions.confirmed
+
+    def connected(self) -> bool:
+        """Whether the broker has accepted the connection and it is not known to be lost."""
+        return self._connected
+
+    def status(self) -> UplinkStatus:
+        """How the connection stands."""
+        return UplinkStatus(
+            self._connected,
+            self._clock.monotonic() - self._since,
+            self._connects,
+            self._last_error,
+            self._certificate.id if self._certificate is not None else None,
+        )
+
+    def start(self) -> None:
+        """Connect in the background, and again after every loss.
+
+        Raises `UplinkError` where the certificate or key cannot be used.
+        """
+        group = io.EventLoopGroup(1)
+        self._bootstrap = io.ClientBootstrap(group, io.DefaultHostResolver(group))
+        try:
+            self._new_client()
+        except Exception as error:
+            raise UplinkError(f"certificate, private_key or root_ca cannot be used: {error}") from error
+        self._dispatcher.start()
+        _log.info("connecting to %s as %s", self._endpoint, self._client_id)
+        self._thread.start()
+
+    def stop(self, timeout_s: float) -> None:
+        """Unsubscribe, disconnect and end, within the time."""
+        if not self._thread.is_alive():
+            return
+        until = self._clock.monotonic() + timeout_s
+        if self._connected and self._subscriptions.confirmed:
+            gone = threading.Event()
+            filters = sorted(self._subscriptions.confirmed)
+            future = self._client.unsubscribe(mqtt5.UnsubscribePacket(topic_filters=filters))
+            future.add_done_callback(lambda _: gone.set())
+            gone.wait(timeout_s / 2)
+        self._stop.set()
+        self._down.set()
+        self._thread.join(max(0.1, until - self._clock.monotonic()))
+        if self._thread.is_alive():
+            _log.warning("the connection did not close in time")
+        self._dispatcher.stop(max(0.1, until - self._clock.monotonic()))
+
+    def publish(self, topic: str, payload: bytes, *, qos: int, done: Done) -> None:
+        """Hand a message to the client; ``done`` hears of the PUBACK (QoS 1) or the write (QoS 0)."""
+        if not self._connected:
+            self._dispatcher.post(lambda: done(UplinkError("not connected")))
+            return
+        packet = mqtt5.PublishPacket(topic=topic, payload=payload, qos=_QOS[qos])
+        if qos:
+            self._operate(lambda: self._client.publish(packet), lambda future: done(_publish_error(future)))
+        else:
+            # Another thread to hear of it costs as much as the message.
+            self._begin(lambda: self._client.publish(packet)).add_done_callback(
+                lambda future: done(_write_error(future))
+            )
+
+    def _operate(self, start: Callable[[], Future[Any]], finish: Callable[[Future[Any]], None]) -> None:
+        """Start an operation of the client's; its result, or its refusal, comes by the dispatcher."""
+        self._begin(start).add_done_callback(lambda result: self._dispatcher.post(lambda: finish(result)))
+
+    @staticmethod
+    def _begin(start: Callable[[], Future[Any]]) -> Future[Any]:
+        """Start an operation of the client's; a refusal is a result as well."""
+        try:
+            return start()
+        except Exception as error:  # noqa: BLE001 - the client raises AwsCrtError, TypeError, ...
+            future: Future[Any] = Future()
+            future.set_exception(error)
+            return future
+
+    # What follows is called in the uplink's own thread.
+
+    def _keep_connected(self) -> None:
+        """One attempt after another, until asked to stop."""
+        while not self._stop.is_set():
+            began = self._clock.monotonic()
+            self._down.clear()
+            self._client_stopped.clear()
+            self._slow = False
+            if self._stop.is_set():
+                break
+            self._client.start()
+            while not self._clock.wait(self._down, _LOOK_S):
+                if self._connected and self._replaced():
+                    _log.info("%s was replaced: connecting with it", self._certificate_file)
+                    self._backoff.reset()
+                    break
+            self._stop_client()
+            if not self._stop.is_set():
+                self._pause(began)
+
+    def _stop_client(self) -> None:
+        self._client.stop(mqtt5.DisconnectPacket() if self._connected else None)
+        if not self._client_stopped.wait(_CLIENT_STOPS_S):
+            _log.warning("the MQTT client did not stop in time; going on with a new one")
+            self._try_new_client()
+
+    def _pause(self, began: float) -> None:
+        """Wait until the next attempt is due. Replaced files make it due, a second after the last."""
+        earliest = began + SHORTEST_S
+        due = max(earliest, self._clock.monotonic() + self._backoff.next_s(slow=self._slow))
+        while not self._stop.is_set():
+            if self._replaced():
+                due = earliest
+                self._try_new_client()
+            left = due - self._clock.monotonic()
+            if left <= 0:
+                return
+            self._clock.wait(self._stop, min(left, _LOOK_S))
+
+    def _replaced(self) -> bool:
+        """Whether a file differs from what the client was made of; not while one is missing."""
+        now = stamp(*self._files)
+        return now != self._stamp and None not in now
+
+    def _try_new_client(self) -> None:
+        try:
+            self._new_client()
+        except Exception as error:  # noqa: BLE001 - whatever the library makes of a wrong file
+            _log.error(
+                "certificate, private_key or root_ca was replaced by one that cannot be used, "
+                "going on with the one before: %s",
+                error,
+            )
+
+    def _new_client(self) -> None:
+        """A client made of the files as they are now."""
+        self._stamp = stamp(*self._files)
+        generation = self._generation + 1
+
+        def ours(handler: Callable[[Any], None]) -> Callable[[Any], None]:
+            # What a client that was replaced still has to say is of no interest.
+            return lambda data: handler(data) if self._generation == generation else None
+
+        client = self._build(
+            client_bootstrap=self._bootstrap,
+            on_publish_received=ours(self._on_publish),
+            on_lifecycle_connection_success=ours(self._on_connected),
+            on_lifecycle_connection_failure=ours(self._on_refused),
+            on_lifecycle_disconnection=ours(self._on_lost),
+            on_lifecycle_stopped=ours(self._on_stopped),
+        )
+        try:
+            self._certificate = read_certificate(self._certificate_file)
+        except IdentityError as error:
+            # The library could read it, so it is good enough; only its dates stay unknown.
+            _log.warning("%s", error)
+            self._certificate = None
+        self._client, self._generation = client, generation
+
+    # What follows is called in the client's own thread, which must not wait.
+
+    def _on_publish(self, data: Any) -> None:
+        at = self._clock.monotonic()
+        packet = data.publish_packet
+        self._subscriptions.hand_out(Message(packet.topic, bytes(packet.payload or b""), at))
+
+    def _on_connected(self, _: Any) -> None:
+        keep_state()
+        send_at_once(self._port)
+        self._switch(connected=True)
+        self._connects += 1
+        self._causes.connected()
+        _log.info("connected to %s as %s", self._endpoint, self._client_id)
+        self._dispatcher.post(self._subscriptions.renew)
+        self._tell(connected=True)
+
+    def _on_refused(self, data: Any) -> None:
+        if not self._stop.is_set():
+            cause = why_not_connected(
+                data,
+                client_id=self._client_id,
+                certificate=self._certificate,
+                now_us=self._clock.now_us(),
+                hung_up=self._causes.hung_up,
+            )
+            self._slow = cause.slow
+            self._last_error = cause.text
+            level = logging.DEBUG
+            if self._causes.is_news(cause):
+                level = logging.ERROR if cause.slow else logging.WARNING
+            _log.log(level, "cannot connect to %s as %s: %s", self._endpoint, self._client_id, cause.text)
+        self._down.set()
+
+    def _on_lost(self, data: Any) -> None:
+        self._subscriptions.lost()
+        if self._clock.monotonic() - self._since > SETTLED_S:
+            self._backoff.reset()
+        self._switch(connected=False)
+        packet = data.disconnect_packet
+        if self._stop.is_set() or error_name(data.exception) == _OUR_WISH:
+            _log.info("disconnected from %s", self._endpoint)
+        elif packet is not None and packet.reason_code == mqtt5.DisconnectReasonCode.SESSION_TAKEN_OVER:
+            self._last_error = f"another client has connected as {self._client_id}"
+            _log.error(
+                "disconnected: another client has connected as %s. A robot's name may be in use only once; "
+                "both will keep on taking the connection from each other",
+                self._client_id,
+            )
+        else:
+            self._last_error = said(packet) if packet is not None else explain(data.exception)
+            _log.warning("connection to %s lost: %s", self._endpoint, self._last_error)
+        self._tell(connected=False)
+        self._down.set()
+
+    def _on_stopped(self, _: Any) -> None:
+        self._client_stopped.set()
+
+    def _switch(self, *, connected: bool) -> None:
+        self._connected = connected
+        self._since = self._clock.monotonic()
+
+    def _tell(self, *, connected: bool) -> None:
+        for handler in self._handlers:
+            self._dispatcher.post(functools.partial(handler, connected))
+
+    # What follows is called by the dispatcher.
+
+    def _subscribe(self, topic_filter: str, done: Callable[[Future[Any]], None]) -> None:
+        packet = mqtt5.SubscribePacket([mqtt5.Subscription(topic_filter, mqtt5.QoS.AT_LEAST_ONCE)])
+        self._operate(functools.partial(self._client.subscribe, packet), done)
+
+    def _note_error(self, text: str) -> None:
+        self._last_error = text
+
+
+def make_uplink(config: Config, clock: Clock) -> IotCore:
+    """The uplink of a robot's configuration."""
+    return IotCore(
+        endpoint=config.endpoint,
+        port=config.port,
+        client_id=config.robot,
+        certificate=config.certificate,
+        private_key=config.private_key,
+        root_ca=config.root_ca,
+        clock=clock,
+        dispatcher=Dispatcher(),
+    )
+
+
+def _write_error(future: Future[Any]) -> UplinkError | None:
+    error = future.exception()
+    return UplinkError(explain(error)) if error is not None else None
+
+
+def _publish_error(future: Future[Any]) -> UplinkError | None:
+    error = _write_error(future)
+    if error is not None:
+        return error
+    puback = future.result().puback
+    code = getattr(puback, "reason_code", None)
+    # QoS 0 has no reason code; "no matching subscribers" is a rule's normal answer on some brokers.
+    if code is None or code < 128:
+        return None
+    return UplinkError(said(puback))

@@ -1,0 +1,127 @@
+"""An uplink without a network: a broker in memory that can be cut, slowed and made to refuse."""
+
+from __future__ import annotations
+
+from functools import partial
+from typing import Callable, NamedTuple, Optional
+
+from iort_agent.clock import Clock
+from iort_agent.dispatch import Dispatcher
+from iort_agent.errors import UplinkError
+from iort_agent.mqtt.uplink import Done, Message, OnConnection, OnMessage, UplinkStatus, matches
+
+
+class Published(NamedTuple):
+    """A message that the broker has got."""
+
+    topic: str
+    payload: bytes
+    qos: int
+
+
+# What the broker makes of a publish: None to accept, otherwise why not.
+Verdict = Callable[[Published], Optional[str]]
+
+
+class Loopback:
+    """Publishes come back to matching subscriptions. ``hold`` keeps acknowledgements back, ``stalled``
+    what is told of writes, too."""
+
+    def __init__(self, clock: Clock, dispatcher: Dispatcher, *, connected: bool = True) -> None:
+        self._clock = clock
+        self._dispatcher = dispatcher
+        self._connect_on_start = connected
+        self._connected = False
+        self._connects, self._switched = 0, clock.monotonic()
+        self._handlers: list[OnConnection] = []
+        self._subscriptions: dict[str, OnMessage] = {}
+        self._waiting: list[Done] = []
+        self.published: list[Published] = []
+        self.hold = self.stalled = False
+        self.verdict: Verdict = lambda _: None
+        self.stopped = False
+
+    def on_connection(self, handler: OnConnection) -> None:
+        """Tell the handler of every `connect` and `cut`."""
+        self._handlers.append(handler)
+
+    def subscribe(self, topic_filter: str, handler: OnMessage) -> None:
+        """Receive what matches the filter."""
+        self._subscriptions[topic_filter] = handler
+
+    def subscribed(self, topic_filter: str) -> bool:
+        """Whether the filter was subscribed to and there is a connection."""
+        return self._connected and topic_filter in self._subscriptions
+
+    def connected(self) -> bool:
+        """Whether it is connected."""
+        return self._connected
+
+    def status(self) -> UplinkStatus:
+        """How the connection stands."""
+        return UplinkStatus(self._connected, self._clock.monotonic() - self._switched, self._connects)
+
+    def publish(self, topic: str, payload: bytes, *, qos: int, done: Done) -> None:
+        """Accept, refuse or hold the message, and hand it to the subscriptions."""
+        if not self._connected:
+            self._finish(done, UplinkError("not connected"))
+            return
+        message = Published(topic, payload, qos)
+        refusal = self.verdict(message)
+        if refusal is not None:
+            self._finish(done, UplinkError(refusal))
+            return
+        self.published.append(message)
+        if self.stalled or (self.hold and qos):
+            self._waiting.append(done)
+        elif qos:
+            self._finish(done, None)
+        else:
+            # The hardest that `Done` allows.
+            done(None)
+        self.deliver(topic, payload)
+
+    def deliver(self, topic: str, payload: bytes) -> None:
+        """Let a message arrive, as if another client had published it."""
+        message = Message(topic, payload, self._clock.monotonic())
+        for topic_filter, handler in self._subscriptions.items():
+            if matches(topic_filter, topic):
+                self._dispatcher.post(partial(handler, message))
+
+    def release(self, *, error: str | None = None, count: int | None = None) -> None:
+        """Acknowledge what was held back, or fail it; the first ``count`` of it or all."""
+        ready = self._waiting[:count]
+        del self._waiting[:count]
+        for done in ready:
+            self._finish(done, UplinkError(error) if error else None)
+
+    def connect(self) -> None:
+        """Let the connection come up."""
+        self._switch(connected=True)
+
+    def cut(self) -> None:
+        """Lose the connection; what was held back fails, as with the real client."""
+        self._switch(connected=False)
+        self.release(error="the connection was lost")
+
+    def start(self) -> None:
+        """Connect, unless told not to."""
+        self._dispatcher.start()
+        if self._connect_on_start:
+            self.connect()
+
+    def stop(self, timeout_s: float) -> None:
+        """Disconnect."""
+        self.cut()
+        self._dispatcher.stop(timeout_s)
+        self.stopped = True
+
+    def _switch(self, *, connected: bool) -> None:
+        self._connected = connected
+        self._connects += connected
+        self._switched = self._clock.monotonic()
+        for handler in self._handlers:
+            self._dispatcher.post(partial(handler, connected))
+
+    def _finish(self, done: Done, error: UplinkError | None) -> None:
+        self._dispatcher.post(lambda: done(error))

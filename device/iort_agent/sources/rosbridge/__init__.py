@@ -1,0 +1,1 @@
+"""ROS topics over the rosbridge WebSocket protocol."""

@@ -1,0 +1,167 @@
+"""The physics of a small electric car, such as F1TENTH's: motor, mass, battery, heat and a driver.
+
+Plausible, not exact: what matters is that speed, duty cycle, currents, voltage sag, counters and
+temperature hang together as on a real VESC, so that whoever looks at a chart is not fooled.
+"""
+
+from __future__ import annotations
+
+import math
+import random
+from dataclasses import dataclass
+
+from iort_agent.config.schema import number, setting
+from iort_contract import Value
+
+_G = 9.81
+_AMBIENT_DEGC = 24.0
+# The VESC counts six steps of its tachometer an electrical revolution.
+_COUNTS_PER_EREV = 6
+# What its logic draws from the battery, and motor friction in newtons at the wheel.
+_IDLE_W = 1.5
+# Of the board: its heat capacity and its cooling when the car stands.
+_BOARD_J_PER_K, _BOARD_W_PER_K = 60.0, 0.25
+
+
+@dataclass(frozen=True)
+class VehicleConfig:
+    """A car; the defaults are a 1:10 F1TENTH car on a three-cell pack."""
+
+    mass_kg: float = setting(number(0.1, 5000, unit="kg"), 3.7)
+    drag_area_m2: float = setting(number(0, 5, unit="m2, drag coefficient times area"), 0.03)
+    rolling_resistance: float = setting(number(0, 0.5), 0.03)
+    speed_to_erpm_gain: float = setting(number(1, 1e6, unit="erpm per m/s"), 4614.0)
+    pole_pairs: int = setting(number(1, 50, whole=True), 2)
+    motor_kv: float = setting(number(1, 20_000, unit="rpm/V"), 3500.0)
+    motor_resistance_ohm: float = setting(number(0.0001, 10, unit="ohm"), 0.03)
+    drivetrain_efficiency: float = setting(number(0.1, 1), 0.85)
+    max_current_a: float = setting(number(0.1, 1000, unit="A"), 40.0)
+    max_brake_current_a: float = setting(number(0, 1000, unit="A"), 20.0)
+    max_speed_mps: float = setting(number(0.1, 100, unit="m/s"), 6.5)
+    cells: int = setting(number(1, 100, whole=True), 3)
+    capacity_ah: float = setting(number(0.01, 1000, unit="Ah"), 5.0)
+    battery_resistance_ohm: float = setting(number(0, 10, unit="ohm"), 0.03)
+
+
+class Driver:
+    """Drives laps: straights at full speed, corners slower, a little different every time."""
+
+    # Length in metres and speed as a share of the highest; the last corner is a hairpin.
+    _LAP: tuple[tuple[float, float], ...] = ((14, 1.0), (5, 0.5), (6, 0.75), (4, 0.42), (11, 0.92), (5, 0.3))
+    _LOOKAHEAD_S = 0.6
+
+    def __init__(self, config: VehicleConfig, chance: random.Random) -> None:
+        self._chance = chance
+        self._top_mps = config.max_speed_mps
+        self._section = 0
+        self._left_m = self._LAP[0][0]
+        self._mood = 1.0
+
+    def target_mps(self, speed_mps: float, dt: float) -> float:
+        """The speed wanted now; brakes before the corner, not in it."""
+        self._left_m -= speed_mps * dt
+        if self._left_m <= 0:
+            self._section = (self._section + 1) % len(self._LAP)
+            self._left_m += self._LAP[self._section][0]
+            self._mood = self._chance.uniform(0.93, 1.0)
+        here = self._LAP[self._section][1]
+        ahead = self._LAP[(self._section + 1) % len(self._LAP)][1]
+        share = min(here, ahead) if self._left_m < speed_mps * self._LOOKAHEAD_S else here
+        return share * self._mood * self._top_mps
+
+
+class Vehicle:
+    """A car's state; `step` moves it on, `sample` is what its VESC would report then."""
+
+    def __init__(self, config: VehicleConfig, seed: int) -> None:
+        self._config = config
+        self._chance = random.Random(seed)  # noqa: S311 - noise, not secrets
+        self._driver = Driver(config, self._chance)
+        # From the motor's speed constant; volts, newtons and m/s are tied by the same number.
+        self._volts_per_mps = config.speed_to_erpm_gain / config.pole_pairs / config.motor_kv
+        rad_s_per_mps = config.speed_to_erpm_gain / config.pole_pairs * 2 * math.pi / 60
+        self._newtons_per_amp = 60 / (2 * math.pi * config.motor_kv) * rad_s_per_mps
+        self._speed_mps = 0.0
+        self._current_a = 0.0
+        self._battery_a = 0.0
+        self._charge_left = 0.97
+        self._voltage = self._open_voltage()
+        self._duty = 0.0
+        self._board_degc = _AMBIENT_DEGC + 3.0
+        self._counts = self._counts_abs = 0.0
+        self._drawn_ah = self._regen_ah = self._drawn_wh = self._regen_wh = 0.0
+
+    def step(self, dt: float) -> None:
+        """Let ``dt`` seconds pass; small ones, 20 ms or less, keep the driver steady."""
+        c = self._config
+        self._steer(dt)
+        force = self._current_a * self._newtons_per_amp
+        # Losses of the gears work against the motion whoever drives whom.
+        force *= c.drivetrain_efficiency if self._current_a > 0 else 1 / c.drivetrain_efficiency
+        drag = 0.5 * 1.2 * c.drag_area_m2 * self._speed_mps**2
+        rolling = c.rolling_resistance * c.mass_kg * _G if self._speed_mps > 0 else 0.0
+        speed = max(0.0, self._speed_mps + (force - drag - rolling) / c.mass_kg * dt)
+        mean_mps, self._speed_mps = (self._speed_mps + speed) / 2, speed
+        self._electrics(dt)
+        counts = mean_mps * c.speed_to_erpm_gain / 60 * _COUNTS_PER_EREV * dt
+        self._counts += counts
+        self._counts_abs += counts
+
+    def sample(self) -> dict[str, Value]:
+        """The 13 fields of the ROS 1 driver's VescState, in its units and with its resolution."""
+        noise = self._chance.gauss
+        erpm = self._speed_mps * self._config.speed_to_erpm_gain
+        return {
+            "voltage_input": round(self._voltage + noise(0, 0.02), 1),
+            "temperature_pcb": round(self._board_degc + noise(0, 0.04), 1),
+            "current_motor": round(self._current_a + noise(0, 0.08), 2),
+            "current_input": round(self._battery_a + noise(0, 0.04), 2),
+            "speed": float(round(erpm + (noise(0, 12) if erpm else 0))),
+            "duty_cycle": round(self._duty, 3),
+            "charge_drawn": float(int(self._drawn_ah * 1e4)),
+            "charge_regen": float(int(self._regen_ah * 1e4)),
+            "energy_drawn": float(int(self._drawn_wh * 1e4)),
+            "energy_regen": float(int(self._regen_wh * 1e4)),
+            "displacement": float(int(self._counts)),
+            "distance_traveled": float(int(self._counts_abs)),
+            "fault_code": 0,
+        }
+
+    def _steer(self, dt: float) -> None:
+        """The driver's foot: motor current in proportion to the missing speed, within the limits."""
+        c = self._config
+        error = self._driver.target_mps(self._speed_mps, dt) - self._speed_mps
+        wanted = error * c.mass_kg * 4 / self._newtons_per_amp
+        wanted = max(-c.max_brake_current_a, min(c.max_current_a, wanted))
+        # A foot needs a tenth of a second, and no current brakes a car that stands.
+        self._current_a += (wanted - self._current_a) * min(1.0, dt / 0.1)
+        if self._speed_mps == 0:
+            self._current_a = max(0.0, self._current_a)
+
+    def _electrics(self, dt: float) -> None:
+        c = self._config
+        motor_volts = self._speed_mps * self._volts_per_mps + self._current_a * c.motor_resistance_ohm
+        watts = motor_volts * self._current_a + _IDLE_W
+        # Power at the terminals: V = open - I R and V I = watts, of which the root near no load is real.
+        open_v = self._open_voltage()
+        root = max(0.0, open_v**2 - 4 * c.battery_resistance_ohm * watts)
+        self._voltage = (open_v + math.sqrt(root)) / 2
+        self._battery_a = watts / self._voltage
+        self._duty = max(-0.95, min(0.95, motor_volts / self._voltage))
+        amp_hours = self._battery_a * dt / 3600
+        if amp_hours > 0:
+            self._drawn_ah += amp_hours
+            self._drawn_wh += amp_hours * self._voltage
+        else:
+            self._regen_ah -= amp_hours
+            self._regen_wh -= amp_hours * self._voltage
+        self._charge_left = max(0.0, self._charge_left - amp_hours / c.capacity_ah)
+        # The MOSFETs' resistance, a third of the motor's, heats the board.
+        heat_w = self._current_a**2 * c.motor_resistance_ohm / 3 + _IDLE_W
+        cooling_w = (self._board_degc - _AMBIENT_DEGC) * _BOARD_W_PER_K * (1 + self._speed_mps / 5)
+        self._board_degc += (heat_w - cooling_w) / _BOARD_J_PER_K * dt
+
+    def _open_voltage(self) -> float:
+        """Of a lithium-polymer pack at rest: a long flat stretch, then a knee."""
+        left = self._charge_left
+        return self._config.cells * (3.45 + 0.55 * left + 0.2 * left**8 - 0.45 * (1 - left) ** 12)

@@ -1,0 +1,330 @@
+"""The motor controller itself, over its serial line: asks a VESC for its values at a set rate.
+
+One request is under way at a time, each sent at its absolute deadline, or as soon as the answer before
+it is there; a line or a controller slower than ``rate_hz`` skips deadlines, which are counted. Answers
+carry neither time nor number, so a sample's time is the middle between request and answer, by the
+machine's clock: half the round trip, the most it can be wrong by, is about 4 ms at 115200 baud and below
+1 ms over USB. An answer that comes after its timeout is dropped, unless the next request is already out,
+whose answer it is then taken for.
+
+The port is opened by its path again and again until it is there, and again when it goes away: name it
+by ``/dev/serial/by-id/...``, which stays when numbers change. It is locked while it is open, because
+two programs reading one port each get half of the bytes.
+"""
+
+from __future__ import annotations
+
+import errno
+import logging
+import random
+import threading
+from dataclasses import dataclass
+from typing import Any, Mapping, Sequence
+
+import iort_contract
+from iort_agent.clock import Clock
+from iort_agent.config.schema import number, setting, text
+from iort_agent.errors import SourceError
+from iort_agent.sources import Emit
+from iort_agent.sources.vesc.protocol import (
+    COMM_FW_VERSION,
+    COMM_GET_VALUES,
+    FrameParser,
+    ProtocolError,
+    decode_firmware,
+    decode_values,
+    frame,
+    request,
+)
+
+_log = logging.getLogger(__name__)
+
+# A read returns after this at the latest, so that a stop is noticed.
+_READ_S = 0.05
+_FIRMWARE_TRIES = 3
+# So long without an answer is worth a line in the log, and then a try with the port opened afresh.
+_SILENT_S = 1.0
+_REOPEN_S = 3.0
+_BACKOFF_S = (0.1, 2.0)
+_REPORT_S = 60.0
+
+
+@dataclass(frozen=True)
+class VescConfig:
+    """A VESC on a serial port.
+
+    ``can_id`` asks the controller with that id on the CAN bus, through the one on the port. ``timeout_s``
+    is how long an answer may take. 115200 baud carry about 130 answers a second; USB knows no baud rate.
+    """
+
+    port: str = setting(text())
+    baudrate: int = setting(number(1200, 4_000_000, whole=True, unit="baud"), 115200)
+    rate_hz: float = setting(number(1, 1000, unit="Hz"), 50.0)
+    stream: str = setting(text(iort_contract.check_stream), iort_contract.VESC_STREAM)
+    can_id: int | None = setting(number(0, 254, whole=True), None)
+    timeout_s: float = setting(number(0.01, 5, unit="s"), 0.2)
+
+    def streams(self) -> Sequence[str]:
+        """The one stream."""
+        return [self.stream]
+
+    def describe(self) -> str:
+        """The source in a few words."""
+        behind = "" if self.can_id is None else f", CAN id {self.can_id},"
+        return f"VESC on {self.port}{behind} at {self.rate_hz:g} Hz"
+
+    def build(self, clock: Clock) -> VescSource:
+        """Make the source; the port is opened when it runs."""
+        return VescSource(self, clock)
+
+
+@dataclass
+class VescCounts:
+    """What became of the requests, and what else was on the line.
+
+    ``timeouts`` were not answered in time, ``late`` answers came after that, ``skipped_polls`` are
+    deadlines that passed while another request was under way, ``unknown`` answers have a length of no
+    known firmware, ``bad_crc`` frames and ``garbage`` bytes are the line's.
+    """
+
+    samples: int = 0
+    timeouts: int = 0
+    late: int = 0
+    skipped_polls: int = 0
+    unknown: int = 0
+    bad_crc: int = 0
+    garbage: int = 0
+    opened: int = 0
+
+
+class VescSource:
+    """Emits a sample an answer, for as long as it is not stopped."""
+
+    def __init__(self, config: VescConfig, clock: Clock) -> None:
+        self.counts = VescCounts()
+        self._config = config
+        self._clock = clock
+        self._trouble = ""
+        self._unknown: set[int] = set()
+
+    def report(self) -> Mapping[str, Any]:
+        """Samples, and what was wrong on the line."""
+        return vars(self.counts)
+
+    def run(self, emit: Emit, stop: threading.Event) -> None:
+        """Poll until ``stop`` is set. Raises `SourceError` where pyserial is not installed."""
+        library = _load_pyserial()
+        backoff = _BACKOFF_S[0]
+        while not stop.is_set():
+            samples, opened = self.counts.samples, self.counts.opened
+            try:
+                with self._open(library) as port:
+                    self.counts.opened += 1
+                    _Session(self._config, self._clock, self, port).run(emit, stop)
+            except library.errors as error:
+                self.trouble(_why(error, was_open=self.counts.opened > opened))
+            if self.counts.samples > samples:
+                backoff = _BACKOFF_S[0]
+            # Jitter, because nothing says that ours is the only program waiting for this port.
+            self._clock.wait(stop, backoff * random.uniform(0.5, 1.0))  # noqa: S311 - jitter, not secrets
+            backoff = min(_BACKOFF_S[1], backoff * 2)
+        _log.info("%s: %s", self._config.port, ", ".join(f"{k} {v}" for k, v in vars(self.counts).items()))
+
+    def trouble(self, what: str) -> None:
+        """Say what keeps samples from coming, once for as long as it is the same."""
+        if what != self._trouble:
+            _log.warning("%s: %s", self._config.port, what)
+        self._trouble = what
+
+    def answered(self) -> None:
+        """A sample has come: whatever the trouble was, it is over."""
+        self.counts.samples += 1
+        if self._trouble:
+            _log.info("%s: samples are coming again", self._config.port)
+            self._trouble = ""
+
+    def unknown(self, payload: bytes, error: ProtocolError) -> None:
+        """Count an answer that cannot be read, and say so once a length."""
+        self.counts.unknown += 1
+        if len(payload) not in self._unknown:
+            self._unknown.add(len(payload))
+            _log.error("%s: the controller answers %s; such answers are dropped", self._config.port, error)
+
+    def _open(self, library: _Library) -> Any:
+        config = self._config
+        port = library.Serial(
+            config.port,
+            config.baudrate,
+            timeout=min(_READ_S, config.timeout_s),
+            write_timeout=max(_READ_S, config.timeout_s),
+            exclusive=True,
+        )
+        port.reset_input_buffer()
+        return port
+
+
+class _Session:
+    """One opening of the port, until it fails or has been silent for too long."""
+
+    def __init__(self, config: VescConfig, clock: Clock, source: VescSource, port: Any) -> None:
+        self._config = config
+        self._clock = clock
+        self._source = source
+        self._counts = source.counts
+        self._port = port
+        self._parser = FrameParser()
+        self._garbage = self._bad_crc = 0
+        # What a read waits for; the length of the answers, once it is known, saves most of the reads.
+        self._expected = 1
+        self._answered = clock.monotonic()
+        self._report = _Report(clock)
+
+    def run(self, emit: Emit, stop: threading.Event) -> None:
+        config, clock = self._config, self._clock
+        self._say_firmware(stop)
+        ask = request(COMM_GET_VALUES, config.can_id)
+        self._answered = start = clock.monotonic()
+        tick = 0
+        while not stop.is_set():
+            wait = start + tick / config.rate_hz - clock.monotonic()
+            if wait > 0 and clock.wait(stop, wait):
+                return
+            sent = clock.monotonic()
+            self._drop_late()
+            payload = self._ask(ask, COMM_GET_VALUES, stop)
+            if payload is not None:
+                self._take(payload, sent, emit)
+            elif not stop.is_set() and not self._still_hoping():
+                return
+            # The next deadline, or the newest that has passed already: that one is met late.
+            due = max(tick + 1, int((clock.monotonic() - start) * config.rate_hz))
+            if due > tick + 1:
+                self._counts.skipped_polls += due - tick - 1
+                self._report.slow(config, self._counts)
+            tick = due
+
+    def _take(self, payload: bytes, sent: float, emit: Emit) -> None:
+        round_trip_us = round((self._clock.monotonic() - sent) * 1_000_000)
+        t_us = self._clock.now_us() - round_trip_us // 2
+        self._answered = self._clock.monotonic()
+        try:
+            values = decode_values(payload)
+        except ProtocolError as error:
+            self._source.unknown(payload, error)
+            return
+        self._expected = len(frame(payload))
+        self._source.answered()
+        emit(self._config.stream, t_us, values)
+
+    def _still_hoping(self) -> bool:
+        """Count a request without an answer; False when the port had better be opened afresh."""
+        self._counts.timeouts += 1
+        silent_s = self._clock.monotonic() - self._answered
+        if silent_s >= _SILENT_S:
+            behind = (
+                "" if self._config.can_id is None else f", a controller with CAN id {self._config.can_id}"
+            )
+            heard = (
+                " (what comes instead is no frame: is the baud rate right?)"
+                if self._garbage or self._parser.pending
+                else ""
+            )
+            self._source.trouble(f"open, but no answer: is it a VESC{behind}, powered, UART enabled?{heard}")
+        return silent_s < max(_REOPEN_S, 3 * self._config.timeout_s)
+
+    def _say_firmware(self, stop: threading.Event) -> None:
+        """Ask for the version, for the log alone: one that does not say may still give values."""
+        for _ in range(_FIRMWARE_TRIES):
+            payload = self._ask(request(COMM_FW_VERSION, self._config.can_id), COMM_FW_VERSION, stop)
+            if payload is not None:
+                try:
+                    _log.info("%s: VESC with %s", self._config.port, decode_firmware(payload))
+                except ProtocolError as error:
+                    _log.warning("%s: %s", self._config.port, error)
+                return
+            if stop.is_set():
+                return
+        _log.info("%s: open, firmware version not told", self._config.port)
+
+    def _ask(self, ask: bytes, command: int, stop: threading.Event) -> bytes | None:
+        """Send a request and wait for its answer; None when there is none in time."""
+        self._port.write(ask)
+        deadline = self._clock.monotonic() + self._config.timeout_s
+        wanted = self._expected
+        while not stop.is_set():
+            for payload in self._read(wanted):
+                if payload[0] == command:
+                    return payload
+            if self._clock.monotonic() >= deadline:
+                return None
+            wanted = 1
+        return None
+
+    def _drop_late(self) -> None:
+        """Read what has come since the last answer was waited for: it is nobody's."""
+        if self._port.in_waiting:
+            self._counts.late += sum(payload[0] == COMM_GET_VALUES for payload in self._read(1))
+
+    def _read(self, wanted: int) -> list[bytes]:
+        parser, counts = self._parser, self._counts
+        payloads = parser.feed(self._port.read(max(wanted, self._port.in_waiting)))
+        counts.garbage += parser.skipped - self._garbage
+        counts.bad_crc += parser.bad_crc - self._bad_crc
+        self._garbage, self._bad_crc = parser.skipped, parser.bad_crc
+        return payloads
+
+
+class _Report:
+    """Says at most once a minute that the line is slower than asked for."""
+
+    def __init__(self, clock: Clock) -> None:
+        self._clock = clock
+        self._next = clock.monotonic() + _REPORT_S
+        self._samples = self._skipped = 0
+
+    def slow(self, config: VescConfig, counts: VescCounts) -> None:
+        now = self._clock.monotonic()
+        if now >= self._next:
+            skipped, given = counts.skipped_polls - self._skipped, counts.samples - self._samples
+            _log.warning(
+                "%s: too slow for %g Hz: %d samples and %d skipped polls since the last such line",
+                config.port, config.rate_hz, given, skipped,
+            )  # fmt: skip
+            self._next, self._samples, self._skipped = now + _REPORT_S, counts.samples, counts.skipped_polls
+
+
+class _Library:
+    """pyserial, and whatever it raises when a port is not there, goes away or misbehaves."""
+
+    def __init__(self) -> None:
+        import termios  # noqa: PLC0415 - only where there is a port
+
+        import serial  # noqa: PLC0415 - optional
+
+        self.Serial = serial.Serial
+        self.errors = (OSError, termios.error)
+
+
+def _load_pyserial() -> _Library:
+    try:
+        # Only a robot that reads its VESC by itself needs it: pip install iort-agent[serial].
+        return _Library()
+    except ImportError as error:
+        raise SourceError(
+            "reading a VESC needs the package pyserial: pip install 'iort-agent[serial]'"
+        ) from error
+
+
+def _why(error: Exception, *, was_open: bool) -> str:
+    """What the operating system says, in words that help."""
+    # pyserial keeps the number of some errors, and only chains the error of others.
+    numbers = {first for e in (error, error.__context__) if e is not None for first in e.args[:1]}
+    if numbers & {errno.ENOENT, errno.ENODEV, errno.ENXIO}:
+        return "is not there: waiting for it to be plugged in"
+    if numbers & {errno.EACCES, errno.EPERM}:
+        return "may not be opened: add the user to its group, mostly `sudo usermod -aG dialout $USER`"
+    if numbers & {errno.EBUSY, errno.EAGAIN}:
+        return "is in use by another program, perhaps the ROS driver of the VESC"
+    if errno.ENOTTY in numbers:
+        return "is no serial port"
+    return f"went away: {error}" if was_open else f"cannot be opened: {error}"

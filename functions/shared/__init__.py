@@ -1,0 +1,1 @@
+"""What several functions use; nothing here has a handler."""

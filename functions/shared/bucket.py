@@ -1,0 +1,145 @@
+"""The adapter to S3: which of a robot's files the bucket has, and signed addresses for what it lacks."""
+
+from __future__ import annotations
+
+import base64
+import hashlib
+from collections.abc import Iterator, Mapping
+from typing import Any, NamedTuple
+
+from botocore.exceptions import ClientError
+
+from iort_contract import UPLOAD_URL_S, Address, File, part_range
+
+
+class Part(NamedTuple):
+    """A part that S3 has taken: it has computed the SHA-256 itself and compared it with the signed one."""
+
+    size: int
+    etag: str
+    sha256: str
+
+
+class Bucket:
+    """The files' bucket; ``client`` is a boto3 S3 client."""
+
+    def __init__(self, client: Any, name: str) -> None:
+        self._client, self._name = client, name
+
+    def has(self, key: str) -> bool:
+        """Whether there is an object with the key."""
+        found = self._client.list_objects_v2(Bucket=self._name, Prefix=key, MaxKeys=1)
+        # A key sorts before all that begin with it.
+        return any(one["Key"] == key for one in found.get("Contents", ()))
+
+    def upload_of(self, key: str) -> str | None:
+        """The id of an upload of the key that was begun and not ended; the oldest, if there are several."""
+        pages = self._client.get_paginator("list_multipart_uploads")
+        uploads = [
+            (one["Initiated"], one["UploadId"])
+            for page in pages.paginate(Bucket=self._name, Prefix=key)
+            for one in page.get("Uploads", ())
+            if one["Key"] == key
+        ]
+        return min(uploads)[1] if uploads else None
+
+    def begin(self, key: str, file: File) -> str:
+        """Begin an upload in parts; its id."""
+        begun = self._client.create_multipart_upload(
+            Bucket=self._name,
+            Key=key,
+            ContentType=file.content_type,
+            Metadata=metadata(file),
+            ChecksumAlgorithm="SHA256",
+        )
+        return str(begun["UploadId"])
+
+    def parts(self, key: str, upload_id: str) -> dict[int, Part]:
+        """The parts that are there, by number."""
+        return dict(self._listed(key, upload_id))
+
+    def _listed(self, key: str, upload_id: str) -> Iterator[tuple[int, Part]]:
+        pages = self._client.get_paginator("list_parts")
+        for page in pages.paginate(Bucket=self._name, Key=key, UploadId=upload_id):
+            for one in page.get("Parts", ()):
+                sha256 = base64.b64decode(one["ChecksumSHA256"]).hex()
+                yield int(one["PartNumber"]), Part(one["Size"], one["ETag"], sha256)
+
+    def address(self, key: str, file: File) -> Address:
+        """Where to put a file in one piece: this content, this size, under this key, and only once."""
+        checksum = _base64(file.sha256)
+        url = self._sign(
+            "put_object",
+            Key=key,
+            ContentType=file.content_type,
+            ContentLength=file.size,
+            ChecksumSHA256=checksum,
+            IfNoneMatch="*",
+            Metadata=metadata(file),
+        )
+        headers = {
+            "content-type": file.content_type,
+            "content-length": str(file.size),
+            "x-amz-checksum-sha256": checksum,
+            "if-none-match": "*",
+            **{f"x-amz-meta-{name}": value for name, value in metadata(file).items()},
+        }
+        return Address(1, url, headers)
+
+    def part_address(self, key: str, file: File, upload_id: str, part: int, sha256: str) -> Address:
+        """Where to put one part: this content, this size."""
+        _, size = part_range(file, part)
+        checksum = _base64(sha256)
+        url = self._sign(
+            "upload_part",
+            Key=key,
+            UploadId=upload_id,
+            PartNumber=part,
+            ContentLength=size,
+            ChecksumSHA256=checksum,
+        )
+        return Address(part, url, {"content-length": str(size), "x-amz-checksum-sha256": checksum})
+
+    def complete(self, key: str, upload_id: str, parts: Mapping[int, Part], size: int) -> None:
+        """Make the parts one object. Where somebody else just did, there is nothing left to do."""
+        named = [
+            {"PartNumber": n, "ETag": part.etag, "ChecksumSHA256": _base64(part.sha256)}
+            for n, part in sorted(parts.items())
+        ]
+        try:
+            self._client.complete_multipart_upload(
+                Bucket=self._name,
+                Key=key,
+                UploadId=upload_id,
+                MultipartUpload={"Parts": named},
+                MpuObjectSize=size,
+                IfNoneMatch="*",
+            )
+        except ClientError as error:
+            ended = error.response["Error"]["Code"] in {"NoSuchUpload", "PreconditionFailed"}
+            if not ended or not self.has(key):
+                raise
+
+    def abort(self, key: str, upload_id: str) -> None:
+        """Throw the parts of an upload away."""
+        self._client.abort_multipart_upload(Bucket=self._name, Key=key, UploadId=upload_id)
+
+    def _sign(self, operation: str, **parameters: Any) -> str:
+        url: str = self._client.generate_presigned_url(
+            operation, Params={"Bucket": self._name, **parameters}, ExpiresIn=UPLOAD_URL_S
+        )
+        return url
+
+
+def metadata(file: File) -> dict[str, str]:
+    """What an object says of its file: `iort files get` checks the SHA-256 of the whole."""
+    return {"sha256": file.sha256, "kind": file.kind, "t": str(file.t_us)}
+
+
+def parts_sha256(parts: Mapping[int, Part]) -> str:
+    """The SHA-256 of the parts' SHA-256, in order."""
+    return hashlib.sha256(b"".join(bytes.fromhex(parts[n].sha256) for n in sorted(parts))).hexdigest()
+
+
+def _base64(sha256: str) -> str:
+    return base64.b64encode(bytes.fromhex(sha256)).decode()

@@ -1,0 +1,115 @@
+"""The adapter to the queue before the quarantine, for what a function refuses by itself."""
+
+from __future__ import annotations
+
+import base64
+import json
+import logging
+from collections.abc import Iterator, Mapping, Sequence
+from typing import Any, NamedTuple
+
+import boto3
+from botocore.config import Config
+from botocore.exceptions import BotoCoreError, ClientError
+
+from iort_contract import BATCH, ITEM_BASE64, REASON, TOPIC
+
+_log = logging.getLogger(__name__)
+# SendMessageBatch: at most ten messages, of 256 KiB together.
+_MESSAGES, _BYTES = 10, 256 * 1024
+# And one of its messages alone.
+_MOST_BYTES = 1024 * 1024
+
+
+class Refused(NamedTuple):
+    """A stream record that cannot be decoded: its sequence number, why, and the item as DynamoDB JSON."""
+
+    number: str
+    reason: str
+    image: Mapping[str, Any]
+
+
+class Refusals:
+    """Sends what was refused to the queue before the quarantine; ``client`` is a boto3 SQS client."""
+
+    def __init__(self, client: Any, *, queue_url: str) -> None:
+        self._client, self._queue_url = client, queue_url
+
+    @classmethod
+    def at_once(cls, queue_url: str) -> Refusals:
+        """With a client that does not wait for a queue that does not answer: where a function fails, Lambda
+        itself sends there what it was called with."""
+        config = Config(connect_timeout=2, read_timeout=5, retries={"total_max_attempts": 1})
+        return cls(boto3.client("sqs", config=config), queue_url=queue_url)
+
+    def refuse(self, refused: Sequence[Refused]) -> list[Refused]:
+        """Send each, as many at a time as a call may carry; those that the queue did not take come back."""
+        return [one for several in _calls(refused) for one in self._left(several)]
+
+    def keep(self, body: str) -> bool:
+        """Send one message, as `message` or `refused_event` writes it; whether the queue took it."""
+        try:
+            self._client.send_message(QueueUrl=self._queue_url, MessageBody=body)
+        except (BotoCoreError, ClientError) as error:
+            _log.warning("the queue did not take a refused message: %s", error)
+            return False
+        return True
+
+    def _left(self, several: Mapping[str, tuple[Refused, str]]) -> list[Refused]:
+        entries = [{"Id": name, "MessageBody": body} for name, (_, body) in several.items()]
+        try:
+            answer = self._client.send_message_batch(QueueUrl=self._queue_url, Entries=entries)
+        except (BotoCoreError, ClientError) as error:
+            _log.warning("%d records stay in the stream: %s", len(several), error)
+            return [one for one, _ in several.values()]
+        failed = answer.get("Failed", [])
+        for entry in failed:
+            _log.warning("a record stays in the stream: %s", entry.get("Code"))
+        return [several[entry["Id"]][0] for entry in failed]
+
+
+def _calls(refused: Sequence[Refused]) -> Iterator[dict[str, tuple[Refused, str]]]:
+    """What one call carries each: the messages by an id of their own."""
+    several: dict[str, tuple[Refused, str]] = {}
+    size = 0
+    for number, one in enumerate(refused):
+        body = message(one)
+        if several and (len(several) == _MESSAGES or size + len(body) > _BYTES):
+            yield several
+            several, size = {}, 0
+        several[str(number)] = (one, body)
+        size += len(body)
+    if several:
+        yield several
+
+
+def message(refused: Refused) -> str:
+    """The queue's message. The item is in base64: its text may hold what SQS does not carry.
+
+    Of an item that is too large as JSON (a number of four characters on the wire may have 126 digits there)
+    only the key is told. A record that no queue takes would come again and hold its shard up.
+    """
+    body = _body(refused.reason, refused.image)
+    if len(body) > _MOST_BYTES:
+        key = {name: refused.image[name] for name in (TOPIC, BATCH) if name in refused.image}
+        body = _body(f"too large for the queue, see the telemetry table; {refused.reason}", key)
+    return body
+
+
+def refused_event(function_arn: str, event: Any, reason: str) -> str:
+    """The queue's message about an event that a function was called with and refused, without failing.
+
+    Its form is that of Lambda's own record of an invocation that failed ("Destination event format")."""
+    return json.dumps(
+        {
+            "requestContext": {"functionArn": function_arn, "condition": "Refused"},
+            "requestPayload": event,
+            "responsePayload": {"errorMessage": reason[:1000]},
+        }
+    )
+
+
+def _body(reason: str, item: Mapping[str, Any]) -> str:
+    text = json.dumps(item, separators=(",", ":"), ensure_ascii=False)
+    encoded = base64.b64encode(text.encode("utf-8", "surrogatepass")).decode()
+    return json.dumps({REASON: reason[:1000], ITEM_BASE64: encoded})

@@ -1,0 +1,48 @@
+"""How much longer than usual a message took from the car to the cloud, whatever the car's clock says."""
+
+from __future__ import annotations
+
+from collections import OrderedDict
+from dataclasses import dataclass
+
+_ROBOTS = 1000
+_WINDOW_MS = 15_000
+
+
+@dataclass
+class _Run:
+    """The fastest message of the window that is going on, and of the one before."""
+
+    boot: str
+    began_ms: int
+    fastest_us: int
+    fastest_before_us: int
+
+
+class Legs:
+    """Compares each message with the fastest of its run in the last 15 to 30 s.
+
+    The difference of the car's clock and the cloud's is in both, and falls out. What it cannot see is
+    a delay that all messages of half a minute have in common, and the first message of a run, also in an
+    environment of the function that has just started: it serves the messages of cars that do not know
+    their clock's offset (`iort_contract.LiveSample`). When a car's clock is set back, its messages look late
+    until the window has passed. One environment keeps one, of the thousand robots that sent last, and of
+    each the run that sent last: robots tell each other their runs' names, and none may speak for another.
+    """
+
+    def __init__(self) -> None:
+        self._runs: OrderedDict[str, _Run] = OrderedDict()
+
+    def excess_us(self, robot: str, boot: str, sent_us: int, received_ms: int) -> int:
+        """Note a message of a robot's run; by how much it was slower than the fastest, in microseconds."""
+        leg_us = received_ms * 1000 - sent_us
+        run = self._runs.pop(robot, None)
+        if run is None or run.boot != boot:
+            run = _Run(boot, received_ms, leg_us, leg_us)
+        self._runs[robot] = run
+        if len(self._runs) > _ROBOTS:
+            self._runs.popitem(last=False)
+        if received_ms - run.began_ms >= _WINDOW_MS:
+            run.began_ms, run.fastest_before_us, run.fastest_us = received_ms, run.fastest_us, leg_us
+        run.fastest_us = min(run.fastest_us, leg_us)
+        return leg_us - min(run.fastest_us, run.fastest_before_us)

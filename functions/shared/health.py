@@ -1,0 +1,77 @@
+"""How the cars are, from the batches that Lambda 2 sees anyway: the values of the metrics ``health``."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from itertools import chain
+
+from functions.shared.metrics import MOST_VALUES
+from iort_contract import (
+    AGENT_STREAM,
+    FAULT_FIELD,
+    PING_PATHS,
+    RTT_FIELDS,
+    RTT_STREAM,
+    VOLTAGE_FIELD,
+    Batch,
+    absent,
+)
+from iort_contract.statistics import count_holes, numbers_of
+
+Measured = Mapping[str, float | list[float]]
+# The controllers' own temperatures; a driver that does not measure one leaves it at 0.
+_TEMPERATURES = (
+    "temperature_pcb",
+    "temp_fet",
+    "temp_motor",
+    "ntc_temp_mos1",
+    "ntc_temp_mos2",
+    "ntc_temp_mos3",
+)
+
+
+def measure(stream: str, batches: Sequence[Batch]) -> Measured:
+    """The metrics of one robot's batches of one stream; each batch counts once, whatever its seconds.
+
+    Battery (V) and temperature (degC) are the worst of the batches; holes between samples are counted
+    within each batch.
+    """
+    if stream == RTT_STREAM:
+        return {f"RoundTrip{path.capitalize()}Ms": _numbers(batches, RTT_FIELDS[path]) for path in PING_PATHS}
+    if stream == AGENT_STREAM:
+        backlog = _numbers(batches, "backlog_batches")
+        return {"AgentReports": sum(len(batch.times_us) for batch in batches), "BacklogBatches": backlog[-1:]}
+    volts = [value for value in _numbers(batches, VOLTAGE_FIELD) if value > 0]
+    hot = [
+        value
+        for name in _TEMPERATURES
+        for value in _numbers(batches, name)
+        if value and not absent(name, value)
+    ]
+    return {
+        "SampleGaps": sum(count_holes(batch.times_us) for batch in batches),
+        "FaultSamples": sum(map(bool, _numbers(batches, FAULT_FIELD))),
+        "BatteryVolts": [min(volts)] if volts else [],
+        "TemperatureDegC": [max(hot)] if hot else [],
+    }
+
+
+def together(measured: Iterable[Measured]) -> Iterator[Measured]:
+    """The metrics of several robots in as few lines of log as hold them: counts are summed, values follow
+    each other."""
+    counts: dict[str, float] = {}
+    values: dict[str, list[float]] = {}
+    for one in measured:
+        for name, value in one.items():
+            if isinstance(value, list):
+                values.setdefault(name, []).extend(value)
+            else:
+                counts[name] = counts.get(name, 0) + value
+    yield {**counts, **{name: found[:MOST_VALUES] for name, found in values.items()}}
+    for start in range(MOST_VALUES, max(map(len, values.values()), default=0), MOST_VALUES):
+        yield {name: found[start : start + MOST_VALUES] for name, found in values.items()}
+
+
+def _numbers(batches: Iterable[Batch], name: str) -> list[int | float]:
+    columns = (batch.columns.get(name, ()) for batch in batches)
+    return list(chain.from_iterable(map(numbers_of, columns)))

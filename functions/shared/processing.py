@@ -1,0 +1,215 @@
+"""An event of Lambda 2 from its records to the summary table, whoever calls with it."""
+
+from __future__ import annotations
+
+import gc
+import logging
+import os
+import time
+from collections import Counter
+from collections.abc import Callable, Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
+from functools import cache
+from typing import Any
+
+import boto3
+from botocore.config import Config
+
+from functions.shared.dead_letter import Refusals, Refused
+from functions.shared.decoded import Decoded, decode_records
+from functions.shared.health import measure, together
+from functions.shared.metrics import emit
+from functions.shared.seconds import Summaries, summarize_topic
+from functions.shared.share import REQUESTS_S, Change, OverShareError, Share, robot_of, robot_of_change
+from functions.shared.stored import SECOND_BATCHES
+from functions.shared.tables import Tables
+from iort_contract import RECOMPUTE_FROM_S, RECOMPUTED, REPLAY, Statistics, parse_topic
+
+# Topics that are read side by side; a client keeps ten connections.
+_AT_ONCE = 4
+# A stream keeps its records for 24 hours. What was received before was put into the table by hand (`iort
+# adopt`, a replay), and is no news of its car.
+_NEWS_MS = 24 * 3_600_000
+_BEYOND = f"its second has {SECOND_BATCHES} batches of the stream before it, or too large ones"
+logging.getLogger("functions").setLevel(logging.INFO)
+
+
+Refuse = Callable[[Sequence[Refused]], Sequence[Refused]]
+
+
+@dataclass(frozen=True)
+class Bounds:
+    """How a robot's share of the time is held: what each has left, where the rest waits, and who tells it."""
+
+    share: Share
+    put_off: Callable[[Sequence[Change]], Sequence[Change]]
+    tell: Callable[[str, int, float], None]
+
+
+def process(
+    event: Mapping[str, Any],
+    tables: Tables,
+    refuse: Refuse,
+    *,
+    bounds: Bounds | None = None,
+    beside_others: bool = False,
+    robot_metrics: bool = False,
+    at_once: int = 1,
+    news_since_ms: int = 0,
+) -> dict[str, Any]:
+    """Summarise the event's records. Those that cannot be decoded go to ``refuse``, since trying again
+    would not change them; those of a robot that is over its share wait, as ``bounds`` says. The answer names
+    the ones that were not taken there.
+
+    The good records behind such a one are kept as well: the service sends them again, which changes
+    nothing, and a second need not wait for retries to run out. Of a replay the answer names all that
+    cannot be decoded: they are in quarantine already. ``at_once`` topics are read side by side, which have
+    nothing to do with each other and mostly wait for the table. What was received before ``news_since_ms``
+    is summarised, and in no metric that an alarm is set on. Where somebody else may summarise the same
+    seconds ``beside``, they are read again once they are written.
+    """
+    decoded = decode_records(event["Records"], bounds.share if bounds else None)
+    topics = _summarized(tables, decoded, at_once, bounds.share if bounds else None)
+    _put(tables, topics)
+    # What was stored since it was read may have been summarised since, and just been overwritten.
+    while beside_others and (again := _summarized(tables, decoded, at_once)) != topics:
+        topics = again
+        _put(tables, topics)
+    for name in map(parse_topic, topics):
+        tables.note_stream(name.robot, name.name)
+    for topic, summaries in topics.items():
+        decoded.refuse(topic, summaries.beyond, _BEYOND)
+    left = {one.number for one in (decoded.refused if event.get(REPLAY) else refuse(decoded.refused))}
+    if bounds is not None and decoded.put_off:
+        left |= _put_off(bounds, decoded)
+    good = [batch for batches in decoded.batches.values() for batch in batches]
+    news = decoded.news(news_since_ms)
+    emit(
+        "summarize",
+        BatchesSummarized=len(good),
+        SamplesSummarized=sum(len(batch.times_us) for batch in good),
+        BatchesRefused=len(decoded.refused),
+        BatchesMissing=sum(summaries.missing for topic, summaries in topics.items() if topic in news),
+        BatchesPutOff=len(decoded.put_off),
+    )
+    measured = [
+        (parse_topic(topic).robot, measure(parse_topic(topic).name, batches))
+        for topic, batches in news.items()
+    ]
+    if robot_metrics:
+        for robot, values in measured:
+            emit("health", robot=robot, **values)
+    else:
+        for values in together(values for _, values in measured):
+            emit("health", robot=None, **values)
+    return {"batchItemFailures": [{"itemIdentifier": number} for number in sorted(left)]}
+
+
+def _put(tables: Tables, topics: Mapping[str, Summaries]) -> None:
+    tables.put_seconds(
+        {
+            (topic, second): summary
+            for topic, summaries in topics.items()
+            for second, summary in summaries.seconds.items()
+        }
+    )
+
+
+def _put_off(bounds: Bounds, decoded: Decoded) -> set[str]:
+    """Have what is over its share wait, and tell whose it is; the numbers of those that could not."""
+    left = {change["SequenceNumber"] for change in bounds.put_off(decoded.put_off)}
+    for robot, batches in Counter(map(robot_of_change, decoded.put_off)).items():
+        bounds.tell(robot, batches, decoded.at_s)
+    return left
+
+
+def recompute(event: Mapping[str, Any], tables: Tables) -> dict[str, Any]:
+    """Summarise stored batches once more, with the vehicle's parameters as they are now: the operator has
+    corrected them. Seconds before ``event[RECOMPUTE_FROM_S]`` stay as they are.
+
+    Nothing is counted or put into quarantine a second time. The answer has the seconds that were written, and
+    the records of which nothing can be made.
+    """
+    tables.forget_vehicles()
+    decoded = decode_records(event["Records"])
+    written: dict[tuple[str, int], Mapping[str, Statistics]] = {}
+    for topic, summaries in _summarized(tables, decoded, 1).items():
+        for second, summary in summaries.seconds.items():
+            if second >= event[RECOMPUTE_FROM_S]:
+                written[topic, second] = summary
+        decoded.refuse(topic, summaries.beyond, _BEYOND)
+    tables.put_seconds(written)
+    return {
+        RECOMPUTED: sorted(second for _, second in written),
+        "batchItemFailures": [{"itemIdentifier": refused.number} for refused in decoded.refused],
+    }
+
+
+def _summarized(
+    tables: Tables, decoded: Decoded, at_once: int, share: Share | None = None
+) -> dict[str, Summaries]:
+    """Of each topic. One whose robot is far over its share is not among them: its batches wait."""
+    share = share or Share.unlimited()
+
+    def one(topic: str) -> Summaries | None:
+        meter = share.meter(robot_of(topic), decoded.at_s)
+        try:
+            meter.check()
+            return summarize_topic(tables, topic, decoded.batches[topic], meter.check)
+        except OverShareError:
+            return None
+        finally:
+            meter.charge(REQUESTS_S)
+
+    topics = list(decoded.batches)
+    if at_once == 1 or len(topics) == 1:
+        found = list(map(one, topics))
+    else:
+        with ThreadPoolExecutor(min(at_once, max(1, len(topics)))) as pool:
+            found = list(pool.map(one, topics))
+    summaries: dict[str, Summaries] = {}
+    for topic, made in zip(topics, found, strict=True):
+        if made is None:
+            decoded.wait(topic)
+        else:
+            summaries[topic] = made
+    return summaries
+
+
+@cache
+def stored_tables() -> Tables:
+    """The tables of this environment's deployment."""
+    # Requests are this code's own. To validate them took a third of Lambda 2's processor.
+    client = boto3.client("dynamodb", config=Config(parameter_validation=False))
+    tables = Tables(
+        client,
+        telemetry=os.environ["TELEMETRY_TABLE"],
+        summary=os.environ["SUMMARY_TABLE"],
+        robots=os.environ["ROBOTS_TABLE"],
+    )
+    # botocore's models are a hundred thousand objects that stay: no event's collection need pass them again.
+    gc.collect()
+    gc.freeze()
+    return tables
+
+
+@cache
+def _refusals() -> Refusals:
+    return Refusals(boto3.client("sqs"), queue_url=os.environ["REJECTED_QUEUE"])
+
+
+def processed(
+    event: Mapping[str, Any], *, bounds: Bounds | None = None, beside_others: bool = False
+) -> dict[str, Any]:
+    """`process` with what this environment's deployment has."""
+    return process(
+        event,
+        stored_tables(),
+        _refusals().refuse,
+        bounds=bounds,
+        beside_others=beside_others,
+        robot_metrics=os.environ["ROBOT_METRICS"] == "true",
+        at_once=_AT_ONCE,
+        news_since_ms=int(time.time() * 1000) - _NEWS_MS,
+    )

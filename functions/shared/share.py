@@ -1,0 +1,189 @@
+"""A robot's share of Lambda 2: batches beyond it wait for another function, and no robot waits for them."""
+
+from __future__ import annotations
+
+import json
+import logging
+import math
+import time
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from typing import Any
+
+from botocore.exceptions import BotoCoreError, ClientError
+
+from functions.shared.allowances import Allowances
+from iort_contract import (
+    BATCH,
+    OVER_SHARE,
+    PUT_OFF,
+    PUT_OFF_LAST_MS,
+    PUT_OFF_SINCE_MS,
+    SHADOW,
+    TOPIC,
+    ContractError,
+    parse_topic,
+)
+
+_log = logging.getLogger(__name__)
+# Seconds of a processor that a robot may take: of each second, and at once. A good car takes a hundredth.
+A_SECOND, BURST_S = 0.1, 0.3
+# What the requests for a topic, or for a batch that is refused, cost beside the processor.
+REQUESTS_S = 0.002
+# The keys of a message: of the dearest batches, so many take a tenth of the later function's time.
+KEYS = 20
+# SendMessageBatch takes as many.
+_MESSAGES = 10
+# A robot is told again after so long; one that stayed within its share for longer is told anew.
+TELL_S, OVER_S = 30.0, 60.0
+_ROBOTS = 1000
+
+Change = Mapping[str, Any]
+
+
+class OverShareError(Exception):
+    """A robot is so far over its share that its batch has to wait."""
+
+
+class Share:
+    """What each robot may still take, by the times at which its batches arrived in the table.
+
+    Those are the cloud's, as is the topic that says whose a batch is. One environment keeps it in memory;
+    a shard whose events are served by several gives a robot its share in each. ``spent_s`` is the time that
+    the thread has used a processor for.
+    """
+
+    def __init__(
+        self,
+        *,
+        burst_s: float = BURST_S,
+        a_second: float = A_SECOND,
+        spent_s: Callable[[], float] = time.thread_time,
+    ) -> None:
+        self._burst_s, self._spent_s = burst_s, spent_s
+        self._allowances = Allowances(burst=burst_s, a_second=a_second)
+
+    @classmethod
+    def unlimited(cls) -> Share:
+        """A share that nobody is over."""
+        return cls(burst_s=math.inf)
+
+    def over(self, robot: str, at_s: float) -> bool:
+        """Whether the robot's next batch has to wait."""
+        return self._allowances.left(robot, at_s) <= 0
+
+    def meter(self, robot: str, at_s: float) -> Meter:
+        """Measures from now on what this thread does for a robot."""
+        return Meter(self._allowances, self._spent_s, robot, at_s, least_s=-self._burst_s)
+
+
+class Meter:
+    """Charges a robot what the thread that made it spends."""
+
+    def __init__(
+        self, allowances: Allowances, spent_s: Callable[[], float], robot: str, at_s: float, *, least_s: float
+    ) -> None:
+        self._allowances, self._spent_s = allowances, spent_s
+        self._robot, self._at_s, self._least_s = robot, at_s, least_s
+        self._from_s = spent_s()
+
+    def charge(self, beside_s: float = 0.0) -> float:
+        """Charge what was spent since the last time, and something ``beside`` it; what is left."""
+        before_s, self._from_s = self._from_s, self._spent_s()
+        return self._allowances.spend(self._robot, self._at_s, self._from_s - before_s + beside_s)
+
+    def check(self) -> None:
+        """Charge, and raise `OverShareError` where the robot has spent its allowance twice: what is begun
+        within the share is not given up for a little."""
+        if self.charge() < self._least_s:
+            raise OverShareError(self._robot)
+
+
+def robot_of(topic: str) -> str:
+    """Whose a topic is; "" for one that is none, whose batches are refused without any effort."""
+    try:
+        return parse_topic(topic).robot
+    except ContractError:
+        return ""
+
+
+def robot_of_change(change: Change) -> str:
+    """Whose a changed item is, by its key."""
+    return robot_of(change["Keys"][TOPIC]["S"])
+
+
+class PutOff:
+    """The queue of what waits, by its keys: the batches are in the telemetry table. ``client`` is a boto3
+    SQS client."""
+
+    def __init__(self, client: Any, *, queue_url: str) -> None:
+        self._client, self._queue_url = client, queue_url
+
+    def put(self, changes: Iterable[Change]) -> list[Change]:
+        """Have the batches wait; those that the queue did not take come back."""
+        by_robot: dict[str, list[Change]] = {}
+        for change in changes:
+            by_robot.setdefault(robot_of_change(change), []).append(change)
+        messages = [
+            (robot, several[start : start + KEYS])
+            for robot, several in by_robot.items()
+            for start in range(0, len(several), KEYS)
+        ]
+        left: list[Change] = []
+        for start in range(0, len(messages), _MESSAGES):
+            left += self._left(messages[start : start + _MESSAGES])
+        return left
+
+    def _left(self, messages: Sequence[tuple[str, Sequence[Change]]]) -> list[Change]:
+        # By its group AWS sees whose messages are many, and serves the others first: "SQS fair queues".
+        entries = [
+            {"Id": str(number), "MessageBody": _message(several), "MessageGroupId": robot}
+            for number, (robot, several) in enumerate(messages)
+        ]
+        try:
+            answer = self._client.send_message_batch(QueueUrl=self._queue_url, Entries=entries)
+        except (BotoCoreError, ClientError) as error:
+            _log.warning("batches over their robot's share stay in the stream: %s", error)
+            return [change for _, several in messages for change in several]
+        return [change for entry in answer.get("Failed", []) for change in messages[int(entry["Id"])][1]]
+
+
+def _message(changes: Sequence[Change]) -> str:
+    keys = [[change["Keys"][name]["S"] for name in (TOPIC, BATCH)] for change in changes]
+    return json.dumps({PUT_OFF: keys})
+
+
+def waiting(body: str) -> list[tuple[str, str]]:
+    """Topic and batch of each that waits by a message of the queue."""
+    return [(topic, batch) for topic, batch in json.loads(body)[PUT_OFF]]
+
+
+class Told:
+    """Which robots were told in their shadow that they are over their share; ``client`` is a boto3 client of
+    iot-data."""
+
+    def __init__(self, client: Any) -> None:
+        self._client = client
+        self._robots: dict[str, tuple[float, float, float, int]] = {}
+
+    def tell(self, robot: str, batches: int, at_s: float) -> None:
+        """Tell a robot that so many more of its batches wait. It is told at once, then now and then."""
+        since_s, last_s, told_s, before = self._robots.pop(robot, (at_s, at_s, -math.inf, 0))
+        if at_s - last_s > OVER_S:
+            since_s, told_s, before = at_s, -math.inf, 0
+        count = before + batches
+        if at_s - told_s >= TELL_S:
+            _log.warning("%s is over its share of Lambda 2: %d batches wait for their summary", robot, count)
+            self._update(robot, since_s, at_s, count)
+            told_s = at_s
+        self._robots[robot] = (since_s, at_s, told_s, count)
+        if len(self._robots) > _ROBOTS:
+            del self._robots[next(iter(self._robots))]
+
+    def _update(self, robot: str, since_s: float, at_s: float, count: int) -> None:
+        said = {PUT_OFF_SINCE_MS: int(since_s * 1000), PUT_OFF_LAST_MS: int(at_s * 1000), PUT_OFF: count}
+        payload = json.dumps({"state": {"desired": {OVER_SHARE: said}}})
+        try:
+            self._client.update_thing_shadow(thingName=robot, shadowName=SHADOW, payload=payload)
+        except (BotoCoreError, ClientError) as error:
+            # It only helps to understand: no summary waits for it.
+            _log.warning("%s is not told that it is over its share: %s", robot, error)

@@ -1,0 +1,147 @@
+"""What the telemetry table holds around the batches of an event, and no more of it than a second may hold."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
+from itertools import islice
+from typing import Any, NamedTuple
+
+from functions.shared.tables import Tables
+from iort_contract import (
+    BATCH,
+    EXPIRES_S,
+    MAX_BATCH_SPAN_US,
+    MAX_COLUMNS_BYTES,
+    Batch,
+    BatchId,
+    ContractError,
+    batch_id,
+    decode_item,
+)
+from iort_contract.statistics import missing_before
+
+_SECOND_US = 1_000_000
+# By how much the clocks of two publishers of a stream may differ before batches seem to be missing.
+_ASIDE_US = 10_000_000
+# A second is made of so many batches of a stream, and of about so much of their columns: one robot that puts
+# more in it must not hold up the others. AWS takes as many messages a second from a connection.
+SECOND_BATCHES, _SECOND_BYTES = 100, MAX_COLUMNS_BYTES
+# Beside those of the event: the one before and the one after.
+_BESIDE = 2
+# A neighbour that cannot be decoded is passed over for the next; so many of them end the search.
+_NEIGHBOURS = 10
+
+
+class Stored(NamedTuple):
+    """A batch as the telemetry table holds it; ``beyond`` what its second may hold, it only tells what the
+    next second begins after."""
+
+    batch: Batch
+    expires_s: int | None
+    beyond: bool = False
+
+
+@dataclass
+class Reader:
+    """Reads one topic; what is ``known`` need not be decoded again. ``check`` is called before anything else
+    is, and may raise. ``full`` are the seconds that it found to hold more than they may."""
+
+    tables: Tables
+    topic: str
+    known: Mapping[BatchId, Batch]
+    check: Callable[[], None]
+    full: set[int] = field(default_factory=set)
+
+    def read(self, first: int, last: int) -> list[Stored]:
+        """The stored batches with samples from the first second to the last, the one before them, and all
+        of the second in which the one after them starts; in order of time."""
+        start_us, end_us = first * _SECOND_US, (last + 1) * _SECOND_US
+        stored: list[Stored] = []
+        after_s, passed = None, 0
+        # One query: nearly always the batches are the newest, and nothing comes after them.
+        at_once = sum(start_us <= t_us < end_us for t_us, _, _ in self.known) + _BESIDE
+        for t_us, entry in self._bounded(start_us - MAX_BATCH_SPAN_US, at_once):
+            if after_s is None and t_us >= end_us:
+                passed += 1
+            if passed > _NEIGHBOURS or (after_s is not None and t_us // _SECOND_US != after_s):
+                break
+            if entry is not None:
+                stored.append(entry)
+                if t_us >= end_us:
+                    after_s = t_us // _SECOND_US
+        if stored and stored[0].batch.t_us >= start_us:
+            stored = [*self._before(stored[0].batch.t_us), *stored]
+        return stored
+
+    def missing_before(self, batch: Batch, previous: Batch | None, stored: Sequence[Stored]) -> int:
+        """How many batches the stream lacks just before this one, by their numbers."""
+        if previous is not None and (previous.boot, previous.seq + 1) == (batch.boot, batch.seq):
+            return 0
+        ids = [entry.batch.id for entry in stored]
+        missing = missing_before(batch.id, ids)
+        if missing:
+            # Clocks may interleave: what is missing here may lie some seconds to the side.
+            near = self.tables.numbers(self.topic, batch.t_us - _ASIDE_US, batch.t_us + _ASIDE_US)
+            missing = missing_before(batch.id, sorted({*ids, *near}))
+        return missing
+
+    def _bounded(self, first_us: int, at_once: int) -> Iterator[tuple[int, Stored | None]]:
+        """The batches from a time on and when they start, None for an item that is none. Of a second that
+        holds more than it may, the rest is passed over up to its last."""
+        from_us: int | None = first_us
+        while from_us is not None:
+            start_us, from_us = from_us, None
+            second, count, size, t_us = -1, 0, 0, -1
+            entry: Stored | None = None
+            for item in self.tables.batches_from(self.topic, start_us, at_once=at_once):
+                # A key of no batch begins with a time all the same, or sorts behind them all.
+                before_us, t_us = t_us, _time_of(item, t_us)
+                if t_us // _SECOND_US != second:
+                    second, count, size = t_us // _SECOND_US, 0, 0
+                elif entry is not None:
+                    size += _bytes(entry.batch)
+                if count >= SECOND_BATCHES or size >= _SECOND_BYTES:
+                    self.full.add(second)
+                    from_us = (second + 1) * _SECOND_US
+                    for last in self._before(from_us):
+                        if last.batch.t_us > before_us:
+                            yield last.batch.t_us, last._replace(beyond=True)
+                    break
+                count += 1
+                entry = next(self._stored([item]), None)
+                yield t_us, entry
+
+    def _before(self, t_us: int) -> list[Stored]:
+        found = self._stored(islice(self.tables.before(self.topic, t_us), _NEIGHBOURS))
+        return list(islice(found, 1))
+
+    def _stored(self, items: Iterable[Mapping[str, Any]]) -> Iterator[Stored]:
+        """The items that are batches. Of one that is not, the own record has been or will be refused;
+        here it only must not stop its neighbours."""
+        for item in items:
+            try:
+                batch = self.known.get(batch_id(item[BATCH])) or self._decoded(item)
+                expires_s = int(item[EXPIRES_S]) if EXPIRES_S in item else None
+            except (ContractError, KeyError, TypeError, ValueError, OverflowError):
+                continue
+            yield Stored(batch, expires_s)
+
+    def _decoded(self, item: Mapping[str, Any]) -> Batch:
+        self.check()
+        return decode_item(item)[1]
+
+
+def _time_of(item: Mapping[str, Any], otherwise: int) -> int:
+    try:
+        return batch_id(item[BATCH]).t_us
+    except ContractError:
+        return otherwise
+
+
+def _bytes(batch: Batch) -> int:
+    """About what the columns take in memory."""
+    return sum(
+        8 * len(column) + sum(len(value) for value in column if isinstance(value, str))
+        for column in batch.columns.values()
+    )

@@ -1,0 +1,251 @@
+"""The adapter to DynamoDB: batches out of the telemetry table, seconds into the summary table."""
+
+from __future__ import annotations
+
+import logging
+import math
+import time
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import suppress
+from itertools import islice
+from typing import Any
+
+from botocore.exceptions import ClientError
+
+from iort_contract import (
+    BATCH,
+    OMITTED,
+    ROBOT,
+    SECOND,
+    STREAMS,
+    TOPIC,
+    BatchId,
+    ContractError,
+    Statistics,
+    batch_id,
+    batches_between,
+)
+from iort_contract.attributes import deserialize
+from iort_contract.statistics import Vehicle
+
+_log = logging.getLogger(__name__)
+# BatchWriteItem takes at most this many items a call.
+WRITE_SIZE = 25
+_WRITE_ATTEMPTS = 8
+# Batches of a page, once it is known that many are wanted.
+_MANY = 100
+# What the operator changes in the registry counts after this time at the latest.
+VEHICLE_CACHE_S = 60.0
+# "Limits", items: 400 KB with the names counted in; a little is left to how numbers are counted.
+_MAX_ITEM_BYTES = 380 * 1024
+# A float's longest text; as a number it is shorter.
+_MAX_NUMBER_BYTES = 25
+# What a DynamoDB number can hold, "Supported data types": 38 digits, 1e-130 to 9.99e125.
+_LARGEST, _SMALLEST = 9.99e125, 1e-130
+
+
+class TableError(Exception):
+    """DynamoDB did not take what it was given in the time there was; the caller may try again."""
+
+
+def plain(image: Mapping[str, Any]) -> dict[str, Any]:
+    """An item as Python values; numbers are Decimal."""
+    return {name: deserialize(value) for name, value in image.items()}
+
+
+def attribute(value: Statistics) -> dict[str, Any]:
+    """A value, or a list of some, as a DynamoDB attribute.
+
+    A number too small becomes 0, one too large its own text.
+    """
+    if isinstance(value, list):
+        return {"L": list(map(attribute, value))}
+    if isinstance(value, float):
+        if _SMALLEST <= abs(value) <= _LARGEST:
+            return {"N": repr(value)}
+        return {"N": "0"} if abs(value) < _SMALLEST else {"S": repr(value)}
+    if isinstance(value, bool):
+        return {"BOOL": value}
+    if isinstance(value, int):
+        return {"N": repr(value)}
+    return {"NULL": True} if value is None else {"S": value}
+
+
+class Tables:
+    """The three tables as Lambda 2 sees them; ``client`` is a boto3 DynamoDB client or a fake of it."""
+
+    def __init__(self, client: Any, *, telemetry: str, summary: str, robots: str) -> None:
+        self._client = client
+        self._telemetry, self._summary, self._robots = telemetry, summary, robots
+        self._vehicles: dict[str, tuple[float, Vehicle | None]] = {}
+        self._noted: set[tuple[str, str]] = set()
+
+    def batches_from(self, topic: str, first_us: int, *, at_once: int) -> Iterator[dict[str, Any]]:
+        """The stored batches of a topic that start then or later, in order of time. ``at_once`` are read
+        first, and if more are asked for a hundred at a time: nobody wants a whole drive."""
+        first, last = batches_between(first_us, None)
+        few = self._between(topic, first, last, at_once)
+        read = 0
+        for item in islice(few, at_once):
+            # Behind this one: no key ends with a space.
+            read, first = read + 1, f"{item[BATCH]} "
+            yield item
+        if read == at_once:
+            yield from self._between(topic, first, last, _MANY)
+
+    def _between(self, topic: str, first: str, last: str, at_once: int) -> Iterator[dict[str, Any]]:
+        condition = "#batch BETWEEN :first AND :last"
+        return self._query(topic, condition, {":first": first, ":last": last}, at_once=at_once)
+
+    def before(self, topic: str, t_us: int) -> Iterator[dict[str, Any]]:
+        """The stored batches of a topic that start before the time, the nearest first. Each is read when
+        it is asked for, since the first is nearly always the one that is wanted."""
+        first, _ = batches_between(t_us, None)
+        return self._query(topic, "#batch < :first", {":first": first}, at_once=1, ScanIndexForward=False)
+
+    def numbers(self, topic: str, first_us: int, last_us: int) -> Iterator[BatchId]:
+        """Which batches of a topic start between these times, in order of time, without their samples."""
+        first, last = batches_between(first_us, last_us)
+        condition = "#batch BETWEEN :first AND :last"
+        values = {":first": first, ":last": last}
+        for item in self._query(topic, condition, values, at_once=_MANY, ProjectionExpression="#batch"):
+            with suppress(ContractError):
+                yield batch_id(item[BATCH])
+
+    def _query(
+        self, topic: str, condition: str, values: Mapping[str, str], *, at_once: int, **how: Any
+    ) -> Iterator[dict[str, Any]]:
+        texts = {name: {"S": value} for name, value in values.items()}
+        pages = self._client.get_paginator("query").paginate(
+            TableName=self._telemetry,
+            ConsistentRead=True,
+            KeyConditionExpression=f"#topic = :topic AND {condition}",
+            ExpressionAttributeNames={"#topic": TOPIC, "#batch": BATCH},
+            ExpressionAttributeValues={":topic": {"S": topic}, **texts},
+            PaginationConfig={"PageSize": at_once},
+            **how,
+        )
+        for page in pages:
+            yield from map(plain, page["Items"])
+
+    def item(self, topic: str, batch: str) -> dict[str, Any] | None:
+        """A batch as DynamoDB stores it, by its key; None where it is not there, or no longer."""
+        key = {TOPIC: {"S": topic}, BATCH: {"S": batch}}
+        answer = self._client.get_item(TableName=self._telemetry, Key=key, ConsistentRead=True)
+        found: dict[str, Any] | None = answer.get("Item")
+        return found
+
+    def page(
+        self, condition: Mapping[str, Any], after: Mapping[str, Any] | None, *, scan: bool
+    ) -> dict[str, Any]:
+        """One page of the telemetry table, as DynamoDB gives it: 1 MB read, before any filter.
+
+        ``condition`` are the expressions of a Query or a Scan; ``after`` is the key that the page before
+        ended with.
+        """
+        request = {"TableName": self._telemetry, "ConsistentRead": True, **condition}
+        if after is not None:
+            request["ExclusiveStartKey"] = after
+        page: dict[str, Any] = (self._client.scan if scan else self._client.query)(**request)
+        return page
+
+    def vehicle(self, robot: str) -> Vehicle | None:
+        """The robot's parameters, read at most once in `VEHICLE_CACHE_S`; None where none are registered."""
+        now = time.monotonic()
+        cached = self._vehicles.get(robot)
+        if cached is None or now - cached[0] > VEHICLE_CACHE_S:
+            answer = self._client.get_item(
+                TableName=self._robots, Key={ROBOT: {"S": robot}}, ConsistentRead=True
+            )
+            cached = self._vehicles[robot] = (now, _vehicle(plain(answer.get("Item", {}))))
+        return cached[1]
+
+    def note_stream(self, robot: str, stream: str) -> None:
+        """Keep in the robot's row that it has the stream, once an environment; a robot that is not
+        registered has no row, and gets none."""
+        if (robot, stream) in self._noted:
+            return
+        try:
+            self._client.update_item(
+                TableName=self._robots,
+                Key={ROBOT: {"S": robot}},
+                UpdateExpression="ADD #streams :stream",
+                ConditionExpression="attribute_exists(#robot)",
+                ExpressionAttributeNames={"#streams": STREAMS, "#robot": ROBOT},
+                ExpressionAttributeValues={":stream": {"SS": [stream]}},
+            )
+        except ClientError as error:
+            # It only helps those who look for streams; no summary waits for it.
+            _log.info("the stream %s of %s is not noted: %s", stream, robot, error)
+        self._noted.add((robot, stream))
+
+    def forget_vehicles(self) -> None:
+        """Read every robot's parameters anew the next time."""
+        self._vehicles.clear()
+
+    def put_seconds(self, seconds: Mapping[tuple[str, int], Mapping[str, Statistics]]) -> None:
+        """Write the summaries, keyed by topic and second; raises `TableError` if some stay unwritten."""
+        requests = (
+            {"PutRequest": {"Item": self._second_item(topic, second, summary)}}
+            for (topic, second), summary in seconds.items()
+        )
+        while chunk := list(islice(requests, WRITE_SIZE)):
+            write(self._client, self._summary, chunk)
+
+    def _second_item(self, topic: str, second: int, summary: Mapping[str, Statistics]) -> dict[str, Any]:
+        item = fitting({name: attribute(value) for name, value in summary.items()})
+        return {**item, TOPIC: {"S": topic}, SECOND: {"N": str(second)}}
+
+
+def write(client: Any, table: str, requests: Sequence[Mapping[str, Any]]) -> None:
+    """Have a table take at most `WRITE_SIZE` writes; raises `TableError` if some stay unwritten."""
+    for attempt in range(_WRITE_ATTEMPTS):
+        answer = client.batch_write_item(RequestItems={table: requests})
+        requests = answer.get("UnprocessedItems", {}).get(table, [])
+        if not requests:
+            return
+        # DynamoDB asks for exponential backoff before unprocessed items are sent again.
+        time.sleep(0.02 * 2**attempt)
+    raise TableError(f"{len(requests)} items of {table} not written after {_WRITE_ATTEMPTS} attempts")
+
+
+def fitting(item: dict[str, Any]) -> dict[str, Any]:
+    """The item without the largest attributes that keep it from fitting in DynamoDB's 400 KB.
+
+    A stream may have 512 fields of texts of 4096 characters, of which the summary keeps the last; the
+    samples themselves are in the telemetry table.
+    """
+    sizes = list(map(_size, item, item.values()))
+    total, dropped = sum(sizes), set()
+    if total <= _MAX_ITEM_BYTES:
+        return item
+    for size, name in sorted(zip(sizes, item, strict=True), reverse=True):
+        if total <= _MAX_ITEM_BYTES:
+            break
+        dropped.add(name)
+        total -= size
+    _log.warning("a summary of %d attributes is too large: %d left out", len(item), len(dropped))
+    kept = {name: value for name, value in item.items() if name not in dropped}
+    return {**kept, OMITTED: {"N": str(len(dropped))}}
+
+
+def _size(name: str, value: Mapping[str, Any]) -> int:
+    """At least what DynamoDB counts: names and texts in UTF-8, and no number more than its digits."""
+    ((kind, content),) = value.items()
+    if kind == "S":
+        return len(name.encode()) + len(content.encode("utf-8", "surrogatepass")) + 3
+    return len(name.encode()) + 3 + _MAX_NUMBER_BYTES * (len(content) if kind == "L" else 1)
+
+
+def _vehicle(row: Mapping[str, Any]) -> Vehicle | None:
+    """The vehicle in a row of the registry; a row that is wrong must not stop its robot's summaries."""
+    if "speed_to_erpm_gain" not in row:
+        return None
+    try:
+        gain, offset = float(row["speed_to_erpm_gain"]), float(row.get("speed_to_erpm_offset", 0))
+    except (TypeError, ValueError):
+        gain = offset = math.nan
+    if not gain or not math.isfinite(gain) or not math.isfinite(offset):
+        _log.warning("vehicle parameters of %s are not numbers, or the gain is 0", row.get(ROBOT))
+        return None
+    return Vehicle(gain, offset)

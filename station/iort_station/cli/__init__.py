@@ -1,0 +1,1 @@
+"""The command `iort`: its options, its verbs and how answers are printed."""

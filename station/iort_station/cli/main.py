@@ -1,0 +1,96 @@
+"""The command `iort`: its options, its commands and how it ends."""
+
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+from typing import Annotated, NoReturn
+
+import typer
+from botocore.exceptions import BotoCoreError, ClientError
+
+from iort_contract import DEFAULT_NAMESPACE
+from iort_station.cli.console import visible
+from iort_station.cli.verbs import (
+    adopt,
+    audit,
+    config,
+    cost,
+    dashboard,
+    errors,
+    export,
+    files,
+    plot,
+    pubnub,
+    query,
+    robots,
+    send,
+    site,
+    trace,
+    watch,
+)
+from iort_station.cli.where import Where
+from iort_station.cloud import EMBEDDED
+from iort_station.errors import StationError
+
+app = typer.Typer(no_args_is_help=True, add_completion=True, help="The operator's station of iort.")
+app.add_typer(robots.commands, name="robots")
+app.add_typer(files.commands, name="files")
+app.add_typer(pubnub.commands)
+app.add_typer(dashboard.commands)
+app.add_typer(cost.commands)
+app.add_typer(audit.commands)
+app.add_typer(query.commands)
+app.add_typer(export.commands)
+app.add_typer(plot.commands)
+app.add_typer(trace.commands)
+app.add_typer(watch.commands)
+app.add_typer(site.commands)
+app.add_typer(errors.commands)
+app.add_typer(adopt.commands)
+app.add_typer(send.commands)
+app.add_typer(config.commands)
+
+
+@app.callback()
+def _where(
+    context: typer.Context,
+    namespace: Annotated[str, typer.Option(help="The deployment's namespace.")] = DEFAULT_NAMESPACE,
+    profile: Annotated[str | None, typer.Option(help="AWS profile.")] = None,
+    region: Annotated[str | None, typer.Option(help="AWS region.")] = None,
+    local: Annotated[
+        bool,
+        typer.Option(
+            "--local", help="The embedded cloud; also meant when one runs and no AWS option is given."
+        ),
+    ] = False,
+    embedded: Annotated[
+        Path, typer.Option(help="The file in which an embedded cloud says how to reach it.")
+    ] = EMBEDDED,
+) -> None:
+    context.obj = Where(namespace, profile, region, local, embedded)
+
+
+def said(error: OSError) -> str:
+    """The operating system's error for people: the file and what is wrong with it, no number."""
+    return f"{error.filename}: {error.strerror}" if error.filename and error.strerror else str(error)
+
+
+def main() -> None:
+    """Run the command; an error that is expected is one line on standard error, and status 1."""
+    try:
+        app()
+    except StationError as error:
+        _end(str(error))
+    except ClientError as error:
+        _end(f"AWS refused a call: {error}")
+    except BotoCoreError as error:
+        _end(f"AWS could not be asked: {error}")
+    except OSError as error:
+        _end(said(error))
+    except KeyboardInterrupt:
+        sys.exit(130)
+
+
+def _end(text: str) -> NoReturn:
+    sys.exit(visible(f"iort: {text}"))

@@ -1,0 +1,230 @@
+"""Pictures of what was recorded: fields over time, where a robot went, how values are distributed.
+
+The colours are Okabe and Ito's, which colour-blind people can tell apart; from the ninth series on the
+dashes differ too.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from datetime import datetime, timezone
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.dates import AutoDateLocator, ConciseDateFormatter
+from matplotlib.figure import Figure
+from numpy.typing import NDArray
+
+from iort_station.data.data import Result
+from iort_station.data.positions import Fields, fixes, local_metres, position_fields
+from iort_station.errors import StationError
+
+COLOURS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#000000", "#B8A800")
+_DASHES = ("-", "--", ":", "-.")
+# More points than a picture has columns tell nothing more, and make an SVG heavy.
+_POINTS = 4_000
+# A step this many times the usual one, and a second at least, is a hole that no line should bridge.
+_HOLE, _HOLE_US = 5, 1_000_000
+
+
+class Run(NamedTuple):
+    """A result and what it is called in the legend."""
+
+    name: str
+    result: Result
+
+
+def over_time(runs: Sequence[Run], fields: Sequence[str], *, from_start: bool = False) -> Figure:
+    """A panel a field, a line a run; time is the clock's (UTC), or counted from each run's start."""
+    figure, panels = _panels(len(fields), height=1.9, shared=True)
+    for panel, field in zip(panels, fields, strict=True):
+        for i, run in enumerate(runs):
+            times_us, values = _thinned(run.result.times_us, _column(run, field))
+            origin_us = int(run.result.times_us[0]) if from_start else 0
+            at: Any = (times_us - origin_us) / 1e6 if from_start else times_us.astype("datetime64[us]")
+            panel.plot(at, values, label=run.name, linewidth=1.1, **_style(i))
+        panel.set_ylabel(_labelled(runs, field))
+        panel.margins(x=0.01)
+    bottom = panels[-1]
+    if from_start:
+        bottom.set_xlabel("time since the start (s)")
+    else:
+        locator = AutoDateLocator(tz=timezone.utc)
+        bottom.xaxis.set_major_locator(locator)
+        bottom.xaxis.set_major_formatter(ConciseDateFormatter(locator, tz=timezone.utc))
+        bottom.set_xlabel("time (UTC)")
+    return _finished(figure, runs, "")
+
+
+def trajectory(runs: Sequence[Run]) -> Figure:
+    """Where the robots went, seen from above; a ring is where each began, a dot where it ended.
+
+    Latitudes and longitudes are drawn as metres to the east and north of the first place known.
+
+    Raises `StationError` for a run without a position: none is made up from speeds.
+    """
+    figure = _figure(7.0, 6.2)
+    panel = figure.add_subplot()
+    tracks, labels, note = _tracks(runs)
+    for i, (run, (x, y)) in enumerate(zip(runs, tracks, strict=True)):
+        style = _style(i)
+        panel.plot(x, y, label=run.name, linewidth=1.4, **style)
+        known = np.flatnonzero(~np.isnan(x) & ~np.isnan(y))
+        if len(known):
+            first, last = known[0], known[-1]
+            panel.plot(x[first], y[first], "o", markerfacecolor="white", markersize=8, color=style["color"])
+            panel.plot(x[last], y[last], "o", markersize=6, color=style["color"])
+    panel.set_aspect("equal", adjustable="datalim")
+    panel.set_xlabel(f"{labels[0]} (m)")
+    panel.set_ylabel(f"{labels[1]} (m)")
+    _dress(panel)
+    return _finished(figure, runs, f"ring: start, dot: end{note}")
+
+
+def _tracks(
+    runs: Sequence[Run],
+) -> tuple[list[tuple[Any, Any]], tuple[str, str], str]:
+    """Each run's x and y in metres, what they are, and what more there is to say of them."""
+    fields = [position_of(run.result) for run in runs]
+    if len({each.degrees for each in fields}) > 1:
+        raise StationError(
+            "positions in metres and in degrees cannot be drawn together: "
+            + ", ".join(
+                f"{run.name} has {' and '.join(of.names)}" for run, of in zip(runs, fields, strict=True)
+            )
+        )
+    of = list(zip(runs, fields, strict=True))
+    if not fields[0].degrees:
+        metres = [(_column(run, x), _column(run, y)) for run, ((x, y), _) in of]
+        return metres, fields[0].names, ""
+    places = [fixes(run.result.columns, each) for run, each in of]
+    first = next(((la[i], lo[i]) for la, lo in places for i in np.flatnonzero(~np.isnan(la))[:1]), None)
+    if first is None:
+        raise StationError(f"{', '.join(fields[0].names)} hold no place: the receiver had no fix")
+    note = f"\n{', '.join(fields[0].names)} around {first[0]:.7f}, {first[1]:.7f}"
+    return [local_metres(*place, first) for place in places], ("east", "north"), note
+
+
+def distribution(runs: Sequence[Run], fields: Sequence[str]) -> Figure:
+    """How often each value occurred, a panel a field; the vertical line is the median."""
+    figure, panels = _panels(len(fields), height=2.4, shared=False)
+    for panel, field in zip(panels, fields, strict=True):
+        columns = [column[~np.isnan(column)] for column in (_column(run, field) for run in runs)]
+        everything = np.concatenate(columns)
+        bins = np.histogram_bin_edges(everything, bins=_bins(everything)) if len(everything) else 1
+        for i, (run, column) in enumerate(zip(runs, columns, strict=True)):
+            if not len(column):
+                continue
+            style = _style(i)
+            weights = np.full(len(column), 100 / len(column))
+            panel.hist(column, bins, weights=weights, histtype="stepfilled", alpha=0.25, color=style["color"])
+            panel.hist(column, bins, weights=weights, histtype="step", label=run.name, **style)
+            panel.axvline(float(np.median(column)), linewidth=1.2, **style)
+        panel.set_xlabel(_labelled(runs, field))
+        panel.set_ylabel("samples (%)")
+    return _finished(figure, runs, "line: median")
+
+
+def save(figure: Figure, path: Path) -> None:
+    """Write a picture; its ending says which kind: png, svg or pdf. Raises `StationError`."""
+    kinds = {".png", ".svg", ".pdf"}
+    if path.suffix.lower() not in kinds:
+        raise StationError(f"{path}: allowed is a file ending in {', '.join(sorted(kinds))}")
+    figure.savefig(path, dpi=160, facecolor="white")
+
+
+def position_of(result: Result) -> Fields:
+    """The fields that say where a robot is; raises `StationError` where there are none."""
+    fields = position_fields([name for name, column in result.columns.items() if column.dtype.kind == "f"])
+    if fields is None:
+        raise StationError(
+            f"{result.robot} {result.stream} has no position, such as x and y, or latitude and longitude; "
+            f"it has {', '.join(result.columns)}"
+        )
+    return fields
+
+
+def numeric(result: Result) -> list[str]:
+    """The fields that can be drawn."""
+    return [name for name, column in result.columns.items() if column.dtype.kind in "fb"]
+
+
+def when(t_us: int) -> str:
+    """A run's start, as a legend needs it."""
+    at = datetime.fromtimestamp(t_us // 1_000_000, tz=timezone.utc)
+    return at.strftime("%Y-%m-%d %H:%M:%S")
+
+
+def _column(run: Run, field: str) -> NDArray[np.float64]:
+    column = run.result.columns.get(field)
+    if column is None or column.dtype.kind not in "fb":
+        raise StationError(
+            f"{run.name}: {field} cannot be drawn; what can is {', '.join(numeric(run.result))}"
+        )
+    return column.astype(np.float64)
+
+
+def _thinned(times_us: Any, values: Any) -> tuple[Any, Any]:
+    """At most some thousand points, of each stretch the lowest and the highest; NaN where a hole is."""
+    if len(values) > _POINTS:
+        edges = np.linspace(0, len(values), _POINTS // 2 + 1).astype(int)[:-1]
+        lows, highs = np.fmin.reduceat(values, edges), np.fmax.reduceat(values, edges)
+        values = np.column_stack([lows, highs]).ravel()
+        times_us = np.repeat(times_us[edges], 2)
+    steps = np.diff(times_us)
+    if not len(steps):
+        return times_us, values
+    usual = np.median(steps[steps > 0]) if (steps > 0).any() else 0
+    holes = np.flatnonzero(steps > max(_HOLE_US, _HOLE * usual)) + 1
+    return np.insert(times_us, holes, times_us[holes - 1] + 1), np.insert(values, holes, np.nan)
+
+
+def _bins(values: Any) -> int:
+    return int(min(80, max(10, np.sqrt(len(values)))))
+
+
+def _style(i: int) -> dict[str, Any]:
+    return {
+        "color": COLOURS[i % len(COLOURS)],
+        "linestyle": _DASHES[i // len(COLOURS) % len(_DASHES)],
+    }
+
+
+def _labelled(runs: Sequence[Run], field: str) -> str:
+    unit = " or ".join(dict.fromkeys(run.result.unit(field) for run in runs))
+    return f"{field}\n({unit})" if unit and unit != "1" else field
+
+
+def _figure(width: float, height: float) -> Figure:
+    figure = Figure(figsize=(width, height), layout="constrained")
+    FigureCanvasAgg(figure)
+    return figure
+
+
+def _panels(n: int, *, height: float, shared: bool) -> tuple[Figure, list[Any]]:
+    figure = _figure(10.0, 0.9 + height * n)
+    panels = [row[0] for row in figure.subplots(n, 1, sharex=shared, squeeze=False)]
+    for panel in panels:
+        _dress(panel)
+    return figure, panels
+
+
+def _dress(panel: Any) -> None:
+    panel.grid(visible=True, color="#d0d0d0", linewidth=0.6)
+    panel.set_axisbelow(True)
+    for side in ("top", "right"):
+        panel.spines[side].set_visible(False)
+
+
+def _finished(figure: Figure, runs: Sequence[Run], note: str) -> Figure:
+    handles, labels = figure.axes[0].get_legend_handles_labels()
+    if len(runs) > 1:
+        figure.legend(handles, labels, loc="outside upper left", ncols=min(4, len(runs)), frameon=False)
+        title = note
+    else:
+        title = ", ".join(part for part in (runs[0].name, note) if part)
+    if title:
+        figure.suptitle(title, fontsize=11)
+    return figure

@@ -1,0 +1,213 @@
+"""`iort cost`: dollars a robot-hour and a month, and what a larger fleet needs."""
+
+from __future__ import annotations
+
+import json
+import math
+import os
+from dataclasses import asdict, replace
+from datetime import datetime, timezone
+from pathlib import Path
+from statistics import mean
+from typing import Annotated, Any
+
+import typer
+from rich.table import Table
+
+from iort_agent.config.file import Config, load_config
+from iort_agent.errors import AgentError
+from iort_station.cli.console import Console
+from iort_station.cli.where import Where
+from iort_station.cost import line_items, model, report, scale
+from iort_station.cost.deployed import as_deployed
+from iort_station.cost.fixed_costs import deployment_dollars_per_month
+from iort_station.cost.price_list import API_REGION, Listed, keep, kept_at, load, read
+from iort_station.cost.prices import AS_OF, PRICES, REGION
+from iort_station.cost.usage import Usage
+from iort_station.errors import StationError
+
+commands = typer.Typer()
+_out = Console()
+_DEFAULT = Usage()
+
+
+@commands.command("cost")
+def cost_(
+    context: typer.Context,
+    robots: Annotated[int, typer.Option(help="How many robots.")] = 1,
+    rate_hz: Annotated[float | None, typer.Option(help="Samples a second, of each stream.")] = None,
+    streams: Annotated[int | None, typer.Option(help="Streams that a robot's sources bring.")] = None,
+    live_hz: Annotated[float | None, typer.Option(help="Live messages a second.")] = None,
+    batch_s: Annotated[
+        float | None, typer.Option(help="Seconds a batch spans; 0 sends each sample by itself.")
+    ] = None,
+    ping_hz: Annotated[float | None, typer.Option(help="Pings a second over each path.")] = None,
+    hours_per_day: Annotated[
+        float, typer.Option(help="Hours a robot drives a day.")
+    ] = _DEFAULT.hours_per_day,
+    viewers: Annotated[int, typer.Option(help="People who watch the fleet.")] = _DEFAULT.viewers,
+    retention_days: Annotated[int, typer.Option(help="Days that items are kept.")] = _DEFAULT.retention_days,
+    live_ms: Annotated[float, typer.Option(help="Billed milliseconds of Lambda 1.")] = _DEFAULT.live_ms,
+    summarize_ms: Annotated[
+        float, typer.Option(help="Billed milliseconds of Lambda 2.")
+    ] = _DEFAULT.summarize_ms,
+    connects_per_hour: Annotated[
+        float, typer.Option(help="How often a robot connects in an hour.")
+    ] = _DEFAULT.connects_per_hour,
+    command_hz: Annotated[float, typer.Option(help="Commands a second to a robot.")] = _DEFAULT.command_hz,
+    dashboard_hours: Annotated[
+        float, typer.Option(help="Hours a month that somebody looks at CloudWatch on the live page.")
+    ] = _DEFAULT.dashboard_hours,
+    config: Annotated[
+        Path | None, typer.Option(help="A car.yaml: its rates, where no option says another.")
+    ] = None,
+    deployed: Annotated[
+        bool,
+        typer.Option(
+            "--deployed",
+            help="Memory, concurrency, logs, alarms, dashboards, recovery and key as they are deployed.",
+        ),
+    ] = False,
+    refresh: Annotated[
+        bool,
+        typer.Option(
+            "--refresh",
+            help="Read AWS' price list with your credentials, say what differs, and keep it for later calls.",
+        ),
+    ] = False,
+    as_json: Annotated[bool, typer.Option("--json", help="As JSON.")] = False,
+) -> None:
+    """What a fleet costs, by service and lane, beside the thesis' layout; list prices of one date."""
+    usage = _configured(_DEFAULT, config)
+    listed = _prices(context.obj, refresh=refresh)
+    prices = PRICES if listed is None else listed.prices()
+    if deployed:
+        usage = as_deployed(usage, context.obj.cloud())
+    said: dict[str, Any] = {
+        "rate_hz": rate_hz,
+        "streams": streams,
+        "live_hz": live_hz,
+        "batch_s": batch_s,
+        "ping_hz": ping_hz,
+    }
+    usage = replace(
+        usage,
+        robots=robots,
+        hours_per_day=hours_per_day,
+        viewers=viewers,
+        retention_days=retention_days,
+        live_ms=live_ms,
+        summarize_ms=summarize_ms,
+        connects_per_hour=connects_per_hour,
+        command_hz=command_hz,
+        dashboard_hours=dashboard_hours,
+        **{name: value for name, value in said.items() if value is not None},
+    ).check()
+    if as_json:
+        _out.print_json(json.dumps(_as_json(usage, listed)))
+        return
+    if refresh and listed is not None:
+        _out.print(_table("AWS' price list", report.differences(listed)))
+        for name, why in listed.kept.items():
+            _out.print(f"{name}: the built-in price is kept. {why}")
+    _out.print(
+        f"{_dated(listed)}: "
+        f"{usage.robots:,} robot{'s' * (usage.robots != 1)} at {usage.rate_hz:g} Hz"
+        f"{f' in each of {usage.streams} streams' if usage.streams > 1 else ''}, "
+        f"live {usage.live_hz:g} Hz, {usage.hours_per_day:g} h a day, kept {usage.retention_days} days.\n"
+    )
+    for title, rows in (
+        ("A robot-hour", report.robot_hour(usage, prices)),
+        ("A month", report.month(usage, prices)),
+        ("What if", report.what_if(usage, prices)),
+        ("What it needs of the default quotas", report.quotas(scale.on_paper(usage, prices))),
+    ):
+        _out.print(_table(title, rows))
+
+
+def _configured(usage: Usage, config: Path | None) -> Usage:
+    if config is None:
+        return usage
+    try:
+        car = load_config(config)
+    except AgentError as error:
+        raise StationError(str(error)) from error
+    return replace(usage, **_rates(car))
+
+
+def _rates(car: Config) -> dict[str, Any]:
+    # What a source alone does not say, such as the rate of a ROS topic, is as in a `Usage`.
+    rates = [
+        (getattr(source, "rate_hz", _DEFAULT.rate_hz), getattr(source, "rate_hz", math.inf))
+        for source in car.sources
+        for _ in range(max(1, len(set(source.streams()))))
+    ]
+    # The live lane's rate is of each stream, which sends no more than its source brings.
+    live_hz = sum(min(car.live.rate_hz, most_hz) for _, most_hz in rates)
+    return {
+        "live_hz": live_hz if car.live.enabled else 0.0,
+        "batch_s": car.record.batch_s,
+        "ping_hz": car.ping.rate_hz,
+        "agent_every_s": car.metrics.every_s if car.metrics.enabled else 0.0,
+        "streams": len(rates),
+        "rate_hz": mean(rate_hz for rate_hz, _ in rates),
+    }
+
+
+def _prices(where: Where, *, refresh: bool) -> Listed | None:
+    """AWS' price list as it is now, or as it was when it was last asked for; None for the built-in prices."""
+    path = kept_at(os.environ)
+    if not refresh:
+        return load(path)
+    cloud = where.account(region=REGION)
+    listed = read(
+        cloud.client("pricing", API_REGION), str(cloud.region_name), datetime.now(timezone.utc).date()
+    )
+    keep(listed, path)
+    return listed
+
+
+def _dated(listed: Listed | None) -> str:
+    """Of when and of where the prices are."""
+    if listed is None:
+        return f"List prices of {AS_OF} in US dollars, {REGION}"
+    kept = f"; of {AS_OF} as they were: {', '.join(listed.kept)}" if listed.kept else ""
+    return f"AWS' price list as read on {listed.read_on}, {listed.region}{kept}; PubNub's prices of {AS_OF}"
+
+
+def _as_json(usage: Usage, listed: Listed | None) -> dict[str, Any]:
+    prices = PRICES if listed is None else listed.prices()
+    paper = scale.on_paper(usage, prices)
+    ours, thesis = model.bill(usage, prices), model.thesis_bill(usage, prices)
+
+    def items(found: list[line_items.Item]) -> list[dict[str, Any]]:
+        return [{**item._asdict(), "dollars_per_robot_hour": item.dollars} for item in found]
+
+    return {
+        "prices_as_of": AS_OF if listed is None else listed.read_on,
+        "prices_kept": {} if listed is None else listed.kept,
+        "prices_changed": {} if listed is None else listed.changed(),
+        "region": REGION if listed is None else listed.region,
+        "usage": asdict(usage),
+        "items": items(ours),
+        "thesis_items": items(thesis),
+        "pubnub_items": items(model.pubnub_bill(usage, prices)),
+        "dollars_per_robot_hour": line_items.total(ours),
+        "thesis_dollars_per_robot_hour": line_items.total(thesis),
+        "deployment_dollars_per_month": deployment_dollars_per_month(usage, prices),
+        "fleet_dollars_per_month": paper.aws_dollars_per_month,
+        "pubnub_mau_dollars_per_month": model.pubnub_mau_dollars_per_month(usage),
+        "quotas": [
+            {"name": n.name, "needed": n.needed, "quota": n.quota.value, "robots_at_quota": n.robots_at_quota}
+            for n in paper.needs
+        ],
+    }
+
+
+def _table(title: str, rows: report.Rows) -> Table:
+    table = Table(title=title, title_justify="left", title_style="bold")
+    for i, name in enumerate(rows.head):
+        table.add_column(name, justify="right" if i else "left")
+    for row in rows.body:
+        table.add_row(*row, style="bold" if row[0].startswith("total") else "")
+    return table

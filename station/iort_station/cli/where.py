@@ -1,0 +1,77 @@
+"""Which cloud an `iort` command means, by the options before its name."""
+
+from __future__ import annotations
+
+import os
+import socket
+from dataclasses import dataclass, replace
+from pathlib import Path
+from urllib.parse import urlsplit
+
+from botocore.exceptions import BotoCoreError
+
+from iort_station.cli.progress import say
+from iort_station.cloud import Cloud
+from iort_station.errors import StationError
+
+# Whoever has set one of these means an AWS account.
+_AWS_NAMED = ("AWS_PROFILE", "AWS_REGION", "AWS_DEFAULT_REGION", "AWS_ACCESS_KEY_ID")
+# It is on this machine.
+_CONNECT_S = 5.0
+
+
+@dataclass
+class Where:
+    """The options that name a cloud; a command finds it in ``context.obj``."""
+
+    namespace: str
+    profile: str | None
+    region: str | None
+    local: bool
+    embedded: Path
+
+    def cloud(self) -> Cloud:
+        """The cloud that they name: an embedded one that runs here, unless something says AWS.
+
+        Raises `StationError` where there is neither one nor what AWS asks for.
+        """
+        said = self.profile or self.region or any(os.environ.get(name) for name in _AWS_NAMED)
+        if self.local or (not said and self.embedded.exists()):
+            if not self.local:
+                say("on the embedded cloud that runs in this checkout")
+            return _alive(Cloud.load(self.embedded), self.embedded)
+        cloud = Cloud(namespace=self.namespace, profile=self.profile, region=self.region)
+        try:
+            return cloud.check()
+        except StationError as error:
+            if said:
+                raise
+            raise StationError(
+                f"{error}. No embedded cloud runs here either; `make demo` starts one"
+            ) from error
+
+    def account(self, *, region: str) -> Cloud:
+        """An AWS account, whatever runs here; in the ``region`` where nothing says another.
+
+        Raises `StationError` where the embedded cloud is asked for, or credentials are missing.
+        """
+        if self.local:
+            raise StationError("only AWS has this, and --local means the embedded cloud")
+        cloud = Cloud(namespace=self.namespace, profile=self.profile, region=self.region)
+        try:
+            named = cloud.region_name
+        except BotoCoreError as error:
+            raise StationError(f"AWS: {error}") from error
+        return replace(cloud, region=named or region).check()
+
+
+def _alive(cloud: Cloud, path: Path) -> Cloud:
+    """The embedded cloud; raises `StationError` where nothing is left of it but its description."""
+    address = urlsplit(cloud.endpoint_url or "")
+    try:
+        socket.create_connection((address.hostname or "", address.port or 0), _CONNECT_S).close()
+    except OSError as error:
+        raise StationError(
+            f"the embedded cloud of {path} does not answer, as after a kill: `make demo` starts another"
+        ) from error
+    return cloud

@@ -1,0 +1,157 @@
+"""Where the operator's cloud is: an AWS account, or the embedded cloud of this checkout.
+
+Both are the same to the rest of the station: clients of AWS' services, the names that the stacks
+put out, and the address where robots connect.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+from dataclasses import asdict, dataclass, field
+from functools import cache, cached_property
+from pathlib import Path
+from typing import Any
+from urllib.parse import urlsplit
+
+import boto3
+import botocore.session
+from botocore.config import Config
+from botocore.exceptions import BotoCoreError, ClientError
+
+from iort_contract import DEFAULT_NAMESPACE
+from iort_station.errors import StationError
+
+# Where an embedded cloud that runs in this checkout says how to reach it.
+EMBEDDED = Path(__file__).resolve().parents[2] / "build" / "local" / "cloud.json"
+
+# An embedded cloud has credentials of its own, and the profile that AWS_PROFILE names need not exist.
+_NO_PROFILE = {"profile": (None, None, None, None)}
+_CONFIG = Config(retries={"mode": "standard", "max_attempts": 5}, connect_timeout=5, read_timeout=20)
+
+
+def without_proxy(host: str) -> None:
+    """Let no library of this process ask a proxy for ``host``, which is on this machine."""
+    known = os.environ.get("no_proxy") or os.environ.get("NO_PROXY", "")
+    if host and host not in known.split(","):
+        os.environ["no_proxy"] = os.environ["NO_PROXY"] = f"{known},{host}".lstrip(",")
+
+
+@dataclass(frozen=True, kw_only=True)
+class Cloud:
+    """A deployment of the stacks. The fields that are empty follow AWS' usual chain."""
+
+    namespace: str = DEFAULT_NAMESPACE
+    region: str | None = None
+    profile: str | None = None
+    endpoint_url: str | None = None
+    ca_bundle: str | None = None
+    access_key_id: str | None = None
+    secret_access_key: str | None = field(default=None, repr=False)
+    mqtt_host: str | None = None
+    mqtt_port: int = 8883
+    root_ca_pem: str | None = None
+
+    @classmethod
+    def load(cls, path: Path) -> Cloud:
+        """The embedded cloud that wrote ``path``; raises `StationError` where none is running."""
+        try:
+            cloud = cls(**json.loads(path.read_text()))
+        except FileNotFoundError as error:
+            raise StationError(f"no embedded cloud is running: {path} is not there") from error
+        except (OSError, TypeError, ValueError) as error:
+            raise StationError(f"{path} does not describe an embedded cloud: {error}") from error
+        without_proxy(urlsplit(cloud.endpoint_url or "").hostname or "")
+        return cloud
+
+    def save(self, path: Path) -> None:
+        """Write what `load` reads."""
+        path.write_text(json.dumps(asdict(self)))
+
+    @cached_property
+    def _session(self) -> boto3.Session:
+        return boto3.Session(
+            botocore_session=None if self.access_key_id is None else botocore.session.Session(_NO_PROFILE),
+            profile_name=self.profile,
+            # Of AWS' tools boto3 alone reads AWS_DEFAULT_REGION only.
+            region_name=self.region or os.environ.get("AWS_REGION"),
+            aws_access_key_id=self.access_key_id,
+            aws_secret_access_key=self.secret_access_key,
+        )
+
+    def check(self) -> Cloud:
+        """Itself; raises `StationError` where profile, region or credentials are missing."""
+        try:
+            region, credentials = self._session.region_name, self._session.get_credentials()
+        except BotoCoreError as error:
+            raise StationError(f"AWS: {error}") from error
+        if not region:
+            raise StationError("no AWS region: give --region, or set AWS_REGION")
+        if credentials is None:
+            raise StationError(
+                "no AWS credentials: give --profile, or set AWS_PROFILE, or AWS_ACCESS_KEY_ID and "
+                "AWS_SECRET_ACCESS_KEY; `aws configure` writes a profile"
+            )
+        return self
+
+    @cached_property
+    def _clients(self) -> dict[tuple[str, str | None], Any]:
+        return {}
+
+    def client(self, service: str, region: str | None = None) -> Any:
+        """A boto3 client, made once; of another ``region`` for a service that is in few.
+
+        Raises `StationError` where region or credentials are missing.
+        """
+        key = service, region
+        if key not in self._clients:
+            try:
+                self._clients[key] = self._session.client(
+                    service,
+                    region_name=region,
+                    endpoint_url=self.endpoint_url,
+                    verify=self.ca_bundle,
+                    config=_CONFIG,
+                )
+            except BotoCoreError as error:
+                raise StationError(f"no AWS client for {service}: {error}") from error
+        return self._clients[key]
+
+    @property
+    def region_name(self) -> str | None:
+        """The region by AWS' usual chain."""
+        found = self._session.region_name
+        return None if found is None else str(found)
+
+    @cached_property
+    def mqtt_endpoint(self) -> str:
+        """The host that robots connect to."""
+        if self.mqtt_host:
+            return self.mqtt_host
+        answer = self.client("iot").describe_endpoint(endpointType="iot:Data-ATS")
+        return str(answer["endpointAddress"])
+
+    def output(self, noun: str, name: str) -> str:
+        """An output of a stack, such as ``("storage", "TelemetryTable")``.
+
+        Raises `StationError` where the stack is not deployed or has no such output.
+        """
+        stack = f"{self.namespace}-{noun}"
+        try:
+            outputs = _outputs(self.client("cloudformation"), stack)
+        except ClientError as error:
+            if error.response["Error"]["Code"] != "ValidationError":
+                raise StationError(f"stack {stack} cannot be read: {error}") from error
+            where = f"{self._session.region_name}: `make deploy`, or --region and --namespace"
+            raise StationError(f"stack {stack} is not deployed in {where} of where it is") from error
+        except BotoCoreError as error:
+            raise StationError(f"stack {stack} cannot be read: {error}") from error
+        if name not in outputs:
+            raise StationError(f"stack {stack} has no output {name}; deploy the current stacks")
+        return outputs[name]
+
+
+@cache
+def _outputs(cloudformation: Any, stack: str) -> dict[str, str]:
+    described = cloudformation.describe_stacks(StackName=stack)["Stacks"][0]
+    return {output["OutputKey"]: output["OutputValue"] for output in described.get("Outputs", [])}

@@ -1,0 +1,161 @@
+"""The cost model's tables, as rows of text: the command prints them, the README and the bench keep them."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import NamedTuple
+
+from iort_station.cost import line_items, model
+from iort_station.cost.fixed_costs import deployment_dollars_per_month
+from iort_station.cost.price_list import PRODUCTS, Listed
+from iort_station.cost.prices import AS_OF, PRICES, REGION, Price
+from iort_station.cost.scale import Scale
+from iort_station.cost.usage import Usage, variations
+
+# A line of the robot-hour's table begins here, as its numbers do; what is below is in the totals alone.
+_LEAST_DOLLARS = 0.00005
+
+
+class Rows(NamedTuple):
+    """A table: its column names and its lines."""
+
+    head: tuple[str, ...]
+    body: list[tuple[str, ...]]
+
+    def markdown(self) -> str:
+        """As a Markdown table, numbers to the right."""
+        lines = [self.head, ("---", *("---:" for _ in self.head[1:])), *self.body]
+        return "\n".join(f"| {' | '.join(line)} |" for line in lines)
+
+
+def robot_hour(usage: Usage, prices: Mapping[str, Price] = PRICES) -> Rows:
+    """Dollars a robot-hour by service and lane, thesis' layout beside ours, PubNub apart."""
+    ours, thesis = model.bill(usage, prices), model.thesis_bill(usage, prices)
+    pubnub = model.pubnub_bill(usage, prices), model.pubnub_bill(usage, prices, thesis=True)
+    body: list[tuple[str, ...]] = []
+    services = sorted({item.service for item in [*ours, *thesis]})
+    for service in services:
+        lanes: list[str] = []
+        for item in [*ours, *thesis]:
+            if item.service == service and item.lane not in lanes:
+                lanes.append(item.lane)
+        body.extend(
+            (f"{service}, {lane}", *(_shown(items, service, lane) for items in (thesis, ours)), "")
+            for lane in lanes
+            if max(_sum(thesis, service, lane), _sum(ours, service, lane)) >= _LEAST_DOLLARS
+        )
+    whole = line_items.total(thesis), line_items.total(ours)
+    body.append(("total AWS", _dollars(whole[0]), _dollars(whole[1]), f"1/{whole[0] / whole[1]:.1f}"))
+    unlogged = [sum(i.dollars for i in items if i.price != "logs") for items in (thesis, ours)]
+    body.append(("of it without log lines", *map(_dollars, unlogged), _ratio((unlogged[0], unlogged[1]))))
+    both = line_items.total(pubnub[1]), line_items.total(pubnub[0])
+    body.append(("PubNub, plan by transactions", _dollars(both[0]), _dollars(both[1]), _ratio(both)))
+    return Rows(("dollars a robot-hour", "a message a sample", "iort", "ratio"), body)
+
+
+def month(usage: Usage, prices: Mapping[str, Price] = PRICES) -> Rows:
+    """Dollars a month for the fleet, and what a deployment costs whoever drives."""
+    aws = line_items.dollars_per_month(model.bill(usage, prices), usage)
+    thesis = line_items.dollars_per_month(model.thesis_bill(usage, prices), usage)
+    transactions = line_items.dollars_per_month(model.pubnub_bill(usage, prices), usage)
+    users = model.pubnub_mau_dollars_per_month(usage)
+    body: list[tuple[str, ...]] = [
+        ("AWS, the driving", f"{aws:,.2f}"),
+        *(
+            (f"AWS, {name}", f"{dollars:,.2f}")
+            for name, dollars in deployment_dollars_per_month(usage, prices).items()
+        ),
+        ("AWS, the same driving a message a sample", f"{thesis:,.2f}"),
+        ("PubNub, plan by transactions", f"{transactions:,.2f}"),
+        ("PubNub, plan by monthly active users", "ask PubNub" if users is None else f"{users:,.2f}"),
+    ]
+    return Rows((f"dollars a month, {usage.robots:,} robot{'s' * (usage.robots != 1)}", ""), body)
+
+
+def differences(listed: Listed) -> Rows:
+    """What AWS' price list says otherwise than the built-in prices."""
+    body: list[tuple[str, ...]] = [
+        (f"{name}: {PRICES[name].per:,.0f} x {PRICES[name].unit}", f"{ours:g}", f"{aws:g}")
+        for name, (ours, aws) in listed.changed().items()
+    ]
+    same = len(listed.each) - len(body)
+    body.append((f"as built in: {same} of {len(PRODUCTS)}", "", ""))
+    return Rows(("dollars", f"{AS_OF}, {REGION}", f"{listed.read_on}, {listed.region}"), body)
+
+
+def what_if(usage: Usage, prices: Mapping[str, Price] = PRICES) -> Rows:
+    """One setting changed at a time: dollars a robot-hour, and the share of the thesis' layout."""
+    body: list[tuple[str, ...]] = []
+    for name, other in variations(usage):
+        ours, thesis, pubnub = (
+            line_items.total(made(other, prices))
+            for made in (model.bill, model.thesis_bill, model.pubnub_bill)
+        )
+        body.append((name, _dollars(ours), f"1/{thesis / ours:.1f}", _dollars(pubnub)))
+    return Rows(("dollars a robot-hour", "AWS", "of a message a sample", "PubNub by transactions"), body)
+
+
+def quotas(scale: Scale) -> Rows:
+    """What a fleet needs of each default quota, the one that breaks first on top."""
+    body: list[tuple[str, ...]] = []
+    for need in scale.needs:
+        at = "never" if need.robots_at_quota is None else f"{need.robots_at_quota:,.0f}"
+        fixed = "" if need.quota.adjustable else ", fixed"
+        quota = f"{need.quota.value:,.0f} {need.quota.unit}{fixed}"
+        body.append((need.name, f"{need.needed:,.1f}", quota, _times(need.times), at))
+    return Rows(
+        (
+            f"{scale.robots:,} robot{'s' * (scale.robots > 1)}",
+            "needed",
+            "quota",
+            "times",
+            "robots at the quota",
+        ),
+        body,
+    )
+
+
+def fleets(scales: list[Scale]) -> Rows:
+    """A column a fleet: the need of each quota as a multiple of it, and dollars a month."""
+    head = (
+        "needed, as a multiple of the default quota",
+        *(f"{scale.robots:,} robot{'s' * (scale.robots > 1)}" for scale in scales),
+    )
+    body: list[tuple[str, ...]] = []
+    for need in scales[-1].needs:
+        times = [next(n.times for n in scale.needs if n.name == need.name) for scale in scales]
+        body.append((need.name, *(f"**{_times(value)}**" if value > 1 else _times(value) for value in times)))
+    body.append(("breaks first", *(_first(scale) for scale in scales)))
+    body.append(("AWS, dollars a month", *(f"{scale.aws_dollars_per_month:,.0f}" for scale in scales)))
+    body.append(
+        ("PubNub by transactions, a month", *(f"{scale.pubnub_dollars_per_month:,.0f}" for scale in scales))
+    )
+    body.append(("PubNub, publishes/s", *(f"{scale.pubnub_publishes_per_s:,.0f}" for scale in scales)))
+    return Rows(head, body)
+
+
+def _times(value: float) -> str:
+    if value >= 10:
+        return f"{value:,.0f}"
+    return f"{value:.2g}" if value >= 0.001 else "< 0.001"
+
+
+def _first(scale: Scale) -> str:
+    return scale.breaks_first.name if scale.breaks_first.times > 1 else "none"
+
+
+def _sum(items: list[line_items.Item], service: str, lane: str) -> float:
+    return sum(item.dollars for item in items if (item.service, item.lane) == (service, lane))
+
+
+def _shown(items: list[line_items.Item], service: str, lane: str) -> str:
+    dollars = _sum(items, service, lane)
+    return _dollars(dollars) if dollars >= _LEAST_DOLLARS else ""
+
+
+def _dollars(dollars: float) -> str:
+    return f"{dollars:.4f}" if dollars < 1 else f"{dollars:,.2f}"
+
+
+def _ratio(both: tuple[float, float]) -> str:
+    return f"1/{both[0] / both[1]:.1f}" if both[1] else ""

@@ -1,0 +1,112 @@
+"""What a fleet needs of AWS, held against the default quotas: which of them breaks first. Pure."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import replace
+from typing import NamedTuple
+
+from iort_agent.mqtt.reconnect import SHORTEST_S
+from iort_station.cost.line_items import dollars_per_month, total
+from iort_station.cost.model import SUBSCRIPTIONS, bill, pubnub_bill
+from iort_station.cost.prices import PRICES, QUOTAS, Price, Quota
+from iort_station.cost.sizes import measure
+from iort_station.cost.usage import Usage
+
+
+class Need(NamedTuple):
+    """What a fleet needs of one quota, and with how many robots the quota is used up (None: never)."""
+
+    name: str
+    needed: float
+    quota: Quota
+    robots_at_quota: float | None
+
+    @property
+    def times(self) -> float:
+        """The need as a multiple of the quota."""
+        return self.needed / self.quota.value
+
+
+class Scale(NamedTuple):
+    """A fleet on paper: needs in the order in which the quotas break, and dollars a month."""
+
+    robots: int
+    needs: list[Need]
+    aws_dollars_per_month: float
+    pubnub_dollars_per_month: float
+    pubnub_publishes_per_s: float
+
+    @property
+    def breaks_first(self) -> Need:
+        """The quota that the fewest robots use up."""
+        return self.needs[0]
+
+
+def on_paper(usage: Usage, prices: Mapping[str, Price] = PRICES) -> Scale:
+    """What the fleet needs, all robots driving at once."""
+    one = _per_robot(usage)
+    quotas = dict(QUOTAS)
+    if usage.live_concurrency:
+        page = "live_concurrency, a parameter of the deployment"
+        quotas[_RESERVED] = Quota(usage.live_concurrency, "executions", adjustable=True, page=page)
+    needs = [
+        Need(
+            name,
+            one[name] * (1 if name in _ONE_ROBOTS else usage.robots),
+            quota,
+            None if name in _ONE_ROBOTS or not one[name] else quota.value / one[name],
+        )
+        for name, quota in quotas.items()
+    ]
+    needs.sort(key=lambda need: need.robots_at_quota or float("inf"))
+    return Scale(
+        usage.robots,
+        needs,
+        dollars_per_month(bill(usage, prices), usage),
+        total(pubnub_bill(usage, prices)) * usage.robot_hours_per_month,
+        usage.live_hz * usage.robots,
+    )
+
+
+def fleets(usage: Usage, sizes: tuple[int, ...] = (1, 100, 10_000, 1_000_000)) -> list[Scale]:
+    """The same driving with other numbers of robots."""
+    return [on_paper(replace(usage, robots=robots)) for robots in sizes]
+
+
+_RESERVED = "Lambda 1: concurrency reserved by this deployment"
+# What does not grow with the fleet: each robot has a connection and partition keys of its own.
+_ONE_ROBOTS = frozenset(
+    {
+        "IoT Core: publishes of one connection",
+        "IoT Core: connects of one client id",
+        "DynamoDB: writes to one partition",
+    }
+)
+
+
+def _per_robot(usage: Usage) -> dict[str, float]:
+    sizes = measure(usage.rate_hz, usage.batch_s)
+    batches = usage.batches_per_s + usage.own_batches_per_s
+    publishes = batches + usage.live_hz + 3 * usage.ping_hz + usage.clock_pings_per_s
+    telemetry = usage.batches_per_s * -(-sizes.telemetry_item // 1024) + usage.own_batches_per_s
+    summary = usage.batches_per_s * -(-sizes.summary_item // 1024) + usage.own_batches_per_s
+    # Lambda 2 is bounded by the stream's shards, Lambda 1 by what it waits for.
+    busy = usage.live_hz * usage.live_ms / 1000 + usage.ping_hz * 0.005
+    # What passes the broker is looked at by three rules.
+    live_rules = usage.live_hz + 2 * usage.live_at_broker_per_s
+    return {
+        _RESERVED: usage.live_hz * usage.live_ms / 1000,
+        "IoT Core: connections": 1,
+        "IoT Core: connects in a minute after an outage": 1,
+        "IoT Core: connects of one client id": 1 / SHORTEST_S,
+        "IoT Core: subscriptions": SUBSCRIPTIONS,
+        # Basic Ingest is counted in: it passes the same gateway.
+        "IoT Core: publishes in": publishes,
+        "IoT Core: rule evaluations": batches + live_rules + 2 * usage.ping_hz + usage.clock_pings_per_s,
+        "IoT Core: publishes of one connection": publishes,
+        "DynamoDB: writes to table telemetry": telemetry,
+        "DynamoDB: writes to table summary": summary,
+        "DynamoDB: writes to one partition": usage.stream_batches_per_s * -(-sizes.telemetry_item // 1024),
+        "Lambda: concurrent executions": busy,
+    }

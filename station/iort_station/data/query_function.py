@@ -1,0 +1,104 @@
+"""Samples chosen by the query function in the cloud: functions/query.py."""
+
+from __future__ import annotations
+
+import base64
+import json
+import ssl
+import urllib.request
+import zlib
+from collections.abc import Iterator, Mapping
+from typing import Any
+
+import numpy as np
+
+from iort_contract import PLAIN_CODEC
+from iort_station.cli.progress import Told
+from iort_station.cloud import Cloud
+from iort_station.data.blocks import Block, column_of, join, ordered
+from iort_station.data.selection import Selection
+from iort_station.data.sensors import Sensors
+from iort_station.data.stored import Refused
+from iort_station.errors import StationError
+from iort_station.fleet import inventory
+
+_DOWNLOAD_S = 60
+
+
+def samples(
+    cloud: Cloud,
+    selection: Selection,
+    *,
+    refused: Refused,
+    sensors: Sensors,
+    scan: bool = False,
+    progress: Told | None = None,
+) -> Iterator[Block]:
+    """The selection's samples, from as many invocations as it takes.
+
+    Raises `StationError` where the function refuses or fails, and at the end where a field that was
+    named was in none of the samples.
+    """
+    request: dict[str, Any] = {
+        "robot": selection.robot,
+        "stream": selection.stream,
+        "start_us": selection.start_us,
+        "end_us": selection.end_us,
+        "fields": None if selection.fields is None else list(selection.fields),
+        "where": selection.where,
+        "scan": scan,
+    }
+    function = cloud.output("processing", "QueryFunction")
+    parts: list[Block] = []
+    there: set[str] = set()
+    while True:
+        reply = _invoke(cloud, function, request)
+        part = _unpacked(cloud, reply)
+        parts.append(part)
+        there |= set(reply["fields"])
+        refused.count += reply["refused"]
+        refused.reason = refused.reason or reply["reason"]
+        sensors.absent.update(reply["absent"])
+        if progress is not None and len(part.times_us):
+            progress(reply["items"], int(part.times_us[-1]))
+        if reply["token"] is None:
+            break
+        request["token"] = reply["token"]
+    if there:
+        inventory.check_fields(cloud, selection, there)
+    # What a batch holds may reach into the next, which may be another invocation's.
+    block = ordered(join(parts))
+    if len(block.times_us):
+        names = selection.fields or tuple(block.columns)
+        yield Block(block.times_us, {name: block.columns[name] for name in names})
+
+
+def _invoke(cloud: Cloud, function: str, request: Mapping[str, Any]) -> dict[str, Any]:
+    answer = cloud.client("lambda").invoke(FunctionName=function, Payload=json.dumps(request).encode())
+    text = answer["Payload"].read()
+    reply: dict[str, Any] = json.loads(text)
+    if "FunctionError" in answer:
+        raise StationError(f"the query function failed: {reply.get('errorMessage', text[:500])}")
+    if "error" in reply:
+        raise StationError(f"the query function refused: {reply['error']}")
+    if reply["codec"] != PLAIN_CODEC:
+        raise StationError(f"the query function answers in {reply['codec']}: deploy the current stacks")
+    return reply
+
+
+def _unpacked(cloud: Cloud, reply: Mapping[str, Any]) -> Block:
+    packed = base64.b64decode(reply["samples"]) if "samples" in reply else _download(cloud, reply["url"])
+    body = json.loads(zlib.decompress(packed))
+    times = np.cumsum(np.array(body["dt"], dtype=np.int64))
+    return Block(times, {name: column_of(column) for name, column in body["fields"].items()})
+
+
+def _download(cloud: Cloud, url: str) -> bytes:
+    context = ssl.create_default_context(cafile=cloud.ca_bundle)
+    try:
+        with urllib.request.urlopen(  # noqa: S310 - signed by our own function
+            url, timeout=_DOWNLOAD_S, context=context
+        ) as response:
+            return bytes(response.read())
+    except OSError as error:
+        raise StationError(f"the result cannot be fetched: {error}") from error

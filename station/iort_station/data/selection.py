@@ -1,0 +1,79 @@
+"""What of a stream somebody asks for."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+
+import iort_contract
+from iort_contract import ContractError, expression
+from iort_contract.expression import ExpressionError, Node
+from iort_station.cli.times import Time, time_us
+from iort_station.errors import StationError
+
+# What each derived quantity is made of.
+MADE_OF = {"speed_mps": ("speed",), "power_w": ("voltage_input", "current_input")}
+
+
+@dataclass(frozen=True, kw_only=True)
+class Selection:
+    """A range of a stream, start included and end not; the fields (None for all); and which samples."""
+
+    robot: str
+    stream: str
+    start_us: int | None = None
+    end_us: int | None = None
+    fields: tuple[str, ...] | None = None
+    where: str | None = None
+    condition: Node | None = field(default=None, repr=False)
+
+    def named(self) -> frozenset[str]:
+        """The fields that are named, to be given or to decide by."""
+        deciding = expression.names(self.condition) if self.condition is not None else frozenset()
+        return deciding.union(self.fields or ())
+
+    def needs(self, name: str) -> bool:
+        """Whether it takes this stored field to answer."""
+        if self.fields is None:
+            return True
+        named = self.named()
+        return name in named or any(name in parts for made, parts in MADE_OF.items() if made in named)
+
+    def holds_time(self, t_us: int) -> bool:
+        """Whether the range holds a time."""
+        return (self.start_us is None or self.start_us <= t_us) and (
+            self.end_us is None or t_us < self.end_us
+        )
+
+
+def select(
+    robot: str,
+    stream: str,
+    start: Time | None = None,
+    end: Time | None = None,
+    *,
+    fields: Sequence[str] | None = None,
+    where: str | None = None,
+) -> Selection:
+    """A selection of what people write; raises `StationError` for what cannot be read."""
+    now_us = time.time_ns() // 1000
+    try:
+        iort_contract.check_robot(robot)
+        iort_contract.check_stream(stream)
+        condition = expression.parse(where) if where is not None else None
+    except (ContractError, ExpressionError) as error:
+        raise StationError(str(error)) from error
+    start_us = None if start is None else time_us(start, now_us)
+    end_us = None if end is None else time_us(end, now_us)
+    if start_us is not None and end_us is not None and start_us > end_us:
+        raise StationError("the range ends before it starts")
+    return Selection(
+        robot=robot,
+        stream=stream,
+        start_us=start_us,
+        end_us=end_us,
+        fields=None if fields is None else tuple(dict.fromkeys(fields)),
+        where=where,
+        condition=condition,
+    )

@@ -1,0 +1,1 @@
+"""Robots and what belongs to them: registry rows, claims, certificates, shadows, files."""

@@ -1,0 +1,176 @@
+"""The registry: a row a robot, in the robots table. Who may have a name is decided by its row."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Iterator, Mapping
+from decimal import Decimal
+from typing import Any, NamedTuple
+
+from boto3.dynamodb.types import TypeSerializer
+
+from iort_contract import (
+    ADMIT_CLAIM,
+    ADMIT_FINGERPRINT,
+    ADMIT_UNTIL_S,
+    ADMITTED_CERTIFICATE,
+    ADMITTED_MS,
+    CONNECTED_MS,
+    DISCONNECTED_MS,
+    ONLINE,
+    ROBOT,
+    ContractError,
+    check_robot,
+)
+from iort_station.cloud import Cloud
+from iort_station.data.items import plain
+from iort_station.errors import StationError
+
+_serialize = TypeSerializer().serialize
+
+
+def checked(robot: str) -> str:
+    """The name, if it may name a robot; raises `StationError` otherwise."""
+    try:
+        return check_robot(robot)
+    except ContractError as error:
+        raise StationError(str(error)) from error
+
+
+def listed(cloud: Cloud) -> Iterator[dict[str, Any]]:
+    """Every row of the registry, in no order."""
+    for page in cloud.client("dynamodb").get_paginator("scan").paginate(TableName=_table(cloud)):
+        for item in page["Items"]:
+            yield _row(item)
+
+
+def _row(item: Mapping[str, Any]) -> dict[str, Any]:
+    """A row as JSON can have it: a set is a list in order."""
+    return {name: sorted(value) if isinstance(value, set) else value for name, value in plain(item).items()}
+
+
+def vehicles(cloud: Cloud) -> dict[str, dict[str, float]]:
+    """What is known of the cars whose speed can be told in m/s, by their names."""
+    gain, offset = "speed_to_erpm_gain", "speed_to_erpm_offset"
+    return {
+        str(row[ROBOT]): {gain: float(row[gain]), offset: float(row.get(offset) or 0)}
+        for row in listed(cloud)
+        if row.get(gain)
+    }
+
+
+def presence(cloud: Cloud) -> dict[str, dict[str, Any]]:
+    """Of every robot whether it is ``online`` and, as ``since_ms``, since when it is or is not; None where it
+    has never connected."""
+    found = {}
+    for row in listed(cloud):
+        online = bool(row.get(ONLINE))
+        at_ms = row.get(CONNECTED_MS if online else DISCONNECTED_MS)
+        found[str(row[ROBOT])] = {"online": online, "since_ms": None if at_ms is None else int(at_ms)}
+    return found
+
+
+def find(cloud: Cloud, robot: str) -> dict[str, Any] | None:
+    """A robot's row as it is now; None where it is not registered."""
+    answer = cloud.client("dynamodb").get_item(
+        TableName=_table(cloud), Key=_key(checked(robot)), ConsistentRead=True
+    )
+    return _row(answer["Item"]) if "Item" in answer else None
+
+
+def get(cloud: Cloud, robot: str) -> dict[str, Any]:
+    """A robot's row as it is now; raises `StationError` where it is not registered."""
+    row = find(cloud, robot)
+    if row is None:
+        raise StationError(f"robot {robot} is not registered")
+    return row
+
+
+def enter(cloud: Cloud, robot: str, row: Mapping[str, Any]) -> None:
+    """Write a new row, which is what makes a name taken: making a thing twice is no error.
+
+    Raises `StationError` where the robot is registered already.
+    """
+    item = {ROBOT: checked(robot), **row}
+    numbers = {name: Decimal(repr(value)) for name, value in item.items() if isinstance(value, int | float)}
+    dynamodb = cloud.client("dynamodb")
+    try:
+        dynamodb.put_item(
+            TableName=_table(cloud),
+            Item={name: _serialize(value) for name, value in {**item, **numbers}.items()},
+            ConditionExpression="attribute_not_exists(#robot)",
+            ExpressionAttributeNames={"#robot": ROBOT},
+        )
+    except dynamodb.exceptions.ConditionalCheckFailedException as error:
+        raise StationError(f"robot {robot} is already registered; remove it first") from error
+
+
+def set_vehicle(cloud: Cloud, robot: str, vehicle: Mapping[str, float]) -> dict[str, float]:
+    """Change these of a robot's vehicle parameters, and nothing else; what they were, those that it had.
+
+    Raises `StationError` where the robot is not registered.
+    """
+    dynamodb = cloud.client("dynamodb")
+    try:
+        answer = dynamodb.update_item(
+            TableName=_table(cloud),
+            Key=_key(checked(robot)),
+            UpdateExpression="SET " + ", ".join(f"#{name} = :{name}" for name in vehicle),
+            ConditionExpression="attribute_exists(#robot)",
+            ExpressionAttributeNames={"#robot": ROBOT, **{f"#{name}": name for name in vehicle}},
+            ExpressionAttributeValues={f":{name}": {"N": repr(value)} for name, value in vehicle.items()},
+            ReturnValues="UPDATED_OLD",
+        )
+    except dynamodb.exceptions.ConditionalCheckFailedException as error:
+        raise StationError(f"robot {robot} is not registered") from error
+    return {name: float(value) for name, value in plain(answer.get("Attributes", {})).items()}
+
+
+class ClaimId(NamedTuple):
+    """What a claim's certificate is known by: AWS' id of it, and its SHA-256 in hex."""
+
+    id: str
+    fingerprint: str
+
+
+def open_name(cloud: Cloud, robot: str, *, for_s: float, claim: ClaimId | None) -> None:
+    """Let one certificate be issued for a name: within the time, for this claim or for any. Which one was
+    issued before is forgotten."""
+    values = {":until": {"N": str(int(time.time() + for_s))}}
+    update, before = f"SET {ADMIT_UNTIL_S} = :until", f"{ADMITTED_CERTIFICATE}, {ADMITTED_MS}"
+    if claim is None:
+        update += f" REMOVE {before}, {ADMIT_CLAIM}, {ADMIT_FINGERPRINT}"
+    else:
+        update += f", {ADMIT_CLAIM} = :claim, {ADMIT_FINGERPRINT} = :fingerprint REMOVE {before}"
+        values[":claim"] = {"S": claim.id.lower().removeprefix("0x")}
+        values[":fingerprint"] = {"S": claim.fingerprint}
+    cloud.client("dynamodb").update_item(
+        TableName=_table(cloud),
+        Key=_key(robot),
+        UpdateExpression=update,
+        ConditionExpression=f"attribute_exists({ROBOT})",
+        ExpressionAttributeValues=values,
+    )
+
+
+def close_name(cloud: Cloud, robot: str) -> None:
+    """Let no certificate be issued for a name any more."""
+    cloud.client("dynamodb").update_item(
+        TableName=_table(cloud),
+        Key=_key(robot),
+        UpdateExpression=f"REMOVE {ADMIT_UNTIL_S}, {ADMIT_CLAIM}, {ADMIT_FINGERPRINT}",
+        ConditionExpression=f"attribute_exists({ROBOT})",
+    )
+
+
+def forget(cloud: Cloud, robot: str) -> None:
+    """Delete a robot's row."""
+    cloud.client("dynamodb").delete_item(TableName=_table(cloud), Key=_key(robot))
+
+
+def _table(cloud: Cloud) -> str:
+    return cloud.output("storage", "RobotsTable")
+
+
+def _key(robot: str) -> dict[str, Any]:
+    return {ROBOT: {"S": robot}}

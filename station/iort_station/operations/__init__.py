@@ -1,0 +1,1 @@
+"""Whether everything arrived and why not: audit, quarantine, replay, traces, CloudWatch."""

@@ -1,0 +1,255 @@
+"""CloudWatch's dashboards as they are deployed: the widgets of GetDashboard with the data of GetMetricData
+and the states of DescribeAlarms.
+
+What CloudWatch's console draws, on any cloud that answers these calls, the embedded one included.
+"""
+
+from __future__ import annotations
+
+import json
+import time
+from collections import Counter
+from collections.abc import Iterator, Mapping, Sequence
+from datetime import datetime, timezone
+from typing import Any, NamedTuple
+
+from botocore.exceptions import ClientError
+
+from iort_station.cloud import Cloud
+from iort_station.errors import StationError
+
+_PERIOD_S = 300
+# GetMetricData's own limit of queries a call.
+_MAX_QUERIES = 500
+# A metric is named by its namespace and its name at least.
+_LEAST_PARTS = 2
+# And DescribeAlarms' of names.
+_MAX_NAMES = 100
+
+
+def dashboards(cloud: Cloud) -> list[str]:
+    """The names of the dashboards there are, this deployment's first."""
+    pages = cloud.client("cloudwatch").get_paginator("list_dashboards").paginate()
+    names = [str(entry["DashboardName"]) for page in pages for entry in page.get("DashboardEntries", [])]
+    ours = cloud.namespace.lower()
+    return sorted(names, key=lambda name: (not name.lower().startswith(ours), name))
+
+
+def dashboard(cloud: Cloud, name: str, *, minutes: int, now_s: float | None = None) -> dict[str, Any]:
+    """A dashboard's widgets with the last ``minutes`` of their metrics, as answers.ts describes it.
+
+    Raises `StationError` where there is none of that name, or its body cannot be read.
+    """
+    client, widgets = cloud.client("cloudwatch"), body_of(cloud, name)
+    # To the full minute, which the newest period ends with.
+    to_s = int(time.time() if now_s is None else now_s) // 60 * 60 + 60
+    from_s = to_s - minutes * 60
+    return {
+        "name": name,
+        "from_s": from_s,
+        "to_s": to_s,
+        "widgets": [
+            {"number": number, **_widget(client, widget, from_s, to_s)}
+            for number, widget in enumerate(widgets)
+        ],
+    }
+
+
+def body_of(cloud: Cloud, name: str) -> list[Mapping[str, Any]]:
+    """A dashboard's widgets, as they are deployed.
+
+    Raises `StationError` where there is none of that name, or its body cannot be read.
+    """
+    try:
+        body = json.loads(cloud.client("cloudwatch").get_dashboard(DashboardName=name)["DashboardBody"])
+        return list(body["widgets"])
+    except ClientError as error:
+        raise StationError(f"there is no dashboard {name[:80]!r}") from error
+    except (KeyError, TypeError, ValueError) as error:
+        raise StationError(f"the body of dashboard {name[:80]!r} cannot be read") from error
+
+
+def metrics(rows: Sequence[Sequence[Any]]) -> Iterator[tuple[list[str], dict[str, Any]]]:
+    """The rows of a widget's ``metrics``: namespace, name and dimensions, and the options beside them.
+
+    ``"."`` stands for what the row before has in that place, ``"..."`` for all that it has up to there; a
+    row of options alone is an expression.
+    """
+    before: list[str] = []
+    for row in rows:
+        options = dict(row[-1]) if row and isinstance(row[-1], Mapping) else {}
+        given = [str(part) for part in row if not isinstance(part, Mapping)]
+        parts: list[str] = []
+        for i, part in enumerate(given):
+            if part == "...":
+                parts += before[len(parts) : len(before) - (len(given) - i - 1)]
+            else:
+                parts.append(before[len(parts)] if part == "." and len(parts) < len(before) else part)
+        if parts:
+            before = parts
+        yield parts, options
+
+
+class Counted(NamedTuple):
+    """What dashboards are billed by: metrics that are named, and searches, which each find any number."""
+
+    metrics: int
+    searches: int
+
+
+def count(widgets: Sequence[Mapping[str, Any]]) -> Counted:
+    """How many metrics a dashboard's widgets show, each as often as it is shown."""
+    rows = [row for widget in widgets for row in widget.get("properties", {}).get("metrics", [])]
+    named = sum(len(parts) >= _LEAST_PARTS for parts, _ in metrics(rows))
+    searches = sum("SEARCH(" in str(options.get("expression", "")) for _, options in metrics(rows))
+    return Counted(named, searches)
+
+
+def _widget(client: Any, widget: Mapping[str, Any], from_s: int, to_s: int) -> dict[str, Any]:
+    properties: Mapping[str, Any] = widget.get("properties", {})
+    place = {key: int(widget.get(key, default)) for key, default in _PLACE.items()}
+    period_s = int(properties.get("period", _PERIOD_S))
+    drawn = {
+        **place,
+        "title": str(properties.get("title", "")),
+        "text": "",
+        "series": [],
+        "alarms": [],
+        "period_s": period_s,
+    }
+    if widget.get("type") == "text":
+        return {**drawn, "kind": "text", "text": str(properties.get("markdown", ""))}
+    if widget.get("type") == "alarm":
+        return _with_alarms(client, drawn, properties)
+    if widget.get("type") == "log":
+        # Its rows are asked for by themselves: Logs Insights takes its time. See cloudwatch_logs.py.
+        return {**drawn, "kind": "log"}
+    if widget.get("type") != "metric" or "metrics" not in properties:
+        return {
+            **drawn,
+            "kind": "other",
+            "text": f"a widget of type {widget.get('type')}: see the AWS console",
+        }
+    kind = "number" if properties.get("view") == "singleValue" else "series"
+    queries, shown = _queries(properties, period_s)
+    if not queries:
+        return {**drawn, "kind": kind}
+    period_s = min((q["MetricStat"]["Period"] for q in queries if "MetricStat" in q), default=period_s)
+    try:
+        series = _series(client, queries, shown, from_s, to_s)
+    except ClientError as error:
+        text = f"CloudWatch refuses this widget's metrics: {_reason(error)}"
+        return {**drawn, "kind": "other", "text": text}
+    return {**drawn, "kind": kind, "series": series, "period_s": period_s}
+
+
+def _with_alarms(client: Any, drawn: dict[str, Any], properties: Mapping[str, Any]) -> dict[str, Any]:
+    """The widget with the state of its alarms, in its own order; one that is gone is left out."""
+    names = [str(arn).partition(":alarm:")[2] for arn in properties.get("alarms", [])]
+    try:
+        found = [
+            alarm
+            for i in range(0, len(names), _MAX_NAMES)
+            for alarm in client.describe_alarms(
+                AlarmNames=names[i : i + _MAX_NAMES], AlarmTypes=["MetricAlarm"], MaxRecords=_MAX_NAMES
+            )["MetricAlarms"]
+        ]
+    except ClientError as error:
+        return {**drawn, "kind": "other", "text": f"CloudWatch does not tell its alarms: {_reason(error)}"}
+    alarms = [
+        {
+            "name": alarm["AlarmName"],
+            "about": alarm.get("AlarmDescription", ""),
+            "state": alarm["StateValue"],
+            "reason": alarm.get("StateReason", ""),
+            "since_s": alarm["StateUpdatedTimestamp"].timestamp(),
+        }
+        for alarm in sorted(found, key=lambda alarm: names.index(alarm["AlarmName"]))
+    ]
+    return {**drawn, "kind": "alarms", "alarms": alarms}
+
+
+def _reason(error: ClientError) -> str:
+    return str(error.response.get("Error", {}).get("Message", error))
+
+
+_PLACE = {"x": 0, "y": 0, "width": 6, "height": 6}
+
+
+def _queries(
+    properties: Mapping[str, Any], period_s: int
+) -> tuple[list[dict[str, Any]], dict[str, dict[str, Any]]]:
+    """GetMetricData's queries, and of those that are drawn the label and the axis by their id."""
+    queries: list[dict[str, Any]] = []
+    shown: dict[str, dict[str, Any]] = {}
+    for i, (parts, options) in enumerate(metrics(properties["metrics"])):
+        key = str(options.get("id", f"iort{i}"))
+        visible = bool(options.get("visible", True))
+        query: dict[str, Any] = {"Id": key, "ReturnData": visible}
+        if "label" in options:
+            query["Label"] = str(options["label"])
+        if "expression" in options:
+            query |= {
+                "Expression": str(options["expression"]),
+                "Period": int(options.get("period", period_s)),
+            }
+        elif len(parts) >= _LEAST_PARTS:
+            names = iter(parts[2:])
+            dimensions = [{"Name": name, "Value": value} for name, value in zip(names, names, strict=False)]
+            metric = {"Namespace": parts[0], "MetricName": parts[1], "Dimensions": dimensions}
+            query["MetricStat"] = {
+                "Metric": metric,
+                "Period": int(options.get("period", period_s)),
+                "Stat": str(options.get("stat", properties.get("stat", "Average"))),
+            }
+        else:
+            continue
+        queries.append(query)
+        if visible:
+            label = options.get("label", parts[1] if parts else key)
+            shown[key] = {
+                "label": label,
+                "right": options.get("yAxis") == "right",
+                "searched": str(options.get("expression", "")).startswith("SEARCH("),
+            }
+    return queries[:_MAX_QUERIES], shown
+
+
+def _series(
+    client: Any,
+    queries: Sequence[Mapping[str, Any]],
+    shown: Mapping[str, Mapping[str, Any]],
+    from_s: int,
+    to_s: int,
+) -> list[dict[str, Any]]:
+    # A SEARCH answers with a result a metric found: all with the query's id, told apart by their labels,
+    # and those of one label by their place.
+    found: dict[tuple[str, str, int], dict[float, float]] = {}
+    pages = client.get_paginator("get_metric_data").paginate(
+        MetricDataQueries=list(queries),
+        StartTime=datetime.fromtimestamp(from_s, timezone.utc),
+        EndTime=datetime.fromtimestamp(to_s, timezone.utc),
+        ScanBy="TimestampAscending",
+    )
+    for page in pages:
+        seen: Counter[tuple[str, str]] = Counter()
+        for result in page["MetricDataResults"]:
+            if result["Id"] in shown:
+                stamps = (stamp.timestamp() for stamp in result["Timestamps"])
+                key = result["Id"], result.get("Label", "")
+                values = found.setdefault((*key, seen[key]), {})
+                values.update(zip(stamps, result["Values"], strict=True))
+                seen[key] += 1
+    series = []
+    for query_id, options in shown.items():
+        several = [(label, values) for (id_, label, _), values in found.items() if id_ == query_id]
+        for label, values in several or [("", {})]:
+            series.append(
+                {
+                    "label": (options["searched"] and label) or str(options["label"]),
+                    "right": bool(options["right"]),
+                    "times_s": sorted(values),
+                    "values": [values[at] for at in sorted(values)],
+                }
+            )
+    return series

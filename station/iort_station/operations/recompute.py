@@ -1,0 +1,110 @@
+"""Summaries made again from what is stored, after a vehicle's parameters were corrected."""
+
+from __future__ import annotations
+
+import threading
+from collections import deque
+from collections.abc import Iterator, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from typing import Any, NamedTuple
+
+from functions.shared.tables import VEHICLE_CACHE_S
+from iort_contract import EXPIRES_S, OWN_STREAMS, RECEIVED_MS, RECOMPUTE_FROM_S, RECOMPUTED, ROBOT, TOPIC
+from iort_station.cli.progress import Told
+from iort_station.cloud import Cloud
+from iort_station.data import reading
+from iort_station.data.reading import Item
+from iort_station.data.selection import Selection
+from iort_station.data.stored import ATTRIBUTES
+from iort_station.errors import StationError
+from iort_station.fleet import inventory
+from iort_station.operations.replay import summarize
+
+# As long as Lambda 2 may go on with the old parameters, and a little for what it is in the middle of.
+SETTLED_S = VEHICLE_CACHE_S + 5
+# What Lambda 2 is given of a batch: all that it would find in the stream.
+_IMAGE = tuple(dict.fromkeys((*ATTRIBUTES, TOPIC, ROBOT, RECEIVED_MS, EXPIRES_S)))
+# An event may have 6 MB, and takes a second or two.
+_AT_ONCE, _EVENT_BATCHES, _EVENT_BYTES = 4, 100, 2_000_000
+
+
+class Recomputed(NamedTuple):
+    """How many ``seconds`` of a stream were written; ``left_out`` counts stored items of which nothing
+    could be made."""
+
+    seconds: int
+    left_out: int
+
+
+def wait_until_settled() -> None:
+    """Return when nothing summarises with the old parameters any more: what is made after this is right,
+    and what was made before it is there to be made again."""
+    threading.Event().wait(SETTLED_S)
+
+
+def streams(cloud: Cloud, robot: str, since_us: int | None) -> list[str]:
+    """The robot's streams whose summary has a speed, of those that are known by name."""
+    known = (name for name in inventory.streams_of(cloud, robot) if name not in OWN_STREAMS)
+    return [name for name in known if _has_speed(cloud, _from(robot, name, since_us))]
+
+
+def recompute(
+    cloud: Cloud, robot: str, stream: str, since_us: int | None, *, progress: Told | None = None
+) -> Recomputed:
+    """Have Lambda 2 summarise a stream again, from the second that ``since_us`` lies in; None is all that is
+    stored. Doing it again changes nothing.
+
+    Raises `StationError` where Lambda 2 fails; what was made until then is good.
+    """
+    selection = _from(robot, stream, since_us)
+    event = {RECOMPUTE_FROM_S: 0 if selection.start_us is None else selection.start_us // 1_000_000}
+    pages = reading.told(reading.batches(cloud, selection, _IMAGE), progress)
+    # Neighbours may write the same second, each the same of it.
+    seconds: set[int] = set()
+    left_out = 0
+
+    def count(answer: dict[str, Any]) -> None:
+        nonlocal left_out
+        if RECOMPUTED not in answer:
+            raise StationError("Lambda 2 cannot summarise again: deploy the current stacks")
+        seconds.update(answer[RECOMPUTED])
+        left_out += len(answer["batchItemFailures"])
+
+    with ThreadPoolExecutor(_AT_ONCE) as pool:
+        asked: deque[Any] = deque()
+        try:
+            for items in _parted(pages):
+                if len(asked) >= _AT_ONCE:
+                    count(asked.popleft().result())
+                asked.append(pool.submit(summarize, cloud, items, event))
+            while asked:
+                count(asked.popleft().result())
+        finally:
+            pool.shutdown(cancel_futures=True)
+    return Recomputed(len(seconds), left_out)
+
+
+def _from(robot: str, stream: str, since_us: int | None) -> Selection:
+    whole_us = None if since_us is None else since_us // 1_000_000 * 1_000_000
+    return Selection(robot=robot, stream=stream, start_us=whole_us)
+
+
+def _has_speed(cloud: Cloud, selection: Selection) -> bool:
+    pages = reading.seconds(cloud, selection)
+    return any(name.startswith("speed") for items in pages for item in items for name in item)
+
+
+def _parted(pages: Iterator[Sequence[Item]]) -> Iterator[list[Item]]:
+    """The items, as many together as fit in an event."""
+    part: list[Item] = []
+    size = 0
+    for items in pages:
+        for item in items:
+            length = len(item.get("samples", {}).get("S", "")) + 1000
+            if part and (len(part) >= _EVENT_BATCHES or size + length > _EVENT_BYTES):
+                yield part
+                part, size = [], 0
+            part.append(item)
+            size += length
+    if part:
+        yield part

@@ -1,0 +1,1 @@
+"""The live page: its server, its settings, and what keeps it fresh."""

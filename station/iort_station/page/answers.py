@@ -1,0 +1,156 @@
+"""What the live page may ask its server: cars' parameters, a car's past, and CloudWatch's dashboards.
+
+Each answer is a function of the request's parameters; station/web/src/answers.ts is the other end.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from typing import Any
+
+import numpy as np
+
+from iort_contract import CLAIM_FIELDS, check_robot
+from iort_station.cloud import Cloud
+from iort_station.data import data
+from iort_station.data.conditions import Column, values
+from iort_station.errors import StationError
+from iort_station.fleet import inventory, registry
+from iort_station.operations import cloudwatch, cloudwatch_logs
+
+# A chart has no more points across.
+MAX_ROWS = 5_000
+# Of ranges longer than this the seconds are read that Lambda 2 has written, not the samples.
+_SAMPLES_US = 3_600_000_000
+
+
+def answers(cloud: Cloud) -> dict[str, Callable[[Mapping[str, str]], dict[str, Any]]]:
+    """Every answer by its name."""
+    return {
+        "robots": lambda _asked: {"robots": registry.presence(cloud)},
+        "vehicles": lambda _asked: {"vehicles": registry.vehicles(cloud)},
+        "streams": lambda asked: {"streams": inventory.streams_of(cloud, check_robot(_text(asked, "robot")))},
+        "history": lambda asked: history(cloud, asked),
+        "dashboards": lambda _asked: {"dashboards": cloudwatch.dashboards(cloud)},
+        "dashboard": lambda asked: cloudwatch.dashboard(
+            cloud, _text(asked, "name"), minutes=_whole(asked, "minutes", 1, 14 * 24 * 60)
+        ),
+        "log": lambda asked: cloudwatch_logs.rows(
+            cloud,
+            _text(asked, "name"),
+            _whole(asked, "widget", 0, 500),
+            minutes=_whole(asked, "minutes", 1, 14 * 24 * 60),
+        ),
+    }
+
+
+def history(cloud: Cloud, asked: Mapping[str, str]) -> dict[str, Any]:
+    """The samples of ``robot`` and ``stream`` from ``from_us`` to ``to_us``, in at most ``rows`` rows.
+
+    A row that stands for several samples has the least, the mean and the most of every number, of a claim
+    on content the last whole one, and of everything else the last that is not null. Raises `StationError`
+    for a request that cannot be answered.
+    """
+    start_us, end_us = (_whole(asked, name, 0, 2**53) for name in ("from_us", "to_us"))
+    rows = _whole(asked, "rows", 2, MAX_ROWS)
+    if start_us >= end_us:
+        raise StationError("the range ends before it starts")
+    summary = end_us - start_us > _SAMPLES_US
+    robot, stream = _text(asked, "robot"), _text(asked, "stream")
+    found = data.query(cloud, robot, stream, start_us, end_us, summary=summary)
+    columns = (
+        _by_statistic(found.columns) if summary else {name: (c, c, c) for name, c in found.columns.items()}
+    )
+    claims = _claims(columns)
+    n = len(found)
+    row_us = 0
+    starts = np.arange(n)
+    if n > rows:
+        row_us = -(-(int(found.times_us[-1] - found.times_us[0]) + 1) // rows)
+        bins = (found.times_us - found.times_us[0]) // row_us
+        starts = np.flatnonzero(np.append(True, bins[1:] != bins[:-1]))
+    several = summary or row_us > 0
+    fields = {
+        name: _rows(each, starts, n, several=several) for name, each in columns.items() if name not in claims
+    }
+    for name, key in claims.items():
+        # The five fields of one claim belong together, so they are of one sample.
+        told, ends = values(found.columns[name]), _last_known(found.columns[key], starts)
+        fields[name] = {"mean": [told[end] for end in ends]}
+    return {
+        "times_s": [t_us / 1e6 for t_us in found.times_us[starts].tolist()],
+        "fields": fields,
+        "samples": int(np.nansum(found.columns["n"])) if summary and "n" in found.columns else n,
+        "ros2": found.ros2,
+        "row_s": max(row_us / 1e6, 1.0 if summary else 0.0),
+    }
+
+
+def _by_statistic(columns: Mapping[str, Column]) -> dict[str, tuple[Column, Column, Column]]:
+    """The summary's columns, one entry a field: mean, least, most."""
+    names = [name.removesuffix("_mean") for name in columns if name.endswith("_mean")]
+    return {
+        name: (columns[f"{name}_mean"], columns[f"{name}_min"], columns[f"{name}_max"])
+        for name in names
+        if f"{name}_min" in columns and f"{name}_max" in columns
+    }
+
+
+def _claims(columns: Mapping[str, Any]) -> dict[str, str]:
+    """The fields of claims on content (docs/files.md) by name, each with that of its claim's key."""
+    fields = [name.removesuffix(".key") for name in columns if name.endswith(".key")]
+    return {
+        f"{field}.{part}": f"{field}.key"
+        for field in fields
+        if all(f"{field}.{part}" in columns for part in CLAIM_FIELDS)
+        for part in CLAIM_FIELDS
+    }
+
+
+def _rows(of: tuple[Column, Column, Column], starts: Any, n: int, *, several: bool) -> dict[str, list[Any]]:
+    mean, least, most = of
+    if mean.dtype.kind != "f":
+        ends = _last_known(mean, starts)
+        return {"mean": mean[ends].tolist()}
+    if not several or n == 0:
+        return {"mean": values(mean)}
+    known = ~np.isnan(mean)
+    number = np.add.reduceat(known.astype(float), starts)
+    number[number == 0] = np.nan
+    valued = np.where(known, mean, 0.0)
+    with np.errstate(invalid="ignore", over="ignore"):
+        average = np.add.reduceat(valued, starts) / number
+        # The sum of a few numbers may be beyond what a number holds, their mean is not.
+        parts = valued / np.repeat(number, np.diff(np.append(starts, n)))
+        average = np.where(np.isinf(average), np.add.reduceat(parts, starts), average)
+    return {
+        "mean": values(average),
+        "least": values(np.fmin.reduceat(least, starts)),
+        "most": values(np.fmax.reduceat(most, starts)),
+    }
+
+
+def _last_known(column: Column, starts: Any) -> Any:
+    """Of each row the index of its last value that is not null, or of its last where all are: most claims
+    on pictures are null, and the one that is not is what there is to see."""
+    n = len(column)
+    if not n:
+        return starts
+    known = np.array([value is not None for value in column.tolist()])
+    ranked = np.where(known, np.arange(n), -1)
+    last = np.maximum.reduceat(ranked, starts)
+    return np.where(last >= starts, last, np.append(starts[1:], n) - 1)
+
+
+def _text(asked: Mapping[str, str], name: str) -> str:
+    if not asked.get(name):
+        raise StationError(f"the request names no {name}")
+    return asked[name]
+
+
+def _whole(asked: Mapping[str, str], name: str, least: int, most: int) -> int:
+    text = _text(asked, name)
+    # Sixteen digits hold all that is allowed.
+    if not (text.isascii() and text.isdecimal()) or len(text) > 16 or not least <= int(text) <= most:
+        raise StationError(f"{name} {text[:40]!r}: allowed is a whole number from {least} to {most}")
+    return int(text)

@@ -1,0 +1,123 @@
+"""Listens to the fleet's PubNub channels, as the dashboard does, and keeps what it needs of each update."""
+
+from __future__ import annotations
+
+import threading
+import time
+from collections.abc import Callable, Mapping
+from types import TracebackType
+from typing import Any, NamedTuple
+
+from pubnub.callbacks import SubscribeCallback
+from pubnub.enums import PNReconnectionPolicy, PNStatusCategory
+from pubnub.pnconfiguration import PNConfiguration
+from pubnub.pubnub import PubNub
+from typing_extensions import Self
+
+from iort_contract import DEFAULT_NAMESPACE, ROBOT, T_US, channel, check_namespace
+from iort_station.errors import StationError
+
+_CONNECT_S = 15.0
+
+
+class Heard(NamedTuple):
+    """One update: whose, which, how long it took from leaving the car to being here, its sample's time
+    (microseconds) and the hops' (`iort_contract.live_update`)."""
+
+    robot: str
+    stream: str
+    boot: str
+    seq: int
+    delay_ms: float
+    t_us: int
+    hops: Mapping[str, int]
+
+
+# Takes an update, PubNub's time of taking it and this machine's of receiving it, in microseconds; in
+# the listener's own thread.
+OnUpdate = Callable[[dict[str, Any], int, int], None]
+
+
+class Listener:
+    """Subscribed from `__enter__` to `__exit__`; `heard` grows meanwhile, or ``on_update`` is called.
+
+    ``robot`` None is the whole fleet; ``token`` is PubNub's access token, where Access Manager is on.
+
+    The delay compares the car's clock with this machine's, so it is only as good as the two agree.
+    Raises `StationError` where PubNub does not answer.
+    """
+
+    def __init__(
+        self,
+        *,
+        subscribe_key: str,
+        robot: str | None,
+        namespace: str = DEFAULT_NAMESPACE,
+        origin: str = "",
+        tls: bool = True,
+        on_update: OnUpdate | None = None,
+        token: str = "",
+    ) -> None:
+        config = PNConfiguration()
+        config.subscribe_key, config.user_id = subscribe_key, "iort-station"
+        if origin:
+            config.origin = origin
+        config.ssl, config.daemon = tls, True
+        config.disable_config_locking = False
+        config.reconnect_policy = PNReconnectionPolicy.EXPONENTIAL
+        self._channel = f"{check_namespace(namespace)}.*" if robot is None else channel(robot, namespace)
+        self._callback = _Callback(on_update)
+        self._client = PubNub(config)
+        if token:
+            self._client.set_token(token)
+        self._client.add_listener(self._callback)
+
+    @property
+    def heard(self) -> list[Heard]:
+        """What came so far, in order of arrival."""
+        return self._callback.heard
+
+    def __enter__(self) -> Self:
+        self._client.subscribe().channels(self._channel).execute()
+        if not self._callback.connected.wait(_CONNECT_S):
+            self._client.stop()
+            raise StationError(f"PubNub did not accept the subscription within {_CONNECT_S:.0f} s")
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self._client.stop()
+
+
+class _Callback(SubscribeCallback):  # type: ignore[misc]  # the SDK's base class has no types
+    def __init__(self, on_update: OnUpdate | None) -> None:
+        self._on_update = on_update
+        self.connected = threading.Event()
+        self.heard: list[Heard] = []
+
+    def status(self, _pubnub: Any, status: Any) -> None:
+        if status.category == PNStatusCategory.PNConnectedCategory:
+            self.connected.set()
+
+    def presence(self, _pubnub: Any, _presence: Any) -> None:
+        pass
+
+    def message(self, _pubnub: Any, message: Any) -> None:
+        now_us = time.time_ns() // 1000
+        update = message.message
+        if self._on_update is not None:
+            self._on_update(update, int(message.timetoken) // 10, now_us)
+            return
+        hops = update["hops"]
+        self.heard.append(
+            Heard(
+                robot=update[ROBOT],
+                stream=update["stream"],
+                boot=update["boot"],
+                seq=update["seq"],
+                delay_ms=(now_us - hops["sent_us"]) / 1000,
+                t_us=update[T_US],
+                hops=hops,
+            )
+        )

@@ -1,0 +1,145 @@
+"""The live page: what it is told, and under which policy a browser may run it.
+
+``npm run build`` makes it from station/web into the folder `built`. `iort_station.page.server` serves it, and
+`iort_station.page.site` puts it on the web.
+"""
+
+from __future__ import annotations
+
+import math
+import re
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import iort_contract
+from iort_station.data.units import ROS_UNITS, agent_unit
+from iort_station.errors import StationError
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping
+
+BUILT = Path(__file__).resolve().parent / "built"
+PUBNUB_ORIGIN = "ps.pndsn.com"
+# Beside the policy, on every file.
+HEADERS = {
+    "X-Content-Type-Options": "nosniff",
+    "Referrer-Policy": "no-referrer",
+    "Cross-Origin-Resource-Policy": "same-origin",
+}
+TYPES = {
+    ".html": "text/html; charset=utf-8",
+    ".css": "text/css; charset=utf-8",
+    ".js": "text/javascript; charset=utf-8",
+    ".map": "application/json",
+    ".json": "application/json",
+    ".svg": "image/svg+xml",
+    ".txt": "text/plain; charset=utf-8",
+}
+
+_KEY = re.compile(r"[A-Za-z0-9_-]{1,128}")
+_TOKEN = re.compile(r"[A-Za-z0-9_=-]{1,4096}")
+_ORIGIN = re.compile(r"([A-Za-z0-9.-]{1,253}|\[[0-9A-Fa-f:]{2,45}\])(:[0-9]{1,5})?")
+
+
+def built_files(built: Path = BUILT) -> dict[str, bytes]:
+    """Every file of the built page by its path within; raises `StationError` where it is not built."""
+    index = built / "index.html"
+    if not index.is_file():
+        raise StationError(f"the live page is not built ({index} is missing): run `make setup`")
+    return {
+        path.relative_to(built).as_posix(): path.read_bytes()
+        for path in sorted(built.rglob("*"))
+        if path.is_file() and path.suffix in TYPES
+    }
+
+
+def config(
+    *,
+    namespace: str,
+    subscribe_key: str,
+    origin: str = PUBNUB_ORIGIN,
+    tls: bool = True,
+    vehicles: Mapping[str, Mapping[str, float]] | None = None,
+    token: str = "",
+    answers: bool = False,
+) -> dict[str, Any]:
+    """What the page is told, ``/config.json``; raises `StationError` for what it must not be told.
+
+    ``vehicles`` maps a robot to its parameters; with ``speed_to_erpm_gain`` (and ``_offset``) the page
+    shows its speed in m/s beside the motor's erpm. ``token`` is PubNub's access token for a page, which may
+    only read.
+    """
+    try:
+        iort_contract.check_namespace(namespace)
+        known = {iort_contract.check_robot(robot): dict(car) for robot, car in (vehicles or {}).items()}
+    except iort_contract.ContractError as error:
+        raise StationError(f"the page's configuration: {error}") from error
+    if not _KEY.fullmatch(subscribe_key):
+        raise StationError("the page's subscribe_key: allowed is 1 to 128 of A-Z a-z 0-9 _ -")
+    if subscribe_key.startswith(("pub-c-", "sec-c-")):
+        raise StationError("the page's subscribe_key is a publish or secret key, which no page may see")
+    if token and not _TOKEN.fullmatch(token):
+        raise StationError(
+            "the page's access token: allowed is what PubNub's grant gives, up to 4096 characters"
+        )
+    if not _ORIGIN.fullmatch(origin):
+        raise StationError(f"the page's origin {origin!r}: allowed is a host, or host:port")
+    for robot, car in known.items():
+        gain = car.get("speed_to_erpm_gain")
+        if gain is not None and (not math.isfinite(gain) or gain == 0):
+            raise StationError(f"speed_to_erpm_gain of {robot} is {gain}: allowed is a number, not 0")
+        offset = car.get("speed_to_erpm_offset", 0)
+        if not math.isfinite(offset):
+            raise StationError(f"speed_to_erpm_offset of {robot} is {offset}: allowed is a number")
+    return {
+        "namespace": namespace,
+        "subscribe_key": subscribe_key,
+        "origin": origin,
+        "tls": tls,
+        "vehicles": known,
+        "token": token,
+        "answers": answers,
+    }
+
+
+def field_table() -> dict[str, Any]:
+    """The contract's field table as the page reads it, ``/fields.json``."""
+    fields = {
+        f.name: {"unit": f.unit, "meaning": f.meaning} | ({"ros2_unit": f.ros2_unit} if f.ros2_unit else {})
+        for f in iort_contract.VESC_FIELDS.values()
+    }
+    fields |= {name: {"unit": unit, "meaning": ""} for name, unit in iort_contract.DERIVED_UNITS.items()}
+    fields |= {
+        name: {"unit": "ms", "meaning": f"round trip over the path {path}"}
+        for path, name in iort_contract.RTT_FIELDS.items()
+    }
+    fields |= {
+        name: {"unit": agent_unit(name), "meaning": meaning}
+        for name, meaning in iort_contract.AGENT_FIELDS.items()
+    }
+    faults = {str(code): name for code, name in iort_contract.FAULTS.items()}
+    return {
+        "version": iort_contract.SCHEMA_VERSION,
+        "stream": iort_contract.VESC_STREAM,
+        "fields": fields,
+        "ros_units": ROS_UNITS,
+        "faults": faults,
+    }
+
+
+def security_policy(*, origin: str, tls: bool) -> str:
+    """The page's Content-Security-Policy: its own files, PubNub at ``origin``, and nothing else."""
+    pubnub = f"{'https' if tls else 'http'}://{origin}"
+    return "; ".join(
+        (
+            "default-src 'none'",
+            "script-src 'self'",
+            "worker-src 'self'",
+            "style-src 'self'",
+            "img-src 'self'",
+            f"connect-src 'self' {pubnub}",
+            "base-uri 'none'",
+            "form-action 'none'",
+            "frame-ancestors 'none'",
+        )
+    )

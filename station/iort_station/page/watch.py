@@ -1,0 +1,163 @@
+"""The newest of every car, from the live updates: what `iort watch` shows."""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import Any
+
+from rich.table import Table
+from rich.text import Text
+
+from iort_contract import FAULTS, ROBOT, SCHEMA_VERSION, T_US, ContractError, check_robot, check_stream
+from iort_contract.statistics import Vehicle
+
+# As on the page: older values are stale, and a car unheard of for longer is gone.
+STALE_S, GONE_S = 1.5, 4.5
+MAX_ROBOTS = 256
+_TEMPERATURES = ("temperature_pcb", "temp_fet", "temp_motor")
+_STATES = {"online": "green", "stale": "yellow", "gone": "red"}
+
+
+@dataclass
+class Car:
+    """A car as last heard; times in microseconds since the epoch, by this machine's clock."""
+
+    robot: str
+    heard_us: int = 0
+    taken_us: int = 0
+    delay_ms: float = 0.0
+    sample: dict[str, Any] = field(default_factory=dict)
+
+    def state(self, now_us: int) -> str:
+        """``online``, ``stale`` or ``gone``."""
+        if now_us - self.heard_us > GONE_S * 1e6:
+            return "gone"
+        return "stale" if now_us - self.taken_us > STALE_S * 1e6 else "online"
+
+    def age_s(self, now_us: int) -> float:
+        """How old its newest value is."""
+        return max(0.0, (now_us - self.taken_us) / 1e6)
+
+    def number(self, name: str) -> float | None:
+        """A field of the newest sample, where it is a number."""
+        value = self.sample.get(name)
+        return float(value) if isinstance(value, (int, float)) and not isinstance(value, bool) else None
+
+    def hottest_degc(self) -> float | None:
+        """The highest temperature; drivers leave those that they do not have at 0."""
+        return max(
+            (value for name in _TEMPERATURES if (value := self.number(name)) is not None), default=None
+        )
+
+    def fault(self) -> str:
+        """The fault's name; empty without one."""
+        code = self.number("fault_code")
+        return f"{FAULTS.get(int(code), 'unknown fault')} ({code:.0f})" if code else ""
+
+
+class FleetWatch:
+    """Takes updates in one thread, tells of them in another."""
+
+    def __init__(self, vehicles: Mapping[str, Vehicle]) -> None:
+        self._vehicles = vehicles
+        self._lock = threading.Lock()
+        self._cars: dict[str, Car] = {}
+        self.refused = 0
+
+    def take(self, update: Any, _pubnub_us: int, now_us: int) -> None:
+        """Take an update as it came from PubNub; one that is none is counted in `refused`."""
+        try:
+            robot, sample, stamps = read(update)
+        except ContractError:
+            self.refused += 1
+            return
+        with self._lock:
+            if robot not in self._cars and len(self._cars) >= MAX_ROBOTS:
+                del self._cars[min(self._cars.values(), key=lambda car: car.heard_us).robot]
+            car = self._cars.setdefault(robot, Car(robot))
+            car.heard_us = now_us
+            # By the car's clock a sample is as old as it was on leaving, and has been under way since.
+            car.delay_ms = (now_us - stamps["sent_us"] - stamps["offset_us"]) / 1000
+            in_car_us = stamps["sent_us"] - stamps["t_us"]
+            car.taken_us = now_us - max(0, in_car_us) - max(0, round(car.delay_ms * 1000))
+            car.sample.update(sample)
+
+    def cars(self) -> list[Car]:
+        """The cars by name, those with numbers in the order of the numbers."""
+        with self._lock:
+            return sorted(self._cars.values(), key=lambda car: _natural(car.robot))
+
+    def table(self, now_us: int, width: int) -> Table:
+        """What there is to see, in ``width`` characters."""
+        wide, narrow = width >= 90, width < 56
+        table = Table(box=None, expand=True, pad_edge=False, header_style="dim")
+        columns = [
+            "car",
+            "state",
+            "speed",
+            "V",
+            *([] if narrow else ["°C", "delay"]),
+            *(["age"] if wide else []),
+        ]
+        for name in columns:
+            left = name in {"car", "state"}
+            longest = 16 if narrow and name == "car" else None
+            table.add_column(name, justify="left" if left else "right", no_wrap=True, max_width=longest)
+        # What is left over is the fault's.
+        table.add_column("fault", no_wrap=True, overflow="ellipsis", style="bold red", ratio=1)
+        for car in self.cars():
+            state = car.state(now_us)
+            cells: dict[str, Text | str] = {
+                "car": Text(car.robot, style="bold" if state == "online" else "dim"),
+                "state": Text(state, style=_STATES[state]),
+                "speed": self._speed(car),
+                "V": _figure(car.number("voltage_input"), 1),
+                "°C": _figure(car.hottest_degc(), 0),
+                "delay": f"{car.delay_ms:.0f} ms",
+                "age": f"{car.age_s(now_us):.1f} s",
+            }
+            style = "" if state == "online" else "dim"
+            table.add_row(*(cells[name] for name in columns), car.fault(), style=style)
+        return table
+
+    def _speed(self, car: Car) -> str:
+        erpm = car.number("speed")
+        vehicle = self._vehicles.get(car.robot)
+        if erpm is None:
+            return "-"
+        if vehicle is None:
+            return f"{erpm:.0f} erpm"
+        return f"{(erpm - vehicle.speed_to_erpm_offset) / vehicle.speed_to_erpm_gain:.1f} m/s"
+
+
+def read(update: Any) -> tuple[str, dict[str, Any], dict[str, int]]:
+    """Whose an update is, its sample and its times; raises `ContractError` for what is no update."""
+    try:
+        if update["v"] != SCHEMA_VERSION:
+            raise ContractError("another schema version")
+        robot, _ = check_robot(update[ROBOT]), check_stream(update["stream"])
+        hops = update["hops"]
+        stamps = {"t_us": update[T_US], "sent_us": hops["sent_us"], "offset_us": hops.get("offset_us", 0)}
+        sample = dict(update["sample"])
+    except (AttributeError, KeyError, TypeError, ValueError) as error:
+        raise ContractError(f"no live update: {error}") from error
+    if not all(type(stamp) is int for stamp in stamps.values()):
+        raise ContractError("a time that is no integer")
+    return robot, sample, stamps
+
+
+def _figure(value: float | None, digits: int) -> str:
+    return "-" if value is None else f"{value:.{digits}f}"
+
+
+def _natural(name: str) -> list[tuple[int, str]]:
+    """car2 before car10."""
+    parts: list[tuple[int, str]] = []
+    for char in name:
+        if char.isdecimal() and parts and parts[-1][1] == "":
+            parts[-1] = (parts[-1][0] * 10 + int(char), "")
+        else:
+            parts.append((int(char), "") if char.isdecimal() else (-1, char))
+    return parts

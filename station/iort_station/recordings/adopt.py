@@ -1,0 +1,163 @@
+"""Stored batches out of another table into the telemetry table: an old one, or one restored from a backup."""
+
+from __future__ import annotations
+
+import time
+from collections import Counter
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
+from decimal import Decimal
+from operator import itemgetter
+from typing import Any, NamedTuple
+
+from botocore.exceptions import ClientError
+
+from functions.shared.tables import WRITE_SIZE, TableError, write
+from iort_contract import (
+    AGENT_STREAM,
+    BATCH,
+    EXPIRES_S,
+    RECEIVED_MS,
+    RECORD,
+    T_US,
+    TOPIC,
+    Batch,
+    ContractError,
+    Topic,
+    build_topic,
+    decode_item,
+)
+from iort_station.cloud import Cloud
+from iort_station.data.items import plain
+from iort_station.data.reading import Item, ahead
+from iort_station.errors import StationError
+from iort_station.recordings.old_batches import is_old, upgraded_item
+
+# A unit writes a kilobyte. AWS takes 1,000 a second of a partition, which all of a topic is in: half of them
+# leaves the other half to the robot itself.
+UNITS_PER_S = 500
+_UNIT_BYTES = 1024
+# Of version 1 and of today.
+_KEYS = ([TOPIC, T_US], [TOPIC, BATCH])
+
+
+class Left(NamedTuple):
+    """An item that is not adopted: its key as the table has it, and why."""
+
+    topic: str
+    key: str
+    cause: str
+
+
+@dataclass
+class Adoption:
+    """What became of the table's items. Batches and their samples are counted by robot and stream;
+    ``expired`` items are only not deleted yet."""
+
+    batches: Counter[tuple[str, str]] = field(default_factory=Counter)
+    samples: Counter[tuple[str, str]] = field(default_factory=Counter)
+    expired: int = 0
+    left: list[Left] = field(default_factory=list)
+
+
+def source_table(cloud: Cloud, name: str | None) -> tuple[str, int]:
+    """The table of that name, or the one that the deployment has kept, and about how many items it has.
+
+    Raises `StationError` where there is none, or it has no batches, or is the telemetry table itself.
+    """
+    if name is None:
+        try:
+            name = cloud.output("storage", "OldTelemetryTable")
+        except StationError as error:
+            raise StationError(f"{error} with -c old_telemetry=true, or name a table") from error
+    try:
+        table = cloud.client("dynamodb").describe_table(TableName=name)["Table"]
+    except ClientError as error:
+        if error.response["Error"]["Code"] != "ResourceNotFoundException":
+            raise
+        raise StationError(f"there is no table {name}") from error
+    keys = [key["AttributeName"] for key in sorted(table["KeySchema"], key=itemgetter("KeyType"))]
+    if keys not in _KEYS:
+        allowed = " or ".join(", ".join(one) for one in _KEYS)
+        raise StationError(f"the table {name} has the keys {', '.join(keys)}: must be {allowed}")
+    if name == cloud.output("storage", "TelemetryTable"):
+        raise StationError(f"{name} is the telemetry table itself")
+    return name, table["ItemCount"]
+
+
+def adopt(
+    cloud: Cloud,
+    table: str,
+    *,
+    robot: str | None = None,
+    units_per_s: int = UNITS_PER_S,
+    dry_run: bool = False,
+    progress: Callable[[int], None] = lambda _items: None,
+) -> Adoption:
+    """Copy what a table has, of one robot or of all, at so many write units a second. An item is copied
+    with all that it holds, so that doing it again changes nothing. ``progress`` hears how many were read.
+
+    Raises `StationError` where DynamoDB does not take it; what was copied until then is good.
+    """
+    done = Adoption()
+    new_table = cloud.output("storage", "TelemetryTable")
+    for read, items in ahead(_pages(cloud, table, robot)):
+        new = list(_adoptable(items, cloud.namespace, done))
+        for start in range(0, 0 if dry_run else len(new), WRITE_SIZE):
+            _write(cloud, new_table, new[start : start + WRITE_SIZE], units_per_s)
+        progress(read)
+    return done
+
+
+def _pages(cloud: Cloud, table: str, robot: str | None) -> Iterator[tuple[int, Sequence[Item]]]:
+    """How many items were read, and those of them that are wanted; a topic's in order of time."""
+    request: dict[str, Any] = {"TableName": table, "ConsistentRead": True}
+    if robot is not None:
+        whole = build_topic(RECORD, robot, AGENT_STREAM, cloud.namespace)
+        request["FilterExpression"] = "begins_with(#topic, :start)"
+        request["ExpressionAttributeNames"] = {"#topic": TOPIC}
+        request["ExpressionAttributeValues"] = {":start": {"S": whole.removesuffix(AGENT_STREAM)}}
+    for page in cloud.client("dynamodb").get_paginator("scan").paginate(**request):
+        yield page["ScannedCount"], page["Items"]
+
+
+def _adoptable(items: Sequence[Item], namespace: str, done: Adoption) -> Iterator[dict[str, Any]]:
+    now_s = time.time()
+    for item in items:
+        values = plain(item)
+        expires = values.get(EXPIRES_S)
+        if isinstance(expires, Decimal) and expires <= now_s:
+            done.expired += 1
+            continue
+        try:
+            new = upgraded_item(item) if is_old(values) else dict(item)
+            topic, batch = _checked(new, namespace)
+        except ContractError as error:
+            done.left.append(Left(item[TOPIC]["S"], str(values.get(BATCH, values.get(T_US))), str(error)))
+            continue
+        done.batches[topic.robot, topic.name] += 1
+        done.samples[topic.robot, topic.name] += len(batch.times_us)
+        yield new
+
+
+def _checked(item: Item, namespace: str) -> tuple[Topic, Batch]:
+    # Without the time of receipt: a batch from years ahead of it is stored as any other.
+    topic, batch = decode_item(plain({name: value for name, value in item.items() if name != RECEIVED_MS}))
+    if topic.namespace != namespace:
+        raise ContractError(f"of the namespace {topic.namespace}: must be {namespace}")
+    return topic, batch
+
+
+def _write(cloud: Cloud, table: str, items: Sequence[Mapping[str, Any]], units_per_s: int) -> None:
+    began = time.monotonic()
+    try:
+        write(cloud.client("dynamodb"), table, [{"PutRequest": {"Item": item}} for item in items])
+    except TableError as error:
+        raise StationError(f"{error}; do it again, or with fewer --units") from error
+    spent_s = sum(map(_units, items)) / units_per_s
+    time.sleep(max(0.0, began + spent_s - time.monotonic()))
+
+
+def _units(item: Mapping[str, Any]) -> int:
+    """About what an item's write costs: nearly all of it is samples."""
+    return -(-len(str(item)) // _UNIT_BYTES)

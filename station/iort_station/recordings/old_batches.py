@@ -1,0 +1,43 @@
+"""Batches of version 1, which had no id, as batches of this version: their samples are written alike."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+from iort_contract import BATCH, NONFINITE, T_US, BatchId, ContractError
+from iort_contract.checks import check_header, check_version, integer
+from iort_contract.limits import BATCH_VERSION
+from iort_station.data.items import plain
+
+OLD_VERSION = 1
+_VERSION, _BOOT, _SEQ = "v", "boot", "seq"
+
+
+def is_old(envelope: Mapping[str, Any]) -> bool:
+    """Whether a message, or a stored item's attributes, say that they are of version 1."""
+    version = envelope.get(_VERSION)
+    return not isinstance(version, bool) and bool(version == OLD_VERSION)
+
+
+def upgraded(envelope: Mapping[str, Any]) -> dict[str, Any]:
+    """The message in this version, with all else that it holds; the samples are not looked at.
+
+    Raises `ContractError` where it is none of version 1, and where there is no id to make of it, as of a time
+    before 1970.
+    """
+    check_version(envelope, OLD_VERSION)
+    t_us, seq, nonfinite = (integer(envelope, name) for name in (T_US, _SEQ, NONFINITE))
+    boot = check_header(envelope.get(_BOOT), seq, nonfinite)
+    if t_us < 0:
+        raise ContractError(f"time {t_us} us: before 1970")
+    gone = {_BOOT, _SEQ, T_US} | (set() if nonfinite else {NONFINITE})
+    rest = {name: value for name, value in envelope.items() if name not in gone}
+    return {**rest, _VERSION: BATCH_VERSION, BATCH: str(BatchId(t_us, boot, seq))}
+
+
+def upgraded_item(item: Mapping[str, Any]) -> dict[str, Any]:
+    """As `upgraded`, of an item as DynamoDB has it; what is kept is kept to the letter."""
+    new = upgraded(plain(item))
+    kept = {name: value for name, value in item.items() if name in new}
+    return {**kept, _VERSION: {"N": str(new[_VERSION])}, BATCH: {"S": new[BATCH]}}

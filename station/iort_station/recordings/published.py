@@ -1,0 +1,93 @@
+"""ROS messages as they were published, out of the stored batches."""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from typing import Any, NamedTuple
+
+from iort_contract import CLAIM_AT, CLAIM_FIELDS, Batch, ContractError, MessageType, messages_of
+from iort_contract.ros1.message import filled
+from iort_station.cli.progress import Told
+from iort_station.cloud import Cloud
+from iort_station.data import reading
+from iort_station.data.items import plain
+from iort_station.data.selection import Selection
+from iort_station.data.stored import ATTRIBUTES, Refused
+
+# Gives the content of an uploaded file by its key; None where it is not there.
+Content = Callable[[str], "bytes | None"]
+
+
+class Published(NamedTuple):
+    """A message: the sample's time, the id of its type, its bytes."""
+
+    t_us: int
+    type_id: str
+    raw: bytes
+
+
+class Export:
+    """Reads a selection's messages. ``types`` are those that the robot has said, by id.
+
+    While it reads, it gathers: ``types`` grows by what batches say of theirs where the robot has said
+    nothing; ``others`` counts samples that are no messages; ``empty`` counts messages that have an empty
+    array for a content that is not there.
+    """
+
+    def __init__(
+        self, cloud: Cloud, selection: Selection, types: Mapping[str, MessageType], content: Content
+    ) -> None:
+        self.types = dict(types)
+        self.others = self.empty = 0
+        self.refused = Refused()
+        self._cloud, self._selection, self._content = cloud, selection, content
+        self._layouts = {name: kind.layout for name, kind in types.items()}
+
+    def messages(self, progress: Told | None = None) -> Iterator[Published]:
+        """The messages, in order of their batches' times."""
+        pages = reading.batches(self._cloud, self._selection, ATTRIBUTES)
+        for items in reading.told(pages, progress):
+            for item in items:
+                yield from self._of(plain(item))
+
+    def _of(self, item: Mapping[str, Any]) -> Sequence[Published]:
+        try:
+            batch, messages = messages_of(item, self._layouts)
+        except ContractError as error:
+            self.refused.add(error)
+            return ()
+        inside = [i for i, t_us in enumerate(batch.times_us) if self._selection.holds_time(t_us)]
+        if messages is None:
+            self.others += len(inside)
+            return ()
+        if messages.type_id not in self.types and not messages.layout:
+            self.refused.add(ContractError(f"nobody has said what the type {messages.type_id} is"))
+            return ()
+        if messages.type_id not in self.types:
+            kind, _, definition = messages.layout.partition("\n")
+            stream = self._selection.stream
+            self.types[messages.type_id] = MessageType(stream, f"/{stream}", kind, "", definition)
+        name, raws = messages.type_id, messages.raw
+        try:
+            return [Published(batch.times_us[i], name, self._filled(raws[i], batch, i)) for i in inside]
+        except ContractError as error:
+            self.refused.add(error)
+            return ()
+
+    def _filled(self, raw: bytes, batch: Batch, i: int) -> bytes:
+        """The message with what was kept as files; what was cut out last comes back first."""
+        places = [name for name in batch.columns if name.endswith(f".{CLAIM_AT}")]
+        for place in reversed(places):
+            at, field = batch.columns[place][i], place[: -len(CLAIM_AT) - 1]
+            # A message may have a field of that name itself.
+            if type(at) is not int or not all(f"{field}.{part}" in batch.columns for part in CLAIM_FIELDS):
+                continue
+            key, sha256 = (batch.columns[f"{field}.{part}"][i] for part in ("key", "sha256"))
+            content = self._content(key) if isinstance(key, str) else None
+            if content is None or hashlib.sha256(content).hexdigest() != sha256:
+                # Where those before it were is no longer known.
+                self.empty += 1
+                break
+            raw = filled(raw, content, at)
+        return raw

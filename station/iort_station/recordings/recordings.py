@@ -1,0 +1,110 @@
+"""Recordings for other tools: MCAP, which Foxglove opens, and ROS 1 bags, which `rosbag play` plays."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any, Protocol
+
+from mcap.writer import Writer as McapWriter
+from rosbags.rosbag1 import Writer as BagWriter
+from rosbags.typesys import Stores, get_types_from_msg, get_typestore
+
+from iort_station.errors import StationError
+
+Write = Callable[[int, bytes], None]
+
+
+class Recording(Protocol):
+    """A file that messages are written into."""
+
+    def topic(self, topic: str, kind: str, definition: str, md5sum: str) -> Write:
+        """Begin a topic's messages of one ROS 1 type; what is returned writes one, with its time in
+        nanoseconds since the epoch. Raises `StationError` for a definition that is none."""
+
+
+class _Bag:
+    def __init__(self, writer: BagWriter) -> None:
+        self._writer = writer
+        self._connections: dict[tuple[str, str, str], Any] = {}
+
+    def topic(self, topic: str, kind: str, definition: str, md5sum: str) -> Write:
+        named = (topic, kind, md5sum)
+        if named not in self._connections:
+            try:
+                self._connections[named] = self._writer.add_connection(
+                    topic,
+                    kind.replace("/", "/msg/"),
+                    msgdef=definition,
+                    md5sum=md5sum or checksum(kind, definition),
+                    # A bag keeps two types of one topic apart by who published them.
+                    callerid="/iort" if not self._connections else f"/iort_{len(self._connections)}",
+                )
+            except Exception as error:  # whatever a bag library raises
+                raise StationError(f"topic {topic} of type {kind} cannot be written: {error}") from error
+        connection = self._connections[named]
+        return lambda t_ns, message: self._writer.write(connection, t_ns, message)
+
+
+class _Mcap:
+    def __init__(self, writer: McapWriter) -> None:
+        self._writer = writer
+        self._sequence = 0
+
+    def topic(self, topic: str, kind: str, definition: str, md5sum: str) -> Write:
+        schema = self._writer.register_schema(kind, "ros1msg", definition.encode())
+        about = {"md5sum": md5sum or checksum(kind, definition), "callerid": "/iort"}
+        channel = self._writer.register_channel(topic, "ros1", schema, about)
+
+        def write(t_ns: int, message: bytes) -> None:
+            self._writer.add_message(channel, t_ns, message, t_ns, self._sequence)
+            self._sequence += 1
+
+        return write
+
+
+def checksum(kind: str, definition: str) -> str:
+    """ROS 1's MD5 of a definition. Raises `StationError` for what is none."""
+    name = kind.replace("/", "/msg/")
+    try:
+        store = get_typestore(Stores.EMPTY)
+        store.register(get_types_from_msg(definition, name))
+        return str(store.generate_msgdef(name, ros_version=1)[1])
+    except Exception as error:  # whatever a library raises on a text
+        raise StationError(f"the type {kind} cannot be read: {error}") from error
+
+
+@contextmanager
+def bag(path: Path) -> Iterator[Recording]:
+    """A new ROS 1 bag, there once it is whole; raises `StationError` where the file exists."""
+    with _new(path) as part, BagWriter(part) as writer:
+        yield _Bag(writer)
+
+
+@contextmanager
+def mcap(path: Path) -> Iterator[Recording]:
+    """A new MCAP file, there once it is whole; raises `StationError` where the file exists."""
+    with _new(path) as part, part.open("wb") as file:
+        writer = McapWriter(file)
+        writer.start(profile="ros1", library="iort")
+        yield _Mcap(writer)
+        writer.finish()
+
+
+@contextmanager
+def _new(path: Path) -> Iterator[Path]:
+    """Where to write what becomes ``path``, so that what broke off is never taken for a recording."""
+    if path.exists():
+        raise StationError(f"{path} exists")
+    part = path.with_name(f".{path.name}.{os.getpid()}.part")
+    try:
+        yield part
+        part.rename(path)
+    finally:
+        part.unlink(missing_ok=True)
+
+
+KINDS = {".bag": bag, ".mcap": mcap}
+__all__: Sequence[str] = ("KINDS", "Recording", "bag", "mcap")
