@@ -2,7 +2,7 @@
 
     python -m bench.run [--only query,outage] [--target embedded|aws] [--yes] [--out build/bench]
 
-Writes report.md, report.html, report.json and the pictures into the folder. Exit status 1 if a target is
+Writes report.md, report.json and the pictures into the folder. Exit status 1 if a target is
 missed, 2 if a section could not be measured.
 
 With --target aws it says what that costs and asks first. Ctrl-C, or the end of its terminal, still puts back
@@ -77,7 +77,7 @@ def run(options: argparse.Namespace, cloud: Cloud | None = None) -> None:
         if sections:
             report.write(options.out, sections, here, options.target)
     _show(console, sections)
-    console.print(f"{options.out / 'report.html'}  after {time.monotonic() - began:.0f} s", highlight=False)
+    console.print(f"{options.out / 'report.md'}  after {time.monotonic() - began:.0f} s", highlight=False)
     if failed:
         console.print(f"not measured: {', '.join(failed)}", style="red")
         sys.exit(2)

@@ -78,20 +78,11 @@ def test_markdown_has_tables_pictures_and_the_machine():
     assert "A processor" in text
 
 
-def test_page_takes_no_text_for_markup():
-    text = report.page([_section(Ratio("r", 1, 2))], MACHINE, "embedded")
-    assert "<script>" not in text
-    assert "&lt;script&gt;" in text
-    assert text.count("<svg") == 1
-    assert "<td class=good>yes</td>" in text
-
-
 def test_written_report_is_whole_and_old_pictures_go(tmp_path):
     (tmp_path / "report-old.svg").write_text("<svg/>")
     report.write(tmp_path, [_section(Ratio("r", 1, 2))], MACHINE, "embedded")
     assert sorted(path.name for path in tmp_path.iterdir()) == [
         "report-bars.svg",
-        "report.html",
         "report.json",
         "report.md",
     ]
