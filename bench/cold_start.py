@@ -25,7 +25,7 @@ from tempfile import TemporaryDirectory
 from rich.console import Console
 from rich.table import Table
 
-from bench.machine import ROOT
+from bench import ROOT
 from bench.runtime.deployed import functions
 from bench.runtime.environment import Function, RuntimeFailedError, link_runtime, started
 from bench.runtime.events import events

@@ -27,8 +27,8 @@ from rich.progress import Progress
 from rich.table import Table
 
 from bench.errors import BenchError
-from bench.fleet_arrivals import Tell
-from bench.fleet_run import Fleet, measure
+from bench.load.fleet_arrivals import Tell
+from bench.load.fleet_run import Fleet, measure
 from local.cloud import EmbeddedCloud
 from local.errors import LocalError
 

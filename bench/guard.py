@@ -2,7 +2,7 @@
 
     python -m bench.guard [--new build/bench/report.json] [--old docs/bench/report.json]
 
-A figure may be so many times worse as it says of itself (`bench.result.Ratio.tolerance`), whatever its
+A figure may be so many times worse as it says of itself (`bench.report.result.Ratio.tolerance`), whatever its
 target; what was nothing (samples lost) must stay nothing. A figure whose other half is a constant is a time
 in disguise: on a machine of another kind it is held to its target alone. A figure that a section no longer
 gives counts as worse. Exit status 1 where something is worse, 2 where nothing can be compared.
@@ -17,8 +17,8 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, NoReturn
 
-from bench.machine import ROOT
-from bench.result import Ratio
+from bench import ROOT
+from bench.report.result import Ratio
 
 Report = dict[str, Any]
 # Two reports with these alike were made on machines of a kind.

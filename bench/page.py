@@ -25,8 +25,8 @@ from typing import Any
 from rich.console import Console
 from rich.table import Table
 
-from bench import chromium
 from bench.errors import BenchError
+from bench.meters import chromium
 from iort_station.fleet.robots import F1TENTH
 from iort_station.page.server import PageServer
 from local.pubnub_standin import PubNubStandIn
@@ -107,7 +107,7 @@ def _options() -> argparse.Namespace:
 def _cars(origin: str, count: int) -> Iterator[None]:
     """The cars, in a process of their own; it ends when its input does."""
     keys = ["--publish-key", _KEY, "--subscribe-key", _KEY]
-    command = [sys.executable, "-m", "bench.cars", "--origin", origin, *keys, "--cars", str(count)]
+    command = [sys.executable, "-m", "bench.load.cars", "--origin", origin, *keys, "--cars", str(count)]
     with subprocess.Popen(command, stdin=subprocess.PIPE):
         yield
 

@@ -23,9 +23,10 @@ from rich.markup import escape
 from rich.prompt import Confirm
 from rich.table import Table
 
-from bench import machine, report, spending
+from bench import ROOT, spending
 from bench.interrupts import wound_up
-from bench.result import Section
+from bench.report import machine, writer
+from bench.report.result import Section
 from bench.sections import SECTIONS
 from bench.target import AWS, EMBEDDED, Target, open_target
 from iort_contract import DEFAULT_NAMESPACE
@@ -34,7 +35,7 @@ from iort_station.cost.prices import AS_OF, REGION
 from iort_station.errors import StationError
 from local.errors import LocalError
 
-OUT = machine.ROOT / "build" / "bench"
+OUT = ROOT / "build" / "bench"
 
 
 def main() -> None:
@@ -75,7 +76,7 @@ def run(options: argparse.Namespace, cloud: Cloud | None = None) -> None:
         sys.exit(2)
     finally:
         if sections:
-            report.write(options.out, sections, here, options.target)
+            writer.write(options.out, sections, here, options.target)
     _show(console, sections)
     console.print(f"{options.out / 'report.md'}  after {time.monotonic() - began:.0f} s", highlight=False)
     if failed:
@@ -117,7 +118,7 @@ def _measure(key: str, target: Target, console: Console, sections: list[Section]
 
 
 def _show(console: Console, sections: list[Section]) -> None:
-    rows = report.headline(sections)
+    rows = writer.headline(sections)
     table = Table(title=rows.title, title_justify="left", title_style="bold")
     for i, name in enumerate(rows.head):
         table.add_column(name, justify="right" if i else "left")

@@ -19,14 +19,14 @@ from contextlib import ExitStack, contextmanager
 from pathlib import Path
 from typing import Any, Literal
 
-from bench import chromium
-from bench.cars import Publisher, SimulatedCar, drive
+from bench import ROOT
 from bench.errors import BenchError
+from bench.load.cars import Publisher, SimulatedCar, drive
+from bench.meters import chromium
 from iort_station.fleet import robots
 from iort_station.page.answers import answers
 from iort_station.page.server import PageServer
 from local.cloud import EmbeddedCloud
-from local.deployment import ROOT
 
 OUT = ROOT / "docs" / "images"
 DRIVE_S = 100

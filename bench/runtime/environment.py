@@ -19,7 +19,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-from bench import cpu
+from bench.meters import cpu
 from bench.runtime.api import NEXT, Call, RuntimeApi, Services, served
 
 _ANSWER_S = 60.0

@@ -9,12 +9,12 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass
 
-from bench import thesis
 from bench.probes import dynamodb, functions, iot_core, watching
-from bench.probes.ground import Ground, No
-from bench.result import Ratio, Section, Table
+from bench.probes.probe_fixture import AbilityMissingError, ProbeFixture
+from bench.report import thesis
+from bench.report.result import Ratio, Section, Table
+from bench.report.thesis import UNSAID, said
 from bench.target import Say, Target
-from bench.thesis import UNSAID, said
 
 _IOT_CORE, _DYNAMODB, _LAMBDA, _PUBNUB, _CLOUDWATCH = "IoT Core", "DynamoDB", "Lambda", "PubNub", "CloudWatch"
 # What the thesis said, by the point that an ability is an instance of.
@@ -33,7 +33,7 @@ class Probe:
     service: str
     ability: str
     thesis: str
-    ask: Callable[[Ground], str]
+    ask: Callable[[ProbeFixture], str]
 
 
 # Every cell, by the thesis' table that it belongs to.
@@ -92,13 +92,13 @@ def run(target: Target, say: Say) -> Section:
     section = Section("abilities", "Abilities (tables 6.1 to 6.3)")
     answers: dict[str, list[list[str]]] = {}
     failed = 0
-    with Ground(target) as ground:
+    with ProbeFixture(target) as fixture:
         for criteria, probes in PROBES.items():
             title = f"{criteria.title.capitalize()} (table {criteria.number})"
             rows = answers[title] = []
             for probe in probes:
                 say(f"{probe.service}: {probe.ability}")
-                answer, seen = _answer(probe, ground)
+                answer, seen = _answer(probe, fixture)
                 failed += answer == "no"
                 rows.append([probe.ability, probe.service, answer, probe.thesis, seen])
             head = ["ability", "service", "here", "thesis, 2018", "what the probe saw"]
@@ -113,10 +113,10 @@ def run(target: Target, say: Say) -> Section:
     return section
 
 
-def _answer(probe: Probe, ground: Ground) -> tuple[str, str]:
+def _answer(probe: Probe, fixture: ProbeFixture) -> tuple[str, str]:
     try:
-        return "yes", probe.ask(ground)
-    except No as no:
-        return "no", str(no)
+        return "yes", probe.ask(fixture)
+    except AbilityMissingError as missing:
+        return "no", str(missing)
     except Exception as error:  # noqa: BLE001 - whatever the service does instead is the answer
         return "no", f"{type(error).__name__}: {error}"[:160]

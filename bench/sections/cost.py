@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from dataclasses import asdict, replace
 
-from bench import plots
-from bench.result import Plot, Ratio, Section, Table
+from bench.report import plots
+from bench.report.result import Plot, Ratio, Section, Table
 from bench.target import Say, Target
 from iort_station.cost import line_items, model, report, scale
 from iort_station.cost.prices import AS_OF, REGION

@@ -1,8 +1,8 @@
 """A mixed robot on a real ROS 1 graph: what the agent costs beside `rosbag record` of the same topics.
 
-Both are subscribed to every topic of `bench.mixed_robot` at the same time, and so is a bare rospy subscriber,
-which is what Python and rospy take by themselves. The agent publishes to mosquitto, where all is counted.
-Where ROS 1 or mosquitto is not installed, the section says so and has no figures.
+Both subscribe to every topic of `bench.ros.mixed_robot` at the same time. So does a bare rospy subscriber,
+which shows what Python and rospy take by themselves. The agent publishes to mosquitto, where a watcher counts
+everything. Without ROS 1 or mosquitto the section has no figures and says why.
 """
 
 from __future__ import annotations
@@ -23,14 +23,15 @@ from typing import Any
 import yaml
 from awscrt import mqtt5
 
-from bench import plots, usage
 from bench.errors import BenchError
-from bench.mixed_robot import NODES, topics
-from bench.mosquitto import HOST, Mosquitto, found
-from bench.result import NOT_MEASURED, Plot, Ratio, Section, Table
-from bench.ros_graph import PACKAGES, SYSTEM_PYTHON, Publisher, RosGraph, python_with_rospy
+from bench.floors.mosquitto import HOST, Mosquitto, found
+from bench.meters import usage
+from bench.meters.watcher import subscribed
+from bench.report import plots
+from bench.report.result import NOT_MEASURED, Plot, Ratio, Section, Table
+from bench.ros.graph import PACKAGES, SYSTEM_PYTHON, Publisher, RosGraph, python_with_rospy
+from bench.ros.mixed_robot import NODES, topics
 from bench.target import Say, Target
-from bench.watcher import subscribed
 from iort_contract import LIVE, RECORD, decode, parse_topic
 
 SECONDS = 30
@@ -110,11 +111,11 @@ def measure(program: str, python: str, seconds: int, say: Say) -> Found:
             AGENT: graph.start(
                 "iort_agent.cli", "run", "--config", config, "--report", written, "--drain-s", _CATCH_UP_S
             ),
-            FLOOR: graph.start("bench.ros_floor", *topics()),
+            FLOOR: graph.start("bench.floors.ros_floor", *topics()),
         }
         lasts_s = seconds + _WARM_UP_S
         publishers = [
-            Publisher(graph.start("bench.mixed_publisher", node, lasts_s, _SUBSCRIBERS)) for node in NODES
+            Publisher(graph.start("bench.ros.mixed_publisher", node, lasts_s, _SUBSCRIBERS)) for node in NODES
         ]
         say("waiting for every subscriber of every topic")
         for publisher in publishers:

@@ -13,11 +13,11 @@ from contextlib import contextmanager, suppress
 from statistics import median
 from typing import Any
 
-from bench import plots
-from bench.driving import Driving
 from bench.errors import BenchError
-from bench.result import Plot, Ratio, Section, Table
-from bench.spread import spread
+from bench.load.agent_process import AgentProcess
+from bench.report import plots
+from bench.report.result import Plot, Ratio, Section, Table
+from bench.report.spread import spread
 from bench.target import Say, Target
 from iort_agent.config.file import load_config
 from iort_contract import BATCH, OWN_STREAMS, VESC_STREAM, batch_id
@@ -39,7 +39,11 @@ def run(target: Target, say: Say) -> Section:
     seconds = BEFORE_S + CUT_S + AFTER_S
     source = {"type": "sim", "stream": VESC_STREAM, "rate_hz": RATE_HZ, "duration_s": seconds}
     bundle = target.robot(ROBOT, sources=[source], queue={"path": "queue.db"})
-    with _way(target, bundle) as way, target.listener(bundle.robot) as listener, Driving(bundle) as driving:
+    with (
+        _way(target, bundle) as way,
+        target.listener(bundle.robot) as listener,
+        AgentProcess(bundle) as agent,
+    ):
         _wait_for(lambda: bool(listener.heard), "the first live update")
         say(f"driving for {BEFORE_S} s")
         threading.Event().wait(BEFORE_S)
@@ -51,7 +55,7 @@ def run(target: Target, say: Say) -> Section:
         way.mend()
         mended_us = time.time_ns() // 1000
         say("draining")
-        report = driving.finished()
+        report = agent.finished()
         heard = list(listener.heard)
     sent = sum(s["samples"] for name, s in report["streams"].items() if name not in OWN_STREAMS)
     # What is lost never comes; it is counted, not waited for.

@@ -14,10 +14,12 @@ from typing import Any, NamedTuple
 import boto3
 from boto3.dynamodb.conditions import Attr, Key
 
-from bench import cpu, drives, plots, thesis
 from bench.errors import BenchError
-from bench.result import NOT_MEASURED, Plot, Ratio, Section, Table
-from bench.spread import ratio, spread
+from bench.load import stored_drive
+from bench.meters import cpu
+from bench.report import plots, thesis
+from bench.report.result import NOT_MEASURED, Plot, Ratio, Section, Table
+from bench.report.spread import ratio, spread
 from bench.target import Say, Target
 from iort_contract import RECEIVED_MS, RECORD, TOPIC, VESC_STREAM, build_topic
 from iort_station.cost.sizes import item_bytes
@@ -27,7 +29,7 @@ from iort_station.operations import delivery
 POINTS = 14_368
 ROBOT, HOUR_ROBOT = "bench-query", "bench-hour"
 REPEATS = 3
-HOUR_POINTS = 3600 * drives.RATE_HZ
+HOUR_POINTS = 3600 * stored_drive.RATE_HZ
 _CATCH_UP_S = 120.0
 THESIS_QUERY, THESIS_SCAN = "thesis' layout, query through Table", "thesis' layout, scan through Table"
 OURS_QUERY, OURS_SCAN = "iort, query on premises", "iort, scan on premises"
@@ -64,9 +66,9 @@ class Way:
 def run(target: Target, say: Say) -> Section:
     """Store the same drive in both layouts, then read it back in turns."""
     section = Section("query", "Query and scan (table 6.6)")
-    robot, samples = target.name(ROBOT), drives.simulated(POINTS)
+    robot, samples = target.name(ROBOT), stored_drive.simulated(POINTS)
     say(f"storing {POINTS:,} points in both layouts")
-    drives.store(target, robot, samples)
+    stored_drive.store(target, robot, samples)
     _until_summarized(target, robot, POINTS, say)
     with _thesis_table(target, robot, samples) as table:
         topic = build_topic(RECORD, robot, VESC_STREAM, target.cloud.namespace)
@@ -111,7 +113,7 @@ def run(target: Target, say: Say) -> Section:
 def _hour(target: Target, section: Section, say: Say) -> None:
     robot = target.name(HOUR_ROBOT)
     say(f"storing an hour of one robot, {HOUR_POINTS:,} points")
-    drives.store(target, robot, drives.simulated(HOUR_POINTS))
+    stored_drive.store(target, robot, stored_drive.simulated(HOUR_POINTS))
     _until_summarized(target, robot, HOUR_POINTS, say)
     way = Way()
     for turn in range(REPEATS + 1):
@@ -250,7 +252,7 @@ def _header(seq: int, t_us: int) -> dict[str, Any]:
 
 
 @contextmanager
-def _thesis_table(target: Target, robot: str, samples: list[drives.Sample]) -> Iterator[Any]:
+def _thesis_table(target: Target, robot: str, samples: list[stored_drive.Sample]) -> Iterator[Any]:
     """A table of one item a sample, as the thesis' rule wrote it; gone afterwards."""
     name = target.name(f"{target.cloud.namespace}-bench-thesis")
     cloud = target.cloud

@@ -6,8 +6,9 @@ the section on cost.
 
 from __future__ import annotations
 
-from bench import fleet_run, plots
-from bench.result import Plot, Ratio, Section, Table
+from bench.load import fleet_run
+from bench.report import plots
+from bench.report.result import Plot, Ratio, Section, Table
 from bench.target import Say, Target
 
 # How long each fleet drives, in seconds: a large one makes as many batches in less.

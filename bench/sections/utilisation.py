@@ -17,13 +17,15 @@ from dataclasses import asdict
 from statistics import median
 from typing import Any
 
-from bench import borrowed, drives, plots, thesis
+from bench import ROOT
 from bench.errors import BenchError
-from bench.invocations import Event, Measured, configure, invoke, measure, reporting
-from bench.machine import ROOT
-from bench.result import NOT_MEASURED, Plot, Ratio, Section, Table
-from bench.spread import spread
+from bench.load import stored_drive
+from bench.meters.invocations import Event, Measured, configure, invoke, measure, reporting
+from bench.report import plots, thesis
+from bench.report.result import NOT_MEASURED, Plot, Ratio, Section, Table
+from bench.report.spread import spread
 from bench.target import Say, Target
+from bench.temporary_function import temporary_function
 from iort_agent.sources.vehicle import Vehicle, VehicleConfig
 from iort_contract import (
     BATCH,
@@ -67,7 +69,7 @@ def run(target: Target, say: Say) -> Section:
     }
     live = target.cloud.output("processing", "LiveFunction")
     summarize = target.cloud.output("processing", "SummarizeFunction")
-    with borrowed.function(target, "empty", _NOTHING, memory_mb=256) as empty, ExitStack() as reports:
+    with temporary_function(target, "empty", _NOTHING, memory_mb=256) as empty, ExitStack() as reports:
         names = dict(zip(events, (live, summarize, summarize), strict=True))
         events[_EMPTY], names[_EMPTY] = (lambda _: {}), empty
         for name in sorted(set(names.values())):
@@ -230,9 +232,9 @@ def _store(target: Target, say: Say) -> list[dict[str, Any]]:
     """The items of a drive of 100 s in the telemetry table; waits until Lambda 2 has seen them."""
     say("storing a drive")
     robot = target.name(ROBOT)
-    items = drives.store(target, robot, drives.simulated(BATCHES * drives.RATE_HZ))
+    items = stored_drive.store(target, robot, stored_drive.simulated(BATCHES * stored_drive.RATE_HZ))
     deadline = time.monotonic() + _CATCH_UP_S
-    while delivery.samples_summarized(target.cloud, robot, VESC_STREAM) < BATCHES * drives.RATE_HZ:
+    while delivery.samples_summarized(target.cloud, robot, VESC_STREAM) < BATCHES * stored_drive.RATE_HZ:
         if time.monotonic() > deadline:
             raise BenchError("Lambda 2 has not summarised what was stored")
         threading.Event().wait(0.2)
@@ -269,9 +271,13 @@ def _live_event(target: Target, i: int) -> dict[str, Any]:
 
 def _cycle() -> dict[str, float]:
     done = subprocess.run(
-        [sys.executable, "-m", "bench.cycle", "5000"], cwd=ROOT, capture_output=True, text=True, check=False
+        [sys.executable, "-m", "bench.meters.cycle", "5000"],
+        cwd=ROOT,
+        capture_output=True,
+        text=True,
+        check=False,
     )
     if done.returncode:
-        raise BenchError(f"bench.cycle failed: {done.stderr[-800:]}")
+        raise BenchError(f"bench.meters.cycle failed: {done.stderr[-800:]}")
     found: dict[str, float] = json.loads(done.stdout)
     return found

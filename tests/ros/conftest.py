@@ -19,7 +19,8 @@ from typing import Any
 
 import pytest
 
-from bench.ros_graph import ROOT, SYSTEM_PYTHON, python_with_rospy
+from bench import ROOT
+from bench.ros.graph import SYSTEM_PYTHON, python_with_rospy
 from tests.ports import free_port
 
 HERE = Path(__file__).resolve().parent

@@ -13,8 +13,8 @@ from contextlib import contextmanager
 from dataclasses import dataclass, field
 from typing import Any
 
-from bench import cpu
 from bench.errors import BenchError
+from bench.meters import cpu
 from bench.target import Target
 
 _LOGS_S = 60.0

@@ -1,4 +1,4 @@
-"""A function of the bench's own, for as long as it measures."""
+"""A Lambda function that exists only while a measurement needs it."""
 
 from __future__ import annotations
 
@@ -11,11 +11,13 @@ from bench.target import Target
 
 
 @contextmanager
-def function(
+def temporary_function(
     target: Target, name: str, source: str, *, memory_mb: int, timeout_s: int = 3, like: str = "Echo"
 ) -> Iterator[str]:
-    """The name of a deployed function whose ``source`` has a `handler`, with runtime, role, architecture
-    and log of the function ``like``; it is deleted in the end."""
+    """Deploy a function, yield its name, and delete it at the end.
+
+    ``source`` defines `handler`. Runtime, role, architecture and log are those of the function ``like``.
+    """
     client = target.cloud.client("lambda")
     whole = target.name(f"{target.cloud.namespace}-bench-{name}")
     model = target.cloud.output("processing", f"{like}Function")

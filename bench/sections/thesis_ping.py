@@ -1,4 +1,4 @@
-"""The round trips and the way to the dashboard with the thesis' own ping in the way, beside its figures.
+"""Round trips, and the delay to the dashboard, with the ping of the thesis added, beside its figures.
 
 The project's proxy stands before the broker, and another before PubNub's stand-in: each delays every byte by
 25 ms, both ways. The thesis' car had a ping of 50 ms to its cloud.
@@ -11,14 +11,14 @@ from collections.abc import Mapping
 from dataclasses import asdict
 from typing import Any
 
-from bench import plots
-from bench.driving import Driving
 from bench.errors import BenchError
-from bench.lines import RAW, Lines
-from bench.result import NOT_MEASURED, Plot, Ratio, Section, Table
-from bench.spread import ratio, spread
+from bench.load.agent_process import AgentProcess
+from bench.meters.round_trips import RAW, RoundTrips
+from bench.report import plots
+from bench.report.result import NOT_MEASURED, Plot, Ratio, Section, Table
+from bench.report.spread import ratio, spread
+from bench.report.thesis import PING_MS, SOURCE
 from bench.target import Say, Target
-from bench.thesis import PING_MS, SOURCE
 from iort_contract import BROKER, PING_PATHS, T_US, VESC_STREAM
 from iort_station.fleet.robots import Bundle
 from iort_station.page import keys
@@ -42,7 +42,7 @@ def measure(target: Target, bundles: Mapping[str, Bundle], floor: Bundle, say: S
     found: dict[str, Repeats] = {}
     cloud = target.cloud
     with Proxy(cloud.mqtt_endpoint, cloud.mqtt_port, latency_s=ONE_WAY_S) as proxy:
-        with Lines(bundles, floor, cloud.namespace, proxy.port) as lines:
+        with RoundTrips(bundles, floor, cloud.namespace, proxy.port) as lines:
             for repeat in range(_REPEATS):
                 for rate_hz in RATES_HZ:
                     say(f"{WITH}, {rate_hz} Hz, {repeat + 1} of {_REPEATS}")
@@ -73,7 +73,7 @@ def _to_subscriber(target: Target, port: int) -> list[float]:
             on_update=lambda update, _, here_us: delays_ms.append((here_us - update[T_US]) / 1000),
             **pubnub,
         ),
-        Driving(bundle),
+        AgentProcess(bundle),
     ):
         threading.Event().wait(_WARM_UP_S)
         delays_ms.clear()

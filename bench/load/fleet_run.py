@@ -16,17 +16,17 @@ from typing import Any
 
 from botocore.exceptions import BotoCoreError, ClientError
 
-from bench import usage
+from bench import ROOT
 from bench.errors import BenchError
-from bench.fleet_arrivals import Tell, stored, summarized
-from bench.fleet_load import SAMPLES as BATCH_SAMPLES
-from bench.fleet_load import Load
+from bench.load.fleet_arrivals import Tell, stored, summarized
+from bench.load.fleet_load import SAMPLES as BATCH_SAMPLES
+from bench.load.fleet_load import Load
+from bench.meters import usage
 from iort_contract import SECOND, VESC_STREAM
 from iort_station.cloud import Cloud
 from iort_station.data.items import of_topic
 from iort_station.fleet import robots
 from local.cloud import EmbeddedCloud
-from local.deployment import ROOT
 from local.figures import Spread
 
 
@@ -141,7 +141,7 @@ def measure(embedded: EmbeddedCloud, count: int, seconds: int, tell: Tell, *, pr
 @contextmanager
 def _generator(load: Load) -> Iterator[Iterator[dict[str, Any]]]:
     """What the process that drives the robots says, a dictionary a line."""
-    command = [sys.executable, "-m", "bench.fleet_load"]
+    command = [sys.executable, "-m", "bench.load.fleet_load"]
     with subprocess.Popen(
         command, cwd=ROOT, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True
     ) as process:

@@ -1,6 +1,6 @@
 """The node's own cycle: from a message's bytes in the callback to the batch in the spool, no network.
 
-    python -m bench.cycle SAMPLES
+    python -m bench.meters.cycle SAMPLES
 
 Uses the agent's own parts, a spool on disk, and the uplink that keeps messages in memory; prints the
 cycle's percentiles in milliseconds as JSON.
@@ -16,7 +16,7 @@ import time
 from pathlib import Path
 from statistics import quantiles
 
-from bench.ros_message import DEFINITION, TYPE, body
+from bench.ros.message import DEFINITION, TYPE, body
 from iort_agent.agent import Agent
 from iort_agent.clock import SystemClock
 from iort_agent.config.file import Config, QueueConfig

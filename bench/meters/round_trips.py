@@ -11,7 +11,7 @@ from typing import Any
 from typing_extensions import Self
 
 from bench.errors import BenchError
-from bench.raw_mqtt import RawClient
+from bench.floors.raw_mqtt import RawClient
 from iort_agent.clock import SystemClock
 from iort_agent.config.file import load_config
 from iort_agent.dispatch import Dispatcher
@@ -29,7 +29,7 @@ _CONNECT_S = 30.0
 _SET_UP_S = 0.3
 
 
-class Lines:
+class RoundTrips:
     """Connected from `__enter__` to `__exit__`: the agent's own uplink a path, and the smallest MQTT client
     there can be. ``port`` is that of what stands before the broker, if anything does."""
 

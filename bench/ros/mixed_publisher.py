@@ -1,6 +1,6 @@
 """One node of the mixed robot; runs under a Python with rospy.
 
-python -m bench.mixed_publisher NODE SECONDS SUBSCRIBERS
+python -m bench.ros.mixed_publisher NODE SECONDS SUBSCRIBERS
 
 Waits for so many subscribers of each of its topics, then for a line on its input; publishes each topic at its
 rate, stamped as it goes out; says at the end how many messages went out, by topic, as JSON.
@@ -16,7 +16,7 @@ from typing import Any
 import genpy.dynamic
 import rospy
 
-from bench.mixed_robot import HEADER, NODES, Topic
+from bench.ros.mixed_robot import HEADER, NODES, Topic
 
 # Of a subscriber's connection: a second of the fastest topic.
 _QUEUE = 1000

@@ -8,7 +8,7 @@ from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from typing import Any
 
-from bench.fleet_load import SAMPLES as BATCH_SAMPLES
+from bench.load.fleet_load import SAMPLES as BATCH_SAMPLES
 from iort_contract import BATCH, RECEIVED_MS, SAMPLES, SECOND, VESC_STREAM, batch_id
 from iort_station.cloud import Cloud
 from iort_station.data.items import of_topic, plain

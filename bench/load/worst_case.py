@@ -1,9 +1,9 @@
-"""What the dearest batches cost Lambda 2, which a robot that means harm may send a hundred of a second.
+"""The most expensive batches for Lambda 2. A hostile robot may send a hundred of them a second.
 
-    python -m bench.dear
+    python -m bench.load.worst_case
 
-Each fits into a message. Measured are decoding and summarising, without any table, in processor time of
-this machine, and the memory that the decoded batch holds; of what is refused, the refusal.
+Each batch fits into a message. The command measures the processor time to decode and summarise it, without
+any table, and the memory that the decoded batch holds. For a refused batch it prints the reason.
 """
 
 from __future__ import annotations
@@ -36,8 +36,8 @@ from iort_contract.statistics import summarize_second
 
 _BOOT, _T_US = "0badcafe", 1_700_000_000_000_000
 _TIMES = 5
-# Of those in the codec of today.
-_DEAREST = f"{MAX_BATCH_VALUES:,} texts full of escapes"
+# The most expensive case in the current codec.
+_WORST = f"{MAX_BATCH_VALUES:,} texts full of escapes"
 
 
 class Case(NamedTuple):
@@ -55,9 +55,9 @@ class Cost(NamedTuple):
     refused: str
 
 
-def dearest(count: int, *, first_us: int = _T_US) -> Iterator[bytes]:
-    """So many batches of a stream, each as dear as the contract allows and of another second."""
-    (message,) = (case.message for case in cases() if case.what == _DEAREST)
+def worst_batches(count: int, *, first_us: int = _T_US) -> Iterator[bytes]:
+    """Yield ``count`` batches of a stream, one for each second, as expensive as the contract allows."""
+    (message,) = (case.message for case in cases() if case.what == _WORST)
     envelope = json.loads(message)
     for number in range(count):
         envelope[BATCH] = str(BatchId(first_us + number * 1_000_000, _BOOT, number))
@@ -65,7 +65,7 @@ def dearest(count: int, *, first_us: int = _T_US) -> Iterator[bytes]:
 
 
 def cases() -> Iterator[Case]:
-    """The dearest that were thought of, and the largest batch of a good car."""
+    """Yield the most expensive batches that we know, and the largest batch of a good car."""
     n, fields = 4000, 500
     zeros = _columns(n, [b"[1.0%s]" % (b",1.0" * (n - 1))] * fields)
     yield Case("two million equal values, in the codec of before", _message(PLAIN_CODEC, n, zeros))
@@ -79,7 +79,7 @@ def cases() -> Iterator[Case]:
         f"{n:,} texts full of escapes, in the codec of before", _message(PLAIN_CODEC, n, _columns(n, texts))
     )
     texts = [b"[null%s]" % ((b',"' + rb"\n" * 36 + b'"') * n)]
-    yield Case(_DEAREST, _message(CODEC, n, _columns(n, texts)))
+    yield Case(_WORST, _message(CODEC, n, _columns(n, texts)))
     numbers = [b"[3,1000%s]" % (b",500" * (n - 1))]
     yield Case(f"{n:,} numbers of one field", _message(CODEC, n, _columns(n, numbers)))
     chance = random.Random(1)  # noqa: S311 - a noise, not a secret

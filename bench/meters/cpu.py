@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from bench.usage import descendants
+from bench.meters.usage import descendants
 
 
 def of_tree(pid: int) -> dict[int, int]:

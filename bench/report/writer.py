@@ -7,7 +7,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-from bench.result import Ratio, Section, Table
+from bench.report.result import Ratio, Section, Table
 
 NAME = "report"
 

@@ -1,6 +1,6 @@
 """The floor of the live lane: a bare rospy subscriber that hands messages to a bare MQTT client.
 
-    python -m bench.mqtt_floor TOPIC EVERY PORT CERTIFICATE KEY CA MQTT_TOPIC
+    python -m bench.floors.mqtt_floor TOPIC EVERY PORT CERTIFICATE KEY CA MQTT_TOPIC
 
 Publishes the bytes of every so many messages as they are; ends with a line on its input.
 """

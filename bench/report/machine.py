@@ -10,7 +10,8 @@ from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Any
 
-ROOT = Path(__file__).resolve().parent.parent
+from bench import ROOT
+
 _PACKAGES = ("aws-cdk-lib", "boto3", "awsiotsdk", "awscrt", "ministack", "pubnub", "numpy", "playwright")
 
 

@@ -14,9 +14,9 @@ from types import TracebackType
 
 from typing_extensions import Self
 
+from bench import ROOT
 from bench.errors import BenchError
 
-ROOT = Path(__file__).resolve().parent.parent
 SYSTEM_PYTHON = "/usr/bin/python3"
 PACKAGES = "python3-rospy python3-rosmaster python3-std-msgs python3-venv"
 _START_S = 20.0
@@ -94,7 +94,7 @@ class RosGraph:
 
     def publisher(self, topic: str, rate_hz: int, count: int) -> Publisher:
         """A publisher of so many messages, which waits to be told to begin."""
-        return Publisher(self.start("bench.ros_publisher", topic, rate_hz, count))
+        return Publisher(self.start("bench.ros.publisher", topic, rate_hz, count))
 
     def run(self, command: list[str]) -> subprocess.Popen[str]:
         """Run a command in the graph."""

@@ -1,6 +1,6 @@
 """Publishes VescStateStamped at a rate, stamped as it goes out; runs under a Python with rospy.
 
-python -m bench.ros_publisher TOPIC RATE_HZ COUNT
+python -m bench.ros.publisher TOPIC RATE_HZ COUNT
 """
 
 import sys
@@ -10,7 +10,7 @@ import time
 import genpy.dynamic
 import rospy
 
-from bench.ros_message import DEFINITION, FIELDS, TYPE, values
+from bench.ros.message import DEFINITION, FIELDS, TYPE, values
 
 
 def main() -> None:

@@ -12,15 +12,15 @@ from typing import Any
 
 from typing_extensions import Self
 
+from bench import ROOT
 from bench.errors import BenchError
-from bench.machine import ROOT
 from iort_station.fleet.robots import Bundle
 
 _COMMAND = str(Path(sys.executable).parent / "iort-agent")
 _END_S = 120.0
 
 
-class Driving:
+class AgentProcess:
     """The agent of a bundle, from `__enter__` to `__exit__`, which ends it in good order."""
 
     def __init__(self, bundle: Bundle, *, drain_s: float = 60.0) -> None:

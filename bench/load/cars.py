@@ -1,6 +1,6 @@
 """Many simulated cars, published to PubNub's stand-in as Lambda 1 publishes them: what measures the page.
 
-python -m bench.cars --origin 127.0.0.1:8000 --publish-key P --subscribe-key S --cars 20
+python -m bench.load.cars --origin 127.0.0.1:8000 --publish-key P --subscribe-key S --cars 20
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ from collections.abc import Mapping
 from typing import Any
 
 import iort_contract
-from bench import camera
+from bench.load import camera
 from iort_agent.sources.vehicle import Vehicle, VehicleConfig
 
 RATE_HZ = 10.0

@@ -13,9 +13,9 @@ from pathlib import Path
 
 import yaml
 
-from bench.mosquitto import HOST, Mosquitto
-from bench.ros_graph import RosGraph
-from bench.watcher import listening, live_us
+from bench.floors.mosquitto import HOST, Mosquitto
+from bench.meters.watcher import listening, live_us
+from bench.ros.graph import RosGraph
 from iort_contract import LIVE, LIVE_MAX_RATE_HZ, VESC_STREAM, build_topic, live_topic
 from local.figures import Spread
 
@@ -58,8 +58,8 @@ def measure(program: str, python: str, rate_hz: int, seconds: int) -> Lane:
         ) as heard:
             graph.start("iort_agent.cli", "run", "--config", _car(broker, Path(name)))
             every = max(1, round(rate_hz / LIVE_MAX_RATE_HZ))
-            graph.start("bench.mqtt_floor", TOPIC, every, broker.port, *broker.identity("floor"), broker.ca,
-                        _FLOOR)  # fmt: skip
+            floor = (TOPIC, every, broker.port, *broker.identity("floor"), broker.ca, _FLOOR)
+            graph.start("bench.floors.mqtt_floor", *floor)
             publisher = graph.publisher(TOPIC, rate_hz, rate_hz * (seconds + _WARM_UP_S))
             publisher.begin()
             publisher.publish_for(_WARM_UP_S)

@@ -1,4 +1,4 @@
-"""What the probes stand on: two robots with raw connections, a function that says who it is, and waiting."""
+"""The fixture of the probes: two robots with raw connections, and a function that identifies itself."""
 
 from __future__ import annotations
 
@@ -12,10 +12,10 @@ from typing import Any
 
 from typing_extensions import Self
 
-from bench import borrowed
 from bench.errors import BenchError
-from bench.raw_mqtt import RawClient
+from bench.floors.raw_mqtt import RawClient
 from bench.target import Target
+from bench.temporary_function import temporary_function
 from iort_contract import (
     LIVE,
     PING,
@@ -41,27 +41,30 @@ def handler(event, context):
 """
 
 
-class No(BenchError):  # noqa: N818 - an answer, not an error
+class AbilityMissingError(BenchError):
     """The service does not have the ability; the text says what was seen."""
 
 
 def equal(found: Any, expected: Any) -> None:
-    """Raises `No` unless it is."""
+    """Raises `AbilityMissingError` unless it is."""
     if found != expected:
-        raise No(f"{found!r:.80} is not {expected!r:.80}")
+        raise AbilityMissingError(f"{found!r:.80} is not {expected!r:.80}")
 
 
 def until(true: Callable[[], bool], what: str, seconds: float = WAIT_S) -> None:
-    """Wait; raises `No` where it takes longer."""
+    """Wait; raises `AbilityMissingError` where it takes longer."""
     deadline = time.monotonic() + seconds
     while not true():
         if time.monotonic() > deadline:
-            raise No(f"waited {seconds:.0f} s for {what}")
+            raise AbilityMissingError(f"waited {seconds:.0f} s for {what}")
         threading.Event().wait(0.1)
 
 
-class Ground:
-    """From `__enter__` to `__exit__`: ``a`` and ``b`` are the robots' names, ``function`` the function's."""
+class ProbeFixture:
+    """Robots and a function that exist from `__enter__` to `__exit__`.
+
+    ``a`` and ``b`` are the names of the robots, ``function`` is the name of the function.
+    """
 
     def __init__(self, target: Target) -> None:
         self.target, self._exit = target, ExitStack()
@@ -72,7 +75,7 @@ class Ground:
         self._bundles = [self.target.robot(f"bench-ability-{i}") for i in range(2)]
         self.a, self.b = (bundle.robot for bundle in self._bundles)
         self.function = self._exit.enter_context(
-            borrowed.function(self.target, "who", _WHO, memory_mb=128, timeout_s=10)
+            temporary_function(self.target, "who", _WHO, memory_mb=128, timeout_s=10)
         )
         return self
 
