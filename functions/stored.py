@@ -27,6 +27,8 @@ _ASIDE_US = 10_000_000
 # A second is made of so many batches of a stream, and of about so much of their columns: one robot that puts
 # more in it must not hold up the others. AWS takes as many messages a second from a connection.
 SECOND_BATCHES, _SECOND_BYTES = 100, MAX_COLUMNS_BYTES
+# Of a second's neighbours so many are looked at: as many as the seconds to its sides may hold.
+_NUMBERS = SECOND_BATCHES * (2 * _ASIDE_US // _SECOND_US + 1)
 # Beside those of the event: the one before and the one after.
 _BESIDE = 2
 # A neighbour that cannot be decoded is passed over for the next; so many of them end the search.
@@ -52,6 +54,7 @@ class Reader:
     known: Mapping[BatchId, Batch]
     check: Callable[[], None]
     full: set[int] = field(default_factory=set)
+    _near: tuple[int, list[BatchId]] = (-1, [])
 
     def read(self, first: int, last: int) -> list[Stored]:
         """The stored batches with samples from the first second to the last, the one before them, and all
@@ -78,13 +81,22 @@ class Reader:
         """How many batches the stream lacks just before this one, by their numbers."""
         if previous is not None and (previous.boot, previous.seq + 1) == (batch.boot, batch.seq):
             return 0
+        # A robot may leave a hole before every batch.
+        self.check()
         ids = [entry.batch.id for entry in stored]
         missing = missing_before(batch.id, ids)
         if missing:
             # Clocks may interleave: what is missing here may lie some seconds to the side.
-            near = self.tables.numbers(self.topic, batch.t_us - _ASIDE_US, batch.t_us + _ASIDE_US)
-            missing = missing_before(batch.id, sorted({*ids, *near}))
+            missing = missing_before(batch.id, sorted({*ids, *self._numbers(batch.t_us // _SECOND_US)}))
         return missing
+
+    def _numbers(self, second: int) -> list[BatchId]:
+        """The batches of a second and to its sides, read once for all holes of the second."""
+        if self._near[0] != second:
+            start_us = second * _SECOND_US
+            near = self.tables.numbers(self.topic, start_us - _ASIDE_US, start_us + _SECOND_US + _ASIDE_US)
+            self._near = second, list(islice(near, _NUMBERS))
+        return self._near[1]
 
     def _bounded(self, first_us: int, at_once: int) -> Iterator[tuple[int, Stored | None]]:
         """The batches from a time on and when they start, None for an item that is none. Of a second that
