@@ -14,7 +14,7 @@ from contract import SECOND, VESC_STREAM, Batch, record_topic
 from station import delivery, shadow
 from station.items import of_topic
 from tests.local.conftest import until
-from tests.local.robot import Robot
+from verify.robot import Robot
 
 S = 1_000_000
 GOOD = 8
