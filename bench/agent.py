@@ -33,7 +33,7 @@ from rich.table import Table
 from bench.errors import BenchError
 from bench.floors import mosquitto
 from bench.meters import live_lane, usage
-from bench.ros.graph import RosError, RosGraph, python_with_rospy
+from bench.ros.graph import PYTHONPATH, RosError, RosGraph, python_with_rospy
 from iort_station.cloud import Cloud
 from iort_station.fleet import robots
 from iort_station.operations import delivery
@@ -138,7 +138,8 @@ def _stored(cloud: Cloud, robot: str, count: int) -> int:
 
 
 def _output(command: list[str]) -> str:
-    done = subprocess.run(command, capture_output=True, text=True, check=False)
+    environment = {**os.environ, "PYTHONPATH": PYTHONPATH}
+    done = subprocess.run(command, env=environment, capture_output=True, text=True, check=False)
     if done.returncode:
         raise RosError(f"{' '.join(command)} failed:\n{done.stderr[-1000:]}")
     return done.stdout

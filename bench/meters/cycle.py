@@ -16,7 +16,7 @@ import time
 from pathlib import Path
 from statistics import quantiles
 
-from bench.ros.message import DEFINITION, TYPE, body
+from bench.ros.vesc_message import DEFINITION, TYPE, body
 from iort_agent.agent import Agent
 from iort_agent.clock import SystemClock
 from iort_agent.config.file import Config, QueueConfig

@@ -18,6 +18,8 @@ from bench import ROOT
 from bench.errors import BenchError
 
 SYSTEM_PYTHON = "/usr/bin/python3"
+# The packages of the checkout that a node imports; the Python with rospy has none of them installed.
+PYTHONPATH = os.pathsep.join(str(ROOT / folder) for folder in ("", "contract", "device"))
 PACKAGES = "python3-rospy python3-rosmaster python3-std-msgs python3-venv"
 _START_S = 20.0
 
@@ -61,7 +63,7 @@ class RosGraph:
             "ROS_IP": "127.0.0.1",
             "ROS_LOG_DIR": str(folder),
             "ROS_HOME": str(folder),
-            "PYTHONPATH": str(ROOT),
+            "PYTHONPATH": PYTHONPATH,
             "PYTHONUNBUFFERED": "1",
         }
         self._processes: list[subprocess.Popen[str]] = []

@@ -11,7 +11,7 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import Any
 
-from bench.ros import message
+from bench.ros import vesc_message
 
 _SEPARATOR = "\n" + "=" * 80 + "\n"
 _PARTS = {
@@ -84,7 +84,7 @@ class Topic:
 
 
 def _vesc(message: Any, _: Classes, i: int) -> None:
-    for name, value in zip(message.FIELDS, message.values(i), strict=True):
+    for name, value in zip(vesc_message.FIELDS, vesc_message.values(i), strict=True):
         setattr(message.state, name, value)
 
 
@@ -177,7 +177,7 @@ _JOINTS = ("sensor_msgs/JointState", _text(_STATES, "std_msgs/Header"))
 # The topics of each node.
 NODES: dict[str, tuple[Topic, ...]] = {
     "base": (
-        Topic("/sensors/core", "vesc", message.TYPE, message.DEFINITION, 50, _vesc, "base_link"),
+        Topic("/sensors/core", "vesc", vesc_message.TYPE, vesc_message.DEFINITION, 50, _vesc, "base_link"),
         Topic(
             "/imu", "imu", "sensor_msgs/Imu",
             _text(_IMU, "std_msgs/Header", "geometry_msgs/Quaternion", "geometry_msgs/Vector3"),

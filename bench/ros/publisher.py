@@ -10,7 +10,7 @@ import time
 import genpy.dynamic
 import rospy
 
-from bench.ros.message import DEFINITION, FIELDS, TYPE, values
+from bench.ros.vesc_message import DEFINITION, FIELDS, TYPE, values
 
 
 def main() -> None:
