@@ -1,4 +1,4 @@
-"""`make bench-agent`: what the agent costs, on a real ROS 1 graph, beside a bare rospy subscriber.
+"""`make bench-agent`: the cost of the agent on a real ROS 1 graph, beside a bare rospy subscriber.
 
     python -m bench.agent [--seconds 30] [--soak 600] [--json FILE]
 
@@ -51,7 +51,7 @@ _CATCH_UP_S = 30.0
 
 @dataclass(frozen=True)
 class Run:
-    """One rate: microseconds of processor a sample, memory, and what was lost."""
+    """The figures at one rate: processor time a sample in us, memory, and lost samples."""
 
     rate_hz: int
     samples: int
@@ -128,7 +128,7 @@ def _measure(cloud: Cloud, python: str, rate_hz: int, seconds: int) -> Run:
 
 
 def _stored(cloud: Cloud, robot: str, count: int) -> int:
-    """The samples in the table, once they are all there or nothing more comes."""
+    """Count the samples in the table, after all have arrived or the wait is over."""
     deadline = time.monotonic() + _CATCH_UP_S
     while True:
         stored = sum(len(batch.times_us) for batch in delivery.batches(cloud, robot, "vesc"))

@@ -5,8 +5,8 @@
 Writes report.md, report.json and the pictures into the folder. Exit status 1 if a target is
 missed, 2 if a section could not be measured.
 
-With --target aws it says what that costs and asks first. Ctrl-C, or the end of its terminal, still puts back
-what was changed and removes what was made.
+With --target aws it shows the cost and asks first. After Ctrl-C or a closed terminal it still restores every
+setting and removes every resource of the bench.
 """
 
 from __future__ import annotations
@@ -39,7 +39,7 @@ OUT = ROOT / "build" / "bench"
 
 
 def main() -> None:
-    """Measure, write and say."""
+    """Measure the sections, write the report and print its headline."""
     try:
         run(_options())
     except KeyboardInterrupt:
@@ -47,7 +47,7 @@ def main() -> None:
 
 
 def run(options: argparse.Namespace, cloud: Cloud | None = None) -> None:
-    """The same, on ``cloud`` where it is not the one that the options and the environment lead to."""
+    """Measure on ``cloud``, or without it on the cloud of the options and the environment."""
     console = Console()
     began = time.monotonic()
     here = machine.describe()
@@ -86,7 +86,7 @@ def run(options: argparse.Namespace, cloud: Cloud | None = None) -> None:
 
 
 def _confirm(console: Console, dollars: dict[str, float]) -> None:
-    """Ask before money is spent. Raises `StationError` where nobody can be asked."""
+    """Ask before the run spends money. Raises `StationError` without a terminal or without consent."""
     parts = ", ".join(f"{key} {usd:.3f}" for key, usd in dollars.items())
     console.print(
         f"This costs about ${sum(dollars.values()):.2f} in your account ({parts}) at the list prices of "
@@ -95,13 +95,13 @@ def _confirm(console: Console, dollars: dict[str, float]) -> None:
         highlight=False,
     )
     if not sys.stdin.isatty():
-        raise StationError("nobody is here to agree: say so with --yes (make bench TARGET=aws YES=1)")
+        raise StationError("no terminal to ask at: agree with --yes (make bench TARGET=aws YES=1)")
     if not Confirm.ask("Go on?", console=console, default=False):
         raise StationError("nothing was measured")
 
 
 def _measure(key: str, target: Target, console: Console, sections: list[Section], failed: list[str]) -> None:
-    """One section; one that fails does not take the others with it."""
+    """Measure one section; a failure does not stop the others."""
     began = time.monotonic()
 
     def say(text: str) -> None:
@@ -109,7 +109,7 @@ def _measure(key: str, target: Target, console: Console, sections: list[Section]
 
     try:
         section = SECTIONS[key](target, say)
-    except Exception:  # noqa: BLE001 - whatever a section raises, the others are worth having
+    except Exception:  # noqa: BLE001 - any error of a section must not stop the others
         console.print(traceback.format_exc(), style="red", markup=False, highlight=False)
         failed.append(key)
         return

@@ -1,6 +1,6 @@
-"""Debian's mosquitto with mutual TLS, as a second broker: what a broker in C leaves for the agent to spend.
+"""Debian's mosquitto with mutual TLS: the floor of a broker, written in C.
 
-It only passes messages on: there are no rules, no tables and no policies behind it.
+It only passes messages on: it has no rules, tables or policies.
 """
 
 from __future__ import annotations
@@ -34,7 +34,7 @@ log_type error
 
 
 def found() -> str | None:
-    """Where mosquitto is, if it is installed; Debian keeps it out of a user's path."""
+    """Return the path of mosquitto, if it is installed; Debian keeps it out of a user's PATH."""
     return shutil.which("mosquitto") or shutil.which("mosquitto", path="/usr/sbin")
 
 
@@ -61,7 +61,7 @@ class Mosquitto:
         self.identity("broker")
         config = self._folder / "mosquitto.conf"
         config.write_text(_SETTINGS.format(port=self.port, host=HOST, folder=self._folder))
-        # Started by root it would become the user mosquitto, who may not read the keys.
+        # As root, mosquitto would switch to the user mosquitto, who may not read the keys.
         with config.open("a") as file:
             file.write("user root\n")
         with (self._folder / "mosquitto.log").open("w") as log:
@@ -74,7 +74,7 @@ class Mosquitto:
                 if self._process.poll() is not None or time.monotonic() > deadline:
                     said = (self._folder / "mosquitto.log").read_text()
                     raise BenchError(f"mosquitto does not start: {said}") from error
-                time.sleep(0.02)  # it has no other way to tell that it listens
+                time.sleep(0.02)  # mosquitto does not report when it listens
             else:
                 return self
 

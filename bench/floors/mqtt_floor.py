@@ -2,7 +2,7 @@
 
     python -m bench.floors.mqtt_floor TOPIC EVERY PORT CERTIFICATE KEY CA MQTT_TOPIC
 
-Publishes the bytes of every so many messages as they are; ends with a line on its input.
+Publishes the bytes of every EVERY-th message unchanged. Ends after a line on its input.
 """
 
 import itertools
@@ -17,7 +17,7 @@ from iort_agent.mqtt.nodelay import send_at_once
 
 
 def main() -> None:
-    """Connect, subscribe, pass on."""
+    """Connect, subscribe, and pass messages on until a line on the input."""
     topic, every, port, certificate, key, ca, to = sys.argv[1:]
     connected, stopped, numbers = threading.Event(), threading.Event(), itertools.count()
     client = mqtt5_client_builder.mtls_from_path(

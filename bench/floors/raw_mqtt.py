@@ -1,10 +1,11 @@
-"""The floor: as little MQTT as there can be, 3.1.1 over one blocking TLS socket, nothing else.
+"""The floor of the round trips: the barest MQTT 3.1.1 client, over one blocking TLS socket.
 
-    with RawClient(folder_of_a_robot, client_id) as client:
+    with RawClient(folder_of_a_robot) as client:
         client.subscribe("ping/iort/car/broker")
         took_s = client.round_trip("ping/iort/car/broker", payload)
 
-MQTT 3.1.1 is the OASIS standard of 2014; the packets are those of its chapters 3.1 to 3.13.
+MQTT 3.1.1 is the OASIS standard of 2014; its chapters 3.1 to 3.13 define the packets. paho-mqtt is slower
+(docs/decisions/0046-the-floor-is-our-own-mqtt-client.md).
 """
 
 from __future__ import annotations
@@ -29,11 +30,11 @@ _NOTHING = b""
 
 
 class RawError(BenchError):
-    """The broker said something else than what was waited for, or nothing."""
+    """The broker sent an unexpected packet, or none."""
 
 
 class RawClient:
-    """A connection with the certificate of a registered robot, as that robot; to ``port`` if given."""
+    """A connection as a registered robot, with its certificate; to ``port`` if given."""
 
     def __init__(self, bundle: Path, port: int | None = None) -> None:
         self._config: dict[str, Any] = yaml.safe_load((bundle / "car.yaml").read_text())
@@ -64,7 +65,7 @@ class RawClient:
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
-        with suppress(OSError):  # the broker was first
+        with suppress(OSError):  # the broker may have closed first
             self._send(0xE0, _NOTHING)
         self._socket.close()
 
@@ -82,7 +83,7 @@ class RawClient:
         answer = self._expect(_PUBLISH)
         took = time.perf_counter() - began
         if not answer.endswith(payload):
-            raise RawError("another message came back")
+            raise RawError("the answer must be the message that was sent, got another")
         return took
 
     def publish(self, topic: str, payload: bytes) -> None:
@@ -96,7 +97,7 @@ class RawClient:
         return body[2 : 2 + length].decode(), body[2 + length :]
 
     def ping(self) -> float:
-        """A PINGREQ and its PINGRESP, two bytes each: a TLS echo of the broker's own process; seconds."""
+        """Time a PINGREQ and its PINGRESP, two bytes each, in seconds: a TLS echo of the broker's process."""
         began = time.perf_counter()
         self._send(0xC0, _NOTHING)
         self._expect(_PINGRESP)
@@ -116,7 +117,7 @@ class RawClient:
                 break
         body = self._receive(length)
         if head >> 4 != kind:
-            raise RawError(f"packet {head >> 4} came where {kind} was waited for")
+            raise RawError(f"packet type must be {kind}, got {head >> 4}")
         return body
 
     def _receive(self, count: int) -> bytes:
@@ -131,7 +132,7 @@ class RawClient:
 
 
 def tcp_connect_s(host: str, port: int) -> float:
-    """One TCP handshake, which is one round trip of the network: what `ping` measures, without its rights."""
+    """Time one TCP handshake, which is one round trip of the network; `ping` would need more rights."""
     began = time.perf_counter()
     with socket.create_connection((host, port), timeout=_TIMEOUT_S):
         return time.perf_counter() - began

@@ -1,4 +1,4 @@
-"""The installed agent in a process of its own, driving a robot for the bench."""
+"""Runs the installed agent in its own process, to drive a robot for the bench."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ _END_S = 120.0
 
 
 class AgentProcess:
-    """The agent of a bundle, from `__enter__` to `__exit__`, which ends it in good order."""
+    """The agent of a bundle; it runs from `__enter__` to `__exit__`, which stops it in good order."""
 
     def __init__(self, bundle: Bundle, *, drain_s: float = 60.0) -> None:
         self._bundle = bundle
@@ -52,7 +52,7 @@ class AgentProcess:
         self._log.close()
 
     def finished(self) -> dict[str, Any]:
-        """Wait for the end of its sources and the last delivery; the agent's own report."""
+        """Wait for the end of its sources and the last delivery; return the agent's report."""
         status = self.process.wait(_END_S + self._drain_s)
         if status:
             self._log.seek(0)

@@ -1,4 +1,4 @@
-"""What a car's camera would see of its lap, as the agent would send it: a small picture and a claim."""
+"""A simulated camera: the sample that the agent would send, with a small picture and an attachment."""
 
 from __future__ import annotations
 
@@ -11,8 +11,8 @@ import iort_contract
 _WIDTH, _HEIGHT, _HORIZON = 96, 54, 20
 
 
-def claim(robot: str, driven_m: float, yaw_rate_rad_s: float) -> dict[str, iort_contract.Value]:
-    """A sample of a camera topic with ``large: upload``; the key is one that the agent would give."""
+def attachment(robot: str, driven_m: float, yaw_rate_rad_s: float) -> dict[str, iort_contract.Value]:
+    """A sample of a camera topic with ``large: upload``; the key has the form of the agent's keys."""
     content = _jpeg(driven_m, yaw_rate_rad_s)
     return {
         "format": "jpeg",

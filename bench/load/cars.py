@@ -1,4 +1,4 @@
-"""Many simulated cars, published to PubNub's stand-in as Lambda 1 publishes them: what measures the page.
+"""Publishes many simulated cars to PubNub's stand-in, as Lambda 1 does, to measure the page.
 
 python -m bench.load.cars --origin 127.0.0.1:8000 --publish-key P --subscribe-key S --cars 20
 """
@@ -21,15 +21,14 @@ from bench.load import camera
 from iort_agent.sources.vehicle import Vehicle, VehicleConfig
 
 RATE_HZ = 10.0
-# Of a physical step; larger ones let the driver swerve.
+# Length of a simulation step; with larger ones the driver swerves.
 _STEP_S = 0.02
-# What the path of a real car takes: so long before the publish it left the car, and reached the cloud.
+# The delays of a real car: before the publish, the sample left the car and reached the cloud this long ago.
 _SENT_MS, _RECEIVED_MS, _LAMBDA_MS = 11.0, 7.0, 3.0
 
 
 class SimulatedCar:
-    """A car that drives laps: its motor controller and, with ``senses``, its pose, its accelerations and
-    its camera."""
+    """A car that drives laps: motor controller and, with ``senses``, pose, accelerations and camera."""
 
     def __init__(self, name: str, seed: int, *, senses: bool = False) -> None:
         self.name, self.senses = name, senses
@@ -43,7 +42,7 @@ class SimulatedCar:
             self._vehicle.step(_STEP_S)
 
     def updates(self, dt: float) -> list[dict[str, Any]]:
-        """Drive on for ``dt`` seconds; a live update a stream."""
+        """Drive on for ``dt`` seconds; return one live update for each stream."""
         for _ in range(round(dt / _STEP_S)):
             self._vehicle.step(_STEP_S)
         sample = {**self._vehicle.sample(), "fault_code": self.fault_code}
@@ -74,7 +73,7 @@ class SimulatedCar:
             "linear_acceleration.y": round(speed_mps * yaw_rate, 3),
             "angular_velocity.z": round(yaw_rate, 3),
         }
-        picture = camera.claim(self.name, self._driven_m, yaw_rate)
+        picture = camera.attachment(self.name, self._driven_m, yaw_rate)
         return [
             self._update("odom", pose),
             self._update("imu", acceleration),
@@ -93,7 +92,7 @@ class SimulatedCar:
 
 
 class Publisher:
-    """One kept connection to the stand-in."""
+    """A persistent connection to the stand-in."""
 
     def __init__(self, *, origin: str, publish_key: str, subscribe_key: str) -> None:
         self._connection = http.client.HTTPConnection(origin, timeout=30)

@@ -1,4 +1,4 @@
-"""What arrived of a fleet's drive, counted in the tables, robot by robot."""
+"""Counts the arrived batches and samples of a fleet in the tables, robot by robot."""
 
 from __future__ import annotations
 
@@ -13,16 +13,19 @@ from iort_contract import BATCH, RECEIVED_MS, SAMPLES, SECOND, VESC_STREAM, batc
 from iort_station.cloud import Cloud
 from iort_station.data.items import of_topic, plain
 
-# Hears the share done, and of what.
+# Takes the share done and the name of the step.
 Tell = Callable[[float, str], None]
-# So long without any news, and no more comes.
+# After so long without a change no more comes.
 _CATCH_UP_S = 120.0
 
 
 @dataclass(frozen=True)
 class Stored:
-    """Of one robot: its batches in the table, how many of those it sent are ``missing``, whether they lie
-    there and came in the order of their numbers, and what each took to the rule."""
+    """One robot's batches in the table; ``missing`` counts the batches that were sent and are not there.
+
+    ``ordered`` is True if they arrived and are stored in the order of their numbers. ``delays_ms`` has the
+    time that each took to the rule.
+    """
 
     batches: int
     missing: int
@@ -31,7 +34,7 @@ class Stored:
 
 
 def stored(cloud: Cloud, robot: str, sent_ms: list[int]) -> Stored:
-    """A robot's items against what it sent: which are there, and in the order of their numbers."""
+    """Compare a robot's items with the batches that it sent."""
     items = list(_items(cloud, "TelemetryTable", robot, BATCH, RECEIVED_MS))
     seqs = [batch_id(item[BATCH]).seq for item in items]
     received = [int(item[RECEIVED_MS]) for item in items]
@@ -44,15 +47,15 @@ def stored(cloud: Cloud, robot: str, sent_ms: list[int]) -> Stored:
 
 
 def summarized(cloud: Cloud, expected: dict[str, int], tell: Tell) -> int:
-    """The samples in the summary of all robots, once they are all there or no more come.
+    """Count the samples in the summaries of all robots, after all have arrived or no more come.
 
-    One robot is asked for after the other: all are equally far behind, so the one that is waited for tells.
+    It waits for one robot after the other, since all lag equally.
     """
     total, since = 0, time.monotonic()
     for name, samples in expected.items():
         counted, looked_at = 0, None
         while True:
-            # To count is dear: not before its seconds go as far as what was sent.
+            # Counting is expensive: count only when the summaries reach the last second that was sent.
             spanned = _spanned(cloud, name)
             if spanned * BATCH_SAMPLES >= samples:
                 counted = _samples(cloud, name)
@@ -75,7 +78,7 @@ def _samples(cloud: Cloud, robot: str) -> int:
 
 
 def _spanned(cloud: Cloud, robot: str) -> int:
-    """The seconds from a robot's first to its last summary."""
+    """Return the seconds from a robot's first to its last summary."""
     query = cloud.client("dynamodb").query
     seconds = of_topic(cloud, "SummaryTable", robot, VESC_STREAM, SECOND)
     ends = [

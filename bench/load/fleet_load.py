@@ -1,7 +1,7 @@
 """Many simulated robots in one process, each with its own certificate, session and record lane.
 
-Reads what to do from standard input (`Load` as JSON) and writes what it did to standard output, a JSON
-object a line: progress, and at the end the numbers of what was sent. Run by `bench.fleet`.
+Reads a `Load` as JSON from standard input. Writes one JSON object a line to standard output: progress, and at
+the end a `Sent`. Run by `bench.fleet`.
 """
 
 from __future__ import annotations
@@ -35,7 +35,7 @@ _SAY_S = 5.0
 
 @dataclass(frozen=True)
 class Load:
-    """Which robots, each with the folder of its keys; for how long; where the broker is."""
+    """The robots, each with the folder of its keys, the duration, and the address of the broker."""
 
     robots: dict[str, str]
     namespace: str
@@ -46,8 +46,10 @@ class Load:
 
 @dataclass
 class Sent:
-    """What became of it: batches by robot, what was sent again, lost sessions, ms to acknowledgements,
-    and when each batch left (robot -> ms since the epoch by number)."""
+    """The result: batches by robot, resent batches, lost sessions, and ms to the acknowledgements.
+
+    ``sent_ms`` has the time at which each batch left, by robot and number, in ms since the epoch.
+    """
 
     batches: dict[str, int] = field(default_factory=dict)
     resent: int = 0
@@ -58,7 +60,7 @@ class Sent:
 
 
 class Robot:
-    """One robot: a session of its own, and batches of 50 samples numbered from 0."""
+    """One robot with its own session; it sends batches of 50 samples, numbered from 0."""
 
     def __init__(
         self, name: str, folder: Path, load: Load, columns: Sequence[dict[str, list[Value]]]
@@ -100,9 +102,9 @@ class Robot:
         self.lost += 1
 
     def send(self) -> None:
-        """The batch of the last second."""
+        """Send the batch of the last second."""
         seq = len(self.sent_ms)
-        # As the agent's, a batch lies within one second of wall time.
+        # Like the agent's batches, a batch lies within one second of wall time.
         self._first_us = self._first_us or (time.time_ns() // 1_000_000_000 - 1) * SAMPLES * _STEP_US
         first_us = self._first_us + seq * SAMPLES * _STEP_US
         times = range(first_us, first_us + SAMPLES * _STEP_US, _STEP_US)
@@ -127,7 +129,7 @@ class Robot:
 
 
 def laps() -> list[Columns]:
-    """A minute of a simulated car, a second each."""
+    """Return a minute of a simulated car, split into seconds."""
     vehicle = Vehicle(VehicleConfig(), seed=1)
     found = []
     for _ in range(_LAPS):
@@ -141,7 +143,7 @@ def laps() -> list[Columns]:
 
 
 def drive(load: Load) -> Sent:
-    """Connect every robot, let each send one batch a second at a moment of its own, wait for the end."""
+    """Connect every robot; each sends one batch a second at its own moment; wait for the end."""
     seconds = laps()
     robots = [
         Robot(name, Path(folder), load, seconds[i % _LAPS :] + seconds[: i % _LAPS])
@@ -149,7 +151,7 @@ def drive(load: Load) -> Sent:
     ]
     for i, robot in enumerate(robots):
         robot.start()
-        # Handshakes in small groups, as a fleet that is switched on by hand.
+        # Connect in small groups, like a fleet that is switched on by hand.
         if i % 10 == 9:
             _connected(robots[i - 9 : i + 1])
             _say(connected=i + 1)
@@ -193,7 +195,7 @@ def _say(**what: Any) -> None:
 
 
 def main() -> None:
-    """Drive as standard input says."""
+    """Drive the load of standard input."""
     sent = drive(Load(**json.loads(sys.stdin.readline())))
     _say(sent=asdict(sent))
 

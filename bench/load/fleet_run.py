@@ -32,11 +32,11 @@ from local.figures import Spread
 
 @dataclass(frozen=True)
 class Fleet:
-    """Of one run: what was sent, what arrived, how late, and what the machine spent on it.
+    """One run: what was sent, what arrived and how late, and the cost in processor time and memory.
 
     ``delay_ms`` is from the robot's publish to the rule's ``received_ms``; ``ack_ms`` to the broker's
-    acknowledgement; ``summary_behind_s`` is the age of the newest summarised second of one robot, seen
-    once a second; ``catch_up_s`` how long Lambda 2 went on after the last batch. CPU is in percent of
+    acknowledgement; ``summary_behind_s`` is the age of the newest summarised second of one robot, sampled
+    once a second; ``catch_up_s`` is how long Lambda 2 went on after the last batch. CPU is in percent of
     one core while the fleet drives, memory in MB at its end.
     """
 
@@ -60,13 +60,13 @@ class Fleet:
 
     @property
     def samples_lost(self) -> int:
-        """Sent, and not in the telemetry table or not in the summary."""
+        """Samples that were sent and are missing in the telemetry table or in the summary."""
         stored = self.samples_sent - self.batches_lost * BATCH_SAMPLES
         return self.samples_sent - min(stored, self.samples_summarized)
 
     @property
     def good(self) -> bool:
-        """Nothing lost, nothing twice, every topic in order."""
+        """True if nothing is lost or stored twice and every topic is in order."""
         return (
             self.samples_sent == self.samples_summarized
             and not self.batches_lost
@@ -75,13 +75,12 @@ class Fleet:
         )
 
     def as_json(self) -> dict[str, Any]:
-        """The figures, and what they come to."""
+        """Return the figures with the derived ones."""
         return {**asdict(self), "samples_lost": self.samples_lost, "good": self.good}
 
 
 def measure(embedded: EmbeddedCloud, count: int, seconds: int, tell: Tell, *, prefix: str = "bench") -> Fleet:
-    """Register ``count`` robots, drive them, count what arrived. ``tell`` hears the share done, and of
-    what."""
+    """Register ``count`` robots, drive them, and count what arrived; ``tell`` gets the progress."""
     cloud, names = embedded.cloud, [f"{prefix}-{count}-{i:04}" for i in range(count)]
     with tempfile.TemporaryDirectory() as folder:
         bundles = {}
@@ -102,7 +101,7 @@ def measure(embedded: EmbeddedCloud, count: int, seconds: int, tell: Tell, *, pr
                 for said in generator:
                     if "sent" in said:
                         break
-                    # The generator's memory is gone with the process, which ends when all is sent.
+                    # The generator's memory disappears with the process, which ends when all is sent.
                     after, took_s = _usage(pid, emulator), time.monotonic() - began
                     tell(said["second"] / seconds, "driving")
         sent = said["sent"]
@@ -140,7 +139,7 @@ def measure(embedded: EmbeddedCloud, count: int, seconds: int, tell: Tell, *, pr
 
 @contextmanager
 def _generator(load: Load) -> Iterator[Iterator[dict[str, Any]]]:
-    """What the process that drives the robots says, a dictionary a line."""
+    """Run the process that drives the robots; yield its output, a dictionary for each line."""
     command = [sys.executable, "-m", "bench.load.fleet_load"]
     with subprocess.Popen(
         command, cwd=ROOT, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True
@@ -172,7 +171,7 @@ def _usage(generator: int, emulator: int) -> dict[str, usage.Usage]:
 
 @contextmanager
 def _summary_age(cloud: Cloud, robot: str) -> Iterator[list[float]]:
-    """How old the newest summarised second of a robot is, in seconds, once a second meanwhile."""
+    """Collect the age of the newest summarised second of a robot, in seconds, once a second."""
     seen: list[float] = []
     over = threading.Event()
     newest = of_topic(cloud, "SummaryTable", robot, VESC_STREAM, SECOND)
@@ -182,7 +181,7 @@ def _summary_age(cloud: Cloud, robot: str) -> Iterator[list[float]]:
             try:
                 answer = cloud.client("dynamodb").query(**newest, ScanIndexForward=False, Limit=1)
             except (BotoCoreError, ClientError):
-                # A cloud that is overloaded answers late, or not; what it stores is what counts.
+                # An overloaded cloud answers late or not at all; only the stored items count.
                 continue
             # A second is over when the next one begins.
             seen.extend(round(time.time() - int(item[SECOND]["N"]) - 1, 3) for item in answer["Items"])

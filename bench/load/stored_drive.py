@@ -1,4 +1,4 @@
-"""A simulated drive, and its batches put straight into the telemetry table, as the record rule puts them."""
+"""Stores the batches of a simulated drive directly in the telemetry table, as the record rule does."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ Sample = tuple[int, dict[str, Value]]
 
 
 def simulated(points: int) -> list[Sample]:
-    """Time in microseconds and fields of every sample; the drive ended a minute ago."""
+    """Return the time in microseconds and the fields of every sample of a drive that ended a minute ago."""
     vehicle = Vehicle(VehicleConfig(), seed=1)
     first_us = (int(time.time()) - points // RATE_HZ - 60) * 1_000_000
     samples = []
@@ -40,7 +40,7 @@ def simulated(points: int) -> list[Sample]:
 
 
 def store(target: Target, robot: str, samples: Sequence[Sample]) -> list[dict[str, Any]]:
-    """Put a batch a second into the table; the items."""
+    """Put one batch a second into the table; return the items."""
     serialize = TypeSerializer().serialize
     client, table = target.cloud.client("dynamodb"), target.cloud.output("storage", "TelemetryTable")
     topic = build_topic(RECORD, robot, VESC_STREAM, target.cloud.namespace)

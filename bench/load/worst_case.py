@@ -41,7 +41,7 @@ _WORST = f"{MAX_BATCH_VALUES:,} texts full of escapes"
 
 
 class Case(NamedTuple):
-    """A message, and what it is."""
+    """A message and its description."""
 
     what: str
     message: bytes
@@ -90,7 +90,7 @@ def cases() -> Iterator[Case]:
 
 
 def measure(message: bytes) -> Cost:
-    """What Lambda 2 does with a message, but for its tables."""
+    """Measure Lambda 2's work on a message, without its tables."""
     refused, spent_ms = "", []
     for _ in range(_TIMES):
         began = time.process_time()

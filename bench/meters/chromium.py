@@ -1,4 +1,4 @@
-"""Chromium, which looks at the page; the machine's own, for playwright brings none along."""
+"""Opens the machine's Chromium; the installed playwright brings no browser."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from bench.errors import BenchError
 if TYPE_CHECKING:
     from playwright.sync_api import Browser
 
-# Nobody's sandbox, screen or network: it opens our own page on loopback.
+# It opens only our own page on loopback, so it needs no sandbox, GPU or background network.
 FLAGS = (
     "--no-sandbox",
     "--disable-gpu",
@@ -26,13 +26,13 @@ FLAGS = (
 
 
 def found() -> str | None:
-    """The program that CHROMIUM names, or the one that is installed."""
+    """Return the program in the variable CHROMIUM, or the installed one."""
     return os.environ.get("CHROMIUM") or shutil.which("chromium") or shutil.which("chromium-browser")
 
 
 @contextmanager
 def opened() -> Iterator[Browser]:
-    """A browser; raises `BenchError` where there is none."""
+    """Yield a browser. Raises `BenchError` without one."""
     try:
         from playwright.sync_api import sync_playwright  # noqa: PLC0415 - only who has a browser needs it
     except ImportError as error:

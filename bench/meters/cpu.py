@@ -1,4 +1,4 @@
-"""Processor time of what the emulator has started, to the microsecond: Linux' scheduler keeps it."""
+"""Reads processor time to the microsecond from Linux' scheduler."""
 
 from __future__ import annotations
 
@@ -8,12 +8,12 @@ from bench.meters.usage import descendants
 
 
 def of_tree(pid: int) -> dict[int, int]:
-    """Nanoseconds on a processor so far, of every thread of every process below ``pid``."""
+    """Return the processor time so far, in ns, of every thread of every process below ``pid``."""
     return _threads(descendants(pid))
 
 
 def of_process(pid: int) -> dict[int, int]:
-    """Of every thread of one process."""
+    """Return the processor time so far, in ns, of every thread of one process."""
     return _threads([pid])
 
 
@@ -33,5 +33,5 @@ def _threads(pids: list[int]) -> dict[int, int]:
 
 
 def spent_ms(before: dict[int, int], after: dict[int, int]) -> float:
-    """Between two looks, in milliseconds; a thread that is new counts whole, one that is gone not at all."""
+    """Return the ms between two readings; a new thread counts whole, an ended one not at all."""
     return sum(now - before.get(thread, 0) for thread, now in after.items()) / 1e6

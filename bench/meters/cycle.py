@@ -1,4 +1,4 @@
-"""The node's own cycle: from a message's bytes in the callback to the batch in the spool, no network.
+"""Measures the node's cycle: from the message in the callback to the batch in the spool, without network.
 
     python -m bench.meters.cycle SAMPLES
 
@@ -28,7 +28,7 @@ from iort_agent.spool.sqlite import make_spool
 
 
 def main() -> None:
-    """Feed the callback as fast as it takes, and time each call."""
+    """Call the callback as fast as possible, and time each call."""
     samples = int(sys.argv[1])
     with tempfile.TemporaryDirectory() as folder:
         clock = SystemClock()

@@ -1,5 +1,7 @@
-"""Functions of the deployment, invoked and measured: durations by Lambda's REPORT lines, processor time by
-the operating system where the cloud is embedded."""
+"""Invokes functions of the deployment and measures them.
+
+Durations come from Lambda's REPORT lines. On the embedded cloud the operating system measures processor time.
+"""
 
 from __future__ import annotations
 
@@ -27,8 +29,11 @@ Event = Callable[[int], dict[str, Any]]
 
 @dataclass
 class Measured:
-    """Of one function, all in milliseconds: durations, a list a round; processor time an invocation, a
-    figure a round, where it can be measured; what environments took to start, where one did."""
+    """The figures of one function in ms.
+
+    ``duration_ms`` has a list for each round. ``cpu_ms`` has the processor time an invocation for each round,
+    on the embedded cloud. ``init_ms`` has the start times of new environments.
+    """
 
     duration_ms: list[list[float]] = field(default_factory=list)
     cpu_ms: list[float] = field(default_factory=list)
@@ -36,7 +41,7 @@ class Measured:
 
 
 def measure(target: Target, function: str, event: Event, calls: int, found: Measured) -> None:
-    """Invoke the function so often, one after the other, and add the round to what was ``found``.
+    """Invoke the function ``calls`` times, one after the other, and add the round to ``found``.
 
     Raises `BenchError` where an invocation fails, or no REPORT line comes.
     """
@@ -46,7 +51,7 @@ def measure(target: Target, function: str, event: Event, calls: int, found: Meas
     after = _cpu(target)
     if before is not None and after is not None:
         found.cpu_ms.append(cpu.spent_ms(before, after) / calls)
-    # AWS' answers end with the REPORT line; the embedded cloud's are in its log, where nobody else's are.
+    # AWS' answers end with the REPORT line; the embedded cloud writes it to the log, which nobody else uses.
     reports = [line for line in told if line is not None]
     if len(reports) < calls:
         reports = _logged(target, function, began_ms, calls)
@@ -59,8 +64,7 @@ def _cpu(target: Target) -> dict[int, int] | None:
 
 
 def invoke(target: Target, function: str, event: dict[str, Any]) -> str | None:
-    """Run the function once and wait; its REPORT line, if the answer has it. Raises `BenchError` where it
-    fails."""
+    """Run the function once; return its REPORT line, if the answer has it. Raises `BenchError` on failure."""
     answer = target.cloud.client("lambda").invoke(
         FunctionName=function, Payload=json.dumps(event).encode(), LogType="Tail"
     )
@@ -70,13 +74,13 @@ def invoke(target: Target, function: str, event: dict[str, Any]) -> str | None:
 
 
 def report_line(tail: str) -> str | None:
-    """The REPORT line of an invocation's log, if it is there."""
+    """Return the REPORT line of an invocation's log, if there is one."""
     match = _REPORT.search(tail)
     return None if match is None else match[0]
 
 
 def _logged(target: Target, function: str, began_ms: int, calls: int) -> list[str]:
-    """The REPORT lines in the function's log since then, once they are all there."""
+    """Wait for the REPORT lines since ``began_ms`` in the function's log, and return them."""
     client = target.cloud.client("lambda")
     logging = client.get_function_configuration(FunctionName=function).get("LoggingConfig", {})
     group = logging.get("LogGroup", f"/aws/lambda/{function}")
@@ -95,7 +99,7 @@ def _logged(target: Target, function: str, began_ms: int, calls: int) -> list[st
             )
         if len(reports) >= calls or time.monotonic() > deadline:
             return reports
-        # A log tells nobody when it has the next line.
+        # A log has no notification of new lines.
         threading.Event().wait(0.5)
 
 
@@ -110,7 +114,7 @@ def configure(client: Any, function: str, **change: Any) -> None:
 
 @contextmanager
 def reporting(target: Target, function: str) -> Iterator[None]:
-    """Have Lambda write its REPORT lines meanwhile, which the stacks leave out (`function_logs`)."""
+    """Have Lambda write REPORT lines; the stacks leave them out (`function_logs`)."""
     client = target.cloud.client("lambda")
     was = client.get_function_configuration(FunctionName=function).get("LoggingConfig", {})
     if was.get("LogFormat") != "JSON":

@@ -1,7 +1,7 @@
-"""From ROS publish to an MQTT subscriber over the live lane, through mosquitto, beside the floor.
+"""Measures the delay from ROS publish to an MQTT subscriber over the live lane, through mosquitto.
 
-The floor is a bare rospy subscriber that hands the same messages, as many a second, to a bare MQTT client:
-the same topic, broker, TLS and subscriber at the same time.
+The floor is a bare rospy subscriber that hands the same messages, at the same rate, to a bare MQTT client.
+Both use the same topic, broker, TLS and subscriber at the same time.
 """
 
 from __future__ import annotations
@@ -36,12 +36,12 @@ class Lane:
 
     @staticmethod
     def shown(spread: Spread) -> str:
-        """To a hundredth of a millisecond, for that is what the two differ by."""
+        """Format to a hundredth of a ms; the two differ by no more."""
         return "-" if spread.p50 is None else f"{spread.p50:.2f} ms (p95 {spread.p95:.2f})"
 
 
 def measure(program: str, python: str, rate_hz: int, seconds: int) -> Lane:
-    """Run both side by side; raises `RosError` where one of the processes stops."""
+    """Run both side by side. Raises `RosError` if one of the processes stops."""
     with (
         tempfile.TemporaryDirectory() as name,
         Mosquitto(program, Path(name)) as broker,

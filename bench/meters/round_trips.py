@@ -1,4 +1,4 @@
-"""Round trips over every path at the same time, each on a connection of its own, and the floor's beside."""
+"""Measures round trips over every path and of the floor at the same time, each on its own connection."""
 
 from __future__ import annotations
 
@@ -22,16 +22,18 @@ from iort_contract import BROKER, PING, PONG, RTT_FIELDS, Value, build_topic, en
 from iort_station.fleet.robots import Bundle
 
 RAW = "raw client"
-# What a ping has besides its padding, about.
+# Bytes of a ping besides its padding, approximately.
 _ENVELOPE = 60
 _CONNECT_S = 30.0
-# To subscribe anew and to be there when the first turn comes.
+# Time to subscribe again before the first ping.
 _SET_UP_S = 0.3
 
 
 class RoundTrips:
-    """Connected from `__enter__` to `__exit__`: the agent's own uplink a path, and the smallest MQTT client
-    there can be. ``port`` is that of what stands before the broker, if anything does."""
+    """One uplink of the agent for each path, and the raw client, connected from `__enter__` to `__exit__`.
+
+    ``port`` is the port of a proxy before the broker, if there is one.
+    """
 
     def __init__(
         self, bundles: Mapping[str, Bundle], floor: Bundle, namespace: str, port: int | None = None
@@ -59,9 +61,9 @@ class RoundTrips:
         return sum(uplink.lost for uplink in self._uplinks.values())
 
     def measure(self, *, size: int, rate_hz: int, lasts_s: float) -> dict[str, list[float]]:
-        """Round trips in milliseconds over each path and of the floor, for so long."""
+        """Return the round trips in ms over each path and of the floor, measured for ``lasts_s`` seconds."""
         found: dict[str, list[float]] = {}
-        # Each in its own part of the period, so that none waits for another's message.
+        # Each has its own part of the period, so that none waits for another's message.
         names = (*self._uplinks, RAW)
         starts_s = {name: i / len(names) / rate_hz for i, name in enumerate(names)}
         began = time.perf_counter() + _SET_UP_S
@@ -74,7 +76,7 @@ class RoundTrips:
             payload = encode_ping(1, time.time_ns() // 1000, "x" * max(0, size - _ENVELOPE))
             values = found[RAW] = []
             due = began + starts_s[RAW]
-            # One at a time: where the way is longer than the period, the next leaves when this one is back.
+            # One at a time: if a round trip takes longer than the period, the next ping leaves when it ends.
             while due < began + lasts_s:
                 pause.wait(max(0.0, due - time.perf_counter()))
                 values.append(self.raw.round_trip(self._topic, payload) * 1000)

@@ -1,4 +1,4 @@
-"""Processor time and memory of a process and all that it has started, from Linux' /proc."""
+"""Reads processor time and memory of a process and its descendants from Linux' /proc."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ class Usage:
 
 
 def of(pid: int) -> Usage:
-    """Of one process; nothing of one that is gone. What its ended children used is in its own."""
+    """Return the usage of one process with its ended children; 0 for an ended process."""
     try:
         fields = Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()
     except OSError:
@@ -33,7 +33,7 @@ def of(pid: int) -> Usage:
 
 
 def descendants(pid: int) -> list[int]:
-    """Every process below ``pid``, itself not among them."""
+    """Return every process below ``pid``, without ``pid``."""
     parents: dict[int, list[int]] = {}
     for entry in Path("/proc").iterdir():
         if entry.name.isdecimal():
@@ -51,5 +51,5 @@ def descendants(pid: int) -> list[int]:
 
 
 def below(pid: int) -> Usage:
-    """Of all that ``pid`` has started together."""
+    """Return the usage of all descendants of ``pid`` together."""
     return sum((of(child) for child in descendants(pid)), Usage(0.0, 0.0))

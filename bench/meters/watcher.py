@@ -1,4 +1,4 @@
-"""Listens at a broker, and says how long messages took."""
+"""Subscribes at a broker and measures the delay of messages."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ TimeOf = Callable[[bytes], int]
 
 
 def live_us(payload: bytes) -> int:
-    """The time of a live message's sample, in microseconds."""
+    """Return the time of a live message's sample, in microseconds."""
     return decode_live(payload).t_us
 
 
@@ -29,8 +29,10 @@ def live_us(payload: bytes) -> int:
 def listening(
     *, endpoint: str, port: int, certificate: Path, key: Path, ca: Path, took_us: Mapping[str, TimeOf]
 ) -> Iterator[dict[str, list[float]]]:
-    """The delays in ms of every message meanwhile by topic filter, each of which says how to read the
-    time at which a message's way began."""
+    """Collect the delay in ms of every message, by topic filter.
+
+    ``took_us`` has a function for each topic filter that reads from a message when it was sent.
+    """
     heard: dict[str, list[float]] = {topic_filter: [] for topic_filter in took_us}
 
     def take(topic: str, payload: bytes) -> None:
@@ -52,8 +54,10 @@ def subscribed(
     *,
     qos: mqtt5.QoS = mqtt5.QoS.AT_MOST_ONCE,
 ) -> Iterator[None]:
-    """Have ``take`` called with topic and payload of every message meanwhile, in the client's thread;
-    ``files`` are the certificate, its key and the authority's certificate."""
+    """Call ``take`` with topic and payload of every message, in the client's thread.
+
+    ``files`` are the certificate, its key and the authority's certificate.
+    """
     connected, stopped = threading.Event(), threading.Event()
     certificate, key, ca = files
     endpoint, port = address

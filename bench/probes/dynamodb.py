@@ -1,4 +1,4 @@
-"""What DynamoDB can do."""
+"""Probes of DynamoDB."""
 
 from __future__ import annotations
 
@@ -30,13 +30,13 @@ def stores(fixture: ProbeFixture) -> str:
 
 
 def range_of_time(fixture: ProbeFixture) -> str:
-    """Of a drive, a range has the batches that begin in it."""
+    """A range query returns the batches that begin in the range."""
     sent = fixture.drive()
     first, last = batches_between(sent[1].t_us, sent[2].t_us - 1)
     answer = fixture.cloud.client("dynamodb").query(
         TableName=fixture.cloud.output("storage", "TelemetryTable"),
         KeyConditionExpression="topic = :topic AND #batch BETWEEN :a AND :b",
-        # A word of DynamoDB's own.
+        # A reserved word of DynamoDB.
         ExpressionAttributeNames={"#batch": BATCH},
         ExpressionAttributeValues={
             ":topic": {"S": build_topic("dt", fixture.a, VESC_STREAM, fixture.namespace)},
@@ -49,18 +49,18 @@ def range_of_time(fixture: ProbeFixture) -> str:
 
 
 def stream_of_changes(fixture: ProbeFixture) -> str:
-    """What is stored is summarised by the function behind the stream."""
+    """The function behind the stream summarises the stored batches."""
     before = delivery.samples_summarized(fixture.cloud, fixture.a, VESC_STREAM)
     fixture.drive()
     until(
         lambda: delivery.samples_summarized(fixture.cloud, fixture.a, VESC_STREAM) >= before + 150,
         "the stream's function to write the other table",
     )
-    return "what was stored in one table came summarised to the other"
+    return "batches of one table arrived summarised in the other"
 
 
 def many_writers(fixture: ProbeFixture) -> str:
-    """Threads that write as fast as they can; one that is throttled raises."""
+    """Threads write as fast as they can; a throttled write raises."""
     client, table = fixture.cloud.client("dynamodb"), fixture.cloud.output("storage", "RobotsTable")
 
     def write(i: int) -> int:
@@ -76,7 +76,7 @@ def many_writers(fixture: ProbeFixture) -> str:
 
 
 def on_demand(fixture: ProbeFixture) -> str:
-    """The table's own word."""
+    """The table describes itself as on demand."""
     table = fixture.cloud.output("storage", "TelemetryTable")
     described = fixture.cloud.client("dynamodb").describe_table(TableName=table)["Table"]
     mode = described.get("BillingModeSummary", {}).get("BillingMode")

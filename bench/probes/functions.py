@@ -1,4 +1,4 @@
-"""What Lambda can do."""
+"""Probes of Lambda."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ def computes(fixture: ProbeFixture) -> str:
 
 
 def many_instances(fixture: ProbeFixture) -> str:
-    """Invocations at once say which instance they ran in."""
+    """Simultaneous invocations run in several instances."""
     with ThreadPoolExecutor(INSTANCES) as pool:
         answers = list(pool.map(lambda _: fixture.who(0.5), range(INSTANCES)))
     instances = {answer["instance"] for answer in answers}
@@ -29,7 +29,7 @@ def many_instances(fixture: ProbeFixture) -> str:
 
 
 def memory_size(fixture: ProbeFixture) -> str:
-    """The size before and after a change, as the function sees it."""
+    """The function sees its memory size change."""
     client = fixture.cloud.client("lambda")
     before = fixture.who(0)["memory_mb"]
     client.update_function_configuration(FunctionName=fixture.function, MemorySize=512)

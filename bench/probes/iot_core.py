@@ -1,4 +1,4 @@
-"""What AWS IoT Core can do."""
+"""Probes of AWS IoT Core."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ CLIENTS = 20
 
 
 def robot_to_robot(fixture: ProbeFixture) -> str:
-    """From one robot to another's subscription."""
+    """A message of one robot reaches another robot's subscription."""
     topic, payload = fixture.topic(FLEET, fixture.a, "pose"), uuid.uuid4().hex.encode()
     with fixture.client(0) as one, fixture.client(1) as other:
         other.subscribe(topic)
@@ -37,7 +37,7 @@ def robot_to_robot(fixture: ProbeFixture) -> str:
 
 
 def rule_republishes(fixture: ProbeFixture) -> str:
-    """A ping comes back with the cloud's time in it."""
+    """A ping comes back with the cloud's time."""
     answer = fixture.pong(RULE)
     if RECEIVED_MS not in answer:
         raise AbilityMissingError(f"the answer has {sorted(answer)}")
@@ -45,7 +45,7 @@ def rule_republishes(fixture: ProbeFixture) -> str:
 
 
 def newest_state(fixture: ProbeFixture) -> str:
-    """The shadow gives back what was written to it."""
+    """The shadow returns the state that was written to it."""
     client, value = fixture.cloud.client("iot-data"), uuid.uuid4().hex
     document = json.dumps({"state": {"desired": {"bench": value}}})
     client.update_thing_shadow(thingName=fixture.b, shadowName=SHADOW, payload=document)
@@ -55,7 +55,7 @@ def newest_state(fixture: ProbeFixture) -> str:
 
 
 def any_mqtt_client(fixture: ProbeFixture) -> str:
-    """A client of our own, of another version of MQTT than the agent's."""
+    """A client of another MQTT version than the agent's gets its message back."""
     with fixture.client(0) as client:
         topic = fixture.topic(PING, fixture.a, BROKER)
         client.subscribe(topic)
@@ -64,7 +64,7 @@ def any_mqtt_client(fixture: ProbeFixture) -> str:
 
 
 def messages_over_https(fixture: ProbeFixture) -> str:
-    """In over HTTPS, out over MQTT."""
+    """A message that was sent over HTTPS arrives over MQTT."""
     topic, payload = fixture.topic(CMD, fixture.a, "bench"), uuid.uuid4().hex.encode()
     with fixture.client(0) as client:
         client.subscribe(topic)
@@ -74,7 +74,7 @@ def messages_over_https(fixture: ProbeFixture) -> str:
 
 
 def rule_to_table(fixture: ProbeFixture) -> str:
-    """A drive's batches are items of the table."""
+    """The batches of a drive become items of the table."""
     sent = fixture.drive()
     stored = [b for b in fixture.stored() if b.boot == sent[0].boot]
     equal([list(b.times_us) for b in stored], [list(b.times_us) for b in sent])
@@ -82,12 +82,12 @@ def rule_to_table(fixture: ProbeFixture) -> str:
 
 
 def rule_to_function(fixture: ProbeFixture) -> str:
-    """A ping by way of a function."""
+    """A function answers a ping."""
     return f"a function answered ping {fixture.pong(LAMBDA)['id']}"
 
 
 def what_fails_is_kept(fixture: ProbeFixture) -> str:
-    """A message that is no batch comes to the quarantine as it was."""
+    """A message that is no batch reaches the quarantine unchanged."""
     mark = uuid.uuid4().hex
     message = json.dumps({"bench": mark}).encode()
     with fixture.client(0) as client:
@@ -104,7 +104,7 @@ def what_fails_is_kept(fixture: ProbeFixture) -> str:
 
 
 def many_connections(fixture: ProbeFixture) -> str:
-    """So many sessions at once, each of which answers."""
+    """All of `CLIENTS` simultaneous sessions answer."""
     bundles = [fixture.target.robot(f"bench-many-{i}") for i in range(CLIENTS)]
     with ExitStack() as stack, ThreadPoolExecutor(CLIENTS) as pool:
         clients = list(pool.map(lambda b: stack.enter_context(RawClient(b.folder)), bundles))

@@ -42,17 +42,17 @@ def handler(event, context):
 
 
 class AbilityMissingError(BenchError):
-    """The service does not have the ability; the text says what was seen."""
+    """The service lacks the ability; the text says what the probe saw."""
 
 
 def equal(found: Any, expected: Any) -> None:
-    """Raises `AbilityMissingError` unless it is."""
+    """Raise `AbilityMissingError` unless ``found`` equals ``expected``."""
     if found != expected:
-        raise AbilityMissingError(f"{found!r:.80} is not {expected!r:.80}")
+        raise AbilityMissingError(f"must be {expected!r:.80}, got {found!r:.80}")
 
 
 def until(true: Callable[[], bool], what: str, seconds: float = WAIT_S) -> None:
-    """Wait; raises `AbilityMissingError` where it takes longer."""
+    """Wait until ``true`` returns True. Raises `AbilityMissingError` after ``seconds``."""
     deadline = time.monotonic() + seconds
     while not true():
         if time.monotonic() > deadline:
@@ -83,15 +83,15 @@ class ProbeFixture:
         self._exit.close()
 
     def client(self, index: int) -> RawClient:
-        """A connection of the first robot (0) or the second (1)."""
+        """Return a connection of the first robot (0) or the second (1)."""
         return RawClient(self._bundles[index].folder)
 
     def topic(self, lane: str, robot: str, name: str) -> str:
-        """A topic of this deployment."""
+        """Return a topic of this deployment."""
         return build_topic(lane, robot, name, self.namespace)
 
     def pong(self, path: str) -> dict[str, Any]:
-        """What the path answers to a ping of the first robot's."""
+        """Return the answer of the path to a ping of the first robot."""
         with self.client(0) as client:
             client.subscribe(self.topic(PONG, self.a, path))
             number = time.time_ns() % 1_000_000
@@ -101,8 +101,8 @@ class ProbeFixture:
         return answer
 
     def drive(self) -> list[Batch]:
-        """Publish a drive of three seconds of the first robot's; its batches, once they are stored."""
-        # Each drive in seconds of its own, which the one before has not filled.
+        """Publish a drive of three seconds as the first robot; return its batches after they are stored."""
+        # Each drive has its own seconds, which the one before has not filled.
         self._drives += 1
         first_s = int(time.time()) - 60 * self._drives
         boot = uuid.uuid4().hex[:8]
@@ -118,11 +118,11 @@ class ProbeFixture:
         return batches
 
     def stored(self) -> list[Batch]:
-        """The first robot's batches in the telemetry table."""
+        """Return the first robot's batches in the telemetry table."""
         return list(delivery.batches(self.cloud, self.a, VESC_STREAM))
 
     def live_until(self, client: RawClient, true: Callable[[], bool], what: str) -> None:
-        """Publish live samples as a car does: the first ones may be stale before a cold function starts."""
+        """Publish live samples until ``true``; the first may be stale before a cold function starts."""
 
         def heard() -> bool:
             self._seq += 1
@@ -134,7 +134,7 @@ class ProbeFixture:
         until(heard, what)
 
     def who(self, seconds: float) -> dict[str, Any]:
-        """The function's answer, which takes it so many seconds: ``instance`` and ``memory_mb``."""
+        """Return ``instance`` and ``memory_mb`` from the function, which takes ``seconds`` to answer."""
         payload = json.dumps({"seconds": seconds}).encode()
         answer = self.cloud.client("lambda").invoke(FunctionName=self.function, Payload=payload)
         found: dict[str, Any] = json.loads(answer["Payload"].read())

@@ -1,4 +1,4 @@
-"""What PubNub and CloudWatch can do."""
+"""Probes of PubNub and CloudWatch."""
 
 from __future__ import annotations
 
@@ -16,14 +16,14 @@ LISTENERS = 4
 
 
 def live_sample(fixture: ProbeFixture) -> str:
-    """A live sample comes to a subscriber."""
+    """A live sample reaches a subscriber."""
     with fixture.target.listener(fixture.a) as listener, fixture.client(0) as client:
         fixture.live_until(client, lambda: bool(listener.heard), "the subscriber to hear a sample")
         return f"a live sample came to a subscriber after {listener.heard[0].delay_ms:.0f} ms"
 
 
 def many_subscribers(fixture: ProbeFixture) -> str:
-    """The same comes to each of several."""
+    """The same message reaches several subscribers."""
     with ExitStack() as stack:
         listeners = [stack.enter_context(fixture.target.listener(fixture.a)) for _ in range(LISTENERS)]
         fixture.live_until(
@@ -35,7 +35,7 @@ def many_subscribers(fixture: ProbeFixture) -> str:
 
 
 def metrics(fixture: ProbeFixture) -> str:
-    """The mean of values that were put in."""
+    """CloudWatch returns the mean of the values of a metric."""
     client, now = fixture.cloud.client("cloudwatch"), datetime.now(timezone.utc)
     name = f"Bench{uuid.uuid4().hex[:8]}"
     values = {"Values": [1.0, 2.0, 6.0], "Counts": [1.0, 1.0, 1.0]}
@@ -61,7 +61,7 @@ def metrics(fixture: ProbeFixture) -> str:
 
 
 def logs(fixture: ProbeFixture) -> str:
-    """An invocation's lines are found in its log."""
+    """The log has the lines of an invocation."""
     function = fixture.cloud.output("processing", "EchoFunction")
     client = fixture.cloud.client("lambda")
     group = client.get_function_configuration(FunctionName=function)["LoggingConfig"]["LogGroup"]
@@ -76,7 +76,7 @@ def logs(fixture: ProbeFixture) -> str:
 
 
 def dashboards(fixture: ProbeFixture) -> str:
-    """The deployment's dashboards, with their widgets."""
+    """The deployment has dashboards with widgets."""
     client = fixture.cloud.client("cloudwatch")
     names = [entry["DashboardName"] for entry in client.list_dashboards()["DashboardEntries"]]
     if not names:

@@ -1,4 +1,4 @@
-"""On what a report was made: the machine and the versions, without names of hosts, people or folders."""
+"""Describes the machine and the versions behind a report, without names of hosts, people or folders."""
 
 from __future__ import annotations
 

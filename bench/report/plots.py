@@ -1,4 +1,4 @@
-"""The report's pictures: small SVGs that read in black on white and by colour-blind people."""
+"""The report's pictures: small SVGs, legible in black on white and for colour-blind readers."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ def cdf(title: str, curves: Mapping[str, Sequence[float]], *, unit: str = "ms") 
 
 
 def bars(title: str, values: Mapping[str, float], *, unit: str, log: bool = False) -> str:
-    """A bar a name, its value written at its end."""
+    """One bar for each name, with its value at the end."""
     figure, axes = _figure(title, height=0.42 * len(values) + 1.0)
     names = list(values)
     axes.barh(names, [values[name] for name in names], color=[COLOURS[i % 7] for i in range(len(names))])
@@ -58,14 +58,14 @@ def bars(title: str, values: Mapping[str, float], *, unit: str, log: bool = Fals
 def ranges(
     title: str, names: Sequence[str], series: Mapping[str, Mapping[str, tuple[float, float]]], *, unit: str
 ) -> str:
-    """A row a name, and in it a bar from least to most for each series that has the name."""
+    """One row for each name, with a bar from least to most for each series that has the name."""
     figure, axes = _figure(title, height=0.5 * len(names) + 1.0)
     thick = 0.8 / len(series)
     longest = max(most for bars in series.values() for _, most in bars.values())
     for i, (label, bars) in enumerate(series.items()):
         at = [names.index(name) + (i - (len(series) - 1) / 2) * thick for name in bars]
         left = [least for least, _ in bars.values()]
-        # A range of nothing is seen too.
+        # An empty range must be visible too.
         wide = [max(most - least, longest / 300) for least, most in bars.values()]
         axes.barh(at, wide, thick * 0.8, left, color=COLOURS[i % 7], label=label)
         for y, (least, most) in zip(at, bars.values(), strict=True):
@@ -95,7 +95,7 @@ def lines(
     y_label: str,
     log: bool = False,
 ) -> str:
-    """One line a name over the same abscissa."""
+    """One line for each name, over the same x values."""
     figure, axes = _figure(title)
     for i, (name, values) in enumerate(series.items()):
         axes.plot(x, values, "o" + _LINES[i % 4], color=COLOURS[i % 7], label=name, markersize=4)
@@ -117,7 +117,7 @@ def points(
     y_label: str,
     shaded: tuple[float, float] | None = None,
 ) -> str:
-    """Points over time, with a stretch of it shaded."""
+    """Points over time, with one time range shaded."""
     figure, axes = _figure(title)
     if shaded:
         axes.axvspan(*shaded, color="#dddddd", label="broker unreachable")
@@ -133,7 +133,7 @@ def points(
 
 
 def _figure(title: str, height: float = 3.4) -> tuple[Figure, mpl.axes.Axes]:
-    # Figures of their own and no pyplot: nothing global, and no display.
+    # No pyplot: it has global state and needs a display.
     figure = Figure(figsize=(6.8, height), layout="constrained")
     axes = figure.subplots()
     axes.set_title(title, fontsize=10, loc="left")

@@ -1,4 +1,4 @@
-"""What a section of the bench found: tables, plots, ratios and the values behind them."""
+"""The result of a section of the bench: tables, plots, ratios and the values behind them."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ class Table:
 
 @dataclass(frozen=True)
 class Plot:
-    """A picture: ``svg`` is the whole file."""
+    """A picture; ``svg`` is the text of the file."""
 
     name: str
     title: str
@@ -28,12 +28,12 @@ class Plot:
 
 @dataclass(frozen=True)
 class Ratio:
-    """A figure, and the most it may be; ``unit`` says ratio of what.
+    """A figure with its unit (``x`` for a ratio) and its target, which is the most that it may be.
 
-    Where ``at_least``, larger is better and ``target`` is the least. A target of None is not held.
-    ``tolerance`` is how many times worse than in the report that is kept the guard lets it be: above what
-    the same tree has shown on a machine with other work (docs/bench.md). ``by_machine`` says that the other
-    half of the ratio is a constant, so that a slower machine has a larger one.
+    With ``at_least`` larger is better and ``target`` is the least. None means no target. The guard accepts a
+    figure that is ``tolerance`` times worse than in the kept report; this exceeds the variation of one tree
+    on a machine with other work (docs/bench.md). ``by_machine`` marks a ratio to a constant, which a slower
+    machine makes larger.
     """
 
     name: str
@@ -46,7 +46,7 @@ class Ratio:
 
     @property
     def reached(self) -> bool | None:
-        """Whether the target is; None without one."""
+        """True if the target is reached; None without a target."""
         if self.target is None:
             return None
         return self.value >= self.target if self.at_least else self.value <= self.target
@@ -54,7 +54,7 @@ class Ratio:
 
 @dataclass
 class Section:
-    """One section of the report; ``raw`` are the values behind it, for whoever wants to look again."""
+    """One section of the report; ``raw`` has the values behind it."""
 
     key: str
     title: str
@@ -66,7 +66,7 @@ class Section:
     seconds: float = 0.0
 
     def as_json(self) -> dict[str, Any]:
-        """Without the pictures, which are files of their own."""
+        """Return the section without its pictures, which have their own files."""
         found = asdict(self)
         found["plots"] = [{"name": plot.name, "title": plot.title} for plot in self.plots]
         return found

@@ -1,4 +1,4 @@
-"""How values spread: percentiles of one run, and the range of the medians of repeated ones. Pure."""
+"""Percentiles of a run, and the range of the medians of repeated runs. Pure functions."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from statistics import median, quantiles
 
 @dataclass(frozen=True)
 class Spread:
-    """Percentiles of ``n`` values, and between which the medians of the repeats lie."""
+    """Percentiles of ``n`` values, and the least and the greatest median of the repeats."""
 
     n: int
     p50: float
@@ -19,14 +19,14 @@ class Spread:
     high: float
 
     def text(self, unit: str = "ms", digits: int = 2) -> str:
-        """``1.20 ms (p95 2.10, p99 3.00; 1.10 to 1.30)``; the range only of repeats."""
+        """``1.20 ms (p95 2.10, p99 3.00; 1.10 to 1.30)``; only repeats have a range."""
         tail = f"p95 {self.p95:.{digits}f}, p99 {self.p99:.{digits}f}"
         repeats = "" if self.low == self.high else f"; {self.low:.{digits}f} to {self.high:.{digits}f}"
         return f"{self.p50:.{digits}f} {unit} ({tail}{repeats})"
 
 
 def spread(repeats: Sequence[Sequence[float]]) -> Spread | None:
-    """The spread of all values of all repeats; None where nothing was measured."""
+    """Return the spread of all values of all repeats; None without values."""
     medians = [median(values) for values in repeats if values]
     values = [value for repeat in repeats for value in repeat]
     if not values:
@@ -36,8 +36,10 @@ def spread(repeats: Sequence[Sequence[float]]) -> Spread | None:
 
 
 def ratio(ours: Sequence[Sequence[float]], floor: Sequence[Sequence[float]]) -> float | None:
-    """The median over the repeats of ours against the floor of the same repeat, so that a machine that
-    is slow for a while is slow for both; None where there is no pair."""
+    """Return the median, over the repeats, of ours / floor in the same repeat; None without a pair.
+
+    A machine that is slow for a while slows both halves of a pair.
+    """
     pairs = [
         median(one) / median(other)
         for one, other in zip(ours, floor, strict=False)

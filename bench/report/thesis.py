@@ -1,4 +1,4 @@
-"""What the KTH thesis of 2018 found, for the columns beside our own: its tables 6.1 to 6.3, 6.5 and 6.6.
+"""The figures of the KTH thesis of 2018, shown beside our own: its tables 6.1 to 6.3, 6.5 and 6.6.
 
 "A Practical Approach of an Internet of Robotic Things Platform": a car with ROS in Stockholm, AWS in Dublin,
 a ping of 50 ms. The round trips of its table 6.4 are in `local.figures`.
@@ -13,7 +13,7 @@ from bench.report.result import Table
 
 SOURCE = "KTH thesis of 2018"
 ROS, AWS_IOT, LAMBDA, DYNAMODB, CLOUDWATCH = "ROS", "AWS IoT", "Lambda", "DynamoDB", "CloudWatch"
-# Of a service or a criterion that its tables do not have.
+# For a service or a criterion that its tables lack.
 UNSAID = "not in its tables"
 # Between its car and its cloud.
 PING_MS = 50
@@ -21,7 +21,7 @@ PING_MS = 50
 
 @dataclass(frozen=True, eq=False)
 class Criteria:
-    """One of its tables: what it says of every service by each criterion."""
+    """One of its tables: an entry for every service and criterion."""
 
     number: str
     title: str
@@ -29,7 +29,7 @@ class Criteria:
     rows: Mapping[str, tuple[str, ...]]
 
     def as_table(self) -> Table:
-        """As the thesis has it."""
+        """Return the table as in the thesis."""
         head = ["service", *self.criteria]
         return Table(
             f"{SOURCE}, table {self.number}: {self.title}", head, [[k, *v] for k, v in self.rows.items()]
@@ -82,7 +82,7 @@ QUERY_IN_LAMBDA, SCAN_IN_LAMBDA = "5.5 s (512 MB)", "12.9 s (512 MB)"
 
 
 def said(service: str, criterion: str) -> str:
-    """What its tables say, with the criterion before it. Raises `KeyError` for what they do not have."""
+    """Return the entry of its tables, with the criterion before it. Raises `KeyError` for a missing entry."""
     for table in TABLES:
         if criterion in table.criteria:
             return f"{criterion}: {table.rows[service][table.criteria.index(criterion)]}"

@@ -13,7 +13,7 @@ NAME = "report"
 
 
 def headline(sections: Sequence[Section]) -> Table:
-    """Every figure that holds on any machine, beside what it may be."""
+    """Return a table of all ratios with their targets."""
     rows = [ratio_row(ratio) for section in sections for ratio in section.ratios]
     return Table(
         "Ratios, each measured side by side in this run", ["figure", "measured", "target", "reached"], rows
@@ -21,7 +21,7 @@ def headline(sections: Sequence[Section]) -> Table:
 
 
 def ratio_row(ratio: Ratio) -> list[str]:
-    """Name, value, target and whether it is reached, as text."""
+    """Return name, value, target and whether it is reached, as text."""
     unit = "" if ratio.unit == "x" else f" {ratio.unit}"
     sign = "at least" if ratio.at_least else "at most"
     target = "" if ratio.target is None else f"{sign} {ratio.target:g}{unit}"

@@ -1,4 +1,4 @@
-"""A ROS 1 master and nodes of its own, for the bench: a Python that sees rospy, on a free port."""
+"""Runs a ROS 1 master on a free port, and nodes under a Python that has rospy."""
 
 from __future__ import annotations
 
@@ -25,11 +25,11 @@ _START_S = 20.0
 
 
 class RosError(BenchError):
-    """There is no ROS 1 here, or it does not start; the text says what to do."""
+    """ROS 1 is not installed or does not start; the text says how to fix it."""
 
 
 def python_with_rospy() -> str:
-    """A Python that sees rospy and what the agent needs: IORT_ROS_PYTHON, or one made in build/."""
+    """Return a Python with rospy and the agent's requirements: IORT_ROS_PYTHON, or one made in build/."""
     given = os.environ.get("IORT_ROS_PYTHON")
     if given:
         return given
@@ -50,7 +50,7 @@ def python_with_rospy() -> str:
 
 
 class RosGraph:
-    """The master from `__enter__` to `__exit__`, and `start` for nodes."""
+    """A master that runs from `__enter__` to `__exit__`; `start` adds nodes."""
 
     def __init__(self, python: str, folder: Path) -> None:
         self._python, self._folder = python, folder
@@ -78,7 +78,7 @@ class RosGraph:
             except OSError as error:
                 if time.monotonic() > deadline:
                     raise RosError(f"rosmaster does not answer: {error}") from error
-                # It has no other way to tell that it is there.
+                # The master does not report when it is ready.
                 time.sleep(0.05)
             else:
                 return self
@@ -91,11 +91,11 @@ class RosGraph:
             process.communicate()
 
     def start(self, module: str, *arguments: object) -> subprocess.Popen[str]:
-        """Run a module under the Python that sees rospy."""
+        """Run a module under the Python that has rospy."""
         return self.run([self._python, "-m", module, *map(str, arguments)])
 
     def publisher(self, topic: str, rate_hz: int, count: int) -> Publisher:
-        """A publisher of so many messages, which waits to be told to begin."""
+        """Return a publisher of ``count`` messages, which waits for `Publisher.begin`."""
         return Publisher(self.start("bench.ros.publisher", topic, rate_hz, count))
 
     def run(self, command: list[str]) -> subprocess.Popen[str]:
@@ -115,28 +115,28 @@ class RosGraph:
 
 
 class Publisher:
-    """A publisher of the bench in a process of its own; methods raise `RosError` where that has ended."""
+    """A publisher in its own process; methods raise `RosError` after the process has ended."""
 
     def __init__(self, process: subprocess.Popen[str]) -> None:
         self._process = process
 
     def begin(self) -> None:
-        """Wait until all subscribers have come, and have it publish."""
+        """Wait for all subscribers, then start to publish."""
         self.ready()
         self.go()
 
     def ready(self) -> None:
-        """Wait until all subscribers have come."""
+        """Wait for all subscribers."""
         self._hear()
 
     def go(self) -> None:
-        """Have it publish."""
+        """Start to publish."""
         assert self._process.stdin is not None
         self._process.stdin.write("\n")
         self._process.stdin.flush()
 
     def publish_for(self, seconds: float) -> None:
-        """Let it publish for so long."""
+        """Let it publish for ``seconds``."""
         try:
             self._process.wait(seconds)
         except subprocess.TimeoutExpired:
@@ -144,7 +144,7 @@ class Publisher:
         raise RosError(f"the publisher stopped with status {self._process.returncode}")
 
     def finish(self) -> str:
-        """Wait until all is published; what it says of it."""
+        """Wait until everything is published; return the line that it prints."""
         return self._hear()
 
     def _hear(self) -> str:

@@ -2,8 +2,8 @@
 
 python -m bench.ros.mixed_publisher NODE SECONDS SUBSCRIBERS
 
-Waits for so many subscribers of each of its topics, then for a line on its input; publishes each topic at its
-rate, stamped as it goes out; says at the end how many messages went out, by topic, as JSON.
+Waits for the subscribers of each of its topics, then for a line on its input. Publishes each topic at its
+rate with time stamps of now. At the end it prints the number of messages by topic, as JSON.
 """
 
 import heapq
@@ -18,7 +18,7 @@ import rospy
 
 from bench.ros.mixed_robot import HEADER, NODES, Topic
 
-# Of a subscriber's connection: a second of the fastest topic.
+# Messages that a subscriber's connection may hold: a second of the fastest topic.
 _QUEUE = 1000
 
 

@@ -1,4 +1,4 @@
-"""The mixed robot of the bench: its topics, their types as text, and values such as a robot's sensors have.
+"""The mixed robot of the bench: its topics, their types as text, and values like those of real sensors.
 
 Types come from the text, as every subscriber gets them, so that only Debian's rospy has to be installed.
 """
@@ -64,7 +64,7 @@ def _text(own: str, *parts: str) -> str:
 
 @dataclass(frozen=True)
 class Topic:
-    """What one node publishes on a topic. ``fill`` sets a message's fields, except for its header's.
+    """A topic of one node. ``fill`` sets the fields of a message, except for the header.
 
     A rate of 0 is one message, latched.
     """
@@ -79,7 +79,7 @@ class Topic:
 
     @property
     def time(self) -> str:
-        """By which time the agent takes it."""
+        """Return the kind of time that the agent uses for the topic."""
         return HEADER if self.definition.startswith("Header header") else ARRIVAL
 
 
@@ -230,5 +230,5 @@ NODES: dict[str, tuple[Topic, ...]] = {
 
 
 def topics() -> dict[str, Topic]:
-    """Each topic of all nodes once, by name."""
+    """Return each topic of all nodes once, by name."""
     return {topic.name: topic for node in NODES.values() for topic in node}

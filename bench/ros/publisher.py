@@ -1,4 +1,4 @@
-"""Publishes VescStateStamped at a rate, stamped as it goes out; runs under a Python with rospy.
+"""Publishes VescStateStamped at a rate with time stamps of now; runs under a Python with rospy.
 
 python -m bench.ros.publisher TOPIC RATE_HZ COUNT
 """

@@ -27,7 +27,7 @@ DEFINITION = "\n".join(
 )
 
 
-# The firmware sends whole numbers, the driver divides these by so much, and the rest by one.
+# The firmware sends integers; the driver divides these fields by the number, and the others by 1.
 _PARTS = {
     "voltage_input": 10,
     "temperature_pcb": 10,
@@ -38,10 +38,10 @@ _PARTS = {
 
 
 def values(i: int) -> list[float]:
-    """The fields of the i-th message, with as many digits as a VESC's have; the speed counts."""
+    """Return the fields of the i-th message with a VESC's digits; the speed is ``i``."""
     return [float(i) if name == "speed" else (115 + i % 97) / _PARTS.get(name, 1) for name in FIELDS]
 
 
 def body(i: int) -> bytes:
-    """The i-th message as ROS 1 serializes it, from the frame_id on."""
+    """Return the i-th message as ROS 1 serializes it, from the frame_id on."""
     return struct.pack(f"<I9s{len(FIELDS)}di", 9, b"base_link", *values(i), 0)

@@ -1,7 +1,7 @@
-"""Tables 6.1 to 6.3: what each service can do, every answer by doing it in this run.
+"""Tables 6.1 to 6.3: the abilities of each service, each tried in this run.
 
-The thesis gave its answers from documentation and use; here a probe exercises each ability on the deployed
-stacks. Beside each stands what the thesis' tables say on the same point; its tables as they are follow.
+The thesis took its answers from documentation and use. Here a probe tries each ability on the deployed
+stacks. The report has the thesis' entry on the same point beside each answer, then its tables.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ from bench.report.thesis import UNSAID, said
 from bench.target import Say, Target
 
 _IOT_CORE, _DYNAMODB, _LAMBDA, _PUBNUB, _CLOUDWATCH = "IoT Core", "DynamoDB", "Lambda", "PubNub", "CloudWatch"
-# What the thesis said, by the point that an ability is an instance of.
+# The thesis' entry on the point of an ability.
 _PATTERN, _PROTOCOL = said(thesis.AWS_IOT, "pattern"), said(thesis.AWS_IOT, "protocol")
 _COMPUTE, _NO_STORAGE = said(thesis.AWS_IOT, "compute"), said(thesis.AWS_IOT, "storage")
 _STORAGE = said(thesis.DYNAMODB, "storage")
@@ -28,7 +28,7 @@ _MONITORING = said(thesis.CLOUDWATCH, "monitoring")
 
 @dataclass(frozen=True)
 class Probe:
-    """One cell: ``ask`` exercises the ability and says what it saw, or raises."""
+    """One cell: ``ask`` tries the ability and returns what it saw, or raises."""
 
     service: str
     ability: str
@@ -36,7 +36,7 @@ class Probe:
     ask: Callable[[ProbeFixture], str]
 
 
-# Every cell, by the thesis' table that it belongs to.
+# The cells of each table of the thesis.
 PROBES = {
     thesis.FUNCTIONALITY: (
         Probe(_IOT_CORE, "pushes a robot's message to another robot", _PATTERN, iot_core.robot_to_robot),
@@ -118,5 +118,5 @@ def _answer(probe: Probe, fixture: ProbeFixture) -> tuple[str, str]:
         return "yes", probe.ask(fixture)
     except AbilityMissingError as missing:
         return "no", str(missing)
-    except Exception as error:  # noqa: BLE001 - whatever the service does instead is the answer
+    except Exception as error:  # noqa: BLE001 - any other behaviour of the service is an answer
         return "no", f"{type(error).__name__}: {error}"[:160]

@@ -1,4 +1,4 @@
-"""From the car to the dashboard: to a PubNub subscriber hop by hop, and to a painted frame in Chromium."""
+"""The delay from the car to a PubNub subscriber, hop by hop, and to a painted frame in Chromium."""
 
 from __future__ import annotations
 
@@ -151,7 +151,7 @@ def _chunks(values: list[float]) -> list[list[float]]:
 
 @contextmanager
 def _page(target: Target, robot: str, say: Say) -> Iterator[Any]:
-    """The live page in a real browser; None where there is no browser or no built page."""
+    """Yield the live page in a real browser, or None without a browser or a built page."""
     if chromium.found() is None or not (BUILT / "index.html").is_file():
         say("no Chromium, or the page is not built: measured to the subscriber only")
         yield None

@@ -20,7 +20,7 @@ from bench.target import Say, Target
 from iort_contract import LIVE, SECOND, VESC_STREAM, LiveSample, build_topic, encode_live, record_topic
 from iort_station.data.items import of_topic
 
-# AWS IoT takes so many publishes a second from a connection.
+# AWS IoT accepts this many publishes a second from a connection.
 RATE_HZ = 100
 STRETCH_S = 8
 _REPEATS = 2
@@ -36,12 +36,12 @@ Message = Callable[[int], bytes]
 
 
 def bad(number: int) -> bytes:
-    """What no robot of ours sends."""
+    """Return a message that is no JSON."""
     return b"no JSON %d" % number
 
 
 def good(number: int) -> bytes:
-    """A live message of now."""
+    """Return a live message with the current time."""
     now_us = time.time_ns() // 1000
     return encode_live(LiveSample("0badcafe", number, now_us, now_us, {"speed": number}))
 
@@ -72,7 +72,7 @@ def run(target: Target, say: Say) -> Section:
             if time.monotonic() - began > _WARM_UP_S:
                 raise BenchError("no live update was heard")
             threading.Event().wait(0.1)
-        # Once each beforehand: clients are made and environments started only the first time.
+        # Warm up once with each kind: the first message creates clients and environments.
         for message in KINDS.values():
             _stretch(client, topic, message, 2)
         for _ in range(_REPEATS):
@@ -127,7 +127,7 @@ def _summary_delays(target: Target, car: str, client: RawClient, other: str, rat
             _paced(client, topic, messages, rate_hz)
         else:
             over.wait(WORST_S)
-        # Of the last seconds, too, the summary is waited for.
+        # Wait for the summaries of the last seconds too.
         deadline = time.monotonic() + _WARM_UP_S
         while int(began_s) + WORST_S not in seen and time.monotonic() < deadline:
             over.wait(_LOOK_S)

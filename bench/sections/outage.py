@@ -1,7 +1,7 @@
-"""Outage: the way to the broker is cut for a minute while a car drives at 50 Hz.
+"""Outage: the connection to the broker is cut for a minute while a car drives at 50 Hz.
 
 On the embedded cloud a proxy between car and broker resets every connection; on AWS the car's certificate
-is deactivated, which ends its session and refuses the next ones.
+is deactivated, which ends its session and refuses new ones.
 """
 
 from __future__ import annotations
@@ -28,13 +28,13 @@ from local.proxy import PASS, REFUSE, Proxy
 
 ROBOT = "bench-outage"
 RATE_HZ = 50
-# After the way is back the agent may wait for its next attempt, and then it must still drive.
+# After the outage the agent may wait for its next attempt, and must still drive then.
 BEFORE_S, CUT_S, AFTER_S = 8, 60, 30
 _SUMMARY_S = 60.0
 
 
 def run(target: Target, say: Say) -> Section:
-    """Drive, cut, drive on; then count in the table, and look at the live updates meanwhile."""
+    """Drive, cut the connection, restore it; then count the stored samples and the live updates."""
     section = Section("outage", "Outage: no broker for 60 s at 50 Hz")
     seconds = BEFORE_S + CUT_S + AFTER_S
     source = {"type": "sim", "stream": VESC_STREAM, "rate_hz": RATE_HZ, "duration_s": seconds}
@@ -58,7 +58,7 @@ def run(target: Target, say: Say) -> Section:
         report = agent.finished()
         heard = list(listener.heard)
     sent = sum(s["samples"] for name, s in report["streams"].items() if name not in OWN_STREAMS)
-    # What is lost never comes; it is counted, not waited for.
+    # Lost samples never arrive: they are counted after the wait.
     with suppress(BenchError):
         _wait_for(
             lambda: delivery.samples_summarized(target.cloud, bundle.robot, VESC_STREAM) >= sent,
@@ -129,7 +129,7 @@ def _report(
     section.ratios += [
         Ratio("samples lost over an outage", lost, 0, "samples"),
         Ratio("batches stored twice over an outage", duplicated, 0, "batches"),
-        # Most of it is the wait for the agent's next attempt, which is drawn by lot.
+        # Most of it is the random wait before the agent's next attempt.
         Ratio("time to drain / outage", round(drain_s / CUT_S, 4), 0.5, tolerance=4),
     ]
     if after and before:
@@ -176,8 +176,7 @@ class _Proxied:
 class _Certificate:
     """AWS ends the sessions of a certificate that is deactivated, and refuses new ones.
 
-    An agent that is refused waits for minutes, until somebody gives it another certificate: the file is
-    written anew with what it holds.
+    A refused agent waits for minutes, or until its certificate file changes: `mend` touches the file.
     """
 
     def __init__(self, target: Target, bundle: Bundle) -> None:

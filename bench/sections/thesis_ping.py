@@ -38,7 +38,7 @@ Repeats = list[list[float]]
 
 
 def measure(target: Target, bundles: Mapping[str, Bundle], floor: Bundle, say: Say) -> dict[str, Repeats]:
-    """What was found by ``<way> at <rate> Hz``, and of the dashboard and of the echo."""
+    """Return the values by ``<way> at <rate> Hz``, and those of the dashboard and the echo."""
     found: dict[str, Repeats] = {}
     cloud = target.cloud
     with Proxy(cloud.mqtt_endpoint, cloud.mqtt_port, latency_s=ONE_WAY_S) as proxy:
@@ -57,7 +57,7 @@ def measure(target: Target, bundles: Mapping[str, Bundle], floor: Bundle, say: S
 
 
 def _to_subscriber(target: Target, port: int) -> list[float]:
-    """From the sample in a driving car to the subscriber, in ms, by this machine's one clock."""
+    """Return the delays in ms from the sample in a driving car to the subscriber, by one clock."""
     bundle = target.robot(
         "bench-far", port=port, sources=[{"type": "sim", "stream": VESC_STREAM, "rate_hz": 50}]
     )

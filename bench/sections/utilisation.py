@@ -1,8 +1,8 @@
-"""Table 6.5: what the functions and the robot's node use.
+"""Table 6.5: the time and processor time of the functions and of the robot's node.
 
-Durations are those of Lambda's REPORT lines in CloudWatch Logs. The embedded cloud runs every function
-with the whole of a core whatever its memory, so there processor time is measured as well, by the operating
-system, and projected to each memory size; on AWS the sizes are set and measured.
+Durations come from Lambda's REPORT lines. The embedded cloud gives every function a whole core, whatever its
+memory size. So there the operating system also measures processor time, which is projected to each memory
+size. On AWS each size is set and measured.
 """
 
 from __future__ import annotations
@@ -195,7 +195,7 @@ def _cold_text(one: Measured) -> str:
 
 
 def _memory_sizes(target: Target, function: str, event: Event, say: Say) -> dict[int, Measured]:
-    """Lambda 1 at each memory size, on AWS; the size that was is set again."""
+    """Measure Lambda 1 at each memory size, on AWS; restore the size at the end."""
     if target.embedded is not None:
         return {}
     client = target.cloud.client("lambda")
@@ -214,7 +214,7 @@ def _memory_sizes(target: Target, function: str, event: Event, say: Say) -> dict
 
 
 def _cold(target: Target, function: str, event: Event, say: Say) -> Measured:
-    """The first invocation of new environments: another environment variable makes one."""
+    """Measure first invocations; a changed environment variable starts a new environment."""
     client = target.cloud.client("lambda")
     was = client.get_function_configuration(FunctionName=function).get("Environment", {}).get("Variables", {})
     found = Measured()
@@ -229,7 +229,7 @@ def _cold(target: Target, function: str, event: Event, say: Say) -> Measured:
 
 
 def _store(target: Target, say: Say) -> list[dict[str, Any]]:
-    """The items of a drive of 100 s in the telemetry table; waits until Lambda 2 has seen them."""
+    """Store a drive of 100 s, wait until Lambda 2 has summarised it, and return its items."""
     say("storing a drive")
     robot = target.name(ROBOT)
     items = stored_drive.store(target, robot, stored_drive.simulated(BATCHES * stored_drive.RATE_HZ))
@@ -261,7 +261,7 @@ def _stream_event(items: list[dict[str, Any]]) -> dict[str, Any]:
 
 
 def _live_event(target: Target, i: int) -> dict[str, Any]:
-    """What the live rule gives to Lambda 1."""
+    """Return an event as the live rule sends it to Lambda 1."""
     now_us = time.time_ns() // 1000
     sample = Vehicle(VehicleConfig(), seed=1).sample()
     message = encode_live(LiveSample("0badcafe", i, now_us - 1000, now_us, sample))
