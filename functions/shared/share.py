@@ -29,8 +29,8 @@ _log = logging.getLogger(__name__)
 A_SECOND, BURST_S = 0.1, 0.3
 # What the requests for a topic, or for a batch that is refused, cost beside the processor.
 REQUESTS_S = 0.002
-# The keys of a message. The dearest batch, of 60 s, takes 2.6 s of a processor with the seconds around it, and
-# the later function has 0.29 of one for 60 s.
+# The keys of a message. The dearest batch, of 60 s, takes 2.6 s of a processor with the seconds beside
+# it, and the later function has 0.29 of one for 60 s.
 KEYS = 4
 # SendMessageBatch takes as many.
 _MESSAGES = 10
