@@ -1,4 +1,4 @@
-"""Ctrl-C, or the end of the terminal, while something must still be put back."""
+"""Handles Ctrl-C and a closed terminal while changes must still be restored."""
 
 from __future__ import annotations
 
@@ -13,8 +13,10 @@ _INTERRUPTS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
 
 @contextmanager
 def wound_up(console: Console) -> Iterator[Callable[[], None]]:
-    """An interrupt ends what runs now, in good order; another one does not end the putting in order. Nor
-    does the first one once the function that this gives was called: what is put back then has begun."""
+    """Let the first interrupt stop the work in good order, and ignore further ones during the cleanup.
+
+    Yields a function that announces the cleanup: after its call even the first interrupt is ignored.
+    """
     asked = False
 
     def putting_back() -> None:
@@ -26,7 +28,7 @@ def wound_up(console: Console) -> Iterator[Callable[[], None]]:
         if asked:
             # The terminal may have gone.
             with suppress(OSError):
-                console.print("still putting back what was changed", style="yellow")
+                console.print("still restoring the changes", style="yellow")
             return
         asked = True
         raise KeyboardInterrupt

@@ -25,8 +25,8 @@ from rich.console import Console
 from rich.markup import escape
 from rich.prompt import Confirm
 
-from bench import machine
 from bench.interrupts import wound_up
+from bench.report import machine
 from bench.target import AWS, EMBEDDED, Target, open_target
 from iort_station.cloud import Cloud
 from iort_station.cost.prices import AS_OF

@@ -39,7 +39,7 @@ ROBOT = "car"
 
 
 def events() -> dict[str, dict[str, Any]]:
-    """By the function's name; of now, because what is late is not worked on."""
+    """Return the events by the function's name, with the current time: functions ignore late events."""
     now_us = time.time_ns() // 1000
     now_ms = now_us // 1000
     topic = build_topic(RECORD, ROBOT, VESC_STREAM)
