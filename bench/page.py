@@ -29,7 +29,7 @@ from bench import chromium
 from bench.errors import BenchError
 from iort_station.fleet.robots import F1TENTH
 from iort_station.page.server import PageServer
-from local.pubnub_standin import PubNubStandIn
+from local.pubnub.standin import PubNubStandIn
 
 # Of a processor: the page is to leave the rest to whoever looks at it.
 MAX_BUSY = 0.30

@@ -49,7 +49,7 @@ from local.certificates import Identity
 from local.deployment import ROOT, deploy
 from local.errors import LocalError
 from local.processes import Child
-from local.pubnub_standin import PubNubStandIn
+from local.pubnub.standin import PubNubStandIn
 
 FOLDER = EMBEDDED.parent
 

@@ -22,7 +22,7 @@ from urllib.parse import quote, unquote
 from aiohttp import web
 
 import iort_contract
-from local.pubnub_history import History, Message, Subscription
+from local.pubnub.history import History, Message, Subscription
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
