@@ -14,6 +14,7 @@ from urllib.parse import quote
 import pytest
 from pubnub.pubnub import SubscribeListener
 
+from local.pubnub import standin as server
 from local.pubnub.standin import PubNubStandIn
 from tests.local.pubnub_sdk import PAYLOADS, WAIT_S, ask, poll, publish
 
