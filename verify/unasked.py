@@ -28,7 +28,7 @@ UNASKED = (
         "failures.",
         f"{_LAMBDA}/invocation-async-error-handling.html",
         "stacks/processing.py",
-        "local/gaps.py",
+        "local/gaps/functions/async_invocations.py",
     ),
     _documented(
         "lambda.at_least_once",
@@ -49,7 +49,7 @@ UNASKED = (
         "Lambda sets up logging before it loads a function, and a logged line has its level.",
         f"{_LAMBDA}/python-logging.html",
         "functions/summarize.py",
-        "local/log_gap.py",
+        "local/gaps/functions/log_levels.py",
     ),
     _documented(
         "lambda.reserved_concurrency",
@@ -63,8 +63,8 @@ UNASKED = (
         "A stream keeps records for 24 hours, in the order of each partition key.",
         f"{_DYNAMODB}/Streams.html",
         "functions/summarize.py",
-        "local/stream_gap.py",
-        "local/stream_mapping.py",
+        "local/gaps/functions/stream_retries.py",
+        "local/gaps/parts/stream_mapping.py",
     ),
     _documented(
         "dynamodb.ttl",
@@ -77,14 +77,14 @@ UNASKED = (
         "A Query reads at most 1 MB of one partition, in the order of the sort key.",
         f"{_DYNAMODB}/Query.Pagination.html",
         "station/iort_station/data/reading.py",
-        "local/table_gap.py",
+        "local/gaps/storage/query_time.py",
     ),
     _documented(
         "sqs.keeps_messages",
         "A message that SQS has accepted stays in the queue until it is deleted or expires.",
         "https://docs.aws.amazon.com/AWSSimpleQueueService/latest/SQSDeveloperGuide/sqs-message-metadata.html",
         "stacks/quarantine.py",
-        "local/queue_gap.py",
+        "local/gaps/storage/queue_lock.py",
     ),
     # The hook's time-out would need a deployment of its own.
     _documented(
@@ -111,13 +111,13 @@ UNASKED = (
         "A session whose certificate is deactivated is ended within minutes.",
         f"{_IOT}/device-certs-create.html",
         "station/iort_station/fleet/robots.py",
-        "local/cut_sessions.py",
+        "local/gaps/broker/certificate_status.py",
     ),
     _documented(
         "broker.slow_handshake",
         "A connection without a CONNECT is closed by the broker.",
         "https://docs.aws.amazon.com/general/latest/gr/iot-core.html",
-        "local/listener_gap.py",
+        "local/gaps/broker/connect_timeout.py",
     ),
     # Only a bill shows it.
     _documented(
@@ -151,7 +151,7 @@ UNASKED = (
         "A policy names a named shadow as a level of its thing: thing/<thing>/<shadow>.",
         f"{_IOT}/iot-action-resources.html",
         "stacks/processing.py",
-        "local/stream_gap.py",
+        "local/gaps/access/shadow_arn.py",
     ),
     _documented(
         "sqs.fair_queues",
