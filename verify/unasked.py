@@ -6,6 +6,7 @@ from verify.assumption import Assumption, Basis
 
 _IOT = "https://docs.aws.amazon.com/iot/latest/developerguide"
 _LAMBDA = "https://docs.aws.amazon.com/lambda/latest/dg"
+_CLOUDWATCH = "https://docs.aws.amazon.com/AmazonCloudWatch/latest/monitoring"
 _DYNAMODB = "https://docs.aws.amazon.com/amazondynamodb/latest/developerguide"
 
 
@@ -164,6 +165,91 @@ UNASKED = (
         "A rule's action runs as the role that the rule names; the emulator runs it without.",
         f"{_IOT}/iot-create-role.html",
         "stacks/ingest.py",
+    ),
+    _documented(
+        "iot.topic_templates",
+        "A republish action's topic may hold ${topic(n)}.",
+        f"{_IOT}/iot-substitution-templates.html",
+        "contract/iort_contract/cloud.py",
+        "local/gaps/rules/republish_topic.py",
+    ),
+    _documented(
+        "iot.sql_floor",
+        "The SQL function floor() rounds a number down to an integer.",
+        f"{_IOT}/iot-sql-functions.html",
+        "contract/iort_contract/cloud.py",
+        "local/gaps/rules/sql_floor.py",
+    ),
+    _documented(
+        "iot.calls_over_tls",
+        "A rule's SQS action is a request over TLS, so that a queue's policy may demand aws:SecureTransport.",
+        "https://docs.aws.amazon.com/IAM/latest/UserGuide/reference_policies_condition-keys.html",
+        "stacks/queue.py",
+        "local/gaps/rules/sqs_action_tls.py",
+    ),
+    _documented(
+        "broker.delete_connection",
+        "DeleteConnection ends the session of one client.",
+        "https://docs.aws.amazon.com/iot/latest/apireference/API_iotdata_DeleteConnection.html",
+        "station/iort_station/fleet/certificates.py",
+        "local/gaps/broker/delete_connection.py",
+    ),
+    _documented(
+        "broker.client_certificate",
+        "A client without a certificate is not served on port 8883.",
+        f"{_IOT}/x509-client-certs.html",
+        "stacks/documents.py",
+        "local/gaps/broker/client_certificate.py",
+    ),
+    _documented(
+        "sqs.batch_permission",
+        "SendMessageBatch needs the permission sqs:SendMessage.",
+        "https://docs.aws.amazon.com/AWSSimpleQueueService/latest/SQSDeveloperGuide/sqs-api-permissions-reference.html",
+        "functions/shared/share.py",
+        "local/gaps/access/send_message_batch.py",
+    ),
+    _documented(
+        "dynamodb.stream_resource",
+        "A role may be granted the reading of one stream, by its ARN.",
+        "https://docs.aws.amazon.com/service-authorization/latest/reference/list_amazondynamodb.html",
+        "stacks/quarantine.py",
+        "local/gaps/access/stream_arn.py",
+    ),
+    _documented(
+        "cloudwatch.lambda_metrics",
+        "AWS/Lambda counts every invocation, for each function and for the account.",
+        f"{_LAMBDA}/monitoring-metrics-types.html",
+        "stacks/metrics.py",
+        "local/gaps/metrics/lambda_metrics.py",
+    ),
+    _documented(
+        "cloudwatch.iot_metrics",
+        "AWS/IoT counts connections, messages, and the matches and actions of rules.",
+        f"{_IOT}/metrics_dimensions.html",
+        "stacks/metrics.py",
+        "local/gaps/metrics/iot_metrics.py",
+    ),
+    _documented(
+        "cloudwatch.queue_metrics",
+        "AWS/SQS counts the messages that wait in each queue.",
+        "https://docs.aws.amazon.com/AWSSimpleQueueService/latest/SQSDeveloperGuide/sqs-available-cloudwatch-metrics.html",
+        "stacks/metrics.py",
+        "local/gaps/metrics/queue_metrics.py",
+    ),
+    _documented(
+        "cloudwatch.search",
+        "SEARCH in GetMetricData finds metrics by namespace, dimensions and name.",
+        f"{_CLOUDWATCH}/search-expression-syntax.html",
+        "stacks/metrics.py",
+        "local/gaps/metrics/metric_search.py",
+    ),
+    _documented(
+        "cloudwatch.alarm_evaluation",
+        "An alarm is evaluated every period, with its own dimensions, whether data comes or not.",
+        f"{_CLOUDWATCH}/AlarmThatSendsEmail.html",
+        "stacks/alarms.py",
+        "local/gaps/metrics/alarm_state.py",
+        "local/gaps/metrics/alarm_timer.py",
     ),
     # CloudFormation's console lines are not an interface.
     _assumed(

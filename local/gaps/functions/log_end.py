@@ -1,7 +1,6 @@
 """The end of an invocation's log.
 
-AWS: does not wait for a log before it takes the next event
-  (https://docs.aws.amazon.com/lambda/latest/dg/lambda-runtime-environment.html).
+AWS: does not apply; an invocation's time does not depend on its log.
 ministack: reads the log from the worker's standard error and does not know where it ends. It waits 50 ms for
   a first line, ten times as long as a function runs that logs nothing. Here the worker prints a line at the
   end.
