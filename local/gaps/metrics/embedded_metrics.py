@@ -9,13 +9,15 @@ Patch: none; it needs ministack's own store to merge the values of a minute, or 
 
 from __future__ import annotations
 
-import inspect
 import json
+import time
 from collections.abc import Callable
 from functools import wraps
 from typing import Any
+from unittest.mock import patch
 
-from ministack.services import lambda_svc
+from ministack.core.responses import request_scope
+from ministack.services import cloudwatch, lambda_svc
 
 from local.gaps.parts.points import record
 
@@ -26,8 +28,20 @@ def install() -> None:
 
 
 def is_open() -> bool:
-    """Look at the source: to show it, a function would have to run."""
-    return "CloudWatchMetrics" not in inspect.getsource(lambda_svc)
+    """Run a function that logs a metric, in an account of its own, and look for the metric."""
+    directive = {"Namespace": "gaps", "Dimensions": [[]], "Metrics": [{"Name": "Embedded"}]}
+    line = json.dumps({"_aws": {"Timestamp": 0, "CloudWatchMetrics": [directive]}, "Embedded": 1})
+    function = {"config": {"FunctionName": "gaps-embedded-metrics"}}
+    with (
+        request_scope("000000000001", "eu-west-1"),
+        patch.multiple(
+            lambda_svc,
+            _proxy_url_for=lambda _config: "http://nowhere",
+            _execute_function_proxy=lambda *_: {"body": None, "log": line},
+        ),
+    ):
+        lambda_svc._execute_function_dispatch(function, function["config"], {}, "id", time.time())
+        return ("gaps", "Embedded", "") not in cloudwatch._metrics
 
 
 def _reading_logs(dispatch: Callable[..., Any]) -> Callable[..., Any]:
