@@ -13,7 +13,6 @@ import json
 import socket
 import threading
 import time
-import zlib
 from concurrent.futures import Future
 from typing import TYPE_CHECKING
 from urllib.parse import quote, unquote
@@ -22,6 +21,7 @@ from aiohttp import web
 
 import iort_contract
 from local.pubnub.history import History, Message, Subscription
+from local.pubnub.protocol import Refusal, entry, preflight, read, refuse_constant, text
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
@@ -39,22 +39,6 @@ MAX_LINE_BYTES = 4 * iort_contract.MAX_PUBNUB_BYTES
 
 # Features of PubNub that change the delivery. Ignoring them would give wrong answers.
 UNSUPPORTED = ("custom_message_type", "filter-expr", "meta", "norep")
-
-
-class Refusal(Exception):  # noqa: N818 - an answer, not a fault
-    """A request that is answered with an error, in one of PubNub's two forms."""
-
-    def __init__(self, status: int, message: str, service: str | None = None) -> None:
-        super().__init__(message)
-        self.status, self.message, self.service = status, message, service
-
-    def body(self, token: int) -> str:
-        """A list for publish, an object for every other service."""
-        if self.service is None:
-            return json.dumps([0, self.message, str(token)])
-        return json.dumps(
-            {"status": self.status, "service": self.service, "error": True, "message": self.message}
-        )
 
 
 class PubNubStandIn:
@@ -159,7 +143,7 @@ class PubNubStandIn:
         try:
             status, messages, body = 200, 0, ""
             if request.method == "OPTIONS":
-                return await self._write(request, web.Response(status=204, headers=_preflight(request)))
+                return await self._write(request, web.Response(status=204, headers=preflight(request)))
             messages, body = await self._route(request)
         except Refusal as refusal:
             self.refused += 1
@@ -194,10 +178,10 @@ class PubNubStandIn:
         match [request.method, *path]:
             case ["GET", "publish", publish_key, subscribe_key, "0", channel, _, payload]:
                 self._check_keys(publish_key, subscribe_key, None)
-                return 0, self._publish(request, channel, _text(payload))
+                return 0, self._publish(request, channel, text(payload))
             case ["POST", "publish", publish_key, subscribe_key, "0", channel, _]:
                 self._check_keys(publish_key, subscribe_key, None)
-                return 0, self._publish(request, channel, await _read(request))
+                return 0, self._publish(request, channel, await read(request))
             case ["GET", "v2", "subscribe", subscribe_key, channels, "0"]:
                 self._check_keys(None, subscribe_key, "Access Manager")
                 return await self._subscribe(request, subscribe_key, channels)
@@ -214,14 +198,14 @@ class PubNubStandIn:
                 raise Refusal(400, "Invalid Key", service)
 
     def _publish(self, request: web.BaseRequest, channel: str, payload: str) -> str:
-        channel = _text(channel)
+        channel = text(channel)
         if not channel or any(c in ",*/:\\" or c < " " for c in channel):
             raise Refusal(400, "Invalid Channel")
         # PubNub's own formula: channel and payload as in an URL, and 100 bytes.
         if len(quote(channel + payload, safe="!~*'()")) + 100 > iort_contract.MAX_PUBNUB_BYTES:
             raise Refusal(413, "Message Too Large")
         try:
-            json.loads(payload, parse_constant=_refuse_constant)
+            json.loads(payload, parse_constant=refuse_constant)
         except (ValueError, RecursionError):
             raise Refusal(400, "Invalid JSON") from None
         message = Message(self._token(), channel, request.query.get("uuid", ""), payload)
@@ -233,7 +217,7 @@ class PubNubStandIn:
         return f'[1,"Sent","{message.token}"]'
 
     async def _subscribe(self, request: web.BaseRequest, key: str, channels: str) -> tuple[int, str]:
-        wanted = Subscription([_text(name) for name in channels.split(",") if name])
+        wanted = Subscription([text(name) for name in channels.split(",") if name])
         try:
             cursor = int(request.query.get("tt", "0"))
         except ValueError:
@@ -248,7 +232,7 @@ class PubNubStandIn:
                 await asyncio.wait([poll], timeout=self._poll_s)
             found = self._history.after(cursor, wanted)
         token = found[-1][1].token if found else cursor
-        entries = ",".join(_entry(match, message, unquote(key)) for match, message in found)
+        entries = ",".join(entry(match, message, unquote(key)) for match, message in found)
         return len(found), f'{{"t":{{"t":"{token}","r":1}},"m":[{entries}]}}'
 
     @contextlib.contextmanager
@@ -284,51 +268,3 @@ async def _drop_connections(server: web.Server) -> None:
 async def _send(request: web.BaseRequest, response: web.Response) -> None:
     await response.prepare(request)
     await response.write_eof()
-
-
-async def _read(request: web.BaseRequest) -> str:
-    try:
-        body = await request.read()
-        if request.headers.get("Content-Encoding") == "gzip":
-            # 47 accepts both headers: the Python SDK announces gzip and sends zlib.
-            inflater = zlib.decompressobj(47)
-            body = inflater.decompress(body, iort_contract.MAX_PUBNUB_BYTES)
-            if inflater.unconsumed_tail:
-                raise Refusal(413, "Message Too Large")
-            if not inflater.eof:
-                raise Refusal(400, "Invalid Encoding")
-        return body.decode()
-    except web.HTTPRequestEntityTooLarge:
-        raise Refusal(413, "Message Too Large") from None
-    except (UnicodeDecodeError, zlib.error):
-        raise Refusal(400, "Invalid Encoding") from None
-
-
-def _text(quoted: str) -> str:
-    try:
-        return unquote(quoted, errors="strict")
-    except UnicodeDecodeError:
-        raise Refusal(400, "Invalid Encoding") from None
-
-
-def _refuse_constant(name: str) -> None:
-    raise ValueError(name)
-
-
-def _entry(match: str, message: Message, key: str) -> str:
-    # Without "e": with a 0 there the JavaScript SDK takes the message for a file.
-    head = {"a": "1", "f": 0, "i": message.publisher, "p": {"t": str(message.token), "r": 1}, "k": key}
-    names = {"c": message.channel, "b": match}
-    return f'{json.dumps(head)[:-1]},{json.dumps(names)[1:-1]},"d":{message.payload}}}'
-
-
-def _preflight(request: web.BaseRequest) -> dict[str, str]:
-    """Any page may use it, as with PubNub, also one from another machine in the network."""
-    asked = request.headers
-    return {
-        "Access-Control-Allow-Origin": "*",
-        "Access-Control-Allow-Methods": "GET, POST, OPTIONS",
-        "Access-Control-Allow-Headers": asked.get("Access-Control-Request-Headers", "*"),
-        "Access-Control-Allow-Private-Network": "true",
-        "Access-Control-Max-Age": "7200",
-    }
