@@ -29,7 +29,7 @@ from bench.errors import BenchError
 from bench.meters import chromium
 from iort_station.fleet.robots import F1TENTH
 from iort_station.page.server import PageServer
-from local.pubnub_standin import PubNubStandIn
+from local.pubnub.standin import PubNubStandIn
 
 # Share of a processor; the rest stays free for the user of the machine.
 MAX_BUSY = 0.30

@@ -1,7 +1,7 @@
 """Refuses at synth what the embedded cloud would accept and then silently not do.
 
 The same stacks run on AWS and on the embedded cloud; a rule that only works on one of them is a
-defect that nobody would see. The lists are what the pinned ministack and local/gaps.py implement;
+defect that nobody would see. The lists are what the pinned ministack and local/gaps/ implement;
 tests/stacks/test_portable.py holds them against both.
 """
 
@@ -31,7 +31,7 @@ SQL_FUNCTIONS = frozenset(
         "traceid",
     }
 )
-# What local/gaps.py expands in a republish action's topic.
+# What local/gaps/rules/republish_topic.py expands in a republish action's topic.
 _TEMPLATE = re.compile(r"\$\{\s*topic\(\s*\d*\s*\)\s*\}")
 _CALL = re.compile(r"\b([A-Za-z_]\w*)\s*\(")
 # What may stand before a bracket and is no function.

@@ -122,7 +122,12 @@ CHECKS = (
             f"{_CLOUDWATCH}/CloudWatch_Embedded_Metric_Format_Specification.html and "
             f"{_GUIDE}/monitoring-cloudwatchlogs-log-level.html"
         ),
-        relied_on_by=("functions/shared/metrics.py", "stacks/function.py", "stacks/alarms.py"),
+        relied_on_by=(
+            "functions/shared/metrics.py",
+            "stacks/function.py",
+            "stacks/alarms.py",
+            "local/gaps/metrics/embedded_metrics.py",
+        ),
         ask=_metric,
     ),
     Check(

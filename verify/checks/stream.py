@@ -198,7 +198,11 @@ CHECKS = (
         },
         basis=Basis.DOCUMENTED,
         source=f"{_GUIDE}/services-dynamodb-errors.html",
-        relied_on_by=("stacks/processing.py", "functions/quarantine.py", "local/stream_mapping.py"),
+        relied_on_by=(
+            "stacks/processing.py",
+            "functions/quarantine.py",
+            "local/gaps/parts/stream_mapping.py",
+        ),
         ask=_bisected,
     ),
     Check(
@@ -215,7 +219,7 @@ CHECKS = (
         },
         basis=Basis.DOCUMENTED,
         source=f"{_GUIDE}/services-ddb-batchfailurereporting.html",
-        relied_on_by=("functions/summarize.py", "stacks/processing.py", "local/stream_mapping.py"),
+        relied_on_by=("functions/summarize.py", "stacks/processing.py", "local/gaps/parts/stream_mapping.py"),
         ask=_reported,
     ),
 )

@@ -1,4 +1,4 @@
-"""Calls in a few threads, in which those who have calls waiting take turns."""
+"""A few threads that serve the owners of waiting calls in turn."""
 
 from __future__ import annotations
 
@@ -13,10 +13,9 @@ _Call = tuple[Callable[..., object], tuple[Any, ...]]
 
 
 class Turns:
-    """Runs what is submitted in so many threads, which end with the process.
+    """Runs submitted calls in a fixed number of daemon threads.
 
-    Calls of one are in their order, and of several each has one before anybody has a second: who submits
-    many makes nobody else wait for more than the calls that are running and one of each.
+    The calls of one owner start in their order. Owners take turns: each gets one call before any gets two.
     """
 
     def __init__(self, threads: int) -> None:
@@ -26,7 +25,7 @@ class Turns:
             threading.Thread(target=self._run, daemon=True).start()
 
     def submit(self, whose: str, function: Callable[..., object], *arguments: Any) -> None:
-        """Have the function called as soon as it is the turn of ``whose``."""
+        """Call the function when it is the turn of the owner ``whose``."""
         with self._changed:
             self._waiting.setdefault(whose, deque()).append((function, arguments))
             self._changed.notify()
@@ -41,5 +40,5 @@ class Turns:
                     self._waiting[whose] = calls
             try:
                 function(*arguments)
-            except Exception:  # noqa: BLE001 - the others' calls are still to be made
+            except Exception:  # noqa: BLE001 - the thread has to serve the other calls
                 _log.exception("a call of %r failed", whose)

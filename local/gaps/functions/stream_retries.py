@@ -1,79 +1,53 @@
-"""The embedded cloud's mappings of DynamoDB streams, as AWS' are: `local.stream_mapping` in its process.
+"""Retries of a stream's event source mapping.
 
-ministack invokes a function with a batch until it succeeds, in the thread that also serves the queues.
-Here every mapping has a thread for each of its concurrent batches, splits, retries, gives up and tells
-the destination. Records of a deployment that was restarted are read from the beginning again, which AWS
-does too after a lost acknowledgement.
+AWS: splits a failed batch, gives it up after its retries or its age, and tells the destination
+  (https://docs.aws.amazon.com/lambda/latest/dg/services-dynamodb-errors.html).
+ministack: invokes the function with the same batch until it succeeds, in the thread that also serves the
+  queues. Each mapping has here a thread for each of its concurrent batches. After a restart of the emulator
+  it reads the stream from its beginning again, which AWS too does after a lost acknowledgement.
+Test:
+  tests/local/test_stream_gap.py::test_the_record_that_fails_is_given_up_alone_and_the_destination_hears_of_it
+Patch: none; it replaces the whole poller by local/gaps/parts/stream_mapping.py
 """
 
 from __future__ import annotations
 
+import inspect
 import json
 import logging
 import threading
 import time
 from collections.abc import Callable
 from dataclasses import dataclass, field
-from functools import wraps
 from typing import Any
 
-from ministack.core import iam_actions
 from ministack.core.responses import request_scope
-from ministack.services import dynamodb, dynamodb_streams, lambda_svc
+from ministack.services import dynamodb, lambda_svc
 
-from local.stream_mapping import Answer, Settings, Shard
+from local.gaps.parts.stream_mapping import Answer, Settings, Shard
 
 _log = logging.getLogger(__name__)
-# AWS waits longer between attempts; a test has less patience.
+# AWS waits longer between attempts; tests must not.
 _FIRST_PAUSE_S, _LONGEST_PAUSE_S = 0.1, 5.0
-# Two clocks differ by less.
+# The two clocks differ by less than this.
 _SLACK_S = 0.005
-# Records read ahead of the function, at least as many as one event may hold.
+# Records to read ahead; at least as many as one event may hold.
 _AHEAD = 2_000
 
 
 def install() -> None:
-    """Close the gap in this process, before the emulator starts."""
+    """Close the gap in this process."""
     lambda_svc._poll_dynamodb_streams = StreamMappings().poll
-    iam_actions.extract_resource_arn = _knowing_shadows(_knowing_streams(iam_actions.extract_resource_arn))
 
 
-def _knowing_streams(resource_arn: Callable[..., str]) -> Callable[..., str]:
-    """The stream that a request is about, which ministack takes for a request about everything."""
-
-    @wraps(resource_arn)
-    def extract(service: str, *request: Any) -> str:
-        if service != "dynamodbstreams":
-            return resource_arn(service, *request)
-        try:
-            asked = json.loads(request[3] or b"{}")
-        except ValueError:
-            asked = {}
-        iterator = dynamodb_streams._decode_iterator(asked.get("ShardIterator") or "") or {}
-        return str(asked.get("StreamArn") or iterator.get("arn") or "*")
-
-    return extract
-
-
-def _knowing_shadows(resource_arn: Callable[..., str]) -> Callable[..., str]:
-    """A named shadow, which ministack takes for its thing. AWS IoT, "AWS IoT Core action resources"."""
-
-    @wraps(resource_arn)
-    def extract(service: str, *request: Any) -> str:
-        found = resource_arn(service, *request)
-        path, asked = request[1], request[4] or {}
-        if service not in {"iot", "iot-data"} or not path.endswith("/shadow") or ":thing/" not in found:
-            return found
-        name = asked.get("name") or ""
-        name = name[0] if isinstance(name, list) else name
-        return f"{found}/{name}" if name else found
-
-    return extract
+def is_open() -> bool:
+    """Look at the source: no finite number of attempts shows that a batch is tried for ever."""
+    return "Bisect" not in inspect.getsource(lambda_svc._poll_dynamodb_streams)
 
 
 @dataclass
 class _Running:
-    """A mapping at work: how far it has read, and which lanes wait for their function."""
+    """The state of one mapping: its position in the stream, and the lanes whose function runs."""
 
     account: str
     region: str
@@ -86,7 +60,7 @@ class _Running:
 
 
 class StreamMappings:
-    """All mappings of streams; `poll` takes the place of ministack's own poller."""
+    """All stream mappings; `poll` replaces ministack's own poller."""
 
     def __init__(self, clock: Callable[[], float] = time.time) -> None:
         self._clock = clock
@@ -94,7 +68,7 @@ class StreamMappings:
         self._lock = threading.Lock()
 
     def poll(self) -> bool:
-        """Start what there is to start; whether anything was."""
+        """Start every invocation that is due; returns whether one was started."""
         started = False
         for account, region, mapping in lambda_svc._iter_all_esms():
             if mapping.get("Enabled", True) and ":dynamodb:" in mapping.get("EventSourceArn", ""):
@@ -136,7 +110,7 @@ class StreamMappings:
         if running is None:
             latest = mapping.get("StartingPosition") == "LATEST"
             position = (dynamodb.stream_end_position if latest else dynamodb.stream_start_position)(table)
-            # ministack notes where a mapping began when it was made.
+            # ministack stores where a new mapping begins.
             position = lambda_svc._dynamodb_stream_positions.get(mapping["UUID"], position)
             running = self._running[mapping["UUID"]] = _Running(
                 account, region, mapping, Shard(settings), position
@@ -171,13 +145,13 @@ class StreamMappings:
             running.mapping["LastProcessingResult"] = "FAILED" if failed else f"OK - {len(batch)} records"
             self._tell(running, function)
         if failed:
-            # The poller sleeps up to a second when nothing is to do.
+            # The poller sleeps up to a second when it has nothing to do.
             threading.Timer(pause_s, lambda_svc._esm_wake.set).start()
         else:
             lambda_svc._esm_wake.set()
 
     def _tell(self, running: _Running, function: dict[str, Any]) -> None:
-        """Send what was given up to the mapping's destination."""
+        """Send discarded records to the mapping's destination."""
         with self._lock:
             discarded = running.shard.discarded()
         mapping = running.mapping
@@ -189,7 +163,7 @@ class StreamMappings:
 
 
 def _wake_at(due_s: float | None, now_s: float, windows: dict[int, float], number: int) -> None:
-    """Have the poller look when a lane's batching window is over; it would sleep up to a second longer."""
+    """Wake the poller when a lane's batching window is over; it could sleep a second longer."""
     if due_s is not None and windows.get(number) != due_s:
         windows[number] = due_s
         timer = threading.Timer(max(0.0, due_s - now_s) + _SLACK_S, lambda_svc._esm_wake.set)

@@ -1,9 +1,8 @@
-"""Stands in for PubNub, which cannot be reached from everywhere: a small HTTP server that PubNub's own,
-unmodified SDKs talk to, given its ``origin`` and no TLS.
+"""A small HTTP server in PubNub's place. PubNub's unmodified SDKs use it by its ``origin``, without TLS.
 
-It does publish (GET and POST), subscribe (long poll, several channels, ``iort.*``), presence heartbeats
-and time, on one event loop in one thread. What it does not do, it refuses in PubNub's error shapes;
-only channel groups, which are always empty here, are let through.
+It serves publish (GET and POST), subscribe (long poll, several channels, ``iort.*``), presence heartbeats and
+time, on one event loop in one thread. It refuses every other feature with PubNub's errors, except channel
+groups, which are always empty here.
 """
 
 from __future__ import annotations
@@ -14,7 +13,6 @@ import json
 import socket
 import threading
 import time
-import zlib
 from concurrent.futures import Future
 from typing import TYPE_CHECKING
 from urllib.parse import quote, unquote
@@ -22,7 +20,8 @@ from urllib.parse import quote, unquote
 from aiohttp import web
 
 import iort_contract
-from local.pubnub_history import History, Message, Subscription
+from local.pubnub.history import History, Message, Subscription
+from local.pubnub.protocol import Refusal, entry, preflight, read, refuse_constant, text
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
@@ -30,40 +29,23 @@ if TYPE_CHECKING:
 
     from typing_extensions import Self
 
-# PubNub answers an idle long poll a little before its SDKs, which wait 310 s, take it for dead.
+# PubNub answers an idle long poll before its SDKs give up, which is after 310 s.
 POLL_S = 280.0
-# A subscriber that has not read its answer after this long is cut off; its SDK reconnects.
+# The time that a subscriber has to read an answer. Then it is cut off, and its SDK reconnects.
 WRITE_S = 10.0
 MAX_POLLS = 1_000
-# Above what the SDKs can send, so that a message too large is told so by us.
+# Longer than any request of the SDKs, so that we can answer a message that is too large.
 MAX_LINE_BYTES = 4 * iort_contract.MAX_PUBNUB_BYTES
 
-# PubNub features that change what is delivered and to whom: without them the answer would be wrong.
+# Features of PubNub that change the delivery. Ignoring them would give wrong answers.
 UNSUPPORTED = ("custom_message_type", "filter-expr", "meta", "norep")
-
-
-class Refusal(Exception):  # noqa: N818 - an answer, not a fault
-    """A request that is answered with an error, in one of PubNub's two shapes."""
-
-    def __init__(self, status: int, message: str, service: str | None = None) -> None:
-        super().__init__(message)
-        self.status, self.message, self.service = status, message, service
-
-    def body(self, token: int) -> str:
-        """A list where publish reports failure, an object from every other service."""
-        if self.service is None:
-            return json.dumps([0, self.message, str(token)])
-        return json.dumps(
-            {"status": self.status, "service": self.service, "error": True, "message": self.message}
-        )
 
 
 class PubNubStandIn:
     """The server, in a thread of its own: ``with PubNubStandIn() as pubnub: ... pubnub.origin``.
 
-    With keys given it refuses other keys. ``port=0`` takes a free port. The counters may be read from
-    any thread: ``published`` messages taken, ``delivered`` messages sent to subscribers (once for each
-    of them) and ``refused`` requests.
+    If keys are given, it refuses other keys. ``port=0`` takes a free port. The counters may be read from any
+    thread: ``published`` messages, ``delivered`` messages (one for each subscriber) and ``refused`` requests.
     """
 
     def __init__(
@@ -88,11 +70,11 @@ class PubNubStandIn:
 
     @property
     def origin(self) -> str:
-        """What the SDKs are given as ``origin``, beside ``ssl`` switched off."""
+        """The SDKs' setting ``origin``; they also need ``ssl`` switched off."""
         return f"{self.host}:{self.port}"
 
     def start(self) -> Self:
-        """Listen, and return once connections are taken. Raises `OSError` where the port is not free."""
+        """Listen, and return once connections are accepted. Raises `OSError` if the port is not free."""
         if self._thread is not None:
             raise RuntimeError("the PubNub stand-in is running already")
         listening = socket.create_server((self.host, self.port))
@@ -112,7 +94,7 @@ class PubNubStandIn:
         return self
 
     def stop(self) -> None:
-        """Drop every connection and end the thread; a second call does nothing."""
+        """Drop every connection and end the thread. A second call has no effect."""
         if self._thread is not None:
             self._loop.call_soon_threadsafe(self._stopping.set)
             self._thread.join()
@@ -151,7 +133,7 @@ class PubNubStandIn:
             await web.SockSite(runner, listening).start()
             started.set_result(None)
             await self._stopping.wait()
-            # First no new connections, then no old ones: asyncio loses one that comes in while it closes.
+            # Stop accepting before dropping connections: asyncio loses one that comes while it closes.
             self._loop.remove_reader(listening)
             await _drop_connections(server)
         finally:
@@ -161,7 +143,7 @@ class PubNubStandIn:
         try:
             status, messages, body = 200, 0, ""
             if request.method == "OPTIONS":
-                return await self._write(request, web.Response(status=204, headers=_preflight(request)))
+                return await self._write(request, web.Response(status=204, headers=preflight(request)))
             messages, body = await self._route(request)
         except Refusal as refusal:
             self.refused += 1
@@ -188,7 +170,7 @@ class PubNubStandIn:
             request.transport.abort()
 
     async def _route(self, request: web.BaseRequest) -> tuple[int, str]:
-        """How many messages the answer delivers, and the answer."""
+        """The number of messages in the answer, and the answer."""
         path = request.raw_path.partition("?")[0].split("/")[1:]
         for name in UNSUPPORTED:
             if name in request.query:
@@ -196,10 +178,10 @@ class PubNubStandIn:
         match [request.method, *path]:
             case ["GET", "publish", publish_key, subscribe_key, "0", channel, _, payload]:
                 self._check_keys(publish_key, subscribe_key, None)
-                return 0, self._publish(request, channel, _text(payload))
+                return 0, self._publish(request, channel, text(payload))
             case ["POST", "publish", publish_key, subscribe_key, "0", channel, _]:
                 self._check_keys(publish_key, subscribe_key, None)
-                return 0, self._publish(request, channel, await _read(request))
+                return 0, self._publish(request, channel, await read(request))
             case ["GET", "v2", "subscribe", subscribe_key, channels, "0"]:
                 self._check_keys(None, subscribe_key, "Access Manager")
                 return await self._subscribe(request, subscribe_key, channels)
@@ -216,14 +198,14 @@ class PubNubStandIn:
                 raise Refusal(400, "Invalid Key", service)
 
     def _publish(self, request: web.BaseRequest, channel: str, payload: str) -> str:
-        channel = _text(channel)
+        channel = text(channel)
         if not channel or any(c in ",*/:\\" or c < " " for c in channel):
             raise Refusal(400, "Invalid Channel")
-        # PubNub's own formula: both, as they would stand in an URL, and 100 bytes.
+        # PubNub's own formula: channel and payload as in an URL, and 100 bytes.
         if len(quote(channel + payload, safe="!~*'()")) + 100 > iort_contract.MAX_PUBNUB_BYTES:
             raise Refusal(413, "Message Too Large")
         try:
-            json.loads(payload, parse_constant=_refuse_constant)
+            json.loads(payload, parse_constant=refuse_constant)
         except (ValueError, RecursionError):
             raise Refusal(400, "Invalid JSON") from None
         message = Message(self._token(), channel, request.query.get("uuid", ""), payload)
@@ -235,14 +217,14 @@ class PubNubStandIn:
         return f'[1,"Sent","{message.token}"]'
 
     async def _subscribe(self, request: web.BaseRequest, key: str, channels: str) -> tuple[int, str]:
-        wanted = Subscription([_text(name) for name in channels.split(",") if name])
+        wanted = Subscription([text(name) for name in channels.split(",") if name])
         try:
             cursor = int(request.query.get("tt", "0"))
         except ValueError:
             raise Refusal(400, "Invalid Timetoken", "Stand-in") from None
         if cursor <= 0:
             return 0, f'{{"t":{{"t":"{self._token()}","r":1}},"m":[]}}'
-        # A cursor of a clock that was set back since must not be deaf until the clock catches up.
+        # After the clock is set back, an old cursor would get no message until the clock catches up.
         cursor = min(cursor, self._token())
         found = self._history.after(cursor, wanted)
         if not found:
@@ -250,12 +232,12 @@ class PubNubStandIn:
                 await asyncio.wait([poll], timeout=self._poll_s)
             found = self._history.after(cursor, wanted)
         token = found[-1][1].token if found else cursor
-        entries = ",".join(_entry(match, message, unquote(key)) for match, message in found)
+        entries = ",".join(entry(match, message, unquote(key)) for match, message in found)
         return len(found), f'{{"t":{{"t":"{token}","r":1}},"m":[{entries}]}}'
 
     @contextlib.contextmanager
     def _polling(self, wanted: Subscription) -> Iterator[asyncio.Future[None]]:
-        """A future that the next message wanted completes."""
+        """A future that the next matching message completes."""
         if len(self._polls) >= MAX_POLLS:
             raise Refusal(429, "Too Many Requests", "Stand-in")
         poll: asyncio.Future[None] = self._loop.create_future()
@@ -272,8 +254,8 @@ class PubNubStandIn:
 
 
 async def _drop_connections(server: web.Server) -> None:
-    """Every connection is a task, and so is one being accepted, which `web.Server` does not list yet."""
-    for _ in range(100):  # one or two rounds do; what is left after a second, asyncio.run cancels
+    """Drop every connection, also one that `web.Server` has accepted and does not list yet."""
+    for _ in range(100):  # one or two rounds suffice; asyncio.run cancels the rest after a second
         others = asyncio.all_tasks() - {asyncio.current_task()}
         if not others:
             return
@@ -286,51 +268,3 @@ async def _drop_connections(server: web.Server) -> None:
 async def _send(request: web.BaseRequest, response: web.Response) -> None:
     await response.prepare(request)
     await response.write_eof()
-
-
-async def _read(request: web.BaseRequest) -> str:
-    try:
-        body = await request.read()
-        if request.headers.get("Content-Encoding") == "gzip":
-            # 47: gzip's header or zlib's, as the Python SDK says the one and sends the other.
-            inflater = zlib.decompressobj(47)
-            body = inflater.decompress(body, iort_contract.MAX_PUBNUB_BYTES)
-            if inflater.unconsumed_tail:
-                raise Refusal(413, "Message Too Large")
-            if not inflater.eof:
-                raise Refusal(400, "Invalid Encoding")
-        return body.decode()
-    except web.HTTPRequestEntityTooLarge:
-        raise Refusal(413, "Message Too Large") from None
-    except (UnicodeDecodeError, zlib.error):
-        raise Refusal(400, "Invalid Encoding") from None
-
-
-def _text(quoted: str) -> str:
-    try:
-        return unquote(quoted, errors="strict")
-    except UnicodeDecodeError:
-        raise Refusal(400, "Invalid Encoding") from None
-
-
-def _refuse_constant(name: str) -> None:
-    raise ValueError(name)
-
-
-def _entry(match: str, message: Message, key: str) -> str:
-    # No "e": a 0 there makes the JavaScript SDK take the message for a file.
-    head = {"a": "1", "f": 0, "i": message.publisher, "p": {"t": str(message.token), "r": 1}, "k": key}
-    names = {"c": message.channel, "b": match}
-    return f'{json.dumps(head)[:-1]},{json.dumps(names)[1:-1]},"d":{message.payload}}}'
-
-
-def _preflight(request: web.BaseRequest) -> dict[str, str]:
-    """Any page may ask, as with PubNub; a page on another machine of the network included."""
-    asked = request.headers
-    return {
-        "Access-Control-Allow-Origin": "*",
-        "Access-Control-Allow-Methods": "GET, POST, OPTIONS",
-        "Access-Control-Allow-Headers": asked.get("Access-Control-Request-Headers", "*"),
-        "Access-Control-Allow-Private-Network": "true",
-        "Access-Control-Max-Age": "7200",
-    }

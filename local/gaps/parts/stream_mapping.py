@@ -1,7 +1,7 @@
-"""Lambda's mapping of a DynamoDB stream, as AWS documents it: what is tried again, split, given up.
+"""A model of Lambda's mapping of a DynamoDB stream, as AWS documents it: retries, splits, discarded records.
 
-Pure: what time it is and what the function answered come in, what to invoke and what was given up go
-out. The embedded cloud drives it (local/stream_gap.py), and so do the tests of Lambda 2.
+It has no clock and no threads: time and the function's answers are arguments, batches and discarded records
+are results. The embedded cloud uses it (local/gaps/functions/stream_retries.py), and so do Lambda 2's tests.
 
 Sources, AWS Lambda's developer guide: "Using AWS Lambda with Amazon DynamoDB", "Configuring partial batch
 response with DynamoDB and Lambda", "Retain discarded records from DynamoDB"; `CreateEventSourceMapping`.
@@ -26,10 +26,10 @@ _WHOLE = -1
 
 @dataclass(frozen=True)
 class Settings:
-    """A mapping's settings; -1 is without end, as in the API.
+    """A mapping's settings; -1 means no limit, as in the API.
 
-    ``halve_at_checkpoint`` is what the documentation leaves open: whether a partial answer that names
-    the first record of the batch, and so checkpoints nothing, is also split in two.
+    The documentation does not say whether a batch is split after a partial answer that names its first
+    record. ``halve_at_checkpoint`` chooses.
     """
 
     batch_size: int = 100
@@ -61,7 +61,7 @@ class Settings:
 
 
 class Condition(str, Enum):
-    """Why records were given up, in the words of the destination's message."""
+    """Why records were discarded, in the words of the destination's message."""
 
     AGE = "MaxRecordAgeExceeded"
     RETRIES = "RetryAttemptsExhausted"
@@ -69,7 +69,7 @@ class Condition(str, Enum):
 
 @dataclass(frozen=True)
 class Discarded:
-    """Records that the destination hears of."""
+    """Discarded records, for the destination."""
 
     condition: Condition
     records: Sequence[Record]
@@ -78,8 +78,7 @@ class Discarded:
 
 @dataclass(frozen=True)
 class Answer:
-    """What an invocation came to: the function's answer, an error of its own (a time-out is one), or a
-    throttle, which never reached it."""
+    """The result of an invocation: the function's answer, its error (also a time-out), or a throttle."""
 
     payload: Any = None
     error: bool = False
@@ -88,7 +87,7 @@ class Answer:
 
 @dataclass
 class _Part:
-    """Records that are invoked together; ``failures`` counts towards the retries."""
+    """Records of one invocation; ``failures`` counts towards the retries."""
 
     records: list[Record]
     failures: int = 0
@@ -96,7 +95,7 @@ class _Part:
 
 @dataclass
 class Lane:
-    """One of the shard's concurrent batches: its records strictly one batch after the other."""
+    """One of a shard's concurrent lanes: it invokes one batch after the other."""
 
     settings: Settings
     _waiting: deque[tuple[Record, int]] = field(default_factory=deque)
@@ -106,18 +105,18 @@ class Lane:
     discarded: list[Discarded] = field(default_factory=list)
 
     def put(self, record: Record) -> None:
-        """A record read off the stream."""
+        """Add a record of the stream."""
         size = len(json.dumps(record, default=str))
         self._waiting.append((record, size))
         self._waiting_bytes += size
 
     @property
     def size(self) -> int:
-        """Records that are neither done nor given up."""
+        """The number of records that are neither done nor discarded."""
         return len(self._waiting) + sum(len(part.records) for part in self._parts)
 
     def batch(self, now_s: float) -> list[Record]:
-        """What to invoke the function with next; nothing where there is nothing, or it is `due` later."""
+        """The records of the next invocation; empty if none wait or the window is still open."""
         self._expire(now_s)
         if not self._parts and self._gathered(now_s):
             records: list[Record] = []
@@ -133,13 +132,13 @@ class Lane:
 
     @property
     def due_s(self) -> float | None:
-        """When the batching window of what waits is over; None where nothing waits, or for its turn."""
+        """When the batching window ends; None if no window is open."""
         return None if self._since_s is None else self._since_s + self.settings.window_s
 
     def _gathered(self, now_s: float) -> bool:
-        """Whether what waits is invoked now: "until it has gathered a full batch, the batching window
-        expires, or the batch reaches the payload limit of 6 MB". The window begins with the first record
-        after the batch before; one that is tried again waits for no other."""
+        """Whether to invoke now: "until it has gathered a full batch, the batching window expires, or the
+        batch reaches the payload limit of 6 MB". The window begins with the first record after a batch. A
+        retry does not wait."""
         if not self._waiting:
             self._since_s = None
             return False
@@ -154,7 +153,7 @@ class Lane:
         return record
 
     def answered(self, answer: Answer) -> None:
-        """The function's answer to the last `batch`."""
+        """Take the function's answer to the last `batch`."""
         if answer.throttled:
             # "This doesn't apply to service errors or throttles where the batch didn't reach the function."
             return
@@ -164,7 +163,7 @@ class Lane:
             return
         halves = done == _WHOLE or self.settings.halve_at_checkpoint
         if done > 0:
-            # Split at the number that the function returned: only the rest is tried again.
+            # Split at the returned number: only the rest is tried again.
             self._again(_Part(part.records[done:], part.failures), counts=not self.settings.bisect)
         elif self.settings.bisect and len(part.records) > 1 and halves:
             # "Splitting a batch does not count towards the retry quota."
@@ -182,7 +181,7 @@ class Lane:
             self._parts.appendleft(part)
 
     def _checkpoint(self, part: _Part, payload: Any) -> int | None:
-        """How many records of the part are done; None for all, `_WHOLE` where the answer is none."""
+        """The number of records that are done; None for all, `_WHOLE` for an invalid answer."""
         if not self.settings.report_failures or not payload:
             return None
         failures = payload.get("batchItemFailures") if isinstance(payload, Mapping) else None
@@ -190,7 +189,7 @@ class Lane:
             return None
         numbers = [record["dynamodb"]["SequenceNumber"] for record in part.records]
         named = [failure.get("itemIdentifier") for failure in failures]
-        # An identifier that is empty, null, misspelt or of no record fails the whole batch.
+        # An identifier of no record of the batch fails the whole batch.
         if not set(named) <= set(numbers):
             return _WHOLE
         # "Lambda uses the record with the lowest sequence number as the checkpoint."
@@ -219,7 +218,7 @@ def _age_s(record: Record, now_s: float) -> float:
 
 
 class Shard:
-    """A shard of the stream under a mapping: its records in lanes by the hash of the item's key.
+    """A shard of the stream: its records go to lanes by the hash of the item's key.
 
     "Lambda still ensures in-order processing at the item (partition and sort key) level."
     """
@@ -229,18 +228,18 @@ class Shard:
         self.lanes = [Lane(settings) for _ in range(settings.parallel)]
 
     def put(self, records: Iterable[Record]) -> None:
-        """Records in the order of the stream."""
+        """Add records in the order of the stream."""
         for record in records:
             keys = json.dumps(record["dynamodb"]["Keys"], sort_keys=True)
             self.lanes[zlib.crc32(keys.encode()) % len(self.lanes)].put(record)
 
     @property
     def size(self) -> int:
-        """Records that are neither done nor given up."""
+        """The number of records that are neither done nor discarded."""
         return sum(lane.size for lane in self.lanes)
 
     def discarded(self) -> list[Discarded]:
-        """What was given up since the last call."""
+        """The records discarded since the last call."""
         found = [one for lane in self.lanes for one in lane.discarded]
         for lane in self.lanes:
             lane.discarded.clear()

@@ -1,11 +1,11 @@
-"""What the stand-in for PubNub keeps of every channel, and what of it a subscription asks for."""
+"""The messages that PubNub's stand-in keeps, and the selection of a subscription."""
 
 from __future__ import annotations
 
 from collections import OrderedDict, deque
 from typing import NamedTuple
 
-# What is kept for subscribers that are away, and what bounds the memory it takes.
+# Limits of the messages kept for subscribers that are away, and so of the memory.
 KEPT_A_CHANNEL = 100
 KEPT_CHANNELS = 1_000
 KEPT_BYTES = 64 * 1024 * 1024
@@ -13,7 +13,7 @@ MESSAGES_AN_ANSWER = 100
 
 
 class Message(NamedTuple):
-    """One publish; the payload stays the JSON text that was sent."""
+    """One published message; the payload is the JSON text as sent."""
 
     token: int
     channel: str
@@ -22,14 +22,14 @@ class Message(NamedTuple):
 
 
 class Subscription:
-    """The channels a request asks for: plain names, and wildcards by what they start with."""
+    """The channels of a request: plain names, and wildcards by their prefixes."""
 
     def __init__(self, channels: list[str]) -> None:
         self.names = {name for name in channels if not name.endswith(".*")}
         self._prefixes = {name[:-1]: name for name in channels if name.endswith(".*")}
 
     def match(self, channel: str) -> str | None:
-        """Which entry of the subscription the channel belongs to, the plain name first."""
+        """The entry of the subscription that the channel matches; a plain name comes first."""
         if channel in self.names:
             return channel
         for prefix, wildcard in self._prefixes.items():
@@ -39,7 +39,7 @@ class Subscription:
 
 
 class History:
-    """The newest messages of every channel, up to a number a channel; so many channels and bytes in all."""
+    """The newest messages of each channel, within limits of messages, channels and bytes."""
 
     def __init__(self, *, channels: int = KEPT_CHANNELS, size_bytes: int = KEPT_BYTES) -> None:
         self._most_channels, self._most_bytes = channels, size_bytes
@@ -47,7 +47,7 @@ class History:
         self._bytes = 0
 
     def add(self, message: Message) -> None:
-        """Keep the message; the channel silent for longest makes room when there is none."""
+        """Keep the message. At a limit the channel that was silent for longest is dropped."""
         kept = self._channels.setdefault(message.channel, deque())
         self._channels.move_to_end(message.channel)
         kept.append(message)
@@ -61,7 +61,7 @@ class History:
             self._bytes -= sum(len(old.payload) for old in dropped)
 
     def after(self, cursor: int, wanted: Subscription) -> list[tuple[str, Message]]:
-        """The oldest messages after the cursor, as many as one answer holds, each with its match."""
+        """The oldest messages after the cursor, at most those of one answer, each with its match."""
         found: list[tuple[str, Message]] = []
         for channel, kept in self._channels.items():
             match = wanted.match(channel)
