@@ -1,8 +1,8 @@
-"""Refuses at synth what the embedded cloud would accept and then silently not do.
+"""Refuses at synth every rule that the embedded cloud would accept and silently drop.
 
-The same stacks run on AWS and on the embedded cloud; a rule that only works on one of them is a
-defect that nobody would see. The lists are what the pinned ministack and local/gaps.py implement;
-tests/stacks/test_portable.py holds them against both.
+The same stacks run on AWS and on the embedded cloud; a rule that works on only one of them is a hidden
+defect. The lists hold the features of the pinned ministack and local/gaps.py; tests/stacks/test_portable.py
+compares them.
 """
 
 from __future__ import annotations
@@ -31,10 +31,10 @@ SQL_FUNCTIONS = frozenset(
         "traceid",
     }
 )
-# What local/gaps.py expands in a republish action's topic.
+# The templates that local/gaps.py expands in a republish action's topic.
 _TEMPLATE = re.compile(r"\$\{\s*topic\(\s*\d*\s*\)\s*\}")
 _CALL = re.compile(r"\b([A-Za-z_]\w*)\s*\(")
-# What may stand before a bracket and is no function.
+# Words that may precede a bracket without being a function.
 _KEYWORDS = frozenset(
     {"and", "as", "case", "else", "exists", "in", "not", "or", "select", "then", "when", "where"}
 )
@@ -52,7 +52,7 @@ def sql_functions(sql: str) -> set[str]:
 
 
 def rule_problems(payload: dict[str, Any]) -> list[str]:
-    """What of a TopicRulePayload (as CloudFormation spells it) the embedded cloud would drop."""
+    """The parts of a TopicRulePayload (CloudFormation's spelling) that the embedded cloud would drop."""
     problems = [
         f"SQL function {name}() is not implemented"
         for name in sorted(sql_functions(payload["sql"]) - SQL_FUNCTIONS)
