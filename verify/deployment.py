@@ -1,4 +1,4 @@
-"""A deployment in an AWS account that lives as long as it is asked."""
+"""A temporary deployment in an AWS account."""
 
 from __future__ import annotations
 
@@ -19,25 +19,25 @@ from local.errors import LocalError
 from local.processes import run
 from verify.errors import VerifyError
 
-# The distribution apart, a stage takes five minutes; AWS keeps a policy for five more after its robots.
+# Without CloudFront a stage takes five minutes; AWS keeps a policy for five more after its robots.
 _DEPLOY_S, _DESTROY_S = 1_800.0, 1_800.0
 
 Say = Callable[[str], None]
 
 
 class Deployment:
-    """The project's stacks under a namespace of their own; logs of the CDK go into ``folder``."""
+    """The project's stacks under a namespace of their own; the CDK's logs go into ``folder``."""
 
     def __init__(self, cloud: Cloud, folder: Path, say: Say) -> None:
         self._cloud, self._folder, self._say = cloud, folder, say
 
     def deploy(self, settings: Mapping[str, str]) -> None:
-        """Make the stacks, or change them to the settings. Raises `VerifyError` where the CDK fails."""
+        """Create the stacks, or update them to the settings. Raises `VerifyError` if the CDK fails."""
         named = "".join(f", {key}={value}" for key, value in settings.items())
         self._cdk(f"deploy{named}", _DEPLOY_S, ["deploy", "--require-approval", "never"], settings)
 
     def destroy(self) -> list[str]:
-        """Remove robots, claims and stacks; what stayed is returned, a line each."""
+        """Remove robots, claims and stacks; return the leftovers, one line each."""
         left = self._without_robots()
         try:
             self._cdk("destroy", _DESTROY_S, ["destroy", "--force"], {})

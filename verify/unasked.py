@@ -1,4 +1,4 @@
-"""What the design takes for granted and no program asks in a quarter of an hour."""
+"""Assumptions of the design that no program can ask in a quarter of an hour."""
 
 from __future__ import annotations
 
@@ -20,10 +20,10 @@ def _assumed(name: str, assumed: str, *relied_on_by: str) -> Assumption:
 
 
 UNASKED = (
-    # An outage of Lambda cannot be ordered.
+    # Nobody can order an outage of Lambda.
     _documented(
         "lambda.asynchronous",
-        "A rule's invocation waits in a queue of Lambda's. A throttled one is tried again for up to six "
+        "A rule's invocation waits in a queue of Lambda. A throttled one is retried for up to six "
         "hours, a failed one as often as the function's settings say; then it goes to the destination for "
         "failures.",
         f"{_LAMBDA}/invocation-async-error-handling.html",
@@ -37,7 +37,7 @@ UNASKED = (
         "functions/summarize.py",
         "functions/live.py",
     ),
-    # Whether an environment was kept shows only by chance.
+    # A warm environment shows only by chance.
     _documented(
         "lambda.environment_survives",
         "A handler that raises does not end its execution environment; the next event finds it warm.",
@@ -86,7 +86,7 @@ UNASKED = (
         "stacks/quarantine.py",
         "local/queue_gap.py",
     ),
-    # The hook's time-out would need a deployment of its own.
+    # The hook's timeout would need a deployment of its own.
     _documented(
         "provisioning.hook_timeout",
         "A pre-provisioning hook that does not answer in 5 seconds counts as a refusal.",
@@ -168,7 +168,7 @@ UNASKED = (
     # CloudFormation's console lines are not an interface.
     _assumed(
         "cdk.failed_deletion",
-        "The CDK prints DELETE_FAILED and AWS::IoT::Policy in one line where a policy cannot be deleted yet.",
+        "The CDK prints DELETE_FAILED and AWS::IoT::Policy in one line if a policy cannot be deleted yet.",
         "scripts/destroy.py",
     ),
 )

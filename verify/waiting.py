@@ -1,4 +1,4 @@
-"""Waits for what a service shows only when it is asked again."""
+"""Polls a service until it shows a result."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ _POLL_S = 0.5
 
 
 def until(found: Callable[[], Found | None], what: str, *, within_s: float = 90.0) -> Found:
-    """The first true value of ``found``. Raises `VerifyError` with ``what`` where none comes in time."""
+    """The first true value of ``found``. Raises `VerifyError` with ``what`` if none comes in time."""
     deadline = time.monotonic() + within_s
     while not (value := found()):
         if time.monotonic() > deadline:
