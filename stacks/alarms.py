@@ -62,10 +62,10 @@ class Alarms(Construct):
         """Messages that can be lost without being in quarantine. Account-wide, since AWS documents no values
         for some of the dimensions; the embedded cloud has no Metrics Insights."""
         for name, namespace, what in (
-            ("ParseError", "AWS/IoT", "messages are no JSON, and some rule could not read them"),
-            ("ErrorActionFailure", "AWS/IoT", "messages that a rule failed on did not reach the quarantine"),
-            ("RuleMessageThrottled", "AWS/IoT", "messages were not given to a rule"),
-            ("DestinationDeliveryFailures", "AWS/Lambda", "what a function failed on is not in quarantine"),
+            ("ParseError", "AWS/IoT", "messages are not JSON, and a rule could not read them"),
+            ("ErrorActionFailure", "AWS/IoT", "failed messages of a rule did not reach the quarantine"),
+            ("RuleMessageThrottled", "AWS/IoT", "messages did not reach a rule"),
+            ("DestinationDeliveryFailures", "AWS/Lambda", "a function's failures are not in quarantine"),
         ):
             self._alarm(name, metrics.of_the_account(namespace, name), 0, what)
 

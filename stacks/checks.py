@@ -61,7 +61,7 @@ def broken(template: Mapping[str, Any]) -> Iterator[Broken]:
                 "managed-policy", logical_id, "a role has a managed policy, whose actions AWS changes"
             )
         if kind == "AWS::IoT::TopicRule" and not properties["TopicRulePayload"].get("ErrorAction"):
-            yield Broken("error-action", logical_id, "a rule has no error action: what fails is lost")
+            yield Broken("error-action", logical_id, "a rule has no error action: failed messages are lost")
         if kind == "AWS::Lambda::Function":
             for name in properties.get("Environment", {}).get("Variables", {}):
                 if _SECRET_NAME.search(name):
