@@ -65,7 +65,7 @@ class Alarms(Construct):
             ("ParseError", "AWS/IoT", "messages are not JSON, and a rule could not read them"),
             ("ErrorActionFailure", "AWS/IoT", "failed messages of a rule did not reach the quarantine"),
             ("RuleMessageThrottled", "AWS/IoT", "messages did not reach a rule"),
-            ("DestinationDeliveryFailures", "AWS/Lambda", "a function's failures are not in quarantine"),
+            ("DestinationDeliveryFailures", "AWS/Lambda", "failures of a function are not in quarantine"),
         ):
             self._alarm(name, metrics.of_the_account(namespace, name), 0, what)
 
