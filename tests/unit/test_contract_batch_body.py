@@ -56,7 +56,7 @@ BODIES = [
     (b"\xff\xfe{}", "not JSON"),
     (b'{"dt":[0,5],"fields":{"a":["\xff",1]}}', "not JSON"),
     (b"[" * DEEP, "nested"),
-    (b'{"dt":' + b"[" * DEEP + b"]" * DEEP + b',"fields":{}}', "more than columns"),
+    (b'{"dt":' + b"[" * DEEP + b"]" * DEEP + b',"fields":{}}', "must be columns"),
     (b'{"dt":[0,5],"fields":' + b'{"a":' * DEEP + b"0" + b"}" * DEEP + b"}", "too many texts"),
     (b'{"dt":[0,5],"fields":{"a":[' + b"[" * 500 + b"]" * 500 + b",1]}}", "must hold numbers"),
     (b'{"dt":[0,5],"fields":{"a":[1,NaN]}}', "NaN"),

@@ -186,7 +186,7 @@ def test_the_layout_must_be_known_and_be_the_types() -> None:
     for wrong, named in (
         (STAMPED_FLAT.layout, "the columns do not fit the type"),
         (NAMES.layout, "must consist of numbers"),
-        ("a_msgs/A\nnonsense", "has the line"),
+        ("a_msgs/A\nnonsense", "invalid line"),
         ("a_msgs/A\n" + "#" * MAX_LAYOUT, "must be at most"),
     ):
         with pytest.raises(ContractError, match=named):

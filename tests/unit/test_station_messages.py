@@ -153,5 +153,5 @@ def test_a_type_survives_the_wire_and_a_wrong_one_is_refused():
         message_type({"stream": "s"})
     with pytest.raises(StationError, match="not that of its checksum"):
         Maker(kind, ["x"])
-    with pytest.raises(StationError, match="cannot be rebuilt"):
+    with pytest.raises(StationError, match="cannot be made again"):
         Maker(kind._replace(definition="nonsense nonsense nonsense"), ["x"])
