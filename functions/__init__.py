@@ -1,1 +1,1 @@
-"""What runs in Lambda, one effect a file. The asset holds this package and contract/, nothing else."""
+"""The Lambda functions, one effect a file. The asset holds this package and iort_contract, nothing else."""

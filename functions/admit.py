@@ -1,9 +1,9 @@
-"""Admit: says which claims become robots. The provisioning template's hook, which AWS IoT asks before it
-registers a thing, and which must answer within 5 s, a cold start included.
+"""Admit: decides which claims become robots. AWS IoT calls this pre-provisioning hook before it registers a
+thing; it must answer within 5 s, cold start included.
 
-The operator opens a name, for one certificate and for a time (`iort robots claim`, `register`); what
-was not opened is refused, and so is everything when something goes wrong here. The one certificate is the one
-that comes through: one that was admitted and never registered gives way to another (docs/decisions/0039).
+The operator opens a name for one certificate and a limited time (`iort robots claim`, `register`). Every
+other request is refused, and so is every request during a failure here. A certificate that was admitted but
+never registered gives way to another (docs/decisions/0039).
 """
 
 from __future__ import annotations
@@ -36,32 +36,32 @@ from iort_contract import (
 
 _log = logging.getLogger(__name__)
 
-# Both attempts fit, at their slowest, into the function's own time-out, and that into AWS' 5 s.
+# Both attempts, at their slowest, fit into the function's own timeout, and that fits into AWS' 5 s.
 _CONFIG = Config(connect_timeout=1, read_timeout=1, retries={"mode": "standard", "total_max_attempts": 2})
 _MAX_TEXT = 800
 SPENT = "another certificate has its admission: `iort robots claim` opens it again"
-# AWS IoT waits 5 s for this function and registers then. What was admitted so long ago is through, or is not.
+# AWS IoT waits 5 s for this function and then registers. An older admission has succeeded or failed.
 SETTLED_MS = 60_000
-# "Lifecycle events": the broker's clocks, by which connections are timed, may be so far apart.
+# "Lifecycle events": the broker's clocks, which time connections, may differ by this much.
 _CLOCKS_APART_MS = 120_000
 
 
 class Earlier(NamedTuple):
-    """The certificate that has the admission, and since when."""
+    """The certificate that holds the admission, and since when."""
 
     certificate: str
     admitted_ms: int
 
 
 def admission(event: Mapping[str, Any], now_ms: int, instead_of: Earlier | None = None) -> dict[str, Any]:
-    """Take the admission that is open for the robot: UpdateItem's arguments but for the table.
+    """Take the robot's open admission: UpdateItem's arguments without the table.
 
-    It may be taken ``instead_of`` a certificate that did not come through, as long as that has it still.
+    ``instead_of`` names a certificate that never came through; the update replaces it if it still holds the
+    admission.
 
-    The update does it in one step, so that of two claims for one name one is refused. The same
-    certificate may ask again, because an answer may be lost or come too late. AWS does not say that a
-    claim has here the id with which it was made, so the SHA-256 of its certificate is taken too. Raises
-    `ContractError` for a request that is not complete.
+    The update is one step, so only one of two claims for a name succeeds. The same certificate may ask again,
+    because an answer may be lost or late. AWS does not document that a claim keeps the id it was created
+    with, so the SHA-256 of its certificate is accepted too. Raises `ContractError` for an incomplete request.
     """
     parameters = event.get("parameters")
     if not isinstance(parameters, Mapping):
@@ -102,18 +102,18 @@ def _earlier_values(instead_of: Earlier | None) -> dict[str, Any]:
 
 
 def earlier(row: Mapping[str, Any]) -> Earlier | None:
-    """Which certificate has the admission of a row; None where none has."""
+    """The certificate that holds the admission of a row; None if no certificate does."""
     if ADMITTED_CERTIFICATE not in row or ADMITTED_MS not in row:
         return None
     return Earlier(row[ADMITTED_CERTIFICATE]["S"], int(row[ADMITTED_MS]["N"]))
 
 
 def gives_way(row: Mapping[str, Any], status: str | None) -> bool:
-    """Whether the certificate that has the admission never came through, by its ``status`` at AWS IoT.
+    """Whether the certificate that holds the admission never came through, by its ``status`` at AWS IoT.
 
-    A new certificate is PENDING_ACTIVATION until it is registered, and after an hour AWS IoT deletes it
-    ("Device provisioning MQTT API"). One that is gone (None) may also have come through and been
-    deleted by the operator: then the robot may have connected since.
+    A new certificate is PENDING_ACTIVATION until it is registered, and AWS IoT deletes it after an hour
+    ("Device provisioning MQTT API"). A deleted one (None) may also have come through first, and then the
+    operator deleted it: in that case the robot may have connected since.
     """
     if status is not None:
         return status == "PENDING_ACTIVATION"
@@ -123,9 +123,9 @@ def gives_way(row: Mapping[str, Any], status: str | None) -> bool:
 
 
 def reason(row: Mapping[str, Any], event: Mapping[str, Any], now_ms: int) -> str:
-    """Why a row's robot was not admitted, for the log; the row as DynamoDB returns it, empty for none.
+    """Why a row's robot was not admitted, for the log. The row is DynamoDB's, or empty.
 
-    `SPENT` where nothing but another certificate stands against it.
+    Returns `SPENT` if only another certificate blocks the admission.
     """
     if not row:
         return "it is not registered"
@@ -142,7 +142,7 @@ def reason(row: Mapping[str, Any], event: Mapping[str, Any], now_ms: int) -> str
 
 
 def _claim_id(event: Mapping[str, Any]) -> str:
-    """The claim's id, as the station writes it: AWS allows 0x before the hex, and capitals in it."""
+    """The claim's id in the station's spelling: AWS allows capitals and 0x before the hex digits."""
     claim = _text(event, "claimCertificateId")
     return claim.lower().removeprefix("0x")
 
@@ -156,13 +156,13 @@ def _text(values: Mapping[str, Any], name: str) -> str:
 
 @cache
 def _dynamodb() -> Any:
-    # botocore alone: boto3 brings what moves files to S3, a fifth of the time until the first answer.
+    # botocore alone: boto3 adds S3 transfers, a fifth of the time until the first answer.
     return botocore.session.get_session().create_client("dynamodb", config=_CONFIG)
 
 
 def _status(certificate: str) -> str | None:
-    """A certificate's status at AWS IoT; None where it is gone."""
-    # Its model is large and seldom needed. Answered once or not at all: the robot asks again.
+    """A certificate's status at AWS IoT; None if it was deleted."""
+    # Its model is large and rarely needed. A single attempt, since the robot asks again.
     config = _CONFIG.merge(Config(retries={"total_max_attempts": 1}))
     iot = botocore.session.get_session().create_client("iot", config=config)
     try:
@@ -177,7 +177,7 @@ def handler(event: dict[str, Any], _context: object) -> dict[str, bool]:
     try:
         allowed = _admit(event)
     except Exception:  # noqa: BLE001 - whatever went wrong, nobody was found to be expected
-        _log.exception("refused, because it could not be decided")
+        _log.exception("refused, because the check failed")
         allowed = False
     emit("admit", RobotsAdmitted=allowed, RobotsRefused=not allowed)
     return {"allowProvisioning": allowed}
@@ -192,7 +192,7 @@ def _admit(event: Mapping[str, Any]) -> bool:
             if why == SPENT and has is not None and now_ms - has.admitted_ms >= SETTLED_MS:
                 status = _status(has.certificate)
                 if gives_way(row, status):
-                    _log.warning("certificate %s was admitted and never registered", has.certificate)
+                    _log.warning("certificate %s was admitted but never registered", has.certificate)
                     row = _take(admission(event, now_ms, has))
     except ContractError as error:
         _log.warning("refused: %s", error)
@@ -208,7 +208,7 @@ def _admit(event: Mapping[str, Any]) -> bool:
 
 
 def _take(update: Mapping[str, Any]) -> Mapping[str, Any] | None:
-    """Do the update; where its condition is not met, the row against which it was held, empty for none."""
+    """Do the update. If its condition fails, return the row that failed it (empty if none exists)."""
     dynamodb = _dynamodb()
     try:
         dynamodb.update_item(TableName=os.environ["ROBOTS_TABLE"], **update)
@@ -219,5 +219,5 @@ def _take(update: Mapping[str, Any]) -> Mapping[str, Any] | None:
 
 
 if "AWS_LAMBDA_INITIALIZATION_TYPE" in os.environ:
-    # In Lambda, where the client is made before the first request waits for it.
+    # In Lambda, create the client before the first request needs it.
     _dynamodb()

@@ -1,7 +1,7 @@
-"""Alert: a car's fault or low battery, from a rule each to the humans who asked to be told.
+"""Alert: mails a car's fault or low battery, one rule each, to the subscribers.
 
-A rule fires as often as it sees the car say so; a human is told once a car and cause, and
-again when it has lasted for `QUIET_S`.
+A rule fires on every matching message; the mail is sent once per car and cause, and repeated if the cause
+lasts for `QUIET_S`.
 """
 
 from __future__ import annotations
@@ -36,19 +36,19 @@ Notify = Callable[[str, str], None]
 
 @dataclass(frozen=True)
 class Cause:
-    """Why somebody should know: ``key`` tells causes of one car apart, ``text`` is for the reader."""
+    """The reason for a mail: ``key`` separates a car's causes, ``text`` is for the reader."""
 
     key: str
     text: str
 
 
 def causes(event: Mapping[str, Any], low_voltage_v: float) -> list[Cause]:
-    """What of a message that a rule selected is alarming; nothing of values that are no numbers."""
+    """The alarming values of a message that a rule selected; values that are not numbers are ignored."""
     found = []
     code, volts = event.get(FAULT_FIELD), event.get(VOLTAGE_FIELD)
     if _is_number(code) and code > 0:
-        # All unknown codes are one cause: a car that makes them up may neither send a mail for each nor
-        # fill its row of the registry.
+        # All unknown codes are one cause: a car with invented codes may neither send a mail for each nor fill
+        # its row of the registry.
         meaning = FAULTS[int(code)] if code in FAULTS else None
         key = f"{ALERT_PREFIX}fault_{'unknown' if meaning is None else int(code)}"
         found.append(Cause(key, f"fault {code:g}, {meaning or 'a code that the contract does not know'}"))
@@ -60,16 +60,16 @@ def causes(event: Mapping[str, Any], low_voltage_v: float) -> list[Cause]:
 
 
 class Notices:
-    """When a human was last told of a car's cause, in the car's row of the registry; what this
-    environment remembers saves a request."""
+    """The last mail of each car and cause, in the car's row of the registry; a cache in this environment
+    saves requests."""
 
     def __init__(self, client: Any, table: str) -> None:
         self._client, self._table = client, table
         self._until_s: dict[tuple[str, str], float] = {}
 
     def take(self, robot: str, key: str, now_s: int) -> bool:
-        """Whether it is time to tell; of all who ask within `QUIET_S`, one is told so. Never of a robot
-        that has no row: it was removed, and what it still sent must not make it one again."""
+        """Whether to send a mail now; one caller per `QUIET_S` gets True. Always False for a removed robot,
+        which has no row and must not get one again."""
         if now_s < self._until_s.get((robot, key), 0):
             return False
         try:
@@ -84,14 +84,15 @@ class Notices:
                 },
             )
         except self._client.exceptions.ConditionalCheckFailedException:
-            # Another environment told, some time within the quiet; to look again later costs a request.
+            # Another environment sent it, at an unknown time within the quiet period; another look costs a
+            # request.
             self._until_s[robot, key] = now_s + QUIET_S / 10
             return False
         self._until_s[robot, key] = now_s + QUIET_S
         return True
 
     def give_back(self, robot: str, key: str) -> None:
-        """Nobody could be told: the next one tries again."""
+        """Sending failed: the next caller tries again."""
         self._until_s.pop((robot, key), None)
         with suppress(self._client.exceptions.ConditionalCheckFailedException):
             self._update(robot, "REMOVE #key", key, "attribute_exists(#key)")
@@ -110,9 +111,9 @@ class Notices:
 def process(
     event: Mapping[str, Any], low_voltage_v: float, notices: Notices, notify: Notify, now_s: int
 ) -> None:
-    """Tell of each cause that it is time for. Raises what ``notify`` raises, and leaves no trace of it.
+    """Notify for each cause that is due. If ``notify`` raises, the notice is given back and the error raised.
 
-    Raises `iort_contract.ContractError` for a topic that is not one of ours.
+    Raises `iort_contract.ContractError` for a topic outside the contract.
     """
     topic = parse_topic(event[TOPIC])
     when = datetime.fromtimestamp(int(event[RECEIVED_MS]) / 1000, timezone.utc)

@@ -1,4 +1,4 @@
-"""Echo: the answer to a ping that asks for the way through Lambda."""
+"""Echo: answers a ping through Lambda."""
 
 from __future__ import annotations
 
@@ -24,9 +24,9 @@ from iort_contract import (
 
 
 def pong(event: Mapping[str, Any]) -> tuple[str, bytes]:
-    """The topic and payload of the answer: the ping's fields and the cloud's ``received_ms``.
+    """The answer's topic and payload: the ping's fields and the cloud's ``received_ms``.
 
-    Raises `ContractError` for a topic that is not one of ours, and for a message that is no ping.
+    Raises `ContractError` for a topic outside the contract, or a message that is not a ping.
     """
     topic = parse_topic(event[TOPIC])
     ping = json_object(event_message(event), "ping")
@@ -41,7 +41,7 @@ def _iot_data() -> Any:
 
 
 def handler(event: dict[str, Any], _context: object) -> None:
-    """Entry point of the echo rule's Lambda action; what it fails on goes to the quarantine."""
+    """Entry point of the echo rule's Lambda action; a failed message goes to the quarantine."""
     topic, payload = pong(event)
     _iot_data().publish(topic=topic, qos=0, payload=payload)
     emit("echo", PongsSent=1)

@@ -1,7 +1,7 @@
-"""Batches that Lambda 2 put off, since their robot was over its share: summarised here, beside the others.
+"""Later: summarises batches that Lambda 2 put off because their robot was over its share.
 
-A message says which batches, and the telemetry table has them. What becomes of them is what Lambda 2 would
-have made of them; a message that fails comes again.
+A message names the batches; the telemetry table holds them. They get the same treatment as in Lambda 2. A
+failed message comes again.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ class LaterError(Exception):
 
 
 def records(tables: Tables, body: str) -> list[dict[str, Any]]:
-    """The stream's records of the batches that a message names, as far as the table still has them."""
+    """The stream records of the batches that a message names, without those that have expired."""
     found: list[dict[str, Any]] = []
     for number, (topic, batch) in enumerate(waiting(body)):
         item = tables.item(topic, batch)
@@ -35,7 +35,7 @@ def records(tables: Tables, body: str) -> list[dict[str, Any]]:
 
 
 def handler(event: dict[str, Any], _context: object) -> None:
-    """Entry point of the queue's mapping, which gives one message at a time."""
+    """Entry point of the queue's mapping, which delivers one message at a time."""
     for message in event["Records"]:
         again = {"Records": records(stored_tables(), message["body"])}
         if failed := processed(again, beside_others=True)["batchItemFailures"]:

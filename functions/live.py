@@ -1,4 +1,4 @@
-"""Lambda 1: the newest sample of a car, from the live rule to the car's PubNub channel."""
+"""Lambda 1: sends a car's newest sample from the live rule to the car's PubNub channel."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ Publish = Callable[[str, dict[str, Any]], None]
 
 @dataclass(frozen=True)
 class LiveSettings:
-    """Which fields of which stream go to the dashboard; a stream not named sends all its fields."""
+    """The fields of each stream on the dashboard; a stream not named sends all its fields."""
 
     fields: Mapping[str, frozenset[str]]
 
@@ -50,11 +50,11 @@ class LiveSettings:
 
 
 def age_ms(robot: str, live: LiveSample, received_ms: int, now_us: int, legs: Legs) -> float:
-    """How old a robot's sample is, whatever the car's clock says.
+    """How old a robot's sample is, regardless of the car's clock.
 
-    A car that has measured how far the cloud's clock is from its own says so in the message: then the
-    whole way is on one clock. Of any other the age is its time in the car and its time in the cloud, each
-    by its own clock, and by how much the leg between was slower than it usually is.
+    A car that knows its clock offset sends it in the message, so the whole way is measured on one clock. For
+    other cars the age is the time in the car plus the time in the cloud, each by its own clock, plus the
+    network's delay above its usual minimum.
     """
     if live.offset_us is not None:
         return (now_us - live.t_us - live.offset_us) / 1000
@@ -65,7 +65,7 @@ def age_ms(robot: str, live: LiveSample, received_ms: int, now_us: int, legs: Le
 
 
 class RefusedError(Exception):
-    """A live message that no robot of ours sends."""
+    """A live message that is malformed."""
 
 
 def process(
@@ -77,10 +77,10 @@ def process(
     counted: Gathered,
     now_us: int,
 ) -> None:
-    """Publish one live message, or count why not. A live message is never worth a retry.
+    """Publish one live message, or count why not. A live message is never retried.
 
-    Failures are written at once, everything else is ``counted`` and written now and then. Raises
-    `RefusedError` for one that is malformed.
+    Failures are logged at once; everything else is ``counted`` and logged periodically. Raises `RefusedError`
+    for a malformed message.
     """
     try:
         topic = parse_topic(event[TOPIC])
@@ -89,13 +89,13 @@ def process(
     except (ContractError, AttributeError, KeyError, TypeError, ValueError, OverflowError) as error:
         emit("live", LiveRefused=1)
         raise RefusedError(f"{type(error).__name__}: {error}") from error
-    # Of a car that has not measured its clock's offset neither the leg between nor the whole way is known.
+    # Without the car's clock offset, neither the network's delay nor the total is known.
     uplink_ms = way_ms = 0.0
     if live.offset_us is not None:
         uplink_ms = max(0.0, received_ms - (live.sent_us + live.offset_us) / 1000)
         way_ms = max(0.0, (now_us - live.sent_us - live.offset_us) / 1000)
     if age_ms(topic.robot, live, received_ms, now_us, legs) > LIVE_MAX_AGE_MS:
-        # The stale ones are the late ones: an alarm that does not hear of them never goes off.
+        # Stale messages are late ones: the alarm must count them, or it would never go off.
         counted.add(now_us / 1e6, LiveStale=1, CarToLambdaMs=way_ms)
         return
     chosen = settings.fields.get(topic.name, live.sample.keys())
@@ -130,10 +130,10 @@ def serve(
     function_arn: str,
     now_s: float,
 ) -> None:
-    """Have ``show`` process a live message; one that it refuses goes to the quarantine's queue, by ``keep``.
+    """Have ``show`` process a live message. A refused message goes to the quarantine's queue by ``keep``.
 
-    An invocation that fails may cost its environment, and every robot waits for the next one. So this fails
-    only where the queue does not take the message: Lambda then sends it to the same queue.
+    A failed invocation may cost its environment, and all robots wait for the next one. So this fails only if
+    the queue does not take the message; Lambda then sends it to the same queue.
     """
     robot = _robot(event)
     if cut_off.closed(robot, now_s):
@@ -145,7 +145,7 @@ def serve(
         reason = str(error)
         if cut_off.refused(robot, now_s):
             reason += "; so many were refused that the next are not looked at, metric LiveCutOff"
-            _log.warning("the live messages of %s are not looked at for a while", robot)
+            _log.warning("live messages of %s are skipped for a while", robot)
         if not keep(refused_event(function_arn, event, reason)):
             raise
 

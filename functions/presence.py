@@ -1,8 +1,8 @@
-"""Presence: keeps the registry's row of a robot by what the broker says of its connections.
+"""Presence: updates a robot's row of the registry from the broker's lifecycle events.
 
-Lifecycle events may come twice and overtake each other. The broker numbers a client's connections;
-connect and disconnect of one connection have the same number, and it starts again at 0 for a client
-that was away for about an hour. Source: AWS IoT Core, "Lifecycle events".
+Lifecycle events may repeat and overtake each other. The broker numbers a client's connections; connect and
+disconnect of one connection share a number. The numbers restart at 0 for a client that was away for about an
+hour. Source: AWS IoT Core, "Lifecycle events".
 """
 
 from __future__ import annotations
@@ -32,16 +32,16 @@ from iort_contract import (
 
 _log = logging.getLogger(__name__)
 
-# Numbers that start again come an hour later, two events of neighbouring connections with clocks up to
-# two minutes apart; half an hour tells them from each other.
+# Restarted numbers come an hour later. Events of neighbouring connections are at most two minutes apart
+# (clock difference). Half an hour separates the two cases.
 _RESTARTED_MS = 30 * 60 * 1000
 _MAX_TEXT = 128
 
 
 def change(event: Mapping[str, Any]) -> dict[str, Any]:
-    """What an event does to its robot's row: UpdateItem's arguments but for the table.
+    """The update of the robot's row for an event: UpdateItem's arguments without the table.
 
-    Raises `ContractError` for an event that is not about a robot of ours.
+    Raises `ContractError` for an event that is not about one of our robots.
     """
     if AGENT_VERSION in event:
         return {
@@ -57,7 +57,7 @@ def change(event: Mapping[str, Any]) -> dict[str, Any]:
         ":long_ago": {"N": str(at_ms - _RESTARTED_MS)},
         ":far_ahead": {"N": str(at_ms + _RESTARTED_MS)},
     }
-    # What comes after within a connection is its end alone.
+    # Only a disconnect can follow a connect of the same connection.
     next_ = f"{SESSION_VERSION} < :version"
     if kind == "connected":
         values[":online"] = {"BOOL": True}
@@ -72,7 +72,7 @@ def change(event: Mapping[str, Any]) -> dict[str, Any]:
         removed = ""
         next_ = f"({next_} OR ({SESSION_VERSION} = :version AND #online = :was))"
     else:
-        raise ContractError(f"eventType {str(kind)[:40]!r}: allowed is connected or disconnected")
+        raise ContractError(f"eventType must be connected or disconnected, got {str(kind)[:40]!r}")
     newer = (
         f"attribute_not_exists({SESSION_VERSION}) OR {LAST_SEEN_MS} < :long_ago"
         f" OR ({LAST_SEEN_MS} < :far_ahead AND {next_})"
@@ -82,9 +82,9 @@ def change(event: Mapping[str, Any]) -> dict[str, Any]:
         "UpdateExpression": (
             f"{update}, #online = :online, {LAST_SEEN_MS} = :at, {SESSION_VERSION} = :version{removed}"
         ),
-        # A client that has no row is no robot of ours: a claim, or another deployment's.
+        # A client without a row is not one of our robots: a claim, or another deployment's.
         "ConditionExpression": f"attribute_exists({ROBOT}) AND ({newer})",
-        # A reserved word.
+        # "online" is a reserved word.
         "ExpressionAttributeNames": {"#online": ONLINE},
         "ExpressionAttributeValues": values,
     }
@@ -93,13 +93,13 @@ def change(event: Mapping[str, Any]) -> dict[str, Any]:
 def _number(event: Mapping[str, Any], name: str) -> int:
     value = event.get(name)
     if type(value) is not int or value < 0:
-        raise ContractError(f"{name} {str(value)[:40]!r}: expected a whole number")
+        raise ContractError(f"{name} must be a whole number, got {str(value)[:40]!r}")
     return value
 
 
 def _text(value: Any) -> str:
     if not isinstance(value, str) or not 1 <= len(value) <= _MAX_TEXT:
-        raise ContractError(f"{str(value)[:40]!r}: expected a text of up to {_MAX_TEXT} characters")
+        raise ContractError(f"expected a text of up to {_MAX_TEXT} characters, got {str(value)[:40]!r}")
     return value
 
 
@@ -109,7 +109,7 @@ def _dynamodb() -> Any:
 
 
 def handler(event: dict[str, Any], _context: object) -> None:
-    """Entry point of the rules presence and version. An event that changes nothing is counted."""
+    """Entry point of the rules presence and version. Events without effect are counted."""
     dynamodb = _dynamodb()
     try:
         dynamodb.update_item(TableName=os.environ["ROBOTS_TABLE"], **change(event))

@@ -1,7 +1,7 @@
-"""Quarantine: what rules, streams and functions could not process, from a queue into a table.
+"""Quarantine: moves messages that rules, streams and functions could not process from a queue into a table.
 
-A queue cannot be listed and forgets after 14 days; the table keeps every message with its bytes, the
-reason and how often it came, for `iort errors` and `iort replay-errors`.
+A queue cannot be listed and forgets after 14 days. The table keeps every message with its bytes, its reason
+and its count, for `iort errors` and `iort replay-errors`.
 """
 
 from __future__ import annotations
@@ -51,9 +51,9 @@ from iort_contract import (
 _log = logging.getLogger(__name__)
 _log.setLevel(logging.INFO)
 _REASON_CHARACTERS = 2_000
-# An item holds 400 KB, and one of the telemetry table can be larger as JSON than it is there.
+# An item holds 400 KB; an item of the telemetry table can be larger as JSON.
 _MAX_PAYLOAD_BYTES = 360 * 1024
-# "GetRecords": an empty answer does not say that nothing follows. So many of them are looked behind.
+# "GetRecords": an empty answer does not mean the end. This is the number of empty answers to skip.
 _EMPTY_ANSWERS = 50
 
 Records = Callable[[Mapping[str, Any]], Iterable[Mapping[str, Any]]]
@@ -61,7 +61,7 @@ Records = Callable[[Mapping[str, Any]], Iterable[Mapping[str, Any]]]
 
 @dataclass(frozen=True)
 class Entry:
-    """A message to keep: where it was refused, its topic ("" where it had none), why, and its bytes."""
+    """A message to keep: its source, its topic ("" if unknown), the reason, and its bytes."""
 
     source: str
     topic: str
@@ -70,22 +70,24 @@ class Entry:
 
     @property
     def robot(self) -> str:
-        """The robot that the topic names; `iort_contract.NO_ROBOT` where it names none."""
+        """The robot in the topic; `iort_contract.NO_ROBOT` if the topic names no robot."""
         levels = self.topic.split("/")
         return levels[2] if len(levels) >= 3 and levels[0] in LANES and levels[2] else NO_ROBOT
 
     @property
     def id(self) -> str:
-        """The same for the same message from the same source, however often it comes."""
+        """The same id for the same message from the same source, however often it comes."""
         head = f"{self.source}\0{self.topic}\0".encode("utf-8", "surrogatepass")
         return hashlib.sha256(head + self.payload).hexdigest()[:16]
 
 
 def entries(body: str, records: Records) -> list[Entry]:
-    """The messages in one message of the queue, which is one of these: a rule's error document, a record
-    that Lambda 2 refused, an asynchronous invocation that failed, a batch of the stream that failed
-    (whose records must be fetched with ``records``), the keys of batches that were put off and failed since.
-    Whatever else comes is kept as it is."""
+    """The quarantined messages in one queue message.
+
+    The queue message is a rule's error document, a record that Lambda 2 refused, a failed asynchronous
+    invocation, a failed batch of the stream (``records`` fetches its records), or the keys of put-off batches
+    that failed. Any other message is kept as it is.
+    """
     try:
         document = json.loads(body)
         if "base64OriginalPayload" in document:
@@ -147,7 +149,7 @@ def _of_invocation(document: Mapping[str, Any]) -> Entry:
 
 
 def _message(event: Any) -> bytes:
-    """What a function was called about: a message's own bytes, or else the event."""
+    """The bytes of the message that a function was called with, or else the event."""
     with suppress(ContractError, AttributeError):
         return event_message(event)
     return _json(event)
@@ -171,8 +173,8 @@ class Store:
         self._client, self._table, self._retention_s = client, table, retention_s
 
     def put(self, entry: Entry, sent_ms: int) -> None:
-        """Keep the message; one that is there already counts once more. Of one that does not fit into
-        an item, the beginning: the item that it is made of stands in the telemetry table."""
+        """Keep the message; a repeated message only raises its count. A message too large for an item is cut:
+        its full item is in the telemetry table."""
         payload, reason = entry.payload, _unicode(entry.reason[:_REASON_CHARACTERS])
         if len(payload) > _MAX_PAYLOAD_BYTES:
             payload = payload[:_MAX_PAYLOAD_BYTES]
@@ -202,25 +204,25 @@ class Store:
 
 
 def _unicode(text: str) -> str:
-    """The text with escapes for halves of surrogate pairs, which JSON may hold and no table takes."""
+    """The text with lone surrogates escaped; JSON may hold them, but no table takes them."""
     return text.encode("utf-8", "backslashreplace").decode()
 
 
 class StreamError(Exception):
-    """The stream did not give a failed batch's records in the calls that there were; worth another try."""
+    """The stream did not return a failed batch's records within the allowed calls; try again."""
 
 
 class Stream:
-    """Reads records off the telemetry table's stream; ``client`` is a boto3 DynamoDB Streams client."""
+    """Reads records from the telemetry table's stream; ``client`` is a boto3 DynamoDB Streams client."""
 
     def __init__(self, client: Any) -> None:
         self._client = client
 
     def records(self, info: Mapping[str, Any]) -> list[Mapping[str, Any]]:
-        """The records of a failed batch (``DDBStreamBatchInfo``); none where they have left the stream.
+        """The records of a failed batch (``DDBStreamBatchInfo``); empty if they have left the stream.
 
-        Raises `StreamError` where the last of them was not reached: a part of a batch would be taken for
-        all of it.
+        Raises `StreamError` if the last record was not reached, because a part would look like the whole
+        batch.
         """
         last = int(info["endSequenceNumber"])
         found: list[Mapping[str, Any]] = []
@@ -246,11 +248,11 @@ class Stream:
         except self._client.exceptions.TrimmedDataAccessException:
             _log.warning("the records of a failed batch have left the stream: %s", info)
             return []
-        raise StreamError(f"{len(found)} records, and not the last, of {info}")
+        raise StreamError(f"found {len(found)} records, but not the last one, of {info}")
 
 
 def process(event: Mapping[str, Any], store: Store, records: Records) -> dict[str, Any]:
-    """Keep what the queue's messages hold; the answer names the messages that are to come again."""
+    """Keep the queue's messages; the answer names the messages to deliver again."""
     failed, kept = [], 0
     for message in event["Records"]:
         sent_ms = int(message.get("attributes", {}).get("SentTimestamp") or time.time() * 1000)

@@ -1,8 +1,8 @@
-"""Queries in the cloud: the samples of a range that meet a condition, without the rest leaving AWS.
+"""Query: filters a range of samples in the cloud, so that only matching ones leave AWS.
 
-Invoked by the operator's `iort query --on lambda`. The answer is packed as a batch is; what Lambda's
-response cannot hold goes through the files' bucket by a pre-signed address. An invocation ends before its
-time or its memory does, with a token from which the next one goes on.
+The operator's `iort query --on lambda` invokes it. The answer is encoded like a batch; a large answer goes
+through the files' bucket by a pre-signed address. An invocation stops before its time or memory runs out, and
+returns a token to continue.
 """
 
 from __future__ import annotations
@@ -42,11 +42,11 @@ from iort_contract import (
 from iort_contract.expression import ExpressionError, MismatchError, Node
 from iort_contract.statistics import derive, without_absent
 
-# Lambda's synchronous answer holds 6 MB; the envelope around the samples is some hundred bytes.
+# Lambda's synchronous answer holds 6 MB; the envelope around the samples takes some hundred bytes.
 MAX_INLINE_BYTES = 5_500_000
-# Python takes some 30 bytes a value, and the packing as much again.
+# Python takes some 30 bytes a value, and encoding as much again.
 MAX_VALUES = 6_000_000
-# What is left of the time when the last page is asked for: packing and storing take no longer.
+# The last page is requested with at least this much time left: encoding and storing take no longer.
 MARGIN_MS = 8_000
 _URL_S = 900
 _FIRST, _LAST = -(2**53), 2**53
@@ -61,9 +61,9 @@ class RequestError(ValueError):
 
 @dataclass(frozen=True)
 class Request:
-    """What is asked: a topic's samples from ``start_us`` (included) to ``end_us`` (not).
+    """A query for a topic's samples from ``start_us`` (inclusive) to ``end_us`` (exclusive).
 
-    ``fields`` None is all. ``token`` is the last answer's, to go on where it ended.
+    ``fields`` None means all. ``token`` comes from the previous answer and continues there.
     """
 
     topic: str
@@ -75,17 +75,17 @@ class Request:
     token: Mapping[str, Any] | None
 
     def needs(self, name: str) -> bool:
-        """Whether it takes this stored field to answer."""
+        """Whether the answer needs this stored field."""
         deciding = expression.names(self.condition) if self.condition is not None else ()
         return self.fields is None or name in self.fields or name in deciding
 
     @classmethod
     def read(cls, event: Mapping[str, Any], namespace: str) -> Request:
-        """The request in an event; raises `RequestError`."""
+        """Read the request from an event; raises `RequestError`."""
         try:
             where, fields = event.get("where"), event.get("fields")
             if fields is not None and not all(isinstance(name, str) for name in fields):
-                raise RequestError(f"fields {fields!r}: allowed is a list of names")
+                raise RequestError(f"fields must be a list of names, got {fields!r}")
             return cls(
                 topic=build_topic(RECORD, event["robot"], event["stream"], namespace),
                 start_us=_time(event, "start_us", _FIRST),
@@ -106,12 +106,12 @@ def _time(event: Mapping[str, Any], key: str, otherwise: int) -> int:
     if value is None:
         return otherwise
     if type(value) is not int:
-        raise RequestError(f"{key} {value!r}: allowed is an integer of microseconds")
+        raise RequestError(f"{key} must be an integer of microseconds, got {value!r}")
     return max(_FIRST, min(_LAST, value))
 
 
 class Found:
-    """The samples that meet the condition, as lists that grow."""
+    """The matching samples, as growing lists."""
 
     def __init__(self, request: Request, tables: Tables) -> None:
         self._request = request
@@ -125,16 +125,16 @@ class Found:
         self.there: dict[str, None] = {}
         self.refused = 0
         self.reason = ""
-        # Values of sensors that are not fitted, by field.
+        # Values of absent sensors, by field.
         self.absent: Counter[str] = Counter()
 
     @property
     def values(self) -> int:
-        """How many values are held."""
+        """The number of values held."""
         return len(self.times_us) * (1 + len(self.columns))
 
     def add(self, item: Mapping[str, Any]) -> None:
-        """Take what meets the condition out of a stored item."""
+        """Add the matching samples of a stored item."""
         request = self._request
         try:
             batch = decode(item)
@@ -181,8 +181,8 @@ def answer(
     max_values: int = MAX_VALUES,
     max_inline_bytes: int = MAX_INLINE_BYTES,
 ) -> dict[str, Any]:
-    """Answer one request. ``store`` keeps bytes and gives the address to get them from; ``left_ms``
-    says how much of the invocation's time is left."""
+    """Answer one request. ``store`` keeps bytes and returns their address; ``left_ms`` returns the
+    invocation's remaining time."""
     try:
         request = Request.read(event, namespace)
         return _answer(
@@ -191,7 +191,7 @@ def answer(
     except RequestError as error:
         return {"error": str(error)}
     except MismatchError as error:
-        return {"error": f"the condition cannot be answered: {error}"}
+        return {"error": f"the condition cannot be evaluated: {error}"}
 
 
 def _answer(
@@ -203,7 +203,7 @@ def _answer(
     for page, after in _pages(request, tables):
         pages += 1
         token = after
-        # A page of a car that stands still may inflate to more than there is memory for: it may be parted.
+        # A page of a car that stands still may inflate beyond the memory, so a page may be split.
         for number, item in enumerate(page, 1):
             items += 1
             found.add(plain(item))
@@ -232,7 +232,7 @@ def _answer(
 def _pages(
     request: Request, tables: Tables
 ) -> Iterator[tuple[Sequence[Mapping[str, Any]], Mapping[str, Any] | None]]:
-    """Pages of items, each with the key after which the next one begins; None behind the last."""
+    """Pages of items, each with the key to continue after; None for the last page."""
     first, last = batches_between(request.start_us - MAX_BATCH_SPAN_US + 1, request.end_us - 1)
     if first > last:
         return
@@ -257,7 +257,7 @@ def _pages(
 
 
 def _packed(found: Found) -> bytes:
-    """Times and columns as a batch has them, but for the first time, which stands in ``dt``."""
+    """Times and columns, encoded like a batch; the first time is in ``dt``."""
     times = found.times_us
     dt = times[:1] + [b - a for a, b in pairwise(times)]
     text = json.dumps({"dt": dt, "fields": found.columns}, separators=(",", ":"))
@@ -269,14 +269,14 @@ def _tables() -> Tables:
     return Tables(
         boto3.client("dynamodb"),
         telemetry=os.environ["TELEMETRY_TABLE"],
-        summary="",  # which it may not read
+        summary="",  # it may not read this table
         robots=os.environ["ROBOTS_TABLE"],
     )
 
 
 @cache
 def _s3() -> Any:
-    # As in functions/upload.py: the global host redirects, which no signature survives.
+    # As in functions/upload.py: the global host redirects, which invalidates a signature.
     config = Config(signature_version="s3v4", s3={"addressing_style": "virtual"})
     return boto3.client("s3", config=config)
 

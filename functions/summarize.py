@@ -1,6 +1,7 @@
-"""Lambda 2: batches off the telemetry table's stream, one item a second into the summary table.
+"""Lambda 2: reads batches from the telemetry table's stream, and writes one item a second to the summary
+table.
 
-Of a robot that takes more than its share of the time, batches are put off until `functions.later`.
+Batches of a robot over its share are put off to `functions.later`.
 """
 
 from __future__ import annotations
@@ -30,7 +31,7 @@ def _put_off() -> PutOff:
 
 @cache
 def _told() -> Told:
-    # No robot's summary waits for a service that does not answer.
+    # No robot's summary waits for an unavailable service.
     config = Config(connect_timeout=1, read_timeout=2, retries={"total_max_attempts": 1})
     return Told(boto3.client("iot-data", config=config))
 
@@ -40,6 +41,6 @@ def handler(event: dict[str, Any], _context: object) -> dict[str, Any]:
     if RECOMPUTE_FROM_S in event:
         return recompute(event, stored_tables())
     if event.get(REPLAY):
-        # What the operator puts back is no robot's doing, and the stream goes on meanwhile.
+        # The operator's replays are not charged to a robot, and the stream continues meanwhile.
         return processed(event, beside_others=True)
     return processed(event, bounds=_bounds())

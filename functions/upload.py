@@ -1,4 +1,4 @@
-"""Upload: signed addresses for a robot's files, asked for over MQTT, so that no robot holds AWS keys."""
+"""Upload: signs upload addresses, requested over MQTT, so that no robot holds AWS keys."""
 
 from __future__ import annotations
 
@@ -43,13 +43,13 @@ _AGAIN_S = 3600
 def answer(
     robot: str, request: FileRequest, bucket: Bucket, allotment: Allotment, now_s: float
 ) -> FileAnswer:
-    """What the bucket has of the file and where the robot may put the rest. The robot is the topic's;
-    the key follows from it and the file, so that no request can reach another's, or another file."""
+    """The state of the file in the bucket, and the addresses for the rest. The robot comes from the topic,
+    and the key from robot and file, so that no request can reach another file."""
     file, key = request.file, file_key(robot, request.file)
     if bucket.has(key):
         return FileAnswer(request.id, key, stored=True)
     upload_id = bucket.upload_of(key) if file.parts > 1 else None
-    # A file in one piece counts with each address for it, a larger one when its upload begins.
+    # A file in one piece counts for each address, a larger file when its upload begins.
     begins = upload_id is None and (file.parts > 1 or bool(request.parts))
     if begins and not allotment.take(robot, file.size, now_s):
         why = f"no more than {allotment.bytes_a_day} bytes a day, and only of registered robots"
@@ -75,7 +75,7 @@ def answer(
 
 
 def ranges(numbers: Mapping[int, Any]) -> Iterator[tuple[int, int]]:
-    """The numbers as ranges, both ends included."""
+    """The numbers as ranges, both ends inclusive."""
     first = last = None
     for number in sorted(numbers):
         if last is not None and number == last + 1:
@@ -90,8 +90,7 @@ def ranges(numbers: Mapping[int, Any]) -> Iterator[tuple[int, int]]:
 
 @cache
 def _bucket() -> Bucket:
-    # Virtual addressing is what gives the region's own host: the global one redirects, which no
-    # signature survives.
+    # Virtual addressing gives the region's own host: the global one redirects, which invalidates a signature.
     config = Config(signature_version="s3v4", s3={"addressing_style": "virtual"})
     return Bucket(boto3.client("s3", config=config), os.environ["FILES_BUCKET"])
 
@@ -140,8 +139,8 @@ def handler(event: dict[str, Any], context: Any) -> None:
 def _refuse(
     event: Mapping[str, Any], said: Mapping[str, Any], topic: Topic, error: ContractError, context: Any
 ) -> None:
-    """Tell the robot why; where it has not said which request it is, the quarantine. Raises `error` where
-    that does not take it, so that Lambda tries."""
+    """Tell the robot why. A request without an id goes to the quarantine. Raises `error` if the queue does
+    not take it, so that Lambda sends it."""
     _log.warning("refused a request of %s: %s", topic.robot, error)
     emit("upload", FilesRefused=1)
     request_id = file_request_id(said)

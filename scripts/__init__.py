@@ -1,1 +1,1 @@
-"""What sets the checkout up, checks it and writes its generated pages: `python scripts/NAME.py` or `-m`."""
+"""Scripts that set the checkout up, check it and write generated pages: `python scripts/NAME.py` or `-m`."""

@@ -1,12 +1,12 @@
-"""Runs the independent checkers over the stacks of both stages: cfn-lint, cdk-nag and checkov; and our own.
+"""Runs the checkers over the stacks of both stages: cfn-lint, cdk-nag, checkov, and our own.
 
-cfn-lint and our own also read every variation of the parameters (stacks/variations.py).
+cfn-lint and our own checks also read every variation of the parameters (stacks/variations.py).
 
     python scripts/check_stacks.py [--checkov build/checkov/bin/checkov] [--write]
 
-Needs no credentials and no network. What the stacks deliberately do otherwise is in
-stacks/acknowledged.py, where what no checker finds any more is a finding too; --write makes
-docs/acknowledged.md from it. Our own, stacks/checks.py, has nothing to acknowledge.
+It needs no credentials and no network. stacks/acknowledged.py lists the findings that the stacks do not
+follow; an entry that no checker reports any more is a finding too. --write generates docs/acknowledged.md
+from it. Our own checks, stacks/checks.py, cannot be acknowledged.
 """
 
 from __future__ import annotations
@@ -55,8 +55,7 @@ STAGES: dict[str, dict[str, Any]] = {
 
 
 class Finding(NamedTuple):
-    """What a checker has against a construct, by its path; of one that is acknowledged, that it still
-    would have it."""
+    """A checker's finding about a construct, by its path; ``acknowledged`` if the stacks acknowledge it."""
 
     rule: str
     path: str
@@ -65,7 +64,7 @@ class Finding(NamedTuple):
 
 
 def main() -> None:
-    """Print what is open, and exit with 1 if anything is."""
+    """Print the open findings; exit with 1 if any is open."""
     parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
     parser.add_argument("--checkov", type=Path, help="checkov's command, in its own environment")
     parser.add_argument("--write", action="store_true", help="write docs/acknowledged.md")
@@ -83,7 +82,7 @@ def main() -> None:
             found += nag(out)
             print(f"check: stage {stage} synthesized, cdk-nag ({time.monotonic() - began:.0f} s)", flush=True)
         began = time.monotonic()
-        # What cdk-nag and checkov ask for depends on no other parameter than what the stages have.
+        # cdk-nag's and checkov's findings depend only on the parameters of the stages.
         for name, given in VARIATIONS.items():
             app = App(outdir=str(Path(others) / name))
             build(app, Settings(layer=layer, **given))
@@ -108,12 +107,12 @@ def main() -> None:
         findings.append(f"{DOCUMENT.relative_to(ROOT)} is not up to date: scripts/check_stacks.py --write")
     if findings:
         sys.exit(
-            "\n".join([*findings, f"{len(findings)} open: do it, or say why not in stacks/acknowledged.py"])
+            "\n".join([*findings, f"{len(findings)} open: fix, or give a reason in stacks/acknowledged.py"])
         )
 
 
 def synthesize(settings: Settings, out: Path) -> list[Acknowledged]:
-    """The templates, and cdk-nag's report, into ``out``."""
+    """Write the templates and cdk-nag's report into ``out``."""
     app = App(outdir=str(out))
     known = build(app, settings)
     Validations.of(app).add_plugins(AwsSolutionsChecks(app), ServerlessChecks(app))
@@ -126,7 +125,7 @@ def synthesize(settings: Settings, out: Path) -> list[Acknowledged]:
 
 
 def nag(out: Path) -> Iterator[Finding]:
-    """What cdk-nag has against a synthesized app; raises if a pack did not run."""
+    """cdk-nag's findings about a synthesized app; raises if a pack did not run."""
     report = json.loads((out / "validation-report.json").read_text())
     packs = {plugin["pluginName"]: plugin for plugin in report["pluginReports"]}
     for name in ("AwsSolutions", "Serverless"):
@@ -141,13 +140,13 @@ def nag(out: Path) -> Iterator[Finding]:
 
 
 def templates_below(*folders: Path) -> list[Path]:
-    """The templates below the folders, one of each content: most variations are of one stack."""
+    """The different templates below the folders: most variations change one stack."""
     found = [template for folder in folders for template in sorted(folder.rglob("*.template.json"))]
     return list({template.read_bytes(): template for template in reversed(found)}.values())[::-1]
 
 
 def own(*folders: Path) -> Iterator[Finding]:
-    """What does not hold of the templates below ``folders`` of what must."""
+    """The findings of our own checks about the templates below ``folders``."""
     for template in templates_below(*folders):
         content = json.loads(template.read_text())
         app = [json.loads(one.read_text()) for one in template.parent.glob("*.template.json")]
@@ -157,10 +156,10 @@ def own(*folders: Path) -> Iterator[Finding]:
 
 
 def lint(*folders: Path) -> Iterator[Finding]:
-    """What cfn-lint has against the templates below ``folders``.
+    """cfn-lint's findings about the templates below ``folders``.
 
-    It does not report what a resource's metadata tells it to ignore, so it reads the templates a second
-    time without that.
+    It skips findings that a resource's metadata ignores, so it reads the templates a second time without that
+    metadata.
     """
     templates = templates_below(*folders)
     with TemporaryDirectory() as elsewhere:
@@ -183,7 +182,7 @@ def lint(*folders: Path) -> Iterator[Finding]:
 
 
 def checkov(command: Path, folder: Path) -> Iterator[Finding]:
-    """What checkov has against the templates below ``folder``."""
+    """Findings of checkov about the templates below ``folder``."""
     options = ["--framework", "cloudformation", "--compact", "--skip-download", "--output", "json"]
     report = json.loads(output([str(command), "--directory", str(folder), *options], good=(0, 1)))
     if report["summary"]["parsing_errors"] or not report["summary"]["passed"]:
@@ -198,7 +197,7 @@ def checkov(command: Path, folder: Path) -> Iterator[Finding]:
 
 @cache
 def _paths(template: Path) -> dict[str, str]:
-    """Logical id to construct path, as the CDK notes it beside a template."""
+    """Logical id to construct path, from the CDK's metadata beside a template."""
     beside = template.with_name(template.name.replace(".template.", ".metadata."))
     return {
         entry["data"]: path.lstrip("/")
@@ -211,17 +210,17 @@ def _paths(template: Path) -> dict[str, str]:
 def stale(
     known: dict[str, list[Acknowledged]], found: list[Finding], *, unjudged: tuple[str, ...] = ()
 ) -> Iterator[str]:
-    """What is acknowledged and no checker finds any more, in any stage; ``unjudged`` are the beginnings of
-    rules whose checker did not run."""
+    """Acknowledged findings that no checker reports any more, in any stage; ``unjudged`` are the rule
+    prefixes of checkers that did not run."""
     still = {(one.rule, short(one.path, DEFAULT_NAMESPACE)) for one in found}
     everywhere = {(one.rule, one.path): one for acknowledged in known.values() for one in acknowledged}
     for rule, path in sorted(everywhere.keys() - still):
         if not rule.startswith(unjudged):
-            yield f"{rule} on {path}: no checker finds what stacks/acknowledged.py acknowledges; remove it"
+            yield f"{rule} on {path}: no checker reports it any more; remove it from stacks/acknowledged.py"
 
 
 def output(command: list[str], *, good: Iterable[int]) -> str:
-    """A tool's standard output. Neither tool needs a network, and neither gets one."""
+    """A tool's standard output; the tools run without network."""
     nowhere = "http://127.0.0.1:9"
     environment = {**os.environ, "HTTPS_PROXY": nowhere, "HTTP_PROXY": nowhere, "LOG_LEVEL": "ERROR"}
     done = subprocess.run(command, env=environment, capture_output=True, text=True, check=False)
@@ -231,20 +230,20 @@ def output(command: list[str], *, good: Iterable[int]) -> str:
 
 
 def document(known: dict[str, list[Acknowledged]]) -> str:
-    """docs/acknowledged.md: rule and reason, and every resource that it is acknowledged for."""
+    """docs/acknowledged.md: rule, reason, and the acknowledged resources."""
     where: dict[tuple[str, str], dict[str, set[str]]] = defaultdict(lambda: defaultdict(set))
     for stage, acknowledged in known.items():
         for one in acknowledged:
             where[one.rule, one.reason][one.path].add(stage)
     lines = [
-        "# What the checkers ask for and the stacks do not do",
+        "# Findings of the checkers that the stacks do not follow",
         "",
         "Generated by `scripts/check_stacks.py --write` from",
         "[stacks/acknowledged.py](../stacks/acknowledged.py). `make check` runs cfn-lint (W), cdk-nag",
         "(AwsSolutions, Serverless) and checkov (CKV) over both stages, prod with a customer-managed key,",
-        "and fails on anything that is not here, and when this is not up to date.",
+        "and fails on any other finding, or if this page is out of date.",
         "",
-        "| rule | why not | resources |",
+        "| rule | reason | resources |",
         "|---|---|---|",
     ]
     for (rule, reason), paths in sorted(where.items()):

@@ -29,7 +29,7 @@ def tables() -> dict[str, str]:
 
 
 def filled(text: str) -> str:
-    """The text with every table in its place."""
+    """The text with the current tables."""
     known = tables()
     return _BLOCK.sub(lambda match: match[1] + known[match[2]] + match[3], text)
 

@@ -25,7 +25,7 @@ def table() -> str:
 
 
 def filled(readme: str) -> str:
-    """The README with the table in its place."""
+    """The README with the current table."""
     return _BLOCK.sub(lambda match: match[1] + table() + match[2], readme)
 
 

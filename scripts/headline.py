@@ -19,7 +19,7 @@ _BLOCK = re.compile(r"(<!-- bench:.*?-->\n).*?(\n<!-- /bench -->)", re.DOTALL)
 
 
 def table(report: dict[str, Any]) -> str:
-    """The ratios that have a target, as Markdown, and what they were measured on."""
+    """The ratios that have a target, as Markdown, and the machine of the measurement."""
     machine = report["machine"]
     on = f"{machine['cores']} cores of {machine['cpu']}, target {report['target']}"
     made = f"Made on {machine['date'][:10]} on {on}:"
@@ -30,7 +30,7 @@ def table(report: dict[str, Any]) -> str:
 
 
 def filled(readme: str, report: dict[str, Any]) -> str:
-    """The README with the table in its place."""
+    """The README with the current table."""
     return _BLOCK.sub(lambda match: match[1] + table(report) + match[2], readme)
 
 

@@ -2,9 +2,8 @@
 
     python -m scripts.layer {local,lambda} [--compiler PYTHON]
 
-What is installed follows from the Python and the platform that the layer is for, whatever this runs on.
-Bytecode is read by one version of Python alone, so it needs a compiler of that version: without one, the
-layer has none, and Lambda compiles at every cold start.
+The packages depend only on the target's Python and platform, not on this machine. Bytecode fits only one
+version of Python, so a compiler of that version is needed; without it Lambda compiles at every cold start.
 """
 
 from __future__ import annotations
@@ -20,8 +19,8 @@ from pathlib import Path
 from stacks.target import PLATFORM, PYTHON
 
 ROOT = Path(__file__).resolve().parent.parent
-# No compiler of C is needed: pubnub, which publishes no wheel, is Python alone.
-# It is built with the locked setuptools of .venv, not with whatever is newest today.
+# No C compiler is needed: pubnub, which publishes no wheel, is pure Python.
+# The build uses the locked setuptools of .venv, not today's newest.
 LOCKED = (
     *("--require-hashes", "--no-deps", "--only-binary", ":all:"),
     *("--no-binary", "pubnub", "--no-build-isolation"),
@@ -30,7 +29,7 @@ LOCKED = (
 
 @dataclass(frozen=True)
 class Target:
-    """The Python and, as uv names it, the platform that a layer is for."""
+    """The Python of a layer, and its platform in uv's spelling."""
 
     python: str
     platform: str | None = None
@@ -41,7 +40,7 @@ LAMBDA = Target(PYTHON, PLATFORM)
 
 
 def main() -> None:
-    """Build one."""
+    """Build one layer."""
     parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
     parser.add_argument("name", choices=["local", "lambda"], help="for this machine, or for AWS")
     parser.add_argument("--compiler", metavar="PYTHON", help=f"a Python {PYTHON}, for lambda")
@@ -57,7 +56,7 @@ def main() -> None:
 
 
 def build(folder: Path, requirements: Path, target: Target, compiler: str | None) -> None:
-    """Build the layer anew. Raises `subprocess.CalledProcessError`."""
+    """Build the layer from scratch; raises `subprocess.CalledProcessError`."""
     shutil.rmtree(folder, ignore_errors=True)
     packages = folder / "python"
     platform = ["--python-platform", target.platform] if target.platform else []
@@ -69,7 +68,7 @@ def build(folder: Path, requirements: Path, target: Target, compiler: str | None
         ],
         check=True,
     )
-    # Programs begin with the path of this machine's Python, and nothing calls them there.
+    # Scripts start with this machine's Python path, and Lambda never calls them.
     shutil.rmtree(packages / "bin", ignore_errors=True)
     (packages / ".lock").unlink(missing_ok=True)
     if compiler is not None:
@@ -79,13 +78,13 @@ def build(folder: Path, requirements: Path, target: Target, compiler: str | None
 def compile_all(folder: Path, compiler: str) -> None:
     """Compile every module below the folder. Two runs give the same bytes.
 
-    "unchecked-hash": Python takes the bytecode as it is. A time stamp would not survive the archive that a
-    layer is sent in. A module that this Python cannot compile is left to fail where it is imported.
+    "unchecked-hash": Python never compares the bytecode with the source. Time stamps would change in the
+    layer's archive. A module that this Python cannot compile is left as source.
     """
     subprocess.run(
         [
             *(compiler, "-m", "compileall", "-qq", "--invalidation-mode", "unchecked-hash"),
-            # So a traceback names the module as Lambda finds it, and this machine's folders are not told.
+            # Tracebacks then show Lambda's path, not this machine's folders.
             *("-s", folder, "-p", "/opt/python", folder),
         ],
         env={**os.environ, "PYTHONHASHSEED": "0"},

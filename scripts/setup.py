@@ -1,9 +1,9 @@
-"""Sets the checkout up: .venv, node_modules, the built page and Lambda 1's layer. Nothing outside it.
+"""Sets the checkout up: .venv, node_modules, the built page and Lambda 1's layer. Writes only inside it.
 
     python3 scripts/setup.py [--layer lambda] [--checkov] [--oldest any|/path/to/python3.8]
 
-Needs only a Python from 3.10 on with the venv module. A step whose inputs have not changed since it
-last succeeded is passed over, so running it again costs nothing.
+It needs only Python 3.10 or newer with the venv module. It skips steps whose inputs are unchanged since their
+last success, so another run is cheap.
 """
 
 from __future__ import annotations
@@ -23,14 +23,14 @@ from pathlib import Path
 ROOT = Path(__file__).resolve().parent.parent
 VENV, BUILD = ROOT / ".venv", ROOT / "build"
 PYTHON, UV = VENV / "bin" / "python", VENV / "bin" / "uv"
-# The interpreter itself, also when this runs in a virtual environment, even in the one made here.
+# The base interpreter, even if this runs in a virtual environment, such as the one created here.
 BASE_PYTHON = Path(getattr(sys, "_base_executable", sys.executable)).resolve()
 OLDEST = (3, 10)
-# The robot's: ROS Noetic's.
+# ROS Noetic's Python, for the robot.
 OLDEST_OF_ROBOT = "3.8"
 LEAST_FREE_BYTES = 3 * 1024**3
-# No compiler is needed: pubnub, which publishes no wheel, is Python alone.
-# It is built with the locked setuptools of .venv, not with whatever is newest today.
+# No compiler is needed: pubnub, which publishes no wheel, is pure Python.
+# The build uses the locked setuptools of .venv, not today's newest.
 LOCKED = (
     *("--require-hashes", "--no-deps", "--only-binary", ":all:"),
     *("--no-binary", "pubnub", "--no-build-isolation"),
@@ -38,7 +38,7 @@ LOCKED = (
 # Each is installed from its folder.
 DISTRIBUTIONS = ("contract", "device", "station")
 STARTED = time.monotonic()
-# npm's and uv's caches are theirs to keep elsewhere; nothing of ours goes outside the checkout.
+# npm and uv keep their own caches; our files stay inside the checkout.
 CACHES = {"npm_config_cache": str(BUILD / "npm-cache"), "npm_config_update_notifier": "false"}
 
 
@@ -83,11 +83,11 @@ def main() -> None:
 
 
 def check_machine() -> None:
-    """Refuse a machine on which a later step would fail for a reason that is hard to see there."""
+    """Refuse a machine on which a later step would fail for an obscure reason."""
     if sys.version_info < OLDEST:
         wanted = ".".join(map(str, OLDEST))
         raise SetupError(
-            f"Python {sys.version.split()[0]} is too old, {wanted} is the oldest that will do: "
+            f"Python must be {wanted} or newer, got {sys.version.split()[0]}: "
             "install a newer one and run `make setup PYTHON=python3.12`"
         )
     for module in ("venv", "ensurepip"):
@@ -96,7 +96,7 @@ def check_machine() -> None:
                 f"this Python has no {module} module: install it (Debian: `apt install python3-venv`)"
             )
     if not (ROOT / ".venv").exists() and shutil.disk_usage(ROOT).free < LEAST_FREE_BYTES:
-        raise SetupError(f"less than {LEAST_FREE_BYTES // 1024**3} GB free in {ROOT}: free some")
+        raise SetupError(f"{ROOT} must have {LEAST_FREE_BYTES // 1024**3} GB free: free some")
 
 
 def step(title: str, inputs: Iterable[Path], action: Callable[[], None], *, stamp: str) -> None:
@@ -118,32 +118,32 @@ def step(title: str, inputs: Iterable[Path], action: Callable[[], None], *, stam
 
 
 def make_venv() -> None:
-    """Make .venv anew, with this Python."""
+    """Create .venv from scratch, with this Python."""
     shutil.rmtree(BUILD / "setup", ignore_errors=True)
     (BUILD / "setup").mkdir(parents=True)
     run([BASE_PYTHON, "-m", "venv", "--clear", VENV])
 
 
 def install_python() -> None:
-    """Install exactly what is locked; every file is checked against its hash.
+    """Install the locked packages; every file is checked against its hash.
 
-    Python compiles a module when it first imports it. Compiling all of them here took longer than
-    everything else, and most are never imported.
+    Python compiles a module on its first import. Compiling all of them here took longer than everything else,
+    and most are never imported.
     """
-    # What uv installs with; pip comes with Python.
+    # Install uv first; pip comes with Python.
     pip = ("-m", "pip", "--disable-pip-version-check", "--quiet", "install", "--no-compile")
     run([PYTHON, *pip, *LOCKED[:4], "-r", "requirements/build.txt"])
     install(VENV, *LOCKED, "-r", "requirements/dev.txt")
 
 
 def install_project() -> None:
-    """Put iort-agent and iort into .venv/bin, reading the checkout itself."""
+    """Install iort-agent and iort into .venv/bin, editable from the checkout."""
     editable = [part for folder in DISTRIBUTIONS for part in ("--editable", folder)]
     install(VENV, "--no-deps", "--no-build-isolation", *editable)
 
 
 def install_node() -> None:
-    """Install exactly what package-lock.json locks, with the npm that came from PyPI."""
+    """Install the packages of package-lock.json, with the npm from PyPI."""
     run([VENV / "bin" / "npm", "ci", "--no-progress"])
 
 
@@ -158,15 +158,15 @@ def build_layer(target: str, *more: str) -> None:
 
 
 def build_layer_for_aws() -> None:
-    """With bytecode, where there is a Python of Lambda's version to make it."""
+    """Build the layer with bytecode, if Lambda's version of Python is available."""
     version = re.findall(r'^PYTHON = "(.+)"', (ROOT / "stacks" / "target.py").read_text(), re.MULTILINE)[0]
     try:
         compiler = ["--compiler", python_of(version)]
     except SetupError:
         compiler = []
-        print(f" without bytecode: there is no Python {version} here to make it, and uv could not")
-        print("setup: fetch one. Cold starts take longer. Install it and remove build/setup/layer-lambda")
-        print("setup: to have it ...", end="", flush=True)
+        print(f" without bytecode: Python {version} is missing here, and uv could not fetch it.")
+        print("setup: Cold starts take longer. To fix it, install that Python and remove")
+        print("setup: build/setup/layer-lambda ...", end="", flush=True)
     build_layer("lambda", *compiler)
 
 
@@ -177,16 +177,16 @@ def install_checkov() -> None:
 
 
 def install_oldest(given: str | None) -> None:
-    """Install the agent and what its tests need for the oldest Python that a robot has, into build/oldest."""
+    """Install the agent and its tests for the oldest Python of a robot, into build/oldest."""
     try:
         python = given or python_of(OLDEST_OF_ROBOT)
     except SetupError as error:
         raise SetupError(
-            f"there is no Python {OLDEST_OF_ROBOT} here, and uv could not fetch one: install it, or name it "
+            f"Python {OLDEST_OF_ROBOT} is missing here, and uv could not fetch it: install it, or name it "
             f"with `make test-oldest OLDEST=/path/to/python{OLDEST_OF_ROBOT}`\n{error}"
         ) from error
     if version_of(python) != OLDEST_OF_ROBOT:
-        raise SetupError(f"{python} is not Python {OLDEST_OF_ROBOT}")
+        raise SetupError(f"{python} must be Python {OLDEST_OF_ROBOT}")
     run([UV, "venv", "--clear", "--python", python, BUILD / "oldest"])
     install(BUILD / "oldest", *LOCKED[:4], "-r", "requirements/oldest.txt")
     robot = ("--editable", "contract", "--editable", "device")
@@ -194,10 +194,10 @@ def install_oldest(given: str | None) -> None:
 
 
 def python_of(version: str) -> str:
-    """An interpreter of a version: one that this machine has, or one that uv fetches into build/. Raises
+    """An interpreter of a version: this machine's, or one that uv fetches into build/. Raises
     `SetupError`."""
     pyenv = Path(os.environ.get("PYENV_ROOT") or Path.home() / ".pyenv") / "versions"
-    # pyenv's own before what it has on the path: programs that fail for a version that is not switched on.
+    # pyenv's own before the path: pyenv's shims fail for a version that is not activated.
     places = [*map(str, sorted(pyenv.glob("*/bin"))), os.environ.get("PATH", os.defpath)]
     os.environ["UV_PYTHON_SEARCH_PATH"] = os.pathsep.join(places)
     os.environ["UV_PYTHON_INSTALL_DIR"] = str(BUILD / "python")
@@ -210,7 +210,7 @@ def python_of(version: str) -> str:
 
 
 def version_of(python: str) -> str:
-    """A Python's version, as 3.8; empty for what is none."""
+    """A Python's version, such as 3.8; empty if it is not a Python."""
     try:
         return last_line(run([python, "-c", "import sys; print('%d.%d' % sys.version_info[:2])"]))
     except (OSError, SetupError):
@@ -218,7 +218,7 @@ def version_of(python: str) -> str:
 
 
 def last_line(text: str) -> str:
-    """What a program says behind its warnings."""
+    """The last line of a program's output, after its warnings."""
     return text.rstrip().rpartition("\n")[2]
 
 
@@ -228,10 +228,10 @@ def install(environment: Path, *arguments: str) -> None:
 
 
 def run(command: Sequence[str | Path]) -> str:
-    """Run a command and give its output; raises `SetupError` with the end of it if it fails."""
+    """Run a command and return its output; raises `SetupError` with the end of the output if it fails."""
     log = BUILD / "setup" / "log"
     log.parent.mkdir(parents=True, exist_ok=True)
-    # The venv's own node and npm come before any that the machine may have.
+    # The venv's own node and npm come before the machine's.
     path = f"{VENV / 'bin'}{os.pathsep}{os.environ.get('PATH', os.defpath)}"
     with log.open("wb") as output:
         done = subprocess.run(

@@ -1,8 +1,7 @@
-"""What holds for the whole account: Device Defender's audit, and what AWS IoT logs.
+"""Settings of the whole account: Device Defender's audit and AWS IoT's log.
 
-An account has one of each in a region, and where they are configured this stack fails. So it is there only
-where it is asked for (`device_defender`, `iot_log_level`), and the last to be deployed: nothing waits for it.
-The embedded cloud has neither.
+An account has one of each per region. This stack fails where they are already configured, so it is built
+only on request (`device_defender`, `iot_log_level`), and deployed last. The embedded cloud has neither.
 """
 
 from __future__ import annotations
@@ -17,8 +16,8 @@ from constructs import Construct
 from stacks import iot_core
 from stacks.settings import Settings
 
-# "Audit checks" that are about certificates, policies and clients; the others are about role aliases,
-# Cognito and intermediate authorities, of which there is nothing here.
+# The "Audit checks" of certificates, policies and clients. The others concern role aliases, Cognito and
+# intermediate authorities, which this platform does not use.
 _CHECKS = (
     "CA_CERTIFICATE_EXPIRING_CHECK",
     "CA_CERTIFICATE_KEY_QUALITY_CHECK",
@@ -31,8 +30,8 @@ _CHECKS = (
     "REVOKED_CA_CERTIFICATE_STILL_ACTIVE_CHECK",
     "REVOKED_DEVICE_CERTIFICATE_STILL_ACTIVE_CHECK",
 )
-# What these checks read. Source: the managed policy AWSIoTDeviceDefenderAudit, which reads IAM and
-# Cognito besides, for the checks that are off.
+# The resources that these checks read. Source: the managed policy AWSIoTDeviceDefenderAudit, without IAM and
+# Cognito, which only the disabled checks read.
 _AUDIT_READS = (
     "DescribeCACertificate",
     "DescribeCertificate",
@@ -44,12 +43,12 @@ _AUDIT_READS = (
     "ListCertificates",
     "ListPolicies",
 )
-# AWS IoT makes it and keeps it for ever; why its end is set by hand: docs/cloud.md, "AWS IoT's own log".
+# AWS IoT creates this log group and never expires it; docs/cloud.md, "AWS IoT's own log", sets the retention.
 _LOG_GROUP = "AWSIotLogsV2"
 
 
 class Account(Stack):
-    """The audit, once a day, and the log, as far as the settings want them."""
+    """A daily audit and the log, as the settings ask."""
 
     def __init__(self, scope: Construct, construct_id: str, *, settings: Settings, **kwargs: Any) -> None:
         super().__init__(scope, construct_id, **kwargs)

@@ -1,7 +1,7 @@
-"""What the independent checkers (cfn-lint, cdk-nag, checkov) ask for and these stacks do not do, and why.
+"""The findings of cfn-lint, cdk-nag and checkov that these stacks do not follow, with reasons.
 
-Each finding is acknowledged for one rule on one resource, in the checker's own way: a reviewer who runs
-the tools over the templates sees none open. docs/acknowledged.md, generated from this, lists them all.
+Each finding is acknowledged for one rule on one resource, in the checker's own way, so that the tools report
+no open finding. docs/acknowledged.md is generated from this file.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ _NAG_PACKS = ("AwsSolutions", "Serverless")
 
 @dataclass(frozen=True)
 class Acknowledged:
-    """One rule on one resource, or on what is below it."""
+    """One rule on one resource, or on the resources below it."""
 
     path: str
     rule: str
@@ -29,7 +29,7 @@ class Acknowledged:
 
 
 def acknowledge(app: App, settings: Settings) -> list[Acknowledged]:
-    """Tell the checkers; returns what was acknowledged, a resource and rule each."""
+    """Tell the checkers; return each acknowledged rule and resource."""
     found = [*_of_a_kind(app, settings), *_one_by_one(app, settings)]
     skips: dict[str, tuple[CfnResource, dict[str, str]]] = {}
     for resource, one in found:
@@ -53,18 +53,18 @@ Found = tuple[CfnResource, Acknowledged]
 # --- decisions about every resource of a kind -------------------------------------------------------
 
 _FUNCTION = {
-    "CKV_AWS_117": "no function needs anything in a VPC, and a way out of one costs more than all the rest",
+    "CKV_AWS_117": "no function needs a resource in a VPC, and a NAT gateway costs more than all the rest",
     "CKV_AWS_173": "the environment holds names and no secret; Lambda encrypts it with its own key",
-    "CKV_AWS_116": "what fails goes to the quarantine, by the destination of its mapping or invocation",
+    "CKV_AWS_116": "failures go to the quarantine, by the destination of the mapping or invocation",
     "Serverless-LambdaDLQ": "as CKV_AWS_116: a destination also says why",
     "Serverless-LambdaTracing": "every message carries the time of each hop, and `iort trace` shows them; "
-    "X-Ray would see one invocation in twenty",
-    "AwsSolutions-L1": "PubNub's SDK names Python 3.13 as the newest that it supports",
+    "X-Ray would sample one invocation in twenty",
+    "AwsSolutions-L1": "PubNub's SDK supports Python up to 3.13",
     "Serverless-LambdaLatestVersion": "as AwsSolutions-L1",
     "W3005": "the CDK writes the dependency",
 }
-_OWN_KEY = "encrypted with the service's own key; `customer_key` makes it one of the account's"
-_DEV = "stage dev goes with its stacks; stage prod has it"
+_OWN_KEY = "encrypted with the service's own key; `customer_key` selects a key of the account"
+_DEV = "stage dev is deleted with its stacks; stage prod has it"
 
 
 def _of_a_kind(app: App, settings: Settings) -> Iterator[Found]:
@@ -90,17 +90,19 @@ def _decisions(resource: CfnResource, settings: Settings) -> Mapping[str, str]:
     if kind == "AWS::DynamoDB::Table" and not settings.protected:
         decisions |= {"CKV_AWS_28": _DEV, "AwsSolutions-DDB3": _DEV}
     if kind == "AWS::SQS::Queue" and getattr(resource, "redrive_policy", None) is None:
-        end = "where messages end that failed elsewhere; an alarm tells a human, who sends them back"
+        end = "this queue is the last stop; an alarm tells the operator, who sends its messages back"
         decisions["Serverless-SQSRedrivePolicy"] = end
     if kind == "AWS::IoT::TopicRule":
-        decisions["W3005"] = "IoT Core tries the role when the rule is made, so role and policy come first"
+        decisions["W3005"] = "IoT Core tests the role when it creates the rule, so role and policy come first"
     return decisions
 
 
 def _unreserved(function: CfnResource) -> Mapping[str, str]:
     if Stack.of(function).resolve(getattr(function, "reserved_concurrent_executions", None)):
         return {}
-    return {"CKV_AWS_115": "bounded by what invokes it; reserving takes from the account's other functions"}
+    return {
+        "CKV_AWS_115": "its event sources limit it; a reservation takes from the account's other functions"
+    }
 
 
 # --- one resource at a time ------------------------------------------------------------------------
@@ -113,7 +115,7 @@ def _one_by_one(app: App, settings: Settings) -> Iterator[Found]:
         for name in ids:
             construct = construct.node.try_find_child(name) if construct else None
         if construct is None:
-            # The stage or a setting leaves it out; that none is left out everywhere is tested.
+            # The stage or a setting leaves it out; a test checks that each one exists in some variation.
             continue
         resource = construct if CfnResource.is_cfn_resource(construct) else construct.node.default_child
         for rule, reason in rules.items():
@@ -128,7 +130,7 @@ def single(settings: Settings) -> dict[str, dict[str, str]]:
     def wide(resource: str) -> str:
         return f"AwsSolutions-IAM5[Resource::{resource}]"
 
-    a_robot = "the wildcard is the robot, which is known when the message comes"
+    a_robot = "the wildcard is the robot, which is known when the message arrives"
     to_a_queue = {
         "AwsSolutions-IAM5[Action::kms:GenerateDataKey*]": "the CDK's grant to a queue's sender, one key",
         "AwsSolutions-IAM5[Action::kms:ReEncrypt*]": "as kms:GenerateDataKey*",
@@ -138,17 +140,17 @@ def single(settings: Settings) -> dict[str, dict[str, str]]:
         "account/LogRole/DefaultPolicy": {
             wide(f"{logs}:log-group:AWSIotLogsV2:*"): "the wildcard is the log's streams"
         },
-        "account/Audit": {"W3005": "the role's policy must be there before the role is tried"},
+        "account/Audit": {"W3005": "the role's policy must exist before AWS tests the role"},
         "account/Log": {"W3005": "as account/Audit"},
         "fleet/ProvisioningRole/DefaultPolicy": {
-            wide(f"{iot}:thing/*"): "a thing is named by the robot that asks to be provisioned",
-            wide(f"{iot}:cert/*"): "a certificate's id is made when it is",
-            wide("*"): "RegisterThing and two lists know no resources",
+            wide(f"{iot}:thing/*"): "the robot that asks to be provisioned names its thing",
+            wide(f"{iot}:cert/*"): "AWS assigns a certificate's id when it creates it",
+            wide("*"): "RegisterThing and two lists take no resources",
         },
         "fleet/AdmitRole/DefaultPolicy": {
-            wide(f"{iot}:cert/*"): "a certificate's id is made when it is; its status alone is read"
+            wide(f"{iot}:cert/*"): "AWS assigns a certificate's id later; the function reads only its status"
         },
-        "fleet/Provisioning": {"W3005": "RegisterThing tries role and policy, which must be there first"},
+        "fleet/Provisioning": {"W3005": "RegisterThing tests role and policy, which must exist first"},
         "fleet/PresenceRole/DefaultPolicy": {**to_a_queue},
         "ingest/PongRole/DefaultPolicy": {wide(f"{iot}:topic/pong/{settings.namespace}/*/rule"): a_robot},
         "processing/EchoRole/DefaultPolicy": {
@@ -158,24 +160,24 @@ def single(settings: Settings) -> dict[str, dict[str, str]]:
         "processing/LiveRole/DefaultPolicy": {**to_a_queue},
         "processing/AlertRole/DefaultPolicy": {**to_a_queue},
         f"processing/Alarms/{settings.alarm_email}": {
-            "Serverless-SNSRedrivePolicy": "a mail that is not delivered has nobody to read it from a queue; "
-            "the alarm's state stays"
+            "Serverless-SNSRedrivePolicy": "nobody would read undelivered mails from a queue; "
+            "the alarm keeps its state"
         },
         "processing/UploadRole/DefaultPolicy": {
             wide(f"{settings.namespace}-storage:ExportsOutputFnGetAttFiles8E6940B8ArnD8EE6C03/robots/*"): (
-                "the wildcard is the robot, and the function signs for the one that asked"
+                "the wildcard is the robot, and the function signs only for the robot that asked"
             ),
             wide(f"{iot}:topic/pong/{settings.namespace}/*/file"): a_robot,
             **to_a_queue,
         },
         "processing/QueryRole/DefaultPolicy": {
             wide(f"{settings.namespace}-storage:ExportsOutputFnGetAttFiles8E6940B8ArnD8EE6C03/results/*"): (
-                "the wildcard is the result, which the function names by chance"
+                "the wildcard is the result, which the function gives a random name"
             ),
         },
         "processing/SummarizeRole/DefaultPolicy": {
-            wide("*"): "dynamodb:ListStreams knows no resources; the CDK grants it with the stream",
-            wide(f"{iot}:thing/*/{SHADOW}"): f"{a_robot}; of its shadows this one alone",
+            wide("*"): "dynamodb:ListStreams takes no resources; the CDK grants it with the stream",
+            wide(f"{iot}:thing/*/{SHADOW}"): f"{a_robot}; only this one of its shadows",
             **to_a_queue,
         },
         "processing/LaterRole/DefaultPolicy": {**to_a_queue},
@@ -184,33 +186,33 @@ def single(settings: Settings) -> dict[str, dict[str, str]]:
             "queue is the quarantine's"
         },
         "quarantine/Rejections": {
-            "Serverless-LambdaEventSourceMappingDestination": "a queue's mapping knows none; what fails five "
-            "times goes to the queue's own dead-letter queue"
+            "Serverless-LambdaEventSourceMappingDestination": "a queue's mapping has no destination; after "
+            "five failures a message goes to the queue's own dead-letter queue"
         },
         "site/Page": {
-            "AwsSolutions-S1": "CloudFront alone reads it, and what is in it is public by its purpose",
+            "AwsSolutions-S1": "only CloudFront reads it, and its content is meant to be public",
             "CKV_AWS_18": "as AwsSolutions-S1",
             "CKV_AWS_21": "built files, which `iort site` writes again from the repository",
         },
         "site/Distribution": {
-            "AwsSolutions-CFR1": "robots are watched from wherever their people are",
-            "AwsSolutions-CFR2": "static files without a back end: a firewall has nothing to keep",
+            "AwsSolutions-CFR1": "people watch robots from anywhere",
+            "AwsSolutions-CFR2": "static files without a back end: a firewall has nothing to protect",
             "CKV_AWS_68": "as AwsSolutions-CFR2",
-            "AwsSolutions-CFR3": "who reads a public page is nobody's business; CloudWatch counts requests",
+            "AwsSolutions-CFR3": "readers of a public page stay anonymous; CloudWatch counts requests",
             "CKV_AWS_86": "as AwsSolutions-CFR3",
             "AwsSolutions-CFR4": "CloudFront's own certificate decides; with a domain of one's own "
-            "TLS 1.2 is the least, as the stack says",
+            "TLS 1.2 is the minimum, as the stack says",
             "CKV_AWS_174": "as AwsSolutions-CFR4",
         },
         "storage/Files": {
             "AwsSolutions-S1": "only robots with pre-signed requests and the operator reach it; CloudTrail's "
-            "data events tell who, at $0.10 per 100,000, without a second bucket",
+            "data events log access, at $0.10 per 100,000, without a second bucket",
             "CKV_AWS_18": "as AwsSolutions-S1",
-            "CKV_AWS_21": "a key is written once and names its content; a version could only be what "
-            "somebody threw away",
+            "CKV_AWS_21": "a key is written once and names its content; a second version could only be a "
+            "deleted file",
         },
         "storage/Key": {
-            "CKV_AWS_33": "anybody of this account, through the services named only: decision 11"
+            "CKV_AWS_33": "any principal of this account, only through the named services: decision 11"
         },
     }
 
@@ -226,5 +228,5 @@ def _path(resource: Any, settings: Settings) -> str:
 
 
 def short(path: str, namespace: str) -> str:
-    """A construct's path as `Acknowledged` has it: stack and construct ids, the resource's own left out."""
+    """A construct's path for `Acknowledged`: stack and construct ids, without the resource's own id."""
     return path.removeprefix(f"{namespace}-").removesuffix("/Resource")

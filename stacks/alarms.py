@@ -1,4 +1,4 @@
-"""What a human should know: every alarm, its threshold and what to do, which docs/cloud.md says at length."""
+"""Every alarm with its threshold; docs/cloud.md says what to do about each."""
 
 from __future__ import annotations
 
@@ -16,8 +16,8 @@ _FIVE_MINUTES = Duration.minutes(5)
 
 
 class Alarms(Construct):
-    """An alarm tells the topic when it goes off, not when it ends. No data is no alarm: a fleet that is
-    switched off sends none. ``every`` is all of them, in the order of what to look at first."""
+    """An alarm notifies the topic when it goes off, not when it ends. Missing data is no alarm: a fleet that
+    is switched off sends none. ``every`` lists all alarms, the most urgent first."""
 
     def __init__(
         self, scope: Construct, construct_id: str, *, settings: Settings, watched: Watched, topic: sns.ITopic
@@ -34,7 +34,7 @@ class Alarms(Construct):
     def _lost_or_late(self, settings: Settings, watched: Watched) -> None:
         for name, queue in watched.queues.items():
             if name == "PutOff":
-                # A car that empties its queue after an outage is over its share for some minutes.
+                # A car that empties its queue after an outage exceeds its share for some minutes.
                 what = "a robot is over its share of Lambda 2, and its summaries are late"
                 self._alarm(f"{name}Waiting", metrics.waiting(queue), 0, what, periods=15)
             else:
@@ -51,7 +51,7 @@ class Alarms(Construct):
             behind_ms = limits.stream_behind_s * 1000
             self._alarm(f"{name}Behind", age, behind_ms, "the stream is read late", periods=3)
         self._ours("Quarantined", "quarantine", 0, "messages that could not be processed are in quarantine")
-        # Of five minutes, since a live lane at 0.01 Hz, the slowest that there is, sends in three of them.
+        # Of five minutes: a live lane at 0.01 Hz, the slowest allowed, sends in three of them.
         self._ours("PubNubFailed", "live", 0, "live samples did not reach PubNub", periods=3, within=5)
         late_ms = limits.car_to_lambda_ms
         self._ours("CarToLambdaMs", "live", late_ms, "live samples are late", periods=3, within=5)
@@ -59,19 +59,19 @@ class Alarms(Construct):
         self._ours("BatchesRefused", "summarize", 0, "batches cannot be decoded")
 
     def _never_kept(self) -> None:
-        """Where a message can end without being in quarantine. Of the whole account, since AWS documents
-        no values for some of the dimensions; the embedded cloud has no Metrics Insights."""
+        """Messages that can be lost without being in quarantine. Account-wide, since AWS documents no values
+        for some of the dimensions; the embedded cloud has no Metrics Insights."""
         for name, namespace, what in (
-            ("ParseError", "AWS/IoT", "messages are no JSON, and some rule could not read them"),
-            ("ErrorActionFailure", "AWS/IoT", "messages that a rule failed on did not reach the quarantine"),
-            ("RuleMessageThrottled", "AWS/IoT", "messages were not given to a rule"),
-            ("DestinationDeliveryFailures", "AWS/Lambda", "what a function failed on is not in quarantine"),
+            ("ParseError", "AWS/IoT", "messages are not JSON, and a rule could not read them"),
+            ("ErrorActionFailure", "AWS/IoT", "failed messages of a rule did not reach the quarantine"),
+            ("RuleMessageThrottled", "AWS/IoT", "messages did not reach a rule"),
+            ("DestinationDeliveryFailures", "AWS/Lambda", "failures of a function are not in quarantine"),
         ):
             self._alarm(name, metrics.of_the_account(namespace, name), 0, what)
 
     def _cars(self, settings: Settings) -> None:
-        """From the record lane, which nothing is lost of; the rules fault and battery are faster and name
-        the car."""
+        """From the record lane, which is lossless; the rules fault and battery are faster and name the
+        car."""
         limits = settings.thresholds
         self._ours("FaultSamples", "health", 0, "a car reports a fault")
         self._ours("TemperatureDegC", "health", limits.high_temperature_degc, "a car's controller is hot")
@@ -102,7 +102,7 @@ class Alarms(Construct):
         within: int | None = None,
         below: bool = False,
     ) -> None:
-        """``periods`` beyond the limit, one after the other or ``within`` so many, set it off."""
+        """``periods`` over the limit set it off: in a row, or ``within`` that many periods."""
         operator = cloudwatch.ComparisonOperator
         alarm = cloudwatch.Alarm(
             self,

@@ -1,8 +1,8 @@
-"""What must hold of every template, whoever adds to the stacks: `make check` and tests/stacks both ask.
+"""Invariants of every template; `make check` and tests/stacks run them.
 
-What the independent checkers (scripts/check_stacks.py) let through: a wildcard on the actions of a service
-that they do not know, a rule whose failures go nowhere, a secret in a function's environment. Unlike their
-findings, these cannot be acknowledged, but for `EVERY_RESOURCE` and `FAMILIES`.
+They cover gaps of the independent checkers (scripts/check_stacks.py): a wildcard on the actions of a service
+that those do not know, a rule without error action, a secret in a function's environment. They cannot be
+acknowledged, except by `EVERY_RESOURCE` and `FAMILIES`.
 """
 
 from __future__ import annotations
@@ -12,7 +12,7 @@ import re
 from collections.abc import Iterator, Mapping
 from typing import Any, NamedTuple
 
-# The role and the action of each statement about every resource, with why it cannot name one.
+# Role and action of each statement about every resource, with the reason.
 EVERY_RESOURCE = {
     # "Actions, resources, and condition keys for Amazon DynamoDB": ListStreams has no resource type.
     ("SummarizeRole", "dynamodb:ListStreams"),
@@ -24,7 +24,7 @@ EVERY_RESOURCE = {
             *("ListPrincipalThings", "RegisterThing"),
         )
     ),
-    # An audit is of everything: certificates and policies, whoever's they are.
+    # An audit covers all certificates and policies, whoever owns them.
     *(
         ("AuditRole", f"iot:{action}")
         for action in (
@@ -33,17 +33,17 @@ EVERY_RESOURCE = {
         )
     ),
 }
-# What the CDK grants whoever may use a key: each is one action's forms, on the key alone.
+# The CDK grants these to the users of a key: each is the variants of one action, on the key alone.
 FAMILIES = {"kms:GenerateDataKey*", "kms:ReEncrypt*"}
 _SECRET_NAME = re.compile(r"KEY|SECRET|TOKEN|PASSWORD|PASSWD|CREDENTIAL", re.IGNORECASE)
 # AWS' access keys, PubNub's keys, a private key's PEM.
 _SECRET = re.compile(r"\b(?:AKIA|ASIA)[A-Z0-9]{16}\b|\b(?:pub|sub|sec)-c-[0-9a-f]|BEGIN [A-Z ]*PRIVATE KEY")
-# The CDK ends a logical id with one.
+# The CDK ends a logical id with a hash.
 _HASH = re.compile(r"[0-9A-F]{8}$")
 
 
 class Broken(NamedTuple):
-    """A check that a resource of a template does not meet."""
+    """A check that a resource of a template fails."""
 
     check: str
     logical_id: str
@@ -51,7 +51,7 @@ class Broken(NamedTuple):
 
 
 def broken(template: Mapping[str, Any]) -> Iterator[Broken]:
-    """What does not hold of a template."""
+    """Yield the checks that a template fails."""
     for logical_id, resource in template.get("Resources", {}).items():
         kind, properties = resource["Type"], resource.get("Properties", {})
         for role, statement in granted(logical_id, kind, properties):
@@ -61,7 +61,7 @@ def broken(template: Mapping[str, Any]) -> Iterator[Broken]:
                 "managed-policy", logical_id, "a role has a managed policy, whose actions AWS changes"
             )
         if kind == "AWS::IoT::TopicRule" and not properties["TopicRulePayload"].get("ErrorAction"):
-            yield Broken("error-action", logical_id, "a rule has no error action: what fails is lost")
+            yield Broken("error-action", logical_id, "a rule has no error action: failed messages are lost")
         if kind == "AWS::Lambda::Function":
             for name in properties.get("Environment", {}).get("Variables", {}):
                 if _SECRET_NAME.search(name):
@@ -74,7 +74,7 @@ def broken(template: Mapping[str, Any]) -> Iterator[Broken]:
 def granted(
     logical_id: str, kind: str, properties: Mapping[str, Any]
 ) -> Iterator[tuple[str, dict[str, Any]]]:
-    """Role, or the policy's own name, and statement of what a principal is granted."""
+    """Yield (role or policy name, statement) for each grant to a principal."""
     documents: list[tuple[str, Any]] = []
     if kind in {"AWS::IAM::Policy", "AWS::IAM::ManagedPolicy"}:
         roles = [role.get("Ref", logical_id) for role in properties.get("Roles", [])]
@@ -101,5 +101,5 @@ def _too_much(logical_id: str, role: str, statement: Mapping[str, Any]) -> Itera
 
 
 def several(value: Any) -> list[Any]:
-    """A policy's value as a list, which it may be or not."""
+    """A policy's value as a list; it may be a list or a single value."""
     return value if isinstance(value, list) else [value]

@@ -1,4 +1,4 @@
-"""The code of every function, one asset: functions/ and the contract's package side by side."""
+"""The code of every function as one asset: functions/ and the contract's package side by side."""
 
 from __future__ import annotations
 
@@ -12,15 +12,15 @@ from aws_cdk import aws_lambda as lambda_
 
 from stacks.settings import ROOT
 
-# Exactly what a function imports; see the wiring tests.
+# Exactly the files that a function imports; see the wiring tests.
 FOLDERS = ("functions", "contract/iort_contract")
 _CACHES = ("__pycache__", ".mypy_cache", ".ruff_cache")
 _EXCLUDES = ["/*", "!/functions", "!/contract", "/contract/*", "!/contract/iort_contract", *_CACHES]
 
 
 def code() -> lambda_.Code:
-    """The asset; its hash is that of the folders."""
-    # The image is never asked for: copying cannot fail to be possible here.
+    """The asset; its hash is the folders' hash."""
+    # The image is never used, since copying always works here.
     bundling = BundlingOptions(image=DockerImage.from_registry("scratch"), local=_SideBySide())
     return lambda_.Code.from_asset(
         str(ROOT), exclude=_EXCLUDES, ignore_mode=IgnoreMode.GIT, bundling=bundling

@@ -1,8 +1,7 @@
-"""The two dashboards: the platform, a row a service in the order of a message's path, and the robots.
+"""The two dashboards: the platform, a row per service in the order of a message's path, and the robots.
 
-A dashboard of up to fifty metrics is free, three an account. So what has an alarm of its own and is zero on a
-good day is not drawn again, and nothing is searched for that is not there by itself
-(docs/decisions/0034-dashboards-of-fifty-metrics.md).
+A dashboard of up to fifty metrics is free, three per account. A metric with an alarm that is normally zero is
+therefore not drawn again, and no widget uses SEARCH (docs/decisions/0034-dashboards-of-fifty-metrics.md).
 """
 
 from __future__ import annotations
@@ -18,14 +17,14 @@ from stacks import metrics
 from stacks.settings import Settings
 from stacks.watched import Watched
 
-# What every sample passes.
+# The hops of every sample.
 _FUNCTIONS_OF_SAMPLES, _TABLES_OF_SAMPLES = ("Live", "Summarize"), ("Batches", "Summary")
 _HOPS = ("InCarMs", "UplinkMs", "ToLambdaMs", "CarToLambdaMs")
 _ROUND_TRIPS = ("RoundTripBrokerMs", "RoundTripRuleMs", "RoundTripLambdaMs")
 
 
 class Dashboards(Construct):
-    """``<namespace>-platform``, the state of every alarm first, and ``<namespace>-robots``."""
+    """``<namespace>-platform``, which starts with the state of every alarm, and ``<namespace>-robots``."""
 
     def __init__(
         self,
@@ -173,7 +172,7 @@ class Dashboards(Construct):
         ]
 
     def _asked(self) -> list[cloudwatch.GraphWidget]:
-        """What robots ask of the cloud: who comes and goes, files, and round trips through a function."""
+        """Requests of robots to the cloud: presence, files, and round trips through a function."""
         return [
             _graph("Robots: who comes and goes", self._ours("presence", *METRICS["presence"])),
             _graph(
@@ -192,11 +191,11 @@ class Dashboards(Construct):
 
 
 def _warnings(watched: Watched) -> cloudwatch.LogQueryWidget:
-    """The newest lines that a function warns with, or Lambda of a function."""
+    """The newest warnings of functions, and of Lambda about them."""
     return cloudwatch.LogQueryWidget(
         title="Warnings and errors in the functions' logs, newest first",
         log_group_names=[function.log_group.log_group_name for function in watched.functions.values()],
-        # The levels of Python and of Lambda, in lines of text and of JSON, and what a crash leaves.
+        # Log levels of Python and of Lambda, in text and in JSON lines, and the traces of a crash.
         query_lines=[
             "fields @timestamp, @log, @message",
             "filter @message like /WARN|ERROR|CRITICAL|FATAL|Traceback|Task timed out/",

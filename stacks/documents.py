@@ -1,4 +1,5 @@
-"""The fleet's documents: what a robot and a claim may do at the broker, and what provisioning makes."""
+"""The fleet's documents: the rights of a robot and of a claim at the broker, and the provisioning
+template."""
 
 from __future__ import annotations
 
@@ -22,15 +23,15 @@ from iort_contract import (
 
 # A robot's name is its thing name and its client id; the certificate is attached to the thing.
 _ME = "${iot:Connection.Thing.ThingName}"
-# A robot hears its pongs, and its own ping on the path broker: one pattern for both, since the policy has
-# no room for two. In a policy ? is any one character ("Using wildcard characters in MQTT and AWS IoT Core
-# policies").
+# A robot subscribes to its pongs, and to its own ping on the path broker. One pattern covers both, since the
+# policy has no room for two. In a policy ? is any one character ("Using wildcard characters in MQTT and AWS
+# IoT Core policies").
 _PING_OR_PONG = "p?ng"
 
 
 def provisioning_template(namespace: str) -> dict[str, Any]:
-    """The template's body. A thing that exists keeps its attributes, and one with another serial
-    number is refused: two robots do not share a name."""
+    """The template's body. An existing thing keeps its attributes, and another serial number is refused, so
+    that two robots cannot share a name."""
     name = fleet_name(namespace)
     return {
         "Parameters": {ROBOT_PARAMETER: {"Type": "String"}, SERIAL_PARAMETER: {"Type": "String"}},
@@ -59,7 +60,7 @@ def provisioning_template(namespace: str) -> dict[str, Any]:
 
 
 def claim_policy(stack: Stack, *, namespace: str) -> dict[str, Any]:
-    """The IoT policy document of a lasting claim: provisioning with this fleet's template, no more."""
+    """The IoT policy document of a lasting claim: it allows provisioning with this fleet's template only."""
     asked = (
         "$aws/certificates/create-from-csr/json",
         f"$aws/provisioning-templates/{fleet_name(namespace)}/provision/json",
@@ -78,14 +79,14 @@ def claim_policy(stack: Stack, *, namespace: str) -> dict[str, Any]:
 
 
 def robot_policy(stack: Stack, *, namespace: str) -> dict[str, Any]:
-    """The IoT policy document of a robot: its own topics and shadow, and other robots' words to the fleet.
+    """The IoT policy document of a robot: its own topics and shadow, and other robots' messages to the fleet.
 
-    AWS allows 2048 characters, white space not counted; a test holds it to that with the longest names.
+    AWS allows 2048 characters without white space; a test checks that with the longest names.
     """
     mine = f"{namespace}/{_ME}"
     shadow = f"$aws/things/{_ME}/shadow/name/{SHADOW}"
     publish = (
-        # Basic Ingest: the rule is named in the topic, and no other rule may be.
+        # Basic Ingest has the rule in the topic; only these rules are allowed.
         f"$aws/rules/{rule_name('record', namespace)}/{RECORD}/{mine}/*",
         f"$aws/rules/{rule_name('live', namespace)}/{LIVE}/{mine}/*",
         f"{LIVE}/{mine}/*",

@@ -1,4 +1,4 @@
-"""With whose key the kept data is encrypted: the service's own, or one of the account's."""
+"""The key that encrypts stored data: the service's own, or one of the account."""
 
 from __future__ import annotations
 
@@ -14,22 +14,22 @@ from constructs import Construct
 
 from stacks.settings import Settings
 
-# Through these whoever may use the service's resource may use the key: docs/decisions/0011.
+# A principal that may use the service's resource may use the key through these: docs/decisions/0011.
 SERVICES = ("dynamodb", "s3", "sns", "sqs")
 
 
 class Encryption:
-    """One key for tables, queues, buckets, topics and logs where the settings ask for it; ``key`` is
-    None otherwise, and each service encrypts with its own.
+    """One key for tables, queues, buckets, topics and logs if the settings ask for it. Otherwise ``key`` is
+    None, and each service encrypts with its own key.
 
-    The properties are arguments for the constructs: ``sqs.Queue(..., **encryption.queue)``.
+    The properties are arguments of the constructs: ``sqs.Queue(..., **encryption.queue)``.
     """
 
     def __init__(self, scope: Construct, *, settings: Settings) -> None:
         self.key: kms.Key | None = None
         if settings.customer_key or settings.keep_customer_key:
             key = _key(scope, settings)
-            # The other stacks import it until they are updated, which is after this one.
+            # The other stacks import it until they are updated, after this one.
             Stack.of(scope).export_value(key.key_arn)
             self.key = key if settings.customer_key else None
 
@@ -45,7 +45,7 @@ class Encryption:
         """Arguments of a `sqs.Queue`."""
         if self.key is None:
             return {"encryption": sqs.QueueEncryption.SQS_MANAGED}
-        # Without reuse, every message would be a request to the key.
+        # Without reuse, every message would be a request to KMS.
         return {
             "encryption": sqs.QueueEncryption.KMS,
             "encryption_master_key": self.key,
@@ -70,13 +70,13 @@ class Encryption:
 
     @property
     def topic(self) -> dict[str, Any]:
-        """Arguments of a `sns.Topic`. SNS' own key would keep CloudWatch's alarms out."""
+        """Arguments of a `sns.Topic`. With SNS' own key, CloudWatch's alarms could not publish."""
         return {} if self.key is None else {"master_key": self.key}
 
 
 def _key(scope: Construct, settings: Settings) -> kms.Key:
-    """Rotated every year. The account's own principals use it through the services named, and the
-    services that act by themselves only for this account's resources, but for CloudWatch's alarms."""
+    """Rotated yearly. The account's principals use it through the named services. Services that act by
+    themselves use it only for this account's resources, except for CloudWatch's alarms."""
     stack = Stack.of(scope)
     key = kms.Key(
         scope,
@@ -100,7 +100,7 @@ def _key(scope: Construct, settings: Settings) -> kms.Key:
     through = [f"{service}.{stack.region}.{Aws.URL_SUFFIX}" for service in SERVICES]
     ours = {"kms:CallerAccount": stack.account, "kms:ViaService": through}
     let("ThroughTheServices", iam.AnyPrincipal(), use, {"StringEquals": ours})
-    # A table works in the background, with a grant that its maker gives to the service.
+    # A table works in the background, by a grant that its creator gives to the service.
     for_aws = {"StringEquals": ours, "Bool": {"kms:GrantIsForAWSResource": True}}
     let("GrantsToTheServices", iam.AnyPrincipal(), ["kms:CreateGrant"], for_aws)
     groups = stack.format_arn(
@@ -108,7 +108,7 @@ def _key(scope: Construct, settings: Settings) -> kms.Key:
     )
     of_a_group = {"ArnLike": {"kms:EncryptionContext:aws:logs:arn": groups}}
     let("Logs", iam.ServicePrincipal(f"logs.{stack.region}.{Aws.URL_SUFFIX}"), use, of_a_group)
-    # Without a condition, as in AWS' example: AWS does not say that an alarm's request has aws:SourceAccount.
+    # Without a condition, as in AWS' example: AWS does not document aws:SourceAccount for an alarm's request.
     # https://repost.aws/knowledge-center/cloudwatch-configure-alarm-sns
     alarms = iam.ServicePrincipal("cloudwatch.amazonaws.com")
     let("Alarms", alarms, ["kms:Decrypt", "kms:GenerateDataKey*"])

@@ -22,10 +22,10 @@ from stacks.storage import Storage
 
 
 class Fleet(Stack):
-    """What every robot is registered with. One policy serves all: its variables bind each
-    certificate to the topics of the thing that it is attached to.
+    """The resources to register robots. One policy serves all robots: its variables restrict each certificate
+    to the topics of its thing.
 
-    ``admit`` decides whether a claim may have the name it asks for, ``presence`` keeps the robots' rows.
+    ``admit`` decides if a claim may have the name it asks for; ``presence`` keeps the robots' rows.
     """
 
     def __init__(
@@ -79,12 +79,13 @@ class Fleet(Stack):
         )
         template_arn = self.format_arn(service="iot", resource="provisioningtemplate", resource_name=name)
         asking = iot_core.may_call(self, "AdmitPermission", self.admit, source_arn=template_arn)
-        # RegisterThing names them, and role and hook are tried when the template is made.
+        # RegisterThing needs them: AWS tests role and hook when it creates the template.
         for needed in (robot_type, robots, policy, role, asking):
             template.node.add_dependency(needed)
 
     def _admit(self, storage: Storage) -> lambda_.Function:
-        # AWS IoT waits 5 s for the answer, a cold start included. Processor comes with memory: this is one.
+        # AWS IoT waits 5 s for the answer, cold start included. Lambda assigns CPU by memory: this is one
+        # core.
         admit = function(
             self,
             "Admit",
@@ -95,7 +96,7 @@ class Fleet(Stack):
             environment={"ROBOTS_TABLE": storage.robots.table_name},
         )
         storage.robots.grant(admit, "dynamodb:UpdateItem")
-        # Whether the certificate that it admitted came through; whose that will be, nobody knows before.
+        # Reads the status of an admitted certificate, whose id is unknown at deployment.
         certificates = self.format_arn(service="iot", resource="cert", resource_name="*")
         admit.add_to_role_policy(
             iam.PolicyStatement(actions=["iot:DescribeCertificate"], resources=[certificates])
@@ -111,7 +112,7 @@ class Fleet(Stack):
             memory_mb=256,
             environment={"ROBOTS_TABLE": storage.robots.table_name},
         )
-        # An event that comes late is put in its place or ignored, so it may be tried again for long.
+        # A late event is sorted in or ignored, so long retries are safe.
         presence.configure_async_invoke(
             max_event_age=Duration.hours(6),
             retry_attempts=2,
@@ -121,10 +122,10 @@ class Fleet(Stack):
         return presence
 
     def _provisioning_role(self, name: str) -> iam.Role:
-        """What AWS IoT does in the template's name: this fleet's things, and certificates.
+        """The actions of AWS IoT in the template's name: on this fleet's things, and on certificates.
 
-        AWS does not say which actions it needs; its managed policy AWSIoTThingsRegistration has them, on
-        every resource. These are its actions but for those that this template never asks for.
+        AWS does not document the actions that it needs. Its managed policy AWSIoTThingsRegistration has them,
+        on every resource; this role has the same actions, without those that this template never uses.
         """
         role = iot_core.role(self, "ProvisioningRole")
 
@@ -147,7 +148,7 @@ class Fleet(Stack):
         allow(["AttachPolicy", "AttachPrincipalPolicy", "DetachPolicy"], certificates)
         allow(["AttachThingPrincipal", "DetachThingPrincipal"], things, certificates)
         allow(["GetPolicy", "ListTargetsForPolicy"], policy)
-        # These know no resources, or only a certificate whose number nobody knows yet.
+        # These take no resources, or a certificate whose id is not known yet.
         allow(
             [
                 "ListAttachedPolicies",

@@ -1,4 +1,4 @@
-"""A Lambda function of ours: one asset of code for all, a role and a log of its own each."""
+"""A Lambda function of ours: shared code, a role and a log of its own."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from stacks.encryption import Encryption
 from stacks.settings import ALL_LOGS, Settings
 
 RUNTIME = lambda_.Runtime(f"python{target.PYTHON}", lambda_.RuntimeFamily.PYTHON)
-# The emulator runs the functions on the machine it stands on, so the architecture means nothing there.
+# The emulator runs functions on its host, so the architecture has no effect there.
 ARCHITECTURE = lambda_.Architecture.custom(target.ARCHITECTURE)
 
 
@@ -31,9 +31,9 @@ def function(
     layers: list[lambda_.ILayerVersion] | None = None,
     reserved_concurrency: int = 0,
 ) -> lambda_.Function:
-    """``functions/<name, in lower case>.py``'s handler, which may write its own log and nothing else yet.
+    """The handler of ``functions/<name in lower case>.py``. Its role may only write its own log so far.
 
-    The stack puts its name out as ``<name>Function``. A ``reserved_concurrency`` of 0 reserves nothing.
+    The stack outputs its name as ``<name>Function``. A ``reserved_concurrency`` of 0 reserves nothing.
     """
     log = logs.LogGroup(
         stack,
@@ -57,7 +57,7 @@ def function(
         **_logged(settings),
         memory_size=memory_mb,
         timeout=Duration.seconds(timeout_s),
-        # Under this namespace its metrics are counted: functions/shared/metrics.py.
+        # functions/shared/metrics.py counts under this namespace.
         environment={"NAMESPACE": settings.namespace, **(environment or {})},
         layers=layers,
         reserved_concurrent_executions=reserved_concurrency or None,
@@ -67,14 +67,13 @@ def function(
 
 
 def _logged(settings: Settings) -> dict[str, Any]:
-    """Lambda's START, END and REPORT lines cost as much as what functions say themselves. Only logs in JSON
-    can leave them out; of an invocation that fails or times out there is still a report."""
+    """Lambda's START, END and REPORT lines cost as much as the functions' own lines. Only JSON logs can omit
+    them; a failed or timed-out invocation is still reported."""
     if settings.function_logs == ALL_LOGS:
         return {}
     return {
         "logging_format": lambda_.LoggingFormat.JSON,
         "system_log_level_v2": lambda_.SystemLogLevel.WARN,
-        # Metrics are lines without a level, which counts as INFO ("Log-level filtering"): with WARN here they
-        # would be filtered out.
+        # Metric lines have no level, which counts as INFO ("Log-level filtering"); WARN here would drop them.
         "application_log_level_v2": lambda_.ApplicationLogLevel.INFO,
     }

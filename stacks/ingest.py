@@ -1,4 +1,4 @@
-"""What comes in: the topic rules, each with a role of its own and the quarantine for what fails."""
+"""The topic rules, each with its own role, and with the quarantine for failures."""
 
 from __future__ import annotations
 
@@ -22,8 +22,8 @@ Action = iot.CfnTopicRule.ActionProperty
 
 
 class Ingest(Stack):
-    """The rules, by which messages leave the broker. What an action cannot take goes to the quarantine's
-    queue, with the message's own bytes (base64OriginalPayload) and the reason."""
+    """The rules that take messages from the broker. Messages that an action rejects go to the quarantine's
+    queue, with their bytes (base64OriginalPayload) and the reason."""
 
     def __init__(
         self,
@@ -104,6 +104,6 @@ class Ingest(Stack):
                 error_action=Action(sqs=rejected),
             ),
         )
-        # IoT Core tries the role when the rule is made, so its policy must be there before.
+        # IoT Core tests the role when it creates the rule, so its policy must exist first.
         rule.node.add_dependency(role)
         return rule

@@ -1,4 +1,4 @@
-"""AWS IoT as one who acts: the role that it takes, and the function that it may call."""
+"""AWS IoT as a principal: the role that it assumes, and the functions that it may call."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ _SERVICE = "iot.amazonaws.com"
 
 
 def role(stack: Stack, construct_id: str) -> iam.Role:
-    """A role that AWS IoT may take for this account's resources, and that may do nothing yet."""
+    """A role that AWS IoT may assume for this account's resources; it grants nothing yet."""
     principal = iam.ServicePrincipal(
         _SERVICE, conditions={"StringEquals": {"aws:SourceAccount": stack.account}}
     )
@@ -22,7 +22,7 @@ def may_call(
 ) -> lambda_.CfnPermission:
     """Let a rule or template of this account call a function.
 
-    The permission is of ``stack``, not of the function's, which would make the two depend on each other.
+    The permission belongs to ``stack``; in the function's stack it would make the two depend on each other.
     """
     return lambda_.CfnPermission(
         stack,

@@ -1,7 +1,7 @@
-"""The metrics that dashboards and alarms are made of: AWS' own and ours, each with its statistic.
+"""The metrics of dashboards and alarms, AWS' and ours, each with its statistic.
 
-AWS' names and dimensions are from each service's page "metrics and dimensions"; the tests hold every one that
-is shown to a table of those pages.
+AWS' names and dimensions are from each service's page "metrics and dimensions"; tests compare every used
+metric with a table of those pages.
 """
 
 from __future__ import annotations
@@ -15,13 +15,13 @@ from aws_cdk import aws_sqs as sqs
 from iort_contract import METRIC_DEPLOYMENT, METRIC_FUNCTION, METRIC_NAMESPACE, METRIC_ROBOT, METRICS
 
 PERIOD = Duration.minutes(1)
-# Of the worst car, where the mean of all would hide it.
+# The worst car counts; a mean would hide it.
 _STATISTICS = {"BatteryVolts": "Minimum", "TemperatureDegC": "Maximum", "BacklogBatches": "Maximum"}
 _FUNCTION_STATISTICS = {"Duration": "p95", "ConcurrentExecutions": "Maximum", "IteratorAge": "Maximum"}
 
 
 def ours(function: str, name: str, *, namespace: str, label: str | None = None) -> cloudwatch.Metric:
-    """A metric that functions/ emits; a KeyError for one that the contract does not know."""
+    """A metric that functions/ emits; KeyError if the contract does not know it."""
     if name not in METRICS[function]:
         raise KeyError(name)
     return _metric(
@@ -34,7 +34,7 @@ def ours(function: str, name: str, *, namespace: str, label: str | None = None) 
 
 
 def each_robot(function: str, name: str, *, namespace: str) -> cloudwatch.MathExpression:
-    """A metric of ours of every robot by itself, whichever there are: needs ``robot_metrics``."""
+    """A metric of ours, one line for each robot: needs ``robot_metrics``."""
     if name not in METRICS[function]:
         raise KeyError(name)
     schema = f"{METRIC_NAMESPACE},{METRIC_DEPLOYMENT},{METRIC_FUNCTION},{METRIC_ROBOT}"
@@ -48,7 +48,7 @@ def each_robot(function: str, name: str, *, namespace: str) -> cloudwatch.MathEx
 
 
 def statistic(name: str) -> str:
-    """What a minute of a metric of ours is read as."""
+    """The statistic of a minute of a metric of ours."""
     return _STATISTICS.get(name, "p95" if name.endswith("Ms") else "Sum")
 
 
@@ -82,8 +82,8 @@ def table(name: str, of: dynamodb.ITable, *, label: str | None = None) -> cloudw
 
 
 def of_the_account(namespace: str, name: str) -> cloudwatch.MathExpression:
-    """The sum of a metric whatever its dimensions, by Metrics Insights: an alarm may ask that, and none
-    may search."""
+    """The sum of a metric over all dimensions, by Metrics Insights, which an alarm may use; it may not use
+    SEARCH."""
     return cloudwatch.MathExpression(
         expression=f'SELECT SUM({name}) FROM "{namespace}"',  # noqa: S608 - no database is asked
         using_metrics={},

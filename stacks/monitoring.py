@@ -1,4 +1,4 @@
-"""What is watched: dashboards over every service that a message passes, alarms, and the budget."""
+"""Dashboards over every service that a message passes, alarms, and the budget."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from stacks.watched import Watched
 
 
 class Monitoring(Stack):
-    """Watches every function, table and queue of the ``stacks``; alarms tell the ``topic``."""
+    """Watches every function, table and queue of ``stacks``; alarms notify ``topic``."""
 
     def __init__(
         self,
@@ -37,7 +37,7 @@ class Monitoring(Stack):
             self._budget(settings)
 
     def _budget(self, settings: Settings) -> None:
-        """Of the whole account: a budget by tag counts nothing until somebody activates the tag."""
+        """For the whole account: a budget by tag counts nothing until somebody activates the tag."""
 
         def told(kind: str, percent: float) -> budgets.CfnBudget.NotificationWithSubscribersProperty:
             return budgets.CfnBudget.NotificationWithSubscribersProperty(

@@ -1,4 +1,4 @@
-"""Refuses at synth what the embedded cloud would accept and then silently not do.
+"""Refuses at synth every rule that the embedded cloud would accept and silently drop.
 
 The same stacks run on AWS and on the embedded cloud; a rule that only works on one of them is a
 defect that nobody would see. The lists are what the pinned ministack and local/gaps/ implement;
@@ -34,7 +34,7 @@ SQL_FUNCTIONS = frozenset(
 # What local/gaps/rules/republish_topic.py expands in a republish action's topic.
 _TEMPLATE = re.compile(r"\$\{\s*topic\(\s*\d*\s*\)\s*\}")
 _CALL = re.compile(r"\b([A-Za-z_]\w*)\s*\(")
-# What may stand before a bracket and is no function.
+# Words that may precede a bracket without being a function.
 _KEYWORDS = frozenset(
     {"and", "as", "case", "else", "exists", "in", "not", "or", "select", "then", "when", "where"}
 )
@@ -52,7 +52,7 @@ def sql_functions(sql: str) -> set[str]:
 
 
 def rule_problems(payload: dict[str, Any]) -> list[str]:
-    """What of a TopicRulePayload (as CloudFormation spells it) the embedded cloud would drop."""
+    """The parts of a TopicRulePayload (CloudFormation's spelling) that the embedded cloud would drop."""
     problems = [
         f"SQL function {name}() is not implemented"
         for name in sorted(sql_functions(payload["sql"]) - SQL_FUNCTIONS)

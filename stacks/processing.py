@@ -1,5 +1,5 @@
-"""What is computed: Lambda 1 live, Lambda 2 summarize and later, echo and upload, each with its own role and
-log."""
+"""The functions that compute: Lambda 1 live, Lambda 2 summarize, and later, echo and upload, each with its
+own role and log."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ _SUMMARIZE_S = 60
 
 
 class Processing(Stack):
-    """The functions, and the grants that each of them needs and no more."""
+    """The functions, with the grants that each one needs."""
 
     def __init__(
         self,
@@ -95,25 +95,25 @@ class Processing(Stack):
     def _summarize(self, storage: Storage) -> lambda_.Function:
         summarize = self._summarizing("Summarize", storage, PUT_OFF_QUEUE=self.put_off.queue_url)
         self._allow(summarize, ["sqs:SendMessage"], self.put_off.queue_arn)
-        # It tells a robot in its shadow that it is over its share. AWS IoT: "Action resources".
+        # It tells a robot in its shadow that the robot is over its share. AWS IoT: "Action resources".
         shadow = self.format_arn(service="iot", resource="thing", resource_name=f"*/{SHADOW}")
         self._allow(summarize, ["iot:UpdateThingShadow"], shadow)
         summarize.add_event_source(
             sources.DynamoEventSource(
                 storage.telemetry,
                 starting_position=lambda_.StartingPosition.TRIM_HORIZON,
-                # What a robot sends in the window is read and written once.
+                # Batches of a robot in the window are read and written once.
                 batch_size=500,
                 max_batching_window=Duration.seconds(2),
-                # With more, two batches of a robot could be summarised at once, and the one that read
-                # the table first could write last: docs/processing.md.
+                # With more, two batches of a robot could be summarised at once, and the one that read the
+                # table first could write last: docs/processing.md.
                 parallelization_factor=1,
                 bisect_batch_on_error=True,
                 report_batch_item_failures=True,
                 retry_attempts=5,
                 max_record_age=Duration.hours(6),
                 on_failure=sources.SqsDlq(self._rejected),
-                # What expires leaves the stream too, and is nothing to summarise.
+                # Expired items appear in the stream too; they need no summary.
                 filters=[
                     lambda_.FilterCriteria.filter({"eventName": lambda_.FilterRule.is_equal("INSERT")}),
                     lambda_.FilterCriteria.filter({"eventName": lambda_.FilterRule.is_equal("MODIFY")}),
@@ -123,13 +123,13 @@ class Processing(Stack):
         return summarize
 
     def _put_off(self) -> sqs.Queue:
-        """The keys of batches that wait, since their robot is over its share of Lambda 2."""
+        """The keys of waiting batches, whose robot is over its share of Lambda 2."""
         return queue(
             self,
             "PutOff",
             settings=self._settings,
             encryption=self._encryption,
-            # AWS advises six times the function's time.
+            # AWS advises six times the function's timeout.
             visibility_timeout=Duration.seconds(6 * _SUMMARIZE_S),
             dead_letter_queue=sqs.DeadLetterQueue(max_receive_count=5, queue=self._rejected),
         )
@@ -141,7 +141,7 @@ class Processing(Stack):
         storage.telemetry.grant(later, "dynamodb:GetItem")
         self._rejected.grant_send_messages(later)
         self.put_off.grant_consume_messages(later)
-        # The fewest at once that AWS allows: what waits takes no other function's environments.
+        # AWS' minimum: waiting batches take no other function's environments.
         lambda_.EventSourceMapping(
             self,
             "PutOffs",
@@ -185,9 +185,9 @@ class Processing(Stack):
             "Query",
             settings=self._settings,
             encryption=self._encryption,
-            # AWS gives a whole core at 1769 MB, and decoding is all that it does.
+            # AWS gives a whole core at 1769 MB, and this function only decodes.
             memory_mb=1769,
-            # Short enough for the caller's connection; what takes longer goes on in another invocation.
+            # Below the caller's connection timeout; a longer query continues in another invocation.
             timeout_s=18,
             environment={
                 "TELEMETRY_TABLE": storage.telemetry.table_name,
@@ -197,15 +197,15 @@ class Processing(Stack):
         )
         storage.telemetry.grant(query, "dynamodb:Query", "dynamodb:Scan")
         storage.robots.grant(query, "dynamodb:GetItem")
-        # The pre-signed address is good for what the function itself may read.
+        # A pre-signed address allows only reads that the function itself may do.
         results = storage.files.arn_for_objects(f"{RESULTS_PREFIX}*")
         self._allow(query, ["s3:GetObject", "s3:PutObject"], results)
         return query
 
     def _alarms(self) -> sns.Topic:
-        """Where every alarm and every car's alert goes."""
+        """The topic of every alarm and every car's alert."""
         topic = sns.Topic(self, "Alarms", enforce_ssl=True, **self._encryption.topic)
-        # A topic with a policy of its own has lost the one that lets its account's alarms in.
+        # A topic with a policy of its own loses the default that lets the account's alarms publish.
         topic.add_to_resource_policy(
             iam.PolicyStatement(
                 principals=[iam.ServicePrincipal("cloudwatch.amazonaws.com")],
@@ -234,7 +234,7 @@ class Processing(Stack):
         )
         storage.may_keep(alert, f"{ALERT_PREFIX}*")
         self._allow(alert, ["sns:Publish"], self.alarms.topic_arn)
-        # The car says the same again within 10 s.
+        # The car repeats the message within 10 s.
         alert.configure_async_invoke(
             max_event_age=Duration.minutes(5),
             retry_attempts=1,
@@ -262,9 +262,9 @@ class Processing(Stack):
                 "UPLOAD_BYTES_A_DAY": str(self._settings.upload_gb_a_day * 10**9),
             },
         )
-        # The robot asks again where no answer comes.
+        # The robot asks again if no answer comes.
         self._invoked_once(upload)
-        # What it signs, it must be allowed itself. It may neither read a file nor delete one.
+        # It can sign only for its own rights. It may neither read a file nor delete one.
         self._allow(
             upload,
             ["s3:AbortMultipartUpload", "s3:ListMultipartUploadParts", "s3:PutObject"],
@@ -287,9 +287,9 @@ class Processing(Stack):
         one.add_to_role_policy(iam.PolicyStatement(actions=actions, resources=[resource]))
 
     def _invoked_once(self, called: lambda_.Function) -> None:
-        """A rule calls it and does not wait. What it answers is about now: late after 2 s (the shortest
-        age that Lambda allows is a minute), and never worth a second attempt. It may send to the queue, so
-        that what it refuses need not fail."""
+        """A rule calls it and does not wait. Its answer is late after 2 s (the shortest age that Lambda
+        allows is a minute), so it is never retried. It may send to the queue, so that it can refuse a message
+        without failing."""
         called.configure_async_invoke(
             max_event_age=Duration.minutes(1),
             retry_attempts=0,

@@ -1,9 +1,9 @@
-"""What cannot be processed: one queue that everything fails into, and a table that keeps it.
+"""The quarantine: one queue that takes every failure, and a table that keeps it.
 
-A rule's error action, a batch of the stream that Lambda 2 gave up, an asynchronous invocation that failed
-and a record that Lambda 2 refused all go to ``rejected``; the function moves them into the quarantine
-table. What it cannot move after five attempts waits in ``last``, which nothing reads but the operator:
-the chain ends there, and nothing that fails in it comes back to its beginning.
+A rule's error action, a stream batch that Lambda 2 gave up, a failed asynchronous invocation and a record
+that Lambda 2 refused all go to ``rejected``; the function moves them into the quarantine table. After five
+failed attempts a message goes to ``last``, the dead-letter queue, which only the operator reads. A failure
+there cannot come back to the beginning.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ from stacks.storage import Storage
 
 _TIMEOUT_S = 10
 _ATTEMPTS = 5
-# At once, ten messages each: a flood of refusals waits in the queue, which is cheap, not in the table.
+# Concurrent batches of ten messages: a flood of refusals waits in the queue, which is cheaper than the table.
 _CONCURRENCY = 2
 
 
@@ -56,7 +56,7 @@ class Quarantine(Stack):
             },
         )
         storage.quarantine.grant(self.function, "dynamodb:UpdateItem")
-        # Of a batch that failed only the place in the stream is told, so that its records are read again.
+        # A failed batch is reported only by its place in the stream, so its records are read again.
         storage.telemetry.grant_stream(self.function, "dynamodb:GetRecords", "dynamodb:GetShardIterator")
         self.rejected.grant_consume_messages(self.function)
         lambda_.EventSourceMapping(

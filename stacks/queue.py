@@ -1,4 +1,4 @@
-"""A queue of ours: encrypted, over TLS alone, and for as long as AWS keeps messages."""
+"""A queue of ours: encrypted, TLS only, with the longest retention."""
 
 from __future__ import annotations
 
@@ -14,12 +14,12 @@ from stacks.settings import Settings
 def queue(
     stack: Stack, name: str, *, settings: Settings, encryption: Encryption, **properties: Any
 ) -> sqs.Queue:
-    """The stack puts its address out as ``<name>Queue``."""
+    """The stack outputs its address as ``<name>Queue``."""
     made = sqs.Queue(
         stack,
         name,
         enforce_ssl=True,
-        # The longest there is.
+        # The maximum.
         retention_period=Duration.days(14),
         removal_policy=settings.removal_policy,
         **properties,

@@ -35,20 +35,21 @@ _TAG_KEY = re.compile(r"(?!aws:)[\w .:/=+@-]{1,128}", re.IGNORECASE)
 _TAG_VALUE = re.compile(r"[\w .:/=+@-]{0,256}")
 
 
-# Of a context key and its value what the setting is; raises `SettingsError`.
+# Parse one context value; raises `SettingsError`.
 _Reader = Callable[[str, Any], Any]
 
 
 class SettingsError(ValueError):
-    """A context value that the stacks cannot be built with; the text names key, value and what is allowed."""
+    """A context value that the stacks cannot use; the text names the key, the value and the allowed
+    values."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class Thresholds:
-    """From where on a human should know; each is a context key of its name.
+    """Alarm thresholds; each is a context key of the same name.
 
-    The voltage suits a battery of three lithium cells; the temperatures are those of the controller's
-    board and MOSFETs, which a VESC throttles from 85 degC on.
+    The voltage suits a battery of three lithium cells. The temperatures are those of the controller's board
+    and MOSFETs; a VESC throttles from 85 degC.
     """
 
     low_voltage_v: float = LOW_VOLTAGE_V
@@ -59,25 +60,22 @@ class Thresholds:
 
 @dataclass(frozen=True, kw_only=True)
 class Settings:
-    """What may differ between two deployments of the same stacks.
+    """Settings that may differ between two deployments of the same stacks.
 
-    ``namespace`` prefixes topics, rules and stacks; ``stage`` is dev, where everything goes with the
-    stack, or prod, where what holds data stays and is protected; ``tags`` are put on every resource;
-    ``customer_key`` encrypts what is kept with a key of the account's own, and ``keep_customer_key``
-    keeps that key without it, for what is encrypted already; ``budget_usd`` is the
-    account's monthly budget (0: none), and ``alarm_email`` who hears of it and of every alarm.
-    ``old_telemetry`` keeps the telemetry table of a deployment from before batches had ids.
-    ``robot_metrics`` counts every robot's health by itself as well, which costs by the robot.
-    ``retention_days`` is how long telemetry and summaries are kept; ``files_days`` is how long uploaded
-    files are (0: for good), ``upload_gb_a_day`` what one robot may upload in a day, in 1e9 bytes;
-    ``live_concurrency`` is what is reserved for Lambda 1, which also bounds it (0: nothing; None: as
-    `reserved_for_live` says); ``live_fields`` maps stream to the fields that go to the dashboard;
-    ``function_logs`` is "own" for what the functions themselves write, or "all" for Lambda's lines about
-    every invocation as well;
-    ``device_defender`` and ``iot_log_level`` ("" for none) are for the account as a whole;
-    ``site`` adds the stack that puts the page on the web; ``layer`` is the folder of Lambda 1's
-    third-party code; ``embedded`` is true for the embedded cloud, which is deployed with the caller's
-    own credentials.
+    ``namespace`` prefixes topics, rules and stacks. ``stage`` is dev, which deletes all data with its stack,
+    or prod, which keeps and protects tables and files. ``tags`` are put on every resource. ``customer_key``
+    encrypts stored data with a key of the account; ``keep_customer_key`` keeps that key without using it, for
+    data that it has encrypted. ``budget_usd`` is the account's monthly budget (0: none), and ``alarm_email``
+    receives its alerts and every alarm. ``old_telemetry`` keeps the telemetry table of a deployment from
+    before batches had ids. ``robot_metrics`` also counts every robot by itself, at a cost per robot.
+    ``retention_days`` is the lifetime of telemetry and summaries, ``files_days`` of uploaded files (0: for
+    good). ``upload_gb_a_day`` is a robot's daily upload limit, in 1e9 bytes. ``live_concurrency`` is the
+    reserved concurrency of Lambda 1, which also limits it (0: nothing; None: see `reserved_for_live`).
+    ``live_fields`` maps a stream to its fields on the dashboard. ``function_logs`` is "own" for the
+    functions' own lines, or "all" to add Lambda's lines about every invocation. ``device_defender`` and
+    ``iot_log_level`` ("" for none) apply to the whole account. ``site`` adds the stack that puts the page on
+    the web. ``layer`` is the folder of Lambda 1's third-party code. ``embedded`` is true for the embedded
+    cloud, which is deployed with the caller's own credentials.
     """
 
     namespace: str = DEFAULT_NAMESPACE
@@ -104,16 +102,16 @@ class Settings:
 
     @property
     def protected(self) -> bool:
-        """Whether data outlives its stack: retained, recoverable to a point in time, and protected
-        from deletion and termination."""
+        """Whether data outlives its stack: retained, with point-in-time recovery, and protected from deletion
+        and termination."""
         return self.stage == PROD
 
     @property
     def reserved_for_live(self) -> int:
-        """Executions reserved for Lambda 1, 0 for none.
+        """Reserved concurrency of Lambda 1, 0 for none.
 
-        Lambda refuses a reservation that leaves an account fewer than 100 unreserved
-        (PutFunctionConcurrency), and new accounts have 10 in all: the first deployment of a lab would fail.
+        Lambda rejects a reservation that leaves an account fewer than 100 unreserved executions
+        (PutFunctionConcurrency). New accounts have 10 in all, so their first deployment would fail.
         """
         if self.live_concurrency is None:
             return _RESERVED_FOR_LIVE if self.protected else 0
@@ -121,22 +119,22 @@ class Settings:
 
     @property
     def account_wide(self) -> bool:
-        """Whether anything is set for the account as a whole."""
+        """Whether any setting of the whole account is on."""
         return not self.embedded and (self.device_defender or bool(self.iot_log_level))
 
     @property
     def removal_policy(self) -> RemovalPolicy:
-        """What becomes of a resource that holds data when its stack goes."""
+        """The removal policy of resources that hold data."""
         return RemovalPolicy.RETAIN if self.protected else RemovalPolicy.DESTROY
 
     @classmethod
     def from_context(cls, app: App) -> Settings:
-        """Read ``-c key=value`` and cdk.json; raises `SettingsError` for a value that is not allowed."""
+        """Read ``-c key=value`` and cdk.json; raises `SettingsError` for an invalid value."""
         return cls.read(app.node.try_get_context)
 
     @classmethod
     def read(cls, context: Callable[[str], Any]) -> Settings:
-        """The same of ``context``, which says a key's value, or None; raises `SettingsError`."""
+        """Read from ``context``, which returns a key's value or None; raises `SettingsError`."""
         given: dict[str, Any] = {
             key: read(key, value) for key, read in _READ.items() if (value := context(key)) is not None
         }
@@ -149,13 +147,13 @@ class Settings:
         )
         settings = cls(**given)
         if settings.budget_usd and not settings.alarm_email:
-            raise SettingsError("context budget_usd: a budget needs alarm_email, whom it tells")
+            raise SettingsError("context budget_usd needs alarm_email, which receives the alerts")
         if settings.site and settings.embedded:
             raise SettingsError(
                 "context site: the embedded cloud has no CloudFront; `make demo` serves the page"
             )
         if not settings.layer.is_dir():
-            raise SettingsError(f"layer {settings.layer} is not there: run `make layer`")
+            raise SettingsError(f"layer {settings.layer} is missing: run `make layer`")
         return settings
 
 
@@ -168,10 +166,10 @@ def _namespace(_key: str, value: Any) -> str:
 
 def _whole(low: int, high: int) -> _Reader:
     def read(key: str, value: Any) -> int:
-        # The CDK CLI gives every -c as text, cdk.json a number of either kind.
+        # The CDK CLI passes every -c as text, cdk.json a number of either kind.
         text = str(int(value)) if isinstance(value, float) and value.is_integer() else str(value)
         if not text.isdecimal() or not low <= int(text) <= high:
-            raise SettingsError(f"context {key} = {value!r}: allowed is a whole number from {low} to {high}")
+            raise SettingsError(f"context {key} must be a whole number from {low} to {high}, got {value!r}")
         return int(text)
 
     return read
@@ -181,7 +179,7 @@ def _one_of(*allowed: str) -> _Reader:
     def read(key: str, value: Any) -> str:
         if value not in allowed:
             raise SettingsError(
-                f"context {key} = {value!r}: allowed is {', '.join(allowed[:-1])} or {allowed[-1]}"
+                f"context {key} must be {', '.join(allowed[:-1])} or {allowed[-1]}, got {value!r}"
             )
         return str(value)
 
@@ -199,24 +197,24 @@ def _positive(key: str, value: Any) -> float:
     except (TypeError, ValueError):
         number = math.nan
     if not 0 < number < math.inf:
-        raise SettingsError(f"context {key} = {value!r}: allowed is a number above 0")
+        raise SettingsError(f"context {key} must be a number above 0, got {value!r}")
     return number
 
 
 def _boolean(key: str, value: Any) -> bool:
     if str(value).lower() not in ("true", "false"):
-        raise SettingsError(f"context {key} = {value!r}: allowed is true or false")
+        raise SettingsError(f"context {key} must be true or false, got {value!r}")
     return str(value).lower() == "true"
 
 
 def _email(key: str, value: Any) -> str:
     if not isinstance(value, str) or not _EMAIL.fullmatch(value):
-        raise SettingsError(f"context {key} = {value!r}: allowed is one e-mail address")
+        raise SettingsError(f"context {key} must be one e-mail address, got {value!r}")
     return value
 
 
 def _tags(key: str, value: Any) -> dict[str, str]:
-    """From cdk.json an object, from the command line ``team=lab,cost-centre=7``."""
+    """Parse tags: an object in cdk.json, ``team=lab,cost-centre=7`` on the command line."""
     tags: Mapping[Any, Any] | None = value if isinstance(value, Mapping) else None
     if isinstance(value, str):
         pairs = [pair.split("=", 1) for pair in value.split(",")]
@@ -228,7 +226,7 @@ def _tags(key: str, value: Any) -> dict[str, str]:
         and _TAG_VALUE.fullmatch(text)
         for name, text in tags.items()
     ):
-        raise SettingsError(f"context {key} = {_shown(value)}: allowed is key=value,key=value with AWS' tags")
+        raise SettingsError(f"context {key} must be key=value,key=value with AWS' tags, got {_shown(value)}")
     return dict(tags)
 
 

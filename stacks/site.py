@@ -1,8 +1,8 @@
-"""The page on the web, for who wants it there: a private bucket, and CloudFront before it.
+"""The page on the web, as an option: a private bucket behind CloudFront.
 
-CloudFormation makes the place and no more: what goes into it, the operator's `iort site` uploads. PubNub's
-subscribe key is read from Parameter Store, which no template can, and no function with rights to the bucket
-stays behind (docs/decisions/0012).
+The template creates only the resources; the operator's `iort site` uploads the content. PubNub's subscribe
+key is in Parameter Store, which no template can read, and no function with rights to the bucket is deployed
+(docs/decisions/0012).
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ _HSTS = Duration.days(365)
 
 
 class Site(Stack):
-    """The page's bucket, which CloudFront alone may read, and its distribution, over TLS alone."""
+    """The page's bucket, which only CloudFront may read, and its distribution, TLS only."""
 
     def __init__(self, scope: Construct, construct_id: str, *, settings: Settings, **kwargs: Any) -> None:
         super().__init__(scope, construct_id, **kwargs)
@@ -58,7 +58,7 @@ class Site(Stack):
         CfnOutput(self, "PageUrl", value=f"https://{self.distribution.distribution_domain_name}/")
 
     def _headers(self) -> cloudfront.ResponseHeadersPolicy:
-        """What the page's own server sends, and HSTS."""
+        """The headers of the page's own server, and HSTS."""
         custom = [
             cloudfront.ResponseCustomHeader(header=name, value=value, override=True)
             for name, value in HEADERS.items()

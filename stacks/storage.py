@@ -1,4 +1,4 @@
-"""What is kept: the telemetry, summary, robots and quarantine tables, and the files' bucket."""
+"""The telemetry, summary, robots and quarantine tables, and the files' bucket."""
 
 from __future__ import annotations
 
@@ -14,26 +14,26 @@ from iort_contract import BATCH, ENTRY, EXPIRES_S, FILES_PREFIX, RESULTS_PREFIX,
 from stacks.encryption import Encryption
 from stacks.settings import Settings
 
-# Half the price to keep, a cent a gigabyte to read; S3 allows it from this day on, and leaves objects
-# below 128 KB, for which it would cost more, where they are.
+# Storage at half the price, reads at a cent a gigabyte. S3 allows the move from this day on, and does not
+# move objects below 128 KB, which it would make dearer.
 _RARE_AFTER_DAYS = 30
-# The telemetry table's construct before batches had ids.
+# The telemetry table's construct id before batches had ids.
 OLD_TELEMETRY = "Telemetry"
 _TEXT = dynamodb.AttributeType.STRING
 
 
 class Storage(Stack):
-    """Four tables, paid by request, and a bucket. Every topic is a time series: partition key topic,
-    sort key time. The quarantine has a message an item, by robot.
+    """Four tables, paid by request, and a bucket. Every topic is a time series: partition key topic, sort key
+    time. The quarantine has one item per message, by robot.
 
-    ``encryption`` is for whatever else the deployment keeps, in whichever stack.
+    All other stacks use ``encryption`` for their resources.
     """
 
     def __init__(self, scope: Construct, construct_id: str, *, settings: Settings, **kwargs: Any) -> None:
         super().__init__(scope, construct_id, **kwargs)
         self._settings = settings
         self.encryption = Encryption(self, settings=settings)
-        # Another name than the table's of before, which was keyed by time alone: see docs/upgrading.md.
+        # Not the old table's name, which had the time alone as its key: see docs/upgrading.md.
         self.telemetry = self._table(
             "Batches",
             output="TelemetryTable",
@@ -82,10 +82,10 @@ class Storage(Stack):
         return table
 
     def _old_telemetry(self) -> None:
-        """The telemetry table of a deployment from before batches had ids, as it was. Nothing writes it any
-        more, and it stays in whatever stage; `iort adopt` copies from it.
+        """The unchanged telemetry table of a deployment from before batches had ids. It stays in every stage,
+        unwritten; `iort adopt` copies from it.
 
-        The stacks that import its exports are updated after this one, and CloudFormation takes no export away
+        The stacks that import its exports are updated after this one, and CloudFormation removes no export
         that is in use.
         """
         table = self._table(
@@ -101,11 +101,11 @@ class Storage(Stack):
             self.export_value(value)
 
     def may_keep(self, role: iam.IGrantable, *attributes: str) -> None:
-        """Let a role change these attributes of a robot's row, and no other: a name's admission and its
-        vehicle stand in the same row. A ``*`` stands for the rest of a name.
+        """Let a role change only these attributes of a robot's row: a name's admission and its vehicle are in
+        the same row. A ``*`` stands for the rest of a name.
 
-        Source: DynamoDB, "Using IAM policy conditions for fine-grained access control", by which the
-        condition is only as good as what the answer may hold.
+        Source: DynamoDB, "Using IAM policy conditions for fine-grained access control". The condition only
+        protects attributes that the answer may not return.
         """
         statement = iam.PolicyStatement(
             actions=["dynamodb:UpdateItem"],
@@ -118,8 +118,8 @@ class Storage(Stack):
         role.grant_principal.add_to_principal_policy(statement)
 
     def _files(self) -> s3.Bucket:
-        """What is too large for a message. Not versioned: a key is written once and names its content,
-        and nothing of ours may delete, so that a second version can only be what somebody threw away."""
+        """Files too large for a message. Not versioned: a key is written once and names its content, and our
+        code deletes nothing, so a second version could only be a file that somebody deleted."""
         rules = [
             s3.LifecycleRule(id="abandoned", abort_incomplete_multipart_upload_after=Duration.days(7)),
             s3.LifecycleRule(id="results", prefix=RESULTS_PREFIX, expiration=Duration.days(1)),
@@ -141,8 +141,8 @@ class Storage(Stack):
             enforce_ssl=True,
             minimum_tls_version=1.2,
             lifecycle_rules=rules,
-            # CloudFormation deletes an empty bucket only; `iort files empty` comes before, because the
-            # CDK's own way is a function that may delete every object, deployed for good.
+            # CloudFormation deletes only an empty bucket, so `iort files empty` comes first. The CDK's own
+            # way deploys a function that may delete every object, for good.
             removal_policy=self._settings.removal_policy,
             **self.encryption.bucket,
         )

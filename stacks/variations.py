@@ -1,4 +1,4 @@
-"""Settings that the checks synthesize besides the defaults, so that nothing is checked in one form only.
+"""Settings that the checks synthesize besides the defaults, to check every form.
 
 `make check` lints every one of them, and tests/stacks updates, measures and deploys them.
 """
@@ -9,8 +9,8 @@ from typing import Any
 
 from stacks.settings import ALL_LOGS, PROD, Thresholds
 
-# Parameters and the values that they are changed to and back from; the base has every default. What only
-# changes properties, each of another resource, is changed at once: an app takes seconds to synthesize.
+# Parameters with two values each, to change and to change back; the base has every default. Settings that
+# only change properties of different resources change together: an app takes seconds to synthesize.
 FLIPS: dict[str, dict[str, Any]] = {
     "stage": {"stage": PROD},
     "mail": {"alarm_email": "lab@example.org"},
@@ -33,10 +33,10 @@ FLIPS: dict[str, dict[str, Any]] = {
 KEY: dict[str, Any] = {"customer_key": True}
 # Another namespace is another deployment, and so is the embedded cloud; the layer is a folder.
 NOT_FLIPPED = {"namespace", "embedded", "layer"}
-# The longest that the contract allows: what is named is named by it.
+# The longest that the contract allows; resource names contain it.
 LONGEST_NAMESPACE = "n" * 16
 EVERYTHING: dict[str, Any] = {name: value for flip in FLIPS.values() for name, value in flip.items()} | KEY
-# `keep_customer_key` says nothing beside `customer_key`.
+# `keep_customer_key` has no effect beside `customer_key`.
 VARIATIONS: dict[str, dict[str, Any]] = {
     "default": {},
     **FLIPS,

@@ -1,4 +1,4 @@
-"""What other stacks have that should be watched: found, so that nothing is forgotten when it is added."""
+"""Finds the resources of other stacks to watch, so that no new one is forgotten."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from stacks.storage import OLD_TELEMETRY
 
 @dataclass(frozen=True)
 class Watched:
-    """Functions, tables and queues by their construct's name, and of the functions those that read a
+    """Functions, tables and queues by their construct's name; ``readers`` are the functions that read a
     stream."""
 
     functions: Mapping[str, lambda_.Function]
@@ -25,7 +25,7 @@ class Watched:
 
     @classmethod
     def of(cls, stacks: Iterable[Stack]) -> Watched:
-        """All that the stacks have, in their order."""
+        """All resources of the stacks, in order."""
         functions: dict[str, lambda_.Function] = {}
         tables: dict[str, dynamodb.Table] = {}
         queues: dict[str, sqs.Queue] = {}
@@ -35,7 +35,7 @@ class Watched:
                 if isinstance(construct, lambda_.Function):
                     functions[construct.node.id] = construct
                 elif isinstance(construct, dynamodb.Table):
-                    # Nothing writes the old one, and an alarm would keep it in its stack by what it imports.
+                    # The old table gets no writes, and its exports would tie it to an alarm's stack.
                     if construct.node.id != OLD_TELEMETRY:
                         tables[construct.node.id] = construct
                 elif isinstance(construct, sqs.Queue):

@@ -1,1 +1,1 @@
-"""Asks a deployment what the design rests on, `make verify-aws`; an instrument, which only tests import."""
+"""`make verify-aws`: asks a deployment about the assumptions of the design. Only tests import it."""

@@ -1,4 +1,4 @@
-"""What the design takes for granted about AWS."""
+"""The design's assumptions about AWS."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 
 class Basis(enum.Enum):
-    """Why we believe an assumption, as long as nobody has measured it on AWS."""
+    """The reason to believe an assumption until it is measured on AWS."""
 
     DOCUMENTED = "documented"
     ASSUMED = "assumed"
@@ -17,8 +17,8 @@ class Basis(enum.Enum):
 class Assumption:
     """One behaviour of AWS that the code relies on.
 
-    ``name`` is ``subject.detail``; ``assumed`` is one to three sentences; ``source`` names AWS' page where it
-    is documented; ``relied_on_by`` are files of the repository.
+    ``name`` is ``subject.detail``; ``assumed`` is one to three sentences; ``source`` names AWS' page if it is
+    documented; ``relied_on_by`` are files of the repository.
     """
 
     name: str

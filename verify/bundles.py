@@ -1,4 +1,4 @@
-"""The robots and listeners that questions are asked with."""
+"""The robots and listeners of the questions."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from verify.spoofing import spoofed
 
 
 def registered(target: Target, base: str) -> Bundle:
-    """The robot of that name, which is registered when it is first asked for."""
+    """The robot of that name, registered on first use."""
     name = target.name(base)
     folder = target.folder / "robots" / name
     return Bundle(name, folder) if folder.exists() else target.robot(base)
@@ -28,18 +28,18 @@ def registered(target: Target, base: str) -> Bundle:
 
 @contextmanager
 def removed_after(target: Target, base: str) -> Iterator[tuple[str, Path]]:
-    """The name of a robot that a question registers, and a folder for it; it is removed at the end."""
+    """The name of a robot that a question registers, and its folder; the robot is removed at the end."""
     name = target.name(base)
     try:
         yield name, target.folder / "claims" / name
     finally:
-        # It may not have come so far that it is registered, or be removed already.
+        # It may not be registered yet, or be removed already.
         with suppress(StationError):
             robots.remove(target.cloud, name)
 
 
 def listener(target: Target, robot: str) -> Listener:
-    """A subscriber of the robot's channel. Raises `CannotAskError` where PubNub's keys are not stored."""
+    """A subscriber of the robot's channel. Raises `CannotAskError` if PubNub's keys are not stored."""
     try:
         return target.listener(robot)
     except StationError as error:
@@ -47,14 +47,14 @@ def listener(target: Target, robot: str) -> Listener:
 
 
 class Pair(NamedTuple):
-    """The robot that tries, connected, and its neighbour."""
+    """The robot that attacks, connected, and its neighbour."""
 
     target: Target
     robot: Robot
     victim: str
 
     def send(self, lane: str, name: str, message: bytes) -> None:
-        """Publish the message with every key of the cloud's in the neighbour's name."""
+        """Publish the message with every key of the cloud in the neighbour's name."""
         namespace = self.target.cloud.namespace
         topic = build_topic(lane, self.robot.name, name, namespace)
         if lane == RECORD:
@@ -62,13 +62,13 @@ class Pair(NamedTuple):
         self.publish(topic, spoofed(message, self.victim, lane, name, namespace))
 
     def publish(self, topic: str, payload: bytes) -> None:
-        """Publish; raises `VerifyError` where the broker does not take it."""
+        """Publish; raises `VerifyError` if the broker refuses."""
         answer = self.robot.publish(topic, payload)
         if answer != "SUCCESS":
             raise VerifyError(f"the broker answered {answer} on {topic}")
 
     def asked(self, name: str, message: bytes) -> dict[str, Any]:
-        """The answer on the lane pong, which is the robot's own."""
+        """The answer on the robot's own lane pong."""
         self.robot.subscribe(build_topic(PONG, self.robot.name, name, self.target.cloud.namespace))
         self.send(PING, name, message)
         answer: dict[str, Any] = json.loads(self.robot.next_message()[1])
@@ -77,7 +77,7 @@ class Pair(NamedTuple):
 
 @contextmanager
 def pair_of(target: Target, base: str) -> Iterator[Pair]:
-    """A robot of that name, connected, and the neighbour that all of them have."""
+    """A robot of that name, connected, and the shared neighbour."""
     victim, bundle = registered(target, "verify-victim").robot, registered(target, base)
     with Robot(bundle.folder) as robot:
         yield Pair(target, robot.online(), victim)

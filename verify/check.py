@@ -1,4 +1,4 @@
-"""One question to a deployment: what the design assumes, what was seen, and the verdict."""
+"""One question to a deployment: the assumption, the answer, and the verdict."""
 
 from __future__ import annotations
 
@@ -12,9 +12,9 @@ from bench.target import EMBEDDED, Target
 from verify.assumption import Assumption
 from verify.errors import CannotAskError
 
-# What a question tells beside the answer, such as a version: in the report, and not compared.
+# Prefix of notes beside the answer, such as a version: they are reported, but not compared.
 NOTE = "note_"
-# The deployment as it is made first, and after it was changed to a key of the account's own.
+# Phases: the first deployment, and the same after a change to a key of the account's own.
 FIRST, WITH_KEY = "first deployment", "with customer_key"
 
 
@@ -29,12 +29,12 @@ class Verdict(enum.Enum):
 
 @dataclass(frozen=True, kw_only=True)
 class Check(Assumption):
-    """An assumption, and how to ask a deployment for it.
+    """An assumption, with the code that asks a deployment.
 
-    ``expected`` says the assumption in values of JSON. ``ask`` returns what was seen, in the form of
-    ``expected``, without secrets and without names or times that change from run to run; keys that begin with
-    `NOTE` are not compared. It cleans up what it makes, and raises `CannotAskError` where it cannot ask.
-    ``not_embedded`` says why the embedded cloud cannot be asked; "" where it can.
+    ``expected`` is the assumption as JSON values. ``ask`` returns the answer in the form of ``expected``,
+    without secrets and without names or times that change between runs; keys that begin with `NOTE` are not
+    compared. It removes everything that it creates, and raises `CannotAskError` if it cannot ask.
+    ``not_embedded`` says why the embedded cloud cannot be asked; "" if it can.
     """
 
     expected: Mapping[str, Any]
@@ -59,9 +59,9 @@ class Answer:
 def ask(
     check: Check, target: Target, clock: Callable[[], float], expected: Mapping[str, Any] | None = None
 ) -> Answer:
-    """Ask one question; an error of the services is an answer as well, and never ends the run.
+    """Ask one question. A service error is an answer too, and never ends the run.
 
-    ``expected`` takes the place of the check's own where AWS has been measured.
+    ``expected`` replaces the check's own value if AWS has been measured.
     """
     if target.kind == EMBEDDED and check.not_embedded:
         return Answer(check=check, verdict=Verdict.NOT_ASKED, reason=check.not_embedded)

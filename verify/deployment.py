@@ -1,4 +1,4 @@
-"""A deployment in an AWS account that lives as long as it is asked."""
+"""A temporary deployment in an AWS account."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ from verify.errors import VerifyError
 from verify.preflight_deployed import STACKS, stack
 from verify.waiting import until
 
-# The distribution apart, a stage takes five minutes; AWS keeps a policy for five more after its robots.
+# Without CloudFront a stage takes five minutes; AWS keeps a policy for five more after its robots.
 _DEPLOY_S, _DESTROY_S = 1_800.0, 1_800.0
 
 _POLL_S = 10.0
@@ -44,7 +44,7 @@ Say = Callable[[str], None]
 
 
 class Deployment:
-    """The project's stacks under a namespace of their own; logs of the CDK go into ``folder``."""
+    """The project's stacks under a namespace of their own; the CDK's logs go into ``folder``."""
 
     def __init__(
         self,
@@ -59,7 +59,7 @@ class Deployment:
         self._run, self._poll_s = run, poll_s
 
     def deploy(self, settings: Mapping[str, str]) -> None:
-        """Make the stacks, or change them to the settings. Raises `VerifyError` where the CDK fails."""
+        """Create the stacks, or update them to the settings. Raises `VerifyError` if the CDK fails."""
         named = "".join(f", {key}={value}" for key, value in settings.items())
         self._cdk(f"deploy{named}", _DEPLOY_S, ["deploy", "--require-approval", "never"], settings)
 

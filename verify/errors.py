@@ -1,4 +1,4 @@
-"""What can go wrong while a deployment is verified."""
+"""The errors of this package."""
 
 
 class VerifyError(Exception):

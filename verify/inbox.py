@@ -1,4 +1,4 @@
-"""What a topic sends to its subscribers: a queue that subscribes for a while, since a mail needs a human."""
+"""Receives a topic's messages by a temporary queue, since a mail needs a person."""
 
 from __future__ import annotations
 
@@ -13,13 +13,13 @@ from verify.waiting import until
 
 _PROBE = "verify: does this arrive?"
 Message = dict[str, Any]
-# The first message for which it is true. Raises `VerifyError` where none comes in time.
+# Returns the first message that matches. Raises `VerifyError` if none arrives in time.
 Receive = Callable[[Callable[[Message], bool], str], Message]
 
 
 @contextmanager
 def inbox(target: Target, topic: str) -> Iterator[Receive]:
-    """A queue that is subscribed to the topic; subscription and queue are removed in the end."""
+    """A queue subscribed to the topic; subscription and queue are removed at the end."""
     sqs, sns = target.cloud.client("sqs"), target.cloud.client("sns")
     # SQS refuses a name for 60 s after its queue was deleted.
     name = f"{target.cloud.namespace}-verify-{uuid.uuid4().hex[:8]}"
@@ -29,7 +29,7 @@ def inbox(target: Target, topic: str) -> Iterator[Receive]:
         sqs.set_queue_attributes(QueueUrl=url, Attributes={"Policy": _policy(arn, topic)})
         subscription = sns.subscribe(TopicArn=topic, Protocol="sqs", Endpoint=arn)["SubscriptionArn"]
         try:
-            # A queue's policy takes up to 60 s to be known everywhere, and what comes before is lost.
+            # A queue's policy may take 60 s to become effective, and earlier messages are lost.
             until(lambda: _probed(sns, topic, sqs, url), "a message of the topic at its new subscriber")
             yield lambda wanted, what: until(lambda: _received(sqs, url, wanted), what)
         finally:

@@ -14,12 +14,12 @@ from verify.unasked import UNASKED
 
 PAGE = ROOT / "docs" / "assumptions.md"
 _HEAD = """\
-# What the design takes for granted about AWS
+# The design's assumptions about AWS
 
 `python -m verify.page` writes this page from verify/. Each row is a behaviour of AWS that the code relies on
-and that the embedded cloud imitates. *Documented* names AWS' page. *Assumed* means that AWS says nothing.
-*Measured* means that `make verify-aws` has seen it in an account; tests/local/test_verify.py then expects the
-kept answer of the embedded cloud as well. How to ask your own account: [cloud.md](cloud.md#ask-your-account).
+and that the embedded cloud imitates. *Documented* names AWS' page. *Assumed* means that AWS does not document
+it. *Measured* means that `make verify-aws` has seen it in an account; tests/local/test_verify.py then expects
+the same answer from the embedded cloud. How to ask your own account: [cloud.md](cloud.md#ask-your-account).
 """
 
 
@@ -37,7 +37,7 @@ def _lines(known: Measured) -> Iterator[str]:
     yield _HEAD
     count = sum(check.name in known.seen for check in ALL)
     yield (
-        f"Of {len(ALL) + len(UNASKED)} behaviours {len(ALL)} are asked by `make verify-aws`. {count} were "
+        f"`make verify-aws` asks {len(ALL)} of {len(ALL) + len(UNASKED)} behaviours. {count} were "
         f"measured{f' by {known.by} on {known.date} in {known.region}' if known.seen else ''}."
     )
     yield ""

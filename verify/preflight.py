@@ -1,9 +1,10 @@
-"""Asks an account what makes a deployment fail, before it is tried; read-only.
+"""Checks an account for causes of a failed deployment, beforehand and read-only.
 
     python -m verify.preflight [-c key=value ...] [--profile NAME] [--json]
 
-Settings are read as app.py reads them; other options of the CDK's are ignored. Exit status 1 where something
-stops the deployment. `make deploy` asks first (SKIP_PREFLIGHT=1: not); `make verify-aws` too, for its report.
+It reads settings like app.py and ignores other options of the CDK. Exit status 1 means that the deployment
+would fail. `make deploy` runs it first (skip it with SKIP_PREFLIGHT=1); `make verify-aws` runs it for its
+report.
 """
 
 from __future__ import annotations
@@ -25,36 +26,36 @@ _STYLES = {Verdict.FINE: "green", Verdict.WARNING: "yellow", Verdict.STOPS: "red
 
 
 def look(clients: Clients, settings: Settings) -> list[Finding]:
-    """Every finding, in the order in which a deployment would meet it."""
+    """All findings, in the order of a deployment."""
     who = preflight_account.credentials(clients, settings)
     if who.verdict is Verdict.STOPS:
-        # Every other question would get this answer.
+        # All other items would get the same answer.
         return [who]
     return [who, *(ask(clients, settings) for ask in (*preflight_account.ITEMS, *preflight_deployed.ITEMS))]
 
 
 def stopped(findings: Sequence[Finding]) -> bool:
-    """Whether any of them stops the deployment."""
+    """Whether any finding stops the deployment."""
     return any(finding.verdict is Verdict.STOPS for finding in findings)
 
 
 def as_json(findings: Sequence[Finding]) -> list[dict[str, str]]:
-    """The findings as a report has them."""
+    """The findings in the report's form."""
     return [{**asdict(finding), "verdict": finding.verdict.value} for finding in findings]
 
 
 def options(arguments: Sequence[str]) -> argparse.Namespace:
-    """The command line's, as `make deploy` hands ARGS on to the CDK and to this."""
+    """Parse the command line; `make deploy` passes ARGS both to the CDK and to this."""
     parser = argparse.ArgumentParser(prog="verify.preflight", description=(__doc__ or "").splitlines()[0])
     parser.add_argument("-c", "--context", action="append", default=[], metavar="KEY=VALUE")
-    parser.add_argument("--profile", help="of AWS' configuration")
+    parser.add_argument("--profile", help="profile of the AWS configuration")
     parser.add_argument("--json", action="store_true", help="print the findings as JSON")
     known, _others = parser.parse_known_args(arguments)
     return known
 
 
 def context(given: Sequence[str]) -> Mapping[str, Any]:
-    """What the CDK would hand to app.py: cdk.json's values and, over them, ``key=value``."""
+    """The CDK's context for app.py: cdk.json's values, overridden by ``key=value``."""
     in_file: dict[str, Any] = json.loads((ROOT / "cdk.json").read_text()).get("context", {})
     pairs = (pair.partition("=") for pair in given)
     return {**in_file, **{key: value for key, _, value in pairs}}
@@ -67,7 +68,7 @@ def line(finding: Finding) -> str:
 
 
 def show(findings: Sequence[Finding], console: Console) -> None:
-    """A line a finding, and below it what to do."""
+    """Print one line per finding, and below it the remedy."""
     for finding in findings:
         style = _STYLES[finding.verdict]
         console.print(
@@ -78,7 +79,7 @@ def show(findings: Sequence[Finding], console: Console) -> None:
 
 
 def main() -> None:
-    """Look, say, and exit with 1 where the deployment would fail."""
+    """Check, print, and exit with 1 if the deployment would fail."""
     asked = options(sys.argv[1:])
     try:
         settings = Settings.read(context(asked.context).get)
@@ -90,7 +91,7 @@ def main() -> None:
     else:
         show(findings, Console())
     if stopped(findings):
-        sys.exit("preflight: nothing was deployed; SKIP_PREFLIGHT=1 deploys all the same")
+        sys.exit("preflight: nothing was deployed; SKIP_PREFLIGHT=1 deploys anyway")
 
 
 if __name__ == "__main__":

@@ -1,4 +1,4 @@
-"""What a deployment needs of the account and region, whatever is deployed there."""
+"""A deployment's requirements for account and region, whatever is deployed there."""
 
 from __future__ import annotations
 
@@ -12,14 +12,15 @@ from stacks.settings import Settings
 from verify.preflight_deployed import resources
 from verify.preflight_finding import Clients, Found, code, fine, item, stops, warning
 
-# What the CDK's default synthesizer asks of the bootstrap stack; a test holds it to the app's manifest.
+# The CDK's default synthesizer needs this version of the bootstrap stack; a test compares it with the
+# manifest.
 BOOTSTRAP = 6
 BOOTSTRAP_PARAMETER = "/cdk-bootstrap/hnb659fds/version"
-# "PutFunctionConcurrency": a reservation must leave so many executions to everything else.
+# "PutFunctionConcurrency": a reservation must leave this many executions to all other functions.
 UNRESERVED = 100
-# A fleet for which the quotas should do.
+# The quotas should suffice for this fleet.
 ROBOTS = 100
-# Service Quotas' name of AWS IoT Core, and of each quota with what a fleet needs of it (cost/scale.py).
+# Service Quotas' name of AWS IoT Core, and each quota with a fleet's need (cost/scale.py).
 IOT_CORE = "iotcore"
 RULES_QUOTA = "Maximum number of rules per AWS account"
 QUOTAS = {
@@ -32,7 +33,7 @@ CONNECTS_QUOTA = "Connect requests per second per account"
 
 @item("credentials", "sts GetCallerIdentity")
 def credentials(clients: Clients, _settings: Settings) -> Found:
-    """Whether there are credentials that AWS takes, and a region."""
+    """Check the credentials and the region."""
     try:
         sts = clients.client("sts")
         answer = sts.get_caller_identity()
@@ -45,7 +46,7 @@ def credentials(clients: Clients, _settings: Settings) -> Found:
 
 @item("bootstrap", f"ssm GetParameter {BOOTSTRAP_PARAMETER}")
 def bootstrap(clients: Clients, _settings: Settings) -> Found:
-    """Whether the CDK's own stack is there, and new enough for our templates."""
+    """Check that the CDK's bootstrap stack exists, and is new enough for our templates."""
     try:
         answer = clients.client("ssm").get_parameter(Name=BOOTSTRAP_PARAMETER)
     except ClientError as error:
@@ -54,13 +55,13 @@ def bootstrap(clients: Clients, _settings: Settings) -> Found:
         return stops("this account and region are not bootstrapped", "`make bootstrap`, once")
     version = int(answer["Parameter"]["Value"])
     if version < BOOTSTRAP:
-        return stops(f"version {version}, needed is {BOOTSTRAP}", "`make bootstrap` again")
+        return stops(f"version must be {BOOTSTRAP} or newer, got {version}", "`make bootstrap` again")
     return fine(f"version {version}, needed is {BOOTSTRAP}")
 
 
 @item("AWS IoT's log", "iot GetV2LoggingOptions")
 def iot_log(clients: Clients, settings: Settings) -> Found:
-    """Whether the region's one setting is free where `iot_log_level` wants it."""
+    """Check that the region's one setting is free if `iort_log_level` needs it."""
     iot = clients.client("iot")
     try:
         options = iot.get_v2_logging_options()
@@ -68,7 +69,7 @@ def iot_log(clients: Clients, settings: Settings) -> Found:
         if code(error) != "NotConfiguredException":
             raise
         options = {}
-    # CloudFormation's handler takes a log that is disabled for none.
+    # CloudFormation's handler treats a disabled log as free.
     configured = bool(options.get("roleArn")) and not options.get("disableAllLogs")
     said = f"configured ({options.get('defaultLogLevel', 'no level')})" if configured else "not configured"
     if not configured or not settings.iot_log_level or settings.embedded:
@@ -83,8 +84,8 @@ def iot_log(clients: Clients, settings: Settings) -> Found:
 
 @item("Device Defender's audit", "iot DescribeAccountAuditConfiguration")
 def audit(clients: Clients, settings: Settings) -> Found:
-    """Whether the region's one configuration is free where `device_defender` wants it."""
-    # CloudFormation's handler tells by the role, too: where nothing is configured AWS answers without one.
+    """Check that the region's one configuration is free if `device_defender` needs it."""
+    # CloudFormation's handler also decides by the role: without configuration, AWS answers without one.
     configured = bool(clients.client("iot").describe_account_audit_configuration().get("roleArn"))
     said = "configured" if configured else "not configured"
     wanted = "wanted" if settings.device_defender else "not wanted (device_defender=false)"
@@ -100,7 +101,7 @@ def audit(clients: Clients, settings: Settings) -> Found:
 
 @item("Lambda's concurrency", "lambda GetAccountSettings")
 def concurrency(clients: Clients, settings: Settings) -> Found:
-    """Whether what is reserved for Lambda 1 leaves enough for the others."""
+    """Check that Lambda 1's reservation leaves enough for the others."""
     lambda_ = clients.client("lambda")
     limit = lambda_.get_account_settings()["AccountLimit"]
     total, unreserved = limit["ConcurrentExecutions"], limit["UnreservedConcurrentExecutions"]
@@ -112,10 +113,10 @@ def concurrency(clients: Clients, settings: Settings) -> Found:
             if one.kind == "AWS::Lambda::Function" and one.logical_id.startswith("Live"):
                 answer = lambda_.get_function_concurrency(FunctionName=one.physical_id)
                 held = answer.get("ReservedConcurrentExecutions", 0)
-    text = f"{total} executions at once, {unreserved} of them unreserved; {wanted} are to be reserved"
+    text = f"{total} concurrent executions, {unreserved} of them unreserved; {wanted} are to be reserved"
     if wanted and unreserved + held - wanted < UNRESERVED:
         return stops(
-            f"{text}, and Lambda wants {UNRESERVED} to be left",
+            f"{text}, and Lambda requires {UNRESERVED} unreserved",
             "ask for more ('Service Quotas', AWS Lambda, 'Concurrent executions'), or -c live_concurrency=0",
         )
     if total < UNRESERVED:
@@ -125,14 +126,14 @@ def concurrency(clients: Clients, settings: Settings) -> Found:
 
 @item("CloudFront", "cloudfront ListDistributions, where `site` is set")
 def cloudfront(clients: Clients, settings: Settings) -> Found:
-    """Whether CloudFront answers; whether it would make a distribution, nothing read-only says."""
+    """Check that CloudFront answers; no read-only call tells if it would create a distribution."""
     if not settings.site:
         return fine("not wanted (site=false)")
     if resources(clients, f"{settings.namespace}-site"):
         return fine("the stack site is deployed")
     clients.client("cloudfront").list_distributions(MaxItems="1")
     return warning(
-        "it answers; that the account is verified for it cannot be read",
+        "it answers; its verification of the account cannot be read",
         "if the stack site fails with 'Your account must be verified', ask AWS Support",
     )
 
@@ -141,7 +142,7 @@ def cloudfront(clients: Clients, settings: Settings) -> Found:
     "AWS IoT's quotas", "service-quotas ListServiceQuotas and ListAWSDefaultServiceQuotas, iot ListTopicRules"
 )
 def quotas(clients: Clients, settings: Settings) -> Found:
-    """For how many robots the quotas do, and whether our rules fit."""
+    """Check that our rules fit, and how many robots the quotas allow."""
     service = clients.client("service-quotas")
     values: dict[str, float] = {}
     for operation in ("list_aws_default_service_quotas", "list_service_quotas"):
@@ -152,21 +153,21 @@ def quotas(clients: Clients, settings: Settings) -> Found:
     others = {rule["ruleName"] for page in pages for rule in page["rules"]} - ours
     if RULES_QUOTA in values and len(others) + len(ours) > values[RULES_QUOTA]:
         return stops(
-            f"{len(others)} rules of others and {len(ours)} of ours, allowed are {values[RULES_QUOTA]:g}",
+            f"{len(others)} rules of others and {len(ours)} of ours exceed the limit {values[RULES_QUOTA]:g}",
             "remove rules, or ask for more ('Service Quotas', AWS IoT Core)",
         )
     needs = {need.name: need.needed for need in on_paper(Usage()).needs}
     robots = {name: values[name] / needs[need] for name, need in QUOTAS.items() if name in values}
     if CONNECTS_QUOTA in values:
-        # After an outage the whole fleet is back within a minute.
+        # After an outage the whole fleet reconnects within a minute.
         robots[CONNECTS_QUOTA] = values[CONNECTS_QUOTA] * 60
     missing = (QUOTAS.keys() | {CONNECTS_QUOTA}) - robots.keys()
     if not robots:
-        return warning("AWS names none of the quotas", "see 'Service Quotas', AWS IoT Core, in the console")
+        return warning("AWS reports none of the quotas", "see 'Service Quotas', AWS IoT Core, in the console")
     scarce = min(robots, key=lambda name: robots[name])
-    text = f"for {robots[scarce]:,.0f} robots that drive at once; first: {scarce}, {values[scarce]:g}"
+    text = f"for {robots[scarce]:,.0f} robots that drive at once; first limit: {scarce}, {values[scarce]:g}"
     if missing:
-        text += f"; not told: {', '.join(sorted(missing))}"
+        text += f"; unknown: {', '.join(sorted(missing))}"
     if robots[scarce] < ROBOTS:
         return warning(text, "ask for more ('Service Quotas', AWS IoT Core) before the fleet grows")
     return fine(text)

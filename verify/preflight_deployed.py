@@ -1,5 +1,5 @@
-"""What is deployed under the namespace already: its stacks, what others of that name are in the way, and
-which settings may not be changed in one step."""
+"""Checks the deployment of the same namespace: its stacks, other resources with its names, and settings that
+cannot change in one step."""
 
 from __future__ import annotations
 
@@ -13,15 +13,15 @@ from stacks.settings import PROD, Settings
 from stacks.storage import OLD_TELEMETRY
 from verify.preflight_finding import Clients, Found, code, fine, item, stops, warning
 
-# Every stack that app.py may make, in the order of deployment; a test holds it to the app.
+# Every stack that app.py may create, in the order of deployment; a test compares it with the app.
 STACKS = ("storage", "quarantine", "fleet", "processing", "ingest", "monitoring", "site", "account")
-# States from which CloudFormation, or the CDK, does not go on by itself.
+# In these states neither CloudFormation nor the CDK can continue.
 _STUCK = {
     "ROLLBACK_COMPLETE": "its first deployment failed: delete it (`aws cloudformation delete-stack`)",
     "ROLLBACK_FAILED": "its first deployment failed: delete it (`aws cloudformation delete-stack`)",
     "CREATE_FAILED": "its first deployment failed: delete it (`aws cloudformation delete-stack`)",
-    "DELETE_FAILED": "it was not deleted to the end: its events say what stayed; delete it again",
-    "REVIEW_IN_PROGRESS": "a change set was made and never executed: delete the stack, it is empty",
+    "DELETE_FAILED": "its deletion failed: its events say what stayed; delete it again",
+    "REVIEW_IN_PROGRESS": "its change set was never executed: delete the stack, it is empty",
     "UPDATE_ROLLBACK_FAILED": "`aws cloudformation continue-update-rollback`, then deploy again",
 }
 
@@ -35,7 +35,7 @@ class Resource(NamedTuple):
 
 
 def stack(clients: Clients, name: str) -> dict[str, Any] | None:
-    """A stack as CloudFormation describes it; None where there is none."""
+    """A stack as CloudFormation describes it; None if it does not exist."""
     try:
         answer = clients.client("cloudformation").describe_stacks(StackName=name)
     except ClientError as error:
@@ -47,7 +47,7 @@ def stack(clients: Clients, name: str) -> dict[str, Any] | None:
 
 
 def resources(clients: Clients, name: str) -> list[Resource]:
-    """What a stack has made; nothing where there is none."""
+    """The resources of a stack; empty if it does not exist."""
     pages = clients.client("cloudformation").get_paginator("list_stack_resources").paginate(StackName=name)
     try:
         return [
@@ -64,7 +64,7 @@ def resources(clients: Clients, name: str) -> list[Resource]:
 
 @item("stacks", "cloudformation DescribeStacks of every stack of the namespace")
 def stacks(clients: Clients, settings: Settings) -> Found:
-    """Whether every stack that is there can be updated."""
+    """Check that every existing stack can be updated."""
     states = {}
     for noun in STACKS:
         name = f"{settings.namespace}-{noun}"
@@ -93,7 +93,7 @@ def _todo(state: str) -> str:
     "iot Describe.../GetPolicy/ListTopicRules, cloudwatch ListDashboards: names that are part of the design",
 )
 def names(clients: Clients, settings: Settings) -> Found:
-    """Whether what has a fixed name is free, where the stack that makes it is not there."""
+    """Check that fixed names are free if the stack that creates them does not exist."""
     taken: list[str] = []
     if stack(clients, f"{settings.namespace}-fleet") is None:
         taken += _taken_of_the_fleet(clients, settings)
@@ -111,10 +111,10 @@ def names(clients: Clients, settings: Settings) -> Found:
         taken += sorted(f"dashboard {name}" for name in entries if name in ours)
     if taken:
         return stops(
-            f"there without their stack: {', '.join(taken)}",
+            f"exist without their stack: {', '.join(taken)}",
             "delete them, or deploy under another name: -c namespace=...",
         )
-    return fine("free, or this deployment's own")
+    return fine("free, or used by this deployment")
 
 
 def _taken_of_the_fleet(clients: Clients, settings: Settings) -> Iterator[str]:
@@ -138,21 +138,21 @@ def _taken_of_the_fleet(clients: Clients, settings: Settings) -> Iterator[str]:
 
 @item("kept data", "dynamodb ListTables, s3 ListBuckets, sqs ListQueues, logs DescribeLogGroups")
 def kept(clients: Clients, settings: Settings) -> Found:
-    """What an earlier deployment left. The CDK's names end in chance, so nothing of it collides."""
+    """Look for leftovers of an earlier deployment. The CDK's names end randomly, so they never collide."""
     known = {one.physical_id for noun in STACKS for one in resources(clients, f"{settings.namespace}-{noun}")}
     known |= {name.rsplit("/", 1)[-1] for name in known if name.startswith("http")}
     left = sorted(name for name in _holders(clients, settings.namespace) if name not in known)
     if not left:
-        return fine("none of an earlier deployment")
+        return fine("no leftovers")
     shown = ", ".join(left[:10]) + (f" and {len(left) - 10} more" if len(left) > 10 else "")
     return warning(
-        f"of an earlier deployment, in nobody's way: {shown}",
-        "a new deployment begins empty: `iort adopt TABLE` copies batches into it; or delete them, they cost",
+        f"of an earlier deployment, without conflict: {shown}",
+        "a new deployment begins empty: copy batches with `iort adopt TABLE`, or delete them to save costs",
     )
 
 
 def _holders(clients: Clients, namespace: str) -> Iterator[str]:
-    """Names of tables, buckets, queues and log groups as the CDK gives them to our stacks."""
+    """Tables, buckets, queues and log groups with the names that the CDK gives to our stacks."""
     prefixes = tuple(f"{namespace}-{noun}-" for noun in STACKS)
     for page in clients.client("dynamodb").get_paginator("list_tables").paginate():
         yield from (name for name in page["TableNames"] if name.startswith(prefixes))
@@ -176,7 +176,7 @@ def _holders(clients: Clients, namespace: str) -> Iterator[str]:
 
 @item("changed settings", "cloudformation ListExports, ListImports and DescribeStacks, against the settings")
 def changes(clients: Clients, settings: Settings) -> Found:
-    """Whether the settings may follow those of what is deployed."""
+    """Check that the settings may follow those of the deployed stacks."""
     storage = f"{settings.namespace}-storage"
     deployed = stack(clients, storage)
     if deployed is None:
@@ -196,8 +196,8 @@ def changes(clients: Clients, settings: Settings) -> Found:
     tags = {tag["Key"]: tag["Value"] for tag in deployed.get("Tags", [])}
     if tags.get("stage") == PROD != settings.stage:
         return warning(
-            "deployed is stage prod, now it is to be dev: data is no longer protected",
-            "give -c stage=prod, as always; leave it away only to take the deployment down",
+            "the deployed stage is prod, the new one is dev: data would no longer be protected",
+            "pass -c stage=prod, as always; leave it out only to take the deployment down",
         )
     wanted = {"site": settings.site, "account": settings.account_wide}
     gone = [f"{settings.namespace}-{noun}" for noun, want in wanted.items() if not want]
@@ -211,7 +211,7 @@ def changes(clients: Clients, settings: Settings) -> Found:
 
 
 def _used_exports(clients: Clients, storage: str) -> dict[str, list[str]]:
-    """Which stacks import the key, or the old telemetry table, of the storage stack."""
+    """The stacks that import the storage stack's key or old telemetry table."""
     cloudformation = clients.client("cloudformation")
     used: dict[str, list[str]] = {"Key": [], OLD_TELEMETRY: []}
     exports = [
@@ -221,7 +221,7 @@ def _used_exports(clients: Clients, storage: str) -> dict[str, list[str]]:
     ]
     for what, importers in used.items():
         for name in exports:
-            # The CDK's name of an export: how it is read, the construct, and a hash.
+            # The CDK names an export by its reading, the construct, and a hash.
             if not name.startswith(
                 tuple(f"{storage}:ExportsOutput{how}{what}" for how in ("FnGetAtt", "Ref"))
             ):
@@ -230,7 +230,7 @@ def _used_exports(clients: Clients, storage: str) -> dict[str, list[str]]:
                 pages = cloudformation.get_paginator("list_imports").paginate(ExportName=name)
                 importers += [one for page in pages for one in page["Imports"]]
             except ClientError as error:
-                # AWS calls it an error where nobody does.
+                # AWS answers with an error if no stack imports it.
                 if "not imported" not in str(error):
                     raise
     return used

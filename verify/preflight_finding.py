@@ -1,4 +1,4 @@
-"""A finding of the preflight, and how an item becomes one whatever AWS answers."""
+"""A finding of the preflight, and its creation from any answer of AWS."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ _ACTION = re.compile(r"not authorized to perform:? ([a-z0-9-]+:\w+)", re.IGNOREC
 
 
 class Verdict(enum.Enum):
-    """What a finding means for the deployment."""
+    """The meaning of a finding for the deployment."""
 
     FINE = "fine"
     WARNING = "warning"
@@ -27,14 +27,14 @@ class Verdict(enum.Enum):
 
 
 class Clients(Protocol):
-    """Makes clients of AWS' services; `iort_station.cloud.Cloud` is one."""
+    """Creates clients of AWS' services; `iort_station.cloud.Cloud` is one."""
 
     def client(self, service: str) -> Any:
         """A boto3 client."""
 
 
 class Found(NamedTuple):
-    """What an item found; ``do`` says what to do where that is not fine."""
+    """An item's result; ``do`` is the remedy."""
 
     verdict: Verdict
     text: str
@@ -43,7 +43,7 @@ class Found(NamedTuple):
 
 @dataclass(frozen=True, kw_only=True)
 class Finding:
-    """One item of the preflight: what was ``asked``, what was ``found``, what that means, what to ``do``."""
+    """One item of the preflight: what was ``asked`` and ``found``, the verdict, and the remedy, ``do``."""
 
     item: str
     asked: str
@@ -61,7 +61,7 @@ def fine(text: str) -> Found:
 
 
 def warning(text: str, do: str) -> Found:
-    """The deployment goes through, and its operator should know."""
+    """The deployment would succeed, but its operator should know."""
     return Found(Verdict.WARNING, text, do)
 
 
@@ -71,8 +71,8 @@ def stops(text: str, do: str) -> Found:
 
 
 def item(name: str, asked: str) -> Callable[[Callable[[Clients, Settings], Found]], Item]:
-    """Make a finding of what a function found. What AWS does not answer is a warning and never stops: the
-    deployment itself may do with less, or with other, permissions."""
+    """Turn a function's result into a finding. A missing answer of AWS is a warning and never stops: the
+    deployment itself may need other permissions."""
 
     def wrap(look: Callable[[Clients, Settings], Found]) -> Item:
         @wraps(look)
@@ -97,7 +97,7 @@ def code(error: ClientError) -> str:
 
 def _not_answered(error: ClientError) -> Found:
     if code(error) not in _DENIED:
-        return warning(f"not answered: {error}", "ask it by hand, or go on without it")
+        return warning(f"not answered: {error}", "ask it by hand, or continue without it")
     said = _ACTION.search(str(error))
     action = said[1] if said else error.operation_name
     return warning(

@@ -1,4 +1,4 @@
-"""What a run of `make verify-aws` costs, at list prices and on the generous side."""
+"""The cost of a run of `make verify-aws`, at list prices, generously estimated."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ _GB_SECONDS = INVOCATIONS * 0.5 * 1.0
 
 
 def estimate() -> dict[str, float]:
-    """Dollars by what is metered."""
+    """Dollars by meter."""
     month = _HOURS / MONTH_HOURS
     each = {name: price.each for name, price in PRICES.items()}
     return {
@@ -29,6 +29,6 @@ def estimate() -> dict[str, float]:
 
 
 def told(dollars: dict[str, float]) -> str:
-    """The estimate in a line, rounded up to a cent."""
+    """The estimate in one line, rounded up to a cent."""
     parts = ", ".join(f"{name} {usd:.3f}" for name, usd in dollars.items())
     return f"about ${ceil(sum(dollars.values()) * 100) / 100:.2f} ({parts})"

@@ -1,4 +1,4 @@
-"""The report of a run, as JSON and as Markdown, without accounts and secrets."""
+"""The report of a run, as JSON and as Markdown, without account numbers and secrets."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from typing import Any
 
 from verify.check import NOTE, Answer, Verdict, compared
 
-# An account's number, an access key's id, PubNub's keys, a private key, a session's token.
+# An account number, an access key's id, PubNub's keys, a private key, a session token.
 _SECRETS = (
     (re.compile(r"\b\d{12}\b"), "<account>"),
     (re.compile(r"\b(?:AKIA|ASIA)[A-Z0-9]{12,}\b"), "<access key>"),
@@ -24,7 +24,7 @@ _SECRETS = (
 
 @dataclass(frozen=True, kw_only=True)
 class Run:
-    """Who asked which cloud, and when; ``findings`` are the preflight's lines."""
+    """The asker, the cloud and the time; ``findings`` are the preflight's lines."""
 
     target: str
     region: str
@@ -36,7 +36,7 @@ class Run:
 
 
 def redacted(text: str) -> str:
-    """The text without what identifies an account or opens anything."""
+    """The text without account numbers and credentials."""
     for pattern, instead in _SECRETS:
         text = pattern.sub(instead, text)
     return text
@@ -45,7 +45,7 @@ def redacted(text: str) -> str:
 def write(folder: Path, run: Run, answers: Sequence[Answer]) -> None:
     """Write ``report.json`` and ``report.md`` into the folder."""
     folder.mkdir(parents=True, exist_ok=True)
-    # Times of twelve digits and more are no accounts: the answers hold none, by `Check`.
+    # A time with twelve digits or more is not an account; by `Check`, answers hold no times.
     (folder / "report.json").write_text(redacted(as_json(run, answers)))
     (folder / "report.md").write_text(redacted(as_markdown(run, answers)))
 
@@ -77,7 +77,7 @@ def as_json(run: Run, answers: Sequence[Answer]) -> str:
 
 
 def as_markdown(run: Run, answers: Sequence[Answer]) -> str:
-    """The same for people: the verdicts first, then every answer that is not as assumed."""
+    """The report for people: the verdicts first, then all answers that differ."""
     lines = [
         f"# What {run.target} answered",
         "",

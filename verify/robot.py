@@ -1,4 +1,4 @@
-"""A bare MQTT 5 client with a robot's certificate, which says what the broker answers."""
+"""A bare MQTT 5 client with a robot's certificate; it reports the broker's answers."""
 
 from __future__ import annotations
 
@@ -19,22 +19,22 @@ from verify.errors import VerifyError
 from verify.waiting import until
 
 WAIT_S = 60.0
-# AWS takes one CONNECT a second of a client id ("Connect requests per second per client ID").
+# AWS accepts one CONNECT a second per client id ("Connect requests per second per client ID").
 CONNECT_AGAIN_S = 1.2
-# A live message that Lambda 1 drops: what it refuses is kept, and costs the robot its allowance.
+# A live message that Lambda 1 drops: a refused one would be kept, and cost the robot its allowance.
 STALE = encode_live(LiveSample("0" * 8, 0, 0, 0, {}, offset_us=0))
 
 
 def payload_for(topic: str) -> bytes:
-    """What may be published on any topic that does not matter to the test."""
+    """A payload for any topic where the content does not matter."""
     return STALE if f"{LIVE}/" in topic else b"{}"
 
 
 class Robot:
     """Connects as `name`, or as another client id, with the bundle of a registered robot.
 
-    ``paced``, the library keeps to AWS' quotas of a connection. `reason` is the name of the reason code with
-    which the broker refused or ended the connection; "" where it gave none.
+    With ``paced``, the library respects AWS' quotas of a connection. `reason` is the name of the reason code
+    with which the broker refused or ended the connection; "" if it gave none.
     """
 
     def __init__(self, folder: Path, *, client_id: str | None = None, paced: bool = True) -> None:
@@ -82,19 +82,19 @@ class Robot:
         return self
 
     def publish(self, topic: str, payload: bytes) -> str:
-        """Publish at QoS 1; the name of the broker's reason code. Raises `VerifyError` where none comes."""
+        """Publish at QoS 1; return the broker's reason code. Raises `VerifyError` if none comes."""
         answer = self._answer(self.send(topic, payload))
         return str(answer.puback.reason_code.name)
 
     def send(self, topic: str, payload: bytes) -> Future[Any]:
-        """Publish at QoS 1 without waiting; the library's future."""
+        """Publish at QoS 1 without waiting; return the library's future."""
         packet = mqtt5.PublishPacket(topic=topic, payload=payload, qos=mqtt5.QoS.AT_LEAST_ONCE)
         published: Future[Any] = self._client.publish(packet)
         return published
 
     def attempt(self, topic: str, payload: bytes) -> str:
-        """Publish at QoS 1; the name of the broker's reason code, "DISCONNECTED" where it ends the session,
-        "NOT_SENT" where the library does not take what the broker would refuse."""
+        """Publish at QoS 1; return the broker's reason code, "DISCONNECTED" if it ends the session, or
+        "NOT_SENT" if the library rejects what the broker would refuse."""
         sent = self.send(topic, payload)
         until(lambda: sent.done() or self.lost.is_set(), f"an answer to a message on {topic}")
         if sent.done() and not sent.exception():
@@ -102,14 +102,14 @@ class Robot:
         return "DISCONNECTED" if self.lost.is_set() else "NOT_SENT"
 
     def subscribe(self, topic_filter: str) -> str:
-        """Subscribe at QoS 1; the name of the broker's reason code. Raises `VerifyError` where none comes."""
+        """Subscribe at QoS 1; return the broker's reason code. Raises `VerifyError` if none comes."""
         subscription = mqtt5.Subscription(topic_filter=topic_filter, qos=mqtt5.QoS.AT_LEAST_ONCE)
         packet = mqtt5.SubscribePacket(subscriptions=[subscription])
         answer = self._answer(self._client.subscribe(packet))
         return str(answer.reason_codes[0].name)
 
     def next_message(self, within_s: float = WAIT_S) -> tuple[str, bytes]:
-        """The next message that comes in. Raises `VerifyError` where none comes in time."""
+        """The next incoming message. Raises `VerifyError` if none comes in time."""
         try:
             return self.messages.get(timeout=within_s)
         except queue.Empty:
@@ -128,15 +128,14 @@ class Robot:
 
 
 def refusal(folder: Path, *, client_id: str | None = None) -> str | None:
-    """The name of the code with which a connection is refused, "" where there is none; None for one that
-    is accepted."""
+    """The name of the code with which a connection is refused, "" without a code; None if it is accepted."""
     with Robot(folder, client_id=client_id) as robot:
         until(lambda: robot.connected.is_set() or robot.refused.is_set(), "the broker's answer to a CONNECT")
         return None if robot.connected.is_set() else robot.reason
 
 
 def soon_refused(folder: Path) -> str | None:
-    """The same, where the broker may need some seconds until it knows."""
+    """Like `refusal`, if the broker may need some seconds to know."""
 
     def refused() -> list[str]:
         time.sleep(CONNECT_AGAIN_S)

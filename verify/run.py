@@ -1,11 +1,11 @@
-"""`make verify-aws`: asks an AWS account everything that the design takes for granted about AWS.
+"""`make verify-aws`: asks an AWS account about all assumptions of the design.
 
     python -m verify.run [--target aws|embedded] [--only rules,files] [--yes] [--out build/verify] [--keep]
 
-It looks first, says what it costs and asks; makes the stacks under a namespace of their own; asks; changes
-them to a key of the account's own and asks what depends on it; takes everything down again, also after
-Ctrl-C. Writes report.json and report.md. Exit status 1 if an answer is not as assumed, 2 if a question failed
-or something was left over.
+It checks the account, prints the costs and asks for confirmation. It creates the stacks under a namespace of
+their own, asks the questions, changes to a key of the account's own, and asks the questions about that. It
+removes everything at the end, also after Ctrl-C. It writes report.json and report.md. Exit status 1 if an
+answer differs, 2 if a question failed or something was left over.
 """
 
 from __future__ import annotations
@@ -53,7 +53,7 @@ Say = Callable[[str], None]
 
 
 def main() -> None:
-    """Ask, write and say."""
+    """Ask, write and print."""
     try:
         sys.exit(run(_options()))
     except KeyboardInterrupt:
@@ -64,7 +64,7 @@ def main() -> None:
 
 
 def run(options: argparse.Namespace, cloud: Cloud | None = None, deployment: Deployment | None = None) -> int:
-    """The exit status; on ``cloud`` and with ``deployment`` where they are not made from the options."""
+    """Return the exit status; ``cloud`` and ``deployment`` replace those made from the options."""
     console = Console()
     began = time.monotonic()
 
@@ -98,7 +98,7 @@ def run(options: argparse.Namespace, cloud: Cloud | None = None, deployment: Dep
                 with suppress(VerifyError, StationError, ClientError):
                     lent.enter_context(keys_lent(target))
                 region = target.cloud.client("iot").meta.region_name
-                # One by one: what was answered before an interrupt is in the report.
+                # One by one, so that the report has all answers before an interrupt.
                 answers.extend(_asked(options.only, FIRST, target, console))
                 if deployment and any(check.phase == WITH_KEY for check in options.only):
                     deployment.deploy({"customer_key": "true"})
@@ -123,8 +123,8 @@ def run(options: argparse.Namespace, cloud: Cloud | None = None, deployment: Dep
 
 
 def _asked(checks: Sequence[Check], phase: str, target: Target, console: Console) -> Iterator[Answer]:
-    """Ask the questions of a phase, one after the other; each is said with its verdict."""
-    # The embedded cloud is held to what AWS has answered.
+    """Ask the questions of a phase in order, and print each verdict."""
+    # The embedded cloud must give AWS' measured answers.
     known = measured.load() if target.kind == EMBEDDED else measured.Measured()
     these = [check for check in checks if check.phase == phase]
     for number, check in enumerate(these, 1):
@@ -142,29 +142,29 @@ def _asked(checks: Sequence[Check], phase: str, target: Target, console: Console
 
 
 def _looked(cloud: Cloud, console: Console) -> list[str]:
-    """The preflight's lines for the report. Raises `VerifyError` where the deployment would fail."""
+    """The preflight's lines for the report. Raises `VerifyError` if the deployment would fail."""
     found = preflight.look(cloud, Settings(namespace=cloud.namespace))
     lines = [preflight.line(finding) for finding in found]
     for text in lines:
         console.print(report.redacted(text), markup=False, highlight=False)
     if preflight.stopped(found):
-        raise VerifyError("nothing was made: the preflight says what to do")
+        raise VerifyError("nothing was created: the preflight says what to do")
     return lines
 
 
 def _confirm(console: Console, cloud: Cloud) -> None:
-    """Ask before money is spent. Raises `VerifyError` where nobody can be asked, or the answer is no."""
+    """Ask before money is spent. Raises `VerifyError` without a terminal, or if the answer is no."""
     console.print(
         f"This takes about half an hour and costs {price.told(price.estimate())} at the list prices of "
         f"{AS_OF}. "
-        f"It makes the stacks of namespace {cloud.namespace}, asks them, and removes them with all they "
-        "hold. A key of the account's own is scheduled for deletion, which AWS does not charge for.",
+        f"It creates the stacks of namespace {cloud.namespace}, asks them, and removes them with all their "
+        "data. A key of the account's own is scheduled for deletion, which AWS does not charge for.",
         highlight=False,
     )
     if not sys.stdin.isatty():
-        raise VerifyError("nobody can be asked whether to go on: --yes (`make verify-aws YES=1`) says so")
+        raise VerifyError("no terminal to ask for confirmation: use --yes (`make verify-aws YES=1`)")
     if not Confirm.ask("Go on?", console=console, default=False):
-        raise VerifyError("nothing was made")
+        raise VerifyError("nothing was created")
 
 
 def _described(
@@ -188,8 +188,8 @@ def _options() -> argparse.Namespace:
     parser.add_argument("--only", type=_selected, default=ALL, help="subjects or questions, with commas")
     parser.add_argument("--namespace", default=f"verify{secrets.token_hex(3)}")
     parser.add_argument("--out", type=Path, default=OUT, help="folder of the report (build/verify)")
-    parser.add_argument("--by", default=getpass.getuser(), help="who asks, for the report")
-    parser.add_argument("--yes", action="store_true", help="do not ask before money is spent")
+    parser.add_argument("--by", default=getpass.getuser(), help="your name, for the report")
+    parser.add_argument("--yes", action="store_true", help="spend money without confirmation")
     parser.add_argument("--keep", action="store_true", help="keep the answers in the repository")
     options = parser.parse_args()
     if options.keep and options.target != AWS:

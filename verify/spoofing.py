@@ -1,4 +1,4 @@
-"""A message that says what only the cloud may say: every key that a rule adds, in another robot's name."""
+"""A message that fakes the cloud's keys: every key that a rule adds, in another robot's name."""
 
 from __future__ import annotations
 
@@ -16,12 +16,12 @@ from iort_contract import (
     build_topic,
 )
 
-# Times that no cloud says: of 1970, and of the year 2286.
+# Times that the cloud never sends: of 1970, and of the year 2286.
 LONG_AGO_MS, FAR_AHEAD_S = 7, 10**10
 
 
 def spoofed(message: bytes, victim: str, lane: str, name: str, namespace: str = DEFAULT_NAMESPACE) -> bytes:
-    """The message with every such key, first and last (a reader of JSON may take either)."""
+    """The message with every such key, first and last (a JSON reader may take either)."""
     keys = {
         TOPIC: build_topic(lane, victim, name, namespace),
         RECEIVED_MS: LONG_AGO_MS,

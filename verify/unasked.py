@@ -21,10 +21,10 @@ def _assumed(name: str, assumed: str, *relied_on_by: str) -> Assumption:
 
 
 UNASKED = (
-    # An outage of Lambda cannot be ordered.
+    # Nobody can order an outage of Lambda.
     _documented(
         "lambda.asynchronous",
-        "A rule's invocation waits in a queue of Lambda's. A throttled one is tried again for up to six "
+        "A rule's invocation waits in a queue of Lambda. A throttled one is retried for up to six "
         "hours, a failed one as often as the function's settings say; then it goes to the destination for "
         "failures.",
         f"{_LAMBDA}/invocation-async-error-handling.html",
@@ -38,7 +38,7 @@ UNASKED = (
         "functions/summarize.py",
         "functions/live.py",
     ),
-    # Whether an environment was kept shows only by chance.
+    # A warm environment shows only by chance.
     _documented(
         "lambda.environment_survives",
         "A handler that raises does not end its execution environment; the next event finds it warm.",
@@ -87,7 +87,7 @@ UNASKED = (
         "stacks/quarantine.py",
         "local/gaps/storage/queue_lock.py",
     ),
-    # The hook's time-out would need a deployment of its own.
+    # The hook's timeout would need a deployment of its own.
     _documented(
         "provisioning.hook_timeout",
         "A pre-provisioning hook that does not answer in 5 seconds counts as a refusal.",
@@ -254,7 +254,7 @@ UNASKED = (
     # CloudFormation's console lines are not an interface.
     _assumed(
         "cdk.failed_deletion",
-        "The CDK prints DELETE_FAILED and AWS::IoT::Policy in one line where a policy cannot be deleted yet.",
+        "The CDK prints DELETE_FAILED and AWS::IoT::Policy in one line if a policy cannot be deleted yet.",
         "scripts/destroy.py",
     ),
 )

@@ -1,4 +1,4 @@
-"""A robot that asks for signed addresses over MQTT, and puts bodies there."""
+"""A robot that requests signed addresses over MQTT, and uploads bodies there."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ _CODE = re.compile(r"<Code>([^<]+)</Code>")
 
 
 class Asking:
-    """A robot that asks for addresses and puts bodies there."""
+    """A robot that requests addresses and uploads bodies there."""
 
     def __init__(self, target: Target, robot: Robot) -> None:
         self._robot, self._namespace = robot, target.cloud.namespace
@@ -68,7 +68,7 @@ def sent(
     body: bytes = b"",
     headers: Mapping[str, str] | None = None,
 ) -> tuple[int, str]:
-    """Send a body to an address as it is; the status, and the code of S3's error."""
+    """Send a body unchanged to an address; return the status, and the code of S3's error."""
     parts = urlsplit(url)
     with closing(http.client.HTTPSConnection(parts.netloc, context=context, timeout=60)) as connection:
         connection.request(method, f"{parts.path}?{parts.query}", body, dict(headers or {}))
@@ -79,7 +79,7 @@ def sent(
 
 @contextmanager
 def asking(target: Target, base: str, file: File) -> Iterator[tuple[Asking, str]]:
-    """A new robot and the key of its file; the file is deleted in the end."""
+    """A new robot and the key of its file; the file is deleted at the end."""
     bundle, bucket = target.robot(base), target.cloud.output("storage", "FilesBucket")
     key = file_key(bundle.robot, file)
     with Robot(bundle.folder) as robot:

@@ -1,4 +1,4 @@
-"""Waits for what a service shows only when it is asked again."""
+"""Polls a service until it shows a result."""
 
 from __future__ import annotations
 

@@ -1,10 +1,10 @@
-"""What both ends of every wire agree on: names, units, envelopes and limits.
+"""The contract of every message: names, units, envelopes and limits.
 
-The robot, the Lambda functions, the stacks and the operator's station all import this package, so it
-needs nothing but Python 3.8's standard library. Units are in the names (``_us`` microseconds,
-``_ms`` milliseconds, ``_s`` seconds since the Unix epoch) or in `VESC_FIELDS`.
+The robot, the Lambda functions, the stacks and the operator's station all import this package, so it needs
+only Python 3.8's standard library. Units are in the names (``_us`` microseconds, ``_ms`` milliseconds, ``_s``
+seconds since the Unix epoch) or in `VESC_FIELDS`.
 
-Everything here that refuses its input raises `ContractError`, and nothing else.
+Every check of input raises `ContractError`, and no other error.
 """
 
 from __future__ import annotations

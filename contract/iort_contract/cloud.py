@@ -1,4 +1,4 @@
-"""What the cloud is made of, by name: rules, metrics, the files' bucket, PubNub's channels."""
+"""The names of the cloud's parts: rules, metrics, the files' bucket, PubNub's channels."""
 
 from __future__ import annotations
 
@@ -22,17 +22,17 @@ from iort_contract.topics import (
 )
 from iort_contract.vesc import FAULT_FIELD, VOLTAGE_FIELD
 
-# Where the broker says who came and went.
+# The broker publishes connects and disconnects here.
 _PRESENCE = "$aws/events/presence"
-# A battery of three lithium cells below this is nearly empty; the deployment may say otherwise.
+# A battery of three lithium cells below this is nearly empty; a deployment can set another value.
 LOW_VOLTAGE_V = 10.5
-# The files' bucket: what robots upload, and query results too large for an answer, kept for a day.
+# The files' bucket: robots' uploads, and large query results, which expire after a day.
 FILES_PREFIX, RESULTS_PREFIX = "robots/", "results/"
 
 METRIC_NAMESPACE = "iort"
-# The dimensions of every metric: the deployment's namespace and what emits it.
+# The dimensions of every metric: the deployment's namespace and the function.
 METRIC_DEPLOYMENT, METRIC_FUNCTION = "Deployment", "Function"
-# The third of those that `robot_metrics` also counts a robot: each is billed a robot.
+# The third dimension, with `robot_metrics`: AWS bills each robot's metrics.
 METRIC_ROBOT = "Robot"
 METRICS = {
     "live": (
@@ -81,13 +81,13 @@ def rule_sql(
 ) -> str:
     """The SELECT of a topic rule.
 
-    A rule that adds what only the cloud may say (whose message, when received, when it expires) never
-    selects ``*`` beside it: AWS does not say which of two keys of one name stays. It selects the message's
-    keys by name, or the message as one opaque value.
+    A rule that adds keys of the cloud (topic, receipt, expiry) never selects ``*`` beside them: AWS does not
+    document which of two keys of one name stays. It selects the message's keys by name, or the message as one
+    opaque value.
     """
     name = check_namespace(namespace)
     received = f"timestamp() AS {RECEIVED_MS}"
-    # Byte by byte, whatever it is, JSON or not.
+    # Raw bytes, JSON or not.
     message = f"encode(*, 'base64') AS {MESSAGE_BASE64}, topic() AS {TOPIC}, {received}"
     if rule == "record":
         expires = f"floor(timestamp() / 1000) + {retention_s} AS {EXPIRES_S}"
@@ -109,14 +109,14 @@ def rule_sql(
             f"SELECT {reported} AS {AGENT_VERSION}, topic(3) AS {ROBOT} "
             f"FROM '$aws/things/+/shadow/name/{SHADOW}/update/accepted' WHERE {reported} <> ''"
         )
-    # Two rules and not one with OR, which AWS IoT calls Undefined where either side compares with null.
+    # Two rules instead of OR, which AWS IoT calls Undefined if either side compares with null.
     if rule == "fault":
         return _alert_sql(FAULT_FIELD, name, f"sample.{FAULT_FIELD} > 0")
     if rule == "battery":
         # A controller that does not measure its voltage says 0.
         low = f"sample.{VOLTAGE_FIELD} > 0 AND sample.{VOLTAGE_FIELD} < {low_voltage_v:g}"
         return _alert_sql(VOLTAGE_FIELD, name, low)
-    raise ContractError(f"rule {shown(rule)}: allowed is one of {', '.join(RULES)}")
+    raise ContractError(f"rule must be one of {', '.join(RULES)}, got {shown(rule)}")
 
 
 def _alert_sql(field: str, namespace: str, condition: str) -> str:
@@ -143,7 +143,7 @@ def fleet_name(namespace: str = DEFAULT_NAMESPACE) -> str:
 
 
 def claim_name(namespace: str = DEFAULT_NAMESPACE) -> str:
-    """The name of the claims' IoT policy, and what a client id that uses a claim begins with."""
+    """The name of the claims' IoT policy, and the prefix of a claim's client id."""
     return f"{check_namespace(namespace)}-claim"
 
 

@@ -1,14 +1,14 @@
-"""A condition on samples, such as ``speed_mps > 1.2 and fault_code == 0``: parsed, never evaluated by Python.
+"""Conditions on samples, such as ``speed_mps > 1.2 and fault_code == 0``: parsed, never evaluated by Python.
 
 The language is a part of Python's own syntax: fields (a dotted path, ``covariance[0]`` for an element),
 numbers, texts, ``+ - * / %``, ``abs()``, comparisons (also chained and ``in (...)``), ``is None`` and
-``is not None`` (also written ``== None`` and ``!= None``), ``and``, ``or``, ``not`` and brackets. What is
-null makes arithmetic null and every comparison false; division by zero is null. A field by itself is true
-where it is neither null, zero nor empty. A number compared with a text is an error, as is calculating with
-a text: no sample could ever answer it.
+``is not None`` (also written ``== None`` and ``!= None``), ``and``, ``or``, ``not`` and brackets. With null,
+arithmetic gives null and every comparison is false; division by zero gives null. A field by itself is true
+if it is neither null, zero nor empty. A comparison of a number with a text, or arithmetic with a text, is an
+error, since no sample could match.
 
-The query function evaluates over lists; iort_station.data.conditions does over numpy's
-columns, with the same answers.
+The query function evaluates over lists; iort_station.data.conditions evaluates over numpy's columns, with the
+same answers.
 """
 
 from __future__ import annotations
@@ -22,9 +22,9 @@ from typing import Any, NamedTuple, TypeAlias
 from iort_contract import ContractError, Value, check_field
 
 MAX_LENGTH = 1000
-# Deeper than anybody writes, and far from the interpreter's own limit.
+# Deeper than practical expressions, and well below the interpreter's own limit.
 _MAX_DEPTH = 40
-# What a value is, as far as comparing goes; a flag is 0 or 1.
+# The kind of a value for comparisons; a flag counts as 0 or 1.
 _NULL, _NUMBER, _TEXT = "null", "a number", "a text"
 _Kinds: TypeAlias = Mapping[str, frozenset[str]]
 
@@ -54,7 +54,7 @@ class Constant(NamedTuple):
 
 
 class Arithmetic(NamedTuple):
-    """Two numbers make one; null where either is."""
+    """An operation on two numbers; null if either is null."""
 
     symbol: str
     left: Node
@@ -62,13 +62,13 @@ class Arithmetic(NamedTuple):
 
 
 class Magnitude(NamedTuple):
-    """A number without its sign."""
+    """The absolute value of a number."""
 
     of: Node
 
 
 class Comparison(NamedTuple):
-    """Two values compared; false where either is null."""
+    """A comparison of two values; false if either is null."""
 
     symbol: str
     left: Node
@@ -76,25 +76,25 @@ class Comparison(NamedTuple):
 
 
 class IsNull(NamedTuple):
-    """Whether a value is missing."""
+    """Whether a value is null."""
 
     of: Node
 
 
 class Every(NamedTuple):
-    """True where all of them are."""
+    """True if all parts are true."""
 
     of: tuple[Node, ...]
 
 
 class Some(NamedTuple):
-    """True where any of them is."""
+    """True if any part is true."""
 
     of: tuple[Node, ...]
 
 
 class Not(NamedTuple):
-    """True where the other is not."""
+    """True if the part is false."""
 
     of: Node
 
@@ -121,24 +121,24 @@ _COMPARE = {ast.Eq: "==", ast.NotEq: "!=", ast.Lt: "<", ast.LtE: "<=", ast.Gt: "
 
 
 def parse(expression: str) -> Node:
-    """The tree of an expression; raises `ExpressionError` for what is not in the language."""
+    """Parse an expression; raises `ExpressionError` if it is not in the language."""
     if len(expression) > MAX_LENGTH:
-        raise ExpressionError(f"the expression has over {MAX_LENGTH} characters", expression[:60] + "...", 0)
-    # Spaces in front are an indentation to Python, and a line's end is an end.
+        raise ExpressionError(f"must be at most {MAX_LENGTH} characters", expression[:60] + "...", 0)
+    # For Python, leading spaces are indentation, and a newline ends the expression.
     text = " ".join(expression.splitlines()).strip()
     try:
         tree = ast.parse(text, mode="eval")
     except SyntaxError as error:
-        # The end of the text has no place of its own.
+        # The position is the end of the text.
         position = min(len(text), (error.offset or len(text) + 1) - 1)
-        raise ExpressionError(f"this is no expression: {error.msg}", text, position) from error
+        raise ExpressionError(f"invalid expression: {error.msg}", text, position) from error
     except (ValueError, MemoryError, RecursionError) as error:
-        raise ExpressionError("this is no expression", text[:60], 0) from error
+        raise ExpressionError("invalid expression", text[:60], 0) from error
     return _Reader(text).read(tree.body)
 
 
 def names(node: Node) -> frozenset[str]:
-    """The fields that a tree refers to."""
+    """The fields in a tree."""
     if isinstance(node, Field):
         return frozenset({node.name})
     if isinstance(node, Constant):
@@ -150,9 +150,9 @@ def names(node: Node) -> frozenset[str]:
 
 
 def holds(node: Node, columns: Mapping[str, Sequence[Value]], n: int) -> list[bool]:
-    """Where the condition is true, a value a sample; a field that is not there is null.
+    """Evaluate the condition, one value per sample; a missing field is null.
 
-    Raises `MismatchError` where numbers and texts would be compared.
+    Raises `MismatchError` if the condition mixes numbers and texts.
     """
     fields = {name: columns.get(name) or [None] * n for name in names(node)}
     kinds = {name: frozenset(map(_kind, column)) - {_NULL} for name, column in fields.items()}
@@ -207,14 +207,14 @@ def _kind(value: Value) -> str:
 
 
 def _kinds(node: Node, of: _Kinds) -> frozenset[str]:
-    """What the values of a node are; nothing where that is not known, or all are null."""
+    """The kinds of a node's values; empty if unknown, or if all are null."""
     if isinstance(node, Field):
         return of.get(node.name, frozenset())
     return frozenset({_kind(node.value) if isinstance(node, Constant) else _NUMBER})
 
 
 def _mismatch(node: Node, of: _Kinds) -> str:
-    """What a condition asks that fields of these kinds cannot answer; empty where there is nothing."""
+    """The error text if the condition mixes numbers and texts of these kinds; empty if it does not."""
     if isinstance(node, (Field, Constant)):
         return ""
     if isinstance(node, (Arithmetic, Comparison)):
@@ -226,20 +226,20 @@ def _mismatch(node: Node, of: _Kinds) -> str:
         f"{_shown(part)} is {' or '.join(sorted(_kinds(part, of)))}" for part in parts if _kinds(part, of)
     )
     if isinstance(node, Comparison) and len(kinds) > 1:
-        return f"a number and a text cannot be compared: {said}"
+        return f"cannot compare a number with a text: {said}"
     if isinstance(node, (Arithmetic, Magnitude)) and _TEXT in kinds:
-        return f"a text cannot be calculated with: {said}"
+        return f"cannot calculate with a text: {said}"
     return next(filter(None, (_mismatch(part, of) for part in parts)), "")
 
 
 def _shown(node: Node) -> str:
     if isinstance(node, Field):
         return node.name
-    return repr(node.value) if isinstance(node, Constant) else "what is calculated"
+    return repr(node.value) if isinstance(node, Constant) else "the result"
 
 
 class _Reader:
-    """Turns Python's tree into ours, and refuses everything that ours does not have."""
+    """Turns Python's tree into ours; refuses everything outside our language."""
 
     def __init__(self, text: str) -> None:
         self._text = text
@@ -260,7 +260,7 @@ class _Reader:
         if isinstance(node, ast.Constant):
             return self._constant(node)
         made = self._made(node)
-        # What the fields are, only the samples will tell.
+        # The kinds of fields are known only with the samples.
         if problem := _mismatch(made, {}):
             raise self._error(problem, node)
         return made
@@ -282,7 +282,7 @@ class _Reader:
             return self._compare(node)
         if isinstance(node, ast.Call):
             return self._call(node)
-        raise self._error("this is not part of the language: fields, numbers, texts, + - * / %, "
+        raise self._error("not part of the language: fields, numbers, texts, + - * / %, "
                           "abs(), comparisons, and, or, not", node)  # fmt: skip
 
     def _field(self, node: ast.expr) -> Field:
@@ -293,10 +293,10 @@ class _Reader:
                 path.append(at.attr)
             elif isinstance(at, ast.Subscript) and isinstance(at.slice, ast.Constant):
                 if type(at.slice.value) is not int:
-                    raise self._error("an element has a number", at.slice)
+                    raise self._error("an index must be a number", at.slice)
                 path.append(str(at.slice.value))
             else:
-                raise self._error("this is not a field", node)
+                raise self._error("not a field", node)
             at = at.value
         name = ".".join([at.id, *reversed(path)])
         try:
@@ -317,8 +317,8 @@ class _Reader:
         if isinstance(value, (bool, str)):
             return Constant(value)
         if value is None:
-            raise self._error("None can only be asked for: x is None, x is not None", node)
-        raise self._error("this is neither number nor text", node)
+            raise self._error("None is only allowed as x is None, x is not None", node)
+        raise self._error("must be a number or a text", node)
 
     def _compare(self, node: ast.Compare) -> Node:
         parts: list[Node] = []
@@ -330,7 +330,7 @@ class _Reader:
 
     def _pair(self, left: ast.expr, kind: ast.cmpop, right: ast.expr) -> Node:
         if isinstance(kind, (ast.Is, ast.IsNot)) and not _is_none(right):
-            raise self._error("`is` asks for None alone; use ==", right)
+            raise self._error("`is` only works with None; use ==", right)
         if isinstance(kind, (ast.Is, ast.IsNot, ast.Eq, ast.NotEq)) and (_is_none(left) or _is_none(right)):
             null = IsNull(self.read(left if _is_none(right) else right))
             return null if isinstance(kind, (ast.Is, ast.Eq)) else Not(null)
@@ -344,7 +344,7 @@ class _Reader:
     def _call(self, node: ast.Call) -> Node:
         known = isinstance(node.func, ast.Name) and node.func.id == "abs"
         if not known or len(node.args) != 1 or node.keywords:
-            raise self._error("the one function is abs(x)", node)
+            raise self._error("the only function is abs(x)", node)
         return Magnitude(self.read(node.args[0]))
 
     def _error(self, problem: str, node: ast.expr) -> ExpressionError:

@@ -1,4 +1,4 @@
-"""What a second of a stream looked like, from the batches that hold its samples. Pure."""
+"""Summarises a second of a stream from its batches. Pure functions."""
 
 from __future__ import annotations
 
@@ -26,8 +26,8 @@ from iort_contract import (
     packed_second,
 )
 
-# A step this many times the usual one is a hole: one lost sample makes 2, jitter of a loaded
-# Jetson was seen to reach 2.5 on a recorded drive at 50 Hz.
+# A step this many times the median is a gap: one lost sample makes 2; the jitter of a loaded Jetson reached
+# 2.5 on a recorded drive at 50 Hz.
 _HOLE = 3.0
 _SECOND_US = 1_000_000
 _NUMBERS = {int, float}
@@ -35,7 +35,7 @@ _NUMBERS = {int, float}
 
 @dataclass(frozen=True)
 class Vehicle:
-    """What turns a VESC's numbers into the car's: ``erpm = gain * m/s + offset`` (vesc.yaml)."""
+    """Parameters that convert a VESC's values to the car's: ``erpm = gain * m/s + offset`` (vesc.yaml)."""
 
     speed_to_erpm_gain: float
     speed_to_erpm_offset: float = 0.0
@@ -44,14 +44,14 @@ class Vehicle:
 def summarize_second(
     second: int, batches: Sequence[Batch], vehicle: Vehicle | None, missing: int = 0
 ) -> dict[str, Statistics] | None:
-    """The summary of one second as it is stored, or None where no sample lies in it; ``missing`` batches
-    are known to lack before those that start in it.
+    """The summary of one second as stored, or None if it has no samples; ``missing`` batches are known to be
+    missing before its own.
 
-    ``batches`` are those of one stream, in order of time: every one that has a sample in the second
-    and the one before, from which holes and missing batches are seen. The result has ``n``, ``batches``,
-    ``missing_batches``, ``gaps``, ``nonfinite`` and every field, with ``speed_mps`` and ``power_w`` derived
-    where the fields and the vehicle's parameters allow (`iort_contract.codec.seconds`); ``absent`` counts
-    values of sensors that are not fitted, which are null here.
+    ``batches`` are those of one stream, in order of time: all with a sample in the second, and the one
+    before, which shows gaps and missing batches. The result has ``n``, ``batches``, ``missing_batches``,
+    ``gaps``, ``nonfinite`` and every field, with the derived ``speed_mps`` and ``power_w`` if fields and
+    vehicle allow (`iort_contract.codec.seconds`). ``absent`` counts values of sensors that are not fitted,
+    which are null here.
     """
     start_us, end_us = second * _SECOND_US, (second + 1) * _SECOND_US
     times: list[int] = []
@@ -90,12 +90,12 @@ def summarize_second(
 def without_absent(
     columns: Mapping[str, Sequence[Value]],
 ) -> tuple[Mapping[str, Sequence[Value]], dict[str, int]]:
-    """The columns with None for values of sensors that are not fitted, and how many those are by field."""
+    """The columns with None for values of sensors that are not fitted, and the count of those by field."""
     found: dict[str, Sequence[Value]] = {}
     absences: dict[str, int] = {}
     for name in columns.keys() & ABSENT_FROM.keys():
         column = columns[name]
-        # Of nearly every column one look at its least tells.
+        # For nearly every column, its minimum decides.
         if _are_numbers(column) and not (column and absent(name, min(column))):
             continue
         known = [None if absent(name, value) else value for value in column]
@@ -106,12 +106,12 @@ def without_absent(
 
 
 def missing_before(batch: BatchId, near: Sequence[BatchId]) -> int:
-    """How many batches the stream lacks just before one, by their numbers.
+    """The number of batches missing just before one, by their sequence numbers.
 
-    ``near`` are the batches around it in order of time, and at least the one before. Numbers grow by one,
-    also over a restart where the spool is durable; one that starts again at a lower number with a new
-    ``boot`` is a spool that was lost, of which only the start can be told. Where two runs lie over one
-    another in time, as of a recording that was played twice, nothing is told of the first of a run.
+    ``near`` are the batches around it in order of time, with at least the one before. Numbers grow by one,
+    also over a restart if the spool is durable. A restart at a lower number with a new ``boot`` means a lost
+    spool; only its start is known. If two runs overlap in time, as when a recording is played twice, the
+    first batch of a run counts as complete.
     """
     own = [other.seq for other in near if other.boot == batch.boot and other.seq < batch.seq]
     if own:
@@ -125,7 +125,7 @@ def missing_before(batch: BatchId, near: Sequence[BatchId]) -> int:
 
 
 def count_holes(times_us: Sequence[int]) -> int:
-    """Steps between samples over three times the median step; fewer than three steps tell nothing."""
+    """Steps between samples over three times the median step; at least three steps are needed."""
     steps = list(map(sub, times_us[1:], times_us))
     if len(steps) < 3:
         return 0
@@ -134,7 +134,7 @@ def count_holes(times_us: Sequence[int]) -> int:
 
 
 def derive(columns: Mapping[str, Sequence[Value]], vehicle: Vehicle | None) -> dict[str, list[Value]]:
-    """Speed in m/s (needs the vehicle) and electrical power in W, a value a sample."""
+    """Speed in m/s (needs the vehicle) and electrical power in W, one value per sample."""
     derived: dict[str, list[Value]] = {}
     speed = columns.get("speed")
     if speed is not None and vehicle is not None:
@@ -148,8 +148,8 @@ def derive(columns: Mapping[str, Sequence[Value]], vehicle: Vehicle | None) -> d
 
 
 def _statistics(column: Sequence[Value]) -> Statistics:
-    """Least, mean, most and last of a column's numbers, or one value where they are the same; the last
-    value of one that holds anything else, None of one that holds nothing."""
+    """Min, mean, max and last of a numeric column, or one value if all are equal; the last value of any other
+    column; None for an empty one."""
     numbers = numbers_of(column)
     if len(numbers) < len(column):
         values = [value for value in column if value is not None]
@@ -160,7 +160,7 @@ def _statistics(column: Sequence[Value]) -> Statistics:
     low, high = ordered[0], ordered[-1]
     if low == high:
         return [low]
-    # A mean is good to nine digits; the full seventeen would double what the table stores.
+    # Nine digits are enough for a mean; seventeen would double the table's size.
     rounded = float(f"{_mean(numbers):.9g}")
     return [low, min(max(rounded, low), high), high, numbers[-1]]
 
@@ -173,12 +173,12 @@ def numbers_of(column: Sequence[Value]) -> Sequence[int | float]:
 def _mean(numbers: Sequence[int | float]) -> float:
     try:
         return math.fsum(numbers) / len(numbers)
-    except OverflowError:  # the sum is over 1.8e308, which the mean never is
+    except OverflowError:  # the sum is over 1.8e308, but the mean never is
         return float(mean(numbers))
 
 
 def _numeric(column: Sequence[Value]) -> Sequence[int | float | None]:
-    """The column with None for what is no number."""
+    """The column with None for values that are not numbers."""
     return column if _are_numbers(column) else [value if _is_number(value) else None for value in column]
 
 
@@ -187,7 +187,7 @@ def _finite(values: Sequence[float | None]) -> list[Value]:
 
 
 def _are_numbers(column: Sequence[Value]) -> TypeGuard[Sequence[int | float]]:
-    """Whether all are numbers, which nearly every column's are: one look at their types tells."""
+    """Whether all values are numbers, by their types, as in nearly every column."""
     return set(map(type, column)) <= _NUMBERS
 
 

@@ -1,4 +1,4 @@
-"""Names, and the topics that are made of them."""
+"""Names, and the topics built from them."""
 
 from __future__ import annotations
 
@@ -9,36 +9,36 @@ from iort_contract.checks import checked, shown
 from iort_contract.limits import DEFAULT_NAMESPACE, ContractError
 
 _NAME = re.compile(r"[A-Za-z0-9_-]{1,64}")
-# Rule names allow no dash and start the names of two stages apart, so the namespace is stricter.
+# Rule names allow no dash and must differ between stages, so the namespace is stricter.
 _NAMESPACE = re.compile(r"[a-z][a-z0-9]{0,15}")
 
 RECORD, LIVE, FLEET, CMD, PING, PONG = "dt", "live", "fleet", "cmd", "ping", "pong"
 LANES = (RECORD, LIVE, FLEET, CMD, PING, PONG)
 BROKER, RULE, LAMBDA = "broker", "rule", "lambda"
-# What else is asked and answered on the lanes ping and pong: where a file may be uploaded to.
+# Another question on the lanes ping and pong: upload addresses of a file.
 FILE = "file"
 PING_PATHS = (BROKER, RULE, LAMBDA)
-# Round trips are a stream like any other: one sample a pong, the other paths' fields None.
+# Round trips are a stream like any other: one sample per pong, with None in the other paths' fields.
 RTT_STREAM = "rtt"
 RTT_FIELDS = {path: f"{path}_ms" for path in PING_PATHS}
-# What the agent says of itself; the fields are AGENT_FIELDS.
+# The agent's own figures; the fields are AGENT_FIELDS.
 AGENT_STREAM = "agent"
-# What the messages were that a stream's samples are made of: `MessageType`.
+# The ROS types of a stream's messages: `MessageType`.
 TYPES_STREAM = "types"
-# What the agent took, stored and did not record: contract/iort_contract/messages/account.py.
+# The agent's counts of taken, stored and unrecorded samples: contract/iort_contract/messages/account.py.
 ACCOUNT_STREAM = "account"
-# The streams that every robot may have and no source's configuration names.
+# The streams that every robot may have without configuration.
 OWN_STREAMS = frozenset({RTT_STREAM, AGENT_STREAM, TYPES_STREAM, ACCOUNT_STREAM})
-# The named shadow of a robot's thing that carries the agent's settings.
+# The named shadow of a robot's thing with the agent's settings.
 SHADOW = "agent"
-# Where the shadow says what became of the commands that asked for an answer.
+# In the shadow: the results of commands that asked for an answer.
 COMMANDS, ACCEPTED = "commands", "accepted"
 
 
 class Topic(NamedTuple):
     """A parsed topic, ``<lane>/<namespace>/<robot>/<name>``.
 
-    ``name`` is the stream (record, live), the path (ping, pong) or the message's own (fleet, cmd).
+    ``name`` is the stream (record, live), the path (ping, pong) or the message's own name (fleet, cmd).
     """
 
     lane: str
@@ -51,45 +51,45 @@ class Topic(NamedTuple):
 
 
 def check_robot(name: str) -> str:
-    """Return ``name`` if it may name a robot: thing name, client id and topic level alike."""
+    """Return ``name`` if it is a valid robot name: thing name, client id and topic level alike."""
     return checked(_NAME, name, "robot name", "1 to 64 of A-Z a-z 0-9 _ -")
 
 
 def check_stream(name: str) -> str:
-    """Return ``name`` if it may name a stream or be the last level of any topic."""
+    """Return ``name`` if it is a valid stream name, or last level of any topic."""
     return checked(_NAME, name, "stream name", "1 to 64 of A-Z a-z 0-9 _ -")
 
 
 def check_namespace(name: str) -> str:
-    """Return ``name`` if it may be a deployment's namespace."""
+    """Return ``name`` if it is a valid namespace of a deployment."""
     return checked(_NAMESPACE, name, "namespace", "a lower-case letter, then up to 15 of a-z 0-9")
 
 
 def build_topic(lane: str, robot: str, name: str, namespace: str = DEFAULT_NAMESPACE) -> str:
-    """The topic of a robot's message; raises `ContractError` where a level is not allowed."""
+    """The topic of a robot's message; raises `ContractError` for an invalid level."""
     if lane not in LANES:
-        raise ContractError(f"lane {shown(lane)}: allowed is one of {', '.join(LANES)}")
+        raise ContractError(f"lane must be one of {', '.join(LANES)}, got {shown(lane)}")
     return str(Topic(lane, check_namespace(namespace), check_robot(robot), check_stream(name)))
 
 
 def parse_topic(topic: str) -> Topic:
-    """Take a topic apart; raises `ContractError` for one that `build_topic` cannot have built."""
+    """Parse a topic; raises `ContractError` for one that `build_topic` cannot have built."""
     levels = topic.split("/") if isinstance(topic, str) else []
     if len(levels) != 4:
-        raise ContractError(f"topic {shown(topic)}: expected <lane>/<namespace>/<robot>/<name>")
+        raise ContractError(f"topic must be <lane>/<namespace>/<robot>/<name>, got {shown(topic)}")
     build_topic(levels[0], levels[2], levels[3], levels[1])
     return Topic(*levels)
 
 
 def record_topic(robot: str, stream: str, namespace: str = DEFAULT_NAMESPACE) -> str:
-    """Where a robot publishes its batches: straight to the rule, by Basic Ingest, which costs no
-    messaging. The rule's ``topic()`` sees ``dt/<namespace>/<robot>/<stream>``."""
+    """The topic for a robot's batches: straight to the rule, by Basic Ingest, which costs no messaging. The
+    rule's ``topic()`` sees ``dt/<namespace>/<robot>/<stream>``."""
     return _straight_to("record", build_topic(RECORD, robot, stream, namespace), namespace)
 
 
 def live_topic(robot: str, stream: str, namespace: str = DEFAULT_NAMESPACE) -> str:
-    """Where a robot publishes a live message that only the live rule shall see: by Basic Ingest, as
-    `record_topic`. Every other one goes to ``live/<namespace>/<robot>/<stream>``."""
+    """The topic for live messages that only the live rule needs: by Basic Ingest, like `record_topic`. All
+    other live messages go to ``live/<namespace>/<robot>/<stream>``."""
     return _straight_to("live", build_topic(LIVE, robot, stream, namespace), namespace)
 
 
@@ -98,9 +98,9 @@ def _straight_to(rule: str, topic: str, namespace: str) -> str:
 
 
 def as_subscribed(topic: str, rule: str) -> str:
-    """The topic without Basic Ingest's prefix to the rule of that physical name, if it has it.
+    """The topic without Basic Ingest's prefix of that rule (physical name).
 
-    ``topic()`` leaves it out; AWS does not say whether an error action's document does.
+    ``topic()`` leaves it out; AWS does not document whether an error action's document does.
     """
     prefix = f"$aws/rules/{rule}/"
     return topic[len(prefix) :] if topic.startswith(prefix) else topic
@@ -112,5 +112,5 @@ RULES = ("record", "live", "pong", "echo", "upload", "presence", "version", "fau
 def rule_name(rule: str, namespace: str = DEFAULT_NAMESPACE) -> str:
     """The physical name of a topic rule; robots need two of them for Basic Ingest."""
     if rule not in RULES:
-        raise ContractError(f"rule {shown(rule)}: allowed is one of {', '.join(RULES)}")
+        raise ContractError(f"rule must be one of {', '.join(RULES)}, got {shown(rule)}")
     return f"{check_namespace(namespace)}_{rule}"

@@ -6,7 +6,7 @@ from typing import NamedTuple
 
 from iort_contract.limits import Value
 
-# A thermistor that is not fitted reads as colder than this, down to absolute zero.
+# A thermistor that is not fitted reads colder than this, down to absolute zero.
 NO_SENSOR_DEGC = -50.0
 
 
@@ -14,8 +14,8 @@ _NUMBERS = (int, float)
 
 
 class Field(NamedTuple):
-    """One field of VescStateStamped: its unit, what it means and which driver reports it. The ROS 2
-    driver's unit is ``ros2_unit`` where that is another one."""
+    """One field of VescStateStamped: unit, meaning and the drivers that report it. ``ros2_unit`` is the ROS 2
+    driver's unit if it differs."""
 
     name: str
     unit: str
@@ -24,12 +24,12 @@ class Field(NamedTuple):
     ros2_unit: str | None = None
 
 
-# Sources: vesc_msgs/VescState.msg of the ROS 1 and the ROS 2 driver and COMM_GET_VALUES of the
-# firmware. Charge and energy are in the unit the ROS 1 driver really sends, whatever its comments
-# say: the integer of 1e-4 Ah and Wh straight off the wire. The ROS 2 driver divides by 1e4 first; nothing
-# on the way to the tables converts either. Values that are not whole are therefore the ROS 2 driver's.
+# Sources: vesc_msgs/VescState.msg of the ROS 1 and the ROS 2 driver, and COMM_GET_VALUES of the firmware.
+# Charge and energy are in the unit that the ROS 1 driver really sends, despite its comments: the raw integer
+# of 1e-4 Ah and Wh. The ROS 2 driver divides by 1e4 first. Nothing on the way to the tables converts either,
+# so fractional values come from the ROS 2 driver.
 VESC_STREAM = "vesc"
-# What a human is told of, straight from a rule.
+# The fields behind alert mails.
 FAULT_FIELD, VOLTAGE_FIELD = "fault_code", "voltage_input"
 VESC_FIELDS: dict[str, Field] = {
     f.name: f
@@ -60,22 +60,22 @@ VESC_FIELDS: dict[str, Field] = {
         Field("avg_vq", "V", "quadrature-axis voltage", (2,)),
     )
 }
-# Field -> at this and below, its value only says that its sensor is not fitted; for whole columns.
+# Field -> the value at and below which its sensor is not fitted; for whole columns.
 ABSENT_FROM = {f.name: NO_SENSOR_DEGC for f in VESC_FIELDS.values() if f.unit == "degC"}
 
 
 def absent(field: str, value: Value) -> bool:
-    """Whether a value only says that its sensor is not fitted.
+    """Whether a value means that its sensor is not fitted.
 
-    Such values are recorded, and exported as messages, as they came. Whoever makes numbers of them, or
-    shows one, takes null instead: the summary, queries, pictures, live updates and the health metrics.
+    Such values are recorded and exported unchanged. Everything that calculates with them or shows them uses
+    null instead: the summary, queries, plots, live updates and the health metrics.
     """
     limit = ABSENT_FROM.get(field)
     return limit is not None and type(value) in _NUMBERS and value <= limit  # type: ignore[operator]  # a number
 
 
-# The firmware's mc_fault_code, in its order: the code is the place. Its own name, which VESC Tool's logs
-# have, and what it means.
+# The firmware's mc_fault_code, in order: the code is the index. Each has its own name, as in VESC Tool's
+# logs, and its meaning.
 _FAULTS = (
     ("NONE", "none"),
     ("OVER_VOLTAGE", "over voltage"),
@@ -113,10 +113,10 @@ _FAULTS = (
     ("ABS_OVERSPEED", "absolute overspeed"),
 )
 FAULTS = {code: meaning for code, (_, meaning) in enumerate(_FAULTS)}
-# Older firmware called the gate driver by its type.
+# Older firmware named the gate driver by its type.
 FAULT_CODES = {**{name: code for code, (name, _) in enumerate(_FAULTS)}, "DRV8302": 3}
-# The agent's own figures. Counts grow from 0 at its start; the offset is what to add to the car's
-# clock to have the cloud's, known to within its uncertainty, and null before the first pong.
+# The agent's own figures. Counts grow from 0 at its start. The clock offset converts the car's clock to the
+# cloud's by addition; it is null before the first pong.
 AGENT_FIELDS = {
     "cpu_percent": "% of one core, since the sample before",
     "rss_mb": "MB of memory in use",

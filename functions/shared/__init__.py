@@ -1,1 +1,1 @@
-"""What several functions use; nothing here has a handler."""
+"""Helpers shared by several functions; no handlers here."""

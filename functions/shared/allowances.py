@@ -1,19 +1,18 @@
-"""What each robot may spend: so much at once, and so much more with every second."""
+"""A token bucket for each robot."""
 
 from __future__ import annotations
 
 import threading
 from collections import OrderedDict
 
-# Of the others, none has spent anything worth mentioning.
+# Robots beyond this number have spent nothing worth keeping.
 _ROBOTS = 10_000
 
 
 class Allowances:
-    """A robot may spend ``burst`` at once, and ``a_second`` more with every second that passes. None shares
-    another's allowance.
+    """Each robot may spend ``burst`` at once, and ``a_second`` more with every second. Robots share nothing.
 
-    Kept are the ten thousand robots that spent something last. Several threads may spend.
+    It keeps the ten thousand robots that spent last. It is safe for several threads.
     """
 
     def __init__(self, *, burst: float, a_second: float) -> None:
@@ -22,16 +21,16 @@ class Allowances:
         self._lock = threading.Lock()
 
     def left(self, robot: str, now_s: float) -> float:
-        """What the robot may still spend; less than nothing where it spent more than it may."""
+        """The robot's remaining allowance; negative after overspending."""
         left, at_s = self._left.get(robot, (self._burst, now_s))
         # A clock that is set back takes nothing away.
         return min(self._burst, left + self._a_second * max(0.0, now_s - at_s))
 
     def spend(self, robot: str, now_s: float, amount: float) -> float:
-        """Note what the robot spent; what is left."""
+        """Spend an amount; return the rest."""
         with self._lock:
             left = self.left(robot, now_s) - amount
-            # Nor may a clock that was set back give twice.
+            # After a clock was set back, the same seconds must not count twice.
             _, at_s = self._left.get(robot, (0.0, now_s))
             self._left[robot] = (left, max(at_s, now_s))
             self._left.move_to_end(robot)

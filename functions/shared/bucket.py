@@ -1,4 +1,4 @@
-"""The adapter to S3: which of a robot's files the bucket has, and signed addresses for what it lacks."""
+"""The adapter to S3: finds a robot's files in the bucket, and signs addresses for missing ones."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from iort_contract import UPLOAD_URL_S, Address, File, part_range
 
 
 class Part(NamedTuple):
-    """A part that S3 has taken: it has computed the SHA-256 itself and compared it with the signed one."""
+    """A part in S3, which has computed the SHA-256 and compared it with the signed one."""
 
     size: int
     etag: str
@@ -27,13 +27,13 @@ class Bucket:
         self._client, self._name = client, name
 
     def has(self, key: str) -> bool:
-        """Whether there is an object with the key."""
+        """Whether an object with the key exists."""
         found = self._client.list_objects_v2(Bucket=self._name, Prefix=key, MaxKeys=1)
-        # A key sorts before all that begin with it.
+        # A key sorts before its own extensions.
         return any(one["Key"] == key for one in found.get("Contents", ()))
 
     def upload_of(self, key: str) -> str | None:
-        """The id of an upload of the key that was begun and not ended; the oldest, if there are several."""
+        """The id of an unfinished upload of the key; the oldest if there are several."""
         pages = self._client.get_paginator("list_multipart_uploads")
         uploads = [
             (one["Initiated"], one["UploadId"])
@@ -44,7 +44,7 @@ class Bucket:
         return min(uploads)[1] if uploads else None
 
     def begin(self, key: str, file: File) -> str:
-        """Begin an upload in parts; its id."""
+        """Begin a multipart upload; return its id."""
         begun = self._client.create_multipart_upload(
             Bucket=self._name,
             Key=key,
@@ -55,7 +55,7 @@ class Bucket:
         return str(begun["UploadId"])
 
     def parts(self, key: str, upload_id: str) -> dict[int, Part]:
-        """The parts that are there, by number."""
+        """The uploaded parts by number."""
         return dict(self._listed(key, upload_id))
 
     def _listed(self, key: str, upload_id: str) -> Iterator[tuple[int, Part]]:
@@ -66,7 +66,7 @@ class Bucket:
                 yield int(one["PartNumber"]), Part(one["Size"], one["ETag"], sha256)
 
     def address(self, key: str, file: File) -> Address:
-        """Where to put a file in one piece: this content, this size, under this key, and only once."""
+        """The address to upload a whole file: fixed content, size and key, usable once."""
         checksum = _base64(file.sha256)
         url = self._sign(
             "put_object",
@@ -87,7 +87,7 @@ class Bucket:
         return Address(1, url, headers)
 
     def part_address(self, key: str, file: File, upload_id: str, part: int, sha256: str) -> Address:
-        """Where to put one part: this content, this size."""
+        """The address to upload one part: fixed content and size."""
         _, size = part_range(file, part)
         checksum = _base64(sha256)
         url = self._sign(
@@ -101,7 +101,7 @@ class Bucket:
         return Address(part, url, {"content-length": str(size), "x-amz-checksum-sha256": checksum})
 
     def complete(self, key: str, upload_id: str, parts: Mapping[int, Part], size: int) -> None:
-        """Make the parts one object. Where somebody else just did, there is nothing left to do."""
+        """Join the parts to one object. If another call has just done so, this does nothing."""
         named = [
             {"PartNumber": n, "ETag": part.etag, "ChecksumSHA256": _base64(part.sha256)}
             for n, part in sorted(parts.items())
@@ -121,7 +121,7 @@ class Bucket:
                 raise
 
     def abort(self, key: str, upload_id: str) -> None:
-        """Throw the parts of an upload away."""
+        """Delete the parts of an upload."""
         self._client.abort_multipart_upload(Bucket=self._name, Key=key, UploadId=upload_id)
 
     def _sign(self, operation: str, **parameters: Any) -> str:
@@ -132,7 +132,7 @@ class Bucket:
 
 
 def metadata(file: File) -> dict[str, str]:
-    """What an object says of its file: `iort files get` checks the SHA-256 of the whole."""
+    """An object's metadata; `iort files get` checks the SHA-256 of the whole."""
     return {"sha256": file.sha256, "kind": file.kind, "t": str(file.t_us)}
 
 

@@ -1,10 +1,10 @@
-"""Whose live messages are not looked at for a while: a robot's whose messages are refused over and over."""
+"""Skips live messages of robots that send too many malformed ones."""
 
 from __future__ import annotations
 
 from functions.shared.allowances import Allowances
 
-# So many messages of a robot may be refused at once, and one more with every second that passes.
+# Allowed refusals per robot: this many at once, and one more with every second.
 BURST = 20
 A_SECOND = 1.0
 
@@ -12,13 +12,12 @@ A_SECOND = 1.0
 class CutOff:
     """A robot's allowance of refused messages.
 
-    A refused message costs a call to the queue, a good one does not. While a robot has used its allowance
-    up, its messages, good or bad, are not looked at: about one a second still is, so that a robot that has
-    been mended is seen again at once. No other robot's messages wait for it, and none shares its allowance.
+    A refused message costs a call to the queue, a good one does not. While a robot's allowance is used up,
+    its messages are skipped, good or bad. About one a second is still processed, so that a repaired robot is
+    seen again at once. Other robots are not affected.
 
-    One environment of the function keeps one, and environments do not know of each other. So a robot is
-    refused at most `A_SECOND` times as many messages a second as there are environments, and each of these
-    loses no more time to it than that of one refusal a second.
+    Each environment of the function has its own allowances. So a robot can have at most `A_SECOND` refusals a
+    second and environment, and costs each environment no more time than one refusal a second.
     """
 
     def __init__(self) -> None:
@@ -29,5 +28,5 @@ class CutOff:
         return self._refusals.left(robot, now_s) < 1
 
     def refused(self, robot: str, now_s: float) -> bool:
-        """Note a refused message; whether the robot's next ones are not looked at."""
+        """Count a refused message; return whether the robot's next messages are skipped."""
         return self._refusals.spend(robot, now_s, 1) < 1

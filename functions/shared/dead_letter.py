@@ -1,4 +1,4 @@
-"""The adapter to the queue before the quarantine, for what a function refuses by itself."""
+"""The adapter to the quarantine's queue, for messages that a function refuses."""
 
 from __future__ import annotations
 
@@ -17,12 +17,13 @@ from iort_contract import BATCH, ITEM_BASE64, REASON, TOPIC
 _log = logging.getLogger(__name__)
 # SendMessageBatch: at most ten messages, of 256 KiB together.
 _MESSAGES, _BYTES = 10, 256 * 1024
-# And one of its messages alone.
+# The limit of a single message.
 _MOST_BYTES = 1024 * 1024
 
 
 class Refused(NamedTuple):
-    """A stream record that cannot be decoded: its sequence number, why, and the item as DynamoDB JSON."""
+    """A stream record that cannot be decoded: its sequence number, the reason, and the item as DynamoDB
+    JSON."""
 
     number: str
     reason: str
@@ -30,24 +31,24 @@ class Refused(NamedTuple):
 
 
 class Refusals:
-    """Sends what was refused to the queue before the quarantine; ``client`` is a boto3 SQS client."""
+    """Sends refused records to the quarantine's queue; ``client`` is a boto3 SQS client."""
 
     def __init__(self, client: Any, *, queue_url: str) -> None:
         self._client, self._queue_url = client, queue_url
 
     @classmethod
     def at_once(cls, queue_url: str) -> Refusals:
-        """With a client that does not wait for a queue that does not answer: where a function fails, Lambda
-        itself sends there what it was called with."""
+        """With a client that gives up quickly: if a function fails, Lambda sends the event to the queue
+        itself."""
         config = Config(connect_timeout=2, read_timeout=5, retries={"total_max_attempts": 1})
         return cls(boto3.client("sqs", config=config), queue_url=queue_url)
 
     def refuse(self, refused: Sequence[Refused]) -> list[Refused]:
-        """Send each, as many at a time as a call may carry; those that the queue did not take come back."""
+        """Send each record, in as few calls as possible; return those that the queue did not take."""
         return [one for several in _calls(refused) for one in self._left(several)]
 
     def keep(self, body: str) -> bool:
-        """Send one message, as `message` or `refused_event` writes it; whether the queue took it."""
+        """Send one body made by `message` or `refused_event`; return whether the queue took it."""
         try:
             self._client.send_message(QueueUrl=self._queue_url, MessageBody=body)
         except (BotoCoreError, ClientError) as error:
@@ -69,7 +70,7 @@ class Refusals:
 
 
 def _calls(refused: Sequence[Refused]) -> Iterator[dict[str, tuple[Refused, str]]]:
-    """What one call carries each: the messages by an id of their own."""
+    """Group the messages into calls, each message by an id."""
     several: dict[str, tuple[Refused, str]] = {}
     size = 0
     for number, one in enumerate(refused):
@@ -84,10 +85,10 @@ def _calls(refused: Sequence[Refused]) -> Iterator[dict[str, tuple[Refused, str]
 
 
 def message(refused: Refused) -> str:
-    """The queue's message. The item is in base64: its text may hold what SQS does not carry.
+    """The queue's message. The item is in base64, since its text may hold characters that SQS refuses.
 
-    Of an item that is too large as JSON (a number of four characters on the wire may have 126 digits there)
-    only the key is told. A record that no queue takes would come again and hold its shard up.
+    An item too large as JSON (a number of four characters on the wire may have 126 digits there) is replaced
+    by its key. A record that the queue never takes would block its shard.
     """
     body = _body(refused.reason, refused.image)
     if len(body) > _MOST_BYTES:
@@ -97,9 +98,9 @@ def message(refused: Refused) -> str:
 
 
 def refused_event(function_arn: str, event: Any, reason: str) -> str:
-    """The queue's message about an event that a function was called with and refused, without failing.
+    """The queue's message for an event that a function refused without failing.
 
-    Its form is that of Lambda's own record of an invocation that failed ("Destination event format")."""
+    It has the form of Lambda's record of a failed invocation ("Destination event format")."""
     return json.dumps(
         {
             "requestContext": {"functionArn": function_arn, "condition": "Refused"},

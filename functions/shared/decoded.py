@@ -1,4 +1,4 @@
-"""The records of a stream's event, read: good batches by topic, what is refused, and what has to wait."""
+"""Decodes the records of a stream event: good batches by topic, refused ones, and waiting ones."""
 
 from __future__ import annotations
 
@@ -21,8 +21,8 @@ _log = logging.getLogger(__name__)
 
 @dataclass
 class Decoded:
-    """The good batches of some stream records by topic, what is wrong with others, and which have to wait;
-    ``at_s`` is when the newest arrived in the table."""
+    """The good batches of some stream records by topic, the refused ones, and the waiting ones; ``at_s`` is
+    the newest arrival in the table."""
 
     batches: dict[str, list[Batch]] = field(default_factory=lambda: defaultdict(list))
     records: dict[tuple[str, BatchId], Change] = field(default_factory=dict)
@@ -31,17 +31,17 @@ class Decoded:
     at_s: float = 0.0
 
     def refuse(self, topic: str, keys: AbstractSet[BatchId], reason: str) -> None:
-        """Count batches of a topic among what is refused."""
+        """Add batches of a topic to the refused ones."""
         self.batches[topic] = [batch for batch in self.batches[topic] if batch.id not in keys]
         for change in (self.records[topic, key] for key in sorted(keys)):
             self.refused.append(Refused(change["SequenceNumber"], reason, change["NewImage"]))
 
     def wait(self, topic: str) -> None:
-        """Count the batches of a topic among those that have to wait."""
+        """Move the batches of a topic to the waiting ones."""
         self.put_off += [self.records[topic, batch.id] for batch in self.batches.pop(topic)]
 
     def news(self, since_ms: int) -> dict[str, list[Batch]]:
-        """The batches that the cloud received at that time or later, of topics that have some."""
+        """The batches that the cloud received since then, by topic."""
         found: dict[str, list[Batch]] = {}
         for topic, batches in self.batches.items():
             for batch in batches:
@@ -52,8 +52,8 @@ class Decoded:
 
 
 def decode_records(records: Iterable[Mapping[str, Any]], share: Share | None = None) -> Decoded:
-    """Read stream records, each charged to its robot; what is over its share is not read. Removals (expiry)
-    carry no image and are passed over."""
+    """Decode stream records and charge each to its robot. Records over the robot's share are not decoded.
+    Removals (expiry) carry no image and are skipped."""
     share = share or Share.unlimited()
     decoded = Decoded()
     for record in records:

@@ -1,4 +1,4 @@
-"""How much longer than usual a message took from the car to the cloud, whatever the car's clock says."""
+"""Estimates the extra delay of a message from the car to the cloud, regardless of the car's clock."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ _WINDOW_MS = 15_000
 
 @dataclass
 class _Run:
-    """The fastest message of the window that is going on, and of the one before."""
+    """The fastest message of the current window and of the previous one."""
 
     boot: str
     began_ms: int
@@ -22,19 +22,19 @@ class _Run:
 class Legs:
     """Compares each message with the fastest of its run in the last 15 to 30 s.
 
-    The difference of the car's clock and the cloud's is in both, and falls out. What it cannot see is
-    a delay that all messages of half a minute have in common, and the first message of a run, also in an
-    environment of the function that has just started: it serves the messages of cars that do not know
-    their clock's offset (`iort_contract.LiveSample`). When a car's clock is set back, its messages look late
-    until the window has passed. One environment keeps one, of the thousand robots that sent last, and of
-    each the run that sent last: robots tell each other their runs' names, and none may speak for another.
+    Both contain the difference between the car's clock and the cloud's, so it cancels out. It misses a delay
+    that all messages of half a minute share, and that of the first message of a run or of a new environment.
+    It serves the cars that do not know their clock offset (`iort_contract.LiveSample`). After a car's clock
+    is set back, its messages look late until the window has passed. Each environment keeps one, for the
+    thousand robots that sent last, and the latest run of each: robots know each other's run names, and must
+    not act for another.
     """
 
     def __init__(self) -> None:
         self._runs: OrderedDict[str, _Run] = OrderedDict()
 
     def excess_us(self, robot: str, boot: str, sent_us: int, received_ms: int) -> int:
-        """Note a message of a robot's run; by how much it was slower than the fastest, in microseconds."""
+        """Note a message of a robot's run; return its delay above the fastest, in microseconds."""
         leg_us = received_ms * 1000 - sent_us
         run = self._runs.pop(robot, None)
         if run is None or run.boot != boot:

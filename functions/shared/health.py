@@ -1,4 +1,4 @@
-"""How the cars are, from the batches that Lambda 2 sees anyway: the values of the metrics ``health``."""
+"""The metrics ``health`` of the cars, from the batches that Lambda 2 reads anyway."""
 
 from __future__ import annotations
 
@@ -31,10 +31,10 @@ _TEMPERATURES = (
 
 
 def measure(stream: str, batches: Sequence[Batch]) -> Measured:
-    """The metrics of one robot's batches of one stream; each batch counts once, whatever its seconds.
+    """The metrics of one robot's batches of one stream; each batch counts once, however many seconds it has.
 
-    Battery (V) and temperature (degC) are the worst of the batches; holes between samples are counted
-    within each batch.
+    Battery (V) and temperature (degC) are the worst of the batches; gaps between samples are counted within
+    each batch.
     """
     if stream == RTT_STREAM:
         return {f"RoundTrip{path.capitalize()}Ms": _numbers(batches, RTT_FIELDS[path]) for path in PING_PATHS}
@@ -57,8 +57,8 @@ def measure(stream: str, batches: Sequence[Batch]) -> Measured:
 
 
 def together(measured: Iterable[Measured]) -> Iterator[Measured]:
-    """The metrics of several robots in as few lines of log as hold them: counts are summed, values follow
-    each other."""
+    """Merge the metrics of several robots into as few log lines as possible: counts are added, values are
+    listed."""
     counts: dict[str, float] = {}
     values: dict[str, list[float]] = {}
     for one in measured:

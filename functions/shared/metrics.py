@@ -1,4 +1,4 @@
-"""Metrics as log lines in CloudWatch's embedded metric format: no API call, no waiting."""
+"""Metrics as log lines in CloudWatch's embedded metric format (EMF): no API call, no waiting."""
 
 from __future__ import annotations
 
@@ -10,11 +10,11 @@ from collections.abc import Callable, Mapping, Sequence
 
 from iort_contract import METRIC_DEPLOYMENT, METRIC_FUNCTION, METRIC_NAMESPACE, METRIC_ROBOT, METRICS
 
-# "Specification: Embedded metric format": so many values may a metric have in one line.
+# "Specification: Embedded metric format": the most values of a metric in one line.
 MOST_VALUES = 100
-# So long values are gathered: the frame of a line is 400 bytes, a value in it seven.
+# Values are gathered for this long: a line's frame is 400 bytes, a value in it seven.
 GATHER_S = 10.0
-# "MetricDatum": CloudWatch rejects what is beyond, and with it what else the line holds, of other robots too.
+# "MetricDatum": CloudWatch rejects larger values, together with the rest of the line, also of other robots.
 _MOST = 2.0**360
 
 Values = Mapping[str, float | Sequence[float]]
@@ -22,20 +22,19 @@ Write = Callable[[str, Values, float], None]
 
 
 def emit(function: str, *, robot: str | None = None, **values: float | Sequence[float]) -> None:
-    """`write` the values, which are of now."""
+    """`write` the values with the current time."""
     write(function, values, time.time(), robot)
 
 
 def write(function: str, values: Values, at_s: float, robot: str | None = None) -> None:
     """Write the values that are not zero as one EMF line to standard output.
 
-    A list is so many values of one metric, of which the newest hundred are written; a value beyond what
-    CloudWatch takes is as large as it takes. With a ``robot``
-    the same is counted for that robot alone as well. The values are of ``at_s``, in seconds since the epoch.
-    ``function`` and the metric names must be the contract's; a name it does not know is a KeyError,
-    so that no dashboard can wait for a metric that nothing emits.
-    The deployment's ``NAMESPACE`` is a dimension: two stages in one account do not add up.
-    Source of the format: CloudWatch, "Specification: Embedded metric format".
+    A list holds several values of one metric; the newest hundred are written. A value beyond CloudWatch's
+    limits is set to the limit. With a ``robot`` the values also count for that robot alone. The time is
+    ``at_s``, in seconds since the epoch. ``function`` and the metric names must be in the contract, otherwise
+    KeyError: a dashboard can then not wait for a metric that nothing emits. The deployment's ``NAMESPACE`` is
+    a dimension, so that two stages in one account do not add up. Source of the format: CloudWatch,
+    "Specification: Embedded metric format".
     """
     known = METRICS[function]
     shown = {
@@ -66,10 +65,10 @@ def write(function: str, values: Values, at_s: float, robot: str | None = None) 
 
 
 class Gathered:
-    """The metrics of a function that is called many times a second, of some seconds in one line.
+    """Collects the metrics of a frequently called function, some seconds in one line.
 
-    What an environment counts first is written at once. What it has not written when AWS ends it is lost:
-    less than `GATHER_S` of counts and delays. Failures do not go this way.
+    The first values of an environment are written at once. If AWS ends the environment, the unwritten ones
+    are lost: less than `GATHER_S` of counts and delays. Failures are not collected here.
     """
 
     def __init__(self, function: str, into: Write = write) -> None:
@@ -78,10 +77,10 @@ class Gathered:
         self._newest_s = self._written_s = -math.inf
 
     def add(self, now_s: float, **values: float) -> None:
-        """Count the values that are not zero; ``now_s`` is in seconds since the epoch. Counts are summed,
-        of everything else each value is kept to a hundredth."""
+        """Add the values that are not zero; ``now_s`` is in seconds since the epoch. Counts are added; other
+        values are listed, rounded to a hundredth."""
         if self._values and now_s - self._newest_s >= GATHER_S:
-            # Calls have paused: what is left is of the minute before.
+            # After a pause in the calls, the rest belongs to the minute before.
             self._flush(self._newest_s)
         self._newest_s = now_s
         for name, value in values.items():
@@ -106,7 +105,7 @@ class Gathered:
 
 
 def _bounded(value: float) -> float:
-    # A truth value counts as the number that it is in Python: JSON's true is no metric value.
+    # JSON's true is not a metric value, so a bool becomes a number.
     return +max(-_MOST, min(_MOST, value))
 
 

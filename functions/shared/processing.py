@@ -1,4 +1,4 @@
-"""An event of Lambda 2 from its records to the summary table, whoever calls with it."""
+"""An event of Lambda 2, from its records to the summary table, for every caller."""
 
 from __future__ import annotations
 
@@ -26,10 +26,10 @@ from functions.shared.stored import SECOND_BATCHES
 from functions.shared.tables import TableError, Tables
 from iort_contract import RECOMPUTE_FROM_S, RECOMPUTED, REPLAY, Statistics, parse_topic
 
-# Topics that are read side by side; a client keeps ten connections.
+# Topics to process in parallel; a client keeps ten connections.
 _AT_ONCE = 4
-# A stream keeps its records for 24 hours. What was received before was put into the table by hand (`iort
-# adopt`, a replay), and is no news of its car.
+# A stream keeps its records for 24 hours. Older ones were put into the table by hand (`iort adopt`, a
+# replay), and are no news of their car.
 _NEWS_MS = 24 * 3_600_000
 # A car adds to a second for a second, and a round reads it after that.
 _ROUNDS = 5
@@ -42,7 +42,7 @@ Refuse = Callable[[Sequence[Refused]], Sequence[Refused]]
 
 @dataclass(frozen=True)
 class Bounds:
-    """How a robot's share of the time is held: what each has left, where the rest waits, and who tells it."""
+    """The limits of a robot's share: the shares, the queue for waiting batches, and the robot's notice."""
 
     share: Share
     put_off: Callable[[Sequence[Change]], Sequence[Change]]
@@ -60,16 +60,15 @@ def process(
     at_once: int = 1,
     news_since_ms: int = 0,
 ) -> dict[str, Any]:
-    """Summarise the event's records. Those that cannot be decoded go to ``refuse``, since trying again
-    would not change them; those of a robot that is over its share wait, as ``bounds`` says. The answer names
-    the ones that were not taken there.
+    """Summarise the event's records. Undecodable records go to ``refuse``, since a retry would not help.
+    Records over a robot's share wait, by ``bounds``. The answer names the records that were not taken there.
 
-    The good records behind such a one are kept as well: the service sends them again, which changes
-    nothing, and a second need not wait for retries to run out. Of a replay the answer names all that
-    cannot be decoded: they are in quarantine already. ``at_once`` topics are read side by side, which have
-    nothing to do with each other and mostly wait for the table. What was received before ``news_since_ms``
-    is summarised, and in no metric that an alarm is set on. Where somebody else may summarise the same
-    seconds ``beside``, they are read again once they are written.
+    The good records after one of those are kept as well: the service sends them again, which changes nothing,
+    and no second waits until the retries end. For a replay the answer names all undecodable records, which
+    are in quarantine already. ``at_once`` topics are processed in parallel, since they are independent and
+    mostly wait for the table. Records received before ``news_since_ms`` are summarised, but not counted in
+    metrics that have an alarm. If another function may summarise the same seconds ``beside`` this one, they
+    are read again after writing.
     """
     decoded = decode_records(event["Records"], bounds.share if bounds else None)
     topics = _summarized(tables, decoded, at_once, bounds.share if bounds else None)
@@ -132,7 +131,8 @@ def _put(tables: Tables, topics: Mapping[str, Summaries]) -> None:
 
 
 def _put_off(bounds: Bounds, decoded: Decoded) -> set[str]:
-    """Have what is over its share wait, and tell whose it is; the numbers of those that could not."""
+    """Queue the batches over their robot's share and notify the robot; return the sequence numbers that
+    failed."""
     left = {change["SequenceNumber"] for change in bounds.put_off(decoded.put_off)}
     for robot, batches in Counter(map(robot_of_change, decoded.put_off)).items():
         bounds.tell(robot, batches, decoded.at_s)
@@ -140,11 +140,11 @@ def _put_off(bounds: Bounds, decoded: Decoded) -> set[str]:
 
 
 def recompute(event: Mapping[str, Any], tables: Tables) -> dict[str, Any]:
-    """Summarise stored batches once more, with the vehicle's parameters as they are now: the operator has
-    corrected them. Seconds before ``event[RECOMPUTE_FROM_S]`` stay as they are.
+    """Summarise stored batches again with the vehicle's current parameters, which the operator has corrected.
+    Seconds before ``event[RECOMPUTE_FROM_S]`` stay unchanged.
 
-    Nothing is counted or put into quarantine a second time. The answer has the seconds that were written, and
-    the records of which nothing can be made.
+    Nothing is counted or quarantined a second time. The answer has the written seconds and the undecodable
+    records.
     """
     tables.forget_vehicles()
     decoded = decode_records(event["Records"])
@@ -164,7 +164,7 @@ def recompute(event: Mapping[str, Any], tables: Tables) -> dict[str, Any]:
 def _summarized(
     tables: Tables, decoded: Decoded, at_once: int, share: Share | None = None
 ) -> dict[str, Summaries]:
-    """Of each topic. One whose robot is far over its share is not among them: its batches wait."""
+    """Summaries by topic. A topic whose robot is far over its share is missing: its batches wait."""
     share = share or Share.unlimited()
 
     def one(topic: str) -> Summaries | None:
@@ -195,7 +195,7 @@ def _summarized(
 @cache
 def stored_tables() -> Tables:
     """The tables of this environment's deployment."""
-    # Requests are this code's own. To validate them took a third of Lambda 2's processor.
+    # Requests come from this code only. Validating them took a third of Lambda 2's CPU time.
     client = boto3.client("dynamodb", config=Config(parameter_validation=False))
     tables = Tables(
         client,
@@ -203,7 +203,7 @@ def stored_tables() -> Tables:
         summary=os.environ["SUMMARY_TABLE"],
         robots=os.environ["ROBOTS_TABLE"],
     )
-    # botocore's models are a hundred thousand objects that stay: no event's collection need pass them again.
+    # botocore's models are a hundred thousand permanent objects; the garbage collector need not scan them.
     gc.collect()
     gc.freeze()
     return tables

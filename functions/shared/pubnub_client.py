@@ -1,4 +1,4 @@
-"""The adapter to PubNub's SDK: one client and one kept connection for the life of the environment."""
+"""The adapter to PubNub's SDK: one client and one persistent connection per environment."""
 
 from __future__ import annotations
 
@@ -13,15 +13,15 @@ from pubnub.pubnub import PubNub
 
 from iort_contract import MAX_PUBNUB_BYTES
 
-# PubNub's keys are in the path of every request, which these log.
+# These loggers log request paths, which contain PubNub's keys.
 for _logger in ("httpx", "httpcore", "pubnub"):
     logging.getLogger(_logger).setLevel(logging.WARNING)
-# A live sample is stale after 2 s; waiting longer than this for PubNub only makes the next one late.
+# A live sample is stale after 2 s; a longer wait for PubNub only delays the next one.
 _TIMEOUT_S = 1
 
 
 class PublishError(Exception):
-    """PubNub did not take the message, or could not be asked to; the text says why, without keys."""
+    """PubNub did not take the message, or the request failed; the text says why, without keys."""
 
 
 class PubNubPublisher:
@@ -53,14 +53,16 @@ class PubNubPublisher:
         )
 
     def publish(self, channel: str, message: dict[str, Any]) -> None:
-        """Publish without storing; raises `PublishError` where PubNub does not confirm it."""
+        """Publish without storing; raises `PublishError` if PubNub does not confirm it."""
         size = len(quote(json.dumps(message, separators=(",", ":"))))
         if size > MAX_PUBNUB_BYTES:
-            raise PublishError(f"{size} bytes after URL encoding; PubNub takes {MAX_PUBNUB_BYTES}")
+            raise PublishError(
+                f"message must be at most {MAX_PUBNUB_BYTES} bytes after URL encoding, got {size}"
+            )
         request = self._client.publish().channel(channel).message(message)
         try:
             request.should_store(should_store=False).use_post(use_post=True).sync()
         except Exception as error:
-            # The SDK lets through what its parts raise, on an answer that is not JSON for one.
+            # The SDK does not wrap the errors of its libraries, for example on an answer that is not JSON.
             status = getattr(error, "_status_code", 0)
             raise PublishError(f"{type(error).__name__}, status {status}") from error

@@ -1,7 +1,7 @@
-"""A topic's seconds from what the telemetry table holds of it.
+"""Computes a topic's seconds from the telemetry table.
 
-A second is computed from the table, not from the records: whatever order, number or grouping they
-arrive in, the last record of a second leaves the same item behind.
+The input is the table, not the records: in any order, number or grouping of records, the last one of a second
+leaves the same item.
 """
 
 from __future__ import annotations
@@ -17,15 +17,15 @@ from iort_contract import EXPIRES_S, MAX_BATCH_SPAN_US, Batch, BatchId, Statisti
 from iort_contract.statistics import summarize_second
 
 _SECOND_US = 1_000_000
-# Seconds closer than this are read together, since a query costs as much as the batches between them; and
-# only so many of them, since they are held in memory.
+# Seconds closer than this are read together, since a query costs as much as the batches between them. The
+# number is limited, since they are held in memory.
 _NEAR_S, _READ_TOGETHER_S = 10, 60
 
 
 @dataclass
 class Summaries:
-    """Of one topic: a summary a second, the batches missing just before those of the event, and those of
-    the event that are beyond what their second may hold."""
+    """A topic's summary by second, the batches missing just before the event's batches, and the event's
+    batches beyond their second's limit."""
 
     seconds: dict[int, dict[str, Statistics]] = field(default_factory=dict)
     missing: int = 0
@@ -33,15 +33,14 @@ class Summaries:
 
 
 def _never() -> None:
-    """A check that nothing fails."""
+    """A check that always passes."""
 
 
 def summarize_topic(
     tables: Tables, topic: str, batches: Sequence[Batch], check: Callable[[], None] = _never
 ) -> Summaries:
-    """The summaries of every second that the batches touch, and of the second of the batch after
-    each: a late batch fills the hole that its successor had reported. ``check`` is called now and then, and
-    may raise."""
+    """The summaries of every second that the batches touch, and of the second of the batch after each: a late
+    batch fills the gap that its successor reported. ``check`` is called regularly and may raise."""
     known = {batch.id: batch for batch in batches}
     reader = Reader(tables, topic, known, check)
     vehicle = tables.vehicle(parse_topic(topic).robot)
@@ -59,7 +58,7 @@ def summarize_topic(
         missing: dict[int, int] = defaultdict(int)
         for batch, _, beyond in stored:
             second = batch.t_us // _SECOND_US
-            # What is read in front of a run is there in part, and belongs to another, as does what follows.
+            # The seconds before and after a range are read in part, and belong to another range.
             if previous is not None and previous.id in known and second >= touched[0]:
                 seconds.add(second)
             if second in seconds:
@@ -76,8 +75,8 @@ def summarize_topic(
             summary = summarize_second(second, batches_near, vehicle, missing[second])
             if summary is None:
                 continue
-            # It is kept as long as what it was made from, which has the time of its receipt: the
-            # samples' own may be years off, in a replayed drive or under a car's wrong clock.
+            # A second expires with its batches, by their time of receipt: the samples' own time may be years
+            # off, in a replayed drive or under a car's wrong clock.
             if expires := [entry.expires_s for entry in near if entry.expires_s]:
                 summary[EXPIRES_S] = max(expires)
             summaries.seconds[second] = summary
@@ -86,8 +85,8 @@ def summarize_topic(
 
 
 def around(stored: Sequence[Stored], second: int) -> Sequence[Stored]:
-    """Of batches in order of time, those with samples in the second and the one before them, without what
-    is beyond the second itself."""
+    """From batches in order of time, those with samples in the second and the one before. It leaves out
+    batches beyond the second's own limit."""
     start_us, end_us = second * _SECOND_US, (second + 1) * _SECOND_US
     first = bisect_left(stored, start_us - MAX_BATCH_SPAN_US, key=_start)
     end = bisect_left(stored, end_us, lo=first, key=_start)
@@ -105,7 +104,7 @@ def _start(entry: Stored) -> int:
 
 
 def _runs(seconds: set[int]) -> list[list[int]]:
-    """The seconds in order, apart where they are: a car whose clock jumped touches 1970 and today."""
+    """The seconds in order, grouped into ranges: a car whose clock jumped touches 1970 and today."""
     runs: list[list[int]] = []
     for second in sorted(seconds):
         if not runs or second - runs[-1][-1] > _NEAR_S or second - runs[-1][0] >= _READ_TOGETHER_S:

@@ -1,4 +1,4 @@
-"""A robot's share of Lambda 2: batches beyond it wait for another function, and no robot waits for them."""
+"""A robot's share of Lambda 2. Batches beyond it wait for another function, and delay no other robot."""
 
 from __future__ import annotations
 
@@ -25,16 +25,16 @@ from iort_contract import (
 )
 
 _log = logging.getLogger(__name__)
-# Seconds of a processor that a robot may take: of each second, and at once. A good car takes a hundredth.
+# CPU seconds of a robot: per second, and as a burst. A normal car takes a hundredth.
 A_SECOND, BURST_S = 0.1, 0.3
-# What the requests for a topic, or for a batch that is refused, cost beside the processor.
+# The cost of the requests for a topic, or for a refused batch, besides CPU time.
 REQUESTS_S = 0.002
 # The keys of a message. The dearest batch, of 60 s, takes 2.6 s of a processor with the seconds beside
 # it, and the later function has 0.29 of one for 60 s.
 KEYS = 4
 # SendMessageBatch takes as many.
 _MESSAGES = 10
-# A robot is told again after so long; one that stayed within its share for longer is told anew.
+# A robot is notified again after this time; after a longer time within its share, it is notified anew.
 TELL_S, OVER_S = 30.0, 60.0
 _ROBOTS = 1000
 
@@ -46,11 +46,11 @@ class OverShareError(Exception):
 
 
 class Share:
-    """What each robot may still take, by the times at which its batches arrived in the table.
+    """What each robot may still use, by the arrival times of its batches in the table.
 
-    Those are the cloud's, as is the topic that says whose a batch is. One environment keeps it in memory;
-    a shard whose events are served by several gives a robot its share in each. ``spent_s`` is the time that
-    the thread has used a processor for.
+    The times and the topic, which names the robot, are the cloud's. One environment keeps the shares in
+    memory; if several environments serve a shard, a robot has its share in each. ``spent_s`` returns the
+    thread's CPU time.
     """
 
     def __init__(
@@ -65,7 +65,7 @@ class Share:
 
     @classmethod
     def unlimited(cls) -> Share:
-        """A share that nobody is over."""
+        """A share without limit."""
         return cls(burst_s=math.inf)
 
     def over(self, robot: str, at_s: float) -> bool:
@@ -73,12 +73,12 @@ class Share:
         return self._allowances.left(robot, at_s) <= 0
 
     def meter(self, robot: str, at_s: float) -> Meter:
-        """Measures from now on what this thread does for a robot."""
+        """Measure this thread's work for a robot from now on."""
         return Meter(self._allowances, self._spent_s, robot, at_s, least_s=-self._burst_s)
 
 
 class Meter:
-    """Charges a robot what the thread that made it spends."""
+    """Charges the work of the thread that created it to a robot."""
 
     def __init__(
         self, allowances: Allowances, spent_s: Callable[[], float], robot: str, at_s: float, *, least_s: float
@@ -88,19 +88,19 @@ class Meter:
         self._from_s = spent_s()
 
     def charge(self, beside_s: float = 0.0) -> float:
-        """Charge what was spent since the last time, and something ``beside`` it; what is left."""
+        """Charge the work since the last call, plus ``beside_s``; return the rest."""
         before_s, self._from_s = self._from_s, self._spent_s()
         return self._allowances.spend(self._robot, self._at_s, self._from_s - before_s + beside_s)
 
     def check(self) -> None:
-        """Charge, and raise `OverShareError` where the robot has spent its allowance twice: what is begun
-        within the share is not given up for a little."""
+        """Charge, and raise `OverShareError` if the robot has spent its allowance twice. Work that began
+        within the share is not given up for a small excess."""
         if self.charge() < self._least_s:
             raise OverShareError(self._robot)
 
 
 def robot_of(topic: str) -> str:
-    """Whose a topic is; "" for one that is none, whose batches are refused without any effort."""
+    """The robot of a topic; "" for an invalid topic, whose batches are refused at no cost."""
     try:
         return parse_topic(topic).robot
     except ContractError:
@@ -108,19 +108,19 @@ def robot_of(topic: str) -> str:
 
 
 def robot_of_change(change: Change) -> str:
-    """Whose a changed item is, by its key."""
+    """The robot of a changed item, by its key."""
     return robot_of(change["Keys"][TOPIC]["S"])
 
 
 class PutOff:
-    """The queue of what waits, by its keys: the batches are in the telemetry table. ``client`` is a boto3
-    SQS client."""
+    """The queue of waiting batches' keys; the telemetry table has the batches. ``client`` is a boto3 SQS
+    client."""
 
     def __init__(self, client: Any, *, queue_url: str) -> None:
         self._client, self._queue_url = client, queue_url
 
     def put(self, changes: Iterable[Change]) -> list[Change]:
-        """Have the batches wait; those that the queue did not take come back."""
+        """Queue the batches; return those that the queue did not take."""
         by_robot: dict[str, list[Change]] = {}
         for change in changes:
             by_robot.setdefault(robot_of_change(change), []).append(change)
@@ -135,7 +135,7 @@ class PutOff:
         return left
 
     def _left(self, messages: Sequence[tuple[str, Sequence[Change]]]) -> list[Change]:
-        # By its group AWS sees whose messages are many, and serves the others first: "SQS fair queues".
+        # AWS recognises a noisy robot by its group, and serves the others first: "SQS fair queues".
         entries = [
             {"Id": str(number), "MessageBody": _message(several), "MessageGroupId": robot}
             for number, (robot, several) in enumerate(messages)
@@ -154,20 +154,20 @@ def _message(changes: Sequence[Change]) -> str:
 
 
 def waiting(body: str) -> list[tuple[str, str]]:
-    """Topic and batch of each that waits by a message of the queue."""
+    """Topic and batch of each entry of a queue message."""
     return [(topic, batch) for topic, batch in json.loads(body)[PUT_OFF]]
 
 
 class Told:
-    """Which robots were told in their shadow that they are over their share; ``client`` is a boto3 client of
-    iot-data."""
+    """Notifies robots in their shadow that they are over their share; ``client`` is a boto3 iot-data
+    client."""
 
     def __init__(self, client: Any) -> None:
         self._client = client
         self._robots: dict[str, tuple[float, float, float, int]] = {}
 
     def tell(self, robot: str, batches: int, at_s: float) -> None:
-        """Tell a robot that so many more of its batches wait. It is told at once, then now and then."""
+        """Count waiting batches and notify the robot: at once, then at intervals."""
         since_s, last_s, told_s, before = self._robots.pop(robot, (at_s, at_s, -math.inf, 0))
         if at_s - last_s > OVER_S:
             since_s, told_s, before = at_s, -math.inf, 0
@@ -186,5 +186,5 @@ class Told:
         try:
             self._client.update_thing_shadow(thingName=robot, shadowName=SHADOW, payload=payload)
         except (BotoCoreError, ClientError) as error:
-            # It only helps to understand: no summary waits for it.
+            # A failure is harmless: the notice is only information.
             _log.warning("%s is not told that it is over its share: %s", robot, error)

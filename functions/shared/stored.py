@@ -1,4 +1,4 @@
-"""What the telemetry table holds around the batches of an event, and no more of it than a second may hold."""
+"""Reads the telemetry table around the batches of an event, within the limits of a second."""
 
 from __future__ import annotations
 
@@ -22,10 +22,10 @@ from iort_contract import (
 from iort_contract.statistics import missing_before
 
 _SECOND_US = 1_000_000
-# By how much the clocks of two publishers of a stream may differ before batches seem to be missing.
+# The clocks of a stream's publishers may differ by this much before batches count as missing.
 _ASIDE_US = 10_000_000
-# A second is made of so many batches of a stream, and of about so much of their columns: one robot that puts
-# more in it must not hold up the others. AWS takes as many messages a second from a connection.
+# The limits of batches and column bytes per second and stream: a robot beyond them must not delay others. AWS
+# takes as many messages a second from a connection.
 SECOND_BATCHES, _SECOND_BYTES = 100, MAX_COLUMNS_BYTES
 # Seconds are read together until they are as much as one may be.
 _TOGETHER_BYTES = _SECOND_BYTES
@@ -33,13 +33,13 @@ _TOGETHER_BYTES = _SECOND_BYTES
 _NUMBERS = SECOND_BATCHES * (2 * _ASIDE_US // _SECOND_US + 1)
 # Beside those of the event: the one before and the one after.
 _BESIDE = 2
-# A neighbour that cannot be decoded is passed over for the next; so many of them end the search.
+# An undecodable neighbour is skipped; this many of them end the search.
 _NEIGHBOURS = 10
 
 
 class Stored(NamedTuple):
-    """A batch as the telemetry table holds it; ``beyond`` what its second may hold, it only tells what the
-    next second begins after."""
+    """A batch as stored in the telemetry table. One ``beyond`` its second's limit only marks the start of the
+    next second."""
 
     batch: Batch
     expires_s: int | None
@@ -48,8 +48,8 @@ class Stored(NamedTuple):
 
 @dataclass
 class Reader:
-    """Reads one topic; what is ``known`` need not be decoded again. ``check`` is called before anything else
-    is, and may raise. ``full`` are the seconds that it found to hold more than they may."""
+    """Reads one topic. ``known`` batches are not decoded again. ``check`` is called before every read and may
+    raise. ``full`` lists the seconds found over their limit."""
 
     tables: Tables
     topic: str
@@ -85,7 +85,7 @@ class Reader:
         return stored, end_us // _SECOND_US - 1
 
     def missing_before(self, batch: Batch, previous: Batch | None, stored: Sequence[Stored]) -> int:
-        """How many batches the stream lacks just before this one, by their numbers."""
+        """The number of batches missing just before this one, by their sequence numbers."""
         if previous is not None and (previous.boot, previous.seq + 1) == (batch.boot, batch.seq):
             return 0
         # A robot may leave a hole before every batch.
@@ -106,15 +106,15 @@ class Reader:
         return self._near[1]
 
     def _bounded(self, first_us: int, at_once: int) -> Iterator[tuple[int, Stored | None]]:
-        """The batches from a time on and when they start, None for an item that is none. Of a second that
-        holds more than it may, the rest is passed over up to its last."""
+        """Yield (start, batch) from a time on; None instead of a batch that cannot be decoded. In a second
+        over its limit, the rest except the last is skipped."""
         from_us: int | None = first_us
         while from_us is not None:
             start_us, from_us = from_us, None
             second, count, size, t_us = -1, 0, 0, -1
             entry: Stored | None = None
             for item in self.tables.batches_from(self.topic, start_us, at_once=at_once):
-                # A key of no batch begins with a time all the same, or sorts behind them all.
+                # An invalid key still begins with a time, or sorts after all others.
                 before_us, t_us = t_us, _time_of(item, t_us)
                 if t_us // _SECOND_US != second:
                     second, count, size = t_us // _SECOND_US, 0, 0
@@ -136,8 +136,8 @@ class Reader:
         return list(islice(found, 1))
 
     def _stored(self, items: Iterable[Mapping[str, Any]]) -> Iterator[Stored]:
-        """The items that are batches. Of one that is not, the own record has been or will be refused;
-        here it only must not stop its neighbours."""
+        """The decodable items. An undecodable one is refused by its own record; here it only must not block
+        its neighbours."""
         for item in items:
             try:
                 batch = self.known.get(batch_id(item[BATCH])) or self._decoded(item)
@@ -159,7 +159,7 @@ def _time_of(item: Mapping[str, Any], otherwise: int) -> int:
 
 
 def _bytes(batch: Batch) -> int:
-    """About what the columns take in memory."""
+    """Estimated memory of the columns."""
     return sum(
         8 * len(column) + sum(len(value) for value in column if isinstance(value, str))
         for column in batch.columns.values()

@@ -1,4 +1,4 @@
-"""The adapter to DynamoDB: batches out of the telemetry table, seconds into the summary table."""
+"""The adapter to DynamoDB: reads batches from the telemetry table, writes seconds to the summary table."""
 
 from __future__ import annotations
 
@@ -32,23 +32,23 @@ _log = logging.getLogger(__name__)
 # BatchWriteItem takes at most this many items a call.
 WRITE_SIZE = 25
 _WRITE_ATTEMPTS = 8
-# Batches of a page, once it is known that many are wanted.
+# Page size, once many batches are wanted.
 _MANY = 100
 # How many streams a robot's row names, of which each write costs by its size, and how many an environment
 # knows to be there.
 MAX_STREAMS, _NOTED = 200, 50_000
 # What the operator changes in the registry counts after this time at the latest.
 VEHICLE_CACHE_S = 60.0
-# "Limits", items: 400 KB with the names counted in; a little is left to how numbers are counted.
+# "Limits", items: 400 KB including the names; a margin is left for the size of numbers.
 _MAX_ITEM_BYTES = 380 * 1024
-# A float's longest text; as a number it is shorter.
+# The longest text of a float; its stored number is shorter.
 _MAX_NUMBER_BYTES = 25
-# What a DynamoDB number can hold, "Supported data types": 38 digits, 1e-130 to 9.99e125.
+# The range of a DynamoDB number, "Supported data types": 38 digits, 1e-130 to 9.99e125.
 _LARGEST, _SMALLEST = 9.99e125, 1e-130
 
 
 class TableError(Exception):
-    """DynamoDB did not take what it was given in the time there was; the caller may try again."""
+    """DynamoDB did not take the items in time; the caller may try again."""
 
 
 def plain(image: Mapping[str, Any]) -> dict[str, Any]:
@@ -57,9 +57,9 @@ def plain(image: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def attribute(value: Statistics) -> dict[str, Any]:
-    """A value, or a list of some, as a DynamoDB attribute.
+    """A value, or a list of values, as a DynamoDB attribute.
 
-    A number too small becomes 0, one too large its own text.
+    A number too small becomes 0, one too large becomes text.
     """
     if isinstance(value, list):
         return {"L": list(map(attribute, value))}
@@ -75,7 +75,7 @@ def attribute(value: Statistics) -> dict[str, Any]:
 
 
 class Tables:
-    """The three tables as Lambda 2 sees them; ``client`` is a boto3 DynamoDB client or a fake of it."""
+    """The three tables of Lambda 2; ``client`` is a boto3 DynamoDB client or a fake of it."""
 
     def __init__(self, client: Any, *, telemetry: str, summary: str, robots: str) -> None:
         self._client = client
@@ -84,13 +84,13 @@ class Tables:
         self._noted: set[tuple[str, str]] = set()
 
     def batches_from(self, topic: str, first_us: int, *, at_once: int) -> Iterator[dict[str, Any]]:
-        """The stored batches of a topic that start then or later, in order of time. ``at_once`` are read
-        first, and if more are asked for a hundred at a time: nobody wants a whole drive."""
+        """A topic's stored batches from a start time on, in order of time. The first page has ``at_once``
+        batches, later ones a hundred: callers rarely want a whole drive."""
         first, last = batches_between(first_us, None)
         few = self._between(topic, first, last, at_once)
         read = 0
         for item in islice(few, at_once):
-            # Behind this one: no key ends with a space.
+            # Sorts after this one: no key ends with a space.
             read, first = read + 1, f"{item[BATCH]} "
             yield item
         if read == at_once:
@@ -101,13 +101,13 @@ class Tables:
         return self._query(topic, condition, {":first": first, ":last": last}, at_once=at_once)
 
     def before(self, topic: str, t_us: int) -> Iterator[dict[str, Any]]:
-        """The stored batches of a topic that start before the time, the nearest first. Each is read when
-        it is asked for, since the first is nearly always the one that is wanted."""
+        """A topic's stored batches before a time, the nearest first. Each is read on demand, since the first
+        one is nearly always enough."""
         first, _ = batches_between(t_us, None)
         return self._query(topic, "#batch < :first", {":first": first}, at_once=1, ScanIndexForward=False)
 
     def numbers(self, topic: str, first_us: int, last_us: int) -> Iterator[BatchId]:
-        """Which batches of a topic start between these times, in order of time, without their samples."""
+        """The ids of a topic's batches between two times, in order of time, without their samples."""
         first, last = batches_between(first_us, last_us)
         condition = "#batch BETWEEN :first AND :last"
         values = {":first": first, ":last": last}
@@ -132,7 +132,7 @@ class Tables:
             yield from map(plain, page["Items"])
 
     def item(self, topic: str, batch: str) -> dict[str, Any] | None:
-        """A batch as DynamoDB stores it, by its key; None where it is not there, or no longer."""
+        """A batch as DynamoDB stores it, by its key; None if it is missing or expired."""
         key = {TOPIC: {"S": topic}, BATCH: {"S": batch}}
         answer = self._client.get_item(TableName=self._telemetry, Key=key, ConsistentRead=True)
         found: dict[str, Any] | None = answer.get("Item")
@@ -141,10 +141,10 @@ class Tables:
     def page(
         self, condition: Mapping[str, Any], after: Mapping[str, Any] | None, *, scan: bool
     ) -> dict[str, Any]:
-        """One page of the telemetry table, as DynamoDB gives it: 1 MB read, before any filter.
+        """One page of the telemetry table as DynamoDB returns it: 1 MB read, before any filter.
 
-        ``condition`` are the expressions of a Query or a Scan; ``after`` is the key that the page before
-        ended with.
+        ``condition`` holds the expressions of a Query or a Scan; ``after`` is the last key of the previous
+        page.
         """
         request = {"TableName": self._telemetry, "ConsistentRead": True, **condition}
         if after is not None:
@@ -153,7 +153,7 @@ class Tables:
         return page
 
     def vehicle(self, robot: str) -> Vehicle | None:
-        """The robot's parameters, read at most once in `VEHICLE_CACHE_S`; None where none are registered."""
+        """The robot's parameters, cached for `VEHICLE_CACHE_S`; None if not registered."""
         now = time.monotonic()
         cached = self._vehicles.get(robot)
         if cached is None or now - cached[0] > VEHICLE_CACHE_S:
@@ -180,14 +180,14 @@ class Tables:
                 ExpressionAttributeValues={":stream": {"SS": [stream]}, ":most": {"N": str(MAX_STREAMS)}},
             )
         except ClientError as error:
-            # It only helps those who look for streams; no summary waits for it.
+            # A failure is harmless: only the list of streams uses it.
             _log.info("the stream %s of %s is not noted: %s", stream, robot, error)
         if len(self._noted) >= _NOTED:
             self._noted.clear()
         self._noted.add((robot, stream))
 
     def forget_vehicles(self) -> None:
-        """Read every robot's parameters anew the next time."""
+        """Clear the cache of robots' parameters."""
         self._vehicles.clear()
 
     def put_seconds(self, seconds: Mapping[tuple[str, int], Mapping[str, Statistics]]) -> None:
@@ -205,7 +205,7 @@ class Tables:
 
 
 def write(client: Any, table: str, requests: Sequence[Mapping[str, Any]]) -> None:
-    """Have a table take at most `WRITE_SIZE` writes; raises `TableError` if some stay unwritten."""
+    """Write at most `WRITE_SIZE` requests to a table; raises `TableError` if some stay unwritten."""
     for attempt in range(_WRITE_ATTEMPTS):
         answer = client.batch_write_item(RequestItems={table: requests})
         requests = answer.get("UnprocessedItems", {}).get(table, [])
@@ -217,9 +217,9 @@ def write(client: Any, table: str, requests: Sequence[Mapping[str, Any]]) -> Non
 
 
 def fitting(item: dict[str, Any]) -> dict[str, Any]:
-    """The item without the largest attributes that keep it from fitting in DynamoDB's 400 KB.
+    """The item without its largest attributes, so that it fits in DynamoDB's 400 KB.
 
-    A stream may have 512 fields of texts of 4096 characters, of which the summary keeps the last; the
+    A stream may have 512 fields of texts of 4096 characters, and the summary keeps the last of each; the
     samples themselves are in the telemetry table.
     """
     sizes = list(map(_size, item, item.values()))
@@ -231,13 +231,13 @@ def fitting(item: dict[str, Any]) -> dict[str, Any]:
             break
         dropped.add(name)
         total -= size
-    _log.warning("a summary of %d attributes is too large: %d left out", len(item), len(dropped))
+    _log.warning("a summary of %d attributes is too large: dropped %d", len(item), len(dropped))
     kept = {name: value for name, value in item.items() if name not in dropped}
     return {**kept, OMITTED: {"N": str(len(dropped))}}
 
 
 def _size(name: str, value: Mapping[str, Any]) -> int:
-    """At least what DynamoDB counts: names and texts in UTF-8, and no number more than its digits."""
+    """An upper bound of DynamoDB's count: names and texts in UTF-8, numbers by their digits."""
     ((kind, content),) = value.items()
     if kind == "S":
         return len(name.encode()) + len(content.encode("utf-8", "surrogatepass")) + 3
@@ -245,7 +245,7 @@ def _size(name: str, value: Mapping[str, Any]) -> int:
 
 
 def _vehicle(row: Mapping[str, Any]) -> Vehicle | None:
-    """The vehicle in a row of the registry; a row that is wrong must not stop its robot's summaries."""
+    """The vehicle in a row of the registry; a wrong row must not stop its robot's summaries."""
     if "speed_to_erpm_gain" not in row:
         return None
     try:
@@ -253,6 +253,6 @@ def _vehicle(row: Mapping[str, Any]) -> Vehicle | None:
     except (TypeError, ValueError):
         gain = offset = math.nan
     if not gain or not math.isfinite(gain) or not math.isfinite(offset):
-        _log.warning("vehicle parameters of %s are not numbers, or the gain is 0", row.get(ROBOT))
+        _log.warning("vehicle parameters of %s must be numbers, and the gain not 0", row.get(ROBOT))
         return None
     return Vehicle(gain, offset)

@@ -1,4 +1,4 @@
-"""How many bytes a robot may still upload today: a count in its row of the robots table."""
+"""A robot's daily upload quota: a count in its row of the robots table."""
 
 from __future__ import annotations
 
@@ -17,8 +17,7 @@ class Allotment:
         self._client, self._table, self.bytes_a_day = client, table, bytes_a_day
 
     def take(self, robot: str, size: int, now_s: float) -> bool:
-        """Whether the robot may upload so much more today; if so, it is counted. One that is not
-        registered may not."""
+        """Count the size and return True if it fits in today's quota. An unregistered robot has none."""
         if size > self.bytes_a_day:
             return False
         values = {

@@ -33,7 +33,7 @@ def test_robot_is_added_listed_and_removed(iort, tmp_path):
 @pytest.mark.parametrize(
     ("arguments", "said"),
     [
-        (("robots", "add", "car/1"), "robot name 'car/1'"),
+        (("robots", "add", "car/1"), "got 'car/1'"),
         (("robots", "remove", "nobody"), "robot nobody is not registered"),
         (("files", "list", "nobody"), "there is no robot nobody; there is "),
         (("files", "list", "nobody", "--last", "1h", "--json"), "there is no robot nobody"),

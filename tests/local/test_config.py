@@ -57,7 +57,7 @@ def test_a_robot_that_is_off_has_not_answered_and_the_wish_stands(iort, bundle):
     ("arguments", "said"),
     [
         (("config", "nobody"), "robot nobody is not registered"),
-        (("config", "car/1"), "robot name 'car/1'"),
+        (("config", "car/1"), "got 'car/1'"),
         (("send", "nobody", "drive", "{}"), "robot nobody is not registered"),
     ],
 )
@@ -71,7 +71,7 @@ def test_what_cannot_be_asked_is_said(iort, arguments, said):
         (("config", "CAR", "live.rate_hz"), "expected NAME=VALUE"),
         (("send", "CAR", "drive", "{"), "is not JSON"),
         (("send", "CAR", "drive", "7"), "expected a JSON object"),
-        (("send", "CAR", "a/b", "{}"), "stream name 'a/b'"),
+        (("send", "CAR", "a/b", "{}"), "got 'a/b'"),
     ],
 )
 def test_what_cannot_be_sent_is_said(iort, bundle, arguments, said):

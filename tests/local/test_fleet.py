@@ -223,7 +223,7 @@ def test_revoked_claims_provision_nothing_more(embedded, tmp_path, iort):
         (("register", "a", "b", "--serial", "s"), "--serial is of one machine"),
         (("show", "nobody"), "robot nobody is not registered"),
         (("rotate", "nobody"), "robot nobody is not registered"),
-        (("register", "a/b"), "robot name 'a/b'"),
+        (("register", "a/b"), "got 'a/b'"),
     ],
 )
 def test_what_the_command_refuses(iort, arguments, said):

@@ -13,8 +13,8 @@ def test_the_embedded_cloud_stops_nothing(embedded):
     said = {item: one.found for item, one in findings.items() if one.verdict is Verdict.FINE}
     assert "account 000000000000" in said["credentials"]
     assert said["stacks"] == "6 of 8 are there, each can be updated"
-    assert said["names"] == "free, or this deployment's own"
-    assert said["kept data"] == "none of an earlier deployment"
+    assert said["names"] == "free, or used by this deployment"
+    assert said["kept data"] == "no leftovers"
     assert said["changed settings"] == "none that must not be"
 
 

@@ -87,13 +87,13 @@ def test_what_the_rule_cannot_store_is_kept_byte_by_byte(bundle, entry_of, paylo
 @pytest.mark.parametrize(
     ("changes", "stream", "reason"),
     [
-        ({"v": 1}, "vesc", "schema version 1"),
-        ({"codec": "later"}, "vesc", "codec 'later': this side knows steps"),
-        ({"samples": "AAAA"}, "vesc", "samples are not base64 of zlib"),
-        ({"batch": "yesterday"}, "vesc", "expected <16 digits of microseconds>-<run>-<number>"),
+        ({"v": 1}, "vesc", "schema version must be 2, got 1"),
+        ({"codec": "later"}, "vesc", "codec must be steps"),
+        ({"samples": "AAAA"}, "vesc", "samples must be base64 of zlib"),
+        ({"batch": "yesterday"}, "vesc", "must be <16 digits of microseconds>-<run>-<number>"),
         ({"batch": "4000000000000000-0badcafe-0"}, "vesc", "clock is wrong"),
-        ({}, "b ad", "stream name 'b ad'"),
-        ({}, "a/b", "expected <lane>/<namespace>/<robot>/<name>"),
+        ({}, "b ad", "stream name must be 1 to 64 of A-Z a-z 0-9 _ -, got 'b ad'"),
+        ({}, "a/b", "must be <lane>/<namespace>/<robot>/<name>"),
     ],
     ids=["version", "codec", "samples", "no-id", "years-ahead", "stream", "levels"],
 )

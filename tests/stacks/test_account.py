@@ -86,6 +86,6 @@ def test_the_level_of_the_context(tmp_path, given, level):
 
 def test_a_level_that_there_is_not(tmp_path):
     with pytest.raises(
-        SettingsError, match=r"iot_log_level = 'loud': allowed is off, error, warn, info or debug"
+        SettingsError, match=r"iot_log_level must be off, error, warn, info or debug, got 'loud'"
     ):
         Settings.from_context(App(context={"iot_log_level": "loud", "layer": str(tmp_path)}))

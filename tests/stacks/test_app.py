@@ -65,7 +65,7 @@ def test_a_wrong_value_is_one_line(tmp_path, layer):
     returncode, _, err = finished(run(tmp_path, "out", retention_days="soon"))
     assert returncode == 1
     (line,) = [line for line in err.splitlines() if line.startswith("app.py")]
-    assert line == "app.py: context retention_days = 'soon': allowed is a whole number from 1 to 3650"
+    assert line == "app.py: context retention_days must be a whole number from 1 to 3650, got 'soon'"
     assert "Traceback" not in err
     assert not list((tmp_path / "out").glob("*.template.json"))
 

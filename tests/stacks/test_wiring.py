@@ -259,7 +259,7 @@ def test_lambdas_own_lines_come_back_where_they_are_asked_for(tmp_path):
         if resource["Type"] == "AWS::Lambda::Function"
     )
     assert made["LoggingConfig"].keys() == {"LogGroup"}
-    with pytest.raises(SettingsError, match="function_logs = 'none': allowed is own or all"):
+    with pytest.raises(SettingsError, match="function_logs must be own or all, got 'none'"):
         Settings.from_context(App(context={"function_logs": "none", "layer": str(tmp_path)}))
 
 

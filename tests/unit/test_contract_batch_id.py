@@ -75,7 +75,7 @@ def test_both_ends_of_a_range_belong_to_it(at):
     ],
 )
 def test_what_is_no_id_is_refused(text):
-    with pytest.raises(ContractError, match="expected <16 digits of microseconds>-<run>-<number>"):
+    with pytest.raises(ContractError, match="must be <16 digits of microseconds>-<run>-<number>"):
         batch_id(text)
 
 

@@ -57,7 +57,7 @@ def test_columns_that_somebody_spaces_out_are_read():
 
 @pytest.mark.parametrize(("samples", "fields"), [(MOST // 2 + 1, 2), (98, 512)])
 def test_more_values_are_refused_on_either_side(samples, fields):
-    said = f"{samples} samples of {fields} fields: allowed is up to {MOST} values"
+    said = f"at most {MOST} values, got {samples} samples of {fields} fields"
     with pytest.raises(ContractError, match=said):
         iort_contract.encode(Batch(BOOT, 0, range(samples), {f"f{i}": [1] * samples for i in range(fields)}))
     columns = b",".join(b'"f%d":[%s0]' % (i, b"0," * (samples - 1)) for i in range(fields))
@@ -84,9 +84,9 @@ DEAR = {
 
 @pytest.mark.parametrize("body", DEAR.values(), ids=DEAR)
 def test_what_is_dear_to_read_is_refused_before_it_is_read(body):
-    with pytest.raises(ContractError, match=r"samples hold (more than columns|too many texts)"):
+    with pytest.raises(ContractError, match=r"samples must (be columns|hold at most)"):
         check_effort(body)
-    with pytest.raises(ContractError, match="samples hold"):
+    with pytest.raises(ContractError, match="samples must"):
         iort_contract.decode(enveloped(body, 1))
 
 
@@ -95,9 +95,9 @@ def test_names_are_no_place_for_megabytes():
     batch = Batch(BOOT, 0, [0], {longest: [1]})
     assert iort_contract.decode(iort_contract.encode(batch)) == batch
     for name in (longest + "d", "a" + ".b" * 1_000_000):
-        with pytest.raises(ContractError, match="over 1024 characters"):
+        with pytest.raises(ContractError, match="at most 1024 characters"):
             iort_contract.encode(Batch(BOOT, 0, [0], {name: [1]}))
-        with pytest.raises(ContractError, match="over 1024 characters"):
+        with pytest.raises(ContractError, match="at most 1024 characters"):
             iort_contract.decode(enveloped(b'{"dt":[0],"fields":{"%s":[1]}}' % name.encode(), 1))
 
 

@@ -207,15 +207,15 @@ def test_arrays_within_arrays_cost_no_more_than_a_view(n: int, fields: int) -> N
 @pytest.mark.parametrize(
     ("definition", "data", "error"),
     [
-        ("float64 a", bytes(7), "7 bytes is cut short"),
-        ("float64 a", bytes(9), "has 9 bytes, its definition 8"),
-        ("string s", u32(5) + b"abc", "has 7 bytes, its definition 9"),
-        ("string s", b"\x01", "cut short"),
-        ("float64[] a", u32(2**32 - 1), "cut short"),
-        ("uint8[] a", u32(2**32 - 1), "cut short"),
-        ("string[] a", u32(20_000), "cut short"),
-        ("string[] a", u32(2**32 - 1), "4294967295 elements are too many"),
-        ("string[1000000] a", b"", "cut short"),
+        ("float64 a", bytes(7), "7 bytes is truncated"),
+        ("float64 a", bytes(9), "must have 8 bytes, got 9"),
+        ("string s", u32(5) + b"abc", "must have 9 bytes, got 7"),
+        ("string s", b"\x01", "truncated"),
+        ("float64[] a", u32(2**32 - 1), "truncated"),
+        ("uint8[] a", u32(2**32 - 1), "truncated"),
+        ("string[] a", u32(20_000), "truncated"),
+        ("string[] a", u32(2**32 - 1), "too many elements to decode: 4294967295"),
+        ("string[1000000] a", b"", "truncated"),
     ],
 )
 def test_bytes_that_do_not_fit(definition: str, data: bytes, error: str) -> None:
@@ -228,13 +228,13 @@ def test_bytes_that_do_not_fit(definition: str, data: bytes, error: str) -> None
 @pytest.mark.parametrize(
     ("definition", "error"),
     [
-        ("float64", "has the line 'float64'"),
-        ("float64 a b", "has the line"),
-        ("flo at64 a[3]", "has the line"),
+        ("float64", "invalid line 'float64'"),
+        ("float64 a b", "invalid line"),
+        ("flo at64 a[3]", "invalid line"),
         ("Unknown a", "the definition of a_msgs/Unknown is missing"),
         ("A a", "contains itself"),
         ("B b\n" + "=" * 80 + "\nMSG: a_msgs/B\nA a", "contains itself"),
-        ("B b\n" + "=" * 80 + "\nuint8 a", "not with MSG"),
+        ("B b\n" + "=" * 80 + "\nuint8 a", "must begin with MSG"),
         ("uint8[99999999999] a", "99999999999 elements"),
     ],
 )

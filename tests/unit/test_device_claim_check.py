@@ -233,7 +233,7 @@ def test_a_live_topics_bytes_are_handed_over_where_it_says_upload():
     assert refusing.decode(message)[0] == {"format": "jpeg", "last": 7}
     assert refusing.left_out == {"data": 1}
     assert Decoder(definition, select=["format"], large=True).decode(message)[0] == {"format": "jpeg"}
-    with pytest.raises(MessageError, match="cut short"):
+    with pytest.raises(MessageError, match="truncated"):
         Decoder(definition, large=True).decode(message[:100])
 
 

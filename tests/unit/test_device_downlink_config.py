@@ -30,7 +30,7 @@ def test_a_wrong_configuration(change: Any, error: str) -> None:
 @pytest.mark.parametrize(
     ("config", "error"),
     [
-        ({"cmd": {"a/b": CONFIG["cmd"]["say"]}}, "stream name 'a/b'"),
+        ({"cmd": {"a/b": CONFIG["cmd"]["say"]}}, "got 'a/b'"),
         ({"fleet": {"pose": {"topic": "/pose", "type": "a/B"}}}, "{robot} in it"),
         ({"fleet": {"pose": {"topic": "/{robot}/{robot}", "type": "a/B"}}}, "{robot} in it"),
         ({"share": {"pose": {"name": "pose"}}}, "ROS topic 'pose'"),

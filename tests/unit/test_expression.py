@@ -127,15 +127,15 @@ def test_refuses_at_once_what_no_field_could_answer(text, position):
 @pytest.mark.parametrize(
     ("text", "said"),
     [
-        ("speed > '3'", "a number and a text cannot be compared: speed is a number, '3' is a text"),
+        ("speed > '3'", "cannot compare a number with a text: speed is a number, '3' is a text"),
         ("fault_code == 7 and speed != '3'", "speed is a number, '3' is a text"),
         ("speed in (1, '2')", "speed is a number, '2' is a text"),
         ("on == 'true'", "on is a number, 'true' is a text"),
         ("name == 3", "name is a text, 3 is a number"),
         ("name == fault_code", "name is a text, fault_code is a number"),
         ("mixed == 'a'", "mixed is a number or a text, 'a' is a text"),
-        ("name + 1 > 2", "a text cannot be calculated with: name is a text, 1 is a number"),
-        ("not abs(name) > 2", "a text cannot be calculated with: name is a text"),
+        ("name + 1 > 2", "cannot calculate with a text: name is a text, 1 is a number"),
+        ("not abs(name) > 2", "cannot calculate with a text: name is a text"),
     ],
 )
 def test_a_number_compared_with_a_text_is_an_error_and_not_nothing_found(text, said):

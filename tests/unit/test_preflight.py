@@ -175,7 +175,13 @@ def exported(name, *importers):
 CASES = [
     ("bootstrap", {}, {}, FINE, "version 21, needed is 6"),
     ("bootstrap", {}, {"GetParameter": Refused("ParameterNotFound")}, STOPS, "not bootstrapped"),
-    ("bootstrap", {}, {"GetParameter": {"Parameter": {"Value": "5"}}}, STOPS, "version 5, needed is 6"),
+    (
+        "bootstrap",
+        {},
+        {"GetParameter": {"Parameter": {"Value": "5"}}},
+        STOPS,
+        "version must be 6 or newer, got 5",
+    ),
     ("iot_log", {}, {}, FINE, "not configured; iot_log_level is off"),
     ("iot_log", {"iot_log_level": "error"}, {}, FINE, "not configured; iot_log_level is error"),
     ("iot_log", {}, {"GetV2LoggingOptions": LOG}, FINE, "configured (ERROR); iot_log_level is off"),
@@ -213,7 +219,7 @@ CASES = [
         "by this deployment",
     ),
     ("concurrency", {}, {}, FINE, "0 are to be reserved"),
-    ("concurrency", {}, {"GetAccountSettings": limits(10, 10)}, WARNING, "10 executions at once"),
+    ("concurrency", {}, {"GetAccountSettings": limits(10, 10)}, WARNING, "10 concurrent executions"),
     (
         "concurrency",
         {"stage": "prod"},
@@ -226,7 +232,7 @@ CASES = [
         {"stage": "prod"},
         {"GetAccountSettings": limits(104, 104)},
         STOPS,
-        "wants 100 to be left",
+        "requires 100 unreserved",
     ),
     (
         "concurrency",
@@ -248,7 +254,7 @@ CASES = [
         FINE,
         "deployed",
     ),
-    ("quotas", {}, {}, FINE, "first: "),
+    ("quotas", {}, {}, FINE, "first limit: "),
     (
         "quotas",
         {},
@@ -261,7 +267,7 @@ CASES = [
         {},
         {"ListAWSDefaultServiceQuotas": {"Quotas": QUOTAS[:1]}},
         FINE,
-        "not told: Connect requests",
+        "unknown: Connect requests",
     ),
     ("quotas", {}, {"ListAWSDefaultServiceQuotas": {"Quotas": []}}, WARNING, "none of the quotas"),
     (
@@ -269,7 +275,7 @@ CASES = [
         {},
         {"ListTopicRules": {"rules": [{"ruleName": f"other{n}"} for n in range(992)]}},
         STOPS,
-        "992 rules of others and 9 of ours, allowed are 1000",
+        "992 rules of others and 9 of ours exceed the limit 1000",
     ),
     (
         "quotas",
@@ -308,8 +314,8 @@ CASES = [
         STOPS,
         "without their stack: dashboard iort-platform",
     ),
-    ("names", {}, {"GetPolicy": {"policyName": "a"}} | stack_answers(ALL), FINE, "this deployment's own"),
-    ("kept", {}, {}, FINE, "none of an earlier"),
+    ("names", {}, {"GetPolicy": {"policyName": "a"}} | stack_answers(ALL), FINE, "used by this deployment"),
+    ("kept", {}, {}, FINE, "no leftovers"),
     (
         "kept",
         {},
@@ -339,7 +345,7 @@ CASES = [
             },
         ),
         FINE,
-        "none of an earlier",
+        "no leftovers",
     ),
     ("changes", {}, {}, FINE, "nothing is deployed"),
     ("changes", {"site": True, "device_defender": True}, stack_answers(ALL), FINE, "none that must not be"),
@@ -504,5 +510,5 @@ def test_the_cdks_arguments_are_read_as_app_py_reads_them(tmp_path):
     read = preflight.context([*asked.context, f"layer={tmp_path}"])
     made = Settings.read(read.get)
     assert (made.stage, made.budget_usd, made.alarm_email) == ("prod", 50, "a@b.org")
-    with pytest.raises(SettingsError, match="stage = 'test'"):
+    with pytest.raises(SettingsError, match="stage must be"):
         Settings.read(preflight.context(["stage=test"]).get)

@@ -229,11 +229,11 @@ def test_an_empty_range_is_no_error():
         ({"fields": ["volts"]}, "car has no volts in vesc in this range; it has speed, speed_mps"),
         ({"where": "volts > 1"}, "car has no volts"),
         ({"fields": ["speed_mps"]}, "speed_mps needs the speed_to_erpm_gain of car"),
-        ({"where": "speed >"}, "no expression"),
+        ({"where": "speed >"}, "invalid expression"),
         ({"start": "yesterday"}, "time 'yesterday': allowed is now, -10m"),
         ({"start": 5, "end": 4}, "ends before it starts"),
         ({"every": "1 fortnight"}, "duration '1 fortnight'"),
-        ({"robot": "a/b"}, "robot name 'a/b'"),
+        ({"robot": "a/b"}, "got 'a/b'"),
     ],
 )
 def test_a_mistake_is_answered_with_what_there_is(question, answer):

@@ -149,7 +149,7 @@ def test_a_type_survives_the_wire_and_a_wrong_one_is_refused():
     assert message_type(kind.sample()) == kind
     with pytest.raises(ContractError, match="characters"):
         kind._replace(definition="x" * 300_000).sample()
-    with pytest.raises(ContractError, match="without 'topic'"):
+    with pytest.raises(ContractError, match="must have 'topic'"):
         message_type({"stream": "s"})
     with pytest.raises(StationError, match="not that of its checksum"):
         Maker(kind, ["x"])

@@ -130,7 +130,7 @@ def test_a_request_that_is_not_allowed_is_refused(wrong):
 def test_no_more_addresses_are_asked_for_than_fit_a_message():
     content = file_of(b"")
     large = replace(content, size=PART_BYTES * 20)
-    with pytest.raises(ContractError, match="allowed is up to 16"):
+    with pytest.raises(ContractError, match="at most 16"):
         iort_contract.encode_file_request(FileRequest(ID, large, dict.fromkeys(range(1, 18), "a" * 64)))
     longest = Address(10_000, "https://x/" + "u" * 3000, {"x-amz-checksum-sha256": "c" * 44})
     answer = FileAnswer(ID, "k" * 500, addresses=[longest] * iort_contract.MAX_ADDRESSES)
@@ -418,7 +418,7 @@ def test_the_handler_says_what_is_wrong_with_a_request(published, capsys):
     upload.handler(event(SMALL, parts={"9": "x"}), Context)
     (answer,) = (iort_contract.decode_file_answer(one["payload"]) for one in published)
     assert answer.id == ID
-    assert answer.refused == "part 9: allowed is 1 to 1"
+    assert answer.refused == "part must be 1 to 1, got 9"
     assert answer.again_s is None
     assert json.loads(capsys.readouterr().out.splitlines()[-1])["FilesRefused"] == 1
 

@@ -87,7 +87,7 @@ def test_a_kept_report_is_read_again(tmp_path):
 
 def test_a_file_of_another_form_is_refused(tmp_path):
     (tmp_path / "report.json").write_text("[]")
-    with pytest.raises(VerifyError, match="no report of verify"):
+    with pytest.raises(VerifyError, match="must be a report of verify"):
         measured.load(tmp_path / "report.json")
 
 

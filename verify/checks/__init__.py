@@ -1,4 +1,4 @@
-"""The questions, a file a subject; each file has a tuple CHECKS, and `ALL` is all of them in order."""
+"""The questions, one file per subject; each file has a tuple CHECKS, and `ALL` joins them in order."""
 
 from __future__ import annotations
 

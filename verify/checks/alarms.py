@@ -1,4 +1,4 @@
-"""Alarms and alerts: what reaches a human, and that CloudWatch takes what the alarms ask."""
+"""Alarms and alerts: notices reach a person, and CloudWatch accepts the alarms' queries."""
 
 from __future__ import annotations
 
@@ -17,22 +17,22 @@ from verify.inbox import inbox
 from verify.robot import Robot
 from verify.waiting import until
 
-_REASON = "verify: is it told?"
+_REASON = "verify: does it notify?"
 _ALARM = "ALARM"
 _RUN = "0badcafe"
 _FAULT = 5
-# The alarms that ask by Metrics Insights: stacks/alarms.py.
+# The alarms that use Metrics Insights: stacks/alarms.py.
 _INSIGHTS = ("ParseError", "ErrorActionFailure", "RuleMessageThrottled", "DestinationDeliveryFailures")
 
 
 def _quiet_alarm(target: Target) -> dict[str, Any]:
-    """An alarm of the deployment that does not say ALARM: only a change of state is told."""
+    """An alarm of the deployment that is not in ALARM: only a change of state sends a notice."""
     pages = target.cloud.client("cloudwatch").get_paginator("describe_alarms")
     for page in pages.paginate(AlarmNamePrefix=f"{target.cloud.namespace}-", AlarmTypes=["MetricAlarm"]):
         for alarm in page["MetricAlarms"]:
             if alarm["StateValue"] != _ALARM:
                 return dict(alarm)
-    raise VerifyError("no alarm of the deployment is quiet")
+    raise VerifyError("every alarm of the deployment is in ALARM")
 
 
 def _set_state(target: Target) -> dict[str, Any]:
@@ -70,7 +70,7 @@ def _insights(target: Target) -> dict[str, Any]:
     names = [f"{target.cloud.namespace}-{name}" for name in _INSIGHTS]
 
     def alarms() -> list[dict[str, Any]] | None:
-        """The alarms, once CloudWatch has looked at each."""
+        """The alarms, once CloudWatch has evaluated each."""
         found = list(cloudwatch.describe_alarms(AlarmNames=names)["MetricAlarms"])
         looked = all(alarm["StateValue"] != "INSUFFICIENT_DATA" for alarm in found)
         return found if looked and found else None
@@ -100,7 +100,7 @@ def _alert(target: Target) -> dict[str, Any]:
         robot.online()
         now_us = time.time_ns() // 1000
         live = encode_live(LiveSample(_RUN, 0, now_us, now_us, {FAULT_FIELD: _FAULT}))
-        # Not by Basic Ingest, which comes to the live rule alone.
+        # Not by Basic Ingest, which reaches only the live rule.
         robot.publish(build_topic(LIVE, robot.name, VESC_STREAM, namespace), live)
         mail = receive(lambda mail: robot.name in mail["Message"], "the alert at the topic's subscriber")
     lines = mail["Message"].replace(bundle.robot, "ROBOT").replace(namespace, "NAMESPACE").splitlines()
@@ -114,7 +114,7 @@ def _alert(target: Target) -> dict[str, Any]:
 _SET_STATE = Check(
     name="alarms.set_state",
     assumed=(
-        "An alarm whose state is set to ALARM tells the alarm topic, and the topic its subscribers, with "
+        "An alarm whose state is set to ALARM notifies the alarm topic, and the topic its subscribers, with "
         "name, description, both states and the reason."
     ),
     expected={
@@ -138,7 +138,7 @@ CHECKS = (
         _SET_STATE,
         name="alarms.set_state_with_key",
         assumed=(
-            "The same where the topic is encrypted with the account's own key, which lets CloudWatch in "
+            "The same with a topic encrypted with the account's own key, which admits CloudWatch "
             "without a condition."
         ),
         expected={**_SET_STATE.expected, "topic_has_key": True},
@@ -150,8 +150,8 @@ CHECKS = (
     Check(
         name="alarms.metrics_insights",
         assumed=(
-            "An alarm may sum a metric over all of its dimensions by Metrics Insights. Where the metric has "
-            "no data, the query is complete, and the alarm is no longer in its first state."
+            "An alarm may sum a metric over all of its dimensions by Metrics Insights. If the metric has "
+            "no data, the query completes, and the alarm leaves its first state."
         ),
         expected={
             "alarms": len(_INSIGHTS),

@@ -1,4 +1,4 @@
-"""The broker: whom it lets in, what it refuses and how, and what it takes in a second."""
+"""The broker: admission, refusals and their form, and limits per second."""
 
 from __future__ import annotations
 
@@ -60,7 +60,7 @@ def _foreign_topic(target: Target) -> dict[str, Any]:
 
 
 def _burst(robot: Robot, topic: str, per_s: int) -> dict[str, Any]:
-    """What comes back for so many messages a second."""
+    """The answers to this many messages a second."""
     began, sent = time.monotonic(), []
     for number in range(_BURST_S * per_s):
         # The pace is the question.
@@ -91,7 +91,7 @@ CHECKS = (
     Check(
         name="broker.session_taken_over",
         assumed=(
-            "Of two clients with one client id the second is connected, and the first is disconnected with "
+            "If two clients share a client id, the second is connected, and the first is disconnected with "
             "the reason code 0x8E, session taken over."
         ),
         expected={
@@ -106,7 +106,7 @@ CHECKS = (
     ),
     Check(
         name="broker.another_client_id",
-        assumed="A robot's certificate connects with no client id but its own name.",
+        assumed="A robot's certificate can connect only with the robot's own name as client id.",
         expected={"neighbours": True, "one_that_nobody_has": True},
         basis=Basis.DOCUMENTED,
         source="https://docs.aws.amazon.com/iot/latest/developerguide/thing-policy-variables.html",
@@ -116,8 +116,8 @@ CHECKS = (
     Check(
         name="broker.foreign_topic",
         assumed=(
-            "What a robot publishes to its neighbour's commands does not reach the neighbour. AWS has two "
-            "answers, a PUBACK with 0x87 or the session's end, and does not say which one comes. A "
+            "A robot's message to its neighbour's commands does not reach the neighbour. AWS has two "
+            "answers, a PUBACK with 0x87 or the session's end, and does not document which one comes. A "
             "subscription is refused by itself."
         ),
         expected={"subscribe": "NOT_AUTHORIZED", "publish_is_refused": True, "neighbour_heard": 0},
@@ -129,8 +129,8 @@ CHECKS = (
     Check(
         name="broker.publishes_a_second",
         assumed=(
-            "A connection may publish 90 times a second, the agent's share of AWS' 100. What is beyond 100 "
-            "is discarded; the agent never sends it."
+            "A connection may publish 90 times a second, the agent's share of AWS' 100. AWS discards "
+            "messages beyond 100; the agent never sends them."
         ),
         expected={"at_90_a_second": _ALL_TAKEN},
         basis=Basis.DOCUMENTED,

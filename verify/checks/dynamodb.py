@@ -1,4 +1,4 @@
-"""DynamoDB: what expires, which names an expression may not have, and what a condition that fails says."""
+"""DynamoDB: expiry, reserved words in expressions, and the answer of a failed condition."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ def _expiry(target: Target) -> dict[str, Any]:
     for output in _TABLES:
         table = target.cloud.output("storage", output)
         told = client.describe_time_to_live(TableName=table)["TimeToLiveDescription"]
-        # It may take an hour until it is enabled.
+        # Enabling it may take an hour.
         if told["TimeToLiveStatus"] in ("ENABLED", "ENABLING"):
             found[output] = told["AttributeName"]
     return found
@@ -79,7 +79,7 @@ CHECKS = (
     ),
     Check(
         name="dynamodb.reserved_words",
-        assumed="Of the tables' attributes an expression may name all but batch and online.",
+        assumed="An expression may name all of the tables' attributes except batch and online.",
         expected={"refused": [BATCH, "online"]},
         basis=Basis.DOCUMENTED,
         source=f"{_GUIDE}/ReservedWords.html",
@@ -92,7 +92,7 @@ CHECKS = (
     ),
     Check(
         name="dynamodb.failed_condition",
-        assumed="A condition that fails is an error with the row as it is, where the request asks for it.",
+        assumed="A failed condition is an error with the current row, if the request asks for it.",
         expected={"code": "ConditionalCheckFailedException", "status": 400, "row": True},
         basis=Basis.DOCUMENTED,
         source=f"{_API}/API_UpdateItem.html",

@@ -1,4 +1,4 @@
-"""The files' bucket: what a signed address is good for, and that nobody gets in without one."""
+"""The files' bucket: the limits of a signed address, and no access without one."""
 
 from __future__ import annotations
 
@@ -86,7 +86,7 @@ def _in_parts(target: Target) -> dict[str, Any]:
 
 
 def _closed(target: Target) -> dict[str, Any]:
-    """Signed for a second, with the upload function's role: robots' addresses are good for 15 minutes."""
+    """Signed for a second, with the upload function's role: robots' addresses are valid for 15 minutes."""
     cloud, context = target.cloud, trust(target)
     s3, client = cloud.client("s3"), cloud.client("lambda")
     place = {"Bucket": cloud.output("storage", "FilesBucket"), "Key": f"{FILES_PREFIX}verify/expired"}
@@ -98,7 +98,7 @@ def _closed(target: Target) -> dict[str, Any]:
             answer = sent(context, "PUT", url, _SMALL)
             return None if answer[0] == http.client.OK else answer
 
-        expired, code = until(refused, "the end of an address that was signed for a second")
+        expired, code = until(refused, "the expiry of an address that was signed for a second")
         unsigned = {method: sent(context, method, url.split("?")[0])[0] for method in ("GET", "PUT")}
     finally:
         s3.delete_object(**place)
@@ -116,9 +116,9 @@ CHECKS = (
     Check(
         name="files.in_one",
         assumed=(
-            "A signed address takes this content, of this length, under this key, once. Other bytes are "
-            "refused with 400 and a code that the agent knows, everything else that was signed with 403, and "
-            "the same again with 412."
+            "A signed address accepts this content, of this length, under this key, once. Other bytes are "
+            "refused with 400 and a code that the agent knows, all other changes with 403, and a second "
+            "upload with 412."
         ),
         expected={
             "other_bytes": 400,
@@ -142,8 +142,8 @@ CHECKS = (
     Check(
         name="files.in_parts",
         assumed=(
-            "A part is taken with its SHA-256 alone; the list of parts has the SHA-256 of each, by which the "
-            "function completes the upload without having read it."
+            "A part is accepted with its SHA-256 alone; the list of parts has the SHA-256 of each, so the "
+            "function completes the upload without reading it."
         ),
         expected={
             "other_bytes": 400,
@@ -161,7 +161,7 @@ CHECKS = (
     ),
     Check(
         name="files.closed",
-        assumed="An address that has expired is refused with 403, and so is what nobody has signed.",
+        assumed="An expired address is refused with 403, and so is a request without signature.",
         expected={
             "expired": 403,
             "unsigned": {"GET": 403, "PUT": 403},

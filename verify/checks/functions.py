@@ -1,4 +1,4 @@
-"""Lambda: what the runtime brings, and how the failure of an invocation that nobody waits for is told."""
+"""Lambda: the runtime's versions, and the report of a failed asynchronous invocation."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from verify.waiting import until
 _GUIDE = "https://docs.aws.amazon.com/lambda/latest/dg"
 _MEMORY_MB = 256
 _WITHIN_S = 180.0
-# What functions/ gives boto3's clients beyond what is years old.
+# The newer parameters that functions/ passes to boto3's clients.
 _PARAMETERS = {
     "CompleteMultipartUpload": ["IfNoneMatch", "MpuObjectSize"],
     "PutObject": ["ChecksumSHA256", "IfNoneMatch"],
@@ -82,7 +82,7 @@ def _python(target: Target) -> dict[str, Any]:
 
 
 def _failure(target: Target) -> dict[str, Any]:
-    """The function echo is called with a ping that is none, by nobody who waits."""
+    """The function echo is invoked asynchronously with a message that is not a ping."""
     bundle, cloud = target.robot("verify-failure"), target.cloud
     name, message = cloud.output("processing", "EchoFunction"), b"\xff no ping"
     event = rule_event(
@@ -111,7 +111,7 @@ CHECKS = (
         name="functions.runtime",
         assumed=(
             "boto3 of Lambda's runtime knows every parameter that the functions use, and the environment and "
-            "the context say memory, name and time left."
+            "the context have memory, name and time left."
         ),
         expected={
             "parameters_that_boto3_does_not_know": [],
@@ -132,12 +132,12 @@ CHECKS = (
         source=f"{_GUIDE}/lambda-runtimes.html",
         relied_on_by=("stacks/function.py", "scripts/setup.py"),
         ask=_python,
-        not_embedded="the embedded cloud runs the functions with the Python of the machine it stands on",
+        not_embedded="the embedded cloud runs the functions with its host's Python",
     ),
     Check(
         name="functions.failed_invocation",
         assumed=(
-            "An asynchronous invocation that fails, and is not tried again, comes to the destination with "
+            "A failed asynchronous invocation without retries reaches the destination with "
             "its event, the function's ARN, the condition RetriesExhausted and the error's message."
         ),
         expected={

@@ -32,7 +32,7 @@ from verify.waiting import until
 
 _RUN = "0badcafe"
 _STALE = 0
-# Two clocks of AWS' differ by less, and the operator's and AWS' by less than the other.
+# Two clocks of AWS differ by less than the first, the operator's and AWS' by less than the second.
 _SAME_CLOCK_US, _OTHER_CLOCK_US = 100_000, 60_000_000
 
 
@@ -45,7 +45,7 @@ def _sent(robot: Robot, target: Target, number: int, age_s: float = 0.0) -> Live
 
 @contextmanager
 def keys_lent(target: Target) -> Iterator[None]:
-    """Have PubNub's keys stored: where the deployment has none of its own, those of the namespace iort."""
+    """Store PubNub's keys: a deployment without its own gets those of the namespace iort."""
     cloud = target.cloud
     own = _stored(cloud)
     if own is None:
@@ -75,7 +75,7 @@ def _live(target: Target) -> dict[str, Any]:
         numbers = count(_STALE + 1)
 
         def shown() -> bool:
-            """Lambda 1 may have to start first, and what waited for that for 2 s is not shown."""
+            """Lambda 1 may have to start first, and messages older than 2 s are dropped."""
             _sent(robot, target, next(numbers))
             return bool(listener.heard)
 
@@ -110,7 +110,7 @@ CHECKS = (
         name="live.to_subscriber",
         assumed=(
             "A live sample goes by Basic Ingest to Lambda 1 and by PubNub to the subscriber of the robot's "
-            "channel; one that is a minute old does not."
+            "channel; a sample that is a minute old does not."
         ),
         expected={
             "stale_heard": False,

@@ -1,4 +1,4 @@
-"""What functions print: a line that becomes a metric, and the lines that the dashboard shows as warnings."""
+"""The functions' output: lines that become metrics, and lines that the dashboard shows as warnings."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ _GUIDE = "https://docs.aws.amazon.com/lambda/latest/dg"
 _METRIC, _FUNCTION = "BatchesSummarized", "summarize"
 _RUN = "0badcafe"
 _WITHIN_S = 170.0
-# As the log widget in stacks/dashboards.py asks.
+# The filter of the log widget in stacks/dashboards.py.
 _SHOWN = re.compile("WARN|ERROR|CRITICAL|FATAL|Traceback|Task timed out")
 _WARNED, _RAISED, _PRINTED = "verify warned", "verify raised", "verify printed"
 _SPEAKING = f"""
@@ -44,7 +44,7 @@ def handler(event, context):
 
 
 def _counted(target: Target, since: datetime) -> float:
-    """The batches that Lambda 2 says it has summarised since then."""
+    """The number of batches that Lambda 2 has summarised since then, by its metric."""
     dimensions = {METRIC_DEPLOYMENT: target.cloud.namespace, METRIC_FUNCTION: _FUNCTION}
     metric = {
         "Namespace": METRIC_NAMESPACE,
@@ -93,7 +93,7 @@ def _lines(target: Target) -> dict[str, Any]:
         client.invoke(FunctionName=name, Payload=b"{}")
 
         def said() -> list[str] | None:
-            """The lines of the function's environment, once the last of them is there."""
+            """The lines of the function's environment, once the last one is there."""
             pages = logs.get_paginator("filter_log_events").paginate(logGroupName=group, startTime=began_ms)
             events = [event for page in pages for event in page["events"]]
             ours = {event["logStreamName"] for event in events if _RAISED in event["message"]}
@@ -103,7 +103,7 @@ def _lines(target: Target) -> dict[str, Any]:
     return {
         "printed_as_it_is": _PRINTED in lines,
         "warning_is_shown": any(_WARNED in line and _SHOWN.search(line) for line in lines),
-        # Of an error there may be several lines, of which one has its level.
+        # An error may have several lines, and only one has its level.
         "failure_is_shown": any(_WARNED not in line and _SHOWN.search(line) for line in lines),
         "note_failure_in_json": any(_RAISED in line and line.startswith("{") for line in lines),
     }
@@ -113,8 +113,8 @@ CHECKS = (
     Check(
         name="logs.metric",
         assumed=(
-            "A line in the embedded metric format that a function prints, with logs in JSON and the level "
-            "INFO, becomes a metric with our dimensions within three minutes."
+            "If a function prints a line in the embedded metric format, with logs in JSON and the level "
+            "INFO, it becomes a metric with our dimensions within three minutes."
         ),
         expected={"counted": True},
         basis=Basis.DOCUMENTED,
@@ -133,8 +133,8 @@ CHECKS = (
     Check(
         name="logs.lines",
         assumed=(
-            "With logs in JSON, what a function prints stays as it is; a warning and an error that it does "
-            "not catch are lines with their level, which the dashboard's log widget finds."
+            "With logs in JSON, printed lines stay unchanged; warnings and uncaught errors are lines with "
+            "their level, which the dashboard's log widget finds."
         ),
         expected={"printed_as_it_is": True, "warning_is_shown": True, "failure_is_shown": True},
         basis=Basis.ASSUMED,

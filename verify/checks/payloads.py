@@ -1,4 +1,4 @@
-"""What the topic rules make of payloads that are no JSON, and how large a payload may be."""
+"""The topic rules with payloads that are not JSON, and the size limit of a payload."""
 
 from __future__ import annotations
 
@@ -30,13 +30,13 @@ from verify.waiting import until
 
 _GUIDE = "https://docs.aws.amazon.com/iot/latest/developerguide"
 _QUOTAS = "https://docs.aws.amazon.com/general/latest/gr/iot-core.html"
-# No JSON, and no UTF-8 either.
+# Neither JSON nor UTF-8.
 _BYTES = b"\xff\x00 no JSON"
 _AWS_MESSAGE_BYTES = 128 * 1024
 
 
 def _refused(target: Target, robot: str) -> list[Entry]:
-    """What is in quarantine of the robot."""
+    """The robot's messages in quarantine."""
     return list(quarantine.entries(target.cloud, robot=robot))
 
 
@@ -62,7 +62,7 @@ def _record_no_json(target: Target) -> dict[str, Any]:
     with pair_of(target, "verify-record-no-json") as pair:
         robot = pair.robot.name
         pair.publish(record_topic(robot, VESC_STREAM, cloud.namespace), _BYTES)
-        # A batch without its key: it is refused later than the other, where the other is.
+        # A batch without its key is refused later than the other payload.
         pair.publish(record_topic(robot, VESC_STREAM, cloud.namespace), b'{"v": 1}')
 
         def of_the_batch() -> list[Entry]:
@@ -115,7 +115,7 @@ CHECKS = (
     Check(
         name="payloads.live_no_json",
         assumed=(
-            "encode(*, 'base64') takes a payload that is no JSON. Lambda 1 refuses it, and the quarantine "
+            "encode(*, 'base64') accepts a payload that is not JSON. Lambda 1 refuses it, and the quarantine "
             "has it byte by byte."
         ),
         expected={"refused_by": "function", "topic_as_subscribed": True, "byte_by_byte": True},
@@ -131,8 +131,8 @@ CHECKS = (
     Check(
         name="payloads.record_no_json",
         assumed=(
-            "Of a payload that is no JSON the rule record stores nothing, nor of a batch without a key. The "
-            "batch is in quarantine. AWS does not say whether the other one is: the alarm ParseError tells."
+            "The rule record stores nothing from a payload that is not JSON, or from a batch without a key. "
+            "The batch is in quarantine. AWS does not document if the other one is: see alarm ParseError."
         ),
         expected={"stored": 0, "refused_by": ["rule"]},
         basis=Basis.ASSUMED,
@@ -142,8 +142,8 @@ CHECKS = (
     Check(
         name="payloads.pong_no_json",
         assumed=(
-            "A ping that is no JSON does no harm to the next one. AWS does not say whether the rule pong "
-            "answers to it, without the ping's fields."
+            "A ping that is not JSON does not affect the next one. AWS does not document if the rule pong "
+            "answers it, without the ping's fields."
         ),
         expected={"the_next_ping_is_answered": True},
         basis=Basis.ASSUMED,
@@ -153,8 +153,8 @@ CHECKS = (
     Check(
         name="payloads.largest_message",
         assumed=(
-            "A message of 127 KiB is taken. AWS takes payloads of 128 KB, and an MQTT 5 client counts topic "
-            "and header in."
+            "A message of 127 KiB is accepted. AWS accepts payloads of 128 KB, and an MQTT 5 client counts "
+            "topic and header too."
         ),
         expected={"ours": "SUCCESS"},
         basis=Basis.DOCUMENTED,

@@ -40,12 +40,12 @@ _SERIAL = "verify"
 
 
 class _RefusedError(VerifyError):
-    """RegisterThing was refused, with the code that is this error's text."""
+    """RegisterThing was refused; the error's text is the code."""
 
 
 @contextmanager
 def _agent() -> Iterator[None]:
-    """Runs the agent's code; what it raises is this package's error."""
+    """Run the agent's code; its errors become this package's error."""
     try:
         yield
     except IdentityError as error:
@@ -55,7 +55,7 @@ def _agent() -> Iterator[None]:
 
 
 def _provision(file: Path, robot: str | None = None) -> str:
-    """The code with which RegisterThing is refused; "" where it is not."""
+    """The code with which RegisterThing is refused; "" if it succeeds."""
     try:
         with _agent():
             provision.provision(file, robot=robot)
@@ -65,14 +65,14 @@ def _provision(file: Path, robot: str | None = None) -> str:
 
 
 def _claim(target: Target, robot: str | None, folder: Path, *, lasting: bool = False) -> Path:
-    """A claim's file, which says what machine this is: not every machine that asks has a number."""
+    """A claim's file with a serial number: not every machine here has one."""
     file = claims.claim(target.cloud, robot, out=folder, lasting=lasting)
     file.write_text(file.read_text() + yaml.safe_dump({"serial": _SERIAL}))
     return file
 
 
 def _made(target: Target, robot: str, folder: Path, file: Path) -> dict[str, Any]:
-    """What provisioning makes of a robot."""
+    """The result of a robot's provisioning."""
     if refused := _provision(file, robot):
         return {"refused": refused}
     thing = target.cloud.client("iot").describe_thing(thingName=robot)
@@ -102,7 +102,7 @@ def _lasting_claim(target: Target) -> dict[str, Any]:
 
 
 def _known_by(target: Target) -> dict[str, Any]:
-    """Open a name for the claim's id alone, and another one for its fingerprint alone."""
+    """Open one name for the claim's id alone, and another for its fingerprint alone."""
     nobody, seen = "0" * 64, {}
     for which in (ADMIT_CLAIM, ADMIT_FINGERPRINT):
         with removed_after(target, f"verify-by-{which}") as (name, folder):
@@ -120,7 +120,7 @@ def _known_by(target: Target) -> dict[str, Any]:
 
 
 def _registered_again(target: Target) -> dict[str, Any]:
-    """RegisterThing twice, as the agent does where the first answer was lost."""
+    """RegisterThing twice, like the agent after a lost first answer."""
     with removed_after(target, "verify-again") as (name, folder):
         claim = load_claim(_claim(target, name, folder))
         _, request = make_key(name)
@@ -163,7 +163,7 @@ CHECKS = (
         name="provisioning.claim_for_minutes",
         assumed=(
             "A claim of CreateProvisioningClaim is exchanged for a certificate of the robot's own key. The "
-            "hook admits it, and the template makes the thing and attaches certificate and policy."
+            "hook admits it, and the template creates the thing and attaches certificate and policy."
         ),
         expected=_MADE,
         basis=Basis.DOCUMENTED,
@@ -190,7 +190,7 @@ CHECKS = (
         name="provisioning.claim_known_by",
         assumed=(
             "The hook's claimCertificateId is the id of CreateProvisioningClaim or the SHA-256 of its "
-            "certificate. AWS does not say which; both are taken."
+            "certificate. AWS does not document which; both are accepted."
         ),
         expected={"by_one_of_both": True},
         basis=Basis.ASSUMED,
@@ -200,8 +200,8 @@ CHECKS = (
     Check(
         name="provisioning.registered_again",
         assumed=(
-            "RegisterThing with the same certificate and token succeeds again: the agent tries again where "
-            "the first answer was lost."
+            "RegisterThing with the same certificate and token succeeds again: the agent retries after a "
+            "lost first answer."
         ),
         expected={"first_is_its_own": True, "again_refused": "", "certificates": ["ACTIVE"]},
         basis=Basis.ASSUMED,
@@ -211,7 +211,7 @@ CHECKS = (
     Check(
         name="provisioning.name_taken",
         assumed=(
-            "A second certificate for a name that is taken is refused by the hook, and RegisterThing with "
+            "The hook refuses a second certificate for a taken name, and RegisterThing fails with "
             "it; the certificate is not attached."
         ),
         expected={"first": "", "second_is_refused": True, "certificates": 1},

@@ -1,4 +1,4 @@
-"""From a batch that is refused to the quarantine, and from there back."""
+"""A refused batch on its way to the quarantine, and back."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ _RUN = "0badcafe"
 
 
 def _batch(number: int, **changes: Any) -> bytes:
-    """A batch of now with one sample, with some of its envelope changed."""
+    """A current batch with one sample, with changes in its envelope."""
     batch = Batch(_RUN, number, [(int(time.time()) - 5 + number) * 1_000_000], {"speed": [1.5]})
     return json.dumps({**json.loads(encode(batch)), **changes}).encode()
 
@@ -70,7 +70,7 @@ def _refused(target: Target) -> dict[str, Any]:
 
 
 def _replayed(target: Target) -> dict[str, Any]:
-    """What the record rule's error action sends where the table is throttled."""
+    """The message of the record rule's error action when the table is throttled."""
     cloud, robot = target.cloud, target.robot("verify-replayed").robot
     document = {
         "ruleName": rule_name("record", cloud.namespace),
@@ -96,13 +96,13 @@ CHECKS = (
         name="quarantine.refused_batch",
         assumed=(
             "A batch that Lambda 2 cannot decode goes through the queue into the quarantine's table, with "
-            "its item; the batches before and behind it are summarised."
+            "its item; the batches before and after it are summarised."
         ),
         expected={
             "summarized": 2,
             "refused": 1,
             "source": "stream",
-            "reason": "samples are not base64 of zlib",
+            "reason": "samples must be base64 of zlib",
             "seen": 1,
         },
         basis=Basis.ASSUMED,
@@ -113,7 +113,7 @@ CHECKS = (
         name="quarantine.replayed",
         assumed=(
             "A batch in quarantine is published again to its rule alone, by Basic Ingest; it is then in the "
-            "telemetry table, is summarised, and the quarantine no longer has it."
+            "telemetry table, is summarised, and leaves the quarantine."
         ),
         expected={"before": 0, "fate": "replayed", "summarized": 1, "left": 0},
         basis=Basis.DOCUMENTED,

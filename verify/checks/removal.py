@@ -1,4 +1,4 @@
-"""Taking things away: a policy straight after it was detached, a robot, a certificate's right to connect."""
+"""Removal: a policy right after its detachment, a robot, a certificate's right to connect."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ def _policy_deleted(target: Target) -> dict[str, Any]:
         iot.create_policy(policyName=name, policyDocument=document)
         iot.attach_policy(policyName=name, target=made.arn)
         iot.detach_policy(policyName=name, target=made.arn)
-        until(deleted, "the end of a policy that was detached", within_s=360)
+        until(deleted, "the deletion of a detached policy", within_s=360)
     finally:
         iot.update_certificate(certificateId=made.id, newStatus="REVOKED")
         certificates.once_detached(iot, iot.delete_certificate, certificateId=made.id, forceDelete=True)
@@ -70,8 +70,8 @@ CHECKS = (
     Check(
         name="removal.policy_deleted_after_detach",
         assumed=(
-            "A policy that was detached is deleted at once or within five minutes, until when AWS refuses it "
-            "with DeleteConflictException. `make destroy` tries again for six."
+            "A detached policy is deleted at once or within five minutes; until then AWS refuses it "
+            "with DeleteConflictException. `make destroy` retries for six."
         ),
         expected={"deleted_within_six_minutes": True},
         basis=Basis.DOCUMENTED,
@@ -83,7 +83,7 @@ CHECKS = (
         name="removal.robot_removed",
         assumed=(
             "`iort robots remove` ends the robot's session and deletes its certificate, its thing and its "
-            "row straight after each other. It does not connect again."
+            "row in a row. The robot does not connect again."
         ),
         expected={"session_ended": True, "connects_again": False},
         basis=Basis.DOCUMENTED,

@@ -1,4 +1,4 @@
-"""Renewal: a registered robot's next certificate, by the agent's own code, and the end of the one before."""
+"""Renewal: a registered robot's next certificate, by the agent's own code, and the end of the old one."""
 
 from __future__ import annotations
 
@@ -48,7 +48,7 @@ CHECKS = (
     Check(
         name="renewal.rotated",
         assumed=(
-            "A registered robot gets a second certificate by a claim and connects with it. When it has, the "
+            "A registered robot gets a second certificate by a claim and connects with it. After that, the "
             "first one is revoked and deleted, and does not connect."
         ),
         expected={

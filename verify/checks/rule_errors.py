@@ -1,4 +1,4 @@
-"""Rules of this file's own: what AWS hands to an error action, and what a star beside a key keeps."""
+"""Rules of this file's own: AWS' document for an error action, and a star beside a key."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ _GUIDE = "https://docs.aws.amazon.com/iot/latest/developerguide"
 def _rule(
     target: Target, select: str, topic: str, *, action: Mapping[str, Any], error: Mapping[str, Any]
 ) -> Iterator[str]:
-    """A rule of this question's own; its name."""
+    """A rule for this question; yields its name."""
     iot, name = target.cloud.client("iot"), f"{target.cloud.namespace}_verify_{uuid.uuid4().hex[:8]}"
     payload = {
         "sql": f"{select} FROM '{topic}'",
@@ -40,14 +40,14 @@ def _rule(
 
 
 def _republishing(target: Target, topic: str) -> dict[str, Any]:
-    """An action in the name of the rule pong, which may publish to robots' pongs alone."""
+    """An action in the name of the rule pong, which may publish only to robots' pongs."""
     rule = target.cloud.client("iot").get_topic_rule(ruleName=rule_name("pong", target.cloud.namespace))
     (pong,) = rule["rule"]["actions"]
     return {"republish": {"roleArn": pong["republish"]["roleArn"], "topic": topic, "qos": 1}}
 
 
 def _heard(pair: Pair, topic: str, payload: bytes) -> bytes:
-    """What comes back for a message that the operator publishes; again, as long as the rule is not there."""
+    """The answer to the operator's message, which is repeated until the rule is active."""
     data = pair.target.cloud.client("iot-data")
 
     def heard() -> bytes | None:
@@ -67,7 +67,7 @@ def _error_document(target: Target) -> dict[str, Any]:
         pair.robot.subscribe(heard_on)
         topic = build_topic(PING, pair.robot.name, "error", cloud.namespace)
         told = _republishing(target, heard_on)
-        # Neither may the role of the rule pong write to the table, nor has the message the table's key.
+        # The role of the rule pong may not write to the table, and the message lacks the table's key.
         table = {"tableName": cloud.output("storage", "TelemetryTable")}
         fails = {"dynamoDBv2": {"roleArn": told["republish"]["roleArn"], "putItem": table}}
         with _rule(target, "SELECT *", topic, action=fails, error=told) as name:
@@ -106,8 +106,8 @@ CHECKS = (
     Check(
         name="rule_errors.document",
         assumed=(
-            "A rule whose action fails hands its error action the topic, the original payload in base64 and "
-            "the reasons. The quarantine reads that, with Basic Ingest's prefix before the topic or without."
+            "A rule whose action fails gives its error action the topic, the original payload in base64 and "
+            "the reasons. The quarantine reads that, with or without Basic Ingest's prefix before the topic."
         ),
         expected={
             "source": "rule NAME",
@@ -124,8 +124,8 @@ CHECKS = (
     Check(
         name="rule_errors.star_beside_a_key",
         assumed=(
-            "SELECT * with a key beside it adds the key to the payload. AWS does not say which one stays "
-            "where the payload has the same key; no rule of this project depends on it."
+            "SELECT * with a key beside it adds the key to the payload. AWS does not document which one "
+            "stays if the payload has the same key; no rule of this project depends on it."
         ),
         expected={"other_keys_stay": True},
         basis=Basis.DOCUMENTED,

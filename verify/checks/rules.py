@@ -1,4 +1,4 @@
-"""The topic rules: what they make of a message that says what only the cloud may say."""
+"""The topic rules with a message that fakes the cloud's keys."""
 
 from __future__ import annotations
 
@@ -49,7 +49,7 @@ _SQL = f"{_GUIDE}/iot-sql-select.html"
 _DYNAMODB_V2 = f"{_GUIDE}/dynamodb-v2-rule-action.html"
 _BINARY = f"{_GUIDE}/binary-payloads.html"
 _RUN = "0badcafe"
-# A batch without `nonfinite`, as DynamoDB types it.
+# A batch without `nonfinite`, with DynamoDB's types.
 _STORED = {
     "v": "N",
     "batch": "S",
@@ -63,7 +63,7 @@ _STORED = {
 
 
 def _items(target: Target, robot: str) -> list[dict[str, Any]]:
-    """The robot's telemetry as DynamoDB has it, types included."""
+    """The robot's telemetry as stored in DynamoDB, types included."""
     topic = build_topic(RECORD, robot, VESC_STREAM, target.cloud.namespace)
     answer = target.cloud.client("dynamodb").query(
         TableName=target.cloud.output("storage", "TelemetryTable"),
@@ -101,7 +101,7 @@ def _live(target: Target) -> dict[str, Any]:
         seqs = itertools.count()
 
         def shown() -> list[Any]:
-            # One that waits for a function's first environment is stale before it is shown.
+            # A message that waits for a function's first environment is stale before it is shown.
             now_us = time.time_ns() // 1000
             live = LiveSample(_RUN, next(seqs), now_us, now_us, {"speed": 3}, offset_us=0)
             pair.send(LIVE, VESC_STREAM, encode_live(live))
@@ -212,8 +212,8 @@ CHECKS = (
         "live",
         _live,
         {"as_its_own": True, "received_by_the_clouds_clock": True, "as_the_victims": 0},
-        "The rule live hands the message over as one value in base64. What Lambda 1 publishes is the "
-        "robot's of the topic, whatever the message says.",
+        "The rule live hands the message over as one value in base64. Lambda 1 publishes it for the "
+        "robot of the topic, whatever the message says.",
         "functions/live.py",
     ),
     _spoofed(

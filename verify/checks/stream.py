@@ -1,4 +1,4 @@
-"""The telemetry table's stream under a mapping of Lambda's: records, retries, halves, answers in part."""
+"""The telemetry table's stream under a Lambda mapping: records, retries, splits, partial answers."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ _RUN = "0badcafe"
 _COUNT, _POISONED, _REPORTED = 5, 2, 3
 _WITHIN_S = 170.0
 _SAID = "verify: "
-# Says which batches it is given, by number, and does with them as the check wants.
+# Logs the numbers of its batches, and treats them as the check wants.
 _READER = """
 import json
 
@@ -38,7 +38,7 @@ _FAIL = f"""
     if {_POISONED} in numbers:
         raise ValueError("poisoned")
 """
-# Only where records of before are in the event: what comes next then begins with it.
+# Only if older records are in the event: the next event then begins with it.
 _REPORT = f"""
     if {_REPORTED} in numbers[1:]:
         number = records[numbers.index({_REPORTED})]["SequenceNumber"]
@@ -73,8 +73,8 @@ def _topic(target: Target, robot: str) -> str:
 
 @contextmanager
 def _read(target: Target, robot: str, name: str, then: str) -> Iterator[_Said]:
-    """A second reader of the stream, of this robot's batches alone, with the settings of Lambda 2's mapping
-    but for fewer attempts. It reads from the oldest record, so that all batches come at once."""
+    """A second reader of the stream for this robot's batches only, with the settings of Lambda 2's mapping
+    except for fewer attempts. It reads from the oldest record, so that all batches come at once."""
     client, cloud = target.cloud.client("lambda"), target.cloud
     summarize = cloud.output("processing", "SummarizeFunction")
     (mapping,) = client.list_event_source_mappings(FunctionName=summarize)["EventSourceMappings"]
@@ -101,7 +101,7 @@ def _read(target: Target, robot: str, name: str, then: str) -> Iterator[_Said]:
 
 
 class _Said:
-    """What the reader says in its log, which is Lambda 2's."""
+    """The reader's lines in Lambda 2's log."""
 
     def __init__(self, target: Target, like: str, began_ms: int) -> None:
         configuration = target.cloud.client("lambda").get_function_configuration(FunctionName=like)
@@ -109,7 +109,7 @@ class _Said:
         self._logs = target.cloud.client("logs")
 
     def events(self) -> list[Mapping[str, Any]]:
-        """Each event that it was given, in order."""
+        """Its events, in order."""
         pages = self._logs.get_paginator("filter_log_events").paginate(
             logGroupName=self._group, startTime=self._began_ms
         )
@@ -122,7 +122,7 @@ def _bisected(target: Target) -> dict[str, Any]:
     with _read(target, robot, "failing", _FAIL) as said:
 
         def passed() -> list[int] | None:
-            """The batches of the events that did not fail, once that is all but one."""
+            """The batches of the successful events, once all but one have passed."""
             good = [event["numbers"] for event in said.events() if _POISONED not in event["numbers"]]
             numbers = list(dict.fromkeys(number for event in good for number in event))
             return numbers if len(numbers) == _COUNT - 1 else None
@@ -176,8 +176,8 @@ CHECKS = (
     Check(
         name="stream.bisected",
         assumed=(
-            "A batch of the stream on which the function fails is split until the poisoned record is alone. "
-            "That one is given up after the retries and told to the mapping's destination, by its place in "
+            "If the function fails on a batch of the stream, the batch is split until the poisoned record is "
+            "alone. After the retries, that record is reported to the mapping's destination, by its place in "
             "the stream, where it is read again. The others pass, in order. A record has these fields, and "
             "replay puts it back."
         ),
@@ -208,7 +208,7 @@ CHECKS = (
     Check(
         name="stream.reported",
         assumed=(
-            "Where the function's answer names a record in batchItemFailures, the records before it are "
+            "If the function's answer names a record in batchItemFailures, the records before it are "
             "done, and the next event begins with it."
         ),
         expected={

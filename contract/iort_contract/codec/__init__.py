@@ -1,1 +1,1 @@
-"""How columns of numbers are written in a batch, and what reading one may cost."""
+"""Encoding of numeric columns in a batch, and limits on the cost of decoding."""

@@ -1,8 +1,8 @@
-"""How a batch's columns are written: numbers as steps in JSON, compressed with what is expected.
+"""Encodes a batch's columns: numbers as steps in JSON, compressed with a preset dictionary.
 
-A column is a list whose first entry is its decimals. Behind a number follow the first value and the step
-from each value to the next, all whole because they are multiplied by ten to the power of the decimals.
-Behind null follow the values as they are. In `PLAIN_CODEC` a column was its values and nothing else.
+A column is a list whose first entry is its decimals. After a number follow the first value and the step from
+each value to the next, as integers: the values times ten to the power of the decimals. After null follow the
+plain values. In `PLAIN_CODEC` a column was the plain values only.
 """
 
 from __future__ import annotations
@@ -17,17 +17,17 @@ from typing import Any, Mapping, Sequence, cast
 from iort_contract.checks import COMPACT, shown, wire_column
 from iort_contract.limits import MAX_COLUMNS_BYTES, ContractError, Value
 
-# Of the batches that are written, and of those that were written before and are read for ever.
-# `SERIALIZED_CODEC` keeps ROS messages as they were published: contract/iort_contract/ros1/serialized.py.
+# Codecs of new batches and of stored ones, which stay readable for ever. `SERIALIZED_CODEC` keeps ROS
+# messages byte for byte: contract/iort_contract/ros1/serialized.py.
 CODEC, SERIALIZED_CODEC, PLAIN_CODEC = "steps", "ros1", "columns+zlib+base64"
-# A step has half the characters of the value that it stands for, which takes as much memory.
+# A step has half the characters of its value, and takes as much memory.
 _MOST_BYTES = {
     CODEC: MAX_COLUMNS_BYTES // 2,
     SERIALIZED_CODEC: MAX_COLUMNS_BYTES + 2 * 1024 * 1024,
     PLAIN_CODEC: MAX_COLUMNS_BYTES,
 }
-# zlib's preset dictionary. Frozen with the codec's name, since it is needed to read what is stored; a
-# field that it does not know costs its name. What is nearest to the end is the cheapest to point to.
+# zlib's preset dictionary. It is frozen with the codec's name, since stored batches need it. An unknown field
+# costs its name. The end of the dictionary is the cheapest to refer to.
 DICTIONARY = (
     b'"cpu_percent":[0],"rss_mb":[0],"samples_per_s":[0],"backlog_batches":[0],"backlog_bytes":[0],'
     b'"dropped_batches":[0],"connects":[0],"clock_offset_ms":[0],"clock_uncertainty_ms":[0],'
@@ -39,8 +39,8 @@ DICTIONARY = (
     b'"energy_drawn":[0,0,0],"energy_regen":[0,0,0],"displacement":[0,0,0],"distance_traveled":[0,0,0],'
     b'"fault_code":[0,0,0,0,0,0,1,0,-1,0,0,0,0,{"dt":[0,20000,19999,20001],"fields":{"voltage_input":[1,'
 )
-# Whole numbers below this, and they divided by any of these powers of ten, are as exact in a float64 of
-# whatever language as they are here.
+# Integers below this, divided by any of these powers of ten, are equally exact in the float64 of any
+# language.
 EXACT = 2**53
 SCALES = tuple(float(f"1e{decimals}") for decimals in range(23))
 
@@ -48,42 +48,41 @@ SCALES = tuple(float(f"1e{decimals}") for decimals in range(23))
 def packed_samples(
     dt: Sequence[int], fields: Mapping[str, Sequence[Value]], behind: bytes = b"", codec: str = CODEC
 ) -> str:
-    """A batch's times and columns, of the values that `wire_column` has made, as `CODEC` has them; what
-    comes ``behind`` follows a line's end.
+    """A batch's times and columns (as made by `wire_column`) in `CODEC`, then a newline and ``behind``.
 
-    Raises `ContractError` where they are too large.
+    Raises `ContractError` if they are too large.
     """
     columns = {name: packed(column) for name, column in fields.items()}
     text = COMPACT.encode({"dt": dt, "fields": columns})
     if len(text) > _MOST_BYTES[CODEC]:
-        raise ContractError(f"batch of {len(text)} bytes of columns: allowed is up to {_MOST_BYTES[CODEC]}")
+        raise ContractError(f"columns of a batch must be at most {_MOST_BYTES[CODEC]} bytes, got {len(text)}")
     deflater = zlib.compressobj(6, zdict=DICTIONARY)
     body = text.encode() + (b"\n" + behind if behind else b"")
     if len(body) > _MOST_BYTES[codec]:
-        raise ContractError(f"batch of {len(body)} bytes: allowed is up to {_MOST_BYTES[codec]}")
+        raise ContractError(f"batch must be at most {_MOST_BYTES[codec]} bytes, got {len(body)}")
     return base64.b64encode(deflater.compress(body) + deflater.flush()).decode()
 
 
 def inflate(samples: Any, codec: str) -> bytes:
-    """The JSON of a batch's columns, as large as a batch may be and no larger; raises `ContractError`."""
+    """The JSON of a batch's columns, up to the size limit of a batch; raises `ContractError`."""
     if not isinstance(samples, (str, bytes)):
-        raise ContractError(f"samples {shown(samples)}: expected base64 text")
+        raise ContractError(f"samples must be base64 text, got {shown(samples)}")
     most = _MOST_BYTES[codec]
     try:
         deflated = base64.b64decode(samples, validate=True)
         inflater = zlib.decompressobj(zdict=b"" if codec == PLAIN_CODEC else DICTIONARY)
         body = inflater.decompress(deflated, most + 1)
     except (binascii.Error, ValueError, zlib.error) as error:
-        raise ContractError(f"samples are not base64 of zlib: {error}") from error
+        raise ContractError(f"samples must be base64 of zlib: {error}") from error
     if len(body) > most:
-        raise ContractError(f"samples inflate to over {most} bytes")
+        raise ContractError(f"samples must inflate to at most {most} bytes")
     if not inflater.eof or inflater.unused_data:
-        raise ContractError("samples are cut short, or more follows them")
+        raise ContractError("samples are truncated, or have trailing data")
     return body
 
 
 def packed(column: Sequence[Value]) -> list[Value]:
-    """A column as it is written."""
+    """Encode a column."""
     kinds = set(map(type, column))
     if kinds == {int}:
         whole, decimals = cast("Sequence[int]", column), 0
@@ -98,7 +97,7 @@ def packed(column: Sequence[Value]) -> list[Value]:
 
 
 def _whole(column: Sequence[float]) -> tuple[int, list[int]] | None:
-    """The decimals with which all values are whole numbers of 53 bits, and these; None without."""
+    """The decimals that make all values integers of 53 bits, and these integers; None if there are none."""
     largest = max(*column, -min(column))
     decimals = max(map(_decimals, {column[0], column[len(column) // 2], column[-1]}))
     while decimals < len(SCALES) and largest * SCALES[decimals] < EXACT - 1:
@@ -107,7 +106,7 @@ def _whole(column: Sequence[float]) -> tuple[int, list[int]] | None:
         back = list(map(scale.__rtruediv__, whole))
         if back == column:
             return decimals, whole
-        # The three looked at nearly always have as many decimals as any; who has more, says how many.
+        # The three sampled values nearly always have the most decimals; the check below finds the exceptions.
         more = max(_decimals(value) for value, near in zip(column, back) if value != near)
         if more <= decimals:
             break
@@ -116,38 +115,38 @@ def _whole(column: Sequence[float]) -> tuple[int, list[int]] | None:
 
 
 def _decimals(value: float) -> int:
-    """How many decimals the shortest text has that reads as the value."""
+    """The number of decimals in the value's shortest text."""
     mantissa, _, exponent = repr(value).partition("e")
     return max(0, len(mantissa.partition(".")[2]) - int(exponent or 0))
 
 
 def unpacked(codec: str, name: str, column: Any, n: int) -> list[Value]:
-    """The ``n`` values of a written column. Raises `ContractError` for what cannot have been written."""
+    """Decode ``n`` values of a column; raises `ContractError` if `packed` cannot have written it."""
     if codec == PLAIN_CODEC and isinstance(column, list):
         column = [None, *column]
     if not isinstance(column, list) or len(column) != n + 1:
-        raise ContractError(f"field {name}: expected {n} values")
+        raise ContractError(f"field {name} must have {n} values")
     decimals, values = column[0], column[1:]
     if decimals is None:
         if wire_column(name, values)[1]:
-            raise ContractError(f"field {name}: a number is not finite")
+            raise ContractError(f"field {name}: numbers must be finite")
         return values
     if type(decimals) is not int or not 0 <= decimals < len(SCALES):
-        raise ContractError(f"field {name}: {shown(decimals)} decimals; allowed is 0 to {len(SCALES) - 1}")
-    # The first decides: texts and lists have a sum as well, whose parts grow with the square of their length.
+        raise ContractError(f"field {name}: decimals must be 0 to {len(SCALES) - 1}, got {shown(decimals)}")
+    # Check the first step before adding: sums of texts and lists take quadratic time.
     if type(values[0]) is not int:
         raise ContractError(f"field {name}: the steps must be integers")
     try:
         whole = list(accumulate(values))
     except (TypeError, OverflowError):
         whole = [None]
-    # A sum is an integer where all its parts are, or say true or false, which are the steps 1 and 0.
+    # An integer sum means integer steps, or booleans, which count as 1 and 0.
     if type(whole[-1]) is not int:
         raise ContractError(f"field {name}: the steps must be integers")
     # Sorting finds both ends in half the time of min and max.
     ordered = sorted(whole)
     if ordered[-1] >= EXACT or ordered[0] <= -EXACT:
-        raise ContractError(f"field {name}: the steps lead beyond 53 bits")
+        raise ContractError(f"field {name}: values must fit in 53 bits")
     if not decimals:
         return cast("list[Value]", whole)
     scale = SCALES[decimals]

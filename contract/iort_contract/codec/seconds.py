@@ -1,7 +1,7 @@
-"""A second of the summary table: a field's statistics are one list, since its name would be half of each.
+"""Encodes a second of the summary table: a field's statistics are one list, which saves repeating its name.
 
-Outside of the table a second is flat, ``<field>_min`` and so on. Items were once stored so, and some
-attributes are still.
+Outside of the table a second is flat, with ``<field>_min`` and so on. Older items are flat in the table too,
+and some attributes still are.
 """
 
 from __future__ import annotations
@@ -12,17 +12,18 @@ from typing import Any, List, Mapping, Union
 from iort_contract.limits import Value
 from iort_contract.tables import EXPIRES_S, OMITTED, SECOND, STATS, TOPIC
 
-# What a second holds of a field: `STATS`, or one value where all four are that; of what are no numbers the
-# last, by itself.
+# A field's entry in a second: `STATS`, or one value if all four are equal. A column that is not numeric has
+# only its last value.
 Statistics = Union[List[Value], Value]
 _TAKEN = frozenset({TOPIC, SECOND, EXPIRES_S, OMITTED})
 _SUFFIXES = tuple(f"_{statistic}" for statistic in STATS)
 
 
 def packed_second(counts: Mapping[str, Value], fields: Mapping[str, Statistics]) -> dict[str, Statistics]:
-    """The second as it is stored: what is known of it as a whole, and each field's statistics by its name.
+    """The second as stored: its counts, and each field's statistics by its name.
 
-    What is no list becomes ``<field>_last``. A field whose name the second has for something else is flat.
+    A single value of a column that is not numeric becomes ``<field>_last``. A field whose name is taken stays
+    flat.
     """
     packed: dict[str, Statistics] = dict(fields)
     taken = _TAKEN.union(counts)
@@ -30,14 +31,13 @@ def packed_second(counts: Mapping[str, Value], fields: Mapping[str, Statistics])
     while odd := [name for name, found in packed.items() if name in taken or type(found) is not list]:
         for name in odd:
             flat.update(_flat(name, packed.pop(name)))
-        # A field may be called as the statistic of another is now.
+        # A field may have the name of another field's statistic.
         taken |= flat.keys()
     return {**flat, **packed}
 
 
 def flat_second(packed: Mapping[str, Any]) -> dict[str, Any]:
-    """The second with ``<field>_min``, ``_mean``, ``_max`` and ``_last``, whatever types the attributes'
-    values were read as."""
+    """The second with ``<field>_min``, ``_mean``, ``_max`` and ``_last``, for any types of values."""
     flat: dict[str, Any] = {}
     for name, value in packed.items():
         flat.update(_flat(name, value) if isinstance(value, list) else {name: value})

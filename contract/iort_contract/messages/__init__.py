@@ -1,1 +1,1 @@
-"""The messages on the wire, a kind a file: each is encoded, decoded and checked here."""
+"""The messages on the wire, one kind per file: encode, decode and check."""

@@ -1,7 +1,7 @@
-"""What the agent says of its own record: a stream of samples, against which an audit holds the table.
+"""The agent's account of its record: a stream of samples that an audit compares with the table.
 
-Once in a while and at its end a run says of every stream that it was configured for or has seen how many
-samples it took and stored, and of every source what it did not record, by cause.
+Regularly and at its end, a run reports the samples taken and stored for every stream, configured or seen, and
+the losses of every source by cause.
 """
 
 from __future__ import annotations
@@ -11,17 +11,17 @@ from typing import Mapping, NamedTuple, Union
 
 from iort_contract.limits import ContractError, Value
 
-# How often a run tells it while nothing is lost. Batches are numbered, so seldom is enough.
+# The interval of reports while nothing is lost. Batches are numbered, so a long interval is enough.
 ACCOUNT_EVERY_S = 30.0
-# A text in a sample holds no more.
+# The size limit of a text in a sample.
 _MAX_TEXT = 4096
 
 
 class StreamAccount(NamedTuple):
-    """Of one stream, since the start of the run: samples ``taken``, ``stored`` in batches whose numbers are
-    from ``first_seq`` to before ``next_seq``, ``refused`` because no message can hold them, and values
-    ``nulled`` because they were not finite. The rest of those taken were in open batches. ``ended`` says that
-    the run ended in good order, so that nothing was."""
+    """A stream's counts since the start of the run: samples ``taken``; samples ``stored`` in batches with
+    sequence numbers from ``first_seq`` (inclusive) to ``next_seq`` (exclusive); ``refused`` samples, which no
+    message can hold; and ``nulled`` values, which were not finite. The rest of the taken samples was in open
+    batches. ``ended`` marks the end of an orderly run, without open batches."""
 
     stream: str
     taken: int
@@ -38,13 +38,13 @@ class StreamAccount(NamedTuple):
 
 
 class SourceAccount(NamedTuple):
-    """Of one source, or of the queue: how often what happened, by a path such as ``/tf.malformed``."""
+    """A source's or the queue's event counts, by a path such as ``/tf.malformed``."""
 
     source: str
     counts: Mapping[str, int]
 
     def sample(self) -> dict[str, Value]:
-        """The account as a sample; causes that do not fit are counted together."""
+        """The account as a sample; causes that do not fit are added up."""
         counts = dict(sorted(self.counts.items(), key=lambda count: -count[1]))
         rest = 0
         while len(text := _json({**counts, **({"others": rest} if rest else {})})) > _MAX_TEXT:
@@ -54,7 +54,7 @@ class SourceAccount(NamedTuple):
 
 Account = Union[StreamAccount, SourceAccount]
 
-# Parts of paths that count messages or rows that were given and are not in the record.
+# Path parts that count messages or rows which were received and not recorded.
 LOST = frozenset(
     {
         "malformed",
@@ -77,13 +77,13 @@ LOST = frozenset(
 
 
 def account(sample: Mapping[str, Value]) -> Account:
-    """The account in a sample; raises `ContractError` for what neither kind can have written."""
+    """Decode an account; raises `ContractError` if it is neither kind."""
     if isinstance(sample.get("source"), str):
         try:
             counts = json.loads(str(sample["counts"]))
             return SourceAccount(str(sample["source"]), {str(name): int(n) for name, n in counts.items()})
         except (KeyError, ValueError, TypeError, AttributeError) as error:
-            raise ContractError(f"a source's account that cannot be read: {error}") from error
+            raise ContractError(f"a source's account cannot be decoded: {error}") from error
     try:
         names = StreamAccount._fields[1:-1]
         taken, stored, refused, nulled, first_seq, next_seq = (int(sample[name] or 0) for name in names)
@@ -91,11 +91,11 @@ def account(sample: Mapping[str, Value]) -> Account:
             str(sample["stream"]), taken, stored, refused, nulled, first_seq, next_seq, bool(sample["ended"])
         )
     except (KeyError, ValueError, TypeError) as error:
-        raise ContractError(f"a stream's account that cannot be read: {error}") from error
+        raise ContractError(f"a stream's account cannot be decoded: {error}") from error
 
 
 def lost(counts: Mapping[str, int]) -> dict[str, int]:
-    """Those of a source's counts that stand for what is not in the record."""
+    """A source's counts of unrecorded messages."""
     parts = {path: path.split(".") for path in counts}
     return {path: counts[path] for path, of in parts.items() if counts[path] and not LOST.isdisjoint(of)}
 

@@ -1,4 +1,4 @@
-"""The record lane: samples of a stream in one message, which is stored as it is."""
+"""The record lane: samples of a stream in one message, which is stored unchanged."""
 
 from __future__ import annotations
 
@@ -49,9 +49,10 @@ _MAX_BATCH_ID_US = 10**16
 
 
 class BatchId(NamedTuple):
-    """What no two batches of a topic share: the time of the first sample, the agent's run, and the number.
+    """A batch's unique id within its topic: the time of the first sample, the agent's run, and the sequence
+    number.
 
-    As a text it sorts by time, so that a range of times is a range of keys.
+    As text it sorts by time, so a range of times is a range of keys.
     """
 
     t_us: int
@@ -63,10 +64,10 @@ class BatchId(NamedTuple):
 
 
 def batch_id(text: Any) -> BatchId:
-    """The id in a text; raises `ContractError`."""
+    """Parse an id; raises `ContractError`."""
     match = _BATCH_ID.fullmatch(text) if isinstance(text, str) else None
     if match is None:
-        raise ContractError(f"{BATCH} {shown(text)}: expected <16 digits of microseconds>-<run>-<number>")
+        raise ContractError(f"{BATCH} must be <16 digits of microseconds>-<run>-<number>, got {shown(text)}")
     found = BatchId(int(match.group(1)), match.group(2), int(match.group(3)))
     check_time(found.t_us, BATCH)
     check_header(found.boot, found.seq, 0)
@@ -74,10 +75,10 @@ def batch_id(text: Any) -> BatchId:
 
 
 def batches_between(first_us: int | None, last_us: int | None) -> tuple[str, str]:
-    """The least and the greatest key of batches that start at these times or between; None is open."""
+    """The lowest and highest key of batches that start between these times, both inclusive; None is open."""
     first = min(max(0, first_us or 0), _MAX_BATCH_ID_US - 1)
     last = _MAX_BATCH_ID_US - 1 if last_us is None else min(max(-1, last_us), _MAX_BATCH_ID_US - 1)
-    # Behind all that begins with the time: "~" is greater than what an id has.
+    # Sorts after all ids of this time: "~" is greater than any character of an id.
     return (f"{first:016d}", f"{last:016d}~") if last >= 0 else ("~", "~")
 
 
@@ -85,12 +86,11 @@ def batches_between(first_us: int | None, last_us: int | None) -> tuple[str, str
 class Batch:
     """Samples of one stream.
 
-    ``boot`` names the agent's run; ``seq`` numbers the stream's batches without a hole, across
-    restarts where the spool is durable; ``times_us`` are microseconds since the epoch, one a sample, in
-    order and within `MAX_BATCH_SPAN_US`; ``columns`` holds a list of equal length a field; ``nonfinite``
-    counts the NaNs and infinities that became None. ``messages`` are the ROS messages that the samples
-    are a view of, where the batch has them as they were published; to be encoded, ``columns`` then hold
-    what stands beside them.
+    ``boot`` names the agent's run. ``seq`` numbers the stream's batches without gaps, also across restarts if
+    the spool is durable. ``times_us`` are microseconds since the epoch, one per sample, in order and within
+    `MAX_BATCH_SPAN_US`. ``columns`` holds a list of equal length per field. ``nonfinite`` counts the NaNs and
+    infinities that became None. ``messages`` are the ROS messages behind the samples, if the batch holds them
+    as published; for encoding, ``columns`` then hold only additional fields.
     """
 
     boot: str
@@ -107,23 +107,23 @@ class Batch:
 
     @property
     def id(self) -> BatchId:
-        """What the batch is told by from others of its topic."""
+        """The batch's unique id in its topic."""
         return BatchId(self.t_us, self.boot, self.seq)
 
 
 def encode(batch: Batch) -> bytes:
     """The envelope as JSON. NaN and infinities become null and are added to ``nonfinite``.
 
-    Raises `ContractError` where the batch is not allowed; a batch too large for one message is encoded all
-    the same: compare with `MAX_MESSAGE_BYTES` and use `split`.
+    Raises `ContractError` for an invalid batch. A batch too large for one message is still encoded: compare
+    with `MAX_MESSAGE_BYTES` and use `split`.
     """
     check_header(batch.boot, batch.seq, batch.nonfinite)
     times, n = batch.times_us, len(batch.times_us)
     if not 1 <= n <= MAX_SAMPLES:
-        raise ContractError(f"batch of {n} samples: allowed is 1 to {MAX_SAMPLES}")
+        raise ContractError(f"batch must have 1 to {MAX_SAMPLES} samples, got {n}")
     check_times(times)
     if times[0] < 0:
-        raise ContractError(f"time {times[0]} us: before 1970")
+        raise ContractError(f"time must be from 1970 on, got {times[0]} us")
     dt = [0] + [b - a for a, b in zip(times, times[1:])]
     fields, nonfinite = _wire_columns(batch, n)
     codec, samples = CODEC, ""
@@ -144,16 +144,16 @@ def encode(batch: Batch) -> bytes:
 
 
 def _wire_columns(batch: Batch, n: int) -> tuple[dict[str, list[Value]], int]:
-    """The columns as they are written, and how many values are not finite with those known."""
+    """The columns for the wire, and the total count of values that are not finite."""
     if len(batch.columns) > MAX_FIELDS:
-        raise ContractError(f"batch of {len(batch.columns)} fields: allowed is up to {MAX_FIELDS}")
+        raise ContractError(f"batch must have at most {MAX_FIELDS} fields, got {len(batch.columns)}")
     _check_values(n, len(batch.columns))
     nonfinite = batch.nonfinite
     fields: dict[str, list[Value]] = {}
     for name, column in batch.columns.items():
         check_field(name)
         if len(column) != n:
-            raise ContractError(f"field {name}: {len(column)} values for {n} samples")
+            raise ContractError(f"field {name} must have {n} values, got {len(column)}")
         fields[name], nulled = wire_column(name, column)
         nonfinite += nulled
     return fields, nonfinite
@@ -162,10 +162,10 @@ def _wire_columns(batch: Batch, n: int) -> tuple[dict[str, list[Value]], int]:
 def _packed_messages(
     messages: Messages, times: Sequence[int], dt: Sequence[int], beside: Mapping[str, Sequence[Value]]
 ) -> tuple[str, str]:
-    """Codec and samples of messages: as columns where those say all, or else as they are."""
+    """Codec and samples of messages: as columns if those hold everything, otherwise unchanged."""
     n = len(dt)
     if len(messages.raw) != n:
-        raise ContractError(f"{len(messages.raw)} messages for {n} samples")
+        raise ContractError(f"batch of {n} samples must have as many messages, got {len(messages.raw)}")
     _check_values(n, len(beside) + values_a_message(messages))
     found = None if beside else as_columns(messages, times)
     if found is not None:
@@ -175,10 +175,10 @@ def _packed_messages(
 
 
 def decode(message: bytes | str | Mapping[str, Any]) -> Batch:
-    """The batch in an envelope: the message as sent, or the attributes of a stored item.
+    """Decode the batch in an envelope: the message as sent, or the attributes of a stored item.
 
-    Messages that are kept as columns stay columns: `messages_of` makes them again. Raises `ContractError`,
-    naming what is wrong, for anything that `encode` cannot have written.
+    Messages stored as columns stay columns; `messages_of` rebuilds them. Raises `ContractError`, with the
+    reason, for everything that `encode` cannot have written.
     """
     return _read(message)[0]
 
@@ -186,10 +186,10 @@ def decode(message: bytes | str | Mapping[str, Any]) -> Batch:
 def messages_of(
     message: bytes | str | Mapping[str, Any], layouts: Mapping[str, str]
 ) -> tuple[Batch, Messages | None]:
-    """The batch in an envelope, and its ROS messages byte for byte; None where they were never messages.
+    """The batch in an envelope, and its ROS messages byte for byte; None if the samples were never messages.
 
-    ``layouts`` has each type's layout by its id. Raises `ContractError` as `decode`, and where the type is
-    not among them.
+    ``layouts`` has each type's layout by its id. Raises `ContractError` as `decode` does, and for an unknown
+    type.
     """
     batch, about = _read(message)
     if batch.messages is not None or not about:
@@ -198,28 +198,26 @@ def messages_of(
 
 
 def _read(message: bytes | str | Mapping[str, Any]) -> tuple[Batch, str]:
-    """The batch, and what stands behind its columns."""
+    """The batch, and the text after its columns."""
     envelope = message if isinstance(message, Mapping) else json_object(message, "envelope")
     check_version(envelope, BATCH_VERSION)
     codec = envelope.get("codec")
     if codec not in (CODEC, SERIALIZED_CODEC, PLAIN_CODEC):
-        raise ContractError(
-            f"codec {shown(codec)}: this side knows {CODEC}, {SERIALIZED_CODEC}, {PLAIN_CODEC}"
-        )
+        raise ContractError(f"codec must be {CODEC}, {SERIALIZED_CODEC} or {PLAIN_CODEC}, got {shown(codec)}")
     first_us, boot, seq = batch_id(envelope.get(BATCH))
     n = integer(envelope, SAMPLES)
     nonfinite = integer(envelope, NONFINITE) if NONFINITE in envelope else 0
     check_header(boot, seq, nonfinite)
     if not 1 <= n <= MAX_SAMPLES:
-        raise ContractError(f"envelope says {n} samples: allowed is 1 to {MAX_SAMPLES}")
+        raise ContractError(f"envelope must say 1 to {MAX_SAMPLES} samples, got {n}")
     text, _, behind = inflate(envelope.get("samples"), codec).partition(b"\n")
     check_effort(text)
     body = json_object(text, "samples")
     dt, fields = body.get("dt"), body.get("fields")
     if not isinstance(dt, list) or len(dt) != n or not isinstance(fields, dict):
-        raise ContractError(f"samples: expected {n} dt and an object of fields")
+        raise ContractError(f"samples must have {n} dt and an object of fields")
     if len(fields) > MAX_FIELDS:
-        raise ContractError(f"samples of {len(fields)} fields: allowed is up to {MAX_FIELDS}")
+        raise ContractError(f"samples must have at most {MAX_FIELDS} fields, got {len(fields)}")
     _check_values(n, len(fields))
     if dt[0] != 0 or not set(map(type, dt)) <= {int}:
         raise ContractError("samples: dt must be integers, the first 0")
@@ -240,37 +238,41 @@ def _text(behind: bytes) -> str:
     try:
         return behind.decode()
     except UnicodeDecodeError as error:
-        raise ContractError(f"what stands behind the columns is no text: {error}") from error
+        raise ContractError(f"data after the columns must be text: {error}") from error
 
 
 def _check_values(samples: int, fields: int) -> None:
     if samples * fields > MAX_BATCH_VALUES:
         raise ContractError(
-            f"{samples} samples of {fields} fields: allowed is up to {MAX_BATCH_VALUES} values in a batch"
+            f"batch must have at most {MAX_BATCH_VALUES} values, got {samples} samples of {fields} fields"
         )
 
 
 def decode_item(item: Mapping[str, Any]) -> tuple[Topic, Batch]:
-    """Whose a stored item is, and its batch.
+    """The topic of a stored item, and its batch.
 
-    Raises `ContractError` for one that is no batch, that is not of the record lane, whose body names
-    another robot than its topic, or whose time is `MAX_AHEAD_US` after its receipt.
+    Raises `ContractError` for an item that is not a batch of the record lane, for a body that names another
+    robot than its topic, and for a time more than `MAX_AHEAD_US` after its receipt.
     """
     topic = parse_topic(item[TOPIC]) if TOPIC in item else None
     if topic is None or topic.lane != RECORD:
-        raise ContractError(f"topic {shown(item.get(TOPIC))}: expected {RECORD}/<namespace>/<robot>/<stream>")
+        raise ContractError(
+            f"topic must be {RECORD}/<namespace>/<robot>/<stream>, got {shown(item.get(TOPIC))}"
+        )
     if item.get(ROBOT, topic.robot) != topic.robot:
         raise ContractError(f"sent by {topic.robot} in the name of {shown(item[ROBOT])}")
     batch = decode(item)
     if RECEIVED_MS in item and batch.t_us > integer(item, RECEIVED_MS) * 1000 + MAX_AHEAD_US:
-        raise ContractError(f"time {batch.t_us} us: over a year after its receipt; the car's clock is wrong")
+        raise ContractError(
+            f"time {batch.t_us} us is over a year after its receipt: the car's clock is wrong"
+        )
     return topic, batch
 
 
 def split(batch: Batch) -> tuple[Batch, Batch]:
     """The two halves of a batch, the second with the next ``seq``.
 
-    Raises `ContractError` for a single sample, which cannot be made smaller.
+    Raises `ContractError` for a single sample, which cannot be split.
     """
     half = len(batch.times_us) // 2
     if half == 0:

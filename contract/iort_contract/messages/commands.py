@@ -1,4 +1,4 @@
-"""Commands to a robot, and what robots tell each other."""
+"""Commands to a robot, and messages between robots."""
 
 from __future__ import annotations
 
@@ -20,9 +20,9 @@ from iort_contract.checks import (
 )
 from iort_contract.limits import MAX_MESSAGE_BYTES, SCHEMA_VERSION, ContractError
 
-# However long an operator asks for: a command is for now, and a motion must not go on by itself.
+# Upper limits, whatever an operator asks for: a command expires, and a motion must end.
 MAX_VALID_MS, MAX_LEASE_MS = 60_000, 10_000
-# A message for others to act on is worth nothing later; LIVE_MAX_AGE_MS is for eyes.
+# Other robots act on fleet messages, so they expire sooner than live samples for people (LIVE_MAX_AGE_MS).
 FLEET_MAX_AGE_MS = 2_000
 
 
@@ -30,12 +30,12 @@ FLEET_MAX_AGE_MS = 2_000
 class Command:
     """A ROS message for a robot to publish.
 
-    Commands are in the order of ``started_us``, ``session``, ``seq``: ``session`` names an operator's
-    session, which began at ``started_us``, and ``seq`` numbers its commands; a later session takes
-    over. After ``valid_ms`` from ``sent_us``, by the cloud's clock, the command is stale. ``lease_ms``,
-    without which a motion is refused, is how long from ``sent_us`` it may go on. ``message`` is the
-    ROS message. With ``answer`` the robot says in its shadow what became of it: `COMMANDS`, name,
-    ``session``, ``seq`` and ``outcome``, `ACCEPTED` or why not.
+    Commands are ordered by ``started_us``, ``session``, ``seq``. ``session`` names an operator's session,
+    which began at ``started_us``; ``seq`` numbers its commands. A later session takes over. The command is
+    stale ``valid_ms`` after ``sent_us``, by the cloud's clock. ``lease_ms`` limits a motion, also from
+    ``sent_us``; a motion without it is refused. ``message`` is the ROS message. With ``answer`` the robot
+    reports the result in its shadow: `COMMANDS`, name, ``session``, ``seq`` and ``outcome``, which is
+    `ACCEPTED` or the reason.
     """
 
     session: str
@@ -49,12 +49,12 @@ class Command:
 
     @property
     def order(self) -> tuple[int, str, int]:
-        """What of two commands the later one has more of."""
+        """The key by which commands are ordered."""
         return (self.started_us, self.session, self.seq)
 
 
 def encode_command(command: Command) -> bytes:
-    """The command as JSON. Raises `ContractError` for one that is not allowed."""
+    """The command as JSON; raises `ContractError` if it is invalid."""
     _check_command(command)
     envelope: dict[str, Any] = {
         "v": SCHEMA_VERSION,
@@ -72,7 +72,7 @@ def encode_command(command: Command) -> bytes:
 
 
 def decode_command(payload: bytes | str) -> Command:
-    """Read a command; raises `ContractError` for what `encode_command` cannot have written."""
+    """Decode a command; raises `ContractError` for everything that `encode_command` cannot have written."""
     envelope = _message_envelope(payload, "command")
     command = Command(
         session=text(envelope, "session"),
@@ -91,7 +91,7 @@ def decode_command(payload: bytes | str) -> Command:
 @dataclass(frozen=True)
 class FleetMessage:
     """A robot's ROS message for other robots: the newest only, ``seq`` growing within a ``boot``.
-    ``offset_us`` is what to add to ``sent_us`` to have the cloud's time, where the robot knows it."""
+    ``offset_us`` converts ``sent_us`` to the cloud's time by addition, if the robot knows it."""
 
     boot: str
     seq: int
@@ -101,7 +101,7 @@ class FleetMessage:
 
 
 def encode_fleet(fleet: FleetMessage) -> bytes:
-    """The message as JSON. Raises `ContractError` for one that is not allowed."""
+    """The message as JSON; raises `ContractError` if it is invalid."""
     envelope = {
         "v": SCHEMA_VERSION,
         "boot": check_header(fleet.boot, fleet.seq, 0),
@@ -113,7 +113,8 @@ def encode_fleet(fleet: FleetMessage) -> bytes:
 
 
 def decode_fleet(payload: bytes | str) -> FleetMessage:
-    """Read another robot's message; raises `ContractError` for what `encode_fleet` cannot write."""
+    """Decode another robot's message; raises `ContractError` for everything that `encode_fleet` cannot
+    write."""
     envelope = _message_envelope(payload, "fleet message")
     seq = integer(envelope, "seq")
     boot = check_header(envelope.get("boot"), seq, 0)
@@ -127,7 +128,7 @@ def _check_command(command: Command) -> None:
     checked(BOOT, command.session, "session", "8 to 32 of 0-9 a-f")
     check_header(command.session, command.seq, 0)
     if not isinstance(command.answer, bool):
-        raise ContractError(f"answer {shown(command.answer)}: allowed is true or false")
+        raise ContractError(f"answer must be true or false, got {shown(command.answer)}")
     if check_time(command.started_us, "started_us") > check_time(command.sent_us, "sent_us"):
         raise ContractError("the command was sent before its session started")
     for name, value, most in (
@@ -137,18 +138,18 @@ def _check_command(command: Command) -> None:
         if value is None and name == "lease_ms":
             continue
         if type(value) is not int or not 1 <= value <= most:
-            raise ContractError(f"{name} {shown(value)}: allowed is an integer from 1 to {most}")
+            raise ContractError(f"{name} must be an integer from 1 to {most}, got {shown(value)}")
 
 
 def _message_json(envelope: Mapping[str, Any]) -> bytes:
     if not isinstance(envelope["message"], dict):
-        raise ContractError(f"message {shown(envelope['message'])}: expected an object")
+        raise ContractError(f"message must be an object, got {shown(envelope['message'])}")
     try:
         payload = json.dumps(envelope, separators=(",", ":"), allow_nan=False).encode()
     except (TypeError, ValueError, RecursionError) as error:
         raise ContractError(f"the message is not JSON: {error}") from error
     if len(payload) > MAX_MESSAGE_BYTES:
-        raise ContractError(f"the message would have {len(payload)} of {MAX_MESSAGE_BYTES} bytes")
+        raise ContractError(f"message must be at most {MAX_MESSAGE_BYTES} bytes, got {len(payload)}")
     return payload
 
 
@@ -156,5 +157,5 @@ def _message_envelope(payload: bytes | str, what: str) -> dict[str, Any]:
     envelope = json_object(payload, what)
     check_version(envelope)
     if not isinstance(envelope.get("message"), dict):
-        raise ContractError(f"message {shown(envelope.get('message'))}: expected an object")
+        raise ContractError(f"message must be an object, got {shown(envelope.get('message'))}")
     return envelope

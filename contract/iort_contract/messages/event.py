@@ -1,4 +1,4 @@
-"""A message as a topic rule hands it to a function: its own bytes, beside what only the cloud can say."""
+"""A topic rule's event for a function: the message's bytes, and the cloud's own keys."""
 
 from __future__ import annotations
 
@@ -9,22 +9,21 @@ from iort_contract.checks import shown
 from iort_contract.limits import ContractError
 from iort_contract.tables import RECEIVED_MS, TOPIC
 
-# As one opaque value, whatever it is: no key of the message's can stand where the cloud's own stands.
+# One opaque value for any content: no key of the message can replace one of the cloud's.
 MESSAGE_BASE64 = "message_base64"
 
 
 def rule_event(message: bytes, topic: str, received_ms: int) -> dict[str, Any]:
-    """What the rules live, echo and upload make of a message, and their functions are called with."""
+    """The event that the rules live, echo and upload make of a message."""
     return {MESSAGE_BASE64: base64.b64encode(message).decode(), TOPIC: topic, RECEIVED_MS: received_ms}
 
 
 def event_message(event: Mapping[str, Any]) -> bytes:
-    """The message that a `rule_event` was made of, as it was sent; raises `ContractError` for an event of
-    another kind."""
+    """The message of a `rule_event` as it was sent; raises `ContractError` for another kind of event."""
     encoded = event.get(MESSAGE_BASE64)
     if not isinstance(encoded, str):
-        raise ContractError(f"{MESSAGE_BASE64}: expected text, not {shown(encoded)}")
+        raise ContractError(f"{MESSAGE_BASE64} must be text, got {shown(encoded)}")
     try:
         return base64.b64decode(encoded, validate=True)
     except ValueError as error:
-        raise ContractError(f"{MESSAGE_BASE64}: no base64") from error
+        raise ContractError(f"{MESSAGE_BASE64} must be base64") from error

@@ -1,4 +1,4 @@
-"""Files: how a robot asks where to upload one, and what it is answered."""
+"""Requests of robots for upload addresses, and their answers."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from iort_contract.limits import SCHEMA_VERSION, ContractError
 from iort_contract.tables import T_US
 from iort_contract.topics import check_robot
 
-# S3 takes parts of 5 MiB and more, up to 10,000 of them, and SHA-256 of each part.
+# S3 takes up to 10,000 parts of 5 MiB and more, with a SHA-256 each.
 PART_BYTES = 8 * 1024 * 1024
 MAX_FILE_BYTES = 64 * 1024**3
 # A signed address takes 2 KB, most of it the function's session.
@@ -23,16 +23,16 @@ MAX_ADDRESSES = 16
 UPLOAD_URL_S = 900
 KINDS = ("recording", "image", "log", "message", "other")
 
-# What stands in a sample for a field that is too large for a message, as <field>.<one of these>: the
-# claim check. All are null where the content was not kept, and the thumbnail where there is none.
+# The attachment: these fields replace a field too large for a message, as <field>.<name>. All are null if the
+# content was not kept; the thumbnail is null if the field has none.
 CLAIM_FIELDS = {
-    "key": "where the content is, or will be, in the files' bucket",
-    "sha256": "of the content, in hex",
+    "key": "the content's key in the files' bucket, also before its upload",
+    "sha256": "SHA-256 of the content, in hex",
     "size": "bytes of content",
-    "content_type": "of the content",
+    "content_type": "the content's type",
     "thumbnail": "of an image: base64 of a small JPEG",
 }
-# And where in the serialized message the content was, which is an empty array there.
+# The place of the content in the serialized message, which has an empty array there.
 CLAIM_AT = "at"
 
 _FILE_LEVEL = r"[A-Za-z0-9][A-Za-z0-9._-]{0,99}"
@@ -44,8 +44,8 @@ _MAX_WAIT_S = 86_400
 
 @dataclass(frozen=True)
 class File:
-    """A file that a robot has: its name (up to four levels), one of `KINDS`, its content type and size,
-    the SHA-256 of its content in hex, and the time it was last written, microseconds since the epoch."""
+    """A file on a robot: its name (up to four levels), one of `KINDS`, its content type and size, the SHA-256
+    of its content in hex, and its modification time in microseconds since the epoch."""
 
     name: str
     kind: str
@@ -56,17 +56,17 @@ class File:
 
     @property
     def parts(self) -> int:
-        """Of how many parts the upload is: 1 for a file that goes in one piece."""
+        """The number of parts of the upload: 1 for a file in one piece."""
         return max(1, -(-self.size // PART_BYTES))
 
 
 @dataclass(frozen=True)
 class FileRequest:
-    """Asks where a file may be uploaded to, and says at the end that it is.
+    """Asks for upload addresses, and at the end reports the upload.
 
-    ``id`` names the request, the answer repeats it. ``parts`` maps number (from 1) to SHA-256 of those
-    parts whose addresses are wanted, at most `MAX_ADDRESSES`; a file of one part names that. ``parts_sha256``
-    says that all parts are there: it is the SHA-256 of their SHA-256, one after the other.
+    ``id`` names the request; the answer repeats it. ``parts`` maps the number (from 1) to the SHA-256 of each
+    part to upload next, at most `MAX_ADDRESSES`; a file of one part names that part. ``parts_sha256`` reports
+    that all parts are there: it is the SHA-256 of their SHA-256, in order.
     """
 
     id: str
@@ -76,7 +76,7 @@ class FileRequest:
 
 
 class Address(NamedTuple):
-    """Where to PUT a part (or the file, if it has but one), with exactly these headers."""
+    """Where to PUT a part (or the whole file), with exactly these headers."""
 
     part: int
     url: str
@@ -85,9 +85,9 @@ class Address(NamedTuple):
 
 @dataclass(frozen=True)
 class FileAnswer:
-    """``stored``: the bucket has it, under ``key``. Otherwise ``addresses`` of what it lacks, and
-    ``have``, the ranges (first, last) of parts that it has. ``refused`` says why there are none, and
-    ``again_s`` after how many seconds it is worth to ask again; None: never."""
+    """``stored``: the bucket has the file under ``key``. Otherwise ``addresses`` are for missing parts, and
+    ``have`` lists the ranges (first, last) of stored parts. ``refused`` says why the request failed, and
+    ``again_s`` is the delay in seconds before another attempt; None: never."""
 
     id: str
     key: str | None = None
@@ -99,16 +99,16 @@ class FileAnswer:
 
 
 def file_key(robot: str, file: File) -> str:
-    """The key of a robot's file in the bucket. It follows from the file alone, so that robot and cloud
-    need not tell each other, and it names the content, so that no other content can have it."""
+    """The key of a robot's file in the bucket. It follows from the file alone, so robot and cloud compute it
+    independently. It names the content, so other content has another key."""
     moment = time.gmtime(_check_file(file).t_us // 1_000_000)
     day, second = time.strftime("%Y/%m/%d", moment), time.strftime("%H%M%S", moment)
     return f"{FILES_PREFIX}{check_robot(robot)}/{day}/{second}-{file.sha256[:12]}/{file.name}"
 
 
 class FileKey(NamedTuple):
-    """What a key says of its file: whose it is, the second it was last written (since the epoch), the
-    first 12 digits of its SHA-256, and its name."""
+    """A parsed key: the file's robot, the second of its modification (since the epoch), the first 12 digits
+    of its SHA-256, and its name."""
 
     robot: str
     second: int
@@ -122,28 +122,28 @@ _FILE_KEY = re.compile(
 
 
 def parse_file_key(key: str) -> FileKey:
-    """Take a key apart; raises `ContractError` for one that `file_key` cannot have built."""
+    """Parse a key; raises `ContractError` for one that `file_key` cannot have built."""
     match = _FILE_KEY.fullmatch(key)
     if match is None:
-        raise ContractError(f"key {shown(key)}: expected {FILES_PREFIX}<robot>/<day>/<time>-<hash>/<name>")
+        raise ContractError(f"key must be {FILES_PREFIX}<robot>/<day>/<time>-<hash>/<name>, got {shown(key)}")
     robot, when, digits, name = match.groups()
     try:
         second = calendar.timegm(time.strptime(when, "%Y/%m/%d/%H%M%S"))
     except ValueError as error:
-        raise ContractError(f"key {shown(key)}: {when} is no time") from error
+        raise ContractError(f"key {shown(key)}: time must be valid, got {when}") from error
     return FileKey(check_robot(robot), second, digits, name)
 
 
 def part_range(file: File, part: int) -> tuple[int, int]:
-    """Where a part begins in its file, and its size; raises `ContractError` for one that it does not have."""
+    """A part's start in its file, and its size; raises `ContractError` if the file has no such part."""
     if type(part) is not int or not 1 <= part <= file.parts:
-        raise ContractError(f"part {shown(part)}: allowed is 1 to {file.parts}")
+        raise ContractError(f"part must be 1 to {file.parts}, got {shown(part)}")
     first = (part - 1) * PART_BYTES
     return first, min(PART_BYTES, file.size - first)
 
 
 def encode_file_request(request: FileRequest) -> bytes:
-    """The request as JSON. Raises `ContractError` for one that is not allowed."""
+    """The request as JSON; raises `ContractError` if it is invalid."""
     _check_file_request(request)
     file = request.file
     envelope: dict[str, Any] = {
@@ -165,12 +165,13 @@ def encode_file_request(request: FileRequest) -> bytes:
 
 
 def decode_file_request(message: bytes | str | Mapping[str, Any]) -> FileRequest:
-    """Read a request; raises `ContractError` for what `encode_file_request` cannot have written."""
+    """Decode a request; raises `ContractError` for everything that `encode_file_request` cannot have
+    written."""
     envelope = message if isinstance(message, Mapping) else json_object(message, "file request")
     check_version(envelope)
     given, parts = envelope.get("file"), envelope.get("parts")
     if not isinstance(given, Mapping) or not isinstance(parts, Mapping):
-        raise ContractError("file and parts: expected an object each")
+        raise ContractError("file and parts must be an object each")
     file = File(
         name=text(given, "name"),
         kind=text(given, "kind"),
@@ -186,13 +187,13 @@ def decode_file_request(message: bytes | str | Mapping[str, Any]) -> FileRequest
 
 
 def file_request_id(message: Mapping[str, Any]) -> str | None:
-    """The id of a request, whatever else it says; None where it has none that an answer could repeat."""
+    """A request's id, even if the rest is invalid; None if an answer could not repeat it."""
     given = message.get("id")
     return given if isinstance(given, str) and BOOT.fullmatch(given) else None
 
 
 def encode_file_answer(answer: FileAnswer) -> bytes:
-    """The answer as JSON, without what it does not say."""
+    """The answer as JSON, without empty entries."""
     envelope: dict[str, Any] = {"v": SCHEMA_VERSION, "id": answer.id}
     if answer.refused is not None:
         envelope["refused"] = answer.refused
@@ -208,18 +209,19 @@ def encode_file_answer(answer: FileAnswer) -> bytes:
 
 
 def decode_file_answer(message: bytes | str) -> FileAnswer:
-    """Read an answer; raises `ContractError` for what `encode_file_answer` cannot have written."""
+    """Decode an answer; raises `ContractError` for everything that `encode_file_answer` cannot have
+    written."""
     envelope = json_object(message, "file answer")
     check_version(envelope)
     given_id = checked(BOOT, envelope.get("id"), "id", "8 to 32 of 0-9 a-f")
     if "refused" in envelope:
         again_s = integer(envelope, "again_s") if "again_s" in envelope else None
         if again_s is not None and not 0 <= again_s <= _MAX_WAIT_S:
-            raise ContractError(f"again_s {again_s}: allowed is 0 to {_MAX_WAIT_S}")
+            raise ContractError(f"again_s must be 0 to {_MAX_WAIT_S}, got {again_s}")
         return FileAnswer(given_id, refused=str(envelope["refused"]), again_s=again_s)
     key, stored = envelope.get("key"), envelope.get("stored")
     if not isinstance(key, str) or not isinstance(stored, bool):
-        raise ContractError("key and stored: expected a text, and true or false")
+        raise ContractError("key must be a text, and stored true or false")
     try:
         have = tuple((int(first), int(last)) for first, last in envelope.get("have", ()))
         addresses = tuple(
@@ -227,9 +229,9 @@ def decode_file_answer(message: bytes | str) -> FileAnswer:
             for one in envelope.get("addresses", ())
         )
     except (ArithmeticError, AttributeError, KeyError, TypeError, ValueError) as error:
-        raise ContractError(f"have or addresses are not what they should be: {error}") from error
+        raise ContractError(f"have or addresses are invalid: {error}") from error
     if any(later[0] <= earlier[1] for earlier, later in zip(have, have[1:])):
-        raise ContractError("have: expected ranges in order, of which none overlap")
+        raise ContractError("have must be ranges in order, without overlaps")
     return FileAnswer(given_id, key, stored, have, addresses)
 
 
@@ -237,7 +239,7 @@ def _check_file_request(request: FileRequest) -> None:
     checked(BOOT, request.id, "id", "8 to 32 of 0-9 a-f")
     file = _check_file(request.file)
     if len(request.parts) > MAX_ADDRESSES:
-        raise ContractError(f"{len(request.parts)} parts asked for: allowed is up to {MAX_ADDRESSES}")
+        raise ContractError(f"parts must be at most {MAX_ADDRESSES}, got {len(request.parts)}")
     for part, sha256 in request.parts.items():
         part_range(file, part)
         checked(_SHA256, sha256, f"SHA-256 of part {part}", "64 of 0-9 a-f")
@@ -248,11 +250,11 @@ def _check_file_request(request: FileRequest) -> None:
 def _check_file(file: File) -> File:
     checked(_FILE_NAME, file.name, "file name", "up to 4 levels of A-Z a-z 0-9 . _ -, up to 100 each")
     if file.kind not in KINDS:
-        raise ContractError(f"kind {shown(file.kind)}: allowed is one of {', '.join(KINDS)}")
+        raise ContractError(f"kind must be one of {', '.join(KINDS)}, got {shown(file.kind)}")
     checked(_CONTENT_TYPE, file.content_type, "content type", "type/subtype in lower case")
     checked(_SHA256, file.sha256, "SHA-256", "64 of 0-9 a-f")
     if type(file.size) is not int or not 0 <= file.size <= MAX_FILE_BYTES:
-        raise ContractError(f"size {shown(file.size)}: allowed is 0 to {MAX_FILE_BYTES} bytes")
+        raise ContractError(f"size must be 0 to {MAX_FILE_BYTES} bytes, got {shown(file.size)}")
     if check_time(file.t_us, "file time") < 0:
-        raise ContractError(f"file time {file.t_us}: allowed is from 1970 on")
+        raise ContractError(f"file time must be from 1970 on, got {file.t_us}")
     return file

@@ -1,4 +1,4 @@
-"""The live lane, the newest sample; and pings, which measure the way."""
+"""The live lane, which carries the newest sample; and pings, which measure delays."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ from iort_contract.checks import (
 from iort_contract.limits import MAX_FIELDS, SCHEMA_VERSION, ContractError, Value
 from iort_contract.tables import NONFINITE, RECEIVED_MS, ROBOT, T_US
 
-# What a ping says; the answer repeats it.
+# The fields of a ping; the answer repeats them.
 PING_FIELDS = ("v", "id", "sent_us", "padding")
 
 
@@ -31,11 +31,10 @@ PING_FIELDS = ("v", "id", "sent_us", "padding")
 class LiveSample:
     """The newest sample of a stream, as the live lane carries it.
 
-    ``seq`` numbers the stream's live messages of a run; ``t_us`` is the sample's time, ``sent_us`` the time
-    it left the car; ``sample`` maps field to value. Fields stand in an object of their own, so that no
-    ROS field can be taken for one of ours; a rule filters on ``sample.fault_code``. ``offset_us`` is what
-    to add to the car's clock to have the cloud's, where the car knows it to within
-    `CLOCK_MAX_UNCERTAINTY_MS`.
+    ``seq`` numbers the stream's live messages of a run. ``t_us`` is the sample's time, ``sent_us`` the time
+    it left the car. ``sample`` maps field to value, in an object of its own, so that no ROS field can be
+    mistaken for one of ours; a rule filters on ``sample.fault_code``. ``offset_us`` converts the car's clock
+    to the cloud's by addition, if the car knows it to within `CLOCK_MAX_UNCERTAINTY_MS`.
     """
 
     boot: str
@@ -51,7 +50,7 @@ def encode_live(live: LiveSample) -> bytes:
     """The live message as JSON; NaN and infinities become null and are counted."""
     check_header(live.boot, live.seq, live.nonfinite)
     if len(live.sample) > MAX_FIELDS:
-        raise ContractError(f"sample of {len(live.sample)} fields: allowed is up to {MAX_FIELDS}")
+        raise ContractError(f"sample must have at most {MAX_FIELDS} fields, got {len(live.sample)}")
     sample, nulled = wire_sample(live.sample)
     nonfinite = live.nonfinite + nulled
     check_header(live.boot, live.seq, nonfinite)
@@ -69,18 +68,18 @@ def encode_live(live: LiveSample) -> bytes:
 
 
 def decode_live(message: bytes | str) -> LiveSample:
-    """The sample in a live message; raises `ContractError` for what `encode_live` cannot write."""
+    """Decode a live message; raises `ContractError` for everything that `encode_live` cannot write."""
     envelope = json_object(message, "live message")
     check_version(envelope)
     seq, nonfinite = integer(envelope, "seq"), integer(envelope, NONFINITE)
     boot = check_header(envelope.get("boot"), seq, nonfinite)
     sample = envelope.get("sample")
     if not isinstance(sample, dict) or len(sample) > MAX_FIELDS:
-        raise ContractError(f"sample: expected an object of up to {MAX_FIELDS} fields")
+        raise ContractError(f"sample must be an object of at most {MAX_FIELDS} fields")
     for name, value in sample.items():
         check_field(name)
         if wire_column(name, (value,))[1]:
-            raise ContractError(f"field {name}: the number is not finite")
+            raise ContractError(f"field {name}: numbers must be finite")
     t_us = check_time(integer(envelope, T_US), "sample time")
     sent_us = check_time(integer(envelope, "sent_us"), "sent_us")
     offset_us = integer(envelope, "offset_us") if "offset_us" in envelope else None
@@ -91,8 +90,8 @@ def decode_live(message: bytes | str) -> LiveSample:
 def live_update(
     robot: str, stream: str, live: LiveSample, received_ms: int, lambda_us: int
 ) -> dict[str, Any]:
-    """What Lambda 1 sends to PubNub: the sample, the time of every hop it has passed and, where the car
-    knows it, what to add to the car's times to have the cloud's."""
+    """Lambda 1's message to PubNub: the sample, the time of every hop so far and, if the car knows it, the
+    clock offset that converts the car's times to the cloud's."""
     hops = {"sent_us": live.sent_us, RECEIVED_MS: received_ms, "lambda_us": lambda_us}
     return {
         "v": SCHEMA_VERSION,
@@ -107,9 +106,9 @@ def live_update(
 
 
 def encode_ping(ping_id: int, sent_us: int, padding: str = "") -> bytes:
-    """A ping; the pong has the same content, and the cloud's ``received_ms``."""
+    """A ping; the pong repeats it and adds the cloud's ``received_ms``."""
     if type(ping_id) is not int or not 0 <= ping_id <= MAX_SEQ:
-        raise ContractError(f"ping id {shown(ping_id)}: allowed is an integer from 0")
+        raise ContractError(f"ping id must be an integer from 0, got {shown(ping_id)}")
     ping: dict[str, Any] = {"v": SCHEMA_VERSION, "id": ping_id}
     ping["sent_us"] = check_time(sent_us, "sent_us")
     if padding:
@@ -118,7 +117,7 @@ def encode_ping(ping_id: int, sent_us: int, padding: str = "") -> bytes:
 
 
 class Pong(NamedTuple):
-    """The answer to a ping; ``received_ms`` is None on the broker path, which the cloud never sees."""
+    """The answer to a ping; ``received_ms`` is None on the broker path, which runs no code in the cloud."""
 
     id: int
     sent_us: int
@@ -126,7 +125,7 @@ class Pong(NamedTuple):
 
 
 def decode_pong(message: bytes | str) -> Pong:
-    """Read a pong, or a ping that came straight back; raises `ContractError` otherwise."""
+    """Decode a pong, or a ping that came straight back; raises `ContractError` otherwise."""
     envelope = json_object(message, "pong")
     received = integer(envelope, RECEIVED_MS) if RECEIVED_MS in envelope else None
     if received is not None:

@@ -1,4 +1,4 @@
-"""The ROS types that a stream's samples were made of, told as a stream."""
+"""The ROS types of a stream's messages, sent as a stream."""
 
 from __future__ import annotations
 
@@ -7,16 +7,16 @@ from typing import Mapping, NamedTuple
 from iort_contract.limits import ContractError, Value
 from iort_contract.ros1.message import RosType, type_id
 
-# A definition is a text of its own, in pieces that a field may hold.
+# A definition is one text, cut into pieces that a field may hold.
 _PIECE, _MAX_PIECES = 4000, 64
 
 
 class MessageType(NamedTuple):
-    """The ROS 1 type of the messages that a stream's samples are made of.
+    """The ROS 1 type of a stream's messages.
 
-    A source says it once a run, as a sample of the stream `TYPES_STREAM`: from then on downstream knows
-    how to make the messages again. ``kind`` is as ROS 1 writes it, ``package/Type``; ``definition`` is the
-    text that a publisher sends and a bag keeps, with every type within.
+    A source sends it once a run, as a sample of the stream `TYPES_STREAM`; readers need it to rebuild the
+    messages. ``kind`` is in ROS 1's form, ``package/Type``; ``definition`` is the text that a publisher sends
+    and a bag keeps, with all nested types.
     """
 
     stream: str
@@ -27,19 +27,21 @@ class MessageType(NamedTuple):
 
     @property
     def id(self) -> str:
-        """By which batches refer to it."""
+        """The id in batches of this type."""
         return type_id(self.topic, self.kind, self.md5sum)
 
     @property
     def layout(self) -> str:
-        """What it takes to decode the messages; empty where the definition is none."""
+        """The layout for decoding messages; empty for an invalid definition."""
         return RosType(self.topic, self.kind, self.md5sum, self.definition).layout
 
     def sample(self) -> dict[str, Value]:
-        """The type as a sample. Raises `ContractError` for a definition that is too long."""
+        """The type as a sample; raises `ContractError` if the definition is too long."""
         pieces = [self.definition[i : i + _PIECE] for i in range(0, len(self.definition), _PIECE)]
         if len(pieces) > _MAX_PIECES:
-            raise ContractError(f"the definition of {self.kind} has over {_PIECE * _MAX_PIECES} characters")
+            raise ContractError(
+                f"definition of {self.kind} must be at most {_PIECE * _MAX_PIECES} characters"
+            )
         sample: dict[str, Value] = dict(self._asdict())
         del sample["definition"]
         sample.update({f"definition.{i}": piece for i, piece in enumerate(pieces)})
@@ -47,11 +49,11 @@ class MessageType(NamedTuple):
 
 
 def message_type(sample: Mapping[str, Value]) -> MessageType:
-    """The type in a sample; raises `ContractError` for what `MessageType.sample` cannot have written."""
+    """Decode a type; raises `ContractError` for everything that `MessageType.sample` cannot have written."""
     texts = {name: value for name, value in sample.items() if isinstance(value, str)}
     try:
         stream, topic, kind, md5sum = (texts[name] for name in ("stream", "topic", "kind", "md5sum"))
         pieces = [texts[f"definition.{i}"] for i in range(sum("definition." in name for name in texts))]
     except KeyError as error:
-        raise ContractError(f"a message type without {error}") from error
+        raise ContractError(f"message type must have {error}") from error
     return MessageType(stream, topic, kind, md5sum, "".join(pieces))

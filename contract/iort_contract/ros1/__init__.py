@@ -1,2 +1,2 @@
-"""ROS 1 messages: what a definition says, a message as one flat sample, and batches that keep messages as
-they were published. Standard library and the contract's limits only."""
+"""ROS 1 messages: definitions, messages as flat samples, and batches that keep messages as published. It uses
+only the standard library and the contract's limits."""

@@ -1,9 +1,9 @@
-"""Serialized messages as columns and back: a sample a message for whoever asks, and the exact bytes again.
+"""Serialized messages as columns and back: one sample per message, and the exact bytes again.
 
-A message that is nothing but numbers behind its header (`Decoder.flat`) is written as columns, which take
-half the bytes of the message compressed, and what its header says stands beside them. Whoever writes them
-makes the messages again and compares; where one differs in a bit (a NaN's, a negative zero's), or where
-the numbers do not become steps, the messages are kept as they are.
+A message of numbers only, after its header (`Decoder.flat`), is written as columns, which take half the bytes
+of the compressed message; its header is stored beside them. The writer rebuilds the messages and compares
+them. If any bit differs (a NaN's, a negative zero's), or the numbers do not become steps, the messages are
+stored unchanged.
 """
 
 from __future__ import annotations
@@ -28,26 +28,26 @@ from iort_contract.ros1.definition import parse
 from iort_contract.ros1.message import MAX_LAYOUT, Messages
 
 _NS = 1_000_000_000
-# Of all frame_ids of a batch; messages of longer ones are kept as they are.
+# The limit for all frame_ids of a batch; messages with longer ones are stored unchanged.
 _MAX_FRAMES = 256 * 1024
-# A batch of ours holds no more values; of what another packs, the rest is not looked into.
+# Our batches hold at most this many values; in a batch of other software, the rest is not decoded.
 _MAX_VIEWED = 2 * MAX_BATCH_VALUES
 
 
 @lru_cache(maxsize=64)
 def decoder_of(layout: str) -> Decoder:
-    """The decoder of a layout, which is a type's name, a line's end and its definition.
+    """The decoder of a layout: a type's name, a newline and its definition.
 
-    Raises `MessageError` for what is none.
+    Raises `MessageError` for an invalid layout.
     """
     kind, _, definition = layout.partition("\n")
     if len(layout) > MAX_LAYOUT:
-        raise MessageError(f"a layout of {len(layout)} characters: allowed is up to {MAX_LAYOUT}")
+        raise MessageError(f"layout must be at most {MAX_LAYOUT} characters, got {len(layout)}")
     return Decoder(parse(kind, definition))
 
 
 def values_a_message(messages: Messages) -> int:
-    """About how many values a message has, judged by the longest."""
+    """The estimated number of values per message, by the longest."""
     if not messages.layout:
         return 0
     try:
@@ -57,7 +57,8 @@ def values_a_message(messages: Messages) -> int:
 
 
 def view(messages: Messages) -> tuple[dict[str, list[Value]], int]:
-    """The samples of messages as columns, None where one lacks a field; how many values were not finite."""
+    """The messages' samples as columns, None for a missing field; and the count of values that are not
+    finite."""
     columns: dict[str, list[Value]] = {}
     if not messages.layout:
         return {}, 0
@@ -85,7 +86,7 @@ def view(messages: Messages) -> tuple[dict[str, list[Value]], int]:
     shown: dict[str, list[Value]] = {}
     nulled = 0
     for name, column in columns.items():
-        # Nobody could ask for a longer name.
+        # A query could not use a longer name.
         if len(name) <= MAX_FIELD_CHARACTERS:
             shown[name], several = wire_column(name, column)
             nulled += several
@@ -93,8 +94,8 @@ def view(messages: Messages) -> tuple[dict[str, list[Value]], int]:
 
 
 def as_columns(messages: Messages, times_us: Sequence[int]) -> tuple[dict[str, list[Value]], str] | None:
-    """Messages as columns for the wire and, as JSON, what else it takes to make them again; None where
-    they are better kept, or can only be kept, as they are."""
+    """Messages as columns for the wire, and the rest needed to rebuild them, as JSON. None if the messages
+    are better stored unchanged."""
     if not messages.layout:
         return None
     decoder = decoder_of(messages.layout)
@@ -106,7 +107,7 @@ def as_columns(messages: Messages, times_us: Sequence[int]) -> tuple[dict[str, l
         return None
     for name, column in _columns(decoder, bodies).items():
         columns[name] = wire_column(name, column)[0]
-        # What is no step is longer as text than its bytes are.
+        # Numbers that are not steps take more as text than as bytes.
         if float in set(map(type, columns[name])) and packed(columns[name])[0] is None:
             return None
     if b"".join(bodies) != _rows(decoder, columns):
@@ -132,22 +133,22 @@ def as_columns(messages: Messages, times_us: Sequence[int]) -> tuple[dict[str, l
 def from_columns(
     columns: Mapping[str, Sequence[Value]], about: str, times_us: Sequence[int], layouts: Mapping[str, str]
 ) -> Messages:
-    """The messages of `as_columns` again; ``layouts`` has the layout of each type by its id.
+    """Rebuild the messages of `as_columns`; ``layouts`` has the layout of each type by its id.
 
-    Raises `ContractError` where it lacks the type's, or the columns are not of it.
+    Raises `ContractError` for an unknown type, or columns of another type.
     """
     n = len(times_us)
     try:
         name, *head = json.loads(about)
         if not isinstance(name, str) or name not in layouts:
-            raise ContractError(f"the messages' type, {shown(name)}, is not known")
+            raise ContractError(f"the messages' type {shown(name)} is unknown")
         decoder = decoder_of(layouts[name])
         if decoder.flat is None:
-            raise ContractError(f"the type {name} is not of numbers alone")
+            raise ContractError(f"type {name} must consist of numbers")
         rows = _rows(decoder, columns)
         size = decoder.flat[0].size
         if len(rows) != n * size:
-            raise ContractError(f"the columns are not of the type {name}")
+            raise ContractError(f"the columns do not fit the type {name}")
         raw = [rows[i * size : (i + 1) * size] for i in range(n)]
         if decoder.stamped:
             seq, stamp, frame = head
@@ -157,16 +158,16 @@ def from_columns(
                 if isinstance(stamp, str)
                 else unpacked(CODEC, "stamp", stamp, n)
             )
-            # One stands for all: it is written once, and made so often.
+            # A single value stands for all messages.
             texts = [frame] * n if isinstance(frame, str) else frame
             if not isinstance(texts, list) or len(texts) != n or sum(map(len, texts)) > _MAX_FRAMES:
-                raise ContractError(f"frame_id: expected {n} texts of up to {_MAX_FRAMES} characters")
+                raise ContractError(f"frame_id must be {n} texts of at most {_MAX_FRAMES} characters")
             heads = map(_head, seqs, times_us, offsets, texts)
             raw = [start + body for start, body in zip(heads, raw)]
     except (AttributeError, RecursionError, TypeError, ValueError, struct.error) as error:
         if isinstance(error, ContractError):
             raise
-        raise ContractError(f"the messages cannot be made again: {error}") from error
+        raise ContractError(f"the messages cannot be rebuilt: {error}") from error
     return Messages(name, layouts[name], raw)
 
 
@@ -177,14 +178,14 @@ def _head(seq: Any, t_us: int, offset_ns: Any, frame: str) -> bytes:
 
 
 def _digits(offsets: Sequence[int]) -> str:
-    """Offsets within a microsecond as three digits each, which nothing packs better; empty for others."""
+    """Offsets within a microsecond as three digits each, the most compact form; empty for others."""
     if min(offsets) < 0 or max(offsets) > 999:
         return ""
     return "".join(map("{:03d}".format, offsets))
 
 
 def _bodies(decoder: Decoder, raws: Iterable[bytes]) -> list[bytes] | None:
-    """What is behind the headers, where that is as long as the layout says."""
+    """The bodies after the headers, if they have the length of the layout."""
     if decoder.flat is None:
         return None
     size = decoder.flat[0].size
@@ -205,7 +206,7 @@ def _columns(decoder: Decoder, bodies: Sequence[bytes]) -> dict[str, list[Value]
 
 
 def _rows(decoder: Decoder, columns: Mapping[str, Sequence[Value]]) -> bytes:
-    """The messages' bodies behind one another; empty where a value does not fit."""
+    """The messages' bodies, joined; empty if a value does not fit."""
     assert decoder.flat is not None
     writer, names = decoder.flat
     if columns.keys() != set(names):

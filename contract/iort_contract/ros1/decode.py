@@ -1,16 +1,15 @@
-"""A ROS 1 message's bytes as one flat sample, by its definition: field path -> value.
+"""Decodes a ROS 1 message to one flat sample, by its definition: field path -> value.
 
-A definition is compiled once to a list of steps: neighbouring fixed-size fields are one
-`struct.Struct`, in which what is not wanted is padding. Nested messages flatten to dotted paths and
-arrays to indexes: ``pose.position.x``, ``covariance.0``; time and duration are ``sec`` and ``nanosec`` as in
-ROS 2. The header that a message begins with is left out: its stamp is the sample's time. A message that
-is a header and exactly one nested message (VescStateStamped, PoseStamped) gives that message's fields without
-a prefix.
+A definition is compiled once to a list of steps. Neighbouring fixed-size fields become one `struct.Struct`,
+with padding for unselected fields. Nested messages flatten to dotted paths and arrays to indexes:
+``pose.position.x``, ``covariance.0``; time and duration become ``sec`` and ``nanosec`` as in ROS 2. A leading
+header is left out: its stamp is the sample's time. A message of a header and exactly one nested message
+(VescStateStamped, PoseStamped) gives that message's fields without a prefix.
 
-The sample is a view; what is recorded is the message. Left out of the view, and counted, is what no table
-shows: arrays of more than `MAX_ELEMENTS`, ``uint8[]`` of any length, texts that the contract would
-refuse, fields beyond `MAX_FIELDS`. An element named in the selection (``ranges.540``) is taken from any
-array. With ``large``, a ``uint8[]`` stays the bytes that it is.
+The sample is a view; the record holds the message. The view leaves out, and counts, fields that no table
+shows: arrays of more than `MAX_ELEMENTS`, ``uint8[]`` of any length, texts that the contract refuses, fields
+beyond `MAX_FIELDS`. An element named in the selection (``ranges.540``) is taken from any array. With
+``large``, a ``uint8[]`` stays bytes.
 """
 
 from __future__ import annotations
@@ -24,14 +23,14 @@ from iort_contract.ros1.definition import LETTERS, STRING, VARIABLE, Definition,
 
 MAX_ELEMENTS = 64
 MAX_TEXT = 4096
-# Elements of variable size are walked one by one; a message of more is not looked into.
+# Elements of variable size are walked one by one; a message with more is not decoded.
 _MAX_WALKED = 20_000
-# Of the places in a message that a decoder has a name for: a few lines can nest to more than anybody walks.
+# The limit of named places in a decoder: a few lines can nest to more than anybody can walk.
 _MAX_NAMED = 20_000
 
-# Reads from the bytes at an offset into the sample; returns the offset behind what it has read.
+# Reads from the bytes at an offset into the sample; returns the offset after the last byte read.
 Step = Callable[[bytes, int, Dict[str, Value]], int]
-# Whether a path is wanted by itself, and whether anything below it is.
+# Whether a path is selected itself, and whether anything below it is.
 Wanted = Callable[[str], bool]
 
 _LENGTH = struct.Struct("<I")
@@ -41,18 +40,17 @@ _BLOBS = ("uint8", "char")
 _BEYOND = f"(fields beyond {MAX_FIELDS})"
 
 
-# A sample; the header's stamp in microseconds if the message has one and it was asked for; the header's
-# frame_id, as bytes, if the message begins with a header: it is nearly always the same, which is seen
-# without decoding it.
+# The sample; the header's stamp in microseconds, if it exists and was asked for; and a leading header's
+# frame_id as bytes. The frame_id is nearly always the same, and the bytes can be compared without decoding.
 Decoded = Tuple[Dict[str, Value], Optional[int], Optional[bytes]]
 
 
 class Decoder:
-    """Decodes the messages of one definition. ``select`` are the paths wanted; None is for all.
+    """Decodes the messages of one definition. ``select`` are the selected paths; None selects all.
 
     ``stamped`` says whether messages begin with a header. ``unknown`` are selected paths that the message
-    does not have; ``left_out`` counts what was, by path. ``flat`` is the layout of a message that is
-    nothing but numbers at fixed places behind its header, and their names; None for all others.
+    does not have; ``left_out`` counts omitted values by path. ``flat`` is the layout of a message of numbers
+    only, at fixed places after its header, and their names; None for all others.
     """
 
     def __init__(
@@ -71,7 +69,7 @@ class Decoder:
         try:
             self._steps = compiler.message(headed=self.stamped)
         except struct.error as error:
-            raise MessageError(f"{self._kind}: no message is so large: {error}") from error
+            raise MessageError(f"{self._kind}: the message would be too large: {error}") from error
         self.unknown = sorted(set(select or ()) - compiler.used)
         self._walked = compiler.walked
         self.flat: tuple[struct.Struct, list[str]] | None = None
@@ -80,13 +78,13 @@ class Decoder:
 
     @property
     def walked(self) -> int:
-        """How many elements of variable size were walked so far, each field of theirs counted: what makes
-        a message dear to look into."""
+        """The number of walked elements of variable size, counting each of their fields. It is the main cost
+        of decoding."""
         return self._walked[0]
 
     def decode(self, data: bytes) -> Decoded:
-        """The sample in a message. Raises `MessageError` where the bytes do not fit the definition."""
-        # Read here and not by steps: after a pause each function called costs as much as the work in it.
+        """Decode a message; raises `MessageError` if the bytes do not fit the definition."""
+        # The header is read inline, not by steps: after a pause each call costs as much as its work.
         values: dict[str, Value] = {}
         at, stamp_us, frame = 0, None, None
         try:
@@ -95,14 +93,14 @@ class Decoder:
                 at = HEADER.size + length
                 frame = data[HEADER.size : at]
                 if self._stamp:
-                    # Wholes and remainders apart, for a float of seconds would lose the last digits.
+                    # Seconds and the rest apart, since a float of seconds would lose the last digits.
                     stamp_us = sec * 1_000_000 + nanosec // 1000
             for step in self._steps:
                 at = step(data, at, values)
         except struct.error as error:
-            raise MessageError(f"{self._kind}: the message of {len(data)} bytes is cut short") from error
+            raise MessageError(f"{self._kind}: the message of {len(data)} bytes is truncated") from error
         if at != len(data):
-            raise MessageError(f"{self._kind}: the message has {len(data)} bytes, its definition {at}")
+            raise MessageError(f"{self._kind}: the message must have {at} bytes, got {len(data)}")
         if len(values) > MAX_FIELDS:
             self.left_out[_BEYOND] = self.left_out.get(_BEYOND, 0) + 1
             values = dict(islice(values.items(), MAX_FIELDS))
@@ -110,7 +108,7 @@ class Decoder:
 
 
 class _Compiler:
-    """Turns types into steps. What is not kept is stepped over, in one step if its size is fixed."""
+    """Turns types into steps. An unselected field is skipped, in one step if its size is fixed."""
 
     def __init__(
         self,
@@ -132,8 +130,8 @@ class _Compiler:
         self.fixed: dict[Step, tuple[struct.Struct, list[str]]] = {}
 
     def message(self, *, headed: bool) -> list[Step]:
-        """The steps of a whole message, behind its header if it begins with one; a stamped one thing is
-        that thing."""
+        """The steps of a whole message, after a leading header. A message of a header and one nested message
+        gives the nested message."""
         run = _Run(self.fixed)
         body = self._definition.fields()[1 if headed else 0 :]
         lone = headed and len(body) == 1
@@ -160,7 +158,7 @@ class _Compiler:
             self._array(run, field, path, field.length)
 
     def _full(self) -> bool:
-        """Whether nothing more can be shown: what comes is stepped over and not taken apart."""
+        """Whether the sample is full; later fields are skipped as a whole."""
         return self._emitted > MAX_FIELDS or self._named > _MAX_NAMED
 
     def _single(self, run: _Run, kind: str, path: str) -> None:
@@ -180,7 +178,7 @@ class _Compiler:
             run.fixed(LETTERS[kind], path if wanted else None)
 
     def _array(self, run: _Run, field: Field, path: str, length: int) -> None:
-        """An array of fixed length, which is so many fields."""
+        """An array of fixed length, decoded as single fields."""
         whole = self._wanted(path)
         if whole and length > MAX_ELEMENTS:
             run.step(_noted(path, self._left_out))
@@ -195,7 +193,7 @@ class _Compiler:
         self._skip(run, Field(field.name, field.kind, length - done))
 
     def _variable(self, kind: str, path: str) -> Step:
-        """An array whose length each message says."""
+        """An array whose length is in each message."""
         size = self._size(kind)
         left_out, walked = self._left_out, self.walked
         whole, few = self._wanted(path), self._indexes(path, None)
@@ -210,7 +208,7 @@ class _Compiler:
         self._named += MAX_ELEMENTS if letter else 1
 
         def steps(i: int) -> list[Step]:
-            # Made when a message is first so long: most arrays stay short.
+            # Created on the first message of this length: most arrays stay short.
             if i not in elements:
                 if self._full():
                     return skip
@@ -223,7 +221,7 @@ class _Compiler:
             all_of_it = whole and not blob and n <= MAX_ELEMENTS
             if whole and not all_of_it:
                 left_out[path] = left_out.get(path, 0) + 1
-            # What comes now is cut off anyway.
+            # The following values do not fit anyway.
             all_of_it = all_of_it and len(out) <= MAX_FIELDS
             if size is not None and at + n * size > len(data):
                 raise struct.error
@@ -239,7 +237,7 @@ class _Compiler:
                     _walk(steps(i), data, at + i * size, out)
                 return at + int(n) * size
             if n > _MAX_WALKED:
-                raise MessageError(f"{path}: {n} elements are too many to look into")
+                raise MessageError(f"{path}: too many elements to decode: {n}")
             walked[0] += n * len(skip)
             for i in range(n):
                 at = _walk(steps(i) if all_of_it or i in few else skip, data, at, out)
@@ -267,7 +265,7 @@ class _Compiler:
             run.step(_repeated(self._skipped(field.kind), field.length))
 
     def _skipped(self, kind: str) -> list[Step]:
-        """The steps over one value of a type, made once."""
+        """The steps that skip one value of a type, created once."""
         if kind not in self._skips:
             run = _Run({})
             if self._size(kind) is not None:
@@ -278,13 +276,13 @@ class _Compiler:
                 inner = _Run({})
                 for nested in self._definition.fields(kind):
                     self._skip(inner, nested)
-                # One step, however much is within.
+                # One step, whatever its content.
                 run.step(_repeated(inner.finish(), 1))
             self._skips[kind] = run.finish()
         return self._skips[kind]
 
     def _size(self, kind: str) -> int | None:
-        """The bytes of a type, or None where a message's own content decides."""
+        """The size of a type in bytes, or None if it varies."""
         if kind in LETTERS:
             return struct.calcsize(f"<{LETTERS[kind]}")
         if kind == STRING:
@@ -302,10 +300,10 @@ class _Compiler:
             self._sizes[kind] = total
         return self._sizes[kind]
 
-    # What the selection says.
+    # The selection.
 
     def _wanted(self, path: str) -> bool:
-        """Whether the path itself is asked for, by its own name or that of something around it."""
+        """Whether the path is selected, by its own name or by a parent's."""
         if self._select is None:
             return True
         for name in self._select:
@@ -315,11 +313,11 @@ class _Compiler:
         return False
 
     def _within(self, path: str) -> bool:
-        """Whether the path, or something in it, is asked for."""
+        """Whether the path, or a path in it, is selected."""
         return self._wanted(path) or any(name.startswith(f"{path}.") for name in self._select or ())
 
     def _indexes(self, path: str, length: int | None) -> list[int]:
-        """The elements of an array that are asked for by their numbers."""
+        """The array elements that are selected by number."""
         numbers = set()
         for name in self._select or ():
             if name.startswith(f"{path}."):
@@ -389,7 +387,7 @@ def _text(path: str, left_out: dict[str, int]) -> Step:
     def step(data: bytes, at: int, out: dict[str, Value]) -> int:
         (n,) = _LENGTH.unpack_from(data, at)
         at += 4
-        # ROS 1 does not say how a text is encoded.
+        # ROS 1 does not define the encoding of a text.
         text = data[at : at + n].decode("utf-8", "replace") if n <= 4 * MAX_TEXT else None
         if text is None or len(text) > MAX_TEXT:
             left_out[path] = left_out.get(path, 0) + 1
@@ -435,7 +433,7 @@ def _skip_many(size: int | None, element: list[Step], walked: list[int]) -> Step
         if size is not None:
             return at + int(n) * size
         if n > _MAX_WALKED:
-            raise MessageError(f"{n} elements are too many to look into")
+            raise MessageError(f"too many elements to decode: {n}")
         walked[0] += n * len(element)
         for _ in range(n):
             at = _walk(element, data, at, out)

@@ -1,6 +1,6 @@
-"""ROS 1 message definitions, read from their text: what a message consists of, in the wire's order.
+"""Parses ROS 1 message definitions: the fields of a message, in the wire's order.
 
-The text is what a publisher sends in its connection header and what a bag keeps: the message's own
+The text is the one that a publisher sends in its connection header and that a bag keeps: the message's own
 definition, then each nested type's after a line of ``=`` and ``MSG: package/Type``.
 """
 
@@ -32,7 +32,7 @@ VARIABLE = -1
 
 _SEPARATOR = re.compile(r"^={20,}\s*$", re.MULTILINE)
 _LINE = re.compile(r"([A-Za-z][\w/]*)(?:\[(\d*)\])?\s+([A-Za-z]\w*)\s*(=?)", re.ASCII)
-# Deeper nesting, or a message of more fields, is no message that anybody sends.
+# Limits of nesting and of fields, beyond all messages in use.
 _MAX_DEPTH, _MAX_TYPES, _MAX_ARRAY = 32, 256, 2**24
 
 
@@ -58,25 +58,25 @@ class Definition(NamedTuple):
         return self.types[kind or self.kind]
 
     def stamped(self) -> bool:
-        """Whether the message begins with a header, as ROS asks of those that have one."""
+        """Whether the message begins with a header, as ROS requires."""
         fields = self.fields()
         return bool(fields) and fields[0] == Field("header", HEADER_TYPE, None)
 
 
 def parse(kind: str, text: str) -> Definition:
-    """The definition in a text. Raises `MessageError` for what is none."""
+    """Parse a definition; raises `MessageError` if it is invalid."""
     first, *others = _SEPARATOR.split(text)
     types: dict[str, Fields] = {
         TIME: (Field("sec", "uint32", None), Field("nanosec", "uint32", None)),
         DURATION: (Field("sec", "int32", None), Field("nanosec", "int32", None)),
     }
     if len(others) > _MAX_TYPES:
-        raise MessageError(f"{kind}: its definition has over {_MAX_TYPES} types")
+        raise MessageError(f"{kind}: definition must have at most {_MAX_TYPES} types")
     for section in others:
         head, _, body = section.strip().partition("\n")
         name = head[len("MSG:") :].strip() if head.startswith("MSG:") else ""
         if "/" not in name:
-            raise MessageError(f"{kind}: a nested type begins with {head[:60]!r}, not with MSG: package/Type")
+            raise MessageError(f"{kind}: a nested type must begin with MSG: package/Type, got {head[:60]!r}")
         types[name] = _fields(name, body)
     types[kind] = _fields(kind, first)
     definition = Definition(kind, types)
@@ -85,7 +85,7 @@ def parse(kind: str, text: str) -> Definition:
 
 
 def layout(definition: Definition) -> str:
-    """The definition without comments and constants, for `parse` to read: all that decoding needs."""
+    """The definition without comments and constants, in a form that `parse` reads: enough for decoding."""
     order = [definition.kind]
     for kind in order:
         nested = {field.kind: None for field in definition.types[kind]}
@@ -112,7 +112,7 @@ def _fields(kind: str, text: str) -> Fields:
             continue
         match = _LINE.match(stripped)
         if match is None or (not match.group(4) and match.end() != len(stripped)):
-            raise MessageError(f"{kind}: its definition has the line {stripped[:60]!r}")
+            raise MessageError(f"{kind}: the definition has an invalid line {stripped[:60]!r}")
         base, length, name, constant = match.groups()
         if constant:
             continue

@@ -1,4 +1,4 @@
-"""A message as it was published, and the type that says how to read it."""
+"""A message as published, and its type, which is needed to decode it."""
 
 from __future__ import annotations
 
@@ -10,13 +10,13 @@ from iort_contract.limits import MessageError, Value
 from iort_contract.ros1.decode import Decoder
 from iort_contract.ros1.definition import layout, parse
 
-# Of a layout in a batch; the definitions of ROS have some thousand characters.
+# The size limit of a layout in a batch; ROS definitions have some thousand characters.
 MAX_LAYOUT = 64 * 1024
 _LENGTH = struct.Struct("<I")
 
 
 def type_id(topic: str, kind: str, md5sum: str) -> str:
-    """The name by which a batch refers to a topic's type: 8 hex digits of a hash of the three."""
+    """A type's id in batches: 8 hex digits of a hash of topic, type and MD5."""
     named = f"{topic}\0{kind}\0{md5sum}".encode("utf-8", "replace")
     return hashlib.sha256(named).hexdigest()[:8]
 
@@ -24,8 +24,8 @@ def type_id(topic: str, kind: str, md5sum: str) -> str:
 class RosType:
     """The type of a topic's messages: ``definition`` is the text that a publisher sends.
 
-    ``decoder`` is None where the definition cannot be read, and ``error`` then says why; its messages are
-    recorded all the same. ``layout`` is the definition as a batch carries it, empty where there is none.
+    ``decoder`` is None if the definition is invalid, and ``error`` then says why; its messages are still
+    recorded. ``layout`` is the definition as a batch carries it, or empty.
     """
 
     def __init__(self, topic: str, kind: str, md5sum: str, definition: str) -> None:
@@ -39,16 +39,16 @@ class RosType:
                 self.decoder = Decoder(parsed)
                 self.layout = written
             else:
-                self.error = f"{kind}: its layout has over {MAX_LAYOUT} characters"
+                self.error = f"{kind}: layout must be at most {MAX_LAYOUT} characters"
         except MessageError as error:
             self.error = str(error)
 
 
 class RosMessage(Mapping[str, Value]):
-    """A serialized message, which reads as the flat sample that it makes; looked into when asked.
+    """A serialized message that reads like its flat sample; it is decoded on first use.
 
-    ``large`` are the bytes of its ``uint8[]`` fields, for whoever keeps them elsewhere; ``beside`` are fields
-    of the sample that are not in the message, such as where they are kept.
+    ``large`` are the bytes of its ``uint8[]`` fields, to be stored elsewhere; ``beside`` are fields of the
+    sample that are not in the message, such as the place of those bytes.
     """
 
     __slots__ = ("_values", "beside", "kind", "large", "raw")
@@ -88,20 +88,20 @@ class RosMessage(Mapping[str, Value]):
 
 
 def cut(raw: bytes, content: bytes) -> tuple[bytes, int]:
-    """The message with an empty array in the place of this one, and where that is; `filled` undoes it."""
+    """The message with an empty array in place of ``content``, and its position; `filled` undoes it."""
     at = raw.index(_LENGTH.pack(len(content)) + content)
     return raw[:at] + _LENGTH.pack(0) + raw[at + 4 + len(content) :], at
 
 
 def filled(raw: bytes, content: bytes, at: int) -> bytes:
-    """The message that `cut` was given. Raises `MessageError` where no empty array is there."""
+    """Undo `cut`; raises `MessageError` if the message has no empty array there."""
     if raw[at : at + 4] != _LENGTH.pack(0):
-        raise MessageError(f"no empty array at byte {at} of the message")
+        raise MessageError(f"the message has no empty array at byte {at}")
     return raw[:at] + _LENGTH.pack(len(content)) + content + raw[at + 4 :]
 
 
 class Messages(NamedTuple):
-    """A batch's messages as they were published, all of one type: its id, its layout, and their bytes."""
+    """A batch's messages as published, all of one type: its id, its layout, and their bytes."""
 
     type_id: str
     layout: str

@@ -1,7 +1,7 @@
-"""The codec of batches that keep their messages as they were published.
+"""The codec of batches that keep their messages as published.
 
-Messages of one length stand column by column, the first bytes of all, then the second: what hardly changes
-from message to message then packs to nearly nothing.
+Messages of one length are stored column by column, the first bytes of all, then the second: bytes that rarely
+change between messages then compress to nearly nothing.
 """
 
 from __future__ import annotations
@@ -12,18 +12,18 @@ from iort_contract.checks import COMPACT, json_object, shown
 from iort_contract.limits import MAX_COLUMNS_BYTES, MAX_SERIALIZED_BYTES, ContractError
 from iort_contract.ros1.message import Messages
 
-# Longer ones differ in more than they share.
+# Longer messages differ in more than they share.
 _MAX_TURNED = 16 * 1024
 _MAX_HEAD_BYTES = 1024 * 1024
 
 
 def pack(messages: Messages) -> bytes:
-    """The messages as bytes. Raises `ContractError` where they are too large for a batch."""
+    """The messages as bytes; raises `ContractError` if they are too large for a batch."""
     raws = messages.raw
     total = sum(map(len, raws))
     allowed = MAX_SERIALIZED_BYTES if len(raws) > 1 else MAX_COLUMNS_BYTES
     if total > allowed:
-        raise ContractError(f"messages of {total} bytes: allowed is up to {allowed} in a batch")
+        raise ContractError(f"messages of a batch must be at most {allowed} bytes, got {total}")
     sizes = set(map(len, raws))
     data = b"".join(raws)
     turned = len(sizes) == 1 and 0 < max(sizes) <= _MAX_TURNED
@@ -39,22 +39,22 @@ def pack(messages: Messages) -> bytes:
 
 
 def unpack(body: bytes, n: int) -> Messages:
-    """The ``n`` messages; raises `ContractError` for what `pack` cannot have written."""
+    """Decode ``n`` messages; raises `ContractError` for everything that `pack` cannot have written."""
     end = body.find(b"\n", 0, _MAX_HEAD_BYTES)
     if end < 0:
-        raise ContractError("messages without a head")
+        raise ContractError("messages must have a head")
     head = json_object(body[:end], "the messages' head")
     data = body[end + 1 :]
     if n > 1 and len(data) > MAX_SERIALIZED_BYTES:
         raise ContractError(
-            f"messages of {len(data)} bytes: allowed is up to {MAX_SERIALIZED_BYTES} in a batch"
+            f"messages of a batch must be at most {MAX_SERIALIZED_BYTES} bytes, got {len(data)}"
         )
     kind, layout, sizes = head.get("type"), head.get("layout"), head.get("sizes")
     if not isinstance(kind, str) or not isinstance(layout, str):
-        raise ContractError("messages without a type and a layout")
+        raise ContractError("messages must have a type and a layout")
     if type(sizes) is int:
         if not 0 < sizes <= _MAX_TURNED or len(data) != n * sizes:
-            raise ContractError(f"messages of {len(data)} bytes: expected {n} of {shown(sizes)}")
+            raise ContractError(f"messages must be {n} of {shown(sizes)} bytes, got {len(data)} bytes")
         turned = bytearray(len(data))
         for at in range(sizes):
             turned[at::sizes] = data[at * n : (at + 1) * n]
@@ -66,7 +66,7 @@ def _parted(data: bytes, sizes: object, n: int) -> Sequence[bytes]:
     if not isinstance(sizes, list) or len(sizes) != n or not set(map(type, sizes)) <= {int} or min(sizes) < 0:
         raise ContractError(f"the messages' sizes must be {n} integers")
     if sum(sizes) != len(data):
-        raise ContractError(f"messages of {len(data)} bytes: their sizes say {sum(sizes)}")
+        raise ContractError(f"messages must be {sum(sizes)} bytes by their sizes, got {len(data)}")
     parts, at = [], 0
     for size in sizes:
         parts.append(data[at : at + size])
