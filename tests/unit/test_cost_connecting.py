@@ -10,15 +10,14 @@ import pytest
 
 from functions.shared.metrics import emit
 from iort_agent.agent import Agent
-from iort_agent.clock import ManualClock
 from iort_agent.config.file import Config
 from iort_agent.dispatch import Dispatcher
-from iort_agent.mqtt.loopback import Loopback
 from iort_agent.spool.memory import MemorySpool
 from iort_contract import SHADOW
 from iort_station.cost import model, scale
 from iort_station.cost.prices import QUOTAS
 from iort_station.cost.usage import Usage
+from tests.agent_fakes import Loopback, ManualClock
 
 _ONE = Usage()
 # AWS IoT Core, "Additional metering details".
