@@ -23,8 +23,8 @@ _INTRODUCTION = """# iort
 `iort` is the operator's command: the same on AWS, by the usual credentials and region, and on the embedded
 cloud, which is meant with `--local`, or when one runs in the checkout around this folder and nothing says
 AWS. What is asked for goes to standard output, everything else to standard error, so that it pipes well. It
-exits with 0, or with 1 and one line that says why, or with 2 where it is called wrongly. `iort --install-completion` teaches
-your shell the commands and options.
+exits with 0, or with 1 and one line that says why, or with 2 where it is called wrongly. `iort
+--install-completion` teaches your shell the commands and options.
 """
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from decimal import Decimal
+from typing import Any, Mapping
 
 from boto3.dynamodb.types import TypeDeserializer
 
@@ -16,3 +17,8 @@ class _Exact(TypeDeserializer):  # type: ignore[misc]  # boto3 has no types
 
 
 deserialize = _Exact().deserialize
+
+
+def plain(item: Mapping[str, Any]) -> dict[str, Any]:
+    """An item as Python values; numbers are Decimals, bytes are boto3's `Binary`."""
+    return {name: deserialize(value) for name, value in item.items()}

@@ -43,6 +43,8 @@ PUT_OFF_SINCE_MS, PUT_OFF_LAST_MS, PUT_OFF = "since_ms", "last_ms", "batches"
 # What a queue's message of Lambda 2's carries: the stored item as DynamoDB JSON, in base64.
 ITEM_BASE64 = "base64Item"
 
+# Lambda 2 reads a robot's row of the registry again after this time at the latest.
+VEHICLE_CACHE_S = 60.0
 # Of a robot in the registry: the streams that Lambda 2 has seen of it.
 STREAMS = "streams"
 # The registry's row of a robot, beside its vehicle parameters. Of its connection, by the broker's

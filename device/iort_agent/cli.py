@@ -101,11 +101,7 @@ def _parse(arguments: list[str]) -> argparse.Namespace:
     claiming.add_argument("--robot", metavar="NAME", help="the robot's name, instead of the claim's")
     renewing = command("renew", renew, "replace the robot's key and certificate, with a new claim")
     renewing.add_argument("--claim", type=Path, required=True, metavar="FILE", help="the claim's YAML file")
-    if (
-        arguments
-        and arguments[0] not in commands.choices
-        and arguments[0] not in ("-h", "--help", "--version")
-    ):
+    if arguments and arguments[0] not in (*commands.choices, "-h", "--help", "--version"):
         arguments = ["run", *arguments]
     remappings = []
     if arguments and arguments[0] == "run":

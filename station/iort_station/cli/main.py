@@ -53,7 +53,7 @@ app.add_typer(send.commands)
 app.add_typer(config.commands)
 
 
-def _print_version(asked: bool) -> None:
+def _print_version(asked: bool) -> None:  # noqa: FBT001 - typer passes it by position
     if asked:
         typer.echo(f"iort {version('iort-station')}")
         raise typer.Exit
