@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import replace
 from typing import NamedTuple
 
 from iort_station.cost.line_items import dollars_per_month, total
@@ -69,11 +68,6 @@ def on_paper(usage: Usage, prices: Mapping[str, Price] = PRICES) -> Scale:
         total(pubnub_bill(usage, prices)) * usage.robot_hours_per_month,
         usage.live_hz * usage.robots,
     )
-
-
-def fleets(usage: Usage, sizes: tuple[int, ...] = (1, 100, 10_000, 1_000_000)) -> list[Scale]:
-    """The same driving with other numbers of robots."""
-    return [on_paper(replace(usage, robots=robots)) for robots in sizes]
 
 
 _RESERVED = "Lambda 1: concurrency reserved by this deployment"
