@@ -3,9 +3,8 @@
 from __future__ import annotations
 
 import threading
-from collections.abc import Callable
 from functools import partial
-from typing import NamedTuple
+from typing import Callable, NamedTuple, Optional
 
 from iort_agent.clock import Clock
 from iort_agent.dispatch import Dispatcher
@@ -58,7 +57,7 @@ class Published(NamedTuple):
 
 
 # What the broker makes of a publish: None to accept, otherwise why not.
-Verdict = Callable[[Published], str | None]
+Verdict = Callable[[Published], Optional[str]]
 
 
 class Loopback:
