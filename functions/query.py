@@ -22,7 +22,7 @@ from typing import Any
 import boto3
 from botocore.config import Config
 
-from functions.shared.tables import Tables, plain
+from functions.shared.tables import Tables
 from iort_contract import (
     BATCH,
     DERIVED_UNITS,
@@ -39,6 +39,7 @@ from iort_contract import (
     expression,
     parse_topic,
 )
+from iort_contract.attributes import plain
 from iort_contract.expression import ExpressionError, MismatchError, Node
 from iort_contract.statistics import derive, without_absent
 

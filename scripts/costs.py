@@ -9,7 +9,8 @@ from pathlib import Path
 ROOT = Path(__file__).resolve().parent.parent
 sys.path.insert(0, str(ROOT))
 
-from iort_station.cost import report, scale
+from bench.fleet_costs import fleets
+from iort_station.cost import report
 from iort_station.cost.prices import AS_OF, REGION
 from iort_station.cost.usage import Usage
 
@@ -22,10 +23,16 @@ def tables() -> dict[str, str]:
     usage = Usage()
     dated = f"List prices of {AS_OF}, {REGION}, in US dollars; one robot, {usage.rate_hz:g} Hz.\n\n"
     return {
-        "hour": dated + report.robot_hour(usage).markdown(),
-        "whatif": dated + report.what_if(usage).markdown(),
-        "scale": report.fleets(scale.fleets(usage)).markdown(),
+        "hour": dated + markdown(report.robot_hour(usage)),
+        "whatif": dated + markdown(report.what_if(usage)),
+        "scale": markdown(fleets(usage)),
     }
+
+
+def markdown(rows: report.Rows) -> str:
+    """A Markdown table, numbers to the right."""
+    lines = [rows.head, ("---", *("---:" for _ in rows.head[1:])), *rows.body]
+    return "\n".join(f"| {' | '.join(line)} |" for line in lines)
 
 
 def filled(text: str) -> str:

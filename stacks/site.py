@@ -15,7 +15,7 @@ from aws_cdk import aws_cloudfront_origins as origins
 from aws_cdk import aws_s3 as s3
 from constructs import Construct
 
-from iort_station.page.page import HEADERS, PUBNUB_ORIGIN, security_policy
+from iort_contract.page import HEADERS, PUBNUB_ORIGIN, security_policy
 from stacks.settings import Settings
 
 _HSTS = Duration.days(365)

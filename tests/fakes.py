@@ -12,8 +12,9 @@ from boto3.dynamodb.types import TypeSerializer
 from botocore.exceptions import ClientError
 
 import iort_contract
-from functions.shared.tables import Tables, plain
+from functions.shared.tables import Tables
 from iort_contract import BATCH, EXPIRES_S, RECEIVED_MS, ROBOT, SECOND, TOPIC, Batch
+from iort_contract.attributes import plain
 from iort_contract.checks import json_object
 
 serialize = TypeSerializer().serialize

@@ -10,8 +10,9 @@ from typing import Any
 
 from bench.load.fleet_load import SAMPLES as BATCH_SAMPLES
 from iort_contract import BATCH, RECEIVED_MS, SAMPLES, SECOND, VESC_STREAM, batch_id
+from iort_contract.attributes import plain
 from iort_station.cloud import Cloud
-from iort_station.data.items import of_topic, plain
+from iort_station.data.items import of_topic
 
 # Takes the share done and the name of the step.
 Tell = Callable[[float, str], None]

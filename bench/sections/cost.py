@@ -4,10 +4,11 @@ from __future__ import annotations
 
 from dataclasses import asdict, replace
 
+from bench.fleet_costs import fleets
 from bench.report import plots
 from bench.report.result import Plot, Ratio, Section, Table
 from bench.target import Say, Target
-from iort_station.cost import line_items, model, report, scale
+from iort_station.cost import line_items, model, report
 from iort_station.cost.prices import AS_OF, REGION
 from iort_station.cost.usage import Usage
 
@@ -30,7 +31,7 @@ def run(target: Target, say: Say) -> Section:
     for title, rows in (
         (f"Dollars a robot-hour, list prices of {AS_OF} in {REGION}", report.robot_hour(usage)),
         ("What each setting does", report.what_if(usage)),
-        ("On paper: needs of AWS' default quotas", report.fleets(scale.fleets(usage))),
+        ("On paper: needs of AWS' default quotas", fleets(usage)),
     ):
         section.tables.append(Table(title, list(rows.head), [list(row) for row in rows.body]))
     thesis = line_items.total(model.thesis_bill(usage))

@@ -18,13 +18,13 @@ from boto3.dynamodb.conditions import Attr, Key
 
 from bench.errors import BenchError
 from bench.load import stored_drive
+from bench.message_sizes import item_bytes
 from bench.meters import cpu
 from bench.report import plots, thesis
 from bench.report.result import NOT_MEASURED, Plot, Ratio, Section, Table
 from bench.report.spread import ratio, spread
 from bench.target import Say, Target
 from iort_contract import RECEIVED_MS, RECORD, TOPIC, VESC_STREAM, build_topic
-from iort_station.cost.sizes import item_bytes
 from iort_station.data import data
 from iort_station.operations import delivery
 

@@ -11,7 +11,6 @@ from __future__ import annotations
 
 from iort_contract.checks import check_field, json_object
 from iort_contract.cloud import (
-    FILES_PREFIX,
     LOW_VOLTAGE_V,
     METRIC_DEPLOYMENT,
     METRIC_FUNCTION,
@@ -85,6 +84,7 @@ from iort_contract.messages.event import MESSAGE_BASE64, event_message, rule_eve
 from iort_contract.messages.files import (
     CLAIM_AT,
     CLAIM_FIELDS,
+    FILES_PREFIX,
     KINDS,
     MAX_ADDRESSES,
     MAX_FILE_BYTES,
@@ -176,6 +176,7 @@ from iort_contract.tables import (
     STREAMS,
     T_US,
     TOPIC,
+    VEHICLE_CACHE_S,
 )
 from iort_contract.topics import (
     ACCEPTED,
@@ -358,6 +359,7 @@ __all__ = [
     "TYPES_STREAM",
     "T_US",
     "UPLOAD_URL_S",
+    "VEHICLE_CACHE_S",
     "VESC_FIELDS",
     "VESC_STREAM",
     "VOLTAGE_FIELD",

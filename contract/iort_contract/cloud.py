@@ -26,8 +26,8 @@ from iort_contract.vesc import FAULT_FIELD, VOLTAGE_FIELD
 _PRESENCE = "$aws/events/presence"
 # A battery of three lithium cells below this is nearly empty; a deployment can set another value.
 LOW_VOLTAGE_V = 10.5
-# The files' bucket: robots' uploads, and large query results, which expire after a day.
-FILES_PREFIX, RESULTS_PREFIX = "robots/", "results/"
+# Query results too large for an answer, in the files' bucket for a day.
+RESULTS_PREFIX = "results/"
 
 METRIC_NAMESPACE = "iort"
 # The dimensions of every metric: the deployment's namespace and the function.

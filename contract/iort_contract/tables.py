@@ -42,6 +42,8 @@ PUT_OFF_SINCE_MS, PUT_OFF_LAST_MS, PUT_OFF = "since_ms", "last_ms", "batches"
 # In a queue message of Lambda 2: the stored item as DynamoDB JSON, in base64.
 ITEM_BASE64 = "base64Item"
 
+# Lambda 2 reads a robot's row of the registry again after this time at the latest.
+VEHICLE_CACHE_S = 60.0
 # Registry: the streams that Lambda 2 has seen of a robot.
 STREAMS = "streams"
 # Registry, beside the vehicle parameters: a robot's connection, from the broker's lifecycle events. Times are

@@ -5,7 +5,7 @@ from __future__ import annotations
 import logging
 import math
 import time
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping
 from contextlib import suppress
 from itertools import islice
 from typing import Any
@@ -19,41 +19,29 @@ from iort_contract import (
     SECOND,
     STREAMS,
     TOPIC,
+    VEHICLE_CACHE_S,
     BatchId,
     ContractError,
     Statistics,
     batch_id,
     batches_between,
 )
-from iort_contract.attributes import deserialize
+from iort_contract.attributes import plain
 from iort_contract.statistics import Vehicle
+from iort_contract.table_writer import WRITE_SIZE, write
 
 _log = logging.getLogger(__name__)
-# BatchWriteItem takes at most this many items a call.
-WRITE_SIZE = 25
-_WRITE_ATTEMPTS = 8
 # Page size, once many batches are wanted.
 _MANY = 100
 # How many streams a robot's row names, of which each write costs by its size, and how many an environment
 # knows to be there.
 MAX_STREAMS, _NOTED = 200, 50_000
-# What the operator changes in the registry counts after this time at the latest.
-VEHICLE_CACHE_S = 60.0
 # "Limits", items: 400 KB including the names; a margin is left for the size of numbers.
 _MAX_ITEM_BYTES = 380 * 1024
 # The longest text of a float; its stored number is shorter.
 _MAX_NUMBER_BYTES = 25
 # The range of a DynamoDB number, "Supported data types": 38 digits, 1e-130 to 9.99e125.
 _LARGEST, _SMALLEST = 9.99e125, 1e-130
-
-
-class TableError(Exception):
-    """DynamoDB did not take the items in time; the caller may try again."""
-
-
-def plain(image: Mapping[str, Any]) -> dict[str, Any]:
-    """An item as Python values; numbers are Decimal."""
-    return {name: deserialize(value) for name, value in image.items()}
 
 
 def attribute(value: Statistics) -> dict[str, Any]:
@@ -202,18 +190,6 @@ class Tables:
     def _second_item(self, topic: str, second: int, summary: Mapping[str, Statistics]) -> dict[str, Any]:
         item = fitting({name: attribute(value) for name, value in summary.items()})
         return {**item, TOPIC: {"S": topic}, SECOND: {"N": str(second)}}
-
-
-def write(client: Any, table: str, requests: Sequence[Mapping[str, Any]]) -> None:
-    """Write at most `WRITE_SIZE` requests to a table; raises `TableError` if some stay unwritten."""
-    for attempt in range(_WRITE_ATTEMPTS):
-        answer = client.batch_write_item(RequestItems={table: requests})
-        requests = answer.get("UnprocessedItems", {}).get(table, [])
-        if not requests:
-            return
-        # DynamoDB asks for exponential backoff before unprocessed items are sent again.
-        time.sleep(0.02 * 2**attempt)
-    raise TableError(f"{len(requests)} items of {table} not written after {_WRITE_ATTEMPTS} attempts")
 
 
 def fitting(item: dict[str, Any]) -> dict[str, Any]:

@@ -6,7 +6,7 @@ from typing import Any
 
 import pytest
 
-from iort_station.page.page import HEADERS, PUBNUB_ORIGIN, security_policy
+from iort_contract.page import HEADERS, PUBNUB_ORIGIN, security_policy
 from stacks.settings import Settings
 
 

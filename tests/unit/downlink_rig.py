@@ -10,7 +10,6 @@ from pathlib import Path
 from typing import Any
 
 import iort_contract
-from iort_agent.clock import ManualClock
 from iort_agent.config.downlink import DownlinkConfig, share_rule
 from iort_agent.config.schema import Where, load
 from iort_agent.control.downlink import Downlink
@@ -18,9 +17,9 @@ from iort_agent.dispatch import Dispatcher
 from iort_agent.errors import SourceError
 from iort_agent.lanes.clock_offset import Offset
 from iort_agent.lanes.rate_limiter import Allowance
-from iort_agent.mqtt.loopback import Loopback
 from iort_contract import Command
 from iort_contract.ros1.definition import Definition, parse
+from tests.agent_fakes import Loopback, ManualClock
 
 RULE = "=" * 80
 HEADER = f"{RULE}\nMSG: std_msgs/Header\nuint32 seq\ntime stamp\nstring frame_id\n"

@@ -12,7 +12,6 @@ import pytest
 from botocore.stub import Stubber
 
 from functions import admit
-from functions.shared.tables import plain
 from iort_contract import (
     ADMIT_CLAIM,
     ADMIT_FINGERPRINT,
@@ -22,6 +21,7 @@ from iort_contract import (
     CONNECTED_MS,
     SERIAL,
 )
+from iort_contract.attributes import plain
 from tests.fakes import ROBOTS
 
 LATER_S = int(time.time()) + 3600

@@ -11,8 +11,8 @@ import pytest
 
 import iort_contract
 from functions import presence
-from functions.shared.tables import plain
 from iort_contract import ContractError
+from iort_contract.attributes import plain
 from tests.fakes import ROBOTS
 
 MINUTE_MS = 60_000

@@ -9,7 +9,6 @@ from pathlib import Path
 import pytest
 
 import iort_contract
-from functions.shared.tables import plain
 from iort_contract import (
     Batch,
     Command,
@@ -24,6 +23,7 @@ from iort_contract import (
     decode_live,
     messages_of,
 )
+from iort_contract.attributes import plain
 from iort_station.data.stored import Refused, blocks
 from iort_station.operations.audit import audit
 from tests.fakes import item_of, serialize

@@ -6,7 +6,7 @@ from datetime import datetime, timezone
 
 import pytest
 
-from iort_station.cli.times import duration_us, has_zone, iso, iso_s, time_us
+from iort_station.data.times import duration_us, has_zone, iso, iso_s, time_us
 from iort_station.errors import StationError
 
 NOW = 1_700_000_000_123_456

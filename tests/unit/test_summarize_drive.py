@@ -9,8 +9,8 @@ import pytest
 import iort_contract
 from functions import summarize
 from functions.shared import processing
-from functions.shared.tables import plain
 from iort_contract import Batch
+from iort_contract.attributes import plain
 from tests.fakes import (
     NAMES,
     ROBOTS,

@@ -12,8 +12,8 @@ import pytest
 import iort_contract
 from functions.shared import tables as tables_module
 from functions.shared.processing import process
-from functions.shared.tables import TableError
 from iort_contract import BatchId
+from iort_contract.table_writer import TableError
 from tests.fakes import (
     ROBOTS,
     FakeDynamoDB,

@@ -10,11 +10,12 @@ from dataclasses import dataclass
 from typing import Any, Mapping, NamedTuple, Sequence
 
 from iort_contract.checks import BOOT, check_time, check_version, checked, integer, json_object, shown, text
-from iort_contract.cloud import FILES_PREFIX
 from iort_contract.limits import SCHEMA_VERSION, ContractError
 from iort_contract.tables import T_US
 from iort_contract.topics import check_robot
 
+# Where robots upload to, in the files' bucket.
+FILES_PREFIX = "robots/"
 # S3 takes up to 10,000 parts of 5 MiB and more, with a SHA-256 each.
 PART_BYTES = 8 * 1024 * 1024
 MAX_FILE_BYTES = 64 * 1024**3

@@ -4,15 +4,14 @@ from __future__ import annotations
 
 import sys
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from contextlib import contextmanager
 
 from rich.progress import BarColumn, Progress, TextColumn
 
 from iort_station.cli.console import Console, visible
+from iort_station.data.reading import Told
 
-# Hears how many items a page had, and the microseconds at which the last of them starts.
-Told = Callable[[int, int], None]
 _PATIENCE_S = 1.0
 
 

@@ -22,11 +22,6 @@ class Rows(NamedTuple):
     head: tuple[str, ...]
     body: list[tuple[str, ...]]
 
-    def markdown(self) -> str:
-        """As a Markdown table, numbers to the right."""
-        lines = [self.head, ("---", *("---:" for _ in self.head[1:])), *self.body]
-        return "\n".join(f"| {' | '.join(line)} |" for line in lines)
-
 
 def robot_hour(usage: Usage, prices: Mapping[str, Price] = PRICES) -> Rows:
     """Dollars a robot-hour by service and lane, thesis' layout beside ours, PubNub apart."""
@@ -102,7 +97,7 @@ def quotas(scale: Scale) -> Rows:
         at = "never" if need.robots_at_quota is None else f"{need.robots_at_quota:,.0f}"
         fixed = "" if need.quota.adjustable else ", fixed"
         quota = f"{need.quota.value:,.0f} {need.quota.unit}{fixed}"
-        body.append((need.name, f"{need.needed:,.1f}", quota, _times(need.times), at))
+        body.append((need.name, f"{need.needed:,.1f}", quota, times(need.times), at))
     return Rows(
         (
             f"{scale.robots:,} robot{'s' * (scale.robots > 1)}",
@@ -115,33 +110,11 @@ def quotas(scale: Scale) -> Rows:
     )
 
 
-def fleets(scales: list[Scale]) -> Rows:
-    """A column a fleet: the need of each quota as a multiple of it, and dollars a month."""
-    head = (
-        "needed, as a multiple of the default quota",
-        *(f"{scale.robots:,} robot{'s' * (scale.robots > 1)}" for scale in scales),
-    )
-    body: list[tuple[str, ...]] = []
-    for need in scales[-1].needs:
-        times = [next(n.times for n in scale.needs if n.name == need.name) for scale in scales]
-        body.append((need.name, *(f"**{_times(value)}**" if value > 1 else _times(value) for value in times)))
-    body.append(("breaks first", *(_first(scale) for scale in scales)))
-    body.append(("AWS, dollars a month", *(f"{scale.aws_dollars_per_month:,.0f}" for scale in scales)))
-    body.append(
-        ("PubNub by transactions, a month", *(f"{scale.pubnub_dollars_per_month:,.0f}" for scale in scales))
-    )
-    body.append(("PubNub, publishes/s", *(f"{scale.pubnub_publishes_per_s:,.0f}" for scale in scales)))
-    return Rows(head, body)
-
-
-def _times(value: float) -> str:
+def times(value: float) -> str:
+    """A multiple, with as many digits as it deserves."""
     if value >= 10:
         return f"{value:,.0f}"
     return f"{value:.2g}" if value >= 0.001 else "< 0.001"
-
-
-def _first(scale: Scale) -> str:
-    return scale.breaks_first.name if scale.breaks_first.times > 1 else "none"
 
 
 def _sum(items: list[line_items.Item], service: str, lane: str) -> float:

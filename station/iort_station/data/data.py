@@ -20,20 +20,19 @@ import numpy as np
 from numpy.typing import NDArray
 
 from iort_contract import DERIVED_UNITS, MessageType
-from iort_station.cli.progress import Told
-from iort_station.cli.times import Time, duration_us
 from iort_station.cloud import Cloud
-from iort_station.data import query_function, reading
+from iort_station.data import inventory, query_function, reading
 from iort_station.data.blocks import Block, join
 from iort_station.data.conditions import Column, derive, holds
+from iort_station.data.reading import Told
 from iort_station.data.resample import resample
 from iort_station.data.seconds import seconds
 from iort_station.data.selection import Selection, select
 from iort_station.data.sensors import Sensors
 from iort_station.data.stored import ATTRIBUTES, Refused, blocks
+from iort_station.data.times import Time, duration_us
 from iort_station.data.units import Driver, unit
 from iort_station.errors import StationError
-from iort_station.fleet import inventory
 
 # Where samples are chosen: on this machine, or by the query function in the cloud.
 CLIENT, LAMBDA = "client", "lambda"

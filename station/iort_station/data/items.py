@@ -1,18 +1,11 @@
-"""Items of the tables: which to ask for, and what they are in Python's own types."""
+"""Requests for the items of a stream."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from typing import Any
 
 from iort_contract import RECORD, TOPIC, build_topic
-from iort_contract.attributes import deserialize
 from iort_station.cloud import Cloud
-
-
-def plain(item: Mapping[str, Any]) -> dict[str, Any]:
-    """An item as Python values; numbers are Decimals, bytes are boto3's `Binary`."""
-    return {name: deserialize(value) for name, value in item.items()}
 
 
 def of_topic(cloud: Cloud, table: str, robot: str, stream: str, *fields: str) -> dict[str, Any]:

@@ -13,14 +13,14 @@ from typing import Any
 import numpy as np
 
 from iort_contract import PLAIN_CODEC
-from iort_station.cli.progress import Told
 from iort_station.cloud import Cloud
+from iort_station.data import inventory
 from iort_station.data.blocks import Block, column_of, join, ordered
+from iort_station.data.reading import Told
 from iort_station.data.selection import Selection
 from iort_station.data.sensors import Sensors
 from iort_station.data.stored import Refused
 from iort_station.errors import StationError
-from iort_station.fleet import inventory
 
 _DOWNLOAD_S = 60
 

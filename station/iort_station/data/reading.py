@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from decimal import Decimal
 from typing import Any, TypeVar
@@ -18,11 +18,12 @@ from iort_contract import (
     batches_between,
     build_topic,
 )
-from iort_station.cli.progress import Told
 from iort_station.cloud import Cloud
 from iort_station.data.selection import Selection
 
 Item = Mapping[str, Any]
+# Hears how many items a page had, and the microseconds at which the last of them starts.
+Told = Callable[[int, int], None]
 
 # No time reaches these, see contract/.
 _FIRST, _LAST = -(2**53), 2**53

@@ -21,12 +21,11 @@ from iort_contract import (
     expression,
     flat_second,
 )
-from iort_station.cli.progress import Told
 from iort_station.cloud import Cloud
 from iort_station.data import reading
 from iort_station.data.blocks import Block, objects
 from iort_station.data.conditions import Column, holds
-from iort_station.data.reading import Item
+from iort_station.data.reading import Item, Told
 from iort_station.data.selection import Selection
 from iort_station.errors import StationError
 

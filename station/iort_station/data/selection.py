@@ -9,7 +9,7 @@ from dataclasses import dataclass, field
 import iort_contract
 from iort_contract import ContractError, expression
 from iort_contract.expression import ExpressionError, Node
-from iort_station.cli.times import Time, time_us
+from iort_station.data.times import Time, time_us
 from iort_station.errors import StationError
 
 # What each derived quantity is made of.

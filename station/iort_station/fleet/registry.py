@@ -22,8 +22,8 @@ from iort_contract import (
     ContractError,
     check_robot,
 )
+from iort_contract.attributes import plain
 from iort_station.cloud import Cloud
-from iort_station.data.items import plain
 from iort_station.errors import StationError
 
 _serialize = TypeSerializer().serialize

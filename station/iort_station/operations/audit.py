@@ -26,8 +26,9 @@ from iort_contract import (
     build_topic,
     decode,
 )
+from iort_contract.attributes import plain
 from iort_station.cloud import Cloud
-from iort_station.data.items import of_topic, plain
+from iort_station.data.items import of_topic
 
 # Later than the run's fastest batch by more than this. A batch is a second long, and the next one
 # that is sent at once arrives within milliseconds.

@@ -7,8 +7,9 @@ from dataclasses import dataclass
 from typing import Any
 
 from iort_contract import SAMPLES, Batch, decode
+from iort_contract.attributes import plain
 from iort_station.cloud import Cloud
-from iort_station.data.items import of_topic, plain
+from iort_station.data.items import of_topic
 
 
 @dataclass(frozen=True)

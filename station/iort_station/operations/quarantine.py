@@ -20,8 +20,8 @@ from iort_contract import (
     TOPIC,
     as_subscribed,
 )
+from iort_contract.attributes import plain
 from iort_station.cloud import Cloud
-from iort_station.data.items import plain
 from iort_station.errors import StationError
 
 _LISTED = (ROBOT, ENTRY, SOURCE, TOPIC, REASON, FIRST_MS, LAST_MS, SEEN, REPLAYS)

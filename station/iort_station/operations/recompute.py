@@ -8,16 +8,22 @@ from collections.abc import Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from typing import Any, NamedTuple
 
-from functions.shared.tables import VEHICLE_CACHE_S
-from iort_contract import EXPIRES_S, OWN_STREAMS, RECEIVED_MS, RECOMPUTE_FROM_S, RECOMPUTED, ROBOT, TOPIC
-from iort_station.cli.progress import Told
+from iort_contract import (
+    EXPIRES_S,
+    OWN_STREAMS,
+    RECEIVED_MS,
+    RECOMPUTE_FROM_S,
+    RECOMPUTED,
+    ROBOT,
+    TOPIC,
+    VEHICLE_CACHE_S,
+)
 from iort_station.cloud import Cloud
-from iort_station.data import reading
-from iort_station.data.reading import Item
+from iort_station.data import inventory, reading
+from iort_station.data.reading import Item, Told
 from iort_station.data.selection import Selection
 from iort_station.data.stored import ATTRIBUTES
 from iort_station.errors import StationError
-from iort_station.fleet import inventory
 from iort_station.operations.replay import summarize
 
 # As long as Lambda 2 may go on with the old parameters, and a little for what it is in the middle of.

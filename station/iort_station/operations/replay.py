@@ -31,9 +31,9 @@ from iort_contract import (
     ContractError,
     decode_item,
 )
+from iort_contract.attributes import plain
 from iort_contract.checks import COMPACT, json_object
 from iort_station.cloud import Cloud
-from iort_station.data.items import plain
 from iort_station.errors import StationError
 from iort_station.operations.quarantine import Entry, key, load
 from iort_station.recordings.old_batches import is_old, upgraded, upgraded_item

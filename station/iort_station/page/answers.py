@@ -12,10 +12,10 @@ import numpy as np
 
 from iort_contract import CLAIM_FIELDS, check_robot
 from iort_station.cloud import Cloud
-from iort_station.data import data
+from iort_station.data import data, inventory
 from iort_station.data.conditions import Column, values
 from iort_station.errors import StationError
-from iort_station.fleet import inventory, registry
+from iort_station.fleet import registry
 from iort_station.operations import cloudwatch, cloudwatch_logs
 
 # A chart has no more points across.

@@ -1,4 +1,4 @@
-"""The live page: what it is told, and under which policy a browser may run it.
+"""The live page: its files, and the configuration that it is told.
 
 ``npm run build`` makes it from station/web into the folder `built`. `iort_station.page.server` serves it, and
 `iort_station.page.site` puts it on the web.
@@ -8,24 +8,19 @@ from __future__ import annotations
 
 import math
 import re
+from importlib.resources import files
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import iort_contract
+from iort_contract.page import PUBNUB_ORIGIN
 from iort_station.data.units import ROS_UNITS, agent_unit
 from iort_station.errors import StationError
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
 
-BUILT = Path(__file__).resolve().parent / "built"
-PUBNUB_ORIGIN = "ps.pndsn.com"
-# Beside the policy, on every file.
-HEADERS = {
-    "X-Content-Type-Options": "nosniff",
-    "Referrer-Policy": "no-referrer",
-    "Cross-Origin-Resource-Policy": "same-origin",
-}
+BUILT = Path(str(files("iort_station.page") / "built"))
 TYPES = {
     ".html": "text/html; charset=utf-8",
     ".css": "text/css; charset=utf-8",
@@ -125,21 +120,3 @@ def field_table() -> dict[str, Any]:
         "ros_units": ROS_UNITS,
         "faults": faults,
     }
-
-
-def security_policy(*, origin: str, tls: bool) -> str:
-    """The page's Content-Security-Policy: its own files, PubNub at ``origin``, and nothing else."""
-    pubnub = f"{'https' if tls else 'http'}://{origin}"
-    return "; ".join(
-        (
-            "default-src 'none'",
-            "script-src 'self'",
-            "worker-src 'self'",
-            "style-src 'self'",
-            "img-src 'self'",
-            f"connect-src 'self' {pubnub}",
-            "base-uri 'none'",
-            "form-action 'none'",
-            "frame-ancestors 'none'",
-        )
-    )

@@ -30,17 +30,9 @@ from botocore.exceptions import BotoCoreError, ClientError
 from typing_extensions import Self
 
 import iort_contract
+from iort_contract.page import HEADERS, PUBNUB_ORIGIN, security_policy
 from iort_station.errors import StationError
-from iort_station.page.page import (
-    BUILT,
-    HEADERS,
-    PUBNUB_ORIGIN,
-    TYPES,
-    built_files,
-    config,
-    field_table,
-    security_policy,
-)
+from iort_station.page.page import BUILT, TYPES, built_files, config, field_table
 
 Answer = Callable[[Mapping[str, str]], Mapping[str, Any]]
 

@@ -12,7 +12,6 @@ from typing import Any, NamedTuple
 
 from botocore.exceptions import ClientError
 
-from functions.shared.tables import WRITE_SIZE, TableError, write
 from iort_contract import (
     AGENT_STREAM,
     BATCH,
@@ -27,8 +26,9 @@ from iort_contract import (
     build_topic,
     decode_item,
 )
+from iort_contract.attributes import plain
+from iort_contract.table_writer import WRITE_SIZE, TableError, write
 from iort_station.cloud import Cloud
-from iort_station.data.items import plain
 from iort_station.data.reading import Item, ahead
 from iort_station.errors import StationError
 from iort_station.recordings.old_batches import is_old, upgraded_item

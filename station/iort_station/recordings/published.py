@@ -7,11 +7,11 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from typing import Any, NamedTuple
 
 from iort_contract import CLAIM_AT, CLAIM_FIELDS, Batch, ContractError, MessageType, messages_of
+from iort_contract.attributes import plain
 from iort_contract.ros1.message import filled
-from iort_station.cli.progress import Told
 from iort_station.cloud import Cloud
 from iort_station.data import reading
-from iort_station.data.items import plain
+from iort_station.data.reading import Told
 from iort_station.data.selection import Selection
 from iort_station.data.stored import ATTRIBUTES, Refused
 

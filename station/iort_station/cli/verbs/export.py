@@ -57,7 +57,8 @@ def export(
 
 def _write(cloud: Cloud, selection: Selection, file: Recording) -> int:
     """How many messages were written."""
-    from iort_station.fleet import files, inventory  # noqa: PLC0415 - as above
+    from iort_station.data import inventory  # noqa: PLC0415 - as above
+    from iort_station.fleet import files  # noqa: PLC0415 - as above
     from iort_station.recordings import messages  # noqa: PLC0415 - as above
     from iort_station.recordings.published import Export  # noqa: PLC0415 - as above
 

@@ -11,7 +11,7 @@ import typer
 from typing_extensions import Self
 
 from iort_station.cli.progress import say
-from iort_station.cli.times import duration_us, has_zone, time_us
+from iort_station.data.times import duration_us, has_zone, time_us
 from iort_station.errors import StationError
 
 Robot = Annotated[str, typer.Argument(help="The robot's name.")]

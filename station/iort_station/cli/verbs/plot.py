@@ -109,9 +109,8 @@ def _read(
     every: str | None,
 ) -> Run:
     from iort_station.cli.plots import Run  # noqa: PLC0415 - as above
-    from iort_station.data import data  # noqa: PLC0415 - as above
+    from iort_station.data import data, inventory  # noqa: PLC0415 - as above
     from iort_station.data.conditions import derive  # noqa: PLC0415 - as above
-    from iort_station.fleet import inventory  # noqa: PLC0415 - as above
 
     with reading(f"{robot} {stream}", within.start_us, within.end_us) as progress:
         result = data.query(

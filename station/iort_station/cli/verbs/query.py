@@ -77,8 +77,7 @@ def query(
     A range includes its start and not its end. Without one it is the last five minutes.
     """
     # numpy takes longer to load than most commands to run.
-    from iort_station.data import data  # noqa: PLC0415 - see above
-    from iort_station.fleet import inventory  # noqa: PLC0415 - see above
+    from iort_station.data import data, inventory  # noqa: PLC0415 - see above
 
     if form is Format.parquet and output is None and sys.stdout.isatty():
         raise StationError("Parquet is no text for a terminal: give --output FILE, or pipe it on")

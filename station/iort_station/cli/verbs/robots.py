@@ -30,8 +30,8 @@ from iort_contract import (
 )
 from iort_station.cli.console import Console
 from iort_station.cli.progress import reading, say
-from iort_station.cli.times import iso_s, time_us
 from iort_station.cli.verbs.options import since_us
+from iort_station.data.times import iso_s, time_us
 from iort_station.errors import StationError
 from iort_station.fleet import certificates, claims, registry, robots, rotation, shadow
 

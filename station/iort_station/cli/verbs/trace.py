@@ -12,13 +12,13 @@ import typer
 from rich.table import Table
 
 from iort_contract import RTT_STREAM, VESC_STREAM
+from iort_contract.page import PUBNUB_ORIGIN
 from iort_station.cli.console import Console
+from iort_station.data.inventory import check_registered
 from iort_station.errors import StationError
-from iort_station.fleet.inventory import check_registered
 from iort_station.operations import audit, trace
 from iort_station.page import keys
 from iort_station.page.listener import Listener
-from iort_station.page.page import PUBNUB_ORIGIN
 
 commands = typer.Typer()
 _out = Console()

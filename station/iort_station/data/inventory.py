@@ -18,11 +18,11 @@ from iort_contract import (
     message_type,
 )
 from iort_contract.statistics import Vehicle
-from iort_station.cli.times import iso
 from iort_station.cloud import Cloud
 from iort_station.data import reading
 from iort_station.data.selection import MADE_OF, Selection
 from iort_station.data.stored import ATTRIBUTES, Refused, blocks
+from iort_station.data.times import iso
 from iort_station.data.units import VESC_KIND
 from iort_station.errors import StationError
 from iort_station.fleet import registry
