@@ -17,7 +17,7 @@ from bench.raw_mqtt import RawClient, tcp_connect_s
 from bench.result import NOT_MEASURED, Plot, Ratio, Section, Table
 from bench.spread import ratio, spread
 from bench.target import Say, Target
-from iort_agent.lanes.rate_limiter import BYTES_PER_S
+from iort_agent.rate_limiter import BYTES_PER_S
 from iort_contract import BROKER, LAMBDA, PING_PATHS, RULE
 from local.figures import THESIS
 

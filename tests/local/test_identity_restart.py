@@ -27,7 +27,7 @@ KILLED = """
 import os, signal, sys
 from pathlib import Path
 from device import identity
-from iort_agent.identity.exchange import Exchange
+from iort_agent.mqtt.exchange import Exchange
 
 class Killed(Exchange):
     def register(self, token, parameters):

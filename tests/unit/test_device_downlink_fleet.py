@@ -6,8 +6,8 @@ from typing import Any
 
 import iort_contract
 from iort_agent.clock import ManualClock
-from iort_agent.dispatch import Dispatcher
 from iort_agent.lanes.clock_offset import Offset
+from iort_agent.mqtt.dispatch import Dispatcher
 from iort_agent.mqtt.loopback import Loopback
 from iort_agent.mqtt.uplink import Message
 from iort_agent.ros1.json_message import encode
