@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import re
 import shutil
 import subprocess
 import sys
@@ -10,6 +11,7 @@ from pathlib import Path
 
 import grimp
 import pytest
+from importlinter import api
 
 ROOT = Path(__file__).resolve().parents[2]
 PACKAGES = (
@@ -113,3 +115,15 @@ def test_the_contract_needs_the_standard_library_alone() -> None:
     }
     # Only where boto3 gave the attributes is this module imported.
     assert outside == {("iort_contract.attributes", "boto3")}
+
+
+@pytest.mark.parametrize("contract", ["agent", "station", "contract"])
+def test_the_documentation_lists_the_rooms_as_the_walls_do(contract: str) -> None:
+    contracts = api.read_configuration(str(ROOT / "pyproject.toml"))["contracts_options"]
+    (layers,) = (one["layers"] for one in contracts if one["id"] == contract)
+    # What is in parentheses need not be there.
+    rows = [set(re.findall(r"(?<!\()\b\w+\b(?!\))", layer)) for layer in layers]
+    page = (ROOT / "docs/architecture.md").read_text(encoding="utf-8")
+    _, table = page.split(f"**{contract.capitalize()}**", 1)
+    first = [line.split("|")[1] for line in table.split("\n\n")[1].splitlines()[2:]]
+    assert [set(re.findall(r"`(\w+)`", cell)) for cell in first] == [row for row in rows if row]
