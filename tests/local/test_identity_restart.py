@@ -26,8 +26,8 @@ from verify.robot import Robot
 KILLED = """
 import os, signal, sys
 from pathlib import Path
-from device import identity
 from iort_agent.mqtt.exchange import Exchange
+from iort_agent.verbs import provision as identity
 
 class Killed(Exchange):
     def register(self, token, parameters):
