@@ -23,8 +23,9 @@ from functions.shared.metrics import emit
 from functions.shared.seconds import Summaries, summarize_topic
 from functions.shared.share import REQUESTS_S, Change, OverShareError, Share, robot_of, robot_of_change
 from functions.shared.stored import SECOND_BATCHES
-from functions.shared.tables import TableError, Tables
+from functions.shared.tables import Tables
 from iort_contract import RECOMPUTE_FROM_S, RECOMPUTED, REPLAY, Statistics, parse_topic
+from iort_contract.table_writer import TableError
 
 # Topics that are read side by side; a client keeps ten connections.
 _AT_ONCE = 4
