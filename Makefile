@@ -4,7 +4,7 @@ BIN := .venv/bin
 # cdk.json runs `python app.py`.
 bootstrap preflight deploy diff destroy: export PATH := $(CURDIR)/$(BIN):$(PATH)
 
-.PHONY: help demo test test-oldest check setup prove-mixed bench bench-guard bench-agent bench-page screenshots bench-fleet bench-cold verify-aws layer bootstrap preflight deploy diff destroy lock clean
+.PHONY: help demo test test-oldest check setup prove-mixed wheels bench bench-guard bench-agent bench-page screenshots bench-fleet bench-cold verify-aws layer bootstrap preflight deploy diff destroy lock clean
 
 help: ## show this
 	@grep -hE '^[a-z-]+:.*## ' Makefile | sed -E 's/^([a-z-]+):.*## /\1\t/' | expand -t 14
@@ -28,6 +28,9 @@ check: setup ## run the linters, the type checkers, and cfn-lint, cdk-nag and ch
 	@$(PYTHON) scripts/setup.py --checkov
 	@$(BIN)/ruff check . && $(BIN)/ruff format --check . && $(BIN)/mypy app.py contract scripts device functions stacks station local bench verify docs/examples && $(BIN)/lint-imports --no-cache --no-logo && $(BIN)/npm run --silent check
 	@PATH="$(CURDIR)/$(BIN):$$PATH" $(BIN)/python scripts/check_stacks.py --checkov build/checkov/bin/checkov
+
+wheels: setup ## build the wheels of contract, agent and station into dist/
+	@$(BIN)/python -m scripts.wheels
 
 prove-mixed: setup ## drive a robot of every shape of message beside rosbag record: DURATION=300
 	@IORT_MIXED_S=$(or $(DURATION),300) $(BIN)/python -m pytest -rA tests/ros/test_mixed_robot.py
@@ -95,4 +98,4 @@ lock: setup ## compile requirements/*.in to the locked *.txt
 
 clean: ## remove what was made
 	find . -name __pycache__ -type d -prune -exec rm -rf {} +
-	rm -rf .venv node_modules build cdk.out */*.egg-info */build station/iort_station/page/built .mypy_cache .ruff_cache .pytest_cache .hypothesis
+	rm -rf .venv node_modules build dist cdk.out */*.egg-info */build station/iort_station/page/built .mypy_cache .ruff_cache .pytest_cache .hypothesis

@@ -51,7 +51,7 @@ from local.errors import LocalError
 from local.processes import Child
 from local.pubnub_standin import PubNubStandIn
 
-FOLDER = EMBEDDED.parent
+FOLDER = ROOT / EMBEDDED.parent
 
 _REGION = "eu-west-1"
 _LEAST_FREE_BYTES = 500 * 1024 * 1024

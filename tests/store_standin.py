@@ -12,10 +12,10 @@ from pathlib import Path
 from typing import Any
 
 import iort_contract
-from iort_agent.mqtt.loopback import Loopback
 from iort_agent.mqtt.uplink import Message
 from iort_contract import FILE, PING, PONG, Address, FileAnswer, FileRequest, build_topic
 from local.certificates import Identity
+from tests.agent_fakes import Loopback
 
 
 class Store:

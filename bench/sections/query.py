@@ -16,11 +16,11 @@ from boto3.dynamodb.conditions import Attr, Key
 
 from bench import cpu, drives, plots, thesis
 from bench.errors import BenchError
+from bench.message_sizes import item_bytes
 from bench.result import NOT_MEASURED, Plot, Ratio, Section, Table
 from bench.spread import ratio, spread
 from bench.target import Say, Target
 from iort_contract import RECEIVED_MS, RECORD, TOPIC, VESC_STREAM, build_topic
-from iort_station.cost.sizes import item_bytes
 from iort_station.data import data
 from iort_station.operations import delivery
 

@@ -3,22 +3,33 @@
 from __future__ import annotations
 
 from decimal import Decimal
-from typing import Any, Mapping
-
-from boto3.dynamodb.types import TypeDeserializer
-
-
-class _Exact(TypeDeserializer):  # type: ignore[misc]  # boto3 has no types
-    """Numbers as they are written: boto3's own context raises for one of over 38 digits, and 1e125 may be
-    written as 126."""
-
-    def _deserialize_n(self, value: str) -> Decimal:
-        return Decimal(value)
-
-
-deserialize = _Exact().deserialize
+from typing import Any, Callable, Mapping
 
 
 def plain(item: Mapping[str, Any]) -> dict[str, Any]:
-    """An item as Python values; numbers are Decimals, bytes are boto3's `Binary`."""
+    """An item as Python values: numbers are Decimals of any length, as boto3's deserializer refuses them."""
     return {name: deserialize(value) for name, value in item.items()}
+
+
+def deserialize(attribute: Mapping[str, Any]) -> Any:
+    """The value of an attribute such as ``{"N": "1.5"}``."""
+    ((kind, content),) = attribute.items()
+    return _VALUES[kind](content)
+
+
+def _same(content: Any) -> Any:
+    return content
+
+
+_VALUES: dict[str, Callable[[Any], Any]] = {
+    "S": _same,
+    "N": Decimal,
+    "B": _same,
+    "BOOL": _same,
+    "NULL": lambda _: None,
+    "M": plain,
+    "L": lambda content: [deserialize(each) for each in content],
+    "SS": set,
+    "NS": lambda content: {Decimal(each) for each in content},
+    "BS": set,
+}

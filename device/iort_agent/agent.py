@@ -7,7 +7,6 @@ import logging
 import os
 import threading
 import uuid
-from importlib.metadata import PackageNotFoundError, version
 from typing import Any, Mapping
 
 import iort_contract
@@ -32,6 +31,7 @@ from iort_agent.mqtt.uplink import Uplink
 from iort_agent.rate_limiter import Allowance
 from iort_agent.sources import Source
 from iort_agent.spool.memory import Spool
+from iort_agent.version import agent_version
 from iort_contract import Value
 
 _log = logging.getLogger(__name__)
@@ -90,7 +90,7 @@ class Agent:
             base=self._tuning,
             apply=self.tune,
             known_fields=lambda: dict(self._fields),
-            version=_version(),
+            version=agent_version(),
             uplink=uplink,
             clock=clock,
             allowance=allowance,
@@ -458,10 +458,3 @@ class Agent:
         thread = threading.Thread(target=target, name=name, daemon=True)
         thread.start()
         return thread
-
-
-def _version() -> str:
-    try:
-        return version("iort")
-    except PackageNotFoundError:
-        return "run from a checkout"

@@ -22,6 +22,7 @@ from iort_agent.logs import LOG_LEVELS, neutral, set_up
 from iort_agent.spool.sqlite import make_spool
 from iort_agent.status import SOCKET, StatusServer, fetch
 from iort_agent.status import render as render_status
+from iort_agent.version import agent_version
 
 _log = logging.getLogger("iort-agent")
 
@@ -67,6 +68,7 @@ def _parse(arguments: list[str]) -> argparse.Namespace:
         description="Sends a robot's data to AWS IoT: every sample recorded, the newest one live. "
         "Without a command, it runs.",
     )
+    parser.add_argument("--version", action="version", version=f"iort-agent {agent_version()}")
     commands = parser.add_subparsers(metavar="COMMAND", required=True)
 
     def command(name: str, function: Callable[[argparse.Namespace], int], text: str) -> Any:
@@ -99,7 +101,7 @@ def _parse(arguments: list[str]) -> argparse.Namespace:
     claiming.add_argument("--robot", metavar="NAME", help="the robot's name, instead of the claim's")
     renewing = command("renew", renew, "replace the robot's key and certificate, with a new claim")
     renewing.add_argument("--claim", type=Path, required=True, metavar="FILE", help="the claim's YAML file")
-    if arguments and arguments[0] not in commands.choices and arguments[0] not in ("-h", "--help"):
+    if arguments and arguments[0] not in (*commands.choices, "-h", "--help", "--version"):
         arguments = ["run", *arguments]
     remappings = []
     if arguments and arguments[0] == "run":

@@ -35,42 +35,6 @@ class SystemClock:
         return event.wait(seconds)
 
 
-class ManualClock:
-    """A clock that stands still until told; waiting moves it, so a day passes in no time."""
-
-    def __init__(self, *, now_us: int = 1_700_000_000_000_000, monotonic: float = 1000.0) -> None:
-        self._now_us = now_us
-        self._monotonic = monotonic
-        self._lock = threading.Lock()
-
-    def now_us(self) -> int:
-        """Wall time in microseconds since the Unix epoch."""
-        return self._now_us
-
-    def monotonic(self) -> float:
-        """Seconds that only `advance` and `wait` move."""
-        return self._monotonic
-
-    def advance(self, seconds: float) -> None:
-        """Let both clocks go on."""
-        with self._lock:
-            self._now_us += round(seconds * 1_000_000)
-            self._monotonic += seconds
-
-    def set_wall(self, now_us: int) -> None:
-        """Let the wall clock jump, as NTP does; the monotonic clock stays."""
-        self._now_us = now_us
-
-    def wait(self, event: threading.Event, seconds: float | None) -> bool:
-        """Pass the time at once, unless the event is set already. Without a limit: really wait."""
-        if seconds is None:
-            return event.wait()
-        if event.is_set():
-            return True
-        self.advance(max(0.0, seconds))
-        return event.is_set()
-
-
 class Pace:
     """Absolute deadlines, ``period_s`` apart, so that small delays do not add up to a drift."""
 

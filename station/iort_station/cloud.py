@@ -1,4 +1,4 @@
-"""Where the operator's cloud is: an AWS account, or the embedded cloud of this checkout.
+"""Where the operator's cloud is: an AWS account, or the embedded cloud of a checkout.
 
 Both are the same to the rest of the station: clients of AWS' services, the names that the stacks
 put out, and the address where robots connect.
@@ -22,12 +22,20 @@ from botocore.exceptions import BotoCoreError, ClientError
 from iort_contract import DEFAULT_NAMESPACE
 from iort_station.errors import StationError
 
-# Where an embedded cloud that runs in this checkout says how to reach it.
-EMBEDDED = Path(__file__).resolve().parents[2] / "build" / "local" / "cloud.json"
+# Where the embedded cloud of a checkout says how to reach it, below the checkout's folder.
+EMBEDDED = Path("build/local/cloud.json")
+# The environment variable that names such a file anywhere.
+EMBEDDED_VARIABLE = "IORT_EMBEDDED"
 
 # An embedded cloud has credentials of its own, and the profile that AWS_PROFILE names need not exist.
 _NO_PROFILE = {"profile": (None, None, None, None)}
 _CONFIG = Config(retries={"mode": "standard", "max_attempts": 5}, connect_timeout=5, read_timeout=20)
+
+
+def find_embedded(folder: Path) -> Path | None:
+    """The file of an embedded cloud that runs in the checkout around ``folder``; None if none runs."""
+    places = (each / EMBEDDED for each in (folder, *folder.parents))
+    return next((place for place in places if place.is_file()), None)
 
 
 def without_proxy(host: str) -> None:

@@ -12,7 +12,6 @@ from pathlib import PurePath
 import pytest
 
 from iort_agent.cli import main
-from iort_agent.clock import ManualClock
 from iort_agent.errors import AgentError, UploadError
 from iort_agent.files.file import from_json, read, to_json
 from iort_agent.files.folder import STATE, Folder
@@ -23,6 +22,7 @@ from iort_agent.spool.memory import PROCESS
 from iort_agent.spool.reservation import Reservation
 from iort_agent.spool.sqlite import SqliteSpool
 from iort_contract import VESC_STREAM
+from tests.agent_fakes import ManualClock
 from tests.unit.test_device_agent import config_file
 
 SECRET = b"another's, and not for the bucket"

@@ -9,7 +9,6 @@ import threading
 import pytest
 
 import iort_contract
-from iort_agent.clock import ManualClock
 from iort_agent.config.file import load_config
 from iort_agent.errors import UploadError
 from iort_agent.files.file import kind_of, read, wire_name
@@ -17,11 +16,11 @@ from iort_agent.files.folder import STATE, Folder, Uploads
 from iort_agent.files.http import Outcome, Pace, Sender, trusting
 from iort_agent.files.upload import make_uploader
 from iort_agent.mqtt.dispatch import Dispatcher
-from iort_agent.mqtt.loopback import Loopback
 from iort_agent.rate_limiter import Allowance
 from iort_agent.status import SOCKET, StatusServer
 from iort_agent.verbs.upload import upload_files
 from iort_contract import PART_BYTES
+from tests.agent_fakes import Loopback, ManualClock
 from tests.store_standin import store
 
 

@@ -96,7 +96,7 @@ def test_the_registry_follows_a_robot(embedded, bundle, iort):
     )
     assert after[DISCONNECT_REASON] == "CLIENT_INITIATED_DISCONNECT"
     assert after[LAST_SEEN_MS] >= after[CONNECTED_MS] > 0
-    assert after[AGENT_VERSION] == version("iort")
+    assert after[AGENT_VERSION] == version("iort-agent")
     (held,) = certificates.attached(embedded.cloud, car.robot)
     assert after[CERTIFICATE_ID] == held.id
     assert "offline since" in iort("robots", "list").output

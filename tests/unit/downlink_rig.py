@@ -10,17 +10,16 @@ from pathlib import Path
 from typing import Any
 
 import iort_contract
-from iort_agent.clock import ManualClock
 from iort_agent.control.config import DownlinkConfig, share_rule
 from iort_agent.control.downlink import Downlink
 from iort_agent.errors import SourceError
 from iort_agent.lanes.clock_offset import Offset
 from iort_agent.mqtt.dispatch import Dispatcher
-from iort_agent.mqtt.loopback import Loopback
 from iort_agent.rate_limiter import Allowance
 from iort_agent.schema import Where, load
 from iort_contract import Command
 from iort_contract.ros1.definition import Definition, parse
+from tests.agent_fakes import Loopback, ManualClock
 
 RULE = "=" * 80
 HEADER = f"{RULE}\nMSG: std_msgs/Header\nuint32 seq\ntime stamp\nstring frame_id\n"

@@ -8,13 +8,13 @@ from dataclasses import replace
 import pytest
 from typer.testing import CliRunner
 
+from bench import message_sizes
 from functions.shared.health import measure
 from functions.shared.metrics import Gathered, emit
 from iort_agent.lanes.pings import CLOCK_EVERY_S
-from iort_agent.sources.vehicle import Vehicle, VehicleConfig
 from iort_contract import METRICS
 from iort_station.cli.main import app
-from iort_station.cost import line_items, model, report, scale, sizes
+from iort_station.cost import line_items, model, report, scale
 from iort_station.cost.fixed_costs import (
     FREE_ALARMS,
     FREE_DASHBOARD_METRICS,
@@ -170,15 +170,6 @@ def test_refuses_what_no_fleet_can_do(wrong):
         model.bill(replace(_ONE, **wrong))
 
 
-def test_a_second_s_items_fit_in_one_write_unit_each():
-    """The cost rests on it: a byte over a kilobyte is billed as two."""
-    for robot_hz in (10, 50):
-        measured = sizes.measure(robot_hz, 1.0)
-        assert measured.telemetry_item <= 1024
-        assert measured.summary_item <= 1024
-    assert sizes.own_item_bytes("agent", 1) <= 1024
-
-
 def test_an_hour_of_lambda_1_logs_about_as_much_as_it_writes(capsys):
     counted = Gathered("live")
     for i in range(36_000):
@@ -198,32 +189,13 @@ def test_environments_gather_each_for_itself():
 
 
 def test_the_other_lines_are_about_as_long_as_they_are_written(capsys):
-    batch = sizes._batch(sizes._drive(50, 50), 50)
+    batch = message_sizes.batch_of(message_sizes.drive(50, 50), 50)
     emit("summarize", BatchesSummarized=2, SamplesSummarized=100)
     emit("health", **measure("vesc", [batch]))
     emit("echo", PongsSent=1)
     lengths = [len(line) for line in capsys.readouterr().out.splitlines()]
     modelled = [model._SUMMARIZE_LINE, model._HEALTH_LINE, model._PONG_LINE]
     assert lengths == pytest.approx(modelled, rel=0.1)
-
-
-def test_a_drive_is_a_vesc_drive():
-    assert sizes._drive(50, 1)[0].keys() == Vehicle(VehicleConfig(), 1).sample().keys()
-
-
-@pytest.mark.parametrize(
-    ("item", "expected"),
-    [
-        ({"a": "bc"}, 3),
-        ({"n": 0}, 3),
-        ({"n": 12345}, 5),
-        ({"n": -1.5}, 4),
-        ({"b": True}, 2),
-        ({"l": [1, 12345]}, 1 + 3 + (1 + 2) + (1 + 4)),
-    ],
-)
-def test_item_sizes_as_dynamodb_counts_them(item, expected):
-    assert sizes.item_bytes(item) == expected
 
 
 def test_quota_that_breaks_first_is_the_one_that_fewest_robots_use_up():
@@ -263,39 +235,6 @@ def test_command_prints_json_that_adds_up(tmp_path):
     assert answer["usage"]["live_hz"] == 2.0
     summed = sum(item["dollars_per_robot_hour"] for item in answer["items"])
     assert summed == pytest.approx(answer["dollars_per_robot_hour"])
-
-
-def usage_of_a_car(folder, settings):
-    """What `iort cost` makes of a car.yaml."""
-    for name in ("certificate.pem", "private.key"):
-        (folder / name).touch()
-    config = folder / "car.yaml"
-    config.write_text(
-        "robot: car7\nendpoint: example.org\ncertificate: certificate.pem\nprivate_key: private.key\n"
-        f"{settings}"
-    )
-    given = ["cost", "--config", str(config), "--json"]
-    done = CliRunner().invoke(app, given, env={"XDG_CACHE_HOME": str(folder)})
-    assert done.exit_code == 0, done.output
-    return json.loads(done.output)["usage"]
-
-
-def test_command_reads_the_rates_of_a_car(tmp_path):
-    settings = "sources:\n- {type: sim, rate_hz: 20}\nlive: {rate_hz: 2}\nrecord: {batch_s: 0.5}\n"
-    usage = usage_of_a_car(tmp_path, settings)
-    assert (usage["rate_hz"], usage["live_hz"], usage["batch_s"]) == (20.0, 2.0, 0.5)
-
-
-def test_command_counts_the_live_messages_of_every_stream(tmp_path):
-    settings = (
-        "live: {rate_hz: 4}\nsources:\n- {type: sim, rate_hz: 2}\n"
-        "- type: rosbridge\n  url: ws://localhost:9090\n"
-        "  topics: {/a: {stream: a, time: arrival}, /b: {stream: b, time: arrival}}\n"
-    )
-    usage = usage_of_a_car(tmp_path, settings)
-    assert usage["live_hz"] == 2 + 2 * 4
-    # A sample each half second, and two topics of which nothing is known.
-    assert (usage["streams"], usage["rate_hz"]) == (3, (2 + 50 + 50) / 3)
 
 
 @pytest.mark.parametrize("batch_s", [0.0, 0.2, 1.0])

@@ -10,15 +10,15 @@ import pytest
 
 from functions.shared.metrics import emit
 from iort_agent.agent import Agent
-from iort_agent.clock import ManualClock
 from iort_agent.config.file import Config
 from iort_agent.mqtt.dispatch import Dispatcher
-from iort_agent.mqtt.loopback import Loopback
+from iort_agent.mqtt.reconnect import SHORTEST_S
 from iort_agent.spool.memory import MemorySpool
 from iort_contract import SHADOW
 from iort_station.cost import model, scale
 from iort_station.cost.prices import QUOTAS
 from iort_station.cost.usage import Usage
+from tests.agent_fakes import Loopback, ManualClock
 
 _ONE = Usage()
 # AWS IoT Core, "Additional metering details".
@@ -101,3 +101,4 @@ def test_an_outage_is_held_to_the_lower_of_what_awss_pages_say():
     paper = {need.name: need.times for need in scale.on_paper(Usage(robots=60_000)).needs}
     assert paper["IoT Core: connects in a minute after an outage"] == 2
     assert paper["IoT Core: connects of one client id"] == 1, "the agent waits a second at least"
+    assert scale.SHORTEST_RECONNECT_S == SHORTEST_S

@@ -18,11 +18,11 @@ from iort_agent.errors import SourceError
 from iort_agent.lanes.config import PingConfig, RecordConfig
 from iort_agent.metrics import MetricsConfig
 from iort_agent.mqtt.dispatch import Dispatcher
-from iort_agent.mqtt.loopback import Loopback, Published
 from iort_agent.mqtt.uplink import matches
 from iort_agent.sources import Emit
 from iort_agent.sources.recording.bag import BagConfig
 from iort_agent.spool.memory import REJECT_NEW, MemorySpool
+from tests.agent_fakes import Loopback, Published
 
 T0 = 1_700_000_000_000_000
 

@@ -14,9 +14,9 @@ from rosbags.rosbag1 import Writer as Writer1
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
 import iort_contract
-from iort_agent.clock import ManualClock
 from iort_agent.errors import SourceError
 from iort_agent.sources.recording.bag import _VESC_STATE_ROS2, VESC_TYPE, BagConfig
+from tests.agent_fakes import ManualClock
 from tests.recordings import recording
 
 NOW = 1_700_000_000_000_000

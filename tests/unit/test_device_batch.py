@@ -13,11 +13,11 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 import iort_contract
-from iort_agent.clock import ManualClock
 from iort_agent.lanes.batch import MAX_VALUES, Batcher, StreamCounts
 from iort_agent.lanes.batch_encoder import Packer
 from iort_agent.spool.memory import MemorySpool
 from iort_contract import RosMessage, RosType
+from tests.agent_fakes import ManualClock
 from tests.unit.ros1_messages import text
 
 T0 = 1_700_000_000_000_000

@@ -13,7 +13,6 @@ import pytest
 from PIL import Image
 
 import iort_contract
-from iort_agent.clock import ManualClock
 from iort_agent.config.file import load_config
 from iort_agent.errors import ConfigError
 from iort_agent.files.file import read
@@ -26,6 +25,7 @@ from iort_contract.limits import MessageError
 from iort_contract.ros1.decode import Decoder
 from iort_contract.ros1.definition import parse
 from iort_contract.ros1.message import filled
+from tests.agent_fakes import ManualClock
 from tests.images import TOPIC, jpeg, write_bag
 from tests.unit.ros1_messages import text, u32
 

@@ -5,14 +5,13 @@ from __future__ import annotations
 from typing import Any
 
 import iort_contract
-from iort_agent.clock import ManualClock
 from iort_agent.lanes.clock_offset import Offset
 from iort_agent.mqtt.dispatch import Dispatcher
-from iort_agent.mqtt.loopback import Loopback
 from iort_agent.mqtt.uplink import Message
 from iort_agent.ros1.json_message import encode
 from iort_contract import FleetMessage
 from iort_contract.ros1.definition import parse
+from tests.agent_fakes import Loopback, ManualClock
 from tests.unit.downlink_rig import POSE, POSE_MESSAGE, T0, Rig, doubles
 
 SHARE = {"/pose": {"name": "pose", "rate_hz": 5}}

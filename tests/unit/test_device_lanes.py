@@ -15,16 +15,16 @@ import pytest
 
 import iort_contract
 from iort_agent.agent import Agent
-from iort_agent.clock import Clock, ManualClock, SystemClock
+from iort_agent.clock import Clock, SystemClock
 from iort_agent.config.file import Config
 from iort_agent.lanes.config import PingConfig, RecordConfig
 from iort_agent.lanes.production import Production, Rate
 from iort_agent.lanes.record import too_many
 from iort_agent.mqtt.dispatch import Dispatcher
-from iort_agent.mqtt.loopback import Loopback, Published
 from iort_agent.rate_limiter import URGENT, Allowance
 from iort_agent.spool.memory import MemorySpool
 from iort_agent.status import render
+from tests.agent_fakes import Loopback, ManualClock, Published
 
 T0 = 1_700_000_000_000_000
 TICK_MS = 200

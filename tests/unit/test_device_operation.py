@@ -19,7 +19,7 @@ from hypothesis import strategies as st
 
 import iort_contract
 from iort_agent.cli import main
-from iort_agent.clock import ManualClock, SystemClock
+from iort_agent.clock import SystemClock
 from iort_agent.config.file import load_config
 from iort_agent.errors import AgentError
 from iort_agent.lanes.batch import StreamCounts
@@ -27,11 +27,11 @@ from iort_agent.lanes.clock_offset import ClockOffset
 from iort_agent.logs import JournalFormatter, LineFormatter, Troubles, is_journal
 from iort_agent.metrics import AgentMetrics, Rates, rss_mb
 from iort_agent.mqtt.dispatch import Dispatcher
-from iort_agent.mqtt.loopback import Loopback
 from iort_agent.spool.memory import MemorySpool
 from iort_agent.spool.sqlite import make_spool
 from iort_agent.status import StatusServer, fetch, render
 from iort_agent.verbs.check import FAIL, check
+from tests.agent_fakes import Loopback, ManualClock
 
 
 def record(level: int, text: str) -> logging.LogRecord:

@@ -10,13 +10,12 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from iort_agent.clock import ManualClock
 from iort_agent.control.runtime_settings import Tuning, overlay
 from iort_agent.control.shadow import Remote, _difference, _merged
 from iort_agent.mqtt.dispatch import Dispatcher
-from iort_agent.mqtt.loopback import Loopback
 from iort_agent.rate_limiter import Allowance
 from iort_contract import Command
+from tests.agent_fakes import Loopback, ManualClock
 
 BASE = Tuning(record_enabled=True, live_enabled=True, live_rate_hz=10.0, ping_rate_hz=0.0, log_level="info")
 PREFIX = "$aws/things/car1/shadow/name/agent"

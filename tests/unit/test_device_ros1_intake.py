@@ -11,10 +11,10 @@ from typing import Any
 import pytest
 
 import iort_contract
-from iort_agent.clock import ManualClock
 from iort_agent.errors import SourceError
 from iort_agent.sources.ros1 import Intake, Ros1Config, TopicConfig
 from iort_contract import RosMessage
+from tests.agent_fakes import ManualClock
 from tests.unit.ros1_messages import LINE, STAMPED, header, u32
 
 T0 = 1_700_000_000_000_000

@@ -7,10 +7,10 @@ from typing import Any
 import pytest
 from hypothesis import given, settings
 
-from iort_agent.clock import ManualClock
 from iort_agent.sources.rosbridge.rosapi import ANSWER_S, Rosapi, Structure, from_text, from_typedefs, md5sum
 from iort_contract.limits import MessageError
 from iort_contract.ros1.definition import Definition
+from tests.agent_fakes import ManualClock
 from tests.unit.downlink_rig import POSE
 from tests.unit.ros1_values import HEADER, definitions, text_of
 

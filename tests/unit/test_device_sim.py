@@ -10,9 +10,9 @@ from typing import Any
 import pytest
 
 import iort_contract
-from iort_agent.clock import ManualClock
 from iort_agent.sources.sim import SimConfig
 from iort_agent.sources.vehicle import VehicleConfig
+from tests.agent_fakes import ManualClock
 
 T0 = 1_700_000_000_000_000
 

@@ -8,9 +8,9 @@ from typing import TYPE_CHECKING, Any
 
 import pytest
 
-from iort_agent.clock import ManualClock
 from iort_agent.spool.memory import OVERWRITE_OLDEST, REJECT_NEW, MemorySpool, Spool
 from iort_agent.spool.sqlite import SqliteSpool
+from tests.agent_fakes import ManualClock
 
 if TYPE_CHECKING:
     MakeSpool = Callable[..., Spool]

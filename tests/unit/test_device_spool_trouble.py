@@ -12,10 +12,10 @@ from typing import Any
 
 import pytest
 
-from iort_agent.clock import ManualClock
 from iort_agent.errors import AgentError
 from iort_agent.spool.file import SpoolFile
 from iort_agent.spool.reservation import BLOCK, BLOCK_ADRIFT
+from tests.agent_fakes import ManualClock
 from tests.unit.test_device_spool import fill, following, kept
 from tests.unit.test_device_sqlite_spool import MB, ROOT, all_kept, crash, running, spool_at
 

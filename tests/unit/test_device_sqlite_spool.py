@@ -19,7 +19,7 @@ from hypothesis import settings
 from hypothesis import strategies as st
 from hypothesis.stateful import RuleBasedStateMachine, invariant, precondition, rule
 
-from iort_agent.clock import ManualClock, SystemClock
+from iort_agent.clock import SystemClock
 from iort_agent.spool import disk
 from iort_agent.spool.config import QueueConfig
 from iort_agent.spool.file import SpoolFile
@@ -27,6 +27,7 @@ from iort_agent.spool.ledger import Ledger
 from iort_agent.spool.memory import FULL, PROCESS, REJECT_NEW, Entry, MemorySpool
 from iort_agent.spool.reservation import BLOCK, Reservation
 from iort_agent.spool.sqlite import SqliteSpool, make_spool
+from tests.agent_fakes import ManualClock
 from tests.unit.test_device_spool import fill, following, kept
 
 ROOT = Path(__file__).parent.parent.parent

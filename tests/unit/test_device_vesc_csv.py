@@ -14,9 +14,9 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 import iort_contract
-from iort_agent.clock import ManualClock
 from iort_agent.errors import SourceError
 from iort_agent.sources.recording.bag import BagConfig
+from tests.agent_fakes import ManualClock
 from tests.recordings import recording
 
 NOW = 1_700_000_000_000_000

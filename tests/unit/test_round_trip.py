@@ -13,7 +13,6 @@ from hypothesis import strategies as st
 from rosbags.rosbag1 import Reader
 from rosbags.typesys import Stores, get_typestore
 
-from iort_agent.clock import ManualClock
 from iort_agent.lanes.batch import Batcher, StreamCounts
 from iort_agent.lanes.batch_encoder import Packer
 from iort_agent.sources.ros1 import Intake, TopicConfig
@@ -22,6 +21,7 @@ from iort_contract import RECORD, build_topic
 from iort_station.cli.verbs.export import _write
 from iort_station.data.selection import select
 from iort_station.recordings import recordings
+from tests.agent_fakes import ManualClock
 from tests.fakes import TELEMETRY, item_of_message
 from tests.ros.mixed_robot import MESSAGES
 from tests.ros1_strategies import definitions, messages

@@ -13,9 +13,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 import iort_contract
+from bench.message_sizes import stored_bytes
 from iort_contract import Batch
 from iort_contract.checks import wire_column
-from iort_station.cost.sizes import stored_bytes
 from iort_station.data import reading
 from iort_station.data.blocks import join
 from iort_station.data.stored import Refused, blocks

@@ -10,7 +10,7 @@ from typer.testing import CliRunner
 
 from iort_station.cli.main import app, said
 from iort_station.cli.where import Where
-from iort_station.cloud import Cloud
+from iort_station.cloud import Cloud, find_embedded
 from iort_station.errors import StationError
 from iort_station.page import keys
 
@@ -37,6 +37,29 @@ def found(tmp_path):
 def test_neither_account_nor_embedded_cloud_says_how_to_get_either(found):
     with pytest.raises(StationError, match=r"no AWS region.*AWS_REGION.*`make demo`"):
         found()
+
+
+def test_an_embedded_cloud_is_found_from_any_folder_of_its_checkout(tmp_path):
+    inside = tmp_path / "checkout" / "docs" / "examples"
+    inside.mkdir(parents=True)
+    assert find_embedded(inside) is None
+    described = tmp_path / "checkout" / "build" / "local" / "cloud.json"
+    described.parent.mkdir(parents=True)
+    described.touch()
+    assert find_embedded(inside) == find_embedded(tmp_path / "checkout") == described
+    assert find_embedded(tmp_path) is None
+
+
+def test_away_from_a_checkout_local_says_how_to_name_the_file(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    with pytest.raises(StationError, match=r"no embedded cloud is running.*IORT_EMBEDDED names its file"):
+        Where("iort", None, None, local=True, embedded=None).cloud()
+
+
+def test_the_environment_names_an_embedded_cloud(tmp_path):
+    named = {"IORT_EMBEDDED": str(tmp_path / "cloud.json")}
+    done = CliRunner().invoke(app, ["--local", "robots", "list"], env=named)
+    assert f"no embedded cloud is running: {tmp_path / 'cloud.json'} is not there" in str(done.exception)
 
 
 def test_a_region_without_credentials_says_how_to_give_them(found, monkeypatch):

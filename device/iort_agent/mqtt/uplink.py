@@ -1,5 +1,4 @@
-"""What the lanes need of a connection to the broker. `iort_agent.mqtt.aws` is the real one,
-`iort_agent.mqtt.loopback` an in-memory one."""
+"""What the lanes need of a connection to the broker. `iort_agent.mqtt.aws` is the real one."""
 
 from __future__ import annotations
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import sys
+from importlib.metadata import version
 from pathlib import Path
 from typing import Annotated, NoReturn
 
@@ -30,7 +31,7 @@ from iort_station.cli.verbs import (
     watch,
 )
 from iort_station.cli.where import Where
-from iort_station.cloud import EMBEDDED
+from iort_station.cloud import EMBEDDED, EMBEDDED_VARIABLE
 from iort_station.errors import StationError
 
 app = typer.Typer(no_args_is_help=True, add_completion=True, help="The operator's station of iort.")
@@ -52,6 +53,12 @@ app.add_typer(send.commands)
 app.add_typer(config.commands)
 
 
+def _print_version(asked: bool) -> None:  # noqa: FBT001 - typer passes it by position
+    if asked:
+        typer.echo(f"iort {version('iort-station')}")
+        raise typer.Exit
+
+
 @app.callback()
 def _where(
     context: typer.Context,
@@ -65,8 +72,16 @@ def _where(
         ),
     ] = False,
     embedded: Annotated[
-        Path, typer.Option(help="The file in which an embedded cloud says how to reach it.")
-    ] = EMBEDDED,
+        Path | None,
+        typer.Option(
+            envvar=EMBEDDED_VARIABLE,
+            help="The file in which an embedded cloud says how to reach it; also by the environment's "
+            f"{EMBEDDED_VARIABLE}. Else {EMBEDDED}, in this folder or one above.",
+        ),
+    ] = None,
+    _version: Annotated[
+        bool, typer.Option("--version", is_eager=True, callback=_print_version, help="Print the version.")
+    ] = False,
 ) -> None:
     context.obj = Where(namespace, profile, region, local, embedded)
 

@@ -11,7 +11,7 @@ from urllib.parse import urlsplit
 from botocore.exceptions import BotoCoreError
 
 from iort_station.cli.progress import say
-from iort_station.cloud import Cloud
+from iort_station.cloud import EMBEDDED, EMBEDDED_VARIABLE, Cloud, find_embedded
 from iort_station.errors import StationError
 
 # Whoever has set one of these means an AWS account.
@@ -28,7 +28,7 @@ class Where:
     profile: str | None
     region: str | None
     local: bool
-    embedded: Path
+    embedded: Path | None
 
     def cloud(self) -> Cloud:
         """The cloud that they name: an embedded one that runs here, unless something says AWS.
@@ -36,10 +36,17 @@ class Where:
         Raises `StationError` where there is neither one nor what AWS asks for.
         """
         said = self.profile or self.region or any(os.environ.get(name) for name in _AWS_NAMED)
-        if self.local or (not said and self.embedded.exists()):
+        embedded = self.embedded or find_embedded(Path.cwd())
+        if self.local and embedded is None:
+            raise StationError(
+                f"no embedded cloud is running: {Path.cwd()} and the folders above it have no {EMBEDDED}. "
+                "`make demo` starts one in a checkout of iort; --embedded or "
+                f"{EMBEDDED_VARIABLE} names its file from anywhere else"
+            )
+        if embedded and (self.local or (not said and embedded.exists())):
             if not self.local:
-                say("on the embedded cloud that runs in this checkout")
-            return _alive(Cloud.load(self.embedded), self.embedded)
+                say(f"on the embedded cloud of {embedded}")
+            return _alive(Cloud.load(embedded), embedded)
         cloud = Cloud(namespace=self.namespace, profile=self.profile, region=self.region)
         try:
             return cloud.check()

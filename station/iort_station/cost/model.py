@@ -23,7 +23,7 @@ from iort_station.cost.line_items import (
     units,
 )
 from iort_station.cost.prices import PRICES, PUBNUB_MAU_PLANS, Price
-from iort_station.cost.sizes import Sizes, measure, own_item_bytes
+from iort_station.cost.sizes import OWN_ITEM_BYTES, Sizes, sizes_of
 from iort_station.cost.usage import Usage
 
 # A shard of a stream is a partition of the table. Lambda 2 is called once a window, or by as many records;
@@ -54,10 +54,10 @@ def bill(usage: Usage, prices: Mapping[str, Price] = PRICES) -> list[Item]:
 
 def _bill(usage: Usage) -> list[Item]:
     usage.check()
-    sizes = measure(usage.rate_hz, usage.batch_s)
+    sizes = sizes_of(usage.rate_hz, usage.batch_s)
     hour = 3600.0
     batches, own = usage.batches_per_s * hour, usage.own_batches_per_s * hour
-    own_item = own_item_bytes("agent", 1)
+    own_item = OWN_ITEM_BYTES
     items = _connecting(usage)
     items += rules("record", batches, sizes.record)
     items += rules("agent, rtt", own, own_item)
@@ -133,7 +133,7 @@ def thesis_bill(usage: Usage, prices: Mapping[str, Price] = PRICES) -> list[Item
     x86. Prices, retention and the milliseconds of an invocation are the same as ours; there are no pings,
     no figures of the agent's own, no alarms and no metrics."""
     usage.check()
-    sizes = measure(usage.rate_hz, usage.batch_s)
+    sizes = sizes_of(usage.rate_hz, usage.batch_s)
     samples = usage.samples_per_s * 3600
     per_s = usage.robots * usage.samples_per_s
     polls = max(_THESIS_POLLS_PER_S * _shards(per_s), per_s / _THESIS_RECORDS_A_CALL)
@@ -162,7 +162,7 @@ def thesis_bill(usage: Usage, prices: Mapping[str, Price] = PRICES) -> list[Item
 def pubnub_bill(usage: Usage, prices: Mapping[str, Price] = PRICES, *, thesis: bool = False) -> list[Item]:
     """What PubNub bills a robot-hour on its plan by transactions: a publish each, a receipt a viewer."""
     usage.check()
-    size = measure(usage.rate_hz, usage.batch_s).update
+    size = sizes_of(usage.rate_hz, usage.batch_s).update
     messages = (usage.samples_per_s if thesis else usage.live_hz) * 3600 * units(size, PUBNUB_UNIT)
     items = [
         Item("PubNub", "live", "published", "pubnub_publish", messages),
@@ -185,7 +185,7 @@ def summarize_calls_per_s(usage: Usage) -> float:
 
 
 def _shards_of(usage: Usage) -> float:
-    sizes = measure(usage.rate_hz, usage.batch_s)
+    sizes = sizes_of(usage.rate_hz, usage.batch_s)
     return _shards(usage.robots * usage.batches_per_s * units(sizes.telemetry_item, WRITE))
 
 

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import math
 import re
+from importlib.resources import files
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -19,7 +20,7 @@ from iort_station.errors import StationError
 if TYPE_CHECKING:
     from collections.abc import Mapping
 
-BUILT = Path(__file__).resolve().parent / "built"
+BUILT = Path(str(files("iort_station.page") / "built"))
 TYPES = {
     ".html": "text/html; charset=utf-8",
     ".css": "text/css; charset=utf-8",

@@ -3,28 +3,24 @@
 from __future__ import annotations
 
 import json
-import math
 import os
 from dataclasses import asdict, replace
 from datetime import datetime, timezone
 from pathlib import Path
-from statistics import mean
 from typing import Annotated, Any
 
 import typer
 from rich.table import Table
 
-from iort_agent.config.file import Config, load_config
-from iort_agent.errors import AgentError
 from iort_station.cli.console import Console
 from iort_station.cli.where import Where
 from iort_station.cost import line_items, model, report, scale
+from iort_station.cost.car import as_configured
 from iort_station.cost.deployed import as_deployed
 from iort_station.cost.fixed_costs import deployment_dollars_per_month
 from iort_station.cost.price_list import API_REGION, Listed, keep, kept_at, load, read
 from iort_station.cost.prices import AS_OF, PRICES, REGION
 from iort_station.cost.usage import Usage
-from iort_station.errors import StationError
 
 commands = typer.Typer()
 _out = Console()
@@ -78,7 +74,7 @@ def cost_(
     as_json: Annotated[bool, typer.Option("--json", help="As JSON.")] = False,
 ) -> None:
     """What a fleet costs, by service and lane, beside the thesis' layout; list prices of one date."""
-    usage = _configured(_DEFAULT, config)
+    usage = _DEFAULT if config is None else as_configured(_DEFAULT, config)
     listed = _prices(context.obj, refresh=refresh)
     prices = PRICES if listed is None else listed.prices()
     if deployed:
@@ -123,35 +119,6 @@ def cost_(
         ("What it needs of the default quotas", report.quotas(scale.on_paper(usage, prices))),
     ):
         _out.print(_table(title, rows))
-
-
-def _configured(usage: Usage, config: Path | None) -> Usage:
-    if config is None:
-        return usage
-    try:
-        car = load_config(config)
-    except AgentError as error:
-        raise StationError(str(error)) from error
-    return replace(usage, **_rates(car))
-
-
-def _rates(car: Config) -> dict[str, Any]:
-    # What a source alone does not say, such as the rate of a ROS topic, is as in a `Usage`.
-    rates = [
-        (getattr(source, "rate_hz", _DEFAULT.rate_hz), getattr(source, "rate_hz", math.inf))
-        for source in car.sources
-        for _ in range(max(1, len(set(source.streams()))))
-    ]
-    # The live lane's rate is of each stream, which sends no more than its source brings.
-    live_hz = sum(min(car.live.rate_hz, most_hz) for _, most_hz in rates)
-    return {
-        "live_hz": live_hz if car.live.enabled else 0.0,
-        "batch_s": car.record.batch_s,
-        "ping_hz": car.ping.rate_hz,
-        "agent_every_s": car.metrics.every_s if car.metrics.enabled else 0.0,
-        "streams": len(rates),
-        "rate_hz": mean(rate_hz for rate_hz, _ in rates),
-    }
 
 
 def _prices(where: Where, *, refresh: bool) -> Listed | None:

@@ -1,14 +1,52 @@
-"""An uplink without a network: a broker in memory that can be cut, slowed and made to refuse."""
+"""Fakes of the agent's seams: a clock that stands still, and a broker in memory."""
 
 from __future__ import annotations
 
+import threading
+from collections.abc import Callable
 from functools import partial
-from typing import Callable, NamedTuple, Optional
+from typing import NamedTuple
 
 from iort_agent.clock import Clock
 from iort_agent.errors import UplinkError
 from iort_agent.mqtt.dispatch import Dispatcher
 from iort_agent.mqtt.uplink import Done, Message, OnConnection, OnMessage, UplinkStatus, matches
+
+
+class ManualClock:
+    """A clock that stands still until told; waiting moves it, so a day passes in no time."""
+
+    def __init__(self, *, now_us: int = 1_700_000_000_000_000, monotonic: float = 1000.0) -> None:
+        self._now_us = now_us
+        self._monotonic = monotonic
+        self._lock = threading.Lock()
+
+    def now_us(self) -> int:
+        """Wall time in microseconds since the Unix epoch."""
+        return self._now_us
+
+    def monotonic(self) -> float:
+        """Seconds that only `advance` and `wait` move."""
+        return self._monotonic
+
+    def advance(self, seconds: float) -> None:
+        """Let both clocks go on."""
+        with self._lock:
+            self._now_us += round(seconds * 1_000_000)
+            self._monotonic += seconds
+
+    def set_wall(self, now_us: int) -> None:
+        """Let the wall clock jump, as NTP does; the monotonic clock stays."""
+        self._now_us = now_us
+
+    def wait(self, event: threading.Event, seconds: float | None) -> bool:
+        """Pass the time at once, unless the event is set already. Without a limit: really wait."""
+        if seconds is None:
+            return event.wait()
+        if event.is_set():
+            return True
+        self.advance(max(0.0, seconds))
+        return event.is_set()
 
 
 class Published(NamedTuple):
@@ -20,12 +58,15 @@ class Published(NamedTuple):
 
 
 # What the broker makes of a publish: None to accept, otherwise why not.
-Verdict = Callable[[Published], Optional[str]]
+Verdict = Callable[[Published], str | None]
 
 
 class Loopback:
-    """Publishes come back to matching subscriptions. ``hold`` keeps acknowledgements back, ``stalled``
-    what is told of writes, too."""
+    """A broker in memory that can be cut, slowed and made to refuse.
+
+    Publishes come back to matching subscriptions. ``hold`` keeps acknowledgements back, ``stalled``
+    what is told of writes, too.
+    """
 
     def __init__(self, clock: Clock, dispatcher: Dispatcher, *, connected: bool = True) -> None:
         self._clock = clock

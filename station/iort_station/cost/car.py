@@ -1,0 +1,99 @@
+"""What a robot's car.yaml says of its rates, as far as they make a bill.
+
+Only these keys are read; `iort-agent check` on the robot judges the whole file.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import replace
+from pathlib import Path
+from statistics import mean
+from typing import Any
+
+import yaml
+
+from iort_station.cost.usage import Usage
+from iort_station.errors import StationError
+
+# The kinds of source that take samples at a rate of their own; a test holds them to the agent.
+_OWN_RATE_HZ = {"sim": 50.0, "vesc": 50.0}
+
+
+def as_configured(usage: Usage, file: Path) -> Usage:
+    """The usage with the rates of a car.yaml; raises `StationError` for a file that cannot be read.
+
+    The file does not say how fast a ROS topic is or a recording was: their rate stays as in ``usage``.
+    """
+    car = _Section(file, "", _content(file))
+    rates = [rate for source in car.items("sources") for rate in _rates_hz(source)]
+    live, metrics = car.section("live"), car.section("metrics")
+    live_hz = live.number("rate_hz", usage.live_hz)
+    return replace(
+        usage,
+        # The limit is of each stream, and a stream sends no more than its source brings.
+        live_hz=sum(min(live_hz, rate_hz or math.inf) for rate_hz in rates) if live.enabled() else 0.0,
+        batch_s=car.section("record").number("batch_s", usage.batch_s),
+        ping_hz=car.section("ping").number("rate_hz", usage.ping_hz),
+        agent_every_s=metrics.number("every_s", usage.agent_every_s) if metrics.enabled() else 0.0,
+        streams=len(rates),
+        rate_hz=mean(rate_hz or usage.rate_hz for rate_hz in rates),
+    )
+
+
+def _rates_hz(source: _Section) -> list[float | None]:
+    """The rate of each stream of a source; None where the file does not say it."""
+    kind = source.values.get("type")
+    if kind in _OWN_RATE_HZ:
+        return [source.number("rate_hz", _OWN_RATE_HZ[kind])]
+    topics = source.section("topics").values.values()
+    names = {str(topic.get("stream") if isinstance(topic, dict) else topic) for topic in topics}
+    return [None] * max(1, len(names))
+
+
+class _Section:
+    """A mapping in the file; its errors name the file and the key."""
+
+    def __init__(self, file: Path, name: str, values: Any) -> None:
+        self._file, self._name = file, name
+        if values is not None and not isinstance(values, Mapping):
+            raise self._error("", "a mapping", values)
+        self.values: Mapping[Any, Any] = values or {}
+
+    def section(self, key: str) -> _Section:
+        return _Section(self._file, self._path(key), self.values.get(key))
+
+    def items(self, key: str) -> list[_Section]:
+        found = self.values.get(key)
+        if not isinstance(found, list) or not found:
+            raise self._error(key, "a list of at least one item", found)
+        return [_Section(self._file, self._path(f"{key}[{i}]"), item) for i, item in enumerate(found)]
+
+    def number(self, key: str, default: float) -> float:
+        found = self.values.get(key, default)
+        if isinstance(found, bool) or not isinstance(found, (int, float)) or not 0 <= found < math.inf:
+            raise self._error(key, "a number of at least 0", found)
+        return float(found)
+
+    def enabled(self) -> bool:
+        found = self.values.get("enabled", True)
+        if not isinstance(found, bool):
+            raise self._error("enabled", "true or false", found)
+        return found
+
+    def _path(self, key: str) -> str:
+        return f"{self._name}.{key}".strip(".")
+
+    def _error(self, key: str, allowed: str, found: Any) -> StationError:
+        path = self._path(key)
+        return StationError(f"{self._file}: {path}{': ' * bool(path)}must be {allowed}, got {found!r}")
+
+
+def _content(file: Path) -> Any:
+    try:
+        return yaml.safe_load(file.read_text())
+    except (OSError, UnicodeDecodeError) as error:
+        raise StationError(f"{file} cannot be read: {error}") from error
+    except yaml.YAMLError as error:
+        raise StationError(f"{file} is not YAML: {error}") from error

@@ -1,0 +1,116 @@
+"""What `iort cost --config` reads of a car.yaml, held to what the agent makes of the same file."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import fields
+
+import pytest
+from typer.testing import CliRunner
+
+from iort_agent.config.file import Config, load_config
+from iort_agent.sources.registry import SOURCES
+from iort_station.cli.main import app
+from iort_station.cost.car import _OWN_RATE_HZ, as_configured
+from iort_station.cost.usage import Usage
+from iort_station.errors import StationError
+
+NEEDED = "robot: car7\nendpoint: example.org\ncertificate: certificate.pem\nprivate_key: private.key\n"
+SIM = "sources: [{type: sim}]\n"
+RECORDING = "sources:\n- {type: bag, path: drive.bag, topics: {/core: vesc, /imu: imu, /imu2: imu}}\n"
+ROS = (
+    "sources:\n- type: ros1\n  topics: {/a: {stream: a, time: arrival}, /b: {stream: a, time: header}}\n"
+    "- {type: vesc, port: /dev/ttyACM0, rate_hz: 3}\n"
+)
+# Every key that the verb reads, with its default and without.
+FILES = (
+    SIM,
+    RECORDING,
+    ROS,
+    "sources: [{type: vesc, port: /dev/vesc}, {type: bag, path: drive.bag, stream: log}]\n",
+    f"{SIM}live: {{rate_hz: 2}}\nrecord: {{batch_s: 0.5}}\nping: {{rate_hz: 1}}\nmetrics: {{every_s: 60}}\n",
+    f"{ROS}live: {{enabled: false}}\nmetrics: {{enabled: false}}\n",
+)
+
+
+@pytest.fixture
+def car(tmp_path):
+    """Writes a car.yaml."""
+
+    def write(settings):
+        for name in ("certificate.pem", "private.key", "drive.bag"):
+            (tmp_path / name).touch()
+        file = tmp_path / "car.yaml"
+        file.write_text(NEEDED + settings)
+        return file
+
+    return write
+
+
+def in_the_agent(config: Config) -> dict[str, object]:
+    streams = [source for source in config.sources for _ in set(source.streams())]
+    known = [getattr(source, "rate_hz", None) for source in streams]
+    return {
+        "streams": len(streams),
+        "rate_hz": sum(rate or Usage().rate_hz for rate in known) / len(streams),
+        "live_hz": sum(min(config.live.rate_hz, rate or 1e9) for rate in known) * config.live.enabled,
+        "batch_s": config.record.batch_s,
+        "ping_hz": config.ping.rate_hz,
+        "agent_every_s": config.metrics.every_s * config.metrics.enabled,
+    }
+
+
+@pytest.mark.parametrize("settings", FILES)
+def test_the_station_reads_the_rates_that_the_agent_reads(car, settings):
+    file = car(settings)
+    usage = vars(as_configured(Usage(), file))
+    expected = in_the_agent(load_config(file))
+    assert {name: usage[name] for name in expected} == expected
+
+
+def test_sources_with_a_rate_of_their_own_are_the_agents():
+    rates = {
+        kind: field.default
+        for kind, config in SOURCES.items()
+        for field in fields(config)
+        if field.name == "rate_hz"
+    }
+    assert rates == _OWN_RATE_HZ
+
+
+def test_the_verb_reads_a_file_whose_certificate_is_on_the_robot(tmp_path):
+    file = tmp_path / "car.yaml"
+    file.write_text(
+        "live: {rate_hz: 4}\nsources:\n- {type: sim, rate_hz: 2}\n"
+        "- type: rosbridge\n  url: ws://localhost:9090\n"
+        "  topics: {/a: {stream: a, time: arrival}, /b: {stream: b, time: arrival}}\n"
+    )
+    given = ["cost", "--config", str(file), "--json"]
+    done = CliRunner().invoke(app, given, env={"XDG_CACHE_HOME": str(tmp_path)})
+    assert done.exit_code == 0, done.output
+    usage = json.loads(done.output)["usage"]
+    assert usage["live_hz"] == 2 + 2 * 4
+    # A sample each half second, and two topics of which nothing is known.
+    assert (usage["streams"], usage["rate_hz"]) == (3, (2 + 50 + 50) / 3)
+
+
+@pytest.mark.parametrize(
+    ("settings", "said"),
+    [
+        ("", "car.yaml: sources: must be a list of at least one item, got None"),
+        (f"{SIM}live: 5\n", "live: must be a mapping, got 5"),
+        (f"{SIM}live: {{rate_hz: fast}}\n", "live.rate_hz: must be a number of at least 0, got 'fast'"),
+        (f"{SIM}metrics: {{enabled: 1}}\n", "metrics.enabled: must be true or false, got 1"),
+        ("sources: [{type: sim, rate_hz: -1}]", "sources[0].rate_hz: must be a number of at least 0, got -1"),
+        ("sources: [", "is not YAML"),
+    ],
+)
+def test_a_file_that_cannot_be_understood_is_named_with_its_key(car, settings, said):
+    with pytest.raises(StationError) as error:
+        as_configured(Usage(), car(settings))
+    assert said in str(error.value)
+
+
+def test_a_file_that_is_not_there_is_named(tmp_path):
+    with pytest.raises(StationError, match=r"car\.yaml cannot be read"):
+        as_configured(Usage(), tmp_path / "car.yaml")

@@ -1,0 +1,65 @@
+"""The cost model's table of sizes, held to what is measured."""
+
+from __future__ import annotations
+
+from dataclasses import asdict
+
+import pytest
+
+from bench import message_sizes
+from iort_agent.sources.vehicle import Vehicle, VehicleConfig
+from iort_station.cost import sizes
+
+
+def test_a_second_s_items_fit_in_one_write_unit_each():
+    """The cost rests on it: a byte over a kilobyte is billed as two."""
+    for robot_hz in (10, 50):
+        measured = message_sizes.batch_sizes(robot_hz, 1.0)
+        assert measured.telemetry_item <= 1024
+        assert measured.summary_item <= 1024
+    assert message_sizes.own_item_bytes() <= 1024
+
+
+@pytest.mark.parametrize("row", sizes.TABLE, ids=lambda row: str(row.samples))
+def test_the_table_of_sizes_is_what_is_measured(row):
+    # Another zlib compresses a little better or worse.
+    fresh = message_sizes.batch_sizes(row.samples, 1.0)
+    assert row == pytest.approx(fresh, rel=0.03), "put in what `python -m bench.message_sizes` prints"
+
+
+def test_the_other_sizes_are_what_is_measured():
+    assert pytest.approx(message_sizes.own_item_bytes(), rel=0.03) == sizes.OWN_ITEM_BYTES
+    assert message_sizes.message_sizes().items() <= asdict(sizes.sizes_of(50.0, 1.0)).items()
+
+
+@pytest.mark.parametrize(
+    ("rate_hz", "batch_s"), [(0.1, 1.0), (15.0, 1.0), (35.0, 1.0), (50.0, 0.2), (50.0, 0.0), (150.0, 1.0)]
+)
+def test_sizes_between_two_rows_are_close_to_what_is_measured(rate_hz, batch_s):
+    found, fresh = sizes.sizes_of(rate_hz, batch_s), message_sizes.batch_sizes(rate_hz, batch_s)
+    told = (found.record, found.telemetry_item, found.summary_item)
+    assert told == pytest.approx(fresh[1:], rel=0.05)
+
+
+def test_a_short_batch_of_a_fast_stream_is_at_most_a_fifth_smaller_than_the_table_says():
+    found, fresh = sizes.sizes_of(1000.0, 0.05), message_sizes.batch_sizes(1000.0, 0.05)
+    assert fresh.telemetry_item <= found.telemetry_item <= 1.25 * fresh.telemetry_item
+
+
+def test_a_drive_is_a_vesc_drive():
+    assert message_sizes.drive(50, 1)[0].keys() == Vehicle(VehicleConfig(), 1).sample().keys()
+
+
+@pytest.mark.parametrize(
+    ("item", "expected"),
+    [
+        ({"a": "bc"}, 3),
+        ({"n": 0}, 3),
+        ({"n": 12345}, 5),
+        ({"n": -1.5}, 4),
+        ({"b": True}, 2),
+        ({"l": [1, 12345]}, 1 + 3 + (1 + 2) + (1 + 4)),
+    ],
+)
+def test_item_sizes_as_dynamodb_counts_them(item, expected):
+    assert message_sizes.item_bytes(item) == expected
