@@ -7,8 +7,8 @@ from functools import partial
 from typing import Callable, NamedTuple, Optional
 
 from iort_agent.clock import Clock
-from iort_agent.dispatch import Dispatcher
 from iort_agent.errors import UplinkError
+from iort_agent.mqtt.dispatch import Dispatcher
 from iort_agent.mqtt.uplink import Done, Message, OnConnection, OnMessage, UplinkStatus, matches
 
 

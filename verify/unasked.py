@@ -99,7 +99,7 @@ UNASKED = (
         "provisioning.ownership_token",
         "The ownership token of a new certificate is valid for one hour.",
         f"{_IOT}/fleet-provision-api.html",
-        "device/iort_agent/identity/provision.py",
+        "device/iort_agent/verbs/provision.py",
     ),
     _documented(
         "broker.presence_order",

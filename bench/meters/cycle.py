@@ -19,10 +19,11 @@ from statistics import quantiles
 from bench.ros.vesc_message import DEFINITION, TYPE, body
 from iort_agent.agent import Agent
 from iort_agent.clock import SystemClock
-from iort_agent.config.file import Config, QueueConfig
-from iort_agent.dispatch import Dispatcher
+from iort_agent.config.file import Config
+from iort_agent.mqtt.dispatch import Dispatcher
 from iort_agent.sources.ros1 import Intake, TopicConfig
 from iort_agent.sources.sim import SimConfig
+from iort_agent.spool.config import QueueConfig
 from iort_agent.spool.sqlite import make_spool
 from tests.agent_fakes import Loopback
 
@@ -41,7 +42,7 @@ def main() -> None:
             sources=(SimConfig(),),
             queue=QueueConfig(path=Path(folder) / "spool.db"),
         )
-        spool = make_spool(config, clock)
+        spool = make_spool(config.queue, clock)
         agent = Agent(config, uplink=uplink, spool=spool, clock=clock)
         intake = Intake("/sensors/core", TopicConfig("vesc", "header"), emit=agent.emit, clock=clock)
         header = {"type": TYPE, "md5sum": "bench", "message_definition": DEFINITION}

@@ -14,10 +14,10 @@ from bench.errors import BenchError
 from bench.floors.raw_mqtt import RawClient
 from iort_agent.clock import SystemClock
 from iort_agent.config.file import load_config
-from iort_agent.dispatch import Dispatcher
 from iort_agent.lanes.pings import Pings
-from iort_agent.lanes.rate_limiter import Allowance
 from iort_agent.mqtt.aws import IotCore
+from iort_agent.mqtt.dispatch import Dispatcher
+from iort_agent.rate_limiter import Allowance
 from iort_contract import BROKER, PING, PONG, RTT_FIELDS, Value, build_topic, encode_ping
 from iort_station.fleet.robots import Bundle
 

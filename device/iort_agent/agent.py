@@ -13,8 +13,8 @@ import iort_contract
 from iort_agent.account import Accounts
 from iort_agent.clock import Clock
 from iort_agent.config.file import Config
-from iort_agent.config.runtime_settings import Tuning, from_config
 from iort_agent.control.downlink import make_downlink
+from iort_agent.control.runtime_settings import Tuning, configured
 from iort_agent.control.shadow import Remote
 from iort_agent.errors import SourceError
 from iort_agent.files.folder import make_uploads
@@ -24,11 +24,11 @@ from iort_agent.lanes.batch_encoder import Packer
 from iort_agent.lanes.clock_offset import ClockOffset
 from iort_agent.lanes.live import LiveLane
 from iort_agent.lanes.pings import Pings
-from iort_agent.lanes.rate_limiter import Allowance
 from iort_agent.lanes.record import TODO, RecordLane, too_many
 from iort_agent.logs import Troubles, set_level
 from iort_agent.metrics import AgentMetrics, Rates
 from iort_agent.mqtt.uplink import Uplink
+from iort_agent.rate_limiter import Allowance
 from iort_agent.sources import Source
 from iort_agent.spool.memory import Spool
 from iort_agent.version import agent_version
@@ -82,7 +82,9 @@ class Agent:
             on_stamp=self._offset.add,
             **shared,
         )
-        self._tuning = from_config(config)
+        self._tuning = configured(
+            record=config.record, live=config.live, ping=config.ping, log_level=config.log_level
+        )
         self._remote = Remote(
             robot=config.robot,
             base=self._tuning,
@@ -182,7 +184,7 @@ class Agent:
         or a batch could not be delivered within ``drain_s``. Raises `UplinkError` where the uplink cannot
         start at all.
         """
-        problem = too_many(self._config)
+        problem = too_many(self._config.sources, self._config.record)
         if problem is not None:
             _log.warning("record: %s; %s", problem, TODO)
         self._uplink.start()

@@ -16,9 +16,9 @@ from typing import Any, Callable, Sequence
 
 from iort_agent.agent import Agent
 from iort_agent.clock import SystemClock
-from iort_agent.config.file import LOG_LEVELS, Config, load_config
+from iort_agent.config.file import Config, load_config
 from iort_agent.errors import AgentError, ConfigError
-from iort_agent.logs import neutral, set_up
+from iort_agent.logs import LOG_LEVELS, neutral, set_up
 from iort_agent.spool.sqlite import make_spool
 from iort_agent.status import SOCKET, StatusServer, fetch
 from iort_agent.status import render as render_status
@@ -133,11 +133,11 @@ def run(options: argparse.Namespace) -> int:
         _log.warning("%s is ignored: the agent has no ROS parameters, %s has its settings", argument,
                      options.config)  # fmt: skip
     # Reading a configuration must not need the network's library.
-    from iort_agent.mqtt.aws import make_uplink  # noqa: PLC0415 - it loads the library
+    from iort_agent.verbs.uplink import make_uplink  # noqa: PLC0415 - it loads the library
 
     clock = SystemClock()
     uplink = make_uplink(config, clock)
-    spool = make_spool(config, clock)
+    spool = make_spool(config.queue, clock)
     try:
         agent = Agent(config, uplink=uplink, spool=spool, clock=clock, troubles=troubles)
         server = StatusServer(_socket(options, config), agent.status)
@@ -159,8 +159,8 @@ def run(options: argparse.Namespace) -> int:
 
 def check(options: argparse.Namespace) -> int:
     """`iort-agent check`: status 1 if something would not work."""
-    from iort_agent.check import FAIL, render  # noqa: PLC0415 - it loads the network's library
-    from iort_agent.check import check as findings_of  # noqa: PLC0415 - as above
+    from iort_agent.verbs.check import FAIL, render  # noqa: PLC0415 - it loads the network's library
+    from iort_agent.verbs.check import check as findings_of  # noqa: PLC0415 - as above
 
     config = load_config(options.config)
     findings = []
@@ -182,7 +182,7 @@ def show_status(options: argparse.Namespace) -> int:
 
 def upload(options: argparse.Namespace) -> int:
     """`iort-agent upload`: status 1 if a file is not in the bucket now."""
-    from iort_agent.files.command import upload_files  # noqa: PLC0415 - as above
+    from iort_agent.verbs.upload import upload_files  # noqa: PLC0415 - as above
 
     config = load_config(options.config)
     results = upload_files(config, options.files, status_socket=_socket(options, config))
@@ -202,7 +202,7 @@ def upload(options: argparse.Namespace) -> int:
 
 def provision(options: argparse.Namespace) -> int:
     """`iort-agent provision`."""
-    from iort_agent.identity import provision  # noqa: PLC0415 - as above
+    from iort_agent.verbs import provision  # noqa: PLC0415 - as above
 
     written = provision.provision(options.config, robot=options.robot)
     print(f"{written} and its certificate are ready: `iort-agent check --config {written}`")
@@ -211,7 +211,7 @@ def provision(options: argparse.Namespace) -> int:
 
 def renew(options: argparse.Namespace) -> int:
     """`iort-agent renew`."""
-    from iort_agent.identity import provision  # noqa: PLC0415 - as above
+    from iort_agent.verbs import provision  # noqa: PLC0415 - as above
 
     config = load_config(options.config)
     provision.renew(options.config, options.claim, status_socket=_socket(options, config))

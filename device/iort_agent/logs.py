@@ -11,6 +11,7 @@ from typing import Any
 # syslog's words for it: 3 error, 4 warning, 6 info, 7 debug.
 _SYSLOG = ((logging.CRITICAL, 2), (logging.ERROR, 3), (logging.WARNING, 4), (logging.INFO, 6), (0, 7))
 _KEPT = 5
+LOG_LEVELS = ("debug", "info", "warning", "error")
 
 
 def neutral(text: str) -> str:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 import resource
 import time
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Mapping
 
@@ -13,10 +14,19 @@ from iort_agent.files.folder import Uploads
 from iort_agent.lanes.batch import StreamCounts
 from iort_agent.lanes.clock_offset import ClockOffset
 from iort_agent.mqtt.uplink import Uplink
+from iort_agent.schema import flag, number, setting
 from iort_agent.spool.memory import Spool
 from iort_contract import AGENT_FIELDS, Value
 
 _STATM = Path("/proc/self/statm")
+
+
+@dataclass(frozen=True)
+class MetricsConfig:
+    """The agent's own figures, a sample every ``every_s`` of the stream `iort_contract.AGENT_STREAM`."""
+
+    enabled: bool = setting(flag(), default=True)
+    every_s: float = setting(number(1, 3600, unit="s"), 10.0)
 
 
 class Rates:

@@ -10,15 +10,15 @@ import pytest
 
 import iort_contract
 from iort_agent.config.file import load_config
-from iort_agent.dispatch import Dispatcher
 from iort_agent.errors import UploadError
-from iort_agent.files.command import upload_files
 from iort_agent.files.file import kind_of, read, wire_name
 from iort_agent.files.folder import STATE, Folder, Uploads
 from iort_agent.files.http import Outcome, Pace, Sender, trusting
 from iort_agent.files.upload import make_uploader
-from iort_agent.lanes.rate_limiter import Allowance
+from iort_agent.mqtt.dispatch import Dispatcher
+from iort_agent.rate_limiter import Allowance
 from iort_agent.status import SOCKET, StatusServer
+from iort_agent.verbs.upload import upload_files
 from iort_contract import PART_BYTES
 from tests.agent_fakes import Loopback, ManualClock
 from tests.store_standin import store

@@ -120,7 +120,7 @@ def test_renewal_without_an_agent(embedded, bundle, tmp_path):
 
 def test_renewal_that_does_not_connect_leaves_the_old_certificate(embedded, bundle, tmp_path, monkeypatch):
     from iort_agent.errors import IdentityError
-    from iort_agent.identity import provision
+    from iort_agent.verbs import provision
 
     car = bundle()
     before = (car.folder / "certificate.pem").read_text(), (car.folder / "private.key").read_text()

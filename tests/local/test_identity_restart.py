@@ -26,8 +26,8 @@ from verify.robot import Robot
 KILLED = """
 import os, signal, sys
 from pathlib import Path
-from iort_agent.identity import provision as identity
-from iort_agent.identity.exchange import Exchange
+from iort_agent.mqtt.exchange import Exchange
+from iort_agent.verbs import provision as identity
 
 class Killed(Exchange):
     def register(self, token, parameters):

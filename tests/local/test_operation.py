@@ -15,7 +15,7 @@ from xmlrpc.server import SimpleXMLRPCServer
 import pytest
 
 import iort_contract
-from iort_agent.check import OK, Finding, _ros_master
+from iort_agent.verbs.check import OK, Finding, _ros_master
 from iort_station.operations import delivery
 from local.cloud import ROOT
 from tests.local.conftest import until

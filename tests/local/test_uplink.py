@@ -16,9 +16,9 @@ import pytest
 
 import iort_contract
 from iort_agent.clock import SystemClock
-from iort_agent.dispatch import Dispatcher
 from iort_agent.mqtt import aws, subscriptions
 from iort_agent.mqtt.aws import IotCore
+from iort_agent.mqtt.dispatch import Dispatcher
 from iort_agent.mqtt.reconnect import SLOW_SHORTEST_S
 from iort_station.fleet import robots
 from local.cloud import EmbeddedCloud

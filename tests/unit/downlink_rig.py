@@ -10,13 +10,13 @@ from pathlib import Path
 from typing import Any
 
 import iort_contract
-from iort_agent.config.downlink import DownlinkConfig, share_rule
-from iort_agent.config.schema import Where, load
+from iort_agent.control.config import DownlinkConfig, share_rule
 from iort_agent.control.downlink import Downlink
-from iort_agent.dispatch import Dispatcher
 from iort_agent.errors import SourceError
 from iort_agent.lanes.clock_offset import Offset
-from iort_agent.lanes.rate_limiter import Allowance
+from iort_agent.mqtt.dispatch import Dispatcher
+from iort_agent.rate_limiter import Allowance
+from iort_agent.schema import Where, load
 from iort_contract import Command
 from iort_contract.ros1.definition import Definition, parse
 from tests.agent_fakes import Loopback, ManualClock

@@ -11,7 +11,7 @@ import pytest
 from functions.shared.metrics import emit
 from iort_agent.agent import Agent
 from iort_agent.config.file import Config
-from iort_agent.dispatch import Dispatcher
+from iort_agent.mqtt.dispatch import Dispatcher
 from iort_agent.mqtt.reconnect import SHORTEST_S
 from iort_agent.spool.memory import MemorySpool
 from iort_contract import SHADOW

@@ -13,9 +13,11 @@ import iort_contract
 from iort_agent.agent import Agent
 from iort_agent.cli import main
 from iort_agent.clock import Clock, SystemClock
-from iort_agent.config.file import Config, MetricsConfig, PingConfig, RecordConfig
-from iort_agent.dispatch import Dispatcher
+from iort_agent.config.file import Config
 from iort_agent.errors import SourceError
+from iort_agent.lanes.config import PingConfig, RecordConfig
+from iort_agent.metrics import MetricsConfig
+from iort_agent.mqtt.dispatch import Dispatcher
 from iort_agent.mqtt.uplink import matches
 from iort_agent.sources import Emit
 from iort_agent.sources.recording.bag import BagConfig

@@ -5,8 +5,8 @@ from __future__ import annotations
 from typing import Any
 
 import iort_contract
-from iort_agent.dispatch import Dispatcher
 from iort_agent.lanes.clock_offset import Offset
+from iort_agent.mqtt.dispatch import Dispatcher
 from iort_agent.mqtt.uplink import Message
 from iort_agent.ros1.json_message import encode
 from iort_contract import FleetMessage

@@ -11,7 +11,7 @@ import pytest
 import iort_contract
 from iort_agent.errors import IdentityError, RefusedError
 from iort_agent.identity.pending import TOKEN_S, Pending, keep, kept
-from iort_agent.identity.provision import Run, provision, register_again
+from iort_agent.verbs.provision import Run, provision, register_again
 
 
 class Cloud:

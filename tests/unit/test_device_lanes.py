@@ -16,11 +16,12 @@ import pytest
 import iort_contract
 from iort_agent.agent import Agent
 from iort_agent.clock import Clock, SystemClock
-from iort_agent.config.file import Config, PingConfig, RecordConfig
-from iort_agent.dispatch import Dispatcher
+from iort_agent.config.file import Config
+from iort_agent.lanes.config import PingConfig, RecordConfig
 from iort_agent.lanes.production import Production, Rate
-from iort_agent.lanes.rate_limiter import URGENT, Allowance
 from iort_agent.lanes.record import too_many
+from iort_agent.mqtt.dispatch import Dispatcher
+from iort_agent.rate_limiter import URGENT, Allowance
 from iort_agent.spool.memory import MemorySpool
 from iort_agent.status import render
 from tests.agent_fakes import Loopback, ManualClock, Published
@@ -378,10 +379,10 @@ def test_production_is_known_over_seconds_and_growth_only_where_there_is_a_conne
 def test_too_many_streams_are_known_beforehand(streams: int, batch_s: float, made: int | None) -> None:
     record = RecordConfig(batch_s=batch_s)
     config = Config("car1", "host", Path(), Path(), (Named(streams),), record=record)
-    problem = too_many(config)
+    problem = too_many(config.sources, config.record)
     assert (problem is None) == (made is None)
     assert made is None or f"up to {made} batches a second, and one connection takes 90" in str(problem)
-    assert too_many(replace(config, record=replace(record, enabled=False))) is None
+    assert too_many(config.sources, replace(record, enabled=False)) is None
 
 
 def test_too_many_streams_are_said_at_the_start(caplog: pytest.LogCaptureFixture) -> None:

@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 import iort_contract
-from iort_agent.dispatch import Dispatcher
 from iort_agent.lanes.live import LiveLane
-from iort_agent.lanes.rate_limiter import Allowance
+from iort_agent.mqtt.dispatch import Dispatcher
+from iort_agent.rate_limiter import Allowance
 from tests.agent_fakes import Loopback, ManualClock
 
 T0 = 1_700_000_000_000_000

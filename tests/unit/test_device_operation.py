@@ -18,19 +18,19 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 import iort_contract
-from iort_agent.check import FAIL, check
 from iort_agent.cli import main
 from iort_agent.clock import SystemClock
 from iort_agent.config.file import load_config
-from iort_agent.dispatch import Dispatcher
 from iort_agent.errors import AgentError
 from iort_agent.lanes.batch import StreamCounts
 from iort_agent.lanes.clock_offset import ClockOffset
 from iort_agent.logs import JournalFormatter, LineFormatter, Troubles, is_journal
 from iort_agent.metrics import AgentMetrics, Rates, rss_mb
+from iort_agent.mqtt.dispatch import Dispatcher
 from iort_agent.spool.memory import MemorySpool
 from iort_agent.spool.sqlite import make_spool
 from iort_agent.status import StatusServer, fetch, render
+from iort_agent.verbs.check import FAIL, check
 from tests.agent_fakes import Loopback, ManualClock
 
 
@@ -351,7 +351,7 @@ def test_a_queue_that_may_not_be_written_is_found_and_leaves_the_agent_running(
     folder.chmod(0o555)
     with unprivileged():
         findings = {one.what: one for one in check(config, Path("agent.sock"))}
-        spool = make_spool(config, SystemClock())
+        spool = make_spool(config.queue, SystemClock())
         spool.put("vesc", spool.next_seq("vesc"), b"x", samples=1)
         (kept, alarm) = spool.next(0), spool.alarm
         spool.close()

@@ -12,12 +12,12 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 import iort_contract
-from iort_agent.config.file import PingConfig
-from iort_agent.config.schema import Where, load
-from iort_agent.dispatch import Dispatcher
 from iort_agent.errors import ConfigError
+from iort_agent.lanes.config import PingConfig
 from iort_agent.lanes.pings import CLOCK_EVERY_S, CLOCK_FIRST_EVERY_S, TIMEOUT_S, Pings, percentile
-from iort_agent.lanes.rate_limiter import Allowance
+from iort_agent.mqtt.dispatch import Dispatcher
+from iort_agent.rate_limiter import Allowance
+from iort_agent.schema import Where, load
 from tests.agent_fakes import Loopback, ManualClock
 
 T0 = 1_700_000_000_000_000

@@ -8,9 +8,9 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from iort_agent.dispatch import Dispatcher
-from iort_agent.lanes.rate_limiter import Allowance
 from iort_agent.lanes.record import RecordLane
+from iort_agent.mqtt.dispatch import Dispatcher
+from iort_agent.rate_limiter import Allowance
 from iort_agent.spool.memory import MemorySpool
 from tests.agent_fakes import Loopback, ManualClock
 

@@ -10,12 +10,12 @@ from typing import Any, Iterator
 
 import pytest
 
-from iort_agent.check import FAIL, OK, Finding, source_findings
 from iort_agent.config.file import load_config
 from iort_agent.errors import SourceError
 from iort_agent.sources.recording.bag import BagConfig
 from iort_agent.sources.recording.check import look_into
 from iort_agent.sources.recording.player import Message
+from iort_agent.verbs.check import FAIL, OK, Finding, source_findings
 from tests.unit.test_device_agent import config_file
 from tests.unit.test_device_bag import START, STORAGES, play, write_ros1, write_ros2
 from tests.unit.test_device_vesc_csv import row, write

@@ -10,10 +10,10 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from iort_agent.config.runtime_settings import Tuning, overlay
+from iort_agent.control.runtime_settings import Tuning, overlay
 from iort_agent.control.shadow import Remote, _difference, _merged
-from iort_agent.dispatch import Dispatcher
-from iort_agent.lanes.rate_limiter import Allowance
+from iort_agent.mqtt.dispatch import Dispatcher
+from iort_agent.rate_limiter import Allowance
 from iort_contract import Command
 from tests.agent_fakes import Loopback, ManualClock
 

@@ -20,8 +20,8 @@ from hypothesis import strategies as st
 from hypothesis.stateful import RuleBasedStateMachine, invariant, precondition, rule
 
 from iort_agent.clock import SystemClock
-from iort_agent.config.file import QueueConfig
 from iort_agent.spool import disk
+from iort_agent.spool.config import QueueConfig
 from iort_agent.spool.file import SpoolFile
 from iort_agent.spool.ledger import Ledger
 from iort_agent.spool.memory import FULL, PROCESS, REJECT_NEW, Entry, MemorySpool
@@ -415,13 +415,8 @@ def test_a_commit_that_fails_leaves_nothing_half_done(path: Path) -> None:
 
 
 def test_the_configuration_makes_the_spool(path: Path) -> None:
-    class Settings:
-        queue = QueueConfig(path=path, durability=FULL)
-
-    config: Any = Settings()
-    spool = make_spool(config, SystemClock())
+    spool = make_spool(QueueConfig(path=path, durability=FULL), SystemClock())
     assert isinstance(spool, SqliteSpool)
     spool.put("vesc", 0, b"x", samples=1)
     spool.close()
-    config.queue = QueueConfig()
-    assert isinstance(make_spool(config, SystemClock()), MemorySpool)
+    assert isinstance(make_spool(QueueConfig(), SystemClock()), MemorySpool)

@@ -12,7 +12,7 @@ from awsiot import iotidentity
 
 import iort_contract
 from functions.echo import pong
-from iort_agent.config.runtime_settings import FIELDS, RULES, Tuning, overlay
+from iort_agent.control.runtime_settings import FIELDS, RULES, Tuning, overlay
 from iort_contract import (
     AGENT_FIELDS,
     AGENT_VERSION,

@@ -12,10 +12,10 @@ import yaml
 
 from bench.target import Target
 from iort_agent.errors import IdentityError
-from iort_agent.identity import provision
 from iort_agent.identity.claim import load_claim
-from iort_agent.identity.exchange import Exchange
 from iort_agent.identity.machine_key import make_key
+from iort_agent.mqtt.exchange import Exchange
+from iort_agent.verbs import provision
 from iort_contract import (
     ADMIT_CLAIM,
     ADMIT_FINGERPRINT,
@@ -171,7 +171,7 @@ CHECKS = (
         relied_on_by=(
             "station/iort_station/fleet/claims.py",
             "functions/admit.py",
-            "device/iort_agent/identity/provision.py",
+            "device/iort_agent/verbs/provision.py",
             "stacks/fleet.py",
             "local/gaps/broker/certificate_from_csr.py",
         ),
@@ -205,7 +205,7 @@ CHECKS = (
         ),
         expected={"first_is_its_own": True, "again_refused": "", "certificates": ["ACTIVE"]},
         basis=Basis.ASSUMED,
-        relied_on_by=("device/iort_agent/identity/provision.py", "functions/admit.py"),
+        relied_on_by=("device/iort_agent/verbs/provision.py", "functions/admit.py"),
         ask=_registered_again,
     ),
     Check(

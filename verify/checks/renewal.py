@@ -8,7 +8,7 @@ from typing import Any
 
 from bench.target import Target
 from iort_agent.errors import IdentityError
-from iort_agent.identity import provision
+from iort_agent.verbs import provision
 from iort_station.fleet import certificates, claims, rotation
 from verify.assumption import Basis
 from verify.bundles import registered
@@ -60,7 +60,7 @@ CHECKS = (
         basis=Basis.DOCUMENTED,
         source=f"{_GUIDE}/provision-wo-cert.html and {_GUIDE}/life-cycle-events.html",
         relied_on_by=(
-            "device/iort_agent/identity/provision.py",
+            "device/iort_agent/verbs/provision.py",
             "station/iort_station/fleet/rotation.py",
             "functions/presence.py",
         ),

@@ -1,1 +1,1 @@
-"""car.yaml, read once into frozen dataclasses, and the settings that change while the agent runs."""
+"""car.yaml, read once into frozen dataclasses. Each room has its section; `file` collects them."""

@@ -1,6 +1,6 @@
 """From the broker to ROS and between robots: commands, other robots' messages, and our own to them.
 
-`iort_agent.config.downlink` says what of it a robot wants. What comes in is checked against the ROS type's
+`iort_agent.control.config` says what of it a robot wants. What comes in is checked against the ROS type's
 own definition and refused, counted and, once a minute, logged where it does not fit. Motion is under
 `iort_agent.control.leases`.
 """
@@ -14,12 +14,12 @@ from typing import Any, Callable, Iterable, Mapping, Optional, Sequence
 
 import iort_contract
 from iort_agent.clock import Clock
-from iort_agent.config.downlink import ROBOT_IN_TOPIC, CommandConfig, DownlinkConfig, FleetConfig, ShareConfig
+from iort_agent.control.config import ROBOT_IN_TOPIC, CommandConfig, DownlinkConfig, FleetConfig, ShareConfig
 from iort_agent.control.leases import Leases, Limits
 from iort_agent.errors import ConfigError, UplinkError
 from iort_agent.lanes.clock_offset import Offset
-from iort_agent.lanes.rate_limiter import STEADY, Allowance
 from iort_agent.mqtt.uplink import Message, Uplink
+from iort_agent.rate_limiter import STEADY, Allowance
 from iort_agent.ros1.json_message import decode, encode
 from iort_agent.ros1.node import DEFAULT_NODE
 from iort_agent.ros1.publish import Graph, Ros1Graph

@@ -13,10 +13,10 @@ import logging
 from typing import Any, Callable, Mapping
 
 from iort_agent.clock import Clock
-from iort_agent.config.runtime_settings import Tuning, overlay
+from iort_agent.control.runtime_settings import Tuning, overlay
 from iort_agent.errors import UplinkError
-from iort_agent.lanes.rate_limiter import Allowance
 from iort_agent.mqtt.uplink import Message, Uplink
+from iort_agent.rate_limiter import Allowance
 from iort_contract import (
     ACCEPTED,
     AGENT_VERSION,

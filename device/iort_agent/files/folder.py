@@ -15,13 +15,13 @@ from pathlib import Path, PurePath
 from typing import Any, Iterable, Iterator, NamedTuple
 
 from iort_agent.clock import Clock
-from iort_agent.config.schema import Where, any_path, number, setting
 from iort_agent.errors import UploadError
 from iort_agent.files.file import Local, Look, from_json, look_at, read, to_json
 from iort_agent.files.upload import Uploader, make_uploader
-from iort_agent.lanes.rate_limiter import Allowance
 from iort_agent.mqtt.uplink import Uplink
 from iort_agent.private_files import folder_of, open_below, write_below
+from iort_agent.rate_limiter import Allowance
+from iort_agent.schema import Where, any_path, number, setting
 
 _log = logging.getLogger(__name__)
 

@@ -17,8 +17,8 @@ from iort_agent.clock import Clock
 from iort_agent.errors import UploadError
 from iort_agent.files.file import Local, changed, look_at
 from iort_agent.files.http import Outcome, Pace, Sender, trusting
-from iort_agent.lanes.rate_limiter import Allowance
 from iort_agent.mqtt.uplink import Message, Uplink
+from iort_agent.rate_limiter import Allowance
 from iort_contract import FILE, MAX_ADDRESSES, PING, PONG, Address, ContractError, FileAnswer, FileRequest
 
 _log = logging.getLogger(__name__)

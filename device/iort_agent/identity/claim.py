@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import iort_contract
-from iort_agent.config.schema import Where, any_path, existing_path, load, number, read_yaml, setting, text
+from iort_agent.schema import Where, any_path, existing_path, load, number, read_yaml, setting, text
 
 
 @dataclass(frozen=True)

@@ -28,8 +28,8 @@ from typing import Callable, Mapping, NamedTuple
 import iort_contract
 from iort_agent.clock import Clock
 from iort_agent.errors import UplinkError
-from iort_agent.lanes.rate_limiter import LIVE, URGENT, Allowance
 from iort_agent.mqtt.uplink import Uplink
+from iort_agent.rate_limiter import LIVE, URGENT, Allowance
 from iort_contract import ContractError, LiveSample, Value
 
 _log = logging.getLogger(__name__)

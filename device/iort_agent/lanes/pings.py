@@ -9,8 +9,8 @@ from typing import Callable, NamedTuple, Sequence
 import iort_contract
 from iort_agent.clock import Clock, Pace
 from iort_agent.errors import UplinkError
-from iort_agent.lanes.rate_limiter import STEADY, Allowance
 from iort_agent.mqtt.uplink import Message, Uplink
+from iort_agent.rate_limiter import STEADY, Allowance
 from iort_agent.sources import Emit
 from iort_contract import PING, PONG, ContractError, Value
 

@@ -16,14 +16,16 @@ import logging
 import math
 import random
 import threading
+from typing import Sequence
 
 import iort_contract
 from iort_agent.clock import Clock
-from iort_agent.config.file import Config
 from iort_agent.errors import UplinkError
+from iort_agent.lanes.config import RecordConfig
 from iort_agent.lanes.production import Production, Rate
-from iort_agent.lanes.rate_limiter import PUBLISHES_PER_S, SHARE, Allowance
 from iort_agent.mqtt.uplink import Uplink
+from iort_agent.rate_limiter import PUBLISHES_PER_S, SHARE, Allowance
+from iort_agent.sources import SourceConfig
 from iort_agent.spool.memory import Entry, Spool
 
 _log = logging.getLogger(__name__)
@@ -38,16 +40,16 @@ TODO = (
 _MIN_RETRY_S, _MAX_RETRY_S = 0.5, 30.0
 
 
-def too_many(config: Config) -> str | None:
-    """Why the streams of a configuration are too many for one connection, in a line; None where they are not.
+def too_many(sources: Sequence[SourceConfig], record: RecordConfig) -> str | None:
+    """Why the streams of the sources are too many for one connection, in a line; None where they are not.
 
     It is about streams that bring samples all the time; where every sample goes by itself (``batch_s`` 0),
     nobody knows how many that are.
     """
-    if not config.record.enabled:
+    if not record.enabled:
         return None
-    batch_s, most = config.record.batch_s, PUBLISHES_PER_S * SHARE
-    streams = sum(len(source.streams()) for source in config.sources)
+    batch_s, most = record.batch_s, PUBLISHES_PER_S * SHARE
+    streams = sum(len(source.streams()) for source in sources)
     # A batch lies within a second.
     made = streams * math.ceil(1 / batch_s) if batch_s else streams
     if made <= most:

@@ -15,24 +15,21 @@ import logging
 import threading
 from concurrent.futures import Future
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Callable
+from typing import Any, Callable
 
 from awscrt import io, mqtt5
 from awsiot import mqtt5_client_builder
 
 from iort_agent.clock import Clock
-from iort_agent.dispatch import Dispatcher
 from iort_agent.errors import IdentityError, UplinkError
 from iort_agent.identity.certificate import Certificate, read_certificate, stamp
+from iort_agent.mqtt.dispatch import Dispatcher
 from iort_agent.mqtt.failures import error_name, explain, said, why_not_connected
 from iort_agent.mqtt.native_thread import keep_state
 from iort_agent.mqtt.nodelay import send_at_once
 from iort_agent.mqtt.reconnect import SETTLED_S, SHORTEST_S, Backoff, Causes
 from iort_agent.mqtt.subscriptions import Subscriptions
 from iort_agent.mqtt.uplink import Done, Message, OnConnection, OnMessage, UplinkStatus
-
-if TYPE_CHECKING:
-    from iort_agent.config.file import Config
 
 _log = logging.getLogger(__name__)
 
@@ -356,20 +353,6 @@ class IotCore:
 
     def _note_error(self, text: str) -> None:
         self._last_error = text
-
-
-def make_uplink(config: Config, clock: Clock) -> IotCore:
-    """The uplink of a robot's configuration."""
-    return IotCore(
-        endpoint=config.endpoint,
-        port=config.port,
-        client_id=config.robot,
-        certificate=config.certificate,
-        private_key=config.private_key,
-        root_ca=config.root_ca,
-        clock=clock,
-        dispatcher=Dispatcher(),
-    )
 
 
 def _write_error(future: Future[Any]) -> UplinkError | None:

@@ -8,7 +8,7 @@ import threading
 from concurrent.futures import Future
 from typing import Any, Callable
 
-from iort_agent.dispatch import Dispatcher
+from iort_agent.mqtt.dispatch import Dispatcher
 from iort_agent.mqtt.failures import code_name, explain
 from iort_agent.mqtt.uplink import Message, OnMessage, matches
 

@@ -14,9 +14,9 @@ from typing import Any, Mapping, NamedTuple, Optional, Sequence
 
 import iort_contract
 from iort_agent.clock import Clock
-from iort_agent.config.schema import Where, choice, items, pairs, section, setting, text
 from iort_agent.errors import SourceError
 from iort_agent.ros1.node import ANY_TYPE, DEFAULT_NODE, Node, definition_of, shared
+from iort_agent.schema import Where, choice, items, pairs, section, setting, text
 from iort_agent.sources import REFUSE, UPLOAD, Emit
 from iort_agent.throttled_log import Seldom
 from iort_contract import RosMessage, RosType, Value

@@ -27,10 +27,10 @@ import logging
 import sqlite3
 import threading
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 from iort_agent.clock import Clock
 from iort_agent.errors import AgentError
+from iort_agent.spool.config import QueueConfig
 from iort_agent.spool.disk import SpoolDisk
 from iort_agent.spool.file import is_damage
 from iort_agent.spool.memory import (
@@ -45,9 +45,6 @@ from iort_agent.spool.memory import (
 )
 from iort_agent.spool.stock import AHEAD_BYTES, Stock
 
-if TYPE_CHECKING:
-    from iort_agent.config.file import Config
-
 _log = logging.getLogger(__name__)
 
 # Puts wait at most so long for their transaction, and acknowledgements, which need not hurry, so long.
@@ -58,12 +55,11 @@ MEMORY_BYTES = 16 * 1024 * 1024
 RETRY_S = 1.0
 
 
-def make_spool(config: Config, clock: Clock) -> Spool:
+def make_spool(queue: QueueConfig, clock: Clock) -> Spool:
     """The spool that the configuration asks for, ready for use.
 
     Raises `AgentError` where the file is in use by another agent or is none of ours.
     """
-    queue = config.queue
     if queue.path is None:
         return MemorySpool(max_bytes=queue.max_bytes, policy=queue.policy)
     spool = SqliteSpool(

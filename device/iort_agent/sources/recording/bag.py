@@ -15,12 +15,12 @@ from typing import Any, ContextManager, Iterator, Mapping, NamedTuple, Optional,
 
 import iort_contract
 from iort_agent.clock import Clock
-from iort_agent.config.schema import choice, existing_path, flag, number, pairs, setting, text
 from iort_agent.errors import SourceError
+from iort_agent.schema import choice, existing_path, flag, number, pairs, setting, text
 from iort_agent.sources import REFUSE, UPLOAD, Emit
 from iort_agent.sources.recording.player import NOW, ORIGINAL, Message, Open, Playback, play
+from iort_agent.sources.recording.tool_csv import VescLog
 from iort_agent.sources.recording.unreadable import Wrapped, check_kind
-from iort_agent.sources.vesc.tool_csv import VescLog
 from iort_contract import RosMessage, RosType
 from iort_contract.ros1.decode import HEADER, Decoder
 from iort_contract.ros1.definition import parse

@@ -19,9 +19,9 @@ from urllib.parse import urlsplit
 
 import iort_contract
 from iort_agent.clock import Clock
-from iort_agent.config.schema import Where, choice, items, number, pairs, section, setting, text
 from iort_agent.errors import SourceError
 from iort_agent.ros1.write import Writer
+from iort_agent.schema import Where, choice, items, number, pairs, section, setting, text
 from iort_agent.sources import Emit, ros1
 from iort_agent.sources.flatten import HEADER as HEADER_FIELD
 from iort_agent.sources.flatten import flatten

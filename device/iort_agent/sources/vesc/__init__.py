@@ -1,1 +1,1 @@
-"""A VESC itself: its serial line, and the logs of VESC Tool."""
+"""A VESC itself, on its serial line."""

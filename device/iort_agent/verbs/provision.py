@@ -21,9 +21,9 @@ from iort_agent.config.file import Config, load_config
 from iort_agent.errors import AgentError, ConfigError, IdentityError, RefusedError
 from iort_agent.identity.certificate import parse_certificate
 from iort_agent.identity.claim import Claim, load_claim
-from iort_agent.identity.exchange import Exchange
 from iort_agent.identity.machine_key import machine_serial, make_key
 from iort_agent.identity.pending import Pending, forget, keep, kept
+from iort_agent.mqtt.exchange import Exchange
 from iort_agent.private_files import write_below
 from iort_agent.status import fetch
 
@@ -214,7 +214,7 @@ def _wait_connected(config: Config, certificate_id: str, status_socket: Path) ->
 
 
 def _try_alone(config: Config) -> None:
-    from iort_agent.check import FAIL, broker_findings  # noqa: PLC0415 - as above
+    from iort_agent.verbs.check import FAIL, broker_findings  # noqa: PLC0415 - it loads TLS and more
 
     for finding in broker_findings(config):
         if finding.level == FAIL:

@@ -14,8 +14,8 @@ from iort_agent.config.file import Config
 from iort_agent.errors import AgentError, UploadError
 from iort_agent.files.file import read
 from iort_agent.files.upload import Uploader, make_uploader
-from iort_agent.lanes.rate_limiter import Allowance
 from iort_agent.logs import set_up
+from iort_agent.rate_limiter import Allowance
 from iort_agent.status import fetch
 
 _CONNECT_S = 30.0
@@ -38,7 +38,7 @@ def upload_files(config: Config, paths: Sequence[Path], *, status_socket: Path) 
     """
     _refuse_beside_agent(config, status_socket)
     # Reading a configuration must not need the network's library.
-    from iort_agent.mqtt.aws import make_uplink  # noqa: PLC0415 - it loads the library
+    from iort_agent.verbs.uplink import make_uplink  # noqa: PLC0415 - it loads the library
 
     set_up("warning")
     clock, stop = SystemClock(), threading.Event()

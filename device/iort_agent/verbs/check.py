@@ -328,7 +328,7 @@ def _queue(config: Config) -> Iterator[Finding]:
 
 
 def _lanes(config: Config) -> Finding:
-    problem = too_many(config)
+    problem = too_many(config.sources, config.record)
     if problem is not None:
         return Finding("record lane", WARN, problem, TODO)
     return Finding("record lane", OK, "the streams named are few enough for one connection")

@@ -13,9 +13,10 @@ from pathlib import Path
 from typing import Any, Iterator, Mapping
 
 import iort_contract
-from iort_agent.config.file import LOG_LEVELS, Config, LiveConfig, PingConfig, RecordConfig
-from iort_agent.config.schema import Rule, Where, choice, items, text
 from iort_agent.errors import ConfigError
+from iort_agent.lanes.config import LiveConfig, PingConfig, RecordConfig
+from iort_agent.logs import LOG_LEVELS
+from iort_agent.schema import Rule, Where, choice, items, text
 
 # Errors name the place as those of a configuration file do.
 _WHERE = Where(Path("shadow agent"))
@@ -63,15 +64,9 @@ RULES: dict[str, Rule] = {
 _SECTIONS = {name.split(".")[0] for name in RULES if "." in name} | {FIELDS}
 
 
-def from_config(config: Config) -> Tuning:
+def configured(*, record: RecordConfig, live: LiveConfig, ping: PingConfig, log_level: str) -> Tuning:
     """What the configuration file says."""
-    return Tuning(
-        config.record.enabled,
-        config.live.enabled,
-        config.live.rate_hz,
-        config.ping.rate_hz,
-        config.log_level,
-    )
+    return Tuning(record.enabled, live.enabled, live.rate_hz, ping.rate_hz, log_level)
 
 
 def overlay(

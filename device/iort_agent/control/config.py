@@ -19,7 +19,7 @@ from dataclasses import dataclass
 from typing import Any, Callable, Mapping
 
 import iort_contract
-from iort_agent.config.schema import Rule, Where, flag, number, pairs, section, setting, text
+from iort_agent.schema import Rule, Where, flag, number, pairs, section, setting, text
 from iort_agent.sources.ros1 import ros_name
 from iort_contract import ContractError
 

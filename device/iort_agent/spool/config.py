@@ -1,0 +1,40 @@
+"""The configuration's section `queue`."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from iort_agent.schema import Where, choice, number, setting
+from iort_agent.spool.memory import FULL, OVERWRITE_OLDEST, PROCESS, REJECT_NEW
+
+
+def _queue_file(value: Any, where: Where) -> Path | None:
+    """The path of a file that may be made: in a folder that exists, and not the configuration's own."""
+    allowed = "the path of a file, in a folder that exists"
+    if value is None:
+        return None
+    if not isinstance(value, str) or not value:
+        raise where.error(value, allowed)
+    path = where.file.parent / Path(value).expanduser()
+    if not path.parent.is_dir():
+        raise where.error(value, f"{allowed}, and there is no {path.parent}")
+    if path.is_dir() or path.resolve() == where.file.resolve():
+        raise where.error(value, f"{allowed}, that is nothing else already")
+    return path
+
+
+@dataclass(frozen=True)
+class QueueConfig:
+    """Where batches wait for the broker, and what to drop when it is full (Greengrass' words).
+
+    ``path``: the queue's file, which need not exist; without it, the queue ends with the agent.
+    ``max_bytes`` bounds the batches in it, and the file is a little larger. ``durability``: what the
+    file survives, the end of the process or a power cut (``full``) too.
+    """
+
+    path: Path | None = setting(_queue_file, None)
+    max_bytes: int = setting(number(200_000, 2**40, whole=True, unit="bytes"), 64 * 1024 * 1024)
+    policy: str = setting(choice(OVERWRITE_OLDEST, REJECT_NEW), OVERWRITE_OLDEST)
+    durability: str = setting(choice(PROCESS, FULL), PROCESS)
