@@ -86,11 +86,11 @@ def _running(status_socket: Path) -> dict[str, Any] | None:
 
 def _identity(config: Config) -> Iterator[Finding]:
     try:
-        certificate = read_certificate(config.certificate)
+        validity = _validity(read_certificate(config.certificate))
     except IdentityError as error:
         yield Finding("certificate", FAIL, str(error), "`iort robots add` or `iort-agent provision` gets one")
     else:
-        yield _validity(certificate)
+        yield validity
         try:
             check_pair(config.certificate, config.private_key)
         except IdentityError as error:
@@ -106,13 +106,13 @@ def _identity(config: Config) -> Iterator[Finding]:
 
 
 def _validity(certificate: Certificate) -> Finding:
-    now_s = time.time()
-    day = time.strftime("%Y-%m-%d", time.gmtime(certificate.not_after_s))
-    if now_s > certificate.not_after_s:
+    now_s, validity = time.time(), certificate.validity()
+    day = time.strftime("%Y-%m-%d", time.gmtime(validity.not_after_s))
+    if now_s > validity.not_after_s:
         return Finding("certificate", FAIL, f"expired on {day}", "get a new one: `iort-agent renew`")
-    if now_s < certificate.not_before_s:
+    if now_s < validity.not_before_s:
         return Finding("certificate", FAIL, "not valid yet, by this machine's clock", "set the clock")
-    if certificate.not_after_s - now_s < _EXPIRES_SOON_S:
+    if validity.not_after_s - now_s < _EXPIRES_SOON_S:
         return Finding("certificate", WARN, f"expires on {day}", "get a new one: `iort-agent renew`")
     return Finding("certificate", OK, f"{certificate.id[:16]}..., valid until {day}")
 
