@@ -337,7 +337,7 @@ def test_a_slowed_lane_is_warned_of_once_and_shown(caplog: pytest.LogCaptureFixt
     status = make_status(drive.agent.parts)
     told = f"up to 10 Hz, SLOWED to {status.lanes.live.effective_hz:g} Hz a stream by AWS' limit"
     assert told in render(status)
-    assert 1.5 < status["streams"]["topic007"]["live_hz"] < 2.2
+    assert 1.5 < status.streams["topic007"].live_hz < 2.2
     drive.topics = topics(1, 20)
     drive.run(15)
     assert "SLOWED" not in render(make_status(drive.agent.parts))
