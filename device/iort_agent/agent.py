@@ -19,13 +19,13 @@ from iort_agent.lanes.live import LiveLane
 from iort_agent.lanes.pings import Pings
 from iort_agent.lanes.rate_limiter import Allowance
 from iort_agent.lanes.record import RecordLane
-from iort_agent.lanes.streams import Streams
 from iort_agent.logs import Troubles, set_level
 from iort_agent.metrics import AgentMetrics, Rates
 from iort_agent.mqtt.uplink import Uplink
 from iort_agent.runtime import Parts, Runtime
 from iort_agent.sources.run import SourceRun
 from iort_agent.spool.memory import Spool
+from iort_agent.streams import Streams
 
 
 def make_agent(

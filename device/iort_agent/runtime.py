@@ -20,13 +20,13 @@ from iort_agent.lanes.clock_offset import ClockOffset
 from iort_agent.lanes.live import LiveLane
 from iort_agent.lanes.pings import Pings
 from iort_agent.lanes.record import TODO, RecordLane, too_many
-from iort_agent.lanes.streams import Streams
 from iort_agent.logs import Troubles
 from iort_agent.metrics import AgentMetrics, Rates
 from iort_agent.mqtt.uplink import Uplink
 from iort_agent.sources import Emit
 from iort_agent.sources.run import SourceRun
 from iort_agent.spool.memory import Spool
+from iort_agent.streams import Streams
 
 _log = logging.getLogger(__name__)
 
