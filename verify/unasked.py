@@ -1,4 +1,4 @@
-"""What the design takes for granted and no program asks in a quarter of an hour."""
+"""What the design takes for granted and no program asks in half an hour."""
 
 from __future__ import annotations
 
