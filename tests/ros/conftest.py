@@ -144,7 +144,7 @@ class Graph:
             "ROS_IP": "127.0.0.1",
             "ROS_LOG_DIR": str(folder),
             "ROS_HOME": str(folder),
-            "PYTHONPATH": str(ROOT),
+            "PYTHONPATH": os.pathsep.join(map(str, (ROOT, ROOT / "device", ROOT / "contract"))),
             "PYTHONUNBUFFERED": "1",
         }
         self.master: Process
