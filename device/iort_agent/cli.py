@@ -14,14 +14,17 @@ import time
 from pathlib import Path
 from typing import Any, Callable, Sequence
 
-from iort_agent.agent import Agent
+from iort_agent.agent import make_agent
 from iort_agent.clock import SystemClock
 from iort_agent.config.file import Config, load_config
 from iort_agent.errors import AgentError, ConfigError
 from iort_agent.logs import LOG_LEVELS, neutral, set_up
+from iort_agent.reporting import make_report, make_status
+from iort_agent.runtime import Runtime
 from iort_agent.spool.sqlite import make_spool
-from iort_agent.status import SOCKET, StatusServer, fetch
-from iort_agent.status import render as render_status
+from iort_agent.status.server import SOCKET, StatusServer, ask, fetch
+from iort_agent.status.state import document
+from iort_agent.status.text import render as render_status
 from iort_agent.version import agent_version
 
 _log = logging.getLogger("iort-agent")
@@ -139,8 +142,8 @@ def run(options: argparse.Namespace) -> int:
     uplink = make_uplink(config, clock)
     spool = make_spool(config.queue, clock)
     try:
-        agent = Agent(config, uplink=uplink, spool=spool, clock=clock, troubles=troubles)
-        server = StatusServer(_socket(options, config), agent.status)
+        agent = make_agent(config, uplink=uplink, spool=spool, clock=clock, troubles=troubles)
+        server = StatusServer(_socket(options, config), lambda: document(make_status(agent.parts)))
         server.start()
         _end_on_signals(agent)
         try:
@@ -149,11 +152,11 @@ def run(options: argparse.Namespace) -> int:
             server.stop()
     finally:
         spool.close()
-    report = agent.report()
+    report = make_report(agent.parts)
     if options.report is not None:
-        options.report.write_text(json.dumps(report, indent=2) + "\n", encoding="utf-8")
-    samples = sum(counts["samples"] for counts in report["streams"].values())
-    _log.info("ended: %d samples, %d live messages", samples, report["live_published"])
+        options.report.write_text(json.dumps(document(report), indent=2) + "\n", encoding="utf-8")
+    samples = sum(counts.samples for counts in report.streams.values())
+    _log.info("ended: %d samples, %d live messages", samples, report.live_published)
     return status
 
 
@@ -175,8 +178,8 @@ def check(options: argparse.Namespace) -> int:
 
 def show_status(options: argparse.Namespace) -> int:
     """`iort-agent status`."""
-    state = fetch(_socket(options, load_config(options.config)))
-    print(json.dumps(state, indent=2) if options.json else render_status(state))
+    path = _socket(options, load_config(options.config))
+    print(json.dumps(fetch(path), indent=2) if options.json else render_status(ask(path)))
     return 0
 
 
@@ -224,7 +227,7 @@ def _socket(options: argparse.Namespace, config: Config) -> Path:
     return config.status_socket or file.absolute().parent / SOCKET
 
 
-def _end_on_signals(agent: Agent) -> None:
+def _end_on_signals(agent: Runtime) -> None:
     """The first signal ends the agent in good order, a second one at once."""
     first: float | None = None
 

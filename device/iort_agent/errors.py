@@ -7,6 +7,7 @@ UplinkError    the broker cannot be reached, or refused a message
 IdentityError  certificate or key cannot be read, do not belong together, or cannot be had
  RefusedError  AWS IoT refuses to issue or register a certificate
 UploadError    a file cannot be uploaded
+NotRunningError no agent answers on the status socket
 """
 
 from __future__ import annotations
@@ -18,6 +19,10 @@ class AgentError(Exception):
 
 class ConfigError(AgentError):
     """A mistake in the configuration; the text names file, key, what was found and what is allowed."""
+
+
+class NotRunningError(AgentError):
+    """No agent answers on the status socket."""
 
 
 class SourceError(AgentError):

@@ -6,6 +6,7 @@ import logging
 import os
 import sys
 from collections import deque
+from dataclasses import dataclass
 from typing import Any
 
 # syslog's words for it: 3 error, 4 warning, 6 info, 7 debug.
@@ -22,23 +23,32 @@ def neutral(text: str) -> str:
     return "".join(c if c.isprintable() else c.encode("unicode_escape").decode() for c in text)
 
 
+@dataclass(frozen=True)
+class Trouble:
+    """A warning or an error that was logged."""
+
+    at_s: float
+    level: str
+    text: str
+
+
 class Troubles(logging.Handler):
     """Keeps the last few warnings, and the last few errors, which no warning displaces."""
 
     def __init__(self) -> None:
         super().__init__(logging.WARNING)
-        self._warnings: deque[dict[str, Any]] = deque(maxlen=_KEPT)
-        self._errors: deque[dict[str, Any]] = deque(maxlen=_KEPT)
+        self._warnings: deque[Trouble] = deque(maxlen=_KEPT)
+        self._errors: deque[Trouble] = deque(maxlen=_KEPT)
 
     def emit(self, record: logging.LogRecord) -> None:
         """Keep a record's text."""
         lines = self._errors if record.levelno >= logging.ERROR else self._warnings
         text = neutral(record.getMessage())
-        lines.append({"at_s": round(record.created, 3), "level": record.levelname.lower(), "text": text})
+        lines.append(Trouble(round(record.created, 3), record.levelname.lower(), text))
 
-    def last(self) -> list[dict[str, Any]]:
+    def last(self) -> list[Trouble]:
         """The newest last."""
-        return sorted([*self._errors, *self._warnings], key=lambda line: float(line["at_s"]))
+        return sorted([*self._errors, *self._warnings], key=lambda line: line.at_s)
 
 
 class LineFormatter(logging.Formatter):

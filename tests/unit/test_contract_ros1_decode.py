@@ -256,9 +256,9 @@ def test_a_real_recording_is_what_rosbags_reads() -> None:
         # The newest rosbags for Python 3.8 has the older name.
         fields = getattr(reader.typestore, "fielddefs", None) or reader.typestore.FIELDDEFS
 
-        def fields_of(value: Any) -> list[str] | None:
+        def members(value: Any) -> dict[str, Any] | None:
             known = fields.get(getattr(value, "__msgtype__", ""))
-            return None if known is None else [name for name, _ in known[1]]
+            return None if known is None else {name: getattr(value, name) for name, _ in known[1]}
 
         counts: dict[str, int] = {}
         for connection in reader.connections:
@@ -269,7 +269,7 @@ def test_a_real_recording_is_what_rosbags_reads() -> None:
             for _, _, raw in reader.readers[0].messages([connection]):
                 message = reader.deserialize(raw, connection.msgtype)
                 values, stamp_us, _ = decoder.decode(raw)
-                assert values == flatten(message, fields_of)
+                assert values == flatten(message, members)
                 if stamp_us is not None:
                     stamp = message.header.stamp
                     assert stamp_us == stamp.sec * 1_000_000 + stamp.nanosec // 1000
@@ -341,11 +341,13 @@ def test_any_message_is_what_rosbags_wrote(case: tuple[str, list[Any], list[Any]
     message = types["A"](*arrays("a_msgs/A", a_values), nested if array else nested[0])
     data = bytes(store.serialize_ros1(message, "a_msgs/msg/A"))
 
-    def fields_of(value: Any) -> list[str] | None:
+    def members(value: Any) -> dict[str, Any] | None:
         kind = getattr(value, "__msgtype__", None)
-        return None if kind is None else [field.name for field in parsed.fields(kind.replace("/msg/", "/"))]
+        if kind is None:
+            return None
+        return {field.name: getattr(value, field.name) for field in parsed.fields(kind.replace("/msg/", "/"))}
 
-    expected = flatten(message, fields_of)
+    expected = flatten(message, members)
     blobs = tuple(
         f"{prefix}{field.name}."
         for kind, prefixes in (

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import threading
 from dataclasses import replace
 from pathlib import Path
@@ -10,7 +11,7 @@ from typing import Any
 import pytest
 
 import iort_contract
-from iort_agent.agent import Agent
+from iort_agent.agent import make_agent
 from iort_agent.cli import main
 from iort_agent.clock import Clock, SystemClock
 from iort_agent.config.file import Config
@@ -19,9 +20,11 @@ from iort_agent.lanes.config import PingConfig, RecordConfig
 from iort_agent.metrics import MetricsConfig
 from iort_agent.mqtt.dispatch import Dispatcher
 from iort_agent.mqtt.uplink import matches
+from iort_agent.reporting import make_report, make_status
 from iort_agent.sources import Emit
 from iort_agent.sources.recording.bag import BagConfig
 from iort_agent.spool.memory import REJECT_NEW, MemorySpool
+from iort_agent.status.state import Status, document, read
 from tests.agent_fakes import Loopback, Published
 
 T0 = 1_700_000_000_000_000
@@ -57,9 +60,17 @@ class Rig:
         self.clock = SystemClock()
         self.uplink = Loopback(self.clock, Dispatcher(), connected=connected)
         self.spool = MemorySpool(max_bytes=settings.pop("max_bytes", 10**9), policy=REJECT_NEW)
-        self.agent = Agent(
+        self.agent = make_agent(
             replace(config, **settings), uplink=self.uplink, spool=self.spool, clock=self.clock
         )
+
+    def report(self) -> dict[str, Any]:
+        """As `--report` writes it."""
+        return document(make_report(self.agent.parts))
+
+    def status(self) -> dict[str, Any]:
+        """As the status socket gives it."""
+        return document(make_status(self.agent.parts))
 
     def recorded(self, stream: str = "vesc") -> list[Any]:
         topic = f"$aws/rules/iort_record/dt/iort/car1/{stream}"
@@ -73,7 +84,7 @@ def test_every_sample_is_recorded_and_the_report_says_so() -> None:
     assert rig.agent.run(drain_s=10) == 0
     assert rig.recorded() == list(range(500))
     assert rig.seqs == list(range(10))
-    report = rig.agent.report()
+    report = rig.report()
     assert report["streams"]["vesc"] == {
         "samples": 500, "stored": 500, "batches": 10, "refused": 0, "nulled": 0, "first_seq": 0,
     }  # fmt: skip
@@ -82,6 +93,21 @@ def test_every_sample_is_recorded_and_the_report_says_so() -> None:
     live = [m for m in rig.uplink.published if m.topic == "live/iort/car1/vesc"]
     assert report["live_published"] == len(live) > 0
     assert rig.uplink.stopped
+
+
+def test_the_status_is_read_as_it_was_written() -> None:
+    rig = Rig(drive, ping=PingConfig(rate_hz=20, paths=("broker",)))
+    assert rig.agent.run(drain_s=10) == 0
+    status = make_status(rig.agent.parts)
+    assert (status.streams["vesc"].samples, status.lanes.ping.rate_hz) == (500, 20)
+    written = json.loads(json.dumps({**document(status), "of a later version": 1}))
+    written["over_share"] = {"since_ms": 1, "last_ms": 2, "batches": 3}
+    written["clock"] = {"offset_ms": 1.5, "uncertainty_ms": 0.5}
+    written["troubles"] = [{"at_s": 1.0, "level": "error", "text": "x"}]
+    assert document(read(Status, written)) == {k: v for k, v in written.items() if k != "of a later version"}
+    del written["connection"]["connects"]
+    with pytest.raises(KeyError, match="connects"):
+        read(Status, written)
 
 
 def test_a_signal_ends_it_in_good_order() -> None:
@@ -100,7 +126,7 @@ def test_what_cannot_be_delivered_in_time_is_told(caplog: pytest.LogCaptureFixtu
     assert rig.agent.run(drain_s=0.05) == 1
     # And two of the agent's own account, from its start and its end.
     assert "502 samples in 12 batches could not be delivered within 0.05 s" in caplog.text
-    assert rig.agent.report()["spool"]["left_samples"] == 502
+    assert rig.report()["spool"]["left_samples"] == 502
 
 
 def test_a_backlog_is_delivered_when_the_connection_comes_at_last() -> None:
@@ -123,7 +149,7 @@ def test_dropped_samples_are_not_a_success(caplog: pytest.LogCaptureFixture) -> 
     rig = Rig(late, connected=False, max_bytes=1000)
     assert rig.agent.run(drain_s=10) == 1
     assert "were dropped: the queue was full" in caplog.text
-    report = rig.agent.report()
+    report = rig.report()
     assert 0 < len(rig.recorded()) < 1500
     assert rig.seqs == sorted(set(rig.seqs)), "the numbers of those dropped are missing"
     assert len(rig.seqs) < report["streams"]["vesc"]["batches"] == 30
@@ -144,7 +170,7 @@ def test_a_source_that_fails_does_not_take_the_others_with_it(
     rig = Rig(broken, drive)
     assert rig.agent.run(drain_s=10) == 1
     assert rig.recorded() == list(range(500))
-    assert rig.agent.report()["failed_sources"] == ["script"]
+    assert rig.report()["failed_sources"] == ["script"]
     assert text in caplog.text
 
 
@@ -166,7 +192,7 @@ def test_a_source_that_ends_with_nothing_stored_has_failed(
 ) -> None:
     rig = Rig(run)
     assert rig.agent.run(drain_s=10) == 1
-    assert rig.agent.report()["failed_sources"] == ["script"]
+    assert rig.report()["failed_sources"] == ["script"]
     assert f"source failed: script: {why}" in caplog.text
 
 
@@ -177,7 +203,7 @@ def test_one_sample_that_is_refused_is_no_failure() -> None:
 
     rig = Rig(both)
     assert rig.agent.run(drain_s=10) == 0
-    assert rig.agent.report()["streams"]["vesc"]["refused"] == 3
+    assert rig.report()["streams"]["vesc"]["refused"] == 3
 
 
 def test_a_source_that_was_stopped_before_its_first_sample_has_not_failed() -> None:
@@ -221,7 +247,7 @@ def test_round_trips_are_recorded_like_any_stream() -> None:
         iort_contract.decode(m.payload) for m in seen if m.topic == "$aws/rules/iort_record/dt/iort/car1/rtt"
     ]
     values = [value for batch in batches for value in batch.columns["broker_ms"]]
-    ping = rig.agent.report()["pings"]["broker"]
+    ping = rig.report()["pings"]["broker"]
     assert len(values) == ping["received"] == ping["sent"] >= 3
     assert ping["lost"] == 0
     assert not [m for m in seen if m.topic == "live/iort/car1/rtt"]
@@ -231,21 +257,21 @@ def test_the_record_lane_can_be_switched_off() -> None:
     rig = Rig(drive, record=RecordConfig(enabled=False))
     assert rig.agent.run(drain_s=10) == 0
     assert rig.recorded() == []
-    assert rig.agent.report()["live_published"] > 0
+    assert rig.report()["live_published"] > 0
 
 
 def test_lanes_fields_and_rates_change_while_it_runs() -> None:
     def tuned(emit: Emit, stop: threading.Event) -> None:
         emit("vesc", T0, {"speed": 1, "voltage_input": 40})
-        tuning = rig.agent._tuning
-        rig.agent.tune(replace(tuning, fields={"vesc": ("speed", "gone")}))
+        tuning = rig.agent.parts.streams.tuning
+        rig.agent.parts.tune(replace(tuning, fields={"vesc": ("speed", "gone")}))
         emit("vesc", T0 + 1_000_000, {"speed": 2, "voltage_input": 40})
-        rig.agent.tune(replace(tuning, record_enabled=False, live_enabled=False))
-        live = rig.agent.report()["live_published"]
+        rig.agent.parts.tune(replace(tuning, record_enabled=False, live_enabled=False))
+        live = rig.report()["live_published"]
         for i in range(100):
             emit("vesc", T0 + 2_000_000 + i, {"speed": 3, "voltage_input": 40})
-        assert rig.agent.report()["live_published"] <= live + 1
-        rig.agent.tune(tuning)
+        assert rig.report()["live_published"] <= live + 1
+        rig.agent.parts.tune(tuning)
         emit("vesc", T0 + 3_000_000, {"speed": 4, "voltage_input": 40})
 
     rig = Rig(tuned)
@@ -265,7 +291,7 @@ def test_types_are_said_again_when_recording_begins() -> None:
 
     def late(emit: Emit, stop: threading.Event) -> None:
         emit(iort_contract.TYPES_STREAM, T0, said.sample())
-        rig.agent.tune(replace(rig.agent._tuning, record_enabled=True))
+        rig.agent.parts.tune(replace(rig.agent.parts.streams.tuning, record_enabled=True))
         emit("vesc", T0 + 1_000_000, {"speed": 1})
 
     rig = Rig(late, record=RecordConfig(enabled=False))
@@ -282,7 +308,7 @@ def test_an_account_is_of_one_moment() -> None:
     assert rig.agent.run(drain_s=10) == 0
     # As a batch does that is stored between two looks.
     rig.spool.put("vesc", rig.spool.next_seq("vesc"), b"", samples=50)
-    counts, next_seq = rig.agent._counted()["vesc"]
+    counts, next_seq = rig.agent.parts.streams.counted()["vesc"]
     assert (counts.stored, next_seq) == (500, 10)
 
 

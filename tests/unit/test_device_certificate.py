@@ -1,10 +1,12 @@
-"""Certificates read without a library, held against one that can."""
+"""A certificate file's number, validity and key."""
 
 from __future__ import annotations
 
+import base64
 import datetime as dt
-import hashlib
 import os
+import subprocess
+import sys
 from pathlib import Path
 
 import pytest
@@ -17,6 +19,7 @@ from hypothesis import strategies as st
 
 from iort_agent.errors import IdentityError
 from iort_agent.identity.certificate import check_pair, parse_certificate, read_certificate, stamp
+from iort_agent.identity.machine_key import make_key
 
 
 def made(before: dt.datetime, after: dt.datetime, subject: str = "car") -> tuple[x509.Certificate, str]:
@@ -50,22 +53,40 @@ def text(certificate: x509.Certificate) -> str:
         ((1950, 1, 1), (9999, 12, 31)),
     ],
 )
-def test_it_reads_what_the_library_reads(before: tuple[int, int, int], after: tuple[int, int, int]) -> None:
-    certificate, _ = made(dt.datetime(*before), dt.datetime(*after))  # noqa: DTZ001 - the library takes UTC for granted
+def test_number_and_validity(before: tuple[int, int, int], after: tuple[int, int, int]) -> None:
+    first, last = (dt.datetime(*day, tzinfo=dt.timezone.utc) for day in (before, after))
+    certificate, _ = made(first, last)
     found = parse_certificate("some text before\n" + text(certificate) + "and behind")
-    assert found.not_before_s == certificate.not_valid_before_utc.timestamp()
-    assert found.not_after_s == certificate.not_valid_after_utc.timestamp()
-    der = certificate.public_bytes(serialization.Encoding.DER)
-    assert found.id == hashlib.sha256(der).hexdigest(), "as AWS numbers certificates"
+    assert found.validity() == (first.timestamp(), last.timestamp())
+    assert found.id == certificate.fingerprint(hashes.SHA256()).hex(), "as AWS numbers certificates"
 
 
 @given(st.binary(max_size=300))
 def test_what_is_no_certificate_is_refused(der: bytes) -> None:
-    import base64
-
     pem = f"-----BEGIN CERTIFICATE-----\n{base64.b64encode(der).decode()}\n-----END CERTIFICATE-----\n"
     with pytest.raises(IdentityError):
-        parse_certificate(pem)
+        parse_certificate(pem).validity()
+
+
+def test_a_new_key_and_its_request() -> None:
+    key, request = make_key("car7")
+    read = x509.load_pem_x509_csr(request.encode())
+    assert read.is_signature_valid
+    assert read.subject.rfc4514_string() == "CN=car7"
+    private = serialization.load_pem_private_key(key.encode(), password=None)
+    assert read.public_key() == private.public_key()
+    assert make_key("car7")[0] != key
+
+
+def test_the_running_agent_does_not_load_the_library() -> None:
+    code = (
+        "import sys, iort_agent.cli, iort_agent.mqtt.aws, iort_agent.check\n"
+        "from iort_agent.identity.certificate import parse_certificate\n"
+        "parse_certificate(sys.stdin.read()).id\n"
+        "assert 'cryptography' not in sys.modules"
+    )
+    certificate, _ = made(dt.datetime(2020, 1, 1), dt.datetime(2040, 1, 1))  # noqa: DTZ001 - the library takes UTC for granted
+    subprocess.run([sys.executable, "-c", code], input=text(certificate), text=True, check=True)
 
 
 def test_pairs(tmp_path: Path) -> None:

@@ -8,11 +8,11 @@ from typing import Any
 import pytest
 from awscrt import mqtt5
 
-from iort_agent.identity.certificate import Certificate
+from iort_agent.identity.certificate import Validity
 from iort_agent.mqtt.failures import why_not_connected
 
 NOW_S = 1_700_000_000
-GOOD = Certificate(id="c", not_before_s=NOW_S - 10, not_after_s=NOW_S + 10)
+GOOD = Validity(not_before_s=NOW_S - 10, not_after_s=NOW_S + 10)
 REFUSED = mqtt5.ConnectReasonCode.NOT_AUTHORIZED
 HUNG_UP, CLOSED = "AWS_ERROR_MQTT_UNEXPECTED_HANGUP", "AWS_IO_SOCKET_CLOSED"
 DNS = "AWS_IO_DNS_INVALID_NAME"
@@ -24,7 +24,7 @@ def failed(name: str = HUNG_UP, code: Any = None) -> Any:
 
 
 @pytest.mark.parametrize(
-    ("data", "certificate", "again", "expected", "words"),
+    ("data", "validity", "again", "expected", "words"),
     [
         (failed(DNS), GOOD, False, (f"the endpoint's name does not resolve ({DNS})", False), "resolve"),
         (failed(HUNG_UP), GOOD, False, ("", False), "closed the connection"),
@@ -45,12 +45,12 @@ def failed(name: str = HUNG_UP, code: Any = None) -> Any:
     ],
 )
 def test_each_failure_has_its_cause(
-    data: Any, certificate: Certificate | None, again: bool, expected: tuple[str, bool], words: str
+    data: Any, validity: Validity | None, again: bool, expected: tuple[str, bool], words: str
 ) -> None:
     cause = why_not_connected(
         data,
         client_id="car7",
-        certificate=certificate,
+        validity=lambda: validity,
         now_us=NOW_S * 1_000_000,
         hung_up=lambda before_tls: again,
     )

@@ -25,9 +25,11 @@ def message(**fields: Any) -> SimpleNamespace:
     return SimpleNamespace(**fields)
 
 
-def fields_of(value: Any) -> list[str] | None:
+def members(value: Any) -> dict[str, Any] | None:
     # As with rosbags, the constants are on the object but not among the fields.
-    return [n for n in vars(value) if n.islower()] if isinstance(value, SimpleNamespace) else None
+    return (
+        {n: v for n, v in vars(value).items() if n.islower()} if isinstance(value, SimpleNamespace) else None
+    )
 
 
 HEADER = message(seq=1, stamp=message(sec=1, nanosec=2), frame_id="")
@@ -54,11 +56,11 @@ HEADER = message(seq=1, stamp=message(sec=1, nanosec=2), frame_id="")
     ],
 )  # fmt: skip
 def test_flatten(ros: Any, flat: dict[str, Any]) -> None:
-    found = flatten(ros, fields_of)
+    found = flatten(ros, members)
     assert found == flat
     assert list(map(type, found.values())) == list(map(type, flat.values()))
 
 
 def test_an_image_is_not_a_sample() -> None:
     with pytest.raises(SourceError, match="field data has 100000 elements"):
-        flatten(message(data=Numbers([0] * 100_000)), fields_of)
+        flatten(message(data=Numbers([0] * 100_000)), members)

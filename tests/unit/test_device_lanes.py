@@ -14,7 +14,7 @@ from typing import Any, NamedTuple
 import pytest
 
 import iort_contract
-from iort_agent.agent import Agent
+from iort_agent.agent import make_agent
 from iort_agent.clock import Clock, SystemClock
 from iort_agent.config.file import Config
 from iort_agent.lanes.config import PingConfig, RecordConfig
@@ -22,8 +22,10 @@ from iort_agent.lanes.production import Production, Rate
 from iort_agent.lanes.record import too_many
 from iort_agent.mqtt.dispatch import Dispatcher
 from iort_agent.rate_limiter import URGENT, Allowance
+from iort_agent.reporting import make_report, make_status
 from iort_agent.spool.memory import MemorySpool
-from iort_agent.status import render
+from iort_agent.status.state import document
+from iort_agent.status.text import render
 from tests.agent_fakes import Loopback, ManualClock, Published
 
 T0 = 1_700_000_000_000_000
@@ -77,7 +79,7 @@ class Drive:
         self.uplink.verdict = self._sees
         self.spool = MemorySpool(max_bytes=10**9)
         config = replace(Config("car1", "host", Path(), Path(), ()), **settings)
-        self.agent = Agent(config, uplink=self.uplink, spool=self.spool, clock=self.clock)
+        self.agent = make_agent(config, uplink=self.uplink, spool=self.spool, clock=self.clock)
         self.sent: list[Sent] = []
         self.rtt_s = 0.05
         self._acks: list[float] = []
@@ -98,7 +100,7 @@ class Drive:
             if sources:
                 self._offer()
             if self._is_due(pings_hz):
-                self.agent._pings.send(iort_contract.BROKER)
+                self.agent.parts.pings.send(iort_contract.BROKER)
             if self._ms % TICK_MS == 0:
                 self.agent.tick()
             ready = bisect.bisect_right(self._acks, self.clock.monotonic())
@@ -116,14 +118,20 @@ class Drive:
         for i, (stream, topic) in enumerate(self.topics.items()):
             # Each at its own milliseconds.
             if self._is_due(topic.hz, 7 * i):
-                self.agent.emit(stream, self.clock.now_us(), topic.values())
+                self.agent.parts.streams.emit(stream, self.clock.now_us(), topic.values())
 
     def _record(self) -> None:
-        lane = self.agent._record
+        lane = self.agent.parts.record
         if lane._wake.is_set() or self.clock.monotonic() >= self._record_due:
             lane._wake.clear()
             wait_s = lane.step()
             self._record_due = float("inf") if wait_s is None else self.clock.monotonic() + wait_s
+
+    def status(self) -> dict[str, Any]:
+        return document(make_status(self.agent.parts))
+
+    def report(self) -> dict[str, Any]:
+        return document(make_report(self.agent.parts))
 
     def cut(self) -> None:
         self._acks.clear()
@@ -143,11 +151,10 @@ class Drive:
 
     def end(self) -> None:
         """Let everything arrive, and see that it did, and that no second held too much."""
-        for batcher in self.agent._batchers.values():
-            batcher.flush()
+        self.agent.parts.streams.flush()
         self.run(2, sources=False)
         assert self.backlog() == 0
-        taken = {name: one["samples"] for name, one in self.agent.report()["streams"].items()}
+        taken = {name: one.samples for name, one in make_report(self.agent.parts).streams.items()}
         arrived = dict.fromkeys(taken, 0)
         for message in self.uplink.published:
             if message.topic.startswith("$aws/rules/iort_record/"):
@@ -184,7 +191,7 @@ def test_recordings_go_first_and_live_shares_the_rest(
     assert max(live) - min(live) <= 1, "no stream is favoured"
     mean_hz = sum(live) / count / 15
     assert least_live_hz <= mean_hz <= most_live_hz
-    tempo = drive.agent.report()["live"]
+    tempo = drive.report()["live"]
     assert (tempo["asked_hz"], tempo["slowed"]) == (10, True)
     assert tempo["effective_hz"] == pytest.approx(mean_hz, rel=0.15)
     drive.end()
@@ -195,8 +202,8 @@ def test_few_topics_have_what_they_ask_for_and_nobody_is_warned(caplog: pytest.L
     drive.run(SETTLE_S)
     drive.run(10)
     assert set(drive.live(10).values()) <= {99, 100, 101}
-    assert drive.agent.report()["live"]["effective_hz"] == 10
-    assert "SLOWED" not in render(drive.agent.status())
+    assert drive.report()["live"]["effective_hz"] == 10
+    assert "SLOWED" not in render(make_status(drive.agent.parts))
     assert not caplog.messages
     drive.end()
 
@@ -211,7 +218,7 @@ def test_slow_streams_take_their_own_rate_and_leave_the_rest_to_the_others() -> 
     fast = live[:8] + live[10:18]
     assert max(fast) - min(fast) <= 4
     assert min(fast) >= 20 * 3.5
-    assert drive.agent.status()["lanes"]["live"]["effective_hz"] == pytest.approx(min(fast) / 20, rel=0.1)
+    assert drive.status()["lanes"]["live"]["effective_hz"] == pytest.approx(min(fast) / 20, rel=0.1)
     drive.end()
 
 
@@ -273,15 +280,15 @@ def test_another_fault_goes_soon_whatever_else_there_is() -> None:
 def test_pings_have_what_recordings_leave_and_live_what_pings_leave() -> None:
     drive = Drive(topics(50, 20), ping=PingConfig(rate_hz=20, paths=(iort_contract.BROKER,)))
     drive.run(SETTLE_S, pings_hz=20)
-    before = drive.agent.report()["pings"][iort_contract.BROKER]["sent"]
-    held_back = drive.agent.status()["lanes"]["ping"]["held_back"]
+    before = drive.report()["pings"][iort_contract.BROKER]["sent"]
+    held_back = drive.status()["lanes"]["ping"]["held_back"]
     drive.run(10, pings_hz=20)
-    assert drive.agent.report()["pings"][iort_contract.BROKER]["sent"] - before == 200
-    assert drive.agent.status()["lanes"]["ping"]["held_back"] == held_back
+    assert drive.report()["pings"][iort_contract.BROKER]["sent"] - before == 200
+    assert drive.status()["lanes"]["ping"]["held_back"] == held_back
     assert 10 * 15 <= sum(drive.live(10).values()) <= 10 * 20
     assert drive.backlog() <= 3
     drive.run(10, pings_hz=100)
-    assert drive.agent.status()["lanes"]["ping"]["held_back"] > 500
+    assert drive.status()["lanes"]["ping"]["held_back"] > 500
     assert drive.backlog() <= 10, "recordings go before pings, too"
     drive.end()
 
@@ -291,32 +298,32 @@ def test_a_slow_network_is_filled_by_what_is_on_its_way() -> None:
     drive.rtt_s = 0.5
     drive.run(15)
     assert drive.backlog() <= 2 * 50
-    assert drive.agent.status()["alarms"] == []
+    assert drive.status()["alarms"] == []
     drive.end()
 
 
 def test_more_than_one_connection_takes_is_said_with_what_to_do(caplog: pytest.LogCaptureFixture) -> None:
     drive = Drive(topics(120, 2))
     drive.run(9)
-    assert drive.agent.status()["alarms"] == []
+    assert drive.status()["alarms"] == []
     drive.run(16)
-    (alarm,) = drive.agent.status()["alarms"]
+    (alarm,) = drive.status()["alarms"]
     assert "batches wait, 1" in alarm
     assert "the limit allows 90 batches/s" in alarm
     assert "record fewer topics" in alarm
-    assert f"ALARM     {alarm}" in render(drive.agent.status())
+    assert f"ALARM     {alarm}" in render(make_status(drive.agent.parts))
     assert len([text for text in caplog.messages if text.startswith("record: more is recorded")]) == 1
     assert 1 <= sum(drive.live(5).values()) <= 10, "next to nothing is left"
     drive.check_limits()
     drive.run(40, sources=False)
-    assert drive.agent.status()["alarms"] == []
+    assert drive.status()["alarms"] == []
 
 
 def test_a_network_that_is_too_slow_is_told_from_a_limit() -> None:
     drive = Drive(topics(10, 20))
     drive.rtt_s = 20
     drive.run(30)
-    (alarm,) = drive.agent.status()["alarms"]
+    (alarm,) = drive.status()["alarms"]
     assert "the network is too slow" in alarm
 
 
@@ -328,13 +335,13 @@ def test_a_slowed_lane_is_warned_of_once_and_shown(caplog: pytest.LogCaptureFixt
     drive.run(8)
     drive.uplink.connect()
     drive.run(15)
-    status = drive.agent.status()
-    told = f"up to 10 Hz, SLOWED to {status['lanes']['live']['effective_hz']:g} Hz a stream by AWS' limit"
+    status = make_status(drive.agent.parts)
+    told = f"up to 10 Hz, SLOWED to {status.lanes.live.effective_hz:g} Hz a stream by AWS' limit"
     assert told in render(status)
-    assert 1.5 < status["streams"]["topic007"]["live_hz"] < 2.2
+    assert 1.5 < status.streams["topic007"].live_hz < 2.2
     drive.topics = topics(1, 20)
     drive.run(15)
-    assert "SLOWED" not in render(drive.agent.status())
+    assert "SLOWED" not in render(make_status(drive.agent.parts))
     told_of = [(r.levelno, r.message[:15]) for r in caplog.records if r.message.startswith("live: ")]
     assert told_of == [(logging.WARNING, "live: slowed do"), (logging.INFO, "live: up to 10 ")]
 
@@ -387,7 +394,7 @@ def test_too_many_streams_are_known_beforehand(streams: int, batch_s: float, mad
 
 def test_too_many_streams_are_said_at_the_start(caplog: pytest.LogCaptureFixture) -> None:
     clock = SystemClock()
-    agent = Agent(
+    agent = make_agent(
         Config("car1", "host", Path(), Path(), (Named(91),)),
         uplink=Loopback(clock, Dispatcher()),
         spool=MemorySpool(max_bytes=10**6),

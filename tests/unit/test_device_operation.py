@@ -21,7 +21,7 @@ import iort_contract
 from iort_agent.cli import main
 from iort_agent.clock import SystemClock
 from iort_agent.config.file import load_config
-from iort_agent.errors import AgentError
+from iort_agent.errors import AgentError, NotRunningError
 from iort_agent.lanes.batch import StreamCounts
 from iort_agent.lanes.clock_offset import ClockOffset
 from iort_agent.logs import JournalFormatter, LineFormatter, Troubles, is_journal
@@ -29,7 +29,9 @@ from iort_agent.metrics import AgentMetrics, Rates, rss_mb
 from iort_agent.mqtt.dispatch import Dispatcher
 from iort_agent.spool.memory import MemorySpool
 from iort_agent.spool.sqlite import make_spool
-from iort_agent.status import StatusServer, fetch, render
+from iort_agent.status.server import StatusServer, ask, fetch
+from iort_agent.status.state import Status, read
+from iort_agent.status.text import render
 from iort_agent.verbs.check import FAIL, check
 from tests.agent_fakes import Loopback, ManualClock
 
@@ -62,7 +64,7 @@ def test_no_text_of_elsewhere_is_a_line_of_its_own_or_speaks_to_the_terminal() -
     assert LineFormatter("%(message)s").format(said) == shown
     troubles = Troubles()
     troubles.emit(said)
-    assert troubles.last()[0]["text"] == shown
+    assert troubles.last()[0].text == shown
     # As the agent sets it up, for whatever is logged by whom.
     program = (
         f"from iort_agent.logs import set_up; import logging; set_up('info'); logging.warning({HOSTILE!r})"
@@ -87,7 +89,7 @@ def test_the_last_troubles_are_kept() -> None:
     troubles = Troubles()
     for i in range(9):
         troubles.handle(record(logging.WARNING, f"trouble {i}"))
-    assert [line["text"] for line in troubles.last()] == [f"trouble {i}" for i in range(4, 9)]
+    assert [line.text for line in troubles.last()] == [f"trouble {i}" for i in range(4, 9)]
 
 
 def test_warnings_do_not_displace_errors() -> None:
@@ -95,7 +97,7 @@ def test_warnings_do_not_displace_errors() -> None:
     troubles.handle(record(logging.ERROR, "the one that matters"))
     for i in range(9):
         troubles.handle(record(logging.WARNING, f"trouble {i}"))
-    kept = [(line["level"], line["text"]) for line in troubles.last()]
+    kept = [(line.level, line.text) for line in troubles.last()]
     assert kept == [("error", "the one that matters"), *(("warning", f"trouble {i}") for i in range(4, 9))]
 
 
@@ -232,6 +234,18 @@ def test_the_socket_is_the_owners_alone_and_goes_with_the_agent(tmp_path: Path) 
         fetch(path)
 
 
+def test_the_status_of_another_version_is_no_sign_of_a_stopped_agent(tmp_path: Path) -> None:
+    path = tmp_path / "agent.sock"
+    server = StatusServer(path, lambda: {"pid": 7})
+    server.start()
+    try:
+        with pytest.raises(AgentError, match="of another version") as raised:
+            ask(path)
+        assert not isinstance(raised.value, NotRunningError)
+    finally:
+        server.stop()
+
+
 def test_a_long_path_is_no_obstacle(tmp_path: Path) -> None:
     folder = tmp_path / ("x" * 100)
     folder.mkdir()
@@ -304,7 +318,7 @@ def test_a_reader_that_has_seen_enough_is_no_error(tmp_path: Path) -> None:
     rig = Rig(drive)
     assert rig.agent.run(drain_s=10) == 0
     config = config_file(tmp_path, "{type: sim}")
-    server = StatusServer(tmp_path / "agent.sock", rig.agent.status)
+    server = StatusServer(tmp_path / "agent.sock", rig.status)
     server.start()
     reading, writing = os.pipe()
     os.close(reading)
@@ -366,8 +380,8 @@ def test_status_of_an_agent_for_a_person() -> None:
 
     rig = Rig(drive)
     assert rig.agent.run(drain_s=10) == 0
-    state = rig.agent.status()
-    text = render(json.loads(json.dumps(state)))
+    state = rig.status()
+    text = render(read(Status, json.loads(json.dumps(state))))
     assert "robot     car1" in text
     assert "stream    vesc: " in text
     assert "500 samples" in text
@@ -384,7 +398,7 @@ def test_status_of_an_agent_for_a_person() -> None:
             "waits": "another node took the name",
         }
     ]
-    topics = [line for line in render(state).splitlines() if line.startswith("topic ")]
+    topics = [line for line in render(read(Status, state)).splitlines() if line.startswith("topic ")]
     assert topics == [
         "topic     /scan: 201 messages; 201 undecodable",
         "topic     /lost: 3 messages, SILENT; 3 left out ranges; 1 malformed",
@@ -393,7 +407,7 @@ def test_status_of_an_agent_for_a_person() -> None:
         "waiting": 2, "uploaded": 1, "sent_bytes": 1_234_567, "current": "drive.bag",
         "current_bytes": 8_388_608, "last_error": "drive.bag: refused: not today", "large": None,
     }  # fmt: skip
-    text = render(state)
+    text = render(read(Status, state))
     line = "files     2 waiting, 1 uploaded, 1,234,567 bytes sent, now drive.bag (8,388,608 bytes)"
     assert line in text
     assert "last error: drive.bag: refused: not today" in text
@@ -404,11 +418,11 @@ def test_status_says_that_the_robot_is_over_its_share() -> None:
 
     rig = Rig(drive)
     assert rig.agent.run(drain_s=10) == 0
-    state = rig.agent.status()
-    assert "\nshare " not in render(state)
+    state = rig.status()
+    assert "\nshare " not in render(read(Status, state))
     state["over_share"] = {"since_ms": 1_700_000_000_000, "last_ms": 1_700_000_060_000, "batches": 40}
     assert "share     40 batch(es) over this robot's share of the cloud, the last at 22:14:20Z" in render(
-        state
+        read(Status, state)
     )
 
 
@@ -417,7 +431,7 @@ def test_status_says_what_became_of_what_the_sources_read() -> None:
 
     rig = Rig(drive)
     assert rig.agent.run(drain_s=10) == 0
-    state = rig.agent.status()
+    state = rig.status()
     state["sources"] = [
         {"source": "bag ride.csv", "rows": 168, "skipped": {"columns": 100, "time": 40}, "bad_cells": {},
          "clock_back": 53, "columns_left_out": ["note", "gnss lat"], "gnss_ahead_ms": None},
@@ -431,4 +445,4 @@ def test_status_says_what_became_of_what_the_sources_read() -> None:
         "topic     /tf: 7 messages, SILENT; 2 left out a.b",
         "source    VESC",
     ]
-    assert "\n".join(lines) in render(state)
+    assert "\n".join(lines) in render(read(Status, state))

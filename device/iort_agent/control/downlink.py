@@ -165,8 +165,12 @@ class Downlink:
             "fleet": {name: dict(fleet.passed) for name, fleet in self._fleet.items()},
             "shared": {shared.ros_topic: shared.seq for shared in self._shares},
             "refused": self._seldom.counts(),
-            "waits": self._graph.waits(),
+            "waits": self.waits(),
         }
+
+    def waits(self) -> str | None:
+        """What the commands wait for; None if they do not wait."""
+        return self._graph.waits()
 
     def _run(self) -> None:
         while not self._end.is_set():

@@ -75,6 +75,14 @@ class Counts(NamedTuple):
     sent_bytes: int
 
 
+class Current(NamedTuple):
+    """The file on its way and its bytes so far (None: no file is), and the last error of any file."""
+
+    name: str | None
+    sent_bytes: int
+    last_error: str | None
+
+
 class _Held(NamedTuple):
     look: Look
     until: float
@@ -270,14 +278,9 @@ class Uploads:
         """What became of files."""
         return Counts(self.waiting(), self._uploaded, self._uploader.sent_bytes)
 
-    def status(self) -> dict[str, Any]:
-        """How it goes right now."""
-        return {
-            **self.counts()._asdict(),
-            "current": self._current,
-            "current_bytes": self._current_bytes,
-            "last_error": self._last_error,
-        }
+    def current(self) -> Current:
+        """The upload that is under way, and the last error."""
+        return Current(self._current, self._current_bytes, self._last_error)
 
     def _upload(self, folder: Folder, name: Path, stop: threading.Event) -> None:
         self._current, self._current_bytes = str(name), 0

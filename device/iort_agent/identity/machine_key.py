@@ -1,44 +1,37 @@
-"""What tells this machine from others, and a key that is made on it, with the openssl command."""
+"""The machine's serial number, and a private key made on the machine."""
 
 from __future__ import annotations
 
 import contextlib
-import subprocess
 from pathlib import Path
 
 from iort_agent.errors import IdentityError
+from iort_agent.identity.certificate import load_x509
 
-# Where Linux says which machine this is; the first that there is.
+# Where Linux tells the machine's serial number; the first file that exists counts.
 _SERIALS = (Path("/proc/device-tree/serial-number"), Path("/etc/machine-id"))
 
 
 def make_key(robot: str) -> tuple[str, str]:
-    """A new key and a request to certify it, both as PEM. The key is in no file yet."""
-    key = _openssl(["genpkey", "-algorithm", "EC", "-pkeyopt", "ec_paramgen_curve:P-256"])
-    request = _openssl(["req", "-new", "-sha256", "-key", "/dev/stdin", "-subj", f"/CN={robot}"], key)
-    return key, request
+    """Make a new key and a request to certify it, both as PEM. Writes no file."""
+    x509 = load_x509()
+    from cryptography.hazmat.primitives import hashes, serialization  # noqa: PLC0415 - as in `load_x509`
+    from cryptography.hazmat.primitives.asymmetric import ec  # noqa: PLC0415 - as above
+
+    key = ec.generate_private_key(ec.SECP256R1())
+    subject = x509.Name([x509.NameAttribute(x509.NameOID.COMMON_NAME, robot)])
+    request = x509.CertificateSigningRequestBuilder(subject).sign(key, hashes.SHA256())
+    pem = key.private_bytes(
+        serialization.Encoding.PEM, serialization.PrivateFormat.PKCS8, serialization.NoEncryption()
+    )
+    return pem.decode(), request.public_bytes(serialization.Encoding.PEM).decode()
 
 
 def machine_serial() -> str:
-    """What tells this machine from others, and stays when its disk image is copied, if it has such."""
+    """The machine's serial number; where the hardware has one, a copy of the disk image does not share it."""
     for path in _SERIALS:
         with contextlib.suppress(OSError, UnicodeDecodeError):
             serial = path.read_text(encoding="ascii").strip("\0 \n")
             if serial:
                 return serial
-    raise IdentityError("this machine has no serial number to be found: set `serial` in the claim's file")
-
-
-def _openssl(arguments: list[str], given: str | None = None) -> str:
-    try:
-        done = subprocess.run(  # noqa: S603 - the arguments are ours, and no shell reads them
-            ["openssl", *arguments],  # noqa: S607 - wherever the distribution has it
-            input=given, capture_output=True, text=True, check=False,
-        )  # fmt: skip
-    except OSError as error:
-        raise IdentityError(
-            f"the openssl command is needed: {error} (Debian: apt install openssl)"
-        ) from error
-    if done.returncode:
-        raise IdentityError(f"openssl {arguments[0]} failed: {done.stderr.strip()[-300:]}")
-    return done.stdout
+    raise IdentityError("this machine has no serial number: set `serial` in the claim's file")

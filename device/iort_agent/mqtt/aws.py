@@ -22,7 +22,7 @@ from awsiot import mqtt5_client_builder
 
 from iort_agent.clock import Clock
 from iort_agent.errors import IdentityError, UplinkError
-from iort_agent.identity.certificate import Certificate, read_certificate, stamp
+from iort_agent.identity.certificate import Certificate, Validity, read_certificate, stamp
 from iort_agent.mqtt.dispatch import Dispatcher
 from iort_agent.mqtt.failures import error_name, explain, said, why_not_connected
 from iort_agent.mqtt.native_thread import keep_state
@@ -274,7 +274,7 @@ class IotCore:
         try:
             self._certificate = read_certificate(self._certificate_file)
         except IdentityError as error:
-            # The library could read it, so it is good enough; only its dates stay unknown.
+            # The client accepts the file, so go on without its number and validity.
             _log.warning("%s", error)
             self._certificate = None
         self._client, self._generation = client, generation
@@ -301,7 +301,7 @@ class IotCore:
             cause = why_not_connected(
                 data,
                 client_id=self._client_id,
-                certificate=self._certificate,
+                validity=self._validity,
                 now_us=self._clock.now_us(),
                 hung_up=self._causes.hung_up,
             )
@@ -312,6 +312,12 @@ class IotCore:
                 level = logging.ERROR if cause.slow else logging.WARNING
             _log.log(level, "cannot connect to %s as %s: %s", self._endpoint, self._client_id, cause.text)
         self._down.set()
+
+    def _validity(self) -> Validity | None:
+        try:
+            return self._certificate.validity() if self._certificate is not None else None
+        except IdentityError:
+            return None
 
     def _on_lost(self, data: Any) -> None:
         self._subscriptions.lost()

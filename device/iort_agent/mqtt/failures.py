@@ -7,7 +7,7 @@ from typing import Any, Callable
 
 from awscrt import mqtt5
 
-from iort_agent.identity.certificate import Certificate
+from iort_agent.identity.certificate import Validity
 from iort_agent.mqtt.reconnect import Cause
 
 _TLS_FAILED = "AWS_IO_TLS_ERROR_NEGOTIATION_FAILURE"
@@ -47,19 +47,22 @@ def why_not_connected(
     data: Any,
     *,
     client_id: str,
-    certificate: Certificate | None,
+    validity: Callable[[], Validity | None],
     now_us: int,
     hung_up: Callable[..., bool],
 ) -> Cause:
-    """What to make of a connection that was not made, for a robot with this certificate (None: it could
-    not be read) by a clock that says ``now_us``; ``hung_up`` is asked whether the broker hangs up
-    again and again (`iort_agent.mqtt.reconnect.Causes.hung_up`)."""
+    """Explain why a connection failed.
+
+    ``validity`` reads the validity of the robot's certificate (None: it cannot be read); it is asked only
+    where the certificate may be the cause. ``now_us`` is the robot's clock. ``hung_up`` says whether the
+    broker hangs up again and again (`iort_agent.mqtt.reconnect.Causes.hung_up`).
+    """
     packet = data.connack_packet
     code = packet.reason_code if packet is not None else None
     name = error_name(data.exception)
     words = said(packet) if code is not None else explain(data.exception)
     suspicious = code in _REFUSALS or name in (_TLS_FAILED, _HUNG_UP, _CLOSED)
-    if suspicious and (invalid := _invalid(certificate, now_us)) is not None:
+    if suspicious and (invalid := _invalid(validity(), now_us)) is not None:
         return Cause("validity", f"{invalid} ({words}). {_ADVICE}", slow=True)
     if code in _REFUSALS:
         text = (
@@ -80,15 +83,15 @@ def why_not_connected(
     return Cause(words, words)
 
 
-def _invalid(certificate: Certificate | None, now_us: int) -> str | None:
-    """What the clock says against the robot's certificate."""
-    if certificate is None:
+def _invalid(validity: Validity | None, now_us: int) -> str | None:
+    """Why the certificate is not valid by the robot's clock; None if it is, or if its validity is unknown."""
+    if validity is None:
         return None
     now_s = now_us // 1_000_000
-    if now_s > certificate.not_after_s:
-        day = time.strftime("%Y-%m-%d", time.gmtime(certificate.not_after_s))
+    if now_s > validity.not_after_s:
+        day = time.strftime("%Y-%m-%d", time.gmtime(validity.not_after_s))
         return f"the robot's certificate expired on {day}; get a new one with `iort-agent provision`"
-    if now_s < certificate.not_before_s:
+    if now_s < validity.not_before_s:
         today = time.strftime("%Y-%m-%d", time.gmtime(now_s))
         return f"the robot's certificate is not valid yet: its clock says {today}; set the clock"
     return None

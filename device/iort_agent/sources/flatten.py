@@ -1,57 +1,49 @@
-"""A ROS message as one flat sample: field path -> value.
+"""Flattens a ROS message into a sample: field path -> value.
 
-Nested messages flatten to dotted paths and arrays to indexes: ``pose.position.x``, ``covariance.0``.
-The header and a type's constants are left out. A message that is a header and exactly one nested
-message (VescStateStamped, PoseStamped) gives that message's fields without a prefix: the stamp is the
-sample's time, and what is left is the thing itself. With ``large``, a ``uint8[]`` stays the bytes that it is,
-for `iort_agent.lanes.attachment` to take.
+Nested messages give dotted paths and arrays give indexes: ``pose.position.x``, ``covariance.0``. The header
+and a type's constants are left out. A message of a header and exactly one nested message (VescStateStamped,
+PoseStamped) gives the nested message's fields without a prefix, since the stamp is the sample's time.
+
+`iort_contract.ros1.decode` has the same rule for serialized messages; the tests hold the two to each other.
 """
 
 from __future__ import annotations
 
-from typing import Any, Callable, Optional, Sequence
+from typing import Any, Callable, Mapping, Optional
 
 from iort_agent.errors import SourceError
 from iort_contract import MAX_FIELDS
 
-# The names of a message's fields, without constants; None for what is not a message.
-FieldsOf = Callable[[Any], Optional[Sequence[str]]]
+# Gives the fields of a message, without its constants; None for a value that is no message.
+Members = Callable[[Any], Optional[Mapping[str, Any]]]
 
 HEADER = "header"
 
 
-def flatten(message: Any, fields_of: FieldsOf, *, large: bool = False) -> dict[str, Any]:
-    """The sample in a message: values, and bytes with ``large``.
-
-    Raises `SourceError` where it has more fields than a sample may.
-    """
-    names = fields_of(message) or ()
-    body = [name for name in names if name != HEADER]
-    if len(body) == 1 and len(names) == 2:
-        inner = getattr(message, body[0])
-        inner_names = fields_of(inner)
-        if inner_names is not None:
-            message, body = inner, [name for name in inner_names if name != HEADER]
+def flatten(message: Any, members: Members) -> dict[str, Any]:
+    """The sample of a message. Raises `SourceError` if it has more fields than a sample may have."""
+    fields = dict(members(message) or {})
+    if len(fields) == 2 and HEADER in fields:
+        (inner,) = (members(value) for name, value in fields.items() if name != HEADER)
+        fields = dict(fields if inner is None else inner)
+    fields.pop(HEADER, None)
     flat: dict[str, Any] = {}
-    for name in body:
-        _put(flat, name, getattr(message, name), fields_of, large)
+    for name, value in fields.items():
+        _put(flat, name, value, members)
     return flat
 
 
-def _put(flat: dict[str, Any], path: str, value: Any, fields_of: FieldsOf, large: bool) -> None:  # noqa: FBT001 - passed on
+def _put(flat: dict[str, Any], path: str, value: Any, members: Members) -> None:
     if type(value) in (float, int, bool, str):
         flat[path] = value
         return
-    names = fields_of(value)
-    if names is not None:
-        for name in names:
+    fields = members(value)
+    if fields is not None:
+        for name, member in fields.items():
             if name != HEADER:
-                _put(flat, f"{path}.{name}", getattr(value, name), fields_of, large)
+                _put(flat, f"{path}.{name}", member, members)
         return
-    if large and str(getattr(value, "dtype", "")) == "uint8":
-        flat[path] = value.tobytes()
-        return
-    # numpy's arrays and numbers give plain Python values this way.
+    # Turns numpy's arrays and numbers into plain Python values.
     plain = value.tolist() if hasattr(value, "tolist") else value
     if isinstance(plain, (list, tuple, bytes, bytearray)):
         if len(flat) + len(plain) > MAX_FIELDS:
@@ -59,6 +51,6 @@ def _put(flat: dict[str, Any], path: str, value: Any, fields_of: FieldsOf, large
                 f"field {path} has {len(plain)} elements; a sample may have {MAX_FIELDS} fields"
             )
         for i, item in enumerate(plain):
-            _put(flat, f"{path}.{i}", item, fields_of, large)
+            _put(flat, f"{path}.{i}", item, members)
     else:
         flat[path] = plain

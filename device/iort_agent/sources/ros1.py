@@ -28,8 +28,8 @@ from iort_contract.ros1.definition import parse
 _log = logging.getLogger(__name__)
 
 HEADER, ARRIVAL = "header", "arrival"
-# A stamp this far from the wall clock is a clock not yet set, or a simulation's.
-_BELIEVABLE_US = 3600 * 1_000_000
+# A stamp that is further from the wall clock comes from a clock that is not set, or from a simulation.
+BELIEVABLE_US = 3600 * 1_000_000
 _SILENT_S = 5.0
 _LOOK_S = 1.0
 # A topic changes its definition when somebody rebuilds a package, not all the time.
@@ -179,9 +179,9 @@ class Intake:
             kind = self._kind
         assert kind is not None
         t_us, values = self._sample(kind, data)
-        if t_us is None or self.sim_time or not -_BELIEVABLE_US < t_us - arrival_us < _BELIEVABLE_US:
+        if t_us is None or self.sim_time or not -BELIEVABLE_US < t_us - arrival_us < BELIEVABLE_US:
             if self._config.time == HEADER:
-                self._flag(t_us, arrival_us)
+                self.flag(t_us, arrival_us)
             t_us = arrival_us
         if values is None:
             return
@@ -274,7 +274,8 @@ class Intake:
             **self._seldom.counts(),
         }
 
-    def _flag(self, t_us: int | None, arrival_us: int) -> None:
+    def flag(self, t_us: int | None, arrival_us: int) -> None:
+        """Count and log that the time of arrival is used, as the header's stamp is missing or wrong."""
         if t_us is None:
             reason, why = "no_stamp", "its messages have no header, so there is no time in them"
         elif self.sim_time:

@@ -20,11 +20,12 @@ from typing import Any, Iterator, NamedTuple
 
 from iort_agent.clock import SystemClock
 from iort_agent.config.file import Config
-from iort_agent.errors import AgentError, IdentityError
+from iort_agent.errors import IdentityError, NotRunningError
 from iort_agent.identity.certificate import Certificate, check_pair, read_certificate
 from iort_agent.lanes.record import TODO, too_many
 from iort_agent.sources.recording.check import look_into
-from iort_agent.status import fetch
+from iort_agent.status.server import ask
+from iort_agent.status.state import Status
 
 OK, WARN, FAIL = "ok", "warn", "fail"
 
@@ -63,7 +64,7 @@ def check(config: Config, status_socket: Path) -> Iterator[Finding]:
     if running is None:
         yield Finding("agent", OK, "not running")
     else:
-        yield Finding("agent", OK, f"running, process {running['pid']}: see `iort-agent status`")
+        yield Finding("agent", OK, f"running, process {running.pid}: see `iort-agent status`")
 
 
 def render(finding: Finding) -> str:
@@ -77,20 +78,20 @@ def broker_findings(config: Config) -> Iterator[Finding]:
     yield from _endpoint(config, None)
 
 
-def _running(status_socket: Path) -> dict[str, Any] | None:
+def _running(status_socket: Path) -> Status | None:
     try:
-        return fetch(status_socket)
-    except AgentError:
+        return ask(status_socket)
+    except NotRunningError:
         return None
 
 
 def _identity(config: Config) -> Iterator[Finding]:
     try:
-        certificate = read_certificate(config.certificate)
+        validity = _validity(read_certificate(config.certificate))
     except IdentityError as error:
         yield Finding("certificate", FAIL, str(error), "`iort robots add` or `iort-agent provision` gets one")
     else:
-        yield _validity(certificate)
+        yield validity
         try:
             check_pair(config.certificate, config.private_key)
         except IdentityError as error:
@@ -106,18 +107,18 @@ def _identity(config: Config) -> Iterator[Finding]:
 
 
 def _validity(certificate: Certificate) -> Finding:
-    now_s = time.time()
-    day = time.strftime("%Y-%m-%d", time.gmtime(certificate.not_after_s))
-    if now_s > certificate.not_after_s:
+    now_s, validity = time.time(), certificate.validity()
+    day = time.strftime("%Y-%m-%d", time.gmtime(validity.not_after_s))
+    if now_s > validity.not_after_s:
         return Finding("certificate", FAIL, f"expired on {day}", "get a new one: `iort-agent renew`")
-    if now_s < certificate.not_before_s:
+    if now_s < validity.not_before_s:
         return Finding("certificate", FAIL, "not valid yet, by this machine's clock", "set the clock")
-    if certificate.not_after_s - now_s < _EXPIRES_SOON_S:
+    if validity.not_after_s - now_s < _EXPIRES_SOON_S:
         return Finding("certificate", WARN, f"expires on {day}", "get a new one: `iort-agent renew`")
     return Finding("certificate", OK, f"{certificate.id[:16]}..., valid until {day}")
 
 
-def _clock(config: Config, running: dict[str, Any] | None) -> Iterator[Finding]:
+def _clock(config: Config, running: Status | None) -> Iterator[Finding]:
     now_s = time.time()
     shown = time.strftime("%Y-%m-%d %H:%M:%SZ", time.gmtime(now_s))
     todo = "set the clock: `timedatectl set-ntp true`, or `sudo date -s ...`"
@@ -125,8 +126,8 @@ def _clock(config: Config, running: dict[str, Any] | None) -> Iterator[Finding]:
         yield Finding("clock", FAIL, f"says {shown}, which is long past", todo)
         return
     offset_s, by = None, ""
-    if running is not None and running.get("clock"):
-        offset_s, by = running["clock"]["offset_ms"] / 1000, "the running agent's pings"
+    if running is not None and running.clock is not None:
+        offset_s, by = running.clock.offset_ms / 1000, "the running agent's pings"
     elif config.endpoint.endswith(".amazonaws.com"):
         offset_s, by = _http_offset_s(config.endpoint), "AWS' answer over HTTPS"
     if offset_s is None:
@@ -149,7 +150,7 @@ def _http_offset_s(endpoint: str) -> float | None:
         return None
 
 
-def _endpoint(config: Config, running: dict[str, Any] | None) -> Iterator[Finding]:
+def _endpoint(config: Config, running: Status | None) -> Iterator[Finding]:
     where = f"{config.endpoint}:{config.port}"
     try:
         found = socket.getaddrinfo(config.endpoint, config.port, type=socket.SOCK_STREAM)
@@ -184,13 +185,11 @@ def _endpoint(config: Config, running: dict[str, Any] | None) -> Iterator[Findin
             return
         yield Finding("TLS", OK, f"{secure.version()}, the broker's certificate is good")
         if running is not None:
-            connection = running["connection"]
-            if connection["connected"]:
+            if running.connection.connected:
                 yield Finding("broker", OK, "the running agent is connected")
             else:
-                yield Finding(
-                    "broker", FAIL, f"the running agent is not connected: {connection['last_error']}"
-                )
+                why = running.connection.last_error
+                yield Finding("broker", FAIL, f"the running agent is not connected: {why}")
             return
         yield _connack(secure, config.robot)
 

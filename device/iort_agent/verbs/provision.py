@@ -18,14 +18,14 @@ import yaml
 
 import iort_contract
 from iort_agent.config.file import Config, load_config
-from iort_agent.errors import AgentError, ConfigError, IdentityError, RefusedError
+from iort_agent.errors import ConfigError, IdentityError, NotRunningError, RefusedError
 from iort_agent.identity.certificate import parse_certificate
 from iort_agent.identity.claim import Claim, load_claim
 from iort_agent.identity.machine_key import machine_serial, make_key
 from iort_agent.identity.pending import Pending, forget, keep, kept
 from iort_agent.mqtt.exchange import Exchange
 from iort_agent.private_files import write_below
-from iort_agent.status import fetch
+from iort_agent.status.server import ask
 
 _log = logging.getLogger(__name__)
 
@@ -199,18 +199,19 @@ def register_again(register: Callable[[], str], *, wait: Callable[[float], None]
 def _wait_connected(config: Config, certificate_id: str, status_socket: Path) -> None:
     """Until the robot is connected with the certificate: the agent that runs, or else we ourselves."""
     deadline = time.monotonic() + _SWITCH_S
-    state: Mapping[str, Any] = {}
+    last_error = None
     while time.monotonic() < deadline:
         try:
-            state = fetch(status_socket)["connection"]
-        except AgentError:
+            connection = ask(status_socket).connection
+        except NotRunningError:
             _try_alone(config)
             return
-        if state["connected"] and state["certificate_id"] == certificate_id:
+        if connection.connected and connection.certificate_id == certificate_id:
             return
+        last_error = connection.last_error
         # The agent looks at its files now and then, and tells nobody.
         time.sleep(_LOOK_S)
-    raise IdentityError(f"the running agent did not connect with the new certificate: {state['last_error']}")
+    raise IdentityError(f"the running agent did not connect with the new certificate: {last_error}")
 
 
 def _try_alone(config: Config) -> None:

@@ -11,12 +11,12 @@ from typing import Any, Iterator, NamedTuple, Sequence
 
 from iort_agent.clock import SystemClock
 from iort_agent.config.file import Config
-from iort_agent.errors import AgentError, UploadError
+from iort_agent.errors import NotRunningError, UploadError
 from iort_agent.files.file import read
 from iort_agent.files.upload import Uploader, make_uploader
 from iort_agent.logs import set_up
 from iort_agent.rate_limiter import Allowance
-from iort_agent.status import fetch
+from iort_agent.status.server import process_at
 
 _CONNECT_S = 30.0
 _LOOK_S = 0.05
@@ -112,13 +112,13 @@ def _wait_ready(uploader: Uploader, uplink: Any, clock: SystemClock, stop: threa
 
 def _refuse_beside_agent(config: Config, status_socket: Path) -> None:
     try:
-        running = fetch(status_socket)
-    except AgentError:
+        process = process_at(status_socket)
+    except NotRunningError:
         return
     folder = config.files.folder
     what = f"copy the files into {folder}, and it uploads them" if folder else "stop it, or set files.folder"
     raise UploadError(
-        f"an agent is running with this configuration (process {running.get('pid')}), and a robot has one "
+        f"an agent is running with this configuration (process {process}), and a robot has one "
         f"connection: {what}",
         again_s=None,
     )

@@ -13,7 +13,6 @@ import logging
 import threading
 from collections import deque
 from dataclasses import dataclass
-from types import SimpleNamespace
 from typing import Any, Mapping, Sequence
 from urllib.parse import urlsplit
 
@@ -25,6 +24,7 @@ from iort_agent.schema import Where, choice, items, number, pairs, section, sett
 from iort_agent.sources import Emit, ros1
 from iort_agent.sources.flatten import HEADER as HEADER_FIELD
 from iort_agent.sources.flatten import flatten
+from iort_agent.sources.ros1 import ARRIVAL, BELIEVABLE_US, HEADER
 from iort_agent.sources.rosbridge.connection import TIMES, RosbridgeConnection, Times, Topic
 from iort_agent.sources.rosbridge.continuity import Numbers, Repeats
 from iort_agent.sources.rosbridge.rosapi import AGAIN_S, Rosapi, Structure
@@ -34,11 +34,8 @@ from iort_contract.limits import MessageError
 
 _log = logging.getLogger(__name__)
 
-HEADER, ARRIVAL = "header", "arrival"
 MAX_ELEMENTS = 64
 _MAX_TEXT = 4096
-# A stamp this far from the clock is a clock not yet set, or a simulation's.
-_BELIEVABLE_US = 3600 * 1_000_000
 # What is kept of a topic until its type is known.
 _MAX_HELD, _MAX_HELD_BYTES = 2_000, 8_000_000
 
@@ -264,9 +261,8 @@ class Intake:
         self._seldom.warn("structure_not_kept", f"topic {self._topic}: {why}; only single values are stored")
         return None
 
-    def _emit_flat(self, plain: dict[str, Any], arrival_us: int) -> None:
+    def _emit_flat(self, message: dict[str, Any], arrival_us: int) -> None:
         try:
-            message = _namespace(plain)
             values = self._values(message)
         except (SourceError, RecursionError) as error:
             self._seldom.warn("refused", f"topic {self._topic}: {error}")
@@ -274,13 +270,17 @@ class Intake:
         if not values:
             self._seldom.warn("empty", f"topic {self._topic}: there is no field in its messages to send")
             return
-        t_us = arrival_us if self._config.time == ARRIVAL else self._stamp_us(message, arrival_us)
+        t_us = _stamp_us(message)
+        if self._config.time == ARRIVAL or t_us is None or abs(t_us - arrival_us) >= BELIEVABLE_US:
+            if self._config.time == HEADER:
+                self._ros1.flag(t_us, arrival_us)
+            t_us = arrival_us
         self._emit(self._config.stream, t_us, values)
 
-    def _values(self, message: Any) -> dict[str, Value]:
+    def _values(self, message: dict[str, Any]) -> dict[str, Value]:
         wanted = self._config.fields
         # What is selected may be an element of an array that is left out otherwise.
-        values = flatten(message if wanted else _without_long(message), _fields_of)
+        values = flatten(message, _members if wanted else _short_members)
         if wanted:
             chosen = {
                 path: value
@@ -297,52 +297,38 @@ class Intake:
             self._seldom.warn("left_out", f"topic {self._topic}: {path} is too long a text and is left out")
         return values
 
-    def _stamp_us(self, message: Any, arrival_us: int) -> int:
-        """The header's stamp, or the arrival's time if there is none to believe."""
-        stamp = getattr(getattr(message, HEADER_FIELD, None), "stamp", None)
-        sec, nanosec = getattr(stamp, "sec", None), getattr(stamp, "nanosec", None)
-        if type(sec) is not int or type(nanosec) is not int:
-            why = "its messages have no header, so there is no time in them"
-            self._seldom.warn("no_stamp", f"topic {self._topic}: {why}; using the time of arrival")
-            return arrival_us
-        stamp_us = sec * 1_000_000 + nanosec // 1000
-        off_us = stamp_us - arrival_us
-        if abs(off_us) < _BELIEVABLE_US:
-            return stamp_us
-        why = f"its stamps are {off_us / 1e6:.0f} s off the clock"
-        self._seldom.warn("unbelieved_stamps", f"topic {self._topic}: {why}; using the time of arrival")
-        return arrival_us
-
 
 def _header(message: Any) -> dict[str, Any]:
     header = message.get(HEADER_FIELD) if isinstance(message, dict) else None
     return header if isinstance(header, dict) else {}
 
 
-def _namespace(value: Any) -> Any:
-    """JSON's objects as `flatten` takes them."""
-    if isinstance(value, list):
-        return [_namespace(item) for item in value]
+def _stamp_us(message: dict[str, Any]) -> int | None:
+    """The header's stamp; None if it has none."""
+    stamp = _members(_header(message).get("stamp")) or {}
+    sec, nanosec = stamp.get("sec"), stamp.get("nanosec")
+    if type(sec) is not int or type(nanosec) is not int:
+        return None
+    return sec * 1_000_000 + nanosec // 1000
+
+
+def _members(value: Any) -> dict[str, Any] | None:
+    """The fields of a message in JSON, as `flatten` takes them."""
     if not isinstance(value, dict):
-        return value
-    # ROS 1 names a time's parts as nobody else does.
+        return None
+    # Only ROS 1 has these names for the parts of a time.
     if value.keys() == {"secs", "nsecs"}:
-        return SimpleNamespace(sec=value["secs"], nanosec=value["nsecs"])
-    return SimpleNamespace(**{name: _namespace(member) for name, member in value.items()})
+        return {"sec": value["secs"], "nanosec": value["nsecs"]}
+    return value
 
 
-def _fields_of(value: Any) -> list[str] | None:
-    return list(vars(value)) if isinstance(value, SimpleNamespace) else None
-
-
-def _without_long(value: Any) -> Any:
-    """The message without its long arrays, which are no telemetry."""
-    if not isinstance(value, SimpleNamespace):
-        return value
-    return SimpleNamespace(
-        **{
-            name: _without_long(member)
-            for name, member in vars(value).items()
-            if not (isinstance(member, list) and len(member) > MAX_ELEMENTS)
-        }
-    )
+def _short_members(value: Any) -> dict[str, Any] | None:
+    """As `_members`, without long arrays, which are no telemetry."""
+    fields = _members(value)
+    if fields is None:
+        return None
+    return {
+        name: member
+        for name, member in fields.items()
+        if not (isinstance(member, list) and len(member) > MAX_ELEMENTS)
+    }

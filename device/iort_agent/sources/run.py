@@ -1,0 +1,60 @@
+"""One source while the agent runs: how it ended, and whether it failed."""
+
+from __future__ import annotations
+
+import logging
+import threading
+from typing import Any, Mapping, Sequence
+
+from iort_agent.clock import Clock
+from iort_agent.errors import SourceError
+from iort_agent.sources import Emit, SourceConfig
+
+_log = logging.getLogger(__name__)
+
+
+class SourceRun:
+    """Builds the source of a configuration and runs it once."""
+
+    def __init__(self, config: SourceConfig, clock: Clock) -> None:
+        self.description, self.streams = config.describe(), config.streams()
+        self._source = config.build(clock)
+        self.failed = False
+        self._ended = False
+
+    def run(self, emit: Emit, stop: threading.Event) -> None:
+        """Run until the source ends, fails or is stopped. Raises nothing: the other sources go on."""
+        _log.info("source started: %s", self.description)
+        try:
+            self._source.run(emit, stop)
+        except SourceError as error:
+            _log.error("source failed: %s: %s", self.description, error)
+            self.failed = True
+        except Exception:  # noqa: BLE001 - a driver may raise anything
+            _log.exception("source failed: %s", self.description)
+            self.failed = True
+        else:
+            _log.info("source ended: %s", self.description)
+            self._ended = not stop.is_set()
+
+    def check_stored(self, streams: Sequence[tuple[int, int]]) -> None:
+        """Note a failure if the source ended by itself and no sample of it could be stored; ``streams`` are
+        the samples taken and refused of each stream that it gave."""
+        if not self._ended:
+            return
+        samples, refused = sum(one[0] for one in streams), sum(one[1] for one in streams)
+        if not streams:
+            _log.error("source failed: %s: it gave no sample", self.description)
+            self.failed = True
+        elif samples and samples == refused:
+            _log.error("source failed: %s: none of its %d samples could be stored", self.description, samples)
+            self.failed = True
+
+    def waits(self) -> str | None:
+        """What the source waits for; None if it does not wait."""
+        why = self._source.report().get("waits")
+        return str(why) if why else None
+
+    def report(self) -> Mapping[str, Any]:
+        """The source's own counts."""
+        return self._source.report()
