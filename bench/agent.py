@@ -1,12 +1,15 @@
-"""`make bench-agent`: what the agent costs, on a real ROS 1 graph, beside a bare rospy subscriber.
+"""`make bench-agent`: the cost of the agent on a real ROS 1 graph, beside a bare rospy subscriber.
 
     python -m bench.agent [--seconds 30] [--soak 600] [--json FILE]
 
-At 50 Hz and at 1000 Hz: processor time a sample of the agent (both lanes and the spool on, TLS to the
-embedded cloud's broker) and of a bare subscriber of the same topic in the same run; memory at the start and
-at the end; samples lost; and, where mosquitto is installed, the delay from ROS publish to an MQTT subscriber
-over the live lane, beside a bare MQTT client's (`bench.live_lane`). The embedded cloud's broker, as AWS',
-hands what comes by Basic Ingest to its rule and to no subscriber.
+It measures at 50 Hz and at 1000 Hz:
+
+- the processor time a sample, of the agent (both lanes, the spool, TLS to the embedded cloud's broker) and of
+  a bare subscriber of the same topic in the same run;
+- the memory at the start and at the end, and the samples lost;
+- the delay from ROS publish to an MQTT subscriber over the live lane, beside a bare MQTT client's
+  (`bench.meters.live_lane`). This needs mosquitto: the embedded cloud's broker hands Basic Ingest messages to
+  the rule and to no subscriber, as AWS IoT does.
 """
 
 from __future__ import annotations
@@ -27,9 +30,10 @@ from typing import Any
 from rich.console import Console
 from rich.table import Table
 
-from bench import live_lane, mosquitto, usage
 from bench.errors import BenchError
-from bench.ros_graph import RosError, RosGraph, python_with_rospy
+from bench.floors import mosquitto
+from bench.meters import live_lane, usage
+from bench.ros.graph import PYTHONPATH, RosError, RosGraph, python_with_rospy
 from iort_station.cloud import Cloud
 from iort_station.fleet import robots
 from iort_station.operations import delivery
@@ -47,7 +51,7 @@ _CATCH_UP_S = 30.0
 
 @dataclass(frozen=True)
 class Run:
-    """One rate: microseconds of processor a sample, memory, and what was lost."""
+    """The figures at one rate: processor time a sample in us, memory, and lost samples."""
 
     rate_hz: int
     samples: int
@@ -68,7 +72,7 @@ def main() -> None:
     console = Console()
     try:
         python = python_with_rospy()
-        cycle = json.loads(_output([python, "-m", "bench.cycle", "20000"]))
+        cycle = json.loads(_output([python, "-m", "bench.meters.cycle", "20000"]))
         runs = []
         with EmbeddedCloud(progress=lambda step: console.print(f"  {step}", style="dim")) as embedded:
             for rate_hz in (1000,) if options.soak else RATES_HZ:
@@ -99,7 +103,7 @@ def _measure(cloud: Cloud, python: str, rate_hz: int, seconds: int) -> Run:
             cloud, robot, out=folder, settings={"sources": [source], "queue": {"path": "spool.db"}}
         )
         agent = graph.start("iort_agent.cli", "run", "--config", bundle.config)
-        floor = graph.start("bench.ros_floor", TOPIC)
+        floor = graph.start("bench.floors.ros_floor", TOPIC)
         publisher = graph.publisher(TOPIC, rate_hz, count)
         publisher.begin()
         publisher.publish_for(_WARM_UP_S)
@@ -124,7 +128,7 @@ def _measure(cloud: Cloud, python: str, rate_hz: int, seconds: int) -> Run:
 
 
 def _stored(cloud: Cloud, robot: str, count: int) -> int:
-    """The samples in the table, once they are all there or nothing more comes."""
+    """Count the samples in the table, after all have arrived or the wait is over."""
     deadline = time.monotonic() + _CATCH_UP_S
     while True:
         stored = sum(len(batch.times_us) for batch in delivery.batches(cloud, robot, "vesc"))
@@ -134,7 +138,8 @@ def _stored(cloud: Cloud, robot: str, count: int) -> int:
 
 
 def _output(command: list[str]) -> str:
-    done = subprocess.run(command, capture_output=True, text=True, check=False)
+    environment = {**os.environ, "PYTHONPATH": PYTHONPATH}
+    done = subprocess.run(command, env=environment, capture_output=True, text=True, check=False)
     if done.returncode:
         raise RosError(f"{' '.join(command)} failed:\n{done.stderr[-1000:]}")
     return done.stdout

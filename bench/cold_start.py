@@ -1,11 +1,11 @@
-"""`make bench-cold`: what a cold start of every function costs, with bytecode and without, in turns.
+"""`make bench-cold`: the cost of a cold start of every function, with bytecode and without, in turns.
 
     python -m bench.cold_start [--rounds 5] [--json FILE]
 
 Each function is started by AWS' own runtime interface client on a Runtime API of this machine, with the
-layer, and answers one event; the services that it calls are stood in for, and answer at once. Processor time
-is the operating system's, of all threads. A function has the share of a processor that its memory brings:
-so long does the same work take there, if the processor is as fast as this one. Nothing is throttled here.
+layer, and answers one event. Stand-ins for the services that it calls answer at once. The operating system
+measures the processor time of all threads. On AWS the memory size gives a function its share of a processor:
+the table scales the time by this share, for a processor as fast as this one. Nothing is throttled here.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ from tempfile import TemporaryDirectory
 from rich.console import Console
 from rich.table import Table
 
-from bench.machine import ROOT
+from bench import ROOT
 from bench.runtime.deployed import functions
 from bench.runtime.environment import Function, RuntimeFailedError, link_runtime, started
 from bench.runtime.events import events
@@ -52,7 +52,7 @@ class Start:
 
     @property
     def cold_ms(self) -> float:
-        """From nothing to the first answer, with the share of a processor that its memory brings."""
+        """Time from the start to the first answer, with the processor share of its memory size."""
         return (self.start_cpu_ms + self.first_cpu_ms) / min(1.0, self.memory_mb / ONE_VCPU_MB)
 
 
@@ -93,7 +93,7 @@ def main() -> None:
 
 
 def measure(rounds: int, console: Console) -> Iterator[Start]:
-    """Every function, each kind of bytecode in turns."""
+    """Yield the figures of every function; the kinds of bytecode take turns."""
     with TemporaryDirectory() as name:
         folder = Path(name)
         # AWS' own packages are taken to be compiled there, as those of a Python are that has run once.

@@ -1,5 +1,5 @@
-"""What can go wrong in a measurement: every error that the bench raises on purpose is one of these."""
+"""The root of all errors that the bench raises on purpose."""
 
 
 class BenchError(Exception):
-    """Something could not be measured; the text says what."""
+    """A measurement failed; the text says which one."""

@@ -1,4 +1,4 @@
-"""`make bench-fleet`: how many robots the embedded cloud carries, and what that costs.
+"""`make bench-fleet`: the load of many robots on the embedded cloud, and its cost.
 
     python -m bench.fleet [--robots 200] [--seconds 300] [--json FILE]
 
@@ -27,17 +27,17 @@ from rich.progress import Progress
 from rich.table import Table
 
 from bench.errors import BenchError
-from bench.fleet_arrivals import Tell
-from bench.fleet_run import Fleet, measure
+from bench.load.fleet_arrivals import Tell
+from bench.load.fleet_run import Fleet, measure
 from local.cloud import EmbeddedCloud
 from local.errors import LocalError
 
-# How often progress is a line, where it cannot be a bar.
+# How often progress prints a line, without a terminal.
 _SAY_S = 5.0
 
 
 def as_table(fleet: Fleet) -> Table:
-    """The figures for a person."""
+    """Return the figures as a table to print."""
     table = Table(title=f"{fleet.robots} robots, {fleet.seconds} s", title_justify="left", title_style="bold")
     table.add_column("figure")
     table.add_column("", justify="right")
@@ -62,7 +62,7 @@ def as_table(fleet: Fleet) -> Table:
 
 @contextmanager
 def progress(console: Console) -> Iterator[Tell]:
-    """A bar for each thing that `measure` tells of; without a terminal, a line every few seconds."""
+    """Show a bar for each step of `measure`, or without a terminal a line every few seconds."""
     if not console.is_terminal:
         yield _lines(console)
         return

@@ -2,10 +2,10 @@
 
     python -m bench.guard [--new build/bench/report.json] [--old docs/bench/report.json]
 
-A figure may be so many times worse as it says of itself (`bench.result.Ratio.tolerance`), whatever its
-target; what was nothing (samples lost) must stay nothing. A figure whose other half is a constant is a time
-in disguise: on a machine of another kind it is held to its target alone. A figure that a section no longer
-gives counts as worse. Exit status 1 where something is worse, 2 where nothing can be compared.
+A figure may be worse by its tolerance (`bench.report.result.Ratio.tolerance`), whatever its target. A figure
+that was 0 (samples lost) must stay 0. A ratio to a constant is really a time: on another kind of machine
+it is held to its target alone. A figure that a section no longer has counts as worse. The exit status is 1
+if a figure is worse, and 2 if the reports cannot be compared.
 """
 
 from __future__ import annotations
@@ -17,21 +17,21 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, NoReturn
 
-from bench.machine import ROOT
-from bench.result import Ratio
+from bench import ROOT
+from bench.report.result import Ratio
 
 Report = dict[str, Any]
-# Two reports with these alike were made on machines of a kind.
+# Machines with the same values are of one kind.
 _KIND = ("cpu", "cores")
 
 
 def ratios(report: Report) -> dict[str, Ratio]:
-    """The ratios of a report by name; an older report's say less of themselves."""
+    """Return the ratios of a report by name; an older report may lack some of their settings."""
     return {ratio["name"]: Ratio(**ratio) for section in report["sections"] for ratio in section["ratios"]}
 
 
 def regressions(new: Report, old: Report) -> list[str]:
-    """What became worse, a line each. A section that only one report has is not compared."""
+    """Return a line for each figure that became worse. A section must be in both reports."""
     found = []
     now, before = ratios(new), ratios(old)
     kind = all(new["machine"].get(key) == old["machine"].get(key) for key in _KIND)
@@ -47,7 +47,7 @@ def regressions(new: Report, old: Report) -> list[str]:
 
 
 def not_compared(new: Report, old: Report) -> list[str]:
-    """The sections that the new report does not have."""
+    """Return the sections that the new report lacks."""
     measured = {section["key"] for section in new["sections"]}
     return [section["key"] for section in old["sections"] if section["key"] not in measured]
 
@@ -59,7 +59,7 @@ def _worse(now: Ratio, was: float, *, of_a_kind: bool) -> bool:
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
-    """Compare, and say what is worse."""
+    """Compare the reports and print each figure that became worse."""
     parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
     parser.add_argument("--new", type=Path, default=ROOT / "build" / "bench" / "report.json")
     parser.add_argument("--old", type=Path, default=ROOT / "docs" / "bench" / "report.json")

@@ -1,10 +1,10 @@
-"""Ctrl-C, or the end of the terminal, while something must still be put back."""
+"""Handles Ctrl-C and a closed terminal while changes must still be restored."""
 
 from __future__ import annotations
 
 import signal
-from collections.abc import Iterator
-from contextlib import contextmanager
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager, suppress
 
 from rich.console import Console
 
@@ -12,21 +12,30 @@ _INTERRUPTS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
 
 
 @contextmanager
-def wound_up(console: Console) -> Iterator[None]:
-    """An interrupt ends what runs now, in good order; another one does not end the putting in order."""
+def wound_up(console: Console) -> Iterator[Callable[[], None]]:
+    """Let the first interrupt stop the work in good order, and ignore further ones during the cleanup.
+
+    Yields a function that announces the cleanup: after its call even the first interrupt is ignored.
+    """
     asked = False
+
+    def putting_back() -> None:
+        nonlocal asked
+        asked = True
 
     def interrupt(_number: int, _frame: object) -> None:
         nonlocal asked
         if asked:
-            console.print("still putting back what was changed", style="yellow")
+            # The terminal may have gone.
+            with suppress(OSError):
+                console.print("still restoring the changes", style="yellow")
             return
         asked = True
         raise KeyboardInterrupt
 
     before = {number: signal.signal(number, interrupt) for number in _INTERRUPTS}
     try:
-        yield
+        yield putting_back
     finally:
         for number, handler in before.items():
             signal.signal(number, handler)

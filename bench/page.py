@@ -1,4 +1,4 @@
-"""`make bench-page`: what the page costs its browser, with 20 cars at 10 Hz.
+"""`make bench-page`: the cost of the page in the browser, with 20 cars at 10 Hz.
 
     python -m bench.page [--cars 20] [--seconds 30] [--soak 300] [--json FILE]
 
@@ -25,13 +25,13 @@ from typing import Any
 from rich.console import Console
 from rich.table import Table
 
-from bench import chromium
 from bench.errors import BenchError
+from bench.meters import chromium
 from iort_station.fleet.robots import F1TENTH
 from iort_station.page.server import PageServer
-from local.pubnub_standin import PubNubStandIn
+from local.pubnub.standin import PubNubStandIn
 
-# Of a processor: the page is to leave the rest to whoever looks at it.
+# Share of a processor; the rest stays free for the user of the machine.
 MAX_BUSY = 0.30
 _WARM_UP_S = 35.0  # until the charts' 30 s are full
 _STEP_S = 30.0
@@ -40,7 +40,7 @@ _KEY = "bench"
 
 @dataclass(frozen=True)
 class View:
-    """Shares of a processor, over so many seconds, and the messages a second that came meanwhile."""
+    """The main thread's share of a processor over ``seconds``, and the messages a second."""
 
     name: str
     seconds: float
@@ -49,7 +49,7 @@ class View:
 
 
 def main() -> None:
-    """Measure and print; exit status 1 where the main thread is busier than it may be."""
+    """Measure and print; exit status 1 if the main thread is busier than `MAX_BUSY`."""
     options = _options()
     console = Console()
     try:
@@ -65,7 +65,7 @@ def main() -> None:
 
 
 def _watched(console: Console, options: argparse.Namespace) -> tuple[list[View], list[float], Any]:
-    """The views, the heap in MB every half minute of the soak, and the page's own bounds."""
+    """Return the views, the heap in MB every half minute of the soak, and the page's bounds."""
     with ExitStack() as stack:
         pubnub = stack.enter_context(PubNubStandIn(publish_key=_KEY, subscribe_key=_KEY))
         vehicles = {f"car{i + 1}": F1TENTH for i in range(options.cars)}
@@ -105,9 +105,9 @@ def _options() -> argparse.Namespace:
 
 @contextmanager
 def _cars(origin: str, count: int) -> Iterator[None]:
-    """The cars, in a process of their own; it ends when its input does."""
+    """Run the cars in their own process, which ends when its input does."""
     keys = ["--publish-key", _KEY, "--subscribe-key", _KEY]
-    command = [sys.executable, "-m", "bench.cars", "--origin", origin, *keys, "--cars", str(count)]
+    command = [sys.executable, "-m", "bench.load.cars", "--origin", origin, *keys, "--cars", str(count)]
     with subprocess.Popen(command, stdin=subprocess.PIPE):
         yield
 

@@ -2,11 +2,11 @@
 
     python -m bench.run [--only query,outage] [--target embedded|aws] [--yes] [--out build/bench]
 
-Writes report.md, report.html, report.json and the pictures into the folder. Exit status 1 if a target is
+Writes report.md, report.json and the pictures into the folder. Exit status 1 if a target is
 missed, 2 if a section could not be measured.
 
-With --target aws it says what that costs and asks first. Ctrl-C, or the end of its terminal, still puts back
-what was changed and removes what was made.
+With --target aws it shows the cost and asks first. After Ctrl-C or a closed terminal it still restores every
+setting and removes every resource of the bench.
 """
 
 from __future__ import annotations
@@ -23,9 +23,10 @@ from rich.markup import escape
 from rich.prompt import Confirm
 from rich.table import Table
 
-from bench import machine, report, spending
+from bench import ROOT, spending
 from bench.interrupts import wound_up
-from bench.result import Section
+from bench.report import machine, writer
+from bench.report.result import Section
 from bench.sections import SECTIONS
 from bench.target import AWS, EMBEDDED, Target, open_target
 from iort_contract import DEFAULT_NAMESPACE
@@ -34,11 +35,11 @@ from iort_station.cost.prices import AS_OF, REGION
 from iort_station.errors import StationError
 from local.errors import LocalError
 
-OUT = machine.ROOT / "build" / "bench"
+OUT = ROOT / "build" / "bench"
 
 
 def main() -> None:
-    """Measure, write and say."""
+    """Measure the sections, write the report and print its headline."""
     try:
         run(_options())
     except KeyboardInterrupt:
@@ -46,7 +47,7 @@ def main() -> None:
 
 
 def run(options: argparse.Namespace, cloud: Cloud | None = None) -> None:
-    """The same, on ``cloud`` where it is not the one that the options and the environment lead to."""
+    """Measure on ``cloud``, or without it on the cloud of the options and the environment."""
     console = Console()
     began = time.monotonic()
     here = machine.describe()
@@ -75,9 +76,9 @@ def run(options: argparse.Namespace, cloud: Cloud | None = None) -> None:
         sys.exit(2)
     finally:
         if sections:
-            report.write(options.out, sections, here, options.target)
+            writer.write(options.out, sections, here, options.target)
     _show(console, sections)
-    console.print(f"{options.out / 'report.html'}  after {time.monotonic() - began:.0f} s", highlight=False)
+    console.print(f"{options.out / 'report.md'}  after {time.monotonic() - began:.0f} s", highlight=False)
     if failed:
         console.print(f"not measured: {', '.join(failed)}", style="red")
         sys.exit(2)
@@ -85,7 +86,7 @@ def run(options: argparse.Namespace, cloud: Cloud | None = None) -> None:
 
 
 def _confirm(console: Console, dollars: dict[str, float]) -> None:
-    """Ask before money is spent. Raises `StationError` where nobody can be asked."""
+    """Ask before the run spends money. Raises `StationError` without a terminal or without consent."""
     parts = ", ".join(f"{key} {usd:.3f}" for key, usd in dollars.items())
     console.print(
         f"This costs about ${sum(dollars.values()):.2f} in your account ({parts}) at the list prices of "
@@ -94,13 +95,13 @@ def _confirm(console: Console, dollars: dict[str, float]) -> None:
         highlight=False,
     )
     if not sys.stdin.isatty():
-        raise StationError("nobody is here to agree: say so with --yes (make bench TARGET=aws YES=1)")
+        raise StationError("no terminal to ask at: agree with --yes (make bench TARGET=aws YES=1)")
     if not Confirm.ask("Go on?", console=console, default=False):
         raise StationError("nothing was measured")
 
 
 def _measure(key: str, target: Target, console: Console, sections: list[Section], failed: list[str]) -> None:
-    """One section; one that fails does not take the others with it."""
+    """Measure one section; a failure does not stop the others."""
     began = time.monotonic()
 
     def say(text: str) -> None:
@@ -108,7 +109,7 @@ def _measure(key: str, target: Target, console: Console, sections: list[Section]
 
     try:
         section = SECTIONS[key](target, say)
-    except Exception:  # noqa: BLE001 - whatever a section raises, the others are worth having
+    except Exception:  # noqa: BLE001 - any error of a section must not stop the others
         console.print(traceback.format_exc(), style="red", markup=False, highlight=False)
         failed.append(key)
         return
@@ -117,7 +118,7 @@ def _measure(key: str, target: Target, console: Console, sections: list[Section]
 
 
 def _show(console: Console, sections: list[Section]) -> None:
-    rows = report.headline(sections)
+    rows = writer.headline(sections)
     table = Table(title=rows.title, title_justify="left", title_style="bold")
     for i, name in enumerate(rows.head):
         table.add_column(name, justify="right" if i else "left")

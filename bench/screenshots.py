@@ -19,14 +19,14 @@ from contextlib import ExitStack, contextmanager
 from pathlib import Path
 from typing import Any, Literal
 
-from bench import chromium
-from bench.cars import Publisher, SimulatedCar, drive
+from bench import ROOT
 from bench.errors import BenchError
+from bench.load.cars import Publisher, SimulatedCar, drive
+from bench.meters import chromium
 from iort_station.fleet import robots
 from iort_station.page.answers import answers
 from iort_station.page.server import PageServer
 from local.cloud import EmbeddedCloud
-from local.deployment import ROOT
 
 OUT = ROOT / "docs" / "images"
 DRIVE_S = 100
@@ -60,7 +60,7 @@ def main() -> None:
 
 def _take(views: Sequence[str], out: Path) -> None:
     with ExitStack() as stack:
-        # First, because nothing is worth starting without it.
+        # Open the browser first: without it nothing else is needed.
         browser = stack.enter_context(chromium.opened())
         folder = Path(stack.enter_context(tempfile.TemporaryDirectory()))
         cloud = stack.enter_context(EmbeddedCloud(folder / "local"))
@@ -77,7 +77,7 @@ def _take(views: Sequence[str], out: Path) -> None:
             "laptop": _page(browser, url, LAPTOP, ratio=1),
             "phone": _page(browser, url, PHONE, ratio=2),
         }
-        # Until the charts are full, and a minute's metrics have been counted.
+        # Wait until the charts are full and CloudWatch has a minute of metrics.
         threading.Event().wait(_FILL_S)
         for view in views:
             on_phone: Theme = "light" if view in {"car", "cloudwatch"} else "dark"
@@ -101,7 +101,7 @@ def _page(browser: Any, url: str, size: tuple[int, int], *, ratio: int) -> Any:
 
 
 def _look(page: Any, address: str, theme: Theme) -> None:
-    """Another view of the same page, which keeps what it has heard."""
+    """Open another view of the same page, which keeps its data."""
     page.emulate_media(color_scheme=theme)
     page.goto(address)
     if "/history/" in address:
@@ -124,7 +124,7 @@ def _scrub(page: Any) -> None:
 
 @contextmanager
 def _driving(cloud: EmbeddedCloud, folder: Path) -> Iterator[None]:
-    """The real agent, and the other cars, until the block ends."""
+    """Run the real agent and the other cars until the block ends."""
     source = {"type": "sim", "rate_hz": 50, "duration_s": DRIVE_S * 3}
     settings = {"sources": [source], "ping": {"rate_hz": 2}}
     bundle = robots.add(cloud.cloud, _REAL, out=folder, settings=settings)
@@ -158,7 +158,7 @@ def _driving(cloud: EmbeddedCloud, folder: Path) -> Iterator[None]:
 
 
 def _write(path: Path, png: bytes) -> None:
-    """The same picture, to the pixel, in half the bytes."""
+    """Write the picture without loss, in half the bytes."""
     from PIL import Image  # noqa: PLC0415 - only this command needs it
 
     with Image.open(io.BytesIO(png)) as image:

@@ -1,4 +1,4 @@
-"""What `make bench TARGET=aws` will cost, at list prices: counted from what the sections do."""
+"""Estimates the cost of `make bench TARGET=aws` at list prices, from the work of each section."""
 
 from __future__ import annotations
 
@@ -17,14 +17,14 @@ from iort_station.cost.usage import Usage
 # AWS' units: a message and an action are metered by 5 KB, writes by 1 KB, reads by 4 KB and by half where
 # they need not be consistent.
 _METER, _WRITE, _READ = 5 * 1024, 1024, 2 * 4096
-# Of a compressed batch of 50 samples with its keys, and of a second of its summary.
+# Write units of a compressed batch of 50 samples with its keys, and of a second of its summary.
 _BATCH_WRITES, _SUMMARY_WRITES = 2, 3
 _BILLED_S = 0.02
 _MINUTES_CONNECTED = 30
 
 
 def estimate(cloud: Cloud, sections: Sequence[str]) -> dict[str, float]:
-    """Dollars a section, on the generous side; Amazon's alone, at the prices of the cost model."""
+    """Return a generous estimate in dollars for each section, AWS alone, at the cost model's prices."""
     counted: dict[str, Callable[[], list[Item]]] = {
         "round_trips": _round_trips,
         "dashboard": lambda: _driven(dashboard.SECONDS * 2),
@@ -100,7 +100,7 @@ def _item(price: str, units: float) -> Item:
 
 
 def _telemetry_bytes(cloud: Cloud) -> int:
-    """How large the table is, as AWS counts it every six hours."""
+    """Return the size of the table; AWS updates it every six hours."""
     table = cloud.output("storage", "TelemetryTable")
     described = cloud.client("dynamodb").describe_table(TableName=table)["Table"]
     return int(described.get("TableSizeBytes", 0))

@@ -1,4 +1,4 @@
-"""What is measured: the embedded cloud, started for the bench, or a deployment in an AWS account."""
+"""The target of the measurements: an embedded cloud started for the bench, or a deployment on AWS."""
 
 from __future__ import annotations
 
@@ -28,8 +28,7 @@ Say = Callable[[str], None]
 class Target:
     """A deployment, with robots that are registered for the bench and removed after it.
 
-    In an account, ``run`` ends the names of all that this run makes: what an earlier one has stored, or
-    left behind where it was killed, is not taken for its own.
+    In an account, every name of this run ends with ``run``, so that items of an earlier run are not counted.
     """
 
     kind: str
@@ -40,7 +39,7 @@ class Target:
     _robots: list[str] = field(default_factory=list)
 
     def name(self, base: str) -> str:
-        """The name of something that the bench makes."""
+        """Return the name of a resource of the bench."""
         return f"{base}-{self.run}" if self.run else base
 
     def robot(self, base: str, **settings: Any) -> robots.Bundle:
@@ -59,7 +58,7 @@ class Target:
         )
 
     def remove_robots(self, say: Say) -> None:
-        """Take the robots away again, as many as can be; what they sent expires by itself."""
+        """Remove as many of the robots as possible; the data that they sent expires by itself."""
         while self._robots:
             name = self._robots.pop()
             try:
@@ -76,8 +75,10 @@ def open_target(
     cloud: Cloud | None = None,
     say: Say = lambda _: None,
 ) -> Iterator[Target]:
-    """The target from its start to its end. On AWS the stacks are deployed already: those of ``cloud``, or
-    those to which the usual chain of credentials and region leads."""
+    """Yield the target while it exists.
+
+    On AWS the stacks are deployed already: those of ``cloud``, or of the usual credentials and region.
+    """
     with tempfile.TemporaryDirectory(prefix="iort-bench-") as name:
         folder = Path(name)
         if kind == AWS:

@@ -1,1 +1,4 @@
-"""The embedded cloud: AWS and PubNub on this machine, for the same app as is deployed to AWS."""
+"""The embedded cloud: AWS and PubNub on this machine, with the app that is also deployed to AWS.
+
+It may use everything but bench/ and scripts/. It is never installed.
+"""

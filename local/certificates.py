@@ -1,4 +1,4 @@
-"""Certificates for what listens on this machine: queues refuse plain HTTP, and robots plain MQTT."""
+"""Certificates for servers on this machine: queues refuse plain HTTP, and robots refuse plain MQTT."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ class Identity(NamedTuple):
     def make(
         cls, common_name: str, host: str, *, signer: Identity | None = None, authority: bool = False
     ) -> Identity:
-        """A new one for an IP address, signed by ``signer`` or itself; an ``authority`` may sign others."""
+        """Make one for an IP address, signed by ``signer`` or by itself. An ``authority`` may sign others."""
         key = ec.generate_private_key(ec.SECP256R1())
         name = x509.Name([x509.NameAttribute(NameOID.COMMON_NAME, common_name)])
         now = dt.datetime.now(dt.timezone.utc)
@@ -47,14 +47,14 @@ class Identity(NamedTuple):
         return cls(certificate, key)
 
     def write(self, folder: Path, name: str) -> tuple[Path, Path]:
-        """Write ``<name>.pem`` and ``<name>.key``, which its owner alone may read; return their paths."""
+        """Write ``<name>.pem`` and ``<name>.key`` and return their paths. Only the owner may read the key."""
         certificate_path, key_path = folder / f"{name}.pem", folder / f"{name}.key"
         certificate_path.write_bytes(self.certificate.public_bytes(serialization.Encoding.PEM))
         with os.fdopen(os.open(key_path, os.O_WRONLY | os.O_CREAT | os.O_TRUNC, 0o600), "wb") as file:
             file.write(
                 self.key.private_bytes(
                     serialization.Encoding.PEM,
-                    # The agent's TLS library reads keys of elliptic curves in their own format.
+                    # The agent's TLS library reads an elliptic-curve key in this format only.
                     serialization.PrivateFormat.TraditionalOpenSSL,
                     serialization.NoEncryption(),
                 )

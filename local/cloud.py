@@ -3,8 +3,8 @@
     with EmbeddedCloud(folder) as embedded:
         embedded.cloud.client("dynamodb")...
 
-Everything it writes is below its folder, everything it starts is stopped on the way out, and every
-socket listens on loopback unless another host is asked for.
+It writes below its folder only and stops on exit what it has started. Every socket listens on loopback,
+unless the caller gives another host.
 """
 
 from __future__ import annotations
@@ -49,7 +49,7 @@ from local.certificates import Identity
 from local.deployment import ROOT, deploy
 from local.errors import LocalError
 from local.processes import Child
-from local.pubnub_standin import PubNubStandIn
+from local.pubnub.standin import PubNubStandIn
 
 FOLDER = EMBEDDED.parent
 
@@ -64,8 +64,8 @@ Progress = Callable[[str], None]
 class EmbeddedCloud:
     """One embedded cloud, from `__enter__` to `__exit__`.
 
-    ``ports`` may fix ``gateway``, ``mqtt`` and ``pubnub``; others are free ones. ``progress`` hears
-    the name of every step as it begins. Raises `LocalError` where it cannot start, saying what to do.
+    ``ports`` may set ``gateway``, ``mqtt`` and ``pubnub``; the others are free ports. ``progress`` is called
+    with the name of each step when it begins. `__enter__` raises `LocalError` if it cannot start.
     """
 
     def __init__(
@@ -109,14 +109,14 @@ class EmbeddedCloud:
             endpoint_url=f"https://{self.host}:{ports['gateway']}",
             ca_bundle=str(certificate),
             access_key_id="test",
-            secret_access_key="test",  # noqa: S106 - what the emulator takes for its root user
+            secret_access_key="test",  # noqa: S106 - the emulator's name for its root user
             mqtt_host=self.host,
             mqtt_port=ports["mqtt"],
         )
         self._progress("emulator")
         self.start_emulator(certificate, key)
         root_ca = self._get("/_ministack/iot/ca.pem").decode()
-        # Robots send files to the gateway as well, whose certificate is one of its own.
+        # Robots also send files to the gateway, which has a certificate of its own.
         self.cloud = replace(self.cloud, root_ca_pem=root_ca + certificate.read_text())
         self._progress("PubNub stand-in")
         publish_key, subscribe_key = (f"{kind}-c-{secrets.token_hex(8)}" for kind in ("pub", "sub"))
@@ -137,8 +137,8 @@ class EmbeddedCloud:
     def _take_folder(self) -> None:
         self.folder.mkdir(parents=True, exist_ok=True)
         if shutil.disk_usage(self.folder).free < _LEAST_FREE_BYTES:
-            raise LocalError(f"less than {_LEAST_FREE_BYTES // 2**20} MB free for {self.folder}: free some")
-        # The file stays open, and locked, as long as this cloud runs.
+            raise LocalError(f"{self.folder} must have {_LEAST_FREE_BYTES // 2**20} MB free: free some space")
+        # The file stays open and locked while this cloud runs.
         lock = self._exit.enter_context((self.folder.parent / f"{self.folder.name}.lock").open("a+"))
         try:
             fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
@@ -152,7 +152,7 @@ class EmbeddedCloud:
         lock.truncate(0)
         lock.write(str(os.getpid()))
         lock.flush()
-        # What an earlier run left, after a kill -9, is of no use to this one.
+        # Files of an earlier run remain after a kill -9.
         shutil.rmtree(self.folder)
         (self.folder / "tmp").mkdir(parents=True, mode=0o700)
 
@@ -169,10 +169,10 @@ class EmbeddedCloud:
             return int(probe.getsockname()[1])
 
     def start_emulator(self, certificate: Path, key: Path) -> None:
-        """Start the emulator and wait until both its listeners answer."""
+        """Start the emulator and wait until it is ready."""
         gateway = (self.cloud.endpoint_url or "").rsplit(":", 1)[-1]
         environment = {
-            # Not our own environment: its functions would inherit the operator's credentials.
+            # Not our own environment: the functions would inherit the operator's credentials.
             "PATH": os.environ.get("PATH", os.defpath),
             "HOME": str(self.folder),
             "TMPDIR": str(self.folder / "tmp"),
@@ -197,7 +197,7 @@ class EmbeddedCloud:
             environment=environment,
             cwd=ROOT,
             log=self.folder / "emulator.log",
-            # It has nothing to put in order, and its workers end with it.
+            # It has no state to save, and its workers end with it.
             orphaned=signal.SIGKILL,
         )
         self._exit.callback(self.emulator.kill)
@@ -206,7 +206,7 @@ class EmbeddedCloud:
             try:
                 self._get("/_ministack/ready")
             except (urllib.error.URLError, ConnectionError):
-                # It has no other way to tell that it listens.
+                # The emulator gives no other signal that it listens.
                 self.emulator.wait(_POLL_S)
             else:
                 return
@@ -220,21 +220,20 @@ class EmbeddedCloud:
             return bytes(response.read())
 
     def _warm_up(self) -> None:
-        """Have every function started once, with an event that it accepts or refuses without effect.
+        """Invoke every function once, with an event that has no effect.
 
-        The first invocation of a function takes longest where the machine is smallest, and a live
-        message that waits for it is stale by then.
+        A first invocation takes seconds on a small machine, and a live message that waits for it is stale.
         """
         self._progress("functions")
-        # Stale since 1970, and dropped.
+        # A sample of 1970 is stale and is dropped.
         stale = LiveSample(boot="00000000", seq=0, t_us=0, sent_us=0, sample={}, offset_us=0)
         warm_up: dict[tuple[str, str], dict[str, Any]] = {
             ("processing", "Live"): self._rule_event(encode_live(stale), LIVE, "warm-up"),
             ("processing", "Summarize"): {"Records": []},
             ("processing", "Echo"): self._rule_event(encode_ping(0, 0), PING, LAMBDA),
-            # No fault and no low voltage.
+            # An event without a fault and without a low voltage.
             ("processing", "Alert"): self._rule_event(b"", LIVE, "warm-up"),
-            # Refused, and nobody hears the answer; without an id it would be kept in quarantine.
+            # Refused without a listener. Without an id it would go to quarantine.
             ("processing", "Upload"): self._rule_event(b'{"id": "00000000"}', PING, FILE),
             ("fleet", "Admit"): {},
             ("fleet", "Presence"): {},

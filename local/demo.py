@@ -1,4 +1,4 @@
-"""`make demo`: a car drives through the embedded cloud, and what arrived is counted.
+"""`make demo`: a car drives through the embedded cloud, and the demo counts the samples that arrive.
 
 python -m local.demo --duration 20 --bag drive.bag --report report.json
 """
@@ -45,16 +45,16 @@ _STATUS_S = 1.0
 
 
 def main() -> None:
-    """Run the demo; exit status 0 if no sample was lost, 1 otherwise, 2 where it could not run."""
+    """Run the demo. The exit status is 0 if no sample was lost, 1 if one was, and 2 if it could not run."""
     options = _options()
     stopped = threading.Event()
 
     def interrupt(_signal: int, _frame: object) -> NoReturn:
-        # Python drops an exception that is raised while it forks, so the wish is noted too.
+        # Python drops an exception that is raised while it forks, so the event is set too.
         stopped.set()
         raise KeyboardInterrupt
 
-    # Whatever stops the demo stops what it started.
+    # Every signal that stops the demo stops the processes that it started.
     for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
         signal.signal(number, interrupt)
     console = Console()
@@ -91,7 +91,7 @@ def _options() -> argparse.Namespace:
     )
     options = parser.parse_args()
     if options.bag is not None and not options.bag.exists():
-        parser.error(f"BAG={options.bag}: there is no such file")
+        parser.error(f"BAG must exist, got {options.bag}")
     if options.bag is not None:
         try:
             with BagSource(BagConfig(path=options.bag), SystemClock()).open() as messages:
@@ -99,15 +99,15 @@ def _options() -> argparse.Namespace:
         except SourceError as error:
             parser.error(f"BAG={error}")
     if options.report is not None and not options.report.absolute().parent.is_dir():
-        parser.error(f"REPORT={options.report}: there is no such folder")
+        parser.error(f"REPORT must be in an existing folder, got {options.report}")
     if options.report is not None and options.report.is_dir():
-        parser.error(f"REPORT={options.report}: this is a folder; name a file in it")
+        parser.error(f"REPORT must be a file, got the folder {options.report}")
     if not 0 <= options.port <= 65535:
-        parser.error(f"PORT={options.port}: allowed is 1 to 65535")
+        parser.error(f"PORT must be 1 to 65535, got {options.port}")
     try:
         socket.create_server(("127.0.0.1", options.port)).close()
     except OSError as error:
-        parser.error(f"PORT={options.port}: {error.strerror}; give another, or none for a free one")
+        parser.error(f"PORT must be free, got {options.port}: {error.strerror}; give none for a free one")
     return options
 
 
@@ -117,7 +117,7 @@ def _positive(value: str) -> float:
     except ValueError:
         seconds = 0.0
     if not 0 < seconds <= 86_400:
-        raise argparse.ArgumentTypeError(f"DURATION={value}: allowed is more than 0 and up to 86400 seconds")
+        raise argparse.ArgumentTypeError(f"DURATION must be over 0 and at most 86400 s, got {value}")
     return seconds
 
 
@@ -160,7 +160,7 @@ class _Demo:
             if self._options.report is not None:
                 self._options.report.write_text(json.dumps(figures.as_json(), indent=2) + "\n")
             if sys.stdin.isatty() and sys.stdout.isatty():
-                # Somebody who has the figures ends the show; that is no failure.
+                # Ctrl-C after the figures is no failure.
                 with suppress(KeyboardInterrupt):
                     self._stay(embedded, bundle, page.url)
             return figures
@@ -199,7 +199,7 @@ class _Demo:
         return written
 
     def _running(self, agent: Child) -> bool:
-        """Whether it still runs, after a moment; raises KeyboardInterrupt where that is not wanted."""
+        """Wait a second; whether the agent still runs. Raises KeyboardInterrupt if the demo was stopped."""
         if self._stopped.is_set():
             raise KeyboardInterrupt
         return agent.wait(_STATUS_S) is None
@@ -213,7 +213,7 @@ class _Demo:
         )
 
     def _count(self, embedded: EmbeddedCloud, report: dict[str, Any], listener: Listener) -> Figures:
-        """Read the tables until Lambda 2 has caught up with what they hold, or long enough."""
+        """Read the tables until Lambda 2 has summarised every sample, for at most 30 s."""
         streams = [name for name in report["streams"] if name not in OWN_STREAMS]
         sent = sum(report["streams"][name]["samples"] for name in streams)
         deadline = time.monotonic() + _CATCH_UP_S
@@ -223,7 +223,7 @@ class _Demo:
             stored = sum(one.samples_stored for one in found)
             if summarized >= sent or time.monotonic() > deadline:
                 break
-            # The stream that invokes Lambda 2 tells nobody when it is empty.
+            # No event tells that the stream of Lambda 2 is empty.
             threading.Event().wait(0.2)
         return Figures(
             samples_sent=sent,
@@ -236,7 +236,7 @@ class _Demo:
         )
 
     def _stay(self, embedded: EmbeddedCloud, bundle: robots.Bundle, url: str) -> None:
-        """Keep the car on the road, so that there is something to look at."""
+        """Let the car drive on until Ctrl-C, for the page."""
         settings = self._settings()
         settings["sources"][0].pop("duration_s", None)
         if self._options.bag is not None:

@@ -1,4 +1,4 @@
-"""Deploys the project's own stacks into the embedded cloud, with the pinned CDK command line."""
+"""Deploys the project's stacks into the embedded cloud, with the pinned CDK command line."""
 
 from __future__ import annotations
 
@@ -17,14 +17,14 @@ from local.processes import run
 ROOT = Path(__file__).resolve().parent.parent
 _ACCOUNT = "000000000000"
 _STEP_S = 180.0
-# What a synthesized assembly is made of: the same again is deployed as it is.
+# The sources of a synthesized assembly. If they have not changed, the kept assembly is deployed.
 _MADE_OF = ("app.py", "cdk.json", "requirements/dev.txt", "requirements/layer.txt", "scripts/layer.py")
 _MADE_OF_FOLDERS = ("stacks", "functions", "contract/iort_contract")
 _KEPT = 4
 
 
 def deploy(cloud: Cloud, folder: Path, progress: Callable[[str], None]) -> None:
-    """Bootstrap and deploy every stack; logs go into ``folder``. Raises `LocalError` where that fails."""
+    """Bootstrap and deploy every stack; logs go into ``folder``. Raises `LocalError` if that fails."""
     cdk = CommandLine(cloud, folder, progress)
 
     def synthesize(output: Path) -> None:
@@ -38,7 +38,7 @@ def deploy(cloud: Cloud, folder: Path, progress: Callable[[str], None]) -> None:
 
 
 class CommandLine:
-    """The pinned CDK command line, for an emulator; what it says goes into logs in ``folder``."""
+    """The pinned CDK command line for an emulator; its output goes into logs in ``folder``."""
 
     def __init__(self, cloud: Cloud, folder: Path, progress: Callable[[str], None]) -> None:
         self._folder, self._progress, self._region = folder, progress, cloud.region or ""
@@ -72,7 +72,7 @@ class CommandLine:
         )
 
     def run(self, verb: str, *arguments: str) -> None:
-        """One verb, to its end; raises `LocalError` where it fails."""
+        """Run one verb to its end; raises `LocalError` if it fails."""
         self._progress(f"cdk {verb}")
         run(
             f"cdk {verb}",
@@ -85,7 +85,7 @@ class CommandLine:
 
 
 def assembly(root: Path, folder: Path, *, namespace: str, synthesize: Callable[[Path], None]) -> Path:
-    """The synthesized stacks of the checkout as it is: kept ones, or what ``synthesize`` writes."""
+    """The synthesized stacks of the checkout: kept ones, or new ones from ``synthesize``."""
     kept = folder / _key(root, namespace)
     if kept.is_dir():
         kept.touch()
@@ -97,7 +97,7 @@ def assembly(root: Path, folder: Path, *, namespace: str, synthesize: Callable[[
     try:
         making.rename(kept)
     except OSError:
-        # Another process has made the same meanwhile.
+        # Another process has made the same one meanwhile.
         shutil.rmtree(making, ignore_errors=True)
     by_age = sorted(folder.iterdir(), key=lambda path: path.stat().st_mtime)
     for old in by_age[:-_KEPT]:

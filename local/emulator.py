@@ -1,4 +1,4 @@
-"""The emulator's process: ministack with its gaps closed. Configured by ministack's own environment."""
+"""The emulator's process: ministack with its gaps closed, configured by ministack's own environment."""
 
 from __future__ import annotations
 
@@ -6,16 +6,14 @@ import os
 
 from ministack import app
 
-from local import gaps, metrics
+from local import gaps
+from local.gaps.metrics import alarm_timer
 
 
 def main() -> None:
     """Serve until SIGTERM or SIGINT."""
     gaps.install()
-    metrics.install()
-    metrics.start(os.environ["MINISTACK_REGION"])
-    # Under USE_SSL it would also take port 443 of the machine, where it may.
-    app._port_is_bindable = lambda _host, _port: False
+    alarm_timer.start(os.environ["MINISTACK_REGION"])
     app.main()
 
 

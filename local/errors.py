@@ -1,5 +1,5 @@
-"""What can go wrong with the embedded cloud: every error it raises on purpose is one of these."""
+"""The error that the embedded cloud raises on purpose."""
 
 
 class LocalError(Exception):
-    """The embedded cloud cannot do what was asked; the text says why and what to do."""
+    """The embedded cloud cannot do what was asked. The text says why and what to do."""

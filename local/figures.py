@@ -1,4 +1,4 @@
-"""The figures of a drive, each beside the thesis' that the project began from."""
+"""The figures of a drive, beside those of the thesis that the project began from."""
 
 from __future__ import annotations
 
@@ -11,8 +11,8 @@ from rich.table import Table
 
 from iort_contract import BROKER, LAMBDA, PING_PATHS, RTT_FIELDS, RULE, Batch
 
-# Round trips and the way to the dashboard in ms, measured in 2018 from a car in Stockholm to AWS in Dublin,
-# a ping of 50 ms away (KTH thesis of 2018, table 6.4).
+# Round trips and the time from car to dashboard in ms, measured in 2018 between a car in Stockholm and AWS in
+# Dublin, with a network ping of 50 ms (KTH thesis of 2018, table 6.4).
 THESIS_MS = {BROKER: (50, 60), RULE: (100, 110), LAMBDA: (150, 200), "dashboard": (250, 300)}
 THESIS = {way: f"{least} - {most}" for way, (least, most) in THESIS_MS.items()}
 _NOT_MEASURED = "-"
@@ -20,7 +20,7 @@ _NOT_MEASURED = "-"
 
 @dataclass(frozen=True)
 class Spread:
-    """The median and the 95th percentile in ms of so many values; None of none."""
+    """The median and the 95th percentile of ``n`` values in ms; None if there are no values."""
 
     p50: float | None
     p95: float | None
@@ -43,7 +43,7 @@ class Spread:
 
 @dataclass(frozen=True)
 class Figures:
-    """What one drive came to."""
+    """The results of one drive."""
 
     samples_sent: int
     samples_stored: int
@@ -55,11 +55,11 @@ class Figures:
 
     @property
     def samples_lost(self) -> int:
-        """Sent and not stored, or stored and not summarised."""
+        """Samples that were sent and not stored, or stored and not summarised."""
         return self.samples_sent - min(self.samples_stored, self.samples_summarized)
 
     def as_json(self) -> dict[str, Any]:
-        """The figures under the names that the report promises."""
+        """The figures under the names of the report."""
         return {
             "samples_sent": self.samples_sent,
             "samples_stored": self.samples_stored,
@@ -75,7 +75,7 @@ class Figures:
         }
 
     def as_table(self) -> Table:
-        """The figures for a person."""
+        """The figures as a table for the terminal."""
         table = Table(title="The drive", title_justify="left", title_style="bold")
         table.add_column("figure")
         table.add_column("here", justify="right")
@@ -98,7 +98,7 @@ class Figures:
 
 
 def round_trips(batches: Iterable[Batch]) -> dict[str, Spread]:
-    """The round trips over every path, from the stored batches of the stream ``rtt``."""
+    """The round trips of each path, from the stored batches of the stream ``rtt``."""
     values: dict[str, list[float]] = {path: [] for path in PING_PATHS}
     for batch in batches:
         for path, found in values.items():

@@ -1,4 +1,4 @@
-"""Child processes that never outlive us and never hide why they stopped."""
+"""Child processes that end with us, and whose log says why they stopped."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ _LOG_TAIL_LINES = 15
 class Child:
     """A process in a session of its own, with its output in a log file.
 
-    ``orphaned`` is the signal it gets when we end without stopping it.
+    It gets the signal ``orphaned`` if we end without stopping it.
     """
 
     def __init__(
@@ -45,7 +45,7 @@ class Child:
                     stdout=output,
                     stderr=subprocess.STDOUT,
                     start_new_session=True,
-                    preexec_fn=_die_with(os.getpid(), orphaned),  # noqa: PLW1509 - see there
+                    preexec_fn=_die_with(os.getpid(), orphaned),  # noqa: PLW1509 - it takes no lock
                 )
             except OSError as error:
                 raise LocalError(f"{name} cannot be started: {error}") from error
@@ -60,14 +60,14 @@ class Child:
         return self._process.poll()
 
     def wait(self, timeout_s: float | None = None) -> int | None:
-        """Wait for the end; None if it still runs after ``timeout_s``."""
+        """Wait for its end and return its status; None if it still runs after ``timeout_s``."""
         try:
             return self._process.wait(timeout_s)
         except subprocess.TimeoutExpired:
             return None
 
     def check(self) -> None:
-        """Raise `LocalError`, with the end of its log, if it has stopped."""
+        """Raise `LocalError` with the end of its log if it has stopped."""
         if (status := self.poll()) is not None:
             raise LocalError(f"{self.name} stopped with status {status}:\n{self.tail()}")
 
@@ -77,30 +77,29 @@ class Child:
         return "\n".join(f"  {line[:300]}" for line in lines) + f"\n  ({self.log})"
 
     def interrupt(self) -> None:
-        """Ask it to finish what it has begun."""
+        """Send SIGINT, on which it finishes its work."""
         if self.poll() is None:
             self._process.send_signal(signal.SIGINT)
 
     def stop(self) -> None:
-        """End it and whatever it started: politely first, for certain after ten seconds."""
+        """End it and its children: SIGTERM, and SIGKILL after ten seconds."""
         if self.poll() is None:
             self._process.terminate()
             self.wait(_TERMINATE_S)
         self.kill()
 
     def kill(self) -> None:
-        """End it and whatever it started at once: it has nothing to put in order."""
-        # Workers share the session; the group's id is the child's, so this reaches nobody else.
+        """End it and its children at once."""
+        # Its children are in its process group, and nobody else is.
         with suppress(ProcessLookupError):
             os.killpg(self.pid, signal.SIGKILL)
         self._process.wait()
 
 
 def _die_with(parent: int, number: signal.Signals) -> Callable[[], None] | None:
-    """What makes a child end when we do, however we do (Linux); None where that cannot be said.
+    """A function that makes the child end with us, however we end; None on systems other than Linux.
 
-    It runs between fork and exec, where only what needs no lock may be called: the library is loaded
-    and its function found before.
+    It runs between fork and exec, where nothing may take a lock. So the library is loaded before.
     """
     if not sys.platform.startswith("linux"):
         return None
@@ -123,7 +122,7 @@ def run(
     log: Path,
     timeout_s: float,
 ) -> None:
-    """Run a command to its end; raises `LocalError` with the end of its output if it fails."""
+    """Run a command to its end; raises `LocalError` with the last lines of its output if it fails."""
     child = Child(name, command, environment=environment, cwd=cwd, log=log)
     try:
         status = child.wait(timeout_s)

@@ -1,4 +1,4 @@
-"""A TCP proxy that misbehaves on request: what lies between a car and its broker."""
+"""A TCP proxy that imitates a bad network between a car and its broker."""
 
 from __future__ import annotations
 
@@ -18,9 +18,8 @@ _CHUNK = 65536
 class Proxy:
     """Listens on a port of its own and forwards to the target.
 
-    ``mode`` is `PASS`, `REFUSE` (every connection is reset as it comes) or `FREEZE` (connections stand
-    and nothing passes, to what is open too); ``latency_s`` delays every byte, each way; ``attempts``
-    holds the monotonic time of every connection that came, whatever became of it.
+    ``mode`` is `PASS`, `REFUSE` (reset every connection) or `FREEZE` (keep connections open, pass no byte).
+    ``latency_s`` delays every byte, each way. ``attempts`` holds the monotonic time of every attempt.
     """
 
     def __init__(self, host: str, port: int, *, latency_s: float = 0.0) -> None:
@@ -50,7 +49,7 @@ class Proxy:
 
     @property
     def mode(self) -> str:
-        """What happens to connections now."""
+        """How the proxy treats connections now."""
         return self._mode
 
     @mode.setter
@@ -58,15 +57,15 @@ class Proxy:
         self._run(self._switch(mode))
 
     def reset(self) -> None:
-        """Reset every connection that is open."""
+        """Reset every open connection."""
         self._run(self._reset())
 
     def reset_every(self, seconds: float | None) -> None:
-        """Reset every connection again and again; None ends it."""
+        """Reset every connection each ``seconds``; None stops that."""
         self._run(self._reset_every(seconds))
 
     def wait_attempts(self, count: int, seconds: float) -> bool:
-        """Wait until so many connections have come; whether they have."""
+        """Wait for so many connection attempts; returns whether they came in time."""
         with self._changed:
             return self._changed.wait_for(lambda: len(self.attempts) >= count, seconds)
 
@@ -127,7 +126,7 @@ class Proxy:
                 return_when=asyncio.FIRST_COMPLETED,
             )
         except (OSError, asyncio.CancelledError):
-            pass  # the target is down, or we stop: the connection ends as it would without us
+            pass  # the target is down, or we stop: the connection ends in both cases
         finally:
             for one in (writer, out):
                 if one is not None:
@@ -159,7 +158,7 @@ class Proxy:
 
 
 def _abort(writer: asyncio.StreamWriter) -> None:
-    """Close with a reset, as a router that has forgotten the connection does."""
+    """Close with a reset, like a router that has lost the connection."""
     connection = writer.get_extra_info("socket")
     if connection is not None and connection.fileno() >= 0:
         connection.setsockopt(socket.SOL_SOCKET, socket.SO_LINGER, struct.pack("ii", 1, 0))

@@ -11,8 +11,8 @@ from typing import Any
 ROOT = Path(__file__).resolve().parent.parent
 sys.path.insert(0, str(ROOT))
 
-from bench.report import ratio_row
-from bench.result import Ratio
+from bench.report.result import Ratio
+from bench.report.writer import ratio_row
 
 REPORT = ROOT / "docs" / "bench" / "report.json"
 _BLOCK = re.compile(r"(<!-- bench:.*?-->\n).*?(\n<!-- /bench -->)", re.DOTALL)

@@ -1,8 +1,8 @@
 """Refuses at synth every rule that the embedded cloud would accept and silently drop.
 
-The same stacks run on AWS and on the embedded cloud; a rule that works on only one of them is a hidden
-defect. The lists hold the features of the pinned ministack and local/gaps.py; tests/stacks/test_portable.py
-compares them.
+The same stacks run on AWS and on the embedded cloud; a rule that only works on one of them is a
+defect that nobody would see. The lists are what the pinned ministack and local/gaps/ implement;
+tests/stacks/test_portable.py holds them against both.
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ SQL_FUNCTIONS = frozenset(
         "traceid",
     }
 )
-# The templates that local/gaps.py expands in a republish action's topic.
+# What local/gaps/rules/republish_topic.py expands in a republish action's topic.
 _TEMPLATE = re.compile(r"\$\{\s*topic\(\s*\d*\s*\)\s*\}")
 _CALL = re.compile(r"\b([A-Za-z_]\w*)\s*\(")
 # Words that may precede a bracket without being a function.

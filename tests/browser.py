@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 import pytest
 
-from bench import chromium
+from bench.meters import chromium
 
 if TYPE_CHECKING:
     from playwright.sync_api import Browser, Page

@@ -82,9 +82,12 @@ class FakeDynamoDB:
         self.calls["update_item"] += 1
         names, values = how["ExpressionAttributeNames"], how["ExpressionAttributeValues"]
         assert how["UpdateExpression"] == "ADD #streams :stream"
-        assert how["ConditionExpression"] == "attribute_exists(#robot)"
+        assert how["ConditionExpression"] == (
+            "attribute_exists(#robot) AND (attribute_not_exists(#streams) OR size(#streams) < :most)"
+        )
         item = self.items[TableName].get(_key(TableName, Key))
-        if item is None:
+        most = int(values[":most"]["N"])
+        if item is None or len(item.get(names["#streams"], {"SS": []})["SS"]) >= most:
             raise ClientError({"Error": {"Code": "ConditionalCheckFailedException"}}, "UpdateItem")
         there = item.get(names["#streams"], {"SS": []})["SS"]
         item[names["#streams"]] = {"SS": sorted({*there, *values[":stream"]["SS"]})}

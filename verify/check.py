@@ -45,10 +45,12 @@ class Check(Assumption):
 
 @dataclass(frozen=True, kw_only=True)
 class Answer:
-    """A question's outcome; ``reason`` says why it was not asked, or how it failed."""
+    """A question's outcome; ``expected`` is what it was compared with, and ``reason``
+    says why it was not asked, or how it failed."""
 
     check: Check
     verdict: Verdict
+    expected: Mapping[str, Any] | None = None
     seen: Mapping[str, Any] | None = None
     reason: str = ""
     took_s: float = 0.0
@@ -71,9 +73,9 @@ def ask(
     except Exception as error:  # noqa: BLE001 - an answer of another form is one too, and the next are asked
         reason = f"{type(error).__name__}: {error}"
         return Answer(check=check, verdict=Verdict.FAILED, reason=reason, took_s=clock() - began)
-    same = compared(seen) == compared(check.expected if expected is None else expected)
-    verdict = Verdict.AS_ASSUMED if same else Verdict.DIFFERS
-    return Answer(check=check, verdict=verdict, seen=seen, took_s=clock() - began)
+    expected = check.expected if expected is None else expected
+    verdict = Verdict.AS_ASSUMED if compared(seen) == compared(expected) else Verdict.DIFFERS
+    return Answer(check=check, verdict=verdict, expected=expected, seen=seen, took_s=clock() - began)
 
 
 def compared(answer: Mapping[str, Any]) -> dict[str, Any]:

@@ -7,20 +7,38 @@ import shutil
 import sys
 from collections.abc import Callable, Mapping
 from pathlib import Path
+from typing import Any
 
 from botocore.exceptions import BotoCoreError, ClientError
 
 from iort_contract import ROBOT
 from iort_station.cloud import Cloud
 from iort_station.errors import StationError
-from iort_station.fleet import claims, robots
+from iort_station.fleet import claims, files, robots
 from local.deployment import ROOT
 from local.errors import LocalError
 from local.processes import run
+from stacks.settings import DEV
+from verify.checks.removal import POLICY
 from verify.errors import VerifyError
+from verify.preflight_deployed import STACKS, stack
+from verify.waiting import until
 
 # Without CloudFront a stage takes five minutes; AWS keeps a policy for five more after its robots.
 _DEPLOY_S, _DESTROY_S = 1_800.0, 1_800.0
+
+_POLL_S = 10.0
+# cdk.json may say otherwise for the operator's own deployment: what must go again keeps nothing.
+_OF_ITS_OWN = {
+    "stage": DEV,
+    "site": "false",
+    "old_telemetry": "false",
+    "customer_key": "false",
+    "keep_customer_key": "false",
+    "device_defender": "false",
+    "iot_log_level": "off",
+    "budget_usd": "0",
+}
 
 Say = Callable[[str], None]
 
@@ -28,8 +46,17 @@ Say = Callable[[str], None]
 class Deployment:
     """The project's stacks under a namespace of their own; the CDK's logs go into ``folder``."""
 
-    def __init__(self, cloud: Cloud, folder: Path, say: Say) -> None:
+    def __init__(
+        self,
+        cloud: Cloud,
+        folder: Path,
+        say: Say,
+        *,
+        run: Callable[..., None] = run,
+        poll_s: float = _POLL_S,
+    ) -> None:
         self._cloud, self._folder, self._say = cloud, folder, say
+        self._run, self._poll_s = run, poll_s
 
     def deploy(self, settings: Mapping[str, str]) -> None:
         """Create the stacks, or update them to the settings. Raises `VerifyError` if the CDK fails."""
@@ -37,33 +64,79 @@ class Deployment:
         self._cdk(f"deploy{named}", _DEPLOY_S, ["deploy", "--require-approval", "never"], settings)
 
     def destroy(self) -> list[str]:
-        """Remove robots, claims and stacks; return the leftovers, one line each."""
-        left = self._without_robots()
-        try:
-            self._cdk("destroy", _DESTROY_S, ["destroy", "--force"], {})
-        except VerifyError as error:
-            left.append(str(error))
+        """Remove what the questions made, and the stacks; what stayed is returned, a line each."""
+        left = []
+        for what, step in (
+            ("stacks", self._wait),
+            ("robots", self._remove_robots),
+            ("claims", self._revoke_claims),
+            ("files", self._delete_files),
+            ("stacks", lambda: self._cdk("destroy", _DESTROY_S, ["destroy", "--force"], {})),
+            ("policies", self._delete_policies),
+        ):
+            try:
+                step()
+            except (StationError, VerifyError, BotoCoreError, ClientError) as error:  # noqa: PERF203 - all are tried
+                left.append(f"{what}: {error}")
         return left
 
-    def _without_robots(self) -> list[str]:
+    def _wait(self) -> None:
+        """CloudFormation goes on after the CDK was ended, and deletes no stack that it is changing."""
+        until(
+            lambda: not any(map(self._is_changing, STACKS)),
+            "the end of CloudFormation's work",
+            within_s=_DEPLOY_S,
+            poll_s=self._poll_s,
+        )
+
+    def _is_changing(self, noun: str) -> bool:
+        found = self._stack(noun)
+        status = "" if found is None else str(found["StackStatus"])
+        # A change set that was never executed: such a stack is empty.
+        return status.endswith("IN_PROGRESS") and status != "REVIEW_IN_PROGRESS"
+
+    def _stack(self, noun: str) -> Mapping[str, Any] | None:
+        return stack(self._cloud, f"{self._cloud.namespace}-{noun}")
+
+    def _remove_robots(self) -> None:
+        if self._stack("storage") is None:
+            return
         left = []
-        try:
-            for row in list(robots.listed(self._cloud)):
+        for row in list(robots.listed(self._cloud)):
+            try:
                 robots.remove(self._cloud, str(row[ROBOT]))
+            except (StationError, BotoCoreError, ClientError) as error:  # noqa: PERF203 - the next one may go
+                left.append(f"{row[ROBOT]}: {error}")
+        if left:
+            raise VerifyError("; ".join(left))
+
+    def _revoke_claims(self) -> None:
+        if self._stack("fleet") is not None:
             claims.revoke_all(self._cloud)
-        except (StationError, BotoCoreError, ClientError) as error:
-            left.append(f"robots or claims: {error}")
-        return left
+
+    def _delete_files(self) -> None:
+        """CloudFormation deletes no bucket that holds something."""
+        if self._stack("storage") is not None:
+            files.empty(self._cloud)
+
+    def _delete_policies(self) -> None:
+        """Of a question that was interrupted while AWS kept its policy."""
+        iot = self._cloud.client("iot")
+        pages = iot.get_paginator("list_policies").paginate()
+        names = [one["policyName"] for page in pages for one in page["policies"]]
+        for name in names:
+            if name.startswith(f"{self._cloud.namespace}-{POLICY}"):
+                iot.delete_policy(policyName=name)
 
     def _cdk(self, step: str, timeout_s: float, arguments: list[str], settings: Mapping[str, str]) -> None:
         path = f"{Path(sys.executable).parent}{os.pathsep}{os.environ.get('PATH', os.defpath)}"
         node = shutil.which("node", path=path)
         if node is None:
             raise VerifyError("the CDK command line is not installed: run `make setup`")
-        context = {"namespace": self._cloud.namespace, **settings}
+        context = {"namespace": self._cloud.namespace, **_OF_ITS_OWN, **settings}
         self._say(step)
         try:
-            run(
+            self._run(
                 f"cdk {step}",
                 [
                     *[sys.executable, "scripts/destroy.py"] * (arguments[0] == "destroy"),

@@ -46,7 +46,7 @@ def _lines(known: Measured) -> Iterator[str]:
     yield ""
     yield "## Not asked"
     yield ""
-    yield "A program cannot ask these within a quarter of an hour, or only a bill shows them."
+    yield "A program cannot ask these in half an hour, or only a bill shows them."
     yield from _table(UNASKED, known)
 
 

@@ -6,7 +6,7 @@ from math import ceil
 
 from iort_station.cost.prices import MONTH_HOURS, PRICES
 
-# A run takes about a quarter of an hour; hourly charges count for a whole hour.
+# A run takes about half an hour; what is metered by the hour is counted for a whole one.
 _HOURS = 1.0
 # More than all questions together send and invoke (tests/local/test_verify.py counts them).
 MESSAGES, INVOCATIONS, WRITES = 5_000, 2_000, 5_000

@@ -99,8 +99,8 @@ def as_markdown(run: Run, answers: Sequence[Answer]) -> str:
 
 
 def differences(answer: Answer) -> list[tuple[str, str, str]]:
-    """Each differing key of an answer: its name, the expected and the seen value."""
-    expected, seen = answer.check.expected, compared(answer.seen or {})
+    """Each key of an answer that is not as expected: its name, the expected and the seen value."""
+    expected, seen = compared(answer.expected or {}), compared(answer.seen or {})
     keys = [*expected, *(key for key in seen if key not in expected)]
     rows = [(key, json.dumps(expected.get(key)), json.dumps(seen.get(key))) for key in keys]
     return [(key, _cell(want), _cell(got)) for key, want, got in rows if want != got]

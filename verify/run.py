@@ -17,6 +17,7 @@ import shutil
 import sys
 import time
 from collections.abc import Callable, Iterator, Sequence
+from contextlib import ExitStack, suppress
 from pathlib import Path
 
 from botocore.exceptions import BotoCoreError, ClientError
@@ -24,8 +25,8 @@ from rich.console import Console
 from rich.markup import escape
 from rich.prompt import Confirm
 
-from bench import machine
 from bench.interrupts import wound_up
+from bench.report import machine
 from bench.target import AWS, EMBEDDED, Target, open_target
 from iort_station.cloud import Cloud
 from iort_station.cost.prices import AS_OF
@@ -36,6 +37,7 @@ from stacks.settings import Settings
 from verify import measured, preflight, price, report
 from verify.check import FIRST, WITH_KEY, Answer, Check, Verdict, ask
 from verify.checks import ALL
+from verify.checks.live import keys_lent
 from verify.deployment import Deployment
 from verify.errors import VerifyError
 
@@ -67,13 +69,17 @@ def run(options: argparse.Namespace, cloud: Cloud | None = None, deployment: Dep
     began = time.monotonic()
 
     def say(text: str) -> None:
-        console.print(f"{time.monotonic() - began:6.1f} s    {escape(text)}", highlight=False, style="dim")
+        # A terminal that has gone must not end the putting back.
+        with suppress(OSError):
+            console.print(
+                f"{time.monotonic() - began:6.1f} s    {escape(text)}", highlight=False, style="dim"
+            )
 
     answers: list[Answer] = []
     region = ""
     leftovers: list[str] = []
     findings: list[str] = []
-    with wound_up(console):
+    with wound_up(console) as putting_back:
         if options.target == AWS:
             cloud = (cloud or Cloud(namespace=options.namespace)).check()
             options.out.mkdir(parents=True, exist_ok=True)
@@ -84,7 +90,13 @@ def run(options: argparse.Namespace, cloud: Cloud | None = None, deployment: Dep
         try:
             if deployment:
                 deployment.deploy({})
-            with open_target(options.target, namespace=options.namespace, cloud=cloud, say=say) as target:
+            with (
+                open_target(options.target, namespace=options.namespace, cloud=cloud, say=say) as target,
+                ExitStack() as lent,
+            ):
+                # Several questions need them; without, these are not asked.
+                with suppress(VerifyError, StationError, ClientError):
+                    lent.enter_context(keys_lent(target))
                 region = target.cloud.client("iot").meta.region_name
                 # One by one, so that the report has all answers before an interrupt.
                 answers.extend(_asked(options.only, FIRST, target, console))
@@ -92,12 +104,14 @@ def run(options: argparse.Namespace, cloud: Cloud | None = None, deployment: Dep
                     deployment.deploy({"customer_key": "true"})
                 answers.extend(_asked(options.only, WITH_KEY, target, console))
         finally:
+            putting_back()
             if deployment:
                 leftovers = deployment.destroy()
             if answers:
                 report.write(options.out, _described(options, region, findings, leftovers), answers)
-    for line in leftovers:
-        console.print(f"left over: {line}", style="red", markup=False)
+            with suppress(OSError):
+                for line in leftovers:
+                    console.print(f"left over: {line}", style="red", markup=False)
     console.print(f"{report.summary(answers)}: {options.out / 'report.md'}", highlight=False)
     if options.keep:
         shutil.copyfile(options.out / "report.json", measured.KEPT)
@@ -141,7 +155,7 @@ def _looked(cloud: Cloud, console: Console) -> list[str]:
 def _confirm(console: Console, cloud: Cloud) -> None:
     """Ask before money is spent. Raises `VerifyError` without a terminal, or if the answer is no."""
     console.print(
-        f"This takes about 15 minutes and costs {price.told(price.estimate())} at the list prices of "
+        f"This takes about half an hour and costs {price.told(price.estimate())} at the list prices of "
         f"{AS_OF}. "
         f"It creates the stacks of namespace {cloud.namespace}, asks them, and removes them with all their "
         "data. A key of the account's own is scheduled for deletion, which AWS does not charge for.",
@@ -179,7 +193,9 @@ def _options() -> argparse.Namespace:
     parser.add_argument("--keep", action="store_true", help="keep the answers in the repository")
     options = parser.parse_args()
     if options.keep and options.target != AWS:
-        parser.error("--keep needs --target aws")
+        parser.error("--keep: only answers of AWS are kept")
+    if options.keep and options.only != ALL:
+        parser.error("--keep: what is kept takes the place of all earlier answers: leave --only away")
     return options
 
 

@@ -1,4 +1,4 @@
-"""Assumptions of the design that no program can ask in a quarter of an hour."""
+"""What the design takes for granted and no program asks in half an hour."""
 
 from __future__ import annotations
 
@@ -6,6 +6,7 @@ from verify.assumption import Assumption, Basis
 
 _IOT = "https://docs.aws.amazon.com/iot/latest/developerguide"
 _LAMBDA = "https://docs.aws.amazon.com/lambda/latest/dg"
+_CLOUDWATCH = "https://docs.aws.amazon.com/AmazonCloudWatch/latest/monitoring"
 _DYNAMODB = "https://docs.aws.amazon.com/amazondynamodb/latest/developerguide"
 
 
@@ -28,7 +29,7 @@ UNASKED = (
         "failures.",
         f"{_LAMBDA}/invocation-async-error-handling.html",
         "stacks/processing.py",
-        "local/gaps.py",
+        "local/gaps/functions/async_invocations.py",
     ),
     _documented(
         "lambda.at_least_once",
@@ -49,7 +50,7 @@ UNASKED = (
         "Lambda sets up logging before it loads a function, and a logged line has its level.",
         f"{_LAMBDA}/python-logging.html",
         "functions/summarize.py",
-        "local/log_gap.py",
+        "local/gaps/functions/log_levels.py",
     ),
     _documented(
         "lambda.reserved_concurrency",
@@ -63,8 +64,8 @@ UNASKED = (
         "A stream keeps records for 24 hours, in the order of each partition key.",
         f"{_DYNAMODB}/Streams.html",
         "functions/summarize.py",
-        "local/stream_gap.py",
-        "local/stream_mapping.py",
+        "local/gaps/functions/stream_retries.py",
+        "local/gaps/parts/stream_mapping.py",
     ),
     _documented(
         "dynamodb.ttl",
@@ -77,14 +78,14 @@ UNASKED = (
         "A Query reads at most 1 MB of one partition, in the order of the sort key.",
         f"{_DYNAMODB}/Query.Pagination.html",
         "station/iort_station/data/reading.py",
-        "local/table_gap.py",
+        "local/gaps/storage/query_time.py",
     ),
     _documented(
         "sqs.keeps_messages",
         "A message that SQS has accepted stays in the queue until it is deleted or expires.",
         "https://docs.aws.amazon.com/AWSSimpleQueueService/latest/SQSDeveloperGuide/sqs-message-metadata.html",
         "stacks/quarantine.py",
-        "local/queue_gap.py",
+        "local/gaps/storage/queue_lock.py",
     ),
     # The hook's timeout would need a deployment of its own.
     _documented(
@@ -111,13 +112,13 @@ UNASKED = (
         "A session whose certificate is deactivated is ended within minutes.",
         f"{_IOT}/device-certs-create.html",
         "station/iort_station/fleet/robots.py",
-        "local/cut_sessions.py",
+        "local/gaps/broker/certificate_status.py",
     ),
     _documented(
         "broker.slow_handshake",
         "A connection without a CONNECT is closed by the broker.",
         "https://docs.aws.amazon.com/general/latest/gr/iot-core.html",
-        "local/listener_gap.py",
+        "local/gaps/broker/connect_timeout.py",
     ),
     # Only a bill shows it.
     _documented(
@@ -151,7 +152,7 @@ UNASKED = (
         "A policy names a named shadow as a level of its thing: thing/<thing>/<shadow>.",
         f"{_IOT}/iot-action-resources.html",
         "stacks/processing.py",
-        "local/stream_gap.py",
+        "local/gaps/access/shadow_arn.py",
     ),
     _documented(
         "sqs.fair_queues",
@@ -164,6 +165,91 @@ UNASKED = (
         "A rule's action runs as the role that the rule names; the emulator runs it without.",
         f"{_IOT}/iot-create-role.html",
         "stacks/ingest.py",
+    ),
+    _documented(
+        "iot.topic_templates",
+        "A republish action's topic may hold ${topic(n)}.",
+        f"{_IOT}/iot-substitution-templates.html",
+        "contract/iort_contract/cloud.py",
+        "local/gaps/rules/republish_topic.py",
+    ),
+    _documented(
+        "iot.sql_floor",
+        "The SQL function floor() rounds a number down to an integer.",
+        f"{_IOT}/iot-sql-functions.html",
+        "contract/iort_contract/cloud.py",
+        "local/gaps/rules/sql_floor.py",
+    ),
+    _documented(
+        "iot.calls_over_tls",
+        "A rule's SQS action is a request over TLS, so that a queue's policy may demand aws:SecureTransport.",
+        "https://docs.aws.amazon.com/IAM/latest/UserGuide/reference_policies_condition-keys.html",
+        "stacks/queue.py",
+        "local/gaps/rules/sqs_action_tls.py",
+    ),
+    _documented(
+        "broker.delete_connection",
+        "DeleteConnection ends the session of one client.",
+        "https://docs.aws.amazon.com/iot/latest/apireference/API_iotdata_DeleteConnection.html",
+        "station/iort_station/fleet/certificates.py",
+        "local/gaps/broker/delete_connection.py",
+    ),
+    _documented(
+        "broker.client_certificate",
+        "A client without a certificate is not served on port 8883.",
+        f"{_IOT}/x509-client-certs.html",
+        "stacks/documents.py",
+        "local/gaps/broker/client_certificate.py",
+    ),
+    _documented(
+        "sqs.batch_permission",
+        "SendMessageBatch needs the permission sqs:SendMessage.",
+        "https://docs.aws.amazon.com/AWSSimpleQueueService/latest/SQSDeveloperGuide/sqs-api-permissions-reference.html",
+        "functions/shared/share.py",
+        "local/gaps/access/send_message_batch.py",
+    ),
+    _documented(
+        "dynamodb.stream_resource",
+        "A role may be granted the reading of one stream, by its ARN.",
+        "https://docs.aws.amazon.com/service-authorization/latest/reference/list_amazondynamodb.html",
+        "stacks/quarantine.py",
+        "local/gaps/access/stream_arn.py",
+    ),
+    _documented(
+        "cloudwatch.lambda_metrics",
+        "AWS/Lambda counts every invocation, for each function and for the account.",
+        f"{_LAMBDA}/monitoring-metrics-types.html",
+        "stacks/metrics.py",
+        "local/gaps/metrics/lambda_metrics.py",
+    ),
+    _documented(
+        "cloudwatch.iot_metrics",
+        "AWS/IoT counts connections, messages, and the matches and actions of rules.",
+        f"{_IOT}/metrics_dimensions.html",
+        "stacks/metrics.py",
+        "local/gaps/metrics/iot_metrics.py",
+    ),
+    _documented(
+        "cloudwatch.queue_metrics",
+        "AWS/SQS counts the messages that wait in each queue.",
+        "https://docs.aws.amazon.com/AWSSimpleQueueService/latest/SQSDeveloperGuide/sqs-available-cloudwatch-metrics.html",
+        "stacks/metrics.py",
+        "local/gaps/metrics/queue_metrics.py",
+    ),
+    _documented(
+        "cloudwatch.search",
+        "SEARCH in GetMetricData finds metrics by namespace, dimensions and name.",
+        f"{_CLOUDWATCH}/search-expression-syntax.html",
+        "stacks/metrics.py",
+        "local/gaps/metrics/metric_search.py",
+    ),
+    _documented(
+        "cloudwatch.alarm_evaluation",
+        "An alarm is evaluated every period, with its own dimensions, whether data comes or not.",
+        f"{_CLOUDWATCH}/AlarmThatSendsEmail.html",
+        "stacks/alarms.py",
+        "local/gaps/metrics/alarm_state.py",
+        "local/gaps/metrics/alarm_timer.py",
     ),
     # CloudFormation's console lines are not an interface.
     _assumed(

@@ -1,1 +1,1 @@
-"""Probes: each does one thing with the deployed stacks and says what it saw, or raises."""
+"""Probes: each tries one ability of the deployed stacks and returns what it saw, or raises."""

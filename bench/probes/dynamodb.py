@@ -1,22 +1,22 @@
-"""What DynamoDB can do."""
+"""Probes of DynamoDB."""
 
 from __future__ import annotations
 
 import uuid
 from concurrent.futures import ThreadPoolExecutor
 
-from bench.probes.ground import Ground, No, equal, until
+from bench.probes.probe_fixture import AbilityMissingError, ProbeFixture, equal, until
 from iort_contract import BATCH, VESC_STREAM, batches_between, build_topic
 from iort_station.operations import delivery
 
 WRITERS = 8
 
 
-def stores(ground: Ground) -> str:
+def stores(fixture: ProbeFixture) -> str:
     """An item comes back as it was put."""
-    client, table = ground.cloud.client("dynamodb"), ground.cloud.output("storage", "RobotsTable")
+    client, table = fixture.cloud.client("dynamodb"), fixture.cloud.output("storage", "RobotsTable")
     item = {
-        "robot": {"S": ground.target.name("bench-ability-item")},
+        "robot": {"S": fixture.target.name("bench-ability-item")},
         "value": {"S": uuid.uuid4().hex},
         "n": {"N": "1.5"},
     }
@@ -29,17 +29,17 @@ def stores(ground: Ground) -> str:
     return "an item came back as it was put"
 
 
-def range_of_time(ground: Ground) -> str:
-    """Of a drive, a range has the batches that begin in it."""
-    sent = ground.drive()
+def range_of_time(fixture: ProbeFixture) -> str:
+    """A range query returns the batches that begin in the range."""
+    sent = fixture.drive()
     first, last = batches_between(sent[1].t_us, sent[2].t_us - 1)
-    answer = ground.cloud.client("dynamodb").query(
-        TableName=ground.cloud.output("storage", "TelemetryTable"),
+    answer = fixture.cloud.client("dynamodb").query(
+        TableName=fixture.cloud.output("storage", "TelemetryTable"),
         KeyConditionExpression="topic = :topic AND #batch BETWEEN :a AND :b",
-        # A word of DynamoDB's own.
+        # A reserved word of DynamoDB.
         ExpressionAttributeNames={"#batch": BATCH},
         ExpressionAttributeValues={
-            ":topic": {"S": build_topic("dt", ground.a, VESC_STREAM, ground.namespace)},
+            ":topic": {"S": build_topic("dt", fixture.a, VESC_STREAM, fixture.namespace)},
             ":a": {"S": first},
             ":b": {"S": last},
         },
@@ -48,23 +48,23 @@ def range_of_time(ground: Ground) -> str:
     return "of three batches, a range gave the one in it"
 
 
-def stream_of_changes(ground: Ground) -> str:
-    """What is stored is summarised by the function behind the stream."""
-    before = delivery.samples_summarized(ground.cloud, ground.a, VESC_STREAM)
-    ground.drive()
+def stream_of_changes(fixture: ProbeFixture) -> str:
+    """The function behind the stream summarises the stored batches."""
+    before = delivery.samples_summarized(fixture.cloud, fixture.a, VESC_STREAM)
+    fixture.drive()
     until(
-        lambda: delivery.samples_summarized(ground.cloud, ground.a, VESC_STREAM) >= before + 150,
+        lambda: delivery.samples_summarized(fixture.cloud, fixture.a, VESC_STREAM) >= before + 150,
         "the stream's function to write the other table",
     )
-    return "what was stored in one table came summarised to the other"
+    return "batches of one table arrived summarised in the other"
 
 
-def many_writers(ground: Ground) -> str:
-    """Threads that write as fast as they can; one that is throttled raises."""
-    client, table = ground.cloud.client("dynamodb"), ground.cloud.output("storage", "RobotsTable")
+def many_writers(fixture: ProbeFixture) -> str:
+    """Threads write as fast as they can; a throttled write raises."""
+    client, table = fixture.cloud.client("dynamodb"), fixture.cloud.output("storage", "RobotsTable")
 
     def write(i: int) -> int:
-        key = {"robot": {"S": ground.target.name(f"bench-writer-{i}")}}
+        key = {"robot": {"S": fixture.target.name(f"bench-writer-{i}")}}
         for n in range(25):
             client.put_item(TableName=table, Item={**key, "n": {"N": str(n)}})
         client.delete_item(TableName=table, Key=key)
@@ -75,11 +75,11 @@ def many_writers(ground: Ground) -> str:
     return f"{written} writes by {WRITERS} threads, none refused"
 
 
-def on_demand(ground: Ground) -> str:
-    """The table's own word."""
-    table = ground.cloud.output("storage", "TelemetryTable")
-    described = ground.cloud.client("dynamodb").describe_table(TableName=table)["Table"]
+def on_demand(fixture: ProbeFixture) -> str:
+    """The table describes itself as on demand."""
+    table = fixture.cloud.output("storage", "TelemetryTable")
+    described = fixture.cloud.client("dynamodb").describe_table(TableName=table)["Table"]
     mode = described.get("BillingModeSummary", {}).get("BillingMode")
     if mode != "PAY_PER_REQUEST":
-        raise No(f"the billing mode is {mode}")
+        raise AbilityMissingError(f"the billing mode is {mode}")
     return f"the table says {mode}"

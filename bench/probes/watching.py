@@ -1,4 +1,4 @@
-"""What PubNub and CloudWatch can do."""
+"""Probes of PubNub and CloudWatch."""
 
 from __future__ import annotations
 
@@ -9,34 +9,34 @@ from contextlib import ExitStack
 from datetime import datetime, timedelta, timezone
 from typing import Any
 
-from bench.probes.ground import WAIT_S, Ground, No, equal, until
+from bench.probes.probe_fixture import WAIT_S, AbilityMissingError, ProbeFixture, equal, until
 from iort_contract import LAMBDA
 
 LISTENERS = 4
 
 
-def live_sample(ground: Ground) -> str:
-    """A live sample comes to a subscriber."""
-    with ground.target.listener(ground.a) as listener, ground.client(0) as client:
-        ground.live_until(client, lambda: bool(listener.heard), "the subscriber to hear a sample")
+def live_sample(fixture: ProbeFixture) -> str:
+    """A live sample reaches a subscriber."""
+    with fixture.target.listener(fixture.a) as listener, fixture.client(0) as client:
+        fixture.live_until(client, lambda: bool(listener.heard), "the subscriber to hear a sample")
         return f"a live sample came to a subscriber after {listener.heard[0].delay_ms:.0f} ms"
 
 
-def many_subscribers(ground: Ground) -> str:
-    """The same comes to each of several."""
+def many_subscribers(fixture: ProbeFixture) -> str:
+    """The same message reaches several subscribers."""
     with ExitStack() as stack:
-        listeners = [stack.enter_context(ground.target.listener(ground.a)) for _ in range(LISTENERS)]
-        ground.live_until(
-            stack.enter_context(ground.client(0)),
+        listeners = [stack.enter_context(fixture.target.listener(fixture.a)) for _ in range(LISTENERS)]
+        fixture.live_until(
+            stack.enter_context(fixture.client(0)),
             lambda: all(listener.heard for listener in listeners),
             "all subscribers to hear a sample",
         )
     return f"all {LISTENERS} heard one message"
 
 
-def metrics(ground: Ground) -> str:
-    """The mean of values that were put in."""
-    client, now = ground.cloud.client("cloudwatch"), datetime.now(timezone.utc)
+def metrics(fixture: ProbeFixture) -> str:
+    """CloudWatch returns the mean of the values of a metric."""
+    client, now = fixture.cloud.client("cloudwatch"), datetime.now(timezone.utc)
     name = f"Bench{uuid.uuid4().hex[:8]}"
     values = {"Values": [1.0, 2.0, 6.0], "Counts": [1.0, 1.0, 1.0]}
     client.put_metric_data(
@@ -55,19 +55,19 @@ def metrics(ground: Ground) -> str:
         )["Datapoints"]
         return bool(found)
 
-    until(there, "the metric's statistics", 180 if ground.target.embedded is None else WAIT_S)
+    until(there, "the metric's statistics", 180 if fixture.target.embedded is None else WAIT_S)
     equal(round(found[0]["Average"], 6), 3.0)
     return "the mean of 1, 2 and 6 came back as 3"
 
 
-def logs(ground: Ground) -> str:
-    """An invocation's lines are found in its log."""
-    function = ground.cloud.output("processing", "EchoFunction")
-    client = ground.cloud.client("lambda")
+def logs(fixture: ProbeFixture) -> str:
+    """The log has the lines of an invocation."""
+    function = fixture.cloud.output("processing", "EchoFunction")
+    client = fixture.cloud.client("lambda")
     group = client.get_function_configuration(FunctionName=function)["LoggingConfig"]["LogGroup"]
     since = int(time.time() * 1000) - 1000
-    ground.pong(LAMBDA)
-    logs = ground.cloud.client("logs")
+    fixture.pong(LAMBDA)
+    logs = fixture.cloud.client("logs")
     until(
         lambda: bool(logs.filter_log_events(logGroupName=group, startTime=since)["events"]),
         "the log's lines",
@@ -75,12 +75,12 @@ def logs(ground: Ground) -> str:
     return "an invocation's lines are in its log"
 
 
-def dashboards(ground: Ground) -> str:
-    """The deployment's dashboards, with their widgets."""
-    client = ground.cloud.client("cloudwatch")
+def dashboards(fixture: ProbeFixture) -> str:
+    """The deployment has dashboards with widgets."""
+    client = fixture.cloud.client("cloudwatch")
     names = [entry["DashboardName"] for entry in client.list_dashboards()["DashboardEntries"]]
     if not names:
-        raise No("there is no dashboard")
+        raise AbilityMissingError("there is no dashboard")
     widgets = sum(
         len(json.loads(client.get_dashboard(DashboardName=name)["DashboardBody"])["widgets"])
         for name in names

@@ -16,13 +16,13 @@ from typing import Any, NamedTuple
 
 _VERSION = "/2018-06-01/runtime"
 NEXT, RESPONSE, ERROR, INIT_ERROR = "next", "response", "error", "init/error"
-# Stands for both of PubNub's keys: no log may have it.
+# Used for both of PubNub's keys; no log may contain it.
 PUBNUB_KEY = "a-key-of-pubnub"
 ARN = "arn:aws:lambda:eu-west-1:000000000000:function:"
 
 
 class Call(NamedTuple):
-    """What the runtime asked for or told: one of the four kinds, the document, and the error's type."""
+    """One call of the runtime: its kind (one of four), the document, and the error's type."""
 
     kind: str
     document: Any
@@ -42,11 +42,11 @@ class RuntimeApi:
         self._events.put(event)
 
     def end(self) -> None:
-        """Let go of a runtime that waits for an event."""
+        """Release a runtime that waits for an event."""
         self._events.put(None)
 
     def next(self, asked: BaseHTTPRequestHandler) -> None:
-        """Answer the runtime once there is an event, as long as that takes."""
+        """Wait for an event and answer the runtime with it."""
         self.calls.put(Call(NEXT, None, None))
         event = self._events.get()
         if event is None:
@@ -65,7 +65,7 @@ class RuntimeApi:
         )
 
     def told(self, asked: BaseHTTPRequestHandler, body: bytes) -> None:
-        """Take what the runtime says of an invocation, or of its start."""
+        """Record a report of the runtime on an invocation or on its start."""
         kind = next(one for one in (INIT_ERROR, RESPONSE, ERROR) if asked.path.endswith(f"/{one}"))
         error_type = asked.headers.get("Lambda-Runtime-Function-Error-Type")
         self.calls.put(Call(kind, json.loads(body), error_type))
@@ -141,7 +141,7 @@ class _Handler(BaseHTTPRequestHandler):
         return body
 
     def log_message(self, *_: Any) -> None:
-        """Nothing: the functions' own lines are what is looked at."""
+        """Log nothing: only the functions' own lines matter."""
 
 
 def _answer(
@@ -158,7 +158,7 @@ def _answer(
 
 @contextmanager
 def served(api: RuntimeApi, services: Services) -> Iterator[str]:
-    """Serve both on a port of loopback; gives host and port."""
+    """Serve both on a port of loopback; yield host and port."""
     handler = type("Handler", (_Handler,), {"api": api, "services": services})
     server = ThreadingHTTPServer(("127.0.0.1", 0), handler)
     server.daemon_threads = True

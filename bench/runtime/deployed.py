@@ -1,4 +1,4 @@
-"""The functions as the stacks deploy them: configuration off the templates, code and layer off the assets."""
+"""The functions as deployed: configuration from the templates, code and layer from the assets."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from stacks.settings import Settings
 
 
 def functions(folder: Path, settings: Settings) -> dict[str, Function]:
-    """Every function by its module's name; the app is synthesized into ``folder``."""
+    """Return every function by its module's name; the app is synthesized into ``folder``."""
     app = App(outdir=str(folder))
     build(app, settings)
     found = {}
@@ -53,7 +53,7 @@ def _function(folder: Path, properties: Mapping[str, Any], layers: Mapping[str, 
 
 
 def _text(name: str, value: Any) -> str:
-    """A variable's value; what only the deployment knows is a name that would do."""
+    """Return a variable's value, or a placeholder for a value that only the deployment knows."""
     if isinstance(value, str):
         return value
     if name.endswith("_QUEUE"):

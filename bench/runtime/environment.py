@@ -19,7 +19,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-from bench import cpu
+from bench.meters import cpu
 from bench.runtime.api import NEXT, Call, RuntimeApi, Services, served
 
 _ANSWER_S = 60.0
@@ -34,12 +34,12 @@ _MB = 1024
 
 
 class RuntimeFailedError(Exception):
-    """The function did not start, or its runtime ended; the text has what the runtime said."""
+    """The function did not start, or its runtime ended; the text has the runtime's output."""
 
 
 @dataclass(frozen=True)
 class Function:
-    """A function as it is deployed: where its code is, and its configuration."""
+    """A deployed function: the folder of its code, and its configuration."""
 
     name: str
     handler: str
@@ -89,11 +89,11 @@ class Environment:
         return answer
 
     def cpu_ms(self) -> float:
-        """Processor time so far."""
+        """Return the processor time so far."""
         return cpu.spent_ms({}, cpu.of_process(self.process.pid))
 
     def peak_mb(self) -> float:
-        """The most memory that it had resident."""
+        """Return its peak resident memory."""
         status = Path(f"/proc/{self.process.pid}/status").read_text()
         return int(status.partition("VmHWM:")[2].split()[0]) / _MB
 
@@ -141,7 +141,7 @@ def started(function: Function, folder: Path, *, python: str = sys.executable) -
 
 
 def frames(data: bytes) -> list[str]:
-    """The messages in what a runtime writes for Lambda: each behind its type, length and time."""
+    """Yield the messages of a runtime's output; each follows its type, length and time."""
     found = []
     while data:
         _, length, _ = _FRAME.unpack(data[: _FRAME.size])
@@ -167,7 +167,7 @@ def link_runtime(folder: Path) -> list[Path]:
 
 
 def _variables(function: Function, address: str, own: Path, log: int) -> dict[str, str]:
-    """Lambda's "Defined runtime environment variables"; keys of nobody, and no way to any other AWS."""
+    """Return Lambda's "Defined runtime environment variables", with keys that no AWS accepts."""
     path = [own] if function.layer is None else [function.layer / "python", own]
     return {
         **function.environment,

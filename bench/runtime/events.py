@@ -16,6 +16,7 @@ from iort_contract import (
     LAMBDA,
     LIVE,
     PING,
+    PUT_OFF,
     RECEIVED_MS,
     RECORD,
     ROBOT_PARAMETER,
@@ -38,9 +39,10 @@ ROBOT = "car"
 
 
 def events() -> dict[str, dict[str, Any]]:
-    """By the function's name; of now, because what is late is not worked on."""
+    """Return the events by the function's name, with the current time: functions ignore late events."""
     now_us = time.time_ns() // 1000
     now_ms = now_us // 1000
+    topic = build_topic(RECORD, ROBOT, VESC_STREAM)
     sample = {"speed": 1.5, "voltage_input": 9.5, "fault_code": 5}
     live = LiveSample("aaaaaaaa", 0, now_us, now_us, sample, 0)
     file = File("a.bag", "recording", "application/octet-stream", 1, hashlib.sha256(b"a").hexdigest(), now_us)
@@ -56,6 +58,8 @@ def events() -> dict[str, dict[str, Any]]:
         },
         "alert": {TOPIC: build_topic(RECORD, ROBOT, VESC_STREAM), RECEIVED_MS: now_ms, **sample},
         "echo": rule_event(encode_ping(1, now_us), build_topic(PING, ROBOT, LAMBDA), now_ms),
+        # A batch that expired while it waited.
+        "later": {"Records": [{"messageId": "1", "body": json.dumps({PUT_OFF: [[topic, "1-0-0"]]})}]},
         "live": rule_event(encode_live(live), build_topic(LIVE, ROBOT, VESC_STREAM), now_ms),
         "presence": {
             "clientId": ROBOT,

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 
-from bench.result import Section
+from bench.report.result import Section
 from bench.sections import (
     abilities,
     cost,

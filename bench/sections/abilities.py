@@ -1,7 +1,7 @@
-"""Tables 6.1 to 6.3: what each service can do, every answer by doing it in this run.
+"""Tables 6.1 to 6.3: the abilities of each service, each tried in this run.
 
-The thesis gave its answers from documentation and use; here a probe exercises each ability on the deployed
-stacks. Beside each stands what the thesis' tables say on the same point; its tables as they are follow.
+The thesis took its answers from documentation and use. Here a probe tries each ability on the deployed
+stacks. The report has the thesis' entry on the same point beside each answer, then its tables.
 """
 
 from __future__ import annotations
@@ -9,15 +9,15 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass
 
-from bench import thesis
 from bench.probes import dynamodb, functions, iot_core, watching
-from bench.probes.ground import Ground, No
-from bench.result import Ratio, Section, Table
+from bench.probes.probe_fixture import AbilityMissingError, ProbeFixture
+from bench.report import thesis
+from bench.report.result import Ratio, Section, Table
+from bench.report.thesis import UNSAID, said
 from bench.target import Say, Target
-from bench.thesis import UNSAID, said
 
 _IOT_CORE, _DYNAMODB, _LAMBDA, _PUBNUB, _CLOUDWATCH = "IoT Core", "DynamoDB", "Lambda", "PubNub", "CloudWatch"
-# What the thesis said, by the point that an ability is an instance of.
+# The thesis' entry on the point of an ability.
 _PATTERN, _PROTOCOL = said(thesis.AWS_IOT, "pattern"), said(thesis.AWS_IOT, "protocol")
 _COMPUTE, _NO_STORAGE = said(thesis.AWS_IOT, "compute"), said(thesis.AWS_IOT, "storage")
 _STORAGE = said(thesis.DYNAMODB, "storage")
@@ -28,15 +28,15 @@ _MONITORING = said(thesis.CLOUDWATCH, "monitoring")
 
 @dataclass(frozen=True)
 class Probe:
-    """One cell: ``ask`` exercises the ability and says what it saw, or raises."""
+    """One cell: ``ask`` tries the ability and returns what it saw, or raises."""
 
     service: str
     ability: str
     thesis: str
-    ask: Callable[[Ground], str]
+    ask: Callable[[ProbeFixture], str]
 
 
-# Every cell, by the thesis' table that it belongs to.
+# The cells of each table of the thesis.
 PROBES = {
     thesis.FUNCTIONALITY: (
         Probe(_IOT_CORE, "pushes a robot's message to another robot", _PATTERN, iot_core.robot_to_robot),
@@ -92,13 +92,13 @@ def run(target: Target, say: Say) -> Section:
     section = Section("abilities", "Abilities (tables 6.1 to 6.3)")
     answers: dict[str, list[list[str]]] = {}
     failed = 0
-    with Ground(target) as ground:
+    with ProbeFixture(target) as fixture:
         for criteria, probes in PROBES.items():
             title = f"{criteria.title.capitalize()} (table {criteria.number})"
             rows = answers[title] = []
             for probe in probes:
                 say(f"{probe.service}: {probe.ability}")
-                answer, seen = _answer(probe, ground)
+                answer, seen = _answer(probe, fixture)
                 failed += answer == "no"
                 rows.append([probe.ability, probe.service, answer, probe.thesis, seen])
             head = ["ability", "service", "here", "thesis, 2018", "what the probe saw"]
@@ -113,10 +113,10 @@ def run(target: Target, say: Say) -> Section:
     return section
 
 
-def _answer(probe: Probe, ground: Ground) -> tuple[str, str]:
+def _answer(probe: Probe, fixture: ProbeFixture) -> tuple[str, str]:
     try:
-        return "yes", probe.ask(ground)
-    except No as no:
-        return "no", str(no)
-    except Exception as error:  # noqa: BLE001 - whatever the service does instead is the answer
+        return "yes", probe.ask(fixture)
+    except AbilityMissingError as missing:
+        return "no", str(missing)
+    except Exception as error:  # noqa: BLE001 - any other behaviour of the service is an answer
         return "no", f"{type(error).__name__}: {error}"[:160]

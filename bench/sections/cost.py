@@ -1,22 +1,22 @@
-"""Cost a robot-hour, and on paper the fleets that no laptop can carry; computed by the station's model."""
+"""The cost of a robot-hour and of large fleets, computed by the station's cost model."""
 
 from __future__ import annotations
 
 from dataclasses import asdict, replace
 
-from bench import plots
-from bench.result import Plot, Ratio, Section, Table
+from bench.report import plots
+from bench.report.result import Plot, Ratio, Section, Table
 from bench.target import Say, Target
 from iort_station.cost import line_items, model, report, scale
 from iort_station.cost.prices import AS_OF, REGION
 from iort_station.cost.usage import Usage
 
-# Nothing is measured here: the same settings have the same cost, to the last digit shown.
+# Computed, not measured: the same settings have the same cost.
 _COMPUTED = 1.01
 
 
 def run(target: Target, say: Say) -> Section:
-    """The memory of the functions as they are deployed, the rates of the agent's defaults."""
+    """Compute with the deployed memory sizes and the agent's default rates."""
     say("computing")
     client = target.cloud.client("lambda")
     memory = {

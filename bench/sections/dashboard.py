@@ -1,4 +1,4 @@
-"""From the car to the dashboard: to a PubNub subscriber hop by hop, and to a painted frame in Chromium."""
+"""The delay from the car to a PubNub subscriber, hop by hop, and to a painted frame in Chromium."""
 
 from __future__ import annotations
 
@@ -9,11 +9,12 @@ from contextlib import contextmanager
 from dataclasses import asdict
 from typing import Any
 
-from bench import chromium, plots
-from bench.driving import Driving
 from bench.errors import BenchError
-from bench.result import Plot, Ratio, Section, Table
-from bench.spread import spread
+from bench.load.agent_process import AgentProcess
+from bench.meters import chromium
+from bench.report import plots
+from bench.report.result import Plot, Ratio, Section, Table
+from bench.report.spread import spread
 from bench.target import Say, Target
 from iort_contract import VESC_STREAM
 from iort_station.operations import audit, trace
@@ -71,7 +72,7 @@ def run(target: Target, say: Say) -> Section:
     painted: list[tuple[float, float]] = []
     with listener, trace.pubnub_clock(pubnub.origin or PUBNUB_ORIGIN, tls=pubnub.tls) as ask:
         here = trace.clock_of(ask, lambda: time.time_ns() // 1000)
-        with Driving(bundle) as driving, _page(target, bundle.robot, say) as page:
+        with AgentProcess(bundle) as agent, _page(target, bundle.robot, say) as page:
             threading.Event().wait(_WARM_UP_S)
             found.clear()
             say(f"driving for {SECONDS} s")
@@ -81,7 +82,7 @@ def run(target: Target, say: Say) -> Section:
                 painted = [(float(t), float(at)) for t, at in page.evaluate("window.__painted")]
             else:
                 threading.Event().wait(SECONDS)
-            if driving.process.poll() is not None:
+            if agent.process.poll() is not None:
                 raise BenchError("the agent stopped while it was watched")
             updates = list(found)
         figures = audit.last_figures(target.cloud, bundle.robot)
@@ -150,7 +151,7 @@ def _chunks(values: list[float]) -> list[list[float]]:
 
 @contextmanager
 def _page(target: Target, robot: str, say: Say) -> Iterator[Any]:
-    """The live page in a real browser; None where there is no browser or no built page."""
+    """Yield the live page in a real browser, or None without a browser or a built page."""
     if chromium.found() is None or not (BUILT / "index.html").is_file():
         say("no Chromium, or the page is not built: measured to the subscriber only")
         yield None

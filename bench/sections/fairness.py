@@ -1,5 +1,5 @@
-"""Fairness: what one robot at the limit of its connection costs another's live lane, and what its dearest
-batches cost another's summaries.
+"""Fairness: how one robot at the limit of its connection delays another's live lane, and how its most
+expensive batches delay another's summaries.
 
 Only on the embedded cloud: on AWS other sections would share Lambda 1 with what is refused here.
 """
@@ -10,25 +10,25 @@ import threading
 import time
 from collections.abc import Callable, Iterable
 
-from bench.dear import dearest
-from bench.driving import Driving
 from bench.errors import BenchError
-from bench.raw_mqtt import RawClient
-from bench.result import Ratio, Section, Table
-from bench.spread import Spread, spread
+from bench.floors.raw_mqtt import RawClient
+from bench.load.agent_process import AgentProcess
+from bench.load.worst_case import worst_batches
+from bench.report.result import Ratio, Section, Table
+from bench.report.spread import Spread, spread
 from bench.target import Say, Target
 from iort_contract import LIVE, SECOND, VESC_STREAM, LiveSample, build_topic, encode_live, record_topic
 from iort_station.data.items import of_topic
 
-# AWS IoT takes so many publishes a second from a connection.
+# AWS IoT accepts this many publishes a second from a connection.
 RATE_HZ = 100
 STRETCH_S = 8
 _REPEATS = 2
 _MOST = 2.0
 _WARM_UP_S = 30.0
-# The dearest batches that are allowed: of what a robot may well send, and of all that it can.
-DEAR_HZ = (15, 100)
-DEAR_S = 20
+# Worst-case batches a second: what a robot may well send, and the most that it can send.
+WORST_HZ = (15, 100)
+WORST_S = 20
 _LOOK_S = 0.05
 _BEGUN_S = 10.0
 
@@ -36,12 +36,12 @@ Message = Callable[[int], bytes]
 
 
 def bad(number: int) -> bytes:
-    """What no robot of ours sends."""
+    """Return a message that is no JSON."""
     return b"no JSON %d" % number
 
 
 def good(number: int) -> bytes:
-    """A live message of now."""
+    """Return a live message with the current time."""
     now_us = time.time_ns() // 1000
     return encode_live(LiveSample("0badcafe", number, now_us, now_us, {"speed": number}))
 
@@ -64,7 +64,7 @@ def run(target: Target, say: Say) -> Section:
     found: dict[str, list[list[float]]] = {kind: [] for kind in KINDS}
     with (
         target.listener(car.robot) as listener,
-        Driving(car),
+        AgentProcess(car),
         RawClient(other.folder) as client,
     ):
         began = time.monotonic()
@@ -72,7 +72,7 @@ def run(target: Target, say: Say) -> Section:
             if time.monotonic() - began > _WARM_UP_S:
                 raise BenchError("no live update was heard")
             threading.Event().wait(0.1)
-        # Once each beforehand: clients are made and environments started only the first time.
+        # Warm up once with each kind: the first message creates clients and environments.
         for message in KINDS.values():
             _stretch(client, topic, message, 2)
         for _ in range(_REPEATS):
@@ -82,11 +82,11 @@ def run(target: Target, say: Say) -> Section:
                 _stretch(client, topic, message, STRETCH_S)
                 found[kind].append([one.delay_ms for one in listener.heard[heard:]])
     say("summaries")
-    summaries: dict[str, list[list[float]]] = {kind: [] for kind in (_ALONE, *map(_dear, DEAR_HZ))}
-    with Driving(car), RawClient(other.folder) as client:
+    summaries: dict[str, list[list[float]]] = {kind: [] for kind in (_ALONE, *map(_worst, WORST_HZ))}
+    with AgentProcess(car), RawClient(other.folder) as client:
         for _ in range(_REPEATS):
-            for rate_hz in (0, *DEAR_HZ):
-                kind = _dear(rate_hz) if rate_hz else _ALONE
+            for rate_hz in (0, *WORST_HZ):
+                kind = _worst(rate_hz) if rate_hz else _ALONE
                 say(f"the other robot sends {kind}")
                 summaries[kind].append(_summary_delays(target, car.robot, client, other.robot, rate_hz))
                 _forget(target)
@@ -95,22 +95,24 @@ def run(target: Target, say: Say) -> Section:
     return section
 
 
-def _dear(rate_hz: int) -> str:
-    return f"{rate_hz} dear batches a second"
+def _worst(rate_hz: int) -> str:
+    return f"{rate_hz} worst-case batches a second"
 
 
 def _summary_delays(target: Target, car: str, client: RawClient, other: str, rate_hz: int) -> list[float]:
-    """How long after its end each second of the car is in the summary table, in ms, while the other robot
-    sends the dearest batches, if any."""
+    """Return how long after its end each second of the car is in the summary table, in ms.
+
+    Meanwhile the other robot sends ``rate_hz`` worst-case batches a second.
+    """
     topic = record_topic(other, VESC_STREAM, target.cloud.namespace)
-    messages = dearest(rate_hz * DEAR_S, first_us=time.time_ns() // 10**9 * 10**6)
+    messages = worst_batches(rate_hz * WORST_S, first_us=time.time_ns() // 10**9 * 10**6)
     newest = of_topic(target.cloud, "SummaryTable", car, VESC_STREAM, SECOND)
     seen: dict[int, float] = {}
     over = threading.Event()
 
     def watch() -> None:
         while not over.wait(_LOOK_S):
-            answer = target.cloud.client("dynamodb").query(**newest, ScanIndexForward=False, Limit=DEAR_S)
+            answer = target.cloud.client("dynamodb").query(**newest, ScanIndexForward=False, Limit=WORST_S)
             now_s = time.time()
             for item in answer["Items"]:
                 second = int(item[SECOND]["N"])
@@ -124,15 +126,15 @@ def _summary_delays(target: Target, car: str, client: RawClient, other: str, rat
         if rate_hz:
             _paced(client, topic, messages, rate_hz)
         else:
-            over.wait(DEAR_S)
-        # Of the last seconds, too, the summary is waited for.
+            over.wait(WORST_S)
+        # Wait for the summaries of the last seconds too.
         deadline = time.monotonic() + _WARM_UP_S
-        while int(began_s) + DEAR_S not in seen and time.monotonic() < deadline:
+        while int(began_s) + WORST_S not in seen and time.monotonic() < deadline:
             over.wait(_LOOK_S)
     finally:
         over.set()
         watcher.join()
-    return [delay for second, delay in sorted(seen.items()) if began_s < second <= began_s + DEAR_S]
+    return [delay for second, delay in sorted(seen.items()) if began_s < second <= began_s + WORST_S]
 
 
 def _forget(target: Target) -> None:

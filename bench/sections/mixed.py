@@ -1,8 +1,8 @@
-"""A mixed robot on a real ROS 1 graph: what the agent costs beside `rosbag record` of the same topics.
+"""A mixed robot on a real ROS 1 graph: the cost of the agent beside `rosbag record` of the same topics.
 
-Both are subscribed to every topic of `bench.mixed_robot` at the same time, and so is a bare rospy subscriber,
-which is what Python and rospy take by themselves. The agent publishes to mosquitto, where all is counted.
-Where ROS 1 or mosquitto is not installed, the section says so and has no figures.
+Both subscribe to every topic of `bench.ros.mixed_robot` at the same time. So does a bare rospy subscriber,
+which shows what Python and rospy take by themselves. The agent publishes to mosquitto, where a watcher counts
+everything. Without ROS 1 or mosquitto the section has no figures and says why.
 """
 
 from __future__ import annotations
@@ -23,14 +23,15 @@ from typing import Any
 import yaml
 from awscrt import mqtt5
 
-from bench import plots, usage
 from bench.errors import BenchError
-from bench.mixed_robot import NODES, topics
-from bench.mosquitto import HOST, Mosquitto, found
-from bench.result import NOT_MEASURED, Plot, Ratio, Section, Table
-from bench.ros_graph import PACKAGES, SYSTEM_PYTHON, Publisher, RosGraph, python_with_rospy
+from bench.floors.mosquitto import HOST, Mosquitto, found
+from bench.meters import usage
+from bench.meters.watcher import subscribed
+from bench.report import plots
+from bench.report.result import NOT_MEASURED, Plot, Ratio, Section, Table
+from bench.ros.graph import PACKAGES, SYSTEM_PYTHON, Publisher, RosGraph, python_with_rospy
+from bench.ros.mixed_robot import NODES, topics
 from bench.target import Say, Target
-from bench.watcher import subscribed
 from iort_contract import LIVE, RECORD, decode, parse_topic
 
 SECONDS = 30
@@ -44,7 +45,7 @@ _PACKAGES = f"{PACKAGES} python3-rosbag mosquitto"
 
 @dataclass
 class Found:
-    """What one run came to, by topic or by subscriber. ``late`` samples came after the driving had ended."""
+    """The result of a run, by topic or by subscriber. ``late`` samples arrived after the drive."""
 
     seconds: float = 0.0
     published: Counter[str] = field(default_factory=Counter)
@@ -61,7 +62,7 @@ class Found:
     agent: dict[str, Any] = field(default_factory=dict)
 
     def left_out(self) -> Counter[str]:
-        """How often the agent left a field of a message out, by topic, in its own words."""
+        """Return how often the agent reported that it left a field out, by topic."""
         return Counter(
             {
                 topic: sum(said.get("left_out", {}).values())
@@ -72,12 +73,12 @@ class Found:
         )
 
     def lost(self, got: Mapping[str, int]) -> int:
-        """The messages that somebody did not get; one that came twice makes up for none."""
+        """Count the messages that are missing in ``got``; a duplicate replaces no missing message."""
         return sum(max(0, sent - got.get(topic, 0)) for topic, sent in self.published.items())
 
 
 def run(_target: Target, say: Say) -> Section:
-    """Drive the mixed robot once; it needs nothing of the target."""
+    """Drive the mixed robot once; the target is not used."""
     section = Section("mixed", "A mixed robot beside rosbag record")
     program = found()
     if program is None or shutil.which("rosmaster") is None or shutil.which("rosbag") is None:
@@ -88,7 +89,7 @@ def run(_target: Target, say: Say) -> Section:
 
 
 def measure(program: str, python: str, seconds: int, say: Say) -> Found:
-    """Drive for so long, then wait until the agent has delivered what it has."""
+    """Drive for ``seconds``, then wait until the agent has delivered everything."""
     result = Found()
     heard: list[tuple[float, str, bytes]] = []
     with (
@@ -110,11 +111,11 @@ def measure(program: str, python: str, seconds: int, say: Say) -> Found:
             AGENT: graph.start(
                 "iort_agent.cli", "run", "--config", config, "--report", written, "--drain-s", _CATCH_UP_S
             ),
-            FLOOR: graph.start("bench.ros_floor", *topics()),
+            FLOOR: graph.start("bench.floors.ros_floor", *topics()),
         }
         lasts_s = seconds + _WARM_UP_S
         publishers = [
-            Publisher(graph.start("bench.mixed_publisher", node, lasts_s, _SUBSCRIBERS)) for node in NODES
+            Publisher(graph.start("bench.ros.mixed_publisher", node, lasts_s, _SUBSCRIBERS)) for node in NODES
         ]
         say("waiting for every subscriber of every topic")
         for publisher in publishers:
@@ -132,7 +133,7 @@ def measure(program: str, python: str, seconds: int, say: Say) -> Found:
         say("waiting for what is under way")
         _finish(processes[RECORDER], signal.SIGINT)
         _finish(processes[AGENT], signal.SIGTERM)
-        # What the agent has published last is on its way from the broker to the watcher.
+        # The agent's last messages are on their way from the broker to the watcher.
         threading.Event().wait(1.0)
         result.agent = json.loads(written.read_text())
         result.bag_bytes, result.recorded = bag.stat().st_size, _in_bag(bag)
@@ -196,7 +197,7 @@ def _in_bag(bag: Path) -> Counter[str]:
 
 
 def count(result: Found, heard: list[tuple[float, str, bytes]], ended: float) -> None:
-    """Count samples and bytes of what was heard, a batch once however often it came."""
+    """Count the samples and bytes of the messages in ``heard``; a repeated batch counts once."""
     names = {one.stream: one.name for one in topics().values()}
     numbers: set[tuple[str, str, int]] = set()
     for at, whole, payload in heard:
@@ -219,7 +220,7 @@ def count(result: Found, heard: list[tuple[float, str, bytes]], ended: float) ->
 def report(section: Section, result: Found) -> None:
     """Add the tables, the picture and the ratios."""
     messages = sum(result.published.values())
-    # Rates are even, so that a stretch has its share of the messages.
+    # The rates are even, so each stretch has its share of the messages.
     measured = messages * result.seconds / (SECONDS + _WARM_UP_S)
     each_us = {who: cpu_s / measured * 1e6 for who, cpu_s in result.cpu_s.items()}
     sent = result.lane_bytes[RECORD]

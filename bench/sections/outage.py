@@ -1,7 +1,7 @@
-"""Outage: the way to the broker is cut for a minute while a car drives at 50 Hz.
+"""Outage: the connection to the broker is cut for a minute while a car drives at 50 Hz.
 
 On the embedded cloud a proxy between car and broker resets every connection; on AWS the car's certificate
-is deactivated, which ends its session and refuses the next ones.
+is deactivated, which ends its session and refuses new ones.
 """
 
 from __future__ import annotations
@@ -13,11 +13,11 @@ from contextlib import contextmanager, suppress
 from statistics import median
 from typing import Any
 
-from bench import plots
-from bench.driving import Driving
 from bench.errors import BenchError
-from bench.result import Plot, Ratio, Section, Table
-from bench.spread import spread
+from bench.load.agent_process import AgentProcess
+from bench.report import plots
+from bench.report.result import Plot, Ratio, Section, Table
+from bench.report.spread import spread
 from bench.target import Say, Target
 from iort_agent.config.file import load_config
 from iort_contract import BATCH, OWN_STREAMS, VESC_STREAM, batch_id
@@ -28,18 +28,22 @@ from local.proxy import PASS, REFUSE, Proxy
 
 ROBOT = "bench-outage"
 RATE_HZ = 50
-# After the way is back the agent may wait for its next attempt, and then it must still drive.
+# After the outage the agent may wait for its next attempt, and must still drive then.
 BEFORE_S, CUT_S, AFTER_S = 8, 60, 30
 _SUMMARY_S = 60.0
 
 
 def run(target: Target, say: Say) -> Section:
-    """Drive, cut, drive on; then count in the table, and look at the live updates meanwhile."""
+    """Drive, cut the connection, restore it; then count the stored samples and the live updates."""
     section = Section("outage", "Outage: no broker for 60 s at 50 Hz")
     seconds = BEFORE_S + CUT_S + AFTER_S
     source = {"type": "sim", "stream": VESC_STREAM, "rate_hz": RATE_HZ, "duration_s": seconds}
     bundle = target.robot(ROBOT, sources=[source], queue={"path": "queue.db"})
-    with _way(target, bundle) as way, target.listener(bundle.robot) as listener, Driving(bundle) as driving:
+    with (
+        _way(target, bundle) as way,
+        target.listener(bundle.robot) as listener,
+        AgentProcess(bundle) as agent,
+    ):
         _wait_for(lambda: bool(listener.heard), "the first live update")
         say(f"driving for {BEFORE_S} s")
         threading.Event().wait(BEFORE_S)
@@ -51,10 +55,10 @@ def run(target: Target, say: Say) -> Section:
         way.mend()
         mended_us = time.time_ns() // 1000
         say("draining")
-        report = driving.finished()
+        report = agent.finished()
         heard = list(listener.heard)
     sent = sum(s["samples"] for name, s in report["streams"].items() if name not in OWN_STREAMS)
-    # What is lost never comes; it is counted, not waited for.
+    # Lost samples never arrive: they are counted after the wait.
     with suppress(BenchError):
         _wait_for(
             lambda: delivery.samples_summarized(target.cloud, bundle.robot, VESC_STREAM) >= sent,
@@ -125,7 +129,7 @@ def _report(
     section.ratios += [
         Ratio("samples lost over an outage", lost, 0, "samples"),
         Ratio("batches stored twice over an outage", duplicated, 0, "batches"),
-        # Most of it is the wait for the agent's next attempt, which is drawn by lot.
+        # Most of it is the random wait before the agent's next attempt.
         Ratio("time to drain / outage", round(drain_s / CUT_S, 4), 0.5, tolerance=4),
     ]
     if after and before:
@@ -172,8 +176,7 @@ class _Proxied:
 class _Certificate:
     """AWS ends the sessions of a certificate that is deactivated, and refuses new ones.
 
-    An agent that is refused waits for minutes, until somebody gives it another certificate: the file is
-    written anew with what it holds.
+    A refused agent waits for minutes, or until its certificate file changes: `mend` touches the file.
     """
 
     def __init__(self, target: Target, bundle: Bundle) -> None:

@@ -1,5 +1,7 @@
-"""Table 6.6: 14,368 points by query and by scan, on the operator's machine and in Lambda, beside the thesis'
-layout of one item a sample read through boto3's Table, in the same run; and an hour of one robot."""
+"""Table 6.6: 14,368 points by query and by scan, on the operator's machine and in Lambda.
+
+The same run reads the thesis' layout, one item a sample, through boto3's Table, and an hour of one robot.
+"""
 
 from __future__ import annotations
 
@@ -14,10 +16,12 @@ from typing import Any, NamedTuple
 import boto3
 from boto3.dynamodb.conditions import Attr, Key
 
-from bench import cpu, drives, plots, thesis
 from bench.errors import BenchError
-from bench.result import NOT_MEASURED, Plot, Ratio, Section, Table
-from bench.spread import ratio, spread
+from bench.load import stored_drive
+from bench.meters import cpu
+from bench.report import plots, thesis
+from bench.report.result import NOT_MEASURED, Plot, Ratio, Section, Table
+from bench.report.spread import ratio, spread
 from bench.target import Say, Target
 from iort_contract import RECEIVED_MS, RECORD, TOPIC, VESC_STREAM, build_topic
 from iort_station.cost.sizes import item_bytes
@@ -27,7 +31,7 @@ from iort_station.operations import delivery
 POINTS = 14_368
 ROBOT, HOUR_ROBOT = "bench-query", "bench-hour"
 REPEATS = 3
-HOUR_POINTS = 3600 * drives.RATE_HZ
+HOUR_POINTS = 3600 * stored_drive.RATE_HZ
 _CATCH_UP_S = 120.0
 THESIS_QUERY, THESIS_SCAN = "thesis' layout, query through Table", "thesis' layout, scan through Table"
 OURS_QUERY, OURS_SCAN = "iort, query on premises", "iort, scan on premises"
@@ -53,7 +57,7 @@ _COLUMNS = [
 
 @dataclass
 class Way:
-    """One way to read the points: seconds, a value a repeat. ``server_cpu_s`` on the embedded cloud only."""
+    """One way to read the points, in seconds for each repeat; ``server_cpu_s`` needs the embedded cloud."""
 
     wall_s: list[float] = field(default_factory=list)
     client_cpu_s: list[float] = field(default_factory=list)
@@ -64,9 +68,9 @@ class Way:
 def run(target: Target, say: Say) -> Section:
     """Store the same drive in both layouts, then read it back in turns."""
     section = Section("query", "Query and scan (table 6.6)")
-    robot, samples = target.name(ROBOT), drives.simulated(POINTS)
+    robot, samples = target.name(ROBOT), stored_drive.simulated(POINTS)
     say(f"storing {POINTS:,} points in both layouts")
-    drives.store(target, robot, samples)
+    stored_drive.store(target, robot, samples)
     _until_summarized(target, robot, POINTS, say)
     with _thesis_table(target, robot, samples) as table:
         topic = build_topic(RECORD, robot, VESC_STREAM, target.cloud.namespace)
@@ -93,7 +97,7 @@ def run(target: Target, say: Say) -> Section:
         for turn in range(REPEATS + 1):
             for name, read in ways.items():
                 say(f"{name}, {turn} of {REPEATS}" if turn else f"{name}, to warm up")
-                # A twentieth of a second is read several times a turn: one look says more of the machine.
+                # A read of 50 ms runs several times a turn: one alone would depend on the machine.
                 looks = sorted(
                     (_timed(target, read) for _ in range(_LOOKS.get(name, 1))),
                     key=lambda look: look.client_cpu_s,
@@ -111,7 +115,7 @@ def run(target: Target, say: Say) -> Section:
 def _hour(target: Target, section: Section, say: Say) -> None:
     robot = target.name(HOUR_ROBOT)
     say(f"storing an hour of one robot, {HOUR_POINTS:,} points")
-    drives.store(target, robot, drives.simulated(HOUR_POINTS))
+    stored_drive.store(target, robot, stored_drive.simulated(HOUR_POINTS))
     _until_summarized(target, robot, HOUR_POINTS, say)
     way = Way()
     for turn in range(REPEATS + 1):
@@ -128,7 +132,7 @@ def _hour(target: Target, section: Section, say: Say) -> None:
 
 
 def _until_summarized(target: Target, robot: str, points: int, say: Say) -> None:
-    """What Lambda 2 still does would take the processor from the reading."""
+    """Wait for Lambda 2, whose work would slow the reading."""
     deadline = time.monotonic() + _CATCH_UP_S
     while (done := delivery.samples_summarized(target.cloud, robot, VESC_STREAM)) < points:
         if time.monotonic() > deadline:
@@ -194,7 +198,7 @@ def _text(one: Any) -> str:
 
 
 class _Look(NamedTuple):
-    """The points that were read, and the seconds that it took."""
+    """The number of points of one read, and its times."""
 
     points: int
     wall_s: float
@@ -214,7 +218,7 @@ def _timed(target: Target, read: Callable[[], int]) -> _Look:
 
 
 def _server(pid: int | None) -> dict[int, int] | None:
-    """The emulator and the functions' workers, which are its children."""
+    """Return the processor time of the emulator and of its children, the functions' workers."""
     return None if pid is None else cpu.of_process(pid) | cpu.of_tree(pid)
 
 
@@ -227,7 +231,7 @@ def _add(way: Way, look: _Look) -> None:
 
 
 def _pages(read: Callable[..., dict[str, Any]], **arguments: Any) -> int:
-    """Every page, as the thesis' programs did, keeping the items."""
+    """Read every page and keep the items, as the thesis' programs did."""
     items: list[dict[str, Any]] = []
     while True:
         page = read(**arguments)
@@ -238,8 +242,10 @@ def _pages(read: Callable[..., dict[str, Any]], **arguments: Any) -> int:
 
 
 def _header(seq: int, t_us: int) -> dict[str, Any]:
-    """What a ROS message carries besides its fields, and when it was received: with them an item is
-    nearly as large as the thesis' were, 4.95 MB / 14,368."""
+    """Return the header of a ROS message and the time of receipt.
+
+    With them an item is nearly as large as the thesis' items: 4.95 MB / 14,368.
+    """
     return {
         "seq": seq,
         "secs": t_us // 1_000_000,
@@ -250,8 +256,8 @@ def _header(seq: int, t_us: int) -> dict[str, Any]:
 
 
 @contextmanager
-def _thesis_table(target: Target, robot: str, samples: list[drives.Sample]) -> Iterator[Any]:
-    """A table of one item a sample, as the thesis' rule wrote it; gone afterwards."""
+def _thesis_table(target: Target, robot: str, samples: list[stored_drive.Sample]) -> Iterator[Any]:
+    """Yield a temporary table with one item a sample, as the thesis' rule wrote it."""
     name = target.name(f"{target.cloud.namespace}-bench-thesis")
     cloud = target.cloud
     resource = boto3.resource(

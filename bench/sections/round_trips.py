@@ -2,7 +2,7 @@
 
 Each path has a connection of its own, by the agent's own uplink and pings, and so has the floor: the
 smallest MQTT client there can be, on the same broker at the same rate at the same time. On the embedded
-cloud all of it once more with the thesis' ping in the way (`bench.far`).
+cloud everything is measured again with the ping of the thesis added (`bench.sections.thesis_ping`).
 """
 
 from __future__ import annotations
@@ -11,11 +11,12 @@ from dataclasses import asdict
 from itertools import product
 from typing import Any
 
-from bench import far, plots
-from bench.lines import RAW, Lines
-from bench.raw_mqtt import RawClient, tcp_connect_s
-from bench.result import NOT_MEASURED, Plot, Ratio, Section, Table
-from bench.spread import ratio, spread
+from bench.floors.raw_mqtt import RawClient, tcp_connect_s
+from bench.meters.round_trips import RAW, RoundTrips
+from bench.report import plots
+from bench.report.result import NOT_MEASURED, Plot, Ratio, Section, Table
+from bench.report.spread import ratio, spread
+from bench.sections import thesis_ping
 from bench.target import Say, Target
 from iort_agent.lanes.rate_limiter import BYTES_PER_S
 from iort_contract import BROKER, LAMBDA, PING_PATHS, RULE
@@ -33,7 +34,7 @@ def run(target: Target, say: Say) -> Section:
     cells: dict[tuple[str, int], dict[str, list[list[float]]]] = {}
     bundles = {path: target.robot(f"bench-rtt-{path}") for path in PING_PATHS}
     floor = target.robot("bench-rtt-raw")
-    with Lines(bundles, floor, target.cloud.namespace) as lines:
+    with RoundTrips(bundles, floor, target.cloud.namespace) as lines:
         floors = _floors(target, lines.raw)
         for repeat, (size, rate_hz) in product(range(REPEATS), product(SIZES, RATES_HZ)):
             if SIZES[size] * rate_hz > BYTES_PER_S:
@@ -46,7 +47,7 @@ def run(target: Target, say: Say) -> Section:
     _report(section, cells, floors)
     section.ratios.append(Ratio("pings that did not come back", lines.lost, 0, "pings"))
     if target.embedded is not None:
-        far.report(section, far.measure(target, bundles, floor, say))
+        thesis_ping.report(section, thesis_ping.measure(target, bundles, floor, say))
     return section
 
 

@@ -1,16 +1,16 @@
-"""Scale: 1, 10, 100 and 500 robots with sessions of their own, and what bends first.
+"""Scale: 1, 10, 100 and 500 robots, each with its own session, and the first bottleneck.
 
-Only on the embedded cloud, which has this machine's cores for everything; what AWS' quotas allow is in
-the section on cost.
+It runs only on the embedded cloud, which shares this machine's cores. The section on cost has AWS' quotas.
 """
 
 from __future__ import annotations
 
-from bench import fleet_run, plots
-from bench.result import Plot, Ratio, Section, Table
+from bench.load import fleet_run
+from bench.report import plots
+from bench.report.result import Plot, Ratio, Section, Table
 from bench.target import Say, Target
 
-# How long each fleet drives, in seconds: a large one makes as many batches in less.
+# Seconds that each fleet drives; a large fleet makes as many batches in less time.
 FLEETS = {1: 10, 10: 10, 100: 10, 500: 4}
 
 

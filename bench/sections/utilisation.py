@@ -1,8 +1,8 @@
-"""Table 6.5: what the functions and the robot's node use.
+"""Table 6.5: the time and processor time of the functions and of the robot's node.
 
-Durations are those of Lambda's REPORT lines in CloudWatch Logs. The embedded cloud runs every function
-with the whole of a core whatever its memory, so there processor time is measured as well, by the operating
-system, and projected to each memory size; on AWS the sizes are set and measured.
+Durations come from Lambda's REPORT lines. The embedded cloud gives every function a whole core, whatever its
+memory size. So there the operating system also measures processor time, which is projected to each memory
+size. On AWS each size is set and measured.
 """
 
 from __future__ import annotations
@@ -17,13 +17,15 @@ from dataclasses import asdict
 from statistics import median
 from typing import Any
 
-from bench import borrowed, drives, plots, thesis
+from bench import ROOT
 from bench.errors import BenchError
-from bench.invocations import Event, Measured, configure, invoke, measure, reporting
-from bench.machine import ROOT
-from bench.result import NOT_MEASURED, Plot, Ratio, Section, Table
-from bench.spread import spread
+from bench.load import stored_drive
+from bench.meters.invocations import Event, Measured, configure, invoke, measure, reporting
+from bench.report import plots, thesis
+from bench.report.result import NOT_MEASURED, Plot, Ratio, Section, Table
+from bench.report.spread import spread
 from bench.target import Say, Target
+from bench.temporary_function import temporary_function
 from iort_agent.sources.vehicle import Vehicle, VehicleConfig
 from iort_contract import (
     BATCH,
@@ -67,7 +69,7 @@ def run(target: Target, say: Say) -> Section:
     }
     live = target.cloud.output("processing", "LiveFunction")
     summarize = target.cloud.output("processing", "SummarizeFunction")
-    with borrowed.function(target, "empty", _NOTHING, memory_mb=256) as empty, ExitStack() as reports:
+    with temporary_function(target, "empty", _NOTHING, memory_mb=256) as empty, ExitStack() as reports:
         names = dict(zip(events, (live, summarize, summarize), strict=True))
         events[_EMPTY], names[_EMPTY] = (lambda _: {}), empty
         for name in sorted(set(names.values())):
@@ -193,7 +195,7 @@ def _cold_text(one: Measured) -> str:
 
 
 def _memory_sizes(target: Target, function: str, event: Event, say: Say) -> dict[int, Measured]:
-    """Lambda 1 at each memory size, on AWS; the size that was is set again."""
+    """Measure Lambda 1 at each memory size, on AWS; restore the size at the end."""
     if target.embedded is not None:
         return {}
     client = target.cloud.client("lambda")
@@ -212,7 +214,7 @@ def _memory_sizes(target: Target, function: str, event: Event, say: Say) -> dict
 
 
 def _cold(target: Target, function: str, event: Event, say: Say) -> Measured:
-    """The first invocation of new environments: another environment variable makes one."""
+    """Measure first invocations; a changed environment variable starts a new environment."""
     client = target.cloud.client("lambda")
     was = client.get_function_configuration(FunctionName=function).get("Environment", {}).get("Variables", {})
     found = Measured()
@@ -227,12 +229,12 @@ def _cold(target: Target, function: str, event: Event, say: Say) -> Measured:
 
 
 def _store(target: Target, say: Say) -> list[dict[str, Any]]:
-    """The items of a drive of 100 s in the telemetry table; waits until Lambda 2 has seen them."""
+    """Store a drive of 100 s, wait until Lambda 2 has summarised it, and return its items."""
     say("storing a drive")
     robot = target.name(ROBOT)
-    items = drives.store(target, robot, drives.simulated(BATCHES * drives.RATE_HZ))
+    items = stored_drive.store(target, robot, stored_drive.simulated(BATCHES * stored_drive.RATE_HZ))
     deadline = time.monotonic() + _CATCH_UP_S
-    while delivery.samples_summarized(target.cloud, robot, VESC_STREAM) < BATCHES * drives.RATE_HZ:
+    while delivery.samples_summarized(target.cloud, robot, VESC_STREAM) < BATCHES * stored_drive.RATE_HZ:
         if time.monotonic() > deadline:
             raise BenchError("Lambda 2 has not summarised what was stored")
         threading.Event().wait(0.2)
@@ -259,7 +261,7 @@ def _stream_event(items: list[dict[str, Any]]) -> dict[str, Any]:
 
 
 def _live_event(target: Target, i: int) -> dict[str, Any]:
-    """What the live rule gives to Lambda 1."""
+    """Return an event as the live rule sends it to Lambda 1."""
     now_us = time.time_ns() // 1000
     sample = Vehicle(VehicleConfig(), seed=1).sample()
     message = encode_live(LiveSample("0badcafe", i, now_us - 1000, now_us, sample))
@@ -269,9 +271,13 @@ def _live_event(target: Target, i: int) -> dict[str, Any]:
 
 def _cycle() -> dict[str, float]:
     done = subprocess.run(
-        [sys.executable, "-m", "bench.cycle", "5000"], cwd=ROOT, capture_output=True, text=True, check=False
+        [sys.executable, "-m", "bench.meters.cycle", "5000"],
+        cwd=ROOT,
+        capture_output=True,
+        text=True,
+        check=False,
     )
     if done.returncode:
-        raise BenchError(f"bench.cycle failed: {done.stderr[-800:]}")
+        raise BenchError(f"bench.meters.cycle failed: {done.stderr[-800:]}")
     found: dict[str, float] = json.loads(done.stdout)
     return found

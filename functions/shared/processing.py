@@ -23,7 +23,7 @@ from functions.shared.metrics import emit
 from functions.shared.seconds import Summaries, summarize_topic
 from functions.shared.share import REQUESTS_S, Change, OverShareError, Share, robot_of, robot_of_change
 from functions.shared.stored import SECOND_BATCHES
-from functions.shared.tables import Tables
+from functions.shared.tables import TableError, Tables
 from iort_contract import RECOMPUTE_FROM_S, RECOMPUTED, REPLAY, Statistics, parse_topic
 
 # Topics to process in parallel; a client keeps ten connections.
@@ -31,6 +31,8 @@ _AT_ONCE = 4
 # A stream keeps its records for 24 hours. Older ones were put into the table by hand (`iort adopt`, a
 # replay), and are no news of their car.
 _NEWS_MS = 24 * 3_600_000
+# A car adds to a second for a second, and a round reads it after that.
+_ROUNDS = 5
 _BEYOND = f"its second has {SECOND_BATCHES} batches of the stream before it, or too large ones"
 logging.getLogger("functions").setLevel(logging.INFO)
 
@@ -71,10 +73,8 @@ def process(
     decoded = decode_records(event["Records"], bounds.share if bounds else None)
     topics = _summarized(tables, decoded, at_once, bounds.share if bounds else None)
     _put(tables, topics)
-    # Batches stored since the first read may have been summarised meanwhile, and just been overwritten.
-    while beside_others and (again := _summarized(tables, decoded, at_once)) != topics:
-        topics = again
-        _put(tables, topics)
+    if beside_others:
+        topics = _settled(tables, decoded, topics, at_once)
     for name in map(parse_topic, topics):
         tables.note_stream(name.robot, name.name)
     for topic, summaries in topics.items():
@@ -103,6 +103,21 @@ def process(
         for values in together(values for _, values in measured):
             emit("health", robot=None, **values)
     return {"batchItemFailures": [{"itemIdentifier": number} for number in sorted(left)]}
+
+
+def _settled(
+    tables: Tables, decoded: Decoded, topics: dict[str, Summaries], at_once: int
+) -> dict[str, Summaries]:
+    """The summaries that are still right once they are written. What was stored since they were read may have
+    been summarised since, and just been overwritten. Raises `TableError` where that does not end: a robot may
+    add to its seconds as fast as they are read."""
+    for _ in range(_ROUNDS):
+        again = _summarized(tables, decoded, at_once)
+        if again == topics:
+            return topics
+        topics = again
+        _put(tables, topics)
+    raise TableError(f"seconds of {', '.join(topics)} change as fast as they are summarised")
 
 
 def _put(tables: Tables, topics: Mapping[str, Summaries]) -> None:

@@ -46,8 +46,13 @@ def summarize_topic(
     vehicle = tables.vehicle(parse_topic(topic).robot)
     summaries = Summaries()
     within: set[BatchId] = set()
-    for touched in _runs({second for batch in batches for second in _seconds(batch)}):
-        stored = reader.read(touched[0], touched[-1])
+    runs = _runs({second for batch in batches for second in _seconds(batch)})
+    while runs:
+        run = runs.pop(0)
+        stored, last = reader.read(run[0], run[-1])
+        touched, later = [s for s in run if s <= last], [s for s in run if s > last]
+        if later:
+            runs.insert(0, later)
         seconds = set(touched)
         previous: Batch | None = None
         missing: dict[int, int] = defaultdict(int)

@@ -27,7 +27,11 @@ _ASIDE_US = 10_000_000
 # The limits of batches and column bytes per second and stream: a robot beyond them must not delay others. AWS
 # takes as many messages a second from a connection.
 SECOND_BATCHES, _SECOND_BYTES = 100, MAX_COLUMNS_BYTES
-# Besides the event's batches: the one before and the one after.
+# Seconds are read together until they are as much as one may be.
+_TOGETHER_BYTES = _SECOND_BYTES
+# Of a second's neighbours so many are looked at: as many as the seconds to its sides may hold.
+_NUMBERS = SECOND_BATCHES * (2 * _ASIDE_US // _SECOND_US + 1)
+# Beside those of the event: the one before and the one after.
 _BESIDE = 2
 # An undecodable neighbour is skipped; this many of them end the search.
 _NEIGHBOURS = 10
@@ -52,39 +56,54 @@ class Reader:
     known: Mapping[BatchId, Batch]
     check: Callable[[], None]
     full: set[int] = field(default_factory=set)
+    _near: tuple[int, list[BatchId]] = (-1, [])
 
-    def read(self, first: int, last: int) -> list[Stored]:
-        """The stored batches with samples from the first second to the last, plus the one before them, and
-        the whole second of the one after them; in order of time."""
+    def read(self, first: int, last: int) -> tuple[list[Stored], int]:
+        """The stored batches with samples from the first second to the last, the one before them, and all
+        of the second in which the one after them starts; in order of time. And the last second that was
+        read: where seconds hold much, it is an earlier one."""
         start_us, end_us = first * _SECOND_US, (last + 1) * _SECOND_US
+        size = 0
         stored: list[Stored] = []
         after_s, passed = None, 0
         # One query: nearly always the batches are the newest, and nothing comes after them.
         at_once = sum(start_us <= t_us < end_us for t_us, _, _ in self.known) + _BESIDE
         for t_us, entry in self._bounded(start_us - MAX_BATCH_SPAN_US, at_once):
+            if size >= _TOGETHER_BYTES and t_us >= start_us + _SECOND_US:
+                end_us = min(end_us, t_us // _SECOND_US * _SECOND_US)
             if after_s is None and t_us >= end_us:
                 passed += 1
             if passed > _NEIGHBOURS or (after_s is not None and t_us // _SECOND_US != after_s):
                 break
             if entry is not None:
                 stored.append(entry)
+                size += _bytes(entry.batch)
                 if t_us >= end_us:
                     after_s = t_us // _SECOND_US
         if stored and stored[0].batch.t_us >= start_us:
             stored = [*self._before(stored[0].batch.t_us), *stored]
-        return stored
+        return stored, end_us // _SECOND_US - 1
 
     def missing_before(self, batch: Batch, previous: Batch | None, stored: Sequence[Stored]) -> int:
         """The number of batches missing just before this one, by their sequence numbers."""
         if previous is not None and (previous.boot, previous.seq + 1) == (batch.boot, batch.seq):
             return 0
+        # A robot may leave a hole before every batch.
+        self.check()
         ids = [entry.batch.id for entry in stored]
         missing = missing_before(batch.id, ids)
         if missing:
-            # Clocks may interleave, so a missing batch may lie some seconds away.
-            near = self.tables.numbers(self.topic, batch.t_us - _ASIDE_US, batch.t_us + _ASIDE_US)
-            missing = missing_before(batch.id, sorted({*ids, *near}))
+            # Clocks may interleave: what is missing here may lie some seconds to the side.
+            missing = missing_before(batch.id, sorted({*ids, *self._numbers(batch.t_us // _SECOND_US)}))
         return missing
+
+    def _numbers(self, second: int) -> list[BatchId]:
+        """The batches of a second and to its sides, read once for all holes of the second."""
+        if self._near[0] != second:
+            start_us = second * _SECOND_US
+            near = self.tables.numbers(self.topic, start_us - _ASIDE_US, start_us + _SECOND_US + _ASIDE_US)
+            self._near = second, list(islice(near, _NUMBERS))
+        return self._near[1]
 
     def _bounded(self, first_us: int, at_once: int) -> Iterator[tuple[int, Stored | None]]:
         """Yield (start, batch) from a time on; None instead of a batch that cannot be decoded. In a second

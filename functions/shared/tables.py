@@ -34,7 +34,10 @@ WRITE_SIZE = 25
 _WRITE_ATTEMPTS = 8
 # Page size, once many batches are wanted.
 _MANY = 100
-# The operator's changes in the registry take effect within this time.
+# How many streams a robot's row names, of which each write costs by its size, and how many an environment
+# knows to be there.
+MAX_STREAMS, _NOTED = 200, 50_000
+# What the operator changes in the registry counts after this time at the latest.
 VEHICLE_CACHE_S = 60.0
 # "Limits", items: 400 KB including the names; a margin is left for the size of numbers.
 _MAX_ITEM_BYTES = 380 * 1024
@@ -161,7 +164,8 @@ class Tables:
         return cached[1]
 
     def note_stream(self, robot: str, stream: str) -> None:
-        """Add the stream to the robot's row, once per environment; an unregistered robot gets no row."""
+        """Keep in the robot's row that it has the stream, once an environment. A robot that is not
+        registered has no row, and gets none; one that names ever new streams has `MAX_STREAMS` of them."""
         if (robot, stream) in self._noted:
             return
         try:
@@ -169,13 +173,17 @@ class Tables:
                 TableName=self._robots,
                 Key={ROBOT: {"S": robot}},
                 UpdateExpression="ADD #streams :stream",
-                ConditionExpression="attribute_exists(#robot)",
+                ConditionExpression=(
+                    "attribute_exists(#robot) AND (attribute_not_exists(#streams) OR size(#streams) < :most)"
+                ),
                 ExpressionAttributeNames={"#streams": STREAMS, "#robot": ROBOT},
-                ExpressionAttributeValues={":stream": {"SS": [stream]}},
+                ExpressionAttributeValues={":stream": {"SS": [stream]}, ":most": {"N": str(MAX_STREAMS)}},
             )
         except ClientError as error:
             # A failure is harmless: only the list of streams uses it.
             _log.info("the stream %s of %s is not noted: %s", stream, robot, error)
+        if len(self._noted) >= _NOTED:
+            self._noted.clear()
         self._noted.add((robot, stream))
 
     def forget_vehicles(self) -> None:

@@ -107,12 +107,12 @@ def test_in_a_terminal_it_drives_on_alone_until_ctrl_c_and_leaves_nothing_runnin
 @pytest.mark.parametrize(
     ("arguments", "said"),
     [
-        (("--duration", "-3"), "DURATION=-3"),
-        (("--duration", "soon"), "DURATION=soon"),
-        (("--bag", "no/such.bag"), "no such file"),
-        (("--report", "no/such/folder/r.json"), "no such folder"),
-        (("--report", "."), "REPORT=.: this is a folder"),
-        (("--port", "70000"), "PORT=70000"),
+        (("--duration", "-3"), "DURATION must be over 0 and at most 86400 s, got -3"),
+        (("--duration", "soon"), "DURATION must be over 0 and at most 86400 s, got soon"),
+        (("--bag", "no/such.bag"), "BAG must exist, got no/such.bag"),
+        (("--report", "no/such/folder/r.json"), "REPORT must be in an existing folder"),
+        (("--report", "."), "REPORT must be a file, got the folder ."),
+        (("--port", "70000"), "PORT must be 1 to 65535, got 70000"),
     ],
 )
 def test_wrong_use_is_said_at_once(tmp_path, arguments, said):

@@ -44,7 +44,7 @@ from iort_contract import (
 from iort_station.fleet import files, robots
 from iort_station.operations import delivery
 from local.deployment import ROOT
-from local.gaps import AWS_MESSAGE_BYTES
+from local.gaps.broker.message_size import AWS_MESSAGE_BYTES
 from tests.images import TOPIC, jpeg, write_bag
 from tests.local.conftest import until
 from tests.local.drives import Agent

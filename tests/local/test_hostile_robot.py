@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 
 import iort_contract
-from bench.usage import descendants
+from bench.meters.usage import descendants
 from functions.shared.cut_off import BURST
 from iort_contract import FILE, LIVE, PING, VESC_STREAM, LiveSample, build_topic, record_topic
 from iort_station.operations import quarantine

@@ -26,7 +26,7 @@ from verify.robot import Robot
 KILLED = """
 import os, signal, sys
 from pathlib import Path
-from device import identity
+from iort_agent.identity import provision as identity
 from iort_agent.identity.exchange import Exchange
 
 class Killed(Exchange):

@@ -14,7 +14,7 @@ from botocore.exceptions import ClientError
 
 from iort_contract import CMD, FLEET, MAX_MESSAGE_BYTES, PING, PONG, RULE, build_topic, encode_ping
 from iort_station.fleet import claims, robots
-from local.gaps import AWS_MESSAGE_BYTES
+from local.gaps.broker.message_size import AWS_MESSAGE_BYTES
 from tests.isolation import CLAIM, CONNECT, PUBLISH, RECEIVE, ROBOT, ROWS, SUBSCRIBE, A, B, Row
 from verify.errors import VerifyError
 from verify.robot import Robot, payload_for

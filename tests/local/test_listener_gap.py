@@ -10,7 +10,8 @@ from pathlib import Path
 import pytest
 from ministack.services import iot
 
-from local import listener_gap
+from local.gaps.broker.client_hello import later
+from local.gaps.broker.connect_timeout import expecting_connect, in_time
 
 
 def listening(pid: int) -> set[tuple[str, int]]:
@@ -46,10 +47,10 @@ CONNACK = b"\x20\x02\x00\x00"
 @pytest.fixture
 def ended(monkeypatch):
     """Whether the emulator's own acceptor ends a connection within four times its wait."""
-    monkeypatch.setattr(iot, "_register_client", listener_gap._in_time(iot._register_client))
+    monkeypatch.setattr(iot, "_register_client", in_time(iot._register_client))
 
     class Acceptor(iot._MtlsAcceptor):
-        connection_made = listener_gap.expecting_connect(iot._MtlsAcceptor.connection_made, WAIT_S)
+        connection_made = expecting_connect(later(iot._MtlsAcceptor.connection_made), WAIT_S)
 
     async def run(tls, said):
         # Made beforehand: it takes longer than the wait.

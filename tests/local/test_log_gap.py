@@ -11,14 +11,15 @@ from types import SimpleNamespace
 import pytest
 from ministack.core import lambda_runtime
 
-from local import log_gap
+from local.gaps.functions import log_end, log_levels
 
 
 @pytest.fixture(scope="module")
 def installed():
-    """The gap closed in this process, and opened again."""
+    """Both gaps closed in this process, and opened again."""
     kept = lambda_runtime._PYTHON_WORKER_SCRIPT, lambda_runtime.Worker._drain_stderr_bounded
-    log_gap.install()
+    log_end.install()
+    log_levels.install()
     yield
     lambda_runtime._PYTHON_WORKER_SCRIPT, lambda_runtime.Worker._drain_stderr_bounded = kept
 
@@ -38,7 +39,7 @@ def test_the_worker_says_where_each_invocations_log_ends(installed, tmp_path):
     )
     answers = [json.loads(line) for line in done.stdout.splitlines()]
     assert [answer.get("result") for answer in answers] == [None, "one", "", "two"]
-    assert done.stderr.splitlines() == ["one", log_gap._END, log_gap._END, "two", log_gap._END]
+    assert done.stderr.splitlines() == ["one", log_end.END, log_end.END, "two", log_end.END]
 
 
 def test_what_a_function_logs_says_how_bad_it_is(installed, tmp_path):
@@ -63,7 +64,7 @@ def test_what_a_function_logs_says_how_bad_it_is(installed, tmp_path):
 
 def test_what_comes_after_the_end_is_the_next_invocations(installed):
     lines = queue.Queue()
-    for line in ("one", "two", log_gap._END, "three", log_gap._END, log_gap._END):
+    for line in ("one", "two", log_end.END, "three", log_end.END, log_end.END):
         lines.put(line)
     worker = SimpleNamespace(config={"Runtime": "python3.13"}, _stderr_queue=lines)
     log = lambda_runtime.Worker._drain_stderr_bounded

@@ -7,10 +7,12 @@ import json
 import time
 
 import pytest
-from ministack.services import cloudwatch, iot, lambda_svc
+from ministack.core.responses import request_scope
+from ministack.services import cloudwatch, iot, lambda_svc, sqs
 
 from functions.shared.metrics import emit
-from local import metrics
+from local.gaps.metrics import alarm_state, embedded_metrics, lambda_metrics, metric_search, queue_metrics
+from local.gaps.parts import points
 
 
 @pytest.fixture(autouse=True)
@@ -37,17 +39,11 @@ def test_wrapped_functions_take_what_the_wrappers_pass():
     assert parameters(cloudwatch._evaluate_alarm) == ["alarm"]
 
 
-def test_it_is_still_a_gap():
-    source = inspect.getsource(lambda_svc._emit_lambda_logs)
-    assert "CloudWatchMetrics" not in source
-    assert "Expressions not implemented" in inspect.getsource(cloudwatch._get_metric_data)
-
-
 def test_what_a_function_prints_is_a_metric(capsys, monkeypatch):
     monkeypatch.setenv("NAMESPACE", "lab2")
     emit("health", robot="car7", BatteryVolts=[11.5, 11.25], FaultSamples=3)
     log = f"START\n{capsys.readouterr().out}" + '{"_aws": broken\n{"_aws": {}}\nnot a metric'
-    metrics.record_log(log)
+    embedded_metrics.record_log(log)
     whole = {"Deployment": "lab2", "Function": "health"}
     assert values("iort", "BatteryVolts", **whole) == [11.25, 11.5]
     assert values("iort", "BatteryVolts", **whole, Robot="car7") == [11.25, 11.5]
@@ -56,29 +52,31 @@ def test_what_a_function_prints_is_a_metric(capsys, monkeypatch):
 
 def test_a_minute_of_many_values_keeps_their_number_and_no_more_than_it_must():
     for value in range(1000):
-        metrics.record("iort", "CarToLambdaMs", value, "Milliseconds")
+        points.record("iort", "CarToLambdaMs", value, "Milliseconds")
     assert len(values("iort", "CarToLambdaMs")) == 1000
     # The test may run over the end of a minute.
     assert len(cloudwatch._metrics["iort", "CarToLambdaMs", ""]) <= 2 * 120
 
 
 def test_a_search_finds_the_metric_whatever_its_action_is_called():
-    metrics.record("AWS/IoT", "Failure", 1, "Count", RuleName="iort_record", ActionType="DynamoDBv2")
-    metrics.record("AWS/IoT", "Failure", 1, "Count", RuleName="iort_live", ActionType="Lambda")
+    points.record("AWS/IoT", "Failure", 1, "Count", RuleName="iort_record", ActionType="DynamoDBv2")
+    points.record("AWS/IoT", "Failure", 1, "Count", RuleName="iort_live", ActionType="Lambda")
     search = (
         "SEARCH('{AWS/IoT,ActionType,RuleName} MetricName=\"Failure\" RuleName=\"iort_record\"', 'Sum', 60)"
     )
-    (query,) = metrics.expand({"Id": "a", "Expression": search, "Label": "failed"})
+    (query,) = metric_search.expand({"Id": "a", "Expression": search, "Label": "failed"})
     assert (query["Id"], query["Label"], "Expression" in query) == ("a", "failed", False)
     assert query["MetricStat"]["Metric"]["Dimensions"] == [
         {"Name": "ActionType", "Value": "DynamoDBv2"},
         {"Name": "RuleName", "Value": "iort_record"},
     ]
-    assert not list(metrics.expand({"Id": "a", "Expression": search.replace("iort_record", "iort_echo")}))
+    assert not list(
+        metric_search.expand({"Id": "a", "Expression": search.replace("iort_record", "iort_echo")})
+    )
     plain = {"Id": "b", "MetricStat": {}}
-    assert list(metrics.expand(plain)) == [plain]
+    assert list(metric_search.expand(plain)) == [plain]
     sums = {"Id": "c", "Expression": "a + b"}
-    assert list(metrics.expand(sums)) == [sums]
+    assert list(metric_search.expand(sums)) == [sums]
 
 
 ALARM = {
@@ -104,25 +102,48 @@ def test_an_alarm_needs_all_its_periods_and_its_own_dimensions():
     cloudwatch._metric_bucket(("iort", "FaultSamples", "Deployment=lab2")).append(
         {"Timestamp": now_s, "Value": 9.0, "Count": 1.0, "Unit": "Count", "Dimensions": {}}
     )
-    assert not metrics._breaching(ALARM, now_s)
+    assert not alarm_state.breaching(ALARM, now_s)
     point(now_s, 1.0)
-    assert not metrics._breaching(ALARM, now_s)
+    assert not alarm_state.breaching(ALARM, now_s)
     point(now_s - 60, 1.0)
-    assert metrics._breaching(ALARM, now_s)
+    assert alarm_state.breaching(ALARM, now_s)
     # Over: a minute without data is no alarm.
-    assert not metrics._breaching(ALARM, now_s + 180)
+    assert not alarm_state.breaching(ALARM, now_s + 180)
     below = {**ALARM, "ComparisonOperator": "LessThanThreshold", "Threshold": 0.5}
-    assert not metrics._breaching(below, now_s)
+    assert not alarm_state.breaching(below, now_s)
 
 
 def test_an_alarm_goes_off_and_ends():
     alarm = {**ALARM, "StateValue": "INSUFFICIENT_DATA", "EvaluationPeriods": 1, "AlarmActions": []}
     point(time.time(), 4.0)
-    metrics.evaluate(alarm)
+    alarm_state.evaluate(alarm)
     assert alarm["StateValue"] == "ALARM"
     assert "FaultSamples" in alarm["StateReason"]
     cloudwatch._metrics.clear()
-    metrics.evaluate(alarm)
+    alarm_state.evaluate(alarm)
     assert alarm["StateValue"] == "OK"
     states = [json.loads(entry["HistoryData"]) for entry in cloudwatch._history_entries()]
     assert [state["newState"]["stateValue"] for state in states] == ["ALARM", "OK"]
+
+
+@pytest.mark.parametrize("failed", [False, True])
+def test_an_invocation_is_counted(failed):
+    execute = lambda_metrics.counting_invocations(lambda *_: {"error": failed})
+    newest = {"dynamodb": {"ApproximateCreationDateTime": time.time() - 60}}
+    execute({}, {"FunctionName": "f"}, {"Records": [newest]}, "id", time.time())
+    assert values("AWS/Lambda", "Invocations", FunctionName="f") == [1]
+    assert values("AWS/Lambda", "Errors", FunctionName="f") == values("AWS/Lambda", "Errors") == [failed]
+    assert values("AWS/Lambda", "ConcurrentExecutions", FunctionName="f") == [1]
+    (age_ms,) = values("AWS/Lambda", "IteratorAge", FunctionName="f")
+    assert age_ms >= 60_000
+
+
+def test_the_messages_that_wait_are_counted():
+    with request_scope("000000000000", "eu-west-1"):
+        url = sqs._act_create_queue({"QueueName": "counted"}, "")["QueueUrl"]
+        try:
+            sqs._act_send_message({"MessageBody": "text"}, url)
+            queue_metrics.count()
+        finally:
+            sqs._act_delete_queue({"QueueUrl": url}, "")
+        assert values("AWS/SQS", "ApproximateNumberOfMessagesVisible", QueueName="counted") == [1]

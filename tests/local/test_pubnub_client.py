@@ -14,7 +14,7 @@ import pytest
 
 import iort_contract
 from functions.shared.pubnub_client import PublishError, PubNubPublisher
-from local.pubnub_standin import PubNubStandIn
+from local.pubnub.standin import PubNubStandIn
 
 KEYS = {"publish_key": "pub-c-ours", "subscribe_key": "sub-c-ours"}
 MESSAGE = {"robot": "car", "sample": {"speed": 1200, "text": 'a "quoted" ä'}}

@@ -14,8 +14,8 @@ from urllib.parse import quote
 import pytest
 from pubnub.pubnub import SubscribeListener
 
-from local import pubnub_standin
-from local.pubnub_standin import PubNubStandIn
+from local.pubnub import standin as server
+from local.pubnub.standin import PubNubStandIn
 from tests.local.pubnub_sdk import PAYLOADS, WAIT_S, ask, poll, publish
 
 
@@ -154,7 +154,7 @@ def test_cursor_from_a_clock_ahead_is_not_deaf(standin, client):
 
 
 def test_timetokens_grow_even_if_the_clock_does_not(standin, monkeypatch):
-    monkeypatch.setattr(pubnub_standin.time, "time_ns", lambda: 1_700_000_000_000_000_000)
+    monkeypatch.setattr(server.time, "time_ns", lambda: 1_700_000_000_000_000_000)
     tokens = [json.loads(ask(standin, "/time/0")[1])[0] for _ in range(3)]
     assert tokens == sorted(set(tokens))
 

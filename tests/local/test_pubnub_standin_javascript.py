@@ -11,7 +11,7 @@ from pathlib import Path
 
 import pytest
 
-from local.pubnub_standin import PubNubStandIn
+from local.pubnub.standin import PubNubStandIn
 from tests.local.pubnub_sdk import PAYLOADS, WAIT_S, publish
 
 ROOT = Path(__file__).resolve().parents[2]

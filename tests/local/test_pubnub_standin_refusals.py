@@ -12,8 +12,8 @@ import pytest
 from pubnub.exceptions import PubNubException
 
 import iort_contract
-from local import pubnub_standin
-from local.pubnub_standin import PubNubStandIn
+from local.pubnub import standin as server
+from local.pubnub.standin import PubNubStandIn
 from tests.local.pubnub_sdk import WAIT_S, ask, poll, publish
 
 
@@ -34,13 +34,13 @@ def test_gzip(standin, body, answer):
 
 
 def test_too_many_polls_are_refused(standin, monkeypatch):
-    monkeypatch.setattr(pubnub_standin, "MAX_POLLS", 0)
+    monkeypatch.setattr(server, "MAX_POLLS", 0)
     response, _ = ask(standin, "/v2/subscribe/sub/iort.car/0?tt=1")
     assert response.status == 429
 
 
 def test_subscriber_that_does_not_read_is_cut_off(monkeypatch):
-    monkeypatch.setattr(pubnub_standin, "WRITE_S", 0.2)
+    monkeypatch.setattr(server, "WRITE_S", 0.2)
     cut = threading.Event()
 
     class Watched(PubNubStandIn):

@@ -11,7 +11,7 @@ import pytest
 from ministack.core.responses import request_scope
 from ministack.services import lambda_svc, sqs
 
-from local import queue_gap
+from local.gaps.storage import queue_lock
 
 ACCOUNT, REGION = "000000000000", "eu-west-1"
 MESSAGES, SENDERS = 10_000, 4
@@ -23,8 +23,8 @@ def queue(monkeypatch):
     """The url of a queue of ministack's, with a dead-letter queue."""
     monkeypatch.setattr(sqs, "_HANDLERS", dict(sqs._HANDLERS))
     for module, names in (
-        (sqs, (*queue_gap.STEPS, "_queues_lock")),
-        (lambda_svc, queue_gap.DESTINATIONS),
+        (sqs, (*queue_lock.STEPS, "_queues_lock")),
+        (lambda_svc, queue_lock.DESTINATIONS),
     ):
         for name in names:
             # Set to what it is, so that it is set back.
@@ -76,7 +76,7 @@ def drive(url, messages=MESSAGES):
 
 
 def test_each_of_ten_thousand_messages_arrives_once(queue):
-    queue_gap.install()
+    queue_lock.install()
     came = drive(queue)
     assert len(came) == MESSAGES
     assert set(came.values()) == {1}
@@ -85,7 +85,7 @@ def test_each_of_ten_thousand_messages_arrives_once(queue):
 
 def test_the_gap_is_still_one(queue):
     lost = next((MESSAGES - len(came) for _ in range(20) if len(came := drive(queue)) < MESSAGES), 0)
-    assert lost, "ministack loses no message any more: local/queue_gap.py may go"
+    assert lost, "ministack loses no message any more: local/gaps/storage/queue_lock.py may go"
 
 
 def test_every_function_that_changes_a_queue_is_known():
@@ -98,10 +98,10 @@ def test_every_function_that_changes_a_queue_is_known():
     }
     # These two have the lock themselves.
     assert changing - {"_delete_messages_for_esm", "_receive_messages_for_esm"} <= {
-        *queue_gap.STEPS,
+        *queue_lock.STEPS,
         "_collect_fifo",
     }
-    for name in queue_gap.DESTINATIONS:
+    for name in queue_lock.DESTINATIONS:
         assert '["messages"].append' in inspect.getsource(getattr(lambda_svc, name))
     assert "with _queues_lock:" in inspect.getsource(sqs._receive_messages_for_esm)
     assert "with _queues_lock:" in inspect.getsource(sqs._delete_messages_for_esm)

@@ -9,13 +9,13 @@ import time
 import pytest
 
 import iort_contract
-from bench.dear import dearest
+from bench.load.worst_case import worst_batches
 from iort_contract import SECOND, VESC_STREAM, Batch, record_topic
 from iort_station.data.items import of_topic
 from iort_station.fleet import shadow
 from iort_station.operations import delivery
 from tests.local.conftest import until
-from tests.local.robot import Robot
+from verify.robot import Robot
 
 S = 1_000_000
 GOOD = 8
@@ -36,7 +36,7 @@ def test_dear_batches_of_one_robot_wait_and_those_of_the_others_do_not(
     embedded, bundle, iort, rate_hz, count
 ):
     bad, good = bundle("bad"), bundle("good")
-    messages = list(dearest(count))
+    messages = list(worst_batches(count))
     topics = {car: record_topic(car.robot, VESC_STREAM, embedded.namespace) for car in (bad, good)}
     t_us = int(time.time()) * S
     with Robot(bad.folder) as hostile, Robot(good.folder) as other:

@@ -10,7 +10,7 @@ import pytest
 from ministack.core.responses import request_scope
 from ministack.services import dynamodb, lambda_svc, sqs
 
-from local.stream_gap import StreamMappings
+from local.gaps.functions.stream_retries import StreamMappings
 from tests.local import series_table
 
 ACCOUNT, REGION = "000000000000", "eu-west-1"

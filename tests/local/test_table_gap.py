@@ -11,7 +11,8 @@ from hypothesis import strategies as st
 from ministack.core.responses import request_scope
 from ministack.services import dynamodb
 
-from local import table_gap
+from local.gaps.parts.partition import Wanted
+from local.gaps.storage import number_checks, query_time
 from tests.local import series_table
 
 ACCOUNT, REGION = "000000000000", "eu-west-1"
@@ -28,8 +29,8 @@ RANGES = st.one_of(
 def query():
     """Asks both ways, and gives the answer if it is one."""
     plain, evaluate = dynamodb._query, dynamodb._evaluate_condition
-    narrowed = table_gap.narrowing(plain)
-    dynamodb._evaluate_condition = table_gap._evaluating(evaluate)
+    narrowed = query_time.narrowing(plain)
+    dynamodb._evaluate_condition = query_time.evaluating(evaluate)
 
     def ask(**data):
         with request_scope(ACCOUNT, REGION):
@@ -50,7 +51,7 @@ def key(kind, n):
 def table(request):
     """Holds numbers, whatever the order they came in."""
     kind = request.param
-    keep = table_gap._ordering(dynamodb._set_item)
+    keep = query_time.ordering(dynamodb._set_item)
 
     def hold(numbers):
         with request_scope(ACCOUNT, REGION):
@@ -134,7 +135,7 @@ def test_pages_hold_every_item_once(query, table):
 def test_only_what_is_asked_for_is_looked_at(query, table):
     partition = table(range(10, 100))["items"]["a"]
     with request_scope(ACCOUNT, REGION):
-        found, wanted = table_gap._asked(asked((">", 90), table.kind) | {"Limit": 2})
+        found, wanted = query_time.asked(asked((">", 90), table.kind) | {"Limit": 2})
     assert found is partition
     assert [item["t"] for item in partition.between(wanted)] == [key(table.kind, n) for n in (91, 92, 93)]
 
@@ -160,7 +161,7 @@ def test_a_copy_of_a_partition_is_one(table):
     held = table([3, 1, 2])["items"]
     assert copy.deepcopy(held)["a"].kind == table.kind
     copied = copy.deepcopy(held)["a"]
-    everything = table_gap.Wanted(None, None, forward=True, most=None)
+    everything = Wanted(None, None, forward=True, most=None)
     assert copied.between(everything) == held["a"].between(everything)
 
 
@@ -177,4 +178,4 @@ def test_numbers_are_read_as_without(text):
         (dynamodb._ddb_canonicalize_number, lambda plain: plain),
         (dynamodb._number_error, lambda _: None),
     ):
-        assert table_gap._plainly(look, answer)(text) == look(text)
+        assert number_checks.plainly(look, answer)(text) == look(text)

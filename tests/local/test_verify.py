@@ -3,17 +3,24 @@
 from __future__ import annotations
 
 import argparse
+import errno
+import io
 import json
+import signal
+import sys
 import time
 from dataclasses import replace
 
 import pytest
 
 from bench.target import AWS, EMBEDDED, Target
+from iort_contract import ROBOT
 from iort_station.errors import StationError
+from iort_station.fleet import robots
 from iort_station.page import keys
 from verify import measured, price, run
-from verify.check import WITH_KEY, Verdict, ask
+from verify.assumption import Basis
+from verify.check import WITH_KEY, Check, Verdict, ask
 from verify.checks import ALL, live, rules
 from verify.errors import VerifyError
 
@@ -102,6 +109,61 @@ def test_what_fails_is_taken_down_and_what_was_answered_is_reported(embedded, tm
         run.run(options(tmp_path, only=(first, with_key)), embedded.cloud, recorder)
     assert recorder.told == [{}, {"customer_key": "true"}, "destroyed"]
     assert len(json.loads((tmp_path / "report.json").read_text())["answers"]) == 1
+
+
+def test_what_is_left_over_after_a_failure_is_told(embedded, tmp_path, capsys):
+    class Failing(Recorder):
+        def deploy(self, settings):
+            raise VerifyError("cdk deploy failed")
+
+        def destroy(self):
+            return ["the stack storage"]
+
+    with pytest.raises(VerifyError, match="cdk deploy failed"):
+        run.run(options(tmp_path), embedded.cloud, Failing())
+    assert "left over: the stack storage" in capsys.readouterr().out
+
+
+def question(name, seen, ask):
+    return Check(
+        name=name, assumed="It is.", expected=seen, basis=Basis.ASSUMED, relied_on_by=("app.py",), ask=ask
+    )
+
+
+def test_a_run_lends_pubnubs_keys_to_every_question(embedded, tmp_path):
+    cloud = replace(embedded.cloud, namespace="other")
+    lent = question("a.question", {"lent": True}, lambda target: {"lent": bool(keys.load(target.cloud))})
+    assert run.run(options(tmp_path, only=(lent,)), cloud, Recorder()) == 0
+    with pytest.raises(StationError, match="not stored yet"):
+        keys.load(cloud)
+
+
+class Gone(io.StringIO):
+    """A terminal that was closed."""
+
+    def write(self, _text):
+        raise OSError(errno.EIO, "Input/output error")
+
+
+def test_a_terminal_that_has_gone_does_not_end_the_teardown(embedded, tmp_path, monkeypatch):
+    def ask(target):
+        target.robot("verify-gone")
+        monkeypatch.setattr(sys, "stdout", Gone())
+        signal.raise_signal(signal.SIGHUP)
+
+    recorder = Recorder()
+    only = (question("a.question", {}, ask),)
+    with pytest.raises(KeyboardInterrupt):
+        run.run(options(tmp_path, only=only), embedded.cloud, recorder)
+    assert recorder.told == [{}, "destroyed"]
+    assert not [row for row in robots.listed(embedded.cloud) if row[ROBOT].startswith("verify-gone")]
+
+
+def test_a_part_of_the_answers_does_not_take_the_place_of_all(monkeypatch, capsys):
+    monkeypatch.setattr(sys, "argv", ["verify", "--keep", "--only", "rules"])
+    with pytest.raises(SystemExit):
+        run.main()
+    assert "leave --only away" in capsys.readouterr().err
 
 
 def test_the_price_is_told_before(capsys):

@@ -19,7 +19,8 @@ from typing import Any
 
 import pytest
 
-from bench.ros_graph import ROOT, SYSTEM_PYTHON, python_with_rospy
+from bench import ROOT
+from bench.ros.graph import PYTHONPATH, SYSTEM_PYTHON, python_with_rospy
 from tests.ports import free_port
 
 HERE = Path(__file__).resolve().parent
@@ -144,7 +145,7 @@ class Graph:
             "ROS_IP": "127.0.0.1",
             "ROS_LOG_DIR": str(folder),
             "ROS_HOME": str(folder),
-            "PYTHONPATH": str(ROOT),
+            "PYTHONPATH": PYTHONPATH,
             "PYTHONUNBUFFERED": "1",
         }
         self.master: Process

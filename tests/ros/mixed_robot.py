@@ -11,10 +11,10 @@ import struct
 from collections.abc import Mapping
 from typing import NamedTuple
 
-from bench import ros_message
+from bench.ros import vesc_message
 from tests.ros1_types import SIZES, Message, serialize
 
-_VESC_STATE = "\n".join([*(f"float64 {name}" for name in ros_message.FIELDS), "int32 fault_code"])
+_VESC_STATE = "\n".join([*(f"float64 {name}" for name in vesc_message.FIELDS), "int32 fault_code"])
 TEXTS = {
     "std_msgs/Empty": "",
     "std_msgs/String": "string data",

@@ -6,8 +6,8 @@ import shutil
 
 import pytest
 
-from bench import mosquitto
-from bench.mixed_robot import topics
+from bench.floors import mosquitto
+from bench.ros.mixed_robot import topics
 from bench.sections import mixed
 
 

@@ -25,6 +25,7 @@ ANSWERS: dict[str, tuple[Any, set[str]]] = {
     "admit": ({"allowProvisioning": True}, {"UpdateItem"}),
     "alert": (None, {"UpdateItem", "Mail"}),
     "echo": (None, {"Topic"}),
+    "later": (None, {"GetItem"}),
     "live": (None, {"GetParameter", "PubNub"}),
     "presence": (None, {"UpdateItem"}),
     "quarantine": ({"batchItemFailures": []}, {"UpdateItem"}),
@@ -36,6 +37,7 @@ ANSWERS: dict[str, tuple[Any, set[str]]] = {
 RAISES = {
     "alert": "KeyError",
     "echo": "KeyError",
+    "later": "KeyError",
     "quarantine": "KeyError",
     "summarize": "KeyError",
     "upload": "KeyError",

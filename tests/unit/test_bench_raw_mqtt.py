@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from bench.raw_mqtt import _packet, _text
+from bench.floors.raw_mqtt import _packet, _text
 
 
 @pytest.mark.parametrize(

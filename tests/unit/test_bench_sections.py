@@ -6,12 +6,23 @@ import json
 
 import pytest
 
-from bench import far, invocations, mixed_robot, thesis
-from bench.invocations import Measured
-from bench.lines import RAW
-from bench.probes.ground import No
-from bench.result import Section
-from bench.sections import SECTIONS, abilities, fairness, mixed, outage, query, utilisation
+from bench.meters import invocations
+from bench.meters.invocations import Measured
+from bench.meters.round_trips import RAW
+from bench.probes.probe_fixture import AbilityMissingError
+from bench.report import thesis
+from bench.report.result import Section
+from bench.ros import mixed_robot
+from bench.sections import (
+    SECTIONS,
+    abilities,
+    fairness,
+    mixed,
+    outage,
+    query,
+    thesis_ping,
+    utilisation,
+)
 from bench.sections.utilisation import BATCHES
 from iort_contract import BROKER, LAMBDA, RULE, Batch, encode, live_topic, record_topic
 from iort_contract.ros1.definition import parse
@@ -92,7 +103,7 @@ def test_thesis_reader_follows_every_page():
 
 def test_a_probe_that_raises_is_a_no_and_says_what_was_seen():
     def refuses(_):
-        raise No("nothing came")
+        raise AbilityMissingError("nothing came")
 
     def breaks(_):
         raise ValueError("odd")
@@ -131,9 +142,14 @@ def test_the_thesis_tables_are_in_the_report_with_their_source():
 
 def test_round_trips_with_the_thesis_ping_stand_beside_its_figures():
     took_ms = {BROKER: 52.0, RULE: 53.0, LAMBDA: 58.0, RAW: 51.0}
-    found = {f"{way} at {hz} Hz": [[ms] * 3] * 3 for way, ms in took_ms.items() for hz in far.RATES_HZ}
+    found = {
+        f"{way} at {hz} Hz": [[ms] * 3] * 3 for way, ms in took_ms.items() for hz in thesis_ping.RATES_HZ
+    }
     section = Section("round_trips", "")
-    far.report(section, {**found, far.DASHBOARD: [[60.0] * 3], far.ECHO: [[50.5] * 3]})
+    thesis_ping.report(
+        section,
+        {**found, thesis_ping.DASHBOARD: [[60.0] * 3], thesis_ping.ECHO: [[50.5] * 3]},
+    )
     rows = {row[0]: row[1:] for row in section.tables[0].rows}
     ten_hz = {name: (row[1], row[-1]) for name, row in rows.items()}
     assert ten_hz["robot - broker, with 25 ms each way"] == ("52.0 ms (p95 52.0, p99 52.0)", "50 - 60 ms")
@@ -230,9 +246,9 @@ def test_fairness_is_held_to_twice_the_delay_of_a_car_alone():
     assert section.tables[0].rows[1][:2] == ["bad messages", "80"]
 
 
-def test_summaries_beside_dear_batches_are_held_to_twice_the_delay_of_a_car_alone():
+def test_summaries_beside_worst_case_batches_are_held_to_twice_the_delay_of_a_car_alone():
     section = Section("fairness", "")
-    kinds = ("15 dear batches a second", "100 dear batches a second")
+    kinds = ("15 worst-case batches a second", "100 worst-case batches a second")
     delays = ([[2000.0] * 40], [[3000.0] * 40], [[5000.0] * 20])
     fairness.report_summaries(section, dict(zip(("nothing", *kinds), delays, strict=True)))
     values = [(ratio.value, ratio.reached) for ratio in section.ratios]
@@ -241,7 +257,7 @@ def test_summaries_beside_dear_batches_are_held_to_twice_the_delay_of_a_car_alon
 
 
 def test_every_section_of_the_documentation_is_one_that_runs():
-    from bench.machine import ROOT
+    from bench import ROOT
 
     text = (ROOT / "docs" / "bench.md").read_text()
     assert {key for key in SECTIONS if f"| `{key}` |" in text} == set(SECTIONS)

@@ -176,6 +176,14 @@ def test_one_that_is_too_old_by_the_clock_is_not_even_asked_for(
     assert aws.asked == ["token 1"]
 
 
+def test_an_old_one_is_kept_while_nothing_connects(claim: Path, aws: Exchange) -> None:
+    left = earlier(claim.parent, asked_s=time.time() - TOKEN_S)
+    aws.claim_is_good = False
+    with pytest.raises(IdentityError, match="does not connect"):
+        provision(claim, robot="car", run=aws.run)
+    assert kept(claim.parent) == left
+
+
 @pytest.mark.parametrize(
     "refusal", [RefusedError("not expected", "AccessDenied"), IdentityError("no answer")]
 )

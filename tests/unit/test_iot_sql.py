@@ -9,7 +9,7 @@ from types import SimpleNamespace
 import pytest
 from ministack.services import iot
 
-from local import gaps
+from local.gaps.rules.sql_floor import with_floor
 from tests.iot_sql import Message, evaluate
 
 RED = {"color": "red", "temperature": 50}
@@ -38,7 +38,7 @@ def ministacks(sql, topic, payload):
 
 @pytest.fixture(params=[ours, ministacks])
 def run(request, monkeypatch):
-    monkeypatch.setattr(iot, "_eval_select_function", gaps._with_floor(iot._eval_select_function))
+    monkeypatch.setattr(iot, "_eval_select_function", with_floor(iot._eval_select_function))
     monkeypatch.setattr(iot, "time", SimpleNamespace(time=lambda: NOW_MS / 1000))
     return request.param
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import json
 
 import pytest
@@ -12,6 +13,7 @@ from functions.shared import allowances, share
 from functions.shared.allowances import Allowances
 from functions.shared.processing import Bounds, process
 from functions.shared.share import KEYS, OverShareError, PutOff, Share, Told, waiting
+from functions.shared.tables import TableError
 from iort_contract import OVER_SHARE, PUT_OFF, RECORD, SHADOW, VESC_STREAM, build_topic
 from tests.unit.summarizing import T0, S, Stream, batch, counted
 
@@ -247,3 +249,45 @@ def test_those_who_were_told_are_of_a_bounded_number():
     for i in range(share._ROBOTS + 10):
         told.tell(f"car{i}", 1, 100.0)
     assert len(told._robots) == share._ROBOTS
+
+
+def test_holes_before_every_batch_are_within_the_share():
+    stream = Bounded(each_s=0.0)
+    stream.stored_at(99.0, *(batch(T0 + i * S // 100, seq=2 * i) for i in range(1000)), topic=BAD)
+    new = [batch(T0 + 10 * S + i * S // 100, seq=2 * (1000 + i)) for i in range(100)]
+    records = stream.stored_at(100.0, *new, topic=BAD)
+    before = stream.client.calls["query"]
+    stream.summarize(records)
+    # One query a page of what lies around the second, and few for the batches themselves.
+    assert stream.client.calls["query"] - before < 30
+
+
+def test_a_robot_is_given_up_while_its_holes_are_counted():
+    stream = Bounded(each_s=0.0)
+    processor, numbers = stream.share._spent_s, stream.tables.numbers
+
+    def slow(*asked):
+        processor.now_s += 0.25
+        return numbers(*asked)
+
+    stream.tables.numbers = slow
+    records = stream.stored_at(100.0, *(batch(T0 + i * S, seq=2 * i) for i in range(10)), topic=BAD)
+    stream.summarize(records)
+    assert processor.now_s < 1.0
+    assert len(stream.waits()) == 10
+
+
+def test_a_second_that_changes_as_fast_as_it_is_read_holds_nobody_up():
+    stream = Bounded(each_s=0.0)
+    records = stream.store(batch(T0 + 500_000, seq=100), topic=BAD)
+    put, sent = stream.tables.put_seconds, itertools.count(1)
+
+    def put_and_send(seconds):
+        number = next(sent)
+        assert number < 20, "it does not end"
+        stream.store(batch(T0 + 500_000 - number, seq=100 - number), topic=BAD)
+        put(seconds)
+
+    stream.tables.put_seconds = put_and_send
+    with pytest.raises(TableError, match="change as fast"):
+        process({"Records": records}, stream.tables, stream.refuse, beside_others=True)

@@ -56,7 +56,7 @@ def s3(aws):
 @pytest.fixture
 def cloud(s3, monkeypatch):
     made = Cloud(region="eu-west-1")
-    made._clients["s3"] = s3
+    made._clients["s3", None] = s3
     monkeypatch.setattr(
         Cloud, "output", lambda _self, noun, name: {("storage", "FilesBucket"): NAME}[noun, name]
     )

@@ -107,3 +107,10 @@ def test_a_clock_that_is_off_is_refused():
     for off_s in (-3.0, 4.0, 86_400.0):
         with pytest.raises(StationError, match="set it"):
             _check_clock(date, cloud_s + off_s, cloud_s + off_s)
+
+
+@pytest.mark.parametrize("said", ["x", 7, [1], {"drive": "x"}])
+def test_a_robot_that_reports_in_another_form_stops_no_operator(said):
+    state = State(1, {}, {"commands": said, "rejected": said})
+    assert outcome(state, "drive", "feedbeef", 3) is None
+    assert state.refusals() == []

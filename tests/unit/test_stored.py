@@ -102,7 +102,7 @@ def test_other_seconds_and_streams_are_as_ever(stream):
 def test_a_reader_says_which_seconds_are_full(stream):
     stream.store(*packed(MANY))
     reader = Reader(stream.tables, TOPIC_OF_CAR, {}, list)
-    assert len(reader.read(SECOND, SECOND)) == SECOND_BATCHES + 1
+    assert len(reader.read(SECOND, SECOND)[0]) == SECOND_BATCHES + 1
     assert reader.full == {SECOND}
 
 
@@ -141,3 +141,26 @@ def test_topics_that_are_read_side_by_side_come_out_the_same():
         seen.append({topic: stream.summary(topic) for topic in topics})
     assert seen[0] == seen[1]
     assert all(item["batches"] == 3 for items in seen[0].values() for item in items.values())
+
+
+def large(number):
+    """A batch of a second whose columns are half of what a second may hold, and small on the wire."""
+    texts = {f"f{i}": ["x" * 4000] * 100 for i in range(10)}
+    return Batch("aaaaaaaa", number, [T0 + number * S + i * 5000 for i in range(100)], texts)
+
+
+def test_seconds_that_hold_much_are_not_in_memory_together(stream):
+    batches = [large(number) for number in range(8)]
+    records = stream.store(*batches)
+    held = []
+    reader = Reader(stream.tables, TOPIC_OF_CAR, {one.id: one for one in batches}, list)
+    first = SECOND
+    while first < SECOND + 8:
+        stored, last = reader.read(first, SECOND + 7)
+        held.append(len(stored))
+        assert last >= first
+        first = last + 1
+    assert max(held) < 5
+    assert stream.summarize(records) == {"batchItemFailures": []}
+    assert stream.column("n") == dict.fromkeys(range(8), 100)
+    assert stream.column("missing_batches") == dict.fromkeys(range(8), 0)

@@ -1,7 +1,7 @@
 """Lambda 2 under the stream's mapping: whatever goes wrong, the summary is right and nothing is lost.
 
-`local.stream_mapping` is how AWS documents the mapping; here hypothesis makes it histories of poison,
-throttled tables, time-outs, lost acknowledgements and repeated batches, and the real handler runs in it.
+`local.gaps.parts.stream_mapping` does what AWS documents. Hypothesis makes histories of poison, throttled
+tables, time-outs, lost acknowledgements and repeated batches, and the real handler runs in them.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ from functions.shared import tables as tables_module
 from functions.shared.processing import process
 from functions.shared.tables import TableError
 from iort_contract import Batch
-from local.stream_mapping import Answer, Condition, Settings, Shard
+from local.gaps.parts.stream_mapping import Answer, Condition, Settings, Shard
 from tests.fakes import TELEMETRY, FakeDynamoDB, item_of, record_of, summary_of, tables
 
 S = 1_000_000

@@ -277,3 +277,12 @@ def test_every_value_is_read_back_as_it_was_or_as_near_as_dynamodb_can(value):
     else:
         assert back == value
         assert isinstance(back, bool) == isinstance(value, bool)
+
+
+def test_a_robot_that_names_ever_new_streams_has_a_bounded_row(client):
+    put(client, ROBOTS, {"robot": {"S": "car"}})
+    written = tables(client)
+    for number in range(tables_module.MAX_STREAMS + 5):
+        written.note_stream("car", f"s{number:04d}")
+    row = client.get_item(TableName=ROBOTS, Key={"robot": {"S": "car"}})["Item"]
+    assert len(row["streams"]["SS"]) == tables_module.MAX_STREAMS

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import threading
 
-from local.turns import Turns
+from local.gaps.parts.turns import Turns
 
 
 def test_who_has_calls_waiting_takes_turns_with_the_others():

@@ -12,7 +12,7 @@ import iort_contract
 if TYPE_CHECKING:
     from collections.abc import Mapping
 
-    from local.pubnub_standin import PubNubStandIn
+    from local.pubnub.standin import PubNubStandIn
 
 PUBLISH_KEY, SUBSCRIBE_KEY = "pub-local", "sub-local"
 GAIN = 4614.0

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 import pytest
 
 from iort_station.page.server import PageServer
-from local.pubnub_standin import PubNubStandIn
+from local.pubnub.standin import PubNubStandIn
 from tests.web.cars import GAIN, PUBLISH_KEY, SUBSCRIBE_KEY, Car
 
 if TYPE_CHECKING:

@@ -12,7 +12,7 @@ from tests.web.cars import SUBSCRIBE_KEY, Car
 if TYPE_CHECKING:
     from playwright.sync_api import Page
 
-    from local.pubnub_standin import PubNubStandIn
+    from local.pubnub.standin import PubNubStandIn
 
 OFF_MS = 1_700_000_000_000
 REGISTERED = {

@@ -13,7 +13,7 @@ from tests.web.cars import SUBSCRIBE_KEY
 if TYPE_CHECKING:
     from playwright.sync_api import Page
 
-    from local.pubnub_standin import PubNubStandIn
+    from local.pubnub.standin import PubNubStandIn
 
 WIDGET = {
     "number": 3,

@@ -10,7 +10,7 @@ import pytest
 
 import iort_contract
 from iort_station.page.server import PageServer
-from local.pubnub_standin import PubNubStandIn
+from local.pubnub.standin import PubNubStandIn
 from tests.browser import drawn, plain, show, shown, until
 from tests.web.cars import GAIN, SAMPLE, SUBSCRIBE_KEY, Car
 

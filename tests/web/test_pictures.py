@@ -18,7 +18,7 @@ from tests.web.cars import SAMPLE, SUBSCRIBE_KEY, Car
 if TYPE_CHECKING:
     from playwright.sync_api import Page
 
-    from local.pubnub_standin import PubNubStandIn
+    from local.pubnub.standin import PubNubStandIn
 
 KEY = "robots/car-1/2026/05/04/100000-0123456789abcdef/camera/1-data.jpg"
 STREAM = "camera"

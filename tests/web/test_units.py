@@ -19,7 +19,7 @@ from tests.web.cars import GAIN, SAMPLE, SUBSCRIBE_KEY, Car
 if TYPE_CHECKING:
     from playwright.sync_api import Page
 
-    from local.pubnub_standin import PubNubStandIn
+    from local.pubnub.standin import PubNubStandIn
 
 OFFSET_ERPM = 461.4
 VEHICLE = {"speed_to_erpm_gain": GAIN, "speed_to_erpm_offset": OFFSET_ERPM}

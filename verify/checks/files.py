@@ -8,8 +8,8 @@ import json
 import time
 from typing import Any
 
-from bench import borrowed
 from bench.target import Target
+from bench.temporary_function import temporary_function
 from iort_contract import FILES_PREFIX, PART_BYTES, File, part_range
 from verify.assumption import Basis
 from verify.check import Check
@@ -90,7 +90,7 @@ def _closed(target: Target) -> dict[str, Any]:
     cloud, context = target.cloud, trust(target)
     s3, client = cloud.client("s3"), cloud.client("lambda")
     place = {"Bucket": cloud.output("storage", "FilesBucket"), "Key": f"{FILES_PREFIX}verify/expired"}
-    with borrowed.function(target, "signing", _SIGNING, memory_mb=256, timeout_s=30, like="Upload") as name:
+    with temporary_function(target, "signing", _SIGNING, memory_mb=256, timeout_s=30, like="Upload") as name:
         url = json.loads(client.invoke(FunctionName=name, Payload=json.dumps(place))["Payload"].read())
     try:
 

@@ -6,8 +6,8 @@ import json
 import time
 from typing import Any
 
-from bench import borrowed
 from bench.target import Target
+from bench.temporary_function import temporary_function
 from iort_contract import BY_FUNCTION, LAMBDA, PING, TOPIC, build_topic, rule_event
 from iort_station.operations import quarantine
 from verify.assumption import Basis
@@ -52,7 +52,7 @@ def handler(event, context):
 
 def _runtime(target: Target) -> dict[str, Any]:
     client = target.cloud.client("lambda")
-    with borrowed.function(target, "runtime", _RUNTIME, memory_mb=_MEMORY_MB, timeout_s=30) as name:
+    with temporary_function(target, "runtime", _RUNTIME, memory_mb=_MEMORY_MB, timeout_s=30) as name:
         answer = client.invoke(FunctionName=name, Payload=b"{}")
         found = json.loads(answer["Payload"].read())
         if "FunctionError" in answer:
@@ -75,7 +75,7 @@ def _runtime(target: Target) -> dict[str, Any]:
 def _python(target: Target) -> dict[str, Any]:
     source = "import sys\n\ndef handler(event, context):\n    return 'python%d.%d' % sys.version_info[:2]\n"
     client = target.cloud.client("lambda")
-    with borrowed.function(target, "python", source, memory_mb=_MEMORY_MB, timeout_s=30) as name:
+    with temporary_function(target, "python", source, memory_mb=_MEMORY_MB, timeout_s=30) as name:
         named = client.get_function_configuration(FunctionName=name)["Runtime"]
         runs = json.loads(client.invoke(FunctionName=name, Payload=b"{}")["Payload"].read())
     return {"runs_as_named": runs == named, "note_python": runs}

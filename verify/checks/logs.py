@@ -7,9 +7,9 @@ import time
 from datetime import datetime, timedelta, timezone
 from typing import Any
 
-from bench import borrowed
-from bench.invocations import configure
+from bench.meters.invocations import configure
 from bench.target import Target
+from bench.temporary_function import temporary_function
 from iort_contract import (
     METRIC_DEPLOYMENT,
     METRIC_FUNCTION,
@@ -88,7 +88,7 @@ def _lines(target: Target) -> dict[str, Any]:
     model = client.get_function_configuration(FunctionName=target.cloud.output("processing", "EchoFunction"))
     group = model["LoggingConfig"]["LogGroup"]
     began_ms = int(time.time() * 1000)
-    with borrowed.function(target, "speaking", _SPEAKING, memory_mb=128) as name:
+    with temporary_function(target, "speaking", _SPEAKING, memory_mb=128) as name:
         configure(client, name, LoggingConfig=model["LoggingConfig"])
         client.invoke(FunctionName=name, Payload=b"{}")
 
@@ -122,7 +122,12 @@ CHECKS = (
             f"{_CLOUDWATCH}/CloudWatch_Embedded_Metric_Format_Specification.html and "
             f"{_GUIDE}/monitoring-cloudwatchlogs-log-level.html"
         ),
-        relied_on_by=("functions/shared/metrics.py", "stacks/function.py", "stacks/alarms.py"),
+        relied_on_by=(
+            "functions/shared/metrics.py",
+            "stacks/function.py",
+            "stacks/alarms.py",
+            "local/gaps/metrics/embedded_metrics.py",
+        ),
         ask=_metric,
     ),
     Check(

@@ -121,7 +121,11 @@ CHECKS = (
         expected={"refused_by": "function", "topic_as_subscribed": True, "byte_by_byte": True},
         basis=Basis.DOCUMENTED,
         source=f"{_GUIDE}/binary-payloads.html",
-        relied_on_by=("contract/iort_contract/cloud.py", "functions/live.py"),
+        relied_on_by=(
+            "contract/iort_contract/cloud.py",
+            "functions/live.py",
+            "local/gaps/rules/unreadable_payload.py",
+        ),
         ask=_live_no_json,
     ),
     Check(
@@ -155,7 +159,7 @@ CHECKS = (
         expected={"ours": "SUCCESS"},
         basis=Basis.DOCUMENTED,
         source=f"{_QUOTAS} and {_GUIDE}/mqtt.html",
-        relied_on_by=("contract/iort_contract/limits.py",),
+        relied_on_by=("contract/iort_contract/limits.py", "local/gaps/broker/message_size.py"),
         ask=_largest,
     ),
 )

@@ -173,6 +173,7 @@ CHECKS = (
             "functions/admit.py",
             "device/iort_agent/identity/provision.py",
             "stacks/fleet.py",
+            "local/gaps/broker/certificate_from_csr.py",
         ),
         ask=_own_claim,
     ),

@@ -15,11 +15,13 @@ from verify.waiting import until
 
 _MQTT = "https://docs.aws.amazon.com/iot/latest/developerguide/mqtt.html"
 _API = "https://docs.aws.amazon.com/iot/latest/apireference"
+# How the name of a question's policy begins, behind the namespace.
+POLICY = "verify-policy"
 
 
 def _policy_deleted(target: Target) -> dict[str, Any]:
-    """Takes up to six minutes in AWS' documented worst case: a policy must not stay behind."""
-    iot, name = target.cloud.client("iot"), f"{target.cloud.namespace}-{target.name('verify-policy')}"
+    """Up to six minutes in the worst case that AWS documents: a policy must not stay behind."""
+    iot, name = target.cloud.client("iot"), f"{target.cloud.namespace}-{target.name(POLICY)}"
     statement = {"Effect": "Deny", "Action": "iot:Connect", "Resource": "*"}
     document = json.dumps({"Version": "2012-10-17", "Statement": [statement]})
     codes: set[str] = set()

@@ -8,8 +8,8 @@ from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from typing import Any
 
-from bench import borrowed
 from bench.target import Target
+from bench.temporary_function import temporary_function
 from iort_contract import BATCH, RECORD, VESC_STREAM, Batch, batch_id, build_topic, encode, record_topic
 from iort_station.operations import quarantine
 from iort_station.operations.replay import replay
@@ -81,7 +81,7 @@ def _read(target: Target, robot: str, name: str, then: str) -> Iterator[_Said]:
     pattern = {"dynamodb": {"Keys": {"topic": {"S": [_topic(target, robot)]}}}}
     source = _READER % {"said": _SAID, "then": then.strip()}
     began_ms = int(time.time() * 1000)
-    with borrowed.function(target, name, source, memory_mb=128, like="Summarize") as function:
+    with temporary_function(target, name, source, memory_mb=128, like="Summarize") as function:
         made = client.create_event_source_mapping(
             FunctionName=function,
             EventSourceArn=mapping["EventSourceArn"],
@@ -198,7 +198,11 @@ CHECKS = (
         },
         basis=Basis.DOCUMENTED,
         source=f"{_GUIDE}/services-dynamodb-errors.html",
-        relied_on_by=("stacks/processing.py", "functions/quarantine.py", "local/stream_mapping.py"),
+        relied_on_by=(
+            "stacks/processing.py",
+            "functions/quarantine.py",
+            "local/gaps/parts/stream_mapping.py",
+        ),
         ask=_bisected,
     ),
     Check(
@@ -215,7 +219,7 @@ CHECKS = (
         },
         basis=Basis.DOCUMENTED,
         source=f"{_GUIDE}/services-ddb-batchfailurereporting.html",
-        relied_on_by=("functions/summarize.py", "stacks/processing.py", "local/stream_mapping.py"),
+        relied_on_by=("functions/summarize.py", "stacks/processing.py", "local/gaps/parts/stream_mapping.py"),
         ask=_reported,
     ),
 )

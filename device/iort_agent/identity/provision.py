@@ -137,10 +137,13 @@ def _finish(claim: Claim, earlier: Pending, run: Run) -> bool:
     Raises `IdentityError` where it may be registered later: whom the hook refuses now, it refuses with any
     certificate.
     """
-    if not earlier.may_register(time.time()):
-        return _is_registered(run.exchange(claim), earlier)
+    expired = not earlier.may_register(time.time())
     try:
+        # Without a network no certificate connects, which says nothing about this one: ask for another only
+        # while the claim connects.
         with run.exchange(claim) as connection:
+            if expired:
+                return _is_registered(connection, earlier)
             _ask(connection, earlier, run)
     except IdentityError as error:
         if _is_no_longer_good(error):

@@ -1,6 +1,6 @@
 """What the cars have recorded, as numpy's columns or a pandas frame.
 
-    from station import data
+    from iort_station.data import data
     from iort_station.cloud import Cloud
 
     ride = data.query(Cloud(), "car7", "vesc", "-10m", "now", fields=["speed", "speed_mps"])

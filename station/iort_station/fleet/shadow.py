@@ -58,9 +58,13 @@ class State(NamedTuple):
         return dict(_flat({name: value for name, value in self.desired.items() if name != OVER_SHARE}))
 
     def refusals(self) -> list[Refusal]:
-        """The wishes that the robot refuses."""
-        found = self.reported.get("rejected", {})
-        return [Refusal(name, one.get("value"), one.get("reason", "")) for name, one in sorted(found.items())]
+        """The wishes that the robot refuses; none where it says so in another form."""
+        found = _mapping(self.reported.get("rejected"))
+        return [
+            Refusal(name, one.get("value"), str(one.get("reason", "")))
+            for name, one in sorted(found.items())
+            if isinstance(one, dict)
+        ]
 
 
 class Shadow:
@@ -153,10 +157,15 @@ def answered(wishes: Mapping[str, Any], state: State) -> bool | None:
 
 def outcome(state: State, name: str, session: str, seq: int) -> str | None:
     """What the robot says became of a command; None while it has said nothing of this one."""
-    found = state.reported.get(COMMANDS, {}).get(name, {})
+    found = _mapping(_mapping(state.reported.get(COMMANDS)).get(name))
     if (found.get("session"), found.get("seq")) != (session, seq):
         return None
     return str(found.get("outcome"))
+
+
+def _mapping(value: Any) -> Mapping[str, Any]:
+    """What a robot reports where an object is expected; an empty one for anything else."""
+    return value if isinstance(value, dict) else {}
 
 
 def _same(quoted: Any, value: Any) -> bool:

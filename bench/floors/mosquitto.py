@@ -1,0 +1,89 @@
+"""Debian's mosquitto with mutual TLS: the floor of a broker, written in C.
+
+It only passes messages on: it has no rules, tables or policies.
+"""
+
+from __future__ import annotations
+
+import shutil
+import socket
+import subprocess
+import time
+from pathlib import Path
+from types import TracebackType
+
+from typing_extensions import Self
+
+from bench.errors import BenchError
+from local.certificates import Identity
+
+HOST = "127.0.0.1"
+_START_S = 20.0
+# Messages leave at once, as they do from AWS IoT Core and the agent.
+_SETTINGS = """
+listener {port} {host}
+cafile {folder}/ca.pem
+certfile {folder}/broker.pem
+keyfile {folder}/broker.key
+require_certificate true
+use_identity_as_username true
+set_tcp_nodelay true
+persistence false
+log_type error
+"""
+
+
+def found() -> str | None:
+    """Return the path of mosquitto, if it is installed; Debian keeps it out of a user's PATH."""
+    return shutil.which("mosquitto") or shutil.which("mosquitto", path="/usr/sbin")
+
+
+class Mosquitto:
+    """The broker from `__enter__` to `__exit__`; `identity` makes certificates that it accepts.
+
+    Raises `BenchError` where it does not start.
+    """
+
+    def __init__(self, program: str, folder: Path) -> None:
+        self._program, self._folder = program, folder
+        self._authority = Identity.make("iort bench", HOST, authority=True)
+        with socket.socket() as probe:
+            probe.bind((HOST, 0))
+            self.port = int(probe.getsockname()[1])
+
+    @property
+    def ca(self) -> Path:
+        """The certificate of the authority that signed all others."""
+        return self._folder / "ca.pem"
+
+    def __enter__(self) -> Self:
+        self._authority.write(self._folder, "ca")
+        self.identity("broker")
+        config = self._folder / "mosquitto.conf"
+        config.write_text(_SETTINGS.format(port=self.port, host=HOST, folder=self._folder))
+        # As root, mosquitto would switch to the user mosquitto, who may not read the keys.
+        with config.open("a") as file:
+            file.write("user root\n")
+        with (self._folder / "mosquitto.log").open("w") as log:
+            self._process = subprocess.Popen([self._program, "-c", config], stdout=log, stderr=log)
+        deadline = time.monotonic() + _START_S
+        while True:
+            try:
+                socket.create_connection((HOST, self.port)).close()
+            except OSError as error:
+                if self._process.poll() is not None or time.monotonic() > deadline:
+                    said = (self._folder / "mosquitto.log").read_text()
+                    raise BenchError(f"mosquitto does not start: {said}") from error
+                time.sleep(0.02)  # mosquitto does not report when it listens
+            else:
+                return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self._process.terminate()
+        self._process.wait()
+
+    def identity(self, name: str) -> tuple[Path, Path]:
+        """A new certificate and its key, as files."""
+        return Identity.make(name, HOST, signer=self._authority).write(self._folder, name)

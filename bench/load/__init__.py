@@ -1,0 +1,1 @@
+"""The load that is measured: simulated cars, fleets, stored drives and the most expensive batches."""

@@ -1,0 +1,149 @@
+"""Publishes many simulated cars to PubNub's stand-in, as Lambda 1 does, to measure the page.
+
+python -m bench.load.cars --origin 127.0.0.1:8000 --publish-key P --subscribe-key S --cars 20
+"""
+
+from __future__ import annotations
+
+import argparse
+import http.client
+import json
+import math
+import secrets
+import sys
+import threading
+import time
+from collections.abc import Mapping
+from typing import Any
+
+import iort_contract
+from bench.load import camera
+from iort_agent.sources.vehicle import Vehicle, VehicleConfig
+
+RATE_HZ = 10.0
+# Length of a simulation step; with larger ones the driver swerves.
+_STEP_S = 0.02
+# The delays of a real car: before the publish, the sample left the car and reached the cloud this long ago.
+_SENT_MS, _RECEIVED_MS, _LAMBDA_MS = 11.0, 7.0, 3.0
+
+
+class SimulatedCar:
+    """A car that drives laps: motor controller and, with ``senses``, pose, accelerations and camera."""
+
+    def __init__(self, name: str, seed: int, *, senses: bool = False) -> None:
+        self.name, self.senses = name, senses
+        self.fault_code = 0
+        self._vehicle = Vehicle(VehicleConfig(), seed)
+        self._gain = VehicleConfig().speed_to_erpm_gain
+        self._boot = secrets.token_hex(4)
+        self._seqs: dict[str, int] = {}
+        self._x_m = self._y_m = self._heading = self._driven_m = self._speed_mps = 0.0
+        for _ in range(seed * 97 % 500):
+            self._vehicle.step(_STEP_S)
+
+    def updates(self, dt: float) -> list[dict[str, Any]]:
+        """Drive on for ``dt`` seconds; return one live update for each stream."""
+        for _ in range(round(dt / _STEP_S)):
+            self._vehicle.step(_STEP_S)
+        sample = {**self._vehicle.sample(), "fault_code": self.fault_code}
+        updates = [self._update(iort_contract.VESC_STREAM, sample)]
+        if self.senses:
+            updates += self._sense(float(sample["speed"] or 0) / self._gain, dt)
+        return updates
+
+    def _sense(self, speed_mps: float, dt: float) -> list[dict[str, Any]]:
+        # A lap of about 50 m, narrower on one side.
+        self._driven_m += speed_mps * dt
+        turn = self._driven_m / 50 * 2 * math.pi
+        x_m, y_m = 10 * math.cos(turn), 6 * math.sin(turn) * (1 + 0.3 * math.cos(turn))
+        heading = math.atan2(y_m - self._y_m, x_m - self._x_m)
+        turned = (heading - self._heading + math.pi) % (2 * math.pi) - math.pi
+        yaw_rate = turned / dt if self._driven_m > speed_mps * dt * 2 else 0.0
+        self._x_m, self._y_m, self._heading = x_m, y_m, heading
+        longitudinal = (speed_mps - self._speed_mps) / dt
+        self._speed_mps = speed_mps
+        pose: dict[str, iort_contract.Value] = {
+            "pose.pose.position.x": round(x_m, 3),
+            "pose.pose.position.y": round(y_m, 3),
+            "twist.twist.linear.x": round(speed_mps, 3),
+            "child_frame_id": "base_link",
+        }
+        acceleration: dict[str, iort_contract.Value] = {
+            "linear_acceleration.x": round(longitudinal, 3),
+            "linear_acceleration.y": round(speed_mps * yaw_rate, 3),
+            "angular_velocity.z": round(yaw_rate, 3),
+        }
+        picture = camera.attachment(self.name, self._driven_m, yaw_rate)
+        return [
+            self._update("odom", pose),
+            self._update("imu", acceleration),
+            self._update("camera", picture),
+        ]
+
+    def _update(self, stream: str, sample: Mapping[str, iort_contract.Value]) -> dict[str, Any]:
+        seq = self._seqs[stream] = self._seqs.get(stream, -1) + 1
+        now_us = time.time_ns() // 1000
+        sent_us = now_us - int(_SENT_MS * 1000)
+        live = iort_contract.LiveSample(self._boot, seq, sent_us - 2_000, sent_us, dict(sample), 0, 0)
+        received_ms = int(now_us / 1000 - _RECEIVED_MS)
+        return iort_contract.live_update(
+            self.name, stream, live, received_ms, now_us - int(_LAMBDA_MS * 1000)
+        )
+
+
+class Publisher:
+    """A persistent connection to the stand-in."""
+
+    def __init__(self, *, origin: str, publish_key: str, subscribe_key: str) -> None:
+        self._connection = http.client.HTTPConnection(origin, timeout=30)
+        self._path = f"/publish/{publish_key}/{subscribe_key}/0"
+
+    def publish(self, update: Mapping[str, Any]) -> None:
+        """Publish on the robot's channel."""
+        path = f"{self._path}/{iort_contract.channel(update[iort_contract.ROBOT])}/0"
+        self._connection.request("POST", path, json.dumps(update), {"Content-Type": "application/json"})
+        answer = self._connection.getresponse()
+        answer.read()
+        if answer.status != http.HTTPStatus.OK:
+            raise OSError(f"the stand-in answered {answer.status}")
+
+    def close(self) -> None:
+        """Close the connection."""
+        self._connection.close()
+
+
+def drive(cars: list[SimulatedCar], publisher: Publisher, stop: threading.Event) -> None:
+    """Publish every car at `RATE_HZ`, evenly spread, until ``stop`` is set."""
+    began, turn = time.monotonic(), 0
+    while not stop.is_set():
+        for i, car in enumerate(cars):
+            due = began + (turn + i / len(cars)) / RATE_HZ
+            if stop.wait(max(0.0, due - time.monotonic())):
+                return
+            for update in car.updates(1 / RATE_HZ):
+                publisher.publish(update)
+        turn += 1
+
+
+def main() -> None:
+    """Drive until standard input ends."""
+    parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
+    for name in ("--origin", "--publish-key", "--subscribe-key"):
+        parser.add_argument(name, required=True)
+    parser.add_argument("--cars", type=int, default=20)
+    options = parser.parse_args()
+    publisher = Publisher(
+        origin=options.origin, publish_key=options.publish_key, subscribe_key=options.subscribe_key
+    )
+    cars = [SimulatedCar(f"car{i + 1}", i + 1) for i in range(options.cars)]
+    stop = threading.Event()
+    driving = threading.Thread(target=drive, args=(cars, publisher, stop))
+    driving.start()
+    sys.stdin.read()
+    stop.set()
+    driving.join()
+    publisher.close()
+
+
+if __name__ == "__main__":
+    main()

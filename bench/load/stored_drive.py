@@ -1,0 +1,56 @@
+"""Stores the batches of a simulated drive directly in the telemetry table, as the record rule does."""
+
+from __future__ import annotations
+
+import json
+import time
+from collections.abc import Sequence
+from typing import Any
+
+from boto3.dynamodb.types import TypeSerializer
+
+from bench.target import Target
+from iort_agent.sources.vehicle import Vehicle, VehicleConfig
+from iort_contract import (
+    EXPIRES_S,
+    RECEIVED_MS,
+    RECORD,
+    TOPIC,
+    VESC_STREAM,
+    Batch,
+    Value,
+    build_topic,
+    encode,
+)
+
+RATE_HZ = 50
+_KEPT_S = 86_400
+Sample = tuple[int, dict[str, Value]]
+
+
+def simulated(points: int) -> list[Sample]:
+    """Return the time in microseconds and the fields of every sample of a drive that ended a minute ago."""
+    vehicle = Vehicle(VehicleConfig(), seed=1)
+    first_us = (int(time.time()) - points // RATE_HZ - 60) * 1_000_000
+    samples = []
+    for i in range(points):
+        vehicle.step(1 / RATE_HZ)
+        samples.append((first_us + i * 1_000_000 // RATE_HZ, vehicle.sample()))
+    return samples
+
+
+def store(target: Target, robot: str, samples: Sequence[Sample]) -> list[dict[str, Any]]:
+    """Put one batch a second into the table; return the items."""
+    serialize = TypeSerializer().serialize
+    client, table = target.cloud.client("dynamodb"), target.cloud.output("storage", "TelemetryTable")
+    topic = build_topic(RECORD, robot, VESC_STREAM, target.cloud.namespace)
+    expires_s = int(time.time()) + _KEPT_S
+    items = []
+    for seq, at in enumerate(range(0, len(samples), RATE_HZ)):
+        second = samples[at : at + RATE_HZ]
+        columns = {name: [sample[name] for _, sample in second] for name in second[0][1]}
+        item = json.loads(encode(Batch("0badcafe", seq, [t_us for t_us, _ in second], columns)))
+        item |= {TOPIC: topic, RECEIVED_MS: second[-1][0] // 1000, EXPIRES_S: expires_s}
+        items.append({name: serialize(value) for name, value in item.items()})
+        client.put_item(TableName=table, Item=items[-1])
+    return items

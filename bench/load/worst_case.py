@@ -1,0 +1,145 @@
+"""The most expensive batches for Lambda 2. A hostile robot may send a hundred of them a second.
+
+    python -m bench.load.worst_case
+
+Each batch fits into a message. The command measures the processor time to decode and summarise it, without
+any table, and the memory that the decoded batch holds. For a refused batch it prints the reason.
+"""
+
+from __future__ import annotations
+
+import base64
+import json
+import random
+import time
+import tracemalloc
+import zlib
+from collections.abc import Iterator
+from typing import NamedTuple
+
+from rich.console import Console
+from rich.table import Table
+
+from iort_contract import (
+    BATCH,
+    CODEC,
+    DICTIONARY,
+    MAX_BATCH_VALUES,
+    PLAIN_CODEC,
+    Batch,
+    BatchId,
+    ContractError,
+    decode,
+    encode,
+)
+from iort_contract.statistics import summarize_second
+
+_BOOT, _T_US = "0badcafe", 1_700_000_000_000_000
+_TIMES = 5
+# The most expensive case in the current codec.
+_WORST = f"{MAX_BATCH_VALUES:,} texts full of escapes"
+
+
+class Case(NamedTuple):
+    """A message and its description."""
+
+    what: str
+    message: bytes
+
+
+class Cost(NamedTuple):
+    """The least processor time of a few runs in ms, the memory held in MB, and why it was refused, if so."""
+
+    ms: float
+    held_mb: float
+    refused: str
+
+
+def worst_batches(count: int, *, first_us: int = _T_US) -> Iterator[bytes]:
+    """Yield ``count`` batches of a stream, one for each second, as expensive as the contract allows."""
+    (message,) = (case.message for case in cases() if case.what == _WORST)
+    envelope = json.loads(message)
+    for number in range(count):
+        envelope[BATCH] = str(BatchId(first_us + number * 1_000_000, _BOOT, number))
+        yield json.dumps(envelope).encode()
+
+
+def cases() -> Iterator[Case]:
+    """Yield the most expensive batches that we know, and the largest batch of a good car."""
+    n, fields = 4000, 500
+    zeros = _columns(n, [b"[1.0%s]" % (b",1.0" * (n - 1))] * fields)
+    yield Case("two million equal values, in the codec of before", _message(PLAIN_CODEC, n, zeros))
+    steps = _columns(n, [b"[3,1%s]" % (b",0" * (n - 1))] * 490)
+    yield Case("two million equal values", _message(CODEC, n, steps))
+    lists = _columns(1, [b"[%s0]" % (b"[]," * 1_300_000)])
+    yield Case("a million empty lists", _message(CODEC, 1, lists))
+    n = MAX_BATCH_VALUES
+    texts = [b"[0.5%s]" % ((b',"' + rb"\n" * 75 + b'"') * (n - 1))]
+    yield Case(
+        f"{n:,} texts full of escapes, in the codec of before", _message(PLAIN_CODEC, n, _columns(n, texts))
+    )
+    texts = [b"[null%s]" % ((b',"' + rb"\n" * 36 + b'"') * n)]
+    yield Case(_WORST, _message(CODEC, n, _columns(n, texts)))
+    numbers = [b"[3,1000%s]" % (b",500" * (n - 1))]
+    yield Case(f"{n:,} numbers of one field", _message(CODEC, n, _columns(n, numbers)))
+    chance = random.Random(1)  # noqa: S311 - a noise, not a secret
+    n = 434
+    columns = {f"f{i}": [round(chance.gauss(10, 3), 3) for _ in range(n)] for i in range(46)}
+    batch = Batch(_BOOT, 0, range(_T_US, _T_US + 1000 * n, 1000), columns)
+    yield Case(f"the agent's own largest: {n} samples of 46 fields", encode(batch))
+
+
+def measure(message: bytes) -> Cost:
+    """Measure Lambda 2's work on a message, without its tables."""
+    refused, spent_ms = "", []
+    for _ in range(_TIMES):
+        began = time.process_time()
+        try:
+            batch = decode(message)
+            summarize_second(batch.t_us // 1_000_000, [batch], None)
+        except ContractError as error:
+            refused = str(error)
+        spent_ms.append((time.process_time() - began) * 1000)
+    return Cost(min(spent_ms), 0.0 if refused else _held_mb(message), refused)
+
+
+def _held_mb(message: bytes) -> float:
+    tracemalloc.start()
+    try:
+        batch = decode(message)
+        held, _ = tracemalloc.get_traced_memory()
+        del batch
+    finally:
+        tracemalloc.stop()
+    return held / 1e6
+
+
+def _columns(n: int, columns: list[bytes]) -> bytes:
+    named = b",".join(b'"f%d":%s' % each for each in enumerate(columns))
+    return b'{"dt":[0%s],"fields":{%s}}' % (b",1" * (n - 1), named)
+
+
+def _message(codec: str, n: int, body: bytes) -> bytes:
+    deflater = zlib.compressobj(9, zdict=DICTIONARY if codec == CODEC else b"")
+    samples = base64.b64encode(deflater.compress(body) + deflater.flush()).decode()
+    head = json.loads(encode(Batch(_BOOT, 0, [_T_US], {})))
+    return json.dumps({**head, "n": n, "codec": codec, "samples": samples}).encode()
+
+
+def main() -> None:
+    """Measure and print."""
+    table = Table("batch", "on the wire", "processor time", "held", "refused")
+    for case in cases():
+        cost = measure(case.message)
+        table.add_row(
+            case.what,
+            f"{len(case.message) / 1024:.1f} KB",
+            f"{cost.ms:.0f} ms",
+            f"{cost.held_mb:.1f} MB",
+            cost.refused[:40],
+        )
+    Console().print(table)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,161 @@
+"""Measures round trips over every path and of the floor at the same time, each on its own connection."""
+
+from __future__ import annotations
+
+import threading
+import time
+from collections.abc import Mapping
+from contextlib import ExitStack
+from typing import Any
+
+from typing_extensions import Self
+
+from bench.errors import BenchError
+from bench.floors.raw_mqtt import RawClient
+from iort_agent.clock import SystemClock
+from iort_agent.config.file import load_config
+from iort_agent.dispatch import Dispatcher
+from iort_agent.lanes.pings import Pings
+from iort_agent.lanes.rate_limiter import Allowance
+from iort_agent.mqtt.aws import IotCore
+from iort_contract import BROKER, PING, PONG, RTT_FIELDS, Value, build_topic, encode_ping
+from iort_station.fleet.robots import Bundle
+
+RAW = "raw client"
+# Bytes of a ping besides its padding, approximately.
+_ENVELOPE = 60
+_CONNECT_S = 30.0
+# Time to subscribe again before the first ping.
+_SET_UP_S = 0.3
+
+
+class RoundTrips:
+    """One uplink of the agent for each path, and the raw client, connected from `__enter__` to `__exit__`.
+
+    ``port`` is the port of a proxy before the broker, if there is one.
+    """
+
+    def __init__(
+        self, bundles: Mapping[str, Bundle], floor: Bundle, namespace: str, port: int | None = None
+    ) -> None:
+        self._uplinks = {path: _Connected(bundle, port) for path, bundle in bundles.items()}
+        self.raw = RawClient(floor.folder, port)
+        self._topic = build_topic(PING, floor.robot, BROKER, namespace)
+        self._exit = ExitStack()
+
+    def __enter__(self) -> Self:
+        with ExitStack() as stack:
+            for uplink in self._uplinks.values():
+                stack.enter_context(uplink)
+            stack.enter_context(self.raw)
+            self.raw.subscribe(self._topic)
+            self._exit = stack.pop_all()
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._exit.close()
+
+    @property
+    def lost(self) -> int:
+        """Pings that did not come back."""
+        return sum(uplink.lost for uplink in self._uplinks.values())
+
+    def measure(self, *, size: int, rate_hz: int, lasts_s: float) -> dict[str, list[float]]:
+        """Return the round trips in ms over each path and of the floor, measured for ``lasts_s`` seconds."""
+        found: dict[str, list[float]] = {}
+        # Each has its own part of the period, so that none waits for another's message.
+        names = (*self._uplinks, RAW)
+        starts_s = {name: i / len(names) / rate_hz for i, name in enumerate(names)}
+        began = time.perf_counter() + _SET_UP_S
+        pause = threading.Event()
+
+        def ours(path: str) -> None:
+            found[path] = self._uplinks[path].measure(path, rate_hz, size, began + starts_s[path], lasts_s)
+
+        def floor() -> None:
+            payload = encode_ping(1, time.time_ns() // 1000, "x" * max(0, size - _ENVELOPE))
+            values = found[RAW] = []
+            due = began + starts_s[RAW]
+            # One at a time: if a round trip takes longer than the period, the next ping leaves when it ends.
+            while due < began + lasts_s:
+                pause.wait(max(0.0, due - time.perf_counter()))
+                values.append(self.raw.round_trip(self._topic, payload) * 1000)
+                due = max(due + 1 / rate_hz, time.perf_counter())
+
+        threads = [threading.Thread(target=ours, args=(path,)) for path in self._uplinks]
+        threads.append(threading.Thread(target=floor))
+        for thread in threads:
+            thread.start()
+        for thread in threads:
+            thread.join()
+        missing = [name for name in names if not found.get(name)]
+        if missing:
+            raise BenchError(f"nothing was measured over {', '.join(missing)}")
+        return found
+
+
+class _Connected:
+    """The agent's uplink of a bundle, connected from `__enter__` to `__exit__`, to ``port`` if given."""
+
+    def __init__(self, bundle: Bundle, port: int | None) -> None:
+        self.config = load_config(bundle.config)
+        self.clock = SystemClock()
+        self.lost = 0
+        self.uplink = IotCore(
+            endpoint=self.config.endpoint,
+            port=port or self.config.port,
+            client_id=self.config.robot,
+            certificate=self.config.certificate,
+            private_key=self.config.private_key,
+            root_ca=self.config.root_ca,
+            clock=self.clock,
+            dispatcher=Dispatcher(),
+        )
+
+    def __enter__(self) -> Self:
+        connected = threading.Event()
+        self.uplink.on_connection(lambda up: connected.set() if up else None)
+        self.uplink.start()
+        if not connected.wait(_CONNECT_S):
+            raise BenchError(f"{self.config.robot} was not connected within {_CONNECT_S:.0f} s")
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.uplink.stop(5.0)
+
+    def measure(self, path: str, rate_hz: float, size: int, begins: float, seconds: float) -> list[float]:
+        """Round trips over a path from then on, in milliseconds, by the agent's own pings."""
+        trips: list[float] = []
+
+        def emit(_stream: str, _t_us: int, values: Any) -> None:
+            value: Value = values[RTT_FIELDS[path]]
+            if isinstance(value, (int, float)):
+                trips.append(float(value))
+
+        pings = Pings(
+            robot=self.config.robot,
+            namespace=self.config.namespace,
+            paths=[path],
+            rate_hz=rate_hz,
+            padding_bytes=max(0, size - _ENVELOPE),
+            uplink=self.uplink,
+            clock=self.clock,
+            allowance=Allowance(self.clock, publishes_per_s=1e6, bytes_per_s=1e9),
+            emit=emit,
+            on_stamp=lambda _sent, _received, _stamp_ms: None,
+        )
+        stop = threading.Event()
+        lane = PING if path == BROKER else PONG
+        answers = build_topic(lane, self.config.robot, path, self.config.namespace)
+        while not self.uplink.subscribed(answers):
+            stop.wait(0.02)
+        stop.wait(max(0.0, begins - time.perf_counter()))
+        runner = threading.Thread(target=pings.run, args=(stop,), daemon=True)
+        runner.start()
+        stop.wait(seconds)
+        stop.set()
+        pings.wake()
+        runner.join()
+        pings.close(5.0)
+        self.lost += pings.report()[path].lost
+        return trips

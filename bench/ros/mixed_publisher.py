@@ -1,0 +1,73 @@
+"""One node of the mixed robot; runs under a Python with rospy.
+
+python -m bench.ros.mixed_publisher NODE SECONDS SUBSCRIBERS
+
+Waits for the subscribers of each of its topics, then for a line on its input. Publishes each topic at its
+rate with time stamps of now. At the end it prints the number of messages by topic, as JSON.
+"""
+
+import heapq
+import json
+import sys
+import threading
+import time
+from typing import Any
+
+import genpy.dynamic
+import rospy
+
+from bench.ros.mixed_robot import HEADER, NODES, Topic
+
+# Messages that a subscriber's connection may hold: a second of the fastest topic.
+_QUEUE = 1000
+
+
+class Line:
+    """One topic, with its publisher and its next message."""
+
+    def __init__(self, topic: Topic) -> None:
+        self.topic = topic
+        self.sent = 0
+        self._classes: Any = genpy.dynamic.generate_dynamic(topic.kind, topic.definition)
+        self._message = self._classes[topic.kind]()
+        self.publisher = rospy.Publisher(
+            topic.name, type(self._message), queue_size=_QUEUE, tcp_nodelay=True, latch=topic.rate_hz == 0
+        )
+
+    def publish(self) -> None:
+        """Publish the next message."""
+        self.topic.fill(self._message, self._classes, self.sent)
+        if self.topic.time == HEADER:
+            self._message.header.stamp = genpy.Time.from_sec(time.time())
+            self._message.header.frame_id = self.topic.frame
+        self.publisher.publish(self._message)
+        self.sent += 1
+
+
+def main() -> None:
+    """Publish until the seconds are over."""
+    node, seconds, subscribers = sys.argv[1], float(sys.argv[2]), int(sys.argv[3])
+    rospy.init_node(node, disable_signals=True)
+    lines = [Line(topic) for topic in NODES[node]]
+    pause = threading.Event()
+    while any(line.publisher.get_num_connections() < subscribers for line in lines):
+        pause.wait(0.01)
+    print("ready", flush=True)
+    sys.stdin.readline()
+    began = time.monotonic()
+    # When which line is next.
+    due = [(0.0, i) for i in range(len(lines))]
+    while due:
+        at_s, i = heapq.heappop(due)
+        ahead_s = began + at_s - time.monotonic()
+        if ahead_s > 0:
+            pause.wait(ahead_s)
+        lines[i].publish()
+        rate_hz = lines[i].topic.rate_hz
+        if rate_hz and lines[i].sent / rate_hz < seconds:
+            heapq.heappush(due, (lines[i].sent / rate_hz, i))
+    print(json.dumps({line.topic.name: line.sent for line in lines}), flush=True)
+    sys.stdin.readline()
+
+
+main()

@@ -1,0 +1,234 @@
+"""The mixed robot of the bench: its topics, their types as text, and values like those of real sensors.
+
+Types come from the text, as every subscriber gets them, so that only Debian's rospy has to be installed.
+"""
+
+from __future__ import annotations
+
+import math
+import random
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from typing import Any
+
+from bench.ros import vesc_message
+
+_SEPARATOR = "\n" + "=" * 80 + "\n"
+_PARTS = {
+    "std_msgs/Header": "uint32 seq\ntime stamp\nstring frame_id",
+    "geometry_msgs/Point": "float64 x\nfloat64 y\nfloat64 z",
+    "geometry_msgs/Vector3": "float64 x\nfloat64 y\nfloat64 z",
+    "geometry_msgs/Quaternion": "float64 x\nfloat64 y\nfloat64 z\nfloat64 w",
+    "geometry_msgs/Pose": "Point position\nQuaternion orientation",
+    "geometry_msgs/Twist": "Vector3 linear\nVector3 angular",
+    "geometry_msgs/PoseWithCovariance": "Pose pose\nfloat64[36] covariance",
+    "geometry_msgs/TwistWithCovariance": "Twist twist\nfloat64[36] covariance",
+    "geometry_msgs/Transform": "Vector3 translation\nQuaternion rotation",
+    "geometry_msgs/TransformStamped": "Header header\nstring child_frame_id\nTransform transform",
+    "nav_msgs/MapMetaData": (
+        "time map_load_time\nfloat32 resolution\nuint32 width\nuint32 height\ngeometry_msgs/Pose origin"
+    ),
+    "diagnostic_msgs/KeyValue": "string key\nstring value",
+    "diagnostic_msgs/DiagnosticStatus": (
+        "byte OK=0\nbyte level\nstring name\nstring message\nstring hardware_id\nKeyValue[] values"
+    ),
+    # A message of a lab's own: a header that is not its first field.
+    "lab_msgs/Contact": "Header header\nfloat32 force\nbool touching",
+}
+_IMU = (
+    "Header header\ngeometry_msgs/Quaternion orientation\nfloat64[9] orientation_covariance\n"
+    "geometry_msgs/Vector3 angular_velocity\nfloat64[9] angular_velocity_covariance\n"
+    "geometry_msgs/Vector3 linear_acceleration\nfloat64[9] linear_acceleration_covariance"
+)
+_SCAN = (
+    "Header header\nfloat32 angle_min\nfloat32 angle_max\nfloat32 angle_increment\nfloat32 time_increment\n"
+    "float32 scan_time\nfloat32 range_min\nfloat32 range_max\nfloat32[] ranges\nfloat32[] intensities"
+)
+_ODOM = (
+    "Header header\nstring child_frame_id\ngeometry_msgs/PoseWithCovariance pose\n"
+    "geometry_msgs/TwistWithCovariance twist"
+)
+_POSE = ("geometry_msgs/Pose", "geometry_msgs/Point", "geometry_msgs/Quaternion")
+_RANGES, _MAP_CELLS = 720, 200
+_ARM, _GRIPPER = tuple(f"joint_{i}" for i in range(1, 7)), ("finger_left", "finger_right")
+_FRAMES = (("odom", "base_link"), ("base_link", "laser"))
+_noise = random.Random(1).random  # noqa: S311 - a sensor's noise, no secret
+HEADER, ARRIVAL = "header", "arrival"
+# Classes of a topic's type and its parts by name.
+Classes = Mapping[str, Any]
+
+
+def _text(own: str, *parts: str) -> str:
+    return own + "".join(f"{_SEPARATOR}MSG: {part}\n{_PARTS[part]}" for part in parts)
+
+
+@dataclass(frozen=True)
+class Topic:
+    """A topic of one node. ``fill`` sets the fields of a message, except for the header.
+
+    A rate of 0 is one message, latched.
+    """
+
+    name: str
+    stream: str
+    kind: str
+    definition: str
+    rate_hz: int
+    fill: Callable[[Any, Classes, int], None]
+    frame: str = ""
+
+    @property
+    def time(self) -> str:
+        """Return the kind of time that the agent uses for the topic."""
+        return HEADER if self.definition.startswith("Header header") else ARRIVAL
+
+
+def _vesc(message: Any, _: Classes, i: int) -> None:
+    for name, value in zip(vesc_message.FIELDS, vesc_message.values(i), strict=True):
+        setattr(message.state, name, value)
+
+
+def _imu(message: Any, _: Classes, i: int) -> None:
+    # Whole steps of 16-bit converters: 2 g and 250 degrees a second.
+    turn, pull = message.angular_velocity, message.linear_acceleration
+    turn.x, turn.y, turn.z = (round(40 * _noise() - 20) * math.radians(250) / 32768 for _ in range(3))
+    turn.z += round(9000 * math.sin(i / 700)) * math.radians(250) / 32768
+    pull.x, pull.y, pull.z = (round(200 * _noise() + at) * 2 * 9.80665 / 32768 for at in (-100, -100, 16284))
+    message.orientation.w, message.orientation.z = math.cos(i / 3000), math.sin(i / 3000)
+    message.orientation_covariance = [0.01, 0, 0, 0, 0.01, 0, 0, 0, 0.01]
+
+
+def _joints(names: tuple[str, ...]) -> Callable[[Any, Classes, int], None]:
+    def fill(message: Any, _: Classes, i: int) -> None:
+        message.name = list(names)
+        # Steps of an encoder of 4,096 a turn.
+        message.position = [
+            round(900 * math.sin(i / 80 + joint)) * math.tau / 4096 for joint in range(len(names))
+        ]
+        message.velocity = [round(560 * math.cos(i / 80 + joint)) / 1000 for joint in range(len(names))]
+
+    return fill
+
+
+def _tf(message: Any, classes: Classes, i: int) -> None:
+    # Every other message has the laser's transform too, as where two nodes publish.
+    message.transforms = [classes["geometry_msgs/TransformStamped"]() for _ in range(1 + i % 2)]
+    for transform, (parent, child) in zip(message.transforms, _FRAMES, strict=False):
+        transform.header.frame_id, transform.child_frame_id = parent, child
+        transform.header.seq = i
+        transform.transform.rotation.w = 1.0
+    moved = message.transforms[0].transform
+    moved.translation.x, moved.translation.y = 5 * math.cos(i / 500), 5 * math.sin(i / 500)
+    moved.rotation.z, moved.rotation.w = math.sin(i / 1000), math.cos(i / 1000)
+
+
+def _scan(message: Any, _: Classes, i: int) -> None:
+    message.angle_min, message.angle_max = -math.pi, math.pi
+    message.angle_increment, message.scan_time = math.tau / _RANGES, 0.05
+    message.range_min, message.range_max = 0.1, 12.0
+    # A room to the millimetre, with the sensor's noise.
+    message.ranges = [
+        round(4000 + 1500 * math.cos((k + i) / 57) + 12 * _noise()) / 1000 for k in range(_RANGES)
+    ]
+
+
+def _odom(message: Any, _: Classes, i: int) -> None:
+    message.child_frame_id = "base_link"
+    pose, twist = message.pose.pose, message.twist.twist
+    pose.position.x, pose.position.y = 5 * math.cos(i / 500), 5 * math.sin(i / 500)
+    pose.orientation.z, pose.orientation.w = math.sin(i / 1000), math.cos(i / 1000)
+    twist.linear.x, twist.angular.z = 0.5 + round(20 * _noise()) / 1000, 0.1
+    message.pose.covariance = [0.2 if k % 7 == 0 else 0.0 for k in range(36)]
+
+
+def _diagnostics(message: Any, classes: Classes, i: int) -> None:
+    message.status = []
+    for name in ("motor", "battery", "laser"):
+        status = classes["diagnostic_msgs/DiagnosticStatus"]()
+        status.name, status.hardware_id = f"base: {name}", f"{name}-1"
+        status.level, status.message = i % 11 == 0, "OK" if i % 11 else "late by 12 ms"
+        value = classes["diagnostic_msgs/KeyValue"]()
+        value.key, value.value = "temperature", f"{31 + i % 7}.5 C"
+        status.values = [value]
+        message.status.append(status)
+
+
+def _contact(message: Any, _: Classes, i: int) -> None:
+    message.grip.header.seq, message.grip.header.frame_id = i, "finger_left"
+    message.grip.force, message.grip.touching = (i % 50) / 10, i % 50 > 10
+    message.label = "cup"
+
+
+def _map(message: Any, _: Classes, __: int) -> None:
+    message.info.resolution, message.info.width, message.info.height = 0.05, _MAP_CELLS, _MAP_CELLS
+    message.info.origin.orientation.w = 1.0
+    # Known within a circle, with a wall around it.
+    half = _MAP_CELLS // 2
+    far = [math.hypot(k % _MAP_CELLS - half, k // _MAP_CELLS - half) for k in range(_MAP_CELLS**2)]
+    message.data = [0 if away < half - 8 else 100 if away < half - 5 else -1 for away in far]
+
+
+def _nothing(_: Any, __: Classes, ___: int) -> None:
+    pass
+
+
+_STATES = "Header header\nstring[] name\nfloat64[] position\nfloat64[] velocity\nfloat64[] effort"
+_JOINTS = ("sensor_msgs/JointState", _text(_STATES, "std_msgs/Header"))
+# The topics of each node.
+NODES: dict[str, tuple[Topic, ...]] = {
+    "base": (
+        Topic("/sensors/core", "vesc", vesc_message.TYPE, vesc_message.DEFINITION, 50, _vesc, "base_link"),
+        Topic(
+            "/imu", "imu", "sensor_msgs/Imu",
+            _text(_IMU, "std_msgs/Header", "geometry_msgs/Quaternion", "geometry_msgs/Vector3"),
+            1000, _imu, "imu",
+        ),
+        Topic(
+            "/tf", "tf", "tf2_msgs/TFMessage",
+            _text(
+                "geometry_msgs/TransformStamped[] transforms", "geometry_msgs/TransformStamped",
+                "std_msgs/Header", "geometry_msgs/Transform", "geometry_msgs/Vector3",
+                "geometry_msgs/Quaternion",
+            ),
+            50, _tf,
+        ),
+        Topic("/joint_states", "joints", *_JOINTS, 50, _joints(_ARM)),
+        Topic("/scan", "scan", "sensor_msgs/LaserScan", _text(_SCAN, "std_msgs/Header"), 20, _scan, "laser"),
+        Topic(
+            "/odom", "odom", "nav_msgs/Odometry",
+            _text(
+                _ODOM, "std_msgs/Header", "geometry_msgs/PoseWithCovariance", *_POSE,
+                "geometry_msgs/TwistWithCovariance", "geometry_msgs/Twist", "geometry_msgs/Vector3",
+            ),
+            50, _odom, "odom",
+        ),
+        Topic(
+            "/diagnostics", "diagnostics", "diagnostic_msgs/DiagnosticArray",
+            _text(
+                "Header header\nDiagnosticStatus[] status", "std_msgs/Header",
+                "diagnostic_msgs/DiagnosticStatus", "diagnostic_msgs/KeyValue",
+            ),
+            1, _diagnostics,
+        ),
+        Topic("/tick", "tick", "std_msgs/Empty", "", 5, _nothing),
+        Topic(
+            "/contact", "contact", "lab_msgs/LabelledContact",
+            _text("string label\nContact grip", "lab_msgs/Contact", "std_msgs/Header"),
+            10, _contact,
+        ),
+        Topic(
+            "/map", "map", "nav_msgs/OccupancyGrid",
+            _text(
+                "Header header\nMapMetaData info\nint8[] data", "std_msgs/Header", "nav_msgs/MapMetaData",
+                *_POSE,
+            ),
+            0, _map, "map",
+        ),
+    ),
+    "gripper": (Topic("/joint_states", "joints", *_JOINTS, 50, _joints(_GRIPPER)),),
+}  # fmt: skip
+
+
+def topics() -> dict[str, Topic]:
+    """Return each topic of all nodes once, by name."""
+    return {topic.name: topic for node in NODES.values() for topic in node}

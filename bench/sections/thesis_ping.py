@@ -1,0 +1,159 @@
+"""Round trips, and the delay to the dashboard, with the ping of the thesis added, beside its figures.
+
+The project's proxy stands before the broker, and another before PubNub's stand-in: each delays every byte by
+25 ms, both ways. The thesis' car had a ping of 50 ms to its cloud.
+"""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Mapping
+from dataclasses import asdict
+from typing import Any
+
+from bench.errors import BenchError
+from bench.load.agent_process import AgentProcess
+from bench.meters.round_trips import RAW, RoundTrips
+from bench.report import plots
+from bench.report.result import NOT_MEASURED, Plot, Ratio, Section, Table
+from bench.report.spread import ratio, spread
+from bench.report.thesis import PING_MS, SOURCE
+from bench.target import Say, Target
+from iort_contract import BROKER, PING_PATHS, T_US, VESC_STREAM
+from iort_station.fleet.robots import Bundle
+from iort_station.page import keys
+from iort_station.page.listener import Listener
+from local.figures import THESIS, THESIS_MS
+from local.proxy import Proxy
+
+ONE_WAY_S = PING_MS / 2 / 1000
+WITH = f"with {ONE_WAY_S * 1000:.0f} ms each way"
+SIZE = 512
+RATES_HZ = (1, 10, 50)
+DASHBOARD, ECHO = "dashboard", "TLS echo (PINGREQ)"
+_REPEATS, _LASTS_S = 3, 4.0
+_DRIVE_S, _WARM_UP_S = 12.0, 3.0
+# Values in ms, a list a repeat.
+Repeats = list[list[float]]
+
+
+def measure(target: Target, bundles: Mapping[str, Bundle], floor: Bundle, say: Say) -> dict[str, Repeats]:
+    """Return the values by ``<way> at <rate> Hz``, and those of the dashboard and the echo."""
+    found: dict[str, Repeats] = {}
+    cloud = target.cloud
+    with Proxy(cloud.mqtt_endpoint, cloud.mqtt_port, latency_s=ONE_WAY_S) as proxy:
+        with RoundTrips(bundles, floor, cloud.namespace, proxy.port) as lines:
+            for repeat in range(_REPEATS):
+                for rate_hz in RATES_HZ:
+                    say(f"{WITH}, {rate_hz} Hz, {repeat + 1} of {_REPEATS}")
+                    for way, values in lines.measure(size=SIZE, rate_hz=rate_hz, lasts_s=_LASTS_S).items():
+                        found.setdefault(_key(way, rate_hz), []).append(values)
+            found[ECHO] = [[lines.raw.ping() * 1000 for _ in range(20)]]
+        if lines.lost:
+            raise BenchError(f"{WITH}: {lines.lost} pings did not come back")
+        say(f"{WITH}, to a PubNub subscriber")
+        found[DASHBOARD] = [_to_subscriber(target, proxy.port)]
+    return found
+
+
+def _to_subscriber(target: Target, port: int) -> list[float]:
+    """Return the delays in ms from the sample in a driving car to the subscriber, by one clock."""
+    bundle = target.robot(
+        "bench-far", port=port, sources=[{"type": "sim", "stream": VESC_STREAM, "rate_hz": 50}]
+    )
+    pubnub = keys.load(target.cloud).reading()
+    host, _, its_port = pubnub.pop("origin").partition(":")
+    delays_ms: list[float] = []
+    with (
+        Proxy(host, int(its_port), latency_s=ONE_WAY_S) as proxy,
+        Listener(
+            robot=bundle.robot,
+            namespace=target.cloud.namespace,
+            origin=f"{host}:{proxy.port}",
+            on_update=lambda update, _, here_us: delays_ms.append((here_us - update[T_US]) / 1000),
+            **pubnub,
+        ),
+        AgentProcess(bundle),
+    ):
+        threading.Event().wait(_WARM_UP_S)
+        delays_ms.clear()
+        threading.Event().wait(_DRIVE_S)
+        measured = list(delays_ms)
+    if not measured:
+        raise BenchError(f"{WITH}: no live update was heard")
+    return measured
+
+
+def report(section: Section, found: Mapping[str, Repeats]) -> None:
+    """Add the table, the picture and the ratios."""
+    head = ["way", *(f"at {rate_hz} Hz" for rate_hz in RATES_HZ), "thesis, 2018"]
+    rows = [
+        [f"{name}, {WITH}", *(_text(found.get(_key(way, rate_hz))) for rate_hz in RATES_HZ), thesis]
+        for way, name, thesis in (
+            *((path, f"robot - {path}", f"{THESIS[path]} ms") for path in PING_PATHS),
+            (RAW, "floor: raw MQTT client", NOT_MEASURED),
+        )
+    ]
+    live = _text(found[DASHBOARD])
+    rows.append(
+        [f"car to PubNub subscriber, {WITH}", NOT_MEASURED, live, NOT_MEASURED, f"{THESIS[DASHBOARD]} ms"]
+    )
+    rows.append([f"{ECHO}, {WITH}", _text(found[ECHO]), NOT_MEASURED, NOT_MEASURED, f"{PING_MS} ms (ping)"])
+    section.tables.append(
+        Table(f"On the thesis' ground, 0.5 KB {WITH}: median (p95, p99; range)", head, rows)
+    )
+    usual = {path: found[_key(path, 10)] for path in (*PING_PATHS, RAW)} | {DASHBOARD: found[DASHBOARD]}
+    spreads = {way: one for way, values in usual.items() if (one := spread(values)) is not None}
+    title = f"0.5 KB at 10 Hz {WITH}, and the {SOURCE}"
+    named = {
+        way: "car to subscriber" if way == DASHBOARD else way if way == RAW else f"robot - {way}"
+        for way in spreads
+    }
+    section.plots.append(
+        Plot(
+            "round-trips-far",
+            title,
+            plots.ranges(
+                title,
+                [*named.values()],
+                {
+                    "iort, median to p95": {named[way]: (one.p50, one.p95) for way, one in spreads.items()},
+                    "thesis": {named[way]: THESIS_MS[way] for way in spreads if way in THESIS_MS},
+                },
+                unit="ms",
+            ),
+        )
+    )
+    beside = ratio(usual[BROKER], usual[RAW])
+    if beside is not None:
+        section.ratios.append(Ratio(f"broker round trip / raw MQTT client, {WITH}", round(beside, 3), 1.1))
+    for way, name in named.items():
+        if way in THESIS_MS:
+            most = THESIS_MS[way][1]
+            section.ratios.append(
+                Ratio(
+                    f"{name} {WITH} / thesis' {most} ms",
+                    round(spreads[way].p50 / most, 3),
+                    1.0,
+                    by_machine=True,
+                )
+            )
+    section.notes.append(
+        f"The thesis' figures hold a ping of {PING_MS} ms between car and cloud; {WITH}, by a proxy before "
+        "the broker, ours hold the same. The way to the subscriber has as much again between PubNub and the "
+        "subscriber. The raw client sends one message at a time, so at most 20 a second there."
+    )
+    section.raw["far"] = {
+        way: {key: round(value, 3) for key, value in asdict(one).items()}
+        for way, values in found.items()
+        if (one := spread(values)) is not None
+    }
+
+
+def _key(way: str, rate_hz: int) -> str:
+    return f"{way} at {rate_hz} Hz"
+
+
+def _text(values: Any) -> str:
+    shown = spread(values) if values else None
+    return NOT_MEASURED if shown is None else shown.text("ms", 1)

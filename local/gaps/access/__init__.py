@@ -1,0 +1,1 @@
+"""Gaps of IAM: the action and the resource that a request is checked for."""

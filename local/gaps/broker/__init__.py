@@ -1,0 +1,1 @@
+"""Gaps of the MQTT broker: listeners, sessions, certificates, message size."""

@@ -1,0 +1,1 @@
+"""Gaps of AWS Lambda: asynchronous events, stream mappings, logs."""

@@ -1,0 +1,1 @@
+"""Gaps of CloudWatch: metrics that nobody records, SEARCH, alarms."""

@@ -1,0 +1,1 @@
+"""Gaps of AWS IoT rules: SQL and actions."""

@@ -1,0 +1,1 @@
+"""Gaps of DynamoDB and SQS: speed of a Query, messages lost."""

@@ -1,0 +1,164 @@
+"""The time of a Query.
+
+AWS: stores a partition in the order of its sort key, so that a Query reads only what it returns
+  (https://docs.aws.amazon.com/amazondynamodb/latest/developerguide/Query.html).
+ministack: sorts the whole partition for every Query and parses the key condition again for each item. Each
+  Query took longer with every minute of a drive. The answers are the same.
+Test: tests/local/test_table_gap.py::test_only_what_is_asked_for_is_looked_at
+Patch: none; it needs another data structure for the items of a table
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from decimal import InvalidOperation
+from functools import lru_cache, wraps
+from typing import Any
+from unittest.mock import Mock, patch
+
+from ministack.core.responses import request_scope
+from ministack.services import dynamodb
+
+from local.gaps.parts.partition import SHOWN, Bound, Item, Partition, Shown, Wanted, place_of
+
+_REMEMBERED_CONDITIONS = 16_384
+_LOW, _HIGH = {"EQ", "GE", "GT"}, {"EQ", "LE", "LT"}
+
+
+def install() -> None:
+    """Close the gap in this process."""
+    dynamodb._condition_syntax_error = lru_cache(_REMEMBERED_CONDITIONS)(dynamodb._condition_syntax_error)
+    dynamodb._set_item = ordering(dynamodb._set_item)
+    dynamodb._query = narrowing(dynamodb._query)
+    dynamodb._evaluate_condition = evaluating(dynamodb._evaluate_condition)
+
+
+def is_open() -> bool:
+    """Ask for one of ten items, and count how many are looked at."""
+    name, key = "gaps-query-time", [("p", "HASH", "S"), ("t", "RANGE", "N")]
+    with request_scope("000000000000", "eu-west-1"):
+        dynamodb._create_table(
+            {
+                "TableName": name,
+                "KeySchema": [{"AttributeName": n, "KeyType": k} for n, k, _ in key],
+                "AttributeDefinitions": [{"AttributeName": n, "AttributeType": t} for n, _, t in key],
+                "BillingMode": "PAY_PER_REQUEST",
+            }
+        )
+        try:
+            for n in range(10):
+                dynamodb._put_item({"TableName": name, "Item": {"p": {"S": "p"}, "t": {"N": str(n)}}})
+            condition = {"KeyConditionExpression": "p = :p", "ExpressionAttributeValues": {":p": {"S": "p"}}}
+            evaluate = Mock(side_effect=dynamodb._evaluate_condition)
+            with patch.object(dynamodb, "_evaluate_condition", evaluate):
+                dynamodb._query({"TableName": name, "Limit": 1, **condition})
+            return evaluate.call_count >= 10
+        finally:
+            dynamodb._delete_table({"TableName": name})
+
+
+def ordering(set_item: Callable[..., Any]) -> Callable[..., Any]:
+    """A write of an item that makes a new partition a `Partition`."""
+
+    @wraps(set_item)
+    def keep(table: Mapping[str, Any], partition: Any, place: str, item: Item) -> Any:
+        items = table["items"]
+        if partition not in items and (kind := _sorted_by(table)):
+            items[partition] = Partition(kind)
+        return set_item(table, partition, place, item)
+
+    return keep
+
+
+def _sorted_by(table: Mapping[str, Any]) -> str:
+    """The type of the table's sort key if its order is known here, else ""."""
+    name = table.get("sk_name")
+    kind = dynamodb._get_attr_type(table, name) if name else ""
+    return kind if kind in {"N", "S"} else ""
+
+
+def narrowing(query: Callable[..., Any]) -> Callable[..., Any]:
+    """A Query that looks only at items that it may return."""
+
+    @wraps(query)
+    def narrowed(data: Mapping[str, Any]) -> Any:
+        found = asked(data)
+        if found is None:
+            return query(data)
+        partition, wanted = found
+        token = SHOWN.set(Shown(partition, partition.between(wanted), data.get("ExclusiveStartKey")))
+        try:
+            return query(data)
+        finally:
+            SHOWN.reset(token)
+
+    return narrowed
+
+
+def evaluating(evaluate: Callable[..., bool]) -> Callable[..., bool]:
+    """An evaluation that looks at the key condition of a narrowed Query once."""
+
+    @wraps(evaluate)
+    def condition(expression: str, item: Item, *rest: Any, slot: str = "ConditionExpression") -> bool:
+        shown = SHOWN.get()
+        if shown is None or slot != "KeyConditionExpression":
+            return evaluate(expression, item, *rest, slot=slot)
+        if shown.evaluated:
+            return True
+        # A cursor is evaluated first, and may be wrong.
+        shown.evaluated = item is not shown.cursor
+        return evaluate(expression, item, *rest, slot=slot)
+
+    return condition
+
+
+def asked(data: Mapping[str, Any]) -> tuple[Partition, Wanted] | None:
+    """The partition and range of a Query; None if ministack has to look at all items."""
+    table = dynamodb._tables.get(dynamodb._normalize_table_name(data.get("TableName")))
+    condition = data.get("KeyConditionExpression")
+    if not table or not isinstance(condition, str) or data.get("IndexName") or data.get("KeyConditions"):
+        return None
+    try:
+        conditions = _conditions(condition, data)
+        compared, (value,) = conditions[table["pk_name"]]
+        partition = table["items"].get(dynamodb._extract_key_val(value))
+        if compared != "EQ" or not isinstance(partition, Partition):
+            return None
+        kind = partition.kind
+        low, high = _range(kind, *conditions.get(table["sk_name"], ("", ())))
+        most, cursor = data.get("Limit"), data.get("ExclusiveStartKey")
+        forward = data.get("ScanIndexForward", True) is not False
+        if cursor and forward:
+            low = Bound(place_of(kind, cursor[table["sk_name"]][kind]), open=True)
+        elif cursor:
+            high = Bound(place_of(kind, cursor[table["sk_name"]][kind]), open=True)
+        return partition, Wanted(low, high, forward, None if most is None else int(most) + 1)
+    except (KeyError, TypeError, ValueError, AttributeError, InvalidOperation):
+        return None
+
+
+def _range(
+    kind: str, compared: str, values: Sequence[Mapping[str, Any]]
+) -> tuple[Bound | None, Bound | None]:
+    places = [place_of(kind, value[kind]) for value in values]
+    if compared == "BETWEEN":
+        return Bound(places[0]), Bound(places[1])
+    low = Bound(places[0], compared == "GT") if compared in _LOW else None
+    high = Bound(places[0], compared == "LT") if compared in _HIGH else None
+    return low, high
+
+
+def _conditions(condition: str, data: Mapping[str, Any]) -> dict[str, tuple[str, list[Any]]]:
+    """Operator and values by attribute; raises `ValueError` for any other form of condition."""
+    names, values = data.get("ExpressionAttributeNames") or {}, data["ExpressionAttributeValues"]
+    found = {}
+    for clause in dynamodb._key_condition_clauses(dynamodb._tokenize(condition)):
+        kinds, texts = [kind for kind, _ in clause], [text for _, text in clause]
+        name = names[texts[0]] if kinds[0] == "NAME_REF" else texts[0]
+        if kinds[1:] == ["IDENT", "VALUE_REF", "IDENT", "VALUE_REF"] and texts[1].upper() == "BETWEEN":
+            found[name] = ("BETWEEN", [values[texts[2]], values[texts[4]]])
+        elif len(kinds) == 3 and kinds[1] in _LOW | _HIGH and kinds[2] == "VALUE_REF":
+            found[name] = (kinds[1], [values[texts[2]]])
+        else:
+            raise ValueError(condition)
+    return found

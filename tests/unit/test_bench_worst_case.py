@@ -1,0 +1,25 @@
+"""The most expensive batches: any robot could send them, and the contract refuses the unbounded ones."""
+
+from __future__ import annotations
+
+import iort_contract
+from bench.load.worst_case import cases, worst_batches
+
+
+def test_unbounded_batches_are_refused_and_the_others_are_read():
+    refused = []
+    for case in cases():
+        assert len(case.message) <= iort_contract.MAX_MESSAGE_BYTES
+        try:
+            iort_contract.decode(case.message)
+        except iort_contract.ContractError as error:
+            refused.append(str(error))
+        else:
+            refused.append("")
+    assert [reason[:12] for reason in refused] == ["samples hold"] * 3 + [""] * 4
+
+
+def test_worst_batches_cover_one_second_each():
+    found = [iort_contract.decode(message) for message in worst_batches(3, first_us=5_000_000)]
+    assert [(batch.t_us, batch.seq) for batch in found] == [(5_000_000, 0), (6_000_000, 1), (7_000_000, 2)]
+    assert {len(batch.times_us) for batch in found} == {iort_contract.MAX_BATCH_VALUES}

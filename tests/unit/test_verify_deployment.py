@@ -1,0 +1,90 @@
+"""How a deployment of `make verify-aws` is made, and what its teardown does whatever went wrong before."""
+
+from __future__ import annotations
+
+import signal
+from types import SimpleNamespace
+
+from botocore.exceptions import ClientError
+from rich.console import Console
+
+from bench.interrupts import wound_up
+from local.errors import LocalError
+from verify.deployment import Deployment
+from verify.preflight_deployed import STACKS
+
+
+class Account:
+    """An account in which the stacks have these states, one a look, and these policies are."""
+
+    namespace = "verify1"
+
+    def __init__(self, *states, policies=()):
+        self.states, self.policies, self.deleted = list(states), policies, []
+
+    def client(self, _service):
+        return self
+
+    def describe_stacks(self, *, StackName):
+        assert StackName.removeprefix("verify1-") in STACKS
+        if not self.states:
+            raise ClientError({"Error": {"Code": "ValidationError"}}, "DescribeStacks")
+        return {"Stacks": [{"StackStatus": self.states.pop(0)}]}
+
+    def get_paginator(self, operation):
+        assert operation == "list_policies"
+        page = {"policies": [{"policyName": name} for name in self.policies]}
+        return SimpleNamespace(paginate=lambda: [page])
+
+    def delete_policy(self, *, policyName):
+        self.deleted.append(policyName)
+
+
+class Commands:
+    """The CDK's command line, and how many states the account had left when it was called."""
+
+    def __init__(self, account, fails=""):
+        self.account, self.fails, self.said = account, fails, []
+
+    def __call__(self, name, command, **_how):
+        self.said.append((name, command, len(self.account.states)))
+        if self.fails:
+            raise LocalError(self.fails)
+
+
+def deployment(account, tmp_path, fails=""):
+    commands = Commands(account, fails)
+    return Deployment(account, tmp_path, lambda _: None, run=commands, poll_s=0.0), commands
+
+
+def test_no_stack_is_deleted_while_cloudformation_changes_it(tmp_path):
+    account = Account("UPDATE_IN_PROGRESS", "UPDATE_COMPLETE_CLEANUP_IN_PROGRESS")
+    one, commands = deployment(account, tmp_path)
+    assert one.destroy() == []
+    ((name, _, states_left),) = commands.said
+    assert (name, states_left) == ("cdk destroy", 0)
+
+
+def test_what_stays_is_told_and_the_rest_is_removed(tmp_path):
+    account = Account(policies=["verify1-verify-policy-3f", "verify1-robots", "verify12-verify-policy-3f"])
+    one, _ = deployment(account, tmp_path, fails="the stack stays")
+    assert one.destroy() == ["stacks: the stack stays"]
+    assert account.deleted == ["verify1-verify-policy-3f"]
+
+
+def test_what_cdk_json_says_for_another_deployment_does_not_count(tmp_path):
+    one, commands = deployment(Account(), tmp_path)
+    one.deploy({"customer_key": "true"})
+    ((_, command, _),) = commands.said
+    given = dict(pair.split("=", 1) for pair in command if "=" in pair)
+    assert given["stage"] == "dev"
+    assert (given["site"], given["old_telemetry"], given["customer_key"]) == ("false", "false", "true")
+
+
+def test_an_interrupt_does_not_end_the_putting_back():
+    done = []
+    with wound_up(Console(quiet=True)) as putting_back:
+        putting_back()
+        signal.raise_signal(signal.SIGINT)
+        done.append("put back")
+    assert done == ["put back"]
