@@ -29,10 +29,10 @@ _log = logging.getLogger(__name__)
 A_SECOND, BURST_S = 0.1, 0.3
 # The cost of the requests for a topic, or for a refused batch, besides CPU time.
 REQUESTS_S = 0.002
-# The keys of a message. The dearest batch, of 60 s, takes 2.6 s of a processor with the seconds beside
-# it, and the later function has 0.29 of one for 60 s.
+# The keys of a message. The most expensive batch, of 60 s, takes 2.6 s of CPU time with its neighbouring
+# seconds, and the later function has 0.29 cores for 60 s.
 KEYS = 4
-# SendMessageBatch takes as many.
+# The limit of SendMessageBatch.
 _MESSAGES = 10
 # A robot is notified again after this time; after a longer time within its share, it is notified anew.
 TELL_S, OVER_S = 30.0, 60.0

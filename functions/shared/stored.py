@@ -27,11 +27,11 @@ _ASIDE_US = 10_000_000
 # The limits of batches and column bytes per second and stream: a robot beyond them must not delay others. AWS
 # takes as many messages a second from a connection.
 SECOND_BATCHES, _SECOND_BYTES = 100, MAX_COLUMNS_BYTES
-# Seconds are read together until they are as much as one may be.
+# Seconds are read together up to the size limit of one.
 _TOGETHER_BYTES = _SECOND_BYTES
-# Of a second's neighbours so many are looked at: as many as the seconds to its sides may hold.
+# The number of a second's neighbours to read: as many as the seconds beside it may hold.
 _NUMBERS = SECOND_BATCHES * (2 * _ASIDE_US // _SECOND_US + 1)
-# Beside those of the event: the one before and the one after.
+# Besides the event's batches: the one before and the one after.
 _BESIDE = 2
 # An undecodable neighbour is skipped; this many of them end the search.
 _NEIGHBOURS = 10
@@ -93,7 +93,7 @@ class Reader:
         ids = [entry.batch.id for entry in stored]
         missing = missing_before(batch.id, ids)
         if missing:
-            # Clocks may interleave: what is missing here may lie some seconds to the side.
+            # Clocks may interleave, so a missing batch may lie some seconds away.
             missing = missing_before(batch.id, sorted({*ids, *self._numbers(batch.t_us // _SECOND_US)}))
         return missing
 

@@ -34,10 +34,9 @@ WRITE_SIZE = 25
 _WRITE_ATTEMPTS = 8
 # Page size, once many batches are wanted.
 _MANY = 100
-# How many streams a robot's row names, of which each write costs by its size, and how many an environment
-# knows to be there.
+# The limit of streams in a robot's row, since each write costs by its size; and of an environment's cache.
 MAX_STREAMS, _NOTED = 200, 50_000
-# What the operator changes in the registry counts after this time at the latest.
+# The operator's changes in the registry take effect within this time.
 VEHICLE_CACHE_S = 60.0
 # "Limits", items: 400 KB including the names; a margin is left for the size of numbers.
 _MAX_ITEM_BYTES = 380 * 1024
