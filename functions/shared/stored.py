@@ -29,7 +29,7 @@ _ASIDE_US = 10_000_000
 SECOND_BATCHES, _SECOND_BYTES = 100, MAX_COLUMNS_BYTES
 # Seconds are read together until they are as much as one may be.
 _TOGETHER_BYTES = _SECOND_BYTES
-# Of a second's neighbours so many are looked at: as many as the seconds to its sides may hold.
+# The number of a second's neighbours to read: as many as the seconds beside it may hold.
 _NUMBERS = SECOND_BATCHES * (2 * _ASIDE_US // _SECOND_US + 1)
 # Beside those of the event: the one before and the one after.
 _BESIDE = 2
