@@ -80,7 +80,7 @@ def test_a_new_key_and_its_request() -> None:
 
 def test_the_running_agent_does_not_load_the_library() -> None:
     code = (
-        "import sys, iort_agent.cli, iort_agent.mqtt.aws, iort_agent.check\n"
+        "import sys, iort_agent.cli, iort_agent.mqtt.aws, iort_agent.verbs.check\n"
         "from iort_agent.identity.certificate import parse_certificate\n"
         "parse_certificate(sys.stdin.read()).id\n"
         "assert 'cryptography' not in sys.modules"
