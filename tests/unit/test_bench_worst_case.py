@@ -16,7 +16,7 @@ def test_unbounded_batches_are_refused_and_the_others_are_read():
             refused.append(str(error))
         else:
             refused.append("")
-    assert [reason[:12] for reason in refused] == ["samples hold"] * 3 + [""] * 4
+    assert [reason[:12] for reason in refused] == ["samples must"] * 3 + [""] * 4
 
 
 def test_worst_batches_cover_one_second_each():

@@ -60,7 +60,7 @@ def test_a_text_is_no_markup_and_no_picture():
 
 
 def test_every_command_prints_by_it():
-    """What prints otherwise is listed: a line of JSON, and the one that makes its text visible."""
+    """Other prints are listed: the version, a line of JSON, and the one that makes its text visible."""
     folder, printing = Path(iort_station.__file__).parent, set()
     for path in folder.rglob("*.py"):
         name, tree = str(path.relative_to(folder)), ast.parse(path.read_text())
@@ -70,6 +70,7 @@ def test_every_command_prints_by_it():
             if isinstance(node, ast.Call) and ast.unparse(node.func) in {"print", "typer.echo", "click.echo"}:
                 printing.add((name, ast.unparse(node.args[0])))
     assert printing == {
+        ("cli/main.py", "f\"iort {version('iort-station')}\""),
         ("cli/progress.py", "visible(f'iort: {text}')"),
         ("cli/verbs/watch.py", "json.dumps({**line, 'sample': sample})"),
     }

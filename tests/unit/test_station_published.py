@@ -63,7 +63,7 @@ def test_columns_of_a_type_that_nobody_has_said_are_refused_and_the_others_are_g
     found, export = exported(of(FLAT, [b"\1"]), of(NAMES, [u32(0)], seq=1), types={})
     assert found == [(0, NAMES.id, u32(0))]
     assert export.refused.count == 1
-    assert f"the messages' type, '{FLAT.id}', is not known" in export.refused.reason
+    assert f"the messages' type '{FLAT.id}' is unknown" in export.refused.reason
 
 
 def test_a_range_has_its_start_and_not_its_end():

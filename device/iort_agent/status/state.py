@@ -3,7 +3,6 @@
 Both are written as JSON, with the fields' names as keys.
 """
 
-# ruff: noqa: FA100 - `read` evaluates the annotations, on Python 3.8 too
 import dataclasses
 from dataclasses import dataclass
 from typing import Any, Dict, List, Mapping, Optional, Tuple, Type, TypeVar, Union, get_type_hints
