@@ -91,7 +91,7 @@ def test_a_run_deploys_asks_reports_and_destroys(embedded, tmp_path):
 
 def test_without_a_yes_nothing_is_made(embedded, tmp_path):
     recorder = Recorder()
-    with pytest.raises(VerifyError, match="nobody can be asked"):
+    with pytest.raises(VerifyError, match="no terminal to ask"):
         run.run(options(tmp_path, yes=False), embedded.cloud, recorder)
     assert recorder.told == []
 
