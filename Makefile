@@ -22,7 +22,7 @@ test: setup ## run every test: REQUIRE_ALL=1 makes a skip a failure, WORKERS=4 r
 test-oldest: setup ## run the robot's tests on its oldest Python, 3.8, which ROS Noetic has: OLDEST=/path/to/python3.8
 	@$(PYTHON) scripts/setup.py --oldest $(or $(OLDEST),any)
 	@build/oldest/bin/python -m pytest -W "ignore:Python 3.8 is no longer supported" \
-		tests/device tests/unit/test_contract*.py tests/unit/test_device_*.py
+		tests/device tests/unit/agent tests/unit/contract
 
 check: setup ## run the linters, the type checkers, and cfn-lint, cdk-nag and checkov over the stacks
 	@$(PYTHON) scripts/setup.py --checkov

@@ -33,19 +33,16 @@ GROUPS = {
     "tests/stacks/": "app",
     **dict.fromkeys(
         [
-            f"tests/unit/test_{name}.py"
-            for name in (
-                "admit",
-                "adopt",
-                "alert",
-                "presence",
-                "quarantine",
-                "query",
-                "station_data",
-                "summarize_drive",
-                "tables",
-                "upload",
-            )
+            "tests/unit/functions/test_admit.py",
+            "tests/unit/functions/test_alert.py",
+            "tests/unit/functions/test_presence.py",
+            "tests/unit/functions/test_quarantine.py",
+            "tests/unit/functions/test_query.py",
+            "tests/unit/functions/test_summarize_drive.py",
+            "tests/unit/functions/test_tables.py",
+            "tests/unit/functions/test_upload.py",
+            "tests/unit/station/test_adopt.py",
+            "tests/unit/station/test_data.py",
         ],
         "app",
     ),

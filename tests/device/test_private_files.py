@@ -23,7 +23,7 @@ from iort_agent.spool.reservation import Reservation
 from iort_agent.spool.sqlite import SqliteSpool
 from iort_contract import VESC_STREAM
 from tests.agent_fakes import ManualClock
-from tests.unit.test_device_agent import config_file
+from tests.unit.agent.test_agent import config_file
 
 SECRET = b"another's, and not for the bucket"
 

@@ -12,7 +12,7 @@ from iort_contract import EXPIRES_S, RECEIVED_MS, RECORD, TOPIC, Batch, build_to
 from iort_station.data import data
 from iort_station.operations import delivery, quarantine
 from tests.local.conftest import until
-from tests.unit.old_messages import old_envelope, old_message
+from tests.unit.station.old_messages import old_envelope, old_message
 from verify.robot import Robot
 
 RUN = "0badcafe"

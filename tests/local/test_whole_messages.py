@@ -19,7 +19,7 @@ from tests.local.drives import Agent
 from tests.ros.mixed_compare import compare, read
 from tests.ros.mixed_robot import TOPICS, Maker, Topic
 from tests.ros1_types import Message, header
-from tests.unit.test_round_trip import KNOWN
+from tests.unit.station.test_round_trip import KNOWN
 
 COUNT, RATE_HZ = 500, 50
 Recorded = Mapping[str, tuple[Message, Sequence[bytes]]]

@@ -16,7 +16,7 @@ from tests.local.test_uplink import self_signed
 from tests.ros.conftest import Graph, Process
 from tests.ros.test_downlink import connected, drive, has, start
 from tests.ros.test_source import Cars, turns, until_turns
-from tests.unit.test_device_agent import config_file
+from tests.unit.agent.test_agent import config_file
 
 WAITS = "another node is called /iort_agent at http://127.0.0.1:"
 WHEELS = {"type": "ros1", "topics": {"/wheel": {"stream": "wheel", "time": "header"}}}

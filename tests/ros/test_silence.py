@@ -15,7 +15,7 @@ from tests.local.conftest import until
 from tests.local.test_uplink import self_signed
 from tests.ros.conftest import Graph, Process
 from tests.ros.test_source import WHEEL
-from tests.unit.test_device_agent import config_file
+from tests.unit.agent.test_agent import config_file
 
 WAIT_S = 120
 

@@ -60,6 +60,6 @@ def dynamodb(aws, synthesized):
 @pytest.fixture
 def stream():
     """An empty telemetry table and the stream that Lambda 2 reads."""
-    from tests.unit.summarizing import Stream
+    from tests.unit.functions.summarizing import Stream
 
     return Stream()

@@ -1,0 +1,150 @@
+"""What a rosbridge server sends, as the bytes of the ROS 1 message that it was made of."""
+
+from __future__ import annotations
+
+import json
+import math
+from typing import Any
+
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from iort_agent.ros1.json_message import decode
+from iort_agent.ros1.write import Writer
+from iort_contract.limits import MessageError
+from iort_contract.ros1.definition import Definition, parse
+from tests.rosbridge_json import as_rosbridge
+from tests.unit.contract.ros1_values import HEADER, by_rosbags, definitions, values
+
+pytest.importorskip("rosbags")
+
+
+def without_numbers(value: Any) -> Any:
+    """What rosbridge does to NaN and the infinities."""
+    if isinstance(value, dict):
+        return {name: without_numbers(member) for name, member in value.items()}
+    if isinstance(value, list):
+        return [without_numbers(item) for item in value]
+    return math.nan if isinstance(value, float) and not math.isfinite(value) else value
+
+
+def nulls(value: Any) -> int:
+    if isinstance(value, (dict, list)):
+        return sum(map(nulls, value.values() if isinstance(value, dict) else value))
+    return int(value is None)
+
+
+@settings(deadline=None)  # rosbags makes classes of each definition
+@given(st.data())
+def test_any_message_is_what_rosbags_writes(data: Any) -> None:
+    definition = data.draw(definitions())
+    message = data.draw(values(definition))
+    sent = json.loads(json.dumps(as_rosbridge(definition, message)))
+    writer = Writer(definition)
+    assert writer.write(sent) == by_rosbags(definition, without_numbers(message))
+    assert writer.nulls == nulls(sent)
+    ros2 = json.loads(json.dumps(as_rosbridge(definition, message, ros2=True)))
+    assert writer.write(ros2) == writer.write(sent)
+
+
+MIXED = f"""Header header
+bool b
+int8 small
+float32 f
+string s
+int16[2] two
+float64[] many
+uint8[] raw
+char[3] three
+bool[] flags
+byte[] signed
+time t
+Inner[] inner
+Plain[2] plain
+{HEADER}{"=" * 80}
+MSG: a_msgs/Inner
+string[2] names
+{"=" * 80}
+MSG: a_msgs/Plain
+float32 x
+duration d
+"""
+GOOD: dict[str, Any] = {
+    "header": {"seq": 3, "stamp": {"secs": 1, "nsecs": 2}, "frame_id": "map"},
+    "b": True, "small": -128, "f": 1.5, "s": "grün", "two": [1, -2], "many": [1, 2.5], "raw": "AQL/",
+    "three": "YWJj", "flags": [True, False], "signed": [-1, 127], "t": {"secs": 4, "nsecs": 5},
+    "inner": [{"names": ["a", ""]}],
+    "plain": [{"x": 1, "d": {"secs": -1, "nsecs": 6}}, {"x": None, "d": {"secs": 0, "nsecs": 0}}],
+}  # fmt: skip
+
+
+def mixed() -> Definition:
+    return parse("a_msgs/A", MIXED)
+
+
+def test_what_rosbridge_sends() -> None:
+    writer = Writer(mixed())
+    back = decode(mixed(), writer.write(GOOD))
+    assert math.isnan(back["plain"][1].pop("x"))
+    assert writer.nulls == 1
+    assert back == {
+        **GOOD,
+        "header": {"seq": 3, "stamp": {"sec": 1, "nanosec": 2}, "frame_id": "map"},
+        "raw": [1, 2, 255], "three": [97, 98, 99], "t": {"sec": 4, "nanosec": 5},
+        "plain": [{"x": 1, "d": {"sec": -1, "nanosec": 6}}, {"d": {"sec": 0, "nanosec": 0}}],
+    }  # fmt: skip
+
+
+def test_a_header_of_ros_2_has_no_seq() -> None:
+    header = {"stamp": {"sec": 1, "nanosec": 2}, "frame_id": "map"}
+    message = {**GOOD, "header": header, "raw": [1, 2, 255]}
+    assert decode(mixed(), Writer(mixed()).write(message))["header"] == {**header, "seq": 0}
+
+
+@pytest.mark.parametrize(
+    ("change", "error"),
+    [
+        ({"b": None}, "does not fit"),
+        ({"small": 128}, "does not fit"),
+        ({"small": None}, "does not fit"),
+        ({"small": 1.5}, "does not fit"),
+        ({"f": 1e39}, "does not fit"),
+        ({"f": "1"}, "does not fit"),
+        ({"s": 5}, "does not fit"),
+        ({"s": "\ud800"}, "does not fit"),
+        ({"two": [1]}, "two: found .* a list of 2"),
+        ({"two": {"0": 1}}, "two: found"),
+        ({"many": 7}, "many: found 7; allowed is a list"),
+        ({"raw": "a"}, "does not fit"),
+        ({"raw": [256]}, "does not fit"),
+        ({"three": "YWI="}, "three: has 2 elements, and must have 3"),
+        ({"t": {"secs": 1}}, "a time is"),
+        ({"t": {"secs": 1, "nanosec": 2}}, "does not fit"),
+        ({"inner": [{"names": ["a", "b"], "more": 1}]}, "a_msgs/Inner: has the field 'more' too many"),
+        ({"inner": [None]}, "a_msgs/Inner: found None; allowed is an object"),
+        ({"plain": [{"x": 1}, {"x": 1}]}, "a_msgs/Plain: has the field 'd' too many, or lacks it"),
+        ({"header": {"seq": 1, "frame_id": ""}}, "std_msgs/Header"),
+        ({"other": 1}, "a_msgs/A: has the field 'other' too many"),
+    ],
+)
+def test_what_does_not_fit(change: dict[str, Any], error: str) -> None:
+    with pytest.raises(MessageError, match=error):
+        Writer(mixed()).write({**GOOD, **change})
+
+
+JSON = st.recursive(
+    st.none() | st.booleans() | st.integers() | st.floats() | st.text(max_size=3),
+    lambda inner: st.lists(inner, max_size=3) | st.dictionaries(st.sampled_from(list(GOOD)), inner),
+    max_leaves=12,
+)
+
+
+@given(st.dictionaries(st.sampled_from([*GOOD, "other"]), JSON) | JSON)
+def test_any_json_is_a_message_or_refused(message: Any) -> None:
+    whole = {**GOOD, **message} if isinstance(message, dict) else message
+    try:
+        data = Writer(mixed()).write(whole)
+    except MessageError:
+        return
+    decode(mixed(), data)

@@ -1,0 +1,65 @@
+"""What the three distributions declare: every import, and one version."""
+
+from __future__ import annotations
+
+import ast
+import sys
+from collections.abc import Iterator
+from importlib.metadata import packages_distributions, requires, version
+from pathlib import Path
+
+import pytest
+from packaging.requirements import Requirement
+
+ROOT = Path(__file__).resolve().parents[3]
+PACKAGES = {
+    "iort-contract": ROOT / "contract" / "iort_contract",
+    "iort-agent": ROOT / "device" / "iort_agent",
+    "iort-station": ROOT / "station" / "iort_station",
+}
+# They come with ROS, from no registry.
+ROS = {"genpy", "rosgraph", "roslib", "rospy"}
+
+
+def imported(tree: ast.AST) -> Iterator[str]:
+    """The top-level modules that code imports when it runs; types alone are not needed then."""
+    for node in ast.iter_child_nodes(tree):
+        if isinstance(node, ast.If) and "TYPE_CHECKING" in ast.unparse(node.test):
+            for otherwise in node.orelse:
+                yield from imported(otherwise)
+        elif isinstance(node, ast.Import):
+            yield from (alias.name.partition(".")[0] for alias in node.names)
+        elif isinstance(node, ast.ImportFrom):
+            yield (node.module or "").partition(".")[0]
+        else:
+            yield from imported(node)
+
+
+def needed(package: Path) -> set[str]:
+    """The distributions that hold what a package imports."""
+    modules = {name for path in package.rglob("*.py") for name in imported(ast.parse(path.read_text()))}
+    modules -= {*sys.stdlib_module_names, package.name, *ROS}
+    ours = {path.name: name for name, path in PACKAGES.items()}
+    known = packages_distributions()
+    # A module of the checkout that is never installed stands for itself, and nobody can declare it.
+    return {ours.get(name) or known.get(name, [name])[0].lower() for name in modules}
+
+
+@pytest.mark.parametrize("name", PACKAGES)
+def test_every_import_is_declared_and_every_declared_dependency_imported(name):
+    declared = {Requirement(text).name.lower() for text in requires(name) or ()}
+    assert needed(PACKAGES[name]) == declared
+
+
+def test_an_import_inside_a_function_counts_and_one_for_types_does_not():
+    code = (
+        "if TYPE_CHECKING:\n    import one\ndef f():\n    import two.three\n    from four.five import six\n"
+    )
+    assert set(imported(ast.parse(code))) == {"two", "four"}
+
+
+def test_agent_and_station_have_the_contracts_version_and_pin_it():
+    (one,) = {version(name) for name in PACKAGES}
+    for name in ("iort-agent", "iort-station"):
+        (pin,) = (text for text in requires(name) or () if Requirement(text).name == "iort-contract")
+        assert pin == f"iort-contract=={one}"

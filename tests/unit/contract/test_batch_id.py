@@ -1,0 +1,90 @@
+"""A batch's id: no two of a topic share one, and it sorts by time as a text."""
+
+from __future__ import annotations
+
+from decimal import Decimal
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+import iort_contract
+from iort_contract import BatchId, ContractError, batch_id, batches_between
+from tests.unit.contract.contract_values import BOOT, LIMIT_US, boots, seqs
+
+times = st.integers(0, LIMIT_US)
+ids = st.builds(BatchId, times, boots, seqs)
+
+
+@given(ids)
+def test_an_id_is_read_back(one):
+    assert batch_id(str(one)) == one
+
+
+@given(ids, ids)
+def test_an_earlier_batch_has_a_lesser_key(one, other):
+    if one.t_us != other.t_us:
+        assert (str(one) < str(other)) == (one.t_us < other.t_us)
+    assert (str(one) == str(other)) == (one == other)
+
+
+@given(ids, st.none() | times | st.integers(), st.none() | times | st.integers())
+def test_a_range_of_times_is_a_range_of_keys(one, first_us, last_us):
+    first, last = batches_between(first_us, last_us)
+    inside = (first_us is None or first_us <= one.t_us) and (last_us is None or one.t_us <= last_us)
+    assert (first <= str(one) <= last) == inside
+
+
+@pytest.mark.parametrize("at", [0, 1, LIMIT_US])
+def test_both_ends_of_a_range_belong_to_it(at):
+    first, last = batches_between(at, at)
+    greatest = BatchId(at, "f" * 32, 2**53)
+    assert first <= str(BatchId(at, "0" * 8, 0)) < str(greatest) <= last
+    assert not first <= str(BatchId(at + 1, "0" * 8, 0)) <= last
+    if at:
+        assert not first <= str(BatchId(at - 1, "f" * 32, 2**53)) <= last
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        None,
+        5,
+        Decimal(5),
+        b"0000000000000005-0123abcd-7",
+        "",
+        "5",
+        f"5-{BOOT}-7",
+        f"000000000000005-{BOOT}-7",
+        f"00000000000000005-{BOOT}-7",
+        f"-000000000000005-{BOOT}-7",
+        f"+000000000000005-{BOOT}-7",
+        f"000000000000000٣-{BOOT}-7",
+        f"0000000000000005-{BOOT.upper()}-7",
+        "0000000000000005-0123abc-7",
+        f"0000000000000005-{'0' * 33}-7",
+        f"0000000000000005-{BOOT}-07",
+        f"0000000000000005-{BOOT}--7",
+        f"0000000000000005-{BOOT}-",
+        f"0000000000000005-{BOOT}",
+        f"0000000000000005-{BOOT}-{10**16}",
+        f"0000000000000005-{BOOT}-7\n",
+        f" 0000000000000005-{BOOT}-7",
+        f"0000000000000005-{BOOT}-7-1",
+        "x" * 100_000,
+    ],
+)
+def test_what_is_no_id_is_refused(text):
+    with pytest.raises(ContractError, match="must be <16 digits of microseconds>-<run>-<number>"):
+        batch_id(text)
+
+
+def test_batches_of_one_time_have_keys_of_their_own():
+    """Two publishers, or a recording that is played twice: the same time, another number or another run."""
+    same_time = [
+        iort_contract.Batch(boot, seq, [7], {}) for boot in ("0badcafe", "deadbeef") for seq in (0, 9, 10)
+    ]
+    assert len({str(batch.id) for batch in same_time}) == len(same_time)
+    assert {iort_contract.decode(iort_contract.encode(batch)).id for batch in same_time} == {
+        b.id for b in same_time
+    }

@@ -1,0 +1,159 @@
+"""Whatever arrives, every decoder takes it or raises the contract's one error, and takes nothing else."""
+
+from __future__ import annotations
+
+import base64
+import json
+import math
+from decimal import Decimal
+
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+import iort_contract
+from iort_contract import ContractError
+from tests.unit.contract.contract_values import DEEP, GOOD, GOOD_LIVE, batches, decode_or_refuse, json_values
+
+DECODERS = [iort_contract.decode, iort_contract.decode_live, iort_contract.decode_pong]
+decoders = st.sampled_from(DECODERS)
+
+
+# What boto3 and Python can put into a mapping that JSON cannot.
+python_values = json_values | st.decimals() | st.binary(max_size=8) | st.sets(st.integers(), max_size=2)
+awkward = st.sampled_from(
+    [
+        Decimal("NaN"),
+        Decimal("sNaN"),
+        Decimal("Infinity"),
+        Decimal("1E+125"),
+        Decimal("1E+999999999999"),
+        Decimal("1E-130"),
+        Decimal("1.0"),
+        Decimal("-0"),
+        10**5000,
+        2**53,
+        2**63,
+        1e308,
+        math.nan,
+        math.inf,
+        -0.0,
+        "",
+        "1",
+        b"1",
+        bytearray(b"1"),
+        (),
+        "\ud800",
+        object(),
+    ]
+)
+
+
+def envelopes():
+    return st.sampled_from([iort_contract.encode(GOOD), iort_contract.encode_live(GOOD_LIVE)]).map(json.loads)
+
+
+@given(decoders, st.binary(max_size=200))
+def test_any_bytes(decoder, message):
+    decode_or_refuse(decoder, message)
+
+
+@given(decoders, st.text(st.characters(), max_size=200))
+def test_any_text(decoder, message):
+    decode_or_refuse(decoder, message)
+
+
+@given(decoders, json_values)
+def test_any_json(decoder, value):
+    decode_or_refuse(decoder, json.dumps(value))
+    decode_or_refuse(decoder, json.dumps(value).encode("utf-16"))
+
+
+@given(st.sampled_from(DECODERS[:2]), st.dictionaries(st.text(max_size=4), python_values, max_size=4))
+def test_any_item(decoder, item):
+    decode_or_refuse(decoder, item)
+
+
+@settings(max_examples=300)
+@given(st.data(), python_values | awkward)
+def test_one_key_replaced(data, value):
+    envelope = data.draw(envelopes())
+    envelope[data.draw(st.sampled_from(sorted(envelope)))] = value
+    for decoder in DECODERS[:2]:
+        decode_or_refuse(decoder, envelope)
+
+
+@settings(max_examples=200)
+@given(st.data(), json_values)
+def test_one_key_replaced_in_text(data, value):
+    envelope = data.draw(envelopes())
+    envelope[data.draw(st.sampled_from(sorted(envelope)))] = value
+    for decoder in DECODERS:
+        decode_or_refuse(decoder, json.dumps(envelope))
+
+
+@pytest.mark.parametrize(
+    "good", [iort_contract.encode(GOOD), iort_contract.encode_live(GOOD_LIVE)], ids=["batch", "live"]
+)
+def test_one_key_removed(good):
+    decoder = iort_contract.decode if b"codec" in good else iort_contract.decode_live
+    for key in json.loads(good):
+        envelope = json.loads(good)
+        del envelope[key]
+        with pytest.raises(ContractError, match=key):
+            decoder(json.dumps(envelope))
+
+
+@settings(max_examples=300)
+@given(batches(), st.data())
+def test_message_damaged_anywhere(batch, data):
+    message = bytearray(iort_contract.encode(batch))
+    at = data.draw(st.integers(0, len(message) - 1))
+    message[at] = data.draw(st.integers(0, 255))
+    decode_or_refuse(iort_contract.decode, bytes(message))
+    decode_or_refuse(iort_contract.decode, bytes(message[:at]))
+
+
+@settings(max_examples=200)
+@given(st.data())
+def test_compressed_samples_damaged(data):
+    envelope = json.loads(iort_contract.encode(GOOD))
+    packed = bytearray(base64.b64decode(envelope["samples"]))
+    at = data.draw(st.integers(0, len(packed) - 1))
+    packed[at] ^= data.draw(st.integers(1, 255))
+    decode_or_refuse(iort_contract.decode, dict(envelope, samples=base64.b64encode(packed).decode()))
+
+
+@pytest.mark.parametrize("decoder", DECODERS)
+@pytest.mark.parametrize(
+    "message",
+    [
+        b"",
+        b"null",
+        b"\xef\xbb\xbf{}",
+        b"\xed\xa0\x80",
+        b'{"v":' + b"[" * DEEP,
+        b'{"v":' + b"[" * 900 + b"]" * 900 + b"}",
+        b'{"v":1e999}',
+        b'{"v":NaN}',
+        b'{"v":1,"seq":' + b"9" * 5000 + b"}",
+        "\ud800",
+        '{"v":"\ud800"}',
+        None,
+        7,
+        [],
+    ],
+)
+def test_message_refused(decoder, message):
+    with pytest.raises(ContractError):
+        decoder(message)
+
+
+def test_error_of_a_long_value_is_short():
+    with pytest.raises(ContractError) as caught:
+        iort_contract.decode(dict(json.loads(iort_contract.encode(GOOD)), codec="x" * 10_000))
+    assert len(str(caught.value)) < 200
+
+
+def test_there_is_one_error():
+    assert issubclass(ContractError, ValueError)

@@ -1,0 +1,52 @@
+"""Pings and their pongs."""
+
+from __future__ import annotations
+
+import json
+import math
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+import iort_contract
+from iort_contract import ContractError
+from tests.unit.contract.contract_values import seqs, times
+
+
+@given(seqs, times, st.text(st.characters(), max_size=20), st.none() | st.integers(0, 2**53 // 1000))
+def test_pong_round_trip(ping_id, sent_us, padding, received_ms):
+    message = iort_contract.encode_ping(ping_id, sent_us, padding)
+    if received_ms is not None:  # as the rule does
+        message = json.dumps(dict(json.loads(message), received_ms=received_ms)).encode()
+    assert iort_contract.decode_pong(message) == (ping_id, sent_us, received_ms)
+
+
+@pytest.mark.parametrize(
+    ("ping_id", "sent_us"),
+    [(math.nan, 0), (-1, 0), (2**53 + 1, 0), (True, 0), ("1", 0), (1, math.nan), (1, 2**53)],
+)
+def test_ping_refused(ping_id, sent_us):
+    with pytest.raises(ContractError, match=r"ping id|sent_us"):
+        iort_contract.encode_ping(ping_id, sent_us)
+
+
+@pytest.mark.parametrize(
+    "pong",
+    [
+        "{}",
+        '{"id":1}',
+        '{"id":"1","sent_us":0}',
+        '{"id":1,"sent_us":0,"received_ms":null}',
+        "[]",
+        '{"id":1,"sent_us":0,"received_ms":1000000000000000}',
+    ],
+)
+def test_pong_refused(pong):
+    with pytest.raises(ContractError):
+        iort_contract.decode_pong(pong)
+
+
+def test_pong_goes_to_the_robot_that_asked():
+    topic = iort_contract.pong_template("iort").replace("${topic(3)}", "car")
+    assert topic == iort_contract.build_topic(iort_contract.PONG, "car", iort_contract.RULE)

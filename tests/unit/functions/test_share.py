@@ -1,0 +1,293 @@
+"""A robot's share of Lambda 2: who is over it, what becomes of its batches, and who is told."""
+
+from __future__ import annotations
+
+import itertools
+import json
+
+import pytest
+from botocore.exceptions import ClientError
+
+from functions import later
+from functions.shared import allowances, share
+from functions.shared.allowances import Allowances
+from functions.shared.processing import Bounds, process
+from functions.shared.share import KEYS, OverShareError, PutOff, Share, Told, waiting
+from iort_contract import OVER_SHARE, PUT_OFF, RECORD, SHADOW, VESC_STREAM, build_topic
+from iort_contract.table_writer import TableError
+from tests.unit.functions.summarizing import T0, S, Stream, batch, counted
+
+GOOD, BAD = (build_topic(RECORD, robot, VESC_STREAM) for robot in ("good", "bad"))
+
+
+class Processor:
+    """A processor's time by hand: ``each_s`` goes by whenever somebody looks."""
+
+    def __init__(self, each_s=0.0):
+        self.each_s, self.now_s = each_s, 0.0
+
+    def __call__(self):
+        self.now_s += self.each_s
+        return self.now_s
+
+
+class Queue:
+    """SQS, which takes what ``full`` does not say."""
+
+    def __init__(self):
+        self.sent, self.full = [], False
+
+    def send_message_batch(self, *, QueueUrl, Entries):
+        assert QueueUrl == "queue"
+        assert 1 <= len(Entries) <= 10
+        if self.full:
+            return {"Failed": [{"Id": entry["Id"], "Code": "InternalError"} for entry in Entries]}
+        self.sent += Entries
+        return {"Successful": Entries}
+
+
+class Shadows:
+    """The shadows of the robots, as iot-data has them."""
+
+    def __init__(self, *, fails=False):
+        self.said, self.fails = [], fails
+
+    def update_thing_shadow(self, *, thingName, shadowName, payload):
+        if self.fails:
+            raise ClientError({"Error": {"Code": "InternalFailureException"}}, "UpdateThingShadow")
+        assert shadowName == SHADOW
+        self.said.append((thingName, json.loads(payload)["state"]["desired"][OVER_SHARE]))
+
+
+class Bounded(Stream):
+    """The stream, with Lambda 2 held to shares. Each look at the processor's time costs ``each_s``."""
+
+    def __init__(self, each_s):
+        super().__init__()
+        self.queue, self.shadows = Queue(), Shadows()
+        put_off = PutOff(self.queue, queue_url="queue")
+        self.share = Share(spent_s=Processor(each_s))
+        self.bounds = Bounds(self.share, put_off.put, Told(self.shadows).tell)
+
+    def stored_at(self, at_s, *batches, topic):
+        records = self.store(*batches, topic=topic)
+        for record in records:
+            record["dynamodb"]["ApproximateCreationDateTime"] = at_s
+        return records
+
+    def summarize(self, records):
+        return process({"Records": records}, self.tables, self.refuse, bounds=self.bounds)
+
+    def summarize_later(self):
+        """What the queue has, as the other function does it."""
+        for entry in self.queue.sent:
+            records = later.records(self.tables, entry["MessageBody"])
+            answer = process({"Records": records}, self.tables, self.refuse, beside_others=True)
+            assert answer == {"batchItemFailures": []}
+
+    def waits(self):
+        return [key for entry in self.queue.sent for key in waiting(entry["MessageBody"])]
+
+
+def many(count, *, first=0):
+    return [batch(T0 + (first + i) * S, seq=first + i) for i in range(count)]
+
+
+def test_an_allowance_is_had_again_with_time():
+    left = Allowances(burst=1.0, a_second=0.1)
+    assert left.spend("car", 0.0, 3.0) == -2.0
+    assert left.left("other", 0.0) == 1.0
+    assert left.left("car", 20.0) == pytest.approx(0.0)
+    assert left.left("car", 1000.0) == 1.0
+    # A clock that was set back takes nothing away, and gives nothing twice.
+    assert left.spend("car", -100.0, 0.0) == -2.0
+    assert left.left("car", 20.0) == pytest.approx(0.0)
+
+
+def test_allowances_are_of_a_bounded_number_of_robots():
+    left = Allowances(burst=1.0, a_second=0.1)
+    for i in range(allowances._ROBOTS + 1):
+        left.spend(f"car{i}", 0.0, 0.5)
+    assert (left.left("car0", 0.0), left.left("car1", 0.0)) == (1.0, 0.5)
+
+
+def test_a_meter_charges_what_its_thread_spent_and_gives_up_far_over_the_share():
+    processor = Processor()
+    bounded = Share(burst_s=1.0, a_second=0.1, spent_s=processor)
+    meter = bounded.meter("car", 0.0)
+    processor.now_s = 0.75
+    assert meter.charge(0.25) == 0.0
+    assert bounded.over("car", 0.0)
+    assert not bounded.over("other", 0.0)
+    # What was begun is done, up to as much again.
+    processor.now_s = 1.75
+    meter.check()
+    processor.now_s = 1.8
+    with pytest.raises(OverShareError):
+        meter.check()
+    assert not Share.unlimited().over("car", 0.0)
+
+
+def test_batches_over_the_share_wait_and_no_other_robots_do(capsys):
+    stream = Bounded(each_s=0.1)
+    records = stream.stored_at(100.0, *many(30), topic=BAD)
+    good = stream.stored_at(100.0, batch(T0, 50), topic=GOOD)
+    assert stream.summarize([*records, *good]) == {"batchItemFailures": []}
+    assert set(stream.summary(GOOD)) == {T0 // S}
+    done = set(stream.summary(BAD))
+    assert len(done) < 30
+    totals = counted(capsys)
+    assert totals["BatchesPutOff"] == len(stream.waits()) == 30 - len(done)
+    assert totals["BatchesSummarized"] == 1 + len(done)
+    # Whose they are is said beside them, and is in no message of another's.
+    assert {entry["MessageGroupId"] for entry in stream.queue.sent} == {"bad"}
+    assert {topic for topic, _ in stream.waits()} == {BAD}
+    stream.summarize_later()
+    assert set(stream.summary(BAD)) == {T0 // S + i for i in range(30)}
+    assert set(stream.column_of(BAD, "missing_batches")) == {0}
+
+
+def test_a_robot_within_its_share_is_summarised_at_once_again():
+    stream = Bounded(each_s=0.1)
+    stream.summarize(stream.stored_at(100.0, *many(30), topic=BAD))
+    assert (before := len(stream.waits()))
+    stream.summarize(stream.stored_at(101.0, *many(1, first=30), topic=BAD))
+    assert len(stream.waits()) == before + 1
+    stream.summarize(stream.stored_at(200.0, *many(1, first=31), topic=BAD))
+    assert len(stream.waits()) == before + 1
+    assert T0 // S + 31 in stream.summary(BAD)
+
+
+def test_what_cannot_be_decoded_is_charged_to_whose_it_is():
+    stream = Bounded(each_s=0.1)
+    records = stream.stored_at(100.0, *many(30), topic=BAD)
+    for record in records:
+        record["dynamodb"]["NewImage"]["samples"] = {"S": "no base64"}
+    stream.summarize(records)
+    assert len(stream.refused) + len(stream.waits()) == 30
+    assert len(stream.refused) < 12
+
+
+def test_seconds_that_are_dear_to_read_again_wait_too():
+    """The batch itself is cheap; what the table holds beside it costs far more than the share."""
+    stream = Bounded(each_s=0.0)
+    stream.store(*(batch(T0 + i * 10_000, seq=i) for i in range(60)), topic=BAD)
+    records = stream.stored_at(100.0, batch(T0 + 990_000, seq=60), topic=BAD)
+    stream.share._spent_s.each_s = 0.1
+    assert stream.summarize(records) == {"batchItemFailures": []}
+    assert len(stream.waits()) == 1
+    stream.share._spent_s.each_s = 0.0
+    stream.summarize_later()
+    assert stream.column_of(BAD, "n") == [61]
+
+
+def test_batches_that_the_queue_does_not_take_stay_in_the_stream():
+    stream = Bounded(each_s=0.1)
+    stream.queue.full = True
+    records = stream.stored_at(100.0, *many(30), topic=BAD)
+    failed = stream.summarize(records)["batchItemFailures"]
+    assert len(failed) + len(stream.summary(BAD)) == 30
+    numbers = {record["dynamodb"]["SequenceNumber"] for record in records}
+    assert {one["itemIdentifier"] for one in failed} <= numbers
+
+
+def test_a_message_names_a_few_batches_and_a_call_has_a_few_messages():
+    queue = Queue()
+    stream = Stream()
+    changes = [one["dynamodb"] for one in stream.store(*many(KEYS * 12 + 1), topic=BAD)]
+    assert PutOff(queue, queue_url="queue").put(changes) == []
+    sizes = [len(json.loads(entry["MessageBody"])[PUT_OFF]) for entry in queue.sent]
+    assert sizes == [KEYS] * 12 + [1]
+
+
+def test_batches_that_are_gone_meanwhile_are_passed_over():
+    stream = Stream()
+    body = json.dumps({PUT_OFF: [[BAD, "0000000000000000-0badcafe-0"]]})
+    assert later.records(stream.tables, body) == []
+
+
+def test_a_second_that_somebody_else_wrote_meanwhile_is_read_again():
+    """Later reads, a batch comes and is summarised by Lambda 2, and only then later writes."""
+    stream = Stream()
+    first, second = batch(T0, seq=0), batch(T0 + 500_000, seq=1)
+    records = stream.store(first)
+    put_seconds, late = stream.tables.put_seconds, [second]
+
+    def slow(seconds):
+        while late:
+            newer = stream.store(late.pop())
+            process({"Records": newer}, stream.tables, stream.refuse)
+        put_seconds(seconds)
+
+    stream.tables.put_seconds = slow
+    process({"Records": records}, stream.tables, stream.refuse, beside_others=True)
+    assert stream.column("n") == {0: 2}
+
+
+def test_a_robot_is_told_at_once_then_now_and_then_and_anew_after_a_while():
+    shadows = Shadows()
+    told = Told(shadows)
+    for at_s in (100.0, 101.0, 129.0, 131.0):
+        told.tell("bad", 10, at_s)
+    told.tell("other", 1, 131.0)
+    told.tell("bad", 5, 131.0 + share.OVER_S + 1)
+    assert shadows.said == [
+        ("bad", {"batches": 10, "since_ms": 100_000, "last_ms": 100_000}),
+        ("bad", {"batches": 40, "since_ms": 100_000, "last_ms": 131_000}),
+        ("other", {"batches": 1, "since_ms": 131_000, "last_ms": 131_000}),
+        ("bad", {"batches": 5, "since_ms": 192_000, "last_ms": 192_000}),
+    ]
+
+
+def test_a_robot_that_cannot_be_told_loses_no_summary(caplog):
+    Told(Shadows(fails=True)).tell("bad", 1, 100.0)
+    assert "bad is not told" in caplog.text
+
+
+def test_those_who_were_told_are_of_a_bounded_number():
+    told = Told(Shadows())
+    for i in range(share._ROBOTS + 10):
+        told.tell(f"car{i}", 1, 100.0)
+    assert len(told._robots) == share._ROBOTS
+
+
+def test_holes_before_every_batch_are_within_the_share():
+    stream = Bounded(each_s=0.0)
+    stream.stored_at(99.0, *(batch(T0 + i * S // 100, seq=2 * i) for i in range(1000)), topic=BAD)
+    new = [batch(T0 + 10 * S + i * S // 100, seq=2 * (1000 + i)) for i in range(100)]
+    records = stream.stored_at(100.0, *new, topic=BAD)
+    before = stream.client.calls["query"]
+    stream.summarize(records)
+    # One query a page of what lies around the second, and few for the batches themselves.
+    assert stream.client.calls["query"] - before < 30
+
+
+def test_a_robot_is_given_up_while_its_holes_are_counted():
+    stream = Bounded(each_s=0.0)
+    processor, numbers = stream.share._spent_s, stream.tables.numbers
+
+    def slow(*asked):
+        processor.now_s += 0.25
+        return numbers(*asked)
+
+    stream.tables.numbers = slow
+    records = stream.stored_at(100.0, *(batch(T0 + i * S, seq=2 * i) for i in range(10)), topic=BAD)
+    stream.summarize(records)
+    assert processor.now_s < 1.0
+    assert len(stream.waits()) == 10
+
+
+def test_a_second_that_changes_as_fast_as_it_is_read_holds_nobody_up():
+    stream = Bounded(each_s=0.0)
+    records = stream.store(batch(T0 + 500_000, seq=100), topic=BAD)
+    put, sent = stream.tables.put_seconds, itertools.count(1)
+
+    def put_and_send(seconds):
+        number = next(sent)
+        assert number < 20, "it does not end"
+        stream.store(batch(T0 + 500_000 - number, seq=100 - number), topic=BAD)
+        put(seconds)
+
+    stream.tables.put_seconds = put_and_send
+    with pytest.raises(TableError, match="change as fast"):
+        process({"Records": records}, stream.tables, stream.refuse, beside_others=True)

@@ -1,0 +1,98 @@
+"""Batches of version 1 as batches of this version: the same samples, and nothing else lost."""
+
+from __future__ import annotations
+
+import json
+from decimal import Decimal
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+import iort_contract
+from iort_contract import Batch, ContractError, decode
+from iort_contract.attributes import plain
+from iort_station.recordings.old_batches import is_old, upgraded, upgraded_item
+from tests.fakes import item_of_message
+from tests.unit.station.old_messages import old_envelope, old_message
+
+T0 = 1_700_000_000_000_000
+BATCH = Batch("0badcafe", 7, [T0, T0 + 20_000], {"speed": [1.5, None], "mode": ["a", "b"]}, nonfinite=1)
+# Written by the agent of a1b2690: samples of every kind of column, one of them not finite.
+WRITTEN = {
+    "v": 1,
+    "boot": "0badcafe",
+    "seq": 12,
+    "t": T0,
+    "n": 3,
+    "nonfinite": 1,
+    "codec": "steps",
+    "samples": "eLtoWwuwQ9OIqQUWakY6hqYGOkCka2pkit1lII25EIG80pwcYAQr6UAYMaUGBmnJSkD59Pw8uLwhRBZExNbWAgBoLyjg",
+}
+
+
+def test_what_the_agent_of_before_wrote_is_read_as_it_was():
+    batch = decode(upgraded(WRITTEN))
+    assert batch.id == (T0, "0badcafe", 12)
+    assert list(batch.times_us) == [T0, T0 + 20_000, T0 + 40_001]
+    assert batch.columns == {
+        "speed": [1.5, 2, -3.25],
+        "fault_code": [0, 0, 1],
+        "mode": ["a", None, "ü"],
+        "gone": [1, None, None],
+    }
+    assert batch.nonfinite == 1
+
+
+@given(
+    seq=st.integers(0, 2**53),
+    t_us=st.integers(0, 2**53 - 2),
+    speeds=st.lists(st.none() | st.floats() | st.integers(-(2**63), 2**64 - 1), min_size=1, max_size=5),
+)
+def test_any_batch_is_the_same_after_it(seq, t_us, speeds):
+    times = [t_us] * len(speeds)
+    sent = iort_contract.encode(Batch("0123456789abcdef", seq, times, {"speed": speeds}))
+    new = upgraded(old_envelope(decode(sent)))
+    assert new == json.loads(sent)
+
+
+def test_an_item_keeps_all_that_no_batch_has_to_the_letter():
+    """What the rule added, and what a robot put there that nobody asked for."""
+    item = item_of_message(old_message(BATCH), expires_s=1_800_000_001)
+    item |= {"more": {"N": "1E+125"}, "list": {"L": [{"S": "x"}]}}
+    new = upgraded_item(item)
+    gone = {"boot", "seq", "t"}
+    assert new == {
+        **{name: value for name, value in item.items() if name not in gone},
+        "v": {"N": "2"},
+        "batch": {"S": f"{T0:016}-0badcafe-7"},
+    }
+    assert decode(plain(new)) == decode(iort_contract.encode(BATCH))
+
+
+@pytest.mark.parametrize(
+    ("changes", "reason"),
+    [
+        ({"v": 3}, "schema version must be 1, got 3"),
+        ({"t": -5}, "time -5 us: before 1970"),
+        ({"t": 1.5}, "t must be an integer, got 1.5"),
+        ({"t": None}, "t must be an integer, got None"),
+        ({"seq": -1}, "seq must be an integer from 0, got -1"),
+        ({"boot": "me"}, "boot must be .*, got 'me'"),
+        ({"boot": None}, "boot must be .*, got None"),
+        ({"nonfinite": -1}, "nonfinite must be .*, got -1"),
+    ],
+)
+def test_what_no_id_can_be_made_of_says_why(changes, reason):
+    with pytest.raises(ContractError, match=reason):
+        upgraded(old_envelope(BATCH, **changes))
+
+
+@pytest.mark.parametrize("v", [True, 2, "1", None])
+def test_another_version_is_not_old(v):
+    assert not is_old({"v": v})
+    assert not is_old({})
+
+
+def test_the_version_of_a_stored_item_is_a_decimal():
+    assert is_old({"v": Decimal(1)})

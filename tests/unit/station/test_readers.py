@@ -1,0 +1,115 @@
+"""All readers of a message give one answer: what one refuses, none reads."""
+
+from __future__ import annotations
+
+import json
+import re
+from pathlib import Path
+
+import pytest
+
+import iort_contract
+from iort_contract import (
+    Batch,
+    Command,
+    ContractError,
+    FleetMessage,
+    LiveSample,
+    batch_id,
+    decode,
+    decode_command,
+    decode_fleet,
+    decode_item,
+    decode_live,
+    messages_of,
+)
+from iort_contract.attributes import plain
+from iort_station.data.stored import Refused, blocks
+from iort_station.operations.audit import audit
+from tests.fakes import item_of, serialize
+
+T_US = 1_700_000_000_000_000
+RUN = "0badcafe"
+NO_RUNS = ["run-1", "0BADCAFE", "0badcaf", "0" * 33, "", "0badcafe ", "0badcafg"]
+PAGE = Path(__file__).parents[3] / "station" / "web" / "src" / "message.ts"
+
+
+def stored(**changes):
+    """A stored batch as DynamoDB sends it, with some of it changed."""
+    item = item_of(Batch(RUN, 3, [T_US], {"speed": [1.5]}))
+    return {**item, **{name: serialize(value) for name, value in changes.items()}}
+
+
+def by_columns(item):
+    """Read by numpy, in the station."""
+    refused = Refused()
+    found = list(blocks([[item]], refused))
+    assert refused.count == (not found)
+    return bool(found)
+
+
+def read(reader, message):
+    try:
+        reader(message)
+    except ContractError:
+        return False
+    return True
+
+
+def by_contract(reader):
+    return lambda item: read(reader, plain(item))
+
+
+READERS = {
+    "Lambda 2": by_contract(decode_item),
+    "decode": by_contract(decode),
+    "messages": by_contract(lambda item: messages_of(item, {})),
+    "columns": by_columns,
+}
+# Of these the audit sees nothing: it reads no more than the key and two counts.
+BODIES = [{"nonfinite": -1}, {"nonfinite": 10**9}, {"v": 1}, {"n": 2}, {"codec": "later"}]
+IDS = [
+    f"{T_US}-run-1-3",
+    f"{T_US}-run-1",
+    "run-1",
+    f"{T_US}-{RUN.upper()}-3",
+    f"{T_US}-{RUN}-03",
+    f"{T_US}-{RUN}-{2**53 + 1}",
+    f"{2**53}-{RUN}-3",
+    f"{T_US}-{RUN}-\u0663",
+]
+
+
+@pytest.mark.parametrize("changes", [{}, *BODIES, *({"batch": one} for one in IDS)], ids=str)
+def test_every_reader_of_a_stored_batch_says_the_same(changes):
+    item = stored(**changes)
+    said = {name: reads(item) for name, reads in READERS.items()}
+    assert set(said.values()) == {not changes}, said
+
+
+@pytest.mark.parametrize("text", IDS)
+def test_what_is_no_id_is_none_to_the_audit_either(text):
+    with pytest.raises(ContractError):
+        batch_id(text)
+    assert audit("vesc", [{"batch": text, "n": "1", "received_ms": "1"}]).refused == 1
+
+
+def saying(message, **changes):
+    return json.dumps({**json.loads(message), **changes}).encode()
+
+
+def test_one_form_of_a_runs_name_holds_in_every_lane_and_on_the_page():
+    live = iort_contract.encode_live(LiveSample(RUN, 1, T_US, T_US, {}))
+    fleet = iort_contract.encode_fleet(FleetMessage(RUN, 1, T_US, {}))
+    command = iort_contract.encode_command(Command(RUN, T_US, 1, T_US, 100, {}))
+    page = re.search(r"^const BOOT = /\^(.*)\$/;$", PAGE.read_text(), re.MULTILINE)
+    assert page is not None
+    for name, allowed in [(RUN, True), ("0" * 32, True)] + [(one, False) for one in NO_RUNS]:
+        said = {
+            "record": by_contract(decode)(stored(batch=f"{T_US}-{name}-3")),
+            "live": read(decode_live, saying(live, boot=name)),
+            "fleet": read(decode_fleet, saying(fleet, boot=name)),
+            "cmd": read(decode_command, saying(command, session=name)),
+            "page": re.fullmatch(page[1], name) is not None,
+        }
+        assert set(said.values()) == {allowed}, (name, said)

@@ -1,0 +1,131 @@
+"""Summaries made again after a vehicle's parameters were corrected, by Lambda 2 over tables in memory."""
+
+from __future__ import annotations
+
+import io
+import json
+
+import pytest
+
+from functions.shared.processing import process
+from functions.shared.processing import recompute as summarize_again
+from iort_contract import Batch
+from iort_station.errors import StationError
+from iort_station.fleet import robots
+from iort_station.operations import recompute
+from iort_station.operations.recompute import Recomputed
+from tests.fakes import ROBOTS, TELEMETRY, item_of, record_of, serialize, summary_of, tables
+from tests.unit.station.test_data import START, FakeCloud, cloud_of, ride
+
+SECOND = START // 1_000_000
+
+
+class Cloud(FakeCloud):
+    """The tables in memory and one warm Lambda 2 over them, which has seen the ride already."""
+
+    def __init__(self, client, *, old_version=False):
+        super().__init__(client)
+        self.tables, self.old_version, self.events = tables(client), old_version, []
+        every = [record_of(item, i) for i, item in enumerate(client.items[TELEMETRY].values())]
+        process({"Records": every}, self.tables, lambda _refused: [])
+
+    def client(self, service):
+        return self if service == "lambda" else super().client(service)
+
+    def output(self, noun, name):
+        return name if noun == "processing" else super().output(noun, name)
+
+    def invoke(self, *, FunctionName, Payload):
+        assert FunctionName == "SummarizeFunction"
+        self.events.append(json.loads(Payload))
+        answer = {} if self.old_version else summarize_again(self.events[-1], self.tables)
+        return {"Payload": io.BytesIO(json.dumps(answer).encode())}
+
+    def speeds(self):
+        return {at - SECOND: float(item["speed_mps_last"]) for at, item in summary_of(self.table).items()}
+
+
+def set_gain(cloud, gain):
+    cloud.table.put(ROBOTS, {"robot": {"S": "car"}, "speed_to_erpm_gain": serialize(gain)})
+
+
+def again(cloud, since_us=None):
+    streams = recompute.streams(cloud, "car", since_us)
+    return {stream: recompute.recompute(cloud, "car", stream, since_us) for stream in streams}
+
+
+@pytest.fixture
+def cloud():
+    """Four seconds of a ride, summarised with a gain of 10 that Lambda 2 keeps in mind."""
+    return Cloud(cloud_of(*ride(200), gain="10").table)
+
+
+def test_every_second_has_the_new_speed_at_once_and_again(cloud, capsys):
+    assert cloud.speeds() == {0: 4.9, 1: 9.9, 2: 14.9, 3: 19.9}
+    capsys.readouterr()
+    set_gain(cloud, 20)
+    for _ in range(2):
+        assert again(cloud) == {"vesc": Recomputed(4, 0)}
+        assert cloud.speeds() == {0: 2.45, 1: 4.95, 2: 7.45, 3: 9.95}
+    # The metrics have counted these batches, and those that were missing, once.
+    assert capsys.readouterr().out == ""
+
+
+def test_what_was_before_the_time_stays(cloud):
+    set_gain(cloud, 20)
+    assert again(cloud, START + 2_500_000)["vesc"].seconds == 2
+    assert cloud.speeds() == {0: 4.9, 1: 9.9, 2: 7.45, 3: 9.95}
+
+
+def test_nothing_else_of_a_second_changes(cloud):
+    before = summary_of(cloud.table)
+    again(cloud)
+    assert summary_of(cloud.table) == before
+
+
+def test_a_second_in_two_events_counts_once():
+    # 100 batches end in the middle of the seventh second.
+    cloud = Cloud(cloud_of(*ride(800, each=3), gain="10").table)
+    set_gain(cloud, 20)
+    assert again(cloud)["vesc"].seconds == 16
+    assert sorted(len(event["Records"]) for event in cloud.events) == [67, 100, 100]
+    assert cloud.speeds() == {second: (50 * second + 49) / 20 for second in range(16)}
+
+
+def test_what_is_no_batch_is_left_out_and_stops_nothing(cloud):
+    broken = item_of(Batch("0badcafe", 99, [START + 7], {"speed": [1]}))
+    cloud.table.put(TELEMETRY, broken | {"samples": serialize("!")})
+    set_gain(cloud, 20)
+    assert again(cloud) == {"vesc": Recomputed(4, 1)}
+
+
+def test_a_stream_without_a_speed_is_not_asked_for():
+    cloud = Cloud(cloud_of(*ride(fields=("duty_cycle",)), gain="10").table)
+    assert again(cloud) == {}
+    assert cloud.events == []
+
+
+def test_a_lambda_that_does_not_know_how_is_named():
+    cloud = Cloud(cloud_of(*ride(), gain="10").table, old_version=True)
+    with pytest.raises(StationError, match="deploy the current stacks"):
+        again(cloud)
+
+
+@pytest.mark.parametrize(
+    ("vehicle", "said"),
+    [
+        ({"speed_to_erpm_gain": 0.0}, "and not 0, got 0"),
+        ({"speed_to_erpm_gain": float("nan")}, "got nan"),
+        ({"speed_to_erpm_gain": float("-inf")}, "must be a number from -1e.09 to 1e.09"),
+        ({"speed_to_erpm_offset": 1e10}, "speed_to_erpm_offset must be"),
+        ({"serial": 1.0}, "serial is no vehicle parameter; allowed are speed_to_erpm_gain, speed_to_erpm_of"),
+    ],
+)
+def test_parameters_that_cannot_be_are_refused(vehicle, said):
+    with pytest.raises(StationError, match=said):
+        robots.checked_vehicle(vehicle)
+
+
+def test_a_negative_gain_and_no_offset_can_be():
+    vehicle = {"speed_to_erpm_gain": -1060.5, "speed_to_erpm_offset": 0.0}
+    assert robots.checked_vehicle(vehicle) == vehicle
