@@ -14,7 +14,7 @@ import sys
 import genpy
 import genpy.dynamic
 
-from iort_agent.ros1.write import Writer
+from iort_agent.ros1.json_message import Writer
 from iort_agent.sources.rosbridge.rosapi import md5sum
 from iort_contract.ros1.definition import LETTERS, parse
 from tests.rosbridge_json import as_rosbridge

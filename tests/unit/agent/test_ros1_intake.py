@@ -12,7 +12,8 @@ import pytest
 
 import iort_contract
 from iort_agent.errors import SourceError
-from iort_agent.sources.ros1 import Intake, Ros1Config, TopicConfig
+from iort_agent.sources.intake import Intake
+from iort_agent.sources.ros1 import Ros1Config, TopicConfig
 from iort_contract import RosMessage
 from tests.agent_fakes import ManualClock
 from tests.unit.contract.ros1_messages import LINE, STAMPED, header, u32
@@ -27,7 +28,7 @@ class Desk:
         self.samples: list[tuple[str, int, dict[str, Any]]] = []
         self.types: list[iort_contract.MessageType] = []
         config = TopicConfig(**{"stream": "s", "time": "header", **settings})
-        self.intake = Intake("/t", config, emit=self._emit, clock=self.clock)
+        self.intake = Intake("/t", config, emit=self._emit, clock=self.clock, large=config.large)
 
     def _emit(self, stream: str, t_us: int, values: Any) -> None:
         if stream != iort_contract.TYPES_STREAM:
