@@ -11,17 +11,18 @@ import threading
 from dataclasses import dataclass
 from typing import Any, Mapping, NamedTuple, Optional
 
-import iort_contract
 from iort_agent.clock import Clock
 from iort_agent.errors import SourceError
 from iort_agent.ros1.types import installed
 from iort_agent.schema import choice, items, setting, text
 from iort_agent.sources import REFUSE, UPLOAD, Emit
 from iort_agent.throttled_log import Seldom
-from iort_contract import RosMessage, RosType, Value
-from iort_contract.limits import MessageError
+from iort_contract.limits import ContractError, MessageError, Value
+from iort_contract.messages.message_type import MessageType
 from iort_contract.ros1.decode import Decoder, stamp_ns
 from iort_contract.ros1.definition import Definition, parse
+from iort_contract.ros1.message import RosMessage, RosType
+from iort_contract.topics import TYPES_STREAM, check_stream
 
 _log = logging.getLogger(__name__)
 
@@ -46,7 +47,7 @@ class TopicConfig:
     the wanted paths, or their beginnings (``pose.position``); without it, all.
     """
 
-    stream: str = setting(text(iort_contract.check_stream))
+    stream: str = setting(text(check_stream))
     time: str = setting(choice(HEADER, ARRIVAL))
     fields: tuple[str, ...] | None = setting(
         items(text(), at_least=1, what="a list of at least one field"), default=None
@@ -197,10 +198,10 @@ class Intake:
             self._connections.clear()
         self._connections[publisher] = header
         named = header.get("type", ""), header.get("md5sum", "")
-        message_type = iort_contract.MessageType(self._config.stream, self._topic, *named, kind.text)
+        message_type = MessageType(self._config.stream, self._topic, *named, kind.text)
         try:
-            self._emit(iort_contract.TYPES_STREAM, t_us, message_type.sample())
-        except iort_contract.ContractError as error:
+            self._emit(TYPES_STREAM, t_us, message_type.sample())
+        except ContractError as error:
             _log.warning("topic %s: its type is not recorded: %s", self._topic, error)
 
     def _kind_of(self, header: Mapping[str, str]) -> Kind:

@@ -11,7 +11,6 @@ import threading
 from dataclasses import dataclass
 from typing import Any, Iterator, Sequence
 
-import iort_contract
 from iort_agent.clock import Clock
 from iort_agent.errors import SourceError
 from iort_agent.ros1 import master
@@ -19,6 +18,7 @@ from iort_agent.ros1.node import DEFAULT_NODE, Node, shared
 from iort_agent.schema import Where, choice, pairs, section, setting, text
 from iort_agent.sources import FAIL, OK, REFUSE, UPLOAD, Emit, Finding, SourceConfig, intake
 from iort_agent.sources.intake import Intake
+from iort_contract.limits import ContractError
 
 _LOOK_S = 1.0
 _TOPIC = re.compile(r"(/[A-Za-z]\w*)(/\w+)*", re.ASCII)
@@ -28,17 +28,13 @@ _NODE = re.compile(r"[A-Za-z]\w*", re.ASCII)
 def ros_name(value: str) -> str:
     """The full name of a topic. Raises `ContractError` for any other text."""
     if not _TOPIC.fullmatch(value):
-        raise iort_contract.ContractError(
-            f"ROS topic must be a full name such as /sensors/core, got {value!r}"
-        )
+        raise ContractError(f"ROS topic must be a full name such as /sensors/core, got {value!r}")
     return value
 
 
 def _node_name(value: str) -> str:
     if not _NODE.fullmatch(value):
-        raise iort_contract.ContractError(
-            f"ROS node must be a letter, then letters, digits and _, got {value!r}"
-        )
+        raise ContractError(f"ROS node must be a letter, then letters, digits and _, got {value!r}")
     return value
 
 

@@ -5,13 +5,13 @@ from __future__ import annotations
 import threading
 from typing import NamedTuple
 
-import iort_contract
 from iort_agent.errors import SourceError
 from iort_agent.sources.recording.player import Open
+from iort_contract.topics import TYPES_STREAM
 
 
 class Looked(NamedTuple):
-    """``streams`` have a message; ``ended`` is true if the recording ended before every wanted stream had one;
+    """``streams`` have a message; ``ended`` is true if the recording ended before all wanted streams had one;
     ``error`` is empty if nothing is wrong."""
 
     streams: list[str]
@@ -29,7 +29,7 @@ def look_into(recording: Open, wanted: set[str], within_s: float) -> Looked:
         try:
             with recording() as messages:
                 for message in messages:
-                    if message.stream != iort_contract.TYPES_STREAM:
+                    if message.stream != TYPES_STREAM:
                         streams.add(message.stream)
                     if wanted <= streams or stop.is_set():
                         return
