@@ -372,29 +372,6 @@ def test_something_else_listens_there(log: pytest.LogCaptureFixture) -> None:
             eventually(lambda: "is no rosbridge server" in log.text)
 
 
-def test_publishing(server: RosbridgeStandin) -> None:
-    with Running(config(server)) as running:
-        connection = running.source.connection
-        server.wait_for("subscribe")
-        connection.publish("/drive", "std_msgs/Float64", {"data": 1.5})
-        connection.publish("/drive", "std_msgs/Float64", {"data": 2.5})
-        assert server.wait_for("publish", 2)["msg"] == {"data": 2.5}
-        assert [op["op"] for op in server.operations if op["op"] in ("advertise", "publish")] == [
-            "advertise", "publish", "publish",
-        ]  # fmt: skip
-        with pytest.raises(SourceError, match="/drive cannot be published"):
-            connection.publish("/drive", "std_msgs/Float64", {"data": float("nan")})
-        server.__exit__()
-        eventually(lambda: connection._socket is None)
-        with pytest.raises(SourceError, match="not connected"):
-            connection.publish("/drive", "std_msgs/Float64", {"data": 3.5})
-        server.__enter__()
-        server.wait_for("subscribe", 2)
-        connection.publish("/drive", "std_msgs/Float64", {"data": 4.5})
-        server.wait_for("advertise", 2)
-        server.wait_for("publish", 3)
-
-
 def test_without_websocket_client_it_says_what_to_install(
     server: RosbridgeStandin, monkeypatch: pytest.MonkeyPatch
 ) -> None:

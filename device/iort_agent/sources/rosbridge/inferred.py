@@ -9,7 +9,16 @@ from __future__ import annotations
 from typing import Any, Mapping
 
 from iort_contract.limits import MessageError
-from iort_contract.ros1.definition import DURATION, HEADER_TYPE, STRING, TIME, VARIABLE, Definition, Field
+from iort_contract.ros1.definition import (
+    DURATION,
+    HEADER_TYPE,
+    STRING,
+    TIME,
+    TIMES,
+    VARIABLE,
+    Definition,
+    Field,
+)
 
 _KIND = "json/Message"
 _STAMP = ({"secs", "nsecs"}, {"sec", "nanosec"})
@@ -22,8 +31,7 @@ def infer(message: Mapping[str, Any]) -> tuple[Definition, dict[str, Any], bool]
     Raises `MessageError` if no ROS message is like this.
     """
     types = {
-        TIME: (Field("sec", "uint32", None), Field("nanosec", "uint32", None)),
-        DURATION: (Field("sec", "int32", None), Field("nanosec", "int32", None)),
+        **TIMES,
         HEADER_TYPE: (
             Field("seq", "uint32", None),
             Field("stamp", TIME, None),
