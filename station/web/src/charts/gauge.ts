@@ -1,8 +1,8 @@
 // A number with a bar: where it stands between the extremes, and where it has been for 30 seconds.
 
-import { el, Text } from "./dom";
-import { number } from "./format";
-import { roundStep } from "./frame";
+import { el, Text } from "../base/dom";
+import { number } from "../base/format";
+import { roundStep } from "./axes";
 
 export interface GaugeOptions {
   readonly name: string;

@@ -2,7 +2,7 @@
 // it missed; a live page must neither give up nor fall behind, so it starts a new subscription each time.
 
 import type PubNubSdk from "pubnub";
-import type { LinkState, Listening } from "./wire";
+import type { LinkState, Listening } from "./worker_messages";
 
 // The SDK's licence lets unmodified copies be passed on, so it is not bundled: it comes as its own file.
 declare function importScripts(...urls: string[]): void;
@@ -25,7 +25,7 @@ const REASONS: Readonly<Record<string, string>> = {
   PNMalformedResponseCategory: "an answer that is not PubNub's",
 };
 
-export class Link {
+export class PubNubLink {
   state: LinkState = { kind: "connecting" };
   private readonly pubnub: PubNubSdk;
   private readonly channel: string;

@@ -1,8 +1,8 @@
 // Where the time goes: a bar a leg of a message's way, each beginning where the one before it ends.
 
-import { el, setAttribute, Text } from "./dom";
-import { LEGS, MEDIAN_S, type Delay, type Leg, type Robot } from "./fleet";
-import { milliseconds, NOTHING } from "./format";
+import { el, setAttribute, Text } from "../base/dom";
+import { LEGS, MEDIAN_S, type Delay, type Leg, type Robot } from "../live/fleet";
+import { milliseconds, NOTHING } from "../base/format";
 
 const NAMES: Readonly<Record<Leg | "screen", readonly [string, string]>> = {
   car: ["Car", "from the sample to its leaving the car"],

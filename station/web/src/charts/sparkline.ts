@@ -1,8 +1,8 @@
 // A line of the last 30 seconds in a few square centimetres, without axes.
 
-import { WINDOW_S } from "./fleet";
-import type { Ring } from "./ring";
-import { colour, onTheme } from "./theme";
+import { WINDOW_S } from "../live/fleet";
+import type { Ring } from "../live/ring";
+import { colour, onTheme } from "../base/theme";
 
 const HOLE_S = 1;
 const seen = new WeakSet<Element>();

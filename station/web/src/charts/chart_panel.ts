@@ -1,8 +1,8 @@
 // A heading with readings, and a chart below it. Under the pointer, the readings are of that time.
 
-import { Chart, type ChartOptions, type Shown } from "./chart";
-import { el, setAttribute, Text } from "./dom";
-import { age, AS_SENT, linear, number, type Linear } from "./format";
+import { LiveChart, type LiveChartOptions, type Shown } from "./live_chart";
+import { el, setAttribute, Text } from "../base/dom";
+import { age, AS_SENT, linear, number, type Linear } from "../base/format";
 
 /** A value in a panel's heading, computed from those of the panel's lines as they are drawn. */
 export interface Reading {
@@ -15,26 +15,26 @@ export interface Reading {
   readonly from: (values: readonly number[]) => number;
 }
 
-export interface PanelOptions {
+export interface ChartPanelOptions {
   readonly title: string;
   readonly readings: readonly Reading[];
-  readonly chart: ChartOptions;
+  readonly chart: LiveChartOptions;
   /** Present where the viewer may put it away. */
   readonly onClose?: () => void;
 }
 
-export class Panel {
+export class ChartPanel {
   readonly node: HTMLElement;
   private readonly texts: Text[];
   private readonly note = new Text("note");
-  private readonly chart: Chart;
+  private readonly chart: LiveChart;
   private readonly units: Text[];
   private hovered = false;
   private as: Linear = AS_SENT;
 
   constructor(
     host: HTMLElement,
-    private readonly options: PanelOptions,
+    private readonly options: ChartPanelOptions,
   ) {
     const { title, readings, chart, onClose } = options;
     this.texts = readings.map(({ name }) => new Text("num", "span", { "data-reading": name }));
@@ -65,7 +65,7 @@ export class Panel {
     const plot = el("div", { class: "plot", "aria-hidden": "true" });
     this.node = el("section", { class: "panel", "aria-label": title }, heading, plot);
     host.append(this.node);
-    this.chart = new Chart(plot, {
+    this.chart = new LiveChart(plot, {
       ...chart,
       onPoint: (point) => {
         this.hovered = point !== undefined;

@@ -1,11 +1,11 @@
 // The bar above and the line below every view: who is there, whether the connection holds, what was refused.
 
-import type { Config, FieldTable } from "./config";
-import { byId, setAttribute } from "./dom";
-import type { Fleet } from "./fleet";
-import { age, number } from "./format";
-import { now } from "./clock";
-import type { LinkState } from "./wire";
+import type { Config, FieldTable } from "../server/config";
+import { byId, setAttribute } from "../base/dom";
+import type { Fleet } from "../live/fleet";
+import { age, number } from "../base/format";
+import { now } from "../base/clock";
+import type { LinkState } from "../live/worker_messages";
 
 const ANNOUNCE_S = 8;
 const WORDS = { connecting: "Connecting", paused: "Paused", live: "Connected", lost: "Connection lost" } as const;

@@ -1,8 +1,8 @@
 // A log widget: what its query finds, as a table. Asked for by itself, because Logs Insights takes seconds.
 
-import { ask, AnswerError, type Logs } from "./answers";
-import { el, Text } from "./dom";
-import { clockTime, dayTime, zone } from "./format";
+import { ask, AnswerError, type Logs } from "../server/answers";
+import { el, Text } from "../base/dom";
+import { clockTime, dayTime, zone } from "../base/format";
 
 // AWS bills a query by what it reads.
 const AGAIN_S = 60;

@@ -1,10 +1,10 @@
 // What the view of a car shows of the motor controller's fields, and how to know what else a car reports.
 
-import type { Robot } from "../fleet";
-import { AS_SENT, linear, times, type Linear } from "../format";
-import type { GaugeOptions } from "../gauge";
-import type { PanelOptions } from "../panel";
-import type { PlaneOptions } from "../plane";
+import type { Robot } from "../live/fleet";
+import { AS_SENT, linear, times, type Linear } from "../base/format";
+import type { GaugeOptions } from "./gauge";
+import type { ChartPanelOptions } from "./chart_panel";
+import type { XYChartOptions } from "./xy_chart";
 
 export interface GaugeSpec extends GaugeOptions {
   /** The fields that need no tile because of this gauge. */
@@ -59,7 +59,7 @@ export const GAUGES: readonly GaugeSpec[] = [
   },
 ];
 
-interface VescPanel extends PanelOptions {
+interface VescPanel extends ChartPanelOptions {
   readonly fields: readonly string[];
   /** As what it is shown, and the unit that this gives, where it depends on the car. */
   readonly as: (speed: Linear | undefined) => readonly [Linear, string?];
@@ -102,13 +102,13 @@ export const VESC_PANELS: readonly VescPanel[] = [
   },
 ];
 
-export const DELAY_PANEL: PanelOptions = {
+export const DELAY_PANEL: ChartPanelOptions = {
   title: "Delay",
   readings: [{ name: "delay", unit: "ms", digits: 0, from: first }],
   chart: { lines: [{ colour: "--delay", fill: true }], span: 20, zero: true },
 };
 
-export interface PlaneSpec extends Omit<PlaneOptions, "x"> {
+export interface XYChartSpec extends Omit<XYChartOptions, "x"> {
   readonly x: string;
   readonly title: string;
   /** The x axis is the motor's speed, which is the car's where that is known. */
@@ -120,7 +120,7 @@ export interface PlaneSpec extends Omit<PlaneOptions, "x"> {
 // What poses are called in geometry_msgs, nav_msgs and tf2_msgs, and in flat messages of one's own.
 const POSITIONS = ["pose.pose.position.", "pose.position.", "position.", "transform.translation.", "translation.", "pose.", ""];
 
-export const PLANES: readonly PlaneSpec[] = [
+export const XY_CHARTS: readonly XYChartSpec[] = [
   {
     title: "Speed and motor current",
     x: "speed",

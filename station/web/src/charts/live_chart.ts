@@ -1,11 +1,11 @@
 // A chart of the last 30 seconds that scrolls: uPlot, drawn only when there is something new to see.
 
 import uPlot from "uplot";
-import { WINDOW_S } from "./fleet";
-import { AS_SENT, linear, type Linear } from "./format";
-import { axis, calm, faint, fit, holes, labels, paint, PLAIN, rem, roundRange } from "./frame";
-import type { Ring } from "./ring";
-import { colour, onTheme } from "./theme";
+import { WINDOW_S } from "../live/fleet";
+import { AS_SENT, linear, type Linear } from "../base/format";
+import { axis, calm, faint, fit, holes, labels, paint, PLAIN, rem, roundRange } from "./axes";
+import type { Ring } from "../live/ring";
+import { colour, onTheme } from "../base/theme";
 
 export interface Line {
   /** The custom property that holds its colour. */
@@ -15,7 +15,7 @@ export interface Line {
   readonly fill?: boolean;
 }
 
-export interface ChartOptions {
+export interface LiveChartOptions {
   readonly lines: readonly Line[];
   /** The least height of the axis, so that noise is not drawn as a mountain. */
   readonly span: number;
@@ -39,7 +39,7 @@ const FRAME_S = 0.04;
 
 const shared = uPlot.sync("charts");
 
-export class Chart {
+export class LiveChart {
   private readonly plot: uPlot;
   private shown: Shown | undefined;
   private as: Linear = AS_SENT;
@@ -55,7 +55,7 @@ export class Chart {
 
   constructor(
     host: HTMLElement,
-    private readonly options: ChartOptions,
+    private readonly options: LiveChartOptions,
   ) {
     this.readColours();
     const colours = () => this.paint;

@@ -1,6 +1,6 @@
 // What the page and its worker say to each other.
 
-import type { Update } from "./message";
+import type { Update } from "./update";
 
 export type LinkState =
   | { readonly kind: "connecting" }

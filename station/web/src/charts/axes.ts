@@ -1,7 +1,7 @@
 // What every chart has in common: fonts, colours, axes and round numbers.
 
 import type uPlot from "uplot";
-import { colour } from "./theme";
+import { colour } from "../base/theme";
 
 export interface Paint {
   text: string;

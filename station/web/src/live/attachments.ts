@@ -1,7 +1,7 @@
 // What a message was too large for: the sample holds a claim for each field of bytes (docs/files.md), five
 // fields that say where the content is and, of a picture, hold a small one.
 
-import type { Value } from "./message";
+import type { Value } from "./update";
 
 /** The end of a claim's fields' names, as in contract/iort_contract/messages/files.py. */
 const PARTS = ["key", "sha256", "size", "content_type", "thumbnail"] as const;

@@ -1,13 +1,13 @@
 // What is known of every car: its streams' newest samples, the last 30 seconds, the delays and the faults.
 // Nothing here touches the page; times are those of clock.ts.
 
-import { ask, AnswerError } from "./answers";
-import { claim, claimed, type Claim } from "./claims";
-import type { Config, FieldTable, Vehicles } from "./config";
-import type { Linear } from "./format";
-import type { Hops, Update, Value } from "./message";
+import { ask, AnswerError } from "../server/answers";
+import { claim, claimed, type Claim } from "./attachments";
+import type { Config, FieldTable, Vehicles } from "../server/config";
+import type { Linear } from "../base/format";
+import type { Hops, Update, Value } from "./update";
 import { Ring } from "./ring";
-import type { Arrival } from "./wire";
+import type { Arrival } from "./worker_messages";
 
 /** Older values are shown as stale, and a car unheard of for longer as gone. */
 export const STALE_S = 1.5;

@@ -2,9 +2,9 @@
 // go on to allow no pictures but its own; and never before its size is known, because three kilobytes can
 // claim to be a picture of a billion pixels.
 
-import { bytes, type Claim } from "./claims";
-import { el, setAttribute, Text } from "./dom";
-import { age } from "./format";
+import { bytes, type Claim } from "../live/attachments";
+import { el, setAttribute, Text } from "../base/dom";
+import { age } from "../base/format";
 
 // The cars' are of 96 pixels; see device/iort_agent/lanes/thumbnail.py.
 const MOST_PIXELS = 256;
@@ -14,7 +14,7 @@ const START_OF_FRAME = (marker: number): boolean => marker >= 0xc0 && marker <= 
 // what does not, a decoder would look for the next marker elsewhere than this does.
 const BEFORE_FRAME = (marker: number): boolean => [0xc4, 0xdb, 0xdd, 0xfe].includes(marker) || (marker >= 0xe0 && marker <= 0xef);
 
-export class Picture {
+export class Thumbnail {
   readonly node: HTMLElement;
   private readonly canvas = el("canvas", { role: "img" });
   private readonly state = new Text("picture-state");

@@ -1,8 +1,8 @@
 // The faults that this page has heard of since it was opened, the newest first.
 
-import { el, setAttribute, Text } from "./dom";
-import type { Fault, Robot } from "./fleet";
-import { age, clockTime, zone } from "./format";
+import { el, setAttribute, Text } from "../base/dom";
+import type { Fault, Robot } from "../live/fleet";
+import { age, clockTime, zone } from "../base/format";
 
 const SHOWN = 6;
 

@@ -1,10 +1,10 @@
 // One quantity over another: the newest point, and the way it came, which fades.
 
 import uPlot from "uplot";
-import { axis, faint, fit, labels, paint, PLAIN, rem, roundRange } from "./frame";
-import { colour, onTheme } from "./theme";
+import { axis, faint, fit, labels, paint, PLAIN, rem, roundRange } from "./axes";
+import { colour, onTheme } from "../base/theme";
 
-export interface PlaneOptions {
+export interface XYChartOptions {
   /** A text, or what gives one when the plane is drawn. */
   readonly x: string | (() => string);
   readonly y: string;
@@ -25,7 +25,7 @@ export interface Track {
 const FRAME_S = 0.1;
 const SHADES = 12;
 
-export class Plane {
+export class XYChart {
   private readonly plot: uPlot;
   private track: Track = { x: [], y: [] };
   private visible = true;
@@ -36,7 +36,7 @@ export class Plane {
 
   constructor(
     host: HTMLElement,
-    private readonly options: PlaneOptions,
+    private readonly options: XYChartOptions,
   ) {
     this.bounds = { x: [0, options.span[0]], y: [0, options.span[1]] };
     this.ink = colour("--accent");

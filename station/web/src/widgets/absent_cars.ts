@@ -1,15 +1,15 @@
 // The registered cars that this page has not heard: since when they are away, and the way to their past.
 
-import { ask, AnswerError, type Presence } from "./answers";
-import type { Config } from "./config";
-import { byName, el } from "./dom";
-import type { Fleet } from "./fleet";
-import { dayTime, zone } from "./format";
-import { route } from "./route";
+import { ask, AnswerError, type Presence } from "../server/answers";
+import type { Config } from "../server/config";
+import { byName, el } from "../base/dom";
+import type { Fleet } from "../live/fleet";
+import { dayTime, zone } from "../base/format";
+import { route } from "../base/route";
 
 const REFRESH_S = 30;
 
-export class Absent {
+export class AbsentCars {
   readonly node = el("section", { class: "absent", "aria-label": "Cars that are not heard", hidden: "" });
   private robots: Presence = {};
   private drawn = "";

@@ -1,13 +1,13 @@
 // A stream's heading, and a tile for each of its fields: the newest value, its unit and its last 30 seconds;
 // of a field of bytes, the newest picture.
 
-import { claimed, partsOf } from "./claims";
-import type { FieldTable } from "./config";
-import { el, setAttribute, Text } from "./dom";
-import { numeric, STALE_S, type Stream } from "./fleet";
-import { age, spec, write, type Spec } from "./format";
-import { Picture } from "./picture";
-import { Sparkline } from "./sparkline";
+import { claimed, partsOf } from "../live/attachments";
+import type { FieldTable } from "../server/config";
+import { el, setAttribute, Text } from "../base/dom";
+import { numeric, STALE_S, type Stream } from "../live/fleet";
+import { age, spec, write, type Spec } from "../base/format";
+import { Thumbnail } from "./thumbnail";
+import { Sparkline } from "../charts/sparkline";
 
 /** The name under which a field is charted: fields of two streams may have the same name. */
 export const fieldKey = (stream: string, field: string): string => `${stream}/${field}`;
@@ -63,7 +63,7 @@ export class StreamSection {
   private readonly facts = new Text("facts");
   private readonly list = el("div", { class: "tiles" });
   private readonly tiles = new Map<string, Tile>();
-  private readonly pictures = new Map<string, Picture>();
+  private readonly pictures = new Map<string, Thumbnail>();
   private drawn = -1;
   private ros2 = false;
 
@@ -115,7 +115,7 @@ export class StreamSection {
     const ofBytes = claimed(this.stream.sample);
     for (const field of ofBytes) {
       if (this.pictures.has(field)) continue;
-      const picture = new Picture(spec(field, this.table).label, field);
+      const picture = new Thumbnail(spec(field, this.table).label, field);
       this.pictures.set(field, picture);
       this.list.prepend(picture.node);
     }

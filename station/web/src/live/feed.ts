@@ -1,9 +1,9 @@
 // The page's end of its worker: starts it, and hands what it hears to the fleet.
 
-import { now } from "./clock";
-import type { Config, FieldTable } from "./config";
+import { now } from "../base/clock";
+import type { Config, FieldTable } from "../server/config";
 import type { Fleet } from "./fleet";
-import type { FromWorker, LinkState, ToWorker } from "./wire";
+import type { FromWorker, LinkState, ToWorker } from "./worker_messages";
 
 export class Feed {
   state: LinkState = { kind: "connecting" };

@@ -1,9 +1,9 @@
 // Two columns of values: at the time that the viewer looks at, and now.
 
-import { el, Text } from "../dom";
-import type { Stream } from "../fleet";
-import { NOTHING, number, write, type Spec } from "../format";
-import type { Value } from "../message";
+import { el, Text } from "../base/dom";
+import type { Stream } from "../live/fleet";
+import { NOTHING, number, write, type Spec } from "../base/format";
+import type { Value } from "../live/update";
 
 interface Row {
   readonly spec: Spec;

@@ -1,8 +1,8 @@
 // A chart of a range that is over: uPlot with the time of day below it.
 
 import uPlot from "uplot";
-import { axis, faint, fit, holes, labels, paint, PLAIN, rem, roundRange } from "./frame";
-import { colour, onTheme } from "./theme";
+import { axis, faint, fit, holes, labels, paint, PLAIN, rem, roundRange } from "./axes";
+import { colour, onTheme } from "../base/theme";
 
 export interface Curve {
   readonly label: string;
@@ -14,7 +14,7 @@ export interface Curve {
   readonly points?: boolean;
 }
 
-export interface TimeChartOptions {
+export interface RangeChartOptions {
   readonly curves: readonly Curve[];
   readonly zero?: boolean;
   /** Charts of one name share their cursor. */
@@ -28,12 +28,12 @@ export interface TimeChartOptions {
 
 const TIME = { hour: "2-digit", minute: "2-digit", hourCycle: "h23" } as const;
 
-export class TimeChart {
+export class RangeChart {
   private readonly plot: uPlot;
   private palette: string[] = [];
   private paint = paint();
 
-  constructor(host: HTMLElement, options: TimeChartOptions, data: uPlot.AlignedData, range: readonly [number, number]) {
+  constructor(host: HTMLElement, options: RangeChartOptions, data: uPlot.AlignedData, range: readonly [number, number]) {
     const read = (): void => {
       this.palette = options.curves.map((curve) => colour(curve.colour));
       this.paint = paint();
