@@ -15,7 +15,7 @@ from rich.progress import Progress
 from rich.text import Text
 
 from iort_station.cli.console import Console
-from iort_station.cli.verbs.options import since_us
+from iort_station.cli.options import since_us
 from iort_station.operations import quarantine, replay
 from iort_station.operations.quarantine import Entry
 from iort_station.operations.replay import Fate

@@ -9,8 +9,8 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+from iort_station.cli.options import From, Last, Range, Robot, To
 from iort_station.cli.progress import reading, say
-from iort_station.cli.verbs.options import From, Last, Range, Robot, To
 from iort_station.errors import StationError
 
 if TYPE_CHECKING:

@@ -13,8 +13,8 @@ import typer
 
 from iort_contract import NO_SENSOR_DEGC
 from iort_station.cli.console import Console
+from iort_station.cli.options import Every, From, Last, Range, Robot, Stream, To, names
 from iort_station.cli.progress import reading, say
-from iort_station.cli.verbs.options import Every, From, Last, Range, Robot, Stream, To, names
 from iort_station.errors import StationError
 
 if TYPE_CHECKING:

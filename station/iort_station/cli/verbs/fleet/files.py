@@ -15,7 +15,7 @@ import typer
 from rich.progress import BarColumn, DownloadColumn, Progress, TextColumn, TransferSpeedColumn
 
 from iort_station.cli.console import Console
-from iort_station.cli.verbs.options import bounds
+from iort_station.cli.options import bounds
 from iort_station.cloud import Cloud
 from iort_station.data.inventory import check_registered
 from iort_station.data.times import iso_s
@@ -23,7 +23,9 @@ from iort_station.errors import StationError
 from iort_station.fleet import files
 from iort_station.fleet.files import StoredFile, Told
 
-commands = typer.Typer(no_args_is_help=True, help="Bags, images and what else robots have uploaded.")
+commands = typer.Typer(
+    name="files", no_args_is_help=True, help="Bags, images and other files that robots have uploaded."
+)
 _out = Console(soft_wrap=True)
 _errors = Console(stderr=True, soft_wrap=True)
 

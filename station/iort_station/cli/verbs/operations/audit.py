@@ -13,7 +13,7 @@ from rich.text import Text
 
 from iort_contract import ContractError, check_robot, check_stream
 from iort_station.cli.console import Console
-from iort_station.cli.verbs.options import bounds
+from iort_station.cli.options import bounds
 from iort_station.data import inventory
 from iort_station.data.times import duration_us, iso, iso_s
 from iort_station.errors import StationError
