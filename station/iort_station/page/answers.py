@@ -1,6 +1,6 @@
 """What the live page may ask its server: cars' parameters, a car's past, and CloudWatch's dashboards.
 
-Each answer is a function of the request's parameters; station/web/src/answers.ts is the other end.
+Each answer is a function of the request's parameters; station/web/src/server/answers.ts is the other end.
 """
 
 from __future__ import annotations

@@ -1,15 +1,15 @@
 // What a car did: a range from the cloud's table, to scrub through and to hold against what it does now.
 
-import { ask, AnswerError, type Drive } from "../answers";
-import { claim, claimed, partsOf } from "../claims";
-import type { Config, FieldTable } from "../config";
-import { el, setAttribute, Text } from "../dom";
-import type { Fleet } from "../fleet";
-import { age, asSpeed, dayTime, linear, number, spec, zone, type Spec } from "../format";
-import { Picture } from "../picture";
-import { route } from "../route";
-import { TimeChart } from "../timechart";
-import { Comparison } from "./comparison";
+import { ask, AnswerError, type Drive } from "../server/answers";
+import { claim, claimed, partsOf } from "../live/attachments";
+import type { Config, FieldTable } from "../server/config";
+import { el, setAttribute, Text } from "../base/dom";
+import type { Fleet } from "../live/fleet";
+import { age, asSpeed, dayTime, linear, number, spec, zone, type Spec } from "../base/format";
+import { Thumbnail } from "../widgets/thumbnail";
+import { route } from "../base/route";
+import { RangeChart } from "../charts/range_chart";
+import { Comparison } from "../widgets/comparison";
 
 const RANGES = [["1 min", 60], ["5 min", 300], ["15 min", 900], ["1 h", 3600]] as const;
 const FIRST_FIELDS = ["speed", "voltage_input", "current_motor", "current_input", "duty_cycle", "temperature_pcb"];
@@ -36,8 +36,8 @@ export class HistoryView {
   private readonly pictures = el("div", { class: "tiles pictures" });
   private readonly comparison: Comparison;
   /** Of each field of bytes its picture, and the rows in which the car has kept one. */
-  private readonly kept = new Map<string, { readonly picture: Picture; readonly rows: readonly number[] }>();
-  private readonly shown = new Map<string, { readonly node: HTMLElement; readonly chart: TimeChart }>();
+  private readonly kept = new Map<string, { readonly picture: Thumbnail; readonly rows: readonly number[] }>();
+  private readonly shown = new Map<string, { readonly node: HTMLElement; readonly chart: RangeChart }>();
   private robot: string | undefined;
   private drive: Drive | undefined;
   private loading: AbortController | undefined;
@@ -202,7 +202,7 @@ export class HistoryView {
     for (const field of ofBytes) {
       const keys = drive.fields[`${field}.key`]!.mean;
       const rows = [...keys.keys()].filter((row) => keys[row] !== null);
-      this.kept.set(field, { picture: new Picture(spec(field, this.table).label, field), rows });
+      this.kept.set(field, { picture: new Thumbnail(spec(field, this.table).label, field), rows });
     }
     this.pictures.replaceChildren(...[...this.kept.values()].map(({ picture }) => picture.node));
     const claims = new Set(ofBytes.flatMap(partsOf));
@@ -227,7 +227,7 @@ export class HistoryView {
     const node = el("section", { class: "panel", "aria-label": label }, el("header", {}, el("h3", {}, label), el("p", { class: "reading" }, el("span", { class: "unit" }, unit))), plot);
     this.charts.append(node);
     const band = least !== undefined && most !== undefined;
-    const chart = new TimeChart(
+    const chart = new RangeChart(
       plot,
       {
         curves: [{ label, colour: "--accent" }],
