@@ -25,15 +25,15 @@ from botocore.config import Config
 from functions.shared.tables import Tables
 from iort_contract import expression
 from iort_contract.attributes import plain
+from iort_contract.catalog.derived import DERIVED, derive
 from iort_contract.cloud import RESULTS_PREFIX
 from iort_contract.codec.columns import PLAIN_CODEC
 from iort_contract.expression import ExpressionError, MismatchError, Node
 from iort_contract.limits import MAX_BATCH_SPAN_US, ContractError, Value
 from iort_contract.messages.batch import batches_between, decode_batch
-from iort_contract.statistics import derive, without_absent
+from iort_contract.statistics import without_absent
 from iort_contract.tables import BATCH, TOPIC
 from iort_contract.topics import RECORD, build_topic, parse_topic
-from iort_contract.vesc import DERIVED_UNITS
 
 # Lambda's synchronous answer holds 6 MB; the envelope around the samples takes some hundred bytes.
 MAX_INLINE_BYTES = 5_500_000
@@ -111,7 +111,7 @@ class Found:
         named = set(request.fields or ())
         if request.condition is not None:
             named |= expression.names(request.condition)
-        self._derived = sorted(named & DERIVED_UNITS.keys())
+        self._derived = sorted(named & DERIVED.keys())
         self._vehicle = tables.vehicle(parse_topic(request.topic).robot) if self._derived else None
         self.times_us: list[int] = []
         self.columns: dict[str, list[Value]] = {}

@@ -3,8 +3,7 @@
     with PageServer(namespace="iort", subscribe_key="sub-c-...", origin="ps.pndsn.com") as page:
         print(page.url)
 
-The page learns where to listen from ``/config.json`` and what the fields mean from ``/fields.json``.
-Neither holds a key that can publish.
+The page learns where to listen from ``/config.json``, which holds no key that can publish.
 """
 
 from __future__ import annotations
@@ -32,7 +31,7 @@ from typing_extensions import Self
 from iort_contract.limits import ContractError
 from iort_contract.page import HEADERS, PUBNUB_ORIGIN, security_policy
 from iort_station.errors import StationError
-from iort_station.page.page import BUILT, TYPES, built_files, config, field_table
+from iort_station.page.page import BUILT, TYPES, built_files, config
 
 Answer = Callable[[Mapping[str, str]], Mapping[str, Any]]
 
@@ -85,7 +84,6 @@ class PageServer:
         self._names = frozenset(name.lower() for name in ("localhost", host, *names))
         self._files = _load(built)
         self._files["/config.json"] = _json_file(told)
-        self._files["/fields.json"] = _json_file(field_table())
         self._policy = security_policy(origin=origin, tls=tls)
         self._server: _Server | None = None
         self._thread: threading.Thread | None = None

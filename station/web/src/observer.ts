@@ -2,7 +2,8 @@
 
 import { now } from "./base/clock";
 import type { Feed } from "./live/feed";
-import { BOUNDS, GONE_S, STALE_S, type Fleet } from "./live/fleet";
+import { BOUNDS, type Fleet } from "./live/fleet";
+import { GONE_S, STALE_S } from "./base/contract";
 
 export function observer(fleet: Fleet, feed: Feed, tick_s: number): object {
   const robots = (): object =>

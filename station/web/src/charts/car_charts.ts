@@ -1,5 +1,6 @@
 // What the view of a car shows of the motor controller's fields, and how to know what else a car reports.
 
+import { power_w, TEMPERATURES } from "../base/contract";
 import type { Robot } from "../live/fleet";
 import { AS_SENT, linear, times, type Linear } from "../base/format";
 import type { GaugeOptions } from "./gauge";
@@ -24,10 +25,9 @@ const plain = (field: string, scale = 1): Pick<GaugeSpec, "fields" | "extent" | 
   show: (newest) => ({ value: newest(field) * scale, as: times(scale) }),
 });
 
-/** The hottest of the temperatures that a controller reports; drivers leave those it has not at 0. */
-const TEMPERATURES = ["temperature_pcb", "temp_fet", "temp_motor"];
+/** The hottest of the controller's temperatures, as in the contract: a sensor that is not read is 0. */
 export const hottest = (newest: (field: string) => number): number => {
-  const known = TEMPERATURES.map(newest).filter((value) => !Number.isNaN(value));
+  const known = TEMPERATURES.map(newest).filter((value) => !Number.isNaN(value) && value !== 0);
   return known.length > 0 ? Math.max(...known) : NaN;
 };
 
@@ -49,7 +49,7 @@ export const GAUGES: readonly GaugeSpec[] = [
   {
     name: "power_w", label: "Battery power", unit: "W", digits: 1, from: -100, to: 200,
     fields: [],
-    show: (newest) => ({ value: newest("voltage_input") * newest("current_input") }),
+    show: (newest) => ({ value: power_w(newest("voltage_input"), newest("current_input")) }),
   },
   { name: "duty_cycle", label: "Duty cycle", unit: "%", digits: 1, from: -20, to: 100, ...plain("duty_cycle", 100) },
   {

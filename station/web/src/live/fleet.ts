@@ -1,17 +1,15 @@
 // What is known of every car: its streams' newest samples, the last 30 seconds, the delays and the faults.
 // Nothing here touches the page; times are those of clock.ts.
 
+import { GONE_S, STALE_S } from "../base/contract";
+import type { Config, FieldTable, Value, VehiclesAnswer } from "../base/contract";
 import { ask, AnswerError } from "../server/answers";
 import { claim, claimed, type Claim } from "./attachments";
-import type { Config, FieldTable, Vehicles } from "../server/config";
 import type { Linear } from "../base/format";
-import type { Hops, Update, Value } from "./update";
+import type { Hops, Update } from "./update";
 import { Ring } from "./ring";
 import type { Arrival } from "./worker_messages";
 
-/** Older values are shown as stale, and a car unheard of for longer as gone. */
-export const STALE_S = 1.5;
-export const GONE_S = 4.5;
 /** What the charts show, and what a median is taken over. */
 export const WINDOW_S = 30;
 export const MEDIAN_S = 10;
@@ -230,7 +228,7 @@ export class Fleet {
   /** Grows when a car or a stream is heard for the first time, or forgotten. */
   shape = 0;
   private columns = 0;
-  private vehicles: Vehicles;
+  private vehicles: VehiclesAnswer["vehicles"];
   private learning: Promise<void> | undefined;
 
   constructor(
@@ -284,7 +282,7 @@ export class Fleet {
   /** Ask for the cars' parameters again: one was registered after the page was opened. */
   private async learn(): Promise<void> {
     try {
-      this.vehicles = (await ask<{ vehicles: Vehicles }>("vehicles", {})).vehicles;
+      this.vehicles = (await ask<VehiclesAnswer>("vehicles", {})).vehicles;
       // What stands on the page was written without.
       for (const robot of this.robots.values()) robot.version += 1;
     } catch (error) {

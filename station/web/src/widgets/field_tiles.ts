@@ -1,10 +1,10 @@
 // A stream's heading, and a tile for each of its fields: the newest value, its unit and its last 30 seconds;
 // of a field of bytes, the newest picture.
 
+import { STALE_S, type FieldTable } from "../base/contract";
 import { claimed, partsOf } from "../live/attachments";
-import type { FieldTable } from "../server/config";
 import { el, setAttribute, Text } from "../base/dom";
-import { numeric, STALE_S, type Stream } from "../live/fleet";
+import { numeric, type Stream } from "../live/fleet";
 import { age, spec, write, type Spec } from "../base/format";
 import { Thumbnail } from "./thumbnail";
 import { Sparkline } from "../charts/sparkline";

@@ -11,6 +11,7 @@ from typing import Annotated, Any
 import typer
 from rich.table import Table
 
+from iort_contract.catalog.derived import F1TENTH
 from iort_contract.tables import (
     ADMISSION,
     ADMIT_UNTIL_S,
@@ -51,7 +52,7 @@ def add(
     out: Annotated[
         Path, typer.Option(help="Where the robot's folder of configuration and keys goes.")
     ] = Path(),
-    speed_to_erpm_gain: Annotated[float, _GAIN] = 4614.0,
+    speed_to_erpm_gain: Annotated[float, _GAIN] = F1TENTH.speed_to_erpm_gain,
 ) -> None:
     """Register a robot and write the folder that it needs: car.yaml, certificate and key."""
     bundle = robots.add(context.obj.cloud(), name, out=out, vehicle=_vehicle(speed_to_erpm_gain))
@@ -67,7 +68,7 @@ def register(
         str | None, typer.Option(help="The one machine that may have the name, by its serial number.")
     ] = None,
     days: Annotated[float, typer.Option(help="How long it is expected.", min=0)] = claims.DAYS,
-    speed_to_erpm_gain: Annotated[float, _GAIN] = 4614.0,
+    speed_to_erpm_gain: Annotated[float, _GAIN] = F1TENTH.speed_to_erpm_gain,
 ) -> None:
     """Expect robots: each name may be had once, by any robot with one of the fleet's lasting claims."""
     if serial is not None and len(names) != 1:
