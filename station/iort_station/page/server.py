@@ -27,7 +27,7 @@ from aiohttp import ETag, web
 from botocore.exceptions import BotoCoreError, ClientError
 from typing_extensions import Self
 
-import iort_contract
+from iort_contract.limits import ContractError
 from iort_contract.page import HEADERS, PUBNUB_ORIGIN, security_policy
 from iort_station.errors import StationError
 from iort_station.page.background import BackgroundServer
@@ -183,7 +183,7 @@ async def _off_the_loop(work: Callable[[], tuple[int, _Body]]) -> tuple[int, _Bo
 def _answered(answer: Answer, parameters: Mapping[str, str]) -> tuple[int, _Body]:
     try:
         return 200, _json(answer(parameters), level=1)
-    except (StationError, iort_contract.ContractError) as error:
+    except (StationError, ContractError) as error:
         return 400, _json({"error": str(error)})
     except (BotoCoreError, ClientError) as error:
         return 502, _json({"error": f"AWS refused a call: {error}"})
