@@ -6,6 +6,7 @@ import gzip
 import http.client
 import json
 import socket
+import threading
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -98,9 +99,41 @@ def test_nothing_else_is_served(built: Path, path: str) -> None:
     assert "default-src 'none'" in answer.headers["Content-Security-Policy"]
 
 
+def test_a_file_that_the_browser_has_is_not_sent_again(built: Path) -> None:
+    with PageServer(**TOLD, built=built) as page:
+        etag = ask(page, "/page.js")[0].headers["ETag"]
+        again, body = ask(page, "/page.js", headers={"If-None-Match": etag, "Accept-Encoding": "gzip"})
+        other, _ = ask(page, "/style.css", headers={"If-None-Match": etag})
+    assert (again.status, again.headers["ETag"], body) == (304, etag, b"")
+    assert "default-src 'none'" in again.headers["Content-Security-Policy"]
+    assert other.status == 200
+
+
+def test_a_slow_answer_delays_neither_a_file_nor_the_end(built: Path) -> None:
+    asked, done = threading.Event(), threading.Event()
+
+    def slow(_asked: Mapping[str, str]) -> dict[str, Any]:
+        asked.set()
+        done.wait()
+        return {}
+
+    try:
+        with (
+            PageServer(**TOLD, built=built, answers={"slow": slow}) as page,
+            socket.create_connection((page.host, page.port)) as waiting,
+        ):
+            waiting.sendall(b"GET /slow.json HTTP/1.1\r\nHost: localhost\r\n\r\n")
+            assert asked.wait(60)
+            assert ask(page, "/page.js")[0].status == 200
+            page.stop()
+            assert waiting.recv(1) == b""
+    finally:
+        done.set()
+
+
 def test_it_takes_no_other_method(built: Path) -> None:
     with PageServer(**TOLD, built=built) as page:
-        assert ask(page, "/", "POST")[0].status == 501
+        assert ask(page, "/", "POST")[0].status == 405
 
 
 def test_the_page_is_told_where_to_listen_and_nothing_more(built: Path) -> None:

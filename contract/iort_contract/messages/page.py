@@ -1,6 +1,6 @@
 """The messages to the live page: its configuration, and its server's answers.
 
-Each is sent as JSON. scripts/generate.py writes TypeScript's types into station/web/src/base/contract.ts.
+Each is sent as JSON. `make docs-parts` writes TypeScript's types into station/web/src/base/contract.ts.
 """
 
 from __future__ import annotations

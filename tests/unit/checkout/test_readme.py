@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import re
 
-from scripts.generate import ROOT
+from scripts.docs_parts import ROOT
 
 README = (ROOT / "README.md").read_text()
 

@@ -10,8 +10,6 @@ import typer
 from iort_station.cli.console import Console
 from iort_station.fleet import registry
 from iort_station.page import keys
-from iort_station.page.answers import answers
-from iort_station.page.server import PageServer
 
 commands = typer.Typer()
 _out = Console()
@@ -37,6 +35,10 @@ def dashboard(
     ] = "",
 ) -> None:
     """Serve the live page until Ctrl-C: the fleet, each car, its past, and CloudWatch's dashboards."""
+    # numpy and aiohttp take longer to load than most commands to run.
+    from iort_station.page.answers import answers  # noqa: PLC0415 - see above
+    from iort_station.page.server import PageServer  # noqa: PLC0415 - as above
+
     cloud = context.obj.cloud()
     pubnub_keys = keys.load(cloud)
     with PageServer(
