@@ -16,8 +16,7 @@ import pytest
 
 from iort_agent.sources import OK, Finding
 from iort_agent.sources.ros1 import Ros1Config
-from iort_contract.topics import AGENT_STREAM
-from iort_contract.vesc import AGENT_FIELDS
+from iort_contract.catalog.streams import AGENT_FIELDS, AGENT_STREAM
 from iort_station.operations import delivery
 from local.cloud import ROOT
 from tests.local.conftest import until

@@ -19,8 +19,8 @@ from iort_agent.sources.recording.look import look_into
 from iort_agent.sources.recording.player import NOW, ORIGINAL, Message, Open, Playback, play
 from iort_agent.sources.recording.rosbag import Recording
 from iort_agent.sources.recording.tool_csv import VescLog
+from iort_contract.catalog.vesc import VESC_STREAM
 from iort_contract.topics import check_stream
-from iort_contract.vesc import VESC_STREAM
 
 # `iort-agent check` looks into a recording for this long.
 _LOOK_S = 10.0

@@ -11,12 +11,12 @@ from typing import Any, Iterator, Mapping, NamedTuple, Optional, Sequence
 from iort_agent.errors import SourceError
 from iort_agent.sources.recording.player import Message
 from iort_agent.sources.recording.unreadable import check_kind, wrapped
+from iort_contract.catalog.streams import TYPES_STREAM
 from iort_contract.limits import ContractError, MessageError, Value
 from iort_contract.messages.message_type import MessageType
 from iort_contract.ros1.decode import Decoder, stamp_ns
 from iort_contract.ros1.definition import md5sum, parse
 from iort_contract.ros1.message import RosMessage, RosType
-from iort_contract.topics import TYPES_STREAM
 
 _log = logging.getLogger(__name__)
 

@@ -10,8 +10,8 @@ import math
 import re
 from typing import Mapping, NamedTuple, Sequence
 
+from iort_contract.catalog.vesc import FAULT_CODES
 from iort_contract.limits import Value
-from iort_contract.vesc import FAULT_CODES
 
 TIME = "ms_today"
 DAY_MS = 24 * 3600 * 1000
