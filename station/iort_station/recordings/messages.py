@@ -116,7 +116,7 @@ class Maker:
             raise StationError(f"the type {kind.kind} cannot be made again: {error}") from error
         if kind.md5sum not in {"", declared_md5}:
             raise StationError(
-                f"the definition of {kind.kind} must have the MD5 {kind.md5sum}, got {declared_md5}"
+                f"{kind.kind}: the MD5 of its definition must be {kind.md5sum}, got {declared_md5}"
             )
         paths = {leaf.path for leaf in self._leaves if leaf.path}
         self.lacking = sorted(paths - set(fields))
