@@ -19,8 +19,9 @@ from iort_agent.errors import ConfigError, UplinkError
 from iort_agent.lanes.clock_offset import Offset
 from iort_agent.mqtt.uplink import Message, Uplink
 from iort_agent.rate_limiter import STEADY, Allowance
+from iort_agent.ros1.graph import Graph
 from iort_agent.ros1.json_message import decode, encode
-from iort_agent.ros1.node import DEFAULT_NODE, Graph
+from iort_agent.ros1.node import DEFAULT_NODE
 from iort_agent.ros1.node import shared as shared_node
 from iort_agent.sources.ros1 import Ros1Config
 from iort_agent.throttled_log import Seldom

@@ -19,10 +19,11 @@ from iort_agent.ros1.json_message import Writer
 from iort_agent.schema import Where, number, pairs, section, setting, text
 from iort_agent.sources import FAIL, OK, Emit, Finding, SourceConfig, intake
 from iort_agent.sources.intake import Intake, Kind
-from iort_agent.sources.rosbridge.connection import TIMES, RosbridgeConnection, Times, Topic
+from iort_agent.sources.rosbridge.connection import RosbridgeConnection
 from iort_agent.sources.rosbridge.continuity import Numbers, Repeats
 from iort_agent.sources.rosbridge.inferred import infer
 from iort_agent.sources.rosbridge.rosapi import AGAIN_S, Rosapi, Structure
+from iort_agent.sources.rosbridge.subscription import TIMES, Times, Topic
 from iort_contract.limits import MessageError
 
 # Messages of a topic that are kept until its type is known.
