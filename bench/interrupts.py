@@ -1,14 +1,24 @@
-"""Handles Ctrl-C and a closed terminal while changes must still be restored."""
+"""A run that changes something: asks before, and restores it whatever interrupts the run."""
 
 from __future__ import annotations
 
 import signal
+import sys
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 
 from rich.console import Console
+from rich.prompt import Confirm
 
 _INTERRUPTS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
+
+
+def consent(console: Console, text: str) -> str:
+    """Say what the run will do and ask; return why it may not, "" if it may."""
+    console.print(text, highlight=False)
+    if not sys.stdin.isatty():
+        return "no terminal to ask for confirmation: use --yes (`make ... YES=1`)"
+    return "" if Confirm.ask("Go on?", console=console, default=False) else "not confirmed: nothing was done"
 
 
 @contextmanager

@@ -12,7 +12,6 @@ ROOT = Path(__file__).resolve().parent.parent
 sys.path.insert(0, str(ROOT))
 
 from bench.report.result import Ratio
-from bench.report.writer import ratio_row
 
 REPORT = ROOT / "docs" / "bench" / "report.json"
 _BLOCK = re.compile(r"(<!-- bench:.*?-->\n).*?(\n<!-- /bench -->)", re.DOTALL)
@@ -25,7 +24,7 @@ def table(report: dict[str, Any]) -> str:
     made = f"Made on {machine['date'][:10]} on {on}:"
     ratios = [Ratio(**ratio) for section in report["sections"] for ratio in section["ratios"]]
     rows = ["| ratio, side by side in one run | measured | target | reached |", "|---|---:|---:|---:|"]
-    rows += [f"| {' | '.join(ratio_row(ratio))} |" for ratio in ratios if ratio.target is not None]
+    rows += [f"| {' | '.join(ratio.as_row())} |" for ratio in ratios if ratio.target is not None]
     return "\n".join([made, "", *rows])
 
 

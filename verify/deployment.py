@@ -19,10 +19,10 @@ from local.deployment import ROOT
 from local.errors import LocalError
 from local.processes import run
 from stacks.settings import DEV
-from verify.checks.removal import POLICY
 from verify.errors import VerifyError
-from verify.preflight_deployed import STACKS, stack
-from verify.waiting import until
+from verify.preflight.deployed import STACKS, stack
+from verify.questions.certificates import POLICY
+from verify.tools.waiting import until
 
 # Without CloudFront a stage takes five minutes; AWS keeps a policy for five more after its robots.
 _DEPLOY_S, _DESTROY_S = 1_800.0, 1_800.0

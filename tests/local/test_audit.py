@@ -21,7 +21,7 @@ from iort_contract.messages.account import SourceAccount, StreamAccount
 from iort_station.cli.main import app
 from iort_station.operations import audit
 from tests.local.conftest import run_agent, until
-from verify.robot import Robot
+from verify.tools.robot import Robot
 
 T0_US = 1_760_000_000_000_000
 

@@ -11,7 +11,7 @@ import iort_contract
 from iort_contract import Batch, LiveSample, build_topic, encode, encode_live, record_topic
 from iort_station.operations import cloudwatch, cloudwatch_logs
 from tests.local.conftest import run_agent, until
-from verify.robot import Robot
+from verify.tools.robot import Robot
 
 FAULT, LOW_V = 5, 9.5
 

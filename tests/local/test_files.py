@@ -48,7 +48,7 @@ from local.gaps.broker.message_size import AWS_MESSAGE_BYTES
 from tests.images import TOPIC, jpeg, write_bag
 from tests.local.conftest import until
 from tests.local.drives import Agent
-from verify.robot import Robot
+from verify.tools.robot import Robot
 
 CONTENT = b"a small file"
 T_US = 1_700_000_000_000_000

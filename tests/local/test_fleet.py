@@ -28,7 +28,7 @@ from iort_station.errors import StationError
 from iort_station.fleet import certificates, claims, registry, robots, rotation
 from local.cloud import ROOT
 from tests.local.conftest import until
-from verify.robot import STALE, Robot
+from verify.tools.robot import STALE, Robot
 
 AGENT = Path(sys.executable).parent / "iort-agent"
 WAIT_S = 60

@@ -15,7 +15,7 @@ from iort_contract import FILE, LIVE, PING, VESC_STREAM, LiveSample, build_topic
 from iort_station.operations import quarantine
 from iort_station.page.listener import Listener
 from tests.local.conftest import until
-from verify.robot import Robot
+from verify.tools.robot import Robot
 
 BAD, GOOD = 80, 20
 

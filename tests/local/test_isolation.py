@@ -17,7 +17,7 @@ from iort_station.fleet import claims, robots
 from local.gaps.broker.message_size import AWS_MESSAGE_BYTES
 from tests.isolation import CLAIM, CONNECT, PUBLISH, RECEIVE, ROBOT, ROWS, SUBSCRIBE, A, B, Row
 from verify.errors import VerifyError
-from verify.robot import Robot, payload_for
+from verify.tools.robot import Robot, payload_for
 
 WAIT_S = 60
 # What a broker answers to what it lets pass.

@@ -32,7 +32,7 @@ from iort_contract import (
     rule_sql,
 )
 from tests.iot_sql import Message, evaluate
-from verify.spoofing import spoofed
+from verify.tools.spoofing import spoofed
 
 NOW_MS = 1_700_000_000_123
 T_US = 1_700_000_000_000_000

@@ -15,8 +15,8 @@ from iort_station.fleet import robots
 from iort_station.fleet.robots import Bundle
 from iort_station.page.listener import Listener
 from verify.errors import CannotAskError, VerifyError
-from verify.robot import Robot
-from verify.spoofing import spoofed
+from verify.tools.robot import Robot
+from verify.tools.spoofing import spoofed
 
 
 def registered(target: Target, base: str) -> Bundle:

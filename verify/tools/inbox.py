@@ -9,7 +9,7 @@ from contextlib import contextmanager
 from typing import Any
 
 from bench.target import Target
-from verify.waiting import until
+from verify.tools.waiting import until
 
 _PROBE = "verify: does this arrive?"
 Message = dict[str, Any]

@@ -11,11 +11,10 @@ from typing import Any
 from bench.target import Target
 from functions.quarantine import entries
 from iort_contract import PING, PONG, RULE, TOPIC, build_topic, rule_name
-from verify.assumption import Basis
-from verify.bundles import Pair, pair_of
-from verify.check import Check
 from verify.errors import VerifyError
-from verify.waiting import until
+from verify.question import Seen, question
+from verify.tools.robots import Pair, pair_of
+from verify.tools.waiting import until
 
 _GUIDE = "https://docs.aws.amazon.com/iot/latest/developerguide"
 
@@ -60,7 +59,21 @@ def _heard(pair: Pair, topic: str, payload: bytes) -> bytes:
     return until(heard, f"the rule's answer to {topic}", within_s=50)
 
 
-def _error_document(target: Target) -> dict[str, Any]:
+@question(
+    "rule_errors.document",
+    expected={
+        "source": "rule NAME",
+        "robot_is_the_topics": True,
+        "topic_as_published": True,
+        "payload_as_published": True,
+        "says_why": True,
+    },
+    source=f"{_GUIDE}/rule-error-handling.html and {_GUIDE}/iot-basic-ingest.html",
+    relied_on_by=("functions/quarantine.py", "contract/iort_contract/topics.py"),
+)
+def document(target: Target) -> Seen:
+    """A rule whose action fails gives its error action the topic, the original payload in base64 and the
+    reasons. The quarantine reads that, with or without Basic Ingest's prefix before the topic."""
     cloud = target.cloud
     with pair_of(target, "verify-error-document") as pair:
         heard_on = build_topic(PONG, pair.robot.name, RULE, cloud.namespace)
@@ -86,7 +99,15 @@ def _error_document(target: Target) -> dict[str, Any]:
     }
 
 
-def _star(target: Target) -> dict[str, Any]:
+@question(
+    "rule_errors.star_beside_a_key",
+    expected={"other_keys_stay": True},
+    source=f"{_GUIDE}/iot-sql-select.html",
+    relied_on_by=("docs/decisions/0033-no-star-beside-a-key.md",),
+)
+def star_beside_a_key(target: Target) -> Seen:
+    """SELECT * with a key beside it adds the key to the payload. AWS does not document which one stays if
+    the payload has the same key; no rule of this project depends on it."""
     with pair_of(target, "verify-star") as pair:
         heard_on = build_topic(PONG, pair.robot.name, RULE, target.cloud.namespace)
         pair.robot.subscribe(heard_on)
@@ -100,37 +121,3 @@ def _star(target: Target) -> dict[str, Any]:
         "other_keys_stay": ("kept", 1) in members,
         "note_topic_is": [stays.get(value, "another") for name, value in members if name == TOPIC],
     }
-
-
-CHECKS = (
-    Check(
-        name="rule_errors.document",
-        assumed=(
-            "A rule whose action fails gives its error action the topic, the original payload in base64 and "
-            "the reasons. The quarantine reads that, with or without Basic Ingest's prefix before the topic."
-        ),
-        expected={
-            "source": "rule NAME",
-            "robot_is_the_topics": True,
-            "topic_as_published": True,
-            "payload_as_published": True,
-            "says_why": True,
-        },
-        basis=Basis.DOCUMENTED,
-        source=f"{_GUIDE}/rule-error-handling.html and {_GUIDE}/iot-basic-ingest.html",
-        relied_on_by=("functions/quarantine.py", "contract/iort_contract/topics.py"),
-        ask=_error_document,
-    ),
-    Check(
-        name="rule_errors.star_beside_a_key",
-        assumed=(
-            "SELECT * with a key beside it adds the key to the payload. AWS does not document which one "
-            "stays if the payload has the same key; no rule of this project depends on it."
-        ),
-        expected={"other_keys_stay": True},
-        basis=Basis.DOCUMENTED,
-        source=f"{_GUIDE}/iot-sql-select.html",
-        relied_on_by=("docs/decisions/0033-no-star-beside-a-key.md",),
-        ask=_star,
-    ),
-)

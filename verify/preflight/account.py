@@ -9,8 +9,8 @@ from iort_station.cost.scale import on_paper
 from iort_station.cost.usage import Usage
 from iort_station.errors import StationError
 from stacks.settings import Settings
-from verify.preflight_deployed import resources
-from verify.preflight_finding import Clients, Found, code, fine, item, stops, warning
+from verify.preflight.deployed import resources
+from verify.preflight.finding import Clients, Found, code, fine, item, stops, warning
 
 # The CDK's default synthesizer needs this version of the bootstrap stack; a test compares it with the
 # manifest.

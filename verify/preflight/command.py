@@ -19,19 +19,19 @@ from typing import Any
 from iort_station.cli.console import Console
 from iort_station.cloud import Cloud
 from stacks.settings import ROOT, Settings, SettingsError
-from verify import preflight_account, preflight_deployed
-from verify.preflight_finding import Clients, Finding, Verdict
+from verify.preflight import account, deployed
+from verify.preflight.finding import Clients, Finding, Verdict
 
 _STYLES = {Verdict.FINE: "green", Verdict.WARNING: "yellow", Verdict.STOPS: "red"}
 
 
 def look(clients: Clients, settings: Settings) -> list[Finding]:
     """All findings, in the order of a deployment."""
-    who = preflight_account.credentials(clients, settings)
+    who = account.credentials(clients, settings)
     if who.verdict is Verdict.STOPS:
         # All other items would get the same answer.
         return [who]
-    return [who, *(ask(clients, settings) for ask in (*preflight_account.ITEMS, *preflight_deployed.ITEMS))]
+    return [who, *(ask(clients, settings) for ask in (*account.ITEMS, *deployed.ITEMS))]
 
 
 def stopped(findings: Sequence[Finding]) -> bool:
@@ -92,7 +92,3 @@ def main() -> None:
         show(findings, Console())
     if stopped(findings):
         sys.exit("preflight: nothing was deployed; SKIP_PREFLIGHT=1 deploys anyway")
-
-
-if __name__ == "__main__":
-    main()

@@ -11,7 +11,7 @@ from botocore.exceptions import ClientError
 from iort_contract import RULES, claim_name, fleet_name, rule_name
 from stacks.settings import PROD, Settings
 from stacks.storage import OLD_TELEMETRY
-from verify.preflight_finding import Clients, Found, code, fine, item, stops, warning
+from verify.preflight.finding import Clients, Found, code, fine, item, stops, warning
 
 # Every stack that app.py may create, in the order of deployment; a test compares it with the app.
 STACKS = ("storage", "quarantine", "fleet", "processing", "ingest", "monitoring", "site", "account")

@@ -27,7 +27,7 @@ from iort_contract import (
     encode_file_request,
     file_key,
 )
-from verify.robot import Robot
+from verify.tools.robot import Robot
 
 _CODE = re.compile(r"<Code>([^<]+)</Code>")
 

@@ -4,16 +4,13 @@ from __future__ import annotations
 
 import json
 import time
-from typing import Any
 
 from bench.target import Target
 from bench.temporary_function import temporary_function
 from iort_contract import BY_FUNCTION, LAMBDA, PING, TOPIC, build_topic, rule_event
-from iort_station.operations import quarantine
-from verify.assumption import Basis
-from verify.check import Check
 from verify.errors import VerifyError
-from verify.waiting import until
+from verify.question import Seen, question
+from verify.tools.telemetry import only_entry
 
 _GUIDE = "https://docs.aws.amazon.com/lambda/latest/dg"
 _MEMORY_MB = 256
@@ -50,7 +47,20 @@ def handler(event, context):
 """
 
 
-def _runtime(target: Target) -> dict[str, Any]:
+@question(
+    "functions.runtime",
+    expected={
+        "parameters_that_boto3_does_not_know": [],
+        "environment": list(_ENVIRONMENT),
+        "memory_mb": _MEMORY_MB,
+        "time_is_limited": True,
+        "arn_is_a_functions": True,
+    },
+    relied_on_by=("functions/shared/bucket.py", "stacks/function.py", "functions/live.py"),
+)
+def runtime(target: Target) -> Seen:
+    """boto3 of Lambda's runtime knows every parameter that the functions use, and the environment and the
+    context have memory, name and time left."""
     client = target.cloud.client("lambda")
     with temporary_function(target, "runtime", _RUNTIME, memory_mb=_MEMORY_MB, timeout_s=30) as name:
         answer = client.invoke(FunctionName=name, Payload=b"{}")
@@ -72,7 +82,15 @@ def _runtime(target: Target) -> dict[str, Any]:
     }
 
 
-def _python(target: Target) -> dict[str, Any]:
+@question(
+    "functions.python",
+    expected={"runs_as_named": True},
+    source=f"{_GUIDE}/lambda-runtimes.html",
+    relied_on_by=("stacks/function.py", "scripts/setup.py"),
+    not_embedded="the embedded cloud runs the functions with its host's Python",
+)
+def python(target: Target) -> Seen:
+    """The runtime python3.13 runs Python 3.13, for which the layer is built."""
     source = "import sys\n\ndef handler(event, context):\n    return 'python%d.%d' % sys.version_info[:2]\n"
     client = target.cloud.client("lambda")
     with temporary_function(target, "python", source, memory_mb=_MEMORY_MB, timeout_s=30) as name:
@@ -81,22 +99,29 @@ def _python(target: Target) -> dict[str, Any]:
     return {"runs_as_named": runs == named, "note_python": runs}
 
 
-def _failure(target: Target) -> dict[str, Any]:
-    """The function echo is invoked asynchronously with a message that is not a ping."""
+@question(
+    "functions.failed_invocation",
+    expected={
+        "source": True,
+        "topic": True,
+        "condition": "RetriesExhausted",
+        "says_why": True,
+        "message_as_sent": True,
+    },
+    source=f"{_GUIDE}/invocation-async-retain-records.html",
+    relied_on_by=("functions/quarantine.py", "stacks/processing.py"),
+)
+def failed_invocation(target: Target) -> Seen:
+    """A failed asynchronous invocation without retries reaches the destination with its event, the
+    function's ARN, the condition RetriesExhausted and the error's message."""
+    # The function echo is invoked asynchronously with a message that is not a ping.
     bundle, cloud = target.robot("verify-failure"), target.cloud
     name, message = cloud.output("processing", "EchoFunction"), b"\xff no ping"
     event = rule_event(
         message, build_topic(PING, bundle.robot, LAMBDA, cloud.namespace), int(time.time() * 1000)
     )
     cloud.client("lambda").invoke(FunctionName=name, InvocationType="Event", Payload=json.dumps(event))
-    (listed,) = until(
-        lambda: list(quarantine.entries(cloud, robot=bundle.robot)),
-        "the failed invocation in the quarantine",
-        within_s=_WITHIN_S,
-    )
-    entry = quarantine.load(cloud, listed)
-    if entry is None:
-        raise VerifyError("the entry has gone")
+    entry = only_entry(target, bundle.robot, within_s=_WITHIN_S)
     return {
         "source": entry.source == f"{BY_FUNCTION} {name}",
         "topic": entry.topic == event[TOPIC],
@@ -104,52 +129,3 @@ def _failure(target: Target) -> dict[str, Any]:
         "says_why": "not JSON" in entry.reason,
         "message_as_sent": entry.payload == message,
     }
-
-
-CHECKS = (
-    Check(
-        name="functions.runtime",
-        assumed=(
-            "boto3 of Lambda's runtime knows every parameter that the functions use, and the environment and "
-            "the context have memory, name and time left."
-        ),
-        expected={
-            "parameters_that_boto3_does_not_know": [],
-            "environment": list(_ENVIRONMENT),
-            "memory_mb": _MEMORY_MB,
-            "time_is_limited": True,
-            "arn_is_a_functions": True,
-        },
-        basis=Basis.ASSUMED,
-        relied_on_by=("functions/shared/bucket.py", "stacks/function.py", "functions/live.py"),
-        ask=_runtime,
-    ),
-    Check(
-        name="functions.python",
-        assumed="The runtime python3.13 runs Python 3.13, for which the layer is built.",
-        expected={"runs_as_named": True},
-        basis=Basis.DOCUMENTED,
-        source=f"{_GUIDE}/lambda-runtimes.html",
-        relied_on_by=("stacks/function.py", "scripts/setup.py"),
-        ask=_python,
-        not_embedded="the embedded cloud runs the functions with its host's Python",
-    ),
-    Check(
-        name="functions.failed_invocation",
-        assumed=(
-            "A failed asynchronous invocation without retries reaches the destination with "
-            "its event, the function's ARN, the condition RetriesExhausted and the error's message."
-        ),
-        expected={
-            "source": True,
-            "topic": True,
-            "condition": "RetriesExhausted",
-            "says_why": True,
-            "message_as_sent": True,
-        },
-        basis=Basis.DOCUMENTED,
-        source=f"{_GUIDE}/invocation-async-retain-records.html",
-        relied_on_by=("functions/quarantine.py", "stacks/processing.py"),
-        ask=_failure,
-    ),
-)

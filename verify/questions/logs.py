@@ -5,7 +5,6 @@ from __future__ import annotations
 import re
 import time
 from datetime import datetime, timedelta, timezone
-from typing import Any
 
 from bench.meters.invocations import configure
 from bench.target import Target
@@ -14,21 +13,15 @@ from iort_contract import (
     METRIC_DEPLOYMENT,
     METRIC_FUNCTION,
     METRIC_NAMESPACE,
-    VESC_STREAM,
-    Batch,
-    encode,
-    record_topic,
 )
-from verify.assumption import Basis
-from verify.check import Check
 from verify.errors import VerifyError
-from verify.robot import Robot
-from verify.waiting import until
+from verify.question import Seen, question
+from verify.tools.telemetry import batch, send
+from verify.tools.waiting import until
 
 _CLOUDWATCH = "https://docs.aws.amazon.com/AmazonCloudWatch/latest/monitoring"
 _GUIDE = "https://docs.aws.amazon.com/lambda/latest/dg"
 _METRIC, _FUNCTION = "BatchesSummarized", "summarize"
-_RUN = "0badcafe"
 _WITHIN_S = 170.0
 # The filter of the log widget in stacks/dashboards.py.
 _SHOWN = re.compile("WARN|ERROR|CRITICAL|FATAL|Traceback|Task timed out")
@@ -59,7 +52,21 @@ def _counted(target: Target, since: datetime) -> float:
     return float(sum(value for result in answer["MetricDataResults"] for value in result["Values"]))
 
 
-def _metric(target: Target) -> dict[str, Any]:
+@question(
+    "logs.metric",
+    expected={"counted": True},
+    source=f"{_CLOUDWATCH}/CloudWatch_Embedded_Metric_Format_Specification.html and "
+    f"{_GUIDE}/monitoring-cloudwatchlogs-log-level.html",
+    relied_on_by=(
+        "functions/shared/metrics.py",
+        "stacks/function.py",
+        "stacks/alarms.py",
+        "local/gaps/metrics/embedded_metrics.py",
+    ),
+)
+def metric(target: Target) -> Seen:
+    """If a function prints a line in the embedded metric format, with logs in JSON and the level INFO, it
+    becomes a metric with our dimensions within three minutes."""
     bundle, cloud = target.robot("verify-metric"), target.cloud
     configuration = cloud.client("lambda").get_function_configuration(
         FunctionName=cloud.output("processing", "SummarizeFunction")
@@ -67,10 +74,7 @@ def _metric(target: Target) -> dict[str, Any]:
     logging = configuration.get("LoggingConfig", {})
     since = datetime.now(timezone.utc).replace(second=0, microsecond=0) - timedelta(minutes=15)
     before = _counted(target, since)
-    with Robot(bundle.folder) as robot:
-        robot.online()
-        batch = Batch(_RUN, 0, [int(time.time()) * 1_000_000], {"speed": [1.5]})
-        robot.publish(record_topic(robot.name, VESC_STREAM, cloud.namespace), encode(batch))
+    send(target, bundle, batch())
     began = time.monotonic()
     try:
         counted = until(lambda: _counted(target, since) > before, _METRIC, within_s=_WITHIN_S)
@@ -83,7 +87,14 @@ def _metric(target: Target) -> dict[str, Any]:
     }
 
 
-def _lines(target: Target) -> dict[str, Any]:
+@question(
+    "logs.lines",
+    expected={"printed_as_it_is": True, "warning_is_shown": True, "failure_is_shown": True},
+    relied_on_by=("stacks/dashboards.py", "functions/shared/metrics.py"),
+)
+def lines(target: Target) -> Seen:
+    """With logs in JSON, printed lines stay unchanged; warnings and uncaught errors are lines with their
+    level, which the dashboard's log widget finds."""
     client, logs = target.cloud.client("lambda"), target.cloud.client("logs")
     model = client.get_function_configuration(FunctionName=target.cloud.output("processing", "EchoFunction"))
     group = model["LoggingConfig"]["LogGroup"]
@@ -107,38 +118,3 @@ def _lines(target: Target) -> dict[str, Any]:
         "failure_is_shown": any(_WARNED not in line and _SHOWN.search(line) for line in lines),
         "note_failure_in_json": any(_RAISED in line and line.startswith("{") for line in lines),
     }
-
-
-CHECKS = (
-    Check(
-        name="logs.metric",
-        assumed=(
-            "If a function prints a line in the embedded metric format, with logs in JSON and the level "
-            "INFO, it becomes a metric with our dimensions within three minutes."
-        ),
-        expected={"counted": True},
-        basis=Basis.DOCUMENTED,
-        source=(
-            f"{_CLOUDWATCH}/CloudWatch_Embedded_Metric_Format_Specification.html and "
-            f"{_GUIDE}/monitoring-cloudwatchlogs-log-level.html"
-        ),
-        relied_on_by=(
-            "functions/shared/metrics.py",
-            "stacks/function.py",
-            "stacks/alarms.py",
-            "local/gaps/metrics/embedded_metrics.py",
-        ),
-        ask=_metric,
-    ),
-    Check(
-        name="logs.lines",
-        assumed=(
-            "With logs in JSON, printed lines stay unchanged; warnings and uncaught errors are lines with "
-            "their level, which the dashboard's log widget finds."
-        ),
-        expected={"printed_as_it_is": True, "warning_is_shown": True, "failure_is_shown": True},
-        basis=Basis.ASSUMED,
-        relied_on_by=("stacks/dashboards.py", "functions/shared/metrics.py"),
-        ask=_lines,
-    ),
-)

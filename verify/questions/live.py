@@ -8,7 +8,6 @@ from contextlib import contextmanager
 from dataclasses import replace
 from functools import partial
 from itertools import count
-from typing import Any
 
 from bench.target import Target
 from iort_contract import (
@@ -24,13 +23,12 @@ from iort_station.cloud import Cloud
 from iort_station.errors import StationError
 from iort_station.page import keys
 from iort_station.page.listener import Listener
-from verify.assumption import Basis
-from verify.check import Check
 from verify.errors import CannotAskError
-from verify.robot import Robot
-from verify.waiting import until
+from verify.question import Seen, question
+from verify.tools.robot import Robot
+from verify.tools.telemetry import RUN
+from verify.tools.waiting import until
 
-_RUN = "0badcafe"
 _STALE = 0
 # Two clocks of AWS differ by less than the first, the operator's and AWS' by less than the second.
 _SAME_CLOCK_US, _OTHER_CLOCK_US = 100_000, 60_000_000
@@ -38,7 +36,7 @@ _SAME_CLOCK_US, _OTHER_CLOCK_US = 100_000, 60_000_000
 
 def _sent(robot: Robot, target: Target, number: int, age_s: float = 0.0) -> LiveSample:
     now_us = time.time_ns() // 1000
-    live = LiveSample(_RUN, number, int(now_us - age_s * 1_000_000), now_us, {"speed": float(number)})
+    live = LiveSample(RUN, number, int(now_us - age_s * 1_000_000), now_us, {"speed": float(number)})
     robot.publish(live_topic(robot.name, VESC_STREAM, target.cloud.namespace), encode_live(live))
     return live
 
@@ -67,7 +65,25 @@ def _stored(cloud: Cloud) -> keys.PubNubKeys | None:
         return None
 
 
-def _live(target: Target) -> dict[str, Any]:
+@question(
+    "live.to_subscriber",
+    expected={
+        "stale_heard": False,
+        "robot": True,
+        "stream": [VESC_STREAM],
+        "hops": sorted(["sent_us", RECEIVED_MS, "lambda_us"]),
+        "left_car_before_rule": True,
+        "at_rule_before_lambda": True,
+    },
+    relied_on_by=(
+        "functions/live.py",
+        "functions/shared/pubnub_client.py",
+        "contract/iort_contract/cloud.py",
+    ),
+)
+def to_subscriber(target: Target) -> Seen:
+    """A live sample goes by Basic Ingest to Lambda 1 and by PubNub to the subscriber of the robot's
+    channel; a sample that is a minute old does not."""
     bundle = target.robot("verify-live")
     with keys_lent(target), target.listener(bundle.robot) as listener, Robot(bundle.folder) as robot:
         robot.online()
@@ -103,29 +119,3 @@ def _live(target: Target) -> dict[str, Any]:
 
 def _heard(listener: Listener, number: int) -> bool:
     return any(one.seq == number for one in listener.heard)
-
-
-CHECKS = (
-    Check(
-        name="live.to_subscriber",
-        assumed=(
-            "A live sample goes by Basic Ingest to Lambda 1 and by PubNub to the subscriber of the robot's "
-            "channel; a sample that is a minute old does not."
-        ),
-        expected={
-            "stale_heard": False,
-            "robot": True,
-            "stream": [VESC_STREAM],
-            "hops": sorted(["sent_us", RECEIVED_MS, "lambda_us"]),
-            "left_car_before_rule": True,
-            "at_rule_before_lambda": True,
-        },
-        basis=Basis.ASSUMED,
-        relied_on_by=(
-            "functions/live.py",
-            "functions/shared/pubnub_client.py",
-            "contract/iort_contract/cloud.py",
-        ),
-        ask=_live,
-    ),
-)

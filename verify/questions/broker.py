@@ -8,17 +8,24 @@ from typing import Any
 
 from bench.target import Target
 from iort_contract import CMD, FLEET, build_topic
-from verify.assumption import Basis
-from verify.bundles import pair_of, registered
-from verify.check import Check
-from verify.robot import CONNECT_AGAIN_S, Robot, refusal
+from verify.question import Seen, question
+from verify.tools.robot import CONNECT_AGAIN_S, Robot, refusal
+from verify.tools.robots import pair_of, registered
 
 _MQTT = "https://docs.aws.amazon.com/iot/latest/developerguide/mqtt.html"
 _QUOTAS = "https://docs.aws.amazon.com/general/latest/gr/iot-core.html"
 _BURST_S, _ACKNOWLEDGED_S = 2, 10.0
 
 
-def _session_taken_over(target: Target) -> dict[str, Any]:
+@question(
+    "broker.session_taken_over",
+    expected={"second_connects": True, "first_is_ended": True, "first_is_told": "SESSION_TAKEN_OVER"},
+    source=_MQTT,
+    relied_on_by=("device/iort_agent/mqtt/aws.py",),
+)
+def session_taken_over(target: Target) -> Seen:
+    """If two clients share a client id, the second is connected, and the first is disconnected with the
+    reason code 0x8E, session taken over."""
     folder = registered(target, "verify-takeover").folder
     with Robot(folder) as first:
         first.online()
@@ -29,7 +36,14 @@ def _session_taken_over(target: Target) -> dict[str, Any]:
             return {"second_connects": True, "first_is_ended": ended, "first_is_told": first.reason}
 
 
-def _another_client_id(target: Target) -> dict[str, Any]:
+@question(
+    "broker.another_client_id",
+    expected={"neighbours": True, "one_that_nobody_has": True},
+    source="https://docs.aws.amazon.com/iot/latest/developerguide/thing-policy-variables.html",
+    relied_on_by=("stacks/documents.py", "device/iort_agent/mqtt/failures.py"),
+)
+def another_client_id(target: Target) -> Seen:
+    """A robot's certificate can connect only with the robot's own name as client id."""
     bundle, victim = registered(target, "verify-client-id"), registered(target, "verify-victim").robot
     codes = [refusal(bundle.folder, client_id=name) for name in (victim, f"{bundle.robot}-2")]
     return {
@@ -39,7 +53,16 @@ def _another_client_id(target: Target) -> dict[str, Any]:
     }
 
 
-def _foreign_topic(target: Target) -> dict[str, Any]:
+@question(
+    "broker.foreign_topic",
+    expected={"subscribe": "NOT_AUTHORIZED", "publish_is_refused": True, "neighbour_heard": 0},
+    source=_MQTT,
+    relied_on_by=("stacks/documents.py", "device/iort_agent/mqtt/subscriptions.py"),
+)
+def foreign_topic(target: Target) -> Seen:
+    """A robot's message to its neighbour's commands does not reach the neighbour. AWS has two answers, a
+    PUBACK with 0x87 or the session's end, and does not document which one comes. A subscription is refused
+    by itself."""
     namespace, victim = target.cloud.namespace, registered(target, "verify-victim")
     foreign, last = (build_topic(CMD, victim.robot, name, namespace) for name in ("drive", "last"))
     with pair_of(target, "verify-foreign") as pair, Robot(victim.folder) as neighbour:
@@ -59,6 +82,9 @@ def _foreign_topic(target: Target) -> dict[str, Any]:
     }
 
 
+_ALL_TAKEN = {"answers": ["SUCCESS"], "unanswered": False, "session_ended": False}
+
+
 def _burst(robot: Robot, topic: str, per_s: int) -> dict[str, Any]:
     """The answers to this many messages a second."""
     began, sent = time.monotonic(), []
@@ -71,71 +97,20 @@ def _burst(robot: Robot, topic: str, per_s: int) -> dict[str, Any]:
         "an error of the library" if one.exception() else str(one.result().puback.reason_code.name)
         for one in done
     }
-    return {
-        "answers": sorted(codes),
-        "unanswered": bool(waiting),
-        "session_ended": robot.lost.is_set(),
-    }
+    return {"answers": sorted(codes), "unanswered": bool(waiting), "session_ended": robot.lost.is_set()}
 
 
-def _rate(target: Target) -> dict[str, Any]:
+@question(
+    "broker.publishes_a_second",
+    expected={"at_90_a_second": _ALL_TAKEN},
+    source=_QUOTAS,
+    relied_on_by=("device/iort_agent/rate_limiter.py",),
+)
+def publishes_a_second(target: Target) -> Seen:
+    """A connection may publish 90 times a second, the agent's share of AWS' 100. AWS discards messages
+    beyond 100; the agent never sends them."""
     with Robot(registered(target, "verify-rate").folder, paced=False) as robot:
         topic = build_topic(FLEET, robot.online().name, "rate", target.cloud.namespace)
         ours = _burst(robot, topic, 90)
         beyond = {f"note_at_{per_s}_a_second": _burst(robot, topic, per_s) for per_s in (100, 150)}
         return {"at_90_a_second": ours, **beyond}
-
-
-_ALL_TAKEN = {"answers": ["SUCCESS"], "unanswered": False, "session_ended": False}
-CHECKS = (
-    Check(
-        name="broker.session_taken_over",
-        assumed=(
-            "If two clients share a client id, the second is connected, and the first is disconnected with "
-            "the reason code 0x8E, session taken over."
-        ),
-        expected={
-            "second_connects": True,
-            "first_is_ended": True,
-            "first_is_told": "SESSION_TAKEN_OVER",
-        },
-        basis=Basis.DOCUMENTED,
-        source=_MQTT,
-        relied_on_by=("device/iort_agent/mqtt/aws.py",),
-        ask=_session_taken_over,
-    ),
-    Check(
-        name="broker.another_client_id",
-        assumed="A robot's certificate can connect only with the robot's own name as client id.",
-        expected={"neighbours": True, "one_that_nobody_has": True},
-        basis=Basis.DOCUMENTED,
-        source="https://docs.aws.amazon.com/iot/latest/developerguide/thing-policy-variables.html",
-        relied_on_by=("stacks/documents.py", "device/iort_agent/mqtt/failures.py"),
-        ask=_another_client_id,
-    ),
-    Check(
-        name="broker.foreign_topic",
-        assumed=(
-            "A robot's message to its neighbour's commands does not reach the neighbour. AWS has two "
-            "answers, a PUBACK with 0x87 or the session's end, and does not document which one comes. A "
-            "subscription is refused by itself."
-        ),
-        expected={"subscribe": "NOT_AUTHORIZED", "publish_is_refused": True, "neighbour_heard": 0},
-        basis=Basis.DOCUMENTED,
-        source=_MQTT,
-        relied_on_by=("stacks/documents.py", "device/iort_agent/mqtt/subscriptions.py"),
-        ask=_foreign_topic,
-    ),
-    Check(
-        name="broker.publishes_a_second",
-        assumed=(
-            "A connection may publish 90 times a second, the agent's share of AWS' 100. AWS discards "
-            "messages beyond 100; the agent never sends them."
-        ),
-        expected={"at_90_a_second": _ALL_TAKEN},
-        basis=Basis.DOCUMENTED,
-        source=_QUOTAS,
-        relied_on_by=("device/iort_agent/rate_limiter.py",),
-        ask=_rate,
-    ),
-)

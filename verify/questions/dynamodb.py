@@ -2,15 +2,12 @@
 
 from __future__ import annotations
 
-from typing import Any
-
 from botocore.exceptions import ClientError
 
 from bench.target import Target
 from iort_contract import ADMISSION, BATCH, ENVELOPE, EXPIRES_S, PRESENCE, RECEIVED_MS, ROBOT, STREAMS, TOPIC
-from verify.assumption import Basis
-from verify.check import Check
 from verify.errors import VerifyError
+from verify.question import Seen, question
 
 _GUIDE = "https://docs.aws.amazon.com/amazondynamodb/latest/developerguide"
 _API = "https://docs.aws.amazon.com/amazondynamodb/latest/APIReference"
@@ -18,7 +15,15 @@ _TABLES = ("QuarantineTable", "SummaryTable", "TelemetryTable")
 _NAMES = sorted({*ENVELOPE, *PRESENCE, *ADMISSION, TOPIC, ROBOT, RECEIVED_MS, EXPIRES_S, STREAMS})
 
 
-def _expiry(target: Target) -> dict[str, Any]:
+@question(
+    "dynamodb.expiry",
+    expected=dict.fromkeys(_TABLES, EXPIRES_S),
+    source=f"{_GUIDE}/TTL.html",
+    relied_on_by=("stacks/storage.py",),
+    not_embedded="the emulator's CloudFormation does not give a table its TimeToLiveSpecification",
+)
+def expiry(target: Target) -> Seen:
+    """Telemetry, summaries and quarantine expire by the attribute expires_s."""
     client, found = target.cloud.client("dynamodb"), {}
     for output in _TABLES:
         table = target.cloud.output("storage", output)
@@ -29,7 +34,14 @@ def _expiry(target: Target) -> dict[str, Any]:
     return found
 
 
-def _reserved(target: Target) -> dict[str, Any]:
+@question(
+    "dynamodb.reserved_words",
+    expected={"refused": [BATCH, "online"]},
+    source=f"{_GUIDE}/ReservedWords.html",
+    relied_on_by=("functions/presence.py", "functions/admit.py", "station/iort_station/fleet/registry.py"),
+)
+def reserved_words(target: Target) -> Seen:
+    """An expression may name all of the tables' attributes except batch and online."""
     return {"refused": [name for name in _NAMES if _refused(target, name)]}
 
 
@@ -46,7 +58,14 @@ def _refused(target: Target, name: str) -> bool:
     return False
 
 
-def _condition(target: Target) -> dict[str, Any]:
+@question(
+    "dynamodb.failed_condition",
+    expected={"code": "ConditionalCheckFailedException", "status": 400, "row": True},
+    source=f"{_API}/API_UpdateItem.html",
+    relied_on_by=("functions/admit.py", "functions/shared/upload_quota.py", "functions/alert.py"),
+)
+def failed_condition(target: Target) -> Seen:
+    """A failed condition is an error with the current row, if the request asks for it."""
     name = target.robot("verify-condition").robot
     try:
         target.cloud.client("dynamodb").update_item(
@@ -64,39 +83,3 @@ def _condition(target: Target) -> dict[str, Any]:
             "row": error.response.get("Item", {}).get(ROBOT) == {"S": name},
         }
     raise VerifyError("the condition did not fail")
-
-
-CHECKS = (
-    Check(
-        name="dynamodb.expiry",
-        assumed="Telemetry, summaries and quarantine expire by the attribute expires_s.",
-        expected=dict.fromkeys(_TABLES, EXPIRES_S),
-        basis=Basis.DOCUMENTED,
-        source=f"{_GUIDE}/TTL.html",
-        relied_on_by=("stacks/storage.py",),
-        ask=_expiry,
-        not_embedded="the emulator's CloudFormation does not give a table its TimeToLiveSpecification",
-    ),
-    Check(
-        name="dynamodb.reserved_words",
-        assumed="An expression may name all of the tables' attributes except batch and online.",
-        expected={"refused": [BATCH, "online"]},
-        basis=Basis.DOCUMENTED,
-        source=f"{_GUIDE}/ReservedWords.html",
-        relied_on_by=(
-            "functions/presence.py",
-            "functions/admit.py",
-            "station/iort_station/fleet/registry.py",
-        ),
-        ask=_reserved,
-    ),
-    Check(
-        name="dynamodb.failed_condition",
-        assumed="A failed condition is an error with the current row, if the request asks for it.",
-        expected={"code": "ConditionalCheckFailedException", "status": 400, "row": True},
-        basis=Basis.DOCUMENTED,
-        source=f"{_API}/API_UpdateItem.html",
-        relied_on_by=("functions/admit.py", "functions/shared/upload_quota.py", "functions/alert.py"),
-        ask=_condition,
-    ),
-)

@@ -6,15 +6,13 @@ import hashlib
 import http.client
 import json
 import time
-from typing import Any
 
 from bench.target import Target
 from bench.temporary_function import temporary_function
 from iort_contract import FILES_PREFIX, PART_BYTES, File, part_range
-from verify.assumption import Basis
-from verify.check import Check
-from verify.uploading import asking, sent, trust
-from verify.waiting import until
+from verify.question import Seen, question
+from verify.tools.uploading import asking, sent, trust
+from verify.tools.waiting import until
 
 _GUIDE = "https://docs.aws.amazon.com/AmazonS3/latest/userguide"
 _API = "https://docs.aws.amazon.com/AmazonS3/latest/API"
@@ -31,12 +29,34 @@ def handler(event, context):
 """
 
 
+_MISMATCH = [403, "SignatureDoesNotMatch"]
+
+
 def _file(content: bytes, name: str) -> File:
     digest = hashlib.sha256(content).hexdigest()
     return File(name, "log", "text/plain", len(content), digest, int(time.time()) * 1_000_000)
 
 
-def _in_one(target: Target) -> dict[str, Any]:
+@question(
+    "files.in_one",
+    expected={
+        "other_bytes": 400,
+        "other_bytes_told": True,
+        "other_length": _MISMATCH,
+        "without_condition": _MISMATCH,
+        "other_key": _MISMATCH,
+        "stored": [200, ""],
+        "again": [412, "PreconditionFailed"],
+        "metadata": True,
+        "known": True,
+    },
+    source=f"{_GUIDE}/using-presigned-url.html, {_GUIDE}/conditional-requests.html and "
+    "https://repost.aws/knowledge-center/s3-presigned-url-signature-mismatch",
+    relied_on_by=("functions/shared/bucket.py", "functions/upload.py", "device/iort_agent/files/http.py"),
+)
+def in_one(target: Target) -> Seen:
+    """A signed address accepts this content, of this length, under this key, once. Other bytes are refused
+    with 400 and a code that the agent knows, all other changes with 403, and a second upload with 412."""
     file = _file(_SMALL, "verify.txt")
     with asking(target, "verify-file", file) as (robot, key):
         (address,) = robot.ask(file, {1: _SMALL}).addresses
@@ -59,7 +79,23 @@ def _in_one(target: Target) -> dict[str, Any]:
         return {**seen, "metadata": head["Metadata"] == metadata, "known": robot.ask(file, {}).stored}
 
 
-def _in_parts(target: Target) -> dict[str, Any]:
+@question(
+    "files.in_parts",
+    expected={
+        "other_bytes": 400,
+        "parts": [[200, ""], [200, ""]],
+        "have_after_the_second": [[2, 2]],
+        "asked_for_then": [1],
+        "stored": True,
+        "size": True,
+        "metadata": True,
+    },
+    source=f"{_API}/API_CompletedPart.html and {_GUIDE}/checking-object-integrity.html",
+    relied_on_by=("functions/shared/bucket.py", "functions/upload.py"),
+)
+def in_parts(target: Target) -> Seen:
+    """A part is accepted with its SHA-256 alone; the list of parts has the SHA-256 of each, so the function
+    completes the upload without reading it."""
     content = bytes(PART_BYTES) + _REST
     file = _file(content, "verify.bag")
     ranges = {number: part_range(file, number) for number in (1, 2)}
@@ -85,8 +121,19 @@ def _in_parts(target: Target) -> dict[str, Any]:
         }
 
 
-def _closed(target: Target) -> dict[str, Any]:
-    """Signed for a second, with the upload function's role: robots' addresses are valid for 15 minutes."""
+@question(
+    "files.closed",
+    expected={
+        "expired": 403,
+        "unsigned": {"GET": 403, "PUT": 403},
+        "blocked": ["BlockPublicAcls", "BlockPublicPolicy", "IgnorePublicAcls", "RestrictPublicBuckets"],
+    },
+    source=f"{_GUIDE}/using-presigned-url.html and {_GUIDE}/access-control-block-public-access.html",
+    relied_on_by=("stacks/storage.py", "device/iort_agent/files/http.py"),
+)
+def closed(target: Target) -> Seen:
+    """An expired address is refused with 403, and so is a request without signature."""
+    # Signed for a second, with the upload function's role: robots' addresses are valid for 15 minutes.
     cloud, context = target.cloud, trust(target)
     s3, client = cloud.client("s3"), cloud.client("lambda")
     place = {"Bucket": cloud.output("storage", "FilesBucket"), "Key": f"{FILES_PREFIX}verify/expired"}
@@ -109,67 +156,3 @@ def _closed(target: Target) -> dict[str, Any]:
         "blocked": sorted(name for name, value in blocked.items() if value),
         "note_expired": code,
     }
-
-
-_MISMATCH = [403, "SignatureDoesNotMatch"]
-CHECKS = (
-    Check(
-        name="files.in_one",
-        assumed=(
-            "A signed address accepts this content, of this length, under this key, once. Other bytes are "
-            "refused with 400 and a code that the agent knows, all other changes with 403, and a second "
-            "upload with 412."
-        ),
-        expected={
-            "other_bytes": 400,
-            "other_bytes_told": True,
-            "other_length": _MISMATCH,
-            "without_condition": _MISMATCH,
-            "other_key": _MISMATCH,
-            "stored": [200, ""],
-            "again": [412, "PreconditionFailed"],
-            "metadata": True,
-            "known": True,
-        },
-        basis=Basis.DOCUMENTED,
-        source=(
-            f"{_GUIDE}/using-presigned-url.html, {_GUIDE}/conditional-requests.html and "
-            "https://repost.aws/knowledge-center/s3-presigned-url-signature-mismatch"
-        ),
-        relied_on_by=("functions/shared/bucket.py", "functions/upload.py", "device/iort_agent/files/http.py"),
-        ask=_in_one,
-    ),
-    Check(
-        name="files.in_parts",
-        assumed=(
-            "A part is accepted with its SHA-256 alone; the list of parts has the SHA-256 of each, so the "
-            "function completes the upload without reading it."
-        ),
-        expected={
-            "other_bytes": 400,
-            "parts": [[200, ""], [200, ""]],
-            "have_after_the_second": [[2, 2]],
-            "asked_for_then": [1],
-            "stored": True,
-            "size": True,
-            "metadata": True,
-        },
-        basis=Basis.DOCUMENTED,
-        source=f"{_API}/API_CompletedPart.html and {_GUIDE}/checking-object-integrity.html",
-        relied_on_by=("functions/shared/bucket.py", "functions/upload.py"),
-        ask=_in_parts,
-    ),
-    Check(
-        name="files.closed",
-        assumed="An expired address is refused with 403, and so is a request without signature.",
-        expected={
-            "expired": 403,
-            "unsigned": {"GET": 403, "PUT": 403},
-            "blocked": ["BlockPublicAcls", "BlockPublicPolicy", "IgnorePublicAcls", "RestrictPublicBuckets"],
-        },
-        basis=Basis.DOCUMENTED,
-        source=f"{_GUIDE}/using-presigned-url.html and {_GUIDE}/access-control-block-public-access.html",
-        relied_on_by=("stacks/storage.py", "device/iort_agent/files/http.py"),
-        ask=_closed,
-    ),
-)

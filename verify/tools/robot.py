@@ -16,7 +16,7 @@ from typing_extensions import Self
 
 from iort_contract import LIVE, LiveSample, encode_live
 from verify.errors import VerifyError
-from verify.waiting import until
+from verify.tools.waiting import until
 
 WAIT_S = 60.0
 # AWS accepts one CONNECT a second per client id ("Connect requests per second per client ID").

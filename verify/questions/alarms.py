@@ -10,16 +10,15 @@ from typing import Any
 
 from bench.target import Target
 from iort_contract import FAULT_FIELD, LIVE, VESC_STREAM, LiveSample, build_topic, encode_live
-from verify.assumption import Basis
-from verify.check import WITH_KEY, Check
 from verify.errors import VerifyError
-from verify.inbox import inbox
-from verify.robot import Robot
-from verify.waiting import until
+from verify.question import WITH_KEY, Seen, question
+from verify.tools.inbox import inbox
+from verify.tools.robot import Robot
+from verify.tools.telemetry import RUN
+from verify.tools.waiting import until
 
 _REASON = "verify: does it notify?"
 _ALARM = "ALARM"
-_RUN = "0badcafe"
 _FAULT = 5
 # The alarms that use Metrics Insights: stacks/alarms.py.
 _INSIGHTS = ("ParseError", "ErrorActionFailure", "RuleMessageThrottled", "DestinationDeliveryFailures")
@@ -35,7 +34,27 @@ def _quiet_alarm(target: Target) -> dict[str, Any]:
     raise VerifyError("every alarm of the deployment is in ALARM")
 
 
-def _set_state(target: Target) -> dict[str, Any]:
+_NOTIFIED = {
+    "topic_has_key": False,
+    "type": "Notification",
+    "subject_names_alarm": True,
+    "alarm": True,
+    "description": True,
+    "new_state": _ALARM,
+    "old_state": True,
+    "reason": _REASON,
+}
+
+
+@question(
+    "alarms.set_state",
+    expected=_NOTIFIED,
+    source="https://docs.aws.amazon.com/AmazonCloudWatch/latest/APIReference/API_SetAlarmState.html",
+    relied_on_by=("stacks/alarms.py", "stacks/processing.py"),
+)
+def set_state(target: Target) -> Seen:
+    """An alarm whose state is set to ALARM notifies the alarm topic, and the topic its subscribers, with
+    name, description, both states and the reason."""
     cloud = target.cloud
     topic, alarm = cloud.output("processing", "AlarmTopic"), _quiet_alarm(target)
     name, cloudwatch = alarm["AlarmName"], cloud.client("cloudwatch")
@@ -65,7 +84,36 @@ def _set_state(target: Target) -> dict[str, Any]:
     }
 
 
-def _insights(target: Target) -> dict[str, Any]:
+set_state_with_key = replace(
+    set_state,
+    name="alarms.set_state_with_key",
+    assumed=(
+        "The same with a topic encrypted with the account's own key, which admits CloudWatch "
+        "without a condition."
+    ),
+    expected={**_NOTIFIED, "topic_has_key": True},
+    source="https://repost.aws/knowledge-center/cloudwatch-configure-alarm-sns",
+    relied_on_by=("stacks/encryption.py",),
+    phase=WITH_KEY,
+    not_embedded="the embedded cloud is deployed without a key: its topics encrypt nothing",
+)
+
+
+@question(
+    "alarms.metrics_insights",
+    expected={
+        "alarms": len(_INSIGHTS),
+        "evaluation": ["as it should"],
+        "queries": ["Complete"] * len(_INSIGHTS),
+        "messages": [],
+    },
+    source="https://docs.aws.amazon.com/AmazonCloudWatch/latest/monitoring/alarm-evaluation.html",
+    relied_on_by=("stacks/alarms.py", "stacks/metrics.py"),
+    not_embedded="the embedded cloud has no Metrics Insights, and is deployed without these alarms",
+)
+def metrics_insights(target: Target) -> Seen:
+    """An alarm may sum a metric over all of its dimensions by Metrics Insights. If the metric has no data,
+    the query completes, and the alarm leaves its first state."""
     cloudwatch = target.cloud.client("cloudwatch")
     names = [f"{target.cloud.namespace}-{name}" for name in _INSIGHTS]
 
@@ -93,13 +141,24 @@ def _insights(target: Target) -> dict[str, Any]:
     }
 
 
-def _alert(target: Target) -> dict[str, Any]:
+@question(
+    "alarms.alert",
+    expected={
+        "subject": "NAMESPACE: ROBOT, fault 5, MOSFET over-temperature",
+        "first_line": "ROBOT: fault 5, MOSFET over-temperature",
+        "says": ["when", "stream"],
+    },
+    relied_on_by=("functions/alert.py", "stacks/storage.py", "contract/iort_contract/cloud.py"),
+)
+def alert(target: Target) -> Seen:
+    """A car's fault goes from the rule fault to the alert function, which may note it in the car's row, and
+    from there to the alarm topic's subscribers."""
     bundle, namespace = target.robot("verify-alert"), target.cloud.namespace
     topic = target.cloud.output("processing", "AlarmTopic")
     with inbox(target, topic) as receive, Robot(bundle.folder) as robot:
         robot.online()
         now_us = time.time_ns() // 1000
-        live = encode_live(LiveSample(_RUN, 0, now_us, now_us, {FAULT_FIELD: _FAULT}))
+        live = encode_live(LiveSample(RUN, 0, now_us, now_us, {FAULT_FIELD: _FAULT}))
         # Not by Basic Ingest, which reaches only the live rule.
         robot.publish(build_topic(LIVE, robot.name, VESC_STREAM, namespace), live)
         mail = receive(lambda mail: robot.name in mail["Message"], "the alert at the topic's subscriber")
@@ -109,75 +168,3 @@ def _alert(target: Target) -> dict[str, Any]:
         "first_line": lines[0],
         "says": [line.split()[0] for line in lines if line.startswith(("when ", "stream "))],
     }
-
-
-_SET_STATE = Check(
-    name="alarms.set_state",
-    assumed=(
-        "An alarm whose state is set to ALARM notifies the alarm topic, and the topic its subscribers, with "
-        "name, description, both states and the reason."
-    ),
-    expected={
-        "topic_has_key": False,
-        "type": "Notification",
-        "subject_names_alarm": True,
-        "alarm": True,
-        "description": True,
-        "new_state": _ALARM,
-        "old_state": True,
-        "reason": _REASON,
-    },
-    basis=Basis.DOCUMENTED,
-    source="https://docs.aws.amazon.com/AmazonCloudWatch/latest/APIReference/API_SetAlarmState.html",
-    relied_on_by=("stacks/alarms.py", "stacks/processing.py"),
-    ask=_set_state,
-)
-CHECKS = (
-    _SET_STATE,
-    replace(
-        _SET_STATE,
-        name="alarms.set_state_with_key",
-        assumed=(
-            "The same with a topic encrypted with the account's own key, which admits CloudWatch "
-            "without a condition."
-        ),
-        expected={**_SET_STATE.expected, "topic_has_key": True},
-        source="https://repost.aws/knowledge-center/cloudwatch-configure-alarm-sns",
-        relied_on_by=("stacks/encryption.py",),
-        phase=WITH_KEY,
-        not_embedded="the embedded cloud is deployed without a key: its topics encrypt nothing",
-    ),
-    Check(
-        name="alarms.metrics_insights",
-        assumed=(
-            "An alarm may sum a metric over all of its dimensions by Metrics Insights. If the metric has "
-            "no data, the query completes, and the alarm leaves its first state."
-        ),
-        expected={
-            "alarms": len(_INSIGHTS),
-            "evaluation": ["as it should"],
-            "queries": ["Complete"] * len(_INSIGHTS),
-            "messages": [],
-        },
-        basis=Basis.DOCUMENTED,
-        source="https://docs.aws.amazon.com/AmazonCloudWatch/latest/monitoring/alarm-evaluation.html",
-        relied_on_by=("stacks/alarms.py", "stacks/metrics.py"),
-        ask=_insights,
-        not_embedded="the embedded cloud has no Metrics Insights, and is deployed without these alarms",
-    ),
-    Check(
-        name="alarms.alert",
-        assumed=(
-            "A car's fault goes from the rule fault to the alert function, which may note it in the car's "
-            "row, and from there to the alarm topic's subscribers."
-        ),
-        expected={
-            "subject": "NAMESPACE: ROBOT, fault 5, MOSFET over-temperature",
-            "first_line": "ROBOT: fault 5, MOSFET over-temperature",
-            "says": ["when", "stream"],
-        },
-        basis=Basis.ASSUMED,
-        relied_on_by=("functions/alert.py", "stacks/storage.py", "contract/iort_contract/cloud.py"),
-        ask=_alert,
-    ),
-)

@@ -25,11 +25,10 @@ from iort_contract import (
     fleet_name,
 )
 from iort_station.fleet import certificates, claims, registry
-from verify.assumption import Basis
-from verify.bundles import removed_after
-from verify.check import Check
 from verify.errors import VerifyError
-from verify.robot import refusal
+from verify.question import Seen, question
+from verify.tools.robot import refusal
+from verify.tools.robots import removed_after
 
 _GUIDE = "https://docs.aws.amazon.com/iot/latest/developerguide"
 _HOOK = f"{_GUIDE}/pre-provisioning-hook.html"
@@ -37,6 +36,16 @@ _PROVISION = f"{_GUIDE}/provision-wo-cert.html"
 _REFUSED = re.compile(r"RegisterThing was refused: (\w+)")
 _OPEN_S = 600
 _SERIAL = "verify"
+
+
+_MADE = {
+    "refused": "",
+    "thing_type_is_the_fleets": True,
+    "attributes": ["serial", "vehicle"],
+    "certificates": ["ACTIVE"],
+    "name_is_closed_again": True,
+    "connects": True,
+}
 
 
 class _RefusedError(VerifyError):
@@ -86,12 +95,33 @@ def _made(target: Target, robot: str, folder: Path, file: Path) -> dict[str, Any
     }
 
 
-def _own_claim(target: Target) -> dict[str, Any]:
+@question(
+    "provisioning.claim_for_minutes",
+    expected=_MADE,
+    source=f"{_PROVISION} and {_HOOK}",
+    relied_on_by=(
+        "station/iort_station/fleet/claims.py",
+        "functions/admit.py",
+        "device/iort_agent/verbs/provision.py",
+        "stacks/fleet.py",
+        "local/gaps/broker/certificate_from_csr.py",
+    ),
+)
+def claim_for_minutes(target: Target) -> Seen:
+    """A claim of CreateProvisioningClaim is exchanged for a certificate of the robot's own key. The hook
+    admits it, and the template creates the thing and attaches certificate and policy."""
     with removed_after(target, "verify-own-claim") as (name, folder):
         return _made(target, name, folder, _claim(target, name, folder))
 
 
-def _lasting_claim(target: Target) -> dict[str, Any]:
+@question(
+    "provisioning.claim_that_lasts",
+    expected=_MADE,
+    source=f"{_PROVISION} and {_HOOK}",
+    relied_on_by=("station/iort_station/fleet/claims.py", "functions/admit.py", "stacks/documents.py"),
+)
+def claim_that_lasts(target: Target) -> Seen:
+    """A claim certificate with the fleet's claim policy is exchanged in the same way."""
     with removed_after(target, "verify-lasting-claim") as (name, folder):
         file = _claim(target, None, folder, lasting=True)
         try:
@@ -101,8 +131,15 @@ def _lasting_claim(target: Target) -> dict[str, Any]:
             claims.revoke_all(target.cloud)
 
 
-def _known_by(target: Target) -> dict[str, Any]:
-    """Open one name for the claim's id alone, and another for its fingerprint alone."""
+@question(
+    "provisioning.claim_known_by",
+    expected={"by_one_of_both": True},
+    relied_on_by=("functions/admit.py", "station/iort_station/fleet/registry.py"),
+)
+def claim_known_by(target: Target) -> Seen:
+    """The hook's claimCertificateId is the id of CreateProvisioningClaim or the SHA-256 of its certificate.
+    AWS does not document which; both are accepted."""
+    # Open one name for the claim's id alone, and another for its fingerprint alone.
     nobody, seen = "0" * 64, {}
     for which in (ADMIT_CLAIM, ADMIT_FINGERPRINT):
         with removed_after(target, f"verify-by-{which}") as (name, folder):
@@ -119,8 +156,15 @@ def _known_by(target: Target) -> dict[str, Any]:
     }
 
 
-def _registered_again(target: Target) -> dict[str, Any]:
-    """RegisterThing twice, like the agent after a lost first answer."""
+@question(
+    "provisioning.registered_again",
+    expected={"first_is_its_own": True, "again_refused": "", "certificates": ["ACTIVE"]},
+    relied_on_by=("device/iort_agent/verbs/provision.py", "functions/admit.py"),
+)
+def registered_again(target: Target) -> Seen:
+    """RegisterThing with the same certificate and token succeeds again: the agent retries after a lost
+    first answer."""
+    # RegisterThing twice, like the agent after a lost first answer.
     with removed_after(target, "verify-again") as (name, folder):
         claim = load_claim(_claim(target, name, folder))
         _, request = make_key(name)
@@ -142,82 +186,17 @@ def _registered_again(target: Target) -> dict[str, Any]:
     }
 
 
-def _name_taken(target: Target) -> dict[str, Any]:
+@question(
+    "provisioning.name_taken",
+    expected={"first": "", "second_is_refused": True, "certificates": 1},
+    source=_HOOK,
+    relied_on_by=("functions/admit.py",),
+)
+def name_taken(target: Target) -> Seen:
+    """The hook refuses a second certificate for a taken name, and RegisterThing fails with it; the
+    certificate is not attached."""
     with removed_after(target, "verify-taken") as (name, folder):
         file = _claim(target, name, folder)
         first, second = _provision(file), _provision(file)
         held = certificates.attached(target.cloud, name)
     return {"first": first, "second_is_refused": bool(second), "certificates": len(held), "note_code": second}
-
-
-_MADE = {
-    "refused": "",
-    "thing_type_is_the_fleets": True,
-    "attributes": ["serial", "vehicle"],
-    "certificates": ["ACTIVE"],
-    "name_is_closed_again": True,
-    "connects": True,
-}
-CHECKS = (
-    Check(
-        name="provisioning.claim_for_minutes",
-        assumed=(
-            "A claim of CreateProvisioningClaim is exchanged for a certificate of the robot's own key. The "
-            "hook admits it, and the template creates the thing and attaches certificate and policy."
-        ),
-        expected=_MADE,
-        basis=Basis.DOCUMENTED,
-        source=f"{_PROVISION} and {_HOOK}",
-        relied_on_by=(
-            "station/iort_station/fleet/claims.py",
-            "functions/admit.py",
-            "device/iort_agent/verbs/provision.py",
-            "stacks/fleet.py",
-            "local/gaps/broker/certificate_from_csr.py",
-        ),
-        ask=_own_claim,
-    ),
-    Check(
-        name="provisioning.claim_that_lasts",
-        assumed="A claim certificate with the fleet's claim policy is exchanged in the same way.",
-        expected=_MADE,
-        basis=Basis.DOCUMENTED,
-        source=f"{_PROVISION} and {_HOOK}",
-        relied_on_by=("station/iort_station/fleet/claims.py", "functions/admit.py", "stacks/documents.py"),
-        ask=_lasting_claim,
-    ),
-    Check(
-        name="provisioning.claim_known_by",
-        assumed=(
-            "The hook's claimCertificateId is the id of CreateProvisioningClaim or the SHA-256 of its "
-            "certificate. AWS does not document which; both are accepted."
-        ),
-        expected={"by_one_of_both": True},
-        basis=Basis.ASSUMED,
-        relied_on_by=("functions/admit.py", "station/iort_station/fleet/registry.py"),
-        ask=_known_by,
-    ),
-    Check(
-        name="provisioning.registered_again",
-        assumed=(
-            "RegisterThing with the same certificate and token succeeds again: the agent retries after a "
-            "lost first answer."
-        ),
-        expected={"first_is_its_own": True, "again_refused": "", "certificates": ["ACTIVE"]},
-        basis=Basis.ASSUMED,
-        relied_on_by=("device/iort_agent/verbs/provision.py", "functions/admit.py"),
-        ask=_registered_again,
-    ),
-    Check(
-        name="provisioning.name_taken",
-        assumed=(
-            "The hook refuses a second certificate for a taken name, and RegisterThing fails with "
-            "it; the certificate is not attached."
-        ),
-        expected={"first": "", "second_is_refused": True, "certificates": 1},
-        basis=Basis.DOCUMENTED,
-        source=_HOOK,
-        relied_on_by=("functions/admit.py",),
-        ask=_name_taken,
-    ),
-)

@@ -1,0 +1,1 @@
+"""What several questions need: robots, batches, files, mails. It may use everything but the questions."""
