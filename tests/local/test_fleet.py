@@ -127,7 +127,7 @@ def test_removing_a_robot_cuts_its_session_for_good(embedded, bundle):
 
 
 def test_a_session_ends_with_its_certificate(embedded, bundle):
-    """AWS does so within minutes; the emulator's gap is closed in local/gaps/broker/certificate_status.py."""
+    """AWS does so within minutes; the emulator's gap is closed in local/patches/certificate_status.patch."""
     car = bundle()
     with Robot(car.folder) as robot:
         robot.online()

@@ -11,10 +11,10 @@ from pathlib import Path
 
 import pytest
 from botocore.exceptions import ClientError
+from ministack.services import iot
 
 from iort_contract import CMD, FLEET, MAX_MESSAGE_BYTES, PING, PONG, RULE, build_topic, encode_ping
 from iort_station.fleet import claims, robots
-from local.gaps.broker.message_size import AWS_MESSAGE_BYTES
 from tests.isolation import CLAIM, CONNECT, PUBLISH, RECEIVE, ROBOT, ROWS, SUBSCRIBE, A, B, Row
 from verify.errors import VerifyError
 from verify.tools.robot import Robot, payload_for
@@ -210,6 +210,6 @@ def test_largest_message_is_taken(folders):
 
 def test_message_above_128_kb_is_refused(embedded):
     data, topic = embedded.cloud.client("iot-data"), build_topic(FLEET, B, "image")
-    data.publish(topic=topic, payload=b"x" * AWS_MESSAGE_BYTES)
+    data.publish(topic=topic, payload=b"x" * iot._MAX_PAYLOAD_BYTES)
     with pytest.raises(ClientError):
-        data.publish(topic=topic, payload=b"x" * (AWS_MESSAGE_BYTES + 1))
+        data.publish(topic=topic, payload=b"x" * (iot._MAX_PAYLOAD_BYTES + 1))

@@ -39,7 +39,7 @@ _AWS_MESSAGE_BYTES = 128 * 1024
     relied_on_by=(
         "contract/iort_contract/cloud.py",
         "functions/live.py",
-        "local/gaps/rules/unreadable_payload.py",
+        "local/patches/unreadable_payload.patch",
     ),
 )
 def live_no_json(target: Target) -> Seen:
@@ -111,7 +111,7 @@ def pong_no_json(target: Target) -> Seen:
     "payloads.largest_message",
     expected={"ours": "SUCCESS"},
     source=f"{_QUOTAS} and {_GUIDE}/mqtt.html",
-    relied_on_by=("contract/iort_contract/limits.py", "local/gaps/broker/message_size.py"),
+    relied_on_by=("contract/iort_contract/limits.py", "local/patches/message_size.patch"),
 )
 def largest_message(target: Target) -> Seen:
     """A message of 127 KiB is accepted. AWS accepts payloads of 128 KB, and an MQTT 5 client counts topic

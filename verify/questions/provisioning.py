@@ -104,7 +104,7 @@ def _made(target: Target, robot: str, folder: Path, file: Path) -> dict[str, Any
         "functions/admit.py",
         "device/iort_agent/verbs/provision.py",
         "stacks/fleet.py",
-        "local/gaps/broker/certificate_from_csr.py",
+        "local/patches/certificate_from_csr.patch",
     ),
 )
 def claim_for_minutes(target: Target) -> Seen:
