@@ -13,12 +13,13 @@ from rich.prompt import Confirm
 _INTERRUPTS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
 
 
-def consent(console: Console, text: str) -> str:
-    """Say what the run will do and ask; return why it may not, "" if it may."""
+def confirm(console: Console, text: str, error: type[Exception]) -> None:
+    """Say what the run will do, and ask. Raises the error without a terminal, or if the answer is no."""
     console.print(text, highlight=False)
     if not sys.stdin.isatty():
-        return "no terminal to ask for confirmation: use --yes (`make ... YES=1`)"
-    return "" if Confirm.ask("Go on?", console=console, default=False) else "not confirmed: nothing was done"
+        raise error("no terminal to ask for confirmation: use --yes (`make ... YES=1`)")
+    if not Confirm.ask("Go on?", console=console, default=False):
+        raise error("not confirmed: nothing was done")
 
 
 @contextmanager

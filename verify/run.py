@@ -24,7 +24,7 @@ from botocore.exceptions import BotoCoreError, ClientError
 from rich.console import Console
 from rich.markup import escape
 
-from bench.interrupts import consent, wound_up
+from bench.interrupts import confirm, wound_up
 from bench.report import machine
 from bench.target import AWS, EMBEDDED, Target, open_target
 from iort_station.cloud import Cloud
@@ -85,8 +85,8 @@ def run(options: argparse.Namespace, cloud: Cloud | None = None, deployment: Dep
             options.out.mkdir(parents=True, exist_ok=True)
             deployment = deployment or Deployment(cloud, options.out, say)
             findings.extend(_looked(cloud, console))
-            if not options.yes and (refused := consent(console, _announced(cloud))):
-                raise VerifyError(refused)
+            if not options.yes:
+                confirm(console, _announced(cloud), VerifyError)
         try:
             if deployment:
                 deployment.deploy({})

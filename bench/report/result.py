@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import asdict, dataclass, field
 from typing import Any
 
@@ -104,6 +104,10 @@ class Section:
         """Add a figure, unless it was not measured."""
         if value is not None:
             self.ratios.append(Ratio(name, value, target, **settings))
+
+    def plot(self, name: str, title: str, draw: Callable[[str], str]) -> None:
+        """Add a picture; ``draw`` makes its SVG for a title (`bench.report.plots`)."""
+        self.plots.append(Plot(name, title, draw(title)))
 
     def as_json(self) -> dict[str, Any]:
         """Return the section without its pictures, which have their own files."""

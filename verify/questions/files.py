@@ -7,8 +7,7 @@ import http.client
 import json
 import time
 
-from bench.target import Target
-from bench.temporary_function import temporary_function
+from bench.target import Target, temporary_function
 from iort_contract import FILES_PREFIX, PART_BYTES, File, part_range
 from verify.question import Seen, question
 from verify.tools.uploading import asking, sent, trust

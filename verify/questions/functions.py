@@ -5,8 +5,7 @@ from __future__ import annotations
 import json
 import time
 
-from bench.target import Target
-from bench.temporary_function import temporary_function
+from bench.target import Target, temporary_function
 from iort_contract import BY_FUNCTION, LAMBDA, PING, TOPIC, build_topic, rule_event
 from verify.errors import VerifyError
 from verify.question import Seen, question

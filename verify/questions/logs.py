@@ -7,8 +7,7 @@ import time
 from datetime import datetime, timedelta, timezone
 
 from bench.meters.invocations import configure
-from bench.target import Target
-from bench.temporary_function import temporary_function
+from bench.target import Target, temporary_function
 from iort_contract import (
     METRIC_DEPLOYMENT,
     METRIC_FUNCTION,

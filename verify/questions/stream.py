@@ -8,8 +8,7 @@ from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from typing import Any
 
-from bench.target import Target
-from bench.temporary_function import temporary_function
+from bench.target import Target, temporary_function
 from iort_contract import BATCH, batch_id
 from iort_station.operations.replay import replay
 from verify.question import Seen, question

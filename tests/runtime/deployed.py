@@ -9,8 +9,8 @@ from typing import Any
 from aws_cdk import App
 
 from app import build
-from bench.runtime.environment import Function
 from stacks.settings import Settings
+from tests.runtime.environment import Function
 
 
 def functions(folder: Path, settings: Settings) -> dict[str, Function]:

@@ -19,8 +19,8 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-from bench.meters import cpu
-from bench.runtime.api import NEXT, Call, RuntimeApi, Services, served
+from bench.meters import usage
+from tests.runtime.api import NEXT, Call, RuntimeApi, Services, served
 
 _ANSWER_S = 60.0
 REGION = "eu-west-1"
@@ -90,7 +90,7 @@ class Environment:
 
     def cpu_ms(self) -> float:
         """Return the processor time so far."""
-        return cpu.spent_ms({}, cpu.of_process(self.process.pid))
+        return usage.spent_ms({}, usage.threads_ns([self.process.pid]))
 
     def peak_mb(self) -> float:
         """Return its peak resident memory."""
