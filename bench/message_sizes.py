@@ -1,4 +1,4 @@
-"""Measures how large the messages and items of a drive are, by encoding a simulated drive.
+"""Measures the sizes of messages and items, by encoding a simulated drive.
 
     python -m bench.message_sizes
 
@@ -39,7 +39,7 @@ from iort_station.cost.sizes import Measured
 
 _BOOT, _ROBOT = "0badcafe0badcafe", "car-0001"
 _T_US, _MS = 1_750_000_000_000_000, 1_750_000_000_000
-# A drive is looked at when the car is warm and its counters have grown.
+# The drive begins after a minute, when the motor is warm and the counters have grown.
 _WARM_S = 60
 
 
@@ -70,7 +70,7 @@ def batch_sizes(rate_hz: float, batch_s: float) -> Measured:
 
 
 def message_sizes() -> dict[str, int]:
-    """The sizes of what holds one sample, by the field of `iort_station.cost.sizes.Sizes`."""
+    """The sizes of messages and items with one sample, by the field of `iort_station.cost.sizes.Sizes`."""
     (first,) = simulated_drive(1, after_s=_WARM_S)
     live = LiveSample(_BOOT, 100_000, _T_US, _T_US + 500, first)
     flat = {"boot": _BOOT, "seq": 100_000, "t": _T_US, **first}

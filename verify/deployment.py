@@ -21,6 +21,7 @@ from local.processes import run
 from stacks.settings import DEV
 from verify.errors import VerifyError
 from verify.preflight.deployed import STACKS, stack
+from verify.preflight.finding import listed
 from verify.questions.certificates import POLICY
 from verify.tools.waiting import until
 
@@ -122,9 +123,7 @@ class Deployment:
     def _delete_policies(self) -> None:
         """Of a question that was interrupted while AWS kept its policy."""
         iot = self._cloud.client("iot")
-        pages = iot.get_paginator("list_policies").paginate()
-        names = [one["policyName"] for page in pages for one in page["policies"]]
-        for name in names:
+        for name in [one["policyName"] for one in listed(iot, "list_policies", "policies")]:
             if name.startswith(f"{self._cloud.namespace}-{POLICY}"):
                 iot.delete_policy(policyName=name)
 

@@ -126,8 +126,7 @@ def _summary_delays(target: Target, car: str, client: RawClient, other: str, rat
 
 
 def _forget(target: Target) -> None:
-    """Throw away what was put off, and let what is begun end: it would take its part of this machine from the
-    next stretch."""
+    """Delete the batches that were put off, and wait for those in work: they would slow the next stretch."""
     queue = target.cloud.output("processing", "PutOffQueue")
     target.cloud.client("sqs").purge_queue(QueueUrl=queue)
     threading.Event().wait(_BEGUN_S)

@@ -77,8 +77,10 @@ _JSON: dict[str, Any] = {"BatchWriteItem": {"UnprocessedItems": {}}, "SendMessag
 
 
 class Services:
-    """DynamoDB, SSM, SQS, SNS, IoT, S3 and PubNub, as far as that a sample event is answered: nothing is
-    stored. ``items`` is what every table has, ``asked`` the operations in order."""
+    """A stand-in for DynamoDB, SSM, SQS, SNS, IoT, S3 and PubNub, which stores nothing.
+
+    Every table has the ``items``; ``asked`` has the operations in order.
+    """
 
     def __init__(self) -> None:
         self.items: list[dict[str, Any]] = []

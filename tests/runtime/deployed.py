@@ -26,7 +26,7 @@ def functions(folder: Path, settings: Settings) -> dict[str, Function]:
             if one["Type"] == "AWS::Lambda::LayerVersion"
         }
         for one in resources.values():
-            # Others are the CDK's own, which it writes in JavaScript.
+            # The CDK has functions of its own, in JavaScript.
             if one["Type"] == "AWS::Lambda::Function" and one["Properties"]["Handler"].startswith(
                 "functions."
             ):

@@ -1,7 +1,7 @@
-"""An execution environment: a function under `awslambdaric`, started, asked and measured.
+"""An execution environment: starts a function under `awslambdaric`, sends events and measures it.
 
-The runtime writes log records as frames to a pipe of Lambda's, and what the function prints to standard
-output: both are kept apart here, as Lambda gets them.
+The runtime writes log records as frames to a pipe of Lambda, and the function prints to standard output.
+Both are kept apart here, as in Lambda.
 """
 
 from __future__ import annotations
@@ -54,8 +54,8 @@ class Function:
 
 @dataclass
 class Environment:
-    """A started function. ``start_cpu_ms`` is processor time until it asked for its first event, in all
-    threads; ``printed`` and ``logged`` are complete once it has ended."""
+    """A started function. ``start_cpu_ms`` is the processor time of all threads until the first request for
+    an event. ``printed`` and ``logged`` are complete when the process has ended."""
 
     api: RuntimeApi
     services: Services
@@ -66,9 +66,9 @@ class Environment:
     logged: list[str] = field(default_factory=list)
 
     def wait_for_start(self, began: float) -> None:
-        """Until it asks for its first event; ``began`` is when it was started, by the monotonic clock.
+        """Wait until the runtime asks for its first event; ``began`` is the monotonic time of the start.
 
-        Raises `RuntimeFailedError`.
+        Raises `RuntimeFailedError` if it ends before.
         """
         first = self._call()
         if first.kind != NEXT:
@@ -77,9 +77,9 @@ class Environment:
         self.start_cpu_ms = self.cpu_ms()
 
     def invoke(self, event: dict[str, Any]) -> Call:
-        """Have it answer an event, and wait until it asks for the next one; gives the answer.
+        """Send an event, wait until the runtime asks for the next one, and return the answer.
 
-        The tables have what the event's stream records say.
+        Every table has the items of the event's stream records.
         """
         records = event.get("Records", [])
         self.services.items = [one["dynamodb"]["NewImage"] for one in records if "dynamodb" in one]
@@ -109,9 +109,9 @@ class Environment:
 
 @contextlib.contextmanager
 def started(function: Function, folder: Path, *, python: str = sys.executable) -> Iterator[Environment]:
-    """The function in an environment of its own, ended at the end; ``folder`` is for what it needs.
+    """Run the function in an environment of its own while the block lasts; its files are in ``folder``.
 
-    Raises `RuntimeFailedError` where it does not start.
+    Raises `RuntimeFailedError` if it does not start.
     """
     api, services = RuntimeApi(function.name, function.timeout_s), Services()
     own = folder / "runtime"
@@ -120,7 +120,7 @@ def started(function: Function, folder: Path, *, python: str = sys.executable) -
     with served(api, services) as address, printed.open("wb") as out, logged.open("wb") as log:
         began = time.monotonic()
         process = subprocess.Popen(
-            # -S and -s: of this environment nothing is on the path but what is linked.
+            # -S and -s: only the linked packages of this environment are on the path.
             [python, "-S", "-s", "-m", "awslambdaric", function.handler],
             cwd=function.code,
             env=_variables(function, address, own, log.fileno()),
@@ -151,8 +151,10 @@ def frames(data: bytes) -> list[str]:
 
 
 def link_runtime(folder: Path) -> list[Path]:
-    """What AWS' Python has beside the function, from this environment, and nothing else of it; gives what is
-    linked. Raises `RuntimeFailedError`."""
+    """Link the packages that AWS' Python has, from this environment; return their folders and files.
+
+    Raises `RuntimeFailedError` if one is not installed.
+    """
     folder.mkdir()
     linked = []
     for name in RUNTIME_PACKAGES:

@@ -10,7 +10,7 @@ from iort_station.cost.usage import Usage
 from iort_station.errors import StationError
 from stacks.settings import Settings
 from verify.preflight.deployed import resources
-from verify.preflight.finding import Clients, Found, code, fine, item, stops, warning
+from verify.preflight.finding import Clients, Found, code, fine, item, listed, stops, warning
 
 # The CDK's default synthesizer needs this version of the bootstrap stack; a test compares it with the
 # manifest.
@@ -74,12 +74,8 @@ def iot_log(clients: Clients, settings: Settings) -> Found:
     said = f"configured ({options.get('defaultLogLevel', 'no level')})" if configured else "not configured"
     if not configured or not settings.iot_log_level or settings.embedded:
         return fine(f"{said}; iot_log_level is {settings.iot_log_level or 'off'}")
-    if _ours(clients, settings, "AWS::IoT::Logging"):
-        return fine(f"{said}, by this deployment")
-    return stops(
-        f"{said}, not by this deployment: the stack account would fail with 'already exists'",
-        "leave `iot_log_level` off, or disable it first: `aws iot set-v2-logging-options --disable-all-logs`",
-    )
+    remedy = "leave `iot_log_level` off, or disable it: `aws iot set-v2-logging-options --disable-all-logs`"
+    return _held(clients, settings, "AWS::IoT::Logging", said, remedy)
 
 
 @item("Device Defender's audit", "iot DescribeAccountAuditConfiguration")
@@ -91,11 +87,16 @@ def audit(clients: Clients, settings: Settings) -> Found:
     wanted = "wanted" if settings.device_defender else "not wanted (device_defender=false)"
     if not configured or not settings.device_defender or settings.embedded:
         return fine(f"{said}; {wanted}")
-    if _ours(clients, settings, "AWS::IoT::AccountAuditConfiguration"):
+    remedy = "leave `device_defender` off: the account has its audit"
+    return _held(clients, settings, "AWS::IoT::AccountAuditConfiguration", said, remedy)
+
+
+def _held(clients: Clients, settings: Settings, kind: str, said: str, remedy: str) -> Found:
+    """The finding on a setting that the region has only once, and that is set."""
+    if any(one.kind == kind for one in resources(clients, f"{settings.namespace}-account")):
         return fine(f"{said}, by this deployment")
     return stops(
-        f"{said}, not by this deployment: the stack account would fail with 'already exists'",
-        "leave `device_defender` off: the account has its audit",
+        f"{said}, not by this deployment: the stack account would fail with 'already exists'", remedy
     )
 
 
@@ -108,8 +109,7 @@ def concurrency(clients: Clients, settings: Settings) -> Found:
     wanted, held = settings.reserved_for_live, 0
     if wanted and unreserved - wanted < UNRESERVED:
         # An update may hold the reservation already.
-        deployed = resources(clients, f"{settings.namespace}-processing")
-        for one in deployed:
+        for one in resources(clients, f"{settings.namespace}-processing"):
             if one.kind == "AWS::Lambda::Function" and one.logical_id.startswith("Live"):
                 answer = lambda_.get_function_concurrency(FunctionName=one.physical_id)
                 held = answer.get("ReservedConcurrentExecutions", 0)
@@ -146,11 +146,10 @@ def quotas(clients: Clients, settings: Settings) -> Found:
     service = clients.client("service-quotas")
     values: dict[str, float] = {}
     for operation in ("list_aws_default_service_quotas", "list_service_quotas"):
-        for page in service.get_paginator(operation).paginate(ServiceCode=IOT_CORE):
-            values.update((one["QuotaName"], one["Value"]) for one in page["Quotas"])
+        quotas = listed(service, operation, "Quotas", ServiceCode=IOT_CORE)
+        values.update((one["QuotaName"], one["Value"]) for one in quotas)
     ours = {rule_name(rule, settings.namespace) for rule in RULES}
-    pages = clients.client("iot").get_paginator("list_topic_rules").paginate()
-    others = {rule["ruleName"] for page in pages for rule in page["rules"]} - ours
+    others = {rule["ruleName"] for rule in listed(clients.client("iot"), "list_topic_rules", "rules")} - ours
     if RULES_QUOTA in values and len(others) + len(ours) > values[RULES_QUOTA]:
         return stops(
             f"{len(others)} rules of others and {len(ours)} of ours exceed the limit {values[RULES_QUOTA]:g}",
@@ -171,10 +170,6 @@ def quotas(clients: Clients, settings: Settings) -> Found:
     if robots[scarce] < ROBOTS:
         return warning(text, "ask for more ('Service Quotas', AWS IoT Core) before the fleet grows")
     return fine(text)
-
-
-def _ours(clients: Clients, settings: Settings, kind: str) -> bool:
-    return any(one.kind == kind for one in resources(clients, f"{settings.namespace}-account"))
 
 
 ITEMS = (bootstrap, iot_log, audit, concurrency, cloudfront, quotas)

@@ -11,7 +11,7 @@ from botocore.exceptions import ClientError
 from iort_contract import RULES, claim_name, fleet_name, rule_name
 from stacks.settings import PROD, Settings
 from stacks.storage import OLD_TELEMETRY
-from verify.preflight.finding import Clients, Found, code, fine, item, stops, warning
+from verify.preflight.finding import Clients, Found, code, fine, item, listed, stops, warning
 
 # Every stack that app.py may create, in the order of deployment; a test compares it with the app.
 STACKS = ("storage", "quarantine", "fleet", "processing", "ingest", "monitoring", "site", "account")
@@ -48,12 +48,11 @@ def stack(clients: Clients, name: str) -> dict[str, Any] | None:
 
 def resources(clients: Clients, name: str) -> list[Resource]:
     """The resources of a stack; empty if it does not exist."""
-    pages = clients.client("cloudformation").get_paginator("list_stack_resources").paginate(StackName=name)
+    client = clients.client("cloudformation")
     try:
         return [
             Resource(one["ResourceType"], one["LogicalResourceId"], one["PhysicalResourceId"])
-            for page in pages
-            for one in page["StackResourceSummaries"]
+            for one in listed(client, "list_stack_resources", "StackResourceSummaries", StackName=name)
             if "PhysicalResourceId" in one and one["ResourceStatus"] != "DELETE_COMPLETE"
         ]
     except ClientError as error:
@@ -99,16 +98,17 @@ def names(clients: Clients, settings: Settings) -> Found:
         taken += _taken_of_the_fleet(clients, settings)
     if stack(clients, f"{settings.namespace}-ingest") is None:
         ours = {rule_name(rule, settings.namespace) for rule in RULES}
-        pages = clients.client("iot").get_paginator("list_topic_rules").paginate()
-        taken += sorted(
-            f"rule {one['ruleName']}" for page in pages for one in page["rules"] if one["ruleName"] in ours
-        )
+        rules = {one["ruleName"] for one in listed(clients.client("iot"), "list_topic_rules", "rules")}
+        taken += sorted(f"rule {name}" for name in rules & ours)
     if stack(clients, f"{settings.namespace}-monitoring") is None:
         ours = {f"{settings.namespace}-{name}" for name in ("platform", "robots")}
-        paginator = clients.client("cloudwatch").get_paginator("list_dashboards")
-        pages = paginator.paginate(DashboardNamePrefix=f"{settings.namespace}-")
-        entries = [one["DashboardName"] for page in pages for one in page.get("DashboardEntries", [])]
-        taken += sorted(f"dashboard {name}" for name in entries if name in ours)
+        entries = listed(
+            clients.client("cloudwatch"),
+            "list_dashboards",
+            "DashboardEntries",
+            DashboardNamePrefix=f"{settings.namespace}-",
+        )
+        taken += sorted(f"dashboard {name}" for name in {one["DashboardName"] for one in entries} & ours)
     if taken:
         return stops(
             f"exist without their stack: {', '.join(taken)}",
@@ -153,25 +153,18 @@ def kept(clients: Clients, settings: Settings) -> Found:
 
 def _holders(clients: Clients, namespace: str) -> Iterator[str]:
     """Tables, buckets, queues and log groups with the names that the CDK gives to our stacks."""
-    prefixes = tuple(f"{namespace}-{noun}-" for noun in STACKS)
-    for page in clients.client("dynamodb").get_paginator("list_tables").paginate():
-        yield from (name for name in page["TableNames"] if name.startswith(prefixes))
-    for bucket in clients.client("s3").list_buckets()["Buckets"]:
-        if bucket["Name"].startswith(prefixes):
-            yield bucket["Name"]
-    for page in clients.client("sqs").get_paginator("list_queues").paginate(QueueNamePrefix=f"{namespace}-"):
-        for name in (url.rsplit("/", 1)[-1] for url in page.get("QueueUrls", [])):
-            if name.startswith(prefixes):
-                yield name
-    pages = (
-        clients.client("logs")
-        .get_paginator("describe_log_groups")
-        .paginate(logGroupNamePrefix=f"{namespace}-")
+    client = clients.client
+    prefix = f"{namespace}-"
+    queues = listed(client("sqs"), "list_queues", "QueueUrls", QueueNamePrefix=prefix)
+    groups = listed(client("logs"), "describe_log_groups", "logGroups", logGroupNamePrefix=prefix)
+    names = (
+        *listed(client("dynamodb"), "list_tables", "TableNames"),
+        *(bucket["Name"] for bucket in client("s3").list_buckets()["Buckets"]),
+        *(url.rsplit("/", 1)[-1] for url in queues),
+        *(group["logGroupName"] for group in groups),
     )
-    for page in pages:
-        yield from (
-            one["logGroupName"] for one in page["logGroups"] if one["logGroupName"].startswith(prefixes)
-        )
+    prefixes = tuple(f"{namespace}-{noun}-" for noun in STACKS)
+    return (name for name in names if name.startswith(prefixes))
 
 
 @item("changed settings", "cloudformation ListExports, ListImports and DescribeStacks, against the settings")
@@ -212,28 +205,26 @@ def changes(clients: Clients, settings: Settings) -> Found:
 
 def _used_exports(clients: Clients, storage: str) -> dict[str, list[str]]:
     """The stacks that import the storage stack's key or old telemetry table."""
-    cloudformation = clients.client("cloudformation")
+    client = clients.client("cloudformation")
     used: dict[str, list[str]] = {"Key": [], OLD_TELEMETRY: []}
-    exports = [
-        one["Name"]
-        for page in cloudformation.get_paginator("list_exports").paginate()
-        for one in page["Exports"]
-    ]
+    exports = [one["Name"] for one in listed(client, "list_exports", "Exports")]
     for what, importers in used.items():
+        # The CDK names an export by its reading, the construct, and a hash.
+        prefixes = tuple(f"{storage}:ExportsOutput{how}{what}" for how in ("FnGetAtt", "Ref"))
         for name in exports:
-            # The CDK names an export by its reading, the construct, and a hash.
-            if not name.startswith(
-                tuple(f"{storage}:ExportsOutput{how}{what}" for how in ("FnGetAtt", "Ref"))
-            ):
-                continue
-            try:
-                pages = cloudformation.get_paginator("list_imports").paginate(ExportName=name)
-                importers += [one for page in pages for one in page["Imports"]]
-            except ClientError as error:
-                # AWS answers with an error if no stack imports it.
-                if "not imported" not in str(error):
-                    raise
+            if name.startswith(prefixes):
+                importers.extend(_importers(client, name))
     return used
+
+
+def _importers(client: Any, export: str) -> list[str]:
+    try:
+        return list(listed(client, "list_imports", "Imports", ExportName=export))
+    except ClientError as error:
+        # AWS answers with an error if no stack imports it.
+        if "not imported" not in str(error):
+            raise
+        return []
 
 
 def _used_by(importers: list[str]) -> str:

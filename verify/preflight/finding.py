@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import enum
 import re
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from functools import wraps
 from typing import Any, NamedTuple, Protocol
@@ -88,6 +88,12 @@ def item(name: str, asked: str) -> Callable[[Callable[[Clients, Settings], Found
         return ask
 
     return wrap
+
+
+def listed(client: Any, operation: str, key: str, **arguments: Any) -> Iterator[Any]:
+    """The entries of all pages of a list."""
+    for page in client.get_paginator(operation).paginate(**arguments):
+        yield from page.get(key, ())
 
 
 def code(error: ClientError) -> str:
