@@ -33,7 +33,7 @@ from bench.report.result import Table
 from bench.ros.graph import PYTHONPATH, RosError, RosGraph, python_with_rospy
 from bench.ros.mixed_robot import CORE
 from bench.waiting import reached
-from iort_contract import VESC_STREAM
+from iort_contract.catalog.vesc import VESC_STREAM
 from iort_station.cloud import Cloud
 from iort_station.fleet import robots
 from iort_station.operations import delivery

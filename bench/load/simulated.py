@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from iort_agent.sources.vehicle import Vehicle, VehicleConfig
-from iort_contract import Value
+from iort_contract.limits import Value
 
 RATE_HZ = 50
 # With larger steps the driver swerves.

@@ -25,7 +25,9 @@ from bench.report import plots, thesis
 from bench.report.result import NOT_MEASURED, Section
 from bench.report.spread import ratio
 from bench.target import Say, Target
-from iort_contract import RECEIVED_MS, RECORD, TOPIC, VESC_STREAM, build_topic
+from iort_contract.catalog.vesc import VESC_STREAM
+from iort_contract.tables import RECEIVED_MS, TOPIC
+from iort_contract.topics import RECORD, build_topic
 from iort_station.data import data
 
 POINTS = 14_368

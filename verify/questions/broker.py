@@ -7,7 +7,7 @@ import time
 from typing import Any
 
 from bench.target import Target
-from iort_contract import CMD, FLEET, build_topic
+from iort_contract.topics import CMD, FLEET, build_topic
 from verify.question import Seen, question
 from verify.tools.robot import CONNECT_AGAIN_S, Robot, refusal
 from verify.tools.robots import pair_of, registered

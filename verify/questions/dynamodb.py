@@ -5,7 +5,17 @@ from __future__ import annotations
 from botocore.exceptions import ClientError
 
 from bench.target import Target
-from iort_contract import ADMISSION, BATCH, ENVELOPE, EXPIRES_S, PRESENCE, RECEIVED_MS, ROBOT, STREAMS, TOPIC
+from iort_contract.tables import (
+    ADMISSION,
+    BATCH,
+    ENVELOPE,
+    EXPIRES_S,
+    PRESENCE,
+    RECEIVED_MS,
+    ROBOT,
+    STREAMS,
+    TOPIC,
+)
 from verify.errors import VerifyError
 from verify.question import Seen, question
 

@@ -6,7 +6,9 @@ import json
 import time
 
 from bench.target import Target, temporary_function
-from iort_contract import BY_FUNCTION, LAMBDA, PING, TOPIC, build_topic, rule_event
+from iort_contract.messages.event import rule_event
+from iort_contract.tables import BY_FUNCTION, TOPIC
+from iort_contract.topics import LAMBDA, PING, build_topic
 from verify.errors import VerifyError
 from verify.question import Seen, question
 from verify.tools.telemetry import only_entry

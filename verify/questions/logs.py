@@ -8,11 +8,7 @@ from datetime import datetime, timedelta, timezone
 
 from bench.meters.invocations import configure
 from bench.target import Target, temporary_function
-from iort_contract import (
-    METRIC_DEPLOYMENT,
-    METRIC_FUNCTION,
-    METRIC_NAMESPACE,
-)
+from iort_contract.cloud import METRIC_DEPLOYMENT, METRIC_FUNCTION, METRIC_NAMESPACE
 from verify.errors import VerifyError
 from verify.question import Seen, question
 from verify.tools.telemetry import batch, send

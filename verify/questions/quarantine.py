@@ -6,12 +6,10 @@ import base64
 import json
 
 from bench.target import Target
-from iort_contract import (
-    BATCH,
-    VESC_STREAM,
-    batch_id,
-    rule_name,
-)
+from iort_contract.catalog.vesc import VESC_STREAM
+from iort_contract.messages.batch import batch_id
+from iort_contract.tables import BATCH
+from iort_contract.topics import rule_name
 from iort_station.operations import delivery
 from iort_station.operations.replay import replay
 from verify.question import Seen, question

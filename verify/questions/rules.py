@@ -10,29 +10,11 @@ import uuid
 from typing import Any
 
 from bench.target import Target
-from iort_contract import (
-    AGENT_VERSION,
-    ALERT_PREFIX,
-    EXPIRES_S,
-    FAULT_FIELD,
-    FILE,
-    LAMBDA,
-    LIVE,
-    RECEIVED_MS,
-    RECORD,
-    RULE,
-    SHADOW,
-    TOPIC,
-    VESC_STREAM,
-    VOLTAGE_FIELD,
-    File,
-    FileRequest,
-    LiveSample,
-    encode_file_request,
-    encode_live,
-    encode_ping,
-    file_key,
-)
+from iort_contract.catalog.vesc import FAULT_FIELD, VESC_STREAM, VOLTAGE_FIELD
+from iort_contract.messages.files import File, FileRequest, encode_file_request, file_key
+from iort_contract.messages.live import LiveSample, encode_live, encode_ping
+from iort_contract.tables import AGENT_VERSION, ALERT_PREFIX, EXPIRES_S, RECEIVED_MS, TOPIC
+from iort_contract.topics import FILE, LAMBDA, LIVE, RECORD, RULE, SHADOW
 from iort_station.fleet import registry
 from verify.question import Seen, question
 from verify.tools.robots import listener, pair_of

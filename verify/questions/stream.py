@@ -9,7 +9,8 @@ from contextlib import contextmanager
 from typing import Any
 
 from bench.target import Target, temporary_function
-from iort_contract import BATCH, batch_id
+from iort_contract.messages.batch import batch_id
+from iort_contract.tables import BATCH
 from iort_station.operations.replay import replay
 from verify.question import Seen, question
 from verify.tools.telemetry import batch, entries, items, listed, send, topic

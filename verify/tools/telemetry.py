@@ -7,7 +7,9 @@ import time
 from typing import Any
 
 from bench.target import Target
-from iort_contract import RECORD, VESC_STREAM, Batch, build_topic, encode, record_topic
+from iort_contract.catalog.vesc import VESC_STREAM
+from iort_contract.messages.batch import Batch, encode_batch
+from iort_contract.topics import RECORD, build_topic, record_topic
 from iort_station.fleet.robots import Bundle
 from iort_station.operations import quarantine
 from iort_station.operations.quarantine import Entry
@@ -22,7 +24,7 @@ def batch(number: int = 0, *, first_us: int = 0, **changes: Any) -> bytes:
     """A batch with one sample, of now or of ``first_us``; ``changes`` replace members of its envelope."""
     first_us = first_us or (int(time.time()) - 5) * 1_000_000
     made = Batch(RUN, number, [first_us + number * 1_000_000], {"speed": [1.5]})
-    return json.dumps({**json.loads(encode(made)), **changes}).encode()
+    return json.dumps({**json.loads(encode_batch(made)), **changes}).encode()
 
 
 def send(target: Target, bundle: Bundle, *messages: bytes) -> None:

@@ -15,17 +15,20 @@ two programs reading one port each get half of the bytes.
 from __future__ import annotations
 
 import errno
+import importlib.util
 import logging
+import os
 import random
+import stat
 import threading
 from dataclasses import dataclass
-from typing import Any, Mapping, Sequence
+from pathlib import Path
+from typing import Any, Iterator, Mapping, Sequence
 
-import iort_contract
 from iort_agent.clock import Clock
 from iort_agent.errors import SourceError
 from iort_agent.schema import number, setting, text
-from iort_agent.sources import Emit
+from iort_agent.sources import FAIL, OK, Emit, Finding, SourceConfig
 from iort_agent.sources.vesc.protocol import (
     COMM_FW_VERSION,
     COMM_GET_VALUES,
@@ -36,6 +39,8 @@ from iort_agent.sources.vesc.protocol import (
     frame,
     request,
 )
+from iort_contract.catalog.vesc import VESC_STREAM
+from iort_contract.topics import check_stream
 
 _log = logging.getLogger(__name__)
 
@@ -50,7 +55,7 @@ _REPORT_S = 60.0
 
 
 @dataclass(frozen=True)
-class VescConfig:
+class VescConfig(SourceConfig):
     """A VESC on a serial port.
 
     ``can_id`` asks the controller with that id on the CAN bus, through the one on the port. ``timeout_s``
@@ -60,7 +65,7 @@ class VescConfig:
     port: str = setting(text())
     baudrate: int = setting(number(1200, 4_000_000, whole=True, unit="baud"), 115200)
     rate_hz: float = setting(number(1, 1000, unit="Hz"), 50.0)
-    stream: str = setting(text(iort_contract.check_stream), iort_contract.VESC_STREAM)
+    stream: str = setting(text(check_stream), VESC_STREAM)
     can_id: int | None = setting(number(0, 254, whole=True), None)
     timeout_s: float = setting(number(0.01, 5, unit="s"), 0.2)
 
@@ -76,6 +81,22 @@ class VescConfig:
     def build(self, clock: Clock) -> VescSource:
         """Make the source; the port is opened when it runs."""
         return VescSource(self, clock)
+
+    def check(self, title: str) -> Iterator[Finding]:
+        """Whether pyserial and the port are there, and the port may be opened."""
+        if importlib.util.find_spec("serial") is None:
+            yield Finding(title, FAIL, "Python finds no pyserial", "pip install 'iort-agent[serial]'")
+        port = Path(self.port)
+        if not port.exists():
+            todo = "is the VESC plugged in and switched on? The agent waits for it. `ls /dev/serial/by-id`"
+            yield Finding(title, FAIL, f"{port} is not there", todo)
+        elif not stat.S_ISCHR(port.stat().st_mode):
+            yield Finding(title, FAIL, f"{port} is no serial port")
+        elif not os.access(port, os.R_OK | os.W_OK):
+            todo = "sudo usermod -aG dialout $USER, then log in again"
+            yield Finding(title, FAIL, f"{port} may not be opened", todo)
+        else:
+            yield Finding(title, OK, f"{port} is there")
 
 
 @dataclass
