@@ -29,10 +29,10 @@ from bench.command import made, parser, write
 from bench.errors import BenchError
 from bench.floors import mosquitto
 from bench.meters import live_lane, usage
+from bench.meters.waiting import reached
 from bench.report.result import Table
 from bench.ros.graph import PYTHONPATH, RosError, RosGraph, python_with_rospy
 from bench.ros.mixed_robot import CORE
-from bench.waiting import reached
 from iort_contract.catalog.vesc import VESC_STREAM
 from iort_station.cloud import Cloud
 from iort_station.fleet import robots

@@ -22,7 +22,7 @@ from rich.console import Console
 from rich.markup import escape
 
 from bench import ROOT, spending
-from bench.interrupts import confirm, wound_up
+from bench.command import confirm, wound_up
 from bench.report import machine, writer
 from bench.report.result import Section
 from bench.sections import SECTIONS

@@ -17,7 +17,7 @@ import typer
 from cogapp import Cog
 from typer.cli import get_docs_for_click
 
-from bench.fleet_costs import fleets
+from bench.report.fleet_costs import fleets
 from bench.report.result import Ratio
 from iort_contract.catalog.derived import DERIVED
 from iort_contract.catalog.streams import AGENT_FIELDS

@@ -24,7 +24,7 @@ from botocore.exceptions import BotoCoreError, ClientError
 from rich.console import Console
 from rich.markup import escape
 
-from bench.interrupts import confirm, wound_up
+from bench.command import confirm, wound_up
 from bench.report import machine
 from bench.target import AWS, EMBEDDED, Target, open_target
 from iort_station.cloud import Cloud

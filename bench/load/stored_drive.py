@@ -10,8 +10,8 @@ from typing import Any
 from boto3.dynamodb.types import TypeSerializer
 
 from bench.load.simulated import RATE_HZ, simulated_drive
+from bench.meters.waiting import wait_for
 from bench.target import Target
-from bench.waiting import wait_for
 from iort_contract.catalog.vesc import VESC_STREAM
 from iort_contract.limits import Value
 from iort_contract.messages.batch import Batch, encode_batch

@@ -16,8 +16,8 @@ from typing import Any
 
 from bench.errors import BenchError
 from bench.meters import usage
+from bench.meters.waiting import reached
 from bench.target import Target
-from bench.waiting import reached
 
 _LOGS_S = 60.0
 _REPORT = re.compile(r"^REPORT .*?\tDuration: ([\d.]+) ms.*", re.MULTILINE)

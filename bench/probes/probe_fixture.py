@@ -13,8 +13,8 @@ from typing_extensions import Self
 
 from bench.errors import BenchError
 from bench.floors.raw_mqtt import RawClient
+from bench.meters.waiting import reached
 from bench.target import Target, temporary_function
-from bench.waiting import reached
 from iort_contract.catalog.vesc import VESC_STREAM
 from iort_contract.messages.batch import Batch, encode_batch
 from iort_contract.messages.live import LiveSample, encode_live, encode_ping

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from dataclasses import asdict, replace
 
-from bench.fleet_costs import fleets
 from bench.report import plots
+from bench.report.fleet_costs import fleets
 from bench.report.result import Section
 from bench.target import Say, Target
 from iort_station.cost import line_items, model, report

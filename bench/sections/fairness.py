@@ -13,10 +13,10 @@ from collections.abc import Callable, Iterable
 from bench.floors.raw_mqtt import RawClient
 from bench.load.agent_process import AgentProcess
 from bench.load.worst_case import worst_batches
+from bench.meters.waiting import reached, wait_for
 from bench.report.result import NOT_MEASURED, Section
 from bench.report.spread import spread
 from bench.target import Say, Target
-from bench.waiting import reached, wait_for
 from iort_contract.catalog.vesc import VESC_STREAM
 from iort_contract.messages.live import LiveSample, encode_live
 from iort_contract.tables import SECOND

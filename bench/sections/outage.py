@@ -14,11 +14,11 @@ from dataclasses import dataclass
 from statistics import median
 
 from bench.load.agent_process import AgentProcess
+from bench.meters.waiting import reached, wait_for
 from bench.report import plots
 from bench.report.result import NOT_MEASURED, Section
 from bench.report.spread import spread
 from bench.target import Say, Target
-from bench.waiting import reached, wait_for
 from iort_agent.config.file import load_config
 from iort_contract.catalog.streams import OWN_STREAMS
 from iort_contract.catalog.vesc import VESC_STREAM

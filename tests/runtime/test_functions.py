@@ -46,7 +46,7 @@ TAKES = {
     "admit": {"allowProvisioning": False},
     "live": None,
     "presence": None,
-    "query": {"error": "the request has no robot"},
+    "query": {"error": "robot must be a text, got None"},
 }
 
 
