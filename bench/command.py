@@ -1,4 +1,4 @@
-"""What the bench's commands share: options, figures as a file, consent, and an end in good order."""
+"""The parts that all commands share: options, figures as a file, confirmation, and an orderly end."""
 
 from __future__ import annotations
 

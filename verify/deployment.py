@@ -121,7 +121,7 @@ class Deployment:
             files.empty(self._cloud)
 
     def _delete_policies(self) -> None:
-        """Of a question that was interrupted while AWS kept its policy."""
+        """Delete the policies of a question that was interrupted while AWS kept its policy."""
         iot = self._cloud.client("iot")
         for name in [one["policyName"] for one in listed(iot, "list_policies", "policies")]:
             if name.startswith(f"{self._cloud.namespace}-{POLICY}"):

@@ -38,7 +38,7 @@ _SUMMARY_S = 60.0
 
 @dataclass(frozen=True, kw_only=True)
 class Outage:
-    """What was sent, what arrived, and the time and delay in ms of every live update."""
+    """The counts of samples and batches, and the time and delay in ms of every live update."""
 
     sent: int
     lost: int

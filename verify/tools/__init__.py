@@ -1,1 +1,1 @@
-"""What several questions need: robots, batches, files, mails. It may use everything but the questions."""
+"""Tools of several questions: robots, batches, files, mails. They may use everything but the questions."""
