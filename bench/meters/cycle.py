@@ -19,7 +19,7 @@ from statistics import quantiles
 from bench.ros.vesc_message import DEFINITION, TYPE, body
 from iort_agent.agent import make_agent
 from iort_agent.clock import SystemClock
-from iort_agent.config.file import Config
+from iort_agent.config import Config
 from iort_agent.mqtt.dispatch import Dispatcher
 from iort_agent.sources.ros1 import Intake, TopicConfig
 from iort_agent.sources.sim import SimConfig

@@ -13,11 +13,11 @@ from typing_extensions import Self
 from bench.errors import BenchError
 from bench.floors.raw_mqtt import RawClient
 from iort_agent.clock import SystemClock
-from iort_agent.config.file import load_config
+from iort_agent.config import load_config
 from iort_agent.lanes.pings import Pings
 from iort_agent.mqtt.aws import IotCore
 from iort_agent.mqtt.dispatch import Dispatcher
-from iort_agent.rate_limiter import Allowance
+from iort_agent.mqtt.rate_limiter import RateLimiter
 from iort_contract import BROKER, PING, PONG, RTT_FIELDS, Value, build_topic, encode_ping
 from iort_station.fleet.robots import Bundle
 
@@ -140,7 +140,7 @@ class _Connected:
             padding_bytes=max(0, size - _ENVELOPE),
             uplink=self.uplink,
             clock=self.clock,
-            allowance=Allowance(self.clock, publishes_per_s=1e6, bytes_per_s=1e9),
+            rate_limiter=RateLimiter(self.clock, publishes_per_s=1e6, bytes_per_s=1e9),
             emit=emit,
             on_stamp=lambda _sent, _received, _stamp_ms: None,
         )

@@ -19,7 +19,7 @@ from bench.report import plots
 from bench.report.result import Plot, Ratio, Section, Table
 from bench.report.spread import spread
 from bench.target import Say, Target
-from iort_agent.config.file import load_config
+from iort_agent.config import load_config
 from iort_contract import BATCH, OWN_STREAMS, VESC_STREAM, batch_id
 from iort_station.fleet import robots
 from iort_station.fleet.robots import Bundle

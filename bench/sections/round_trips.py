@@ -18,7 +18,7 @@ from bench.report.result import NOT_MEASURED, Plot, Ratio, Section, Table
 from bench.report.spread import ratio, spread
 from bench.sections import thesis_ping
 from bench.target import Say, Target
-from iort_agent.rate_limiter import BYTES_PER_S
+from iort_agent.mqtt.rate_limiter import BYTES_PER_S
 from iort_contract import BROKER, LAMBDA, PING_PATHS, RULE
 from local.figures import THESIS
 

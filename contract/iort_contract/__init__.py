@@ -82,8 +82,8 @@ from iort_contract.messages.commands import (
 )
 from iort_contract.messages.event import MESSAGE_BASE64, event_message, rule_event
 from iort_contract.messages.files import (
-    CLAIM_AT,
-    CLAIM_FIELDS,
+    ATTACHMENT_AT,
+    ATTACHMENT_FIELDS,
     FILES_PREFIX,
     KINDS,
     MAX_ADDRESSES,
@@ -242,6 +242,8 @@ __all__ = [
     "AGENT_STREAM",
     "AGENT_VERSION",
     "ALERT_PREFIX",
+    "ATTACHMENT_AT",
+    "ATTACHMENT_FIELDS",
     "BATCH",
     "BATCHES",
     "BATCH_VERSION",
@@ -251,8 +253,6 @@ __all__ = [
     "BY_RULE",
     "BY_STREAM",
     "CERTIFICATE_ID",
-    "CLAIM_AT",
-    "CLAIM_FIELDS",
     "CLOCK_MAX_UNCERTAINTY_MS",
     "CMD",
     "CODEC",

@@ -5,27 +5,28 @@ from __future__ import annotations
 import uuid
 from typing import Any
 
-from iort_agent.account import Accounts
 from iort_agent.clock import Clock
-from iort_agent.config.file import Config
+from iort_agent.common.logs import Troubles, set_level
+from iort_agent.common.version import agent_version
+from iort_agent.config import Config
 from iort_agent.control.downlink import make_downlink
-from iort_agent.control.runtime_settings import Tuning, configured
-from iort_agent.control.shadow import Remote
+from iort_agent.control.runtime_settings import configured
+from iort_agent.control.shadow import Shadow
 from iort_agent.files.folder import make_uploads
-from iort_agent.lanes.attachment import make_claims
+from iort_agent.lanes.attachment import make_attachments
 from iort_agent.lanes.clock_offset import ClockOffset
+from iort_agent.lanes.config import RuntimeSettings
 from iort_agent.lanes.live import LiveLane
 from iort_agent.lanes.pings import Pings
 from iort_agent.lanes.record import RecordLane
-from iort_agent.logs import Troubles, set_level
-from iort_agent.metrics import AgentMetrics, Rates
+from iort_agent.lanes.streams import Streams
+from iort_agent.mqtt.rate_limiter import RateLimiter
 from iort_agent.mqtt.uplink import Uplink
-from iort_agent.rate_limiter import Allowance
 from iort_agent.runtime import Parts, Runtime
 from iort_agent.sources.run import SourceRun
 from iort_agent.spool.memory import Spool
-from iort_agent.streams import Streams
-from iort_agent.version import agent_version
+from iort_agent.status.account import Accounts
+from iort_agent.status.metrics import AgentMetrics, Rates
 
 
 def make_agent(
@@ -33,16 +34,16 @@ def make_agent(
 ) -> Runtime:
     """The agent of a configuration, ready to run once."""
     boot, began = uuid.uuid4().hex[:16], clock.monotonic()
-    limiter = Allowance(clock)
+    limiter = RateLimiter(clock)
     names = {"robot": config.robot, "namespace": config.namespace}
-    shared: dict[str, Any] = {**names, "uplink": uplink, "clock": clock, "allowance": limiter}
+    shared: dict[str, Any] = {**names, "uplink": uplink, "clock": clock, "rate_limiter": limiter}
     base = configured(record=config.record, live=config.live, ping=config.ping, log_level=config.log_level)
 
     record = RecordLane(spool=spool, **shared)
     offset = ClockOffset(clock)
     live = LiveLane(boot=boot, rate_hz=config.live.rate_hz, offset_us=offset.known_us, **shared)
     streams = Streams(
-        boot=boot, batch_s=config.record.batch_s, tuning=base, live=live, spool=spool, clock=clock
+        boot=boot, batch_s=config.record.batch_s, settings=base, live=live, spool=spool, clock=clock
     )
     pings = Pings(
         paths=config.ping.paths,
@@ -53,15 +54,15 @@ def make_agent(
         **shared,
     )
 
-    def tune(tuning: Tuning) -> None:
-        if tuning.log_level != streams.tuning.log_level:
-            set_level(tuning.log_level)
-        live.enabled = tuning.live_enabled
-        live.set_rate(tuning.live_rate_hz)
-        pings.set_rate(tuning.ping_rate_hz)
-        streams.tune(tuning)
+    def tune(settings: RuntimeSettings) -> None:
+        if settings.log_level != streams.settings.log_level:
+            set_level(settings.log_level)
+        live.enabled = settings.live_enabled
+        live.set_rate(settings.live_rate_hz)
+        pings.set_rate(settings.ping_rate_hz)
+        streams.tune(settings)
 
-    shadow = Remote(
+    shadow = Shadow(
         robot=config.robot,
         base=base,
         apply=tune,
@@ -69,7 +70,7 @@ def make_agent(
         version=agent_version(),
         uplink=uplink,
         clock=clock,
-        allowance=limiter,
+        rate_limiter=limiter,
     )
     downlink = make_downlink(
         config.downlink,
@@ -81,7 +82,7 @@ def make_agent(
         **shared,
     )
     uploads = make_uploads(config.files, root_ca=config.root_ca, **shared)
-    attachments = make_claims(config.files, robot=config.robot, clock=clock, uploads=uploads)
+    attachments = make_attachments(config.files, robot=config.robot, clock=clock, uploads=uploads)
     sources = [SourceRun(source, clock) for source in config.sources]
     accounts = Accounts(
         clock=clock,

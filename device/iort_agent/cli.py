@@ -16,16 +16,16 @@ from typing import Any, Callable, Sequence
 
 from iort_agent.agent import make_agent
 from iort_agent.clock import SystemClock
-from iort_agent.config.file import Config, load_config
+from iort_agent.common.logs import LOG_LEVELS, neutral, set_up
+from iort_agent.common.version import agent_version
+from iort_agent.config import Config, load_config
 from iort_agent.errors import AgentError, ConfigError
-from iort_agent.logs import LOG_LEVELS, neutral, set_up
 from iort_agent.reporting import make_report, make_status
 from iort_agent.runtime import Runtime
 from iort_agent.spool.sqlite import make_spool
 from iort_agent.status.server import SOCKET, StatusServer, ask, fetch
 from iort_agent.status.state import document
 from iort_agent.status.text import render as render_status
-from iort_agent.version import agent_version
 
 _log = logging.getLogger("iort-agent")
 

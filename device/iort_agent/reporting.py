@@ -29,7 +29,7 @@ from iort_agent.status.state import (
 
 def make_status(parts: Parts) -> Status:
     """The agent now."""
-    config, tuning, over_share = parts.config, parts.streams.tuning, parts.shadow.over_share
+    config, settings, over_share = parts.config, parts.streams.settings, parts.shadow.over_share
     link, backlog, dropped = parts.uplink.status(), parts.spool.backlog(), parts.spool.dropped()
     offset = parts.offset.estimate()
     return Status(
@@ -39,16 +39,16 @@ def make_status(parts: Parts) -> Status:
         uptime_s=round(parts.clock.monotonic() - parts.began, 1),
         connection=Connection(*link, endpoint=f"{config.endpoint}:{config.port}"),
         lanes=Lanes(
-            record=RecordLane(tuning.record_enabled),
+            record=RecordLane(settings.record_enabled),
             live=LiveLane(
-                enabled=tuning.live_enabled,
-                rate_hz=tuning.live_rate_hz,
+                enabled=settings.live_enabled,
+                rate_hz=settings.live_rate_hz,
                 effective_hz=parts.live.tempo.effective_hz,
                 slowed=parts.live.tempo.slowed,
                 published=parts.live.published,
                 refused=parts.live.refused,
             ),
-            ping=PingLane(tuning.ping_rate_hz, parts.pings.held_back),
+            ping=PingLane(settings.ping_rate_hz, parts.pings.held_back),
         ),
         sources=_sources(parts),
         streams=_streams(parts),
@@ -75,7 +75,7 @@ def make_report(parts: Parts) -> Report:
         live_refused=parts.live.refused,
         live=LiveReport(*parts.live.tempo, streams_hz=parts.live.rates_hz()),
         spool=QueueReport(left.batches, left.samples, dropped.batches, dropped.samples),
-        pings=_pings(parts) if parts.streams.tuning.ping_rate_hz else {},
+        pings=_pings(parts) if parts.streams.settings.ping_rate_hz else {},
         failed_sources=[source.description for source in parts.sources if source.failed],
         sources=_sources(parts),
         downlink=parts.downlink.report() if parts.downlink is not None else None,
@@ -84,7 +84,7 @@ def make_report(parts: Parts) -> Report:
 
 
 def _streams(parts: Parts) -> dict[str, StreamState]:
-    live_hz, fields = parts.live.rates_hz(), parts.streams.tuning.fields
+    live_hz, fields = parts.live.rates_hz(), parts.streams.settings.fields
     return {
         name: StreamState(
             **vars(counts),

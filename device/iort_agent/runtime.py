@@ -8,25 +8,25 @@ from dataclasses import dataclass
 from typing import Callable, Sequence
 
 import iort_contract
-from iort_agent.account import Accounts
 from iort_agent.clock import Clock
-from iort_agent.config.file import Config
+from iort_agent.common.logs import Troubles
+from iort_agent.config import Config
 from iort_agent.control.downlink import Downlink
-from iort_agent.control.runtime_settings import Tuning
-from iort_agent.control.shadow import Remote
+from iort_agent.control.shadow import Shadow
 from iort_agent.files.folder import Uploads
-from iort_agent.lanes.attachment import ClaimCheck
+from iort_agent.lanes.attachment import Attachments
 from iort_agent.lanes.clock_offset import ClockOffset
+from iort_agent.lanes.config import RuntimeSettings
 from iort_agent.lanes.live import LiveLane
 from iort_agent.lanes.pings import Pings
 from iort_agent.lanes.record import TODO, RecordLane, too_many
-from iort_agent.logs import Troubles
-from iort_agent.metrics import AgentMetrics, Rates
+from iort_agent.lanes.streams import Streams
 from iort_agent.mqtt.uplink import Uplink
 from iort_agent.sources import Emit
 from iort_agent.sources.run import SourceRun
 from iort_agent.spool.memory import Spool
-from iort_agent.streams import Streams
+from iort_agent.status.account import Accounts
+from iort_agent.status.metrics import AgentMetrics, Rates
 
 _log = logging.getLogger(__name__)
 
@@ -55,15 +55,15 @@ class Parts:
     live: LiveLane
     pings: Pings
     offset: ClockOffset
-    shadow: Remote
-    tune: Callable[[Tuning], None]
+    shadow: Shadow
+    tune: Callable[[RuntimeSettings], None]
     sources: Sequence[SourceRun]
     accounts: Accounts
     metrics: AgentMetrics
     rates: Rates
     downlink: Downlink | None
     uploads: Uploads | None
-    attachments: ClaimCheck | None
+    attachments: Attachments | None
     troubles: Troubles | None
 
 

@@ -12,11 +12,11 @@ from pathlib import PurePath
 import pytest
 
 from iort_agent.cli import main
+from iort_agent.common.private_files import make_private, open_below, write_below
 from iort_agent.errors import AgentError, UploadError
 from iort_agent.files.file import from_json, read, to_json
 from iort_agent.files.folder import STATE, Folder
-from iort_agent.lanes.attachment import ClaimCheck
-from iort_agent.private_files import make_private, open_below, write_below
+from iort_agent.lanes.attachment import Attachments
 from iort_agent.spool.file import SpoolFile
 from iort_agent.spool.memory import PROCESS
 from iort_agent.spool.reservation import Reservation
@@ -127,7 +127,7 @@ def test_nothing_is_removed_through_a_link(folder, secret):
 
 def test_claims_are_written_where_they_belong(folder, secret):
     (folder / "camera").symlink_to(secret.parent)
-    claims = ClaimCheck(
+    claims = Attachments(
         robot="car", folder=folder, every_s=0, max_bytes=1000, clock=ManualClock(),
         thumbnail=lambda _content, _type: None, stored=lambda: None,
     )  # fmt: skip
@@ -151,7 +151,7 @@ def test_what_is_written_is_its_owners_alone_whatever_the_umask(folder, open_uma
     files = watched(folder / "uploads")
     files.local(files.next(), threading.Event())
     assert (folder / "uploads" / STATE).exists()
-    claims = ClaimCheck(
+    claims = Attachments(
         robot="car", folder=folder, every_s=0, max_bytes=1000, clock=clock,
         thumbnail=lambda _content, _type: None, stored=lambda: None,
     )  # fmt: skip

@@ -9,14 +9,14 @@ import threading
 import pytest
 
 import iort_contract
-from iort_agent.config.file import load_config
+from iort_agent.config import load_config
 from iort_agent.errors import UploadError
 from iort_agent.files.file import kind_of, read, wire_name
 from iort_agent.files.folder import STATE, Folder, Uploads
 from iort_agent.files.http import Outcome, Pace, Sender, trusting
 from iort_agent.files.upload import make_uploader
 from iort_agent.mqtt.dispatch import Dispatcher
-from iort_agent.rate_limiter import Allowance
+from iort_agent.mqtt.rate_limiter import RateLimiter
 from iort_agent.status.server import SOCKET, StatusServer
 from iort_agent.verbs.upload import upload_files
 from iort_contract import PART_BYTES
@@ -38,7 +38,7 @@ class Rig:
             namespace="iort",
             uplink=self.uplink,
             clock=self.clock,
-            allowance=Allowance(self.clock),
+            rate_limiter=RateLimiter(self.clock),
             root_ca=self.certificate,
             rate_kb_s=0,
         )

@@ -16,7 +16,7 @@ from hashlib import sha256
 from pathlib import Path
 
 from iort_agent.clock import SystemClock
-from iort_agent.schema import Where, load
+from iort_agent.common.schema import Where, load
 from iort_agent.sources.ros1 import Ros1Config
 from iort_contract import RosMessage
 

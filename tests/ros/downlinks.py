@@ -16,14 +16,14 @@ from pathlib import Path
 
 import iort_contract
 from iort_agent.clock import SystemClock
+from iort_agent.common.schema import Where, load
 from iort_agent.control.config import DownlinkConfig, share_rule
 from iort_agent.control.downlink import make_downlink
 from iort_agent.lanes.clock_offset import Offset
 from iort_agent.mqtt.dispatch import Dispatcher
-from iort_agent.rate_limiter import Allowance
+from iort_agent.mqtt.rate_limiter import RateLimiter
 from iort_agent.ros1.node import DEFAULT_NODE
 from iort_agent.ros1.publish import Ros1Graph
-from iort_agent.schema import Where, load
 from tests.agent_fakes import Loopback
 
 
@@ -48,7 +48,7 @@ downlink = make_downlink(
     boot="0badcafe",
     uplink=uplink,
     clock=clock,
-    allowance=Allowance(clock),
+    rate_limiter=RateLimiter(clock),
     offset=lambda: Offset(0.0, 0.0),
     answer=lambda *_: None,
 )

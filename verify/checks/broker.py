@@ -135,7 +135,7 @@ CHECKS = (
         expected={"at_90_a_second": _ALL_TAKEN},
         basis=Basis.DOCUMENTED,
         source=_QUOTAS,
-        relied_on_by=("device/iort_agent/rate_limiter.py",),
+        relied_on_by=("device/iort_agent/mqtt/rate_limiter.py",),
         ask=_rate,
     ),
 )

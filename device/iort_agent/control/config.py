@@ -19,7 +19,7 @@ from dataclasses import dataclass
 from typing import Any, Callable, Mapping
 
 import iort_contract
-from iort_agent.schema import Rule, Where, flag, number, pairs, section, setting, text
+from iort_agent.common.schema import Place, Rule, flag, number, pairs, section, setting, text
 from iort_agent.sources.ros1 import ros_name
 from iort_contract import ContractError
 
@@ -39,14 +39,14 @@ def _fleet_topic(value: str) -> str:
     return value
 
 
-def _object(value: Any, where: Where) -> Any:
+def _object(value: Any, where: Place) -> Any:
     if not isinstance(value, dict):
         raise where.error(value, "a mapping of the ROS message's fields")
     return value
 
 
 def _by(check: Callable[[str], str], rule: Rule, what: str) -> Rule:
-    def mapping(value: Any, where: Where) -> Any:
+    def mapping(value: Any, where: Place) -> Any:
         found = pairs(rule, what=what)(value, where)
         for key, _ in found:
             text(check)(key, where)
@@ -112,7 +112,7 @@ def share_rule() -> Rule:
     """The rule for the configuration's section `share`."""
     shares = _by(ros_name, section(ShareConfig), "a mapping of ROS topic to name and rate")
 
-    def rule(value: Any, where: Where) -> Any:
+    def rule(value: Any, where: Place) -> Any:
         found = shares(value, where)
         names = [settings.name for _, settings in found]
         for i, (topic, settings) in enumerate(found):

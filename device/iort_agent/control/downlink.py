@@ -14,17 +14,17 @@ from typing import Any, Callable, Iterable, Mapping, Optional, Sequence
 
 import iort_contract
 from iort_agent.clock import Clock
+from iort_agent.common.throttled_log import ThrottledLog
 from iort_agent.control.config import ROBOT_IN_TOPIC, CommandConfig, DownlinkConfig, FleetConfig, ShareConfig
 from iort_agent.control.leases import Leases, Limits
 from iort_agent.errors import ConfigError, UplinkError
 from iort_agent.lanes.clock_offset import Offset
+from iort_agent.mqtt.rate_limiter import STEADY, RateLimiter
 from iort_agent.mqtt.uplink import Message, Uplink
-from iort_agent.rate_limiter import STEADY, Allowance
 from iort_agent.ros1.json_message import decode, encode
 from iort_agent.ros1.node import DEFAULT_NODE
 from iort_agent.ros1.publish import Graph, Ros1Graph
 from iort_agent.sources.ros1 import Ros1Config
-from iort_agent.throttled_log import Seldom
 from iort_contract import CMD, FLEET, Command, ContractError, FleetMessage
 from iort_contract.limits import MessageError
 from iort_contract.ros1.definition import Definition, parse
@@ -81,7 +81,7 @@ class Downlink:
         boot: str,
         uplink: Uplink,
         clock: Clock,
-        allowance: Allowance,
+        rate_limiter: RateLimiter,
         graph: Graph,
         offset: Callable[[], Offset | None],
         answer: Answer,
@@ -91,7 +91,7 @@ class Downlink:
         self._offset = offset
         self._clock = clock
         self._graph = graph
-        self._seldom = Seldom(_log, clock)
+        self._throttled = ThrottledLog(_log, clock)
         self._lock = threading.Lock()
         self._wake, self._end = threading.Event(), threading.Event()
         self._thread = threading.Thread(target=self._run, name="downlink", daemon=True)
@@ -108,7 +108,7 @@ class Downlink:
             _Share(topic, settings, iort_contract.build_topic(FLEET, robot, settings.name, namespace), boot)
             for topic, settings in share
         ]
-        self._uplink, self._allowance = uplink, allowance
+        self._uplink, self._rate_limiter = uplink, rate_limiter
         for topic, command in self._commands.items():
             graph.advertise(command.config.topic, command.config.type)
             uplink.subscribe(topic, self._on_command)
@@ -164,7 +164,7 @@ class Downlink:
             },
             "fleet": {name: dict(fleet.passed) for name, fleet in self._fleet.items()},
             "shared": {shared.ros_topic: shared.seq for shared in self._shares},
-            "refused": self._seldom.counts(),
+            "refused": self._throttled.counts(),
             "waits": self.waits(),
         }
 
@@ -274,7 +274,7 @@ class Downlink:
             self._refuse(f"{FLEET} {topic.name}", refusal, f"{topic.robot}: {refusal.replace('_', ' ')}")
 
     def _refuse(self, what: str, reason: str, why: str) -> None:
-        self._seldom.warn(f"{what} {reason}", f"{what}: refused: {why}")
+        self._throttled.warn(f"{what} {reason}", f"{what}: refused: {why}")
 
     # Our own messages to them.
 
@@ -292,7 +292,7 @@ class Downlink:
     def _send(self, shared: _Share, now: float) -> None:
         if shared.newest is None or now < shared.due:
             return
-        if not self._allowance.may_go(STEADY, shared.topic, len(shared.newest[1])):
+        if not self._rate_limiter.may_go(STEADY, shared.topic, len(shared.newest[1])):
             shared.due = now + _NO_ROOM_S
             return
         (header, data, at), shared.newest = shared.newest, None
@@ -305,7 +305,7 @@ class Downlink:
             return
         shared.seq += 1
         shared.due = max(shared.due, now - shared.period_s / 2) + shared.period_s
-        self._allowance.spend(shared.topic, payload)
+        self._rate_limiter.spend(shared.topic, payload)
         self._uplink.publish(shared.topic, payload, qos=0, done=_ignore)
 
 

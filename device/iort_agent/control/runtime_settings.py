@@ -8,45 +8,21 @@ from __future__ import annotations
 
 import dataclasses
 import difflib
-from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Iterator, Mapping
 
 import iort_contract
+from iort_agent.common.logs import LOG_LEVELS
+from iort_agent.common.schema import Place, Rule, choice, items, text
 from iort_agent.errors import ConfigError
-from iort_agent.lanes.config import LiveConfig, PingConfig, RecordConfig
-from iort_agent.logs import LOG_LEVELS
-from iort_agent.schema import Rule, Where, choice, items, text
+from iort_agent.lanes.config import LiveConfig, PingConfig, RecordConfig, RuntimeSettings
 
 # Errors name the place as those of a configuration file do.
-_WHERE = Where(Path("shadow agent"))
+_WHERE = Place(Path("shadow agent"))
 FIELDS = "fields"
 _FIELD_LIST = items(
     text(iort_contract.check_field), what="a list of field names; an empty one means all fields"
 )
-
-
-@dataclass(frozen=True)
-class Tuning:
-    """What is in force. ``fields`` maps a stream to the only fields that are sent of it; a stream that
-    is not there is sent whole."""
-
-    record_enabled: bool
-    live_enabled: bool
-    live_rate_hz: float
-    ping_rate_hz: float
-    log_level: str
-    fields: Mapping[str, tuple[str, ...]] = field(default_factory=dict)
-
-    def as_document(self) -> dict[str, Any]:
-        """As the shadow reports it."""
-        return {
-            "record": {"enabled": self.record_enabled},
-            "live": {"enabled": self.live_enabled, "rate_hz": self.live_rate_hz},
-            "ping": {"rate_hz": self.ping_rate_hz},
-            "log_level": self.log_level,
-            FIELDS: {stream: list(names) for stream, names in sorted(self.fields.items())},
-        }
 
 
 def _rule(cls: type[Any], name: str) -> Rule:
@@ -64,14 +40,16 @@ RULES: dict[str, Rule] = {
 _SECTIONS = {name.split(".")[0] for name in RULES if "." in name} | {FIELDS}
 
 
-def configured(*, record: RecordConfig, live: LiveConfig, ping: PingConfig, log_level: str) -> Tuning:
+def configured(
+    *, record: RecordConfig, live: LiveConfig, ping: PingConfig, log_level: str
+) -> RuntimeSettings:
     """What the configuration file says."""
-    return Tuning(record.enabled, live.enabled, live.rate_hz, ping.rate_hz, log_level)
+    return RuntimeSettings(record.enabled, live.enabled, live.rate_hz, ping.rate_hz, log_level)
 
 
 def overlay(
-    base: Tuning, wished: Mapping[str, Any], known_fields: Mapping[str, Any]
-) -> tuple[Tuning, dict[str, dict[str, Any]]]:
+    base: RuntimeSettings, wished: Mapping[str, Any], known_fields: Mapping[str, Any]
+) -> tuple[RuntimeSettings, dict[str, dict[str, Any]]]:
     """The base with the wishes that are allowed, and by name the value and reason of those that are not.
 
     ``known_fields`` holds the fields of the streams seen so far, of which others cannot be selected.

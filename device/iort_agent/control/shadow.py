@@ -13,10 +13,11 @@ import logging
 from typing import Any, Callable, Mapping
 
 from iort_agent.clock import Clock
-from iort_agent.control.runtime_settings import Tuning, overlay
+from iort_agent.control.runtime_settings import overlay
 from iort_agent.errors import UplinkError
+from iort_agent.lanes.config import RuntimeSettings
+from iort_agent.mqtt.rate_limiter import RateLimiter
 from iort_agent.mqtt.uplink import Message, Uplink
-from iort_agent.rate_limiter import Allowance
 from iort_contract import (
     ACCEPTED,
     AGENT_VERSION,
@@ -39,7 +40,7 @@ _NOT_FOUND = 404
 _MOST = 10**15
 
 
-class Remote:
+class Shadow:
     """Follows the shadow, and says there which version of the agent does so. `tick` is called now and
     then, the rest by the uplink. ``over_share`` is what the cloud said last of batches that it put off:
     since when and when last, in its own milliseconds, and how many."""
@@ -48,21 +49,21 @@ class Remote:
         self,
         *,
         robot: str,
-        base: Tuning,
-        apply: Callable[[Tuning], None],
+        base: RuntimeSettings,
+        apply: Callable[[RuntimeSettings], None],
         known_fields: Callable[[], Mapping[str, Any]],
         version: str,
         uplink: Uplink,
         clock: Clock,
-        allowance: Allowance,
+        rate_limiter: RateLimiter,
     ) -> None:
-        self._base = self.tuning = base
+        self._base = self.settings = base
         self._apply = apply
         self._known_fields = known_fields
         self._agent_version = version
         self._uplink = uplink
         self._clock = clock
-        self._allowance = allowance
+        self._rate_limiter = rate_limiter
         prefix = f"$aws/things/{robot}/shadow/name/{SHADOW}"
         self._get, self._update = f"{prefix}/get", f"{prefix}/update"
         self._filters = {
@@ -160,15 +161,15 @@ class Remote:
         """Bring into force what is allowed of the wishes, and report."""
         self._hear(self._desired.get(OVER_SHARE))
         wishes = {name: value for name, value in self._desired.items() if name != OVER_SHARE}
-        tuning, rejected = overlay(self._base, wishes, self._known_fields())
+        settings, rejected = overlay(self._base, wishes, self._known_fields())
         for name, refusal in rejected.items():
             if self._rejected.get(name) != refusal:
                 _log.warning("refused: %s", refusal["reason"])
         self._rejected = rejected
-        if tuning != self.tuning:
-            _log.info("now in force: %s", json.dumps(tuning.as_document()))
-            self.tuning = tuning
-            self._apply(tuning)
+        if settings != self.settings:
+            _log.info("now in force: %s", json.dumps(settings.as_document()))
+            self.settings = settings
+            self._apply(settings)
         self._report_at = self._clock.monotonic()
 
     def _hear(self, said: Any) -> None:
@@ -189,14 +190,14 @@ class Remote:
             name: {**refusal, "value": _quoted(refusal["value"])} for name, refusal in self._rejected.items()
         }
         return {
-            **self.tuning.as_document(),
+            **self.settings.as_document(),
             "rejected": rejected,
             COMMANDS: dict(self._answers),
             AGENT_VERSION: self._agent_version,
         }
 
     def _publish(self, topic: str, payload: bytes) -> None:
-        self._allowance.spend(topic, payload)
+        self._rate_limiter.spend(topic, payload)
         self._uplink.publish(topic, payload, qos=1, done=_done)
 
 

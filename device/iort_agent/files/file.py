@@ -11,8 +11,8 @@ from pathlib import Path, PurePath
 from typing import Any, BinaryIO, Mapping, NamedTuple, Sequence
 
 import iort_contract
+from iort_agent.common.private_files import folder_of, open_below
 from iort_agent.errors import UploadError
-from iort_agent.private_files import folder_of, open_below
 from iort_contract import PART_BYTES, File
 
 _CHUNK_BYTES = 256 * 1024
@@ -57,7 +57,7 @@ class Local(NamedTuple):
 
     @property
     def path(self) -> Path:
-        """Where it is."""
+        """Place it is."""
         return self.root / self.name
 
     @property

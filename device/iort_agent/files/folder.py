@@ -15,13 +15,13 @@ from pathlib import Path, PurePath
 from typing import Any, Iterable, Iterator, NamedTuple
 
 from iort_agent.clock import Clock
+from iort_agent.common.private_files import folder_of, open_below, write_below
+from iort_agent.common.schema import Place, any_path, number, setting
 from iort_agent.errors import UploadError
 from iort_agent.files.file import Local, Look, from_json, look_at, read, to_json
 from iort_agent.files.upload import Uploader, make_uploader
+from iort_agent.mqtt.rate_limiter import RateLimiter
 from iort_agent.mqtt.uplink import Uplink
-from iort_agent.private_files import folder_of, open_below, write_below
-from iort_agent.rate_limiter import Allowance
-from iort_agent.schema import Where, any_path, number, setting
 
 _log = logging.getLogger(__name__)
 
@@ -41,7 +41,7 @@ _UNFINISHED = (".active", ".tmp", ".part", "-wal", "-shm", "-journal")
 _NICE = 10
 
 
-def _folder(value: Any, where: Where) -> Path:
+def _folder(value: Any, where: Place) -> Path:
     path: Path = any_path()(value, where)
     if not path.is_dir():
         raise where.error(value, f"the path of a folder that exists, and there is none at {path}")
@@ -314,7 +314,7 @@ def make_uploads(
     namespace: str,
     uplink: Uplink,
     clock: Clock,
-    allowance: Allowance,
+    rate_limiter: RateLimiter,
     root_ca: Path | None,
 ) -> Uploads | None:
     """The uploads that the configuration asks for; None where it asks for none.
@@ -339,7 +339,7 @@ def make_uploads(
         namespace=namespace,
         uplink=uplink,
         clock=clock,
-        allowance=allowance,
+        rate_limiter=rate_limiter,
         root_ca=root_ca,
         rate_kb_s=files.rate_kb_s,
     )

@@ -17,8 +17,8 @@ from iort_agent.clock import Clock
 from iort_agent.errors import UploadError
 from iort_agent.files.file import Local, changed, look_at
 from iort_agent.files.http import Outcome, Pace, Sender, trusting
+from iort_agent.mqtt.rate_limiter import RateLimiter
 from iort_agent.mqtt.uplink import Message, Uplink
-from iort_agent.rate_limiter import Allowance
 from iort_contract import FILE, MAX_ADDRESSES, PING, PONG, Address, ContractError, FileAnswer, FileRequest
 
 _log = logging.getLogger(__name__)
@@ -38,9 +38,9 @@ class Asker:
     """Asks the cloud about files, one question at a time in each thread."""
 
     def __init__(
-        self, *, robot: str, namespace: str, uplink: Uplink, clock: Clock, allowance: Allowance
+        self, *, robot: str, namespace: str, uplink: Uplink, clock: Clock, rate_limiter: RateLimiter
     ) -> None:
-        self._uplink, self._clock, self._allowance = uplink, clock, allowance
+        self._uplink, self._clock, self._rate_limiter = uplink, clock, rate_limiter
         self._topic = iort_contract.build_topic(PING, robot, FILE, namespace)
         self._answers = iort_contract.build_topic(PONG, robot, FILE, namespace)
         self._lock = threading.Lock()
@@ -65,7 +65,7 @@ class Asker:
         with self._lock:
             self._waiting[request.id] = heard
         try:
-            self._allowance.spend(self._topic, payload)
+            self._rate_limiter.spend(self._topic, payload)
             self._uplink.publish(self._topic, payload, qos=1, done=lambda _error: None)
             until = self._clock.monotonic() + _ANSWER_S
             while not stop.is_set() and self._clock.monotonic() < until:
@@ -208,11 +208,11 @@ def make_uploader(
     namespace: str,
     uplink: Uplink,
     clock: Clock,
-    allowance: Allowance,
+    rate_limiter: RateLimiter,
     root_ca: Path | None,
     rate_kb_s: float,
 ) -> Uploader:
-    """An uploader as `iort_agent.config.file` says; no faster than ``rate_kb_s``, 0 for no limit."""
-    asker = Asker(robot=robot, namespace=namespace, uplink=uplink, clock=clock, allowance=allowance)
+    """An uploader as `iort_agent.config` says; no faster than ``rate_kb_s``, 0 for no limit."""
+    asker = Asker(robot=robot, namespace=namespace, uplink=uplink, clock=clock, rate_limiter=rate_limiter)
     sender = Sender(trust=trusting(root_ca), pace=Pace(clock, rate_kb_s * 1000))
     return Uploader(asker=asker, sender=sender, clock=clock)

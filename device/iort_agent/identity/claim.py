@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import iort_contract
-from iort_agent.schema import Where, any_path, existing_path, load, number, read_yaml, setting, text
+from iort_agent.common.schema import Place, any_path, existing_path, load, number, read_yaml, setting, text
 
 
 @dataclass(frozen=True)
@@ -26,4 +26,4 @@ class Claim:
 
 def load_claim(file: Path) -> Claim:
     """The claim in a file. Raises `ConfigError`."""
-    return load(Claim, read_yaml(file), Where(file))
+    return load(Claim, read_yaml(file), Place(file))

@@ -8,7 +8,7 @@ from pathlib import Path
 from iort_agent.errors import IdentityError
 from iort_agent.identity.certificate import load_x509
 
-# Where Linux tells the machine's serial number; the first file that exists counts.
+# Place Linux tells the machine's serial number; the first file that exists counts.
 _SERIALS = (Path("/proc/device-tree/serial-number"), Path("/etc/machine-id"))
 
 

@@ -12,7 +12,7 @@ import logging
 from dataclasses import asdict, dataclass
 from pathlib import Path, PurePath
 
-from iort_agent.private_files import open_below, write_below
+from iort_agent.common.private_files import open_below, write_below
 
 _log = logging.getLogger(__name__)
 

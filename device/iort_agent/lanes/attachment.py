@@ -15,13 +15,13 @@ from typing import Any, Callable, Mapping
 
 import iort_contract
 from iort_agent.clock import Clock
+from iort_agent.common.private_files import write_below
+from iort_agent.common.throttled_log import ThrottledLog
 from iort_agent.files.file import kind_of, wire_name
 from iort_agent.files.folder import FilesConfig, Uploads
 from iort_agent.lanes.thumbnail import thumbnail
-from iort_agent.private_files import write_below
 from iort_agent.sources import Emit
-from iort_agent.throttled_log import Seldom
-from iort_contract import CLAIM_AT, CLAIM_FIELDS, File, RosMessage, Value
+from iort_contract import ATTACHMENT_AT, ATTACHMENT_FIELDS, File, RosMessage, Value
 from iort_contract.ros1.message import cut
 
 _log = logging.getLogger(__name__)
@@ -33,7 +33,7 @@ _LOOK_S = 0.1
 Thumbnail = Callable[[bytes, str], "str | None"]
 
 
-class ClaimCheck:
+class Attachments:
     """Takes bytes out of samples and puts claims in. Safe to use from several threads.
 
     Of each stream, at most one content every ``every_s`` of the samples' own time is kept, and no more
@@ -55,7 +55,7 @@ class ClaimCheck:
         self._robot, self._folder, self._max_bytes = robot, folder, max_bytes
         self._every_us = round(every_s * 1_000_000)
         self._clock, self._thumbnail, self._stored = clock, thumbnail, stored
-        self._seldom = Seldom(_log, clock)
+        self._throttled = ThrottledLog(_log, clock)
         self._lock = threading.Lock()
         self._last_us: dict[str, int] = {}
         self._bytes = self._measure()
@@ -83,7 +83,7 @@ class ClaimCheck:
         for field, content in message.large.items():
             raw, at = cut(raw, content)
             beside.update(self._claim(stream, t_us, field, content, keep=keep))
-            beside[f"{field}.{CLAIM_AT}"] = at
+            beside[f"{field}.{ATTACHMENT_AT}"] = at
         return RosMessage(raw, message.kind, beside=beside)
 
     def claim_fields(self, stream: str, t_us: int, values: Mapping[str, Any]) -> dict[str, Value]:
@@ -102,7 +102,7 @@ class ClaimCheck:
         if claim is None:
             self.left_out += keep
             self.not_due += not keep
-            claim = dict.fromkeys(CLAIM_FIELDS)
+            claim = dict.fromkeys(ATTACHMENT_FIELDS)
         return {f"{field}.{name}": one for name, one in claim.items()}
 
     def wait_empty(self, timeout_s: float) -> bool:
@@ -118,7 +118,7 @@ class ClaimCheck:
     def report(self) -> dict[str, Any]:
         """What became of the contents."""
         counts = {"kept": self.kept, "not_due": self.not_due, "left_out": self.left_out}
-        return {**counts, **self._seldom.counts()}
+        return {**counts, **self._throttled.counts()}
 
     def _is_due(self, stream: str, t_us: int) -> bool:
         with self._lock:
@@ -133,12 +133,12 @@ class ClaimCheck:
         suffix = next((end for begin, end in _BEGINNINGS if content.startswith(begin)), ".bin")
         name = PurePath(stream) / f"{t_us}-{field}{suffix}"
         if not self._has_room(len(content)):
-            self._seldom.warn("full", f"{self._folder} is full: contents of {stream} are not kept")
+            self._throttled.warn("full", f"{self._folder} is full: contents of {stream} are not kept")
             return None
         try:
             written_ns = write_below(self._folder, name, content, mtime_ns=max(0, t_us) * 1000)
         except OSError as error:
-            self._seldom.warn("disk", f"{self._folder}: {error.strerror or error}")
+            self._throttled.warn("disk", f"{self._folder}: {error.strerror or error}")
             return None
         kind, content_type = kind_of(name)
         sha256 = hashlib.sha256(content).hexdigest()
@@ -168,13 +168,13 @@ class ClaimCheck:
         return sum(map(_size, self._folder.glob("*/[!.]*")))
 
 
-def make_claims(
+def make_attachments(
     files: FilesConfig, *, robot: str, clock: Clock, uploads: Uploads | None
-) -> ClaimCheck | None:
+) -> Attachments | None:
     """The claim check that the configuration asks for; None where it asks for none."""
     if files.large_folder is None or uploads is None:
         return None
-    return ClaimCheck(
+    return Attachments(
         robot=robot,
         folder=files.large_folder,
         every_s=files.large_every_s,

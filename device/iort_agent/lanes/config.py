@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
+from typing import Any, Mapping
 
 import iort_contract
-from iort_agent.schema import choice, flag, items, number, setting
+from iort_agent.common.schema import choice, flag, items, number, setting
 
 
 @dataclass(frozen=True)
@@ -41,3 +42,26 @@ class PingConfig:
         iort_contract.PING_PATHS,
     )
     padding_bytes: int = setting(number(0, 100_000, whole=True, unit="bytes"), 0)
+
+
+@dataclass(frozen=True)
+class RuntimeSettings:
+    """What is in force. ``fields`` maps a stream to the only fields that are sent of it; a stream that
+    is not there is sent whole."""
+
+    record_enabled: bool
+    live_enabled: bool
+    live_rate_hz: float
+    ping_rate_hz: float
+    log_level: str
+    fields: Mapping[str, tuple[str, ...]] = field(default_factory=dict)
+
+    def as_document(self) -> dict[str, Any]:
+        """As the shadow reports it."""
+        return {
+            "record": {"enabled": self.record_enabled},
+            "live": {"enabled": self.live_enabled, "rate_hz": self.live_rate_hz},
+            "ping": {"rate_hz": self.ping_rate_hz},
+            "log_level": self.log_level,
+            "fields": {stream: list(names) for stream, names in sorted(self.fields.items())},
+        }

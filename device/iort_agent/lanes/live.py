@@ -5,7 +5,7 @@ one is due replaces what waits; it goes with the first sample that is due, or, i
 silent, half a period later. While a message is not written yet, or there is no connection, nothing
 is sent at all, so that the first one afterwards is the newest.
 
-The lane has what the record lane leaves of the connection's `Allowance`. Where that is too little, streams
+The lane has what the record lane leaves of the connection's `RateLimiter`. Place that is too little, streams
 that are due wait for their turn. Next is the one that went longest ago, with the newest sample that it has
 then: so all go equally often, and a slow stream takes no more than its own rate. `tempo` says how often.
 
@@ -28,8 +28,8 @@ from typing import Callable, Mapping, NamedTuple
 import iort_contract
 from iort_agent.clock import Clock
 from iort_agent.errors import UplinkError
+from iort_agent.mqtt.rate_limiter import LIVE, URGENT, RateLimiter
 from iort_agent.mqtt.uplink import Uplink
-from iort_agent.rate_limiter import LIVE, URGENT, Allowance
 from iort_contract import ContractError, LiveSample, Value
 
 _log = logging.getLogger(__name__)
@@ -96,7 +96,7 @@ class LiveLane:
         rate_hz: float,
         uplink: Uplink,
         clock: Clock,
-        allowance: Allowance,
+        rate_limiter: RateLimiter,
         offset_us: Callable[[], int | None],
     ) -> None:
         self._robot = robot
@@ -106,7 +106,7 @@ class LiveLane:
         self._rate_hz, self._period_s = rate_hz, 1 / rate_hz
         self._uplink = uplink
         self._clock = clock
-        self._allowance = allowance
+        self._rate_limiter = rate_limiter
         self._offset_us = offset_us
         self._lock = threading.Lock()
         self._slots: dict[str, _Slot] = {}
@@ -188,7 +188,7 @@ class LiveLane:
         if (
             self._is_new_fault(slot, values, now)
             and slot.seq
-            and self._allowance.may_go(URGENT, slot.broker_topic, slot.payload_bytes)
+            and self._rate_limiter.may_go(URGENT, slot.broker_topic, slot.payload_bytes)
         ):
             self._send(slot, values, now)
         elif now >= slot.due and slot.queued is None:
@@ -203,7 +203,7 @@ class LiveLane:
             values, queued = slot.values, slot.queued
             # After a fault that did not wait, the stream is no longer due.
             ready = values is not None and now >= slot.due and not slot.writing and self._uplink.connected()
-            if ready and not self._allowance.may_go(LIVE, slot.topic, slot.payload_bytes):
+            if ready and not self._rate_limiter.may_go(LIVE, slot.topic, slot.payload_bytes):
                 return
             heapq.heappop(line)
             slot.queued = None
@@ -274,7 +274,7 @@ class LiveLane:
         slot.writing = True
         topic = _topic(slot, _fault(values), now)
         slot.payload_bytes = len(payload)
-        self._allowance.spend(topic, payload)
+        self._rate_limiter.spend(topic, payload)
         self._uplink.publish(topic, payload, qos=0, done=functools.partial(self._done, slot))
 
     @staticmethod

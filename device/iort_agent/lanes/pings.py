@@ -9,13 +9,13 @@ from typing import Callable, NamedTuple, Sequence
 import iort_contract
 from iort_agent.clock import Clock, Pace
 from iort_agent.errors import UplinkError
+from iort_agent.mqtt.rate_limiter import STEADY, RateLimiter
 from iort_agent.mqtt.uplink import Message, Uplink
-from iort_agent.rate_limiter import STEADY, Allowance
 from iort_agent.sources import Emit
 from iort_contract import PING, PONG, ContractError, Value
 
 TIMEOUT_S = 10.0
-# Where round trips through a rule are not measured, a ping now and then still finds the clock's offset,
+# Place round trips through a rule are not measured, a ping now and then still finds the clock's offset,
 # and more often until one came back.
 CLOCK_EVERY_S, CLOCK_FIRST_EVERY_S = 30.0, 1.0
 # A ping without its padding, at most.
@@ -65,7 +65,7 @@ class Pings:
         padding_bytes: int,
         uplink: Uplink,
         clock: Clock,
-        allowance: Allowance,
+        rate_limiter: RateLimiter,
         emit: Emit,
         on_stamp: OnStamp,
     ) -> None:
@@ -75,7 +75,7 @@ class Pings:
         self._padding = "x" * padding_bytes
         self._uplink = uplink
         self._clock = clock
-        self._allowance = allowance
+        self._rate_limiter = rate_limiter
         self._emit = emit
         self._lock = threading.Condition()
         self.held_back = 0
@@ -119,7 +119,7 @@ class Pings:
         path = self._paths[name]
         if not self._uplink.subscribed(path.pong):
             return False
-        if not self._allowance.may_go(STEADY, path.ping, _ENVELOPE_BYTES + len(self._padding)):
+        if not self._rate_limiter.may_go(STEADY, path.ping, _ENVELOPE_BYTES + len(self._padding)):
             self.held_back += 1
             return False
         with self._lock:
@@ -128,7 +128,7 @@ class Pings:
             path.sent += 1
             payload = iort_contract.encode_ping(ping_id, self._clock.now_us(), self._padding)
             path.waiting[ping_id] = self._clock.monotonic()
-        self._allowance.spend(path.ping, payload)
+        self._rate_limiter.spend(path.ping, payload)
         self._uplink.publish(path.ping, payload, qos=0, done=_ignore)
         return True
 

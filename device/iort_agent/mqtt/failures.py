@@ -78,7 +78,7 @@ def why_not_connected(
                 f"{words}, again and again: it may be restarting, or the robot's certificate is unknown, "
                 "inactive or revoked"
             )
-        # Where TLS was not even agreed on, the broker may just as well be down behind a proxy.
+        # Place TLS was not even agreed on, the broker may just as well be down behind a proxy.
         return Cause(f"hangup {name}", f"{text}. {_ADVICE}", slow=name != _CLOSED)
     return Cause(words, words)
 

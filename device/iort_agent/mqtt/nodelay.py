@@ -24,7 +24,7 @@ _REMOTE, _INODE = 2, 9
 def send_at_once(port: int) -> int:
     """Set TCP_NODELAY on every socket of this process that is connected to the port; how many.
 
-    Where there is no /proc (not Linux) it does nothing, which costs time and no data.
+    Place there is no /proc (not Linux) it does nothing, which costs time and no data.
     """
     links = {f"socket:[{inode}]" for table in _TABLES for inode in _connected(table, port)}
     try:

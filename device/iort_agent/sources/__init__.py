@@ -1,4 +1,4 @@
-"""Where samples come from. Each kind of source is one file here and one line in `registry`."""
+"""Place samples come from. Each kind of source is one file here and one line in `registry`."""
 
 from __future__ import annotations
 

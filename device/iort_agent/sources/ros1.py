@@ -14,11 +14,11 @@ from typing import Any, Mapping, NamedTuple, Optional, Sequence
 
 import iort_contract
 from iort_agent.clock import Clock
+from iort_agent.common.schema import Place, choice, items, pairs, section, setting, text
+from iort_agent.common.throttled_log import ThrottledLog
 from iort_agent.errors import SourceError
 from iort_agent.ros1.node import ANY_TYPE, DEFAULT_NODE, Node, definition_of, shared
-from iort_agent.schema import Where, choice, items, pairs, section, setting, text
 from iort_agent.sources import REFUSE, UPLOAD, Emit
-from iort_agent.throttled_log import Seldom
 from iort_contract import RosMessage, RosType, Value
 from iort_contract.limits import MessageError
 from iort_contract.ros1.decode import HEADER as HEADER_STRUCT
@@ -77,7 +77,7 @@ class TopicConfig:
     large: str = setting(choice(REFUSE, UPLOAD), REFUSE)
 
 
-def _topics(value: Any, where: Where) -> Any:
+def _topics(value: Any, where: Place) -> Any:
     rule = pairs(section(TopicConfig), what="a mapping of ROS topic to its stream and time")
     for topic in value if isinstance(value, dict) else ():
         text(ros_name)(topic, where)
@@ -150,7 +150,7 @@ class Intake:
         self._config = config
         self._emit = emit
         self._clock = clock
-        self._seldom = Seldom(_log, clock)
+        self._throttled = ThrottledLog(_log, clock)
         self._header: Mapping[str, str] | None = None
         # Publisher -> its connection, whose messages' type was said.
         self._connections: dict[str, Mapping[str, str]] = {}
@@ -169,7 +169,9 @@ class Intake:
         if arrival_us is None:
             arrival_us = self._clock.now_us()
         if header.get("latching") == "1" and self._came_before(header, data):
-            self._seldom.warn("latched_again", f"topic {self._topic}: a latched message came again; not sent")
+            self._throttled.warn(
+                "latched_again", f"topic {self._topic}: a latched message came again; not sent"
+            )
             return
         self._messages += 1
         # Two publishers of one topic are two threads; almost always there is one.
@@ -202,16 +204,16 @@ class Intake:
             values = kind.decoder.decode(data)[0]
         except MessageError as error:
             if not self._config.fields:
-                self._seldom.warn("undecodable", f"topic {self._topic}: kept as it is: {error}")
+                self._throttled.warn("undecodable", f"topic {self._topic}: kept as it is: {error}")
                 return stamp_us, RosMessage(data, kind.whole)
-            self._seldom.warn("malformed", f"topic {self._topic}: {error}")
+            self._throttled.warn("malformed", f"topic {self._topic}: {error}")
             return stamp_us, None
         if not self._config.fields:
             found: Mapping[str, Any] = values
             contents = {name: value for name, value in found.items() if isinstance(value, bytes) and value}
             return stamp_us, RosMessage(data, kind.whole, large=contents)
         if not values:
-            self._seldom.warn("empty", f"topic {self._topic}: there is no field in its messages to send")
+            self._throttled.warn("empty", f"topic {self._topic}: there is no field in its messages to send")
             return stamp_us, None
         return stamp_us, values
 
@@ -271,7 +273,7 @@ class Intake:
             "messages": self._messages,
             "silent": self._silent,
             "left_out": left_out,
-            **self._seldom.counts(),
+            **self._throttled.counts(),
         }
 
     def flag(self, t_us: int | None, arrival_us: int) -> None:
@@ -283,7 +285,7 @@ class Intake:
         else:
             off = (t_us - arrival_us) / 1e6
             reason, why = "unbelieved_stamps", f"its stamps are {off:.0f} s off the clock"
-        self._seldom.warn(reason, f"topic {self._topic}: {why}; using the time of arrival")
+        self._throttled.warn(reason, f"topic {self._topic}: {why}; using the time of arrival")
 
     def _kind_of(self, header: Mapping[str, str]) -> _Kind:
         key = (header.get("type", ""), header.get("md5sum", ""))
@@ -313,7 +315,7 @@ class Intake:
             pass  # the type itself says what is wrong with it
         except SourceError as error:
             why = f"topic {self._topic}: its messages are kept, but cannot be looked into: {error}"
-            self._seldom.warn("undecodable", why)
+            self._throttled.warn("undecodable", why)
         _log.info("topic %s: %s, %s", self._topic, kind, md5sum)
         if decoder is not None and decoder.unknown:
             unknown = ", ".join(decoder.unknown)
@@ -321,7 +323,7 @@ class Intake:
         whole = RosType(self._topic, kind, md5sum, text)
         if whole.error:
             why = f"topic {self._topic}: its messages are kept, but cannot be looked into: {whole.error}"
-            self._seldom.warn("undecodable", why)
+            self._throttled.warn("undecodable", why)
         return _Kind(whole, text, decoder, stamped=stamped)
 
 

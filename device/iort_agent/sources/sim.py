@@ -9,7 +9,7 @@ from typing import Any, Mapping, Sequence
 
 import iort_contract
 from iort_agent.clock import Clock, Pace
-from iort_agent.schema import number, section, setting, text
+from iort_agent.common.schema import number, section, setting, text
 from iort_agent.sources import Emit
 from iort_agent.sources.vehicle import Vehicle, VehicleConfig
 

@@ -1,1 +1,1 @@
-"""Where batches wait until the broker has acknowledged them, in memory or on disk."""
+"""Place batches wait until the broker has acknowledged them, in memory or on disk."""

@@ -6,11 +6,11 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from iort_agent.schema import Where, choice, number, setting
+from iort_agent.common.schema import Place, choice, number, setting
 from iort_agent.spool.memory import FULL, OVERWRITE_OLDEST, PROCESS, REJECT_NEW
 
 
-def _queue_file(value: Any, where: Where) -> Path | None:
+def _queue_file(value: Any, where: Place) -> Path | None:
     """The path of a file that may be made: in a folder that exists, and not the configuration's own."""
     allowed = "the path of a file, in a folder that exists"
     if value is None:
@@ -27,7 +27,7 @@ def _queue_file(value: Any, where: Where) -> Path | None:
 
 @dataclass(frozen=True)
 class QueueConfig:
-    """Where batches wait for the broker, and what to drop when it is full (Greengrass' words).
+    """Place batches wait for the broker, and what to drop when it is full (Greengrass' words).
 
     ``path``: the queue's file, which need not exist; without it, the queue ends with the agent.
     ``max_bytes`` bounds the batches in it, and the file is a little larger. ``durability``: what the

@@ -7,7 +7,7 @@ import dataclasses
 from dataclasses import dataclass
 from typing import Any, Dict, List, Mapping, Optional, Tuple, Type, TypeVar, Union, get_type_hints
 
-from iort_agent.logs import Trouble
+from iort_agent.common.logs import Trouble
 
 T = TypeVar("T")
 

@@ -19,7 +19,7 @@ from pathlib import Path
 from typing import Any, Iterator, NamedTuple
 
 from iort_agent.clock import SystemClock
-from iort_agent.config.file import Config
+from iort_agent.config import Config
 from iort_agent.errors import IdentityError, NotRunningError
 from iort_agent.identity.certificate import Certificate, check_pair, read_certificate
 from iort_agent.lanes.record import TODO, too_many

@@ -17,14 +17,14 @@ from typing import Any, Callable, Mapping
 import yaml
 
 import iort_contract
-from iort_agent.config.file import Config, load_config
+from iort_agent.common.private_files import write_below
+from iort_agent.config import Config, load_config
 from iort_agent.errors import ConfigError, IdentityError, NotRunningError, RefusedError
 from iort_agent.identity.certificate import parse_certificate
 from iort_agent.identity.claim import Claim, load_claim
 from iort_agent.identity.machine_key import machine_serial, make_key
 from iort_agent.identity.pending import Pending, forget, keep, kept
 from iort_agent.mqtt.exchange import Exchange
-from iort_agent.private_files import write_below
 from iort_agent.status.server import ask
 
 _log = logging.getLogger(__name__)

@@ -10,12 +10,12 @@ from pathlib import Path, PurePath
 from typing import Any, Iterator, NamedTuple, Sequence
 
 from iort_agent.clock import SystemClock
-from iort_agent.config.file import Config
+from iort_agent.common.logs import set_up
+from iort_agent.config import Config
 from iort_agent.errors import NotRunningError, UploadError
 from iort_agent.files.file import read
 from iort_agent.files.upload import Uploader, make_uploader
-from iort_agent.logs import set_up
-from iort_agent.rate_limiter import Allowance
+from iort_agent.mqtt.rate_limiter import RateLimiter
 from iort_agent.status.server import process_at
 
 _CONNECT_S = 30.0
@@ -48,7 +48,7 @@ def upload_files(config: Config, paths: Sequence[Path], *, status_socket: Path) 
         namespace=config.namespace,
         uplink=uplink,
         clock=clock,
-        allowance=Allowance(clock),
+        rate_limiter=RateLimiter(clock),
         root_ca=config.root_ca,
         rate_kb_s=config.files.rate_kb_s,
     )

@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from iort_contract import CLAIM_FIELDS, check_robot
+from iort_contract import ATTACHMENT_FIELDS, check_robot
 from iort_station.cloud import Cloud
 from iort_station.data import data, inventory
 from iort_station.data.conditions import Column, values
@@ -102,8 +102,8 @@ def _claims(columns: Mapping[str, Any]) -> dict[str, str]:
     return {
         f"{field}.{part}": f"{field}.key"
         for field in fields
-        if all(f"{field}.{part}" in columns for part in CLAIM_FIELDS)
-        for part in CLAIM_FIELDS
+        if all(f"{field}.{part}" in columns for part in ATTACHMENT_FIELDS)
+        for part in ATTACHMENT_FIELDS
     }
 
 

@@ -10,13 +10,13 @@ from pathlib import Path
 from typing import Any
 
 import iort_contract
+from iort_agent.common.schema import Place, load
 from iort_agent.control.config import DownlinkConfig, share_rule
 from iort_agent.control.downlink import Downlink
 from iort_agent.errors import SourceError
 from iort_agent.lanes.clock_offset import Offset
 from iort_agent.mqtt.dispatch import Dispatcher
-from iort_agent.rate_limiter import Allowance
-from iort_agent.schema import Where, load
+from iort_agent.mqtt.rate_limiter import RateLimiter
 from iort_contract import Command
 from iort_contract.ros1.definition import Definition, parse
 from tests.agent_fakes import Loopback, ManualClock
@@ -120,7 +120,7 @@ class Rig:
         self.graph = FakeGraph()
         self.answers: list[tuple[str, int, str | None]] = []
         self.offset: Offset | None = Offset(0.0, 0.0)
-        where = Where(Path("car.yaml"))
+        where = Place(Path("car.yaml"))
         self.downlink = Downlink(
             load(DownlinkConfig, {**CONFIG, **config}, where),
             share_rule()(share, where) if share else (),
@@ -129,7 +129,7 @@ class Rig:
             boot="0badcafe",
             uplink=self.uplink,
             clock=self.clock,
-            allowance=Allowance(self.clock),
+            rate_limiter=RateLimiter(self.clock),
             graph=self.graph,
             offset=lambda: self.offset,
             answer=lambda name, command, refusal: self.answers.append((name, command.seq, refusal)),

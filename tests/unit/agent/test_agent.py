@@ -14,16 +14,16 @@ import iort_contract
 from iort_agent.agent import make_agent
 from iort_agent.cli import main
 from iort_agent.clock import Clock, SystemClock
-from iort_agent.config.file import Config
+from iort_agent.config import Config
 from iort_agent.errors import SourceError
 from iort_agent.lanes.config import PingConfig, RecordConfig
-from iort_agent.metrics import MetricsConfig
 from iort_agent.mqtt.dispatch import Dispatcher
 from iort_agent.mqtt.uplink import matches
 from iort_agent.reporting import make_report, make_status
 from iort_agent.sources import Emit
 from iort_agent.sources.recording.bag import BagConfig
 from iort_agent.spool.memory import REJECT_NEW, MemorySpool
+from iort_agent.status.metrics import MetricsConfig
 from iort_agent.status.state import Status, document, read
 from tests.agent_fakes import Loopback, Published
 
@@ -263,15 +263,15 @@ def test_the_record_lane_can_be_switched_off() -> None:
 def test_lanes_fields_and_rates_change_while_it_runs() -> None:
     def tuned(emit: Emit, stop: threading.Event) -> None:
         emit("vesc", T0, {"speed": 1, "voltage_input": 40})
-        tuning = rig.agent.parts.streams.tuning
-        rig.agent.parts.tune(replace(tuning, fields={"vesc": ("speed", "gone")}))
+        settings = rig.agent.parts.streams.settings
+        rig.agent.parts.tune(replace(settings, fields={"vesc": ("speed", "gone")}))
         emit("vesc", T0 + 1_000_000, {"speed": 2, "voltage_input": 40})
-        rig.agent.parts.tune(replace(tuning, record_enabled=False, live_enabled=False))
+        rig.agent.parts.tune(replace(settings, record_enabled=False, live_enabled=False))
         live = rig.report()["live_published"]
         for i in range(100):
             emit("vesc", T0 + 2_000_000 + i, {"speed": 3, "voltage_input": 40})
         assert rig.report()["live_published"] <= live + 1
-        rig.agent.parts.tune(tuning)
+        rig.agent.parts.tune(settings)
         emit("vesc", T0 + 3_000_000, {"speed": 4, "voltage_input": 40})
 
     rig = Rig(tuned)
@@ -291,7 +291,7 @@ def test_types_are_said_again_when_recording_begins() -> None:
 
     def late(emit: Emit, stop: threading.Event) -> None:
         emit(iort_contract.TYPES_STREAM, T0, said.sample())
-        rig.agent.parts.tune(replace(rig.agent.parts.streams.tuning, record_enabled=True))
+        rig.agent.parts.tune(replace(rig.agent.parts.streams.settings, record_enabled=True))
         emit("vesc", T0 + 1_000_000, {"speed": 1})
 
     rig = Rig(late, record=RecordConfig(enabled=False))

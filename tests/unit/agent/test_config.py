@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from iort_agent.config.file import load_config
+from iort_agent.config import load_config
 from iort_agent.errors import ConfigError
 from iort_agent.sources.recording.bag import BagConfig
 from iort_agent.sources.sim import SimConfig

@@ -16,12 +16,12 @@ import pytest
 import iort_contract
 from iort_agent.agent import make_agent
 from iort_agent.clock import Clock, SystemClock
-from iort_agent.config.file import Config
+from iort_agent.config import Config
 from iort_agent.lanes.config import PingConfig, RecordConfig
 from iort_agent.lanes.production import Production, Rate
 from iort_agent.lanes.record import too_many
 from iort_agent.mqtt.dispatch import Dispatcher
-from iort_agent.rate_limiter import URGENT, Allowance
+from iort_agent.mqtt.rate_limiter import URGENT, RateLimiter
 from iort_agent.reporting import make_report, make_status
 from iort_agent.spool.memory import MemorySpool
 from iort_agent.status.state import document
@@ -348,18 +348,18 @@ def test_a_slowed_lane_is_warned_of_once_and_shown(caplog: pytest.LogCaptureFixt
 
 def test_what_overdraws_is_paid_for_and_ends_at_the_limit() -> None:
     clock = ManualClock()
-    allowance = Allowance(clock)
+    rate_limiter = RateLimiter(clock)
     gone = 0
     for _ in range(1000):
-        while allowance.may_go(URGENT, "t", 10):
-            allowance.spend("t", b"x" * 10)
+        while rate_limiter.may_go(URGENT, "t", 10):
+            rate_limiter.spend("t", b"x" * 10)
             gone += 1
         clock.advance(0.001)
     assert gone <= 100
-    assert not allowance.may_go(URGENT, "t", 10)
-    assert allowance.record("t", b"x") > 0
+    assert not rate_limiter.may_go(URGENT, "t", 10)
+    assert rate_limiter.record("t", b"x") > 0
     clock.advance(1)
-    assert allowance.record("t", b"x") == 0
+    assert rate_limiter.record("t", b"x") == 0
 
 
 def test_production_is_known_over_seconds_and_growth_only_where_there_is_a_connection() -> None:

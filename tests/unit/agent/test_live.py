@@ -5,7 +5,7 @@ from __future__ import annotations
 import iort_contract
 from iort_agent.lanes.live import LiveLane
 from iort_agent.mqtt.dispatch import Dispatcher
-from iort_agent.rate_limiter import Allowance
+from iort_agent.mqtt.rate_limiter import RateLimiter
 from tests.agent_fakes import Loopback, ManualClock
 
 T0 = 1_700_000_000_000_000
@@ -26,7 +26,7 @@ class Rig:
             rate_hz=rate_hz,
             uplink=self.uplink,
             clock=self.clock,
-            allowance=Allowance(self.clock),
+            rate_limiter=RateLimiter(self.clock),
             offset_us=lambda: self.offset_us,
         )
 

@@ -20,15 +20,15 @@ from hypothesis import strategies as st
 import iort_contract
 from iort_agent.cli import main
 from iort_agent.clock import SystemClock
-from iort_agent.config.file import load_config
+from iort_agent.common.logs import JournalFormatter, LineFormatter, Troubles, is_journal
+from iort_agent.config import load_config
 from iort_agent.errors import AgentError, NotRunningError
 from iort_agent.lanes.batch import StreamCounts
 from iort_agent.lanes.clock_offset import ClockOffset
-from iort_agent.logs import JournalFormatter, LineFormatter, Troubles, is_journal
-from iort_agent.metrics import AgentMetrics, Rates, rss_mb
 from iort_agent.mqtt.dispatch import Dispatcher
 from iort_agent.spool.memory import MemorySpool
 from iort_agent.spool.sqlite import make_spool
+from iort_agent.status.metrics import AgentMetrics, Rates, rss_mb
 from iort_agent.status.server import StatusServer, ask, fetch
 from iort_agent.status.state import Status, read
 from iort_agent.status.text import render
@@ -66,9 +66,8 @@ def test_no_text_of_elsewhere_is_a_line_of_its_own_or_speaks_to_the_terminal() -
     troubles.emit(said)
     assert troubles.last()[0].text == shown
     # As the agent sets it up, for whatever is logged by whom.
-    program = (
-        f"from iort_agent.logs import set_up; import logging; set_up('info'); logging.warning({HOSTILE!r})"
-    )
+    set_up = "import logging; from iort_agent.common.logs import set_up; set_up('info')"
+    program = f"{set_up}; logging.warning({HOSTILE!r})"
     command = [sys.executable, "-X", "utf8", "-c", program]
     done = subprocess.run(command, capture_output=True, encoding="utf-8", check=True)
     assert done.stderr.count("\n") == 1

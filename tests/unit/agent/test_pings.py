@@ -12,12 +12,12 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 import iort_contract
+from iort_agent.common.schema import Place, load
 from iort_agent.errors import ConfigError
 from iort_agent.lanes.config import PingConfig
 from iort_agent.lanes.pings import CLOCK_EVERY_S, CLOCK_FIRST_EVERY_S, TIMEOUT_S, Pings, percentile
 from iort_agent.mqtt.dispatch import Dispatcher
-from iort_agent.rate_limiter import Allowance
-from iort_agent.schema import Where, load
+from iort_agent.mqtt.rate_limiter import RateLimiter
 from tests.agent_fakes import Loopback, ManualClock
 
 T0 = 1_700_000_000_000_000
@@ -44,7 +44,7 @@ class Rig:
             padding_bytes=padding_bytes,
             uplink=self.uplink,
             clock=self.clock,
-            allowance=Allowance(self.clock),
+            rate_limiter=RateLimiter(self.clock),
             emit=lambda stream, t_us, values: self.samples.append((stream, t_us, values)),
             on_stamp=lambda *stamp: self.stamps.append(stamp),
         )
@@ -134,7 +134,7 @@ def test_paths_take_turns_at_the_rate() -> None:
 def test_the_largest_ping_that_may_be_asked_for_fits_into_a_message_and_so_does_its_answer(
     tmp_path: Path,
 ) -> None:
-    where = Where(tmp_path / "car.yaml")
+    where = Place(tmp_path / "car.yaml")
     largest = 100_000
     assert load(PingConfig, {"padding_bytes": largest}, where).padding_bytes == largest
     with pytest.raises(ConfigError, match=f"0 to {largest}"):

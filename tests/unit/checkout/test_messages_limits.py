@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import iort_contract
 from functions.shared import cut_off, stored
-from iort_agent import rate_limiter
+from iort_agent.mqtt import rate_limiter
 from iort_contract import limits
 from iort_contract.ros1.message import MAX_LAYOUT
 from local.gaps.broker.connect_timeout import CONNECT_S

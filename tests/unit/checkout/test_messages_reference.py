@@ -12,7 +12,8 @@ from awsiot import iotidentity
 
 import iort_contract
 from functions.echo import pong
-from iort_agent.control.runtime_settings import FIELDS, RULES, Tuning, overlay
+from iort_agent.control.runtime_settings import FIELDS, RULES, overlay
+from iort_agent.lanes.config import RuntimeSettings
 from iort_contract import (
     AGENT_FIELDS,
     AGENT_VERSION,
@@ -232,12 +233,12 @@ def test_the_agents_own_figures_are_all_told() -> None:
 
 
 def test_the_shadows_documents_are_what_the_agent_takes_and_says() -> None:
-    base = Tuning(True, True, 10.0, 0, "info")
-    tuning, rejected = overlay(base, EXAMPLES["desired"]["state"]["desired"], {})
+    base = RuntimeSettings(True, True, 10.0, 0, "info")
+    settings, rejected = overlay(base, EXAMPLES["desired"]["state"]["desired"], {})
     assert rejected == {}
     reported = EXAMPLES["reported"]["state"]["reported"]
-    assert {key: reported[key] for key in tuning.as_document()} == tuning.as_document()
-    assert reported.keys() == {*tuning.as_document(), "rejected", COMMANDS, AGENT_VERSION}
+    assert {key: reported[key] for key in settings.as_document()} == settings.as_document()
+    assert reported.keys() == {*settings.as_document(), "rejected", COMMANDS, AGENT_VERSION}
     state = State(1, {}, reported)
     assert outcome(state, "drive", COMMAND.session, COMMAND.seq) == iort_contract.ACCEPTED
     assert [refusal.name for refusal in state.refusals()] == ["live.rate_hz"]

@@ -10,7 +10,7 @@ import pytest
 
 from functions.shared.metrics import emit
 from iort_agent.agent import make_agent
-from iort_agent.config.file import Config
+from iort_agent.config import Config
 from iort_agent.mqtt.dispatch import Dispatcher
 from iort_agent.mqtt.reconnect import SHORTEST_S
 from iort_agent.spool.memory import MemorySpool

@@ -6,7 +6,7 @@ import hashlib
 
 import pytest
 
-from iort_contract import CLAIM_FIELDS, Batch, Messages, MessageType, RosType
+from iort_contract import ATTACHMENT_FIELDS, Batch, Messages, MessageType, RosType
 from iort_contract.ros1.message import cut
 from iort_station.data.selection import select
 from iort_station.recordings.published import Export
@@ -91,7 +91,7 @@ WHOLE = u32(len(A)) + A + text("jpeg") + u32(len(B)) + B
 
 def claim(field, at, key, content):
     """What stands beside a message that a content was cut out of."""
-    claim = {name: [None] for name in CLAIM_FIELDS}
+    claim = {name: [None] for name in ATTACHMENT_FIELDS}
     claim |= {"key": [key], "sha256": [hashlib.sha256(content).hexdigest()], "at": [at]}
     return {f"{field}.{name}": column for name, column in claim.items()}
 

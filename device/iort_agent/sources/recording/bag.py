@@ -15,8 +15,8 @@ from typing import Any, ContextManager, Iterator, Mapping, NamedTuple, Optional,
 
 import iort_contract
 from iort_agent.clock import Clock
+from iort_agent.common.schema import choice, existing_path, flag, number, pairs, setting, text
 from iort_agent.errors import SourceError
-from iort_agent.schema import choice, existing_path, flag, number, pairs, setting, text
 from iort_agent.sources import REFUSE, UPLOAD, Emit
 from iort_agent.sources.recording.player import NOW, ORIGINAL, Message, Open, Playback, play
 from iort_agent.sources.recording.tool_csv import VescLog

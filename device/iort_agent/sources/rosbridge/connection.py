@@ -22,8 +22,8 @@ from socket import SHUT_RDWR
 from typing import Any, Mapping, NamedTuple, Protocol, Sequence
 
 from iort_agent.clock import Clock
+from iort_agent.common.throttled_log import ThrottledLog
 from iort_agent.errors import SourceError
-from iort_agent.throttled_log import Seldom
 
 _log = logging.getLogger(__name__)
 
@@ -98,7 +98,7 @@ class RosbridgeConnection:
         self._times = times
         self._topics = {topic.name: _Hearing(topic, times) for topic in topics}
         self._listener = listener
-        self._seldom = Seldom(_log, clock)
+        self._throttled = ThrottledLog(_log, clock)
         self._lock = threading.Lock()
         self._socket: Any = None
         self._advertised: dict[str, str] = {}
@@ -154,7 +154,7 @@ class RosbridgeConnection:
 
     def counts(self) -> dict[str, int]:
         """What went wrong, by reason."""
-        return self._seldom.counts()
+        return self._throttled.counts()
 
     def report(self, topic: str) -> dict[str, Any]:
         """How often a topic's messages could not come, and for how many seconds.
@@ -220,7 +220,7 @@ class RosbridgeConnection:
                 socket.ping()
         hearings = list(self._topics.values())
         if now >= self._all_due and all(hearing.silent(now) for hearing in hearings):
-            self._seldom.warn("silent", f"{self._url}: nothing comes on any topic: subscribing afresh")
+            self._throttled.warn("silent", f"{self._url}: nothing comes on any topic: subscribing afresh")
             self._patience = min(self._times.max_patience_s, self._patience * 2)
             self._all_due = now + self._patience
             for hearing in hearings:
@@ -230,7 +230,7 @@ class RosbridgeConnection:
                 continue
             if now >= hearing.due:
                 name = hearing.topic.name
-                self._seldom.warn(
+                self._throttled.warn(
                     f"silent {name}", f"{self._url}: nothing comes on {name}: subscribing afresh"
                 )
                 self._resubscribe(hearing, now)
@@ -264,7 +264,7 @@ class RosbridgeConnection:
             if operation == "publish":
                 hearing, message = self._topics.get(str(said["topic"])), said["msg"]
         except (ValueError, KeyError, TypeError, RecursionError) as error:
-            self._seldom.warn("malformed", f"{self._url}: a message is no rosbridge message: {error!r}")
+            self._throttled.warn("malformed", f"{self._url}: a message is no rosbridge message: {error!r}")
             return
         if operation == "publish":
             if hearing is not None:
@@ -278,10 +278,10 @@ class RosbridgeConnection:
         elif operation == "status":
             if said.get("level") in ("error", "warning"):
                 what = str(said.get("msg", ""))[:500]
-                self._seldom.warn(f"server: {what[:80]}", f"{self._url}: the server says: {what}")
+                self._throttled.warn(f"server: {what[:80]}", f"{self._url}: the server says: {what}")
         else:
             what = f"{self._url}: the server sends the operation {operation!r:.40}, which is not known"
-            self._seldom.warn("unknown", what)
+            self._throttled.warn("unknown", what)
 
     def _close(self) -> None:
         with self._lock:
@@ -291,7 +291,7 @@ class RosbridgeConnection:
 
     def _say(self, what: str) -> None:
         """What keeps the connection from being there, once a minute for as long as it is the same."""
-        self._seldom.warn(f"connection: {what[:80]}", f"{self._url}: {what}; trying again")
+        self._throttled.warn(f"connection: {what[:80]}", f"{self._url}: {what}; trying again")
 
 
 class _Hearing:

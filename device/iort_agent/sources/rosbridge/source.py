@@ -1,7 +1,7 @@
 """ROS topics over the rosbridge WebSocket protocol, which serves ROS 1 and ROS 2 robots alike.
 
 JSON has no types, so they are asked of the server's rosapi, and each message is made the ROS 1 message that
-it was; it then goes the way of the ROS 1 source. Where rosapi does not answer, a sample is made of the JSON,
+it was; it then goes the way of the ROS 1 source. Place rosapi does not answer, a sample is made of the JSON,
 as `iort_agent.sources.flatten` does, and counted as ``structure_not_kept``: a ``uint8[]`` is a text there,
 arrays of more than `MAX_ELEMENTS` and texts that the contract would refuse are left out, unless they are what
 `fields` selects, and a ROS 1 time is named as in ROS 2.
@@ -18,9 +18,10 @@ from urllib.parse import urlsplit
 
 import iort_contract
 from iort_agent.clock import Clock
+from iort_agent.common.schema import Place, choice, items, number, pairs, section, setting, text
+from iort_agent.common.throttled_log import ThrottledLog
 from iort_agent.errors import SourceError
 from iort_agent.ros1.write import Writer
-from iort_agent.schema import Where, choice, items, number, pairs, section, setting, text
 from iort_agent.sources import Emit, ros1
 from iort_agent.sources.flatten import HEADER as HEADER_FIELD
 from iort_agent.sources.flatten import flatten
@@ -28,7 +29,6 @@ from iort_agent.sources.ros1 import ARRIVAL, BELIEVABLE_US, HEADER
 from iort_agent.sources.rosbridge.connection import TIMES, RosbridgeConnection, Times, Topic
 from iort_agent.sources.rosbridge.continuity import Numbers, Repeats
 from iort_agent.sources.rosbridge.rosapi import AGAIN_S, Rosapi, Structure
-from iort_agent.throttled_log import Seldom
 from iort_contract import Value
 from iort_contract.limits import MessageError
 
@@ -59,7 +59,7 @@ class TopicConfig:
     throttle_ms: int = setting(number(0, 3_600_000, whole=True, unit="ms"), 0)
 
 
-def _websocket_url(value: Any, where: Where) -> str:
+def _websocket_url(value: Any, where: Place) -> str:
     allowed = "the address of a rosbridge server, such as ws://localhost:9090"
     if not isinstance(value, str):
         raise where.error(value, allowed)
@@ -168,7 +168,7 @@ class Intake:
         self._config = config
         self._emit = emit
         self._clock = clock
-        self._seldom = Seldom(_log, clock)
+        self._throttled = ThrottledLog(_log, clock)
         self._repeats = Repeats()
         self._numbers = Numbers()
         self._messages = 0
@@ -198,11 +198,13 @@ class Intake:
         stamp = _header(message).get("stamp")
         stamped = isinstance(stamp, dict) and any(stamp.values())
         if self._repeats.came_before(data, self._clock.monotonic(), stamped=stamped):
-            self._seldom.warn("latched_again", f"topic {self._topic}: a latched message came again; not sent")
+            self._throttled.warn(
+                "latched_again", f"topic {self._topic}: a latched message came again; not sent"
+            )
             return False
         self._messages += 1
         if not isinstance(message, dict):
-            self._seldom.warn("malformed", f"topic {self._topic}: a message is {message!r:.60}, no object")
+            self._throttled.warn("malformed", f"topic {self._topic}: a message is {message!r:.60}, no object")
             return True
         seq = _header(message).get("seq")
         if type(seq) is int and not self._config.throttle_ms:
@@ -230,7 +232,7 @@ class Intake:
     def report(self) -> dict[str, Any]:
         """What became of the messages."""
         ros = {name: count for name, count in self._ros1.report().items() if count and name != "messages"}
-        counts = {**ros, **self._seldom.counts()}
+        counts = {**ros, **self._throttled.counts()}
         if self._numbers.missed:
             counts["missed"] = self._numbers.missed
         return {"messages": self._messages, **counts}
@@ -256,19 +258,21 @@ class Intake:
             else:
                 if writer.nulls != nulls:
                     why = "the server sends null for NaN and the infinities; NaN is stored"
-                    self._seldom.warn("not_a_number", f"topic {self._topic}: {why}")
+                    self._throttled.warn("not_a_number", f"topic {self._topic}: {why}")
                 return data
-        self._seldom.warn("structure_not_kept", f"topic {self._topic}: {why}; only single values are stored")
+        self._throttled.warn(
+            "structure_not_kept", f"topic {self._topic}: {why}; only single values are stored"
+        )
         return None
 
     def _emit_flat(self, message: dict[str, Any], arrival_us: int) -> None:
         try:
             values = self._values(message)
         except (SourceError, RecursionError) as error:
-            self._seldom.warn("refused", f"topic {self._topic}: {error}")
+            self._throttled.warn("refused", f"topic {self._topic}: {error}")
             return
         if not values:
-            self._seldom.warn("empty", f"topic {self._topic}: there is no field in its messages to send")
+            self._throttled.warn("empty", f"topic {self._topic}: there is no field in its messages to send")
             return
         t_us = _stamp_us(message)
         if self._config.time == ARRIVAL or t_us is None or abs(t_us - arrival_us) >= BELIEVABLE_US:
@@ -289,12 +293,14 @@ class Intake:
             }
             for name in wanted:
                 if not any(path == name or path.startswith(f"{name}.") for path in chosen):
-                    self._seldom.warn("missing", f"topic {self._topic}: its messages have no field {name}")
+                    self._throttled.warn("missing", f"topic {self._topic}: its messages have no field {name}")
             values = chosen
         long = [path for path, value in values.items() if isinstance(value, str) and len(value) > _MAX_TEXT]
         for path in long:
             del values[path]
-            self._seldom.warn("left_out", f"topic {self._topic}: {path} is too long a text and is left out")
+            self._throttled.warn(
+                "left_out", f"topic {self._topic}: {path} is too long a text and is left out"
+            )
         return values
 
 

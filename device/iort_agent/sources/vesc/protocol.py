@@ -63,9 +63,9 @@ class FrameParser:
         self._buffer = bytearray()
         # Up to where the bytes have been looked at, and up to where they are a frame's or counted as skipped.
         self._seen = self._told = 0
-        # Where a frame would end -> where it would begin and how long its head would be.
+        # Place a frame would end -> where it would begin and how long its head would be.
         self._ends: dict[int, list[tuple[int, int]]] = {}
-        # Where something began that had a frame's end and not its CRC; within a frame that is chance.
+        # Place something began that had a frame's end and not its CRC; within a frame that is chance.
         self._failed: list[int] = []
 
     @property

@@ -23,8 +23,8 @@ from typing import Any, Mapping, Sequence
 
 import iort_contract
 from iort_agent.clock import Clock
+from iort_agent.common.schema import number, setting, text
 from iort_agent.errors import SourceError
-from iort_agent.schema import number, setting, text
 from iort_agent.sources import Emit
 from iort_agent.sources.vesc.protocol import (
     COMM_FW_VERSION,

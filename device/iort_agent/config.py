@@ -6,14 +6,9 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import iort_contract
-from iort_agent.control.config import DownlinkConfig, ShareConfig, share_rule
-from iort_agent.errors import ConfigError
-from iort_agent.files.folder import FilesConfig
-from iort_agent.lanes.config import LiveConfig, PingConfig, RecordConfig
-from iort_agent.logs import LOG_LEVELS
-from iort_agent.metrics import MetricsConfig
-from iort_agent.schema import (
-    Where,
+from iort_agent.common.logs import LOG_LEVELS
+from iort_agent.common.schema import (
+    Place,
     any_path,
     choice,
     existing_path,
@@ -26,9 +21,14 @@ from iort_agent.schema import (
     text,
     variant,
 )
+from iort_agent.control.config import DownlinkConfig, ShareConfig, share_rule
+from iort_agent.errors import ConfigError
+from iort_agent.files.folder import FilesConfig
+from iort_agent.lanes.config import LiveConfig, PingConfig, RecordConfig
 from iort_agent.sources import SourceConfig
 from iort_agent.sources.registry import SOURCES, uploads_large
 from iort_agent.spool.config import QueueConfig
+from iort_agent.status.metrics import MetricsConfig
 
 
 @dataclass(frozen=True)
@@ -63,7 +63,7 @@ class Config:
 
 def load_config(file: Path) -> Config:
     """The configuration in a file. Raises `ConfigError`, naming file, key, value and what is allowed."""
-    where = Where(file)
+    where = Place(file)
     content = read_yaml(file)
     if content is None:
         raise ConfigError(f"{file}: is empty")
@@ -80,7 +80,7 @@ def load_config(file: Path) -> Config:
     return config
 
 
-def _check_streams(config: Config, where: Where) -> None:
+def _check_streams(config: Config, where: Place) -> None:
     """Two sources must not write into one stream: their samples would mix into one time series."""
     taken: list[str] = sorted(iort_contract.OWN_STREAMS)
     for i, source in enumerate(config.sources):

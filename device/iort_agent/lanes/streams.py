@@ -7,9 +7,9 @@ from typing import Iterable, Mapping
 
 import iort_contract
 from iort_agent.clock import Clock
-from iort_agent.control.runtime_settings import Tuning
 from iort_agent.lanes.batch import Batcher, StreamCounts
 from iort_agent.lanes.batch_encoder import Packer
+from iort_agent.lanes.config import RuntimeSettings
 from iort_agent.lanes.live import LiveLane
 from iort_agent.spool.memory import Spool
 from iort_contract import Value
@@ -21,11 +21,18 @@ class Streams:
     """The streams of one run. Safe to use from several threads."""
 
     def __init__(
-        self, *, boot: str, batch_s: float, tuning: Tuning, live: LiveLane, spool: Spool, clock: Clock
+        self,
+        *,
+        boot: str,
+        batch_s: float,
+        settings: RuntimeSettings,
+        live: LiveLane,
+        spool: Spool,
+        clock: Clock,
     ) -> None:
         self._boot, self._batch_s = boot, batch_s
         self._live, self._spool, self._clock = live, spool, clock
-        self.tuning = tuning
+        self.settings = settings
         self._lock = threading.Lock()
         self._batchers: dict[str, Batcher] = {}
         self._counts: dict[str, StreamCounts] = {}
@@ -40,9 +47,9 @@ class Streams:
             self._keep_type(values)
             self.record(stream, t_us, values)
             return
-        if self.tuning.fields and stream in self.tuning.fields:
+        if self.settings.fields and stream in self.settings.fields:
             self._fields.setdefault(stream, values.keys())
-            values = {name: values[name] for name in self.tuning.fields[stream] if name in values}
+            values = {name: values[name] for name in self.settings.fields[stream] if name in values}
         # First, since its delay counts.
         self._live.offer(stream, t_us, values)
         self.record(stream, t_us, values)
@@ -52,13 +59,13 @@ class Streams:
         batcher = self._batchers.get(stream)
         if batcher is None:
             batcher = self._new_batcher(stream, values)
-        if self.tuning.record_enabled:
+        if self.settings.record_enabled:
             batcher.add(t_us, values)
 
-    def tune(self, tuning: Tuning) -> None:
+    def tune(self, settings: RuntimeSettings) -> None:
         """Follow other settings from now on."""
-        resumes = tuning.record_enabled and not self.tuning.record_enabled
-        self.tuning = tuning
+        resumes = settings.record_enabled and not self.settings.record_enabled
+        self.settings = settings
         if resumes:
             self.repeat_types()
 

@@ -21,19 +21,19 @@ from iort_agent.errors import ConfigError
 T = TypeVar("T")
 
 
-class Where(NamedTuple):
+class Place(NamedTuple):
     """The place in a configuration file that a value stands at."""
 
     file: Path
     key: str = ""
 
-    def child(self, name: Any) -> Where:
+    def child(self, name: Any) -> Place:
         """The place of a key of the mapping here."""
-        return Where(self.file, f"{self.key}.{name}" if self.key else str(name))
+        return Place(self.file, f"{self.key}.{name}" if self.key else str(name))
 
-    def item(self, index: int) -> Where:
+    def item(self, index: int) -> Place:
         """The place of an item of the list here."""
-        return Where(self.file, f"{self.key}[{index}]")
+        return Place(self.file, f"{self.key}[{index}]")
 
     def error(self, found: Any, allowed: str) -> ConfigError:
         """The error to raise for what was found here."""
@@ -44,7 +44,7 @@ class Where(NamedTuple):
         return ConfigError(f"{self.file}: {self.key}: {text}" if self.key else f"{self.file}: {text}")
 
 
-Rule = Callable[[Any, Where], Any]
+Rule = Callable[[Any, Place], Any]
 
 
 def show(value: Any) -> str:
@@ -68,7 +68,7 @@ def number(low: float, high: float, *, whole: bool = False, unit: str = "") -> R
     limits = f"from {low:g}" if math.isinf(high) else f"from {low:g} to {high:g}"
     allowed = f"{kind} {limits}" + (f" ({unit})" if unit else "")
 
-    def rule(value: Any, where: Where) -> float:
+    def rule(value: Any, where: Place) -> float:
         if isinstance(value, bool) or not isinstance(value, (int, float)):
             raise where.error(value, allowed)
         if not low <= value <= high or math.isinf(value) or (whole and value != int(value)):
@@ -81,7 +81,7 @@ def number(low: float, high: float, *, whole: bool = False, unit: str = "") -> R
 def flag() -> Rule:
     """``true`` or ``false``."""
 
-    def rule(value: Any, where: Where) -> bool:
+    def rule(value: Any, where: Place) -> bool:
         if not isinstance(value, bool):
             raise where.error(value, "true or false")
         return value
@@ -92,7 +92,7 @@ def flag() -> Rule:
 def choice(*names: str) -> Rule:
     """One of the names."""
 
-    def rule(value: Any, where: Where) -> str:
+    def rule(value: Any, where: Place) -> str:
         if value not in names:
             hint = _did_you_mean(value, names)
             raise where.error(value, f"one of {', '.join(names)}{hint}")
@@ -104,7 +104,7 @@ def choice(*names: str) -> Rule:
 def text(check: Callable[[str], str] | None = None) -> Rule:
     """A text that is not empty and that ``check``, one of the contract's, does not refuse."""
 
-    def rule(value: Any, where: Where) -> str:
+    def rule(value: Any, where: Place) -> str:
         if not isinstance(value, str) or not value.strip():
             quotes = "; put it in quotes" if isinstance(value, (int, float)) else ""
             raise where.error(value, f"a text{quotes}")
@@ -120,7 +120,7 @@ def existing_path(*, folder: bool = False) -> Rule:
     """The path of a file that exists (or a folder, if so allowed), relative to the configuration."""
     what = "a file or folder that exists" if folder else "a file that exists"
 
-    def rule(value: Any, where: Where) -> Path:
+    def rule(value: Any, where: Place) -> Path:
         if not isinstance(value, str) or not value:
             raise where.error(value, f"the path of {what}")
         path = where.file.parent / Path(value).expanduser()
@@ -134,7 +134,7 @@ def existing_path(*, folder: bool = False) -> Rule:
 def any_path() -> Rule:
     """A path, relative to the configuration, whether there is something or not."""
 
-    def rule(value: Any, where: Where) -> Path:
+    def rule(value: Any, where: Place) -> Path:
         if not isinstance(value, str) or not value:
             raise where.error(value, "a path")
         return where.file.parent / Path(value).expanduser()
@@ -145,7 +145,7 @@ def any_path() -> Rule:
 def items(rule: Rule, *, at_least: int = 0, what: str) -> Rule:
     """A list whose items all pass the rule, as a tuple."""
 
-    def list_rule(value: Any, where: Where) -> Any:
+    def list_rule(value: Any, where: Place) -> Any:
         if not isinstance(value, list) or len(value) < at_least:
             raise where.error(value, what)
         return tuple(rule(item, where.item(i)) for i, item in enumerate(value))
@@ -156,7 +156,7 @@ def items(rule: Rule, *, at_least: int = 0, what: str) -> Rule:
 def pairs(rule: Rule, *, what: str) -> Rule:
     """A mapping from any text to values that pass the rule, as a tuple of pairs; not empty."""
 
-    def pairs_rule(value: Any, where: Where) -> Any:
+    def pairs_rule(value: Any, where: Place) -> Any:
         if not isinstance(value, dict) or not value:
             raise where.error(value, what)
         for key in value:
@@ -170,7 +170,7 @@ def pairs(rule: Rule, *, what: str) -> Rule:
 def section(cls: type[Any]) -> Rule:
     """A mapping of the settings of a dataclass; nothing at all means its defaults."""
 
-    def rule(value: Any, where: Where) -> Any:
+    def rule(value: Any, where: Place) -> Any:
         return load(cls, {} if value is None else value, where)
 
     return rule
@@ -179,7 +179,7 @@ def section(cls: type[Any]) -> Rule:
 def variant(key: str, classes: Mapping[str, type[Any]]) -> Rule:
     """A mapping whose ``key`` says which dataclass the other keys are settings of."""
 
-    def rule(value: Any, where: Where) -> Any:
+    def rule(value: Any, where: Place) -> Any:
         if not isinstance(value, dict):
             raise where.error(value, f"a mapping with the key {key}")
         kind = choice(*classes)(value.get(key), where.child(key))
@@ -188,7 +188,7 @@ def variant(key: str, classes: Mapping[str, type[Any]]) -> Rule:
     return rule
 
 
-def load(cls: type[T], value: Any, where: Where) -> T:
+def load(cls: type[T], value: Any, where: Place) -> T:
     """The dataclass made of a mapping. Raises `ConfigError` for whatever a rule refuses."""
     rules = {f.name: f for f in dataclasses.fields(cls)}  # type: ignore[arg-type]  # T is any dataclass
     if not isinstance(value, dict):

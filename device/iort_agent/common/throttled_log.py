@@ -10,7 +10,7 @@ from iort_agent.clock import Clock
 PERIOD_S = 60.0
 
 
-class Seldom:
+class ThrottledLog:
     """Counts by reason; the first of a reason is logged at once, later ones once a minute."""
 
     def __init__(self, log: logging.Logger, clock: Clock) -> None:

@@ -10,11 +10,11 @@ from pathlib import Path
 from typing import Mapping
 
 from iort_agent.clock import Clock
+from iort_agent.common.schema import flag, number, setting
 from iort_agent.files.folder import Uploads
 from iort_agent.lanes.batch import StreamCounts
 from iort_agent.lanes.clock_offset import ClockOffset
 from iort_agent.mqtt.uplink import Uplink
-from iort_agent.schema import flag, number, setting
 from iort_agent.spool.memory import Spool
 from iort_contract import AGENT_FIELDS, Value
 

@@ -13,14 +13,14 @@ import pytest
 from PIL import Image
 
 import iort_contract
-from iort_agent.config.file import load_config
+from iort_agent.config import load_config
 from iort_agent.errors import ConfigError
 from iort_agent.files.file import read
 from iort_agent.files.folder import Folder
-from iort_agent.lanes.attachment import ClaimCheck
+from iort_agent.lanes.attachment import Attachments
 from iort_agent.lanes.thumbnail import thumbnail
 from iort_agent.sources.recording.bag import BagConfig
-from iort_contract import CLAIM_AT, CLAIM_FIELDS, RosMessage, RosType
+from iort_contract import ATTACHMENT_AT, ATTACHMENT_FIELDS, RosMessage, RosType
 from iort_contract.limits import MessageError
 from iort_contract.ros1.decode import Decoder
 from iort_contract.ros1.definition import parse
@@ -34,7 +34,7 @@ PICTURE = jpeg()
 
 
 def claims_in(folder, *, every_s=1.0, max_bytes=10**9, small=lambda _content, _kind: "small"):
-    return ClaimCheck(
+    return Attachments(
         robot="car",
         folder=folder,
         every_s=every_s,
@@ -57,7 +57,11 @@ def image(content=PICTURE):
 def test_the_claim_says_where_the_upload_will_put_it(tmp_path):
     claims = claims_in(tmp_path)
     sample = claims.claim("camera", T_US, image())
-    assert sample.keys() == {"format", "last", *(f"data.{name}" for name in (*CLAIM_FIELDS, CLAIM_AT))}
+    assert sample.keys() == {
+        "format",
+        "last",
+        *(f"data.{name}" for name in (*ATTACHMENT_FIELDS, ATTACHMENT_AT)),
+    }
     assert (sample["format"], sample["last"]) == ("jpeg", 7)
     assert sample["data.sha256"] == hashlib.sha256(PICTURE).hexdigest()
     assert (sample["data.size"], sample["data.content_type"]) == (len(PICTURE), "image/jpeg")
@@ -105,7 +109,7 @@ def test_a_content_of_selected_fields_is_claimed_too(tmp_path):
     emit = claims.around(lambda *sample: out.append(sample))
     emit("camera", T_US, {"format": "jpeg", "data": PICTURE})
     ((_, _, sample),) = out
-    assert sample.keys() == {"format", *(f"data.{name}" for name in CLAIM_FIELDS)}
+    assert sample.keys() == {"format", *(f"data.{name}" for name in ATTACHMENT_FIELDS)}
     assert sample["data.sha256"] == hashlib.sha256(PICTURE).hexdigest()
     assert claims.report() == {"kept": 1, "not_due": 0, "left_out": 0}
 
@@ -115,7 +119,7 @@ def test_at_most_one_content_in_so_long_and_the_fields_stay_the_same(tmp_path):
     samples = [claims.claim("camera", T_US + i * 250_000, image()) for i in range(9)]
     assert [sample["data.key"] is not None for sample in samples] == [i % 4 == 0 for i in range(9)]
     assert {tuple(sample.beside) for sample in samples} == {
-        tuple(f"data.{name}" for name in (*CLAIM_FIELDS, CLAIM_AT))
+        tuple(f"data.{name}" for name in (*ATTACHMENT_FIELDS, ATTACHMENT_AT))
     }
     assert claims.report() == {"kept": 3, "not_due": 6, "left_out": 0}
     # Another stream has its own turn, and a recording that begins anew does too.

@@ -10,14 +10,17 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from iort_agent.control.runtime_settings import Tuning, overlay
-from iort_agent.control.shadow import Remote, _difference, _merged
+from iort_agent.control.runtime_settings import overlay
+from iort_agent.control.shadow import Shadow, _difference, _merged
+from iort_agent.lanes.config import RuntimeSettings
 from iort_agent.mqtt.dispatch import Dispatcher
-from iort_agent.rate_limiter import Allowance
+from iort_agent.mqtt.rate_limiter import RateLimiter
 from iort_contract import Command
 from tests.agent_fakes import Loopback, ManualClock
 
-BASE = Tuning(record_enabled=True, live_enabled=True, live_rate_hz=10.0, ping_rate_hz=0.0, log_level="info")
+BASE = RuntimeSettings(
+    record_enabled=True, live_enabled=True, live_rate_hz=10.0, ping_rate_hz=0.0, log_level="info"
+)
 PREFIX = "$aws/things/car1/shadow/name/agent"
 DOCUMENT = BASE.as_document()
 
@@ -28,10 +31,10 @@ class Rig:
     def __init__(self, **desired: Any) -> None:
         self.clock, self.dispatcher = ManualClock(), Dispatcher()
         self.uplink = Loopback(self.clock, self.dispatcher)
-        self.applied: list[Tuning] = []
+        self.applied: list[RuntimeSettings] = []
         self.shadow: dict[str, Any] = {"desired": desired, "reported": {}} if desired else {}
         self.version = 1 if desired else 0
-        self.remote = Remote(
+        self.remote = Shadow(
             robot="car1",
             base=BASE,
             apply=self.applied.append,
@@ -39,7 +42,7 @@ class Rig:
             version="1.2.3",
             uplink=self.uplink,
             clock=self.clock,
-            allowance=Allowance(self.clock),
+            rate_limiter=RateLimiter(self.clock),
         )
         self.seen = 0
         self.uplink.connect()
@@ -168,7 +171,7 @@ def test_old_and_odd_messages_change_nothing() -> None:
     rig.wish(live={"rate_hz": 3})
     rig.deliver("update/accepted", {"state": {"desired": {"live": {"rate_hz": 9}}}, "version": 1})
     rig.settle()
-    assert [tuning.live_rate_hz for tuning in rig.applied] == [3], "older than what it has"
+    assert [settings.live_rate_hz for settings in rig.applied] == [3], "older than what it has"
     rig.uplink.cut()
     rig.settle()
     count = len(rig.uplink.published)
@@ -189,7 +192,7 @@ def test_old_and_odd_messages_change_nothing() -> None:
         rig.deliver("update/rejected", odd)
     rig.uplink.deliver(f"{PREFIX}/update/accepted", b"\xff")
     rig.settle()
-    assert rig.remote.tuning.live_rate_hz in (3, 10)
+    assert rig.remote.settings.live_rate_hz in (3, 10)
     assert rig.applied[0].live_rate_hz == 3
 
 
@@ -255,8 +258,8 @@ def test_a_difference_merged_into_the_old_is_the_new(old: dict[str, Any], new: d
 
 @given(OBJECT)
 def test_no_wish_whatever_brings_it_down(wished: dict[str, Any]) -> None:
-    tuning, rejected = overlay(BASE, wished, {})
-    assert 0.01 <= tuning.live_rate_hz <= 10
+    settings, rejected = overlay(BASE, wished, {})
+    assert 0.01 <= settings.live_rate_hz <= 10
     json.dumps(rejected)
 
 

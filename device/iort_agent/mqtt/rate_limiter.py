@@ -103,7 +103,7 @@ class _Second:
         return self._went[0][0] + _WINDOW_S - now
 
 
-class Allowance:
+class RateLimiter:
     """The limits of one connection, shared by all who publish on it."""
 
     def __init__(
