@@ -16,7 +16,7 @@ from pathlib import Path
 
 import iort_contract
 from iort_agent.clock import SystemClock
-from iort_agent.common.schema import Where, load
+from iort_agent.common.schema import Place, load
 from iort_agent.control.config import DownlinkConfig, share_rule
 from iort_agent.control.downlink import make_downlink
 from iort_agent.lanes.clock_offset import Offset
@@ -35,7 +35,7 @@ def say(line: str) -> None:
 
 logging.basicConfig(stream=sys.stderr, level="INFO", format="%(levelname)s %(message)s")
 file = Path(sys.argv[1])
-settings, where, clock = json.loads(file.read_text()), Where(file), SystemClock()
+settings, where, clock = json.loads(file.read_text()), Place(file), SystemClock()
 uplink = Loopback(clock, Dispatcher())
 graph = Ros1Graph(DEFAULT_NODE, clock)
 downlink = make_downlink(
