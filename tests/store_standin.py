@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import Any
 
 import iort_contract
-from iort_agent.mqtt.uplink import Message
+from iort_agent.mqtt.uplink import MqttMessage
 from iort_contract import FILE, PING, PONG, Address, FileAnswer, FileRequest, build_topic
 from local.certificates import Identity
 from tests.agent_fakes import Loopback
@@ -39,7 +39,7 @@ class Store:
         self.robot = robot
         uplink.subscribe(build_topic(PING, robot, FILE), self._on_request)
 
-    def _on_request(self, message: Message) -> None:
+    def _on_request(self, message: MqttMessage) -> None:
         request = iort_contract.decode_file_request(message.payload)
         self.requests.append(request)
         if self.silent:

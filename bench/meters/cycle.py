@@ -17,7 +17,7 @@ from pathlib import Path
 from statistics import quantiles
 
 from bench.ros.vesc_message import DEFINITION, TYPE, body
-from iort_agent.agent import make_agent
+from iort_agent.agent import Agent
 from iort_agent.clock import SystemClock
 from iort_agent.config import Config
 from iort_agent.mqtt.dispatch import Dispatcher
@@ -43,10 +43,8 @@ def main() -> None:
             queue=QueueConfig(path=Path(folder) / "spool.db"),
         )
         spool = make_spool(config.queue, clock)
-        agent = make_agent(config, uplink=uplink, spool=spool, clock=clock)
-        intake = Intake(
-            "/sensors/core", TopicConfig("vesc", "header"), emit=agent.parts.streams.emit, clock=clock
-        )
+        agent = Agent(config, uplink=uplink, spool=spool, clock=clock)
+        intake = Intake("/sensors/core", TopicConfig("vesc", "header"), emit=agent.streams.emit, clock=clock)
         header = {"type": TYPE, "md5sum": "bench", "message_definition": DEFINITION}
         cycles = []
         for i in range(samples):

@@ -14,10 +14,12 @@ from bench.errors import BenchError
 from bench.floors.raw_mqtt import RawClient
 from iort_agent.clock import SystemClock
 from iort_agent.config import load_config
+from iort_agent.lanes.config import PingConfig
 from iort_agent.lanes.pings import Pings
 from iort_agent.mqtt.aws import IotCore
 from iort_agent.mqtt.dispatch import Dispatcher
 from iort_agent.mqtt.rate_limiter import RateLimiter
+from iort_agent.mqtt.uplink import Link
 from iort_contract import BROKER, PING, PONG, RTT_FIELDS, Value, build_topic, encode_ping
 from iort_station.fleet.robots import Bundle
 
@@ -132,15 +134,10 @@ class _Connected:
             if isinstance(value, (int, float)):
                 trips.append(float(value))
 
+        limiter = RateLimiter(self.clock, publishes_per_s=1e6, bytes_per_s=1e9)
         pings = Pings(
-            robot=self.config.robot,
-            namespace=self.config.namespace,
-            paths=[path],
-            rate_hz=rate_hz,
-            padding_bytes=max(0, size - _ENVELOPE),
-            uplink=self.uplink,
-            clock=self.clock,
-            rate_limiter=RateLimiter(self.clock, publishes_per_s=1e6, bytes_per_s=1e9),
+            Link(self.config.robot, self.config.namespace, self.uplink, self.clock, limiter),
+            PingConfig(rate_hz, (path,), max(0, size - _ENVELOPE)),
             emit=emit,
             on_stamp=lambda _sent, _received, _stamp_ms: None,
         )

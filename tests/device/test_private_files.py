@@ -127,13 +127,13 @@ def test_nothing_is_removed_through_a_link(folder, secret):
 
 def test_claims_are_written_where_they_belong(folder, secret):
     (folder / "camera").symlink_to(secret.parent)
-    claims = Attachments(
+    attachments = Attachments(
         robot="car", folder=folder, every_s=0, max_bytes=1000, clock=ManualClock(),
         thumbnail=lambda _content, _type: None, stored=lambda: None,
     )  # fmt: skip
-    assert set(claims.claim_fields("camera", 1, {"image": b"x"}).values()) == {None}
-    assert claims.claim_fields("lidar", 1, {"scan": b"x"})["scan.size"] == 1
-    assert claims.report()["left_out"] == 1
+    assert set(attachments.attach_to_fields("camera", 1, {"image": b"x"}).values()) == {None}
+    assert attachments.attach_to_fields("lidar", 1, {"scan": b"x"})["scan.size"] == 1
+    assert attachments.report()["left_out"] == 1
 
 
 def test_what_is_written_is_its_owners_alone_whatever_the_umask(folder, open_umask):
@@ -151,11 +151,11 @@ def test_what_is_written_is_its_owners_alone_whatever_the_umask(folder, open_uma
     files = watched(folder / "uploads")
     files.local(files.next(), threading.Event())
     assert (folder / "uploads" / STATE).exists()
-    claims = Attachments(
+    attachments = Attachments(
         robot="car", folder=folder, every_s=0, max_bytes=1000, clock=clock,
         thumbnail=lambda _content, _type: None, stored=lambda: None,
     )  # fmt: skip
-    claims.claim_fields("lidar", 1, {"scan": b"x"})
+    attachments.attach_to_fields("lidar", 1, {"scan": b"x"})
     assert modes(folder) == {0o600}
     assert stat.S_IMODE((folder / "lidar").stat().st_mode) == 0o700
 

@@ -9,18 +9,19 @@ import threading
 import pytest
 
 import iort_contract
+from iort_agent.common.state import Files
 from iort_agent.config import load_config
 from iort_agent.errors import UploadError
 from iort_agent.files.file import kind_of, read, wire_name
-from iort_agent.files.folder import STATE, Folder, Uploads
-from iort_agent.files.http import Outcome, Pace, Sender, trusting
+from iort_agent.files.folder import STATE, Folder
+from iort_agent.files.http import ByteRate, Outcome, Sender, trusting
 from iort_agent.files.upload import make_uploader
+from iort_agent.files.uploads import Uploads
 from iort_agent.mqtt.dispatch import Dispatcher
-from iort_agent.mqtt.rate_limiter import RateLimiter
 from iort_agent.status.server import SOCKET, StatusServer
 from iort_agent.verbs.upload import upload_files
 from iort_contract import PART_BYTES
-from tests.agent_fakes import Loopback, ManualClock
+from tests.agent_fakes import Loopback, ManualClock, link_of
 from tests.store_standin import store
 
 
@@ -34,11 +35,7 @@ class Rig:
 
     def make(self):
         return make_uploader(
-            robot="car",
-            namespace="iort",
-            uplink=self.uplink,
-            clock=self.clock,
-            rate_limiter=RateLimiter(self.clock),
+            link_of(self.uplink, self.clock, robot="car"),
             root_ca=self.certificate,
             rate_kb_s=0,
         )
@@ -200,26 +197,26 @@ def test_a_file_that_changes_meanwhile_is_not_mixed(rig, large):
     local = read(large.parent, large.relative_to(large.parent), stop=rig.stop)
     with large.open("r+b") as file:
         file.write(b"changed")
-    with pytest.raises(UploadError, match="changes while") as caught:
+    with pytest.raises(UploadError, match="changed during its upload") as caught:
         rig.uploader.upload(local, rig.stop)
     assert caught.value.again_s is not None
     assert rig.store.puts == []
     # The same by size and time, and yet another: what S3 computes tells.
     os.utime(large, ns=(local.look.mtime_ns, local.look.mtime_ns))
-    with pytest.raises(UploadError, match="changes while"):
+    with pytest.raises(UploadError, match="changed during its upload"):
         rig.uploader.upload(local, rig.stop)
     assert not rig.store.objects
 
 
 def test_nothing_is_sent_in_the_clear_or_to_whom_we_do_not_trust(rig, small):
-    sender = Sender(trust=trusting(None), pace=Pace(rig.clock, 0))
+    sender = Sender(trust=trusting(None), rate=ByteRate(rig.clock, 0))
     local = read(small.parent, small.relative_to(small.parent), stop=rig.stop)
     url = rig.store._url
     address = iort_contract.Address(1, f"{url}/1", {"content-length": "11"})
     put = sender.put(address, local, 0, 11, rig.stop)
     assert put.outcome is Outcome.FAILED
     assert "CERTIFICATE_VERIFY_FAILED" in put.text
-    with pytest.raises(UploadError, match="not https"):
+    with pytest.raises(UploadError, match="must be https"):
         sender.put(address._replace(url=url.replace("https", "http")), local, 0, 11, rig.stop)
     assert rig.store.puts == []
 
@@ -236,10 +233,10 @@ def test_nothing_is_sent_in_the_clear_or_to_whom_we_do_not_trust(rig, small):
     ],
 )
 def test_an_address_that_is_none_is_a_file_that_is_not_uploaded(rig, small, url, headers):
-    sender = Sender(trust=trusting(rig.certificate), pace=Pace(rig.clock, 0))
+    sender = Sender(trust=trusting(rig.certificate), rate=ByteRate(rig.clock, 0))
     local = read(small.parent, small.relative_to(small.parent), stop=rig.stop)
     address = iort_contract.Address(1, url.replace("HOST", rig.store._url), headers)
-    with pytest.raises(UploadError, match=r"an address that is"):
+    with pytest.raises(UploadError, match="the cloud's address"):
         sender.put(address, local, 0, 11, rig.stop)
 
 
@@ -268,14 +265,14 @@ def test_an_answer_that_is_none_is_said_and_waited_past(rig, small, odd, caplog)
 
     rig.uplink.subscribe(iort_contract.build_topic(iort_contract.PING, "car", iort_contract.FILE), on_request)
     assert rig.store.objects[rig.upload(small)] == b"driven well"
-    assert "an answer about a file is not one" in caplog.text
+    assert "an answer about a file cannot be read" in caplog.text
 
 
 def test_no_faster_than_it_may(tmp_path):
     clock, stop = ManualClock(), threading.Event()
-    pace, began = Pace(clock, 1000), clock.monotonic()
+    rate, began = ByteRate(clock, 1000), clock.monotonic()
     for _ in range(11):
-        pace.spend(500, stop)
+        rate.spend(500, stop)
     assert clock.monotonic() - began == pytest.approx(5.0)
 
 
@@ -297,7 +294,7 @@ def test_only_finished_files_are_uploaded(rig, bags):
     link.symlink_to(growing)
     uploads = rig.folder(bags)
     assert not uploads.step(rig.stop)
-    assert uploads.waiting() == 1
+    assert uploads.status().waiting == 1
     rig.clock.advance(9)
     growing.write_bytes(b"12")
     assert not uploads.step(rig.stop)
@@ -307,8 +304,7 @@ def test_only_finished_files_are_uploaded(rig, bags):
     assert uploads.step(rig.stop)
     assert list(rig.store.objects.values()) == [b"12"]
     assert not uploads.step(rig.stop)
-    assert uploads.counts() == (0, 1, 2)
-    assert uploads.current() == (None, 0, None)
+    assert uploads.status() == Files(0, 1, 2, current=None, current_bytes=0, last_error=None)
 
 
 def test_a_new_process_neither_uploads_again_nor_reads_again(rig, bags, monkeypatch):
@@ -386,11 +382,11 @@ def test_one_refused_file_holds_up_no_other(rig, bags):
     uploads = rig.folder(bags, settle_s=0)
     rig.store.refusals = [("not today", 60)]
     assert uploads.step(rig.stop)
-    assert "first.bag: refused: not today" in (uploads.current().last_error or "")
+    assert "first.bag: refused: not today" in (uploads.status().last_error or "")
     assert uploads.step(rig.stop)
     assert list(rig.store.objects.values()) == [b"second.bag"]
     assert not uploads.step(rig.stop)
-    assert uploads.waiting() == 1
+    assert uploads.status().waiting == 1
     rig.clock.advance(61)
     assert uploads.step(rig.stop)
     assert b"first.bag" in rig.store.objects.values()
@@ -448,7 +444,7 @@ def test_an_error_that_nobody_thought_of_does_not_end_it(rig, bags, caplog):
 
     uploads.step = odd
     uploads.run(rig.stop)
-    assert "going on after an error" in caplog.text
+    assert "continuing after an error" in caplog.text
     assert list(rig.store.objects.values()) == [b"1"]
 
 

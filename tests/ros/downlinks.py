@@ -17,14 +17,13 @@ from pathlib import Path
 import iort_contract
 from iort_agent.clock import SystemClock
 from iort_agent.common.schema import Place, load
+from iort_agent.common.state import ClockOffset
 from iort_agent.control.config import DownlinkConfig, share_rule
-from iort_agent.control.downlink import make_downlink
-from iort_agent.lanes.clock_offset import Offset
+from iort_agent.control.downlink import Downlink
 from iort_agent.mqtt.dispatch import Dispatcher
-from iort_agent.mqtt.rate_limiter import RateLimiter
 from iort_agent.ros1.node import DEFAULT_NODE
 from iort_agent.ros1.publish import Ros1Graph
-from tests.agent_fakes import Loopback
+from tests.agent_fakes import Loopback, link_of
 
 
 def say(line: str) -> None:
@@ -38,21 +37,15 @@ file = Path(sys.argv[1])
 settings, where, clock = json.loads(file.read_text()), Place(file), SystemClock()
 uplink = Loopback(clock, Dispatcher())
 graph = Ros1Graph(DEFAULT_NODE, clock)
-downlink = make_downlink(
+downlink = Downlink(
     load(DownlinkConfig, settings.get("downlink", {}), where),
     share_rule()(settings["share"], where) if "share" in settings else (),
-    sources=(),
+    link=link_of(uplink, clock),
     graph=graph,
-    robot="car1",
-    namespace="iort",
     boot="0badcafe",
-    uplink=uplink,
-    clock=clock,
-    rate_limiter=RateLimiter(clock),
-    offset=lambda: Offset(0.0, 0.0),
+    offset=lambda: ClockOffset(0.0, 0.0),
     answer=lambda *_: None,
 )
-assert downlink is not None
 uplink.start()
 downlink.start()
 say("started")

@@ -1,1 +1,1 @@
-"""Helpers for every room: configuration schema, logging, private files and the version. It uses no room."""
+"""Helpers for every room: configuration schema, status types, logs, private files. It uses no other room."""

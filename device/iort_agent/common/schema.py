@@ -1,8 +1,7 @@
-"""Reading a YAML mapping into frozen dataclasses whose fields carry their own rules.
+"""Reads a YAML mapping into frozen dataclasses whose fields carry their own rules.
 
-A dataclass is the table: each field is a `setting` with the rule that its value must pass and its
-default. `load` does the rest: unknown keys, missing keys, wrong types and values all become a
-`ConfigError` that names file, dotted key, what was found and what is allowed.
+Each field of such a dataclass is a `setting`: a rule for its value, and a default. `load` turns unknown
+keys, missing keys and wrong values into a `ConfigError` that names file, key, value and what is allowed.
 """
 
 from __future__ import annotations
@@ -11,7 +10,7 @@ import dataclasses
 import difflib
 import math
 from pathlib import Path
-from typing import Any, Callable, Mapping, NamedTuple, TypeVar
+from typing import Any, Callable, Iterable, Mapping, NamedTuple, TypeVar
 
 import yaml
 
@@ -19,10 +18,12 @@ import iort_contract
 from iort_agent.errors import ConfigError
 
 T = TypeVar("T")
+# YAML may have read a value as another type than its writer meant.
+_KINDS = {bool: "true or false", int: "a number", float: "a number", dict: "a mapping", list: "a list"}
 
 
 class Place(NamedTuple):
-    """The place in a configuration file that a value stands at."""
+    """A place in a configuration file."""
 
     file: Path
     key: str = ""
@@ -35,25 +36,29 @@ class Place(NamedTuple):
         """The place of an item of the list here."""
         return Place(self.file, f"{self.key}[{index}]")
 
-    def error(self, found: Any, allowed: str) -> ConfigError:
-        """The error to raise for what was found here."""
-        return self.problem(f"found {show(found)}; allowed is {allowed}")
+    def path(self, value: str) -> Path:
+        """A path in the file is relative to the file."""
+        return self.file.parent / Path(value).expanduser()
+
+    def error(self, found: Any, allowed: str, hint: str = "") -> ConfigError:
+        """The error for a value found here."""
+        return self.problem(f"must be {allowed}, got {show(found)}{hint}")
 
     def problem(self, text: str) -> ConfigError:
-        """The error to raise for a problem here that is not one value's."""
+        """The error for another problem here."""
         return ConfigError(f"{self.file}: {self.key}: {text}" if self.key else f"{self.file}: {text}")
 
 
+# Returns the value in its own type, or raises the place's error.
 Rule = Callable[[Any, Place], Any]
 
 
 def show(value: Any) -> str:
-    """The value and, where YAML may have read it as something else than meant, its kind."""
-    kinds = {bool: "true or false", int: "a number", float: "a number", dict: "a mapping", list: "a list"}
+    """The value, shortened, with its type in words."""
     if value is None:
         return "nothing"
     text = repr(value) if len(repr(value)) <= 60 else repr(value)[:57] + "..."
-    kind = kinds.get(type(value))
+    kind = _KINDS.get(type(value))
     return f"{text} ({kind})" if kind else text
 
 
@@ -62,17 +67,22 @@ def setting(rule: Rule, default: Any = dataclasses.MISSING) -> Any:
     return dataclasses.field(default=default, metadata={"rule": rule})
 
 
+def rules_of(cls: type[Any]) -> dict[str, Rule]:
+    """The rules of a dataclass' settings, by name."""
+    return {field.name: field.metadata["rule"] for field in dataclasses.fields(cls)}
+
+
 def number(low: float, high: float, *, whole: bool = False, unit: str = "") -> Rule:
-    """A finite number from ``low`` to ``high``, read as int where it must be whole, else as float."""
+    """A finite number from ``low`` to ``high``: an int if it must be whole, else a float."""
     kind = "a whole number" if whole else "a number"
     limits = f"from {low:g}" if math.isinf(high) else f"from {low:g} to {high:g}"
     allowed = f"{kind} {limits}" + (f" ({unit})" if unit else "")
 
-    def rule(value: Any, where: Place) -> float:
+    def rule(value: Any, place: Place) -> float:
         if isinstance(value, bool) or not isinstance(value, (int, float)):
-            raise where.error(value, allowed)
+            raise place.error(value, allowed)
         if not low <= value <= high or math.isinf(value) or (whole and value != int(value)):
-            raise where.error(value, allowed)
+            raise place.error(value, allowed)
         return int(value) if whole else float(value)
 
     return rule
@@ -81,9 +91,9 @@ def number(low: float, high: float, *, whole: bool = False, unit: str = "") -> R
 def flag() -> Rule:
     """``true`` or ``false``."""
 
-    def rule(value: Any, where: Place) -> bool:
+    def rule(value: Any, place: Place) -> bool:
         if not isinstance(value, bool):
-            raise where.error(value, "true or false")
+            raise place.error(value, "true or false")
         return value
 
     return rule
@@ -92,124 +102,122 @@ def flag() -> Rule:
 def choice(*names: str) -> Rule:
     """One of the names."""
 
-    def rule(value: Any, where: Place) -> str:
+    def rule(value: Any, place: Place) -> str:
         if value not in names:
-            hint = _did_you_mean(value, names)
-            raise where.error(value, f"one of {', '.join(names)}{hint}")
+            raise place.error(value, f"one of {', '.join(names)}", did_you_mean(value, names))
         return str(value)
 
     return rule
 
 
 def text(check: Callable[[str], str] | None = None) -> Rule:
-    """A text that is not empty and that ``check``, one of the contract's, does not refuse."""
+    """A text that is not empty and that passes ``check``, a function of the contract."""
 
-    def rule(value: Any, where: Place) -> str:
+    def rule(value: Any, place: Place) -> str:
         if not isinstance(value, str) or not value.strip():
             quotes = "; put it in quotes" if isinstance(value, (int, float)) else ""
-            raise where.error(value, f"a text{quotes}")
+            raise place.error(value, "a text", quotes)
         try:
             return check(value) if check else value
         except iort_contract.ContractError as error:
-            raise where.problem(str(error)) from error
+            raise place.problem(str(error)) from error
 
     return rule
 
 
 def existing_path(*, folder: bool = False) -> Rule:
-    """The path of a file that exists (or a folder, if so allowed), relative to the configuration."""
+    """The path of an existing file, or of an existing folder if ``folder`` allows it."""
     what = "a file or folder that exists" if folder else "a file that exists"
 
-    def rule(value: Any, where: Place) -> Path:
+    def rule(value: Any, place: Place) -> Path:
         if not isinstance(value, str) or not value:
-            raise where.error(value, f"the path of {what}")
-        path = where.file.parent / Path(value).expanduser()
+            raise place.error(value, f"the path of {what}")
+        path = place.path(value)
         if not (path.exists() if folder else path.is_file()):
-            raise where.error(value, f"the path of {what}, and there is none at {path}")
+            raise place.error(value, f"the path of {what}", f"; there is none at {path}")
         return path
 
     return rule
 
 
 def any_path() -> Rule:
-    """A path, relative to the configuration, whether there is something or not."""
+    """A path, whether something exists there or not."""
 
-    def rule(value: Any, where: Place) -> Path:
+    def rule(value: Any, place: Place) -> Path:
         if not isinstance(value, str) or not value:
-            raise where.error(value, "a path")
-        return where.file.parent / Path(value).expanduser()
+            raise place.error(value, "a path")
+        return place.path(value)
 
     return rule
 
 
 def items(rule: Rule, *, at_least: int = 0, what: str) -> Rule:
-    """A list whose items all pass the rule, as a tuple."""
+    """A list of items that pass the rule, as a tuple."""
 
-    def list_rule(value: Any, where: Place) -> Any:
+    def list_rule(value: Any, place: Place) -> Any:
         if not isinstance(value, list) or len(value) < at_least:
-            raise where.error(value, what)
-        return tuple(rule(item, where.item(i)) for i, item in enumerate(value))
+            raise place.error(value, what)
+        return tuple(rule(item, place.item(i)) for i, item in enumerate(value))
 
     return list_rule
 
 
-def pairs(rule: Rule, *, what: str) -> Rule:
-    """A mapping from any text to values that pass the rule, as a tuple of pairs; not empty."""
+def pairs(rule: Rule, *, what: str, key: Rule | None = None) -> Rule:
+    """A mapping that is not empty, as a tuple of pairs. Its values pass the rule, its keys pass ``key``."""
+    key_rule = key or text()
 
-    def pairs_rule(value: Any, where: Place) -> Any:
+    def pairs_rule(value: Any, place: Place) -> Any:
         if not isinstance(value, dict) or not value:
-            raise where.error(value, what)
-        for key in value:
-            if not isinstance(key, str):
-                raise where.error(key, what)
-        return tuple((key, rule(item, where.child(key))) for key, item in value.items())
+            raise place.error(value, what)
+        for name in value:
+            if not isinstance(name, str):
+                raise place.error(name, what)
+        return tuple((key_rule(name, place), rule(item, place.child(name))) for name, item in value.items())
 
     return pairs_rule
 
 
 def section(cls: type[Any]) -> Rule:
-    """A mapping of the settings of a dataclass; nothing at all means its defaults."""
+    """A mapping of the settings of a dataclass; an empty one means its defaults."""
 
-    def rule(value: Any, where: Place) -> Any:
-        return load(cls, {} if value is None else value, where)
+    def rule(value: Any, place: Place) -> Any:
+        return load(cls, {} if value is None else value, place)
 
     return rule
 
 
 def variant(key: str, classes: Mapping[str, type[Any]]) -> Rule:
-    """A mapping whose ``key`` says which dataclass the other keys are settings of."""
+    """A mapping whose ``key`` selects the dataclass of its other keys."""
 
-    def rule(value: Any, where: Place) -> Any:
+    def rule(value: Any, place: Place) -> Any:
         if not isinstance(value, dict):
-            raise where.error(value, f"a mapping with the key {key}")
-        kind = choice(*classes)(value.get(key), where.child(key))
-        return load(classes[kind], {k: v for k, v in value.items() if k != key}, where)
+            raise place.error(value, f"a mapping with the key {key}")
+        kind = choice(*classes)(value.get(key), place.child(key))
+        return load(classes[kind], {k: v for k, v in value.items() if k != key}, place)
 
     return rule
 
 
-def load(cls: type[T], value: Any, where: Place) -> T:
-    """The dataclass made of a mapping. Raises `ConfigError` for whatever a rule refuses."""
-    rules = {f.name: f for f in dataclasses.fields(cls)}  # type: ignore[arg-type]  # T is any dataclass
+def load(cls: type[T], value: Any, place: Place) -> T:
+    """Make the dataclass from a mapping. Raises `ConfigError` for a value that its rule rejects."""
+    rules = rules_of(cls)
     if not isinstance(value, dict):
-        raise where.error(value, f"a mapping with some of the keys {', '.join(rules)}")
+        raise place.error(value, f"a mapping with some of the keys {', '.join(rules)}")
     for key in value:
         if key not in rules:
-            allowed = f"allowed is {', '.join(rules)}{_did_you_mean(key, rules)}"
-            raise where.child(key).problem(f"unknown key, found {show(value[key])}; {allowed}")
-    loaded: dict[str, Any] = {}
-    for name, field in rules.items():
-        if name in value:
-            loaded[name] = field.metadata["rule"](value[name], where.child(name))
-        elif field.default is dataclasses.MISSING:
-            raise where.child(name).problem("required, and missing")
+            hint = did_you_mean(key, rules)
+            raise place.child(key).problem(f"unknown key{hint}; must be one of {', '.join(rules)}")
+    loaded = {name: rules[name](found, place.child(name)) for name, found in value.items()}
+    for field in dataclasses.fields(cls):  # type: ignore[arg-type]  # T is any dataclass
+        if field.name not in loaded and field.default is dataclasses.MISSING:
+            raise place.child(field.name).problem("required, and missing")
     return cls(**loaded)
 
 
 def read_yaml(file: Path) -> Any:
-    """The content of a YAML file. Raises `ConfigError` where it cannot be read or is no YAML."""
+    """The content of a YAML file. Raises `ConfigError` if it cannot be read or is not YAML."""
     try:
-        # A subclass of SafeLoader: no Python objects are made.
+        # A subclass of SafeLoader: it makes no Python objects.
         return yaml.load(file.read_text(encoding="utf-8"), Loader=_UniqueKeyLoader)  # noqa: S506 - see above
     except OSError as error:
         raise ConfigError(f"{file}: cannot be read: {error.strerror}") from error
@@ -220,7 +228,7 @@ def read_yaml(file: Path) -> Any:
 
 
 class _UniqueKeyLoader(yaml.SafeLoader):
-    """Refuses a key given twice, of which YAML would quietly keep the last."""
+    """Rejects a key given twice. YAML would silently keep the last one."""
 
     def construct_mapping(self, node: yaml.MappingNode, deep: bool = False) -> dict[Any, Any]:  # noqa: FBT001, FBT002 - as PyYAML has it
         keys = [self.construct_object(key, deep=True) for key, _ in node.value]
@@ -232,6 +240,7 @@ class _UniqueKeyLoader(yaml.SafeLoader):
         return super().construct_mapping(node, deep)
 
 
-def _did_you_mean(found: Any, names: Any) -> str:
+def did_you_mean(found: Any, names: Iterable[str]) -> str:
+    """A hint with the closest of the names; empty if none is close."""
     close = difflib.get_close_matches(str(found), list(names), n=1)
     return f" (did you mean {close[0]}?)" if close else ""

@@ -1,4 +1,4 @@
-"""A claim: the certificate that is good for getting the robot's own, and what claim.yaml says beside it."""
+"""A provisioning claim: a certificate that can only be exchanged for the robot's own, and its claim.yaml."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from iort_agent.common.schema import Place, any_path, existing_path, load, numbe
 
 @dataclass(frozen=True)
 class Claim:
-    """What claim.yaml says. ``config`` is the file to write, or to update where it exists."""
+    """The content of claim.yaml. ``config`` is the configuration file to write or to update."""
 
     endpoint: str = setting(text())
     certificate: Path = setting(existing_path())
@@ -25,5 +25,5 @@ class Claim:
 
 
 def load_claim(file: Path) -> Claim:
-    """The claim in a file. Raises `ConfigError`."""
+    """Read a claim file. Raises `ConfigError`."""
     return load(Claim, read_yaml(file), Place(file))

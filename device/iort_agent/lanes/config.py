@@ -1,4 +1,4 @@
-"""The configuration's sections `record`, `live` and `ping`."""
+"""The configuration's sections `record`, `live` and `ping`, and the settings that may change at run time."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from iort_agent.common.schema import choice, flag, items, number, setting
 
 @dataclass(frozen=True)
 class RecordConfig:
-    """The record lane. ``batch_s``: a batch spans at most this; 0 sends each sample by itself."""
+    """The record lane. A batch spans at most ``batch_s``; with 0 each sample is sent by itself."""
 
     enabled: bool = setting(flag(), default=True)
     batch_s: float = setting(number(0, 1, unit="s"), default=1.0)
@@ -19,7 +19,7 @@ class RecordConfig:
 
 @dataclass(frozen=True)
 class LiveConfig:
-    """The live lane. ``rate_hz``: at most so many messages a second of each stream."""
+    """The live lane. ``rate_hz`` is the most messages a second of each stream."""
 
     enabled: bool = setting(flag(), default=True)
     rate_hz: float = setting(
@@ -30,7 +30,7 @@ class LiveConfig:
 
 @dataclass(frozen=True)
 class PingConfig:
-    """Round trips to measure: so many a second over each path, 0 for none."""
+    """The pings. ``rate_hz`` is the number a second over each path; 0 sends none."""
 
     rate_hz: float = setting(number(0, 20, unit="Hz"), 0.0)
     paths: tuple[str, ...] = setting(
@@ -46,8 +46,7 @@ class PingConfig:
 
 @dataclass(frozen=True)
 class RuntimeSettings:
-    """What is in force. ``fields`` maps a stream to the only fields that are sent of it; a stream that
-    is not there is sent whole."""
+    """The settings in force. ``fields`` maps a stream to its selected fields; other streams keep all."""
 
     record_enabled: bool
     live_enabled: bool
@@ -57,7 +56,7 @@ class RuntimeSettings:
     fields: Mapping[str, tuple[str, ...]] = field(default_factory=dict)
 
     def as_document(self) -> dict[str, Any]:
-        """As the shadow reports it."""
+        """The document that the shadow reports."""
         return {
             "record": {"enabled": self.record_enabled},
             "live": {"enabled": self.live_enabled, "rate_hz": self.live_rate_hz},

@@ -36,7 +36,7 @@ class Streams:
         self._lock = threading.Lock()
         self._batchers: dict[str, Batcher] = {}
         self._counts: dict[str, StreamCounts] = {}
-        # The message types that sources have told, under lock.
+        # The message types that sources have emitted, under lock.
         self._types: dict[tuple[Value, ...], Mapping[str, Value]] = {}
         self._fields: dict[str, Iterable[str]] = {}
 
@@ -50,27 +50,27 @@ class Streams:
         if self.settings.fields and stream in self.settings.fields:
             self._fields.setdefault(stream, values.keys())
             values = {name: values[name] for name in self.settings.fields[stream] if name in values}
-        # First, since its delay counts.
+        # First, because its delay counts.
         self._live.offer(stream, t_us, values)
         self.record(stream, t_us, values)
 
     def record(self, stream: str, t_us: int, values: Mapping[str, Value]) -> None:
-        """Take a sample for the record lane alone."""
+        """Take a sample for the record lane only."""
         batcher = self._batchers.get(stream)
         if batcher is None:
             batcher = self._new_batcher(stream, values)
         if self.settings.record_enabled:
             batcher.add(t_us, values)
 
-    def tune(self, settings: RuntimeSettings) -> None:
-        """Follow other settings from now on."""
+    def apply(self, settings: RuntimeSettings) -> None:
+        """Use other settings from now on."""
         resumes = settings.record_enabled and not self.settings.record_enabled
         self.settings = settings
         if resumes:
             self.repeat_types()
 
     def tick(self) -> None:
-        """Close the batches of silent streams; call it several times a second."""
+        """Close the batches of silent streams; called several times a second."""
         for batcher in list(self._batchers.values()):
             batcher.tick()
 
@@ -80,8 +80,8 @@ class Streams:
             batcher.flush()
 
     def repeat_types(self) -> None:
-        """Record the message types once more. A reader needs them to turn columns into messages again, and
-        those recorded before may have been dropped by the queue, or expired, or never recorded."""
+        """Record the message types again. A reader needs them to turn columns into messages, and the earlier
+        records may be missing: dropped by the queue, expired, or never made."""
         with self._lock:
             types = list(self._types.values())
         for values in types:
@@ -92,13 +92,13 @@ class Streams:
         return dict(self._fields)
 
     def counts(self) -> dict[str, StreamCounts]:
-        """The counts of each stream, which go on changing."""
+        """The counts of each stream, which keep changing."""
         return self._counts.copy()
 
     def counted(self) -> dict[str, tuple[StreamCounts, int]]:
         """The counts of each stream at one moment, and the number of its next batch."""
         found = {name: batcher.counts() for name, batcher in list(self._batchers.items())}
-        # The spool's number of this moment may be a batch further than the counts.
+        # The spool's own next number may already count a later batch.
         return {name: (counts, counts.first_seq + counts.batches) for name, counts in found.items()}
 
     def refused(self) -> int:

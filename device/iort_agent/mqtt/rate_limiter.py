@@ -1,7 +1,7 @@
-"""What AWS IoT lets one connection send: 100 publishes and 512 KB a second, and who of us gets it.
+"""AWS IoT's limits of one connection, 100 publishes and 512 KB a second, shared by all who publish on it.
 
-The record lane goes first. What it needs is known from how much is recorded (`expect`); everybody else
-shares the rest. Nobody publishes where that would exceed the limit in the second that ends now.
+The record lane goes first: `RateLimiter.expect` says what it needs, and all others share the rest. Nobody
+publishes what would exceed the limit within the last second.
 """
 
 from __future__ import annotations
@@ -14,50 +14,50 @@ from iort_agent.clock import Clock
 
 PUBLISHES_PER_S = 100
 BYTES_PER_S = 512 * 1024
-# What all of us send in the long run, of the limit: a message that was late on its way shares its second
-# at the broker with those behind it.
+# The share of the limit that is used in the long run. A message delayed on its way counts at the broker in
+# the same second as those behind it.
 SHARE = 0.9
-# So many seconds' worth may go at once after a pause; more only makes those behind it wait.
+# The burst allowed after a pause, in seconds' worth. A longer one would only delay the messages behind it.
 _BURST_S = 0.04
-# The others' rest is kept for so long, since they wait while batches go.
-_KEPT_S = 1.0
-# While a backlog drains, the others may have so much of everything, but no more than half of what the
-# record lane does not need for the present: the other half is what the backlog shrinks by.
+# The same for the others' rest: they wait while batches go.
+_REST_BURST_S = 1.0
+# While a backlog drains, the others get at most this share, and at most half of what the record lane does not
+# need for new batches: the backlog shrinks by the other half.
 _DRAIN_SHARE = 0.1
-# The least that the others have, where more is recorded than may be sent: a fault, the clock's offset.
+# The others always get this share, even if more is recorded than can be sent: for a fault, a ping.
 _LEAST_SHARE = 0.02
-# Batches close together at the second's edge, and the live lane waits for them. A record lane that waits
-# for longer than this is draining a backlog.
+# Batches close together at the second's edge. A record lane that waits for longer than this drains a backlog.
 _BUNCH_S = 1.0
-# The record lane's thread may come a little later than it was told.
+# The record lane's thread may wake up this much later than it was told.
 _LATE_S = 0.05
 _WINDOW_S = 1.0
-_NOTHING_S = 1e-6
+_ROUNDING_S = 1e-6
 # Fixed header, packet id and properties of a PUBLISH, at most.
 _OVERHEAD_BYTES = 16
 
+# Publishes and bytes, of a second or in all.
 Pair = Tuple[float, float]
 
 
-class Claim(NamedTuple):
-    """How somebody beside the record lane may publish: by how many seconds' worth it may overdraw, up to
-    which share of the limit, and whether it waits for batches that wait themselves."""
+class Priority(NamedTuple):
+    """How a publisher other than the record lane may go: by how many seconds' worth it may overdraw, up to
+    which share of the limit, and whether it gives way to waiting batches."""
 
     debt_s: float
     most: float
-    waits: bool
+    yields: bool
 
 
-LIVE = Claim(0.0, 0.96, waits=True)
-# What is sent at a steady rate, and is wrong or worth less when it waits: pings, messages between robots.
-STEADY = Claim(0.05, 0.96, waits=False)
-# What is rare and must not wait: another fault code.
-URGENT = Claim(0.1, 0.99, waits=False)
+LIVE = Priority(0.0, 0.96, yields=True)
+# Messages at a steady rate that lose their value by waiting: pings, messages between robots.
+STEADY = Priority(0.05, 0.96, yields=False)
+# Rare messages that must not wait: another fault code.
+URGENT = Priority(0.1, 0.99, yields=False)
 
 
 class _Bucket:
-    """Two token buckets, of publishes and of bytes. Who finds them not below zero may take, even more than
-    there is."""
+    """Two token buckets, of publishes and of bytes. A message may go if both are above the allowed debt, and
+    may take more than is left."""
 
     def __init__(self, rates: Pair, depth_s: float) -> None:
         self.rates = rates
@@ -73,73 +73,70 @@ class _Bucket:
         self._left[1] -= size
 
     def delay_s(self) -> float:
-        """Seconds until it is not below zero."""
+        """Seconds until the bucket has no debt."""
         return max(-left / rate for left, rate in zip(self._left, self.rates))
 
     def covers(self, debt: Pair) -> bool:
-        """Whether no more than that is owed."""
-        return all(left >= -owed - _NOTHING_S for left, owed in zip(self._left, debt))
+        return all(left >= -owed - _ROUNDING_S for left, owed in zip(self._left, debt))
 
 
-class _Second:
-    """What was published within the second that ends now."""
+class _LastSecond:
+    """The publishes of the last second."""
 
     def __init__(self, limits: Pair) -> None:
         self._limits = limits
-        self._went: deque[tuple[float, int]] = deque()
+        self._sent: deque[tuple[float, int]] = deque()
         self._bytes = 0
 
     def add(self, now: float, size: int) -> None:
-        self._went.append((now, size))
+        self._sent.append((now, size))
         self._bytes += size
 
     def delay_s(self, now: float, size: int, most: float) -> float:
-        """Seconds to wait before it is worth asking again; 0 where a message of that size fits."""
-        while self._went and now - self._went[0][0] >= _WINDOW_S:
-            self._bytes -= self._went.popleft()[1]
+        """Seconds until it is worth asking again; 0 if a message of that size fits."""
+        while self._sent and now - self._sent[0][0] >= _WINDOW_S:
+            self._bytes -= self._sent.popleft()[1]
         publishes, payloads = self._limits[0] * most, self._limits[1] * most
-        if not self._went or (len(self._went) < publishes and self._bytes + size <= payloads):
+        if not self._sent or (len(self._sent) < publishes and self._bytes + size <= payloads):
             return 0.0
-        return self._went[0][0] + _WINDOW_S - now
+        return self._sent[0][0] + _WINDOW_S - now
 
 
 class RateLimiter:
-    """The limits of one connection, shared by all who publish on it."""
+    """The limits of one connection. Safe to use from several threads."""
 
     def __init__(
         self, clock: Clock, *, publishes_per_s: float = PUBLISHES_PER_S, bytes_per_s: float = BYTES_PER_S
     ) -> None:
         self._clock = clock
-        # What may be sent in the long run: publishes a second and bytes a second.
+        # The long-run limits.
         self.rates: Pair = (publishes_per_s * SHARE, bytes_per_s * SHARE)
-        self._second = _Second((publishes_per_s, bytes_per_s))
+        self._second = _LastSecond((publishes_per_s, bytes_per_s))
         self._all = _Bucket(self.rates, _BURST_S)
-        # Which part of it is not the record lane's.
-        self._rest = _Bucket(self.rates, _KEPT_S)
+        # The part of it that the record lane leaves to the others.
+        self._rest = _Bucket(self.rates, _REST_BURST_S)
         self._need: Pair = (0.0, 0.0)
         self._backlog = False
-        # Since when, and until when at least, the record lane waits for its turn.
+        # Since when the record lane waits for its turn, and at least until when.
         self._waits_since = self._waits_until = float("-inf")
         self._at = clock.monotonic()
         self._lock = threading.Lock()
 
     def expect(self, need: Pair, *, backlog: bool) -> None:
-        """What the record lane will need: publishes and bytes a second. ``backlog``: it has more to send
-        than fits into a second."""
+        """Set what the record lane will need a second. ``backlog``: more waits than fits into a second."""
         with self._lock:
             self._need, self._backlog = need, backlog
 
     def record(self, topic: str, payload: bytes) -> float:
-        """The record lane's turn: 0 where it may publish this now, which counts as done; otherwise the
-        seconds after which it asks again."""
+        """The record lane's turn: 0 if it may publish now, which is charged at once; else the seconds after
+        which it asks again."""
         size = _size(topic, len(payload))
         with self._lock:
             now = self._refill()
             delay_s = max(self._all.delay_s(), self._second.delay_s(now, size, LIVE.most))
             if now > self._waits_until + _LATE_S:
                 self._waits_since = now
-            # Rounding leaves a rest that no waiting ends.
-            if delay_s > _NOTHING_S:
+            if delay_s > _ROUNDING_S:
                 self._waits_until = now + delay_s + _LATE_S
                 return delay_s
             self._waits_until = now
@@ -147,28 +144,28 @@ class RateLimiter:
             self._second.add(now, size)
             return 0.0
 
-    def may_go(self, claim: Claim, topic: str, payload_bytes: int) -> bool:
-        """Whether somebody beside the record lane may publish now."""
+    def may_go(self, priority: Priority, topic: str, payload_bytes: int) -> bool:
+        """Whether a publisher other than the record lane may publish now; `spend` charges it."""
         with self._lock:
             now = self._refill()
             drains = self._drains(now)
-            if claim.waits and not drains and now < self._waits_until:
+            if priority.yields and not drains and now < self._waits_until:
                 return False
-            # While a backlog drains, the record lane takes whatever is not owed already.
-            debt_s = max(claim.debt_s, STEADY.debt_s) if drains else claim.debt_s
+            # While a backlog drains, the record lane always leaves a debt.
+            debt_s = max(priority.debt_s, STEADY.debt_s) if drains else priority.debt_s
             return (
-                self._all.covers(self._of_all(debt_s))
-                and self._rest.covers(self._of_all(claim.debt_s))
-                and self._second.delay_s(now, _size(topic, payload_bytes), claim.most) <= 0
+                self._all.covers(self._worth(debt_s))
+                and self._rest.covers(self._worth(priority.debt_s))
+                and self._second.delay_s(now, _size(topic, payload_bytes), priority.most) <= 0
             )
 
     def spend(self, topic: str, payload: bytes) -> None:
-        """Note a publish of anybody beside the record lane: after `may_go`, or because it is rare."""
+        """Charge a publish of anybody but the record lane."""
         size = _size(topic, len(payload))
         with self._lock:
             now = self._refill()
-            for bucket in (self._all, self._rest):
-                bucket.take(size)
+            self._all.take(size)
+            self._rest.take(size)
             self._second.add(now, size)
 
     def _refill(self) -> float:
@@ -190,7 +187,7 @@ class RateLimiter:
             rest = min(rate * _DRAIN_SHARE, rest / 2)
         return max(rest, rate * _LEAST_SHARE)
 
-    def _of_all(self, seconds: float) -> Pair:
+    def _worth(self, seconds: float) -> Pair:
         return (self.rates[0] * seconds, self.rates[1] * seconds)
 
 

@@ -11,19 +11,19 @@ import threading
 from pathlib import Path
 from typing import Any, Callable, Iterator, Mapping
 
+from iort_agent.common.state import Status, read
 from iort_agent.errors import AgentError, NotRunningError
-from iort_agent.status.state import Status, read
 
 _log = logging.getLogger(__name__)
 
 SOCKET = "agent.sock"
 _TIMEOUT_S = 5.0
-# sockaddr_un has room for so many bytes, the terminating zero included.
+# The longest path of a socket: sockaddr_un has 108 bytes, with the terminating zero.
 _MAX_PATH_BYTES = 107
 
 
 class StatusServer:
-    """Answers every connection with one status. Only its owner may open the socket."""
+    """Answers every connection with the status. Only its owner may open the socket."""
 
     def __init__(self, path: Path, status: Callable[[], Mapping[str, Any]]) -> None:
         self._path = path
@@ -31,7 +31,7 @@ class StatusServer:
         self._socket: socket.socket | None = None
 
     def start(self) -> None:
-        """Listen. Raises `AgentError` if an agent already answers there; if the socket cannot be made, the
+        """Listen. Raises `AgentError` if an agent already answers there. If the socket cannot be made, the
         agent runs without it."""
         try:
             self._socket = self._bind()
@@ -45,7 +45,7 @@ class StatusServer:
         listening, self._socket = self._socket, None
         if listening is not None:
             self._path.unlink(missing_ok=True)
-            # Closing alone would not wake a thread that waits in accept.
+            # Closing alone does not wake a thread that waits in accept.
             with contextlib.suppress(OSError):
                 listening.shutdown(socket.SHUT_RDWR)
             listening.close()
@@ -53,7 +53,7 @@ class StatusServer:
     def _bind(self) -> socket.socket:
         listening = socket.socket(socket.AF_UNIX, socket.SOCK_STREAM)
         try:
-            # On Linux the socket file has these permissions from its first moment on.
+            # On Linux the socket file is created with these permissions.
             os.fchmod(listening.fileno(), 0o600)
             with _address(self._path) as address:
                 try:
@@ -74,10 +74,10 @@ class StatusServer:
         try:
             process = process_at(self._path)
         except NotRunningError:
-            return  # an agent that was killed left the file behind
+            return  # a killed agent left the file behind
         raise AgentError(
             f"an agent is already running with this configuration (process {process}); "
-            "two would take the connection from each other"
+            "two would take the connection from each other again and again"
         )
 
     def _serve(self, listening: socket.socket) -> None:
@@ -91,14 +91,14 @@ class StatusServer:
                     connection.settimeout(_TIMEOUT_S)
                     connection.sendall(json.dumps(self._status()).encode())
                 except OSError:
-                    pass  # the client has gone
+                    pass  # the client has disconnected
                 except Exception:  # noqa: BLE001 - the next client must get an answer again
                     _log.exception("the status could not be made")
 
 
 @contextlib.contextmanager
 def _address(path: Path) -> Iterator[str]:
-    """A path of the socket that is short enough for the kernel, whatever the length of its folder's."""
+    """A path of the socket that is short enough for the kernel, even if the folder's path is long."""
     if len(os.fsencode(path)) <= _MAX_PATH_BYTES:
         yield str(path)
         return

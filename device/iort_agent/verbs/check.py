@@ -19,13 +19,13 @@ from pathlib import Path
 from typing import Any, Iterator, NamedTuple
 
 from iort_agent.clock import SystemClock
+from iort_agent.common.state import Status
 from iort_agent.config import Config
 from iort_agent.errors import IdentityError, NotRunningError
 from iort_agent.identity.certificate import Certificate, check_pair, read_certificate
 from iort_agent.lanes.record import TODO, too_many
 from iort_agent.sources.recording.check import look_into
 from iort_agent.status.server import ask
-from iort_agent.status.state import Status
 
 OK, WARN, FAIL = "ok", "warn", "fail"
 

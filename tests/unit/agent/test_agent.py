@@ -11,20 +11,21 @@ from typing import Any
 import pytest
 
 import iort_contract
-from iort_agent.agent import make_agent
+from iort_agent.agent import Agent
 from iort_agent.cli import main
 from iort_agent.clock import Clock, SystemClock
+from iort_agent.common.state import Status, document, read
 from iort_agent.config import Config
 from iort_agent.errors import SourceError
 from iort_agent.lanes.config import PingConfig, RecordConfig
 from iort_agent.mqtt.dispatch import Dispatcher
 from iort_agent.mqtt.uplink import matches
 from iort_agent.reporting import make_report, make_status
+from iort_agent.runtime import Runtime
 from iort_agent.sources import Emit
 from iort_agent.sources.recording.bag import BagConfig
 from iort_agent.spool.memory import REJECT_NEW, MemorySpool
 from iort_agent.status.metrics import MetricsConfig
-from iort_agent.status.state import Status, document, read
 from tests.agent_fakes import Loopback, Published
 
 T0 = 1_700_000_000_000_000
@@ -60,17 +61,18 @@ class Rig:
         self.clock = SystemClock()
         self.uplink = Loopback(self.clock, Dispatcher(), connected=connected)
         self.spool = MemorySpool(max_bytes=settings.pop("max_bytes", 10**9), policy=REJECT_NEW)
-        self.agent = make_agent(
+        self.agent = Agent(
             replace(config, **settings), uplink=self.uplink, spool=self.spool, clock=self.clock
         )
+        self.runtime = Runtime(self.agent)
 
     def report(self) -> dict[str, Any]:
         """As `--report` writes it."""
-        return document(make_report(self.agent.parts))
+        return document(make_report(self.agent))
 
     def status(self) -> dict[str, Any]:
         """As the status socket gives it."""
-        return document(make_status(self.agent.parts))
+        return document(make_status(self.agent))
 
     def recorded(self, stream: str = "vesc") -> list[Any]:
         topic = f"$aws/rules/iort_record/dt/iort/car1/{stream}"
@@ -81,7 +83,7 @@ class Rig:
 
 def test_every_sample_is_recorded_and_the_report_says_so() -> None:
     rig = Rig(drive)
-    assert rig.agent.run(drain_s=10) == 0
+    assert rig.runtime.run(drain_s=10) == 0
     assert rig.recorded() == list(range(500))
     assert rig.seqs == list(range(10))
     report = rig.report()
@@ -97,8 +99,8 @@ def test_every_sample_is_recorded_and_the_report_says_so() -> None:
 
 def test_the_status_is_read_as_it_was_written() -> None:
     rig = Rig(drive, ping=PingConfig(rate_hz=20, paths=("broker",)))
-    assert rig.agent.run(drain_s=10) == 0
-    status = make_status(rig.agent.parts)
+    assert rig.runtime.run(drain_s=10) == 0
+    status = make_status(rig.agent)
     assert (status.streams["vesc"].samples, status.lanes.ping.rate_hz) == (500, 20)
     written = json.loads(json.dumps({**document(status), "of a later version": 1}))
     written["over_share"] = {"since_ms": 1, "last_ms": 2, "batches": 3}
@@ -113,17 +115,17 @@ def test_the_status_is_read_as_it_was_written() -> None:
 def test_a_signal_ends_it_in_good_order() -> None:
     def endless(emit: Emit, stop: threading.Event) -> None:
         drive(emit, stop)
-        rig.agent.stop()
+        rig.runtime.stop()
         assert stop.wait(10)
 
     rig = Rig(endless)
-    assert rig.agent.run(drain_s=10) == 0
+    assert rig.runtime.run(drain_s=10) == 0
     assert rig.recorded() == list(range(500))
 
 
 def test_what_cannot_be_delivered_in_time_is_told(caplog: pytest.LogCaptureFixture) -> None:
     rig = Rig(drive, connected=False)
-    assert rig.agent.run(drain_s=0.05) == 1
+    assert rig.runtime.run(drain_s=0.05) == 1
     # And two of the agent's own account, from its start and its end.
     assert "502 samples in 12 batches could not be delivered within 0.05 s" in caplog.text
     assert rig.report()["spool"]["left_samples"] == 502
@@ -135,7 +137,7 @@ def test_a_backlog_is_delivered_when_the_connection_comes_at_last() -> None:
         rig.uplink.connect()
 
     rig = Rig(late, connected=False)
-    assert rig.agent.run(drain_s=10) == 0
+    assert rig.runtime.run(drain_s=10) == 0
     assert rig.recorded() == list(range(500))
 
 
@@ -147,7 +149,7 @@ def test_dropped_samples_are_not_a_success(caplog: pytest.LogCaptureFixture) -> 
         rig.uplink.connect()
 
     rig = Rig(late, connected=False, max_bytes=1000)
-    assert rig.agent.run(drain_s=10) == 1
+    assert rig.runtime.run(drain_s=10) == 1
     assert "were dropped: the queue was full" in caplog.text
     report = rig.report()
     assert 0 < len(rig.recorded()) < 1500
@@ -168,7 +170,7 @@ def test_a_source_that_fails_does_not_take_the_others_with_it(
         raise error
 
     rig = Rig(broken, drive)
-    assert rig.agent.run(drain_s=10) == 1
+    assert rig.runtime.run(drain_s=10) == 1
     assert rig.recorded() == list(range(500))
     assert rig.report()["failed_sources"] == ["script"]
     assert text in caplog.text
@@ -191,7 +193,7 @@ def test_a_source_that_ends_with_nothing_stored_has_failed(
     run: Any, why: str, caplog: pytest.LogCaptureFixture
 ) -> None:
     rig = Rig(run)
-    assert rig.agent.run(drain_s=10) == 1
+    assert rig.runtime.run(drain_s=10) == 1
     assert rig.report()["failed_sources"] == ["script"]
     assert f"source failed: script: {why}" in caplog.text
 
@@ -202,17 +204,17 @@ def test_one_sample_that_is_refused_is_no_failure() -> None:
         drive(emit, stop)
 
     rig = Rig(both)
-    assert rig.agent.run(drain_s=10) == 0
+    assert rig.runtime.run(drain_s=10) == 0
     assert rig.report()["streams"]["vesc"]["refused"] == 3
 
 
 def test_a_source_that_was_stopped_before_its_first_sample_has_not_failed() -> None:
     def wait(emit: Emit, stop: threading.Event) -> None:
-        rig.agent.stop()
+        rig.runtime.stop()
         assert stop.wait(10)
 
     rig = Rig(wait)
-    assert rig.agent.run(drain_s=10) == 0
+    assert rig.runtime.run(drain_s=10) == 0
 
 
 def test_a_log_with_too_many_columns_is_a_failure_that_says_so(
@@ -222,7 +224,7 @@ def test_a_log_with_too_many_columns_is_a_failure_that_says_so(
     names = [f"x{i}" for i in range(754)]
     path.write_text("\n".join([";".join(["ms_today", *names]), ";".join(["1000", *["1"] * 754])]) + "\n")
     rig = Rig(sources=(BagConfig(path=path),))
-    assert rig.agent.run(drain_s=10) == 1
+    assert rig.runtime.run(drain_s=10) == 1
     assert "754 of its columns hold numbers" in caplog.text
 
 
@@ -242,7 +244,7 @@ def test_round_trips_are_recorded_like_any_stream() -> None:
             enough.set()
 
     rig.uplink.verdict = count
-    assert rig.agent.run(drain_s=10) == 0
+    assert rig.runtime.run(drain_s=10) == 0
     batches = [
         iort_contract.decode(m.payload) for m in seen if m.topic == "$aws/rules/iort_record/dt/iort/car1/rtt"
     ]
@@ -255,7 +257,7 @@ def test_round_trips_are_recorded_like_any_stream() -> None:
 
 def test_the_record_lane_can_be_switched_off() -> None:
     rig = Rig(drive, record=RecordConfig(enabled=False))
-    assert rig.agent.run(drain_s=10) == 0
+    assert rig.runtime.run(drain_s=10) == 0
     assert rig.recorded() == []
     assert rig.report()["live_published"] > 0
 
@@ -263,20 +265,20 @@ def test_the_record_lane_can_be_switched_off() -> None:
 def test_lanes_fields_and_rates_change_while_it_runs() -> None:
     def tuned(emit: Emit, stop: threading.Event) -> None:
         emit("vesc", T0, {"speed": 1, "voltage_input": 40})
-        settings = rig.agent.parts.streams.settings
-        rig.agent.parts.tune(replace(settings, fields={"vesc": ("speed", "gone")}))
+        settings = rig.agent.streams.settings
+        rig.agent.apply(replace(settings, fields={"vesc": ("speed", "gone")}))
         emit("vesc", T0 + 1_000_000, {"speed": 2, "voltage_input": 40})
-        rig.agent.parts.tune(replace(settings, record_enabled=False, live_enabled=False))
+        rig.agent.apply(replace(settings, record_enabled=False, live_enabled=False))
         live = rig.report()["live_published"]
         for i in range(100):
             emit("vesc", T0 + 2_000_000 + i, {"speed": 3, "voltage_input": 40})
         assert rig.report()["live_published"] <= live + 1
-        rig.agent.parts.tune(settings)
+        rig.agent.apply(settings)
         emit("vesc", T0 + 3_000_000, {"speed": 4, "voltage_input": 40})
 
     rig = Rig(tuned)
     began = rig.clock.monotonic()
-    assert rig.agent.run(drain_s=10) == 0
+    assert rig.runtime.run(drain_s=10) == 0
     assert rig.clock.monotonic() - began < 10, "it waited for something that does not come"
     assert rig.recorded() == [1, 2, 4]
     topic = "$aws/rules/iort_record/dt/iort/car1/vesc"
@@ -291,11 +293,11 @@ def test_types_are_said_again_when_recording_begins() -> None:
 
     def late(emit: Emit, stop: threading.Event) -> None:
         emit(iort_contract.TYPES_STREAM, T0, said.sample())
-        rig.agent.parts.tune(replace(rig.agent.parts.streams.settings, record_enabled=True))
+        rig.agent.apply(replace(rig.agent.streams.settings, record_enabled=True))
         emit("vesc", T0 + 1_000_000, {"speed": 1})
 
     rig = Rig(late, record=RecordConfig(enabled=False))
-    assert rig.agent.run(drain_s=10) == 0
+    assert rig.runtime.run(drain_s=10) == 0
     assert rig.recorded() == [1]
     topic = "$aws/rules/iort_record/dt/iort/car1/types"
     (batch,) = [iort_contract.decode(m.payload) for m in rig.uplink.published if m.topic == topic]
@@ -305,10 +307,10 @@ def test_types_are_said_again_when_recording_begins() -> None:
 
 def test_an_account_is_of_one_moment() -> None:
     rig = Rig(drive)
-    assert rig.agent.run(drain_s=10) == 0
+    assert rig.runtime.run(drain_s=10) == 0
     # As a batch does that is stored between two looks.
     rig.spool.put("vesc", rig.spool.next_seq("vesc"), b"", samples=50)
-    counts, next_seq = rig.agent.parts.streams.counted()["vesc"]
+    counts, next_seq = rig.agent.streams.counted()["vesc"]
     assert (counts.stored, next_seq) == (500, 10)
 
 
@@ -322,7 +324,7 @@ def test_its_own_figures_are_a_stream() -> None:
     rig = Rig(wait, metrics=MetricsConfig(every_s=0.1), record=RecordConfig(batch_s=0))
     topic = "$aws/rules/iort_record/dt/iort/car1/agent"
     rig.uplink.verdict = lambda message: seen.set() if message.topic == topic else None
-    assert rig.agent.run(drain_s=10) == 0
+    assert rig.runtime.run(drain_s=10) == 0
     batch = next(iort_contract.decode(m.payload) for m in rig.uplink.published if m.topic == topic)
     assert list(batch.columns) == list(iort_contract.AGENT_FIELDS)
     assert not [m for m in rig.uplink.published if m.topic == "live/iort/car1/agent"]

@@ -56,7 +56,7 @@ def image(content=PICTURE):
 
 def test_the_claim_says_where_the_upload_will_put_it(tmp_path):
     claims = claims_in(tmp_path)
-    sample = claims.claim("camera", T_US, image())
+    sample = claims.attach_to_message("camera", T_US, image())
     assert sample.keys() == {
         "format",
         "last",
@@ -76,7 +76,7 @@ def test_the_claim_says_where_the_upload_will_put_it(tmp_path):
 
 
 def test_what_is_no_picture_is_kept_as_it_is(tmp_path):
-    sample = claims_in(tmp_path, small=thumbnail).claim("scan", T_US, image(b"\0\1\2"))
+    sample = claims_in(tmp_path, small=thumbnail).attach_to_message("scan", T_US, image(b"\0\1\2"))
     assert sample["data.content_type"] == "application/octet-stream"
     assert sample["data.thumbnail"] is None
     assert sample["data.key"].endswith(f"/scan/{T_US}-data.bin")
@@ -91,8 +91,8 @@ def test_a_message_is_whole_again_with_its_contents(tmp_path, every_s):
     a, b, c, d = (u32(len(content)) + content for content in contents.values())
     message = RosMessage(a + text("jpeg") + b + c + d, kind, large=contents)
     claims = claims_in(tmp_path, every_s=every_s)
-    claims.claim("s", T_US, RosMessage(u32(1) + b"z", kind, large={"a": b"z"}))
-    sample = claims.claim("s", T_US + 1, message)
+    claims.attach_to_message("s", T_US, RosMessage(u32(1) + b"z", kind, large={"a": b"z"}))
+    sample = claims.attach_to_message("s", T_US + 1, message)
     assert len(sample.raw) == len(message.raw) - sum(map(len, contents.values()))
     raw = sample.raw
     for name, content in reversed(contents.items()):
@@ -116,35 +116,37 @@ def test_a_content_of_selected_fields_is_claimed_too(tmp_path):
 
 def test_at_most_one_content_in_so_long_and_the_fields_stay_the_same(tmp_path):
     claims = claims_in(tmp_path, every_s=1.0)
-    samples = [claims.claim("camera", T_US + i * 250_000, image()) for i in range(9)]
+    samples = [claims.attach_to_message("camera", T_US + i * 250_000, image()) for i in range(9)]
     assert [sample["data.key"] is not None for sample in samples] == [i % 4 == 0 for i in range(9)]
     assert {tuple(sample.beside) for sample in samples} == {
         tuple(f"data.{name}" for name in (*ATTACHMENT_FIELDS, ATTACHMENT_AT))
     }
     assert claims.report() == {"kept": 3, "not_due": 6, "left_out": 0}
     # Another stream has its own turn, and a recording that begins anew does too.
-    assert claims.claim("rear", T_US, image())["data.key"]
-    assert claims.claim("camera", T_US, image())["data.key"]
+    assert claims.attach_to_message("rear", T_US, image())["data.key"]
+    assert claims.attach_to_message("camera", T_US, image())["data.key"]
 
 
 def test_a_full_folder_keeps_nothing_more_until_there_is_room(tmp_path):
     claims = claims_in(tmp_path, every_s=0, max_bytes=int(2.5 * len(PICTURE)))
-    kept = [claims.claim("camera", T_US + i, image())["data.key"] for i in range(3)]
+    kept = [claims.attach_to_message("camera", T_US + i, image())["data.key"] for i in range(3)]
     assert [key is not None for key in kept] == [True, True, False]
     assert claims.report() == {"kept": 2, "not_due": 0, "left_out": 1, "full": 1}
     # Another run finds what waits.
     assert (
-        claims_in(tmp_path, max_bytes=int(2.5 * len(PICTURE))).claim("camera", T_US, image())["data.key"]
+        claims_in(tmp_path, max_bytes=int(2.5 * len(PICTURE))).attach_to_message("camera", T_US, image())[
+            "data.key"
+        ]
         is None
     )
     next(tmp_path.glob("camera/*.jpg")).unlink()
-    assert claims.claim("camera", T_US + 9, image())["data.key"]
+    assert claims.attach_to_message("camera", T_US + 9, image())["data.key"]
 
 
 def test_a_disk_that_fails_costs_the_content_and_not_the_sample(tmp_path):
     (tmp_path / "camera").write_text("in the way")
     claims = claims_in(tmp_path)
-    sample = claims.claim("camera", T_US, image())
+    sample = claims.attach_to_message("camera", T_US, image())
     assert sample["data.key"] is None
     assert sample["format"] == "jpeg"
     assert claims.report()["disk"] == 1
@@ -153,7 +155,7 @@ def test_a_disk_that_fails_costs_the_content_and_not_the_sample(tmp_path):
 def test_waiting_for_the_folder_to_be_uploaded(tmp_path):
     claims = claims_in(tmp_path)
     assert claims.wait_empty(0)
-    claims.claim("camera", T_US, image())
+    claims.attach_to_message("camera", T_US, image())
     assert not claims.wait_empty(5)
     next(tmp_path.glob("camera/*.jpg")).unlink()
     assert claims.wait_empty(5)
@@ -171,7 +173,7 @@ def test_only_bytes_are_claimed(tmp_path):
 
 
 def test_a_claim_fits_a_batch_and_the_live_lane(tmp_path):
-    sample = claims_in(tmp_path, small=thumbnail).claim("camera", T_US, image())
+    sample = claims_in(tmp_path, small=thumbnail).attach_to_message("camera", T_US, image())
     columns = {name: [value] for name, value in sample.beside.items()}
     messages = iort_contract.Messages(IMAGE.id, IMAGE.layout, [sample.raw])
     batch = iort_contract.Batch("0123456789abcdef", 0, [T_US], columns, 0, messages)
@@ -265,7 +267,7 @@ def test_where_bytes_wait_must_be_said(tmp_path):
 
 
 def test_what_the_folder_has_read_is_what_the_claim_says(tmp_path):
-    claims_in(tmp_path).claim("camera", T_US, image())
+    claims_in(tmp_path).attach_to_message("camera", T_US, image())
     (path,) = tmp_path.glob("camera/*.jpg")
     local = read(tmp_path, path.relative_to(tmp_path), stop=threading.Event())
     assert local.file.t_us == T_US

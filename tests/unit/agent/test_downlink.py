@@ -7,7 +7,7 @@ from typing import Any
 import pytest
 
 from iort_agent.clock import SystemClock
-from iort_agent.lanes.clock_offset import Offset
+from iort_agent.common.state import ClockOffset
 from tests.unit.agent.downlink_rig import T0, Rig, doubles
 
 
@@ -91,7 +91,7 @@ def test_a_deadline_is_judged_by_the_clouds_clock_and_what_may_be_too_old_is() -
     rig = Rig()
     for hour in (-1, 1):
         # The car's clock is an hour off, and knows it to within a tenth of a second.
-        rig.offset = Offset(hour * 3_600_000.0, 100.0)
+        rig.offset = ClockOffset(hour * 3_600_000.0, 100.0)
         cloud_us = rig.clock.now_us() + hour * 3_600_000_000
         for age_us in (0, 400_000, 400_001):
             sent_us = cloud_us - age_us

@@ -5,9 +5,9 @@ from __future__ import annotations
 from typing import Any
 
 import iort_contract
-from iort_agent.lanes.clock_offset import Offset
+from iort_agent.common.state import ClockOffset
 from iort_agent.mqtt.dispatch import Dispatcher
-from iort_agent.mqtt.uplink import Message
+from iort_agent.mqtt.uplink import MqttMessage
 from iort_agent.ros1.json_message import encode
 from iort_contract import FleetMessage
 from iort_contract.ros1.definition import parse
@@ -30,7 +30,7 @@ def test_two_robots_share_their_poses() -> None:
     second = Rig("car2", share=SHARE, uplink=broker, clock=clock)
     both = broker._subscriptions["fleet/iort/+/pose"], handlers["fleet/iort/+/pose"]
 
-    def to_both(message: Message) -> None:
+    def to_both(message: MqttMessage) -> None:
         for handle in both:
             handle(message)
 
@@ -73,7 +73,7 @@ def test_of_another_robot_only_what_is_new_passes() -> None:
 
 def test_two_clocks_that_are_off_are_compared_by_the_clouds() -> None:
     rig = Rig()
-    rig.offset = Offset(3_600_000.0, 1.0)
+    rig.offset = ClockOffset(3_600_000.0, 1.0)
     # Theirs is an hour ahead of ours, and both of them know.
     for seq, age_us in enumerate((0, 2_000_000, 2_000_001)):
         fleet(rig, "car2", seq, age_us=age_us - 3_600_000_000, offset_us=0)

@@ -11,7 +11,7 @@ import pytest
 import iort_contract
 from iort_agent.errors import IdentityError, RefusedError
 from iort_agent.identity.pending import TOKEN_S, Pending, keep, kept
-from iort_agent.verbs.provision import Run, provision, register_again
+from iort_agent.verbs.provision import Seams, provision, register_again
 
 
 class Cloud:
@@ -57,8 +57,8 @@ class Exchange:
         self.waited: list[float] = []
 
     @property
-    def run(self) -> Run:
-        return Run(lambda _claim: self, self.waited.append)
+    def seams(self) -> Seams:
+        return Seams(lambda _claim: self, self.waited.append)
 
     def __enter__(self) -> Exchange:  # noqa: PYI034 - Self came with Python 3.11
         if not self.claim_is_good:
@@ -119,7 +119,7 @@ def earlier(folder: Path, *, asked_s: float | None = None, **other: str) -> Pend
 
 def taken_up(claim: Path, aws: Exchange) -> str:
     """The certificate with which the robot then stands there."""
-    provision(claim, robot="car", run=aws.run)
+    provision(claim, robot="car", seams=aws.seams)
     assert kept(claim.parent) is None
     return (claim.parent / "certificate.pem").read_text()
 
@@ -136,7 +136,7 @@ def test_a_run_that_ends_anywhere_is_taken_up_by_the_next(claim: Path, aws: Exch
 
     aws.register = register
     with pytest.raises(Ended):
-        provision(claim, robot="car", run=aws.run)
+        provision(claim, robot="car", seams=aws.seams)
     del aws.register
     assert taken_up(claim, aws) == "certificate 0"
     assert aws.issued == ["certificate 0"]
@@ -180,7 +180,7 @@ def test_an_old_one_is_kept_while_nothing_connects(claim: Path, aws: Exchange) -
     left = earlier(claim.parent, asked_s=time.time() - TOKEN_S)
     aws.claim_is_good = False
     with pytest.raises(IdentityError, match="does not connect"):
-        provision(claim, robot="car", run=aws.run)
+        provision(claim, robot="car", seams=aws.seams)
     assert kept(claim.parent) == left
 
 
@@ -191,7 +191,7 @@ def test_what_may_be_admitted_later_is_kept(claim: Path, aws: Exchange, refusal:
     left = earlier(claim.parent)
     aws.refusal = refusal
     with pytest.raises(IdentityError, match=str(refusal)):
-        provision(claim, robot="car", run=aws.run)
+        provision(claim, robot="car", seams=aws.seams)
     assert kept(claim.parent) == left
     assert not aws.issued
 

@@ -14,8 +14,9 @@ from typing import Any, NamedTuple
 import pytest
 
 import iort_contract
-from iort_agent.agent import make_agent
+from iort_agent.agent import Agent
 from iort_agent.clock import Clock, SystemClock
+from iort_agent.common.state import document
 from iort_agent.config import Config
 from iort_agent.lanes.config import PingConfig, RecordConfig
 from iort_agent.lanes.production import Production, Rate
@@ -23,8 +24,8 @@ from iort_agent.lanes.record import too_many
 from iort_agent.mqtt.dispatch import Dispatcher
 from iort_agent.mqtt.rate_limiter import URGENT, RateLimiter
 from iort_agent.reporting import make_report, make_status
+from iort_agent.runtime import Runtime
 from iort_agent.spool.memory import MemorySpool
-from iort_agent.status.state import document
 from iort_agent.status.text import render
 from tests.agent_fakes import Loopback, ManualClock, Published
 
@@ -79,7 +80,8 @@ class Drive:
         self.uplink.verdict = self._sees
         self.spool = MemorySpool(max_bytes=10**9)
         config = replace(Config("car1", "host", Path(), Path(), ()), **settings)
-        self.agent = make_agent(config, uplink=self.uplink, spool=self.spool, clock=self.clock)
+        self.agent = Agent(config, uplink=self.uplink, spool=self.spool, clock=self.clock)
+        self.runtime = Runtime(self.agent)
         self.sent: list[Sent] = []
         self.rtt_s = 0.05
         self._acks: list[float] = []
@@ -100,9 +102,9 @@ class Drive:
             if sources:
                 self._offer()
             if self._is_due(pings_hz):
-                self.agent.parts.pings.send(iort_contract.BROKER)
+                self.agent.pings.send(iort_contract.BROKER)
             if self._ms % TICK_MS == 0:
-                self.agent.tick()
+                self.runtime.tick()
             ready = bisect.bisect_right(self._acks, self.clock.monotonic())
             if ready:
                 del self._acks[:ready]
@@ -118,20 +120,20 @@ class Drive:
         for i, (stream, topic) in enumerate(self.topics.items()):
             # Each at its own milliseconds.
             if self._is_due(topic.hz, 7 * i):
-                self.agent.parts.streams.emit(stream, self.clock.now_us(), topic.values())
+                self.agent.streams.emit(stream, self.clock.now_us(), topic.values())
 
     def _record(self) -> None:
-        lane = self.agent.parts.record
+        lane = self.agent.record
         if lane._wake.is_set() or self.clock.monotonic() >= self._record_due:
             lane._wake.clear()
             wait_s = lane.step()
             self._record_due = float("inf") if wait_s is None else self.clock.monotonic() + wait_s
 
     def status(self) -> dict[str, Any]:
-        return document(make_status(self.agent.parts))
+        return document(make_status(self.agent))
 
     def report(self) -> dict[str, Any]:
-        return document(make_report(self.agent.parts))
+        return document(make_report(self.agent))
 
     def cut(self) -> None:
         self._acks.clear()
@@ -151,10 +153,10 @@ class Drive:
 
     def end(self) -> None:
         """Let everything arrive, and see that it did, and that no second held too much."""
-        self.agent.parts.streams.flush()
+        self.agent.streams.flush()
         self.run(2, sources=False)
         assert self.backlog() == 0
-        taken = {name: one.samples for name, one in make_report(self.agent.parts).streams.items()}
+        taken = {name: one.samples for name, one in make_report(self.agent).streams.items()}
         arrived = dict.fromkeys(taken, 0)
         for message in self.uplink.published:
             if message.topic.startswith("$aws/rules/iort_record/"):
@@ -203,7 +205,7 @@ def test_few_topics_have_what_they_ask_for_and_nobody_is_warned(caplog: pytest.L
     drive.run(10)
     assert set(drive.live(10).values()) <= {99, 100, 101}
     assert drive.report()["live"]["effective_hz"] == 10
-    assert "SLOWED" not in render(make_status(drive.agent.parts))
+    assert "SLOWED" not in render(make_status(drive.agent))
     assert not caplog.messages
     drive.end()
 
@@ -311,7 +313,7 @@ def test_more_than_one_connection_takes_is_said_with_what_to_do(caplog: pytest.L
     assert "batches wait, 1" in alarm
     assert "the limit allows 90 batches/s" in alarm
     assert "record fewer topics" in alarm
-    assert f"ALARM     {alarm}" in render(make_status(drive.agent.parts))
+    assert f"ALARM     {alarm}" in render(make_status(drive.agent))
     assert len([text for text in caplog.messages if text.startswith("record: more is recorded")]) == 1
     assert 1 <= sum(drive.live(5).values()) <= 10, "next to nothing is left"
     drive.check_limits()
@@ -335,13 +337,13 @@ def test_a_slowed_lane_is_warned_of_once_and_shown(caplog: pytest.LogCaptureFixt
     drive.run(8)
     drive.uplink.connect()
     drive.run(15)
-    status = make_status(drive.agent.parts)
+    status = make_status(drive.agent)
     told = f"up to 10 Hz, SLOWED to {status.lanes.live.effective_hz:g} Hz a stream by AWS' limit"
     assert told in render(status)
     assert 1.5 < status.streams["topic007"].live_hz < 2.2
     drive.topics = topics(1, 20)
     drive.run(15)
-    assert "SLOWED" not in render(make_status(drive.agent.parts))
+    assert "SLOWED" not in render(make_status(drive.agent))
     told_of = [(r.levelno, r.message[:15]) for r in caplog.records if r.message.startswith("live: ")]
     assert told_of == [(logging.WARNING, "live: slowed do"), (logging.INFO, "live: up to 10 ")]
 
@@ -394,13 +396,13 @@ def test_too_many_streams_are_known_beforehand(streams: int, batch_s: float, mad
 
 def test_too_many_streams_are_said_at_the_start(caplog: pytest.LogCaptureFixture) -> None:
     clock = SystemClock()
-    agent = make_agent(
+    agent = Agent(
         Config("car1", "host", Path(), Path(), (Named(91),)),
         uplink=Loopback(clock, Dispatcher()),
         spool=MemorySpool(max_bytes=10**6),
         clock=clock,
     )
     # The source has none of them, which is a failure of its own.
-    assert agent.run(drain_s=10) == 1
+    assert Runtime(agent).run(drain_s=10) == 1
     assert "record: 91 streams are up to 91 batches a second" in caplog.text
     assert "record fewer topics" in caplog.text

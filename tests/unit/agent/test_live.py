@@ -5,8 +5,7 @@ from __future__ import annotations
 import iort_contract
 from iort_agent.lanes.live import LiveLane
 from iort_agent.mqtt.dispatch import Dispatcher
-from iort_agent.mqtt.rate_limiter import RateLimiter
-from tests.agent_fakes import Loopback, ManualClock
+from tests.agent_fakes import Loopback, ManualClock, link_of
 
 T0 = 1_700_000_000_000_000
 
@@ -20,13 +19,9 @@ class Rig:
         if connected:
             self.uplink.connect()
         self.lane = LiveLane(
-            robot="car1",
-            namespace="iort",
+            link_of(self.uplink, self.clock),
             boot="0123456789abcdef",
             rate_hz=rate_hz,
-            uplink=self.uplink,
-            clock=self.clock,
-            rate_limiter=RateLimiter(self.clock),
             offset_us=lambda: self.offset_us,
         )
 

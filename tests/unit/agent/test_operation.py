@@ -21,16 +21,16 @@ import iort_contract
 from iort_agent.cli import main
 from iort_agent.clock import SystemClock
 from iort_agent.common.logs import JournalFormatter, LineFormatter, Troubles, is_journal
+from iort_agent.common.state import Status, read
 from iort_agent.config import load_config
 from iort_agent.errors import AgentError, NotRunningError
 from iort_agent.lanes.batch import StreamCounts
-from iort_agent.lanes.clock_offset import ClockOffset
+from iort_agent.lanes.clock_offset import OffsetEstimator
 from iort_agent.mqtt.dispatch import Dispatcher
 from iort_agent.spool.memory import MemorySpool
 from iort_agent.spool.sqlite import make_spool
 from iort_agent.status.metrics import AgentMetrics, Rates, rss_mb
 from iort_agent.status.server import StatusServer, ask, fetch
-from iort_agent.status.state import Status, read
 from iort_agent.status.text import render
 from iort_agent.verbs.check import FAIL, check
 from tests.agent_fakes import Loopback, ManualClock
@@ -107,7 +107,7 @@ def test_the_offset_is_within_its_uncertainty(
     true_ms: float, trips: list[tuple[float, float]], chance: random.Random
 ) -> None:
     clock = ManualClock()
-    offset = ClockOffset(clock)
+    offset = OffsetEstimator(clock)
     for trip_ms, share in trips:
         sent = clock.monotonic()
         # The cloud stamps somewhere on the way, in whole milliseconds.
@@ -123,7 +123,7 @@ def test_the_offset_is_within_its_uncertainty(
 
 def test_the_offset_is_right_at_once_when_the_clock_was_set() -> None:
     clock = ManualClock()
-    offset = ClockOffset(clock)
+    offset = OffsetEstimator(clock)
     assert offset.estimate() is None
     sent = clock.monotonic()
     clock.advance(0.01)
@@ -138,7 +138,7 @@ def test_the_offset_is_right_at_once_when_the_clock_was_set() -> None:
 
 def test_the_shortest_round_trip_counts_until_it_is_old() -> None:
     clock = ManualClock()
-    offset = ClockOffset(clock)
+    offset = OffsetEstimator(clock)
     for trip_ms in (10, 2, 200):
         sent = clock.monotonic()
         clock.advance(trip_ms / 1000)
@@ -154,7 +154,7 @@ def test_the_shortest_round_trip_counts_until_it_is_old() -> None:
 
 def test_an_offset_not_known_well_enough_is_not_judged_by() -> None:
     clock = ManualClock()
-    offset = ClockOffset(clock)
+    offset = OffsetEstimator(clock)
     assert offset.known_us() is None
     for trip_s, known in ((1.5, False), (0.9, True), (8, True)):
         sent = clock.monotonic()
@@ -172,7 +172,7 @@ def test_an_offset_not_known_well_enough_is_not_judged_by() -> None:
 def test_a_round_trip_that_excludes_the_best_one_replaces_it() -> None:
     """A computer that slept stopped its monotonic clock, and its wall clock went on."""
     clock = ManualClock()
-    offset = ClockOffset(clock)
+    offset = OffsetEstimator(clock)
     slept_us = 0
     for trip_s in (0.002, 0.3):
         sent = clock.monotonic()
@@ -187,7 +187,7 @@ def test_a_round_trip_that_excludes_the_best_one_replaces_it() -> None:
 def test_a_sample_of_the_agent_has_the_contracts_fields() -> None:
     clock = ManualClock()
     spool, uplink = MemorySpool(max_bytes=1000), Loopback(clock, Dispatcher())
-    metrics = AgentMetrics(clock=clock, spool=spool, uplink=uplink, offset=ClockOffset(clock))
+    metrics = AgentMetrics(clock=clock, spool=spool, uplink=uplink, offset=OffsetEstimator(clock))
     spool.put("vesc", 0, b"x" * 100, samples=1)
     uplink.connect()
     clock.advance(2)
@@ -315,7 +315,7 @@ def test_a_reader_that_has_seen_enough_is_no_error(tmp_path: Path) -> None:
     from tests.unit.agent.test_agent import Rig, config_file, drive
 
     rig = Rig(drive)
-    assert rig.agent.run(drain_s=10) == 0
+    assert rig.runtime.run(drain_s=10) == 0
     config = config_file(tmp_path, "{type: sim}")
     server = StatusServer(tmp_path / "agent.sock", rig.status)
     server.start()
@@ -378,7 +378,7 @@ def test_status_of_an_agent_for_a_person() -> None:
     from tests.unit.agent.test_agent import Rig, drive
 
     rig = Rig(drive)
-    assert rig.agent.run(drain_s=10) == 0
+    assert rig.runtime.run(drain_s=10) == 0
     state = rig.status()
     text = render(read(Status, json.loads(json.dumps(state))))
     assert "robot     car1" in text
@@ -416,7 +416,7 @@ def test_status_says_that_the_robot_is_over_its_share() -> None:
     from tests.unit.agent.test_agent import Rig, drive
 
     rig = Rig(drive)
-    assert rig.agent.run(drain_s=10) == 0
+    assert rig.runtime.run(drain_s=10) == 0
     state = rig.status()
     assert "\nshare " not in render(read(Status, state))
     state["over_share"] = {"since_ms": 1_700_000_000_000, "last_ms": 1_700_000_060_000, "batches": 40}
@@ -429,7 +429,7 @@ def test_status_says_what_became_of_what_the_sources_read() -> None:
     from tests.unit.agent.test_agent import Rig, drive
 
     rig = Rig(drive)
-    assert rig.agent.run(drain_s=10) == 0
+    assert rig.runtime.run(drain_s=10) == 0
     state = rig.status()
     state["sources"] = [
         {"source": "bag ride.csv", "rows": 168, "skipped": {"columns": 100, "time": 40}, "bad_cells": {},

@@ -10,13 +10,13 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from iort_agent.common.state import OverShare
 from iort_agent.control.runtime_settings import overlay
 from iort_agent.control.shadow import Shadow, _difference, _merged
 from iort_agent.lanes.config import RuntimeSettings
 from iort_agent.mqtt.dispatch import Dispatcher
-from iort_agent.mqtt.rate_limiter import RateLimiter
 from iort_contract import Command
-from tests.agent_fakes import Loopback, ManualClock
+from tests.agent_fakes import Loopback, ManualClock, link_of
 
 BASE = RuntimeSettings(
     record_enabled=True, live_enabled=True, live_rate_hz=10.0, ping_rate_hz=0.0, log_level="info"
@@ -32,17 +32,14 @@ class Rig:
         self.clock, self.dispatcher = ManualClock(), Dispatcher()
         self.uplink = Loopback(self.clock, self.dispatcher)
         self.applied: list[RuntimeSettings] = []
-        self.shadow: dict[str, Any] = {"desired": desired, "reported": {}} if desired else {}
+        self.document: dict[str, Any] = {"desired": desired, "reported": {}} if desired else {}
         self.version = 1 if desired else 0
-        self.remote = Shadow(
-            robot="car1",
+        self.shadow = Shadow(
+            link_of(self.uplink, self.clock),
             base=BASE,
             apply=self.applied.append,
             known_fields=lambda: {"vesc": {"speed", "voltage_input"}},
             version="1.2.3",
-            uplink=self.uplink,
-            clock=self.clock,
-            rate_limiter=RateLimiter(self.clock),
         )
         self.seen = 0
         self.uplink.connect()
@@ -51,7 +48,7 @@ class Rig:
     def settle(self) -> None:
         for _ in range(4):
             self.dispatcher.run_pending()
-            self.remote.tick()
+            self.shadow.tick()
             for message in self.uplink.published[self.seen :]:
                 self.answer(message.topic, message.payload)
             self.seen = len(self.uplink.published)
@@ -61,12 +58,12 @@ class Rig:
             if not self.version:
                 self.deliver("get/rejected", {"code": 404, "message": "No shadow exists"})
             else:
-                self.deliver("get/accepted", {"state": self.shadow, "version": self.version})
+                self.deliver("get/accepted", {"state": self.document, "version": self.version})
         elif topic.endswith("/update"):
             self.change(json.loads(payload)["state"])
 
     def change(self, state: dict[str, Any], *, arrives: bool = True) -> None:
-        self.shadow = _merged(self.shadow, state)
+        self.document = _merged(self.document, state)
         self.version += 1
         if arrives:
             self.deliver("update/accepted", {"state": state, "version": self.version})
@@ -80,7 +77,7 @@ class Rig:
 
     @property
     def reported(self) -> Any:
-        return self.shadow.get("reported")
+        return self.document.get("reported")
 
 
 def test_without_a_shadow_it_makes_one() -> None:
@@ -115,8 +112,8 @@ def test_a_wish_meanwhile_and_its_withdrawal() -> None:
 @pytest.mark.parametrize(
     ("wish", "name", "reason"),
     [
-        ({"live": {"rate_hz": 50}}, "live.rate_hz", "found 50 (a number); allowed is a number from 0.01"),
-        ({"live": {"rate_hz": True}}, "live.rate_hz", "found True"),
+        ({"live": {"rate_hz": 50}}, "live.rate_hz", "must be a number from 0.01 to 10 (Hz), got 50"),
+        ({"live": {"rate_hz": True}}, "live.rate_hz", "got True"),
         ({"live": 3}, "live", "cannot be changed"),
         ({"record": {"enabled": "no"}}, "record.enabled", "true or false"),
         ({"log_level": "loud"}, "log_level", "one of debug, info"),
@@ -124,7 +121,7 @@ def test_a_wish_meanwhile_and_its_withdrawal() -> None:
         ({"fields": {"vesc": "speed"}}, "fields.vesc", "a list of field names"),
         ({"fields": {"a b": ["speed"]}}, "fields.a b", "stream name"),
         ({"fields": {"imu": ["a b"]}}, "fields.imu[0]", "field name"),
-        ({"robot": "car2"}, "robot", "cannot be changed; allowed is"),
+        ({"robot": "car2"}, "robot", "cannot be changed; must be one of"),
         ({"live": {"rate": 1}}, "live.rate", "did you mean live.rate_hz?"),
     ],
 )  # fmt: skip
@@ -192,7 +189,7 @@ def test_old_and_odd_messages_change_nothing() -> None:
         rig.deliver("update/rejected", odd)
     rig.uplink.deliver(f"{PREFIX}/update/accepted", b"\xff")
     rig.settle()
-    assert rig.remote.settings.live_rate_hz in (3, 10)
+    assert rig.shadow.settings.live_rate_hz in (3, 10)
     assert rig.applied[0].live_rate_hz == 3
 
 
@@ -202,8 +199,8 @@ def test_a_robot_over_its_share_logs_it_once_and_takes_it_for_no_wish(
     rig = Rig()
     for batches in (1, 40):
         rig.wish(over_share={"since_ms": 1000, "last_ms": 1000 + batches, "batches": batches})
-    assert rig.remote.over_share == {"since_ms": 1000, "last_ms": 1040, "batches": 40}
-    assert rig.shadow["reported"].get("rejected", {}) == {}
+    assert rig.shadow.over_share == OverShare(since_ms=1000, last_ms=1040, batches=40)
+    assert rig.document["reported"].get("rejected", {}) == {}
     assert caplog.text.count("summaries are made later") == 1
     rig.wish(over_share={"since_ms": 90_000, "last_ms": 90_000, "batches": 1})
     assert caplog.text.count("summaries are made later") == 2
@@ -215,7 +212,7 @@ def test_a_robot_over_its_share_logs_it_once_and_takes_it_for_no_wish(
     + [{"since_ms": 1, "last_ms": last_ms, "batches": 1} for last_ms in (-1, 10**15, True)],
 )
 def test_odd_words_about_its_share_are_passed_over(said: Any) -> None:
-    assert Rig(over_share=said).remote.over_share is None
+    assert Rig(over_share=said).shadow.over_share is None
 
 
 def test_a_report_that_gets_no_answer_is_sent_again() -> None:
@@ -266,14 +263,14 @@ def test_no_wish_whatever_brings_it_down(wished: dict[str, Any]) -> None:
 def test_what_became_of_commands_is_reported_and_a_new_run_forgets_it() -> None:
     rig = Rig(live={"rate_hz": 2})
     command = Command("feedbeef", 1, 7, 2, 500, {}, answer=True)
-    rig.remote.answer("drive", command, None)
+    rig.shadow.answer("drive", command, None)
     rig.settle()
     assert rig.reported["commands"]["drive"] == {"session": "feedbeef", "seq": 7, "outcome": "accepted"}
-    rig.remote.answer("drive", replace(command, seq=8), "stale" * 100)
+    rig.shadow.answer("drive", replace(command, seq=8), "stale" * 100)
     rig.settle()
     assert rig.reported["commands"]["drive"]["seq"] == 8
     assert len(rig.reported["commands"]["drive"]["outcome"]) < 250
-    rig.remote._answers.clear()
-    rig.remote._follow()
+    rig.shadow._answers.clear()
+    rig.shadow._follow()
     rig.settle()
     assert not rig.reported.get("commands")
