@@ -20,7 +20,10 @@ from iort_agent.mqtt.aws import IotCore
 from iort_agent.mqtt.dispatch import Dispatcher
 from iort_agent.mqtt.rate_limiter import RateLimiter
 from iort_agent.mqtt.uplink import Link
-from iort_contract import BROKER, PING, PONG, RTT_FIELDS, Value, build_topic, encode_ping
+from iort_contract.catalog.streams import RTT_FIELDS
+from iort_contract.limits import Value
+from iort_contract.messages.live import encode_ping
+from iort_contract.topics import BROKER, PING, PONG, build_topic
 from iort_station.fleet.robots import Bundle
 
 RAW = "raw client"

@@ -6,7 +6,6 @@ from __future__ import annotations
 from dataclasses import dataclass
 from pathlib import Path
 
-import iort_contract
 from iort_agent.common.logs import LOG_LEVELS
 from iort_agent.common.schema import (
     Place,
@@ -30,6 +29,9 @@ from iort_agent.sources import SourceConfig
 from iort_agent.sources.registry import SOURCES, uploads_large
 from iort_agent.spool.config import QueueConfig
 from iort_agent.status.metrics import MetricsConfig
+from iort_contract.catalog.streams import OWN_STREAMS
+from iort_contract.limits import DEFAULT_NAMESPACE
+from iort_contract.topics import check_namespace, check_robot
 
 
 @dataclass(frozen=True)
@@ -40,7 +42,7 @@ class Config:
     default ``status_socket`` is agent.sock beside the file.
     """
 
-    robot: str = setting(text(iort_contract.check_robot))
+    robot: str = setting(text(check_robot))
     endpoint: str = setting(text())
     certificate: Path = setting(existing_path())
     private_key: Path = setting(existing_path())
@@ -48,7 +50,7 @@ class Config:
         items(variant("type", SOURCES), at_least=1, what="a list of at least one source")
     )
     root_ca: Path | None = setting(existing_path(), None)
-    namespace: str = setting(text(iort_contract.check_namespace), iort_contract.DEFAULT_NAMESPACE)
+    namespace: str = setting(text(check_namespace), DEFAULT_NAMESPACE)
     port: int = setting(number(1, 65535, whole=True), 8883)
     record: RecordConfig = setting(section(RecordConfig), RecordConfig())
     live: LiveConfig = setting(section(LiveConfig), LiveConfig())
@@ -81,7 +83,7 @@ def load_config(file: Path) -> Config:
 
 def _check_streams(config: Config, place: Place) -> None:
     """Two sources must not write one stream: their samples would mix into one time series."""
-    taken: list[str] = sorted(iort_contract.OWN_STREAMS)
+    taken: list[str] = sorted(OWN_STREAMS)
     for i, source in enumerate(config.sources):
         for stream in source.streams():
             if stream in taken:

@@ -6,11 +6,11 @@ import logging
 import threading
 from typing import Callable, Sequence
 
-import iort_contract
 from iort_agent.agent import Agent
 from iort_agent.lanes.record import TODO, too_many
 from iort_agent.sources import Emit
 from iort_agent.sources.run import SourceRun
+from iort_contract.catalog.streams import AGENT_STREAM, OWN_STREAMS
 
 _log = logging.getLogger(__name__)
 
@@ -100,10 +100,10 @@ class Runtime:
 
     def _measure(self) -> None:
         """Record a sample of the agent's own stream."""
-        streams, own = self.agent.streams, iort_contract.OWN_STREAMS
+        streams, own = self.agent.streams, OWN_STREAMS
         samples = sum(counts.samples for name, counts in streams.counts().items() if name not in own)
         sample = self.agent.metrics.sample(samples)
-        streams.record(iort_contract.AGENT_STREAM, self.agent.clock.now_us(), sample)
+        streams.record(AGENT_STREAM, self.agent.clock.now_us(), sample)
 
     def _start_source(self, i: int, source: SourceRun) -> threading.Thread:
         emit: Emit = self.agent.streams.emit

@@ -8,7 +8,7 @@ from urllib.parse import unquote
 
 from aiohttp import web
 
-import iort_contract
+from iort_contract.limits import MAX_PUBNUB_BYTES
 from local.pubnub.history import Message
 
 
@@ -28,14 +28,14 @@ class Refusal(Exception):  # noqa: N818 - an answer, not a fault
         )
 
 
-async def read(request: web.BaseRequest) -> str:
+async def content(request: web.BaseRequest) -> str:
     """The body of a request, inflated."""
     try:
         body = await request.read()
         if request.headers.get("Content-Encoding") == "gzip":
             # 47 accepts both headers: the Python SDK announces gzip and sends zlib.
             inflater = zlib.decompressobj(47)
-            body = inflater.decompress(body, iort_contract.MAX_PUBNUB_BYTES)
+            body = inflater.decompress(body, MAX_PUBNUB_BYTES)
             if inflater.unconsumed_tail:
                 raise Refusal(413, "Message Too Large")
             if not inflater.eof:
@@ -47,7 +47,7 @@ async def read(request: web.BaseRequest) -> str:
         raise Refusal(400, "Invalid Encoding") from None
 
 
-def text(quoted: str) -> str:
+def unquoted(quoted: str) -> str:
     """A part of the path, unquoted."""
     try:
         return unquote(quoted, errors="strict")

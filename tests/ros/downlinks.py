@@ -14,7 +14,6 @@ import sys
 import time
 from pathlib import Path
 
-import iort_contract
 from iort_agent.clock import SystemClock
 from iort_agent.common.schema import Place, load
 from iort_agent.common.state import ClockOffset
@@ -23,6 +22,7 @@ from iort_agent.control.downlink import Downlink
 from iort_agent.mqtt.dispatch import Dispatcher
 from iort_agent.ros1.node import DEFAULT_NODE
 from iort_agent.ros1.publish import Ros1Graph
+from iort_contract.messages.commands import Command, FleetMessage, encode_command, encode_fleet
 from tests.agent_fakes import Loopback, link_of
 
 
@@ -64,15 +64,13 @@ for seq, line in zip(itertools.count(), sys.stdin):
         say("heard")
     elif verb == "pose":
         robot, _, message = rest.partition(" ")
-        fleet = iort_contract.FleetMessage("1badcafe", seq, clock.now_us(), json.loads(message))
-        uplink.deliver(f"fleet/iort/{robot}/pose", iort_contract.encode_fleet(fleet))
+        fleet = FleetMessage("1badcafe", seq, clock.now_us(), json.loads(message))
+        uplink.deliver(f"fleet/iort/{robot}/pose", encode_fleet(fleet))
     else:
         lease, _, message = rest.partition(" ")
         now_us = clock.now_us()
-        command = iort_contract.Command(
-            "feedbeef", started_us, seq, now_us, 60_000, json.loads(message), int(lease)
-        )
-        uplink.deliver("cmd/iort/car1/drive", iort_contract.encode_command(command))
+        command = Command("feedbeef", started_us, seq, now_us, 60_000, json.loads(message), int(lease))
+        uplink.deliver("cmd/iort/car1/drive", encode_command(command))
 downlink.halt()
 uplink.stop(1)
 downlink.close()

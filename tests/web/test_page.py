@@ -8,7 +8,8 @@ from typing import TYPE_CHECKING, Any, Literal
 
 import pytest
 
-import iort_contract
+from iort_contract.catalog.vesc import TEMPERATURES
+from iort_contract.limits import Value
 from iort_station.page.server import PageServer
 from local.pubnub.standin import PubNubStandIn
 from tests.browser import drawn, plain, show, shown, until
@@ -55,6 +56,14 @@ def test_values_shown_are_values_sent(page: Page, car: Car) -> None:
         assert plain(page.inner_text(f"[data-reading='{name}']")) == text
 
 
+def test_the_hottest_is_of_all_the_temperatures_that_the_alarm_counts(page: Page, car: Car) -> None:
+    for hot in TEMPERATURES:
+        show(page, car.send({**dict.fromkeys(TEMPERATURES, 0), "temperature_pcb": -4.5, hot: 81.5}))
+        assert shown(page, "temperature") == "81.5"
+    show(page, car.send({**dict.fromkeys(TEMPERATURES, 0), "temperature_pcb": -4.5}))
+    assert shown(page, "temperature") == "-4.5"
+
+
 def test_charge_and_energy_have_the_unit_of_the_driver_that_sent_them(page: Page, car: Car) -> None:
     show(page, car.send({**SAMPLE, "charge_drawn": 0, "energy_drawn": 0}))
     page.click("[data-stream='vesc'] .tile:has([data-value='charge_drawn'])")
@@ -75,7 +84,7 @@ def test_every_newer_message_is_shown(page: Page, car: Car) -> None:
 
 
 def test_any_field_of_any_stream_is_shown(page: Page, car: Car) -> None:
-    sample: dict[str, iort_contract.Value] = {
+    sample: dict[str, Value] = {
         "pose.x": -1.25,
         "armed": True,
         "frame": "map",

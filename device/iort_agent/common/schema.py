@@ -14,8 +14,8 @@ from typing import Any, Callable, Iterable, Mapping, NamedTuple, TypeVar
 
 import yaml
 
-import iort_contract
 from iort_agent.errors import ConfigError
+from iort_contract.limits import ContractError
 
 T = TypeVar("T")
 # YAML may have read a value as another type than its writer meant.
@@ -119,7 +119,7 @@ def text(check: Callable[[str], str] | None = None) -> Rule:
             raise place.error(value, "a text", quotes)
         try:
             return check(value) if check else value
-        except iort_contract.ContractError as error:
+        except ContractError as error:
             raise place.problem(str(error)) from error
 
     return rule

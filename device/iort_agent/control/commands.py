@@ -6,16 +6,16 @@ import logging
 import threading
 from typing import Any, Callable, Optional
 
-import iort_contract
 from iort_agent.control.bridge import Bridge
 from iort_agent.control.config import CommandConfig, DownlinkConfig
 from iort_agent.control.leases import Leases, Limits
 from iort_agent.errors import ConfigError
 from iort_agent.mqtt.uplink import MqttMessage
 from iort_agent.ros1.json_message import encode
-from iort_contract import CMD, Command, ContractError
-from iort_contract.limits import MessageError
+from iort_contract.limits import ContractError, MessageError
+from iort_contract.messages.commands import Command, decode_command
 from iort_contract.ros1.definition import Definition
+from iort_contract.topics import CMD
 
 _log = logging.getLogger(__name__)
 
@@ -103,7 +103,7 @@ class Commands:
     def _on_message(self, message: MqttMessage) -> None:
         command = self._commands[message.topic]
         try:
-            offered = iort_contract.decode_command(message.payload)
+            offered = decode_command(message.payload)
         except ContractError as error:
             self._bridge.reject(message.topic, "malformed", str(error))
             return

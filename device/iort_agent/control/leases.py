@@ -14,7 +14,7 @@ from __future__ import annotations
 
 from typing import NamedTuple
 
-from iort_contract import Command
+from iort_contract.messages.commands import Command
 
 # Repetitions of a stop after the first one.
 STOP_REPEATS = 4

@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-import iort_contract
 from iort_agent.control.bridge import Bridge
 from iort_agent.control.config import ROBOT_IN_TOPIC, DownlinkConfig, FleetConfig
 from iort_agent.mqtt.uplink import MqttMessage
 from iort_agent.ros1.json_message import encode
-from iort_contract import FLEET, ContractError, FleetMessage
-from iort_contract.limits import MessageError
+from iort_contract.limits import ContractError, MessageError
+from iort_contract.messages.commands import FleetMessage, decode_fleet
 from iort_contract.ros1.definition import Definition
+from iort_contract.topics import FLEET, parse_topic
 
 # Each robot needs a ROS topic; a lab has fewer robots than this.
 _MAX_ROBOTS = 64
@@ -56,13 +56,13 @@ class Peers:
         return {name: dict(one.passed) for name, one in self._names.items()}
 
     def _on_message(self, message: MqttMessage) -> None:
-        topic = iort_contract.parse_topic(message.topic)
+        topic = parse_topic(message.topic)
         if topic.robot == self._bridge.link.robot:
             return
         name = self._names[topic.name]
         what, now_us = f"{FLEET} {topic.name}", self._bridge.link.clock.now_us()
         try:
-            heard = iort_contract.decode_fleet(message.payload)
+            heard = decode_fleet(message.payload)
             data = encode(name.definition, heard.message, now_us=now_us)
         except (ContractError, MessageError) as error:
             self._bridge.reject(what, "malformed", f"{topic.robot}: {error}")

@@ -10,17 +10,16 @@ import dataclasses
 from pathlib import Path
 from typing import Any, Iterable, Iterator, Mapping
 
-import iort_contract
 from iort_agent.common.logs import LOG_LEVELS
 from iort_agent.common.schema import Place, Rule, choice, did_you_mean, items, rules_of, text
 from iort_agent.errors import ConfigError
 from iort_agent.lanes.config import LiveConfig, PingConfig, RecordConfig, RuntimeSettings
+from iort_contract.checks import check_field
+from iort_contract.topics import check_stream
 
 _PLACE = Place(Path("shadow agent"))
 FIELDS = "fields"
-_FIELD_LIST = items(
-    text(iort_contract.check_field), what="a list of field names; an empty one means all fields"
-)
+_FIELD_LIST = items(text(check_field), what="a list of field names; an empty one means all fields")
 RULES: dict[str, Rule] = {
     "record.enabled": rules_of(RecordConfig)["enabled"],
     "live.enabled": rules_of(LiveConfig)["enabled"],
@@ -72,7 +71,7 @@ def _flat(desired: Mapping[str, Any]) -> Iterator[tuple[str, Any]]:
 
 def _selection(stream: str, value: Any, known: Iterable[str] | None) -> tuple[str, ...]:
     place = _PLACE.child(FIELDS).child(stream)
-    text(iort_contract.check_stream)(stream, place)
+    text(check_stream)(stream, place)
     names: tuple[str, ...] = _FIELD_LIST(value, place)
     for name in names if known is not None else ():
         if name not in (known or ()):

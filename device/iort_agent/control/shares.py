@@ -6,14 +6,14 @@ import functools
 import threading
 from typing import Callable, Mapping, Sequence
 
-import iort_contract
 from iort_agent.control.bridge import Bridge
 from iort_agent.control.config import ShareConfig
 from iort_agent.mqtt.rate_limiter import STEADY
 from iort_agent.ros1.json_message import decode
-from iort_contract import FLEET, ContractError, FleetMessage
-from iort_contract.limits import MessageError
+from iort_contract.limits import ContractError, MessageError
+from iort_contract.messages.commands import FLEET_MAX_AGE_MS, FleetMessage, encode_fleet
 from iort_contract.ros1.definition import Definition, parse
+from iort_contract.topics import FLEET
 
 # A message waits this long for the rate limiter, unless a newer one replaces it.
 _NO_ROOM_S = 0.05
@@ -90,11 +90,11 @@ class Shares:
             one.due = now + _NO_ROOM_S
             return
         (header, data, at), one.newest = one.newest, None
-        if now - at > iort_contract.FLEET_MAX_AGE_MS / 1000 or not self._link.uplink.connected():
+        if now - at > FLEET_MAX_AGE_MS / 1000 or not self._link.uplink.connected():
             return
         try:
             message = decode(one.definition(header), data)
-            payload = iort_contract.encode_fleet(
+            payload = encode_fleet(
                 FleetMessage(self._boot, one.seq, self._clock.now_us(), message, self._bridge.offset_us())
             )
         except (ContractError, MessageError) as error:

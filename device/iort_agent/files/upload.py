@@ -12,12 +12,20 @@ import uuid
 from pathlib import Path
 from typing import Callable
 
-import iort_contract
 from iort_agent.errors import UploadError
 from iort_agent.files.file import LocalFile, changed, look_at
 from iort_agent.files.http import ByteRate, Outcome, Sender, trusting
 from iort_agent.mqtt.uplink import Link, MqttMessage
-from iort_contract import FILE, MAX_ADDRESSES, PING, PONG, ContractError, FileAnswer, FileRequest
+from iort_contract.limits import ContractError
+from iort_contract.messages.files import (
+    MAX_ADDRESSES,
+    FileAnswer,
+    FileRequest,
+    decode_file_answer,
+    encode_file_request,
+    part_range,
+)
+from iort_contract.topics import FILE, PING, PONG
 
 _log = logging.getLogger(__name__)
 
@@ -52,7 +60,7 @@ class _Requests:
         Raises `UploadError` for a request that the contract does not allow.
         """
         try:
-            payload = iort_contract.encode_file_request(request)
+            payload = encode_file_request(request)
         except ContractError as error:
             raise UploadError(str(error), again_s=None) from error
         heard = threading.Event()
@@ -72,7 +80,7 @@ class _Requests:
 
     def _on_answer(self, message: MqttMessage) -> None:
         try:
-            answer = iort_contract.decode_file_answer(message.payload)
+            answer = decode_file_answer(message.payload)
         except ContractError as error:
             _log.warning("an answer about a file cannot be read: %s", error)
             return
@@ -186,7 +194,7 @@ class _Transfer:
     def part_range(self, part: int) -> tuple[int, int]:
         """First byte and size of a part."""
         try:
-            return iort_contract.part_range(self.local.file, part)
+            return part_range(self.local.file, part)
         except ContractError as error:
             raise UploadError(f"{self.local.path}: the cloud's address: {error}", again_s=None) from error
 

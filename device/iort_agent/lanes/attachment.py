@@ -13,7 +13,6 @@ import threading
 from pathlib import Path, PurePath
 from typing import Any, Callable, Mapping
 
-import iort_contract
 from iort_agent.clock import Clock
 from iort_agent.common.private_files import write_below
 from iort_agent.common.throttled_log import ThrottledLog
@@ -22,8 +21,9 @@ from iort_agent.files.file import kind_of, wire_name
 from iort_agent.files.uploads import Uploads
 from iort_agent.lanes.thumbnail import thumbnail
 from iort_agent.sources import Emit
-from iort_contract import ATTACHMENT_AT, ATTACHMENT_FIELDS, File, RosMessage, Value
-from iort_contract.ros1.message import cut
+from iort_contract.limits import Value
+from iort_contract.messages.files import ATTACHMENT_AT, ATTACHMENT_FIELDS, File, file_key
+from iort_contract.ros1.message import RosMessage, cut
 
 _log = logging.getLogger(__name__)
 
@@ -149,7 +149,7 @@ class Attachments:
         self.kept += 1
         self._stored()
         return {
-            "key": iort_contract.file_key(self._robot, file),
+            "key": file_key(self._robot, file),
             "sha256": sha256,
             "size": len(content),
             "content_type": content_type,

@@ -12,7 +12,7 @@ from typing import NamedTuple
 
 from iort_agent.clock import Clock
 from iort_agent.common.state import ClockOffset
-from iort_contract import CLOCK_MAX_UNCERTAINTY_MS
+from iort_contract.limits import CLOCK_MAX_UNCERTAINTY_MS
 
 # A rule's timestamp() truncates to whole milliseconds.
 _STAMP_MS = 0.5

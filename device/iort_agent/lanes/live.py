@@ -25,14 +25,24 @@ import threading
 from collections import deque
 from typing import Callable, Mapping, NamedTuple
 
-import iort_contract
 from iort_agent.errors import UplinkError
 from iort_agent.mqtt.rate_limiter import LIVE, URGENT
 from iort_agent.mqtt.uplink import Link
-from iort_contract import ContractError, LiveSample, Value
+from iort_contract import topics
+from iort_contract.catalog.vesc import FAULT_FIELD
+from iort_contract.limits import (
+    LIVE_BROKER_EVERY_S,
+    LIVE_MAX_AGE_MS,
+    LIVE_MAX_RATE_HZ,
+    MAX_MESSAGE_BYTES,
+    ContractError,
+    Value,
+)
+from iort_contract.messages.live import LiveSample, encode_live
+from iort_contract.topics import live_topic
 
 _log = logging.getLogger(__name__)
-_FASTEST_S = 1 / iort_contract.LIVE_MAX_RATE_HZ
+_FASTEST_S = 1 / LIVE_MAX_RATE_HZ
 # Rates are means of so many seconds. The lane counts as slowed once streams were late in more than half of
 # them, until they were late in none.
 _SECONDS = 5
@@ -134,9 +144,9 @@ class LiveLane:
         with self._lock:
             slot = self._slots.get(stream)
             if slot is None:
-                live_topic = iort_contract.live_topic(self._link.robot, stream, self._link.namespace)
-                broker_topic = self._link.topic(iort_contract.LIVE, stream)
-                slot = self._slots[stream] = _Slot(live_topic, broker_topic, turn=self._turn)
+                basic_ingest = live_topic(self._link.robot, stream, self._link.namespace)
+                broker_topic = self._link.topic(topics.LIVE, stream)
+                slot = self._slots[stream] = _Slot(basic_ingest, broker_topic, turn=self._turn)
                 self._turn += 1
             slot.t_us, slot.values, slot.offered = t_us, values, now
             slot.offers += 1
@@ -151,7 +161,7 @@ class LiveLane:
             for slot in self._slots.values():
                 if slot.values is None:
                     continue
-                if now - slot.offered > iort_contract.LIVE_MAX_AGE_MS / 1000:
+                if now - slot.offered > LIVE_MAX_AGE_MS / 1000:
                     slot.values = None
                 elif now >= slot.due + self._period_s / 2 or slot.is_new_fault(now):
                     self._take_turn(slot, now)
@@ -267,7 +277,7 @@ def _written(slot: _Slot, error: UplinkError | None) -> None:
 
 def _fault(values: Mapping[str, Value]) -> Value:
     """The fault code; None for NaN, which never equals itself."""
-    code = values.get(iort_contract.FAULT_FIELD)
+    code = values.get(FAULT_FIELD)
     return code if code == code else None  # noqa: PLR0124 - False for NaN alone
 
 
@@ -275,14 +285,12 @@ def _topic(slot: _Slot, fault: Value, now: float) -> str:
     """The topic for the next message of a stream."""
     if now < slot.broker_due and fault == slot.fault:
         return slot.topic
-    slot.broker_due, slot.fault = now + iort_contract.LIVE_BROKER_EVERY_S, fault
+    slot.broker_due, slot.fault = now + LIVE_BROKER_EVERY_S, fault
     return slot.broker_topic
 
 
 def _encode(sample: LiveSample) -> bytes:
-    payload = iort_contract.encode_live(sample)
-    if len(payload) > iort_contract.MAX_MESSAGE_BYTES:
-        raise ContractError(
-            f"the message must have at most {iort_contract.MAX_MESSAGE_BYTES} bytes, got {len(payload)}"
-        )
+    payload = encode_live(sample)
+    if len(payload) > MAX_MESSAGE_BYTES:
+        raise ContractError(f"the message must have at most {MAX_MESSAGE_BYTES} bytes, got {len(payload)}")
     return payload

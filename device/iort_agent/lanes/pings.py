@@ -6,14 +6,16 @@ import threading
 from collections import deque
 from typing import Callable, Sequence
 
-import iort_contract
 from iort_agent.clock import Pace
 from iort_agent.common.state import RoundTrips
 from iort_agent.lanes.config import PingConfig
 from iort_agent.mqtt.rate_limiter import STEADY
 from iort_agent.mqtt.uplink import Link, MqttMessage
 from iort_agent.sources import Emit
-from iort_contract import PING, PONG, ContractError, Value
+from iort_contract.catalog.streams import RTT_FIELDS, RTT_STREAM
+from iort_contract.limits import ContractError, Value
+from iort_contract.messages.live import decode_pong, encode_ping
+from iort_contract.topics import BROKER, PING, PONG, RULE, parse_topic
 
 TIMEOUT_S = 10.0
 # How often a ping measures the clock offset if round trips through a rule are not measured; more often until
@@ -42,7 +44,7 @@ class _Path:
 
 
 class Pings:
-    """Sends pings, takes pongs, and emits each round trip as a sample of `iort_contract.RTT_STREAM`.
+    """Sends pings, takes pongs, and emits each round trip as a sample of `RTT_STREAM`.
 
     ``on_stamp`` gets every round trip through a rule. If none is measured, one every `CLOCK_EVERY_S` is made
     for the clock offset. ``held_back`` counts the pings that the rate limiter did not let through."""
@@ -58,9 +60,9 @@ class Pings:
         self._next_id = 0
         self._paths: dict[str, _Path] = {}
         self._clock_every_s, self._clock_due = CLOCK_FIRST_EVERY_S, self._clock.monotonic()
-        for name in dict.fromkeys([*config.paths, iort_contract.RULE]):
+        for name in dict.fromkeys([*config.paths, RULE]):
             # The broker returns the ping itself; the cloud answers on a topic of its own.
-            lane = PING if name == iort_contract.BROKER else PONG
+            lane = PING if name == BROKER else PONG
             path = self._paths[name] = _Path(link.topic(PING, name), link.topic(lane, name))
             self._uplink.subscribe(path.pong, self._on_pong)
 
@@ -99,7 +101,7 @@ class Pings:
             ping_id = self._next_id
             self._next_id += 1
             path.sent += 1
-            payload = iort_contract.encode_ping(ping_id, self._clock.now_us(), self._padding)
+            payload = encode_ping(ping_id, self._clock.now_us(), self._padding)
             path.waiting[ping_id] = self._clock.monotonic()
         # A ping that is not written counts as lost later.
         self._link.publish(path.ping, payload, qos=0)
@@ -109,8 +111,8 @@ class Pings:
         """Count late pings as lost, and send a ping for the clock offset if one is due."""
         now = self._clock.monotonic()
         self._expire(now - TIMEOUT_S)
-        measured = self._rate_hz and iort_contract.RULE in self._names
-        if not measured and now >= self._clock_due and self.send(iort_contract.RULE):
+        measured = self._rate_hz and RULE in self._names
+        if not measured and now >= self._clock_due and self.send(RULE):
             self._clock_due = now + self._clock_every_s
 
     def close(self, timeout_s: float) -> None:
@@ -126,10 +128,10 @@ class Pings:
             return {name: path.report() for name, path in self._paths.items()}
 
     def _on_pong(self, message: MqttMessage) -> None:
-        name = iort_contract.parse_topic(message.topic).name
+        name = parse_topic(message.topic).name
         path = self._paths[name]
         try:
-            pong = iort_contract.decode_pong(message.payload)
+            pong = decode_pong(message.payload)
         except ContractError:
             return  # from another client that may publish there
         with self._lock:
@@ -140,14 +142,14 @@ class Pings:
             path.received += 1
             path.rtts_ms.append(rtt_ms)
             self._lock.notify_all()
-        if name == iort_contract.RULE and pong.received_ms is not None:
+        if name == RULE and pong.received_ms is not None:
             self._clock_every_s = CLOCK_EVERY_S
             self._on_stamp(sent, message.at, pong.received_ms)
         if not self._rate_hz or name not in self._names:
             return
-        values: dict[str, Value] = dict.fromkeys(iort_contract.RTT_FIELDS.values())
-        values[iort_contract.RTT_FIELDS[name]] = rtt_ms
-        self._emit(iort_contract.RTT_STREAM, self._clock.now_us(), values)
+        values: dict[str, Value] = dict.fromkeys(RTT_FIELDS.values())
+        values[RTT_FIELDS[name]] = rtt_ms
+        self._emit(RTT_STREAM, self._clock.now_us(), values)
 
     def _expire(self, before: float) -> None:
         with self._lock:

@@ -5,11 +5,11 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Callable, NamedTuple, Optional, Protocol
 
-import iort_contract
 from iort_agent.clock import Clock
 from iort_agent.common.state import Connection
 from iort_agent.errors import UplinkError
 from iort_agent.mqtt.rate_limiter import RateLimiter
+from iort_contract.topics import build_topic
 
 # Called once for a publish: with None when the broker has acknowledged it (QoS 1) or it was written (QoS 0).
 # For QoS 0 it may be called within `publish`, and in any thread: it may only note the outcome.
@@ -77,7 +77,7 @@ class Link:
 
     def topic(self, lane: str, name: str) -> str:
         """The robot's topic of this lane and name."""
-        return iort_contract.build_topic(lane, self.robot, name, self.namespace)
+        return build_topic(lane, self.robot, name, self.namespace)
 
     def publish(self, topic: str, payload: bytes, *, qos: int, done: Done = ignore) -> None:
         """Publish, and charge the rate limiter. It was asked before, or the message is rare."""

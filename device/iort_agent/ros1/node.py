@@ -126,7 +126,7 @@ class Node:
         self._absent = False
         self._displaced = False
         self._losses = 0
-        # Place the other node of our name was seen.
+        # Where the other node of our name was seen.
         self._holder: str | None = None
         rosgraph = importlib.import_module("rosgraph")
         # The command line's remappings, as every ROS node reads them.
@@ -284,7 +284,7 @@ class Node:
         self.waits = None
 
     def _living_namesake(self) -> str | None:
-        """Place a node of our name answers; a dead one's registration stays at the master for ever."""
+        """Where a node of our name answers; a dead one's registration stays at the master for ever."""
         _, _, registered = self._master.lookupNode(self._me, self._me)
         # A master that was restarted does not know yet whom we wait for.
         for uri in (registered, self._holder):

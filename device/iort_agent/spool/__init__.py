@@ -1,1 +1,1 @@
-"""Place batches wait until the broker has acknowledged them, in memory or on disk."""
+"""Where batches wait until the broker has acknowledged them, in memory or on disk."""

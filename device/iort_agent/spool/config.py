@@ -27,7 +27,7 @@ def _queue_file(value: Any, where: Place) -> Path | None:
 
 @dataclass(frozen=True)
 class QueueConfig:
-    """Place batches wait for the broker, and what to drop when it is full (Greengrass' words).
+    """Where batches wait for the broker, and what to drop when it is full (Greengrass' words).
 
     ``path``: the queue's file, which need not exist; without it, the queue ends with the agent.
     ``max_bytes`` bounds the batches in it, and the file is a little larger. ``durability``: what the

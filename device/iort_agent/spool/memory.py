@@ -1,4 +1,4 @@
-"""Place batches wait until the broker has acknowledged them: the only place that keeps them.
+"""Where batches wait until the broker has acknowledged them: the only place that keeps them.
 
 `MemorySpool` ends with the process; `iort_agent.spool.sqlite.SqliteSpool` keeps them on disk.
 """

@@ -51,7 +51,7 @@ class Stock:
         self._gone: set[int] = set()
         self.seqs: dict[str, int] = {}
         self._used: set[str] = set()
-        # Place streams begin that are not known: above 0 only if there are too many to know each.
+        # Where streams begin that are not known: above 0 only if there are too many to know each.
         self._floor = 0
         self.dropped = self._dropped_before = Dropped(0, 0)
         self._dropped_written = Dropped(0, 0)

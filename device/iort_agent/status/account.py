@@ -8,7 +8,7 @@ from iort_agent.clock import Clock
 from iort_agent.lanes.batch import StreamCounts
 from iort_agent.lanes.streams import Streams
 from iort_agent.spool.memory import Spool
-from iort_contract import ACCOUNT_STREAM
+from iort_contract.catalog.streams import ACCOUNT_STREAM
 from iort_contract.messages.account import ACCOUNT_EVERY_S, SourceAccount, StreamAccount
 
 # A loss is reported within a second.

@@ -16,7 +16,8 @@ from iort_agent.lanes.batch import StreamCounts
 from iort_agent.lanes.clock_offset import OffsetEstimator
 from iort_agent.mqtt.uplink import Uplink
 from iort_agent.spool.memory import Spool
-from iort_contract import AGENT_FIELDS, Value
+from iort_contract.catalog.streams import AGENT_FIELDS
+from iort_contract.limits import Value
 
 _STATM = Path("/proc/self/statm")
 

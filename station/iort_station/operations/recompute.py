@@ -8,9 +8,9 @@ from collections.abc import Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from typing import Any, NamedTuple
 
-from iort_contract import (
+from iort_contract.catalog.streams import OWN_STREAMS
+from iort_contract.tables import (
     EXPIRES_S,
-    OWN_STREAMS,
     RECEIVED_MS,
     RECOMPUTE_FROM_S,
     RECOMPUTED,

@@ -10,11 +10,12 @@ import math
 import re
 from importlib.resources import files
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
-import iort_contract
+from iort_contract.limits import ContractError
+from iort_contract.messages.page import Config
 from iort_contract.page import PUBNUB_ORIGIN
-from iort_station.data.units import ROS_UNITS, agent_unit
+from iort_contract.topics import check_namespace, check_robot
 from iort_station.errors import StationError
 
 if TYPE_CHECKING:
@@ -57,7 +58,7 @@ def config(
     vehicles: Mapping[str, Mapping[str, float]] | None = None,
     token: str = "",
     answers: bool = False,
-) -> dict[str, Any]:
+) -> Config:
     """What the page is told, ``/config.json``; raises `StationError` for what it must not be told.
 
     ``vehicles`` maps a robot to its parameters; with ``speed_to_erpm_gain`` (and ``_offset``) the page
@@ -65,9 +66,9 @@ def config(
     only read.
     """
     try:
-        iort_contract.check_namespace(namespace)
-        known = {iort_contract.check_robot(robot): dict(car) for robot, car in (vehicles or {}).items()}
-    except iort_contract.ContractError as error:
+        check_namespace(namespace)
+        known = {check_robot(robot): dict(car) for robot, car in (vehicles or {}).items()}
+    except ContractError as error:
         raise StationError(f"the page's configuration: {error}") from error
     if not _KEY.fullmatch(subscribe_key):
         raise StationError("the page's subscribe_key: allowed is 1 to 128 of A-Z a-z 0-9 _ -")
@@ -94,29 +95,4 @@ def config(
         "vehicles": known,
         "token": token,
         "answers": answers,
-    }
-
-
-def field_table() -> dict[str, Any]:
-    """The contract's field table as the page reads it, ``/fields.json``."""
-    fields = {
-        f.name: {"unit": f.unit, "meaning": f.meaning} | ({"ros2_unit": f.ros2_unit} if f.ros2_unit else {})
-        for f in iort_contract.VESC_FIELDS.values()
-    }
-    fields |= {name: {"unit": unit, "meaning": ""} for name, unit in iort_contract.DERIVED_UNITS.items()}
-    fields |= {
-        name: {"unit": "ms", "meaning": f"round trip over the path {path}"}
-        for path, name in iort_contract.RTT_FIELDS.items()
-    }
-    fields |= {
-        name: {"unit": agent_unit(name), "meaning": meaning}
-        for name, meaning in iort_contract.AGENT_FIELDS.items()
-    }
-    faults = {str(code): name for code, name in iort_contract.FAULTS.items()}
-    return {
-        "version": iort_contract.SCHEMA_VERSION,
-        "stream": iort_contract.VESC_STREAM,
-        "fields": fields,
-        "ros_units": ROS_UNITS,
-        "faults": faults,
     }

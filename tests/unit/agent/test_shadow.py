@@ -15,7 +15,7 @@ from iort_agent.control.runtime_settings import overlay
 from iort_agent.control.shadow import Shadow, _difference, _merged
 from iort_agent.lanes.config import RuntimeSettings
 from iort_agent.mqtt.dispatch import Dispatcher
-from iort_contract import Command
+from iort_contract.messages.commands import Command
 from tests.agent_fakes import Loopback, ManualClock, link_of
 
 BASE = RuntimeSettings(

@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-import iort_contract
 from functions.shared import cut_off, stored
 from iort_agent.mqtt import rate_limiter
 from iort_contract import limits
+from iort_contract.messages import commands, files
 from iort_contract.ros1.message import MAX_LAYOUT
 from local.gaps.broker.connect_timeout import CONNECT_S
 from local.gaps.broker.message_size import AWS_MESSAGE_BYTES
@@ -24,10 +24,15 @@ UNITS = {
     "MAX_AHEAD_US": (86_400_000_000, "days"),
     "LIVE_BROKER_EVERY_S": (1, "s"),
     "UPLOAD_URL_S": (1, "s"),
+    "STALE_S": (1, "s"),
+    "GONE_S": (1, "s"),
     **dict.fromkeys(("LIVE_MAX_AGE_MS", "CLOCK_MAX_UNCERTAINTY_MS", "FLEET_MAX_AGE_MS"), (1, "ms")),
     **dict.fromkeys(("MAX_VALID_MS", "MAX_LEASE_MS"), (1, "ms")),
     "upload_gb_a_day": (1, "GB"),
 }
+
+# The modules that define limits.
+MODULES = (limits, commands, files)
 
 
 def test_each_limit_is_told_as_it_is() -> None:
@@ -38,7 +43,7 @@ def test_each_limit_is_told_as_it_is() -> None:
         "BURST": cut_off.BURST,
         "A_SECOND": cut_off.A_SECOND,
         "upload_gb_a_day": Settings.__dataclass_fields__["upload_gb_a_day"].default,
-        **{name: getattr(of, name) for of in (limits, iort_contract) for name in table if hasattr(of, name)},
+        **{name: getattr(of, name) for of in MODULES for name in table if hasattr(of, name)},
     }
     assert table.keys() == told.keys()
     for name, value in told.items():
@@ -51,7 +56,7 @@ def test_each_limit_is_told_as_it_is() -> None:
 def test_no_limit_of_the_contract_is_left_out() -> None:
     text = section("## Limits")
     every = {name for name in vars(limits) if name.isupper() and not name.startswith("_")}
-    every |= {name for name in iort_contract.__all__ if name.startswith("MAX_")}
+    every |= {name for of in MODULES for name in vars(of) if name.startswith("MAX_")}
     assert {name for name in every if f"`{name}`" not in text} == set()
 
 

@@ -57,7 +57,7 @@ class Numbers:
         self.missed = 0
         # The last number of each publisher, the most recent at the end.
         self._last: list[int] = []
-        # Place a gap began -> how many are missing.
+        # Where a gap began -> how many are missing.
         self._gaps: dict[int, int] = {}
 
     def take(self, seq: int) -> None:

@@ -1,7 +1,7 @@
 """ROS topics over the rosbridge WebSocket protocol, which serves ROS 1 and ROS 2 robots alike.
 
 JSON has no types, so they are asked of the server's rosapi, and each message is made the ROS 1 message that
-it was; it then goes the way of the ROS 1 source. Place rosapi does not answer, a sample is made of the JSON,
+it was; it then goes the way of the ROS 1 source. Where rosapi does not answer, a sample is made of the JSON,
 as `iort_agent.sources.flatten` does, and counted as ``structure_not_kept``: a ``uint8[]`` is a text there,
 arrays of more than `MAX_ELEMENTS` and texts that the contract would refuse are left out, unless they are what
 `fields` selects, and a ROS 1 time is named as in ROS 2.
@@ -16,7 +16,6 @@ from dataclasses import dataclass
 from typing import Any, Mapping, Sequence
 from urllib.parse import urlsplit
 
-import iort_contract
 from iort_agent.clock import Clock
 from iort_agent.common.schema import Place, choice, items, number, pairs, section, setting, text
 from iort_agent.common.throttled_log import ThrottledLog
@@ -29,8 +28,8 @@ from iort_agent.sources.ros1 import ARRIVAL, BELIEVABLE_US, HEADER
 from iort_agent.sources.rosbridge.connection import TIMES, RosbridgeConnection, Times, Topic
 from iort_agent.sources.rosbridge.continuity import Numbers, Repeats
 from iort_agent.sources.rosbridge.rosapi import AGAIN_S, Rosapi, Structure
-from iort_contract import Value
-from iort_contract.limits import MessageError
+from iort_contract.limits import MessageError, Value
+from iort_contract.topics import check_stream
 
 _log = logging.getLogger(__name__)
 
@@ -50,7 +49,7 @@ class TopicConfig:
     it, all. ``throttle_ms`` is the least time between messages, kept by the server.
     """
 
-    stream: str = setting(text(iort_contract.check_stream))
+    stream: str = setting(text(check_stream))
     time: str = setting(choice(HEADER, ARRIVAL))
     type: str | None = setting(text(), default=None)
     fields: tuple[str, ...] | None = setting(

@@ -14,7 +14,7 @@ import binascii
 import struct
 from typing import Callable, NamedTuple
 
-from iort_contract import Value
+from iort_contract.limits import Value
 
 COMM_FW_VERSION = 0
 COMM_GET_VALUES = 4
@@ -63,9 +63,9 @@ class FrameParser:
         self._buffer = bytearray()
         # Up to where the bytes have been looked at, and up to where they are a frame's or counted as skipped.
         self._seen = self._told = 0
-        # Place a frame would end -> where it would begin and how long its head would be.
+        # Where a frame would end -> where it would begin and how long its head would be.
         self._ends: dict[int, list[tuple[int, int]]] = {}
-        # Place something began that had a frame's end and not its CRC; within a frame that is chance.
+        # Where something began that had a frame's end and not its CRC; within a frame that is chance.
         self._failed: list[int] = []
 
     @property
