@@ -26,7 +26,7 @@ from iort_agent.errors import ConfigError
 from iort_agent.files.config import FilesConfig
 from iort_agent.lanes.config import LiveConfig, PingConfig, RecordConfig
 from iort_agent.sources import SourceConfig
-from iort_agent.sources.registry import SOURCES, uploads_large
+from iort_agent.sources.registry import SOURCES
 from iort_agent.spool.config import QueueConfig
 from iort_agent.status.metrics import MetricsConfig
 from iort_contract.catalog.streams import OWN_STREAMS
@@ -72,7 +72,7 @@ def load_config(file: Path) -> Config:
         raise ConfigError(f"{file}: is empty")
     config = load(Config, content, place)
     _check_streams(config, place.child("sources"))
-    if config.files.large_folder is None and any(uploads_large(source) for source in config.sources):
+    if config.files.large_folder is None and any(source.uploads_large() for source in config.sources):
         raise place.child("files.large_folder").problem(
             "required, and missing: a source says `large: upload`, and its contents wait in this folder"
         )

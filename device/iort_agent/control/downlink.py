@@ -14,8 +14,7 @@ from iort_agent.control.config import DownlinkConfig, ShareConfig
 from iort_agent.control.peers import Peers
 from iort_agent.control.shares import Shares
 from iort_agent.mqtt.uplink import Link
-from iort_agent.ros1.node import DEFAULT_NODE
-from iort_agent.ros1.publish import Graph, Ros1Graph
+from iort_agent.ros1.node import DEFAULT_NODE, Graph, shared
 from iort_agent.sources.ros1 import Ros1Config
 
 _log = logging.getLogger(__name__)
@@ -116,5 +115,5 @@ def make_downlink(
     if not (config.cmd or config.fleet or share):
         return None
     node = next((source.node for source in sources if isinstance(source, Ros1Config)), DEFAULT_NODE)
-    graph = Ros1Graph(node, link.clock)
+    graph = shared(node, link.clock)
     return Downlink(config, share, link=link, boot=boot, graph=graph, offset=offset, answer=answer)
