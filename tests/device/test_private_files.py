@@ -14,6 +14,7 @@ import pytest
 from iort_agent.cli import main
 from iort_agent.common.private_files import make_private, open_below, write_below
 from iort_agent.errors import AgentError, UploadError
+from iort_agent.files.config import FilesConfig
 from iort_agent.files.file import from_json, read, to_json
 from iort_agent.files.folder import STATE, Folder
 from iort_agent.lanes.attachment import Attachments
@@ -26,6 +27,8 @@ from tests.agent_fakes import ManualClock
 from tests.unit.agent.test_agent import config_file
 
 SECRET = b"another's, and not for the bucket"
+
+LARGE = FilesConfig(large_every_s=0, large_max_mb=0.001)
 
 
 @pytest.fixture
@@ -128,9 +131,8 @@ def test_nothing_is_removed_through_a_link(folder, secret):
 def test_claims_are_written_where_they_belong(folder, secret):
     (folder / "camera").symlink_to(secret.parent)
     attachments = Attachments(
-        robot="car", folder=folder, every_s=0, max_bytes=1000, clock=ManualClock(),
-        thumbnail=lambda _content, _type: None, stored=lambda: None,
-    )  # fmt: skip
+        "car", folder, LARGE, ManualClock(), stored=lambda: None, thumbnail=lambda *_: None
+    )
     assert set(attachments.attach_to_fields("camera", 1, {"image": b"x"}).values()) == {None}
     assert attachments.attach_to_fields("lidar", 1, {"scan": b"x"})["scan.size"] == 1
     assert attachments.report()["left_out"] == 1
@@ -151,10 +153,7 @@ def test_what_is_written_is_its_owners_alone_whatever_the_umask(folder, open_uma
     files = watched(folder / "uploads")
     files.local(files.next(), threading.Event())
     assert (folder / "uploads" / STATE).exists()
-    attachments = Attachments(
-        robot="car", folder=folder, every_s=0, max_bytes=1000, clock=clock,
-        thumbnail=lambda _content, _type: None, stored=lambda: None,
-    )  # fmt: skip
+    attachments = Attachments("car", folder, LARGE, clock, stored=lambda: None, thumbnail=lambda *_: None)
     attachments.attach_to_fields("lidar", 1, {"scan": b"x"})
     assert modes(folder) == {0o600}
     assert stat.S_IMODE((folder / "lidar").stat().st_mode) == 0o700

@@ -37,25 +37,25 @@ Thumbnail = Callable[[bytes, str], "str | None"]
 class Attachments:
     """Replaces bytes in samples by attachments. Safe to use from several threads.
 
-    Each stream keeps at most one content every ``every_s`` of its samples' own time, and at most
-    ``max_bytes`` wait in the folder. The attachment of a content that is not kept is null; `report` counts
+    Each stream keeps at most one content every ``large_every_s`` of its samples' own time, and at most
+    ``large_max_mb`` wait in the folder. The attachment of a content that is not kept is null; `report` counts
     those that were not due and those without room.
     """
 
     def __init__(
         self,
-        *,
         robot: str,
         folder: Path,
-        every_s: float,
-        max_bytes: int,
+        files: FilesConfig,
         clock: Clock,
-        thumbnail: Thumbnail,
+        *,
         stored: Callable[[], None],
+        thumbnail: Thumbnail = thumbnail,
     ) -> None:
-        self._robot, self._folder, self._max_bytes = robot, folder, max_bytes
-        self._every_us = round(every_s * 1_000_000)
-        self._clock, self._thumbnail, self._stored = clock, thumbnail, stored
+        self._robot, self._folder, self._clock = robot, folder, clock
+        self._every_us = round(files.large_every_s * 1e6)
+        self._max_bytes = round(files.large_max_mb * 1e6)
+        self._stored, self._thumbnail = stored, thumbnail
         self._throttled = ThrottledLog(_log, clock)
         self._lock = threading.Lock()
         self._last_us: dict[str, int] = {}
@@ -177,15 +177,7 @@ def make_attachments(
     """The attachments of a configuration that has a ``large_folder``."""
     if files.large_folder is None or uploads is None:
         return None
-    return Attachments(
-        robot=robot,
-        folder=files.large_folder,
-        every_s=files.large_every_s,
-        max_bytes=round(files.large_max_mb * 1e6),
-        clock=clock,
-        thumbnail=thumbnail,
-        stored=uploads.wake,
-    )
+    return Attachments(robot, files.large_folder, files, clock, stored=uploads.wake)
 
 
 def _size(path: Path) -> int:

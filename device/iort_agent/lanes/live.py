@@ -23,6 +23,7 @@ import heapq
 import logging
 import threading
 from collections import deque
+from dataclasses import dataclass, field
 from typing import Callable, Mapping, NamedTuple
 
 from iort_agent.errors import UplinkError
@@ -66,30 +67,31 @@ class _Mark(NamedTuple):
     late: int
 
 
+@dataclass
 class _Slot:
     """The state of one stream. ``values`` are the newest sample's while it waits."""
 
-    def __init__(self, topic: str, broker_topic: str, turn: int) -> None:
-        self.topic = topic
-        self.broker_topic = broker_topic
-        self.broker_due = 0.0
-        self.fault: Value = None
-        self.t_us = 0
-        self.values: Mapping[str, Value] | None = None
-        self.offered = 0.0
-        # When the next message may go: in its turn, and with another fault code.
-        self.due = self.fault_due = 0.0
-        # The number of its last turn, since when it waits in line, and how often it waited too long.
-        self.turn = turn
-        self.queued: float | None = None
-        self.late = 0
-        self.payload_bytes = 0
-        self.seq = 0
-        self.written = 0
-        self.writing = False
-        self.offers = 0
-        self.marks: deque[_Mark] = deque(maxlen=_SECONDS + 1)
-        self.hz = 0.0
+    topic: str
+    broker_topic: str
+    # The number of its last turn, since when it waits in line, and how often it waited too long.
+    turn: int
+    queued: float | None = None
+    late: int = 0
+    # When the next message may go: in its turn, with another fault code, and over the broker.
+    due: float = 0.0
+    fault_due: float = 0.0
+    broker_due: float = 0.0
+    fault: Value = None
+    t_us: int = 0
+    values: Mapping[str, Value] | None = None
+    offered: float = 0.0
+    offers: int = 0
+    seq: int = 0
+    payload_bytes: int = 0
+    writing: bool = False
+    written: int = 0
+    hz: float = 0.0
+    marks: deque[_Mark] = field(default_factory=lambda: deque(maxlen=_SECONDS + 1))
 
     def is_new_fault(self, now: float) -> bool:
         """Whether the waiting sample has another fault code than the last message, and may go."""

@@ -57,38 +57,24 @@ def upload_files(config: Config, paths: Sequence[Path], *, status_socket: Path) 
 
 
 def _upload(uploader: Uploader, path: Path, stop: threading.Event) -> Result:
-    show = _Progress(path)
+    size, shows = 0, sys.stderr.isatty()
+
+    def show(there: int) -> None:
+        """Overwrite a line on a terminal."""
+        if shows:
+            percent = 100 * there // max(1, size)
+            print(f"\r{path.name}  {percent:3d} % of {size:,} bytes", end="", file=sys.stderr)
+
     try:
         # The user may name a link.
         file = Path(os.path.realpath(path))
         local = read(file.parent, PurePath(file.name), stop=stop)
-        show.of(local.look.size)
+        size = local.look.size
         return Result(path, key=uploader.upload(local, stop, show))
     except UploadError as error:
         return Result(path, error=str(error))
     finally:
-        show.end()
-
-
-class _Progress:
-    """A line on a terminal that is overwritten; nothing without a terminal."""
-
-    def __init__(self, path: Path) -> None:
-        self._path, self._size = path, 0
-        self._shows = sys.stderr.isatty()
-
-    def of(self, size: int) -> None:
-        """Set the size of the file."""
-        self._size = size
-        self(0)
-
-    def __call__(self, there: int) -> None:
-        if self._shows:
-            share = 100 * there // max(1, self._size)
-            print(f"\r{self._path.name}  {share:3d} % of {self._size:,} bytes", end="", file=sys.stderr)
-
-    def end(self) -> None:
-        if self._shows:
+        if shows and size:
             print(file=sys.stderr)
 
 

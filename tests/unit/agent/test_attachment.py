@@ -14,6 +14,7 @@ from PIL import Image
 
 from iort_agent.config import load_config
 from iort_agent.errors import ConfigError
+from iort_agent.files.config import FilesConfig
 from iort_agent.files.file import read
 from iort_agent.files.folder import Folder
 from iort_agent.lanes.attachment import Attachments
@@ -35,15 +36,8 @@ PICTURE = jpeg()
 
 
 def claims_in(folder, *, every_s=1.0, max_bytes=10**9, small=lambda _content, _kind: "small"):
-    return Attachments(
-        robot="car",
-        folder=folder,
-        every_s=every_s,
-        max_bytes=max_bytes,
-        clock=ManualClock(),
-        thumbnail=small,
-        stored=lambda: None,
-    )
+    files = FilesConfig(large_every_s=every_s, large_max_mb=max_bytes / 1e6)
+    return Attachments("car", folder, files, ManualClock(), stored=lambda: None, thumbnail=small)
 
 
 IMAGE = RosType("/camera", "sensor_msgs/CompressedImage", "1", "string format\nuint8[] data\nuint8 last")
