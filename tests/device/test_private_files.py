@@ -1,4 +1,4 @@
-"""What the agent reads and writes in a folder where somebody else may put links, pipes and files too."""
+"""Reading and writing in a folder where others may put links, pipes and files."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ LARGE = FilesConfig(large_every_s=0, large_max_mb=0.001)
 
 @pytest.fixture
 def secret(tmp_path):
-    """A file that links lead to; it is as it was at the end."""
+    """The target of the links; it must not change."""
     path = tmp_path / "elsewhere" / "secret"
     path.parent.mkdir()
     path.write_bytes(SECRET)
@@ -51,7 +51,7 @@ def folder(tmp_path):
 
 @pytest.fixture
 def open_umask():
-    """As a supervisor may start the agent."""
+    """The umask with which a supervisor may start the agent."""
     before = os.umask(0)
     yield
     os.umask(before)
@@ -65,7 +65,7 @@ def modes(folder):
     return {stat.S_IMODE(path.lstat().st_mode) for path in folder.rglob("*") if path.is_file()}
 
 
-def test_a_link_in_the_place_of_what_is_written_leads_nowhere(folder, secret):
+def test_a_link_in_place_of_a_written_file_is_replaced(folder, secret):
     for name in (STATE, f"{STATE}.tmp"):
         (folder / name).symlink_to(secret)
     (folder / "a.bag").write_bytes(b"1")
@@ -73,7 +73,7 @@ def test_a_link_in_the_place_of_what_is_written_leads_nowhere(folder, secret):
     name = files.next()
     files.uploaded(name, files.local(name, threading.Event()), "key")
     assert not (folder / STATE).is_symlink()
-    # It was kept, and is found again.
+    # The state was kept and is read again.
     assert watched(folder).next() is None
 
 
@@ -91,7 +91,7 @@ def test_a_file_that_became_a_link_is_neither_read_nor_sent(folder, secret):
     with pytest.raises(OSError, match="symbolic"):
         local.open()
     assert from_json(folder, name, saved) is None
-    # And one whose folder became a link.
+    # The same for a file whose folder became a link.
     path.unlink()
     path.parent.rmdir()
     path.parent.symlink_to(secret.parent)
@@ -102,7 +102,7 @@ def test_a_file_that_became_a_link_is_neither_read_nor_sent(folder, secret):
             open_below(folder, gone)
 
 
-def test_a_pipe_in_the_place_of_a_file_is_not_waited_for(folder):
+def test_a_pipe_in_place_of_a_file_does_not_block(folder):
     os.mkfifo(folder / "a.bag")
     os.mkfifo(folder / STATE)
     with pytest.raises(OSError, match="no regular file"):
@@ -128,7 +128,7 @@ def test_nothing_is_removed_through_a_link(folder, secret):
     assert secret.exists()
 
 
-def test_claims_are_written_where_they_belong(folder, secret):
+def test_attachments_are_written_only_below_their_folder(folder, secret):
     (folder / "camera").symlink_to(secret.parent)
     attachments = Attachments(
         "car", folder, LARGE, ManualClock(), stored=lambda: None, thumbnail=lambda *_: None
@@ -138,7 +138,7 @@ def test_claims_are_written_where_they_belong(folder, secret):
     assert attachments.report()["left_out"] == 1
 
 
-def test_what_is_written_is_its_owners_alone_whatever_the_umask(folder, open_umask):
+def test_only_the_owner_may_read_written_files_with_any_umask(folder, open_umask):
     clock = ManualClock()
     spool = SqliteSpool(folder / "queue.db", max_bytes=10**6, clock=clock)
     spool.put(VESC_STREAM, 0, b"payload", samples=1)
@@ -159,7 +159,7 @@ def test_what_is_written_is_its_owners_alone_whatever_the_umask(folder, open_uma
     assert stat.S_IMODE((folder / "lidar").stat().st_mode) == 0o700
 
 
-def test_a_queue_that_anybody_may_read_is_closed(folder):
+def test_a_readable_queue_is_made_private(folder):
     path = folder / "queue.db"
     SpoolFile(path, durability=PROCESS).close()
     path.chmod(0o644)
@@ -214,7 +214,7 @@ class Asking(io.StringIO):
         return super().write(text)
 
 
-def test_whatever_a_command_writes_is_its_users_alone(tmp_path, open_umask):
+def test_only_the_user_may_read_what_a_command_writes(tmp_path, open_umask):
     asking = Asking()
     with contextlib.redirect_stdout(asking):
         assert main(["--config", str(config_file(tmp_path, "{type: sim}")), "--check-config"]) == 0

@@ -70,11 +70,11 @@ class Rig:
         self.runtime = Runtime(self.agent)
 
     def report(self) -> dict[str, Any]:
-        """As `--report` writes it."""
+        """The document that `--report` writes."""
         return document(make_report(self.agent))
 
     def status(self) -> dict[str, Any]:
-        """As the status socket gives it."""
+        """The document of the status socket."""
         return document(make_status(self.agent))
 
     def recorded(self, stream: str = "vesc") -> list[Any]:
@@ -100,7 +100,7 @@ def test_every_sample_is_recorded_and_the_report_says_so() -> None:
     assert rig.uplink.stopped
 
 
-def test_the_status_is_read_as_it_was_written() -> None:
+def test_a_status_is_the_same_after_reading_its_json() -> None:
     rig = Rig(drive, ping=PingConfig(rate_hz=20, paths=("broker",)))
     assert rig.runtime.run(drain_s=10) == 0
     status = make_status(rig.agent)
@@ -115,7 +115,7 @@ def test_the_status_is_read_as_it_was_written() -> None:
         read(Status, written)
 
 
-def test_a_signal_ends_it_in_good_order() -> None:
+def test_stop_ends_the_run_in_good_order() -> None:
     def endless(emit: Emit, stop: threading.Event) -> None:
         drive(emit, stop)
         rig.runtime.stop()
@@ -126,15 +126,15 @@ def test_a_signal_ends_it_in_good_order() -> None:
     assert rig.recorded() == list(range(500))
 
 
-def test_what_cannot_be_delivered_in_time_is_told(caplog: pytest.LogCaptureFixture) -> None:
+def test_undelivered_samples_are_reported(caplog: pytest.LogCaptureFixture) -> None:
     rig = Rig(drive, connected=False)
     assert rig.runtime.run(drain_s=0.05) == 1
-    # And two of the agent's own account, from its start and its end.
+    # Two of them are the agent's accounts, of its start and its end.
     assert "502 samples in 12 batches could not be delivered within 0.05 s" in caplog.text
     assert rig.report()["spool"]["left_samples"] == 502
 
 
-def test_a_backlog_is_delivered_when_the_connection_comes_at_last() -> None:
+def test_a_backlog_is_delivered_after_a_late_connect() -> None:
     def late(emit: Emit, stop: threading.Event) -> None:
         drive(emit, stop)
         rig.uplink.connect()
@@ -146,7 +146,7 @@ def test_a_backlog_is_delivered_when_the_connection_comes_at_last() -> None:
 
 def test_dropped_samples_are_not_a_success(caplog: pytest.LogCaptureFixture) -> None:
     def late(emit: Emit, stop: threading.Event) -> None:
-        # More seconds than are open at once, so that some are closed before there is a connection.
+        # More seconds than may be open at once, so that some close before the connection.
         for i in range(1500):
             emit("vesc", T0 + i * 20_000, {"speed": i})
         rig.uplink.connect()
@@ -166,7 +166,7 @@ def test_dropped_samples_are_not_a_success(caplog: pytest.LogCaptureFixture) -> 
 @pytest.mark.parametrize(
     ("error", "text"), [(SourceError("no such bag"), "no such bag"), (ZeroDivisionError(), "Traceback")]
 )
-def test_a_source_that_fails_does_not_take_the_others_with_it(
+def test_a_failed_source_does_not_end_the_others(
     error: Exception, text: str, caplog: pytest.LogCaptureFixture
 ) -> None:
     def broken(emit: Emit, stop: threading.Event) -> None:
@@ -201,7 +201,7 @@ def test_a_source_that_ends_with_nothing_stored_has_failed(
     assert f"source failed: script: {why}" in caplog.text
 
 
-def test_one_sample_that_is_refused_is_no_failure() -> None:
+def test_one_refused_sample_is_not_a_failure() -> None:
     def both(emit: Emit, stop: threading.Event) -> None:
         give_too_wide(emit, stop)
         drive(emit, stop)
@@ -220,9 +220,7 @@ def test_a_source_that_was_stopped_before_its_first_sample_has_not_failed() -> N
     assert rig.runtime.run(drain_s=10) == 0
 
 
-def test_a_log_with_too_many_columns_is_a_failure_that_says_so(
-    tmp_path: Path, caplog: pytest.LogCaptureFixture
-) -> None:
+def test_too_many_columns_are_a_logged_failure(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
     path = tmp_path / "ride.csv"
     names = [f"x{i}" for i in range(754)]
     path.write_text("\n".join([";".join(["ms_today", *names]), ";".join(["1000", *["1"] * 754])]) + "\n")
@@ -289,7 +287,7 @@ def test_lanes_fields_and_rates_change_while_it_runs() -> None:
     ]  # fmt: skip
 
 
-def test_types_are_said_again_when_recording_begins() -> None:
+def test_types_are_repeated_when_recording_resumes() -> None:
     said = MessageType("vesc", "/vesc", "p/A", "0" * 32, "float64 speed\n")
 
     def late(emit: Emit, stop: threading.Event) -> None:
@@ -306,16 +304,16 @@ def test_types_are_said_again_when_recording_begins() -> None:
     assert message_type(sample) == said
 
 
-def test_an_account_is_of_one_moment() -> None:
+def test_an_account_counts_one_moment() -> None:
     rig = Rig(drive)
     assert rig.runtime.run(drain_s=10) == 0
-    # As a batch does that is stored between two looks.
+    # A batch may be stored between two looks.
     rig.spool.put("vesc", rig.spool.next_seq("vesc"), b"", samples=50)
     counts, next_seq = rig.agent.streams.counted()["vesc"]
     assert (counts.stored, next_seq) == (500, 10)
 
 
-def test_its_own_figures_are_a_stream() -> None:
+def test_the_agents_metrics_are_a_stream() -> None:
     seen = threading.Event()
 
     def wait(emit: Emit, stop: threading.Event) -> None:
@@ -364,7 +362,7 @@ def test_the_command_checks_a_configuration(tmp_path: Path, capsys: pytest.Captu
     assert "good, robot car1, 1 source" in capsys.readouterr().out
 
 
-def test_roslaunchs_remappings_are_no_wrong_use(tmp_path: Path) -> None:
+def test_remappings_of_roslaunch_are_accepted(tmp_path: Path) -> None:
     config = str(config_file(tmp_path, "{type: sim}"))
     remappings = ["__name:=x", "__log:=/tmp/y.log", "/from:=/to", "~from:=to", "from:=/to", "_rate:=5"]
     assert main(["--config", config, *remappings, "--check-config"]) == 0
@@ -375,7 +373,7 @@ def test_roslaunchs_remappings_are_no_wrong_use(tmp_path: Path) -> None:
         main(["status", "--config", config, "__name:=x"])
 
 
-def test_a_wrong_configuration_is_a_message_and_status_2(
+def test_a_wrong_configuration_prints_a_message_and_exits_with_2(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     assert main(["--config", str(config_file(tmp_path, "{type: sum}"))]) == 2

@@ -1,4 +1,4 @@
-"""The configuration file: what it may say, and what one is told of what it may not."""
+"""The configuration file: its settings and its errors."""
 
 from __future__ import annotations
 
@@ -46,7 +46,7 @@ def test_a_short_file_is_enough(folder: Path) -> None:
     assert config.queue.policy == "OverwriteOldestData"
 
 
-def test_everything_can_be_said(folder: Path) -> None:
+def test_every_section_is_read(folder: Path) -> None:
     text = GOOD.replace("  - type: sim\n", "") + (
         "  - {type: bag, path: drive.bag, topics: {/sensors/core: vesc, /imu: imu}, speed: 0,\n"
         "     stamps: original, loop: true, duration_s: 5}\n"
@@ -72,7 +72,7 @@ def test_everything_can_be_said(folder: Path) -> None:
     assert config.ping.paths == ("rule",)
 
 
-def test_a_section_left_empty_has_its_defaults(folder: Path) -> None:
+def test_an_empty_section_has_its_defaults(folder: Path) -> None:
     assert load_config(write(folder, GOOD + "live:\n")).live.rate_hz == 10
 
 
@@ -178,7 +178,7 @@ SIM = "  - type: sim\n"
     ],
     ids=lambda case: case[1].strip()[:40] if isinstance(case, tuple) else "",
 )
-def test_a_wrong_file_is_told_where_what_and_what_instead(
+def test_an_error_names_key_value_and_what_is_allowed(
     folder: Path, change: tuple[str, str], parts: list[str]
 ) -> None:
     assert change[0] in GOOD
@@ -190,12 +190,12 @@ def test_a_wrong_file_is_told_where_what_and_what_instead(
 
 
 @pytest.mark.parametrize("text", ["", "# nothing\n", "- a\n", "just text\n"])
-def test_a_file_that_is_no_mapping(folder: Path, text: str) -> None:
+def test_a_file_must_be_a_mapping(folder: Path, text: str) -> None:
     with pytest.raises(ConfigError, match=r"car\.yaml: (is empty|must be a mapping)"):
         load_config(write(folder, text))
 
 
-def test_a_file_that_cannot_be_read(folder: Path) -> None:
+def test_an_unreadable_file(folder: Path) -> None:
     with pytest.raises(ConfigError, match=r"no\.yaml: cannot be read: No such file"):
         load_config(folder / "no.yaml")
     (folder / "latin.yaml").write_bytes(b"robot: \xe9")

@@ -1,4 +1,4 @@
-"""What a robot takes and shares is written wrong: told at the start, by file and key."""
+"""Errors in the sections `downlink` and `share` name file and key at the start."""
 
 from __future__ import annotations
 

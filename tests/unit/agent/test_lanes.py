@@ -32,7 +32,7 @@ from tests.agent_fakes import Loopback, ManualClock, Published
 
 T0 = 1_700_000_000_000_000
 TICK_MS = 200
-# What a drive needs before its rates are those of its last seconds.
+# The time until the rates are those of the last seconds.
 SETTLE_S = 4
 
 
@@ -48,7 +48,7 @@ class Topic(NamedTuple):
 
 
 class Named:
-    """A source that only says which streams it has."""
+    """A source that only names its streams."""
 
     def __init__(self, count: int) -> None:
         self._names = [f"topic{i:03}" for i in range(count)]
@@ -70,7 +70,7 @@ class Named:
 
 
 class Drive:
-    """A real agent whose threads are called in turn, once in a millisecond."""
+    """A real agent whose threads are called in turn, every millisecond."""
 
     def __init__(self, topics: Mapping[str, Topic], **settings: Any) -> None:
         self.topics = topics
@@ -119,7 +119,7 @@ class Drive:
 
     def _offer(self) -> None:
         for i, (stream, topic) in enumerate(self.topics.items()):
-            # Each at its own milliseconds.
+            # Each stream has its own milliseconds.
             if self._is_due(topic.hz, 7 * i):
                 self.agent.streams.emit(stream, self.clock.now_us(), topic.values())
 
@@ -144,7 +144,7 @@ class Drive:
         return self.spool.backlog().batches
 
     def live(self, seconds: float) -> dict[str, int]:
-        """How many live messages of each stream went in the last seconds."""
+        """The live messages of each stream in the last seconds."""
         found = dict.fromkeys(self.topics, 0)
         for sent in self.sent:
             levels = sent.topic.split("/")
@@ -153,7 +153,7 @@ class Drive:
         return found
 
     def end(self) -> None:
-        """Let everything arrive, and see that it did, and that no second held too much."""
+        """Deliver everything; check that all arrived and that no second exceeded the limits."""
         self.agent.streams.flush()
         self.run(2, sources=False)
         assert self.backlog() == 0
@@ -167,7 +167,7 @@ class Drive:
         self.check_limits()
 
     def check_limits(self) -> None:
-        """In every second that begins with a publish, both ends included."""
+        """The most in any second that begins with a publish, both ends included."""
         times, total = [sent.at for sent in self.sent], 0
         for i, first in enumerate(self.sent):
             end = bisect.bisect_right(times, first.at + 1)
@@ -200,7 +200,7 @@ def test_recordings_go_first_and_live_shares_the_rest(
     drive.end()
 
 
-def test_few_topics_have_what_they_ask_for_and_nobody_is_warned(caplog: pytest.LogCaptureFixture) -> None:
+def test_few_topics_get_their_rate_without_a_warning(caplog: pytest.LogCaptureFixture) -> None:
     drive = Drive(topics(6, 50))
     drive.run(SETTLE_S)
     drive.run(10)
@@ -211,7 +211,7 @@ def test_few_topics_have_what_they_ask_for_and_nobody_is_warned(caplog: pytest.L
     drive.end()
 
 
-def test_slow_streams_take_their_own_rate_and_leave_the_rest_to_the_others() -> None:
+def test_slow_streams_use_only_their_own_rate() -> None:
     rates = [1000, 100, 50, 20, 20, 10, 10, 10, 5, 5, *[50] * 8, 1, 1, 0.5, 0.5]
     drive = Drive({f"topic{i:03}": Topic(hz, lambda: {"x": 1.5}) for i, hz in enumerate(rates)})
     drive.run(SETTLE_S)
@@ -225,7 +225,7 @@ def test_slow_streams_take_their_own_rate_and_leave_the_rest_to_the_others() -> 
     drive.end()
 
 
-def test_bytes_are_shared_as_publishes_are() -> None:
+def test_bytes_are_shared_like_publishes() -> None:
     chance = random.Random(1)
     numbers = Drive(topics(10, 20, lambda: {f"f{i:03}": chance.random() for i in range(100)}))
     texts = Drive(topics(10, 20, lambda: {f"f{i}": "x" * 4000 for i in range(8)}))
@@ -260,7 +260,7 @@ def test_live_has_a_tenth_while_a_backlog_drains_and_its_rate_afterwards() -> No
     drive.end()
 
 
-def test_another_fault_goes_soon_whatever_else_there_is() -> None:
+def test_another_fault_code_is_sent_soon_under_any_load() -> None:
     fault = {"code": 0}
     faulty = {f"vesc{i}": Topic(20, lambda: {"fault_code": fault["code"]}) for i in range(3)}
     drive = Drive({**topics(50, 20), **faulty})
@@ -280,7 +280,7 @@ def test_another_fault_goes_soon_whatever_else_there_is() -> None:
     drive.check_limits()
 
 
-def test_pings_have_what_recordings_leave_and_live_what_pings_leave() -> None:
+def test_recordings_come_before_pings_and_pings_before_live() -> None:
     drive = Drive(topics(50, 20), ping=PingConfig(rate_hz=20, paths=(BROKER,)))
     drive.run(SETTLE_S, pings_hz=20)
     before = drive.report()["pings"][BROKER]["sent"]
@@ -296,7 +296,7 @@ def test_pings_have_what_recordings_leave_and_live_what_pings_leave() -> None:
     drive.end()
 
 
-def test_a_slow_network_is_filled_by_what_is_on_its_way() -> None:
+def test_unacknowledged_batches_fill_a_slow_network() -> None:
     drive = Drive(topics(50, 20))
     drive.rtt_s = 0.5
     drive.run(15)
@@ -305,7 +305,7 @@ def test_a_slow_network_is_filled_by_what_is_on_its_way() -> None:
     drive.end()
 
 
-def test_more_than_one_connection_takes_is_said_with_what_to_do(caplog: pytest.LogCaptureFixture) -> None:
+def test_too_much_for_one_connection_raises_an_alarm_with_advice(caplog: pytest.LogCaptureFixture) -> None:
     drive = Drive(topics(120, 2))
     drive.run(9)
     assert drive.status()["alarms"] == []
@@ -322,7 +322,7 @@ def test_more_than_one_connection_takes_is_said_with_what_to_do(caplog: pytest.L
     assert drive.status()["alarms"] == []
 
 
-def test_a_network_that_is_too_slow_is_told_from_a_limit() -> None:
+def test_the_alarm_tells_a_slow_network_from_the_limit() -> None:
     drive = Drive(topics(10, 20))
     drive.rtt_s = 20
     drive.run(30)
@@ -330,7 +330,7 @@ def test_a_network_that_is_too_slow_is_told_from_a_limit() -> None:
     assert "the network is too slow" in alarm
 
 
-def test_a_slowed_lane_is_warned_of_once_and_shown(caplog: pytest.LogCaptureFixture) -> None:
+def test_a_slowed_lane_is_logged_once_and_shown(caplog: pytest.LogCaptureFixture) -> None:
     caplog.set_level(logging.INFO)
     drive = Drive(topics(30, 20))
     drive.run(SETTLE_S)
@@ -349,7 +349,7 @@ def test_a_slowed_lane_is_warned_of_once_and_shown(caplog: pytest.LogCaptureFixt
     assert told_of == [(logging.WARNING, "live: slowed do"), (logging.INFO, "live: up to 10 ")]
 
 
-def test_what_overdraws_is_paid_for_and_ends_at_the_limit() -> None:
+def test_overdrafts_are_paid_back_and_end_at_the_limit() -> None:
     clock = ManualClock()
     rate_limiter = RateLimiter(clock)
     gone = 0
@@ -365,7 +365,7 @@ def test_what_overdraws_is_paid_for_and_ends_at_the_limit() -> None:
     assert rate_limiter.record("t", b"x") == 0
 
 
-def test_production_is_known_over_seconds_and_growth_only_where_there_is_a_connection() -> None:
+def test_production_is_a_mean_of_seconds_and_growth_needs_a_connection() -> None:
     for connected in (True, False):
         production, made, sent = Production(), 0.0, 0.0
         for second in range(100):
@@ -386,7 +386,9 @@ def test_production_is_known_over_seconds_and_growth_only_where_there_is_a_conne
     ("streams", "batch_s", "made"),
     [(90, 1.0, None), (91, 1.0, 91), (45, 0.5, None), (46, 0.5, 92), (23, 0.3, 92), (20, 0.0, None)],
 )
-def test_too_many_streams_are_known_beforehand(streams: int, batch_s: float, made: int | None) -> None:
+def test_too_many_streams_are_recognized_from_the_configuration(
+    streams: int, batch_s: float, made: int | None
+) -> None:
     record = RecordConfig(batch_s=batch_s)
     config = Config("car1", "host", Path(), Path(), (Named(streams),), record=record)
     problem = too_many(config.sources, config.record)
@@ -395,7 +397,7 @@ def test_too_many_streams_are_known_beforehand(streams: int, batch_s: float, mad
     assert too_many(config.sources, replace(record, enabled=False)) is None
 
 
-def test_too_many_streams_are_said_at_the_start(caplog: pytest.LogCaptureFixture) -> None:
+def test_too_many_streams_are_logged_at_the_start(caplog: pytest.LogCaptureFixture) -> None:
     clock = SystemClock()
     agent = Agent(
         Config("car1", "host", Path(), Path(), (Named(91),)),
@@ -403,7 +405,7 @@ def test_too_many_streams_are_said_at_the_start(caplog: pytest.LogCaptureFixture
         spool=MemorySpool(max_bytes=10**6),
         clock=clock,
     )
-    # The source has none of them, which is a failure of its own.
+    # The source gives no sample, which is a failure by itself.
     assert Runtime(agent).run(drain_s=10) == 1
     assert "record: 91 streams are up to 91 batches a second" in caplog.text
     assert "record fewer topics" in caplog.text

@@ -47,7 +47,7 @@ class Rig:
         self.uplink.connect()
 
     def answer(self, path: str, message: int = -1) -> None:
-        """The cloud's answer to one of the pings sent."""
+        """Deliver the cloud's answer to a sent ping."""
         ping = json.loads(self.uplink.published[message].payload)
         payload = json.dumps({**ping, RECEIVED_MS: 5}).encode()
         self.uplink.deliver(f"pong/iort/car1/{path}", payload)
@@ -91,7 +91,7 @@ def test_lost_pings_are_counted_and_late_answers_ignored() -> None:
     assert len(rig.samples) == 1
 
 
-def test_what_is_no_answer_of_ours_is_ignored() -> None:
+def test_other_answers_are_ignored() -> None:
     rig = Rig()
     rig.pings.send("rule")
     for payload in (b"", b"[]", b'{"id": "x"}', b'{"id": 999, "sent_us": 1}', b"\xff"):
@@ -103,7 +103,7 @@ def test_what_is_no_answer_of_ours_is_ignored() -> None:
     assert rig.pings.report()["lambda"] == RoundTrips(0, 0, 0, None, None)
 
 
-def test_no_ping_without_a_way_back() -> None:
+def test_no_ping_without_a_subscription_for_its_answer() -> None:
     rig = Rig()
     rig.uplink.cut()
     rig.pings.send("broker")
@@ -127,7 +127,7 @@ def test_paths_take_turns_at_the_rate() -> None:
     assert 480 < len(rig.uplink.published[0].payload) < 560
 
 
-def test_the_largest_ping_that_may_be_asked_for_fits_into_a_message_and_so_does_its_answer(
+def test_the_largest_ping_and_its_answer_fit_into_a_message(
     tmp_path: Path,
 ) -> None:
     where = Place(tmp_path / "car.yaml")
@@ -143,7 +143,7 @@ def test_the_largest_ping_that_may_be_asked_for_fits_into_a_message_and_so_does_
     assert len(json.dumps(pong)) <= MAX_MESSAGE_BYTES
 
 
-def test_the_end_waits_for_answers_but_not_for_ever() -> None:
+def test_the_end_waits_for_answers_for_a_limited_time() -> None:
     rig = Rig()
     rig.pings.send("broker")
     rig.pings.send("rule")
@@ -162,7 +162,7 @@ def test_percentile_is_a_value_with_that_share_below(values: list[float], percen
 
 
 @pytest.mark.parametrize(("rate_hz", "paths"), [(0, PING_PATHS), (0, ("broker",)), (5, ("broker", "lambda"))])
-def test_where_no_trip_through_a_rule_is_measured_a_ping_now_and_then_finds_the_clocks_offset(
+def test_rare_pings_measure_the_clock_offset_if_no_rule_trip_is_measured(
     rate_hz: float, paths: tuple[str, ...]
 ) -> None:
     rig = Rig(rate_hz=rate_hz, paths=paths)
@@ -179,14 +179,14 @@ def test_where_no_trip_through_a_rule_is_measured_a_ping_now_and_then_finds_the_
             if len(times) == 3:
                 rig.answer("rule")
         rig.clock.advance(0.125)
-    # As soon as there is a connection, often until one was answered, then seldom.
+    # Often until the first answer, then rarely.
     first = [5 + i * CLOCK_FIRST_EVERY_S for i in range(4)]
     assert times == [*first, *(first[-1] + i * CLOCK_EVERY_S for i in (1, 2, 3))]
     assert rig.stamps == [(start + times[2], start + times[2], 5)]
     assert rig.samples == [], "it is no measurement of round trips"
 
 
-def test_measured_trips_through_a_rule_are_told_too_and_need_no_other() -> None:
+def test_measured_rule_trips_give_the_clock_offset_without_more_pings() -> None:
     rig = Rig()
     rig.pings.send("rule")
     rig.clock.advance(0.5)

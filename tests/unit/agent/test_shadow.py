@@ -1,4 +1,4 @@
-"""The shadow: wishes, refusals and reports, over an uplink in memory."""
+"""The shadow: desired settings, rejections and reports, over an uplink in memory."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ DOCUMENT = BASE.as_document()
 
 
 class Rig:
-    """A robot and its shadow, kept as AWS keeps it."""
+    """A robot and its shadow, which behaves as AWS'."""
 
     def __init__(self, **desired: Any) -> None:
         self.clock, self.dispatcher = ManualClock(), Dispatcher()
@@ -68,7 +68,7 @@ class Rig:
         if arrives:
             self.deliver("update/accepted", {"state": state, "version": self.version})
 
-    def wish(self, *, arrives: bool = True, **desired: Any) -> None:
+    def desire(self, *, arrives: bool = True, **desired: Any) -> None:
         self.change({"desired": desired}, arrives=arrives)
         self.settle()
 
@@ -80,26 +80,26 @@ class Rig:
         return self.document.get("reported")
 
 
-def test_without_a_shadow_it_makes_one() -> None:
+def test_without_a_shadow_the_agent_creates_it() -> None:
     rig = Rig()
     said = {key: value for key, value in DOCUMENT.items() if value != {}}
     assert rig.reported == {**said, "agent_version": "1.2.3"}
     assert rig.applied == []
 
 
-def test_a_wish_from_before_comes_into_force() -> None:
+def test_an_earlier_desired_setting_is_applied() -> None:
     rig = Rig(live={"rate_hz": 2}, record={"enabled": False})
     assert rig.applied[-1].live_rate_hz == 2
     assert rig.reported["live"] == {"enabled": True, "rate_hz": 2}
     assert rig.reported["record"] == {"enabled": False}
 
 
-def test_a_wish_meanwhile_and_its_withdrawal() -> None:
+def test_a_desired_setting_is_applied_and_removed() -> None:
     rig = Rig()
-    rig.wish(log_level="debug", fields={"vesc": ["speed"]})
+    rig.desire(log_level="debug", fields={"vesc": ["speed"]})
     assert rig.applied[-1].log_level == "debug"
     assert rig.reported["fields"] == {"vesc": ["speed"]}
-    rig.wish(log_level=None, fields=None)
+    rig.desire(log_level=None, fields=None)
     assert rig.applied[-1] == BASE
     assert rig.reported["log_level"] == "info"
     assert not rig.reported["fields"]
@@ -110,7 +110,7 @@ def test_a_wish_meanwhile_and_its_withdrawal() -> None:
 
 
 @pytest.mark.parametrize(
-    ("wish", "name", "reason"),
+    ("desired", "name", "reason"),
     [
         ({"live": {"rate_hz": 50}}, "live.rate_hz", "must be a number from 0.01 to 10 (Hz), got 50"),
         ({"live": {"rate_hz": True}}, "live.rate_hz", "got True"),
@@ -125,11 +125,11 @@ def test_a_wish_meanwhile_and_its_withdrawal() -> None:
         ({"live": {"rate": 1}}, "live.rate", "did you mean live.rate_hz?"),
     ],
 )  # fmt: skip
-def test_a_bad_wish_is_refused_with_its_reason_and_the_others_hold(
-    wish: dict[str, Any], name: str, reason: str
+def test_a_wrong_setting_is_rejected_with_a_reason_and_the_others_apply(
+    desired: dict[str, Any], name: str, reason: str
 ) -> None:
     rig = Rig()
-    rig.wish(**wish, ping={"rate_hz": 5})
+    rig.desire(**desired, ping={"rate_hz": 5})
     key = name.partition("[")[0]
     assert reason in rig.reported["rejected"][key]["reason"]
     assert f"shadow agent: {name}" in rig.reported["rejected"][key]["reason"]
@@ -137,27 +137,27 @@ def test_a_bad_wish_is_refused_with_its_reason_and_the_others_hold(
     assert rig.reported["live"] == DOCUMENT["live"]
 
 
-def test_a_wish_for_what_is_in_force_ends_the_refusal() -> None:
+def test_a_desired_value_that_is_in_force_ends_the_rejection() -> None:
     rig = Rig()
-    rig.wish(live={"rate_hz": 50})
+    rig.desire(live={"rate_hz": 50})
     assert rig.reported["rejected"]
-    # Equal to what is reported: AWS sends no delta for it.
-    rig.wish(live={"rate_hz": 10})
+    # It equals the reported value: AWS sends no delta for it.
+    rig.desire(live={"rate_hz": 10})
     assert not rig.reported["rejected"]
 
 
-def test_what_was_missed_is_fetched() -> None:
+def test_a_missed_change_is_fetched() -> None:
     rig = Rig()
-    rig.wish(arrives=False, live={"rate_hz": 3})
+    rig.desire(arrives=False, live={"rate_hz": 3})
     assert rig.applied == []
-    rig.wish(ping={"rate_hz": 1})
+    rig.desire(ping={"rate_hz": 1})
     assert (rig.applied[-1].live_rate_hz, rig.applied[-1].ping_rate_hz) == (3, 1)
 
 
-def test_a_wish_made_while_offline_is_fetched_at_the_next_connect() -> None:
+def test_a_setting_desired_while_offline_is_fetched_at_the_next_connect() -> None:
     rig = Rig()
     rig.uplink.cut()
-    rig.wish(arrives=False, live={"rate_hz": 3})
+    rig.desire(arrives=False, live={"rate_hz": 3})
     rig.uplink.connect()
     rig.settle()
     assert rig.reported["live"]["rate_hz"] == 3
@@ -165,7 +165,7 @@ def test_a_wish_made_while_offline_is_fetched_at_the_next_connect() -> None:
 
 def test_old_and_odd_messages_change_nothing() -> None:
     rig = Rig()
-    rig.wish(live={"rate_hz": 3})
+    rig.desire(live={"rate_hz": 3})
     rig.deliver("update/accepted", {"state": {"desired": {"live": {"rate_hz": 9}}}, "version": 1})
     rig.settle()
     assert [settings.live_rate_hz for settings in rig.applied] == [3], "older than what it has"
@@ -193,16 +193,16 @@ def test_old_and_odd_messages_change_nothing() -> None:
     assert rig.applied[0].live_rate_hz == 3
 
 
-def test_a_robot_over_its_share_logs_it_once_and_takes_it_for_no_wish(
+def test_a_robot_over_its_share_logs_it_once_and_does_not_reject_it(
     caplog: pytest.LogCaptureFixture,
 ) -> None:
     rig = Rig()
     for batches in (1, 40):
-        rig.wish(over_share={"since_ms": 1000, "last_ms": 1000 + batches, "batches": batches})
+        rig.desire(over_share={"since_ms": 1000, "last_ms": 1000 + batches, "batches": batches})
     assert rig.shadow.over_share == OverShare(since_ms=1000, last_ms=1040, batches=40)
     assert rig.document["reported"].get("rejected", {}) == {}
     assert caplog.text.count("summaries are made later") == 1
-    rig.wish(over_share={"since_ms": 90_000, "last_ms": 90_000, "batches": 1})
+    rig.desire(over_share={"since_ms": 90_000, "last_ms": 90_000, "batches": 1})
     assert caplog.text.count("summaries are made later") == 2
 
 
@@ -211,14 +211,14 @@ def test_a_robot_over_its_share_logs_it_once_and_takes_it_for_no_wish(
     [5, [], {"batches": 3}, {"since_ms": 1, "last_ms": 1e3, "batches": 1}]
     + [{"since_ms": 1, "last_ms": last_ms, "batches": 1} for last_ms in (-1, 10**15, True)],
 )
-def test_odd_words_about_its_share_are_passed_over(said: Any) -> None:
+def test_malformed_reports_about_its_share_are_ignored(said: Any) -> None:
     assert Rig(over_share=said).shadow.over_share is None
 
 
-def test_a_report_that_gets_no_answer_is_sent_again() -> None:
+def test_an_unanswered_report_is_repeated() -> None:
     rig = Rig()
     rig.uplink.verdict = lambda message: "no" if message.topic.endswith("/update") else None
-    rig.wish(live={"rate_hz": 3})
+    rig.desire(live={"rate_hz": 3})
     assert rig.reported["live"]["rate_hz"] == 10
     rig.uplink.verdict = lambda _: None
     rig.clock.advance(31)
@@ -226,9 +226,9 @@ def test_a_report_that_gets_no_answer_is_sent_again() -> None:
     assert rig.reported["live"]["rate_hz"] == 3
 
 
-def test_a_long_value_is_not_reported_whole() -> None:
+def test_a_long_value_is_reported_shortened() -> None:
     rig = Rig()
-    rig.wish(log_level="x" * 5000)
+    rig.desire(log_level="x" * 5000)
     assert len(json.dumps(rig.reported)) < 2000
 
 
@@ -241,7 +241,7 @@ OBJECT = st.dictionaries(st.text(max_size=2), JSON, max_size=4)
 
 
 def bare(value: Any) -> Any:
-    """Without empty objects, which a shadow does not keep apart from none."""
+    """Without empty objects: a shadow does not distinguish them from missing ones."""
     if not isinstance(value, dict):
         return value
     inner = {key: bare(item) for key, item in value.items()}
@@ -249,18 +249,18 @@ def bare(value: Any) -> Any:
 
 
 @given(OBJECT, OBJECT)
-def test_a_difference_merged_into_the_old_is_the_new(old: dict[str, Any], new: dict[str, Any]) -> None:
+def test_merging_the_difference_into_the_old_gives_the_new(old: dict[str, Any], new: dict[str, Any]) -> None:
     assert bare(_merged(old, _difference(old, new))) == bare(new)
 
 
 @given(OBJECT)
-def test_no_wish_whatever_brings_it_down(wished: dict[str, Any]) -> None:
-    settings, rejected = overlay(BASE, wished, {})
+def test_no_desired_value_raises(desired: dict[str, Any]) -> None:
+    settings, rejected = overlay(BASE, desired, {})
     assert 0.01 <= settings.live_rate_hz <= 10
     json.dumps(rejected)
 
 
-def test_what_became_of_commands_is_reported_and_a_new_run_forgets_it() -> None:
+def test_outcomes_of_commands_are_reported_until_the_run_ends() -> None:
     rig = Rig(live={"rate_hz": 2})
     command = Command("feedbeef", 1, 7, 2, 500, {}, answer=True)
     rig.shadow.answer("drive", command, None)
