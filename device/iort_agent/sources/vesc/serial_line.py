@@ -26,8 +26,8 @@ from pathlib import Path
 from typing import Any, Iterator, Mapping, Sequence
 
 from iort_agent.clock import Clock
+from iort_agent.common.schema import number, setting, text
 from iort_agent.errors import SourceError
-from iort_agent.schema import number, setting, text
 from iort_agent.sources import FAIL, OK, Emit, Finding, SourceConfig
 from iort_agent.sources.vesc.protocol import (
     COMM_FW_VERSION,
