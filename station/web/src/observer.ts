@@ -2,7 +2,8 @@
 
 import { now } from "./base/clock";
 import type { Feed } from "./live/feed";
-import { BOUNDS, GONE_S, STALE_S, type Fleet } from "./live/fleet";
+import type { Fleet } from "./live/fleet";
+import { BOUNDS, GONE_S, STALE_S } from "./live/robot";
 
 export function observer(fleet: Fleet, feed: Feed, tick_s: number): object {
   const robots = (): object =>

@@ -84,10 +84,10 @@ def test_a_distribution_is_in_per_cent_with_its_median():
 
 
 def test_what_cannot_be_drawn_is_named(tmp_path):
-    with pytest.raises(StationError, match="volts cannot be drawn; what can is speed"):
+    with pytest.raises(StationError, match="volts cannot be drawn, only speed"):
         plots.over_time([run()], ["volts"])
     figure = plots.over_time([run()], ["speed"])
-    with pytest.raises(StationError, match=r"allowed is a file ending in .pdf, .png, .svg"):
+    with pytest.raises(StationError, match=r"must end in .pdf, .png, .svg"):
         plots.save(figure, tmp_path / "speed.gif")
 
 

@@ -1,7 +1,7 @@
 // A chart of the last 30 seconds that scrolls: uPlot, drawn only when there is something new to see.
 
 import uPlot from "uplot";
-import { WINDOW_S } from "../live/fleet";
+import { WINDOW_S } from "../live/robot";
 import { AS_SENT, linear, type Linear } from "../base/format";
 import { axis, calm, faint, fit, holes, labels, paint, PLAIN, rem, roundRange } from "./axes";
 import type { Ring } from "../live/ring";

@@ -1,6 +1,6 @@
 // A line of the last 30 seconds in a few square centimetres, without axes.
 
-import { WINDOW_S } from "../live/fleet";
+import { WINDOW_S } from "../live/robot";
 import type { Ring } from "../live/ring";
 import { colour, onTheme } from "../base/theme";
 

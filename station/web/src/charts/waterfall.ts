@@ -1,7 +1,7 @@
 // Where the time goes: a bar a leg of a message's way, each beginning where the one before it ends.
 
 import { el, setAttribute, Text } from "../base/dom";
-import { LEGS, MEDIAN_S, type Delay, type Leg, type Robot } from "../live/fleet";
+import { LEGS, MEDIAN_S, type Delay, type Leg, type Robot } from "../live/robot";
 import { milliseconds, NOTHING } from "../base/format";
 
 const NAMES: Readonly<Record<Leg | "screen", readonly [string, string]>> = {

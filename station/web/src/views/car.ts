@@ -1,10 +1,11 @@
-// One car in full: gauges, charts, the delay by hop, planes, faults, and every field of every stream.
+// One car in full: gauges, charts, the delay by hop, XY charts, faults, and every field of every stream.
 
 import type { Shown } from "../charts/live_chart";
 import type { FieldTable } from "../server/config";
 import { byName, el, setAttribute, Text } from "../base/dom";
 import { FaultLog } from "../widgets/fault_log";
-import { median, MEDIAN_S, numeric, WINDOW_S, type Fleet, type Robot, type Stream } from "../live/fleet";
+import type { Fleet } from "../live/fleet";
+import { median, MEDIAN_S, numeric, WINDOW_S, type Robot, type Stream } from "../live/robot";
 import { age, AS_SENT, linear, spec, type Linear } from "../base/format";
 import { Gauge } from "../charts/gauge";
 import { ChartPanel } from "../charts/chart_panel";
@@ -12,7 +13,7 @@ import { XYChart, type Track } from "../charts/xy_chart";
 import { Ring } from "../live/ring";
 import { fieldKey, StreamSection } from "../widgets/field_tiles";
 import { Waterfall } from "../charts/waterfall";
-import { DELAY_PANEL, GAUGES, XY_CHARTS, VESC_PANELS, type XYChartSpec } from "../charts/car_charts";
+import { DELAY_CHART, GAUGES, XY_CHARTS, LINE_CHARTS, type XYChartSpec } from "../charts/car_charts";
 
 const MOST_CHOSEN = 6;
 // Values are written at most 25 times a second.
@@ -21,7 +22,7 @@ const SCREENS = 25 * MEDIAN_S;
 interface ShownXYChart {
   readonly spec: XYChartSpec;
   readonly node: HTMLElement;
-  readonly plane: XYChart;
+  readonly chart: XYChart;
   source: { readonly stream: Stream; readonly x: string; readonly y: string; readonly as: Linear } | undefined;
   unit: string;
 }
@@ -38,7 +39,7 @@ export class CarView {
   private readonly streams = el("div", { class: "streams" });
   private readonly panels: readonly ChartPanel[];
   private readonly delay: ChartPanel;
-  private readonly planes: readonly ShownXYChart[];
+  private readonly xyCharts: readonly ShownXYChart[];
   private readonly waterfall = new Waterfall();
   private readonly faults = new FaultLog();
   private readonly sections = new Map<Stream, StreamSection>();
@@ -56,25 +57,25 @@ export class CarView {
     this.gauges = GAUGES.map((each) => new Gauge(each));
     this.gaugeRow.append(...this.gauges.map(({ node }) => node));
     const aside = el("aside", { class: "aside" });
-    this.panels = VESC_PANELS.map((options) => new ChartPanel(this.charts, options));
+    this.panels = LINE_CHARTS.map((options) => new ChartPanel(this.charts, options));
     aside.append(this.waterfall.node);
-    this.delay = new ChartPanel(aside, DELAY_PANEL);
-    const planeRow = el("div", { class: "planes" });
-    this.planes = XY_CHARTS.map((spec) => {
+    this.delay = new ChartPanel(aside, DELAY_CHART);
+    const xyRow = el("div", { class: "xy-charts" });
+    this.xyCharts = XY_CHARTS.map((spec) => {
       const host = el("div", { class: "plot", "aria-hidden": "true" });
       const node = el("section", { class: "panel", "aria-label": spec.title }, el("header", {}, el("h3", {}, spec.title), el("p", { class: "note" }, `last ${WINDOW_S} s`)), host);
-      planeRow.append(node);
-      const shown: ShownXYChart = { spec, node, plane: new XYChart(host, { ...spec, x: () => spec.x + shown.unit }), source: undefined, unit: "" };
+      xyRow.append(node);
+      const shown: ShownXYChart = { spec, node, chart: new XYChart(host, { ...spec, x: () => spec.x + shown.unit }), source: undefined, unit: "" };
       return shown;
     });
-    planeRow.append(this.faults.node);
+    xyRow.append(this.faults.node);
     this.node = el(
       "article",
       { class: "car", id: "car" },
       el("header", { class: "car-head" }, this.title.node, this.state.node, this.fault, tools),
       this.gaugeRow,
       el("div", { class: "board" }, this.charts, aside),
-      planeRow,
+      xyRow,
       this.chosenCharts,
       this.streams,
     );
@@ -156,7 +157,7 @@ export class CarView {
       this.gauges[i]!.set(show.value, least, most, show.unit, show.digits);
     });
     this.panels.forEach((panel, i) => {
-      const { fields, as } = VESC_PANELS[i]!;
+      const { fields, as } = LINE_CHARTS[i]!;
       panel.show(shown(vesc, fields), ...as(speed));
       panel.update(fields.map(newest));
     });
@@ -179,7 +180,7 @@ export class CarView {
   }
 
   private findPlanes(robot: Robot, speed: Linear | undefined): void {
-    for (const each of this.planes) {
+    for (const each of this.xyCharts) {
       each.source = undefined;
       if (each.spec.speed) each.unit = speed ? ", m/s" : ", erpm";
       for (const stream of robot.streams.values()) {
@@ -218,7 +219,7 @@ export class CarView {
     // All in the same frame: a frame costs more than what is drawn in it.
     if (!panels.some((panel) => panel.due(now))) return;
     for (const panel of panels) panel.draw(now);
-    for (const { plane, source } of this.planes) if (source) plane.draw(now, () => track(source, now));
+    for (const { chart, source } of this.xyCharts) if (source) chart.draw(now, () => track(source, now));
   }
 }
 

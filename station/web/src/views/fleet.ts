@@ -3,7 +3,8 @@
 import { AbsentCars } from "../widgets/absent_cars";
 import type { Config, FieldTable } from "../server/config";
 import { byName, el, setAttribute, Text } from "../base/dom";
-import { numeric, type Fleet, type Robot } from "../live/fleet";
+import type { Fleet } from "../live/fleet";
+import { numeric, type Robot } from "../live/robot";
 import { age, linear, milliseconds, NOTHING, number } from "../base/format";
 import { route } from "../base/route";
 import { Sparkline } from "../charts/sparkline";

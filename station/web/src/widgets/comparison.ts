@@ -1,7 +1,7 @@
 // Two columns of values: at the time that the viewer looks at, and now.
 
 import { el, Text } from "../base/dom";
-import type { Stream } from "../live/fleet";
+import type { Stream } from "../live/robot";
 import { NOTHING, number, write, type Spec } from "../base/format";
 import type { Value } from "../live/update";
 

@@ -4,7 +4,7 @@
 import { claimed, partsOf } from "../live/attachments";
 import type { FieldTable } from "../server/config";
 import { el, setAttribute, Text } from "../base/dom";
-import { numeric, STALE_S, type Stream } from "../live/fleet";
+import { numeric, STALE_S, type Stream } from "../live/robot";
 import { age, spec, write, type Spec } from "../base/format";
 import { Thumbnail } from "./thumbnail";
 import { Sparkline } from "../charts/sparkline";
