@@ -1,6 +1,8 @@
 # One command for each habit. `make demo` and `make test` set everything up by themselves.
 PYTHON ?= python3
 BIN := .venv/bin
+# The environment's bytecode is its own. Without it each of a hundred processes compiles every module again.
+export PYTHONDONTWRITEBYTECODE :=
 # cdk.json runs `python app.py`.
 bootstrap preflight deploy diff destroy: export PATH := $(CURDIR)/$(BIN):$(PATH)
 

@@ -1,4 +1,4 @@
-"""Fills the generated parts of README.md and docs/: `make docs-parts`.
+"""Fills the generated parts of README.md, of docs/ and of the page's contract.ts: `make docs-parts`.
 
 A part stands between two comments. The first holds a call of a function of this module, and cog
 (https://cog.readthedocs.io) replaces what follows by what the function prints.
@@ -20,14 +20,20 @@ from typer.cli import get_docs_for_click
 from bench.fleet_costs import fleets
 from bench.report.result import Ratio
 from bench.report.writer import ratio_row
-from iort_contract.vesc import VESC_FIELDS
+from iort_contract.catalog.derived import DERIVED
+from iort_contract.catalog.streams import AGENT_FIELDS
+from iort_contract.catalog.vesc import VESC
 from iort_station.cli.main import app
 from iort_station.cost import report
 from iort_station.cost.prices import AS_OF, REGION
 from iort_station.cost.usage import Usage
+from scripts.page_contract import formula, page_contract
+
+__all__ = ["agent", "cost", "derived", "fields", "headline", "manual", "page_contract"]
 
 ROOT = Path(__file__).resolve().parent.parent
-FILES = tuple(ROOT / name for name in ("README.md", "docs/cost.md", "docs/iort.md"))
+FILES = tuple(ROOT / name for name in ("README.md", "docs/cost.md", "docs/iort.md", "docs/messages.md"))
+PAGE = ROOT / "station" / "web" / "src" / "base" / "contract.ts"
 REPORT = ROOT / "docs" / "bench" / "report.json"
 
 
@@ -35,16 +41,29 @@ def main(*files: Path, check: bool = False) -> int:
     """Fill every part; with ``check`` change nothing, and return a status that is not 0 if one is old."""
     mode = ["--check", "--diff", "--check-fail-msg=run `make docs-parts`"] if check else ["-r"]
     command = ["cog", *mode, "-P", "-p", "from scripts.docs_parts import *", "--verbosity=1"]
-    return int(Cog().main([*command, *map(str, files or FILES)]))
+    return int(Cog().main([*command, *map(str, files or (*FILES, PAGE))]))
 
 
 def fields() -> None:
-    """The VESC's fields, from the contract."""
+    """The VESC's fields, from the catalogue."""
     rows = []
-    for field in VESC_FIELDS.values():
+    for field in VESC.fields:
         unit = f"{field.unit} (ROS 2: {field.ros2_unit})" if field.ros2_unit else field.unit
-        rows.append((f"`{field.name}`", unit, field.meaning, ", ".join(map(str, field.ros))))
-    _table(("field", "unit", "meaning", "ROS"), rows, right=False)
+        versions = ", ".join(map(str, field.ros))
+        rows.append((f"`{field.name}`", unit, field.meaning, field.group, versions))
+    _table(("field", "unit", "meaning", "group", "ROS"), rows, right=False)
+
+
+def derived() -> None:
+    """The derived fields, from the catalogue."""
+    rows = [(f"`{d.name}`", d.unit, d.meaning, f"`{formula(d)}`") for d in DERIVED.values()]
+    _table(("derived field", "unit", "meaning", "formula"), rows, right=False)
+
+
+def agent() -> None:
+    """The agent's own figures, from the catalogue."""
+    rows = [(f"`{field.name}`", field.unit, field.meaning) for field in AGENT_FIELDS.values()]
+    _table(("field", "unit", "meaning"), rows, right=False)
 
 
 def cost(name: str) -> None:

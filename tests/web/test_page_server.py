@@ -14,9 +14,8 @@ from urllib.parse import urlsplit
 
 import pytest
 
-from iort_contract.vesc import DERIVED_UNITS, FAULTS, VESC_FIELDS
 from iort_station.errors import StationError
-from iort_station.page.page import BUILT, config, field_table
+from iort_station.page.page import BUILT, config
 from iort_station.page.server import PageServer
 
 TOLD: dict[str, Any] = {
@@ -59,7 +58,6 @@ def ask(
         ("/page.js", "text/javascript; charset=utf-8"),
         ("/style.css", "text/css; charset=utf-8"),
         ("/config.json", "application/json"),
-        ("/fields.json", "application/json"),
     ],
 )
 def test_files_come_with_their_type_and_the_policy(built: Path, path: str, kind: str) -> None:
@@ -153,15 +151,6 @@ def test_an_answer_with_numbers_that_json_does_not_have_comes_with_null(built: P
     assert json.loads(body) == {"mean": [1.5, None, None], "of": {"x": None}, "n": 3}
 
 
-def test_the_page_reads_the_contracts_fields(built: Path) -> None:
-    with PageServer(**TOLD, built=built) as page:
-        table = json.loads(ask(page, "/fields.json")[1])
-    assert table == field_table()
-    assert table["fields"].keys() >= VESC_FIELDS.keys() | DERIVED_UNITS.keys()
-    assert table["fields"]["speed"]["unit"] == "erpm"
-    assert table["faults"]["5"] == FAULTS[5]
-
-
 @pytest.mark.parametrize(
     ("change", "says"),
     [
@@ -231,7 +220,7 @@ def test_it_serves_ipv6(built: Path) -> None:
 
 @pytest.mark.parametrize(
     "path",
-    ["/", "/page.js", "/config.json", "/fields.json", "/double.json?n=1", "/no", "http://elsewhere/page.js"],
+    ["/", "/page.js", "/config.json", "/double.json?n=1", "/no", "http://elsewhere/page.js"],
 )
 @pytest.mark.parametrize("host", ["127.0.0.1", "0.0.0.0"])
 def test_no_path_answers_to_somebody_elses_name(built: Path, path: str, host: str) -> None:

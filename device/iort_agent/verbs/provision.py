@@ -25,10 +25,10 @@ from iort_agent.identity.pending import Pending, forget, keep, kept
 from iort_agent.mqtt.exchange import Exchange
 from iort_agent.private_files import write_below
 from iort_agent.status.server import ask
+from iort_contract.catalog.vesc import VESC_STREAM
 from iort_contract.limits import ContractError
 from iort_contract.tables import ROBOT_PARAMETER, SERIAL_PARAMETER
 from iort_contract.topics import check_robot
-from iort_contract.vesc import VESC_STREAM
 
 _log = logging.getLogger(__name__)
 
@@ -218,7 +218,8 @@ def _wait_connected(config: Config, certificate_id: str, status_socket: Path) ->
 
 
 def _try_alone(config: Config) -> None:
-    from iort_agent.verbs.check import FAIL, broker_findings  # noqa: PLC0415 - it loads TLS and more
+    from iort_agent.sources import FAIL  # noqa: PLC0415 - only this verb needs it
+    from iort_agent.verbs.check import broker_findings  # noqa: PLC0415 - it loads TLS and more
 
     for finding in broker_findings(config):
         if finding.level == FAIL:

@@ -3,8 +3,7 @@
     with PageServer(namespace="iort", subscribe_key="sub-c-...", origin="ps.pndsn.com") as page:
         print(page.url)
 
-The page reads from ``/config.json`` where to listen, and from ``/fields.json`` what the fields mean. Neither
-holds a key that can publish.
+The page reads from ``/config.json`` where to listen; it holds no key that can publish.
 """
 
 from __future__ import annotations
@@ -31,7 +30,7 @@ from iort_contract.limits import ContractError
 from iort_contract.page import HEADERS, PUBNUB_ORIGIN, security_policy
 from iort_station.errors import StationError
 from iort_station.page.background import BackgroundServer
-from iort_station.page.page import BUILT, TYPES, built_files, config, field_table
+from iort_station.page.page import BUILT, TYPES, built_files, config
 
 Answer = Callable[[Mapping[str, str]], Mapping[str, Any]]
 
@@ -90,7 +89,6 @@ class PageServer(BackgroundServer):
         }
         self._files["/"] = self._files["/index.html"]
         self._files["/config.json"] = _json(told)
-        self._files["/fields.json"] = _json(field_table())
         self._headers = {
             **HEADERS,
             "Cache-Control": "no-cache",

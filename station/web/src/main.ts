@@ -1,7 +1,8 @@
 // The page: listens to the whole fleet, shows one view of it, and costs nothing while hidden.
 
+import { FIELD_TABLE, type Config, type FieldTable } from "./base/contract";
 import { now } from "./base/clock";
-import { load, type Config, type FieldTable } from "./server/config";
+import { load } from "./server/config";
 import { byId, byName, el, setAttribute } from "./base/dom";
 import { Feed } from "./live/feed";
 import { Fleet } from "./live/fleet";
@@ -146,9 +147,9 @@ class Page {
 const GONE_SHOWN_S = CLOCK_S;
 
 load()
-  .then(({ config, table }) => {
+  .then((config) => {
     startTheme(byId("theme"));
-    return new Page(config, table);
+    return new Page(config, FIELD_TABLE);
   })
   .catch((error: unknown) => {
     setAttribute(byId("link"), "data-state", "lost");

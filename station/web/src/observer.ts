@@ -3,7 +3,8 @@
 import { now } from "./base/clock";
 import type { Feed } from "./live/feed";
 import type { Fleet } from "./live/fleet";
-import { BOUNDS, GONE_S, STALE_S } from "./live/robot";
+import { GONE_S, STALE_S } from "./base/contract";
+import { BOUNDS } from "./live/robot";
 
 export function observer(fleet: Fleet, feed: Feed, tick_s: number): object {
   const robots = (): object =>

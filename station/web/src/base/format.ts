@@ -1,7 +1,6 @@
 // How values are written: unit, scale and digits follow from the contract's field table.
 
-import type { FieldTable } from "../server/config";
-import type { Value } from "../live/update";
+import type { FieldTable, Value } from "./contract";
 
 /** What is shown of a value sent: it times `scale`, and `shift` more. */
 export interface Linear {

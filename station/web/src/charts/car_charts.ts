@@ -1,5 +1,6 @@
 // The charts of a car's view. To add one, add an entry to `CHARTS`.
 
+import { power_w, TEMPERATURES } from "../base/contract";
 import { AS_SENT, linear, times, type Linear } from "../base/format";
 import type { Robot } from "../live/robot";
 import type { ChartPanelOptions } from "./chart_panel";
@@ -46,10 +47,9 @@ const plain = (field: string, scale = 1): Pick<GaugeSpec, "fields" | "extent" | 
   show: (newest) => ({ value: newest(field) * scale, as: times(scale) }),
 });
 
-/** The hottest temperature of a controller; drivers report 0 for a missing sensor. */
-const TEMPERATURES = ["temperature_pcb", "temp_fet", "temp_motor"];
+/** The controller's hottest temperature, as in the contract: a sensor that is not read is 0. */
 export const hottest = (newest: (field: string) => number): number => {
-  const known = TEMPERATURES.map(newest).filter((value) => !Number.isNaN(value));
+  const known = TEMPERATURES.map(newest).filter((value) => !Number.isNaN(value) && value !== 0);
   return known.length > 0 ? Math.max(...known) : NaN;
 };
 
@@ -77,7 +77,7 @@ const CHARTS: readonly (GaugeSpec | LineSpec | XYChartSpec)[] = [
   {
     kind: "gauge", name: "power_w", label: "Battery power", unit: "W", digits: 1, from: -100, to: 200,
     fields: [],
-    show: (newest) => ({ value: newest("voltage_input") * newest("current_input") }),
+    show: (newest) => ({ value: power_w(newest("voltage_input"), newest("current_input")) }),
   },
   { kind: "gauge", name: "duty_cycle", label: "Duty cycle", unit: "%", digits: 1, from: -20, to: 100, ...plain("duty_cycle", 100) },
   {

@@ -1,10 +1,7 @@
 // What a message was too large for: the sample holds a claim for each field of bytes (docs/files.md), five
 // fields that say where the content is and, of a picture, hold a small one.
 
-import type { Value } from "./update";
-
-/** The end of a claim's fields' names, as in contract/iort_contract/messages/files.py. */
-const PARTS = ["key", "sha256", "size", "content_type", "thumbnail"] as const;
+import { ATTACHMENT_PARTS, type Value } from "../base/contract";
 
 export interface Claim {
   readonly key: string;
@@ -22,12 +19,12 @@ export function claimed(sample: Sample): string[] {
   const found = [];
   for (const name of sample.keys()) {
     const field = name.endsWith(end) ? name.slice(0, -end.length) : "";
-    if (field && PARTS.every((part) => sample.has(`${field}.${part}`))) found.push(field);
+    if (field && ATTACHMENT_PARTS.every((part) => sample.has(`${field}.${part}`))) found.push(field);
   }
   return found;
 }
 
-export const partsOf = (field: string): string[] => PARTS.map((part) => `${field}.${part}`);
+export const partsOf = (field: string): string[] => ATTACHMENT_PARTS.map((part) => `${field}.${part}`);
 
 /** The claim on a field; undefined where the car has left this content out. */
 export function claim(field: string, value: (name: string) => Value | undefined): Claim | undefined {

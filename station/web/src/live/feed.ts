@@ -1,7 +1,7 @@
 // The page's end of its worker: starts it, and hands what it hears to the fleet.
 
+import type { Config, FieldTable } from "../base/contract";
 import { now } from "../base/clock";
-import type { Config, FieldTable } from "../server/config";
 import type { Fleet } from "./fleet";
 import type { FromWorker, LinkState, ToWorker } from "./worker_messages";
 

@@ -2,7 +2,7 @@
 
 import type { Linear } from "../base/format";
 import { ask, AnswerError } from "../server/answers";
-import type { Config, FieldTable, Vehicles } from "../server/config";
+import type { Config, FieldTable, VehiclesAnswer } from "../base/contract";
 import { BOUNDS, Robot, Stream } from "./robot";
 import type { Arrival } from "./worker_messages";
 
@@ -16,7 +16,7 @@ export class Fleet {
   /** Grows when a car or a stream is heard for the first time, or forgotten. */
   shape = 0;
   private columns = 0;
-  private vehicles: Vehicles;
+  private vehicles: VehiclesAnswer["vehicles"];
   private learning: Promise<void> | undefined;
 
   constructor(
@@ -70,7 +70,7 @@ export class Fleet {
   /** Ask for the cars' parameters again: one was registered after the page was opened. */
   private async learn(): Promise<void> {
     try {
-      this.vehicles = (await ask<{ vehicles: Vehicles }>("vehicles", {})).vehicles;
+      this.vehicles = (await ask<VehiclesAnswer>("vehicles", {})).vehicles;
       // What stands on the page was written without.
       for (const robot of this.robots.values()) robot.version += 1;
     } catch (error) {

@@ -1,14 +1,11 @@
 // One car: the newest sample of each stream, the last 30 seconds, the delays and the faults. Nothing here
 // touches the page; times are those of base/clock.ts.
 
-import type { FieldTable } from "../server/config";
+import { GONE_S, STALE_S, type FieldTable, type Value } from "../base/contract";
 import { claim, claimed, type Claim } from "./attachments";
 import { Ring } from "./ring";
-import type { Hops, Update, Value } from "./update";
+import type { Hops, Update } from "./update";
 
-/** Older values are shown as stale, and a car unheard of for longer as gone. */
-export const STALE_S = 1.5;
-export const GONE_S = 4.5;
 /** What the charts show, and what a median is taken over. */
 export const WINDOW_S = 30;
 export const MEDIAN_S = 10;

@@ -1,7 +1,7 @@
 // The live update as Lambda 1 sends it (iort_contract.live_update), checked field by field: whatever else
 // arrives on the channel is refused with a reason.
 
-export type Value = null | boolean | number | string;
+import { BOOT, FIELD_NAME, MAX_FIELDS, NAME, type Value } from "../base/contract";
 
 export interface Hops {
   readonly sent_us: number;
@@ -21,11 +21,6 @@ export interface Update {
   readonly hops: Hops;
   readonly sample: ReadonlyMap<string, Value>;
 }
-
-const NAME = /^[A-Za-z0-9_-]{1,64}$/;
-const BOOT = /^[0-9a-f]{8,32}$/;
-const FIELD = /^[A-Za-z][A-Za-z0-9_]*(\.[A-Za-z0-9_]+)*$/;
-const MAX_FIELDS = 512;
 
 /** The update, or what is wrong with it. Whose it is follows from the channel, never from the body. */
 export function parseUpdate(namespace: string, version: number, channel: string, message: unknown): Update | string {
@@ -47,7 +42,7 @@ export function parseUpdate(namespace: string, version: number, channel: string,
   if (entries.length > MAX_FIELDS) return "too many fields";
   const values = new Map<string, Value>();
   for (const [name, value] of entries) {
-    if (!FIELD.test(name)) return "a field name that is not allowed";
+    if (!FIELD_NAME.test(name)) return "a field name that is not allowed";
     if (!isValue(value)) return "a value that is neither number, text, true, false nor null";
     values.set(name, value);
   }

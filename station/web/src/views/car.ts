@@ -1,7 +1,7 @@
 // One car in full: gauges, charts, the delay by hop, XY charts, faults, and every field of every stream.
 
+import type { FieldTable } from "../base/contract";
 import type { Shown } from "../charts/live_chart";
-import type { FieldTable } from "../server/config";
 import { byName, el, setAttribute, Text } from "../base/dom";
 import { FaultLog } from "../widgets/fault_log";
 import type { Fleet } from "../live/fleet";

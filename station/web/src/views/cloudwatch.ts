@@ -1,7 +1,7 @@
 // CloudWatch's dashboards as they are deployed, drawn from the metrics that the cloud has.
 
-import { ask, AnswerError, type Alarm, type Dashboard, type Series, type Widget } from "../server/answers";
-import type { Config } from "../server/config";
+import type { Alarm, Config, Dashboard, Series, Widget } from "../base/contract";
+import { ask, AnswerError } from "../server/answers";
 import { el, Text } from "../base/dom";
 import { clockTime, dayTime, NOTHING, number, zone } from "../base/format";
 import { LogTable } from "../widgets/log_table";

@@ -1,7 +1,7 @@
 // Every car: one card each, in the order of their names, so that a card stays where it is.
 
+import type { Config, FieldTable } from "../base/contract";
 import { AbsentCars } from "../widgets/absent_cars";
-import type { Config, FieldTable } from "../server/config";
 import { byName, el, setAttribute, Text } from "../base/dom";
 import type { Fleet } from "../live/fleet";
 import { numeric, type Robot } from "../live/robot";

@@ -1,7 +1,7 @@
 // The registered cars that this page has not heard: since when they are away, and the way to their past.
 
-import { ask, AnswerError, type Presence } from "../server/answers";
-import type { Config } from "../server/config";
+import type { Config, RobotPresence, RobotsAnswer } from "../base/contract";
+import { ask, AnswerError } from "../server/answers";
 import { byName, el } from "../base/dom";
 import type { Fleet } from "../live/fleet";
 import { dayTime, zone } from "../base/format";
@@ -11,7 +11,7 @@ const REFRESH_S = 30;
 
 export class AbsentCars {
   readonly node = el("section", { class: "absent", "aria-label": "Cars that are not heard", hidden: "" });
-  private robots: Presence = {};
+  private robots: RobotsAnswer["robots"] = {};
   private drawn = "";
   private timer: number | undefined;
 
@@ -44,7 +44,7 @@ export class AbsentCars {
 
   private async find(): Promise<void> {
     try {
-      this.robots = (await ask<{ robots: Presence }>("robots", {})).robots;
+      this.robots = (await ask<RobotsAnswer>("robots", {})).robots;
       this.arrange();
     } catch (error) {
       // What was known stays; that the server does not answer is said where it is asked for more.
@@ -53,7 +53,7 @@ export class AbsentCars {
   }
 }
 
-function state({ online, since_ms }: Presence[string]): string {
+function state({ online, since_ms }: RobotPresence): string {
   if (online) return "connected, and sends nothing live";
   if (since_ms === null) return "never connected";
   return `offline since ${dayTime(since_ms / 1000)} ${zone(since_ms / 1000)}`;

@@ -1,9 +1,9 @@
 // Two columns of values: at the time that the viewer looks at, and now.
 
+import type { Value } from "../base/contract";
 import { el, Text } from "../base/dom";
 import type { Stream } from "../live/robot";
 import { NOTHING, number, write, type Spec } from "../base/format";
-import type { Value } from "../live/update";
 
 interface Row {
   readonly spec: Spec;

@@ -2,9 +2,9 @@
 // of a field of bytes, the newest picture.
 
 import { claimed, partsOf } from "../live/attachments";
-import type { FieldTable } from "../server/config";
 import { el, setAttribute, Text } from "../base/dom";
-import { numeric, STALE_S, type Stream } from "../live/robot";
+import { STALE_S, type FieldTable } from "../base/contract";
+import { numeric, type Stream } from "../live/robot";
 import { age, spec, write, type Spec } from "../base/format";
 import { Thumbnail } from "./thumbnail";
 import { Sparkline } from "../charts/sparkline";

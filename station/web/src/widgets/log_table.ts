@@ -1,6 +1,7 @@
 // A log widget: what its query finds, as a table. Asked for by itself, because Logs Insights takes seconds.
 
-import { ask, AnswerError, type Logs } from "../server/answers";
+import type { Logs } from "../base/contract";
+import { ask, AnswerError } from "../server/answers";
 import { el, Text } from "../base/dom";
 import { clockTime, dayTime, zone } from "../base/format";
 

@@ -1,6 +1,6 @@
 // The bar above and the line below every view: who is there, whether the connection holds, what was refused.
 
-import type { Config, FieldTable } from "../server/config";
+import type { Config, FieldTable } from "../base/contract";
 import { byId, setAttribute } from "../base/dom";
 import type { Fleet } from "../live/fleet";
 import { age, number } from "../base/format";

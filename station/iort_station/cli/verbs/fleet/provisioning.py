@@ -7,6 +7,7 @@ from typing import Annotated
 
 import typer
 
+from iort_contract.catalog.derived import F1TENTH
 from iort_station.cli.console import errors, out
 from iort_station.errors import StationError
 from iort_station.fleet import claims, registry, robots, rotation
@@ -24,7 +25,7 @@ def add(
     folder: Annotated[
         Path, typer.Option("--out", help="Where to write the robot's folder of configuration and keys.")
     ] = Path(),
-    speed_to_erpm_gain: _Gain = 4614.0,
+    speed_to_erpm_gain: _Gain = F1TENTH.speed_to_erpm_gain,
 ) -> None:
     """Register a robot and write its folder: car.yaml, certificate and key."""
     bundle = robots.add(context.obj.cloud(), name, out=folder, vehicle=_vehicle(speed_to_erpm_gain))
@@ -40,7 +41,7 @@ def register(
         str | None, typer.Option(help="The serial number of the one machine that may claim the name.")
     ] = None,
     days: Annotated[float, typer.Option(help="How many days the name can be claimed.", min=0)] = claims.DAYS,
-    speed_to_erpm_gain: _Gain = 4614.0,
+    speed_to_erpm_gain: _Gain = F1TENTH.speed_to_erpm_gain,
 ) -> None:
     """Pre-register names. Any robot with one of the fleet's lasting claims can claim each name once."""
     if serial is not None and len(names) != 1:

@@ -10,9 +10,9 @@ from typing import Annotated, Any
 import typer
 from rich.table import Table
 
+from iort_contract.catalog.streams import RTT_STREAM
+from iort_contract.catalog.vesc import VESC_STREAM
 from iort_contract.page import PUBNUB_ORIGIN
-from iort_contract.topics import RTT_STREAM
-from iort_contract.vesc import VESC_STREAM
 from iort_station.cli.console import errors, out, print_json
 from iort_station.cli.options import AsJson
 from iort_station.data.inventory import check_registered
