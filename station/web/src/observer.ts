@@ -1,4 +1,4 @@
-// What tests and the curious may read; every access makes a copy, so nothing can be changed through it.
+// The page's state for tests and for the browser's console; every access makes a copy, so it is read-only.
 
 import { now } from "./base/clock";
 import type { Feed } from "./live/feed";

@@ -1,4 +1,4 @@
-// Every car that this page has heard. Names come from the network, so what they fill is bounded.
+// Every car that this page has heard. Names come from the network, so the number of cars is bounded.
 
 import type { Linear } from "../base/format";
 import { ask, AnswerError } from "../server/answers";
@@ -11,9 +11,9 @@ export class Fleet {
   received = 0;
   malformed = 0;
   outOfOrder = 0;
-  /** What was wrong with the last message refused. */
+  /** The reason of the last rejected message. */
   lastRefusal = "";
-  /** Grows when a car or a stream is heard for the first time, or forgotten. */
+  /** Grows when a car or a stream is new or forgotten. */
   shape = 0;
   private columns = 0;
   private vehicles: VehiclesAnswer["vehicles"];
@@ -26,7 +26,7 @@ export class Fleet {
     this.vehicles = config.vehicles;
   }
 
-  /** Take what arrived, and how many messages were refused with it. */
+  /** Take arrivals, and the number of messages rejected meanwhile. */
   take(arrivals: readonly Arrival[], refused: number, lastRefusal: string): void {
     this.received += arrivals.length + refused;
     this.malformed += refused;
@@ -61,20 +61,20 @@ export class Fleet {
     robot.delays.push([at, (wall_us - sent_us) / 1e3, ...legs.map((leg_us) => leg_us / 1e3)]);
   }
 
-  /** Metres a second of an erpm, which is gain times them and an offset; undefined for a car that is not known. */
+  /** The conversion from erpm to m/s; undefined if the car's parameters are unknown. */
   speed(robot: string): Linear | undefined {
     const { speed_to_erpm_gain: gain, speed_to_erpm_offset: offset = 0 } = (Object.hasOwn(this.vehicles, robot) && this.vehicles[robot]) || {};
     return gain ? { scale: 1 / gain, shift: offset === 0 ? 0 : -offset / gain } : undefined;
   }
 
-  /** Ask for the cars' parameters again: one was registered after the page was opened. */
+  /** Ask for the cars' parameters again: a car was registered after the page was opened. */
   private async learn(): Promise<void> {
     try {
       this.vehicles = (await ask<VehiclesAnswer>("vehicles", {})).vehicles;
-      // What stands on the page was written without.
+      // The page shows values without the new parameters.
       for (const robot of this.robots.values()) robot.version += 1;
     } catch (error) {
-      // Its speed is shown in erpm, as without a server that answers.
+      // The speed stays in erpm, as without a server.
       if (!(error instanceof AnswerError)) throw error;
     }
   }
@@ -86,7 +86,7 @@ export class Fleet {
       for (const { columns } of silent.streams.values()) this.columns -= columns.size;
     }
     if (this.config.answers && !Object.hasOwn(this.vehicles, name)) {
-      // Twenty cars that come at once are one question.
+      // Several new cars at once are one request.
       this.learning ??= this.learn().finally(() => (this.learning = undefined));
     }
     const robot = new Robot(name);

@@ -6,24 +6,24 @@ import { claim, claimed, type Claim } from "./attachments";
 import { Ring } from "./ring";
 import type { Hops, Update } from "./update";
 
-/** What the charts show, and what a median is taken over. */
+/** The range of the charts, and of medians. */
 export const WINDOW_S = 30;
 export const MEDIAN_S = 10;
 
-// Names and fields come from the network, so whatever they make grow is bounded: 30 s at 16 Hz (the live
-// lane carries at most 10), and in all 12 MB of columns.
+// Names and fields come from the network, so everything that they fill is bounded: 30 s at 16 Hz (the live lane
+// carries at most 10), and 12 MB of columns in all.
 export const BOUNDS = { rows: 512, delays: 2048, columns: 1536, robots: 256, streams: 32, boots: 8, faults: 100, claims: 4 } as const;
 
 export type Freshness = "live" | "stale" | "gone";
 
-/** The legs of a message's way, in the order of `Robot.delays`' columns after arrival and total. */
+/** A message's hops, in the order of the columns of `Robot.delays` after arrival and total. */
 export const LEGS = ["car", "toCloud", "toLambda", "toPubNub", "toPage"] as const;
 export type Leg = (typeof LEGS)[number];
-/** In milliseconds. The total is from leaving the car to arriving here: without the car's own leg. */
+/** In milliseconds. The total is from leaving the car to arriving here, without the hop within the car. */
 export type Delay = { readonly total: number } & Readonly<Record<Leg, number>>;
 
 export interface Fault {
-  /** When it was first and last heard of, in seconds since the epoch. */
+  /** The first and last report, in seconds since the epoch. */
   readonly since: number;
   until: number;
   readonly name: string;
@@ -32,8 +32,8 @@ export interface Fault {
 }
 
 /**
- * Where the sample times of a car's clock lie on the page's clock: the smallest difference seen within
- * the last half to whole minute, which is that of the message that travelled fastest.
+ * The offset from a car's clock to the page's clock: the smallest difference of the last 30 to 60 s, which is that of
+ * the fastest message.
  */
 class ClockOffset {
   private current = Infinity;
@@ -59,18 +59,18 @@ export class Stream {
   t_us = 0;
   hops: Hops = { sent_us: 0, received_ms: 0, lambda_us: 0, offset_us: 0, offset_known: false };
   sample: ReadonlyMap<string, Value> = new Map();
-  /** When the newest sample was taken, on the page's clock, if it had come as fast as the fastest. */
+  /** The newest sample's time on the page's clock, as if it were as fast as the fastest message. */
   takenAt = -Infinity;
   heardAt = -Infinity;
   received = 0;
-  /** Grows with every sample that becomes the newest. */
+  /** Grows with every newer sample. */
   version = 0;
   /** Column 0 is `takenAt`; a numeric field's column is in `columns`. */
   readonly history = new Ring(1, BOUNDS.rows);
   readonly columns = new Map<string, number>();
   /** Whether charge and energy have the ROS 2 driver's units: counts of 1e-4 Ah are whole. */
   ros2 = false;
-  /** Of fields of bytes the newest content that the car has kept, which is not that of every sample. */
+  /** For each field of bytes its newest attachment; not every sample has one. */
   readonly claims = new Map<string, { readonly claim: Claim; readonly takenAt: number }>();
   private readonly arrivals = new Ring(1, BOUNDS.rows);
   private readonly offset = new ClockOffset();
@@ -83,7 +83,7 @@ export class Stream {
     private readonly mayWiden: () => boolean,
   ) {}
 
-  /** Take a newer sample; false for one that comes after a newer one, or twice. */
+  /** Take a newer sample; false for an older or repeated one. */
   take(update: Update, now: number): boolean {
     if (update.boot === this.boot) {
       if (update.seq <= this.seq) return false;
@@ -142,7 +142,7 @@ export class Stream {
 
 export class Robot {
   readonly streams = new Map<string, Stream>();
-  /** Arrival, the total and the legs in milliseconds. */
+  /** Arrival in seconds; the total and the hops in milliseconds. */
   readonly delays = new Ring(2 + LEGS.length, BOUNDS.delays);
   /** The newest last. */
   readonly faults: Fault[] = [];
@@ -157,7 +157,7 @@ export class Robot {
     return now - this.takenAt > STALE_S ? "stale" : "live";
   }
 
-  /** The stream whose fields are the motor controller's, if there is one. */
+  /** The stream of the motor controller, if the car has one. */
   vesc(table: FieldTable): Stream | undefined {
     const named = this.streams.get(table.stream);
     if (named) return named;
@@ -167,7 +167,7 @@ export class Robot {
     return undefined;
   }
 
-  /** The name of the fault that a stream reports, if any does. */
+  /** The name of a reported fault, if any. */
   fault(table: FieldTable): string | undefined {
     for (const { sample } of this.streams.values()) {
       const name = faultName(sample.get("fault_code"), table);
@@ -188,7 +188,7 @@ export class Robot {
     return asDelay((column) => median(this.delays.column(column, from).subarray(skip)));
   }
 
-  /** Keep the log of faults: one entry from the first sample that reports it to the last. */
+  /** Update the fault log: an entry is from the first to the last sample that reports it. */
   logFault(stream: Stream, table: FieldTable, at: number): void {
     const code = stream.sample.get("fault_code");
     if (code === undefined) return;

@@ -16,7 +16,7 @@ import { Waterfall } from "../charts/waterfall";
 import { DELAY_CHART, GAUGES, XY_CHARTS, LINE_CHARTS, type XYChartSpec } from "../charts/car_charts";
 
 const MOST_CHOSEN = 6;
-// Values are written at most 25 times a second.
+// Values are updated at most 25 times a second.
 const SCREENS = 25 * MEDIAN_S;
 
 interface ShownXYChart {
@@ -46,7 +46,7 @@ export class CarView {
   private readonly chosen = new Map<string, { readonly panel: ChartPanel; readonly stream: Stream; readonly field: string; ros2: boolean }>();
   private robot: Robot | undefined;
   private drawn = -1;
-  /** When a message was drawn, and how long that was after its arrival, in milliseconds. */
+  /** The time at which a message was drawn, and its delay since arrival in milliseconds. */
   private screens = new Ring(2, SCREENS);
 
   constructor(
@@ -95,7 +95,7 @@ export class CarView {
     this.arrange();
   }
 
-  /** Sections for the streams there are; called when a stream is heard for the first time. */
+  /** Make a section for each stream; called when a stream is new. */
   private arrange(): void {
     const { robot, table } = this;
     if (!robot) return;
@@ -116,7 +116,7 @@ export class CarView {
     }
   }
 
-  /** Chart a field, or no longer. */
+  /** Chart a field, or remove its chart. */
   private choose(stream: Stream, field: string): void {
     const key = fieldKey(stream.name, field);
     if (this.chosen.has(key)) {
@@ -142,7 +142,7 @@ export class CarView {
     this.chosen.delete(key);
   }
 
-  /** What changes with every message. */
+  /** Update what changes with a message. */
   values(now: number): void {
     const { robot, table } = this;
     if (!robot || robot.version === this.drawn) return;
@@ -194,7 +194,7 @@ export class CarView {
     }
   }
 
-  /** What changes with time alone. */
+  /** Update what changes with time. */
   clock(now: number, linked: boolean): void {
     const { robot } = this;
     if (!robot) return;
@@ -216,7 +216,7 @@ export class CarView {
   draw(now: number): void {
     if (!this.robot) return;
     const panels = [...(this.charts.hidden ? [] : this.panels), this.delay, ...[...this.chosen.values()].map(({ panel }) => panel)];
-    // All in the same frame: a frame costs more than what is drawn in it.
+    // All in the same frame: a frame costs more than its charts.
     if (!panels.some((panel) => panel.due(now))) return;
     for (const panel of panels) panel.draw(now);
     for (const { chart, source } of this.xyCharts) if (source) chart.draw(now, () => track(source, now));
@@ -233,7 +233,7 @@ function track({ stream, x, y, as }: NonNullable<ShownXYChart["source"]>, now: n
   return { x: as === AS_SENT ? across : across.map((value) => linear(value, as)), y: column(y) };
 }
 
-/** The least and the most of a field in the last while. */
+/** The minimum and maximum of a field in the last 30 s. */
 function span(stream: Stream, field: string, now: number, as: Linear): [number, number] {
   const column = stream.columns.get(field);
   if (column === undefined) return [NaN, NaN];

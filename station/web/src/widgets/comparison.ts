@@ -1,4 +1,4 @@
-// Two columns of values: at the time that the viewer looks at, and now.
+// A table of values: at the time under the cursor, and now.
 
 import type { Value } from "../base/contract";
 import { el, Text } from "../base/dom";

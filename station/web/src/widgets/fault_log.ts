@@ -1,4 +1,4 @@
-// The faults that this page has heard of since it was opened, the newest first.
+// The faults since this page was opened, the newest first.
 
 import { el, setAttribute, Text } from "../base/dom";
 import type { Fault, Robot } from "../live/robot";
