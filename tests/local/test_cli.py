@@ -39,7 +39,7 @@ def test_robot_is_added_listed_and_removed(iort, tmp_path):
         (("files", "list", "nobody", "--last", "1h", "--json"), "there is no robot nobody"),
         (("files", "get", "nobody"), "there is no robot nobody"),
         (("trace", "nobody"), "there is no robot nobody"),
-        (("pubnub", "--publish-key", "pub-c-1", "--subscribe-key", "sub-c-1"), "keys of its own"),
+        (("pubnub", "--publish-key", "pub-c-1", "--subscribe-key", "sub-c-1"), "with its own keys"),
     ],
 )
 def test_error_says_what_is_wrong(iort, tmp_path, arguments, said):
