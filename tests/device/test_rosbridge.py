@@ -18,7 +18,7 @@ pytest.importorskip("aiohttp")
 pytest.importorskip("websocket")
 
 from iort_agent.clock import Clock, SystemClock
-from iort_agent.config.file import load_config
+from iort_agent.config import load_config
 from iort_agent.errors import ConfigError, SourceError
 from iort_agent.sources.rosbridge.source import RosbridgeConfig, RosbridgeSource, TopicConfig
 from iort_agent.sources.rosbridge.subscription import Times

@@ -14,7 +14,7 @@ import pytest
 import serial
 
 from iort_agent.clock import SystemClock
-from iort_agent.config.file import load_config
+from iort_agent.config import load_config
 from iort_agent.errors import SourceError
 from iort_agent.sources.vesc.port import why
 from iort_agent.sources.vesc.serial_line import VescConfig

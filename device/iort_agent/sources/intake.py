@@ -12,11 +12,11 @@ from dataclasses import dataclass
 from typing import Any, Mapping, NamedTuple, Optional
 
 from iort_agent.clock import Clock
+from iort_agent.common.schema import choice, items, setting, text
+from iort_agent.common.throttled_log import ThrottledLog
 from iort_agent.errors import SourceError
 from iort_agent.ros1.types import installed
-from iort_agent.schema import choice, items, setting, text
 from iort_agent.sources import REFUSE, UPLOAD, Emit
-from iort_agent.throttled_log import Seldom
 from iort_contract.catalog.streams import TYPES_STREAM
 from iort_contract.limits import ContractError, MessageError, Value
 from iort_contract.messages.message_type import MessageType
@@ -75,7 +75,7 @@ class Intake:
         self, topic: str, config: TopicConfig, *, emit: Emit, clock: Clock, large: str = REFUSE
     ) -> None:
         self.sim_time = False
-        self.throttled = Seldom(_log, clock)
+        self.throttled = ThrottledLog(_log, clock)
         self._topic = topic
         self._config = config
         self._large = large == UPLOAD

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from typing import Sequence
 
 from iort_agent.clock import Clock, Pace
-from iort_agent.schema import number, section, setting, text
+from iort_agent.common.schema import number, section, setting, text
 from iort_agent.sources import Emit, Source, SourceConfig
 from iort_agent.sources.vehicle import Vehicle, VehicleConfig
 from iort_contract.catalog.vesc import VESC_STREAM

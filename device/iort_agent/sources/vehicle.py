@@ -10,7 +10,7 @@ import math
 import random
 from dataclasses import dataclass
 
-from iort_agent.schema import number, setting
+from iort_agent.common.schema import number, setting
 from iort_contract.catalog.derived import F1TENTH
 from iort_contract.limits import Value
 

@@ -17,13 +17,13 @@ from email.utils import parsedate_to_datetime
 from pathlib import Path
 from typing import Iterator
 
-from iort_agent.config.file import Config
+from iort_agent.common.state import Status
+from iort_agent.config import Config
 from iort_agent.errors import IdentityError, NotRunningError
 from iort_agent.identity.certificate import Certificate, check_pair, read_certificate
 from iort_agent.lanes.record import TODO, too_many
 from iort_agent.sources import FAIL, OK, WARN, Finding
 from iort_agent.status.server import ask
-from iort_agent.status.state import Status
 
 _TIMEOUT_S = 5.0
 _EXPIRES_SOON_S = 30 * 86_400

@@ -9,7 +9,7 @@ from typing import Any, NamedTuple
 from iort_contract.attributes import plain
 from iort_contract.limits import ContractError
 from iort_contract.messages.batch import Batch, messages_of
-from iort_contract.messages.files import CLAIM_AT, CLAIM_FIELDS
+from iort_contract.messages.files import ATTACHMENT_AT, ATTACHMENT_FIELDS
 from iort_contract.messages.message_type import MessageType
 from iort_contract.ros1.message import filled
 from iort_station.cloud import Cloud
@@ -79,11 +79,13 @@ class Export:
 
     def _filled(self, raw: bytes, batch: Batch, i: int) -> bytes:
         """The message with its files' contents: the content that was cut out last comes back first."""
-        places = [name for name in batch.columns if name.endswith(f".{CLAIM_AT}")]
+        places = [name for name in batch.columns if name.endswith(f".{ATTACHMENT_AT}")]
         for place in reversed(places):
-            at, field = batch.columns[place][i], place[: -len(CLAIM_AT) - 1]
+            at, field = batch.columns[place][i], place[: -len(ATTACHMENT_AT) - 1]
             # A message may itself have a field of that name.
-            if type(at) is not int or not all(f"{field}.{part}" in batch.columns for part in CLAIM_FIELDS):
+            if type(at) is not int or not all(
+                f"{field}.{part}" in batch.columns for part in ATTACHMENT_FIELDS
+            ):
                 continue
             key, sha256 = (batch.columns[f"{field}.{part}"][i] for part in ("key", "sha256"))
             content = self._content(key) if isinstance(key, str) else None

@@ -19,9 +19,9 @@ import threading
 from typing import Any, Mapping, Protocol, Sequence
 
 from iort_agent.clock import Clock
+from iort_agent.common.throttled_log import ThrottledLog
 from iort_agent.errors import SourceError
 from iort_agent.sources.rosbridge.subscription import Subscription, Times, Topic
-from iort_agent.throttled_log import Seldom
 
 _log = logging.getLogger(__name__)
 
@@ -61,7 +61,7 @@ class RosbridgeConnection:
         self._times = times
         self._subscriptions = {topic.name: Subscription(topic, times) for topic in topics}
         self._listener = listener
-        self._throttled = Seldom(_log, clock)
+        self._throttled = ThrottledLog(_log, clock)
         self._socket: Any = None
         self._fragments: list[str] = []
         self._patience = times.patience_s

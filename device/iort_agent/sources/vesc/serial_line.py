@@ -24,7 +24,7 @@ from pathlib import Path
 from typing import Any, Iterator, Mapping, Sequence
 
 from iort_agent.clock import Clock
-from iort_agent.schema import number, setting, text
+from iort_agent.common.schema import number, setting, text
 from iort_agent.sources import FAIL, OK, Emit, Finding, SourceConfig
 from iort_agent.sources.vesc.port import Library, load_pyserial, why
 from iort_agent.sources.vesc.protocol import (
