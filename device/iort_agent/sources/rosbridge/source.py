@@ -34,13 +34,8 @@ _CHECK_S = 5.0
 
 @dataclass(frozen=True)
 class TopicConfig(intake.TopicConfig):
-    """How a topic is recorded.
-
-    ``type`` lets the server subscribe before anybody publishes. ``time`` is required: ``header`` is the time
-    of the measurement, by the clock of the computer that measured; ``arrival`` is the time of receipt, by the
-    agent's clock. ``fields`` are the wanted paths, or their beginnings (``pose.position``); without it, all.
-    ``throttle_ms`` is the shortest time between messages, kept by the server.
-    """
+    """How a topic is recorded. ``type`` lets the server subscribe before anybody publishes; ``throttle_ms``
+    is the shortest time between messages, kept by the server."""
 
     type: str | None = setting(text(), default=None)
     throttle_ms: int = setting(number(0, 3_600_000, whole=True, unit="ms"), 0)
