@@ -18,11 +18,11 @@ except ModuleNotFoundError as missing:
     )
 
 from stacks.account import Account
-from stacks.acknowledged import Acknowledged, acknowledge
+from stacks.checks.acknowledged import Acknowledged, acknowledge
+from stacks.checks.portable import refuse_what_the_embedded_cloud_drops
 from stacks.fleet import Fleet
 from stacks.ingest import Ingest
-from stacks.monitoring import Monitoring
-from stacks.portable import refuse_what_the_embedded_cloud_drops
+from stacks.monitoring.stack import Monitoring
 from stacks.processing import Processing
 from stacks.quarantine import Quarantine
 from stacks.settings import Settings, SettingsError

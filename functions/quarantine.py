@@ -23,7 +23,7 @@ import boto3
 from botocore.exceptions import BotoCoreError, ClientError
 
 from functions.shared.metrics import emit
-from functions.shared.share import waiting
+from functions.shared.summary.share import waiting
 from iort_contract import (
     BY_FUNCTION,
     BY_LATER,

@@ -13,8 +13,8 @@ from typing import Any
 import boto3
 from botocore.config import Config
 
-from functions.shared.processing import Bounds, processed, recompute, stored_tables
-from functions.shared.share import PutOff, Share, Told
+from functions.shared.summary.processing import Bounds, processed, recompute, stored_tables
+from functions.shared.summary.share import PutOff, Share, Told
 from iort_contract import RECOMPUTE_FROM_S, REPLAY
 
 

@@ -13,9 +13,9 @@ import boto3
 from botocore.config import Config
 
 from functions.shared.bucket import Bucket, parts_sha256
-from functions.shared.dead_letter import Refusals, refused_event
+from functions.shared.dead_letter import DeadLetterQueue, refused_event
 from functions.shared.metrics import emit
-from functions.shared.upload_quota import Allotment
+from functions.shared.upload_quota import UploadQuota
 from iort_contract import (
     FILE,
     PONG,
@@ -41,7 +41,7 @@ _AGAIN_S = 3600
 
 
 def answer(
-    robot: str, request: FileRequest, bucket: Bucket, allotment: Allotment, now_s: float
+    robot: str, request: FileRequest, bucket: Bucket, allotment: UploadQuota, now_s: float
 ) -> FileAnswer:
     """The state of the file in the bucket, and the addresses for the rest. The robot comes from the topic,
     and the key from robot and file, so that no request can reach another file."""
@@ -96,8 +96,8 @@ def _bucket() -> Bucket:
 
 
 @cache
-def _allotment() -> Allotment:
-    return Allotment(
+def _allotment() -> UploadQuota:
+    return UploadQuota(
         boto3.client("dynamodb"),
         table=os.environ["ROBOTS_TABLE"],
         bytes_a_day=int(os.environ["UPLOAD_BYTES_A_DAY"]),
@@ -110,8 +110,8 @@ def _iot_data() -> Any:
 
 
 @cache
-def _refusals() -> Refusals:
-    return Refusals.at_once(os.environ["REJECTED_QUEUE"])
+def _refusals() -> DeadLetterQueue:
+    return DeadLetterQueue.at_once(os.environ["REJECTED_QUEUE"])
 
 
 def handler(event: dict[str, Any], context: Any) -> None:

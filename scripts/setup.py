@@ -63,7 +63,7 @@ def main() -> None:
         step("CDK and page packages", [ROOT / "package-lock.json"], install_node, stamp="node")
         page = [*sorted((ROOT / "station" / "web").rglob("*")), ROOT / "package-lock.json"]
         step("live page", page, build_page, stamp="page")
-        names = ("requirements/layer.txt", "scripts/layer.py", "stacks/target.py")
+        names = ("requirements/layer.txt", "scripts/layer.py", "stacks/parts/target.py")
         layer = [ROOT / name for name in names]
         step("Lambda layer, this machine", layer, lambda: build_layer("local"), stamp="layer-local")
         if asked.layer:

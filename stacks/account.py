@@ -13,7 +13,7 @@ from aws_cdk import aws_iam as iam
 from aws_cdk import aws_iot as iot
 from constructs import Construct
 
-from stacks import iot_core
+from stacks.parts import iot_core
 from stacks.settings import Settings
 
 # The "Audit checks" of certificates, policies and clients. The others concern role aliases, Cognito and

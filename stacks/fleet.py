@@ -13,9 +13,9 @@ from aws_cdk import aws_lambda_destinations as destinations
 from constructs import Construct
 
 from iort_contract import PRESENCE, claim_name, fleet_name
-from stacks import iot_core
-from stacks.documents import claim_policy, provisioning_template, robot_policy
-from stacks.function import function
+from stacks.parts import iot_core
+from stacks.parts.documents import claim_policy, provisioning_template, robot_policy
+from stacks.parts.function import function
 from stacks.quarantine import Quarantine
 from stacks.settings import Settings
 from stacks.storage import Storage

@@ -11,8 +11,8 @@ from aws_cdk import aws_lambda as lambda_
 from constructs import Construct
 
 from iort_contract import PONG, RULE, pong_template, rule_name, rule_sql
-from stacks import iot_core
 from stacks.fleet import Fleet
+from stacks.parts import iot_core
 from stacks.processing import Processing
 from stacks.quarantine import Quarantine
 from stacks.settings import Settings

@@ -29,9 +29,9 @@ from iort_contract import (
     STREAMS,
     pubnub_parameter,
 )
-from stacks.function import RUNTIME, function
+from stacks.parts.function import RUNTIME, function
+from stacks.parts.queue import queue
 from stacks.quarantine import Quarantine
-from stacks.queue import queue
 from stacks.settings import Settings
 from stacks.storage import Storage
 

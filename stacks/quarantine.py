@@ -15,8 +15,8 @@ from aws_cdk import aws_lambda as lambda_
 from aws_cdk import aws_sqs as sqs
 from constructs import Construct
 
-from stacks.function import function
-from stacks.queue import queue
+from stacks.parts.function import function
+from stacks.parts.queue import queue
 from stacks.settings import Settings
 from stacks.storage import Storage
 

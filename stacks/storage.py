@@ -11,7 +11,7 @@ from aws_cdk import aws_s3 as s3
 from constructs import Construct
 
 from iort_contract import BATCH, ENTRY, EXPIRES_S, FILES_PREFIX, RESULTS_PREFIX, ROBOT, SECOND, T_US, TOPIC
-from stacks.encryption import Encryption
+from stacks.parts.encryption import Encryption
 from stacks.settings import Settings
 
 # Storage at half the price, reads at a cent a gigabyte. S3 allows the move from this day on, and does not

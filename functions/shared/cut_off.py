@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from functions.shared.allowances import Allowances
+from functions.shared.rate_limiter import RateLimiter
 
 # Allowed refusals per robot: this many at once, and one more with every second.
 BURST = 20
@@ -21,7 +21,7 @@ class CutOff:
     """
 
     def __init__(self) -> None:
-        self._refusals = Allowances(burst=BURST, a_second=A_SECOND)
+        self._refusals = RateLimiter(burst=BURST, a_second=A_SECOND)
 
     def closed(self, robot: str, now_s: float) -> bool:
         """Whether the robot has used up its allowance."""

@@ -10,7 +10,7 @@ from botocore.exceptions import ClientError
 from iort_contract import FILES_BYTES, FILES_DAY, ROBOT
 
 
-class Allotment:
+class UploadQuota:
     """Counts by day (UTC); ``client`` is a boto3 DynamoDB client."""
 
     def __init__(self, client: Any, *, table: str, bytes_a_day: int) -> None:

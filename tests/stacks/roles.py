@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import iort_contract
-from stacks.checks import EVERY_RESOURCE
+from stacks.checks.invariants import EVERY_RESOURCE
 
 IOT = "arn:${AWS::Partition}:iot:${AWS::Region}:${AWS::AccountId}"
 THINGS, CERTIFICATES = f"{IOT}:thing/*", f"{IOT}:cert/*"

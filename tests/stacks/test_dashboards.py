@@ -9,7 +9,7 @@ import re
 import pytest
 
 import iort_contract
-from functions.shared.health import measure
+from functions.shared.summary.health import measure
 from iort_contract import rule_name
 from iort_station.cost.fixed_costs import (
     FREE_DASHBOARD_METRICS,
@@ -19,7 +19,7 @@ from iort_station.cost.fixed_costs import (
 )
 from iort_station.cost.usage import Usage
 from iort_station.operations import cloudwatch
-from stacks.metrics import statistic
+from stacks.monitoring.metrics import statistic
 from stacks.settings import ROOT
 from tests.stacks.aws_metrics import AWS_METRICS
 

@@ -10,7 +10,7 @@ from typing import Any
 import pytest
 
 import iort_contract
-from stacks.variations import LONGEST_NAMESPACE, VARIATIONS
+from stacks.checks.variations import LONGEST_NAMESPACE, VARIATIONS
 from tests.stacks.cloudformation import has_schema, names, schema
 
 # "CloudFormation quotas". The CDK hands every template over by S3: in a request there is room for 51,200.

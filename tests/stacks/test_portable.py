@@ -11,7 +11,7 @@ from pathlib import Path
 import pytest
 
 from iort_contract import RULES, pong_template, rule_sql
-from stacks.portable import RULE_ACTIONS, SQL_FUNCTIONS, rule_problems, sql_functions
+from stacks.checks.portable import RULE_ACTIONS, SQL_FUNCTIONS, rule_problems, sql_functions
 from stacks.settings import ROOT
 
 GOOD = {"sql": rule_sql("live"), "actions": [{"lambda": {"functionArn": "arn"}}], "errorAction": {"sqs": {}}}
@@ -74,7 +74,7 @@ def refused(tmp_path_factory):
     from aws_cdk import App, Stack
     from aws_cdk import aws_iot as iot
 
-    from stacks.portable import refuse_what_the_embedded_cloud_drops
+    from stacks.checks.portable import refuse_what_the_embedded_cloud_drops
 
     rule = iot.CfnTopicRule
     app = App(outdir=str(tmp_path_factory.mktemp("cdk.out")))

@@ -22,8 +22,8 @@ from iort_contract import (
     record_topic,
     rule_name,
 )
-from stacks.documents import claim_policy
-from stacks.documents import robot_policy as robots_policy
+from stacks.parts.documents import claim_policy
+from stacks.parts.documents import robot_policy as robots_policy
 from tests.stacks.roles import IOT
 
 ME = "${iot:Connection.Thing.ThingName}"

@@ -29,8 +29,8 @@ from iort_contract import (
     record_topic,
     rule_name,
 )
-from stacks.encryption import Encryption
-from stacks.function import function
+from stacks.parts.encryption import Encryption
+from stacks.parts.function import function
 from stacks.settings import ROOT, Settings, SettingsError
 from tests.stacks.templates import name
 from tests.stacks.test_dashboards import FUNCTIONS

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import iort_contract
-from functions.shared import cut_off, stored
+from functions.shared import cut_off
+from functions.shared.summary import stored
 from iort_agent import rate_limiter
 from iort_contract import limits
 from iort_contract.ros1.message import MAX_LAYOUT

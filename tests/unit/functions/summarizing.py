@@ -6,7 +6,7 @@ import json
 from collections import defaultdict
 
 import iort_contract
-from functions.shared.processing import process
+from functions.shared.summary.processing import process
 from iort_contract import Batch
 from tests.fakes import (
     TELEMETRY,

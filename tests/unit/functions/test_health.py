@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import pytest
 
-from functions.shared.health import measure, together
 from functions.shared.metrics import MOST_VALUES
+from functions.shared.summary.health import measure, together
 from iort_contract import AGENT_STREAM, METRICS, RTT_STREAM, Batch
 
 

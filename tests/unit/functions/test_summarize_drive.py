@@ -8,7 +8,7 @@ import pytest
 
 import iort_contract
 from functions import summarize
-from functions.shared import processing
+from functions.shared.summary import processing
 from iort_contract import Batch
 from iort_contract.attributes import plain
 from tests.fakes import (

@@ -11,7 +11,7 @@ import pytest
 
 import iort_contract
 from functions.shared import tables as tables_module
-from functions.shared.processing import process
+from functions.shared.summary.processing import process
 from iort_contract import BatchId
 from iort_contract.table_writer import TableError
 from tests.fakes import (

@@ -18,7 +18,7 @@ import iort_contract
 from functions import upload
 from functions.quarantine import entries
 from functions.shared.bucket import Bucket
-from functions.shared.upload_quota import Allotment
+from functions.shared.upload_quota import UploadQuota
 from iort_contract import (
     FILE,
     FILES_BYTES,
@@ -251,7 +251,7 @@ def ask(s3, dynamodb):
     """Asks as `car`, unless another robot is named."""
 
     def ask(request, robot="car", *, bytes_a_day=10**9, now_s=NOW_S):
-        allotment = Allotment(dynamodb, table=ROBOTS, bytes_a_day=bytes_a_day)
+        allotment = UploadQuota(dynamodb, table=ROBOTS, bytes_a_day=bytes_a_day)
         return upload.answer(robot, request, Bucket(s3, NAME), allotment, now_s)
 
     return ask
@@ -389,7 +389,7 @@ def published(monkeypatch, s3, dynamodb):
     monkeypatch.setenv("NAMESPACE", "iort")
     monkeypatch.setattr(upload, "_iot_data", Broker)
     monkeypatch.setattr(upload, "_bucket", lambda: Bucket(s3, NAME))
-    monkeypatch.setattr(upload, "_allotment", lambda: Allotment(dynamodb, table=ROBOTS, bytes_a_day=10**9))
+    monkeypatch.setattr(upload, "_allotment", lambda: UploadQuota(dynamodb, table=ROBOTS, bytes_a_day=10**9))
     return sent
 
 

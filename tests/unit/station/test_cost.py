@@ -9,8 +9,8 @@ import pytest
 from typer.testing import CliRunner
 
 from bench import message_sizes
-from functions.shared.health import measure
 from functions.shared.metrics import Gathered, emit
+from functions.shared.summary.health import measure
 from iort_agent.lanes.pings import CLOCK_EVERY_S
 from iort_contract import METRICS
 from iort_station.cli.main import app

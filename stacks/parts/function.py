@@ -9,9 +9,9 @@ from aws_cdk import aws_iam as iam
 from aws_cdk import aws_lambda as lambda_
 from aws_cdk import aws_logs as logs
 
-from stacks import target
-from stacks.code import code
-from stacks.encryption import Encryption
+from stacks.parts import target
+from stacks.parts.code import code
+from stacks.parts.encryption import Encryption
 from stacks.settings import ALL_LOGS, Settings
 
 RUNTIME = lambda_.Runtime(f"python{target.PYTHON}", lambda_.RuntimeFamily.PYTHON)

@@ -13,9 +13,9 @@ from aws_cdk import aws_cloudwatch as cloudwatch
 from constructs import Construct
 
 from iort_contract import METRICS, RULES, rule_name
-from stacks import metrics
+from stacks.monitoring import metrics
+from stacks.monitoring.watched import Watched
 from stacks.settings import Settings
-from stacks.watched import Watched
 
 # The hops of every sample.
 _FUNCTIONS_OF_SAMPLES, _TABLES_OF_SAMPLES = ("Live", "Summarize"), ("Batches", "Summary")

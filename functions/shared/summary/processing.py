@@ -16,13 +16,20 @@ from typing import Any
 import boto3
 from botocore.config import Config
 
-from functions.shared.dead_letter import Refusals, Refused
-from functions.shared.decoded import Decoded, decode_records
-from functions.shared.health import measure, together
+from functions.shared.dead_letter import DeadLetterQueue, Refused
 from functions.shared.metrics import emit
-from functions.shared.seconds import Summaries, summarize_topic
-from functions.shared.share import REQUESTS_S, Change, OverShareError, Share, robot_of, robot_of_change
-from functions.shared.stored import SECOND_BATCHES
+from functions.shared.summary.decoded import Decoded, decode_records
+from functions.shared.summary.health import measure, together
+from functions.shared.summary.seconds import Summaries, summarize_topic
+from functions.shared.summary.share import (
+    REQUESTS_S,
+    Change,
+    OverShareError,
+    Share,
+    robot_of,
+    robot_of_change,
+)
+from functions.shared.summary.stored import SECOND_BATCHES
 from functions.shared.tables import Tables
 from iort_contract import RECOMPUTE_FROM_S, RECOMPUTED, REPLAY, Statistics, parse_topic
 from iort_contract.table_writer import TableError
@@ -211,8 +218,8 @@ def stored_tables() -> Tables:
 
 
 @cache
-def _refusals() -> Refusals:
-    return Refusals(boto3.client("sqs"), queue_url=os.environ["REJECTED_QUEUE"])
+def _refusals() -> DeadLetterQueue:
+    return DeadLetterQueue(boto3.client("sqs"), queue_url=os.environ["REJECTED_QUEUE"])
 
 
 def processed(

@@ -10,10 +10,10 @@ from aws_cdk import aws_budgets as budgets
 from aws_cdk import aws_sns as sns
 from constructs import Construct
 
-from stacks.alarms import Alarms
-from stacks.dashboards import Dashboards
+from stacks.monitoring.alarms import Alarms
+from stacks.monitoring.dashboards import Dashboards
+from stacks.monitoring.watched import Watched
 from stacks.settings import Settings
-from stacks.watched import Watched
 
 
 class Monitoring(Stack):

@@ -11,7 +11,7 @@ from typing import Any
 
 from botocore.exceptions import BotoCoreError, ClientError
 
-from functions.shared.allowances import Allowances
+from functions.shared.rate_limiter import RateLimiter
 from iort_contract import (
     BATCH,
     OVER_SHARE,
@@ -61,7 +61,7 @@ class Share:
         spent_s: Callable[[], float] = time.thread_time,
     ) -> None:
         self._burst_s, self._spent_s = burst_s, spent_s
-        self._allowances = Allowances(burst=burst_s, a_second=a_second)
+        self._limiter = RateLimiter(burst=burst_s, a_second=a_second)
 
     @classmethod
     def unlimited(cls) -> Share:
@@ -70,27 +70,33 @@ class Share:
 
     def over(self, robot: str, at_s: float) -> bool:
         """Whether the robot's next batch has to wait."""
-        return self._allowances.left(robot, at_s) <= 0
+        return self._limiter.left(robot, at_s) <= 0
 
     def meter(self, robot: str, at_s: float) -> Meter:
         """Measure this thread's work for a robot from now on."""
-        return Meter(self._allowances, self._spent_s, robot, at_s, least_s=-self._burst_s)
+        return Meter(self._limiter, self._spent_s, robot, at_s, least_s=-self._burst_s)
 
 
 class Meter:
     """Charges the work of the thread that created it to a robot."""
 
     def __init__(
-        self, allowances: Allowances, spent_s: Callable[[], float], robot: str, at_s: float, *, least_s: float
+        self,
+        limiter: RateLimiter,
+        spent_s: Callable[[], float],
+        robot: str,
+        at_s: float,
+        *,
+        least_s: float,
     ) -> None:
-        self._allowances, self._spent_s = allowances, spent_s
+        self._limiter, self._spent_s = limiter, spent_s
         self._robot, self._at_s, self._least_s = robot, at_s, least_s
         self._from_s = spent_s()
 
     def charge(self, beside_s: float = 0.0) -> float:
         """Charge the work since the last call, plus ``beside_s``; return the rest."""
         before_s, self._from_s = self._from_s, self._spent_s()
-        return self._allowances.spend(self._robot, self._at_s, self._from_s - before_s + beside_s)
+        return self._limiter.spend(self._robot, self._at_s, self._from_s - before_s + beside_s)
 
     def check(self) -> None:
         """Charge, and raise `OverShareError` if the robot has spent its allowance twice. Work that began

@@ -8,9 +8,9 @@ from aws_cdk import aws_cloudwatch_actions as actions
 from aws_cdk import aws_sns as sns
 from constructs import Construct
 
-from stacks import metrics
+from stacks.monitoring import metrics
+from stacks.monitoring.watched import Watched
 from stacks.settings import Settings
-from stacks.watched import Watched
 
 _FIVE_MINUTES = Duration.minutes(5)
 

@@ -7,7 +7,7 @@ from typing import Any
 from aws_cdk import CfnOutput, Duration, Stack
 from aws_cdk import aws_sqs as sqs
 
-from stacks.encryption import Encryption
+from stacks.parts.encryption import Encryption
 from stacks.settings import Settings
 
 
