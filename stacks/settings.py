@@ -14,12 +14,12 @@ from aws_cdk import App, RemovalPolicy
 
 from iort_contract import (
     DEFAULT_NAMESPACE,
-    LOW_VOLTAGE_V,
     VESC_FIELDS,
     VESC_STREAM,
     ContractError,
     check_namespace,
 )
+from iort_contract.catalog.rules import LOW_VOLTAGE_V
 
 ROOT = Path(__file__).resolve().parent.parent
 
@@ -116,6 +116,11 @@ class Settings:
         if self.live_concurrency is None:
             return _RESERVED_FOR_LIVE if self.protected else 0
         return self.live_concurrency
+
+    @property
+    def retention_s(self) -> int:
+        """The lifetime of telemetry and summaries."""
+        return self.retention_days * 86_400
 
     @property
     def account_wide(self) -> bool:

@@ -19,7 +19,6 @@ from iort_contract import (
     PONG,
     RECORD,
     RULE,
-    RULES,
     SHADOW,
     build_topic,
     claim_name,
@@ -28,6 +27,7 @@ from iort_contract import (
     record_topic,
     rule_name,
 )
+from iort_contract.catalog.rules import RULES
 
 # Robot A is the one that tries; B is its neighbour.
 A, B = "isolated-a", "isolated-b"

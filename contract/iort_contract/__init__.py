@@ -11,19 +11,11 @@ from __future__ import annotations
 
 from iort_contract.checks import check_field, json_object
 from iort_contract.cloud import (
-    LOW_VOLTAGE_V,
-    METRIC_DEPLOYMENT,
-    METRIC_FUNCTION,
-    METRIC_NAMESPACE,
-    METRIC_ROBOT,
-    METRICS,
     RESULTS_PREFIX,
     channel,
     claim_name,
     fleet_name,
-    pong_template,
     pubnub_parameter,
-    rule_sql,
 )
 from iort_contract.codec.columns import (
     CODEC,
@@ -80,7 +72,7 @@ from iort_contract.messages.commands import (
     encode_command,
     encode_fleet,
 )
-from iort_contract.messages.event import MESSAGE_BASE64, event_message, rule_event
+from iort_contract.messages.event import event_message, rule_event
 from iort_contract.messages.files import (
     CLAIM_AT,
     CLAIM_FIELDS,
@@ -105,7 +97,6 @@ from iort_contract.messages.files import (
     part_range,
 )
 from iort_contract.messages.live import (
-    PING_FIELDS,
     LiveSample,
     Pong,
     decode_live,
@@ -146,6 +137,7 @@ from iort_contract.tables import (
     ITEM_BASE64,
     LAST_MS,
     LAST_SEEN_MS,
+    MESSAGE_BASE64,
     MISSING_BATCHES,
     NO_ROBOT,
     NONFINITE,
@@ -153,6 +145,7 @@ from iort_contract.tables import (
     ONLINE,
     OVER_SHARE,
     PAYLOAD,
+    PING_FIELDS,
     PRESENCE,
     PUT_OFF,
     PUT_OFF_LAST_MS,
@@ -198,7 +191,6 @@ from iort_contract.topics import (
     RTT_FIELDS,
     RTT_STREAM,
     RULE,
-    RULES,
     SHADOW,
     TYPES_STREAM,
     Topic,
@@ -289,7 +281,6 @@ __all__ = [
     "LIVE_MAX_AGE_MS",
     "LIVE_MAX_RATE_HZ",
     "LIVE_MIN_RATE_HZ",
-    "LOW_VOLTAGE_V",
     "MAX_ADDRESSES",
     "MAX_AHEAD_US",
     "MAX_BATCH_SPAN_US",
@@ -304,11 +295,6 @@ __all__ = [
     "MAX_SAMPLES",
     "MAX_VALID_MS",
     "MESSAGE_BASE64",
-    "METRICS",
-    "METRIC_DEPLOYMENT",
-    "METRIC_FUNCTION",
-    "METRIC_NAMESPACE",
-    "METRIC_ROBOT",
     "MISSING_BATCHES",
     "NONFINITE",
     "NO_ROBOT",
@@ -341,7 +327,6 @@ __all__ = [
     "RTT_FIELDS",
     "RTT_STREAM",
     "RULE",
-    "RULES",
     "SAMPLES",
     "SCALES",
     "SCHEMA_VERSION",
@@ -426,12 +411,10 @@ __all__ = [
     "parse_file_key",
     "parse_topic",
     "part_range",
-    "pong_template",
     "pubnub_parameter",
     "record_topic",
     "rule_event",
     "rule_name",
-    "rule_sql",
     "split",
     "type_id",
 ]

@@ -12,15 +12,14 @@ from aws_cdk import Duration
 from aws_cdk import aws_cloudwatch as cloudwatch
 from constructs import Construct
 
-from iort_contract import METRICS, RULES, rule_name
+from iort_contract.catalog.metrics import LIVE, METRICS, QUEUES, ROBOT_CHARTS, Chart
+from iort_contract.catalog.rules import RULES
 from stacks.monitoring import metrics
 from stacks.monitoring.watched import Watched
 from stacks.settings import Settings
 
-# The hops of every sample.
+# The functions and tables that every sample passes.
 _FUNCTIONS_OF_SAMPLES, _TABLES_OF_SAMPLES = ("Live", "Summarize"), ("Batches", "Summary")
-_HOPS = ("InCarMs", "UplinkMs", "ToLambdaMs", "CarToLambdaMs")
-_ROUND_TRIPS = ("RoundTripBrokerMs", "RoundTripRuleMs", "RoundTripLambdaMs")
 
 
 class Dashboards(Construct):
@@ -29,29 +28,33 @@ class Dashboards(Construct):
     def __init__(
         self,
         scope: Construct,
-        construct_id: str,
-        *,
         settings: Settings,
+        *,
         watched: Watched,
         alarms: Sequence[cloudwatch.IAlarm],
     ) -> None:
-        super().__init__(scope, construct_id)
+        super().__init__(scope, "Dashboards")
         self._namespace = settings.namespace
         platform = self._dashboard("Platform")
-        status = cloudwatch.AlarmStatusWidget(title="Alarms", alarms=list(alarms), width=24, height=4)
-        platform.add_widgets(status)
+        platform.add_widgets(
+            cloudwatch.AlarmStatusWidget(title="Alarms", alarms=list(alarms), width=24, height=4)
+        )
         platform.add_widgets(_warnings(watched))
-        platform.add_widgets(*self._iot(), self._tables(watched))
-        platform.add_widgets(*self._functions(watched))
-        platform.add_widgets(*self._streams_and_queues(watched))
-        platform.add_widgets(self._live())
+        platform.add_widgets(*self._broker_and_rules(), _tables(watched))
+        platform.add_widgets(*_functions(watched))
+        platform.add_widgets(_iterator_age(watched), self._queues(watched))
+        platform.add_widgets(self._chart(LIVE))
         robots = self._dashboard("Robots")
-        robots.add_widgets(*self._seen())
-        robots.add_widgets(*self._delays())
-        robots.add_widgets(*self._health())
-        robots.add_widgets(*self._asked())
+        for row in ROBOT_CHARTS:
+            robots.add_widgets(*map(self._chart, row))
         if settings.robot_metrics:
-            robots.add_widgets(*self._one_by_one())
+            robots.add_widgets(
+                *(
+                    _graph(f"{metric.name}, each robot", [metrics.each_robot(metric, self._namespace)])
+                    for metric in METRICS.values()
+                    if metric.of_a_robot
+                )
+            )
 
     def _dashboard(self, name: str) -> cloudwatch.Dashboard:
         return cloudwatch.Dashboard(
@@ -62,14 +65,19 @@ class Dashboards(Construct):
             period_override=cloudwatch.PeriodOverride.INHERIT,
         )
 
-    def _ours(self, function: str, *names: str) -> list[cloudwatch.IMetric]:
-        return [metrics.ours(function, name, namespace=self._namespace) for name in names]
+    def _chart(self, chart: Chart) -> cloudwatch.GraphWidget:
+        return _graph(chart.title, self._ours(chart, right=False), self._ours(chart, right=True))
 
-    # --- platform ----------------------------------------------------------------------------------
+    def _ours(self, chart: Chart, *, right: bool) -> list[cloudwatch.IMetric]:
+        shown = [one for one in METRICS.values() if one.chart == chart and one.right == right]
+        return [metrics.ours(metric, self._namespace) for metric in shown]
 
-    def _iot(self) -> list[cloudwatch.GraphWidget]:
-        matched = [metrics.rule("TopicMatch", rule_name(rule, self._namespace), label=rule) for rule in RULES]
+    def _broker_and_rules(self) -> list[cloudwatch.GraphWidget]:
         refused = [metrics.broker(f"{what}.AuthError") for what in ("Connect", "PublishIn", "Subscribe")]
+        matched = [
+            metrics.rule("TopicMatch", rule.physical_name(self._namespace), label=rule.name)
+            for rule in RULES.values()
+        ]
         return [
             _graph(
                 "Broker: connections and messages, all of the account",
@@ -79,115 +87,9 @@ class Dashboards(Construct):
             _graph("Rules: messages matched", matched),
         ]
 
-    @staticmethod
-    def _tables(watched: Watched) -> cloudwatch.GraphWidget:
-        units = {"ConsumedWriteCapacityUnits": "written", "ConsumedReadCapacityUnits": "read"}
-        return _graph(
-            "Tables: capacity units",
-            [
-                metrics.table(name, watched.tables[table], label=f"{table} {what}")
-                for name, what in units.items()
-                for table in _TABLES_OF_SAMPLES
-            ],
-        )
-
-    @staticmethod
-    def _functions(watched: Watched) -> list[cloudwatch.GraphWidget]:
-        running = "ConcurrentExecutions"
-        return [
-            _graph(
-                "Functions: duration p95, ms",
-                [metrics.function("Duration", of, label=label) for label, of in watched.functions.items()],
-            ),
-            _graph(
-                "Functions: concurrency",
-                [
-                    metrics.all_functions(running, label="all of the account"),
-                    *(
-                        metrics.function(running, watched.functions[name], label=name)
-                        for name in _FUNCTIONS_OF_SAMPLES
-                    ),
-                ],
-            ),
-            _graph(
-                "Functions: errors and throttles, all of the account",
-                [metrics.all_functions("Errors"), metrics.all_functions("Throttles")],
-            ),
-        ]
-
-    def _streams_and_queues(self, watched: Watched) -> list[cloudwatch.GraphWidget]:
-        return [
-            _graph(
-                "Streams: iterator age, ms",
-                [metrics.function("IteratorAge", of, label=label) for label, of in watched.readers.items()],
-            ),
-            _graph(
-                "Queues: messages waiting",
-                [metrics.waiting(queue, label=label) for label, queue in watched.queues.items()],
-                right=self._ours("quarantine", "Quarantined"),
-            ),
-        ]
-
-    def _live(self) -> cloudwatch.GraphWidget:
-        return _graph(
-            "PubNub: live samples published",
-            self._ours("live", "LivePublished"),
-            right=self._ours("live", "PubNubFailed", "LiveStale", "LiveRefused", "LiveCutOff"),
-        )
-
-    # --- robots ------------------------------------------------------------------------------------
-
-    def _seen(self) -> list[cloudwatch.GraphWidget]:
-        return [
-            _graph("Agents: reports a minute, six from each", self._ours("health", "AgentReports")),
-            _graph(
-                "Samples and batches a minute",
-                self._ours("summarize", "SamplesSummarized", "BatchesSummarized"),
-            ),
-            _graph(
-                "Gaps: holes between samples, missing and refused batches",
-                [
-                    *self._ours("health", "SampleGaps"),
-                    *self._ours("summarize", "BatchesMissing", "BatchesRefused", "BatchesPutOff"),
-                ],
-            ),
-            _graph("Backlog: batches waiting in the fullest car", self._ours("health", "BacklogBatches")),
-        ]
-
-    def _delays(self) -> list[cloudwatch.GraphWidget]:
-        return [
-            _graph("Delay of live samples by hop, p95 ms", self._ours("live", *_HOPS)),
-            _graph("Round trips of the cars' pings, p95 ms", self._ours("health", *_ROUND_TRIPS)),
-        ]
-
-    def _health(self) -> list[cloudwatch.GraphWidget]:
-        return [
-            _graph("Battery of the weakest car, V", self._ours("health", "BatteryVolts")),
-            _graph("Temperature of the hottest controller, degC", self._ours("health", "TemperatureDegC")),
-            _graph(
-                "Samples with a fault code, and alerts sent",
-                self._ours("health", "FaultSamples"),
-                right=self._ours("alert", *METRICS["alert"]),
-            ),
-        ]
-
-    def _asked(self) -> list[cloudwatch.GraphWidget]:
-        """Requests of robots to the cloud: presence, files, and round trips through a function."""
-        return [
-            _graph("Robots: who comes and goes", self._ours("presence", *METRICS["presence"])),
-            _graph(
-                "Robots: admitted and refused, and pongs sent",
-                self._ours("admit", *METRICS["admit"]),
-                right=self._ours("echo", *METRICS["echo"]),
-            ),
-            _graph("Robots: files", self._ours("upload", *METRICS["upload"])),
-        ]
-
-    def _one_by_one(self) -> list[cloudwatch.GraphWidget]:
-        return [
-            _graph(f"{name}, each robot", [metrics.each_robot("health", name, namespace=self._namespace)])
-            for name in ("BatteryVolts", "TemperatureDegC", "FaultSamples", "BacklogBatches")
-        ]
+    def _queues(self, watched: Watched) -> cloudwatch.GraphWidget:
+        waiting = [metrics.waiting(queue, label=label) for label, queue in watched.queues.items()]
+        return _graph(QUEUES.title, waiting, self._ours(QUEUES, right=True))
 
 
 def _warnings(watched: Watched) -> cloudwatch.LogQueryWidget:
@@ -207,9 +109,47 @@ def _warnings(watched: Watched) -> cloudwatch.LogQueryWidget:
     )
 
 
+def _tables(watched: Watched) -> cloudwatch.GraphWidget:
+    units = {"ConsumedWriteCapacityUnits": "written", "ConsumedReadCapacityUnits": "read"}
+    return _graph(
+        "Tables: capacity units",
+        [
+            metrics.table(name, watched.tables[table], label=f"{table} {what}")
+            for name, what in units.items()
+            for table in _TABLES_OF_SAMPLES
+        ],
+    )
+
+
+def _functions(watched: Watched) -> list[cloudwatch.GraphWidget]:
+    running = "ConcurrentExecutions"
+    durations = [metrics.function("Duration", of, label=label) for label, of in watched.functions.items()]
+    concurrency = [
+        metrics.function(running, watched.functions[name], label=name) for name in _FUNCTIONS_OF_SAMPLES
+    ]
+    return [
+        _graph("Functions: duration p95, ms", durations),
+        _graph(
+            "Functions: concurrency",
+            [metrics.function(running, label="all of the account"), *concurrency],
+        ),
+        _graph(
+            "Functions: errors and throttles, all of the account",
+            [metrics.function("Errors"), metrics.function("Throttles")],
+        ),
+    ]
+
+
+def _iterator_age(watched: Watched) -> cloudwatch.GraphWidget:
+    return _graph(
+        "Streams: iterator age, ms",
+        [metrics.function("IteratorAge", of, label=label) for label, of in watched.readers.items()],
+    )
+
+
 def _graph(
-    title: str, left: list[cloudwatch.IMetric], right: list[cloudwatch.IMetric] | None = None
+    title: str, left: Sequence[cloudwatch.IMetric], right: Sequence[cloudwatch.IMetric] = ()
 ) -> cloudwatch.GraphWidget:
     return cloudwatch.GraphWidget(
-        title=title, left=left, right=right or [], width=8, height=6, period=metrics.PERIOD
+        title=title, left=list(left), right=list(right), width=8, height=6, period=metrics.PERIOD
     )

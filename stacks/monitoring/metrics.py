@@ -12,73 +12,61 @@ from aws_cdk import aws_dynamodb as dynamodb
 from aws_cdk import aws_lambda as lambda_
 from aws_cdk import aws_sqs as sqs
 
-from iort_contract import METRIC_DEPLOYMENT, METRIC_FUNCTION, METRIC_NAMESPACE, METRIC_ROBOT, METRICS
+from iort_contract.catalog.metrics import (
+    METRIC_DEPLOYMENT,
+    METRIC_FUNCTION,
+    METRIC_NAMESPACE,
+    METRIC_ROBOT,
+    Metric,
+)
 
 PERIOD = Duration.minutes(1)
-# The worst car counts; a mean would hide it.
-_STATISTICS = {"BatteryVolts": "Minimum", "TemperatureDegC": "Maximum", "BacklogBatches": "Maximum"}
 _FUNCTION_STATISTICS = {"Duration": "p95", "ConcurrentExecutions": "Maximum", "IteratorAge": "Maximum"}
 
 
-def ours(function: str, name: str, *, namespace: str, label: str | None = None) -> cloudwatch.Metric:
-    """A metric that functions/ emits; KeyError if the contract does not know it."""
-    if name not in METRICS[function]:
-        raise KeyError(name)
-    return _metric(
-        METRIC_NAMESPACE,
-        name,
-        label=label,
-        statistic=statistic(name),
-        dimensions={METRIC_DEPLOYMENT: namespace, METRIC_FUNCTION: function},
-    )
+def ours(metric: Metric, namespace: str) -> cloudwatch.Metric:
+    """A metric that functions/ emits."""
+    dimensions = {METRIC_DEPLOYMENT: namespace, METRIC_FUNCTION: metric.function}
+    return _metric(METRIC_NAMESPACE, metric.name, dimensions, statistic=metric.statistic)
 
 
-def each_robot(function: str, name: str, *, namespace: str) -> cloudwatch.MathExpression:
+def each_robot(metric: Metric, namespace: str) -> cloudwatch.MathExpression:
     """A metric of ours, one line for each robot: needs ``robot_metrics``."""
-    if name not in METRICS[function]:
-        raise KeyError(name)
     schema = f"{METRIC_NAMESPACE},{METRIC_DEPLOYMENT},{METRIC_FUNCTION},{METRIC_ROBOT}"
-    wanted = f'MetricName="{name}" {METRIC_DEPLOYMENT}="{namespace}" {METRIC_FUNCTION}="{function}"'
+    wanted = (
+        f'MetricName="{metric.name}" {METRIC_DEPLOYMENT}="{namespace}" {METRIC_FUNCTION}="{metric.function}"'
+    )
     return cloudwatch.MathExpression(
-        expression=f"SEARCH('{{{schema}}} {wanted}', '{statistic(name)}', {PERIOD.to_seconds():.0f})",
+        expression=f"SEARCH('{{{schema}}} {wanted}', '{metric.statistic}', {PERIOD.to_seconds():.0f})",
         using_metrics={},
         period=PERIOD,
         label="",
     )
 
 
-def statistic(name: str) -> str:
-    """The statistic of a minute of a metric of ours."""
-    return _STATISTICS.get(name, "p95" if name.endswith("Ms") else "Sum")
-
-
 def rule(name: str, rule_name: str, *, label: str) -> cloudwatch.Metric:
     """A metric of a topic rule, by its physical name."""
-    return _metric("AWS/IoT", name, label=label, dimensions={"RuleName": rule_name})
+    return _metric("AWS/IoT", name, {"RuleName": rule_name}, label=label)
 
 
 def broker(name: str) -> cloudwatch.Metric:
     """A metric of the account's message broker."""
-    return _metric("AWS/IoT", name, dimensions={"Protocol": "MQTT"})
+    return _metric("AWS/IoT", name, {"Protocol": "MQTT"})
 
 
-def function(name: str, of: lambda_.IFunction, *, label: str | None = None) -> cloudwatch.Metric:
-    """A metric of a Lambda function."""
-    how = _FUNCTION_STATISTICS.get(name, "Sum")
+def function(
+    name: str, of: lambda_.IFunction | None = None, *, label: str | None = None
+) -> cloudwatch.Metric:
+    """A metric of a Lambda function; without one of all functions of the account, which has no dimensions."""
+    dimensions = {"FunctionName": of.function_name} if of else {}
     return _metric(
-        "AWS/Lambda", name, label=label, statistic=how, dimensions={"FunctionName": of.function_name}
+        "AWS/Lambda", name, dimensions, label=label, statistic=_FUNCTION_STATISTICS.get(name, "Sum")
     )
-
-
-def all_functions(name: str, *, label: str | None = None) -> cloudwatch.Metric:
-    """A metric of all Lambda functions of the account, which has no dimensions."""
-    how = _FUNCTION_STATISTICS.get(name, "Sum")
-    return _metric("AWS/Lambda", name, label=label, statistic=how, dimensions={})
 
 
 def table(name: str, of: dynamodb.ITable, *, label: str | None = None) -> cloudwatch.Metric:
     """A metric of a DynamoDB table."""
-    return _metric("AWS/DynamoDB", name, label=label, dimensions={"TableName": of.table_name})
+    return _metric("AWS/DynamoDB", name, {"TableName": of.table_name}, label=label)
 
 
 def of_the_account(namespace: str, name: str) -> cloudwatch.MathExpression:
@@ -93,20 +81,15 @@ def of_the_account(namespace: str, name: str) -> cloudwatch.MathExpression:
 
 def waiting(of: sqs.IQueue, *, label: str | None = None) -> cloudwatch.Metric:
     """How many messages wait in a queue."""
-    return _metric(
-        "AWS/SQS",
-        "ApproximateNumberOfMessagesVisible",
-        label=label,
-        statistic="Maximum",
-        dimensions={"QueueName": of.queue_name},
-    )
+    name = "ApproximateNumberOfMessagesVisible"
+    return _metric("AWS/SQS", name, {"QueueName": of.queue_name}, label=label, statistic="Maximum")
 
 
 def _metric(
     namespace: str,
     name: str,
-    *,
     dimensions: dict[str, str],
+    *,
     label: str | None = None,
     statistic: str = "Sum",
 ) -> cloudwatch.Metric:

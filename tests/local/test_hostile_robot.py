@@ -10,7 +10,7 @@ import pytest
 
 import iort_contract
 from bench.meters.usage import descendants
-from functions.shared.cut_off import BURST
+from functions.live import REFUSALS
 from iort_contract import FILE, LIVE, PING, VESC_STREAM, LiveSample, build_topic, record_topic
 from iort_station.operations import quarantine
 from iort_station.page.listener import Listener
@@ -65,7 +65,7 @@ def test_a_robot_refused_over_and_over_leaves_the_others_their_live_lane(embedde
     after = environments(embedded)
     assert before <= after
     assert len(after) <= (os.cpu_count() or 1)
-    found = until(lambda: (now := kept(embedded, bad.robot)) and len(now) >= BURST and now)
+    found = until(lambda: (now := kept(embedded, bad.robot)) and len(now) >= REFUSALS and now)
     assert set(found) <= {b"no JSON %d" % n for n in range(BAD)}
     assert set(found.values()) == {1}
     assert kept(embedded, good.robot) == {}

@@ -5,6 +5,7 @@ from __future__ import annotations
 import re
 
 import iort_contract
+from iort_contract.catalog.rules import LOW_VOLTAGE_V, RULES
 from iort_station.cost.usage import Usage
 from stacks.settings import ROOT, Settings
 from tests.stacks.aws_metrics import AWS_METRICS
@@ -47,7 +48,7 @@ def test_the_cost_model_counts_every_alarm(synthesized, alarms):
     insights = [alarm["Metrics"][0]["Expression"] for alarm in alarms.values() if "Metrics" in alarm]
     assert Usage().alarms == len(alarms) - len(insights)
     of_lambda = 2 * len(synthesized.resources("AWS::Lambda::Function")) + 1
-    most = [len(iort_contract.RULES) if "AWS/IoT" in query else of_lambda for query in insights]
+    most = [len(RULES) if "AWS/IoT" in query else of_lambda for query in insights]
     assert Usage().insights_metrics == sum(most)
 
 
@@ -65,7 +66,7 @@ def test_the_thresholds_are_the_settings(production, synthesized):
         a["AlarmName"]: a["Threshold"] for a in synthesized.resources("AWS::CloudWatch::Alarm").values()
     }
     limits = Settings().thresholds
-    assert alarms["iort-BatteryVolts"] == limits.low_voltage_v == iort_contract.LOW_VOLTAGE_V
+    assert alarms["iort-BatteryVolts"] == limits.low_voltage_v == LOW_VOLTAGE_V
     assert alarms["iort-TemperatureDegC"] == limits.high_temperature_degc
     assert alarms["iort-CarToLambdaMs"] == limits.car_to_lambda_ms
     assert alarms["iort-SummarizeBehind"] == limits.stream_behind_s * 1000

@@ -16,12 +16,12 @@ from iort_contract import (
     LIVE,
     PING,
     PONG,
-    RULES,
     build_topic,
     live_topic,
     record_topic,
     rule_name,
 )
+from iort_contract.catalog.rules import RULES
 from stacks.parts.documents import claim_policy
 from stacks.parts.documents import robot_policy as robots_policy
 from tests.stacks.roles import IOT

@@ -11,14 +11,12 @@ from bench.meters.invocations import configure
 from bench.target import Target
 from bench.temporary_function import temporary_function
 from iort_contract import (
-    METRIC_DEPLOYMENT,
-    METRIC_FUNCTION,
-    METRIC_NAMESPACE,
     VESC_STREAM,
     Batch,
     encode,
     record_topic,
 )
+from iort_contract.catalog.metrics import METRIC_DEPLOYMENT, METRIC_FUNCTION, METRIC_NAMESPACE
 from verify.assumption import Basis
 from verify.check import Check
 from verify.errors import VerifyError

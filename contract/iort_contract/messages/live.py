@@ -23,9 +23,6 @@ from iort_contract.checks import (
 from iort_contract.limits import MAX_FIELDS, SCHEMA_VERSION, ContractError, Value
 from iort_contract.tables import NONFINITE, RECEIVED_MS, ROBOT, T_US
 
-# The fields of a ping; the answer repeats them.
-PING_FIELDS = ("v", "id", "sent_us", "padding")
-
 
 @dataclass(frozen=True)
 class LiveSample:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import iort_contract
-from functions.shared import cut_off
+from functions import live
 from functions.shared.summary import stored
 from iort_agent import rate_limiter
 from iort_contract import limits
@@ -36,8 +36,8 @@ def test_each_limit_is_told_as_it_is() -> None:
     told = {
         "MAX_LAYOUT": MAX_LAYOUT,
         "SECOND_BATCHES": stored.SECOND_BATCHES,
-        "BURST": cut_off.BURST,
-        "A_SECOND": cut_off.A_SECOND,
+        "REFUSALS": live.REFUSALS,
+        "REFUSALS_A_SECOND": live.REFUSALS_A_SECOND,
         "upload_gb_a_day": Settings.__dataclass_fields__["upload_gb_a_day"].default,
         **{name: getattr(of, name) for of in (limits, iort_contract) for name in table if hasattr(of, name)},
     }

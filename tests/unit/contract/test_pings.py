@@ -11,6 +11,7 @@ from hypothesis import strategies as st
 
 import iort_contract
 from iort_contract import ContractError
+from iort_contract.catalog.rules import RULES
 from tests.unit.contract.contract_values import seqs, times
 
 
@@ -48,5 +49,5 @@ def test_pong_refused(pong):
 
 
 def test_pong_goes_to_the_robot_that_asked():
-    topic = iort_contract.pong_template("iort").replace("${topic(3)}", "car")
+    topic = RULES["pong"].action.topic("iort", robot="car")
     assert topic == iort_contract.build_topic(iort_contract.PONG, "car", iort_contract.RULE)

@@ -8,6 +8,7 @@ from hypothesis import strategies as st
 
 import iort_contract
 from iort_contract import ContractError
+from iort_contract.catalog.rules import RULES
 
 robots = st.from_regex(r"[A-Za-z0-9_-]{1,64}", fullmatch=True)
 namespaces = st.from_regex(r"[a-z][a-z0-9]{0,15}", fullmatch=True)
@@ -79,9 +80,8 @@ def test_hostile_names_are_refused_everywhere(name):
         lambda: iort_contract.channel(name),
         lambda: iort_contract.rule_name(name),
         lambda: iort_contract.rule_name("record", name),
-        lambda: iort_contract.rule_sql(name),
-        lambda: iort_contract.rule_sql("record", name),
-        lambda: iort_contract.pong_template(name),
+        lambda: RULES["record"].statement(name),
+        lambda: RULES["pong"].action.topic(name),
         lambda: iort_contract.pubnub_parameter(name),
         lambda: iort_contract.fleet_name(name),
     ):

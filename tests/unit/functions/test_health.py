@@ -6,7 +6,8 @@ import pytest
 
 from functions.shared.metrics import MOST_VALUES
 from functions.shared.summary.health import measure, together
-from iort_contract import AGENT_STREAM, METRICS, RTT_STREAM, Batch
+from iort_contract import AGENT_STREAM, RTT_STREAM, Batch
+from iort_contract.catalog.metrics import metrics_of
 
 
 def batch(columns, *, times_us=None):
@@ -52,7 +53,7 @@ def test_round_trips_and_the_agents_own():
 
 @pytest.mark.parametrize("stream", ["vesc", RTT_STREAM, AGENT_STREAM])
 def test_the_names_are_the_contracts(stream):
-    assert measure(stream, [batch({"x": [1.0]})]).keys() <= set(METRICS["health"])
+    assert measure(stream, [batch({"x": [1.0]})]).keys() <= set(metrics_of("health"))
 
 
 def test_several_robots_are_one_line_of_log_and_none_of_their_values_is_cut_off():

@@ -22,15 +22,14 @@ from iort_contract import (
     RECORD,
     ROBOT,
     RULE,
-    RULES,
     SHADOW,
     TOPIC,
     VOLTAGE_FIELD,
     Batch,
     LiveSample,
     build_topic,
-    rule_sql,
 )
+from iort_contract.catalog.rules import RULES
 from tests.iot_sql import Message, evaluate
 from verify.spoofing import spoofed
 
@@ -65,7 +64,7 @@ def of_rule(request):
     """What a rule makes of a message on a topic."""
 
     def run(rule, topic, payload):
-        sql = rule_sql(rule, retention_s=RETENTION_S)
+        sql = RULES[rule].statement(retention_s=RETENTION_S)
         return evaluate(sql, Message(topic, payload, NOW_MS), payload_wins=request.param)
 
     return run

@@ -8,6 +8,9 @@ import re
 import pytest
 
 import iort_contract
+from iort_contract.catalog import metrics
+from iort_contract.catalog.metrics import METRICS, ROBOT_CHARTS
+from iort_contract.catalog.rules import RULES
 
 
 def matches(pattern, topic):
@@ -28,7 +31,7 @@ RULE_TOPICS = {
 @pytest.mark.parametrize("rule", RULE_TOPICS)
 @pytest.mark.parametrize("namespace", ["iort", "stage2"])
 def test_rule_listens_to_its_own_topics_of_the_contract(rule, namespace):
-    sql = iort_contract.rule_sql(rule, namespace)
+    sql = RULES[rule].statement(namespace)
     [pattern] = re.findall(r"FROM '([^']*)'", sql)
     assert pattern.split("/")[:2] == [RULE_TOPICS[rule][0], namespace]
     every = [
@@ -47,9 +50,9 @@ def test_rule_listens_to_its_own_topics_of_the_contract(rule, namespace):
     assert not matches(pattern, iort_contract.build_topic(lane, "car", name, "other"))
 
 
-@pytest.mark.parametrize("rule", iort_contract.RULES)
+@pytest.mark.parametrize("rule", RULES)
 def test_no_key_of_a_message_can_stand_where_the_cloud_s_own_stands(rule):
-    sql = iort_contract.rule_sql(rule)
+    sql = RULES[rule].statement()
     selected = re.sub(r"\bencode\(\*, 'base64'\)", "encode()", sql[len("SELECT ") : sql.index(" FROM ")])
     names = [part.rsplit(" AS ", 1)[-1] for part in selected.split(", ")]
     assert len(names) == len(set(names))
@@ -74,20 +77,31 @@ def test_the_record_rule_stores_what_a_batch_says_and_a_pong_what_a_ping_says():
     batch = iort_contract.Batch("0badcafe", 0, [1], {"speed": [1.5]}, nonfinite=1)
     assert tuple(json.loads(iort_contract.encode(batch))) == iort_contract.ENVELOPE
     assert tuple(json.loads(iort_contract.encode_ping(1, 1, "x"))) == iort_contract.PING_FIELDS
-    assert iort_contract.rule_sql("record").startswith(
-        f"SELECT {', '.join(iort_contract.ENVELOPE)}, topic() AS topic, "
+    assert (
+        RULES["record"]
+        .statement()
+        .startswith(f"SELECT {', '.join(iort_contract.ENVELOPE)}, topic() AS topic, ")
     )
-    assert iort_contract.rule_sql("pong").startswith(
-        f"SELECT {', '.join(iort_contract.PING_FIELDS)}, timestamp() AS "
+    assert (
+        RULES["pong"]
+        .statement()
+        .startswith(f"SELECT {', '.join(iort_contract.PING_FIELDS)}, timestamp() AS ")
     )
 
 
 def test_rule_names_are_allowed_by_aws():
     for namespace in ("iort", "a" * 16):
-        for rule in iort_contract.RULES:
-            assert re.fullmatch(r"[a-zA-Z0-9_]{1,128}", iort_contract.rule_name(rule, namespace))
+        for rule in RULES:
+            assert re.fullmatch(r"[a-zA-Z0-9_]{1,128}", RULES[rule].physical_name(namespace))
 
 
-def test_metric_names_are_unique():
-    every = [name for group in iort_contract.METRICS.values() for name in group]
-    assert len(every) == len(set(every))
+def test_a_statement_has_the_deployments_parameters():
+    stored = RULES["record"].statement("lab", retention_s=60)
+    assert "+ 60 AS expires_s FROM 'dt/lab/+/+'" in stored
+    assert RULES["battery"].statement(low_voltage_v=14).endswith("sample.voltage_input < 14")
+    assert not [rule for rule in RULES.values() if "{" in rule.statement()]
+
+
+def test_every_metric_has_a_chart_that_is_drawn():
+    drawn = {chart for row in ROBOT_CHARTS for chart in row} | {metrics.QUEUES, metrics.LIVE}
+    assert {metric.chart for metric in METRICS.values()} == drawn
