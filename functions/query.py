@@ -21,26 +21,18 @@ from typing import Any
 from functions.shared import clients
 from functions.shared.environment import variables
 from functions.shared.tables import Tables
-from iort_contract import (
-    BATCH,
-    DERIVED_UNITS,
-    MAX_BATCH_SPAN_US,
-    PLAIN_CODEC,
-    RECORD,
-    RESULTS_PREFIX,
-    TOPIC,
-    ContractError,
-    Value,
-    batches_between,
-    build_topic,
-    decode,
-    expression,
-    parse_topic,
-)
+from iort_contract import expression
 from iort_contract.attributes import plain
 from iort_contract.catalog.environments import QueryEnvironment
+from iort_contract.cloud import RESULTS_PREFIX
+from iort_contract.codec.columns import PLAIN_CODEC
 from iort_contract.expression import ExpressionError, MismatchError, Node
+from iort_contract.limits import MAX_BATCH_SPAN_US, ContractError, Value
+from iort_contract.messages.batch import batches_between, decode_batch
 from iort_contract.statistics import derive, without_absent
+from iort_contract.tables import BATCH, TOPIC
+from iort_contract.topics import RECORD, build_topic, parse_topic
+from iort_contract.vesc import DERIVED_UNITS
 
 # Lambda's synchronous answer holds 6 MB; the envelope around the samples takes some hundred bytes.
 MAX_INLINE_BYTES = 5_500_000
@@ -137,7 +129,7 @@ class Found:
         """Add the matching samples of a stored item."""
         request = self._request
         try:
-            batch = decode(item)
+            batch = decode_batch(item)
         except ContractError as error:
             self.refused += 1
             self.reason = self.reason or str(error)

@@ -9,8 +9,9 @@ from aws_cdk import aws_iam as iam
 from aws_cdk import aws_iot as iot
 from aws_cdk import aws_lambda as lambda_
 
-from iort_contract import PRESENCE, claim_name, fleet_name
 from iort_contract.catalog.environments import RegistryEnvironment
+from iort_contract.cloud import claim_name, fleet_name
+from iort_contract.tables import PRESENCE
 from stacks.parts import iot_core
 from stacks.parts.base import PlatformStack
 from stacks.parts.documents import claim_policy, provisioning_template, robot_policy

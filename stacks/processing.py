@@ -11,19 +11,6 @@ from aws_cdk import aws_sns as sns
 from aws_cdk import aws_sns_subscriptions as subscriptions
 from aws_cdk import aws_sqs as sqs
 
-from iort_contract import (
-    ALERT_PREFIX,
-    FILE,
-    FILES_BYTES,
-    FILES_DAY,
-    FILES_PREFIX,
-    LAMBDA,
-    PONG,
-    RESULTS_PREFIX,
-    SHADOW,
-    STREAMS,
-    pubnub_parameter,
-)
 from iort_contract.catalog.environments import (
     AlertEnvironment,
     Environment,
@@ -33,6 +20,10 @@ from iort_contract.catalog.environments import (
     SummarizeEnvironment,
     UploadEnvironment,
 )
+from iort_contract.cloud import RESULTS_PREFIX, pubnub_parameter
+from iort_contract.messages.files import FILES_PREFIX
+from iort_contract.tables import ALERT_PREFIX, FILES_BYTES, FILES_DAY, STREAMS
+from iort_contract.topics import FILE, LAMBDA, PONG, SHADOW
 from stacks.parts.base import PlatformStack
 from stacks.parts.function import RUNTIME, allow, function, invoked_by_rule
 from stacks.parts.queue import queue

@@ -9,7 +9,9 @@ from __future__ import annotations
 
 from typing import NamedTuple
 
-from iort_contract import (
+from iort_contract.catalog.rules import RULES
+from iort_contract.cloud import claim_name, fleet_name
+from iort_contract.topics import (
     BROKER,
     CMD,
     FLEET,
@@ -21,13 +23,10 @@ from iort_contract import (
     RULE,
     SHADOW,
     build_topic,
-    claim_name,
-    fleet_name,
     live_topic,
     record_topic,
     rule_name,
 )
-from iort_contract.catalog.rules import RULES
 
 # Robot A is the one that tries; B is its neighbour.
 A, B = "isolated-a", "isolated-b"

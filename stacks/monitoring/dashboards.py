@@ -12,7 +12,7 @@ from aws_cdk import Duration
 from aws_cdk import aws_cloudwatch as cloudwatch
 from constructs import Construct
 
-from iort_contract.catalog.metrics import LIVE, METRICS, QUEUES, ROBOT_CHARTS, Chart
+from iort_contract.catalog.metrics import LIVE_CHART, METRICS, QUEUES_CHART, ROBOT_CHARTS, Chart
 from iort_contract.catalog.rules import RULES
 from stacks.monitoring import metrics
 from stacks.monitoring.watched import Watched
@@ -43,7 +43,7 @@ class Dashboards(Construct):
         platform.add_widgets(*self._broker_and_rules(), _tables(watched))
         platform.add_widgets(*_functions(watched))
         platform.add_widgets(_iterator_age(watched), self._queues(watched))
-        platform.add_widgets(self._chart(LIVE))
+        platform.add_widgets(self._chart(LIVE_CHART))
         robots = self._dashboard("Robots")
         for row in ROBOT_CHARTS:
             robots.add_widgets(*map(self._chart, row))
@@ -89,7 +89,7 @@ class Dashboards(Construct):
 
     def _queues(self, watched: Watched) -> cloudwatch.GraphWidget:
         waiting = [metrics.waiting(queue, label=label) for label, queue in watched.queues.items()]
-        return _graph(QUEUES.title, waiting, self._ours(QUEUES, right=True))
+        return _graph(QUEUES_CHART.title, waiting, self._ours(QUEUES_CHART, right=True))
 
 
 def _warnings(watched: Watched) -> cloudwatch.LogQueryWidget:

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import re
 
-import iort_contract
 from iort_contract.catalog.rules import LOW_VOLTAGE_V, RULES
+from iort_contract.limits import LIVE_MIN_RATE_HZ
 from iort_station.cost.usage import Usage
 from stacks.settings import ROOT, Settings
 from tests.stacks.aws_metrics import AWS_METRICS
@@ -76,7 +76,7 @@ def test_the_thresholds_are_the_settings(production, synthesized):
 
 def test_the_slowest_live_lane_can_set_its_alarms_off(alarms):
     """Three minutes one after the other with a message each are more than one in a hundred seconds has."""
-    every_s = 1 / iort_contract.LIVE_MIN_RATE_HZ
+    every_s = 1 / LIVE_MIN_RATE_HZ
     for name_ in ("PubNubFailed", "CarToLambdaMs"):
         alarm = alarms[name_]
         periods, needed = alarm["EvaluationPeriods"], alarm["DatapointsToAlarm"]

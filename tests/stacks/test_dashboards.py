@@ -8,10 +8,12 @@ import re
 
 import pytest
 
-import iort_contract
 from functions.shared.summary.health import measure
 from iort_contract.catalog.metrics import METRIC_NAMESPACE, METRICS, metrics_of
 from iort_contract.catalog.rules import RULES
+from iort_contract.limits import DEFAULT_NAMESPACE
+from iort_contract.messages.batch import Batch
+from iort_contract.topics import AGENT_STREAM, RTT_STREAM
 from iort_station.cost.fixed_costs import (
     FREE_DASHBOARD_METRICS,
     FREE_DASHBOARDS,
@@ -107,8 +109,8 @@ def emitted():
             if isinstance(node, ast.Call) and ast.unparse(node.func) == "self.counted.add":
                 found.setdefault(path.stem, set()).update(keyword.arg for keyword in node.keywords)
     # These have their names computed.
-    batch = iort_contract.Batch("0" * 8, 0, [1], {"voltage_input": [12.0]})
-    for stream in ("vesc", iort_contract.RTT_STREAM, iort_contract.AGENT_STREAM):
+    batch = Batch("0" * 8, 0, [1], {"voltage_input": [12.0]})
+    for stream in ("vesc", RTT_STREAM, AGENT_STREAM):
         found["health"] |= measure(stream, [batch]).keys()
     return found
 
@@ -118,7 +120,7 @@ def test_the_dashboards_show_what_the_functions_emit_and_nothing_else(shown):
     for namespace, metric, dimensions, options in shown:
         if namespace == METRIC_NAMESPACE:
             assert dimensions.keys() == {"Deployment", "Function"}
-            assert dimensions["Deployment"] == iort_contract.DEFAULT_NAMESPACE
+            assert dimensions["Deployment"] == DEFAULT_NAMESPACE
             by_function.setdefault(dimensions["Function"], set()).add(metric)
             assert options["stat"] == METRICS[metric].statistic
     assert by_function == {metric.function: set(metrics_of(metric.function)) for metric in METRICS.values()}

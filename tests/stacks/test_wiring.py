@@ -14,22 +14,27 @@ from pathlib import Path
 import pytest
 from aws_cdk import App
 
-import iort_contract
-from iort_contract import (
+from iort_contract.catalog import environments
+from iort_contract.cloud import pubnub_parameter
+from iort_contract.limits import DEFAULT_NAMESPACE
+from iort_contract.topics import (
     BROKER,
+    CMD,
     FILE,
+    FLEET,
     LAMBDA,
     LIVE,
     PING,
     PONG,
     RECORD,
     RULE,
+    SHADOW,
     build_topic,
     live_topic,
     record_topic,
     rule_name,
 )
-from iort_contract.catalog import environments
+from iort_contract.vesc import VESC_FIELDS, VESC_STREAM
 from stacks.parts.base import PlatformStack
 from stacks.parts.function import function
 from stacks.settings import ROOT, Settings, SettingsError
@@ -197,14 +202,14 @@ def test_what_the_variables_say_is_what_the_functions_expect(functions, reader):
         variables = functions[function]["Environment"]["Variables"]
         return kind.read({key: reader.text(value) for key, value in variables.items()})
 
-    name = iort_contract.DEFAULT_NAMESPACE
+    name = DEFAULT_NAMESPACE
     later = environments.LaterEnvironment(
         name, "Batches", "Summary", "Robots", "Rejected", robot_metrics=False
     )
     files = environments.UploadEnvironment(name, "Files", "Robots", "Rejected", 50 * 10**9)
     query = environments.QueryEnvironment(name, "Batches", "Robots", "Files")
-    fields = {iort_contract.VESC_STREAM: list(iort_contract.VESC_FIELDS)}
-    parameter = iort_contract.pubnub_parameter()
+    fields = {VESC_STREAM: list(VESC_FIELDS)}
+    parameter = pubnub_parameter()
     assert given("Later", environments.LaterEnvironment) == later
     assert given("Summarize", environments.SummarizeEnvironment) == environments.SummarizeEnvironment(
         **vars(later), put_off_queue="PutOff"
@@ -276,13 +281,13 @@ def test_every_topic_of_the_agent_meets_exactly_the_rule_that_it_is_for(filters)
         build_topic(PONG, "car", RULE): set(),
         build_topic(PONG, "car", LAMBDA): set(),
         build_topic(PONG, "car", FILE): set(),
-        build_topic(iort_contract.FLEET, "car", "pose"): set(),
-        build_topic(iort_contract.CMD, "car", "stop"): set(),
+        build_topic(FLEET, "car", "pose"): set(),
+        build_topic(CMD, "car", "stop"): set(),
         build_topic(LIVE, "car", "vesc", "lab2"): set(),
         "$aws/events/presence/connected/car": {"iort_presence"},
         "$aws/events/presence/disconnected/car": {"iort_presence"},
-        f"$aws/things/car/shadow/name/{iort_contract.SHADOW}/update/accepted": {"iort_version"},
-        f"$aws/things/car/shadow/name/{iort_contract.SHADOW}/update/documents": set(),
+        f"$aws/things/car/shadow/name/{SHADOW}/update/accepted": {"iort_version"},
+        f"$aws/things/car/shadow/name/{SHADOW}/update/documents": set(),
         "$aws/things/car/shadow/update/accepted": set(),
     }
     for one, rules in expected.items():

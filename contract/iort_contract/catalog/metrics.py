@@ -24,26 +24,26 @@ class Chart:
     title: str
 
 
-QUEUES = Chart("Queues: messages waiting")
-LIVE = Chart("PubNub: live samples published")
-REPORTS = Chart("Agents: reports a minute, six from each")
-BATCHES = Chart("Samples and batches a minute")
-GAPS = Chart("Gaps: holes between samples, missing and refused batches")
-BACKLOG = Chart("Backlog: batches waiting in the fullest car")
-HOPS = Chart("Delay of live samples by hop, p95 ms")
-ROUND_TRIPS = Chart("Round trips of the cars' pings, p95 ms")
-BATTERY = Chart("Battery of the weakest car, V")
-TEMPERATURE = Chart("Temperature of the hottest controller, degC")
-FAULTS = Chart("Samples with a fault code, and alerts sent")
-PRESENCE = Chart("Robots: who comes and goes")
-ADMISSION = Chart("Robots: admitted and refused, and pongs sent")
-FILES = Chart("Robots: files")
-# The rows of the robots' dashboard. QUEUES and LIVE are on the platform's.
+QUEUES_CHART = Chart("Queues: messages waiting")
+LIVE_CHART = Chart("PubNub: live samples published")
+REPORTS_CHART = Chart("Agents: reports a minute, six from each")
+BATCHES_CHART = Chart("Samples and batches a minute")
+GAPS_CHART = Chart("Gaps: holes between samples, missing and refused batches")
+BACKLOG_CHART = Chart("Backlog: batches waiting in the fullest car")
+HOPS_CHART = Chart("Delay of live samples by hop, p95 ms")
+ROUND_TRIPS_CHART = Chart("Round trips of the cars' pings, p95 ms")
+BATTERY_CHART = Chart("Battery of the weakest car, V")
+TEMPERATURE_CHART = Chart("Temperature of the hottest controller, degC")
+FAULTS_CHART = Chart("Samples with a fault code, and alerts sent")
+PRESENCE_CHART = Chart("Robots: who comes and goes")
+ADMISSION_CHART = Chart("Robots: admitted and refused, and pongs sent")
+FILES_CHART = Chart("Robots: files")
+# The rows of the robots' dashboard. QUEUES_CHART and LIVE_CHART are on the platform's.
 ROBOT_CHARTS: tuple[tuple[Chart, ...], ...] = (
-    (REPORTS, BATCHES, GAPS, BACKLOG),
-    (HOPS, ROUND_TRIPS),
-    (BATTERY, TEMPERATURE, FAULTS),
-    (PRESENCE, ADMISSION, FILES),
+    (REPORTS_CHART, BATCHES_CHART, GAPS_CHART, BACKLOG_CHART),
+    (HOPS_CHART, ROUND_TRIPS_CHART),
+    (BATTERY_CHART, TEMPERATURE_CHART, FAULTS_CHART),
+    (PRESENCE_CHART, ADMISSION_CHART, FILES_CHART),
 )
 
 
@@ -73,18 +73,18 @@ METRICS = {
         Metric(
             "Quarantined",
             "quarantine",
-            QUEUES,
+            QUEUES_CHART,
             right=True,
             alarm=Alarm(
                 "messages that could not be processed are in quarantine",
                 "`iort errors` lists them with their reasons; remove the cause, then `iort replay-errors`",
             ),
         ),
-        Metric("LivePublished", "live", LIVE),
+        Metric("LivePublished", "live", LIVE_CHART),
         Metric(
             "PubNubFailed",
             "live",
-            LIVE,
+            LIVE_CHART,
             right=True,
             # Of five minutes: a live lane at 0.01 Hz, the slowest allowed, sends in three of them.
             alarm=Alarm(
@@ -94,16 +94,16 @@ METRICS = {
                 within=5,
             ),
         ),
-        Metric("LiveStale", "live", LIVE, right=True),
-        Metric("LiveRefused", "live", LIVE, right=True),
-        Metric("LiveCutOff", "live", LIVE, right=True),
-        _delay("InCarMs", "live", HOPS),
-        _delay("UplinkMs", "live", HOPS),
-        _delay("ToLambdaMs", "live", HOPS),
+        Metric("LiveStale", "live", LIVE_CHART, right=True),
+        Metric("LiveRefused", "live", LIVE_CHART, right=True),
+        Metric("LiveCutOff", "live", LIVE_CHART, right=True),
+        _delay("InCarMs", "live", HOPS_CHART),
+        _delay("UplinkMs", "live", HOPS_CHART),
+        _delay("ToLambdaMs", "live", HOPS_CHART),
         _delay(
             "CarToLambdaMs",
             "live",
-            HOPS,
+            HOPS_CHART,
             alarm=Alarm(
                 "live samples are late",
                 "the car's network; the hops on the robots' dashboard say which part of the way. Samples too "
@@ -113,11 +113,11 @@ METRICS = {
                 within=5,
             ),
         ),
-        Metric("SampleGaps", "health", GAPS),
+        Metric("SampleGaps", "health", GAPS_CHART),
         Metric(
             "BatchesMissing",
             "summarize",
-            GAPS,
+            GAPS_CHART,
             alarm=Alarm(
                 "batches of a car are missing",
                 "[`iort audit`](audit.md) says which; a late one fills the hole, a dropped one does not",
@@ -126,22 +126,22 @@ METRICS = {
         Metric(
             "BatchesRefused",
             "summarize",
-            GAPS,
+            GAPS_CHART,
             alarm=Alarm(
                 "batches cannot be decoded",
                 "an agent of another version, or not ours: they are in quarantine with their bytes",
             ),
         ),
-        Metric("BatchesPutOff", "summarize", GAPS),
-        Metric("SamplesSummarized", "summarize", BATCHES),
-        Metric("BatchesSummarized", "summarize", BATCHES),
-        Metric("AgentReports", "health", REPORTS),
+        Metric("BatchesPutOff", "summarize", GAPS_CHART),
+        Metric("SamplesSummarized", "summarize", BATCHES_CHART),
+        Metric("BatchesSummarized", "summarize", BATCHES_CHART),
+        Metric("AgentReports", "health", REPORTS_CHART),
         # The worst car counts; a mean would hide it. From the record lane, which is lossless; the rules fault
         # and battery are faster and name the car.
         Metric(
             "FaultSamples",
             "health",
-            FAULTS,
+            FAULTS_CHART,
             of_a_robot=True,
             alarm=Alarm(
                 "a car reports a fault",
@@ -151,7 +151,7 @@ METRICS = {
         Metric(
             "TemperatureDegC",
             "health",
-            TEMPERATURE,
+            TEMPERATURE_CHART,
             unit="None",
             statistic="Maximum",
             of_a_robot=True,
@@ -164,7 +164,7 @@ METRICS = {
         Metric(
             "BatteryVolts",
             "health",
-            BATTERY,
+            BATTERY_CHART,
             unit="None",
             statistic="Minimum",
             of_a_robot=True,
@@ -175,22 +175,22 @@ METRICS = {
                 below=True,
             ),
         ),
-        Metric("BacklogBatches", "health", BACKLOG, statistic="Maximum", of_a_robot=True),
-        _delay("RoundTripBrokerMs", "health", ROUND_TRIPS),
-        _delay("RoundTripRuleMs", "health", ROUND_TRIPS),
-        _delay("RoundTripLambdaMs", "health", ROUND_TRIPS),
-        Metric("AlertsSent", "alert", FAULTS, right=True),
-        Metric("AlertsHeld", "alert", FAULTS, right=True),
-        Metric("RobotsConnected", "presence", PRESENCE),
-        Metric("RobotsDisconnected", "presence", PRESENCE),
-        Metric("PresenceIgnored", "presence", PRESENCE),
-        Metric("RobotsAdmitted", "admit", ADMISSION),
-        Metric("RobotsRefused", "admit", ADMISSION),
-        Metric("PongsSent", "echo", ADMISSION, right=True),
-        Metric("FilesAsked", "upload", FILES),
-        Metric("FilesStored", "upload", FILES),
-        Metric("FilesRefused", "upload", FILES),
-        Metric("StoredBytes", "upload", FILES, unit="Bytes"),
+        Metric("BacklogBatches", "health", BACKLOG_CHART, statistic="Maximum", of_a_robot=True),
+        _delay("RoundTripBrokerMs", "health", ROUND_TRIPS_CHART),
+        _delay("RoundTripRuleMs", "health", ROUND_TRIPS_CHART),
+        _delay("RoundTripLambdaMs", "health", ROUND_TRIPS_CHART),
+        Metric("AlertsSent", "alert", FAULTS_CHART, right=True),
+        Metric("AlertsHeld", "alert", FAULTS_CHART, right=True),
+        Metric("RobotsConnected", "presence", PRESENCE_CHART),
+        Metric("RobotsDisconnected", "presence", PRESENCE_CHART),
+        Metric("PresenceIgnored", "presence", PRESENCE_CHART),
+        Metric("RobotsAdmitted", "admit", ADMISSION_CHART),
+        Metric("RobotsRefused", "admit", ADMISSION_CHART),
+        Metric("PongsSent", "echo", ADMISSION_CHART, right=True),
+        Metric("FilesAsked", "upload", FILES_CHART),
+        Metric("FilesStored", "upload", FILES_CHART),
+        Metric("FilesRefused", "upload", FILES_CHART),
+        Metric("StoredBytes", "upload", FILES_CHART, unit="Bytes"),
     )
 }
 

@@ -32,9 +32,11 @@ from functions.shared.summary.share import (
 )
 from functions.shared.summary.stored import SECOND_BATCHES
 from functions.shared.tables import Tables
-from iort_contract import RECOMPUTE_FROM_S, RECOMPUTED, REPLAY, Statistics, parse_topic
 from iort_contract.catalog.environments import LaterEnvironment
+from iort_contract.codec.seconds import Statistics
 from iort_contract.table_writer import TableError
+from iort_contract.tables import RECOMPUTE_FROM_S, RECOMPUTED, REPLAY
+from iort_contract.topics import parse_topic
 
 # Topics to process in parallel; a client keeps ten connections.
 _AT_ONCE = 4

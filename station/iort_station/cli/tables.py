@@ -11,7 +11,7 @@ from typing import IO, Any, NamedTuple
 import numpy as np
 from rich.table import Table
 
-from iort_contract import EXACT
+from iort_contract.codec.columns import EXACT
 from iort_station.cli.console import visible
 from iort_station.data.conditions import Column, values
 from iort_station.data.data import Result

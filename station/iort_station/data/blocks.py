@@ -13,7 +13,8 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from iort_contract import EXACT, Value
+from iort_contract.codec.columns import EXACT
+from iort_contract.limits import Value
 from iort_station.data.conditions import Column
 
 

@@ -8,7 +8,7 @@ from typing import Any, TypeAlias
 import numpy as np
 from numpy.typing import NDArray
 
-from iort_contract import Value, expression
+from iort_contract import expression
 from iort_contract.expression import (
     ARITHMETIC,
     COMPARISONS,
@@ -23,6 +23,7 @@ from iort_contract.expression import (
     Node,
     Some,
 )
+from iort_contract.limits import Value
 from iort_contract.statistics import Vehicle
 from iort_station.errors import StationError
 

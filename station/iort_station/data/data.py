@@ -19,7 +19,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from iort_contract import DERIVED_UNITS, MessageType
+from iort_contract.messages.message_type import MessageType
+from iort_contract.vesc import DERIVED_UNITS
 from iort_station.cloud import Cloud
 from iort_station.data import inventory, query_function, reading
 from iort_station.data.blocks import Block, join

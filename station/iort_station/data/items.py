@@ -4,7 +4,8 @@ from __future__ import annotations
 
 from typing import Any
 
-from iort_contract import RECORD, TOPIC, build_topic
+from iort_contract.tables import TOPIC
+from iort_contract.topics import RECORD, build_topic
 from iort_station.cloud import Cloud
 
 

@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 
-from iort_contract import PLAIN_CODEC
+from iort_contract.codec.columns import PLAIN_CODEC
 from iort_station.cloud import Cloud
 from iort_station.data import inventory
 from iort_station.data.blocks import Block, column_of, join, ordered

@@ -7,17 +7,10 @@ from concurrent.futures import ThreadPoolExecutor
 from decimal import Decimal
 from typing import Any, TypeVar
 
-from iort_contract import (
-    BATCH,
-    MAX_BATCH_SPAN_US,
-    RECORD,
-    SECOND,
-    TOPIC,
-    ContractError,
-    batch_id,
-    batches_between,
-    build_topic,
-)
+from iort_contract.limits import MAX_BATCH_SPAN_US, ContractError
+from iort_contract.messages.batch import batch_id, batches_between
+from iort_contract.tables import BATCH, SECOND, TOPIC
+from iort_contract.topics import RECORD, build_topic
 from iort_station.cloud import Cloud
 from iort_station.data.selection import Selection
 

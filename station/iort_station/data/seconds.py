@@ -7,7 +7,9 @@ from typing import Any
 
 from boto3.dynamodb.types import TypeDeserializer
 
-from iort_contract import (
+from iort_contract import expression
+from iort_contract.codec.seconds import flat_second
+from iort_contract.tables import (
     ABSENT,
     BATCHES,
     EXPIRES_S,
@@ -18,8 +20,6 @@ from iort_contract import (
     SECOND,
     STATS,
     TOPIC,
-    expression,
-    flat_second,
 )
 from iort_station.cloud import Cloud
 from iort_station.data import reading

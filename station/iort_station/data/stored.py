@@ -11,29 +11,20 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from iort_contract import (
-    BATCH,
+from iort_contract.checks import check_field
+from iort_contract.codec.columns import CODEC, EXACT, PLAIN_CODEC, SCALES, SERIALIZED_CODEC, inflate
+from iort_contract.codec.complexity_guard import check_effort
+from iort_contract.limits import (
     BATCH_VERSION,
-    CODEC,
-    EXACT,
     MAX_BATCH_SPAN_US,
     MAX_BATCH_VALUES,
     MAX_FIELDS,
     MAX_SAMPLES,
-    NONFINITE,
-    PLAIN_CODEC,
-    SAMPLES,
-    SCALES,
-    SERIALIZED_CODEC,
-    Batch,
     ContractError,
     Value,
-    batch_id,
-    check_effort,
-    check_field,
-    decode,
-    inflate,
 )
+from iort_contract.messages.batch import Batch, batch_id, decode_batch
+from iort_contract.tables import BATCH, NONFINITE, SAMPLES
 from iort_station.data.blocks import EMPTY, Block, column_of, join, joined, ordered
 from iort_station.data.conditions import Column
 from iort_station.data.reading import time_of
@@ -135,7 +126,7 @@ def _by_contract(items: Iterable[Item], refused: Refused, wanted: Wanted) -> Ite
 def _decoded(item: Item, refused: Refused) -> list[Batch]:
     """The batch, if it is one."""
     try:
-        return [decode({name: _plain(value) for name, value in item.items()})]
+        return [decode_batch({name: _plain(value) for name, value in item.items()})]
     except ContractError as error:
         refused.add(error)
         return []

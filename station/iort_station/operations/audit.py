@@ -12,21 +12,11 @@ from dataclasses import dataclass
 from itertools import pairwise
 from typing import Any, NamedTuple
 
-from iort_contract import (
-    AGENT_STREAM,
-    BATCH,
-    RECEIVED_MS,
-    RECORD,
-    SAMPLES,
-    TOPIC,
-    Batch,
-    ContractError,
-    batch_id,
-    batches_between,
-    build_topic,
-    decode,
-)
 from iort_contract.attributes import plain
+from iort_contract.limits import ContractError
+from iort_contract.messages.batch import Batch, batch_id, batches_between, decode_batch
+from iort_contract.tables import BATCH, RECEIVED_MS, SAMPLES, TOPIC
+from iort_contract.topics import AGENT_STREAM, RECORD, build_topic
 from iort_station.cloud import Cloud
 from iort_station.data.items import of_topic
 
@@ -250,6 +240,6 @@ def last_batch(cloud: Cloud, robot: str, stream: str) -> Batch | None:
         Limit=1,
     )
     try:
-        return next((decode(plain(item)) for item in answer["Items"]), None)
+        return next((decode_batch(plain(item)) for item in answer["Items"]), None)
     except ContractError:
         return None

@@ -6,8 +6,9 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import Any
 
-from iort_contract import SAMPLES, Batch, decode
 from iort_contract.attributes import plain
+from iort_contract.messages.batch import Batch, decode_batch
+from iort_contract.tables import SAMPLES
 from iort_station.cloud import Cloud
 from iort_station.data.items import of_topic
 
@@ -25,9 +26,9 @@ class Delivery:
 def batches(cloud: Cloud, robot: str, stream: str) -> Iterator[Batch]:
     """Every stored batch of a stream, in order of time, page by page.
 
-    Raises `iort_contract.ContractError` for an item that is not a batch.
+    Raises `ContractError` for an item that is not a batch.
     """
-    yield from map(decode, items(cloud, robot, stream))
+    yield from map(decode_batch, items(cloud, robot, stream))
 
 
 def items(cloud: Cloud, robot: str, stream: str) -> Iterator[dict[str, Any]]:

@@ -6,7 +6,8 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import Any
 
-from iort_contract import (
+from iort_contract.attributes import plain
+from iort_contract.tables import (
     BY_RULE,
     ENTRY,
     FIRST_MS,
@@ -18,9 +19,8 @@ from iort_contract import (
     SEEN,
     SOURCE,
     TOPIC,
-    as_subscribed,
 )
-from iort_contract.attributes import plain
+from iort_contract.topics import as_subscribed
 from iort_station.cloud import Cloud
 from iort_station.errors import StationError
 
@@ -29,7 +29,7 @@ _LISTED = (ROBOT, ENTRY, SOURCE, TOPIC, REASON, FIRST_MS, LAST_MS, SEEN, REPLAYS
 
 @dataclass(frozen=True)
 class Entry:
-    """A message in quarantine. ``source`` says where it was refused (`iort_contract.BY_RULE` and its like),
+    """A message in quarantine. ``source`` says where it was refused (`BY_RULE` and its like),
     ``first_ms`` and ``last_ms`` when, ``seen`` how often; ``payload`` is None in a list."""
 
     robot: str

@@ -7,10 +7,13 @@ import re
 
 import pytest
 
-import iort_contract
 from iort_contract.catalog import metrics
 from iort_contract.catalog.metrics import METRICS, ROBOT_CHARTS
 from iort_contract.catalog.rules import RULES
+from iort_contract.messages.batch import Batch, encode_batch
+from iort_contract.messages.live import encode_ping
+from iort_contract.tables import ENVELOPE, EXPIRES_S, MESSAGE_BASE64, PING_FIELDS, RECEIVED_MS, ROBOT, TOPIC
+from iort_contract.topics import FILE, LANES, PING_PATHS, build_topic
 
 
 def matches(pattern, topic):
@@ -34,20 +37,12 @@ def test_rule_listens_to_its_own_topics_of_the_contract(rule, namespace):
     sql = RULES[rule].statement(namespace)
     [pattern] = re.findall(r"FROM '([^']*)'", sql)
     assert pattern.split("/")[:2] == [RULE_TOPICS[rule][0], namespace]
-    every = [
-        (lane, name)
-        for lane in iort_contract.LANES
-        for name in ("vesc", iort_contract.FILE, *iort_contract.PING_PATHS)
-    ]
-    heard = {
-        pair
-        for pair in every
-        if matches(pattern, iort_contract.build_topic(pair[0], "car", pair[1], namespace))
-    }
+    every = [(lane, name) for lane in LANES for name in ("vesc", FILE, *PING_PATHS)]
+    heard = {pair for pair in every if matches(pattern, build_topic(pair[0], "car", pair[1], namespace))}
     lane, name = RULE_TOPICS[rule]
     expected = {(lane, name)} if lane == "ping" else {pair for pair in every if pair[0] == lane}
     assert heard == expected
-    assert not matches(pattern, iort_contract.build_topic(lane, "car", name, "other"))
+    assert not matches(pattern, build_topic(lane, "car", name, "other"))
 
 
 @pytest.mark.parametrize("rule", RULES)
@@ -59,34 +54,26 @@ def test_no_key_of_a_message_can_stand_where_the_cloud_s_own_stands(rule):
     # The broker's own events alone are taken whole: no robot says anything in them, and nothing is added.
     assert ("*" in selected) == (rule == "presence")
     assert names == ["*"] or "*" not in names
-    assert (iort_contract.RECEIVED_MS in names) == (rule not in ("presence", "version"))
-    assert (iort_contract.TOPIC in names) == (rule not in ("pong", "presence", "version"))
-    assert (iort_contract.EXPIRES_S in names) == (rule == "record")
-    assert (iort_contract.MESSAGE_BASE64 in names) == (rule in ("live", "echo", "upload"))
+    assert (RECEIVED_MS in names) == (rule not in ("presence", "version"))
+    assert (TOPIC in names) == (rule not in ("pong", "presence", "version"))
+    assert (EXPIRES_S in names) == (rule == "record")
+    assert (MESSAGE_BASE64 in names) == (rule in ("live", "echo", "upload"))
     for name, part in zip(names, selected.split(", ")):
         if name in (
-            iort_contract.RECEIVED_MS,
-            iort_contract.TOPIC,
-            iort_contract.EXPIRES_S,
-            iort_contract.ROBOT,
+            RECEIVED_MS,
+            TOPIC,
+            EXPIRES_S,
+            ROBOT,
         ):
             assert re.match(r"(timestamp|topic|floor)\(", part), part
 
 
 def test_the_record_rule_stores_what_a_batch_says_and_a_pong_what_a_ping_says():
-    batch = iort_contract.Batch("0badcafe", 0, [1], {"speed": [1.5]}, nonfinite=1)
-    assert tuple(json.loads(iort_contract.encode(batch))) == iort_contract.ENVELOPE
-    assert tuple(json.loads(iort_contract.encode_ping(1, 1, "x"))) == iort_contract.PING_FIELDS
-    assert (
-        RULES["record"]
-        .statement()
-        .startswith(f"SELECT {', '.join(iort_contract.ENVELOPE)}, topic() AS topic, ")
-    )
-    assert (
-        RULES["pong"]
-        .statement()
-        .startswith(f"SELECT {', '.join(iort_contract.PING_FIELDS)}, timestamp() AS ")
-    )
+    batch = Batch("0badcafe", 0, [1], {"speed": [1.5]}, nonfinite=1)
+    assert tuple(json.loads(encode_batch(batch))) == ENVELOPE
+    assert tuple(json.loads(encode_ping(1, 1, "x"))) == PING_FIELDS
+    assert RULES["record"].statement().startswith(f"SELECT {', '.join(ENVELOPE)}, topic() AS topic, ")
+    assert RULES["pong"].statement().startswith(f"SELECT {', '.join(PING_FIELDS)}, timestamp() AS ")
 
 
 def test_rule_names_are_allowed_by_aws():
@@ -103,5 +90,5 @@ def test_a_statement_has_the_deployments_parameters():
 
 
 def test_every_metric_has_a_chart_that_is_drawn():
-    drawn = {chart for row in ROBOT_CHARTS for chart in row} | {metrics.QUEUES, metrics.LIVE}
+    drawn = {chart for row in ROBOT_CHARTS for chart in row} | {metrics.QUEUES_CHART, metrics.LIVE_CHART}
     assert {metric.chart for metric in METRICS.values()} == drawn

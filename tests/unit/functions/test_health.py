@@ -6,8 +6,9 @@ import pytest
 
 from functions.shared.metrics import MOST_VALUES
 from functions.shared.summary.health import measure, together
-from iort_contract import AGENT_STREAM, RTT_STREAM, Batch
 from iort_contract.catalog.metrics import metrics_of
+from iort_contract.messages.batch import Batch
+from iort_contract.topics import AGENT_STREAM, RTT_STREAM
 
 
 def batch(columns, *, times_us=None):

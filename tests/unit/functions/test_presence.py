@@ -10,9 +10,9 @@ import boto3
 import pytest
 
 from functions import presence
-from iort_contract import ContractError
 from iort_contract.attributes import plain
 from iort_contract.catalog.metrics import metrics_of
+from iort_contract.limits import ContractError
 from tests.fakes import ROBOTS
 
 MINUTE_MS = 60_000
