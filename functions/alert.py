@@ -18,9 +18,9 @@ from functions.shared import clients
 from functions.shared.environment import variables
 from functions.shared.metrics import emit
 from iort_contract.catalog.environments import AlertEnvironment
+from iort_contract.catalog.vesc import FAULT_FIELD, FAULTS, VOLTAGE_FIELD
 from iort_contract.tables import ALERT_PREFIX, RECEIVED_MS, ROBOT, TOPIC
 from iort_contract.topics import parse_topic
-from iort_contract.vesc import FAULT_FIELD, FAULTS, VOLTAGE_FIELD
 
 if TYPE_CHECKING:
     from types_boto3_dynamodb import DynamoDBClient

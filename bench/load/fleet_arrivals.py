@@ -10,9 +10,9 @@ from typing import Any
 
 from bench.load.fleet_load import SAMPLES as BATCH_SAMPLES
 from iort_contract.attributes import plain
+from iort_contract.catalog.vesc import VESC_STREAM
 from iort_contract.messages.batch import batch_id
 from iort_contract.tables import BATCH, RECEIVED_MS, SAMPLES, SECOND
-from iort_contract.vesc import VESC_STREAM
 from iort_station.cloud import Cloud
 from iort_station.data.items import of_topic
 

@@ -13,10 +13,10 @@ from typing import Any
 from botocore.exceptions import ClientError
 
 from iort_contract.attributes import plain
+from iort_contract.catalog.derived import Vehicle
 from iort_contract.codec.seconds import Statistics
 from iort_contract.limits import ContractError
 from iort_contract.messages.batch import BatchId, batch_id, batches_between
-from iort_contract.statistics import Vehicle
 from iort_contract.table_writer import WRITE_SIZE, write
 from iort_contract.tables import BATCH, OMITTED, ROBOT, SECOND, STREAMS, TOPIC, VEHICLE_CACHE_S
 

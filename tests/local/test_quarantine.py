@@ -9,10 +9,10 @@ import time
 import pytest
 from typer.testing import CliRunner
 
+from iort_contract.catalog.vesc import VESC_STREAM
 from iort_contract.messages.batch import Batch, encode_batch
 from iort_contract.tables import BY_FUNCTION, BY_STREAM, ENTRY, SAMPLES
 from iort_contract.topics import FILE, LAMBDA, LIVE, PING, build_topic, record_topic, rule_name
-from iort_contract.vesc import VESC_STREAM
 from iort_station.cli.main import app
 from iort_station.cloud import EMBEDDED
 from iort_station.data.items import of_topic

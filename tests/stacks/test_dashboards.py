@@ -11,9 +11,9 @@ import pytest
 from functions.shared.summary.health import measure
 from iort_contract.catalog.metrics import METRIC_NAMESPACE, METRICS, metrics_of
 from iort_contract.catalog.rules import RULES
+from iort_contract.catalog.streams import AGENT_STREAM, RTT_STREAM
 from iort_contract.limits import DEFAULT_NAMESPACE
 from iort_contract.messages.batch import Batch
-from iort_contract.topics import AGENT_STREAM, RTT_STREAM
 from iort_station.cost.fixed_costs import (
     FREE_DASHBOARD_METRICS,
     FREE_DASHBOARDS,

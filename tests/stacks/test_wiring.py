@@ -15,6 +15,7 @@ import pytest
 from aws_cdk import App
 
 from iort_contract.catalog import environments
+from iort_contract.catalog.vesc import VESC_FIELDS, VESC_STREAM
 from iort_contract.cloud import pubnub_parameter
 from iort_contract.limits import DEFAULT_NAMESPACE
 from iort_contract.topics import (
@@ -34,7 +35,6 @@ from iort_contract.topics import (
     record_topic,
     rule_name,
 )
-from iort_contract.vesc import VESC_FIELDS, VESC_STREAM
 from stacks.parts.base import PlatformStack
 from stacks.parts.function import function
 from stacks.settings import ROOT, Settings, SettingsError

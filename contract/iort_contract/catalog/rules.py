@@ -7,6 +7,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+from iort_contract.catalog.vesc import FAULT_FIELD, VOLTAGE_FIELD
 from iort_contract.limits import DEFAULT_NAMESPACE
 from iort_contract.tables import (
     AGENT_VERSION,
@@ -30,7 +31,6 @@ from iort_contract.topics import (
     check_namespace,
     rule_name,
 )
-from iort_contract.vesc import FAULT_FIELD, VOLTAGE_FIELD
 
 # A battery of three lithium cells below this is nearly empty; a deployment can set another value.
 LOW_VOLTAGE_V = 10.5

@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from iort_contract import expression
+from iort_contract.catalog.derived import SOURCES, Vehicle, calculable
 from iort_contract.expression import (
     ARITHMETIC,
     COMPARISONS,
@@ -24,7 +25,6 @@ from iort_contract.expression import (
     Some,
 )
 from iort_contract.limits import Value
-from iort_contract.statistics import Vehicle
 from iort_station.errors import StationError
 
 Column: TypeAlias = NDArray[Any]
@@ -50,18 +50,15 @@ def holds(node: Node, columns: Columns, n: int) -> NDArray[np.bool_]:
 
 
 def derive(columns: Columns, vehicle: Vehicle | None) -> dict[str, Column]:
-    """What `iort_contract.statistics.derive` gives, of whole columns."""
-    derived: dict[str, Column] = {}
-    speed = _numbers(columns.get("speed"))
+    """What `iort_contract.catalog.derived.derive` gives, of whole columns."""
+    numbers = {name: column for name, column in columns.items() if column.dtype.kind == "f"}
     with np.errstate(all="ignore"):
-        if speed is not None and vehicle is not None:
-            derived["speed_mps"] = _finite(
-                (speed - vehicle.speed_to_erpm_offset) / vehicle.speed_to_erpm_gain
+        return {
+            entry.name: _finite(
+                entry.formula(**{name: numbers[name] for name in SOURCES[entry.name]}, **parameters)
             )
-        volts, amperes = _numbers(columns.get("voltage_input")), _numbers(columns.get("current_input"))
-        if volts is not None and amperes is not None:
-            derived["power_w"] = _finite(volts * amperes)
-    return derived
+            for entry, parameters in calculable(numbers, vehicle)
+        }
 
 
 def values(column: Column) -> list[Value]:
@@ -70,10 +67,6 @@ def values(column: Column) -> list[Value]:
     if column.dtype.kind == "f" and not (finite := np.isfinite(column)).all():
         return [value if is_finite else None for value, is_finite in zip(plain, finite, strict=True)]
     return plain
-
-
-def _numbers(column: Column | None) -> Column | None:
-    return column if column is not None and column.dtype.kind == "f" else None
 
 
 def _finite(column: Column) -> Column:

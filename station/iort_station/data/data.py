@@ -19,8 +19,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from iort_contract.catalog.derived import DERIVED
 from iort_contract.messages.message_type import MessageType
-from iort_contract.vesc import DERIVED_UNITS
 from iort_station.cloud import Cloud
 from iort_station.data import inventory, query_function, reading
 from iort_station.data.blocks import Block, join
@@ -155,7 +155,7 @@ def samples(
     pages = reading.batches(cloud, selection, ATTRIBUTES, scan=scan)
     found = blocks(reading.told(pages, progress), refused, selection.needs, messages=messages)
     condition, fields, named = selection.condition, selection.fields, selection.named()
-    derived = sorted(named & DERIVED_UNITS.keys())
+    derived = sorted(named & DERIVED.keys())
     vehicle = inventory.vehicle_of(cloud, selection.robot) if derived else None
     there: set[str] = set()
     some = False

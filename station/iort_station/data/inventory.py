@@ -6,15 +6,15 @@ from collections.abc import Set as AbstractSet
 from contextlib import suppress
 from dataclasses import replace
 
+from iort_contract.catalog.derived import PARAMETERS, SOURCES, Vehicle
+from iort_contract.catalog.streams import ACCOUNT_STREAM, OWN_STREAMS, TYPES_STREAM
+from iort_contract.catalog.vesc import VESC_STREAM
 from iort_contract.limits import ContractError
 from iort_contract.messages.message_type import MessageType, message_type
-from iort_contract.statistics import Vehicle
 from iort_contract.tables import ROBOT, STREAMS
-from iort_contract.topics import ACCOUNT_STREAM, OWN_STREAMS, TYPES_STREAM
-from iort_contract.vesc import VESC_STREAM
 from iort_station.cloud import Cloud
 from iort_station.data import reading
-from iort_station.data.selection import MADE_OF, Selection
+from iort_station.data.selection import Selection
 from iort_station.data.stored import ATTRIBUTES, Refused, blocks
 from iort_station.data.times import iso
 from iort_station.data.units import VESC_KIND
@@ -59,11 +59,11 @@ def check_fields(cloud: Cloud, selection: Selection, there: AbstractSet[str]) ->
     if not unknown:
         return
     stored = _fields(cloud, selection)
-    possible = stored | {name for name, parts in MADE_OF.items() if stored.issuperset(parts)}
-    if "speed_mps" in possible.intersection(unknown):
-        raise StationError(
-            f"speed_mps needs the speed_to_erpm_gain of {selection.robot}, which the registry lacks"
-        )
+    possible = stored | {name for name, sources in SOURCES.items() if stored.issuperset(sources)}
+    for name in unknown:
+        if name in possible and PARAMETERS[name]:
+            parameter = PARAMETERS[name][0]
+            raise StationError(f"{name} needs the {parameter} of {selection.robot}, which the registry lacks")
     raise StationError(
         f"{selection.robot} has no {', '.join(unknown)} in {selection.stream} in this range; "
         f"it has {', '.join(sorted(possible))}"

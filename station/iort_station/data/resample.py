@@ -6,7 +6,7 @@ from collections.abc import Iterable
 
 import numpy as np
 
-from iort_contract.vesc import VESC_FIELDS
+from iort_contract.catalog.vesc import VESC_FIELDS
 from iort_station.data.blocks import EMPTY, Block, join
 from iort_station.data.conditions import Column
 

@@ -6,7 +6,7 @@ from collections import Counter
 
 import numpy as np
 
-from iort_contract.vesc import ABSENT_FROM, absent
+from iort_contract.catalog.vesc import ABSENT_FROM, absent
 from iort_station.data.blocks import Block
 from iort_station.data.conditions import Column
 

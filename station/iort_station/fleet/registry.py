@@ -11,6 +11,7 @@ from boto3.dynamodb.types import TypeSerializer
 
 from iort_contract.attributes import plain
 from iort_contract.limits import ContractError
+from iort_contract.messages.page import RobotPresence
 from iort_contract.tables import (
     ADMIT_CLAIM,
     ADMIT_FINGERPRINT,
@@ -51,18 +52,20 @@ def _row(item: Mapping[str, Any]) -> dict[str, Any]:
 
 def vehicles(cloud: Cloud) -> dict[str, dict[str, float]]:
     """What is known of the cars whose speed can be told in m/s, by their names."""
-    gain, offset = "speed_to_erpm_gain", "speed_to_erpm_offset"
     return {
-        str(row[ROBOT]): {gain: float(row[gain]), offset: float(row.get(offset) or 0)}
+        str(row[ROBOT]): {
+            "speed_to_erpm_gain": float(row["speed_to_erpm_gain"]),
+            "speed_to_erpm_offset": float(row.get("speed_to_erpm_offset") or 0),
+        }
         for row in listed(cloud)
-        if row.get(gain)
+        if row.get("speed_to_erpm_gain")
     }
 
 
-def presence(cloud: Cloud) -> dict[str, dict[str, Any]]:
+def presence(cloud: Cloud) -> dict[str, RobotPresence]:
     """Of every robot whether it is ``online`` and, as ``since_ms``, since when it is or is not; None where it
     has never connected."""
-    found = {}
+    found: dict[str, RobotPresence] = {}
     for row in listed(cloud):
         online = bool(row.get(ONLINE))
         at_ms = row.get(CONNECTED_MS if online else DISCONNECTED_MS)

@@ -4,11 +4,13 @@ from __future__ import annotations
 
 import contextlib
 from collections.abc import Mapping
+from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
 from botocore.exceptions import ClientError
 
+from iort_contract.catalog import derived
 from iort_contract.cloud import fleet_name
 from iort_contract.topics import SHADOW
 from iort_station.cloud import Cloud
@@ -19,9 +21,8 @@ from iort_station.fleet.registry import listed
 
 __all__ = ["F1TENTH", "Bundle", "add", "checked_vehicle", "configure", "listed", "remove"]
 
-# The F1TENTH stack's vesc.yaml: erpm = gain * m/s + offset.
 GAIN = "speed_to_erpm_gain"
-F1TENTH = {GAIN: 4614.0, "speed_to_erpm_offset": 0.0}
+F1TENTH: Mapping[str, float] = asdict(derived.F1TENTH)
 
 
 # A gain or an offset of more, or a gain of less, is a slip of the hand.

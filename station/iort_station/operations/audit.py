@@ -13,10 +13,11 @@ from itertools import pairwise
 from typing import Any, NamedTuple
 
 from iort_contract.attributes import plain
+from iort_contract.catalog.streams import AGENT_STREAM
 from iort_contract.limits import ContractError
 from iort_contract.messages.batch import Batch, batch_id, batches_between, decode_batch
 from iort_contract.tables import BATCH, RECEIVED_MS, SAMPLES, TOPIC
-from iort_contract.topics import AGENT_STREAM, RECORD, build_topic
+from iort_contract.topics import RECORD, build_topic
 from iort_station.cloud import Cloud
 from iort_station.data.items import of_topic
 

@@ -14,9 +14,9 @@ from typing import Any
 import numpy as np
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
+from iort_contract.catalog.streams import TYPES_STREAM
 from iort_contract.limits import ContractError, Value
 from iort_contract.messages.message_type import MessageType, message_type
-from iort_contract.topics import TYPES_STREAM
 from iort_station.cloud import Cloud
 from iort_station.data import data
 from iort_station.data.blocks import Block

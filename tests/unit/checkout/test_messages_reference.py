@@ -55,7 +55,6 @@ from iort_contract.tables import (
     SERIAL_PARAMETER,
 )
 from iort_contract.topics import ACCEPTED, COMMANDS, build_topic
-from iort_contract.vesc import AGENT_FIELDS
 from iort_station.fleet.shadow import State, outcome
 from tests.messages_page import EXAMPLES, PAGE, keys_after, named, rows, section
 
@@ -246,11 +245,6 @@ def test_the_samples_of_a_robots_own_streams(name: str, sample: accounts.Account
     if name == "account":
         text = section("## A robot's own streams")
         assert {key for row in rows(text) for key in named(row[0])} == EXAMPLES[name].keys()
-
-
-def test_the_agents_own_figures_are_all_told() -> None:
-    text = section("## A robot's own streams").split("**`agent`**")[1]
-    assert {named(row[0])[0]: row[1] for row in rows(text)} == AGENT_FIELDS
 
 
 def test_the_shadows_documents_are_what_the_agent_takes_and_says() -> None:

@@ -9,6 +9,7 @@ import pytest
 
 from functions import alert, echo, presence
 from iort_contract.catalog.rules import RULES
+from iort_contract.catalog.vesc import FAULT_FIELD, VOLTAGE_FIELD
 from iort_contract.messages.batch import Batch, decode_batch, decode_item, encode_batch
 from iort_contract.messages.event import event_message
 from iort_contract.messages.live import LiveSample, decode_pong, encode_live, encode_ping
@@ -23,7 +24,6 @@ from iort_contract.tables import (
     TOPIC,
 )
 from iort_contract.topics import FILE, LAMBDA, LIVE, PING, PONG, RECORD, RULE, SHADOW, build_topic
-from iort_contract.vesc import FAULT_FIELD, VOLTAGE_FIELD
 from tests.iot_sql import Message, evaluate
 from verify.spoofing import spoofed
 

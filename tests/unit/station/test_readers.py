@@ -27,7 +27,7 @@ from tests.fakes import item_of, serialize
 T_US = 1_700_000_000_000_000
 RUN = "0badcafe"
 NO_RUNS = ["run-1", "0BADCAFE", "0badcaf", "0" * 33, "", "0badcafe ", "0badcafg"]
-PAGE = Path(__file__).parents[3] / "station" / "web" / "src" / "message.ts"
+PAGE = Path(__file__).parents[3] / "station" / "web" / "src" / "live" / "update.ts"
 
 
 def stored(**changes):
