@@ -40,8 +40,8 @@ _SUMMARIZE_S = 60
 class Processing(PlatformStack):
     """The functions, with the grants that each one needs.
 
-    ``called`` are those of all rules, also of other stacks; one that is not described here needs no grants but
-    its log's. ``alarms`` is the topic of every alarm and every car's alert.
+    ``called`` are those of all rules, also of other stacks; one that is not described here needs no grants
+    but its log's. ``alarms`` is the topic of every alarm and every car's alert.
     """
 
     def __init__(
