@@ -12,8 +12,8 @@ from typing import Any
 
 from aws_cdk import App, RemovalPolicy
 
+from iort_contract.catalog.rules import LOW_VOLTAGE_V
 from iort_contract.catalog.vesc import VESC_FIELDS, VESC_STREAM
-from iort_contract.cloud import LOW_VOLTAGE_V
 from iort_contract.limits import DEFAULT_NAMESPACE, ContractError
 from iort_contract.topics import check_namespace
 
@@ -112,6 +112,11 @@ class Settings:
         if self.live_concurrency is None:
             return _RESERVED_FOR_LIVE if self.protected else 0
         return self.live_concurrency
+
+    @property
+    def retention_s(self) -> int:
+        """The lifetime of telemetry and summaries."""
+        return self.retention_days * 86_400
 
     @property
     def account_wide(self) -> bool:

@@ -4,9 +4,8 @@ from __future__ import annotations
 
 import re
 
-from iort_contract.cloud import LOW_VOLTAGE_V
+from iort_contract.catalog.rules import LOW_VOLTAGE_V, RULES
 from iort_contract.limits import LIVE_MIN_RATE_HZ
-from iort_contract.topics import RULES
 from iort_station.cost.usage import Usage
 from stacks.settings import ROOT, Settings
 from tests.stacks.aws_metrics import AWS_METRICS

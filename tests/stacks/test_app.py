@@ -75,7 +75,7 @@ def test_a_python_without_the_cdk_is_one_line(tmp_path):
     command = [sys.executable, "-S", "-E", "-s", str(ROOT / "app.py")]
     done = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, check=False)
     assert done.returncode == 1
-    assert done.stderr.startswith("app.py: aws_cdk is not there for ")
+    assert done.stderr.startswith("app.py: no module aws_cdk for ")
     assert done.stderr.count("\n") == 1
     assert "make layer" in done.stderr
 

@@ -23,7 +23,7 @@ _REASON = "verify: does it notify?"
 _ALARM = "ALARM"
 _RUN = "0badcafe"
 _FAULT = 5
-# The alarms that use Metrics Insights: stacks/alarms.py.
+# The alarms that use Metrics Insights: stacks/monitoring/alarms.py.
 _INSIGHTS = ("ParseError", "ErrorActionFailure", "RuleMessageThrottled", "DestinationDeliveryFailures")
 
 
@@ -131,7 +131,7 @@ _SET_STATE = Check(
     },
     basis=Basis.DOCUMENTED,
     source="https://docs.aws.amazon.com/AmazonCloudWatch/latest/APIReference/API_SetAlarmState.html",
-    relied_on_by=("stacks/alarms.py", "stacks/processing.py"),
+    relied_on_by=("stacks/monitoring/alarms.py", "stacks/processing.py"),
     ask=_set_state,
 )
 CHECKS = (
@@ -145,7 +145,7 @@ CHECKS = (
         ),
         expected={**_SET_STATE.expected, "topic_has_key": True},
         source="https://repost.aws/knowledge-center/cloudwatch-configure-alarm-sns",
-        relied_on_by=("stacks/encryption.py",),
+        relied_on_by=("stacks/parts/encryption.py",),
         phase=WITH_KEY,
         not_embedded="the embedded cloud is deployed without a key: its topics encrypt nothing",
     ),
@@ -163,7 +163,7 @@ CHECKS = (
         },
         basis=Basis.DOCUMENTED,
         source="https://docs.aws.amazon.com/AmazonCloudWatch/latest/monitoring/alarm-evaluation.html",
-        relied_on_by=("stacks/alarms.py", "stacks/metrics.py"),
+        relied_on_by=("stacks/monitoring/alarms.py", "stacks/monitoring/metrics.py"),
         ask=_insights,
         not_embedded="the embedded cloud has no Metrics Insights, and is deployed without these alarms",
     ),

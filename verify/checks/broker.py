@@ -110,7 +110,7 @@ CHECKS = (
         expected={"neighbours": True, "one_that_nobody_has": True},
         basis=Basis.DOCUMENTED,
         source="https://docs.aws.amazon.com/iot/latest/developerguide/thing-policy-variables.html",
-        relied_on_by=("stacks/documents.py", "device/iort_agent/mqtt/failures.py"),
+        relied_on_by=("stacks/parts/documents.py", "device/iort_agent/mqtt/failures.py"),
         ask=_another_client_id,
     ),
     Check(
@@ -123,7 +123,7 @@ CHECKS = (
         expected={"subscribe": "NOT_AUTHORIZED", "publish_is_refused": True, "neighbour_heard": 0},
         basis=Basis.DOCUMENTED,
         source=_MQTT,
-        relied_on_by=("stacks/documents.py", "device/iort_agent/mqtt/subscriptions.py"),
+        relied_on_by=("stacks/parts/documents.py", "device/iort_agent/mqtt/subscriptions.py"),
         ask=_foreign_topic,
     ),
     Check(

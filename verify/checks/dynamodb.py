@@ -68,10 +68,11 @@ def _condition(target: Target) -> dict[str, Any]:
             ReturnValuesOnConditionCheckFailure="ALL_OLD",
         )
     except ClientError as error:
+        item: Any = error.response.get("Item", {})
         return {
             "code": error.response["Error"]["Code"],
             "status": error.response["ResponseMetadata"]["HTTPStatusCode"],
-            "row": error.response.get("Item", {}).get(ROBOT) == {"S": name},
+            "row": item.get(ROBOT) == {"S": name},
         }
     raise VerifyError("the condition did not fail")
 

@@ -123,7 +123,7 @@ CHECKS = (
             "arn_is_a_functions": True,
         },
         basis=Basis.ASSUMED,
-        relied_on_by=("functions/shared/bucket.py", "stacks/function.py", "functions/live.py"),
+        relied_on_by=("functions/shared/bucket.py", "stacks/parts/function.py", "functions/live.py"),
         ask=_runtime,
     ),
     Check(
@@ -132,7 +132,7 @@ CHECKS = (
         expected={"runs_as_named": True},
         basis=Basis.DOCUMENTED,
         source=f"{_GUIDE}/lambda-runtimes.html",
-        relied_on_by=("stacks/function.py", "scripts/setup.py"),
+        relied_on_by=("stacks/parts/function.py", "scripts/setup.py"),
         ask=_python,
         not_embedded="the embedded cloud runs the functions with its host's Python",
     ),

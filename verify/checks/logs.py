@@ -10,8 +10,8 @@ from typing import Any
 from bench.meters.invocations import configure
 from bench.target import Target
 from bench.temporary_function import temporary_function
+from iort_contract.catalog.metrics import METRIC_DEPLOYMENT, METRIC_FUNCTION, METRIC_NAMESPACE
 from iort_contract.catalog.vesc import VESC_STREAM
-from iort_contract.cloud import METRIC_DEPLOYMENT, METRIC_FUNCTION, METRIC_NAMESPACE
 from iort_contract.messages.batch import Batch, encode_batch
 from iort_contract.topics import record_topic
 from verify.assumption import Basis
@@ -25,7 +25,7 @@ _GUIDE = "https://docs.aws.amazon.com/lambda/latest/dg"
 _METRIC, _FUNCTION = "BatchesSummarized", "summarize"
 _RUN = "0badcafe"
 _WITHIN_S = 170.0
-# The filter of the log widget in stacks/dashboards.py.
+# The filter of the log widget in stacks/monitoring/dashboards.py.
 _SHOWN = re.compile("WARN|ERROR|CRITICAL|FATAL|Traceback|Task timed out")
 _WARNED, _RAISED, _PRINTED = "verify warned", "verify raised", "verify printed"
 _SPEAKING = f"""
@@ -119,8 +119,8 @@ CHECKS = (
         ),
         relied_on_by=(
             "functions/shared/metrics.py",
-            "stacks/function.py",
-            "stacks/alarms.py",
+            "stacks/parts/function.py",
+            "stacks/monitoring/alarms.py",
             "local/gaps/metrics/embedded_metrics.py",
         ),
         ask=_metric,
@@ -133,7 +133,7 @@ CHECKS = (
         ),
         expected={"printed_as_it_is": True, "warning_is_shown": True, "failure_is_shown": True},
         basis=Basis.ASSUMED,
-        relied_on_by=("stacks/dashboards.py", "functions/shared/metrics.py"),
+        relied_on_by=("stacks/monitoring/dashboards.py", "functions/shared/metrics.py"),
         ask=_lines,
     ),
 )

@@ -126,7 +126,7 @@ CHECKS = (
         ),
         expected={"stored": 0, "refused_by": ["rule"]},
         basis=Basis.ASSUMED,
-        relied_on_by=("stacks/ingest.py", "stacks/alarms.py"),
+        relied_on_by=("stacks/ingest.py", "stacks/monitoring/alarms.py"),
         ask=_record_no_json,
     ),
     Check(

@@ -183,7 +183,11 @@ CHECKS = (
         expected=_MADE,
         basis=Basis.DOCUMENTED,
         source=f"{_PROVISION} and {_HOOK}",
-        relied_on_by=("station/iort_station/fleet/claims.py", "functions/admit.py", "stacks/documents.py"),
+        relied_on_by=(
+            "station/iort_station/fleet/claims.py",
+            "functions/admit.py",
+            "stacks/parts/documents.py",
+        ),
         ask=_lasting_claim,
     ),
     Check(

@@ -185,7 +185,7 @@ CHECKS = (
         "The rule record stores the keys of a batch and the cloud's three, each by name. A key of the "
         "message with the name of one of the cloud's is not stored. A key that the message lacks is "
         "absent. A text becomes S, a number N.",
-        "functions/shared/stored.py",
+        "functions/shared/summary/stored.py",
         source=f"{_SQL} and {_DYNAMODB_V2}",
     ),
     _spoofed(

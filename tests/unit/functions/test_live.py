@@ -13,25 +13,25 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from functions import live
-from functions.live import LiveSettings, RefusedError, age_ms, process
+from functions.live import REFUSALS, Lane, RefusedError, age_ms
 from functions.quarantine import entries
-from functions.shared.cut_off import BURST, CutOff
-from functions.shared.delay_estimator import Legs
-from functions.shared.metrics import Gathered
+from functions.shared.delay_estimator import DelayEstimator
 from functions.shared.pubnub_client import PublishError, PubNubPublisher
-from iort_contract.cloud import METRICS, pubnub_parameter
-from iort_contract.cloud import channel as pubnub_channel
+from iort_contract.catalog.environments import LiveEnvironment
+from iort_contract.catalog.metrics import metrics_of
+from iort_contract.cloud import channel as channel_of
+from iort_contract.cloud import pubnub_parameter
 from iort_contract.limits import LIVE_MAX_AGE_MS, MAX_PUBNUB_BYTES, SCHEMA_VERSION, ContractError
-from iort_contract.messages.event import MESSAGE_BASE64, event_message, rule_event
+from iort_contract.messages.event import event_message, rule_event
 from iort_contract.messages.live import LiveSample, encode_live
-from iort_contract.tables import BY_FUNCTION, RECEIVED_MS, TOPIC
+from iort_contract.tables import BY_FUNCTION, MESSAGE_BASE64, RECEIVED_MS, TOPIC
 from iort_contract.topics import LIVE, build_topic
 
 T_US = 1_700_000_000_000_000
 SENT_US = T_US + 4_000
 RECEIVED = (SENT_US + 30_000) // 1000
 NOW_US = SENT_US + 35_000
-SETTINGS = LiveSettings({"vesc": frozenset({"speed", "voltage_input"})})
+FIELDS = {"vesc": ["speed", "voltage_input"]}
 SAMPLE = {"speed": 1200, "voltage_input": 15.8, "fault_code": 0}
 
 
@@ -56,9 +56,11 @@ class Channels:
         self.sent.append((channel, message))
 
 
-def show(message, publish, *, settings=SETTINGS, legs=None, now_us=NOW_US):
+def show(message, publish, *, fields=FIELDS, legs=None, now_us=NOW_US):
     """What a new environment does with a message: it writes what it counts at once."""
-    process(message, settings, publish, legs=legs or Legs(), counted=Gathered("live"), now_us=now_us)
+    lane = Lane(fields, publish, keep=pytest.fail)
+    lane.estimator = legs or lane.estimator
+    lane.show(message, now_us)
 
 
 @pytest.fixture
@@ -71,7 +73,7 @@ def counted(capsys):
             entry = json.loads(line, parse_constant=pytest.fail)
             (directive,) = entry["_aws"]["CloudWatchMetrics"]
             for metric in directive["Metrics"]:
-                assert metric["Name"] in METRICS["live"]
+                assert metric["Name"] in metrics_of("live")
                 value = entry[metric["Name"]]
                 value = sum(value) if isinstance(value, list) else value
                 totals[metric["Name"]] = totals.get(metric["Name"], 0) + value
@@ -84,7 +86,7 @@ def test_the_chosen_fields_go_to_the_cars_channel_with_every_hops_time(counted):
     channels = Channels()
     show(event(), channels)
     ((channel, message),) = channels.sent
-    assert channel == pubnub_channel("car")
+    assert channel == channel_of("car")
     assert message == {
         "v": SCHEMA_VERSION,
         "robot": "car",
@@ -109,8 +111,8 @@ def test_a_stream_that_is_not_configured_sends_every_field():
 
 def test_a_stream_configured_with_no_field_sends_none_and_fields_that_are_not_there_are_not_made_up():
     channels = Channels()
-    show(event(), channels, settings=LiveSettings({"vesc": frozenset()}))
-    show(event(), channels, settings=LiveSettings({"vesc": frozenset({"speed", "absent"})}))
+    show(event(), channels, fields={"vesc": []})
+    show(event(), channels, fields={"vesc": ["speed", "absent"]})
     assert [message["sample"] for _, message in channels.sent] == [{}, {"speed": 1200}]
 
 
@@ -118,7 +120,7 @@ def test_what_is_shown_live_is_null_where_no_sensor_is_fitted():
     channels = Channels()
     sample = {"temp_motor": -273.15, "temp_fet": 31.5, "current_motor": -60}
     for fields in ({}, {"vesc": frozenset({"temp_motor"})}):
-        show(event(sample=sample), channels, settings=LiveSettings(fields))
+        show(event(sample=sample), channels, fields=fields)
     assert [message["sample"] for _, message in channels.sent] == [
         {"temp_motor": None, "temp_fet": 31.5, "current_motor": -60},
         {"temp_motor": None},
@@ -128,13 +130,13 @@ def test_what_is_shown_live_is_null_where_no_sensor_is_fitted():
 def test_another_deployment_has_channels_of_its_own():
     channels = Channels()
     show(event(namespace="lab2"), channels)
-    assert channels.sent[0][0] == pubnub_channel("car", "lab2")
+    assert channels.sent[0][0] == channel_of("car", "lab2")
 
 
 def test_the_robot_is_the_topics_whatever_the_message_claims():
     channels = Channels()
     show(event(robot="mine", channel="iort.other"), channels)
-    assert channels.sent[0][0] == pubnub_channel("mine")
+    assert channels.sent[0][0] == channel_of("mine")
     assert channels.sent[0][1]["robot"] == "mine"
 
 
@@ -160,7 +162,7 @@ def test_stale_by_its_time_in_the_car_and_in_the_cloud(
     now_us = RECEIVED * 1000 + round(in_cloud_ms * 1000)
     channels = Channels()
     show(event(t=t_us, sent_us=sent_us), channels, now_us=now_us)
-    age = age_ms("car", LiveSample("0123abcd", 0, t_us, sent_us, {}), RECEIVED, now_us, Legs())
+    age = age_ms("car", LiveSample("0123abcd", 0, t_us, sent_us, {}), RECEIVED, now_us, DelayEstimator())
     assert age == in_car_ms + in_cloud_ms
     assert len(channels.sent) == (not stale)
     totals = counted()
@@ -261,11 +263,6 @@ def test_what_pubnub_does_not_take_is_counted_and_not_raised(counted, caplog):
     assert "car: status 403" in caplog.text
 
 
-def test_the_settings_come_from_the_environment(monkeypatch):
-    monkeypatch.setenv("LIVE_FIELDS", '{"vesc": ["speed", "speed"], "imu": []}')
-    assert LiveSettings.from_environment() == LiveSettings({"vesc": frozenset({"speed"}), "imu": frozenset()})
-
-
 ARN = "arn:aws:lambda:eu-west-1:000000000000:function:iort-processing-Live-1"
 
 
@@ -285,29 +282,11 @@ class Served:
     """One environment of the function, and what it did with each event."""
 
     def __init__(self, *, takes=True):
-        self.channels, self.queue, self.cut_off = Channels(), Queue(takes=takes), CutOff()
-        self.legs, self.counted, self.now_us = Legs(), Gathered("live"), NOW_US
+        self.channels, self.queue, self.now_us = Channels(), Queue(takes=takes), NOW_US
+        self.lane = Lane(FIELDS, self.channels, self.queue)
 
     def __call__(self, message):
-        def one():
-            process(
-                message,
-                SETTINGS,
-                self.channels,
-                legs=self.legs,
-                counted=self.counted,
-                now_us=self.now_us,
-            )
-
-        live.serve(
-            message,
-            one,
-            self.queue,
-            cut_off=self.cut_off,
-            counted=self.counted,
-            function_arn=ARN,
-            now_s=self.now_us / 1e6,
-        )
+        self.lane.serve(message, self.now_us, ARN)
 
 
 @pytest.mark.parametrize("malformed", MALFORMED, ids=range(len(MALFORMED)))
@@ -330,15 +309,15 @@ def test_what_the_queue_does_not_take_fails_the_invocation_so_that_lambda_sends_
 
 def test_a_robot_that_is_refused_over_and_over_is_cut_off_and_no_other_is(counted):
     served = Served()
-    for _ in range(BURST + 30):
+    for _ in range(REFUSALS + 30):
         served({**handed(b"x"), TOPIC: build_topic(LIVE, "bad", "vesc")})
     # Its good ones are not looked at either, and every other robot's are.
     served(event(robot="bad"))
     for i in range(40):
         served(event(robot=f"good{i}"))
-    assert len(served.queue.kept) == BURST
+    assert len(served.queue.kept) == REFUSALS
     assert [entries(body, list)[0].reason.count("LiveCutOff") for body in served.queue.kept] == [
-        *[0] * (BURST - 1),
+        *[0] * (REFUSALS - 1),
         1,
     ]
     assert [message["robot"] for _, message in served.channels.sent] == [f"good{i}" for i in range(40)]
@@ -348,54 +327,43 @@ def test_a_robot_that_is_refused_over_and_over_is_cut_off_and_no_other_is(counte
     served({**mended, RECEIVED_MS: served.now_us // 1000})
     assert served.channels.sent[-1][1]["robot"] == "bad"
     totals = counted()
-    assert (totals["LiveRefused"], totals["LiveCutOff"]) == (BURST, 31)
+    assert (totals["LiveRefused"], totals["LiveCutOff"]) == (REFUSALS, 31)
     assert totals["LivePublished"] == 41
 
 
-def test_an_allowance_is_had_again_with_time_and_whatever_the_clock_does():
-    cut_off = CutOff()
-    assert [cut_off.refused("car", 0.0) for _ in range(BURST)] == [False] * (BURST - 1) + [True]
-    assert cut_off.closed("car", 0.9)
-    assert not cut_off.closed("car", 1.1)
-    assert not cut_off.closed("other", 0.0)
-    # One refused message a second is never cut off.
-    steady = CutOff()
-    assert not any(steady.refused("car", float(second)) for second in range(1000))
-    assert cut_off.closed("car", -3600.0)
-
-
-def test_the_queue_is_that_of_the_environment(aws, monkeypatch):
-    client = boto3.client("sqs")
-    url = client.create_queue(QueueName="rejected")["QueueUrl"]
-    monkeypatch.setenv("REJECTED_QUEUE", url)
-    live._refusals.cache_clear()
-    try:
-        assert live._refusals().keep("body")
-        (message,) = client.receive_message(QueueUrl=url)["Messages"]
-        assert message["Body"] == "body"
-        client.delete_queue(QueueUrl=url)
-        assert not live._refusals().keep("body")
-    finally:
-        live._refusals.cache_clear()
+def test_a_robot_that_is_refused_once_a_second_is_never_cut_off(counted):
+    served = Served()
+    for second in range(100):
+        served.now_us = NOW_US + second * 1_000_000
+        served(handed(b"x"))
+    assert len(served.queue.kept) == 100
+    # A clock that is set back gives nothing twice.
+    served.now_us = NOW_US
+    for _ in range(REFUSALS + 1):
+        served(handed(b"x"))
+    assert "LiveCutOff" in counted()
 
 
 class Context:
     invoked_function_arn = ARN
 
 
-def test_the_handler_wires_settings_publisher_queue_and_clock(monkeypatch, counted):
-    channels, queue = Channels(), Queue()
-    monkeypatch.setattr(live, "_refusals", lambda: type("Refusals", (), {"keep": staticmethod(queue)}))
-    monkeypatch.setattr(live, "_settings", lambda: SETTINGS)
-    monkeypatch.setattr(
-        live, "_publisher", lambda: type("Publisher", (), {"publish": staticmethod(channels)})
-    )
-    monkeypatch.setattr(live.time, "time_ns", lambda: NOW_US * 1000)
-    assert live.handler(event(), Context) is None
+def test_the_handler_has_fields_publisher_and_queue_of_its_environment(aws, monkeypatch, counted):
+    parameter = pubnub_parameter("lab2")
+    boto3.client("ssm").put_parameter(Name=parameter, Type="SecureString", Value=json.dumps(KEYS))
+    queue = boto3.client("sqs").create_queue(QueueName="rejected")["QueueUrl"]
+    given = LiveEnvironment("lab2", parameter, {"vesc": ["speed"], "imu": []}, queue)
+    for name, value in given.variables().items():
+        monkeypatch.setenv(name, value)
     assert live.handler(handed(b"x"), Context) is None
-    assert len(queue.kept) == 1
-    assert channels.sent[0][1]["hops"]["lambda_us"] == NOW_US
-    assert counted()["LivePublished"] == 1
+    (message,) = boto3.client("sqs").receive_message(QueueUrl=queue)["Messages"]
+    (entry,) = entries(message["Body"], lambda _info: [])
+    assert (entry.payload, live.lane().fields) == (b"x", {"vesc": ["speed"], "imu": []})
+    assert live.lane() is live.lane()
+    assert counted() == {"LiveRefused": 1}
+    boto3.client("sqs").delete_queue(QueueUrl=queue)
+    with pytest.raises(RefusedError):
+        live.handler(handed(b"x"), Context)
 
 
 # --- the publisher, without a network -------------------------------------------------------------
@@ -415,17 +383,6 @@ def test_the_keys_come_from_a_secure_parameter(aws, extra, origin, tls):
     assert (config.publish_key, config.subscribe_key) == tuple(KEYS.values())
     assert (config.origin, config.ssl) == (origin, tls)
     assert config.connect_timeout == config.non_subscribe_request_timeout == 1
-
-
-def test_the_publisher_is_made_once_an_environment(aws, monkeypatch):
-    name = pubnub_parameter("lab2")
-    boto3.client("ssm").put_parameter(Name=name, Type="SecureString", Value=json.dumps(KEYS))
-    monkeypatch.setenv("PUBNUB_PARAMETER", name)
-    live._publisher.cache_clear()
-    try:
-        assert live._publisher() is live._publisher()
-    finally:
-        live._publisher.cache_clear()
 
 
 def test_a_message_too_large_is_refused_before_it_is_sent():
@@ -463,7 +420,7 @@ def late(sent_us, received_ms, legs, channels, robot="car"):
 
 @pytest.mark.parametrize("offset_us", [0, 3_600_000_000, -3_600_000_000])
 def test_messages_that_a_stall_held_up_are_stale_whatever_the_cars_clock(capsys, offset_us):
-    channels, legs = Channels(), Legs()
+    channels, legs = Channels(), DelayEstimator()
     start_us = NOW_US
     for i in range(20):
         late(start_us + i * 100_000 + offset_us, (start_us + i * 100_000) // 1000 + 30, legs, channels)
@@ -497,7 +454,7 @@ def test_a_car_that_knows_its_clocks_offset_is_judged_by_it_in_an_environment_wi
 
 
 def test_clock_set_back_is_believed_after_the_window():
-    legs = Legs()
+    legs = DelayEstimator()
     assert legs.excess_us("car", "0badcafe", 0, 0) == 0
     assert legs.excess_us("car", "0badcafe", -5_000_000, 100) == 5_100_000
     for second in range(1, 40):
@@ -507,7 +464,7 @@ def test_clock_set_back_is_believed_after_the_window():
 
 def test_a_robot_that_says_anothers_run_makes_nothing_of_the_others_late(capsys):
     """The name of a run stands in what robots send each other."""
-    channels, legs = Channels(), Legs()
+    channels, legs = Channels(), DelayEstimator()
     late(NOW_US, NOW_US // 1000 + 30, legs, channels)
     late(NOW_US + 3_600_000_000, NOW_US // 1000 + 40, legs, channels, robot="thief")
     late(NOW_US + 100_000, NOW_US // 1000 + 130, legs, channels)
@@ -516,14 +473,14 @@ def test_a_robot_that_says_anothers_run_makes_nothing_of_the_others_late(capsys)
 
 
 def test_another_run_of_a_robot_is_measured_by_itself():
-    legs = Legs()
+    legs = DelayEstimator()
     assert legs.excess_us("car", "0badcafe", 3_600_000_000, 0) == 0
     assert legs.excess_us("car", "cafebabe", 0, 0) == 0
     assert legs.excess_us("car", "cafebabe", 0, 70) == 70_000
 
 
 def test_legs_remember_a_bounded_number_of_robots_and_one_run_of_each():
-    legs = Legs()
+    legs = DelayEstimator()
     for i in range(3000):
         legs.excess_us(f"car{i}", "0badcafe", 0, 0)
         legs.excess_us("hostile", f"{i:08x}", 0, 0)
