@@ -10,7 +10,7 @@ from aws_cdk import aws_iot as iot
 from aws_cdk import aws_lambda as lambda_
 
 from iort_contract.catalog.environments import Environment
-from iort_contract.catalog.rules import RULES, Republish, Rule, Store
+from iort_contract.catalog.rules import RULES, Call, Republish, Rule, Store
 from stacks.parts import iot_core
 from stacks.parts.base import PlatformStack
 from stacks.parts.function import function, invoked_by_rule
@@ -39,7 +39,7 @@ class Ingest(PlatformStack):
         functions: Mapping[str, lambda_.Function],
     ) -> None:
         super().__init__(app, "ingest", settings, storage.encryption)
-        self._functions = dict(functions)
+        self._given, self._functions = functions.keys(), dict(functions)
         self._tables = {"telemetry": storage.telemetry}
         self._queues = {"rejected": quarantine.rejected}
         for rule in RULES.values():
@@ -47,6 +47,8 @@ class Ingest(PlatformStack):
 
     def _rule(self, rule: Rule) -> None:
         name = rule.name.capitalize()
+        if isinstance(rule.action, Call) and rule.action.function not in self._given:
+            name += "Rule"  # its function, which is made here, may have the rule's name
         role = iot_core.role(self, f"{name}Role")
         failures = self._queues[rule.error_queue]
         failures.grant(role, "sqs:SendMessage")

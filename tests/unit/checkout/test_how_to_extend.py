@@ -9,10 +9,13 @@ import shutil
 import subprocess
 import sys
 from pathlib import Path
+from typing import Any
 
 import pytest
 
+from iort_contract.messages.live import LiveSample, encode_live
 from scripts.docs_parts import ROOT
+from tests.iot_sql import Message, evaluate
 
 PAGE = (ROOT / "docs" / "how-to-extend.md").read_text()
 SECTIONS = dict(re.findall(r"^## (.*?)\n(.*?)(?=^## |\Z)", PAGE, re.DOTALL | re.MULTILINE))
@@ -30,6 +33,15 @@ FOLDERS = (
     "tests",
 )
 SKIPPED = ("__pycache__", "*.egg-info", "build", "built", "images", "bench-*", "node_modules")
+SYNTHESIZE = """
+from pathlib import Path
+from aws_cdk import App
+from app import build
+from stacks.settings import Settings
+app = App(outdir="cdk.out")
+build(app, Settings(layer=Path("scripts")))
+app.synth()
+"""
 
 
 class Copy:
@@ -61,7 +73,7 @@ class Copy:
         return touched
 
     def _insert(self, file: Path, lines: list[str]) -> None:
-        before = "".join(f"{line[1:]}\n" for line in lines if line[:1] == " ")
+        before = "".join(f"{line[1:]}\n" for line in lines if not line.startswith("+"))
         after = "".join(f"{line[1:]}\n" for line in lines)
         text = file.read_text()
         assert text.count(before) == 1, f"{file} must have once:\n{before}"
@@ -82,7 +94,7 @@ class Copy:
             env=environment,
             capture_output=True,
             text=True,
-            timeout=120,
+            timeout=300,
         )
         assert done.returncode == 0, done.stderr
         return done.stdout
@@ -136,6 +148,55 @@ def test_a_derived_field(copy: Copy) -> None:
     formula = "`duty_cycle * voltage_input * current_motor`"
     assert f"| {formula} |" in (copy.root / "README.md").read_text()
     assert "export const motor_power_w = " in (copy.root / "station/web/src/base/contract.ts").read_text()
+
+
+def test_a_rule(cloud: Copy) -> None:
+    (rule,) = resources(cloud, "ingest", "AWS::IoT::TopicRule", "HotRule")
+    sql = rule["TopicRulePayload"]["Sql"]
+    live = encode_live(LiveSample("0badcafe", 1, 1_000, 2_000, {"temp_fet": 81.5}))
+    event = evaluate(sql, Message("live/iort/car7/vesc", live, 3))
+    assert event["temp_fet"] == 81.5
+    cold = encode_live(LiveSample("0badcafe", 1, 1_000, 2_000, {"temp_fet": 20}))
+    assert evaluate(sql, Message("live/iort/car7/vesc", cold, 3)) is None
+    assert (
+        copy.run("-c", f"from functions.hot import handler; handler({event!r}, None)") == "car7: 81.5 degC\n"
+    )
+    (made,) = resources(cloud, "ingest", "AWS::Lambda::Function", "Hot")
+    assert made["Handler"] == "functions.hot.handler"
+
+
+def test_a_function(cloud: Copy) -> None:
+    (made,) = resources(cloud, "processing", "AWS::Lambda::Function", "Online")
+    assert made["Handler"] == "functions.online.handler"
+    assert made["Environment"]["Variables"].keys() == {"NAMESPACE", "ROBOTS_TABLE"}
+    found = cloud.show(
+        "online(Client(), 'robots')",
+        "from functions.online import online",
+        "class Client:",
+        "    def get_paginator(self, name): return self",
+        "    def paginate(self, TableName): return self",
+        "    def search(self, path):",
+        "        return [{'robot': {'S': 'a'}, 'online': {'BOOL': True}}, {'robot': {'S': 'b'}}]",
+    )
+    assert found == ["a"]
+
+
+@pytest.fixture(scope="module")
+def cloud(tmp_path_factory: pytest.TempPathFactory) -> Copy:
+    """A copy with a rule and a function more, and its templates: the slow part, done once for both."""
+    copy = Copy(tmp_path_factory.mktemp("cloud") / "checkout")
+    assert len(set(copy.follow("A rule"))) == 2
+    assert len(set(copy.follow("A function"))) == 2
+    copy.run("-c", SYNTHESIZE)
+    return copy
+
+
+def resources(copy: Copy, stack: str, kind: str, start: str) -> list[dict[str, Any]]:
+    """The resources of a kind in a stack of the copy, whose logical ids start with a name."""
+    template = json.loads((copy.root / "cdk.out" / f"iort-{stack}.template.json").read_text())
+    named = re.compile(rf"{start}[0-9A-F]{{8}}|{start}")
+    found = template["Resources"].items()
+    return [r["Properties"] for name, r in found if r["Type"] == kind and named.fullmatch(name)]
 
 
 def test_a_verb(copy: Copy) -> None:
