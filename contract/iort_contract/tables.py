@@ -23,7 +23,7 @@ ENVELOPE = ("v", BATCH, SAMPLES, NONFINITE, "codec", "samples")
 PING_FIELDS = ("v", "id", "sent_us", "padding")
 # A rule's message to a function: one opaque value, so that no key of it can replace one of the cloud's.
 MESSAGE_BASE64 = "message_base64"
-# Only if not zero: values of sensors that are not fitted (contract/iort_contract/vesc.py).
+# Only if not zero: values of sensors that are not fitted (contract/iort_contract/catalog/vesc.py).
 ABSENT = "absent"
 # In a second over DynamoDB's 400 KB: the number of attributes left out, the largest first.
 OMITTED = "omitted"

@@ -1,1 +1,4 @@
-"""One typed entry for each thing that several parts must know. It uses names and limits, and no messages."""
+"""What the system knows of its data, each entry once: streams, fields, units, derived fields, rules, metrics.
+
+Uses the messages and everything below them.
+"""

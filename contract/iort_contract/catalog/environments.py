@@ -22,9 +22,8 @@ class Environment:
         """The variables as text."""
         return {one.name.upper(): _text(getattr(self, one.name)) for one in fields(self)}
 
-    # Python 3.8 has no Self.
     @classmethod
-    def read(cls: type[E], variables: Mapping[str, str]) -> E:  # noqa: PYI019
+    def read(cls: type[E], variables: Mapping[str, str]) -> E:  # noqa: PYI019 - Python 3.8 has no Self
         """Read the variables; KeyError names a missing one."""
         return cls(**{one.name: _value(str(one.type), variables[one.name.upper()]) for one in fields(cls)})
 

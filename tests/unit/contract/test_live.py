@@ -13,7 +13,13 @@ from hypothesis import strategies as st
 from iort_contract.catalog.vesc import VESC_FIELDS
 from iort_contract.limits import MAX_PUBNUB_BYTES, ContractError
 from iort_contract.messages.event import event_message, rule_event
-from iort_contract.messages.live import LiveSample, decode_live, decode_live_update, encode_live, live_update
+from iort_contract.messages.live import (
+    LiveSample,
+    decode_live,
+    decode_live_update,
+    encode_live,
+    live_update,
+)
 from iort_contract.tables import MESSAGE_BASE64
 from tests.unit.contract.contract_values import (
     BAD_HEADERS,
