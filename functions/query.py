@@ -13,7 +13,7 @@ import os
 import uuid
 import zlib
 from collections import Counter
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from functools import cache
 from itertools import pairwise
@@ -26,20 +26,18 @@ from functions.shared.tables import Tables
 from iort_contract import (
     BATCH,
     DERIVED_UNITS,
-    MAX_BATCH_SPAN_US,
     PLAIN_CODEC,
     RECORD,
     RESULTS_PREFIX,
     TOPIC,
     ContractError,
     Value,
-    batches_between,
     build_topic,
     decode,
     expression,
     parse_topic,
 )
-from iort_contract.attributes import plain
+from iort_contract.dynamodb import plain, with_samples_between
 from iort_contract.expression import ExpressionError, MismatchError, Node
 from iort_contract.statistics import derive, without_absent
 
@@ -73,7 +71,7 @@ class Request:
     fields: tuple[str, ...] | None
     condition: Node | None
     scan: bool
-    token: Mapping[str, Any] | None
+    token: dict[str, Any] | None
 
     def needs(self, name: str) -> bool:
         """Whether the answer needs this stored field."""
@@ -200,15 +198,16 @@ def _answer(
 ) -> dict[str, Any]:
     found = Found(request, tables)
     items = pages = 0
-    token: Mapping[str, Any] | None = None
-    for page, after in _pages(request, tables):
+    token: dict[str, Any] | None = None
+    keys = with_samples_between(request.start_us, request.end_us)
+    for page in tables.telemetry.pages(request.topic, keys, after=request.token, scan=request.scan):
         pages += 1
-        token = after
+        token = page.after
         # A page of a car that stands still may inflate beyond the memory, so a page may be split.
-        for number, item in enumerate(page, 1):
+        for number, item in enumerate(page.items, 1):
             items += 1
             found.add(plain(item))
-            if found.values > max_values and number < len(page):
+            if found.values > max_values and number < len(page.items):
                 token = {name: item[name] for name in (TOPIC, BATCH)}
                 break
         if token is not None and (left_ms() < MARGIN_MS or found.values > max_values):
@@ -228,33 +227,6 @@ def _answer(
     if len(samples) * 4 // 3 <= max_inline_bytes:
         return {**reply, "samples": base64.b64encode(samples).decode()}
     return {**reply, "url": store(samples)}
-
-
-def _pages(
-    request: Request, tables: Tables
-) -> Iterator[tuple[Sequence[Mapping[str, Any]], Mapping[str, Any] | None]]:
-    """Pages of items, each with the key to continue after; None for the last page."""
-    first, last = batches_between(request.start_us - MAX_BATCH_SPAN_US + 1, request.end_us - 1)
-    if first > last:
-        return
-    condition = {
-        ("FilterExpression" if request.scan else "KeyConditionExpression"): (
-            "#topic = :topic AND #batch BETWEEN :first AND :last"
-        ),
-        "ExpressionAttributeNames": {"#topic": TOPIC, "#batch": BATCH},
-        "ExpressionAttributeValues": {
-            ":topic": {"S": request.topic},
-            ":first": {"S": first},
-            ":last": {"S": last},
-        },
-    }
-    token = request.token
-    while True:
-        page = tables.page(condition, token, scan=request.scan)
-        token = page.get("LastEvaluatedKey")
-        yield page["Items"], token
-        if token is None:
-            return
 
 
 def _packed(found: Found) -> bytes:

@@ -77,7 +77,7 @@ UNASKED = (
         "dynamodb.query",
         "A Query reads at most 1 MB of one partition, in the order of the sort key.",
         f"{_DYNAMODB}/Query.Pagination.html",
-        "station/iort_station/data/reading.py",
+        "contract/iort_contract/dynamodb.py",
         "local/gaps/storage/query_time.py",
     ),
     _documented(

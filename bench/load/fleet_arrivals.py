@@ -4,15 +4,15 @@ from __future__ import annotations
 
 import threading
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any
 
 from bench.load.fleet_load import SAMPLES as BATCH_SAMPLES
-from iort_contract import BATCH, RECEIVED_MS, SAMPLES, SECOND, VESC_STREAM, batch_id
-from iort_contract.attributes import plain
+from iort_contract import BATCH, RECEIVED_MS, SECOND, VESC_STREAM, batch_id
 from iort_station.cloud import Cloud
-from iort_station.data.items import of_topic
+from iort_station.data.batches import summary_table, topic_of
+from iort_station.operations import delivery
+from iort_station.operations.audit import headers
 
 # Takes the share done and the name of the step.
 Tell = Callable[[float, str], None]
@@ -36,7 +36,7 @@ class Stored:
 
 def stored(cloud: Cloud, robot: str, sent_ms: list[int]) -> Stored:
     """Compare a robot's items with the batches that it sent."""
-    items = list(_items(cloud, "TelemetryTable", robot, BATCH, RECEIVED_MS))
+    items = list(headers(cloud, robot, VESC_STREAM))
     seqs = [batch_id(item[BATCH]).seq for item in items]
     received = [int(item[RECEIVED_MS]) for item in items]
     return Stored(
@@ -75,22 +75,12 @@ def summarized(cloud: Cloud, expected: dict[str, int], tell: Tell) -> int:
 
 
 def _samples(cloud: Cloud, robot: str) -> int:
-    return sum(int(item[SAMPLES]) for item in _items(cloud, "SummaryTable", robot, SAMPLES))
+    return delivery.samples_summarized(cloud, robot, VESC_STREAM)
 
 
 def _spanned(cloud: Cloud, robot: str) -> int:
     """Return the seconds from a robot's first to its last summary."""
-    query = cloud.client("dynamodb").query
-    seconds = of_topic(cloud, "SummaryTable", robot, VESC_STREAM, SECOND)
-    ends = [
-        int(item[SECOND]["N"])
-        for forward in (True, False)
-        for item in query(**seconds, ScanIndexForward=forward, Limit=1)["Items"]
-    ]
-    return ends[1] - ends[0] + 1 if ends else 0
-
-
-def _items(cloud: Cloud, table: str, robot: str, *fields: str) -> Iterator[dict[str, Any]]:
-    pages = cloud.client("dynamodb").get_paginator("query")
-    for page in pages.paginate(**of_topic(cloud, table, robot, VESC_STREAM, *fields)):
-        yield from map(plain, page["Items"])
+    table, topic = summary_table(cloud), topic_of(cloud, robot, VESC_STREAM)
+    ends = [table.first(topic, newest=newest, attributes=(SECOND,)) for newest in (False, True)]
+    first, last = (0 if item is None else int(item[SECOND]["N"]) for item in ends)
+    return last - first + 1 if last else 0

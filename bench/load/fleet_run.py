@@ -24,7 +24,7 @@ from bench.load.fleet_load import Load
 from bench.meters import usage
 from iort_contract import SECOND, VESC_STREAM
 from iort_station.cloud import Cloud
-from iort_station.data.items import of_topic
+from iort_station.data.batches import summary_table, topic_of
 from iort_station.fleet import robots
 from local.cloud import EmbeddedCloud
 from local.figures import Spread
@@ -174,17 +174,18 @@ def _summary_age(cloud: Cloud, robot: str) -> Iterator[list[float]]:
     """Collect the age of the newest summarised second of a robot, in seconds, once a second."""
     seen: list[float] = []
     over = threading.Event()
-    newest = of_topic(cloud, "SummaryTable", robot, VESC_STREAM, SECOND)
+    table, topic = summary_table(cloud), topic_of(cloud, robot, VESC_STREAM)
 
     def watch() -> None:
         while not over.wait(1.0):
             try:
-                answer = cloud.client("dynamodb").query(**newest, ScanIndexForward=False, Limit=1)
+                newest = table.first(topic, newest=True, attributes=(SECOND,))
             except (BotoCoreError, ClientError):
                 # An overloaded cloud answers late or not at all; only the stored items count.
                 continue
             # A second is over when the next one begins.
-            seen.extend(round(time.time() - int(item[SECOND]["N"]) - 1, 3) for item in answer["Items"])
+            if newest is not None:
+                seen.append(round(time.time() - int(newest[SECOND]["N"]) - 1, 3))
 
     watcher = threading.Thread(target=watch, daemon=True)
     watcher.start()

@@ -65,7 +65,7 @@ def run(target: Target, say: Say) -> Section:
             "Lambda 2",
             _SUMMARY_S,
         )
-    items = list(audit.headers(target.cloud, bundle.robot, VESC_STREAM, audit.Range()))
+    items = list(audit.headers(target.cloud, bundle.robot, VESC_STREAM))
     found = audit.audit(VESC_STREAM, items, from_start=True)
     stored = sum(int(item["n"]) for item in items)
     delayed = [i for i in items if cut_us <= batch_id(i[BATCH]).t_us < mended_us]

@@ -25,7 +25,7 @@ from bench.report.result import NOT_MEASURED, Plot, Ratio, Section, Table
 from bench.report.spread import ratio, spread
 from bench.target import Say, Target
 from iort_contract import RECEIVED_MS, RECORD, TOPIC, VESC_STREAM, build_topic
-from iort_station.data import data
+from iort_station import data
 from iort_station.operations import delivery
 
 POINTS = 14_368

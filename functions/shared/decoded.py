@@ -14,7 +14,7 @@ from typing import Any
 from functions.shared.dead_letter import Refused
 from functions.shared.share import REQUESTS_S, Change, Share, robot_of_change
 from iort_contract import RECEIVED_MS, Batch, BatchId, ContractError, decode_item
-from iort_contract.attributes import plain
+from iort_contract.dynamodb import plain
 
 _log = logging.getLogger(__name__)
 

@@ -25,7 +25,7 @@ from functions.shared.share import REQUESTS_S, Change, OverShareError, Share, ro
 from functions.shared.stored import SECOND_BATCHES
 from functions.shared.tables import Tables
 from iort_contract import RECOMPUTE_FROM_S, RECOMPUTED, REPLAY, Statistics, parse_topic
-from iort_contract.table_writer import TableError
+from iort_contract.dynamodb import TableError
 
 # Topics to process in parallel; a client keeps ten connections.
 _AT_ONCE = 4

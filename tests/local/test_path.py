@@ -11,7 +11,7 @@ import time
 import pytest
 
 import iort_contract
-from iort_station.data import data
+from iort_station import data
 from iort_station.operations import delivery
 from iort_station.page.listener import Listener
 from local.cloud import EmbeddedCloud

@@ -13,7 +13,7 @@ import iort_contract
 from iort_contract import ENTRY, LIVE, VESC_STREAM, Batch, build_topic, record_topic
 from iort_station.cli.main import app
 from iort_station.cloud import EMBEDDED
-from iort_station.data.items import of_topic
+from iort_station.data.batches import summary_table, topic_of
 from iort_station.operations import delivery, quarantine
 from tests.local.conftest import until
 from verify.robot import Robot
@@ -260,6 +260,6 @@ def test_a_hail_of_nonsense_leaves_the_others_their_summaries(bundle, embedded):
     send(bundle("bad"), *hostile())
     good = bundle("good")
     send(good, batch())
-    items = of_topic(cloud, "SummaryTable", good.robot, VESC_STREAM)
-    (second,) = until(lambda: cloud.client("dynamodb").query(**items)["Items"])
+    table, topic = summary_table(cloud), topic_of(cloud, good.robot, VESC_STREAM)
+    (second,) = until(lambda: next(table.pages(topic)).items)
     assert second[iort_contract.SAMPLES] == {"N": "1"}

@@ -13,7 +13,7 @@ import pytest
 from boto3.dynamodb.types import TypeSerializer
 
 from iort_contract import RESULTS_PREFIX, Batch, build_topic, encode
-from iort_station.data import data
+from iort_station import data
 from local.cloud import EmbeddedCloud
 from local.deployment import ROOT
 

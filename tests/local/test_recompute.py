@@ -8,7 +8,8 @@ import pytest
 
 import iort_contract
 from iort_contract import Batch, record_topic
-from iort_station.data import data, inventory
+from iort_station import data
+from iort_station.data import inventory
 from iort_station.fleet import registry
 from iort_station.operations import delivery, recompute
 from iort_station.operations.recompute import Recomputed

@@ -11,7 +11,7 @@ import pytest
 import iort_contract
 from bench.load.worst_case import worst_batches
 from iort_contract import SECOND, VESC_STREAM, Batch, record_topic
-from iort_station.data.items import of_topic
+from iort_station.data.batches import summary_table, topic_of
 from iort_station.fleet import shadow
 from iort_station.operations import delivery
 from tests.local.conftest import until
@@ -23,12 +23,8 @@ GOOD = 8
 
 def seconds_of(embedded, robot):
     """The summarised seconds of a robot, in the order in which they are read."""
-    pages = (
-        embedded.cloud.client("dynamodb")
-        .get_paginator("query")
-        .paginate(**of_topic(embedded.cloud, "SummaryTable", robot, VESC_STREAM, SECOND), ConsistentRead=True)
-    )
-    return [int(item[SECOND]["N"]) for page in pages for item in page["Items"]]
+    pages = summary_table(embedded.cloud).pages(topic_of(embedded.cloud, robot, VESC_STREAM))
+    return [int(item[SECOND]["N"]) for page in pages for item in page.items]
 
 
 @pytest.mark.parametrize(("rate_hz", "count"), [(15, 40), (100, 80)])

@@ -9,7 +9,7 @@ import pytest
 from boto3.dynamodb.types import TypeSerializer
 
 from iort_contract import EXPIRES_S, RECEIVED_MS, RECORD, TOPIC, Batch, build_topic, record_topic
-from iort_station.data import data
+from iort_station import data
 from iort_station.operations import delivery, quarantine
 from tests.local.conftest import until
 from tests.unit.station.old_messages import old_envelope, old_message

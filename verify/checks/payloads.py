@@ -22,7 +22,7 @@ from iort_contract import (
     record_topic,
 )
 from iort_station.operations import quarantine
-from iort_station.operations.quarantine import Entry
+from iort_station.operations.quarantine import DeadLetter
 from verify.assumption import Basis
 from verify.bundles import pair_of
 from verify.check import Check
@@ -35,12 +35,12 @@ _BYTES = b"\xff\x00 no JSON"
 _AWS_MESSAGE_BYTES = 128 * 1024
 
 
-def _refused(target: Target, robot: str) -> list[Entry]:
+def _refused(target: Target, robot: str) -> list[DeadLetter]:
     """The robot's messages in quarantine."""
     return list(quarantine.entries(target.cloud, robot=robot))
 
 
-def _kept(target: Target, entry: Entry) -> bytes | None:
+def _kept(target: Target, entry: DeadLetter) -> bytes | None:
     loaded = quarantine.load(target.cloud, entry)
     return loaded.payload if loaded else None
 
@@ -65,7 +65,7 @@ def _record_no_json(target: Target) -> dict[str, Any]:
         # A batch without its key is refused later than the other payload.
         pair.publish(record_topic(robot, VESC_STREAM, cloud.namespace), b'{"v": 1}')
 
-        def of_the_batch() -> list[Entry]:
+        def of_the_batch() -> list[DeadLetter]:
             found = _refused(target, robot)
             return found if any(_kept(target, entry) == b'{"v": 1}' for entry in found) else []
 

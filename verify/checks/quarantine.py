@@ -20,7 +20,7 @@ from iort_contract import (
     rule_name,
 )
 from iort_station.operations import delivery, quarantine
-from iort_station.operations.quarantine import Entry
+from iort_station.operations.quarantine import DeadLetter
 from iort_station.operations.replay import replay
 from verify.assumption import Basis
 from verify.check import Check
@@ -37,7 +37,7 @@ def _batch(number: int, **changes: Any) -> bytes:
     return json.dumps({**json.loads(encode(batch)), **changes}).encode()
 
 
-def _entry(target: Target, robot: str) -> Entry:
+def _entry(target: Target, robot: str) -> DeadLetter:
     (listed,) = until(
         lambda: list(quarantine.entries(target.cloud, robot=robot)), "the entry in the quarantine"
     )

@@ -17,7 +17,7 @@ from matplotlib.dates import AutoDateLocator, ConciseDateFormatter
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
-from iort_station.data.data import Result
+from iort_station.data import Result
 from iort_station.data.positions import Fields, fixes, local_metres, position_fields
 from iort_station.errors import StationError
 

@@ -10,13 +10,13 @@ from contextlib import contextmanager
 from rich.progress import BarColumn, Progress, TextColumn
 
 from iort_station.cli.console import Console, visible
-from iort_station.data.reading import Told
+from iort_station.data.batches import PageProgress
 
 _PATIENCE_S = 1.0
 
 
 @contextmanager
-def reading(what: str, start_us: int | None, end_us: int | None) -> Iterator[Told]:
+def reading(what: str, start_us: int | None, end_us: int | None) -> Iterator[PageProgress]:
     """What a reader tells of its pages, shown as the part of the range that has been read."""
     console = Console(stderr=True)
     bar = Progress(

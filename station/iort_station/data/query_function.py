@@ -1,4 +1,4 @@
-"""Samples chosen by the query function in the cloud: functions/query.py."""
+"""Samples that the query function (functions/query.py) selects in the cloud."""
 
 from __future__ import annotations
 
@@ -7,6 +7,7 @@ import json
 import ssl
 import urllib.request
 import zlib
+from collections import Counter
 from collections.abc import Iterator, Mapping
 from typing import Any
 
@@ -15,11 +16,9 @@ import numpy as np
 from iort_contract import PLAIN_CODEC
 from iort_station.cloud import Cloud
 from iort_station.data import inventory
+from iort_station.data.batches import PageProgress, RefusedItems
 from iort_station.data.blocks import Block, column_of, join, ordered
-from iort_station.data.reading import Told
 from iort_station.data.selection import Selection
-from iort_station.data.sensors import Sensors
-from iort_station.data.stored import Refused
 from iort_station.errors import StationError
 
 _DOWNLOAD_S = 60
@@ -29,15 +28,14 @@ def samples(
     cloud: Cloud,
     selection: Selection,
     *,
-    refused: Refused,
-    sensors: Sensors,
+    refused: RefusedItems,
+    absent: Counter[str],
     scan: bool = False,
-    progress: Told | None = None,
+    progress: PageProgress | None = None,
 ) -> Iterator[Block]:
-    """The selection's samples, from as many invocations as it takes.
+    """The selection's samples, from as many invocations as needed.
 
-    Raises `StationError` where the function refuses or fails, and at the end where a field that was
-    named was in none of the samples.
+    Raises `StationError` if the function fails, and at the end for a field that no sample has.
     """
     request: dict[str, Any] = {
         "robot": selection.robot,
@@ -58,15 +56,15 @@ def samples(
         there |= set(reply["fields"])
         refused.count += reply["refused"]
         refused.reason = refused.reason or reply["reason"]
-        sensors.absent.update(reply["absent"])
+        absent.update(reply["absent"])
         if progress is not None and len(part.times_us):
             progress(reply["items"], int(part.times_us[-1]))
         if reply["token"] is None:
             break
         request["token"] = reply["token"]
-    if there:
-        inventory.check_fields(cloud, selection, there)
-    # What a batch holds may reach into the next, which may be another invocation's.
+    if there and not selection.named() <= there:
+        raise inventory.unknown_fields(cloud, selection, there)
+    # A batch may overlap the next one, which another invocation may have read.
     block = ordered(join(parts))
     if len(block.times_us):
         names = selection.fields or tuple(block.columns)
@@ -82,7 +80,10 @@ def _invoke(cloud: Cloud, function: str, request: Mapping[str, Any]) -> dict[str
     if "error" in reply:
         raise StationError(f"the query function refused: {reply['error']}")
     if reply["codec"] != PLAIN_CODEC:
-        raise StationError(f"the query function answers in {reply['codec']}: deploy the current stacks")
+        raise StationError(
+            f"the query function must answer in {PLAIN_CODEC}, got {reply['codec']}: "
+            "deploy the current stacks"
+        )
     return reply
 
 
@@ -101,4 +102,4 @@ def _download(cloud: Cloud, url: str) -> bytes:
         ) as response:
             return bytes(response.read())
     except OSError as error:
-        raise StationError(f"the result cannot be fetched: {error}") from error
+        raise StationError(f"the result cannot be downloaded: {error}") from error

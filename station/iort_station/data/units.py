@@ -1,11 +1,9 @@
-"""Units of fields: by the type of the messages that they are in, and the driver that values came from."""
+"""Units of fields, by the type of their messages and by the driver that sent them."""
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Mapping
 from functools import lru_cache
-
-import numpy as np
 
 from iort_contract import (
     AGENT_FIELDS,
@@ -20,7 +18,6 @@ from iort_contract import (
 )
 from iort_contract.limits import MessageError
 from iort_contract.ros1.definition import Fields, parse
-from iort_station.data.blocks import Block
 
 VESC_KIND = "vesc_msgs/VescState"
 _VECTOR = dict.fromkeys("xyz", "m")
@@ -32,8 +29,8 @@ _SCAN = {
 _TIME = {"sec": "s", "nanosec": "ns"}
 _PLACE = {"latitude": "deg", "longitude": "deg", "altitude": "m"}
 _CHARGE = dict.fromkeys(("charge", "capacity", "design_capacity"), "Ah")
-# The unit of a field, or of the numbers within it, by the type that the field is in: as the comments of the
-# types' definitions say, and REP 103.
+# Units by message type and field, from the comments in the types' definitions and from REP 103. The unit of a
+# field is also that of the numbers inside it.
 _OF_TYPES: Mapping[str, Mapping[str, str]] = {
     "ackermann_msgs/AckermannDrive": {
         "steering_angle": "rad",
@@ -72,7 +69,7 @@ _OF_TYPES: Mapping[str, Mapping[str, str]] = {
     "sensor_msgs/Temperature": {"temperature": "degC"},
     "time": _TIME,
 }
-# What VESC Tool writes into a log beside what the controller measures, as far as its unit is sure.
+# Columns that VESC Tool adds to a log, where the unit is certain.
 _OF_LOGS = {
     "gnss_lat": "deg",
     "gnss_lon": "deg",
@@ -88,7 +85,7 @@ _OF_LOGS = {
     "current_motor_setup": "A",
     "battery_wh_tot": "Wh",
 }
-# The same where no type is known, of what the types above call so: of the fields x, y and z within.
+# Units of the fields x, y and z within a field of such a name, where the type is unknown.
 ROS_UNITS = {
     "linear_acceleration": "m/s^2",
     "angular_velocity": "rad/s",
@@ -97,31 +94,13 @@ ROS_UNITS = {
     "position": "m",
     "translation": "m",
 }
-_MEAN = f"_{STATS[1]}"
-_BY_DRIVER = tuple(field.name for field in VESC_FIELDS.values() if field.ros2_unit is not None)
-
-
-class Driver:
-    """Tells by samples that pass whose units they have: a count of 1e-4 Ah is whole, what the ROS 2
-    driver made of it is not."""
-
-    def __init__(self) -> None:
-        self.ros2 = False
-
-    def told(self, found: Iterable[Block]) -> Iterator[Block]:
-        """The same blocks: samples, or the summary's seconds."""
-        for block in found:
-            self.ros2 = self.ros2 or any(
-                column.dtype.kind == "f" and bool((column > np.floor(column)).any())
-                for name, column in block.columns.items()
-                if name.startswith(_BY_DRIVER) and not name.endswith(_MEAN)
-            )
-            yield block
 
 
 def unit(stream: str, name: str, *, ros2: bool = False, kind: MessageType | None = None) -> str:
-    """The unit of a field, or of a statistic of it; empty where none is known. ``ros2`` for the ROS 2
-    driver's samples, ``kind`` is the type of the stream's messages."""
+    """The unit of a field or of one of its statistics; empty if unknown.
+
+    ``ros2`` tells that the samples are the ROS 2 driver's; ``kind`` is the type of the stream's messages.
+    """
     stem, _, statistic = name.rpartition("_")
     for field in (name, stem) if statistic in STATS else (name,):
         if found := _unit(stream, field, kind, ros2=ros2):
@@ -142,7 +121,7 @@ def _unit(stream: str, field: str, kind: MessageType | None, *, ros2: bool) -> s
         return _of_a_vesc(field, ros2=ros2)
     if field in _OF_LOGS and (stream == VESC_STREAM if kind is None else kind.kind == VESC_KIND):
         return _OF_LOGS[field]
-    # The driver's VescImu calls its own so, in units of its own.
+    # The driver's VescImu has fields of these names in other units.
     if kind is not None and kind.kind.startswith("vesc_msgs/"):
         return ""
     within, _, axis = field.rpartition(".")
@@ -158,13 +137,14 @@ def _of_a_vesc(field: str, *, ros2: bool) -> str:
 def _by_type(kind: MessageType, path: str, *, ros2: bool) -> str:
     types = _types(kind.kind, kind.definition)
     body = [field for field in types.get(kind.kind, ()) if field.name != "header"]
-    # A header and one thing: the fields are the thing's, see contract/iort_contract/ros1/decode.py.
+    # With a header and one other field, the sample's fields are that field's: see
+    # contract/iort_contract/ros1/decode.py.
     starts = [body[0].kind, kind.kind] if len(body) == 1 else [kind.kind]
     return next(filter(None, (_on_the_way(types, start, path, ros2=ros2) for start in starts)), "")
 
 
 def _on_the_way(types: Mapping[str, Fields], kind: str, path: str, *, ros2: bool) -> str:
-    """The unit that a type on the way from this one gives the next step of the path."""
+    """The unit that a type along the path gives to the next part of the path."""
     for part in path.split("."):
         if part.isdecimal():
             continue
@@ -178,7 +158,7 @@ def _on_the_way(types: Mapping[str, Fields], kind: str, path: str, *, ros2: bool
 
 @lru_cache(maxsize=256)
 def _types(kind: str, definition: str) -> Mapping[str, Fields]:
-    """The fields of a type and of those within; none where the definition cannot be read."""
+    """The fields of a type and of the types inside it; empty for an invalid definition."""
     try:
         return parse(kind, definition).types
     except MessageError:
@@ -186,5 +166,5 @@ def _types(kind: str, definition: str) -> Mapping[str, Fields]:
 
 
 def agent_unit(field: str) -> str:
-    """The unit of one of the agent's own figures."""
+    """The unit of one of the agent's own metrics."""
     return AGENT_FIELDS[field].split()[0].rstrip(",")

@@ -22,7 +22,7 @@ from iort_contract import (
     ContractError,
     check_robot,
 )
-from iort_contract.attributes import plain
+from iort_contract.dynamodb import plain
 from iort_station.cloud import Cloud
 from iort_station.errors import StationError
 

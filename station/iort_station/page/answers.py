@@ -11,9 +11,10 @@ from typing import Any
 import numpy as np
 
 from iort_contract import CLAIM_FIELDS, check_robot
+from iort_station import data
 from iort_station.cloud import Cloud
-from iort_station.data import data, inventory
-from iort_station.data.conditions import Column, values
+from iort_station.data import inventory
+from iort_station.data.blocks import Column, values
 from iort_station.errors import StationError
 from iort_station.fleet import registry
 from iort_station.operations import cloudwatch, cloudwatch_logs

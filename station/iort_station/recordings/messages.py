@@ -7,20 +7,16 @@ import keyword
 import math
 import re
 from collections.abc import Iterator, Mapping, Sequence
-from contextlib import suppress
 from itertools import count
 from typing import Any
 
 import numpy as np
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
-from iort_contract import TYPES_STREAM, ContractError, MessageType, Value, message_type
+from iort_contract import MessageType, Value
 from iort_station.cloud import Cloud
-from iort_station.data import data
-from iort_station.data.blocks import Block
-from iort_station.data.conditions import values
-from iort_station.data.selection import Selection
-from iort_station.data.stored import Refused
+from iort_station.data import inventory
+from iort_station.data.blocks import Block, values
 from iort_station.errors import StationError
 
 # What rosbags' typestore calls the kinds of a field's type: a basic one, another message, arrays.
@@ -37,17 +33,11 @@ _ROS2_HEADER = re.compile(
 def types(cloud: Cloud, robot: str, stream: str) -> dict[str, tuple[int, MessageType]]:
     """The types that a robot has said a stream's messages to be, by their ids, and when it first did."""
     found: dict[str, tuple[int, MessageType]] = {}
-    whole = Selection(robot=robot, stream=TYPES_STREAM)
-    for block in data.samples(cloud, whole, refused=Refused()):
-        columns = {name: values(column) for name, column in block.columns.items()}
-        for i, t_us in enumerate(block.times_us.tolist()):
-            sample = {name: column[i] for name, column in columns.items()}
-            if sample.get("stream") == stream:
-                with suppress(ContractError):
-                    kind = message_type(sample)
-                    first_us, before = found.get(kind.id, (t_us, kind))
-                    # Some publishers send no definition.
-                    found[kind.id] = first_us, before if before.definition.strip() else kind
+    for t_us, kind in inventory.types_of(cloud, robot):
+        if kind.stream == stream:
+            first_us, before = found.get(kind.id, (t_us, kind))
+            # Some publishers send no definition.
+            found[kind.id] = first_us, before if before.definition.strip() else kind
     return found
 
 

@@ -6,8 +6,8 @@ from collections.abc import Mapping
 from typing import Any
 
 from iort_contract import BATCH, NONFINITE, T_US, BatchId, ContractError
-from iort_contract.attributes import plain
 from iort_contract.checks import check_header, check_version, integer
+from iort_contract.dynamodb import plain
 from iort_contract.limits import BATCH_VERSION
 
 OLD_VERSION = 1

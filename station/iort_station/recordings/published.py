@@ -7,13 +7,11 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from typing import Any, NamedTuple
 
 from iort_contract import CLAIM_AT, CLAIM_FIELDS, Batch, ContractError, MessageType, messages_of
-from iort_contract.attributes import plain
+from iort_contract.dynamodb import plain
 from iort_contract.ros1.message import filled
 from iort_station.cloud import Cloud
-from iort_station.data import reading
-from iort_station.data.reading import Told
+from iort_station.data.batches import PageProgress, RefusedItems, stored
 from iort_station.data.selection import Selection
-from iort_station.data.stored import ATTRIBUTES, Refused
 
 # Gives the content of an uploaded file by its key; None where it is not there.
 Content = Callable[[str], "bytes | None"]
@@ -40,14 +38,13 @@ class Export:
     ) -> None:
         self.types = dict(types)
         self.others = self.empty = 0
-        self.refused = Refused()
+        self.refused = RefusedItems()
         self._cloud, self._selection, self._content = cloud, selection, content
         self._layouts = {name: kind.layout for name, kind in types.items()}
 
-    def messages(self, progress: Told | None = None) -> Iterator[Published]:
+    def messages(self, progress: PageProgress | None = None) -> Iterator[Published]:
         """The messages, in order of their batches' times."""
-        pages = reading.batches(self._cloud, self._selection, ATTRIBUTES)
-        for items in reading.told(pages, progress):
+        for items in stored(self._cloud, self._selection, progress=progress):
             for item in items:
                 yield from self._of(plain(item))
 

@@ -21,7 +21,7 @@ from iort_contract import (
     CONNECTED_MS,
     SERIAL,
 )
-from iort_contract.attributes import plain
+from iort_contract.dynamodb import plain
 from tests.fakes import ROBOTS
 
 LATER_S = int(time.time()) + 3600

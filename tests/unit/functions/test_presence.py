@@ -12,7 +12,7 @@ import pytest
 import iort_contract
 from functions import presence
 from iort_contract import ContractError
-from iort_contract.attributes import plain
+from iort_contract.dynamodb import plain
 from tests.fakes import ROBOTS
 
 MINUTE_MS = 60_000

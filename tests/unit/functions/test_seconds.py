@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 import iort_contract
 from functions.shared.tables import attribute
 from iort_contract import Batch, flat_second
-from iort_contract.attributes import plain
+from iort_contract.dynamodb import plain
 from iort_contract.statistics import summarize_second
 
 # Fields that are called like what else a second holds, and like one another's statistics.

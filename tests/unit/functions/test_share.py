@@ -14,7 +14,7 @@ from functions.shared.allowances import Allowances
 from functions.shared.processing import Bounds, process
 from functions.shared.share import KEYS, OverShareError, PutOff, Share, Told, waiting
 from iort_contract import OVER_SHARE, PUT_OFF, RECORD, SHADOW, VESC_STREAM, build_topic
-from iort_contract.table_writer import TableError
+from iort_contract.dynamodb import TableError
 from tests.unit.functions.summarizing import T0, S, Stream, batch, counted
 
 GOOD, BAD = (build_topic(RECORD, robot, VESC_STREAM) for robot in ("good", "bad"))

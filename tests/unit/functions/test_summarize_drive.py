@@ -10,7 +10,7 @@ import iort_contract
 from functions import summarize
 from functions.shared import processing
 from iort_contract import Batch
-from iort_contract.attributes import plain
+from iort_contract.dynamodb import plain
 from tests.fakes import (
     NAMES,
     ROBOTS,

@@ -13,7 +13,7 @@ import iort_contract
 from functions.shared import tables as tables_module
 from functions.shared.processing import process
 from iort_contract import BatchId
-from iort_contract.table_writer import TableError
+from iort_contract.dynamodb import TableError
 from tests.fakes import (
     ROBOTS,
     FakeDynamoDB,

@@ -12,9 +12,8 @@ from hypothesis import strategies as st
 from functions.shared import tables as tables_module
 from functions.shared.tables import attribute
 from iort_contract import BATCH, EXPIRES_S, SECOND, TOPIC, Batch, BatchId, batch_id
-from iort_contract.attributes import plain
+from iort_contract.dynamodb import TableError, plain
 from iort_contract.statistics import Vehicle
-from iort_contract.table_writer import TableError
 from tests.fakes import (
     ROBOTS,
     SUMMARY,

@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 
 import iort_contract
 from iort_contract import Batch, ContractError, decode
-from iort_contract.attributes import plain
+from iort_contract.dynamodb import plain
 from iort_station.recordings.old_batches import is_old, upgraded, upgraded_item
 from tests.fakes import item_of_message
 from tests.unit.station.old_messages import old_envelope, old_message

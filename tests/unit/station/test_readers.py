@@ -23,8 +23,8 @@ from iort_contract import (
     decode_live,
     messages_of,
 )
-from iort_contract.attributes import plain
-from iort_station.data.stored import Refused, blocks
+from iort_contract.dynamodb import plain
+from iort_station.data.batches import RefusedItems, blocks
 from iort_station.operations.audit import audit
 from tests.fakes import item_of, serialize
 
@@ -42,7 +42,7 @@ def stored(**changes):
 
 def by_columns(item):
     """Read by numpy, in the station."""
-    refused = Refused()
+    refused = RefusedItems()
     found = list(blocks([[item]], refused))
     assert refused.count == (not found)
     return bool(found)

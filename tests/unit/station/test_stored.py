@@ -16,14 +16,15 @@ import iort_contract
 from bench.message_sizes import stored_bytes
 from iort_contract import Batch
 from iort_contract.checks import wire_column
-from iort_station.data import reading
+from iort_station.data.batches import RefusedItems, blocks, stored
 from iort_station.data.blocks import join
-from iort_station.data.stored import Refused, blocks
+from iort_station.data.selection import Selection
 from tests.fakes import item_of_message
 from tests.recordings import recording
 from tests.unit.contract.ros1_messages import text, u32
 from tests.unit.contract.test_columns import BOOT, WRONG, columns, message_of, plain_message
 from tests.unit.functions.summarizing import drive_of
+from tests.unit.station.test_data import cloud_of
 
 
 def id_at(second):
@@ -32,7 +33,7 @@ def id_at(second):
 
 def read(*messages):
     """The blocks of messages in one page, and what was refused."""
-    refused = Refused()
+    refused = RefusedItems()
     items = [item_of_message(json.dumps(message).encode()) for message in messages]
     return list(blocks([items], refused)), refused
 
@@ -87,10 +88,12 @@ def test_more_values_than_a_batch_may_hold_are_refused_and_its_neighbours_are_re
 def test_an_item_whose_key_is_no_batchs_is_refused_and_its_neighbours_are_read(key):
     items = [item_of_message(json.dumps(message_of([0, 1, 2])).encode()) for _ in range(2)]
     items[1]["batch"] = {"S": key}
-    refused, told = Refused(), []
-    pages = reading.told([items], lambda *seen: told.append(seen))
+    refused, told = RefusedItems(), []
+    cloud = cloud_of()
+    cloud.table.query = lambda **_: {"Items": items}
+    pages = stored(cloud, Selection(robot="car", stream="vesc"), progress=lambda *seen: told.append(seen))
     (block,) = blocks(pages, refused)
-    # When it begins nobody can tell, so what was read so far is not called later than it.
+    # The start of an item without a valid key is unknown, so no time is reported as read.
     assert (block.columns["f0"].tolist(), refused.count, told) == ([1, 3], 1, [(2, 0)])
 
 
@@ -99,7 +102,7 @@ def test_samples_of_one_time_are_all_given_in_the_order_of_their_batches():
              for seq, t in enumerate([1_000, 1_000, 1_005])]  # fmt: skip
     items = [item_of_message(iort_contract.encode(batch)) for batch in parts]
     for pages in ([items], [items[:1], items[1:]], [[item] for item in items]):
-        found = list(blocks(pages, Refused()))
+        found = list(blocks(pages, RefusedItems()))
         times = [t for block in found for t in block.times_us.tolist()]
         values = [value for block in found for value in block.columns["a"].tolist()]
         assert times == [1_000] * 4 + [1_005] * 4 + [1_010]
@@ -121,7 +124,7 @@ def test_messages_are_samples_too_and_can_be_passed_over():
         Batch(BOOT, 3, [310], {"x": [9.5]}),
     ]
     items = [item_of_message(iort_contract.encode(batch)) for batch in given]
-    refused = Refused()
+    refused = RefusedItems()
     whole = join(list(blocks([items], refused)))
     assert whole.times_us.tolist() == [10, 20, 30, 110, 120, 130, 210, 220, 310]
     assert list(map(as_read, whole.columns["x"].tolist())) == [

@@ -17,7 +17,7 @@ from rich.text import Text
 from iort_station.cli.console import Console
 from iort_station.cli.verbs.options import since_us
 from iort_station.operations import quarantine, replay
-from iort_station.operations.quarantine import Entry
+from iort_station.operations.quarantine import DeadLetter
 from iort_station.operations.replay import Fate
 
 commands = typer.Typer()
@@ -89,13 +89,13 @@ def replay_errors(
             outcomes.append(outcome)
             bar.advance(task)
     if as_json:
-        rows = [{**_as_json(o.entry), "fate": o.fate.value, "detail": o.detail} for o in outcomes]
+        rows = [{**_as_json(o.letter), "fate": o.fate.value, "detail": o.detail} for o in outcomes]
         _out.print_json(json.dumps(rows))
     else:
         for outcome in outcomes:
             if outcome.fate not in (Fate.REPLAYED, Fate.NOT_FOR_REPLAY):
                 detail = f": {outcome.detail}" if outcome.detail else ""
-                line = f"{outcome.entry.id}  {outcome.entry.robot}  {outcome.fate.value}{detail}"
+                line = f"{outcome.letter.id}  {outcome.letter.robot}  {outcome.fate.value}{detail}"
                 _out.print(_one_line(line), soft_wrap=True)
         counts = Counter(outcome.fate for outcome in outcomes)
         _out.print(", ".join(f"{n} {fate.value}" for fate, n in counts.items()) or "nothing in quarantine")
@@ -108,7 +108,7 @@ def _since_ms(text: str | None) -> int:
     return 0 if text is None else since_us(text) // 1000
 
 
-def _print(entry: Entry) -> None:
+def _print(entry: DeadLetter) -> None:
     """Two lines, which no terminal is too narrow for: reasons are long."""
     times = f"{entry.seen} times" + (f", {entry.replays} replays" if entry.replays else "")
     head = f"  {_utc(entry.last_ms)}  {entry.robot}  {times}"
@@ -121,7 +121,7 @@ def _one_line(text: str) -> str:
     return "".join(character if character.isprintable() else " " for character in text)
 
 
-def _show(entry: Entry, *, as_json: bool) -> None:
+def _show(entry: DeadLetter, *, as_json: bool) -> None:
     payload = entry.payload or b""
     if as_json:
         base64_payload = base64.b64encode(payload).decode()
@@ -159,7 +159,7 @@ def as_text(payload: bytes) -> str:
     return "\n".join(lines)
 
 
-def _as_json(entry: Entry) -> dict[str, Any]:
+def _as_json(entry: DeadLetter) -> dict[str, Any]:
     return {name: value for name, value in asdict(entry).items() if name != "payload"}
 
 

@@ -92,12 +92,12 @@ def _write(cloud: Cloud, selection: Selection, file: Recording) -> int:
 
 def _make(cloud: Cloud, selection: Selection, file: Recording, said: Mapping[str, MessageType]) -> int:
     """Write messages made of the samples that are none; how many."""
-    from iort_station.data import data  # noqa: PLC0415 - as above
-    from iort_station.data.stored import Refused  # noqa: PLC0415 - as above
+    from iort_station import data  # noqa: PLC0415 - as above
+    from iort_station.data.batches import RefusedItems  # noqa: PLC0415 - as above
     from iort_station.recordings import messages  # noqa: PLC0415 - as above
 
     robot, stream = selection.robot, selection.stream
-    blocks = data.samples(cloud, selection, refused=Refused(), messages=False)
+    blocks = data.samples(cloud, selection, refused=RefusedItems(), messages=False)
     first = next(blocks, None)
     if first is None:
         return 0

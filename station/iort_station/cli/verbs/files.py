@@ -18,10 +18,10 @@ from iort_station.cli.console import Console
 from iort_station.cli.verbs.options import bounds
 from iort_station.cloud import Cloud
 from iort_station.data.inventory import check_registered
-from iort_station.data.times import iso_s
 from iort_station.errors import StationError
 from iort_station.fleet import files
 from iort_station.fleet.files import StoredFile, Told
+from iort_station.times import iso_s
 
 commands = typer.Typer(no_args_is_help=True, help="Bags, images and what else robots have uploaded.")
 _out = Console(soft_wrap=True)

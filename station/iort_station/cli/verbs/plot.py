@@ -108,8 +108,9 @@ def _read(
     where: str | None,
     every: str | None,
 ) -> Run:
+    from iort_station import data  # noqa: PLC0415 - as above
     from iort_station.cli.plots import Run  # noqa: PLC0415 - as above
-    from iort_station.data import data, inventory  # noqa: PLC0415 - as above
+    from iort_station.data import inventory  # noqa: PLC0415 - as above
     from iort_station.data.conditions import derive  # noqa: PLC0415 - as above
 
     with reading(f"{robot} {stream}", within.start_us, within.end_us) as progress:

@@ -18,7 +18,7 @@ from iort_station.cli.verbs.options import Every, From, Last, Range, Robot, Stre
 from iort_station.errors import StationError
 
 if TYPE_CHECKING:
-    from iort_station.data.data import Result
+    from iort_station.data import Result
 
 commands = typer.Typer()
 
@@ -77,7 +77,8 @@ def query(
     A range includes its start and not its end. Without one it is the last five minutes.
     """
     # numpy takes longer to load than most commands to run.
-    from iort_station.data import data, inventory  # noqa: PLC0415 - see above
+    from iort_station import data  # noqa: PLC0415 - see above
+    from iort_station.data import inventory  # noqa: PLC0415 - see above
 
     if form is Format.parquet and output is None and sys.stdout.isatty():
         raise StationError("Parquet is no text for a terminal: give --output FILE, or pipe it on")

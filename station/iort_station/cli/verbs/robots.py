@@ -31,9 +31,9 @@ from iort_contract import (
 from iort_station.cli.console import Console
 from iort_station.cli.progress import reading, say
 from iort_station.cli.verbs.options import since_us
-from iort_station.data.times import iso_s, time_us
 from iort_station.errors import StationError
 from iort_station.fleet import certificates, claims, registry, robots, rotation, shadow
+from iort_station.times import iso_s, time_us
 
 commands = typer.Typer(no_args_is_help=True, help="The robots that may connect.")
 _out, _errors = Console(), Console(stderr=True)
