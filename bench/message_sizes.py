@@ -14,26 +14,14 @@ from decimal import Decimal
 from typing import Any
 
 from iort_agent.sources.vehicle import Vehicle, VehicleConfig
-from iort_contract import (
-    AGENT_FIELDS,
-    EXPIRES_S,
-    RECEIVED_MS,
-    RECORD,
-    SECOND,
-    TOPIC,
-    VESC_STREAM,
-    Batch,
-    LiveSample,
-    Value,
-    build_topic,
-    encode,
-    encode_live,
-    encode_ping,
-    live_update,
-    record_topic,
-)
+from iort_contract.limits import Value
+from iort_contract.messages.batch import Batch, encode_batch
+from iort_contract.messages.live import LiveSample, encode_live, encode_ping, live_update
 from iort_contract.statistics import Vehicle as Gain
 from iort_contract.statistics import summarize_second
+from iort_contract.tables import EXPIRES_S, RECEIVED_MS, SECOND, TOPIC
+from iort_contract.topics import RECORD, build_topic, record_topic
+from iort_contract.vesc import AGENT_FIELDS, VESC_STREAM
 from iort_station.cost.sizes import Measured
 
 _BOOT, _ROBOT = "0badcafe0badcafe", "car-0001"
@@ -58,7 +46,7 @@ def main() -> None:
 def batch_sizes(rate_hz: float, batch_s: float) -> Measured:
     """The sizes of a batch of a VESC's stream, and of the summary of a second at this rate."""
     samples = drive(rate_hz, max(1, round(rate_hz * batch_s)))
-    message = encode(batch_of(samples, rate_hz))
+    message = encode_batch(batch_of(samples, rate_hz))
     second = batch_of(drive(rate_hz, max(1, round(rate_hz))), rate_hz)
     return Measured(
         samples=len(samples),
@@ -86,7 +74,7 @@ def message_sizes() -> dict[str, int]:
 def own_item_bytes() -> int:
     """The telemetry item of the agent's own figures, one sample."""
     columns: dict[str, list[Value]] = {name: [12.345] for name in AGENT_FIELDS}
-    return stored_bytes(encode(Batch(_BOOT, 100_000, [_T_US], columns)))
+    return stored_bytes(encode_batch(Batch(_BOOT, 100_000, [_T_US], columns)))
 
 
 def stored_bytes(message: bytes) -> int:

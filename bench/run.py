@@ -29,7 +29,7 @@ from bench.report import machine, writer
 from bench.report.result import Section
 from bench.sections import SECTIONS
 from bench.target import AWS, EMBEDDED, Target, open_target
-from iort_contract import DEFAULT_NAMESPACE
+from iort_contract.limits import DEFAULT_NAMESPACE
 from iort_station.cloud import Cloud
 from iort_station.cost.prices import AS_OF, REGION
 from iort_station.errors import StationError

@@ -8,7 +8,7 @@ from math import ceil
 
 from bench.sections import dashboard, outage, query, round_trips, utilisation
 from iort_agent.rate_limiter import BYTES_PER_S
-from iort_contract import PING_PATHS
+from iort_contract.topics import PING_PATHS
 from iort_station.cloud import Cloud
 from iort_station.cost import line_items, model
 from iort_station.cost.line_items import Item

@@ -12,7 +12,7 @@ from typing import Any
 
 from botocore.exceptions import BotoCoreError, ClientError
 
-from iort_contract import DEFAULT_NAMESPACE
+from iort_contract.limits import DEFAULT_NAMESPACE
 from iort_station.cloud import Cloud
 from iort_station.errors import StationError
 from iort_station.fleet import robots

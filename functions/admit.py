@@ -19,7 +19,8 @@ import botocore.session
 from botocore.config import Config
 
 from functions.shared.metrics import emit
-from iort_contract import (
+from iort_contract.limits import ContractError
+from iort_contract.tables import (
     ADMIT_CLAIM,
     ADMIT_FINGERPRINT,
     ADMIT_UNTIL_S,
@@ -30,9 +31,8 @@ from iort_contract import (
     ROBOT_PARAMETER,
     SERIAL,
     SERIAL_PARAMETER,
-    ContractError,
-    check_robot,
 )
+from iort_contract.topics import check_robot
 
 _log = logging.getLogger(__name__)
 

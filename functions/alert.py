@@ -18,16 +18,9 @@ from typing import Any, TypeGuard
 import boto3
 
 from functions.shared.metrics import emit
-from iort_contract import (
-    ALERT_PREFIX,
-    FAULT_FIELD,
-    FAULTS,
-    RECEIVED_MS,
-    ROBOT,
-    TOPIC,
-    VOLTAGE_FIELD,
-    parse_topic,
-)
+from iort_contract.tables import ALERT_PREFIX, RECEIVED_MS, ROBOT, TOPIC
+from iort_contract.topics import parse_topic
+from iort_contract.vesc import FAULT_FIELD, FAULTS, VOLTAGE_FIELD
 
 QUIET_S = 900
 
@@ -113,7 +106,7 @@ def process(
 ) -> None:
     """Notify for each cause that is due. If ``notify`` raises, the notice is given back and the error raised.
 
-    Raises `iort_contract.ContractError` for a topic outside the contract.
+    Raises `ContractError` for a topic outside the contract.
     """
     topic = parse_topic(event[TOPIC])
     when = datetime.fromtimestamp(int(event[RECEIVED_MS]) / 1000, timezone.utc)

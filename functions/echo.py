@@ -10,17 +10,11 @@ from typing import Any
 import boto3
 
 from functions.shared.metrics import emit
-from iort_contract import (
-    LAMBDA,
-    PING_FIELDS,
-    PONG,
-    RECEIVED_MS,
-    TOPIC,
-    build_topic,
-    event_message,
-    json_object,
-    parse_topic,
-)
+from iort_contract.checks import json_object
+from iort_contract.messages.event import event_message
+from iort_contract.messages.live import PING_FIELDS
+from iort_contract.tables import RECEIVED_MS, TOPIC
+from iort_contract.topics import LAMBDA, PONG, build_topic, parse_topic
 
 
 def pong(event: Mapping[str, Any]) -> tuple[str, bytes]:

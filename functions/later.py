@@ -12,7 +12,7 @@ from typing import Any
 from functions.shared.processing import processed, stored_tables
 from functions.shared.share import waiting
 from functions.shared.tables import Tables
-from iort_contract import BATCH, TOPIC
+from iort_contract.tables import BATCH, TOPIC
 
 
 class LaterError(Exception):

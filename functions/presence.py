@@ -16,7 +16,8 @@ from typing import Any
 import boto3
 
 from functions.shared.metrics import emit
-from iort_contract import (
+from iort_contract.limits import ContractError
+from iort_contract.tables import (
     AGENT_VERSION,
     CERTIFICATE_ID,
     CONNECTED_MS,
@@ -26,9 +27,8 @@ from iort_contract import (
     ONLINE,
     ROBOT,
     SESSION_VERSION,
-    ContractError,
-    check_robot,
 )
+from iort_contract.topics import check_robot
 
 _log = logging.getLogger(__name__)
 

@@ -24,7 +24,9 @@ from botocore.exceptions import BotoCoreError, ClientError
 
 from functions.shared.metrics import emit
 from functions.shared.share import waiting
-from iort_contract import (
+from iort_contract.limits import ContractError
+from iort_contract.messages.event import event_message
+from iort_contract.tables import (
     BY_FUNCTION,
     BY_LATER,
     BY_RULE,
@@ -33,7 +35,6 @@ from iort_contract import (
     EXPIRES_S,
     FIRST_MS,
     ITEM_BASE64,
-    LANES,
     LAST_MS,
     NO_ROBOT,
     PAYLOAD,
@@ -43,10 +44,8 @@ from iort_contract import (
     SEEN,
     SOURCE,
     TOPIC,
-    ContractError,
-    as_subscribed,
-    event_message,
 )
+from iort_contract.topics import LANES, as_subscribed
 
 _log = logging.getLogger(__name__)
 _log.setLevel(logging.INFO)
@@ -70,7 +69,7 @@ class Entry:
 
     @property
     def robot(self) -> str:
-        """The robot in the topic; `iort_contract.NO_ROBOT` if the topic names no robot."""
+        """The robot in the topic; `NO_ROBOT` if the topic names no robot."""
         levels = self.topic.split("/")
         return levels[2] if len(levels) >= 3 and levels[0] in LANES and levels[2] else NO_ROBOT
 

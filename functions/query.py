@@ -23,23 +23,17 @@ import boto3
 from botocore.config import Config
 
 from functions.shared.tables import Tables
-from iort_contract import (
-    BATCH,
-    DERIVED_UNITS,
-    PLAIN_CODEC,
-    RECORD,
-    RESULTS_PREFIX,
-    TOPIC,
-    ContractError,
-    Value,
-    build_topic,
-    decode,
-    expression,
-    parse_topic,
-)
+from iort_contract import expression
+from iort_contract.cloud import RESULTS_PREFIX
+from iort_contract.codec.columns import PLAIN_CODEC
 from iort_contract.dynamodb import plain, with_samples_between
 from iort_contract.expression import ExpressionError, MismatchError, Node
+from iort_contract.limits import ContractError, Value
+from iort_contract.messages.batch import decode_batch
 from iort_contract.statistics import derive, without_absent
+from iort_contract.tables import BATCH, TOPIC
+from iort_contract.topics import RECORD, build_topic, parse_topic
+from iort_contract.vesc import DERIVED_UNITS
 
 # Lambda's synchronous answer holds 6 MB; the envelope around the samples takes some hundred bytes.
 MAX_INLINE_BYTES = 5_500_000
@@ -136,7 +130,7 @@ class Found:
         """Add the matching samples of a stored item."""
         request = self._request
         try:
-            batch = decode(item)
+            batch = decode_batch(item)
         except ContractError as error:
             self.refused += 1
             self.reason = self.reason or str(error)

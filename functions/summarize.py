@@ -15,7 +15,7 @@ from botocore.config import Config
 
 from functions.shared.processing import Bounds, processed, recompute, stored_tables
 from functions.shared.share import PutOff, Share, Told
-from iort_contract import RECOMPUTE_FROM_S, REPLAY
+from iort_contract.tables import RECOMPUTE_FROM_S, REPLAY
 
 
 # Most environments never put anything off, and need no client for it.

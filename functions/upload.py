@@ -16,23 +16,19 @@ from functions.shared.bucket import Bucket, parts_sha256
 from functions.shared.dead_letter import Refusals, refused_event
 from functions.shared.metrics import emit
 from functions.shared.upload_quota import Allotment
-from iort_contract import (
-    FILE,
-    PONG,
-    TOPIC,
-    ContractError,
+from iort_contract.checks import json_object
+from iort_contract.limits import ContractError
+from iort_contract.messages.event import event_message
+from iort_contract.messages.files import (
     FileAnswer,
     FileRequest,
-    Topic,
-    build_topic,
     decode_file_request,
     encode_file_answer,
-    event_message,
     file_key,
     file_request_id,
-    json_object,
-    parse_topic,
 )
+from iort_contract.tables import TOPIC
+from iort_contract.topics import FILE, PONG, Topic, build_topic, parse_topic
 
 _log = logging.getLogger(__name__)
 _log.setLevel(logging.INFO)

@@ -30,18 +30,10 @@ from typing import Any
 
 from typing_extensions import Self
 
-from iort_contract import (
-    DEFAULT_NAMESPACE,
-    FILE,
-    LAMBDA,
-    LIVE,
-    PING,
-    LiveSample,
-    build_topic,
-    encode_live,
-    encode_ping,
-    rule_event,
-)
+from iort_contract.limits import DEFAULT_NAMESPACE
+from iort_contract.messages.event import rule_event
+from iort_contract.messages.live import LiveSample, encode_live, encode_ping
+from iort_contract.topics import FILE, LAMBDA, LIVE, PING, build_topic
 from iort_station.cloud import EMBEDDED, Cloud, without_proxy
 from iort_station.page import keys
 from iort_station.page.keys import PubNubKeys

@@ -9,7 +9,8 @@ from typing import Any
 
 from rich.table import Table
 
-from iort_contract import BROKER, LAMBDA, PING_PATHS, RTT_FIELDS, RULE, Batch
+from iort_contract.messages.batch import Batch
+from iort_contract.topics import BROKER, LAMBDA, PING_PATHS, RTT_FIELDS, RULE
 
 # Round trips and the time from car to dashboard in ms, measured in 2018 between a car in Stockholm and AWS in
 # Dublin, with a network ping of 50 ms (KTH thesis of 2018, table 6.4).

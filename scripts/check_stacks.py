@@ -31,7 +31,7 @@ from aws_cdk import App, Validations
 from cdk_nag import AwsSolutionsChecks, ServerlessChecks
 
 from app import build
-from iort_contract import DEFAULT_NAMESPACE
+from iort_contract.limits import DEFAULT_NAMESPACE
 from stacks.acknowledged import Acknowledged, short
 from stacks.checks import broken
 from stacks.grants import unfit

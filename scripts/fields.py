@@ -9,7 +9,7 @@ from pathlib import Path
 ROOT = Path(__file__).resolve().parent.parent
 sys.path.insert(0, str(ROOT))
 
-from iort_contract import VESC_FIELDS
+from iort_contract.vesc import VESC_FIELDS
 
 _BLOCK = re.compile(r"(<!-- fields:.*?-->\n).*?(\n<!-- /fields -->)", re.DOTALL)
 

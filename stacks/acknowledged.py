@@ -13,7 +13,7 @@ from typing import Any
 from aws_cdk import Acknowledgment, App, CfnResource, Stack, Validations
 from constructs import IConstruct
 
-from iort_contract import SHADOW
+from iort_contract.topics import SHADOW
 from stacks.settings import Settings
 
 _NAG_PACKS = ("AwsSolutions", "Serverless")

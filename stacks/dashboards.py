@@ -12,7 +12,8 @@ from aws_cdk import Duration
 from aws_cdk import aws_cloudwatch as cloudwatch
 from constructs import Construct
 
-from iort_contract import METRICS, RULES, rule_name
+from iort_contract.cloud import METRICS
+from iort_contract.topics import RULES, rule_name
 from stacks import metrics
 from stacks.settings import Settings
 from stacks.watched import Watched

@@ -7,19 +7,9 @@ from typing import Any
 
 from aws_cdk import Stack
 
-from iort_contract import (
-    CMD,
-    FLEET,
-    LIVE,
-    PING,
-    RECORD,
-    ROBOT_PARAMETER,
-    SERIAL_PARAMETER,
-    SHADOW,
-    claim_name,
-    fleet_name,
-    rule_name,
-)
+from iort_contract.cloud import claim_name, fleet_name
+from iort_contract.tables import ROBOT_PARAMETER, SERIAL_PARAMETER
+from iort_contract.topics import CMD, FLEET, LIVE, PING, RECORD, SHADOW, rule_name
 
 # A robot's name is its thing name and its client id; the certificate is attached to the thing.
 _ME = "${iot:Connection.Thing.ThingName}"

@@ -12,7 +12,8 @@ from aws_cdk import aws_lambda as lambda_
 from aws_cdk import aws_lambda_destinations as destinations
 from constructs import Construct
 
-from iort_contract import PRESENCE, claim_name, fleet_name
+from iort_contract.cloud import claim_name, fleet_name
+from iort_contract.tables import PRESENCE
 from stacks import iot_core
 from stacks.documents import claim_policy, provisioning_template, robot_policy
 from stacks.function import function

@@ -10,7 +10,8 @@ from aws_cdk import aws_iot as iot
 from aws_cdk import aws_lambda as lambda_
 from constructs import Construct
 
-from iort_contract import PONG, RULE, pong_template, rule_name, rule_sql
+from iort_contract.cloud import pong_template, rule_sql
+from iort_contract.topics import PONG, RULE, rule_name
 from stacks import iot_core
 from stacks.fleet import Fleet
 from stacks.processing import Processing

@@ -16,19 +16,10 @@ from aws_cdk import aws_sns_subscriptions as subscriptions
 from aws_cdk import aws_sqs as sqs
 from constructs import Construct
 
-from iort_contract import (
-    ALERT_PREFIX,
-    FILE,
-    FILES_BYTES,
-    FILES_DAY,
-    FILES_PREFIX,
-    LAMBDA,
-    PONG,
-    RESULTS_PREFIX,
-    SHADOW,
-    STREAMS,
-    pubnub_parameter,
-)
+from iort_contract.cloud import RESULTS_PREFIX, pubnub_parameter
+from iort_contract.messages.files import FILES_PREFIX
+from iort_contract.tables import ALERT_PREFIX, FILES_BYTES, FILES_DAY, STREAMS
+from iort_contract.topics import FILE, LAMBDA, PONG, SHADOW
 from stacks.function import RUNTIME, function
 from stacks.quarantine import Quarantine
 from stacks.queue import queue

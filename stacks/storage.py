@@ -10,7 +10,9 @@ from aws_cdk import aws_iam as iam
 from aws_cdk import aws_s3 as s3
 from constructs import Construct
 
-from iort_contract import BATCH, ENTRY, EXPIRES_S, FILES_PREFIX, RESULTS_PREFIX, ROBOT, SECOND, T_US, TOPIC
+from iort_contract.cloud import RESULTS_PREFIX
+from iort_contract.messages.files import FILES_PREFIX
+from iort_contract.tables import BATCH, ENTRY, EXPIRES_S, ROBOT, SECOND, T_US, TOPIC
 from stacks.encryption import Encryption
 from stacks.settings import Settings
 

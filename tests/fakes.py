@@ -10,11 +10,14 @@ from typing import Any
 from boto3.dynamodb.types import TypeSerializer
 from botocore.exceptions import ClientError
 
-import iort_contract
 from functions.shared.tables import Tables
-from iort_contract import BATCH, EXPIRES_S, RECEIVED_MS, ROBOT, SECOND, TOPIC, Batch
 from iort_contract.checks import json_object
+from iort_contract.codec.seconds import flat_second
 from iort_contract.dynamodb import plain
+from iort_contract.messages.batch import Batch, encode_batch
+from iort_contract.tables import BATCH, EXPIRES_S, RECEIVED_MS, ROBOT, SECOND, TOPIC
+from iort_contract.topics import RECORD, build_topic
+from iort_contract.vesc import VESC_STREAM
 
 serialize = TypeSerializer().serialize
 
@@ -22,7 +25,7 @@ TELEMETRY, SUMMARY, ROBOTS, QUARANTINE = "telemetry", "summary", "robots", "quar
 # What Lambda 2 is given, as the arguments of Tables.
 NAMES = {"telemetry": TELEMETRY, "summary": SUMMARY, "robots": ROBOTS}
 KEYS = {TELEMETRY: (TOPIC, BATCH), SUMMARY: (TOPIC, SECOND), ROBOTS: (ROBOT,)}
-TOPIC_OF_CAR = iort_contract.build_topic(iort_contract.RECORD, "car", iort_contract.VESC_STREAM)
+TOPIC_OF_CAR = build_topic(RECORD, "car", VESC_STREAM)
 EXPIRES = 1_800_000_000
 
 
@@ -145,7 +148,7 @@ def tables(client: Any) -> Tables:
 
 def item_of(batch: Batch, topic: str = TOPIC_OF_CAR, expires_s: int = EXPIRES) -> dict[str, Any]:
     """The telemetry item that the record rule makes of a batch."""
-    return item_of_message(iort_contract.encode(batch), topic, expires_s)
+    return item_of_message(encode_batch(batch), topic, expires_s)
 
 
 def item_of_message(message: bytes, topic: str = TOPIC_OF_CAR, expires_s: int = EXPIRES) -> dict[str, Any]:
@@ -166,4 +169,4 @@ def record_of(item: dict[str, Any], number: int = 1, kind: str = "INSERT") -> di
 def summary_of(client: FakeDynamoDB, topic: str = TOPIC_OF_CAR) -> dict[int, dict[str, Any]]:
     """What the summary table holds of a topic, by second, with the flat names that everybody reads."""
     stored = client.items[SUMMARY].items()
-    return {int(key[1]): iort_contract.flat_second(plain(item)) for key, item in stored if key[0] == topic}
+    return {int(key[1]): flat_second(plain(item)) for key, item in stored if key[0] == topic}

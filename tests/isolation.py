@@ -9,7 +9,8 @@ from __future__ import annotations
 
 from typing import NamedTuple
 
-from iort_contract import (
+from iort_contract.cloud import claim_name, fleet_name
+from iort_contract.topics import (
     BROKER,
     CMD,
     FLEET,
@@ -22,8 +23,6 @@ from iort_contract import (
     RULES,
     SHADOW,
     build_topic,
-    claim_name,
-    fleet_name,
     live_topic,
     record_topic,
     rule_name,

@@ -11,9 +11,17 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
-import iort_contract
 from iort_agent.mqtt.uplink import Message
-from iort_contract import FILE, PING, PONG, Address, FileAnswer, FileRequest, build_topic
+from iort_contract.messages.files import (
+    Address,
+    FileAnswer,
+    FileRequest,
+    decode_file_request,
+    encode_file_answer,
+    file_key,
+    part_range,
+)
+from iort_contract.topics import FILE, PING, PONG, build_topic
 from local.certificates import Identity
 from tests.agent_fakes import Loopback
 
@@ -40,15 +48,15 @@ class Store:
         uplink.subscribe(build_topic(PING, robot, FILE), self._on_request)
 
     def _on_request(self, message: Message) -> None:
-        request = iort_contract.decode_file_request(message.payload)
+        request = decode_file_request(message.payload)
         self.requests.append(request)
         if self.silent:
             self.silent -= 1
             return
-        self._uplink.deliver(self._answers, iort_contract.encode_file_answer(self._answer(request)))
+        self._uplink.deliver(self._answers, encode_file_answer(self._answer(request)))
 
     def _answer(self, request: FileRequest) -> FileAnswer:
-        key = iort_contract.file_key(self.robot, request.file)
+        key = file_key(self.robot, request.file)
         if self.refusals:
             refused, again_s = self.refusals.pop(0)
             return FileAnswer(request.id, refused=refused, again_s=again_s)
@@ -68,7 +76,7 @@ class Store:
 
     @staticmethod
     def _size(request: FileRequest, part: int) -> int:
-        return iort_contract.part_range(request.file, part)[1]
+        return part_range(request.file, part)[1]
 
     def put(self, part: int, content: bytes) -> int:
         """Take a part, if it is what was announced; the HTTP status."""

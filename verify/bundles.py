@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from bench.target import Target
-from iort_contract import PING, PONG, RECORD, build_topic, record_topic
+from iort_contract.topics import PING, PONG, RECORD, build_topic, record_topic
 from iort_station.errors import StationError
 from iort_station.fleet import robots
 from iort_station.fleet.robots import Bundle

@@ -11,7 +11,7 @@ from typing import Any
 
 from botocore.exceptions import BotoCoreError, ClientError
 
-from iort_contract import ROBOT
+from iort_contract.tables import ROBOT
 from iort_station.cloud import Cloud
 from iort_station.errors import StationError
 from iort_station.fleet import claims, files, robots

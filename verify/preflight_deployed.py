@@ -8,7 +8,8 @@ from typing import Any, NamedTuple
 
 from botocore.exceptions import ClientError
 
-from iort_contract import RULES, claim_name, fleet_name, rule_name
+from iort_contract.cloud import claim_name, fleet_name
+from iort_contract.topics import RULES, rule_name
 from stacks.settings import PROD, Settings
 from stacks.storage import OLD_TELEMETRY
 from verify.preflight_finding import Clients, Found, code, fine, item, stops, warning

@@ -14,7 +14,8 @@ from awscrt import mqtt5
 from awsiot import mqtt5_client_builder
 from typing_extensions import Self
 
-from iort_contract import LIVE, LiveSample, encode_live
+from iort_contract.messages.live import LiveSample, encode_live
+from iort_contract.topics import LIVE
 from verify.errors import VerifyError
 from verify.waiting import until
 

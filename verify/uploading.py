@@ -14,19 +14,16 @@ from urllib.parse import urlsplit
 
 from bench.target import Target
 from iort_agent.files.http import trusting
-from iort_contract import (
-    FILE,
-    PING,
-    PONG,
+from iort_contract.messages.files import (
     Address,
     File,
     FileAnswer,
     FileRequest,
-    build_topic,
     decode_file_answer,
     encode_file_request,
     file_key,
 )
+from iort_contract.topics import FILE, PING, PONG, build_topic
 from verify.robot import Robot
 
 _CODE = re.compile(r"<Code>([^<]+)</Code>")

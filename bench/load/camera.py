@@ -6,12 +6,12 @@ import base64
 import io
 import math
 
-import iort_contract
+from iort_contract.limits import Value
 
 _WIDTH, _HEIGHT, _HORIZON = 96, 54, 20
 
 
-def attachment(robot: str, driven_m: float, yaw_rate_rad_s: float) -> dict[str, iort_contract.Value]:
+def attachment(robot: str, driven_m: float, yaw_rate_rad_s: float) -> dict[str, Value]:
     """A sample of a camera topic with ``large: upload``; the key has the form of the agent's keys."""
     content = _jpeg(driven_m, yaw_rate_rad_s)
     return {

@@ -16,9 +16,13 @@ import time
 from collections.abc import Mapping
 from typing import Any
 
-import iort_contract
 from bench.load import camera
 from iort_agent.sources.vehicle import Vehicle, VehicleConfig
+from iort_contract.cloud import channel
+from iort_contract.limits import Value
+from iort_contract.messages.live import LiveSample, live_update
+from iort_contract.tables import ROBOT
+from iort_contract.vesc import VESC_STREAM
 
 RATE_HZ = 10.0
 # Length of a simulation step; with larger ones the driver swerves.
@@ -46,7 +50,7 @@ class SimulatedCar:
         for _ in range(round(dt / _STEP_S)):
             self._vehicle.step(_STEP_S)
         sample = {**self._vehicle.sample(), "fault_code": self.fault_code}
-        updates = [self._update(iort_contract.VESC_STREAM, sample)]
+        updates = [self._update(VESC_STREAM, sample)]
         if self.senses:
             updates += self._sense(float(sample["speed"] or 0) / self._gain, dt)
         return updates
@@ -62,13 +66,13 @@ class SimulatedCar:
         self._x_m, self._y_m, self._heading = x_m, y_m, heading
         longitudinal = (speed_mps - self._speed_mps) / dt
         self._speed_mps = speed_mps
-        pose: dict[str, iort_contract.Value] = {
+        pose: dict[str, Value] = {
             "pose.pose.position.x": round(x_m, 3),
             "pose.pose.position.y": round(y_m, 3),
             "twist.twist.linear.x": round(speed_mps, 3),
             "child_frame_id": "base_link",
         }
-        acceleration: dict[str, iort_contract.Value] = {
+        acceleration: dict[str, Value] = {
             "linear_acceleration.x": round(longitudinal, 3),
             "linear_acceleration.y": round(speed_mps * yaw_rate, 3),
             "angular_velocity.z": round(yaw_rate, 3),
@@ -80,15 +84,13 @@ class SimulatedCar:
             self._update("camera", picture),
         ]
 
-    def _update(self, stream: str, sample: Mapping[str, iort_contract.Value]) -> dict[str, Any]:
+    def _update(self, stream: str, sample: Mapping[str, Value]) -> dict[str, Any]:
         seq = self._seqs[stream] = self._seqs.get(stream, -1) + 1
         now_us = time.time_ns() // 1000
         sent_us = now_us - int(_SENT_MS * 1000)
-        live = iort_contract.LiveSample(self._boot, seq, sent_us - 2_000, sent_us, dict(sample), 0, 0)
+        live = LiveSample(self._boot, seq, sent_us - 2_000, sent_us, dict(sample), 0, 0)
         received_ms = int(now_us / 1000 - _RECEIVED_MS)
-        return iort_contract.live_update(
-            self.name, stream, live, received_ms, now_us - int(_LAMBDA_MS * 1000)
-        )
+        return live_update(self.name, stream, live, received_ms, now_us - int(_LAMBDA_MS * 1000))
 
 
 class Publisher:
@@ -100,7 +102,7 @@ class Publisher:
 
     def publish(self, update: Mapping[str, Any]) -> None:
         """Publish on the robot's channel."""
-        path = f"{self._path}/{iort_contract.channel(update[iort_contract.ROBOT])}/0"
+        path = f"{self._path}/{channel(update[ROBOT])}/0"
         self._connection.request("POST", path, json.dumps(update), {"Content-Type": "application/json"})
         answer = self._connection.getresponse()
         answer.read()

@@ -21,7 +21,10 @@ from awscrt import mqtt5
 from awsiot import mqtt5_client_builder
 
 from iort_agent.sources.vehicle import Vehicle, VehicleConfig
-from iort_contract import VESC_STREAM, Batch, Value, encode, record_topic
+from iort_contract.limits import Value
+from iort_contract.messages.batch import Batch, encode_batch
+from iort_contract.topics import record_topic
+from iort_contract.vesc import VESC_STREAM
 
 Columns = dict[str, list[Value]]
 SAMPLES = 50
@@ -109,7 +112,7 @@ class Robot:
         first_us = self._first_us + seq * SAMPLES * _STEP_US
         times = range(first_us, first_us + SAMPLES * _STEP_US, _STEP_US)
         batch = Batch(self._boot, seq, times, self._columns[seq % len(self._columns)])
-        payload = encode(batch)
+        payload = encode_batch(batch)
         self.sent_ms.append(time.time_ns() // 1_000_000)
         self._publish(seq, payload, time.monotonic())
 

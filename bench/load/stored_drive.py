@@ -11,17 +11,11 @@ from boto3.dynamodb.types import TypeSerializer
 
 from bench.target import Target
 from iort_agent.sources.vehicle import Vehicle, VehicleConfig
-from iort_contract import (
-    EXPIRES_S,
-    RECEIVED_MS,
-    RECORD,
-    TOPIC,
-    VESC_STREAM,
-    Batch,
-    Value,
-    build_topic,
-    encode,
-)
+from iort_contract.limits import Value
+from iort_contract.messages.batch import Batch, encode_batch
+from iort_contract.tables import EXPIRES_S, RECEIVED_MS, TOPIC
+from iort_contract.topics import RECORD, build_topic
+from iort_contract.vesc import VESC_STREAM
 
 RATE_HZ = 50
 _KEPT_S = 86_400
@@ -49,7 +43,7 @@ def store(target: Target, robot: str, samples: Sequence[Sample]) -> list[dict[st
     for seq, at in enumerate(range(0, len(samples), RATE_HZ)):
         second = samples[at : at + RATE_HZ]
         columns = {name: [sample[name] for _, sample in second] for name in second[0][1]}
-        item = json.loads(encode(Batch("0badcafe", seq, [t_us for t_us, _ in second], columns)))
+        item = json.loads(encode_batch(Batch("0badcafe", seq, [t_us for t_us, _ in second], columns)))
         item |= {TOPIC: topic, RECEIVED_MS: second[-1][0] // 1000, EXPIRES_S: expires_s}
         items.append({name: serialize(value) for name, value in item.items()})
         client.put_item(TableName=table, Item=items[-1])

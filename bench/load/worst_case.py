@@ -20,19 +20,11 @@ from typing import NamedTuple
 from rich.console import Console
 from rich.table import Table
 
-from iort_contract import (
-    BATCH,
-    CODEC,
-    DICTIONARY,
-    MAX_BATCH_VALUES,
-    PLAIN_CODEC,
-    Batch,
-    BatchId,
-    ContractError,
-    decode,
-    encode,
-)
+from iort_contract.codec.columns import CODEC, DICTIONARY, PLAIN_CODEC
+from iort_contract.limits import MAX_BATCH_VALUES, ContractError
+from iort_contract.messages.batch import Batch, BatchId, decode_batch, encode_batch
 from iort_contract.statistics import summarize_second
+from iort_contract.tables import BATCH
 
 _BOOT, _T_US = "0badcafe", 1_700_000_000_000_000
 _TIMES = 5
@@ -86,7 +78,7 @@ def cases() -> Iterator[Case]:
     n = 434
     columns = {f"f{i}": [round(chance.gauss(10, 3), 3) for _ in range(n)] for i in range(46)}
     batch = Batch(_BOOT, 0, range(_T_US, _T_US + 1000 * n, 1000), columns)
-    yield Case(f"the agent's own largest: {n} samples of 46 fields", encode(batch))
+    yield Case(f"the agent's own largest: {n} samples of 46 fields", encode_batch(batch))
 
 
 def measure(message: bytes) -> Cost:
@@ -95,7 +87,7 @@ def measure(message: bytes) -> Cost:
     for _ in range(_TIMES):
         began = time.process_time()
         try:
-            batch = decode(message)
+            batch = decode_batch(message)
             summarize_second(batch.t_us // 1_000_000, [batch], None)
         except ContractError as error:
             refused = str(error)
@@ -106,7 +98,7 @@ def measure(message: bytes) -> Cost:
 def _held_mb(message: bytes) -> float:
     tracemalloc.start()
     try:
-        batch = decode(message)
+        batch = decode_batch(message)
         held, _ = tracemalloc.get_traced_memory()
         del batch
     finally:
@@ -122,7 +114,7 @@ def _columns(n: int, columns: list[bytes]) -> bytes:
 def _message(codec: str, n: int, body: bytes) -> bytes:
     deflater = zlib.compressobj(9, zdict=DICTIONARY if codec == CODEC else b"")
     samples = base64.b64encode(deflater.compress(body) + deflater.flush()).decode()
-    head = json.loads(encode(Batch(_BOOT, 0, [_T_US], {})))
+    head = json.loads(encode_batch(Batch(_BOOT, 0, [_T_US], {})))
     return json.dumps({**head, "n": n, "codec": codec, "samples": samples}).encode()
 
 

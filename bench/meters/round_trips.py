@@ -18,7 +18,9 @@ from iort_agent.lanes.pings import Pings
 from iort_agent.mqtt.aws import IotCore
 from iort_agent.mqtt.dispatch import Dispatcher
 from iort_agent.rate_limiter import Allowance
-from iort_contract import BROKER, PING, PONG, RTT_FIELDS, Value, build_topic, encode_ping
+from iort_contract.limits import Value
+from iort_contract.messages.live import encode_ping
+from iort_contract.topics import BROKER, PING, PONG, RTT_FIELDS, build_topic
 from iort_station.fleet.robots import Bundle
 
 RAW = "raw client"

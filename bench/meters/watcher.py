@@ -13,7 +13,7 @@ from awsiot import mqtt5_client_builder
 
 from bench.errors import BenchError
 from iort_agent.mqtt.uplink import matches
-from iort_contract import decode_live
+from iort_contract.messages.live import decode_live
 
 NAME = "bench-watcher"
 _WAIT_S = 20.0

@@ -16,19 +16,10 @@ from bench.errors import BenchError
 from bench.floors.raw_mqtt import RawClient
 from bench.target import Target
 from bench.temporary_function import temporary_function
-from iort_contract import (
-    LIVE,
-    PING,
-    PONG,
-    VESC_STREAM,
-    Batch,
-    LiveSample,
-    build_topic,
-    encode,
-    encode_live,
-    encode_ping,
-    record_topic,
-)
+from iort_contract.messages.batch import Batch, encode_batch
+from iort_contract.messages.live import LiveSample, encode_live, encode_ping
+from iort_contract.topics import LIVE, PING, PONG, build_topic, record_topic
+from iort_contract.vesc import VESC_STREAM
 from iort_station.operations import delivery
 
 WAIT_S = 30.0
@@ -112,7 +103,7 @@ class ProbeFixture:
         ]
         with self.client(0) as client:
             for batch in batches:
-                client.publish(record_topic(self.a, VESC_STREAM, self.namespace), encode(batch))
+                client.publish(record_topic(self.a, VESC_STREAM, self.namespace), encode_batch(batch))
             client.ping()
             until(lambda: sum(b.boot == boot for b in self.stored()) == 3, "the rule to store the batches")
         return batches

@@ -10,7 +10,7 @@ from datetime import datetime, timedelta, timezone
 from typing import Any
 
 from bench.probes.probe_fixture import WAIT_S, AbilityMissingError, ProbeFixture, equal, until
-from iort_contract import LAMBDA
+from iort_contract.topics import LAMBDA
 
 LISTENERS = 4
 

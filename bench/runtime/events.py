@@ -10,30 +10,13 @@ from typing import Any
 
 from boto3.dynamodb.types import TypeSerializer
 
-from iort_contract import (
-    BATCH,
-    FILE,
-    LAMBDA,
-    LIVE,
-    PING,
-    PUT_OFF,
-    RECEIVED_MS,
-    RECORD,
-    ROBOT_PARAMETER,
-    SERIAL_PARAMETER,
-    TOPIC,
-    VESC_STREAM,
-    Batch,
-    File,
-    FileRequest,
-    LiveSample,
-    build_topic,
-    encode,
-    encode_file_request,
-    encode_live,
-    encode_ping,
-    rule_event,
-)
+from iort_contract.messages.batch import Batch, encode_batch
+from iort_contract.messages.event import rule_event
+from iort_contract.messages.files import File, FileRequest, encode_file_request
+from iort_contract.messages.live import LiveSample, encode_live, encode_ping
+from iort_contract.tables import BATCH, PUT_OFF, RECEIVED_MS, ROBOT_PARAMETER, SERIAL_PARAMETER, TOPIC
+from iort_contract.topics import FILE, LAMBDA, LIVE, PING, RECORD, build_topic
+from iort_contract.vesc import VESC_STREAM
 
 ROBOT = "car"
 
@@ -92,7 +75,7 @@ def _record(now_us: int) -> dict[str, Any]:
     times = [now_us + i * 20_000 for i in range(50)]
     batch = Batch("aaaaaaaa", 0, times, {"speed": [1.5] * 50, "voltage_input": [9.5] * 50})
     item = {
-        **json.loads(encode(batch)),
+        **json.loads(encode_batch(batch)),
         TOPIC: build_topic(RECORD, ROBOT, VESC_STREAM),
         RECEIVED_MS: now_us // 1000,
     }

@@ -32,7 +32,8 @@ from bench.report.result import NOT_MEASURED, Plot, Ratio, Section, Table
 from bench.ros.graph import PACKAGES, SYSTEM_PYTHON, Publisher, RosGraph, python_with_rospy
 from bench.ros.mixed_robot import NODES, topics
 from bench.target import Say, Target
-from iort_contract import LIVE, RECORD, decode, parse_topic
+from iort_contract.messages.batch import decode_batch
+from iort_contract.topics import LIVE, RECORD, parse_topic
 
 SECONDS = 30
 RECORDER, AGENT, FLOOR = "rosbag record", "agent", "bare rospy subscriber"
@@ -207,7 +208,7 @@ def count(result: Found, heard: list[tuple[float, str, bytes]], ended: float) ->
         if topic.lane != RECORD:
             continue
         result.stream_bytes[topic.name] += len(payload)
-        batch = decode(payload)
+        batch = decode_batch(payload)
         if (topic.name, batch.boot, batch.seq) in numbers:
             continue
         numbers.add((topic.name, batch.boot, batch.seq))

@@ -19,7 +19,7 @@ from bench.report.spread import ratio, spread
 from bench.sections import thesis_ping
 from bench.target import Say, Target
 from iort_agent.rate_limiter import BYTES_PER_S
-from iort_contract import BROKER, LAMBDA, PING_PATHS, RULE
+from iort_contract.topics import BROKER, LAMBDA, PING_PATHS, RULE
 from local.figures import THESIS
 
 SIZES = {"0.5 KB": 512, "5 KB": 5 * 1024, "50 KB": 50 * 1024, "127 KB": 127 * 1024 - 200}

@@ -19,7 +19,8 @@ import operator
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any, NamedTuple, TypeAlias
 
-from iort_contract import ContractError, Value, check_field
+from iort_contract.checks import check_field
+from iort_contract.limits import ContractError, Value
 
 MAX_LENGTH = 1000
 # Deeper than practical expressions, and well below the interpreter's own limit.

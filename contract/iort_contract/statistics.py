@@ -10,21 +10,11 @@ from operator import sub
 from statistics import mean, median
 from typing import TypeGuard
 
-from iort_contract import (
-    ABSENT,
-    ABSENT_FROM,
-    BATCHES,
-    GAPS,
-    MISSING_BATCHES,
-    NONFINITE,
-    SAMPLES,
-    Batch,
-    BatchId,
-    Statistics,
-    Value,
-    absent,
-    packed_second,
-)
+from iort_contract.codec.seconds import Statistics, packed_second
+from iort_contract.limits import Value
+from iort_contract.messages.batch import Batch, BatchId
+from iort_contract.tables import ABSENT, BATCHES, GAPS, MISSING_BATCHES, NONFINITE, SAMPLES
+from iort_contract.vesc import ABSENT_FROM, absent
 
 # A step this many times the median is a gap: one lost sample makes 2; the jitter of a loaded Jetson reached
 # 2.5 on a recorded drive at 50 Hz.

@@ -16,14 +16,15 @@ from iort_agent.lanes.clock_offset import ClockOffset
 from iort_agent.mqtt.uplink import Uplink
 from iort_agent.schema import flag, number, setting
 from iort_agent.spool.memory import Spool
-from iort_contract import AGENT_FIELDS, Value
+from iort_contract.limits import Value
+from iort_contract.vesc import AGENT_FIELDS
 
 _STATM = Path("/proc/self/statm")
 
 
 @dataclass(frozen=True)
 class MetricsConfig:
-    """The agent's own figures, a sample every ``every_s`` of the stream `iort_contract.AGENT_STREAM`."""
+    """The agent's own figures, a sample every ``every_s`` of the stream `AGENT_STREAM`."""
 
     enabled: bool = setting(flag(), default=True)
     every_s: float = setting(number(1, 3600, unit="s"), 10.0)

@@ -7,7 +7,6 @@ import threading
 from dataclasses import dataclass
 from typing import Callable, Sequence
 
-import iort_contract
 from iort_agent.account import Accounts
 from iort_agent.clock import Clock
 from iort_agent.config.file import Config
@@ -27,6 +26,7 @@ from iort_agent.sources import Emit
 from iort_agent.sources.run import SourceRun
 from iort_agent.spool.memory import Spool
 from iort_agent.streams import Streams
+from iort_contract.topics import AGENT_STREAM, OWN_STREAMS
 
 _log = logging.getLogger(__name__)
 
@@ -148,11 +148,9 @@ class Runtime:
         """Record a sample of the agent's own stream."""
         parts = self.parts
         samples = sum(
-            counts.samples
-            for name, counts in parts.streams.counts().items()
-            if name not in iort_contract.OWN_STREAMS
+            counts.samples for name, counts in parts.streams.counts().items() if name not in OWN_STREAMS
         )
-        parts.streams.record(iort_contract.AGENT_STREAM, parts.clock.now_us(), parts.metrics.sample(samples))
+        parts.streams.record(AGENT_STREAM, parts.clock.now_us(), parts.metrics.sample(samples))
 
     def _start_source(self, i: int, source: SourceRun) -> threading.Thread:
         emit: Emit = self.parts.streams.emit

@@ -15,8 +15,8 @@ from typing import Any, Callable, Mapping, NamedTuple, TypeVar
 
 import yaml
 
-import iort_contract
 from iort_agent.errors import ConfigError
+from iort_contract.limits import ContractError
 
 T = TypeVar("T")
 
@@ -110,7 +110,7 @@ def text(check: Callable[[str], str] | None = None) -> Rule:
             raise where.error(value, f"a text{quotes}")
         try:
             return check(value) if check else value
-        except iort_contract.ContractError as error:
+        except ContractError as error:
             raise where.problem(str(error)) from error
 
     return rule

@@ -5,14 +5,14 @@ from __future__ import annotations
 import threading
 from typing import Iterable, Mapping
 
-import iort_contract
 from iort_agent.clock import Clock
 from iort_agent.control.runtime_settings import Tuning
 from iort_agent.lanes.batch import Batcher, StreamCounts
 from iort_agent.lanes.batch_encoder import Packer
 from iort_agent.lanes.live import LiveLane
 from iort_agent.spool.memory import Spool
-from iort_contract import Value
+from iort_contract.limits import Value
+from iort_contract.topics import TYPES_STREAM, check_stream
 
 _MOST_TYPES = 1024
 
@@ -35,7 +35,7 @@ class Streams:
 
     def emit(self, stream: str, t_us: int, values: Mapping[str, Value]) -> None:
         """Take a sample for both lanes."""
-        if stream == iort_contract.TYPES_STREAM:
+        if stream == TYPES_STREAM:
             # The live lane shows no message types.
             self._keep_type(values)
             self.record(stream, t_us, values)
@@ -78,7 +78,7 @@ class Streams:
         with self._lock:
             types = list(self._types.values())
         for values in types:
-            self.record(iort_contract.TYPES_STREAM, self._clock.now_us(), values)
+            self.record(TYPES_STREAM, self._clock.now_us(), values)
 
     def known_fields(self) -> dict[str, Iterable[str]]:
         """The fields of each stream's first sample."""
@@ -108,7 +108,7 @@ class Streams:
     def _new_batcher(self, stream: str, values: Mapping[str, Value]) -> Batcher:
         with self._lock:
             if stream not in self._batchers:
-                iort_contract.check_stream(stream)
+                check_stream(stream)
                 self._fields.setdefault(stream, values.keys())
                 counts = self._counts[stream] = StreamCounts(first_seq=self._spool.next_seq(stream))
                 packer = Packer(stream=stream, boot=self._boot, spool=self._spool, counts=counts)

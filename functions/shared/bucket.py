@@ -9,7 +9,7 @@ from typing import Any, NamedTuple
 
 from botocore.exceptions import ClientError
 
-from iort_contract import UPLOAD_URL_S, Address, File, part_range
+from iort_contract.messages.files import UPLOAD_URL_S, Address, File, part_range
 
 
 class Part(NamedTuple):

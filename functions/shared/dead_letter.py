@@ -12,7 +12,7 @@ import boto3
 from botocore.config import Config
 from botocore.exceptions import BotoCoreError, ClientError
 
-from iort_contract import BATCH, ITEM_BASE64, REASON, TOPIC
+from iort_contract.tables import BATCH, ITEM_BASE64, REASON, TOPIC
 
 _log = logging.getLogger(__name__)
 # SendMessageBatch: at most ten messages, of 256 KiB together.

@@ -13,8 +13,10 @@ from typing import Any
 
 from functions.shared.dead_letter import Refused
 from functions.shared.share import REQUESTS_S, Change, Share, robot_of_change
-from iort_contract import RECEIVED_MS, Batch, BatchId, ContractError, decode_item
 from iort_contract.dynamodb import plain
+from iort_contract.limits import ContractError
+from iort_contract.messages.batch import Batch, BatchId, decode_item
+from iort_contract.tables import RECEIVED_MS
 
 _log = logging.getLogger(__name__)
 

@@ -6,17 +6,10 @@ from collections.abc import Iterable, Iterator, Mapping, Sequence
 from itertools import chain
 
 from functions.shared.metrics import MOST_VALUES
-from iort_contract import (
-    AGENT_STREAM,
-    FAULT_FIELD,
-    PING_PATHS,
-    RTT_FIELDS,
-    RTT_STREAM,
-    VOLTAGE_FIELD,
-    Batch,
-    absent,
-)
+from iort_contract.messages.batch import Batch
 from iort_contract.statistics import count_holes, numbers_of
+from iort_contract.topics import AGENT_STREAM, PING_PATHS, RTT_FIELDS, RTT_STREAM
+from iort_contract.vesc import FAULT_FIELD, VOLTAGE_FIELD, absent
 
 Measured = Mapping[str, float | list[float]]
 # The controllers' own temperatures; a driver that does not measure one leaves it at 0.

@@ -24,8 +24,10 @@ from functions.shared.seconds import Summaries, summarize_topic
 from functions.shared.share import REQUESTS_S, Change, OverShareError, Share, robot_of, robot_of_change
 from functions.shared.stored import SECOND_BATCHES
 from functions.shared.tables import Tables
-from iort_contract import RECOMPUTE_FROM_S, RECOMPUTED, REPLAY, Statistics, parse_topic
+from iort_contract.codec.seconds import Statistics
 from iort_contract.dynamodb import TableError
+from iort_contract.tables import RECOMPUTE_FROM_S, RECOMPUTED, REPLAY
+from iort_contract.topics import parse_topic
 
 # Topics to process in parallel; a client keeps ten connections.
 _AT_ONCE = 4

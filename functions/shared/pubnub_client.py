@@ -11,7 +11,7 @@ import boto3
 from pubnub.pnconfiguration import PNConfiguration
 from pubnub.pubnub import PubNub
 
-from iort_contract import MAX_PUBNUB_BYTES
+from iort_contract.limits import MAX_PUBNUB_BYTES
 
 # These loggers log request paths, which contain PubNub's keys.
 for _logger in ("httpx", "httpcore", "pubnub"):
@@ -42,7 +42,7 @@ class PubNubPublisher:
 
     @classmethod
     def from_parameter(cls, name: str) -> PubNubPublisher:
-        """Read the keys from Parameter Store; see `iort_contract.pubnub_parameter` for their form."""
+        """Read the keys from Parameter Store; see `pubnub_parameter` for their form."""
         answer = boto3.client("ssm").get_parameter(Name=name, WithDecryption=True)
         keys: dict[str, Any] = json.loads(answer["Parameter"]["Value"])
         return cls(

@@ -13,8 +13,12 @@ from dataclasses import dataclass, field
 
 from functions.shared.stored import Reader, Stored
 from functions.shared.tables import Tables
-from iort_contract import EXPIRES_S, MAX_BATCH_SPAN_US, Batch, BatchId, Statistics, parse_topic
+from iort_contract.codec.seconds import Statistics
+from iort_contract.limits import MAX_BATCH_SPAN_US
+from iort_contract.messages.batch import Batch, BatchId
 from iort_contract.statistics import summarize_second
+from iort_contract.tables import EXPIRES_S
+from iort_contract.topics import parse_topic
 
 _SECOND_US = 1_000_000
 # Seconds closer than this are read together, since a query costs as much as the batches between them. The

@@ -12,17 +12,9 @@ from typing import Any
 from botocore.exceptions import BotoCoreError, ClientError
 
 from functions.shared.allowances import Allowances
-from iort_contract import (
-    BATCH,
-    OVER_SHARE,
-    PUT_OFF,
-    PUT_OFF_LAST_MS,
-    PUT_OFF_SINCE_MS,
-    SHADOW,
-    TOPIC,
-    ContractError,
-    parse_topic,
-)
+from iort_contract.limits import ContractError
+from iort_contract.tables import BATCH, OVER_SHARE, PUT_OFF, PUT_OFF_LAST_MS, PUT_OFF_SINCE_MS, TOPIC
+from iort_contract.topics import SHADOW, parse_topic
 
 _log = logging.getLogger(__name__)
 # CPU seconds of a robot: per second, and as a burst. A normal car takes a hundredth.

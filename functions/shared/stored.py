@@ -8,18 +8,10 @@ from itertools import islice
 from typing import Any, NamedTuple
 
 from functions.shared.tables import Tables
-from iort_contract import (
-    BATCH,
-    EXPIRES_S,
-    MAX_BATCH_SPAN_US,
-    MAX_COLUMNS_BYTES,
-    Batch,
-    BatchId,
-    ContractError,
-    batch_id,
-    decode_item,
-)
+from iort_contract.limits import MAX_BATCH_SPAN_US, MAX_COLUMNS_BYTES, ContractError
+from iort_contract.messages.batch import Batch, BatchId, batch_id, decode_item
 from iort_contract.statistics import missing_before
+from iort_contract.tables import BATCH, EXPIRES_S
 
 _SECOND_US = 1_000_000
 # The clocks of a stream's publishers may differ by this much before batches count as missing.

@@ -7,7 +7,7 @@ from typing import Any
 
 from botocore.exceptions import ClientError
 
-from iort_contract import FILES_BYTES, FILES_DAY, ROBOT
+from iort_contract.tables import FILES_BYTES, FILES_DAY, ROBOT
 
 
 class Allotment:

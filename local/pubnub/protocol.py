@@ -8,7 +8,7 @@ from urllib.parse import unquote
 
 from aiohttp import web
 
-import iort_contract
+from iort_contract.limits import MAX_PUBNUB_BYTES
 from local.pubnub.history import Message
 
 
@@ -35,7 +35,7 @@ async def read(request: web.BaseRequest) -> str:
         if request.headers.get("Content-Encoding") == "gzip":
             # 47 accepts both headers: the Python SDK announces gzip and sends zlib.
             inflater = zlib.decompressobj(47)
-            body = inflater.decompress(body, iort_contract.MAX_PUBNUB_BYTES)
+            body = inflater.decompress(body, MAX_PUBNUB_BYTES)
             if inflater.unconsumed_tail:
                 raise Refusal(413, "Message Too Large")
             if not inflater.eof:

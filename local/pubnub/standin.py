@@ -19,7 +19,7 @@ from urllib.parse import quote, unquote
 
 from aiohttp import web
 
-import iort_contract
+from iort_contract.limits import MAX_PUBNUB_BYTES
 from local.pubnub.history import History, Message, Subscription
 from local.pubnub.protocol import Refusal, entry, preflight, read, refuse_constant, text
 
@@ -35,7 +35,7 @@ POLL_S = 280.0
 WRITE_S = 10.0
 MAX_POLLS = 1_000
 # Longer than any request of the SDKs, so that we can answer a message that is too large.
-MAX_LINE_BYTES = 4 * iort_contract.MAX_PUBNUB_BYTES
+MAX_LINE_BYTES = 4 * MAX_PUBNUB_BYTES
 
 # Features of PubNub that change the delivery. Ignoring them would give wrong answers.
 UNSUPPORTED = ("custom_message_type", "filter-expr", "meta", "norep")
@@ -202,7 +202,7 @@ class PubNubStandIn:
         if not channel or any(c in ",*/:\\" or c < " " for c in channel):
             raise Refusal(400, "Invalid Channel")
         # PubNub's own formula: channel and payload as in an URL, and 100 bytes.
-        if len(quote(channel + payload, safe="!~*'()")) + 100 > iort_contract.MAX_PUBNUB_BYTES:
+        if len(quote(channel + payload, safe="!~*'()")) + 100 > MAX_PUBNUB_BYTES:
             raise Refusal(413, "Message Too Large")
         try:
             json.loads(payload, parse_constant=refuse_constant)

@@ -19,7 +19,7 @@ import botocore.session
 from botocore.config import Config
 from botocore.exceptions import BotoCoreError, ClientError
 
-from iort_contract import DEFAULT_NAMESPACE
+from iort_contract.limits import DEFAULT_NAMESPACE
 from iort_station.errors import StationError
 
 # Where the embedded cloud of a checkout says how to reach it, below the checkout's folder.

@@ -9,8 +9,8 @@ from typing import Any
 
 from typing_extensions import Self
 
-import iort_contract
 from iort_agent.clock import SystemClock
+from iort_contract.topics import TYPES_STREAM
 
 
 class Running:
@@ -49,7 +49,7 @@ class Running:
 
     def _emit(self, stream: str, t_us: int, values: Any) -> None:
         with self._more:
-            if stream == iort_contract.TYPES_STREAM:
+            if stream == TYPES_STREAM:
                 self.said.append(values)
                 return
             self.samples.append((stream, t_us, values))

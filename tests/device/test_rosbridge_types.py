@@ -12,7 +12,7 @@ import pytest
 pytest.importorskip("aiohttp")
 pytest.importorskip("websocket")
 
-import iort_contract
+from iort_contract.messages.message_type import message_type
 from tests.device.running import Running, eventually
 from tests.device.test_rosbridge import CORE, VESC, config, state
 from tests.rosbridge_standin import RosbridgeStandin
@@ -53,7 +53,7 @@ def test_messages_go_the_way_of_ros_1_where_their_type_is_known(*, old: bool) ->
         {"speed": seq + 0.5, "fault_code": 0} for seq in range(3)
     ]
     assert {t_us for _, t_us, _ in running.samples} == {sec * 1_000_000 + 123_456}
-    kind = iort_contract.message_type(running.said[0])
+    kind = message_type(running.said[0])
     assert (kind.topic, kind.kind) == (CORE, VESC)
     if not old:
         # As genmsg of ROS computes it.

@@ -8,7 +8,6 @@ import threading
 
 import pytest
 
-import iort_contract
 from iort_agent.config.file import load_config
 from iort_agent.errors import UploadError
 from iort_agent.files.file import kind_of, read, wire_name
@@ -19,7 +18,15 @@ from iort_agent.mqtt.dispatch import Dispatcher
 from iort_agent.rate_limiter import Allowance
 from iort_agent.status.server import SOCKET, StatusServer
 from iort_agent.verbs.upload import upload_files
-from iort_contract import PART_BYTES
+from iort_contract.limits import SCHEMA_VERSION
+from iort_contract.messages.files import (
+    PART_BYTES,
+    Address,
+    decode_file_request,
+    encode_file_answer,
+    file_key,
+)
+from iort_contract.topics import FILE, PING, build_topic
 from tests.agent_fakes import Loopback, ManualClock
 from tests.store_standin import store
 
@@ -112,7 +119,7 @@ def test_a_file_is_hashed_whole_and_by_part(tmp_path, size):
     pieces = [content[i : i + PART_BYTES] for i in range(0, max(1, size), PART_BYTES)]
     assert list(local.parts) == [hashlib.sha256(piece).hexdigest() for piece in pieces]
     assert local.file.parts == len(local.parts)
-    assert iort_contract.file_key("car", local.file).endswith("/f.bag")
+    assert file_key("car", local.file).endswith("/f.bag")
 
 
 @pytest.mark.parametrize(
@@ -215,7 +222,7 @@ def test_nothing_is_sent_in_the_clear_or_to_whom_we_do_not_trust(rig, small):
     sender = Sender(trust=trusting(None), pace=Pace(rig.clock, 0))
     local = read(small.parent, small.relative_to(small.parent), stop=rig.stop)
     url = rig.store._url
-    address = iort_contract.Address(1, f"{url}/1", {"content-length": "11"})
+    address = Address(1, f"{url}/1", {"content-length": "11"})
     put = sender.put(address, local, 0, 11, rig.stop)
     assert put.outcome is Outcome.FAILED
     assert "CERTIFICATE_VERIFY_FAILED" in put.text
@@ -238,7 +245,7 @@ def test_nothing_is_sent_in_the_clear_or_to_whom_we_do_not_trust(rig, small):
 def test_an_address_that_is_none_is_a_file_that_is_not_uploaded(rig, small, url, headers):
     sender = Sender(trust=trusting(rig.certificate), pace=Pace(rig.clock, 0))
     local = read(small.parent, small.relative_to(small.parent), stop=rig.stop)
-    address = iort_contract.Address(1, url.replace("HOST", rig.store._url), headers)
+    address = Address(1, url.replace("HOST", rig.store._url), headers)
     with pytest.raises(UploadError, match=r"an address that is"):
         sender.put(address, local, 0, 11, rig.stop)
 
@@ -257,16 +264,14 @@ def test_an_answer_that_is_none_is_said_and_waited_past(rig, small, odd, caplog)
     answer, faults = rig.store._answer, [odd]
 
     def on_request(message):
-        request = iort_contract.decode_file_request(message.payload)
+        request = decode_file_request(message.payload)
         if faults:
-            said = (
-                f'{{"v": {iort_contract.SCHEMA_VERSION}, "id": "{request.id}", "key": "k", "stored": false, '
-            )
+            said = f'{{"v": {SCHEMA_VERSION}, "id": "{request.id}", "key": "k", "stored": false, '
             rig.uplink.deliver(rig.store._answers, (said + faults.pop() + "}").encode())
         else:
-            rig.uplink.deliver(rig.store._answers, iort_contract.encode_file_answer(answer(request)))
+            rig.uplink.deliver(rig.store._answers, encode_file_answer(answer(request)))
 
-    rig.uplink.subscribe(iort_contract.build_topic(iort_contract.PING, "car", iort_contract.FILE), on_request)
+    rig.uplink.subscribe(build_topic(PING, "car", FILE), on_request)
     assert rig.store.objects[rig.upload(small)] == b"driven well"
     assert "an answer about a file is not one" in caplog.text
 

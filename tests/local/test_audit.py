@@ -6,18 +6,10 @@ import json
 
 from typer.testing import CliRunner
 
-from iort_contract import (
-    ACCOUNT_STREAM,
-    BATCH,
-    RECORD,
-    TOPIC,
-    Batch,
-    batch_id,
-    build_topic,
-    encode,
-    record_topic,
-)
 from iort_contract.messages.account import SourceAccount, StreamAccount
+from iort_contract.messages.batch import Batch, batch_id, encode_batch
+from iort_contract.tables import BATCH, TOPIC
+from iort_contract.topics import ACCOUNT_STREAM, RECORD, build_topic, record_topic
 from iort_station.cli.main import app
 from iort_station.operations import audit
 from tests.local.conftest import run_agent, until
@@ -91,9 +83,9 @@ def test_what_the_agent_did_not_record_is_told_by_cause(embedded, bundle):
         for seq, samples in enumerate((told, [causes])):
             columns = {name: [sample[name] for sample in samples] for name in samples[0]}
             batch = Batch(boot, seq, [T0_US] * len(samples), columns)
-            assert robot.publish(record_topic(car.robot, ACCOUNT_STREAM), encode(batch)) == "SUCCESS"
+            assert robot.publish(record_topic(car.robot, ACCOUNT_STREAM), encode_batch(batch)) == "SUCCESS"
         scan = Batch(boot, 0, [T0_US + i for i in range(9)], {"i": list(range(9))})
-        assert robot.publish(record_topic(car.robot, "scan"), encode(scan)) == "SUCCESS"
+        assert robot.publish(record_topic(car.robot, "scan"), encode_batch(scan)) == "SUCCESS"
     until(lambda: list(audit.headers(embedded.cloud, car.robot, "scan")))
     done = _run(embedded, car.robot)
     assert done.exit_code == 1
@@ -111,7 +103,7 @@ def test_a_stream_that_only_lambda_2_has_seen_is_audited(embedded, bundle):
     with Robot(car.folder) as robot:
         robot.online()
         batch = Batch("0badcafe", 2, [T0_US], {"i": [1]})
-        assert robot.publish(record_topic(car.robot, "strangers"), encode(batch)) == "SUCCESS"
+        assert robot.publish(record_topic(car.robot, "strangers"), encode_batch(batch)) == "SUCCESS"
 
     def seen():
         return [

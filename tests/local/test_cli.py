@@ -8,7 +8,7 @@ import stat
 import pytest
 from typer.testing import CliRunner
 
-from iort_contract import File, file_key
+from iort_contract.messages.files import File, file_key
 from iort_station.cli.main import app
 from iort_station.cloud import Cloud
 from iort_station.cost.usage import Usage

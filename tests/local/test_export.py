@@ -13,8 +13,9 @@ from rosbags.highlevel import AnyReader
 from rosbags.rosbag1 import Writer
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
-from iort_contract import Batch, encode, record_topic
+from iort_contract.messages.batch import Batch, encode_batch
 from iort_contract.ros1.decode import HEADER
+from iort_contract.topics import record_topic
 from iort_station import data
 from iort_station.cloud import Cloud
 from iort_station.operations import delivery
@@ -166,7 +167,7 @@ def test_fields_that_come_later_are_exported_too(embedded: Any, bundle: Any, tmp
         for seq, columns in enumerate([*wide, {"y": [1.5]}]):
             times = [t_us + seq * 1_000_000 + i for i in range(len(next(iter(columns.values()))))]
             batch = Batch("0badcafe", seq, times, columns)
-            assert robot.publish(record_topic(car.robot, "s"), encode(batch)) == "SUCCESS"
+            assert robot.publish(record_topic(car.robot, "s"), encode_batch(batch)) == "SUCCESS"
     until(lambda: len(list(delivery.items(embedded.cloud, car.robot, "s"))) == batches + 1)
     path = tmp_path / "s.bag"
     done = iort("export", car.robot, "s", "--last", "all", "-o", str(path), embedded=embedded)

@@ -7,8 +7,9 @@ import time
 
 import pytest
 
-import iort_contract
-from iort_contract import Batch, LiveSample, build_topic, encode, encode_live, record_topic
+from iort_contract.messages.batch import Batch, encode_batch
+from iort_contract.messages.live import LiveSample, encode_live
+from iort_contract.topics import FILE, LIVE, PING, build_topic, record_topic
 from iort_station.operations import cloudwatch, cloudwatch_logs
 from tests.local.conftest import run_agent, until
 from verify.robot import Robot
@@ -53,13 +54,13 @@ def test_a_fault_reaches_a_human_and_the_dashboards(embedded, bundle, inbox):
     sample = {"fault_code": FAULT, "voltage_input": LOW_V, "temperature_pcb": 40.0}
     with Robot(bundle.folder) as robot:
         robot.online()
-        live = build_topic(iort_contract.LIVE, robot.name, "vesc")
+        live = build_topic(LIVE, robot.name, "vesc")
         for seq in range(5):
             message = encode_live(LiveSample("0" * 8, seq, now_us + seq, now_us + seq, sample))
             assert robot.publish(live, message) == "SUCCESS"
         columns = {name: [value] * 10 for name, value in sample.items()}
         drive = Batch("0" * 8, 0, [now_us + 20_000 * i for i in range(10)], columns)
-        assert robot.publish(record_topic(robot.name, "vesc"), encode(drive)) == "SUCCESS"
+        assert robot.publish(record_topic(robot.name, "vesc"), encode_batch(drive)) == "SUCCESS"
 
         # From the rule, with robot, code and time: once a cause, though five messages said so.
         def mails():
@@ -112,7 +113,7 @@ def test_a_fault_reaches_a_human_and_the_dashboards(embedded, bundle, inbox):
 def test_what_a_function_warns_of_stands_on_the_platforms_dashboard(embedded, bundle):
     bundle, name = bundle(), f"{embedded.namespace}-platform"
     with Robot(bundle.folder) as robot:
-        robot.publish(build_topic(iort_contract.PING, robot.name, iort_contract.FILE), b"[]")
+        robot.publish(build_topic(PING, robot.name, FILE), b"[]")
     widgets = cloudwatch.dashboard(embedded.cloud, name, minutes=30)["widgets"]
     (number,) = [widget["number"] for widget in widgets if widget["kind"] == "log"]
 

@@ -19,7 +19,8 @@ from pathlib import Path
 
 import pytest
 
-import iort_contract
+from iort_contract.limits import LIVE_MAX_AGE_MS
+from iort_contract.topics import AGENT_STREAM
 from iort_station.fleet import robots
 from iort_station.operations import audit, delivery
 from local.cloud import EmbeddedCloud
@@ -139,7 +140,7 @@ def test_live_lane_shows_now_while_the_backlog_drains(embedded, bundle, proxy, t
         agent.stop()
         driven = agent.report()["streams"]["vesc"]["samples"]
     # What was heard was new when it left the car, and nothing of the outage was shown.
-    oldest_us = 1000 * iort_contract.LIVE_MAX_AGE_MS
+    oldest_us = 1000 * LIVE_MAX_AGE_MS
     assert min(heard.hops["sent_us"] for heard in listener.heard) > passed_us
     assert max(heard.hops["sent_us"] - heard.t_us for heard in listener.heard) < oldest_us
     assert counted(embedded, car.robot) == list(range(driven))
@@ -191,7 +192,7 @@ def test_clock_set_back_an_hour(embedded, bundle, tmp_path):
     values = [int(v) for batch in sorted(batches, key=lambda b: b.seq) for v in batch.columns["speed"]]
     assert values == list(range(10 * RATE_HZ))
     # The clock was set indeed, and the car knew by how much.
-    own = delivery.batches(embedded.cloud, car.robot, iort_contract.AGENT_STREAM)
+    own = delivery.batches(embedded.cloud, car.robot, AGENT_STREAM)
     offsets_ms = [value for batch in own for value in batch.columns["clock_offset_ms"] if value is not None]
     assert max(offsets_ms) > 3_590_000, offsets_ms
     assert report["spool"]["left_samples"] == 0

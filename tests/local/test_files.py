@@ -26,21 +26,18 @@ from rosbags.rosbag1 import Reader
 from iort_agent.clock import SystemClock
 from iort_agent.files.file import read
 from iort_agent.files.http import Outcome, Pace, Sender, trusting
-from iort_contract import (
-    FILE,
+from iort_contract.messages.files import (
     FILES_PREFIX,
     PART_BYTES,
-    PING,
-    PONG,
     Address,
     File,
     FileAnswer,
     FileRequest,
-    build_topic,
     decode_file_answer,
     encode_file_request,
     file_key,
 )
+from iort_contract.topics import FILE, PING, PONG, build_topic
 from iort_station.fleet import files, robots
 from iort_station.operations import delivery
 from local.deployment import ROOT

@@ -12,7 +12,7 @@ from pathlib import Path
 import pytest
 from typer.testing import CliRunner
 
-from iort_contract import (
+from iort_contract.tables import (
     ADMITTED_CERTIFICATE,
     AGENT_VERSION,
     CERTIFICATE_ID,

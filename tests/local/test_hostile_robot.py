@@ -8,10 +8,12 @@ from pathlib import Path
 
 import pytest
 
-import iort_contract
 from bench.meters.usage import descendants
 from functions.shared.cut_off import BURST
-from iort_contract import FILE, LIVE, PING, VESC_STREAM, LiveSample, build_topic, record_topic
+from iort_contract.messages.files import decode_file_answer
+from iort_contract.messages.live import LiveSample, encode_live
+from iort_contract.topics import FILE, LIVE, PING, PONG, build_topic, record_topic
+from iort_contract.vesc import VESC_STREAM
 from iort_station.operations import quarantine
 from iort_station.page.listener import Listener
 from tests.local.conftest import until
@@ -58,7 +60,7 @@ def test_a_robot_refused_over_and_over_leaves_the_others_their_live_lane(embedde
             hostile.publish(topics[bad], b"no JSON %d" % n)
             if n % (BAD // GOOD) == 0:
                 sample = LiveSample("0badcafe", n, t_us, t_us, {"speed": n}, offset_us=0)
-                other.publish(topics[good], iort_contract.encode_live(sample))
+                other.publish(topics[good], encode_live(sample))
         until(lambda: len(listener.heard) == GOOD)
     assert sorted(heard.seq for heard in listener.heard) == list(range(0, BAD, BAD // GOOD))
     # A refusal ended none: there may be one more, since several run at once.
@@ -103,10 +105,10 @@ MALFORMED = [
 def test_a_malformed_request_with_an_id_is_answered(bundle, asked):
     car = bundle()
     with Robot(car.folder) as robot:
-        robot.online().subscribe(build_topic(iort_contract.PONG, car.robot, FILE))
+        robot.online().subscribe(build_topic(PONG, car.robot, FILE))
         robot.publish(build_topic(PING, car.robot, FILE), asked)
         _, answer = robot.next_message()
-    found = iort_contract.decode_file_answer(answer)
+    found = decode_file_answer(answer)
     assert (found.id, found.refused is not None) == ("0badcafe", True)
 
 

@@ -12,7 +12,8 @@ from typing import Any
 import pytest
 import yaml
 
-from iort_contract import ROBOT, claim_name
+from iort_contract.cloud import claim_name
+from iort_contract.tables import ROBOT
 from iort_station.fleet import claims, robots
 from iort_station.operations import delivery
 from local.cloud import ROOT

@@ -16,7 +16,7 @@ import pytest
 
 from functions.admit import SETTLED_MS
 from iort_agent.identity.certificate import parse_certificate
-from iort_contract import ADMIT_CLAIM, ADMITTED_CERTIFICATE, ADMITTED_MS, ROBOT, SERIAL
+from iort_contract.tables import ADMIT_CLAIM, ADMITTED_CERTIFICATE, ADMITTED_MS, ROBOT, SERIAL
 from iort_station.fleet import claims, registry
 from local.cloud import ROOT
 from tests.local.test_identity import certificates, command

@@ -12,7 +12,9 @@ from pathlib import Path
 import pytest
 from botocore.exceptions import ClientError
 
-from iort_contract import CMD, FLEET, MAX_MESSAGE_BYTES, PING, PONG, RULE, build_topic, encode_ping
+from iort_contract.limits import MAX_MESSAGE_BYTES
+from iort_contract.messages.live import encode_ping
+from iort_contract.topics import CMD, FLEET, PING, PONG, RULE, build_topic
 from iort_station.fleet import claims, robots
 from local.gaps.broker.message_size import AWS_MESSAGE_BYTES
 from tests.isolation import CLAIM, CONNECT, PUBLISH, RECEIVE, ROBOT, ROWS, SUBSCRIBE, A, B, Row

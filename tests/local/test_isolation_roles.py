@@ -15,7 +15,7 @@ import pytest
 from botocore.config import Config
 from botocore.exceptions import ClientError
 
-from iort_contract import pubnub_parameter
+from iort_contract.cloud import pubnub_parameter
 from tests import isolation
 from tests.stacks.roles import IOT, ROLES
 from tests.stacks.templates import name

@@ -14,8 +14,9 @@ from xmlrpc.server import SimpleXMLRPCServer
 
 import pytest
 
-import iort_contract
 from iort_agent.verbs.check import OK, Finding, _ros_master
+from iort_contract.topics import AGENT_STREAM
+from iort_contract.vesc import AGENT_FIELDS
 from iort_station.operations import delivery
 from local.cloud import ROOT
 from tests.local.conftest import until
@@ -126,7 +127,7 @@ def test_a_running_agent_tells_of_itself(embedded, bundle):
         finally:
             agent.terminate()
             assert agent.wait(120) == 0
-    assert samples.keys() == iort_contract.AGENT_FIELDS.keys()
+    assert samples.keys() == AGENT_FIELDS.keys()
     assert samples["connects"][-1] == 1
     assert 1 < samples["rss_mb"][-1] < 200
     assert not (car.folder / "agent.sock").exists()
@@ -140,5 +141,5 @@ def _state(config: Path) -> Any:
 
 
 def _own_samples(embedded: Any, robot: str) -> dict[str, Any] | None:
-    found = list(delivery.batches(embedded.cloud, robot, iort_contract.AGENT_STREAM))
+    found = list(delivery.batches(embedded.cloud, robot, AGENT_STREAM))
     return dict(found[-1].columns) if found else None

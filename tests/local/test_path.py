@@ -10,7 +10,11 @@ import time
 
 import pytest
 
-import iort_contract
+from iort_contract.limits import CLOCK_MAX_UNCERTAINTY_MS, LIVE_MAX_AGE_MS
+from iort_contract.messages.live import LiveSample, encode_live
+from iort_contract.tables import STATS
+from iort_contract.topics import LIVE, RECORD, RTT_STREAM, build_topic
+from iort_contract.vesc import VESC_FIELDS
 from iort_station import data
 from iort_station.operations import delivery
 from iort_station.page.listener import Listener
@@ -45,7 +49,7 @@ def test_simulated_drive_arrives_whole_on_both_lanes(embedded, bundle):
     found = delivery.delivery(embedded.cloud, car.robot, "vesc")
     assert (found.samples_stored, found.batches_missing) == (driven, 0)
     assert {heard.robot for heard in listener.heard} == {car.robot}
-    trips = round_trips(delivery.batches(embedded.cloud, car.robot, iort_contract.RTT_STREAM))
+    trips = round_trips(delivery.batches(embedded.cloud, car.robot, RTT_STREAM))
     assert all(spread.n >= 1 and spread.p50 is not None for spread in trips.values()), trips
 
 
@@ -63,7 +67,7 @@ def test_recorded_drive_arrives_whole_and_exact(embedded, bundle):
     with AnyReader([path]) as reader:
         connections = [c for c in reader.connections if c.topic == "/sensors/core"]
         sent = [reader.deserialize(raw, c.msgtype).state for c, _, raw in reader.messages(connections)]
-    for field in (name for name, f in iort_contract.VESC_FIELDS.items() if 1 in f.ros):
+    for field in (name for name, f in VESC_FIELDS.items() if 1 in f.ros):
         kept = [value for batch in stored for value in batch.columns[field]]
         assert kept == [getattr(state, field) for state in sent], field
     until(lambda: delivery.samples_summarized(embedded.cloud, car.robot, "vesc") == 2244)
@@ -73,7 +77,7 @@ def test_seconds_are_summarised_with_speed_in_mps(embedded, bundle):
     car = bundle(sources=[{"type": "sim", "stream": "vesc", "rate_hz": 20, "duration_s": 2}])
     run_agent(car)
     until(lambda: delivery.samples_summarized(embedded.cloud, car.robot, "vesc") == 40)
-    topic = iort_contract.build_topic(iort_contract.RECORD, car.robot, "vesc", embedded.namespace)
+    topic = build_topic(RECORD, car.robot, "vesc", embedded.namespace)
     items = embedded.cloud.client("dynamodb").query(
         TableName=embedded.cloud.output("storage", "SummaryTable"),
         KeyConditionExpression="topic = :topic",
@@ -83,14 +87,14 @@ def test_seconds_are_summarised_with_speed_in_mps(embedded, bundle):
     assert all(int(item["expires_s"]["N"]) > int(item["second"]["N"]) for item in items)
     assert all("L" in item["speed_mps"] for item in items), "a field's statistics are one list"
     found = data.query(embedded.cloud, car.robot, "vesc", summary=True).columns
-    for statistic in iort_contract.STATS:
+    for statistic in STATS:
         mps, erpm = found[f"speed_mps_{statistic}"], found[f"speed_{statistic}"]
         assert mps.tolist() == pytest.approx((erpm / 4614).tolist(), rel=1e-8, abs=1e-12), statistic
 
 
 def test_live_message_without_our_envelope_never_reaches_the_dashboard(embedded, bundle):
     car = bundle()
-    live = iort_contract.build_topic(iort_contract.LIVE, car.robot, "vesc", embedded.namespace)
+    live = build_topic(LIVE, car.robot, "vesc", embedded.namespace)
     seqs = itertools.count(7)
     with _listener(embedded, car.robot) as listener, Robot(car.folder) as robot:
         robot.online()
@@ -99,8 +103,8 @@ def test_live_message_without_our_envelope_never_reaches_the_dashboard(embedded,
         def shown() -> bool:
             # On a slow machine one may be stale before it is shown.
             now_us = time.time_ns() // 1000
-            good = iort_contract.LiveSample("0badcafe", next(seqs), now_us, now_us, {"speed": 3})
-            robot.publish(live, iort_contract.encode_live(good))
+            good = LiveSample("0badcafe", next(seqs), now_us, now_us, {"speed": 3})
+            robot.publish(live, encode_live(good))
             return bool(listener.heard)
 
         until(shown)
@@ -124,7 +128,7 @@ def test_messages_that_a_stalled_broker_held_up_are_not_shown(embedded, bundle):
         agent.report()
     # By what each hop stamped, on the one clock that all of them have here: nothing that Lambda 1 let
     # through was older than it may be, and of what was sent during the stall something was held back.
-    oldest_us = 1000 * (iort_contract.LIVE_MAX_AGE_MS + iort_contract.CLOCK_MAX_UNCERTAINTY_MS)
+    oldest_us = 1000 * (LIVE_MAX_AGE_MS + CLOCK_MAX_UNCERTAINTY_MS)
     told = [heard for heard in listener.heard if "offset_us" in heard.hops]
     assert [heard for heard in told if heard.hops["lambda_us"] - heard.t_us > oldest_us] == []
     before = max(heard.seq for heard in told if heard.hops["sent_us"] < stalled_us)

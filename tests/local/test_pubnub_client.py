@@ -12,8 +12,8 @@ from contextlib import contextmanager
 
 import pytest
 
-import iort_contract
 from functions.shared.pubnub_client import PublishError, PubNubPublisher
+from iort_contract.limits import MAX_PUBNUB_BYTES
 from local.pubnub.standin import PubNubStandIn
 
 KEYS = {"publish_key": "pub-c-ours", "subscribe_key": "sub-c-ours"}
@@ -88,10 +88,10 @@ def test_one_connection_is_kept(standin, publisher, monkeypatch):
 def test_a_message_too_large_is_refused_here_or_there(standin, publisher):
     one = publisher(standin.origin)
     with pytest.raises(PublishError, match="bytes after URL encoding"):
-        one.publish("iort.car", {"text": "x" * iort_contract.MAX_PUBNUB_BYTES})
+        one.publish("iort.car", {"text": "x" * MAX_PUBNUB_BYTES})
     assert standin.refused == 0
     # PubNub counts the channel and its own overhead too: what just passes here is refused there.
-    just = iort_contract.MAX_PUBNUB_BYTES - len("%7B%22text%22%3A%22%22%7D")
+    just = MAX_PUBNUB_BYTES - len("%7B%22text%22%3A%22%22%7D")
     with pytest.raises(PublishError, match="status 413"):
         one.publish("iort.car", {"text": "x" * just})
     one.publish("iort.car", {"text": "x" * (just - 200)})

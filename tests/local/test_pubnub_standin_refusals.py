@@ -11,7 +11,7 @@ import threading
 import pytest
 from pubnub.exceptions import PubNubException
 
-import iort_contract
+from iort_contract.limits import MAX_PUBNUB_BYTES
 from local.pubnub import standin as server
 from local.pubnub.standin import PubNubStandIn
 from tests.local.pubnub_sdk import WAIT_S, ask, poll, publish
@@ -67,7 +67,7 @@ def test_subscriber_that_does_not_read_is_cut_off(monkeypatch):
 @pytest.mark.parametrize("post", [False, True], ids=["GET", "POST"])
 def test_too_large(standin, client, post):
     pubnub = client(standin)
-    room = iort_contract.MAX_PUBNUB_BYTES - 100 - len("c") - 2 * len("%22")
+    room = MAX_PUBNUB_BYTES - 100 - len("c") - 2 * len("%22")
     assert publish(pubnub, "c", "x" * room, post=post).result.timetoken
     with pytest.raises(PubNubException) as caught:
         publish(pubnub, "c", "x" * (room + 1), post=post)

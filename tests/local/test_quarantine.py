@@ -9,8 +9,10 @@ import time
 import pytest
 from typer.testing import CliRunner
 
-import iort_contract
-from iort_contract import ENTRY, LIVE, VESC_STREAM, Batch, build_topic, record_topic
+from iort_contract.messages.batch import Batch, encode_batch
+from iort_contract.tables import BY_FUNCTION, BY_STREAM, ENTRY, SAMPLES
+from iort_contract.topics import FILE, LAMBDA, LIVE, PING, build_topic, record_topic, rule_name
+from iort_contract.vesc import VESC_STREAM
 from iort_station.cli.main import app
 from iort_station.cloud import EMBEDDED
 from iort_station.data.batches import summary_table, topic_of
@@ -53,7 +55,7 @@ def send(car, *messages, stream=VESC_STREAM, namespace="iort"):
 def batch(seq=0, **changes):
     """A batch of now as its message, with some of the envelope changed."""
     t_us = (int(time.time()) + seq) * 1_000_000
-    envelope = json.loads(iort_contract.encode(Batch(RUN, seq, [t_us], {"speed": [1.5]})))
+    envelope = json.loads(encode_batch(Batch(RUN, seq, [t_us], {"speed": [1.5]})))
     return json.dumps({**envelope, **changes}).encode()
 
 
@@ -102,7 +104,7 @@ def test_what_the_table_takes_and_lambda_2_cannot_is_kept(bundle, entry_of, chan
     message = batch(**changes)
     send(car, message, stream=stream)
     entry = entry_of(car.robot)
-    assert entry.source == iort_contract.BY_STREAM
+    assert entry.source == BY_STREAM
     assert reason in entry.reason
     kept = json.loads(entry.payload)
     for name, value in json.loads(message).items():
@@ -123,18 +125,18 @@ def test_a_live_message_that_no_robot_of_ours_sends_is_kept_byte_by_byte(bundle,
         robot.online().publish(build_topic(LIVE, car.robot, VESC_STREAM), message)
     entry = entry_of(car.robot)
     assert entry.payload == message
-    assert entry.source.startswith(f"{iort_contract.BY_FUNCTION} iort-processing-Live")
+    assert entry.source.startswith(f"{BY_FUNCTION} iort-processing-Live")
     assert entry.reason.startswith("Refused: ContractError: ")
 
 
-@pytest.mark.parametrize("path", [iort_contract.LAMBDA, iort_contract.FILE])
+@pytest.mark.parametrize("path", [LAMBDA, FILE])
 def test_a_ping_that_is_no_json_is_kept_byte_by_byte(bundle, entry_of, path):
     car = bundle()
     with Robot(car.folder) as robot:
-        robot.online().publish(build_topic(iort_contract.PING, car.robot, path), b"\xff\x00 no JSON")
+        robot.online().publish(build_topic(PING, car.robot, path), b"\xff\x00 no JSON")
     entry = entry_of(car.robot)
     assert entry.payload == b"\xff\x00 no JSON"
-    assert entry.source.startswith(f"{iort_contract.BY_FUNCTION} iort-processing-")
+    assert entry.source.startswith(f"{BY_FUNCTION} iort-processing-")
     assert "not JSON" in entry.reason
 
 
@@ -144,7 +146,7 @@ def test_a_ping_that_is_no_json_is_kept_byte_by_byte(bundle, entry_of, path):
 def rejected(embedded, robot, message):
     """What the record rule's error action sends when the table is throttled."""
     document = {
-        "ruleName": iort_contract.rule_name("record"),
+        "ruleName": rule_name("record"),
         "topic": f"dt/iort/{robot}/{VESC_STREAM}",
         "base64OriginalPayload": base64.b64encode(message).decode(),
         "failures": [{"failedAction": "DynamoDBv2Action", "errorMessage": "throttled"}],
@@ -262,4 +264,4 @@ def test_a_hail_of_nonsense_leaves_the_others_their_summaries(bundle, embedded):
     send(good, batch())
     table, topic = summary_table(cloud), topic_of(cloud, good.robot, VESC_STREAM)
     (second,) = until(lambda: next(table.pages(topic)).items)
-    assert second[iort_contract.SAMPLES] == {"N": "1"}
+    assert second[SAMPLES] == {"N": "1"}

@@ -12,7 +12,9 @@ import numpy as np
 import pytest
 from boto3.dynamodb.types import TypeSerializer
 
-from iort_contract import RESULTS_PREFIX, Batch, build_topic, encode
+from iort_contract.cloud import RESULTS_PREFIX
+from iort_contract.messages.batch import Batch, encode_batch
+from iort_contract.topics import build_topic
 from iort_station import data
 from local.cloud import EmbeddedCloud
 from local.deployment import ROOT
@@ -28,7 +30,7 @@ def store(embedded, robot, stream, batches):
     serialize = TypeSerializer().serialize
     table, client = embedded.cloud.output("storage", "TelemetryTable"), embedded.cloud.client("dynamodb")
     for batch in batches:
-        item = {**json.loads(encode(batch)), "topic": build_topic("dt", robot, stream)}
+        item = {**json.loads(encode_batch(batch)), "topic": build_topic("dt", robot, stream)}
         client.put_item(TableName=table, Item={name: serialize(value) for name, value in item.items()})
 
 

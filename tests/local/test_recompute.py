@@ -6,8 +6,8 @@ import time
 
 import pytest
 
-import iort_contract
-from iort_contract import Batch, record_topic
+from iort_contract.messages.batch import Batch, encode_batch
+from iort_contract.topics import record_topic
 from iort_station import data
 from iort_station.data import inventory
 from iort_station.fleet import registry
@@ -29,7 +29,7 @@ def drive(embedded, car, stream="vesc"):
             times = [start_us + i * 1_000_000 + k * 100_000 for k in range(10)]
             batch = Batch(RUN, i, times, {"speed": [1060.0 * i] * 10, "duty_cycle": [0.1 * i] * 10})
             topic = record_topic(car.robot, stream)
-            assert robot.publish(topic, iort_contract.encode(batch)) == "SUCCESS"
+            assert robot.publish(topic, encode_batch(batch)) == "SUCCESS"
     until(lambda: delivery.samples_summarized(embedded.cloud, car.robot, stream) == 10 * SECONDS)
     return start_us
 

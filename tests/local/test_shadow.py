@@ -10,7 +10,7 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
-from iort_contract import SHADOW
+from iort_contract.topics import SHADOW
 from iort_station.operations import delivery
 from local.cloud import ROOT
 from tests.local.conftest import until

@@ -8,9 +8,11 @@ import time
 
 import pytest
 
-import iort_contract
 from bench.load.worst_case import worst_batches
-from iort_contract import SECOND, VESC_STREAM, Batch, record_topic
+from iort_contract.messages.batch import Batch, encode_batch
+from iort_contract.tables import OVER_SHARE, SECOND
+from iort_contract.topics import record_topic
+from iort_contract.vesc import VESC_STREAM
 from iort_station.data.batches import summary_table, topic_of
 from iort_station.fleet import shadow
 from iort_station.operations import delivery
@@ -44,7 +46,7 @@ def test_dear_batches_of_one_robot_wait_and_those_of_the_others_do_not(
             if n % (count // GOOD) == 0:
                 seq = n // (count // GOOD)
                 batch = Batch("0badcafe", seq, [t_us + seq * S], {"speed": [seq]})
-                other.publish(topics[good], iort_contract.encode(batch))
+                other.publish(topics[good], encode_batch(batch))
             waiting.wait(max(0.0, began + (n + 1) / rate_hz - time.monotonic()))
     first = t_us // S
     expected = list(range(first, first + len(range(0, count, count // GOOD))))
@@ -54,7 +56,7 @@ def test_dear_batches_of_one_robot_wait_and_those_of_the_others_do_not(
     assert over.batches > 0
     assert shadow.over_share(embedded.cloud, good.robot) is None
     shown = json.loads(iort("robots", "show", bad.robot, "--json").stdout)
-    assert shown[iort_contract.OVER_SHARE]["batches"] >= over.batches
+    assert shown[OVER_SHARE]["batches"] >= over.batches
     stored = list(delivery.batches(embedded.cloud, bad.robot, VESC_STREAM))
     assert [batch.seq for batch in stored] == list(range(count))
     # It has stopped: what waited is summarised without anybody's doing.

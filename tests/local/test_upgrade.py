@@ -8,7 +8,9 @@ import time
 import pytest
 from boto3.dynamodb.types import TypeSerializer
 
-from iort_contract import EXPIRES_S, RECEIVED_MS, RECORD, TOPIC, Batch, build_topic, record_topic
+from iort_contract.messages.batch import Batch
+from iort_contract.tables import EXPIRES_S, RECEIVED_MS, TOPIC
+from iort_contract.topics import RECORD, build_topic, record_topic
 from iort_station import data
 from iort_station.operations import delivery, quarantine
 from tests.local.conftest import until

@@ -14,12 +14,12 @@ from typing import Any
 
 import pytest
 
-import iort_contract
 from iort_agent.clock import SystemClock
 from iort_agent.mqtt import aws, subscriptions
 from iort_agent.mqtt.aws import IotCore
 from iort_agent.mqtt.dispatch import Dispatcher
 from iort_agent.mqtt.reconnect import SLOW_SHORTEST_S
+from iort_contract.topics import BROKER, CMD, PING, build_topic
 from iort_station.fleet import robots
 from local.cloud import EmbeddedCloud
 from local.proxy import FREEZE, PASS, REFUSE, Proxy
@@ -39,7 +39,7 @@ class Told:
     def __init__(self, uplink: IotCore, robot: str) -> None:
         self.connections: list[bool] = []
         self.messages: list[bytes] = []
-        self.topic = iort_contract.build_topic(iort_contract.PING, robot, iort_contract.BROKER)
+        self.topic = build_topic(PING, robot, BROKER)
         self.uplink = uplink
         uplink.on_connection(self.connections.append)
         uplink.subscribe(self.topic, lambda message: self.messages.append(message.payload))
@@ -253,6 +253,6 @@ def test_a_subscription_made_while_connected(bundle, proxy):
     with connecting(car, proxy) as told:
         told.echo(b"before")
         heard: list[bytes] = []
-        topic = iort_contract.build_topic(iort_contract.CMD, car.robot, "drive")
+        topic = build_topic(CMD, car.robot, "drive")
         told.uplink.subscribe(topic, lambda message: heard.append(message.payload))
         until(lambda: told.uplink.subscribed(topic))

@@ -14,7 +14,7 @@ from dataclasses import replace
 import pytest
 
 from bench.target import AWS, EMBEDDED, Target
-from iort_contract import ROBOT
+from iort_contract.tables import ROBOT
 from iort_station.errors import StationError
 from iort_station.fleet import robots
 from iort_station.page import keys

@@ -8,7 +8,9 @@ import time
 import pytest
 
 from bench.target import EMBEDDED, Target
-from iort_contract import RECORD, TOPIC, fleet_name, rule_name
+from iort_contract.cloud import fleet_name
+from iort_contract.tables import TOPIC
+from iort_contract.topics import RECORD, rule_name
 from verify.check import Verdict, ask
 from verify.checks import broker, provisioning, rules
 

@@ -18,7 +18,7 @@ from pathlib import Path
 from iort_agent.clock import SystemClock
 from iort_agent.schema import Where, load
 from iort_agent.sources.ros1 import Ros1Config
-from iort_contract import RosMessage
+from iort_contract.ros1.message import RosMessage
 
 
 def say(line: str) -> None:

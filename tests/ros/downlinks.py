@@ -14,7 +14,6 @@ import sys
 import time
 from pathlib import Path
 
-import iort_contract
 from iort_agent.clock import SystemClock
 from iort_agent.control.config import DownlinkConfig, share_rule
 from iort_agent.control.downlink import make_downlink
@@ -24,6 +23,7 @@ from iort_agent.rate_limiter import Allowance
 from iort_agent.ros1.node import DEFAULT_NODE
 from iort_agent.ros1.publish import Ros1Graph
 from iort_agent.schema import Where, load
+from iort_contract.messages.commands import Command, FleetMessage, encode_command, encode_fleet
 from tests.agent_fakes import Loopback
 
 
@@ -71,15 +71,13 @@ for seq, line in zip(itertools.count(), sys.stdin):
         say("heard")
     elif verb == "pose":
         robot, _, message = rest.partition(" ")
-        fleet = iort_contract.FleetMessage("1badcafe", seq, clock.now_us(), json.loads(message))
-        uplink.deliver(f"fleet/iort/{robot}/pose", iort_contract.encode_fleet(fleet))
+        fleet = FleetMessage("1badcafe", seq, clock.now_us(), json.loads(message))
+        uplink.deliver(f"fleet/iort/{robot}/pose", encode_fleet(fleet))
     else:
         lease, _, message = rest.partition(" ")
         now_us = clock.now_us()
-        command = iort_contract.Command(
-            "feedbeef", started_us, seq, now_us, 60_000, json.loads(message), int(lease)
-        )
-        uplink.deliver("cmd/iort/car1/drive", iort_contract.encode_command(command))
+        command = Command("feedbeef", started_us, seq, now_us, 60_000, json.loads(message), int(lease))
+        uplink.deliver("cmd/iort/car1/drive", encode_command(command))
 downlink.halt()
 uplink.stop(1)
 downlink.close()

@@ -13,7 +13,8 @@ import pytest
 
 from iort_agent.clock import SystemClock
 from iort_agent.sources.recording.bag import BagConfig
-from iort_contract import MessageType, RosMessage, message_type
+from iort_contract.messages.message_type import MessageType, message_type
+from iort_contract.ros1.message import RosMessage
 from iort_station.recordings import recordings
 from tests.recordings import recording
 from tests.ros.conftest import Graph

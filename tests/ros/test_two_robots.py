@@ -11,7 +11,8 @@ from typing import Any
 
 import pytest
 
-import iort_contract
+from iort_contract.messages.commands import Command, encode_command
+from iort_contract.topics import CMD, build_topic
 from iort_station.fleet import robots
 from local.cloud import EmbeddedCloud
 from tests.local.conftest import bundle, embedded, iort  # noqa: F401 - fixtures
@@ -91,12 +92,10 @@ def test_two_robots_see_each_others_poses_and_take_commands(
     driver = graphs[0].run("listener.py", "driver", "/speed", "std_msgs/Float64")
     driver.until(lambda: "connected" in driver.lines, "connection")
     operator, started_us, seq = embedded.cloud.client("iot-data"), time.time_ns() // 1000, 0
-    topic = iort_contract.build_topic(iort_contract.CMD, cars[0].robot, "drive", embedded.namespace)
+    topic = build_topic(CMD, cars[0].robot, "drive", embedded.namespace)
     while 1.5 not in [m["data"] for m in messages(driver)]:
-        command = iort_contract.Command(
-            "feedbeef", started_us, seq, time.time_ns() // 1000, 60_000, {"data": 1.5}, 2000
-        )
-        operator.publish(topic=topic, qos=1, payload=iort_contract.encode_command(command))
+        command = Command("feedbeef", started_us, seq, time.time_ns() // 1000, 60_000, {"data": 1.5}, 2000)
+        operator.publish(topic=topic, qos=1, payload=encode_command(command))
         seq += 1
         assert seq < 1000, "\n".join(agents[0].errors)
         time.sleep(0.1)  # an operator's stick

@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
-import iort_contract
+from iort_contract.cloud import RESULTS_PREFIX
+from iort_contract.messages.files import FILES_PREFIX
+from iort_contract.tables import PRESENCE, STREAMS
+from iort_contract.topics import SHADOW
 from stacks.checks import EVERY_RESOURCE
 
 IOT = "arn:${AWS::Partition}:iot:${AWS::Region}:${AWS::AccountId}"
@@ -97,7 +100,7 @@ ROLES = {
             ("dynamodb:GetShardIterator", "Batches.StreamArn"),
             ("dynamodb:ListStreams", "*"),
             ("sqs:SendMessage", "PutOff.Arn"),
-            ("iot:UpdateThingShadow", f"{IOT}:thing/*/{iort_contract.SHADOW}"),
+            ("iot:UpdateThingShadow", f"{IOT}:thing/*/{SHADOW}"),
         }
         | DESTINATION,
     ),
@@ -140,17 +143,14 @@ ROLES = {
         {(action, "QueryLog.Arn") for action in LOG}
         | {("dynamodb:Query", "Batches.Arn"), ("dynamodb:Scan", "Batches.Arn")}
         | {("dynamodb:GetItem", "Robots.Arn")}
-        | {
-            (f"s3:{action}", f"Files.Arn/{iort_contract.RESULTS_PREFIX}*")
-            for action in ("GetObject", "PutObject")
-        },
+        | {(f"s3:{action}", f"Files.Arn/{RESULTS_PREFIX}*") for action in ("GetObject", "PutObject")},
     ),
     "UploadRole": (
         "lambda.amazonaws.com",
         {(action, "UploadLog.Arn") for action in LOG}
         | DESTINATION
         | {
-            (f"s3:{action}", f"Files.Arn/{iort_contract.FILES_PREFIX}*")
+            (f"s3:{action}", f"Files.Arn/{FILES_PREFIX}*")
             for action in ("AbortMultipartUpload", "ListMultipartUploadParts", "PutObject")
         }
         | {(f"s3:{action}", "Files.Arn") for action in ("ListBucket", "ListBucketMultipartUploads")}
@@ -192,8 +192,8 @@ ROLES = {
 # Of the functions that keep something in a robot's row: which attributes.
 KEEPS = {
     "AlertRole": ("alert_*",),
-    "PresenceRole": iort_contract.PRESENCE,
-    "LaterRole": (iort_contract.STREAMS,),
-    "SummarizeRole": (iort_contract.STREAMS,),
+    "PresenceRole": PRESENCE,
+    "LaterRole": (STREAMS,),
+    "SummarizeRole": (STREAMS,),
     "UploadRole": ("files_bytes", "files_day"),
 }

@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import re
 
-import iort_contract
+from iort_contract.cloud import LOW_VOLTAGE_V
+from iort_contract.limits import LIVE_MIN_RATE_HZ
+from iort_contract.topics import RULES
 from iort_station.cost.usage import Usage
 from stacks.settings import ROOT, Settings
 from tests.stacks.aws_metrics import AWS_METRICS
@@ -47,7 +49,7 @@ def test_the_cost_model_counts_every_alarm(synthesized, alarms):
     insights = [alarm["Metrics"][0]["Expression"] for alarm in alarms.values() if "Metrics" in alarm]
     assert Usage().alarms == len(alarms) - len(insights)
     of_lambda = 2 * len(synthesized.resources("AWS::Lambda::Function")) + 1
-    most = [len(iort_contract.RULES) if "AWS/IoT" in query else of_lambda for query in insights]
+    most = [len(RULES) if "AWS/IoT" in query else of_lambda for query in insights]
     assert Usage().insights_metrics == sum(most)
 
 
@@ -65,7 +67,7 @@ def test_the_thresholds_are_the_settings(production, synthesized):
         a["AlarmName"]: a["Threshold"] for a in synthesized.resources("AWS::CloudWatch::Alarm").values()
     }
     limits = Settings().thresholds
-    assert alarms["iort-BatteryVolts"] == limits.low_voltage_v == iort_contract.LOW_VOLTAGE_V
+    assert alarms["iort-BatteryVolts"] == limits.low_voltage_v == LOW_VOLTAGE_V
     assert alarms["iort-TemperatureDegC"] == limits.high_temperature_degc
     assert alarms["iort-CarToLambdaMs"] == limits.car_to_lambda_ms
     assert alarms["iort-SummarizeBehind"] == limits.stream_behind_s * 1000
@@ -75,7 +77,7 @@ def test_the_thresholds_are_the_settings(production, synthesized):
 
 def test_the_slowest_live_lane_can_set_its_alarms_off(alarms):
     """Three minutes one after the other with a message each are more than one in a hundred seconds has."""
-    every_s = 1 / iort_contract.LIVE_MIN_RATE_HZ
+    every_s = 1 / LIVE_MIN_RATE_HZ
     for name_ in ("PubNubFailed", "CarToLambdaMs"):
         alarm = alarms[name_]
         periods, needed = alarm["EvaluationPeriods"], alarm["DatapointsToAlarm"]

@@ -8,9 +8,11 @@ import re
 
 import pytest
 
-import iort_contract
 from functions.shared.health import measure
-from iort_contract import rule_name
+from iort_contract.cloud import METRIC_NAMESPACE, METRICS
+from iort_contract.limits import DEFAULT_NAMESPACE
+from iort_contract.messages.batch import Batch
+from iort_contract.topics import AGENT_STREAM, RTT_STREAM, RULES, rule_name
 from iort_station.cost.fixed_costs import (
     FREE_DASHBOARD_METRICS,
     FREE_DASHBOARDS,
@@ -107,8 +109,8 @@ def emitted():
             if isinstance(node, ast.Call) and ast.unparse(node.func) == "counted.add":
                 found.setdefault(path.stem, set()).update(keyword.arg for keyword in node.keywords)
     # These have their names computed.
-    batch = iort_contract.Batch("0" * 8, 0, [1], {"voltage_input": [12.0]})
-    for stream in ("vesc", iort_contract.RTT_STREAM, iort_contract.AGENT_STREAM):
+    batch = Batch("0" * 8, 0, [1], {"voltage_input": [12.0]})
+    for stream in ("vesc", RTT_STREAM, AGENT_STREAM):
         found["health"] |= measure(stream, [batch]).keys()
     return found
 
@@ -116,12 +118,12 @@ def emitted():
 def test_the_dashboards_show_what_the_functions_emit_and_nothing_else(shown):
     by_function = {}
     for namespace, metric, dimensions, options in shown:
-        if namespace == iort_contract.METRIC_NAMESPACE:
+        if namespace == METRIC_NAMESPACE:
             assert dimensions.keys() == {"Deployment", "Function"}
-            assert dimensions["Deployment"] == iort_contract.DEFAULT_NAMESPACE
+            assert dimensions["Deployment"] == DEFAULT_NAMESPACE
             by_function.setdefault(dimensions["Function"], set()).add(metric)
             assert options["stat"] == statistic(metric)
-    assert by_function == {function: set(names) for function, names in iort_contract.METRICS.items()}
+    assert by_function == {function: set(names) for function, names in METRICS.items()}
     assert emitted() == by_function
 
 
@@ -131,10 +133,10 @@ def test_the_dashboards_cover_every_service_of_the_path(shown):
         "AWS/DynamoDB",
         "AWS/Lambda",
         "AWS/SQS",
-        iort_contract.METRIC_NAMESPACE,
+        METRIC_NAMESPACE,
     }
     rules = {dimensions["RuleName"] for _, _, dimensions, _ in shown if "RuleName" in dimensions}
-    assert rules == {rule_name(rule) for rule in iort_contract.RULES}
+    assert rules == {rule_name(rule) for rule in RULES}
 
 
 def test_every_metric_of_aws_is_one_that_aws_has(shown, alarms):
@@ -144,7 +146,7 @@ def test_every_metric_of_aws_is_one_that_aws_has(shown, alarms):
         if "Metrics" not in a
     ]
     for namespace, metric, dimensions in [*(one[:3] for one in shown), *of_alarms]:
-        if namespace != iort_contract.METRIC_NAMESPACE:
+        if namespace != METRIC_NAMESPACE:
             assert metric in AWS_METRICS[(namespace, *sorted(dimensions))]
-        elif metric not in iort_contract.METRICS[dimensions["Function"]]:
+        elif metric not in METRICS[dimensions["Function"]]:
             raise AssertionError(f"nothing emits {metric}")

@@ -7,7 +7,8 @@ from typing import Any
 
 import pytest
 
-import iort_contract
+from iort_contract.cloud import claim_name, fleet_name
+from iort_contract.topics import FLEET
 from tests import isolation
 from tests.isolation import CLAIM, CONNECT, ROWS, SUBSCRIBE, A, Row
 from tests.policy import allows
@@ -45,7 +46,7 @@ def test_the_policies_say_what_the_table_says(policies, row):
             "iot:Connection.Thing.IsAttached": "true",
             "iot:ClientId": A,
         }
-    policy = iort_contract.claim_name() if row.who == CLAIM else iort_contract.fleet_name()
+    policy = claim_name() if row.who == CLAIM else fleet_name()
     arn = f"{ACCOUNT}:{kind}/{row.what}"
     assert allows(policies[policy], f"iot:{row.does}", arn, variables) == row.allowed
     # Of a certificate that is attached to no thing, and of another account's or region's topics: never.
@@ -56,7 +57,7 @@ def test_the_policies_say_what_the_table_says(policies, row):
 
 def _is_of_a_thing(row: Row) -> bool:
     """Every word to the fleet is heard by every robot; who is none cannot connect."""
-    return not row.what.startswith(f"{iort_contract.FLEET}/")
+    return not row.what.startswith(f"{FLEET}/")
 
 
 @pytest.mark.parametrize(

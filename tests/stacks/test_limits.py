@@ -9,7 +9,8 @@ from typing import Any
 
 import pytest
 
-import iort_contract
+from iort_contract.limits import ContractError
+from iort_contract.topics import check_namespace
 from stacks.variations import LONGEST_NAMESPACE, VARIATIONS
 from tests.stacks.cloudformation import has_schema, names, schema
 
@@ -126,9 +127,9 @@ def named(resource):
 
 
 def test_the_longest_namespace_is_the_contracts():
-    assert iort_contract.check_namespace(LONGEST_NAMESPACE) == LONGEST_NAMESPACE
-    with pytest.raises(iort_contract.ContractError):
-        iort_contract.check_namespace(f"{LONGEST_NAMESPACE}n")
+    assert check_namespace(LONGEST_NAMESPACE) == LONGEST_NAMESPACE
+    with pytest.raises(ContractError):
+        check_namespace(f"{LONGEST_NAMESPACE}n")
 
 
 def resource(kind, **properties):

@@ -6,7 +6,8 @@ import re
 
 from aws_cdk import Stack
 
-from iort_contract import (
+from iort_contract.cloud import claim_name
+from iort_contract.topics import (
     CMD,
     FILE,
     FLEET,
@@ -21,7 +22,6 @@ from iort_contract import (
     SHADOW,
     as_subscribed,
     build_topic,
-    claim_name,
     live_topic,
     record_topic,
     rule_name,

@@ -6,10 +6,10 @@ import fnmatch
 import json
 import re
 
-import iort_contract
 from functions.alert import Notices, causes
 from functions.presence import change
 from functions.shared.upload_quota import Allotment
+from iort_contract.tables import ADMISSION
 from stacks.checks import EVERY_RESOURCE
 from stacks.documents import provisioning_template
 from tests.stacks.roles import (
@@ -61,7 +61,7 @@ def test_provisioning_may_do_what_aws_managed_policy_says_but_for_what_has_a_rea
 
 def test_no_function_that_keeps_a_robots_row_can_open_its_name():
     for names in KEEPS.values():
-        for name in (*iort_contract.ADMISSION, "speed_to_erpm_gain", "vehicle"):
+        for name in (*ADMISSION, "speed_to_erpm_gain", "vehicle"):
             assert not any(fnmatch.fnmatchcase(name, pattern) for pattern in names), name
 
 

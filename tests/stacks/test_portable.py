@@ -10,7 +10,8 @@ from pathlib import Path
 
 import pytest
 
-from iort_contract import RULES, pong_template, rule_sql
+from iort_contract.cloud import pong_template, rule_sql
+from iort_contract.topics import RULES
 from stacks.portable import RULE_ACTIONS, SQL_FUNCTIONS, rule_problems, sql_functions
 from stacks.settings import ROOT
 

@@ -6,8 +6,10 @@ import json
 
 import pytest
 
-import iort_contract
-from iort_contract import RULES, pong_template, rule_name, rule_sql
+from iort_contract.cloud import RESULTS_PREFIX, pong_template, rule_sql
+from iort_contract.messages.files import FILES_PREFIX
+from iort_contract.tables import BATCH, ENTRY, EXPIRES_S, ROBOT, SECOND, TOPIC
+from iort_contract.topics import RULES, rule_name
 from iort_station.cost.model import RECORDS_A_CALL, WINDOW_S
 from tests.stacks.templates import name
 
@@ -92,11 +94,11 @@ def test_the_tables_keys_are_the_contracts(synthesized):
             (k["AttributeName"], k["KeyType"], types[k["AttributeName"]]) for k in tables[table]["KeySchema"]
         ]
 
-    assert keys("Batches") == [(iort_contract.TOPIC, "HASH", "S"), (iort_contract.BATCH, "RANGE", "S")]
-    assert keys("Summary") == [(iort_contract.TOPIC, "HASH", "S"), (iort_contract.SECOND, "RANGE", "N")]
-    assert keys("Robots") == [(iort_contract.ROBOT, "HASH", "S")]
-    assert keys("Quarantine") == [(iort_contract.ROBOT, "HASH", "S"), (iort_contract.ENTRY, "RANGE", "S")]
-    expires = {"AttributeName": iort_contract.EXPIRES_S, "Enabled": True}
+    assert keys("Batches") == [(TOPIC, "HASH", "S"), (BATCH, "RANGE", "S")]
+    assert keys("Summary") == [(TOPIC, "HASH", "S"), (SECOND, "RANGE", "N")]
+    assert keys("Robots") == [(ROBOT, "HASH", "S")]
+    assert keys("Quarantine") == [(ROBOT, "HASH", "S"), (ENTRY, "RANGE", "S")]
+    expires = {"AttributeName": EXPIRES_S, "Enabled": True}
     assert {t: v.get("TimeToLiveSpecification") for t, v in tables.items()} == {
         "Batches": expires,
         "Summary": expires,
@@ -242,11 +244,11 @@ def test_the_files_bucket_is_private_encrypted_and_cleans_up_after_itself(synthe
     assert rules["abandoned"]["AbortIncompleteMultipartUpload"] == {"DaysAfterInitiation": 7}
     assert "Prefix" not in rules["abandoned"]
     assert (rules["results"]["Prefix"], rules["results"]["ExpirationInDays"]) == (
-        iort_contract.RESULTS_PREFIX,
+        RESULTS_PREFIX,
         1,
     )
     # Without a setting, what robots have uploaded is kept for good.
-    assert rules["rare"]["Prefix"] == iort_contract.FILES_PREFIX
+    assert rules["rare"]["Prefix"] == FILES_PREFIX
     assert "ExpirationInDays" not in rules["rare"]
     (policy,) = synthesized.resources("AWS::S3::BucketPolicy").values()
     statements = policy["PolicyDocument"]["Statement"]

@@ -8,16 +8,20 @@ import re
 import pytest
 from aws_cdk import Stack
 
-import iort_contract
-from iort_contract import (
+from iort_contract.cloud import claim_name, fleet_name
+from iort_contract.topics import (
     BROKER,
     CMD,
+    FILE,
     FLEET,
     LIVE,
     PING,
+    PING_PATHS,
     PONG,
+    RECORD,
     RULES,
     build_topic,
+    check_namespace,
     live_topic,
     record_topic,
     rule_name,
@@ -76,13 +80,13 @@ def iot_policies(synthesized, reader):
 
 @pytest.fixture(scope="module")
 def robot_policy(iot_policies):
-    return iot_policies[iort_contract.fleet_name()]
+    return iot_policies[fleet_name()]
 
 
 def test_the_iot_policies_statement_by_statement(iot_policies):
     assert iot_policies == {
-        iort_contract.fleet_name(): ROBOT_POLICY,
-        iort_contract.claim_name(): CLAIM_POLICY,
+        fleet_name(): ROBOT_POLICY,
+        claim_name(): CLAIM_POLICY,
     }
 
 
@@ -91,7 +95,7 @@ def test_the_policies_fit_whatever_the_namespace_and_the_region():
     stack, longest = Stack(), "n" * 16
     real = {"AWS::Partition": "aws-us-gov", "AWS::Region": "ap-southeast-2", "AWS::AccountId": "0" * 12}
     for policy in (robots_policy, claim_policy):
-        text = json.dumps(stack.resolve(policy(stack, namespace=iort_contract.check_namespace(longest))))
+        text = json.dumps(stack.resolve(policy(stack, namespace=check_namespace(longest))))
         joined = json.dumps(_joined(json.loads(text), real), separators=(",", ":"))
         assert longest in joined
         assert len(joined) <= 2048
@@ -141,7 +145,7 @@ def test_a_robot_may_publish_what_the_agent_builds_and_only_under_its_own_name(r
         live_topic("car", "vesc"),
         build_topic(LIVE, "car", "vesc"),
         build_topic(FLEET, "car", "pose"),
-        *(build_topic(PING, "car", path) for path in (*iort_contract.PING_PATHS, iort_contract.FILE)),
+        *(build_topic(PING, "car", path) for path in (*PING_PATHS, FILE)),
     ]
     for topic in own:
         assert allows(robot_policy, "Publish", "topic", topic), topic
@@ -156,7 +160,7 @@ def test_a_robot_may_not_publish_what_is_for_others_to_say(robot_policy):
         build_topic(CMD, "car", "stop"),
         build_topic(PONG, "car", "rule"),
         # The record lane costs messaging unless it is sent by Basic Ingest.
-        build_topic(iort_contract.RECORD, "car", "vesc"),
+        build_topic(RECORD, "car", "vesc"),
         "$aws/things/car/shadow/update",
         "$aws/things/car/shadow/name/other/update",
         "$aws/things/car2/shadow/name/agent/update",

@@ -14,21 +14,26 @@ from pathlib import Path
 import pytest
 from aws_cdk import App, Stack
 
-import iort_contract
-from iort_contract import (
+from iort_contract.cloud import pubnub_parameter
+from iort_contract.limits import DEFAULT_NAMESPACE
+from iort_contract.topics import (
     BROKER,
+    CMD,
     FILE,
+    FLEET,
     LAMBDA,
     LIVE,
     PING,
     PONG,
     RECORD,
     RULE,
+    SHADOW,
     build_topic,
     live_topic,
     record_topic,
     rule_name,
 )
+from iort_contract.vesc import VESC_FIELDS, VESC_STREAM
 from stacks.encryption import Encryption
 from stacks.function import function
 from stacks.settings import ROOT, Settings, SettingsError
@@ -207,16 +212,14 @@ def test_what_the_variables_say_is_what_the_functions_expect(functions, reader, 
 
     live = functions["Live"]["Environment"]["Variables"]
     monkeypatch.setenv("LIVE_FIELDS", live["LIVE_FIELDS"])
-    assert LiveSettings.from_environment().fields == {
-        iort_contract.VESC_STREAM: frozenset(iort_contract.VESC_FIELDS)
-    }
-    assert live["PUBNUB_PARAMETER"] == iort_contract.pubnub_parameter()
+    assert LiveSettings.from_environment().fields == {VESC_STREAM: frozenset(VESC_FIELDS)}
+    assert live["PUBNUB_PARAMETER"] == pubnub_parameter()
     assert reader.text(live["REJECTED_QUEUE"]) == "Rejected"
-    assert live["NAMESPACE"] == iort_contract.DEFAULT_NAMESPACE
+    assert live["NAMESPACE"] == DEFAULT_NAMESPACE
 
     def given(function):
         variables = functions[function]["Environment"]["Variables"]
-        assert variables["NAMESPACE"] == iort_contract.DEFAULT_NAMESPACE
+        assert variables["NAMESPACE"] == DEFAULT_NAMESPACE
         return {key: reader.text(value) for key, value in variables.items() if key != "NAMESPACE"}
 
     assert given("Later") == {
@@ -301,13 +304,13 @@ def test_every_topic_of_the_agent_meets_exactly_the_rule_that_it_is_for(filters)
         build_topic(PONG, "car", RULE): set(),
         build_topic(PONG, "car", LAMBDA): set(),
         build_topic(PONG, "car", FILE): set(),
-        build_topic(iort_contract.FLEET, "car", "pose"): set(),
-        build_topic(iort_contract.CMD, "car", "stop"): set(),
+        build_topic(FLEET, "car", "pose"): set(),
+        build_topic(CMD, "car", "stop"): set(),
         build_topic(LIVE, "car", "vesc", "lab2"): set(),
         "$aws/events/presence/connected/car": {"iort_presence"},
         "$aws/events/presence/disconnected/car": {"iort_presence"},
-        f"$aws/things/car/shadow/name/{iort_contract.SHADOW}/update/accepted": {"iort_version"},
-        f"$aws/things/car/shadow/name/{iort_contract.SHADOW}/update/documents": set(),
+        f"$aws/things/car/shadow/name/{SHADOW}/update/accepted": {"iort_version"},
+        f"$aws/things/car/shadow/name/{SHADOW}/update/documents": set(),
         "$aws/things/car/shadow/update/accepted": set(),
     }
     for one, rules in expected.items():

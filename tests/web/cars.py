@@ -7,7 +7,10 @@ import json
 import time
 from typing import TYPE_CHECKING, Any
 
-import iort_contract
+from iort_contract.cloud import channel as pubnub_channel
+from iort_contract.limits import Value
+from iort_contract.messages.live import LiveSample, live_update
+from iort_contract.vesc import VESC_STREAM
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
@@ -16,7 +19,7 @@ if TYPE_CHECKING:
 
 PUBLISH_KEY, SUBSCRIBE_KEY = "pub-local", "sub-local"
 GAIN = 4614.0
-SAMPLE: dict[str, iort_contract.Value] = {
+SAMPLE: dict[str, Value] = {
     "voltage_input": 11.65,
     "temperature_pcb": 29.9,
     "current_motor": 3.96,
@@ -36,17 +39,17 @@ class Car:
     def __init__(self, pubnub: PubNubStandIn, name: str = "car-1", boot: str = "0a1b2c3d") -> None:
         self.pubnub, self.name, self.boot, self.seq = pubnub, name, boot, 0
 
-    def update(self, sample: Mapping[str, iort_contract.Value] = SAMPLE, **change: Any) -> dict[str, Any]:
+    def update(self, sample: Mapping[str, Value] = SAMPLE, **change: Any) -> dict[str, Any]:
         now_us = time.time_ns() // 1000
-        live = iort_contract.LiveSample(self.boot, self.seq, now_us - 12_000, now_us - 10_000, dict(sample))
+        live = LiveSample(self.boot, self.seq, now_us - 12_000, now_us - 10_000, dict(sample))
         self.seq += 1
-        stream = change.pop("stream", iort_contract.VESC_STREAM)
+        stream = change.pop("stream", VESC_STREAM)
         return {
-            **iort_contract.live_update(self.name, stream, live, now_us // 1000 - 6, now_us - 2_000),
+            **live_update(self.name, stream, live, now_us // 1000 - 6, now_us - 2_000),
             **change,
         }
 
-    def send(self, sample: Mapping[str, iort_contract.Value] = SAMPLE, **change: Any) -> dict[str, Any]:
+    def send(self, sample: Mapping[str, Value] = SAMPLE, **change: Any) -> dict[str, Any]:
         update = self.update(sample, **change)
         self.publish(update)
         return update
@@ -54,7 +57,7 @@ class Car:
     def publish(self, message: Any, channel: str | None = None) -> None:
         host, port = self.pubnub.origin.split(":")
         connection = http.client.HTTPConnection(host, int(port), timeout=60)
-        path = f"/publish/{PUBLISH_KEY}/{SUBSCRIBE_KEY}/0/{channel or iort_contract.channel(self.name)}/0"
+        path = f"/publish/{PUBLISH_KEY}/{SUBSCRIBE_KEY}/0/{channel or pubnub_channel(self.name)}/0"
         connection.request("POST", path, json.dumps(message), {"Content-Type": "application/json"})
         assert connection.getresponse().status == 200
         connection.close()

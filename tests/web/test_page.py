@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any, Literal
 
 import pytest
 
-import iort_contract
+from iort_contract.limits import Value
 from iort_station.page.server import PageServer
 from local.pubnub.standin import PubNubStandIn
 from tests.browser import drawn, plain, show, shown, until
@@ -75,7 +75,7 @@ def test_every_newer_message_is_shown(page: Page, car: Car) -> None:
 
 
 def test_any_field_of_any_stream_is_shown(page: Page, car: Car) -> None:
-    sample: dict[str, iort_contract.Value] = {
+    sample: dict[str, Value] = {
         "pose.x": -1.25,
         "armed": True,
         "frame": "map",

@@ -13,7 +13,7 @@ from urllib.parse import urlsplit
 
 import pytest
 
-import iort_contract
+from iort_contract.vesc import DERIVED_UNITS, FAULTS, VESC_FIELDS
 from iort_station.errors import StationError
 from iort_station.page.page import BUILT, config, field_table
 from iort_station.page.server import PageServer
@@ -124,9 +124,9 @@ def test_the_page_reads_the_contracts_fields(built: Path) -> None:
     with PageServer(**TOLD, built=built) as page:
         table = json.loads(ask(page, "/fields.json")[1])
     assert table == field_table()
-    assert table["fields"].keys() >= iort_contract.VESC_FIELDS.keys() | iort_contract.DERIVED_UNITS.keys()
+    assert table["fields"].keys() >= VESC_FIELDS.keys() | DERIVED_UNITS.keys()
     assert table["fields"]["speed"]["unit"] == "erpm"
-    assert table["faults"]["5"] == iort_contract.FAULTS[5]
+    assert table["faults"]["5"] == FAULTS[5]
 
 
 @pytest.mark.parametrize(

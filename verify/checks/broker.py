@@ -7,7 +7,7 @@ import time
 from typing import Any
 
 from bench.target import Target
-from iort_contract import CMD, FLEET, build_topic
+from iort_contract.topics import CMD, FLEET, build_topic
 from verify.assumption import Basis
 from verify.bundles import pair_of, registered
 from verify.check import Check

@@ -7,7 +7,17 @@ from typing import Any
 from botocore.exceptions import ClientError
 
 from bench.target import Target
-from iort_contract import ADMISSION, BATCH, ENVELOPE, EXPIRES_S, PRESENCE, RECEIVED_MS, ROBOT, STREAMS, TOPIC
+from iort_contract.tables import (
+    ADMISSION,
+    BATCH,
+    ENVELOPE,
+    EXPIRES_S,
+    PRESENCE,
+    RECEIVED_MS,
+    ROBOT,
+    STREAMS,
+    TOPIC,
+)
 from verify.assumption import Basis
 from verify.check import Check
 from verify.errors import VerifyError

@@ -10,7 +10,7 @@ from typing import Any
 
 from bench.target import Target
 from bench.temporary_function import temporary_function
-from iort_contract import FILES_PREFIX, PART_BYTES, File, part_range
+from iort_contract.messages.files import FILES_PREFIX, PART_BYTES, File, part_range
 from verify.assumption import Basis
 from verify.check import Check
 from verify.uploading import asking, sent, trust

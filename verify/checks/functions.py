@@ -8,7 +8,9 @@ from typing import Any
 
 from bench.target import Target
 from bench.temporary_function import temporary_function
-from iort_contract import BY_FUNCTION, LAMBDA, PING, TOPIC, build_topic, rule_event
+from iort_contract.messages.event import rule_event
+from iort_contract.tables import BY_FUNCTION, TOPIC
+from iort_contract.topics import LAMBDA, PING, build_topic
 from iort_station.operations import quarantine
 from verify.assumption import Basis
 from verify.check import Check

@@ -10,15 +10,10 @@ from typing import Any
 from bench.meters.invocations import configure
 from bench.target import Target
 from bench.temporary_function import temporary_function
-from iort_contract import (
-    METRIC_DEPLOYMENT,
-    METRIC_FUNCTION,
-    METRIC_NAMESPACE,
-    VESC_STREAM,
-    Batch,
-    encode,
-    record_topic,
-)
+from iort_contract.cloud import METRIC_DEPLOYMENT, METRIC_FUNCTION, METRIC_NAMESPACE
+from iort_contract.messages.batch import Batch, encode_batch
+from iort_contract.topics import record_topic
+from iort_contract.vesc import VESC_STREAM
 from verify.assumption import Basis
 from verify.check import Check
 from verify.errors import VerifyError
@@ -70,7 +65,7 @@ def _metric(target: Target) -> dict[str, Any]:
     with Robot(bundle.folder) as robot:
         robot.online()
         batch = Batch(_RUN, 0, [int(time.time()) * 1_000_000], {"speed": [1.5]})
-        robot.publish(record_topic(robot.name, VESC_STREAM, cloud.namespace), encode(batch))
+        robot.publish(record_topic(robot.name, VESC_STREAM, cloud.namespace), encode_batch(batch))
     began = time.monotonic()
     try:
         counted = until(lambda: _counted(target, since) > before, _METRIC, within_s=_WITHIN_S)

@@ -16,13 +16,13 @@ from iort_agent.identity.claim import load_claim
 from iort_agent.identity.machine_key import make_key
 from iort_agent.mqtt.exchange import Exchange
 from iort_agent.verbs import provision
-from iort_contract import (
+from iort_contract.cloud import fleet_name
+from iort_contract.tables import (
     ADMIT_CLAIM,
     ADMIT_FINGERPRINT,
     ADMITTED_CERTIFICATE,
     ROBOT_PARAMETER,
     SERIAL_PARAMETER,
-    fleet_name,
 )
 from iort_station.fleet import certificates, claims, registry
 from verify.assumption import Basis

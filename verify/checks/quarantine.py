@@ -8,17 +8,10 @@ import time
 from typing import Any
 
 from bench.target import Target
-from iort_contract import (
-    BATCH,
-    RECORD,
-    VESC_STREAM,
-    Batch,
-    batch_id,
-    build_topic,
-    encode,
-    record_topic,
-    rule_name,
-)
+from iort_contract.messages.batch import Batch, batch_id, encode_batch
+from iort_contract.tables import BATCH
+from iort_contract.topics import RECORD, build_topic, record_topic, rule_name
+from iort_contract.vesc import VESC_STREAM
 from iort_station.operations import delivery, quarantine
 from iort_station.operations.quarantine import DeadLetter
 from iort_station.operations.replay import replay
@@ -34,7 +27,7 @@ _RUN = "0badcafe"
 def _batch(number: int, **changes: Any) -> bytes:
     """A current batch with one sample, with changes in its envelope."""
     batch = Batch(_RUN, number, [(int(time.time()) - 5 + number) * 1_000_000], {"speed": [1.5]})
-    return json.dumps({**json.loads(encode(batch)), **changes}).encode()
+    return json.dumps({**json.loads(encode_batch(batch)), **changes}).encode()
 
 
 def _entry(target: Target, robot: str) -> DeadLetter:

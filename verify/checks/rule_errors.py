@@ -10,7 +10,8 @@ from typing import Any
 
 from bench.target import Target
 from functions.quarantine import entries
-from iort_contract import PING, PONG, RULE, TOPIC, build_topic, rule_name
+from iort_contract.tables import TOPIC
+from iort_contract.topics import PING, PONG, RULE, build_topic, rule_name
 from verify.assumption import Basis
 from verify.bundles import Pair, pair_of
 from verify.check import Check

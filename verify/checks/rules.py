@@ -11,32 +11,12 @@ from collections.abc import Callable, Mapping
 from typing import Any
 
 from bench.target import Target
-from iort_contract import (
-    AGENT_VERSION,
-    ALERT_PREFIX,
-    EXPIRES_S,
-    FAULT_FIELD,
-    FILE,
-    LAMBDA,
-    LIVE,
-    RECEIVED_MS,
-    RECORD,
-    RULE,
-    SHADOW,
-    TOPIC,
-    VESC_STREAM,
-    VOLTAGE_FIELD,
-    Batch,
-    File,
-    FileRequest,
-    LiveSample,
-    build_topic,
-    encode,
-    encode_file_request,
-    encode_live,
-    encode_ping,
-    file_key,
-)
+from iort_contract.messages.batch import Batch, encode_batch
+from iort_contract.messages.files import File, FileRequest, encode_file_request, file_key
+from iort_contract.messages.live import LiveSample, encode_live, encode_ping
+from iort_contract.tables import AGENT_VERSION, ALERT_PREFIX, EXPIRES_S, RECEIVED_MS, TOPIC
+from iort_contract.topics import FILE, LAMBDA, LIVE, RECORD, RULE, SHADOW, build_topic
+from iort_contract.vesc import FAULT_FIELD, VESC_STREAM, VOLTAGE_FIELD
 from iort_station.fleet import registry
 from verify.assumption import Basis
 from verify.bundles import listener, pair_of
@@ -79,7 +59,7 @@ def _recent(received_ms: float) -> bool:
 
 def _record(target: Target) -> dict[str, Any]:
     with pair_of(target, "verify-spoofs-record") as pair:
-        message = encode(Batch(_RUN, 0, [int(time.time()) * 1_000_000], {"speed": [1.5]}))
+        message = encode_batch(Batch(_RUN, 0, [int(time.time()) * 1_000_000], {"speed": [1.5]}))
         pair.send(RECORD, VESC_STREAM, message)
         (item,) = until(lambda: _items(target, pair.robot.name), "the batch in the telemetry table")
         return {

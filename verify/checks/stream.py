@@ -10,7 +10,10 @@ from typing import Any
 
 from bench.target import Target
 from bench.temporary_function import temporary_function
-from iort_contract import BATCH, RECORD, VESC_STREAM, Batch, batch_id, build_topic, encode, record_topic
+from iort_contract.messages.batch import Batch, batch_id, encode_batch
+from iort_contract.tables import BATCH
+from iort_contract.topics import RECORD, build_topic, record_topic
+from iort_contract.vesc import VESC_STREAM
 from iort_station.operations import quarantine
 from iort_station.operations.replay import replay
 from verify.assumption import Basis
@@ -54,7 +57,7 @@ def _published(target: Target, base: str) -> str:
         robot.online()
         for number in range(_COUNT):
             batch = Batch(_RUN, number, [first_us + number * 1_000_000], {"speed": [1.5]})
-            robot.publish(record_topic(robot.name, VESC_STREAM, cloud.namespace), encode(batch))
+            robot.publish(record_topic(robot.name, VESC_STREAM, cloud.namespace), encode_batch(batch))
     query = {
         "TableName": cloud.output("storage", "TelemetryTable"),
         "KeyConditionExpression": "#topic = :topic",

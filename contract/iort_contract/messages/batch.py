@@ -112,11 +112,11 @@ class Batch:
         return BatchId(self.t_us, self.boot, self.seq)
 
 
-def encode(batch: Batch) -> bytes:
+def encode_batch(batch: Batch) -> bytes:
     """The envelope as JSON. NaN and infinities become null and are added to ``nonfinite``.
 
     Raises `ContractError` for an invalid batch. A batch too large for one message is still encoded: compare
-    with `MAX_MESSAGE_BYTES` and use `split`.
+    with `MAX_MESSAGE_BYTES` and use `split_batch`.
     """
     check_header(batch.boot, batch.seq, batch.nonfinite)
     times, n = batch.times_us, len(batch.times_us)
@@ -233,11 +233,11 @@ def open_batch(message: bytes | str | Mapping[str, Any]) -> Opened:
     return Opened(boot, seq, times, nonfinite, fields, None, _text(behind))
 
 
-def decode(message: bytes | str | Mapping[str, Any]) -> Batch:
+def decode_batch(message: bytes | str | Mapping[str, Any]) -> Batch:
     """Decode the batch in an envelope: the message as sent, or the attributes of a stored item.
 
     Messages stored as columns stay columns; `messages_of` rebuilds them. Raises `ContractError`, with the
-    reason, for everything that `encode` cannot have written.
+    reason, for everything that `encode_batch` cannot have written.
     """
     return decode_opened(open_batch(message))
 
@@ -261,8 +261,8 @@ def messages_of(
 ) -> tuple[Batch, Messages | None]:
     """The batch in an envelope, and its ROS messages byte for byte; None if the samples were never messages.
 
-    ``layouts`` has each type's layout by its id. Raises `ContractError` as `decode` does, and for an unknown
-    type.
+    ``layouts`` has each type's layout by its id. Raises `ContractError` as `decode_batch` does, and for an
+    unknown type.
     """
     opened = open_batch(message)
     batch = decode_opened(opened)
@@ -298,7 +298,7 @@ def decode_item(item: Mapping[str, Any]) -> tuple[Topic, Batch]:
         )
     if item.get(ROBOT, topic.robot) != topic.robot:
         raise ContractError(f"sent by {topic.robot} in the name of {shown(item[ROBOT])}")
-    batch = decode(item)
+    batch = decode_batch(item)
     if RECEIVED_MS in item and batch.t_us > integer(item, RECEIVED_MS) * 1000 + MAX_AHEAD_US:
         raise ContractError(
             f"time {batch.t_us} us is over a year after its receipt: the car's clock is wrong"
@@ -306,7 +306,7 @@ def decode_item(item: Mapping[str, Any]) -> tuple[Topic, Batch]:
     return topic, batch
 
 
-def split(batch: Batch) -> tuple[Batch, Batch]:
+def split_batch(batch: Batch) -> tuple[Batch, Batch]:
     """The two halves of a batch, the second with the next ``seq``.
 
     Raises `ContractError` for a single sample, which cannot be split.

@@ -5,7 +5,6 @@ from __future__ import annotations
 from dataclasses import dataclass
 from pathlib import Path
 
-import iort_contract
 from iort_agent.control.config import DownlinkConfig, ShareConfig, share_rule
 from iort_agent.errors import ConfigError
 from iort_agent.files.folder import FilesConfig
@@ -29,6 +28,8 @@ from iort_agent.schema import (
 from iort_agent.sources import SourceConfig
 from iort_agent.sources.registry import SOURCES, uploads_large
 from iort_agent.spool.config import QueueConfig
+from iort_contract.limits import DEFAULT_NAMESPACE
+from iort_contract.topics import OWN_STREAMS, check_namespace, check_robot
 
 
 @dataclass(frozen=True)
@@ -39,7 +40,7 @@ class Config:
     without a ``status_socket`` it is agent.sock beside the file.
     """
 
-    robot: str = setting(text(iort_contract.check_robot))
+    robot: str = setting(text(check_robot))
     endpoint: str = setting(text())
     certificate: Path = setting(existing_path())
     private_key: Path = setting(existing_path())
@@ -47,7 +48,7 @@ class Config:
         items(variant("type", SOURCES), at_least=1, what="a list of at least one source")
     )
     root_ca: Path | None = setting(existing_path(), None)
-    namespace: str = setting(text(iort_contract.check_namespace), iort_contract.DEFAULT_NAMESPACE)
+    namespace: str = setting(text(check_namespace), DEFAULT_NAMESPACE)
     port: int = setting(number(1, 65535, whole=True), 8883)
     record: RecordConfig = setting(section(RecordConfig), RecordConfig())
     live: LiveConfig = setting(section(LiveConfig), LiveConfig())
@@ -82,7 +83,7 @@ def load_config(file: Path) -> Config:
 
 def _check_streams(config: Config, where: Where) -> None:
     """Two sources must not write into one stream: their samples would mix into one time series."""
-    taken: list[str] = sorted(iort_contract.OWN_STREAMS)
+    taken: list[str] = sorted(OWN_STREAMS)
     for i, source in enumerate(config.sources):
         for stream in source.streams():
             if stream in taken:

@@ -18,10 +18,11 @@ import re
 from dataclasses import dataclass
 from typing import Any, Callable, Mapping
 
-import iort_contract
 from iort_agent.schema import Rule, Where, flag, number, pairs, section, setting, text
 from iort_agent.sources.ros1 import ros_name
-from iort_contract import ContractError
+from iort_contract.limits import ContractError
+from iort_contract.messages.commands import FLEET_MAX_AGE_MS, MAX_LEASE_MS, MAX_VALID_MS
+from iort_contract.topics import check_stream
 
 ROBOT_IN_TOPIC = "{robot}"
 
@@ -62,7 +63,7 @@ class MotionConfig:
     those left out are zero."""
 
     stop: Mapping[str, Any] = setting(_object)
-    lease_s: float = setting(number(0.05, iort_contract.MAX_LEASE_MS / 1000, unit="s"), 0.5)
+    lease_s: float = setting(number(0.05, MAX_LEASE_MS / 1000, unit="s"), 0.5)
 
 
 @dataclass(frozen=True)
@@ -73,7 +74,7 @@ class CommandConfig:
     topic: str = setting(text(ros_name))
     type: str = setting(text(_ros_type))
     partial: bool = setting(flag(), default=False)
-    max_age_s: float = setting(number(0.05, iort_contract.MAX_VALID_MS / 1000, unit="s"), 1.0)
+    max_age_s: float = setting(number(0.05, MAX_VALID_MS / 1000, unit="s"), 1.0)
     motion: MotionConfig | None = setting(section(MotionConfig), default=None)
 
 
@@ -83,14 +84,14 @@ class FleetConfig:
 
     topic: str = setting(text(_fleet_topic))
     type: str = setting(text(_ros_type))
-    max_age_s: float = setting(number(0.05, 60, unit="s"), iort_contract.FLEET_MAX_AGE_MS / 1000)
+    max_age_s: float = setting(number(0.05, 60, unit="s"), FLEET_MAX_AGE_MS / 1000)
 
 
 @dataclass(frozen=True)
 class ShareConfig:
     """A ROS topic's newest message for other robots, at most so often."""
 
-    name: str = setting(text(iort_contract.check_stream))
+    name: str = setting(text(check_stream))
     rate_hz: float = setting(number(0.01, 20, unit="Hz"), 5.0)
 
 
@@ -99,11 +100,11 @@ class DownlinkConfig:
     """What comes from the broker to ROS. ``clock_skew_s``: so far may an operator's clock be ahead."""
 
     cmd: tuple[tuple[str, CommandConfig], ...] = setting(
-        _by(iort_contract.check_stream, section(CommandConfig), "a mapping of command to ROS topic and type"),
+        _by(check_stream, section(CommandConfig), "a mapping of command to ROS topic and type"),
         (),
     )
     fleet: tuple[tuple[str, FleetConfig], ...] = setting(
-        _by(iort_contract.check_stream, section(FleetConfig), "a mapping of name to ROS topic and type"), ()
+        _by(check_stream, section(FleetConfig), "a mapping of name to ROS topic and type"), ()
     )
     clock_skew_s: float = setting(number(0, 60, unit="s"), 1.0)
 

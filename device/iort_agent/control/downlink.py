@@ -12,7 +12,6 @@ import logging
 import threading
 from typing import Any, Callable, Iterable, Mapping, Optional, Sequence
 
-import iort_contract
 from iort_agent.clock import Clock
 from iort_agent.control.config import ROBOT_IN_TOPIC, CommandConfig, DownlinkConfig, FleetConfig, ShareConfig
 from iort_agent.control.leases import Leases, Limits
@@ -25,9 +24,17 @@ from iort_agent.ros1.node import DEFAULT_NODE
 from iort_agent.ros1.publish import Graph, Ros1Graph
 from iort_agent.sources.ros1 import Ros1Config
 from iort_agent.throttled_log import Seldom
-from iort_contract import CMD, FLEET, Command, ContractError, FleetMessage
-from iort_contract.limits import MessageError
+from iort_contract.limits import ContractError, MessageError
+from iort_contract.messages.commands import (
+    FLEET_MAX_AGE_MS,
+    Command,
+    FleetMessage,
+    decode_command,
+    decode_fleet,
+    encode_fleet,
+)
 from iort_contract.ros1.definition import Definition, parse
+from iort_contract.topics import CMD, FLEET, build_topic, check_namespace, parse_topic
 
 _log = logging.getLogger(__name__)
 
@@ -96,7 +103,7 @@ class Downlink:
         self._wake, self._end = threading.Event(), threading.Event()
         self._thread = threading.Thread(target=self._run, name="downlink", daemon=True)
         self._commands = {
-            iort_contract.build_topic(CMD, robot, name, namespace): _Command(
+            build_topic(CMD, robot, name, namespace): _Command(
                 name, settings, graph.definition(settings.type), config.clock_skew_s, clock
             )
             for name, settings in config.cmd
@@ -105,7 +112,7 @@ class Downlink:
             name: _Fleet(settings, graph.definition(settings.type)) for name, settings in config.fleet
         }
         self._shares = [
-            _Share(topic, settings, iort_contract.build_topic(FLEET, robot, settings.name, namespace), boot)
+            _Share(topic, settings, build_topic(FLEET, robot, settings.name, namespace), boot)
             for topic, settings in share
         ]
         self._uplink, self._allowance = uplink, allowance
@@ -113,7 +120,7 @@ class Downlink:
             graph.advertise(command.config.topic, command.config.type)
             uplink.subscribe(topic, self._on_command)
         for name in self._fleet:
-            uplink.subscribe(f"{FLEET}/{iort_contract.check_namespace(namespace)}/+/{name}", self._on_fleet)
+            uplink.subscribe(f"{FLEET}/{check_namespace(namespace)}/+/{name}", self._on_fleet)
         for shared in self._shares:
             graph.subscribe(shared.ros_topic, functools.partial(self._on_ros, shared))
         uplink.on_connection(self._on_connection)
@@ -184,7 +191,7 @@ class Downlink:
     def _on_command(self, message: Message) -> None:
         command = self._commands[message.topic]
         try:
-            offered = iort_contract.decode_command(message.payload)
+            offered = decode_command(message.payload)
         except ContractError as error:
             self._refuse(message.topic, "malformed", str(error))
             return
@@ -247,12 +254,12 @@ class Downlink:
     # Other robots.
 
     def _on_fleet(self, message: Message) -> None:
-        topic = iort_contract.parse_topic(message.topic)
+        topic = parse_topic(message.topic)
         fleet = self._fleet[topic.name]
         if topic.robot == self._robot:
             return
         try:
-            heard = iort_contract.decode_fleet(message.payload)
+            heard = decode_fleet(message.payload)
             now_us = self._clock.now_us()
             data = encode(fleet.definition, heard.message, now_us=now_us)
         except (ContractError, MessageError) as error:
@@ -296,7 +303,7 @@ class Downlink:
             shared.due = now + _NO_ROOM_S
             return
         (header, data, at), shared.newest = shared.newest, None
-        if now - at > iort_contract.FLEET_MAX_AGE_MS / 1000 or not self._uplink.connected():
+        if now - at > FLEET_MAX_AGE_MS / 1000 or not self._uplink.connected():
             return
         try:
             payload = shared.encode(header, data, self._clock.now_us(), self._offset())
@@ -369,7 +376,7 @@ class _Share:
             self._definitions[key] = parse(*key)
         message = decode(self._definitions[key], data)
         offset_us = round(offset.offset_ms * 1000) if offset is not None else None
-        return iort_contract.encode_fleet(FleetMessage(self._boot, self.seq, now_us, message, offset_us))
+        return encode_fleet(FleetMessage(self._boot, self.seq, now_us, message, offset_us))
 
 
 def _ignore(_: UplinkError | None) -> None:

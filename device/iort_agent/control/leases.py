@@ -17,7 +17,7 @@ from __future__ import annotations
 
 from typing import NamedTuple
 
-from iort_contract import Command
+from iort_contract.messages.commands import Command
 
 # A stop is said at once, and so many times more.
 STOP_REPEATS = 4

@@ -12,18 +12,17 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Iterator, Mapping
 
-import iort_contract
 from iort_agent.errors import ConfigError
 from iort_agent.lanes.config import LiveConfig, PingConfig, RecordConfig
 from iort_agent.logs import LOG_LEVELS
 from iort_agent.schema import Rule, Where, choice, items, text
+from iort_contract.checks import check_field
+from iort_contract.topics import check_stream
 
 # Errors name the place as those of a configuration file do.
 _WHERE = Where(Path("shadow agent"))
 FIELDS = "fields"
-_FIELD_LIST = items(
-    text(iort_contract.check_field), what="a list of field names; an empty one means all fields"
-)
+_FIELD_LIST = items(text(check_field), what="a list of field names; an empty one means all fields")
 
 
 @dataclass(frozen=True)
@@ -109,7 +108,7 @@ def _flat(wished: Mapping[str, Any]) -> Iterator[tuple[str, Any]]:
 
 def _selection(stream: str, value: Any, known: Any) -> tuple[str, ...]:
     where = _WHERE.child(FIELDS).child(stream)
-    text(iort_contract.check_stream)(stream, where)
+    text(check_stream)(stream, where)
     names: tuple[str, ...] = _FIELD_LIST(value, where)
     for name in names if known is not None else ():
         if name not in known:

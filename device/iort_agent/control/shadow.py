@@ -17,17 +17,9 @@ from iort_agent.control.runtime_settings import Tuning, overlay
 from iort_agent.errors import UplinkError
 from iort_agent.mqtt.uplink import Message, Uplink
 from iort_agent.rate_limiter import Allowance
-from iort_contract import (
-    ACCEPTED,
-    AGENT_VERSION,
-    COMMANDS,
-    OVER_SHARE,
-    PUT_OFF,
-    PUT_OFF_LAST_MS,
-    PUT_OFF_SINCE_MS,
-    SHADOW,
-    Command,
-)
+from iort_contract.messages.commands import Command
+from iort_contract.tables import AGENT_VERSION, OVER_SHARE, PUT_OFF, PUT_OFF_LAST_MS, PUT_OFF_SINCE_MS
+from iort_contract.topics import ACCEPTED, COMMANDS, SHADOW
 
 _log = logging.getLogger(__name__)
 

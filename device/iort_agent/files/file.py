@@ -10,10 +10,9 @@ import threading
 from pathlib import Path, PurePath
 from typing import Any, BinaryIO, Mapping, NamedTuple, Sequence
 
-import iort_contract
 from iort_agent.errors import UploadError
 from iort_agent.private_files import folder_of, open_below
-from iort_contract import PART_BYTES, File
+from iort_contract.messages.files import MAX_FILE_BYTES, PART_BYTES, File
 
 _CHUNK_BYTES = 256 * 1024
 _AGAIN_S = 10.0
@@ -107,10 +106,8 @@ def read(root: Path, name: PurePath, *, stop: threading.Event) -> Local:
     Raises `UploadError` where it cannot be read, changes meanwhile, is too large, or ``stop`` is set.
     """
     path, look = root / name, look_at(root, name)
-    if look.size > iort_contract.MAX_FILE_BYTES:
-        raise UploadError(
-            f"{path}: has {look.size} bytes; allowed is up to {iort_contract.MAX_FILE_BYTES}", again_s=None
-        )
+    if look.size > MAX_FILE_BYTES:
+        raise UploadError(f"{path}: has {look.size} bytes; allowed is up to {MAX_FILE_BYTES}", again_s=None)
     whole, parts, read_bytes = hashlib.sha256(), [], 0
     try:
         with open_below(root, name) as file:

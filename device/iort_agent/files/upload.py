@@ -12,14 +12,23 @@ import uuid
 from pathlib import Path
 from typing import Callable
 
-import iort_contract
 from iort_agent.clock import Clock
 from iort_agent.errors import UploadError
 from iort_agent.files.file import Local, changed, look_at
 from iort_agent.files.http import Outcome, Pace, Sender, trusting
 from iort_agent.mqtt.uplink import Message, Uplink
 from iort_agent.rate_limiter import Allowance
-from iort_contract import FILE, MAX_ADDRESSES, PING, PONG, Address, ContractError, FileAnswer, FileRequest
+from iort_contract.limits import ContractError
+from iort_contract.messages.files import (
+    MAX_ADDRESSES,
+    Address,
+    FileAnswer,
+    FileRequest,
+    decode_file_answer,
+    encode_file_request,
+    part_range,
+)
+from iort_contract.topics import FILE, PING, PONG, build_topic
 
 _log = logging.getLogger(__name__)
 
@@ -41,8 +50,8 @@ class Asker:
         self, *, robot: str, namespace: str, uplink: Uplink, clock: Clock, allowance: Allowance
     ) -> None:
         self._uplink, self._clock, self._allowance = uplink, clock, allowance
-        self._topic = iort_contract.build_topic(PING, robot, FILE, namespace)
-        self._answers = iort_contract.build_topic(PONG, robot, FILE, namespace)
+        self._topic = build_topic(PING, robot, FILE, namespace)
+        self._answers = build_topic(PONG, robot, FILE, namespace)
         self._lock = threading.Lock()
         self._waiting: dict[str, threading.Event] = {}
         self._answered: dict[str, FileAnswer] = {}
@@ -58,7 +67,7 @@ class Asker:
         Raises `UploadError` for a request that the contract does not allow.
         """
         try:
-            payload = iort_contract.encode_file_request(request)
+            payload = encode_file_request(request)
         except ContractError as error:
             raise UploadError(str(error), again_s=None) from error
         heard = threading.Event()
@@ -79,7 +88,7 @@ class Asker:
 
     def _on_answer(self, message: Message) -> None:
         try:
-            answer = iort_contract.decode_file_answer(message.payload)
+            answer = decode_file_answer(message.payload)
         except ContractError as error:
             _log.warning("an answer about a file is not one: %s", error)
             return
@@ -192,12 +201,12 @@ class _Transfer:
 
     def bytes_there(self) -> int:
         """How much of the file is in the bucket."""
-        return sum(iort_contract.part_range(self.local.file, part)[1] for part in self.there)
+        return sum(part_range(self.local.file, part)[1] for part in self.there)
 
 
 def _range(local: Local, address: Address) -> tuple[int, int]:
     try:
-        return iort_contract.part_range(local.file, address.part)
+        return part_range(local.file, address.part)
     except ContractError as error:
         raise UploadError(f"{local.path}: asked for what it does not have: {error}", again_s=None) from error
 

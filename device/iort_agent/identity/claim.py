@@ -5,8 +5,9 @@ from __future__ import annotations
 from dataclasses import dataclass
 from pathlib import Path
 
-import iort_contract
 from iort_agent.schema import Where, any_path, existing_path, load, number, read_yaml, setting, text
+from iort_contract.limits import DEFAULT_NAMESPACE
+from iort_contract.topics import check_namespace, check_robot
 
 
 @dataclass(frozen=True)
@@ -17,9 +18,9 @@ class Claim:
     certificate: Path = setting(existing_path())
     private_key: Path = setting(existing_path())
     root_ca: Path | None = setting(existing_path(), None)
-    namespace: str = setting(text(iort_contract.check_namespace), iort_contract.DEFAULT_NAMESPACE)
+    namespace: str = setting(text(check_namespace), DEFAULT_NAMESPACE)
     port: int = setting(number(1, 65535, whole=True), 8883)
-    robot: str | None = setting(text(iort_contract.check_robot), None)
+    robot: str | None = setting(text(check_robot), None)
     serial: str | None = setting(text(), None)
     config: Path | None = setting(any_path(), None)
 

@@ -13,7 +13,6 @@ import threading
 from pathlib import Path, PurePath
 from typing import Any, Callable, Mapping
 
-import iort_contract
 from iort_agent.clock import Clock
 from iort_agent.files.file import kind_of, wire_name
 from iort_agent.files.folder import FilesConfig, Uploads
@@ -21,8 +20,9 @@ from iort_agent.lanes.thumbnail import thumbnail
 from iort_agent.private_files import write_below
 from iort_agent.sources import Emit
 from iort_agent.throttled_log import Seldom
-from iort_contract import CLAIM_AT, CLAIM_FIELDS, File, RosMessage, Value
-from iort_contract.ros1.message import cut
+from iort_contract.limits import Value
+from iort_contract.messages.files import CLAIM_AT, CLAIM_FIELDS, File, file_key
+from iort_contract.ros1.message import RosMessage, cut
 
 _log = logging.getLogger(__name__)
 
@@ -146,7 +146,7 @@ class ClaimCheck:
         self.kept += 1
         self._stored()
         return {
-            "key": iort_contract.file_key(self._robot, file),
+            "key": file_key(self._robot, file),
             "sha256": sha256,
             "size": len(content),
             "content_type": content_type,

@@ -19,7 +19,8 @@ from operator import itemgetter
 from typing import Callable, List, Mapping, Tuple
 
 from iort_agent.clock import Clock
-from iort_contract import MAX_SAMPLES, RosMessage, Value
+from iort_contract.limits import MAX_SAMPLES, Value
+from iort_contract.ros1.message import RosMessage
 
 # Real telemetry takes about 2 bytes a value in a message, random doubles 12; what is too large all
 # the same is split when it is packed.

@@ -6,10 +6,11 @@ import logging
 import math
 from typing import Hashable, Mapping, Sequence
 
-import iort_contract
 from iort_agent.lanes.batch import Sample, StreamCounts
 from iort_agent.spool.memory import Spool
-from iort_contract import Batch, ContractError, Messages, RosMessage, Value
+from iort_contract.limits import MAX_MESSAGE_BYTES, ContractError, Value
+from iort_contract.messages.batch import Batch, encode_batch, split_batch
+from iort_contract.ros1.message import Messages, RosMessage
 
 _log = logging.getLogger(__name__)
 
@@ -40,27 +41,23 @@ class Packer:
         seq = self._spool.next_seq(self._stream)
         n = len(batch.times_us)
         try:
-            payload = iort_contract.encode(
-                Batch(batch.boot, seq, batch.times_us, batch.columns, 0, batch.messages)
-            )
+            payload = encode_batch(Batch(batch.boot, seq, batch.times_us, batch.columns, 0, batch.messages))
         except ContractError as error:
             # One bad value must not cost the others: halve until it stands alone.
             if n == 1:
                 self._refuse(str(error))
                 return
         else:
-            if len(payload) <= iort_contract.MAX_MESSAGE_BYTES:
+            if len(payload) <= MAX_MESSAGE_BYTES:
                 self._spool.put(self._stream, seq, payload, samples=n)
                 self._counts.batches += 1
                 self._counts.stored += n
                 self._counts.nulled += _nonfinite(batch.columns)
                 return
             if n == 1:
-                self._refuse(
-                    f"the message would have {len(payload)} of {iort_contract.MAX_MESSAGE_BYTES} bytes"
-                )
+                self._refuse(f"the message would have {len(payload)} of {MAX_MESSAGE_BYTES} bytes")
                 return
-        for half in iort_contract.split(batch):
+        for half in split_batch(batch):
             self._put(half)
 
     def _refuse(self, why: str) -> None:

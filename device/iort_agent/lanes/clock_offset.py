@@ -11,7 +11,7 @@ import threading
 from typing import NamedTuple
 
 from iort_agent.clock import Clock
-from iort_contract import CLOCK_MAX_UNCERTAINTY_MS
+from iort_contract.limits import CLOCK_MAX_UNCERTAINTY_MS
 
 # timestamp() in a rule is whole milliseconds, cut off.
 _STAMP_MS = 0.5
@@ -64,7 +64,7 @@ class ClockOffset:
         )
 
     def known(self) -> Offset | None:
-        """The offset, if it is known well enough to judge by (`iort_contract.CLOCK_MAX_UNCERTAINTY_MS`)."""
+        """The offset, if it is known well enough to judge by (`CLOCK_MAX_UNCERTAINTY_MS`)."""
         found = self.estimate()
         return found if found is not None and found.uncertainty_ms <= CLOCK_MAX_UNCERTAINTY_MS else None
 

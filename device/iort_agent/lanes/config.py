@@ -4,8 +4,9 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-import iort_contract
 from iort_agent.schema import choice, flag, items, number, setting
+from iort_contract.limits import LIVE_MAX_RATE_HZ, LIVE_MIN_RATE_HZ
+from iort_contract.topics import PING_PATHS
 
 
 @dataclass(frozen=True)
@@ -22,8 +23,8 @@ class LiveConfig:
 
     enabled: bool = setting(flag(), default=True)
     rate_hz: float = setting(
-        number(iort_contract.LIVE_MIN_RATE_HZ, iort_contract.LIVE_MAX_RATE_HZ, unit="Hz"),
-        iort_contract.LIVE_MAX_RATE_HZ,
+        number(LIVE_MIN_RATE_HZ, LIVE_MAX_RATE_HZ, unit="Hz"),
+        LIVE_MAX_RATE_HZ,
     )
 
 
@@ -34,10 +35,10 @@ class PingConfig:
     rate_hz: float = setting(number(0, 20, unit="Hz"), 0.0)
     paths: tuple[str, ...] = setting(
         items(
-            choice(*iort_contract.PING_PATHS),
+            choice(*PING_PATHS),
             at_least=1,
-            what=f"a list of some of {', '.join(iort_contract.PING_PATHS)}",
+            what=f"a list of some of {', '.join(PING_PATHS)}",
         ),
-        iort_contract.PING_PATHS,
+        PING_PATHS,
     )
     padding_bytes: int = setting(number(0, 100_000, whole=True, unit="bytes"), 0)

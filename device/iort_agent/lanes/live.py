@@ -25,15 +25,25 @@ import threading
 from collections import deque
 from typing import Callable, Mapping, NamedTuple
 
-import iort_contract
 from iort_agent.clock import Clock
 from iort_agent.errors import UplinkError
 from iort_agent.mqtt.uplink import Uplink
 from iort_agent.rate_limiter import LIVE, URGENT, Allowance
-from iort_contract import ContractError, LiveSample, Value
+from iort_contract.limits import (
+    LIVE_BROKER_EVERY_S,
+    LIVE_MAX_AGE_MS,
+    LIVE_MAX_RATE_HZ,
+    MAX_MESSAGE_BYTES,
+    ContractError,
+    Value,
+)
+from iort_contract.messages.live import LiveSample, encode_live
+from iort_contract.topics import LIVE as LIVE_LANE
+from iort_contract.topics import build_topic, live_topic
+from iort_contract.vesc import FAULT_FIELD
 
 _log = logging.getLogger(__name__)
-_FASTEST_S = 1 / iort_contract.LIVE_MAX_RATE_HZ
+_FASTEST_S = 1 / LIVE_MAX_RATE_HZ
 # Rates are of so many of the last seconds. The lane is slowed down when streams lost their place in more
 # than half of them, and no longer when in none.
 _SECONDS = 5
@@ -151,8 +161,8 @@ class LiveLane:
             slot = self._slots.get(stream)
             if slot is None:
                 slot = self._slots[stream] = _Slot(
-                    iort_contract.live_topic(self._robot, stream, self._namespace),
-                    iort_contract.build_topic(iort_contract.LIVE, self._robot, stream, self._namespace),
+                    live_topic(self._robot, stream, self._namespace),
+                    build_topic(LIVE_LANE, self._robot, stream, self._namespace),
                     turn=self._turn,
                 )
                 self._turn += 1
@@ -170,7 +180,7 @@ class LiveLane:
                 values = slot.values
                 if values is None:
                     continue
-                if now - slot.offered > iort_contract.LIVE_MAX_AGE_MS / 1000:
+                if now - slot.offered > LIVE_MAX_AGE_MS / 1000:
                     slot.values = None
                 elif now >= slot.due + self._period_s / 2 or self._is_new_fault(slot, values, now):
                     self._take_turn(slot, values, now)
@@ -291,7 +301,7 @@ class LiveLane:
 
 def _fault(values: Mapping[str, Value]) -> Value:
     """The fault code; None for NaN, which is another than itself each time."""
-    code = values.get(iort_contract.FAULT_FIELD)
+    code = values.get(FAULT_FIELD)
     return code if code == code else None  # noqa: PLR0124 - what NaN is not
 
 
@@ -299,14 +309,12 @@ def _topic(slot: _Slot, fault: Value, now: float) -> str:
     """Which way the next message of a stream goes."""
     if now < slot.broker_due and fault == slot.fault:
         return slot.topic
-    slot.broker_due, slot.fault = now + iort_contract.LIVE_BROKER_EVERY_S, fault
+    slot.broker_due, slot.fault = now + LIVE_BROKER_EVERY_S, fault
     return slot.broker_topic
 
 
 def _encode(sample: LiveSample) -> bytes:
-    payload = iort_contract.encode_live(sample)
-    if len(payload) > iort_contract.MAX_MESSAGE_BYTES:
-        raise ContractError(
-            f"the message would have {len(payload)} of {iort_contract.MAX_MESSAGE_BYTES} bytes"
-        )
+    payload = encode_live(sample)
+    if len(payload) > MAX_MESSAGE_BYTES:
+        raise ContractError(f"the message would have {len(payload)} of {MAX_MESSAGE_BYTES} bytes")
     return payload

@@ -6,13 +6,14 @@ import threading
 from collections import deque
 from typing import Callable, NamedTuple, Sequence
 
-import iort_contract
 from iort_agent.clock import Clock, Pace
 from iort_agent.errors import UplinkError
 from iort_agent.mqtt.uplink import Message, Uplink
 from iort_agent.rate_limiter import STEADY, Allowance
 from iort_agent.sources import Emit
-from iort_contract import PING, PONG, ContractError, Value
+from iort_contract.limits import ContractError, Value
+from iort_contract.messages.live import decode_pong, encode_ping
+from iort_contract.topics import BROKER, PING, PONG, RTT_FIELDS, RTT_STREAM, RULE, build_topic, parse_topic
 
 TIMEOUT_S = 10.0
 # Where round trips through a rule are not measured, a ping now and then still finds the clock's offset,
@@ -49,7 +50,7 @@ OnStamp = Callable[[float, float, int], None]
 
 
 class Pings:
-    """Sends pings, takes pongs, and emits each round trip as a sample of `iort_contract.RTT_STREAM`.
+    """Sends pings, takes pongs, and emits each round trip as a sample of `RTT_STREAM`.
 
     Every round trip through a rule is told to ``on_stamp``; where none is measured, one every
     `CLOCK_EVERY_S` is made for that alone. A ping that the connection has no room for, since recordings go
@@ -83,11 +84,11 @@ class Pings:
         self._paths: dict[str, _Path] = {}
         self._names = list(paths)
         self._clock_every_s, self._clock_due = CLOCK_FIRST_EVERY_S, clock.monotonic()
-        for name in dict.fromkeys([*paths, iort_contract.RULE]):
-            ping = iort_contract.build_topic(PING, robot, name, namespace)
+        for name in dict.fromkeys([*paths, RULE]):
+            ping = build_topic(PING, robot, name, namespace)
             # Over the broker alone the ping itself comes back; the cloud answers on a topic of its own.
-            lane = PING if name == iort_contract.BROKER else PONG
-            path = _Path(ping, iort_contract.build_topic(lane, robot, name, namespace))
+            lane = PING if name == BROKER else PONG
+            path = _Path(ping, build_topic(lane, robot, name, namespace))
             self._paths[name] = path
             uplink.subscribe(path.pong, self._on_pong)
 
@@ -126,7 +127,7 @@ class Pings:
             ping_id = self._next_id
             self._next_id += 1
             path.sent += 1
-            payload = iort_contract.encode_ping(ping_id, self._clock.now_us(), self._padding)
+            payload = encode_ping(ping_id, self._clock.now_us(), self._padding)
             path.waiting[ping_id] = self._clock.monotonic()
         self._allowance.spend(path.ping, payload)
         self._uplink.publish(path.ping, payload, qos=0, done=_ignore)
@@ -136,8 +137,8 @@ class Pings:
         """Count as lost what has not come back in time, and send what finds the clock's offset."""
         now = self._clock.monotonic()
         self._expire(now - TIMEOUT_S)
-        measured = self._rate_hz and iort_contract.RULE in self._names
-        if not measured and now >= self._clock_due and self.send(iort_contract.RULE):
+        measured = self._rate_hz and RULE in self._names
+        if not measured and now >= self._clock_due and self.send(RULE):
             self._clock_due = now + self._clock_every_s
 
     def close(self, timeout_s: float) -> None:
@@ -162,10 +163,10 @@ class Pings:
             }
 
     def _on_pong(self, message: Message) -> None:
-        name = iort_contract.parse_topic(message.topic).name
+        name = parse_topic(message.topic).name
         path = self._paths[name]
         try:
-            pong = iort_contract.decode_pong(message.payload)
+            pong = decode_pong(message.payload)
         except ContractError:
             return  # not ours: anybody with the right may publish there
         with self._lock:
@@ -176,14 +177,14 @@ class Pings:
             path.received += 1
             path.rtts_ms.append(rtt_ms)
             self._lock.notify_all()
-        if name == iort_contract.RULE and pong.received_ms is not None:
+        if name == RULE and pong.received_ms is not None:
             self._clock_every_s = CLOCK_EVERY_S
             self._on_stamp(sent, message.at, pong.received_ms)
         if not self._rate_hz or name not in self._names:
             return
-        values: dict[str, Value] = dict.fromkeys(iort_contract.RTT_FIELDS.values())
-        values[iort_contract.RTT_FIELDS[name]] = rtt_ms
-        self._emit(iort_contract.RTT_STREAM, self._clock.now_us(), values)
+        values: dict[str, Value] = dict.fromkeys(RTT_FIELDS.values())
+        values[RTT_FIELDS[name]] = rtt_ms
+        self._emit(RTT_STREAM, self._clock.now_us(), values)
 
     def _expire(self, before: float) -> None:
         with self._lock:

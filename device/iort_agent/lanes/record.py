@@ -18,7 +18,6 @@ import random
 import threading
 from typing import Sequence
 
-import iort_contract
 from iort_agent.clock import Clock
 from iort_agent.errors import UplinkError
 from iort_agent.lanes.config import RecordConfig
@@ -27,6 +26,7 @@ from iort_agent.mqtt.uplink import Uplink
 from iort_agent.rate_limiter import PUBLISHES_PER_S, SHARE, Allowance
 from iort_agent.sources import SourceConfig
 from iort_agent.spool.memory import Entry, Spool
+from iort_contract.topics import record_topic
 
 _log = logging.getLogger(__name__)
 
@@ -121,7 +121,7 @@ class RecordLane:
                 entry = self._spool.next(self._sent_id)
                 if entry is None:
                     return None
-                topic = iort_contract.record_topic(self._robot, entry.stream, self._namespace)
+                topic = record_topic(self._robot, entry.stream, self._namespace)
                 delay_s = self._allowance.record(topic, entry.payload)
                 if delay_s > 0:
                     return delay_s

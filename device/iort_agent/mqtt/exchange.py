@@ -6,9 +6,9 @@ import threading
 import uuid
 from typing import Any, Mapping
 
-import iort_contract
 from iort_agent.errors import IdentityError, RefusedError
 from iort_agent.identity.claim import Claim
+from iort_contract.cloud import claim_name, fleet_name
 
 _WAIT_S = 30.0
 
@@ -67,12 +67,12 @@ class Exchange:
 
     def __init__(self, claim: Claim) -> None:
         self._claim = claim
-        self._template = iort_contract.fleet_name(claim.namespace)
+        self._template = fleet_name(claim.namespace)
         self._connection = _Connection(
             claim,
             claim.certificate.read_bytes(),
             claim.private_key.read_bytes(),
-            f"{iort_contract.claim_name(claim.namespace)}-{uuid.uuid4().hex[:8]}",
+            f"{claim_name(claim.namespace)}-{uuid.uuid4().hex[:8]}",
         )
         self._requests: Any = None
 

@@ -6,7 +6,7 @@ import threading
 from typing import Any, Callable, Mapping, Protocol, Sequence
 
 from iort_agent.clock import Clock
-from iort_contract import Value
+from iort_contract.limits import Value
 
 # What becomes of bytes in a message, such as an image: nothing, or a file with a claim in the sample.
 REFUSE, UPLOAD = "refuse", "upload"

@@ -12,7 +12,7 @@ from __future__ import annotations
 from typing import Any, Callable, Mapping, Optional
 
 from iort_agent.errors import SourceError
-from iort_contract import MAX_FIELDS
+from iort_contract.limits import MAX_FIELDS
 
 # Gives the fields of a message, without its constants; None for a value that is no message.
 Members = Callable[[Any], Optional[Mapping[str, Any]]]

@@ -12,18 +12,19 @@ import threading
 from dataclasses import dataclass
 from typing import Any, Mapping, NamedTuple, Optional, Sequence
 
-import iort_contract
 from iort_agent.clock import Clock
 from iort_agent.errors import SourceError
 from iort_agent.ros1.node import ANY_TYPE, DEFAULT_NODE, Node, definition_of, shared
 from iort_agent.schema import Where, choice, items, pairs, section, setting, text
 from iort_agent.sources import REFUSE, UPLOAD, Emit
 from iort_agent.throttled_log import Seldom
-from iort_contract import RosMessage, RosType, Value
-from iort_contract.limits import MessageError
+from iort_contract.limits import ContractError, MessageError, Value
+from iort_contract.messages.message_type import MessageType
 from iort_contract.ros1.decode import HEADER as HEADER_STRUCT
 from iort_contract.ros1.decode import Decoder
 from iort_contract.ros1.definition import parse
+from iort_contract.ros1.message import RosMessage, RosType
+from iort_contract.topics import TYPES_STREAM, check_stream
 
 _log = logging.getLogger(__name__)
 
@@ -44,17 +45,13 @@ _ROS_NAME = re.compile(r"(/[A-Za-z]\w*)(/\w+)*", re.ASCII)
 def ros_name(value: str) -> str:
     """The full name of a topic. Raises `ContractError` for what is none."""
     if not _ROS_NAME.fullmatch(value):
-        raise iort_contract.ContractError(
-            f"ROS topic {value!r}: allowed is a full name such as /sensors/core"
-        )
+        raise ContractError(f"ROS topic {value!r}: allowed is a full name such as /sensors/core")
     return value
 
 
 def _node_name(value: str) -> str:
     if not re.fullmatch(r"[A-Za-z]\w*", value, re.ASCII):
-        raise iort_contract.ContractError(
-            f"ROS node {value!r}: allowed is a letter, then letters, digits and _"
-        )
+        raise ContractError(f"ROS node {value!r}: allowed is a letter, then letters, digits and _")
     return value
 
 
@@ -69,7 +66,7 @@ class TopicConfig:
     (images, point clouds) as files, otherwise they are left out.
     """
 
-    stream: str = setting(text(iort_contract.check_stream))
+    stream: str = setting(text(check_stream))
     time: str = setting(choice(HEADER, ARRIVAL))
     fields: tuple[str, ...] | None = setting(
         items(text(), at_least=1, what="a list of at least one field"), default=None
@@ -241,10 +238,10 @@ class Intake:
         """Say what the messages are, whenever a publisher connects."""
         assert self._kind is not None
         kind, md5sum = header.get("type", ""), header.get("md5sum", "")
-        said = iort_contract.MessageType(self._config.stream, self._topic, kind, md5sum, self._kind.text)
+        said = MessageType(self._config.stream, self._topic, kind, md5sum, self._kind.text)
         try:
-            self._emit(iort_contract.TYPES_STREAM, t_us, said.sample())
-        except iort_contract.ContractError as error:
+            self._emit(TYPES_STREAM, t_us, said.sample())
+        except ContractError as error:
             _log.warning("topic %s: its type is not recorded: %s", self._topic, error)
 
     def look(self, connections: int) -> None:

@@ -7,11 +7,12 @@ import threading
 from dataclasses import dataclass
 from typing import Any, Mapping, Sequence
 
-import iort_contract
 from iort_agent.clock import Clock, Pace
 from iort_agent.schema import number, section, setting, text
 from iort_agent.sources import Emit
 from iort_agent.sources.vehicle import Vehicle, VehicleConfig
+from iort_contract.topics import check_stream
+from iort_contract.vesc import VESC_STREAM
 
 _MAX_STEP_S = 0.02
 
@@ -20,7 +21,7 @@ _MAX_STEP_S = 0.02
 class SimConfig:
     """A simulated car. The same ``seed`` drives the same lap; without ``duration_s`` it never stops."""
 
-    stream: str = setting(text(iort_contract.check_stream), iort_contract.VESC_STREAM)
+    stream: str = setting(text(check_stream), VESC_STREAM)
     rate_hz: float = setting(number(0.1, 2000, unit="Hz"), 50.0)
     duration_s: float | None = setting(number(0.001, 1e9, unit="s"), None)
     seed: int = setting(number(0, 2**31, whole=True), 1)

@@ -11,7 +11,7 @@ import random
 from dataclasses import dataclass
 
 from iort_agent.schema import number, setting
-from iort_contract import Value
+from iort_contract.limits import Value
 
 _G = 9.81
 _AMBIENT_DEGC = 24.0

@@ -16,7 +16,6 @@ from typing import Any, Callable, Mapping
 
 import yaml
 
-import iort_contract
 from iort_agent.config.file import Config, load_config
 from iort_agent.errors import ConfigError, IdentityError, NotRunningError, RefusedError
 from iort_agent.identity.certificate import parse_certificate
@@ -26,6 +25,10 @@ from iort_agent.identity.pending import Pending, forget, keep, kept
 from iort_agent.mqtt.exchange import Exchange
 from iort_agent.private_files import write_below
 from iort_agent.status.server import ask
+from iort_contract.limits import ContractError
+from iort_contract.tables import ROBOT_PARAMETER, SERIAL_PARAMETER
+from iort_contract.topics import check_robot
+from iort_contract.vesc import VESC_STREAM
 
 _log = logging.getLogger(__name__)
 
@@ -37,7 +40,7 @@ _AGAIN_S = (1.0, 4.0)
 _NO_LONGER = ("Invalid", "ResourceNotFound")
 # What RegisterThing takes as a parameter and a thing as an attribute.
 _SERIAL = re.compile(r"[A-Za-z0-9_.,@/:#-]{1,800}")
-_DEFAULT_SOURCES = [{"type": "sim", "stream": iort_contract.VESC_STREAM, "rate_hz": 50}]
+_DEFAULT_SOURCES = [{"type": "sim", "stream": VESC_STREAM, "rate_hz": 50}]
 
 
 @dataclass(frozen=True)
@@ -62,8 +65,8 @@ def provision(file: Path, *, robot: str | None, run: Run = _RUN) -> Path:
     if name is None:
         raise ConfigError(f"{file}: robot: required, and missing: give it here or with --robot")
     try:
-        iort_contract.check_robot(name)
-    except iort_contract.ContractError as error:
+        check_robot(name)
+    except ContractError as error:
         raise ConfigError(str(error)) from error
     config_file = claim.config or file.parent / "car.yaml"
     folder = config_file.parent
@@ -155,7 +158,7 @@ def _finish(claim: Claim, earlier: Pending, run: Run) -> bool:
 
 
 def _ask(connection: Exchange, issued: Pending, run: Run) -> None:
-    parameters = {iort_contract.ROBOT_PARAMETER: issued.robot, iort_contract.SERIAL_PARAMETER: issued.serial}
+    parameters = {ROBOT_PARAMETER: issued.robot, SERIAL_PARAMETER: issued.serial}
     try:
         thing = register_again(lambda: connection.register(issued.token, parameters), wait=run.wait)
     except IdentityError:

@@ -18,7 +18,7 @@ from unittest.mock import patch
 
 from ministack.services import iot, lambda_svc
 
-from iort_contract import TOPIC
+from iort_contract.tables import TOPIC
 from local.gaps.parts.turns import Turns
 
 _RETRIES, _MAX_AGE_S = 2, 21_600

@@ -10,7 +10,7 @@ from typing import Annotated, NoReturn
 import typer
 from botocore.exceptions import BotoCoreError, ClientError
 
-from iort_contract import DEFAULT_NAMESPACE
+from iort_contract.limits import DEFAULT_NAMESPACE
 from iort_station.cli.console import visible
 from iort_station.cli.verbs import (
     adopt,

@@ -11,7 +11,7 @@ from typing import IO, Any, NamedTuple
 import numpy as np
 from rich.table import Table
 
-from iort_contract import EXACT
+from iort_contract.codec.columns import EXACT
 from iort_station.cli.console import visible
 from iort_station.data import Result
 from iort_station.data.blocks import Column, values

@@ -11,7 +11,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 
-from iort_contract import METRICS
+from iort_contract.cloud import METRICS
 from iort_station.cost.prices import MONTH_HOURS, PRICES, Price
 from iort_station.cost.usage import Usage
 

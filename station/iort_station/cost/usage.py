@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
 
-from iort_contract import LIVE_BROKER_EVERY_S
+from iort_contract.limits import LIVE_BROKER_EVERY_S
 from iort_contract.messages.account import ACCOUNT_EVERY_S
 from iort_station.cost.prices import MONTH_DAYS
 from iort_station.errors import StationError

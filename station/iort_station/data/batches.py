@@ -14,20 +14,12 @@ from typing import Any, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
-from iort_contract import (
-    BATCH,
-    NONFINITE,
-    RECORD,
-    SAMPLES,
-    SCALES,
-    Batch,
-    ContractError,
-    batch_id,
-    build_topic,
-)
-from iort_contract.codec.columns import check_sums, decimals_of, not_integers, plain_values
+from iort_contract.codec.columns import SCALES, check_sums, decimals_of, not_integers, plain_values
 from iort_contract.dynamodb import SummaryTable, TelemetryTable, plain, with_samples_between
-from iort_contract.messages.batch import Opened, decode_opened, open_batch
+from iort_contract.limits import ContractError
+from iort_contract.messages.batch import Batch, Opened, batch_id, decode_opened, open_batch
+from iort_contract.tables import BATCH, NONFINITE, SAMPLES
+from iort_contract.topics import RECORD, build_topic
 from iort_station.cloud import Cloud
 from iort_station.data.blocks import EMPTY, Block, Column, column_of, join, joined, ordered
 from iort_station.data.selection import Selection

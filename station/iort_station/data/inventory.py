@@ -7,20 +7,13 @@ from collections.abc import Set as AbstractSet
 from contextlib import suppress
 from dataclasses import replace
 
-from iort_contract import (
-    ACCOUNT_STREAM,
-    BATCH,
-    OWN_STREAMS,
-    ROBOT,
-    STREAMS,
-    TYPES_STREAM,
-    VESC_STREAM,
-    ContractError,
-    MessageType,
-    batch_id,
-    message_type,
-)
+from iort_contract.limits import ContractError
+from iort_contract.messages.batch import batch_id
+from iort_contract.messages.message_type import MessageType, message_type
 from iort_contract.statistics import Vehicle
+from iort_contract.tables import BATCH, ROBOT, STREAMS
+from iort_contract.topics import ACCOUNT_STREAM, OWN_STREAMS, TYPES_STREAM
+from iort_contract.vesc import VESC_STREAM
 from iort_station.cloud import Cloud
 from iort_station.data.batches import RefusedItems, blocks, stored, telemetry_table, topic_of
 from iort_station.data.blocks import Block, values

@@ -11,7 +11,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from iort_contract import ABSENT_FROM, DERIVED_UNITS, STATS, VESC_FIELDS, MessageType, absent
+from iort_contract.messages.message_type import MessageType
+from iort_contract.tables import STATS
+from iort_contract.vesc import ABSENT_FROM, DERIVED_UNITS, VESC_FIELDS, absent
 from iort_station.cloud import Cloud
 from iort_station.data import inventory, query_function
 from iort_station.data.batches import PageProgress, RefusedItems, blocks, stored

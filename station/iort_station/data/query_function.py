@@ -13,7 +13,7 @@ from typing import Any
 
 import numpy as np
 
-from iort_contract import PLAIN_CODEC
+from iort_contract.codec.columns import PLAIN_CODEC
 from iort_station.cloud import Cloud
 from iort_station.data import inventory
 from iort_station.data.batches import PageProgress, RefusedItems

@@ -6,9 +6,10 @@ import time
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 
-import iort_contract
-from iort_contract import ContractError, expression
+from iort_contract import expression
 from iort_contract.expression import ExpressionError, Node
+from iort_contract.limits import ContractError
+from iort_contract.topics import check_robot, check_stream
 from iort_station.errors import StationError
 from iort_station.times import Time, time_us
 
@@ -62,8 +63,8 @@ def select(
     """Make a selection from times and a condition as people write them; raises `StationError`."""
     now_us = time.time_ns() // 1000
     try:
-        iort_contract.check_robot(robot)
-        iort_contract.check_stream(stream)
+        check_robot(robot)
+        check_stream(stream)
         condition = expression.parse(where) if where is not None else None
     except (ContractError, ExpressionError) as error:
         raise StationError(str(error)) from error

@@ -7,7 +7,10 @@ from typing import Any
 
 from boto3.dynamodb.types import TypeDeserializer
 
-from iort_contract import (
+from iort_contract import expression
+from iort_contract.codec.seconds import flat_second
+from iort_contract.dynamodb import seconds_between
+from iort_contract.tables import (
     ABSENT,
     BATCHES,
     EXPIRES_S,
@@ -18,10 +21,7 @@ from iort_contract import (
     SECOND,
     STATS,
     TOPIC,
-    expression,
-    flat_second,
 )
-from iort_contract.dynamodb import seconds_between
 from iort_station.cloud import Cloud
 from iort_station.data.batches import Item, PageProgress, ahead, summary_table, topic_of
 from iort_station.data.blocks import Block, column_of, objects

@@ -5,19 +5,12 @@ from __future__ import annotations
 from collections.abc import Mapping
 from functools import lru_cache
 
-from iort_contract import (
-    AGENT_FIELDS,
-    AGENT_STREAM,
-    DERIVED_UNITS,
-    RTT_FIELDS,
-    RTT_STREAM,
-    STATS,
-    VESC_FIELDS,
-    VESC_STREAM,
-    MessageType,
-)
 from iort_contract.limits import MessageError
+from iort_contract.messages.message_type import MessageType
 from iort_contract.ros1.definition import Fields, parse
+from iort_contract.tables import STATS
+from iort_contract.topics import AGENT_STREAM, RTT_FIELDS, RTT_STREAM
+from iort_contract.vesc import AGENT_FIELDS, DERIVED_UNITS, VESC_FIELDS, VESC_STREAM
 
 VESC_KIND = "vesc_msgs/VescState"
 _VECTOR = dict.fromkeys("xyz", "m")

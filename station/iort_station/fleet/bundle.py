@@ -10,7 +10,7 @@ from typing import Any
 
 import yaml
 
-from iort_contract import VESC_STREAM
+from iort_contract.vesc import VESC_STREAM
 from iort_station.cloud import Cloud
 
 

@@ -12,7 +12,7 @@ from cryptography.hazmat.primitives import hashes, serialization
 from cryptography.hazmat.primitives.asymmetric import ec
 from cryptography.x509.oid import NameOID
 
-from iort_contract import fleet_name
+from iort_contract.cloud import fleet_name
 from iort_station.cloud import Cloud
 
 

@@ -12,7 +12,8 @@ from typing import Any
 import yaml
 from botocore.exceptions import ClientError
 
-from iort_contract import SERIAL, claim_name, fleet_name
+from iort_contract.cloud import claim_name, fleet_name
+from iort_contract.tables import SERIAL
 from iort_station.cloud import Cloud
 from iort_station.errors import StationError
 from iort_station.fleet import certificates, registry

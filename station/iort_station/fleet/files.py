@@ -13,7 +13,9 @@ from typing import Any
 from botocore.exceptions import BotoCoreError, ClientError
 from urllib3.exceptions import HTTPError
 
-from iort_contract import FILES_PREFIX, ContractError, check_robot, parse_file_key
+from iort_contract.limits import ContractError
+from iort_contract.messages.files import FILES_PREFIX, parse_file_key
+from iort_contract.topics import check_robot
 from iort_station.cloud import Cloud
 from iort_station.errors import StationError
 

@@ -9,7 +9,9 @@ from typing import Any, NamedTuple
 
 from boto3.dynamodb.types import TypeSerializer
 
-from iort_contract import (
+from iort_contract.dynamodb import plain
+from iort_contract.limits import ContractError
+from iort_contract.tables import (
     ADMIT_CLAIM,
     ADMIT_FINGERPRINT,
     ADMIT_UNTIL_S,
@@ -19,10 +21,8 @@ from iort_contract import (
     DISCONNECTED_MS,
     ONLINE,
     ROBOT,
-    ContractError,
-    check_robot,
 )
-from iort_contract.dynamodb import plain
+from iort_contract.topics import check_robot
 from iort_station.cloud import Cloud
 from iort_station.errors import StationError
 

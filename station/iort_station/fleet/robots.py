@@ -9,7 +9,8 @@ from typing import Any
 
 from botocore.exceptions import ClientError
 
-from iort_contract import SHADOW, fleet_name
+from iort_contract.cloud import fleet_name
+from iort_contract.topics import SHADOW
 from iort_station.cloud import Cloud
 from iort_station.errors import StationError
 from iort_station.fleet import certificates, registry

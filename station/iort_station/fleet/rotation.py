@@ -5,7 +5,7 @@ from __future__ import annotations
 import time
 from collections.abc import Callable
 
-from iort_contract import CERTIFICATE_ID, ONLINE, SESSION_VERSION
+from iort_contract.tables import CERTIFICATE_ID, ONLINE, SESSION_VERSION
 from iort_station.cloud import Cloud
 from iort_station.errors import StationError
 from iort_station.fleet import certificates, registry

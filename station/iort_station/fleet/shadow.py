@@ -11,17 +11,9 @@ from collections.abc import Callable, Iterator, Mapping
 from email.utils import parsedate_to_datetime
 from typing import Any, NamedTuple, TypeVar
 
-from iort_contract import (
-    AGENT_VERSION,
-    COMMANDS,
-    OVER_SHARE,
-    PUT_OFF,
-    PUT_OFF_LAST_MS,
-    PUT_OFF_SINCE_MS,
-    SHADOW,
-    ContractError,
-    check_robot,
-)
+from iort_contract.limits import ContractError
+from iort_contract.tables import AGENT_VERSION, OVER_SHARE, PUT_OFF, PUT_OFF_LAST_MS, PUT_OFF_SINCE_MS
+from iort_contract.topics import COMMANDS, SHADOW, check_robot
 from iort_station.cloud import Cloud
 from iort_station.errors import StationError
 

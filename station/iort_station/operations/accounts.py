@@ -7,8 +7,11 @@ from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from typing import Any
 
-from iort_contract import ACCOUNT_STREAM, RECEIVED_MS, Batch, ContractError, decode
+from iort_contract.limits import ContractError
 from iort_contract.messages.account import ACCOUNT_EVERY_S, SourceAccount, StreamAccount, account, lost
+from iort_contract.messages.batch import Batch, decode_batch
+from iort_contract.tables import RECEIVED_MS
+from iort_contract.topics import ACCOUNT_STREAM
 from iort_station.cloud import Cloud
 from iort_station.operations.audit import Audit, RunAudit, Shortfall
 from iort_station.operations.delivery import items
@@ -42,7 +45,7 @@ def last_of(stored: Iterable[Mapping[str, Any]]) -> dict[str, Account]:
     batches: list[tuple[Batch, int]] = []
     for item in stored:
         with suppress(ContractError):  # the stream's own audit counts these
-            batches.append((decode(item), int(item.get(RECEIVED_MS, 0)) * 1000))
+            batches.append((decode_batch(item), int(item.get(RECEIVED_MS, 0)) * 1000))
     found: dict[str, Account] = {}
     for batch, received_us in sorted(batches, key=lambda one: one[0].seq):
         run = found.setdefault(batch.boot, Account())

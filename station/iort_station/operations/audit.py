@@ -11,18 +11,11 @@ from dataclasses import dataclass
 from itertools import pairwise
 from typing import Any, NamedTuple
 
-from iort_contract import (
-    AGENT_STREAM,
-    BATCH,
-    RECEIVED_MS,
-    SAMPLES,
-    Batch,
-    BatchId,
-    ContractError,
-    batch_id,
-    decode,
-)
 from iort_contract.dynamodb import plain, starting_between
+from iort_contract.limits import ContractError
+from iort_contract.messages.batch import Batch, BatchId, batch_id, decode_batch
+from iort_contract.tables import BATCH, RECEIVED_MS, SAMPLES
+from iort_contract.topics import AGENT_STREAM
 from iort_station.cloud import Cloud
 from iort_station.data.batches import telemetry_table, topic_of
 
@@ -218,6 +211,6 @@ def last_batch(cloud: Cloud, robot: str, stream: str) -> Batch | None:
     """The newest stored batch of a stream; None if it has none, or an invalid one."""
     item = telemetry_table(cloud).first(topic_of(cloud, robot, stream), newest=True)
     try:
-        return None if item is None else decode(plain(item))
+        return None if item is None else decode_batch(plain(item))
     except ContractError:
         return None

@@ -6,8 +6,9 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import Any
 
-from iort_contract import SAMPLES, Batch, decode
 from iort_contract.dynamodb import plain
+from iort_contract.messages.batch import Batch, decode_batch
+from iort_contract.tables import SAMPLES
 from iort_station.cloud import Cloud
 from iort_station.data.batches import summary_table, telemetry_table, topic_of
 
@@ -24,7 +25,7 @@ class Delivery:
 
 def batches(cloud: Cloud, robot: str, stream: str) -> Iterator[Batch]:
     """Every stored batch of a stream, in order of time; raises `iort_contract.ContractError`."""
-    yield from map(decode, items(cloud, robot, stream))
+    yield from map(decode_batch, items(cloud, robot, stream))
 
 
 def items(cloud: Cloud, robot: str, stream: str) -> Iterator[dict[str, Any]]:

@@ -6,7 +6,8 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import Any
 
-from iort_contract import (
+from iort_contract.dynamodb import plain
+from iort_contract.tables import (
     BY_RULE,
     ENTRY,
     FIRST_MS,
@@ -18,9 +19,8 @@ from iort_contract import (
     SEEN,
     SOURCE,
     TOPIC,
-    as_subscribed,
 )
-from iort_contract.dynamodb import plain
+from iort_contract.topics import as_subscribed
 from iort_station.cloud import Cloud
 from iort_station.errors import StationError
 

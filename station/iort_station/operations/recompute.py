@@ -8,9 +8,8 @@ from collections.abc import Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from typing import Any, NamedTuple
 
-from iort_contract import (
+from iort_contract.tables import (
     EXPIRES_S,
-    OWN_STREAMS,
     RECEIVED_MS,
     RECOMPUTE_FROM_S,
     RECOMPUTED,
@@ -18,6 +17,7 @@ from iort_contract import (
     TOPIC,
     VEHICLE_CACHE_S,
 )
+from iort_contract.topics import OWN_STREAMS
 from iort_station.cloud import Cloud
 from iort_station.data import inventory, summary
 from iort_station.data.batches import ATTRIBUTES, Item, PageProgress, stored

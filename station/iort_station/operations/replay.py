@@ -14,7 +14,11 @@ from typing import Any, NamedTuple
 
 from botocore.exceptions import BotoCoreError, ClientError
 
-from iort_contract import (
+from iort_contract.checks import COMPACT, json_object
+from iort_contract.dynamodb import plain
+from iort_contract.limits import ContractError
+from iort_contract.messages.batch import Batch, decode_item
+from iort_contract.tables import (
     BATCH,
     BY_LATER,
     BY_RULE,
@@ -23,16 +27,11 @@ from iort_contract import (
     ENVELOPE,
     LAST_MS,
     RECEIVED_MS,
-    RECORD,
     REPLAY,
     REPLAYS,
     TOPIC,
-    Batch,
-    ContractError,
-    decode_item,
 )
-from iort_contract.checks import COMPACT, json_object
-from iort_contract.dynamodb import plain
+from iort_contract.topics import RECORD
 from iort_station.cloud import Cloud
 from iort_station.data.batches import telemetry_table
 from iort_station.errors import StationError

@@ -10,7 +10,8 @@ from typing import Any
 
 import numpy as np
 
-from iort_contract import CLAIM_FIELDS, check_robot
+from iort_contract.messages.files import CLAIM_FIELDS
+from iort_contract.topics import check_robot
 from iort_station import data
 from iort_station.cloud import Cloud
 from iort_station.data import inventory

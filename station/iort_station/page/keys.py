@@ -6,7 +6,7 @@ import json
 from dataclasses import dataclass, field
 from typing import Any
 
-from iort_contract import pubnub_parameter
+from iort_contract.cloud import pubnub_parameter
 from iort_station.cloud import Cloud
 from iort_station.errors import StationError
 

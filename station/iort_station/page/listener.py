@@ -14,7 +14,10 @@ from pubnub.pnconfiguration import PNConfiguration
 from pubnub.pubnub import PubNub
 from typing_extensions import Self
 
-from iort_contract import DEFAULT_NAMESPACE, ROBOT, T_US, channel, check_namespace
+from iort_contract.cloud import channel
+from iort_contract.limits import DEFAULT_NAMESPACE
+from iort_contract.tables import ROBOT, T_US
+from iort_contract.topics import check_namespace
 from iort_station.errors import StationError
 
 _CONNECT_S = 15.0
@@ -22,7 +25,7 @@ _CONNECT_S = 15.0
 
 class Heard(NamedTuple):
     """One update: whose, which, how long it took from leaving the car to being here, its sample's time
-    (microseconds) and the hops' (`iort_contract.live_update`)."""
+    (microseconds) and the hops' (`live_update`)."""
 
     robot: str
     stream: str

@@ -12,8 +12,10 @@ from importlib.resources import files
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-import iort_contract
+from iort_contract.limits import SCHEMA_VERSION, ContractError
 from iort_contract.page import PUBNUB_ORIGIN
+from iort_contract.topics import RTT_FIELDS, check_namespace, check_robot
+from iort_contract.vesc import AGENT_FIELDS, DERIVED_UNITS, FAULTS, VESC_FIELDS, VESC_STREAM
 from iort_station.data.units import ROS_UNITS, agent_unit
 from iort_station.errors import StationError
 
@@ -65,9 +67,9 @@ def config(
     only read.
     """
     try:
-        iort_contract.check_namespace(namespace)
-        known = {iort_contract.check_robot(robot): dict(car) for robot, car in (vehicles or {}).items()}
-    except iort_contract.ContractError as error:
+        check_namespace(namespace)
+        known = {check_robot(robot): dict(car) for robot, car in (vehicles or {}).items()}
+    except ContractError as error:
         raise StationError(f"the page's configuration: {error}") from error
     if not _KEY.fullmatch(subscribe_key):
         raise StationError("the page's subscribe_key: allowed is 1 to 128 of A-Z a-z 0-9 _ -")
@@ -101,21 +103,18 @@ def field_table() -> dict[str, Any]:
     """The contract's field table as the page reads it, ``/fields.json``."""
     fields = {
         f.name: {"unit": f.unit, "meaning": f.meaning} | ({"ros2_unit": f.ros2_unit} if f.ros2_unit else {})
-        for f in iort_contract.VESC_FIELDS.values()
+        for f in VESC_FIELDS.values()
     }
-    fields |= {name: {"unit": unit, "meaning": ""} for name, unit in iort_contract.DERIVED_UNITS.items()}
+    fields |= {name: {"unit": unit, "meaning": ""} for name, unit in DERIVED_UNITS.items()}
     fields |= {
         name: {"unit": "ms", "meaning": f"round trip over the path {path}"}
-        for path, name in iort_contract.RTT_FIELDS.items()
+        for path, name in RTT_FIELDS.items()
     }
-    fields |= {
-        name: {"unit": agent_unit(name), "meaning": meaning}
-        for name, meaning in iort_contract.AGENT_FIELDS.items()
-    }
-    faults = {str(code): name for code, name in iort_contract.FAULTS.items()}
+    fields |= {name: {"unit": agent_unit(name), "meaning": meaning} for name, meaning in AGENT_FIELDS.items()}
+    faults = {str(code): name for code, name in FAULTS.items()}
     return {
-        "version": iort_contract.SCHEMA_VERSION,
-        "stream": iort_contract.VESC_STREAM,
+        "version": SCHEMA_VERSION,
+        "stream": VESC_STREAM,
         "fields": fields,
         "ros_units": ROS_UNITS,
         "faults": faults,

@@ -29,7 +29,7 @@ from urllib.parse import parse_qsl
 from botocore.exceptions import BotoCoreError, ClientError
 from typing_extensions import Self
 
-import iort_contract
+from iort_contract.limits import ContractError
 from iort_contract.page import HEADERS, PUBNUB_ORIGIN, security_policy
 from iort_station.errors import StationError
 from iort_station.page.page import BUILT, TYPES, built_files, config, field_table
@@ -199,7 +199,7 @@ class _Handler(BaseHTTPRequestHandler):
     def _answer(self, answer: Answer, parameters: Mapping[str, str]) -> None:
         try:
             status, value = HTTPStatus.OK, answer(parameters)
-        except (StationError, iort_contract.ContractError) as error:
+        except (StationError, ContractError) as error:
             status, value = HTTPStatus.BAD_REQUEST, {"error": str(error)}
         except (BotoCoreError, ClientError) as error:
             status, value = HTTPStatus.BAD_GATEWAY, {"error": f"AWS refused a call: {error}"}

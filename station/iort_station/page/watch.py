@@ -10,8 +10,11 @@ from typing import Any
 from rich.table import Table
 from rich.text import Text
 
-from iort_contract import FAULTS, ROBOT, SCHEMA_VERSION, T_US, ContractError, check_robot, check_stream
+from iort_contract.limits import SCHEMA_VERSION, ContractError
 from iort_contract.statistics import Vehicle
+from iort_contract.tables import ROBOT, T_US
+from iort_contract.topics import check_robot, check_stream
+from iort_contract.vesc import FAULTS
 
 # As on the page: older values are stale, and a car unheard of for longer is gone.
 STALE_S, GONE_S = 1.5, 4.5

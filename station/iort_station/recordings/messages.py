@@ -13,7 +13,8 @@ from typing import Any
 import numpy as np
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
-from iort_contract import MessageType, Value
+from iort_contract.limits import Value
+from iort_contract.messages.message_type import MessageType
 from iort_station.cloud import Cloud
 from iort_station.data import inventory
 from iort_station.data.blocks import Block, values

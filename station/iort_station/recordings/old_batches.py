@@ -5,10 +5,11 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any
 
-from iort_contract import BATCH, NONFINITE, T_US, BatchId, ContractError
 from iort_contract.checks import check_header, check_version, integer
 from iort_contract.dynamodb import plain
-from iort_contract.limits import BATCH_VERSION
+from iort_contract.limits import BATCH_VERSION, ContractError
+from iort_contract.messages.batch import BatchId
+from iort_contract.tables import BATCH, NONFINITE, T_US
 
 OLD_VERSION = 1
 _VERSION, _BOOT, _SEQ = "v", "boot", "seq"

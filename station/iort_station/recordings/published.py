@@ -6,8 +6,11 @@ import hashlib
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from typing import Any, NamedTuple
 
-from iort_contract import CLAIM_AT, CLAIM_FIELDS, Batch, ContractError, MessageType, messages_of
 from iort_contract.dynamodb import plain
+from iort_contract.limits import ContractError
+from iort_contract.messages.batch import Batch, messages_of
+from iort_contract.messages.files import CLAIM_AT, CLAIM_FIELDS
+from iort_contract.messages.message_type import MessageType
 from iort_contract.ros1.message import filled
 from iort_station.cloud import Cloud
 from iort_station.data.batches import PageProgress, RefusedItems, stored

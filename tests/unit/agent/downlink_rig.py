@@ -9,7 +9,6 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-import iort_contract
 from iort_agent.control.config import DownlinkConfig, share_rule
 from iort_agent.control.downlink import Downlink
 from iort_agent.errors import SourceError
@@ -17,7 +16,7 @@ from iort_agent.lanes.clock_offset import Offset
 from iort_agent.mqtt.dispatch import Dispatcher
 from iort_agent.rate_limiter import Allowance
 from iort_agent.schema import Where, load
-from iort_contract import Command
+from iort_contract.messages.commands import Command, encode_command
 from iort_contract.ros1.definition import Definition, parse
 from tests.agent_fakes import Loopback, ManualClock
 
@@ -142,7 +141,7 @@ class Rig:
         now_us = self.clock.now_us()
         command = Command("feedbeef", now_us - 10, self.seq, now_us, 500, message, 300)
         self.seq += 1
-        payload = raw if raw is not None else iort_contract.encode_command(replace(command, **changes))
+        payload = raw if raw is not None else encode_command(replace(command, **changes))
         self.uplink.deliver(f"cmd/iort/car1/{name}", payload)
         self.dispatcher.run_pending()
 

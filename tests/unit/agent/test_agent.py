@@ -10,7 +10,6 @@ from typing import Any
 
 import pytest
 
-import iort_contract
 from iort_agent.agent import make_agent
 from iort_agent.cli import main
 from iort_agent.clock import Clock, SystemClock
@@ -25,6 +24,11 @@ from iort_agent.sources import Emit
 from iort_agent.sources.recording.bag import BagConfig
 from iort_agent.spool.memory import REJECT_NEW, MemorySpool
 from iort_agent.status.state import Status, document, read
+from iort_contract.limits import MAX_FIELDS
+from iort_contract.messages.batch import decode_batch
+from iort_contract.messages.message_type import MessageType, message_type
+from iort_contract.topics import TYPES_STREAM
+from iort_contract.vesc import AGENT_FIELDS
 from tests.agent_fakes import Loopback, Published
 
 T0 = 1_700_000_000_000_000
@@ -74,7 +78,7 @@ class Rig:
 
     def recorded(self, stream: str = "vesc") -> list[Any]:
         topic = f"$aws/rules/iort_record/dt/iort/car1/{stream}"
-        batches = [iort_contract.decode(m.payload) for m in self.uplink.published if m.topic == topic]
+        batches = [decode_batch(m.payload) for m in self.uplink.published if m.topic == topic]
         self.seqs = [batch.seq for batch in batches]
         return [value for batch in batches for value in batch.columns["speed"]]
 
@@ -89,7 +93,7 @@ def test_every_sample_is_recorded_and_the_report_says_so() -> None:
         "samples": 500, "stored": 500, "batches": 10, "refused": 0, "nulled": 0, "first_seq": 0,
     }  # fmt: skip
     assert report["spool"]["left_batches"] == report["spool"]["dropped_batches"] == 0
-    assert report["boot"] == iort_contract.decode(rig.uplink.published[-1].payload).boot
+    assert report["boot"] == decode_batch(rig.uplink.published[-1].payload).boot
     live = [m for m in rig.uplink.published if m.topic == "live/iort/car1/vesc"]
     assert report["live_published"] == len(live) > 0
     assert rig.uplink.stopped
@@ -153,7 +157,7 @@ def test_dropped_samples_are_not_a_success(caplog: pytest.LogCaptureFixture) -> 
     assert 0 < len(rig.recorded()) < 1500
     assert rig.seqs == sorted(set(rig.seqs)), "the numbers of those dropped are missing"
     assert len(rig.seqs) < report["streams"]["vesc"]["batches"] == 30
-    delivered = [iort_contract.decode(m.payload) for m in rig.uplink.published if "/dt/" in m.topic]
+    delivered = [decode_batch(m.payload) for m in rig.uplink.published if "/dt/" in m.topic]
     stored = sum(stream["stored"] for stream in report["streams"].values())
     assert sum(len(batch.times_us) for batch in delivered) == stored - report["spool"]["dropped_samples"]
 
@@ -180,7 +184,7 @@ def give_nothing(emit: Emit, stop: threading.Event) -> None:
 
 def give_too_wide(emit: Emit, stop: threading.Event) -> None:
     for i in range(3):
-        emit("vesc", T0 + i, dict.fromkeys((f"x{i}" for i in range(iort_contract.MAX_FIELDS + 1)), 1.0))
+        emit("vesc", T0 + i, dict.fromkeys((f"x{i}" for i in range(MAX_FIELDS + 1)), 1.0))
 
 
 @pytest.mark.parametrize(
@@ -243,9 +247,7 @@ def test_round_trips_are_recorded_like_any_stream() -> None:
 
     rig.uplink.verdict = count
     assert rig.agent.run(drain_s=10) == 0
-    batches = [
-        iort_contract.decode(m.payload) for m in seen if m.topic == "$aws/rules/iort_record/dt/iort/car1/rtt"
-    ]
+    batches = [decode_batch(m.payload) for m in seen if m.topic == "$aws/rules/iort_record/dt/iort/car1/rtt"]
     values = [value for batch in batches for value in batch.columns["broker_ms"]]
     ping = rig.report()["pings"]["broker"]
     assert len(values) == ping["received"] == ping["sent"] >= 3
@@ -280,17 +282,17 @@ def test_lanes_fields_and_rates_change_while_it_runs() -> None:
     assert rig.clock.monotonic() - began < 10, "it waited for something that does not come"
     assert rig.recorded() == [1, 2, 4]
     topic = "$aws/rules/iort_record/dt/iort/car1/vesc"
-    batches = [iort_contract.decode(m.payload) for m in rig.uplink.published if m.topic == topic]
+    batches = [decode_batch(m.payload) for m in rig.uplink.published if m.topic == topic]
     assert [sorted(batch.columns) for batch in batches] == [
         ["speed", "voltage_input"], ["speed"], ["speed", "voltage_input"],
     ]  # fmt: skip
 
 
 def test_types_are_said_again_when_recording_begins() -> None:
-    said = iort_contract.MessageType("vesc", "/vesc", "p/A", "0" * 32, "float64 speed\n")
+    said = MessageType("vesc", "/vesc", "p/A", "0" * 32, "float64 speed\n")
 
     def late(emit: Emit, stop: threading.Event) -> None:
-        emit(iort_contract.TYPES_STREAM, T0, said.sample())
+        emit(TYPES_STREAM, T0, said.sample())
         rig.agent.parts.tune(replace(rig.agent.parts.streams.tuning, record_enabled=True))
         emit("vesc", T0 + 1_000_000, {"speed": 1})
 
@@ -298,9 +300,9 @@ def test_types_are_said_again_when_recording_begins() -> None:
     assert rig.agent.run(drain_s=10) == 0
     assert rig.recorded() == [1]
     topic = "$aws/rules/iort_record/dt/iort/car1/types"
-    (batch,) = [iort_contract.decode(m.payload) for m in rig.uplink.published if m.topic == topic]
+    (batch,) = [decode_batch(m.payload) for m in rig.uplink.published if m.topic == topic]
     sample = {name: column[0] for name, column in batch.columns.items()}
-    assert iort_contract.message_type(sample) == said
+    assert message_type(sample) == said
 
 
 def test_an_account_is_of_one_moment() -> None:
@@ -323,8 +325,8 @@ def test_its_own_figures_are_a_stream() -> None:
     topic = "$aws/rules/iort_record/dt/iort/car1/agent"
     rig.uplink.verdict = lambda message: seen.set() if message.topic == topic else None
     assert rig.agent.run(drain_s=10) == 0
-    batch = next(iort_contract.decode(m.payload) for m in rig.uplink.published if m.topic == topic)
-    assert list(batch.columns) == list(iort_contract.AGENT_FIELDS)
+    batch = next(decode_batch(m.payload) for m in rig.uplink.published if m.topic == topic)
+    assert list(batch.columns) == list(AGENT_FIELDS)
     assert not [m for m in rig.uplink.published if m.topic == "live/iort/car1/agent"]
 
 

@@ -13,9 +13,12 @@ from rosbags import rosbag2
 from rosbags.rosbag1 import Writer as Writer1
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
-import iort_contract
 from iort_agent.errors import SourceError
 from iort_agent.sources.recording.bag import _VESC_STATE_ROS2, VESC_TYPE, BagConfig
+from iort_contract.messages.message_type import message_type
+from iort_contract.ros1.message import type_id
+from iort_contract.topics import TYPES_STREAM
+from iort_contract.vesc import VESC_FIELDS
 from tests.agent_fakes import ManualClock
 from tests.recordings import recording
 
@@ -31,7 +34,7 @@ Sample = Tuple[str, int, Any]
 
 def play(path: Path, clock: ManualClock | None = None, **settings: Any) -> list[Sample]:
     """The samples, without what says what they are made of."""
-    return [s for s in play_all(path, clock, **settings) if s[0] != iort_contract.TYPES_STREAM]
+    return [s for s in play_all(path, clock, **settings) if s[0] != TYPES_STREAM]
 
 
 def play_all(path: Path, clock: ManualClock | None = None, **settings: Any) -> list[Sample]:
@@ -43,13 +46,13 @@ def play_all(path: Path, clock: ManualClock | None = None, **settings: Any) -> l
 
 def test_the_first_message_of_a_topic_brings_its_type(tmp_path: Path) -> None:
     first, second, *rest = play_all(write_ros1(tmp_path / "a.bag"))
-    kind = iort_contract.message_type(first[2])
-    assert first[:2] == (iort_contract.TYPES_STREAM, second[1])
+    kind = message_type(first[2])
+    assert first[:2] == (TYPES_STREAM, second[1])
     assert (kind.stream, kind.kind) == (second[0], "vesc_msgs/VescStateStamped")
     assert kind.id == second[2].kind.id
     assert "float64 speed" in kind.definition
     assert len(kind.md5sum) == 32
-    assert iort_contract.TYPES_STREAM not in {sample[0] for sample in rest}
+    assert TYPES_STREAM not in {sample[0] for sample in rest}
 
 
 def test_a_type_that_was_rebuilt_while_recording_is_two_types(tmp_path: Path) -> None:
@@ -66,9 +69,9 @@ def test_a_type_that_was_rebuilt_while_recording_is_two_types(tmp_path: Path) ->
             writer.write(connection, START + i, (b"\0\0\x80?", bytes(range(8)))[i])
     types, samples = [], []
     for stream, _, values in play_all(path, topics=(("/state", "state"),)):
-        (types if stream == iort_contract.TYPES_STREAM else samples).append(values)
-    assert [iort_contract.message_type(said).definition for said in types] == definitions
-    assert [sample.kind.id for sample in samples] == [iort_contract.message_type(said).id for said in types]
+        (types if stream == TYPES_STREAM else samples).append(values)
+    assert [message_type(said).definition for said in types] == definitions
+    assert [sample.kind.id for sample in samples] == [message_type(said).id for said in types]
     assert [dict(sample) for sample in samples] == [{"x": 1.0}, {"x": 0x03020100, "more": 0x07060504}]
 
 
@@ -86,14 +89,14 @@ def test_what_is_played_is_what_was_recorded_byte_for_byte(tmp_path: Path, speed
     for stream, topic in streams.items():
         (kind,) = {values.kind for name, _, values in samples if name == stream}
         named = {"servo": "std_msgs/Float64", "car": "vesc_msgs/VescStateStamped"}[stream]
-        assert kind.id == iort_contract.type_id(topic, named, checksums[topic])
+        assert kind.id == type_id(topic, named, checksums[topic])
 
 
 @pytest.mark.parametrize("storage", STORAGES)
 def test_what_ros_2_recorded_is_a_message_of_ros_1(tmp_path: Path, storage: str) -> None:
     folder = write_ros2(tmp_path / "drive", storage)
     said, *samples = play_all(folder)
-    kind = iort_contract.message_type(said[2])
+    kind = message_type(said[2])
     store = get_typestore(Stores.EMPTY)
     store.register(get_types_from_msg(kind.definition, VESC_TYPE))
     assert store.generate_msgdef(VESC_TYPE, ros_version=1)[1] == kind.md5sum
@@ -156,7 +159,7 @@ def ros2_writer(path: Path, storage: str) -> rosbag2.Writer:
 def write_ros2(path: Path, storage: str, *, count: int = 10) -> Path:
     store = ros2_store()
     types = store.types
-    names = [name for name, field in iort_contract.VESC_FIELDS.items() if 2 in field.ros]
+    names = [name for name, field in VESC_FIELDS.items() if 2 in field.ros]
     whole = {"displacement", "distance_traveled", "fault_code", "controller_id"}
     with ros2_writer(path, storage) as writer:
         core = writer.add_connection("/sensors/core", VESC_TYPE, typestore=store)
@@ -180,7 +183,7 @@ def test_a_real_drive() -> None:
     samples = play(recording("f1tenth-motor-servo.bag"))
     assert len(samples) == 2244
     assert {stream for stream, _, _ in samples} == {"vesc"}
-    expected = {name for name, field in iort_contract.VESC_FIELDS.items() if 1 in field.ros}
+    expected = {name for name, field in VESC_FIELDS.items() if 1 in field.ros}
     assert all(set(values) == expected for _, _, values in samples)
     assert samples[0][2]["voltage_input"] == 11.7
     times = [t_us for _, t_us, _ in samples]
@@ -255,7 +258,7 @@ def test_ros_2(tmp_path: Path, storage: str, by_file: bool) -> None:
     samples = play(path)
     assert len(samples) == 10
     values = samples[3][2]
-    expected = [name for name, field in iort_contract.VESC_FIELDS.items() if 2 in field.ros]
+    expected = [name for name, field in VESC_FIELDS.items() if 2 in field.ros]
     assert sorted(values) == sorted(expected)
     assert values["voltage_input"] == expected.index("voltage_input") + 3.5
     assert values["fault_code"] == expected.index("fault_code") + 3

@@ -12,11 +12,12 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-import iort_contract
 from iort_agent.lanes.batch import MAX_VALUES, Batcher, StreamCounts
 from iort_agent.lanes.batch_encoder import Packer
 from iort_agent.spool.memory import MemorySpool
-from iort_contract import RosMessage, RosType
+from iort_contract.limits import MAX_BATCH_VALUES, MAX_MESSAGE_BYTES
+from iort_contract.messages.batch import Batch, decode_batch, messages_of
+from iort_contract.ros1.message import RosMessage, RosType
 from tests.agent_fakes import ManualClock
 from tests.unit.contract.ros1_messages import text
 
@@ -41,8 +42,8 @@ class Line:
             after = entry.id
         return out
 
-    def batches(self) -> list[iort_contract.Batch]:
-        return [iort_contract.decode(payload) for payload in self.messages()]
+    def batches(self) -> list[Batch]:
+        return [decode_batch(payload) for payload in self.messages()]
 
     def samples(self) -> list[tuple[int, dict[str, Any]]]:
         return [
@@ -247,7 +248,7 @@ def test_messages_of_two_types_and_plain_samples_are_a_message_each() -> None:
         {"mode": ["on"] * 3, "note": ["n"] * 3},
     ]
     layouts = {kind.id: kind.layout for kind in (A, B)}
-    found = [iort_contract.messages_of(payload, layouts)[1] for payload in line.messages()]
+    found = [messages_of(payload, layouts)[1] for payload in line.messages()]
     assert [None if one is None else (one.type_id, list(one.raw)) for one in found] == [
         (A.id, [struct.pack("<d", i / 2) for i in range(3)]),
         (B.id, [text("on")] * 3),
@@ -264,7 +265,7 @@ def test_a_message_that_its_type_does_not_fit_costs_nothing() -> None:
         line.batcher.add(T0 + i, RosMessage(raw, A))
     line.batcher.flush()
     (payload,) = line.messages()
-    batch, messages = iort_contract.messages_of(payload, {})
+    batch, messages = messages_of(payload, {})
     assert messages is not None
     assert list(messages.raw) == raws
     assert batch.columns == {"speed": [1.5, None, None, 2.5]}
@@ -278,8 +279,8 @@ def test_a_batch_of_messages_closes_near_the_limit_of_a_message(size: int) -> No
     for i, raw in enumerate(raws):
         line.batcher.add(T0 + i, RosMessage(raw, A))
     line.batcher.flush()
-    assert all(len(payload) <= iort_contract.MAX_MESSAGE_BYTES for payload in line.messages())
-    found = [iort_contract.messages_of(payload, {})[1] for payload in line.messages()]
+    assert all(len(payload) <= MAX_MESSAGE_BYTES for payload in line.messages())
+    found = [messages_of(payload, {})[1] for payload in line.messages()]
     assert [raw for messages in found if messages is not None for raw in messages.raw] == raws
     assert line.counts.refused == 0
     # Not one a message, where they are small.
@@ -292,7 +293,7 @@ def test_a_message_that_is_too_large_is_refused_alone() -> None:
     for i, raw in enumerate(raws):
         line.batcher.add(T0 + i, RosMessage(raw, A))
     line.batcher.flush()
-    found = [iort_contract.messages_of(payload, {})[1] for payload in line.messages()]
+    found = [messages_of(payload, {})[1] for payload in line.messages()]
     assert [raw for messages in found if messages is not None for raw in messages.raw] == [raws[0], raws[2]]
     assert (line.counts.refused, line.counts.stored) == (1, 2)
 
@@ -305,7 +306,7 @@ def test_messages_stay_below_the_limit() -> None:
         line.batcher.add(T0 + i * 1000, {name: math.sin(i * 7919 + k) for k, name in enumerate(names)})
     line.batcher.flush()
     assert len(line.samples()) == 200
-    assert all(len(message) <= iort_contract.MAX_MESSAGE_BYTES for message in line.messages())
+    assert all(len(message) <= MAX_MESSAGE_BYTES for message in line.messages())
     assert all(len(b.times_us) * 400 <= MAX_VALUES for b in line.batches())
     assert len(line.batches()) > 200 * 400 // MAX_VALUES, "some were split"
 
@@ -316,7 +317,7 @@ def test_what_holds_too_many_values_for_a_batch_is_halved() -> None:
     line.packer.store([(t_us, fields) for t_us in range(400)])
     assert [t_us for t_us, _ in line.samples()] == list(range(400))
     assert [len(batch.times_us) for batch in line.batches()] == [100] * 4
-    assert all(len(batch.times_us) * 300 <= iort_contract.MAX_BATCH_VALUES for batch in line.batches())
+    assert all(len(batch.times_us) * 300 <= MAX_BATCH_VALUES for batch in line.batches())
     assert [batch.seq for batch in line.batches()] == [0, 1, 2, 3]
     assert line.counts.refused == 0
 

@@ -12,7 +12,6 @@ from pathlib import Path
 import pytest
 from PIL import Image
 
-import iort_contract
 from iort_agent.config.file import load_config
 from iort_agent.errors import ConfigError
 from iort_agent.files.file import read
@@ -20,11 +19,13 @@ from iort_agent.files.folder import Folder
 from iort_agent.lanes.attachment import ClaimCheck
 from iort_agent.lanes.thumbnail import thumbnail
 from iort_agent.sources.recording.bag import BagConfig
-from iort_contract import CLAIM_AT, CLAIM_FIELDS, RosMessage, RosType
-from iort_contract.limits import MessageError
+from iort_contract.limits import MAX_PUBNUB_BYTES, MessageError
+from iort_contract.messages.batch import Batch, decode_batch, encode_batch
+from iort_contract.messages.files import CLAIM_AT, CLAIM_FIELDS, file_key
+from iort_contract.messages.live import LiveSample, encode_live
 from iort_contract.ros1.decode import Decoder
 from iort_contract.ros1.definition import parse
-from iort_contract.ros1.message import filled
+from iort_contract.ros1.message import Messages, RosMessage, RosType, filled
 from tests.agent_fakes import ManualClock
 from tests.images import TOPIC, jpeg, write_bag
 from tests.unit.contract.ros1_messages import text, u32
@@ -66,7 +67,7 @@ def test_the_claim_says_where_the_upload_will_put_it(tmp_path):
     name = folder.next()
     assert name == Path(f"camera/{T_US}-data.jpg")
     local = folder.local(name, threading.Event())
-    assert iort_contract.file_key("car", local.file) == sample["data.key"]
+    assert file_key("car", local.file) == sample["data.key"]
     assert local.file.kind == "image"
     assert (tmp_path / name).read_bytes() == PICTURE
 
@@ -169,14 +170,12 @@ def test_only_bytes_are_claimed(tmp_path):
 def test_a_claim_fits_a_batch_and_the_live_lane(tmp_path):
     sample = claims_in(tmp_path, small=thumbnail).claim("camera", T_US, image())
     columns = {name: [value] for name, value in sample.beside.items()}
-    messages = iort_contract.Messages(IMAGE.id, IMAGE.layout, [sample.raw])
-    batch = iort_contract.Batch("0123456789abcdef", 0, [T_US], columns, 0, messages)
-    assert len(iort_contract.encode(batch)) < 8000
-    assert iort_contract.decode(iort_contract.encode(batch)).columns == {
-        name: [sample[name]] for name in sample
-    }
-    live = iort_contract.LiveSample("0123456789abcdef", 0, T_US, T_US, sample)
-    assert len(iort_contract.encode_live(live)) < iort_contract.MAX_PUBNUB_BYTES / 2
+    messages = Messages(IMAGE.id, IMAGE.layout, [sample.raw])
+    batch = Batch("0123456789abcdef", 0, [T_US], columns, 0, messages)
+    assert len(encode_batch(batch)) < 8000
+    assert decode_batch(encode_batch(batch)).columns == {name: [sample[name]] for name in sample}
+    live = LiveSample("0123456789abcdef", 0, T_US, T_US, sample)
+    assert len(encode_live(live)) < MAX_PUBNUB_BYTES / 2
 
 
 # --- thumbnails -------------------------------------------------------------------------------------

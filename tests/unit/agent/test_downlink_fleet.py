@@ -4,12 +4,11 @@ from __future__ import annotations
 
 from typing import Any
 
-import iort_contract
 from iort_agent.lanes.clock_offset import Offset
 from iort_agent.mqtt.dispatch import Dispatcher
 from iort_agent.mqtt.uplink import Message
 from iort_agent.ros1.json_message import encode
-from iort_contract import FleetMessage
+from iort_contract.messages.commands import FleetMessage, decode_fleet, encode_fleet
 from iort_contract.ros1.definition import parse
 from tests.agent_fakes import Loopback, ManualClock
 from tests.unit.agent.downlink_rig import POSE, POSE_MESSAGE, T0, Rig, doubles
@@ -56,7 +55,7 @@ def fleet(
     offset_us: int | None = None,
 ) -> None:
     sent_us = rig.clock.now_us() - age_us
-    payload = iort_contract.encode_fleet(FleetMessage(boot, seq, sent_us, message or POSE_MESSAGE, offset_us))
+    payload = encode_fleet(FleetMessage(boot, seq, sent_us, message or POSE_MESSAGE, offset_us))
     rig.uplink.deliver(f"fleet/iort/{robot}/pose", payload)
     rig.dispatcher.run_pending()
 
@@ -101,11 +100,7 @@ def test_another_robots_nonsense_is_refused() -> None:
 
 def shared(rig: Rig) -> list[FleetMessage]:
     rig.dispatcher.run_pending()
-    return [
-        iort_contract.decode_fleet(m.payload)
-        for m in rig.uplink.published
-        if m.topic == "fleet/iort/car1/pose"
-    ]
+    return [decode_fleet(m.payload) for m in rig.uplink.published if m.topic == "fleet/iort/car1/pose"]
 
 
 def test_shared_at_the_rate_and_the_newest() -> None:

@@ -8,10 +8,10 @@ from typing import Mapping
 
 import pytest
 
-import iort_contract
 from iort_agent.errors import IdentityError, RefusedError
 from iort_agent.identity.pending import TOKEN_S, Pending, keep, kept
 from iort_agent.verbs.provision import Run, provision, register_again
+from iort_contract.limits import DEFAULT_NAMESPACE
 
 
 class Cloud:
@@ -107,7 +107,7 @@ def earlier(folder: Path, *, asked_s: float | None = None, **other: str) -> Pend
         "robot": "car",
         "serial": "s1",
         "endpoint": "here",
-        "namespace": iort_contract.DEFAULT_NAMESPACE,
+        "namespace": DEFAULT_NAMESPACE,
         "private_key": "key 0",
         "certificate": "certificate 0",
         "token": "token 0",

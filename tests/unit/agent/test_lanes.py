@@ -13,7 +13,6 @@ from typing import Any, NamedTuple
 
 import pytest
 
-import iort_contract
 from iort_agent.agent import make_agent
 from iort_agent.clock import Clock, SystemClock
 from iort_agent.config.file import Config
@@ -26,6 +25,8 @@ from iort_agent.reporting import make_report, make_status
 from iort_agent.spool.memory import MemorySpool
 from iort_agent.status.state import document
 from iort_agent.status.text import render
+from iort_contract.messages.batch import decode_batch
+from iort_contract.topics import BROKER, LIVE
 from tests.agent_fakes import Loopback, ManualClock, Published
 
 T0 = 1_700_000_000_000_000
@@ -100,7 +101,7 @@ class Drive:
             if sources:
                 self._offer()
             if self._is_due(pings_hz):
-                self.agent.parts.pings.send(iort_contract.BROKER)
+                self.agent.parts.pings.send(BROKER)
             if self._ms % TICK_MS == 0:
                 self.agent.tick()
             ready = bisect.bisect_right(self._acks, self.clock.monotonic())
@@ -145,7 +146,7 @@ class Drive:
         found = dict.fromkeys(self.topics, 0)
         for sent in self.sent:
             levels = sent.topic.split("/")
-            if levels[-4] == iort_contract.LIVE and sent.at >= self.clock.monotonic() - seconds:
+            if levels[-4] == LIVE and sent.at >= self.clock.monotonic() - seconds:
                 found[levels[-1]] += 1
         return found
 
@@ -158,7 +159,7 @@ class Drive:
         arrived = dict.fromkeys(taken, 0)
         for message in self.uplink.published:
             if message.topic.startswith("$aws/rules/iort_record/"):
-                batch = iort_contract.decode(message.payload)
+                batch = decode_batch(message.payload)
                 arrived[message.topic.split("/")[-1]] += len(batch.times_us)
         assert arrived == taken
         self.check_limits()
@@ -278,12 +279,12 @@ def test_another_fault_goes_soon_whatever_else_there_is() -> None:
 
 
 def test_pings_have_what_recordings_leave_and_live_what_pings_leave() -> None:
-    drive = Drive(topics(50, 20), ping=PingConfig(rate_hz=20, paths=(iort_contract.BROKER,)))
+    drive = Drive(topics(50, 20), ping=PingConfig(rate_hz=20, paths=(BROKER,)))
     drive.run(SETTLE_S, pings_hz=20)
-    before = drive.report()["pings"][iort_contract.BROKER]["sent"]
+    before = drive.report()["pings"][BROKER]["sent"]
     held_back = drive.status()["lanes"]["ping"]["held_back"]
     drive.run(10, pings_hz=20)
-    assert drive.report()["pings"][iort_contract.BROKER]["sent"] - before == 200
+    assert drive.report()["pings"][BROKER]["sent"] - before == 200
     assert drive.status()["lanes"]["ping"]["held_back"] == held_back
     assert 10 * 15 <= sum(drive.live(10).values()) <= 10 * 20
     assert drive.backlog() <= 3

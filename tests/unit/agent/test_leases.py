@@ -21,7 +21,7 @@ from iort_agent.control.leases import (
     Leases,
     Limits,
 )
-from iort_contract import Command
+from iort_contract.messages.commands import Command
 
 T0 = 1_700_000_000_000_000
 LIMITS = Limits(max_age_s=1.0, max_ahead_s=0.5, lease_s=0.5)

@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
-import iort_contract
 from iort_agent.lanes.live import LiveLane
 from iort_agent.mqtt.dispatch import Dispatcher
 from iort_agent.rate_limiter import Allowance
+from iort_contract.limits import MAX_MESSAGE_BYTES
+from iort_contract.messages.live import LiveSample, decode_live
 from tests.agent_fakes import Loopback, ManualClock
 
 T0 = 1_700_000_000_000_000
@@ -38,11 +39,9 @@ class Rig:
         self.lane.tick()
         self.dispatcher.run_pending()
 
-    def sent(self, stream: str = "vesc") -> list[iort_contract.LiveSample]:
+    def sent(self, stream: str = "vesc") -> list[LiveSample]:
         topic = f"live/iort/car1/{stream}"
-        return [
-            iort_contract.decode_live(m.payload) for m in self.uplink.published if m.topic.endswith(topic)
-        ]
+        return [decode_live(m.payload) for m in self.uplink.published if m.topic.endswith(topic)]
 
     def speeds(self) -> list[object]:
         return [live.sample["speed"] for live in self.sent()]
@@ -158,7 +157,7 @@ def test_what_is_too_large_for_a_message_never_reaches_the_broker() -> None:
     texts = {f"f{i:02}": "x" * 4096 for i in range(31)}
     rig.lane.offer("vesc", T0, {**texts, "last": ""})
     rig.dispatcher.run_pending()
-    room = iort_contract.MAX_MESSAGE_BYTES - len(rig.uplink.published.pop().payload)
+    room = MAX_MESSAGE_BYTES - len(rig.uplink.published.pop().payload)
     rig.clock.advance(1)
     rig.lane.offer("vesc", T0, {**texts, "last": "x" * (room + 1)})
     rig.dispatcher.run_pending()
@@ -166,7 +165,7 @@ def test_what_is_too_large_for_a_message_never_reaches_the_broker() -> None:
     rig.clock.advance(1)
     rig.lane.offer("vesc", T0, {**texts, "last": "x" * room})
     (message,) = rig.uplink.published
-    assert len(message.payload) == iort_contract.MAX_MESSAGE_BYTES, "one byte more is one too many"
+    assert len(message.payload) == MAX_MESSAGE_BYTES, "one byte more is one too many"
     rig.dispatcher.run_pending()
     assert (rig.lane.refused, rig.lane.published) == (1, 2)
 

@@ -17,7 +17,6 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-import iort_contract
 from iort_agent.cli import main
 from iort_agent.clock import SystemClock
 from iort_agent.config.file import load_config
@@ -33,6 +32,8 @@ from iort_agent.status.server import StatusServer, ask, fetch
 from iort_agent.status.state import Status, read
 from iort_agent.status.text import render
 from iort_agent.verbs.check import FAIL, check
+from iort_contract.limits import CLOCK_MAX_UNCERTAINTY_MS
+from iort_contract.vesc import AGENT_FIELDS
 from tests.agent_fakes import Loopback, ManualClock
 
 
@@ -165,7 +166,7 @@ def test_an_offset_not_known_well_enough_is_not_judged_by() -> None:
         assert (offset.known_us() is not None) == known
     known_us = offset.known_us()
     assert known_us is not None
-    assert abs(known_us - 60_000_000) <= iort_contract.CLOCK_MAX_UNCERTAINTY_MS * 1000
+    assert abs(known_us - 60_000_000) <= CLOCK_MAX_UNCERTAINTY_MS * 1000
     clock.advance(86_400)
     assert offset.known_us() is None, "two oscillators drift apart"
 
@@ -193,7 +194,7 @@ def test_a_sample_of_the_agent_has_the_contracts_fields() -> None:
     uplink.connect()
     clock.advance(2)
     values = metrics.sample(100)
-    assert list(values) == list(iort_contract.AGENT_FIELDS)
+    assert list(values) == list(AGENT_FIELDS)
     assert values["samples_per_s"] == 50
     assert (values["backlog_batches"], values["backlog_bytes"], values["connects"]) == (1, 100, 1)
     assert values["clock_offset_ms"] is None

@@ -11,13 +11,15 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-import iort_contract
 from iort_agent.errors import ConfigError
 from iort_agent.lanes.config import PingConfig
 from iort_agent.lanes.pings import CLOCK_EVERY_S, CLOCK_FIRST_EVERY_S, TIMEOUT_S, Pings, percentile
 from iort_agent.mqtt.dispatch import Dispatcher
 from iort_agent.rate_limiter import Allowance
 from iort_agent.schema import Where, load
+from iort_contract.limits import MAX_MESSAGE_BYTES
+from iort_contract.tables import RECEIVED_MS
+from iort_contract.topics import PING_PATHS
 from tests.agent_fakes import Loopback, ManualClock
 
 T0 = 1_700_000_000_000_000
@@ -29,7 +31,7 @@ class Rig:
         *,
         rate_hz: float = 1,
         padding_bytes: int = 0,
-        paths: tuple[str, ...] = iort_contract.PING_PATHS,
+        paths: tuple[str, ...] = PING_PATHS,
     ) -> None:
         self.clock = ManualClock(now_us=T0)
         self.dispatcher = Dispatcher()
@@ -53,7 +55,7 @@ class Rig:
     def answer(self, path: str, message: int = -1) -> None:
         """The cloud's answer to one of the pings sent."""
         ping = json.loads(self.uplink.published[message].payload)
-        payload = json.dumps({**ping, iort_contract.RECEIVED_MS: 5}).encode()
+        payload = json.dumps({**ping, RECEIVED_MS: 5}).encode()
         self.uplink.deliver(f"pong/iort/car1/{path}", payload)
         self.dispatcher.run_pending()
 
@@ -78,7 +80,7 @@ def test_the_cloud_answers_on_the_pong_topic(path: str) -> None:
     assert rig.pings.report()[path] == (1, 1, 0, 12.5, 12.5)
     ((stream, t_us, values),) = rig.samples
     assert (stream, t_us) == ("rtt", T0 + 12_500)
-    others = {f"{name}_ms": None for name in iort_contract.PING_PATHS if name != path}
+    others = {f"{name}_ms": None for name in PING_PATHS if name != path}
     assert values == {**others, f"{path}_ms": 12.5}
 
 
@@ -143,8 +145,8 @@ def test_the_largest_ping_that_may_be_asked_for_fits_into_a_message_and_so_does_
     rig.pings.send("rule")
     (ping,) = rig.uplink.published
     assert len(ping.payload) > largest
-    pong = {**json.loads(ping.payload), iort_contract.RECEIVED_MS: rig.clock.now_us() // 1000}
-    assert len(json.dumps(pong)) <= iort_contract.MAX_MESSAGE_BYTES
+    pong = {**json.loads(ping.payload), RECEIVED_MS: rig.clock.now_us() // 1000}
+    assert len(json.dumps(pong)) <= MAX_MESSAGE_BYTES
 
 
 def test_the_end_waits_for_answers_but_not_for_ever() -> None:
@@ -165,9 +167,7 @@ def test_percentile_is_a_value_with_that_share_below(values: list[float], percen
     assert sum(v < found for v in values) < len(values) * percent / 100
 
 
-@pytest.mark.parametrize(
-    ("rate_hz", "paths"), [(0, iort_contract.PING_PATHS), (0, ("broker",)), (5, ("broker", "lambda"))]
-)
+@pytest.mark.parametrize(("rate_hz", "paths"), [(0, PING_PATHS), (0, ("broker",)), (5, ("broker", "lambda"))])
 def test_where_no_trip_through_a_rule_is_measured_a_ping_now_and_then_finds_the_clocks_offset(
     rate_hz: float, paths: tuple[str, ...]
 ) -> None:

@@ -14,7 +14,7 @@ from iort_agent.control.runtime_settings import Tuning, overlay
 from iort_agent.control.shadow import Remote, _difference, _merged
 from iort_agent.mqtt.dispatch import Dispatcher
 from iort_agent.rate_limiter import Allowance
-from iort_contract import Command
+from iort_contract.messages.commands import Command
 from tests.agent_fakes import Loopback, ManualClock
 
 BASE = Tuning(record_enabled=True, live_enabled=True, live_rate_hz=10.0, ping_rate_hz=0.0, log_level="info")

@@ -10,10 +10,11 @@ from typing import Any
 
 import pytest
 
-import iort_contract
 from iort_agent.errors import SourceError
 from iort_agent.sources.ros1 import Intake, Ros1Config, TopicConfig
-from iort_contract import RosMessage
+from iort_contract.messages.message_type import MessageType, message_type
+from iort_contract.ros1.message import RosMessage
+from iort_contract.topics import TYPES_STREAM
 from tests.agent_fakes import ManualClock
 from tests.unit.contract.ros1_messages import LINE, STAMPED, header, u32
 
@@ -25,15 +26,15 @@ class Desk:
     def __init__(self, **settings: Any) -> None:
         self.clock = ManualClock(now_us=T0)
         self.samples: list[tuple[str, int, dict[str, Any]]] = []
-        self.types: list[iort_contract.MessageType] = []
+        self.types: list[MessageType] = []
         config = TopicConfig(**{"stream": "s", "time": "header", **settings})
         self.intake = Intake("/t", config, emit=self._emit, clock=self.clock)
 
     def _emit(self, stream: str, t_us: int, values: Any) -> None:
-        if stream != iort_contract.TYPES_STREAM:
+        if stream != TYPES_STREAM:
             self.samples.append((stream, t_us, values))
         else:
-            self.types.append(iort_contract.message_type(values))
+            self.types.append(message_type(values))
 
     def take(self, data: bytes, **header: str) -> None:
         self.intake.take({**CONNECTION, **header}, data)
@@ -44,7 +45,7 @@ def test_a_publishers_type_is_said_when_it_connects() -> None:
     header = {**CONNECTION}
     for _ in range(3):
         desk.intake.take(header, b"")
-    said = iort_contract.MessageType("s", "/t", "a_msgs/A", "1", CONNECTION["message_definition"])
+    said = MessageType("s", "/t", "a_msgs/A", "1", CONNECTION["message_definition"])
     assert desk.types == [said]
 
 

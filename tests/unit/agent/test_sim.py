@@ -9,9 +9,9 @@ from typing import Any
 
 import pytest
 
-import iort_contract
 from iort_agent.sources.sim import SimConfig
 from iort_agent.sources.vehicle import VehicleConfig
+from iort_contract.vesc import VESC_FIELDS
 from tests.agent_fakes import ManualClock
 
 T0 = 1_700_000_000_000_000
@@ -57,7 +57,7 @@ def test_stops_when_asked() -> None:
 
 
 def test_the_fields_are_those_of_the_ros_1_driver() -> None:
-    expected = [name for name, field in iort_contract.VESC_FIELDS.items() if 1 in field.ros]
+    expected = [name for name, field in VESC_FIELDS.items() if 1 in field.ros]
     for stream, _, values in drive(duration_s=1):
         assert stream == "vesc"
         assert sorted(values) == sorted(expected)

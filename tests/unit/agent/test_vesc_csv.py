@@ -13,9 +13,10 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-import iort_contract
 from iort_agent.errors import SourceError
 from iort_agent.sources.recording.bag import BagConfig
+from iort_contract.messages.batch import Batch, decode_batch, encode_batch
+from iort_contract.vesc import VESC_FIELDS, absent
 from tests.agent_fakes import ManualClock
 from tests.recordings import recording
 
@@ -64,7 +65,7 @@ def test_a_real_ride(log: pytest.LogCaptureFixture) -> None:
     }  # fmt: skip
     stream, t_us, first = samples[0]
     assert (stream, t_us) == ("vesc", NOW)
-    ros2 = {name for name, field in iort_contract.VESC_FIELDS.items() if 2 in field.ros}
+    ros2 = {name for name, field in VESC_FIELDS.items() if 2 in field.ros}
     assert ros2 <= set(first)
     assert first["voltage_input"] == 46.4
     assert first["temp_fet"] == 32.7
@@ -73,7 +74,7 @@ def test_a_real_ride(log: pytest.LogCaptureFixture) -> None:
     assert (first["displacement"], first["distance_traveled"]) == (106353, 109537)
     assert first["pid_pos_now"] == 307.511
     # No sensor is fitted: what the controller says is recorded, and null wherever numbers are made of it.
-    assert all(iort_contract.absent("temp_motor", values["temp_motor"]) for _, _, values in samples)
+    assert all(absent("temp_motor", values["temp_motor"]) for _, _, values in samples)
     # The columns that are not the contract's keep their names, the time of day is no field.
     assert first["battery_level"] == 9.152
     assert "ms_today" not in first
@@ -91,8 +92,8 @@ def test_a_real_ride(log: pytest.LogCaptureFixture) -> None:
 def test_it_goes_through_the_contract() -> None:
     samples = play(recording("vesc-tool-ride.csv"))[:10]
     columns = {name: [values[name] for _, _, values in samples] for name in samples[0][2]}
-    batch = iort_contract.Batch("0123456789abcdef", 0, [t_us for _, t_us, _ in samples], columns)
-    assert iort_contract.decode(iort_contract.encode(batch)).columns["charge_drawn"] == [281] * 10
+    batch = Batch("0123456789abcdef", 0, [t_us for _, t_us, _ in samples], columns)
+    assert decode_batch(encode_batch(batch)).columns["charge_drawn"] == [281] * 10
 
 
 @pytest.mark.parametrize(("speed", "seconds"), [(1.0, 0.4), (4.0, 0.1), (0.0, 0.0)])

@@ -8,9 +8,9 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-import iort_contract
 from iort_agent.sources.vesc import protocol
 from iort_agent.sources.vesc.protocol import FrameParser, ProtocolError, decode_firmware, decode_values, frame
+from iort_contract.vesc import VESC_FIELDS
 from tests.vesc_standin import FIRMWARE, framed, values
 
 payloads = st.one_of(
@@ -171,7 +171,7 @@ def test_the_values_of_current_firmware_are_the_contracts() -> None:
         "avg_vq": 24.842,
         "status": 1,
     }
-    ros2 = {name for name, field in iort_contract.VESC_FIELDS.items() if 2 in field.ros}
+    ros2 = {name for name, field in VESC_FIELDS.items() if 2 in field.ros}
     assert set(decode_values(values())) == ros2 | {"status"}
 
 
@@ -192,7 +192,7 @@ def test_firmware_2_has_a_layout_of_its_own() -> None:
     )  # fmt: skip
     assert len(payload) == 56
     decoded = decode_values(payload)
-    expected = {name for name, field in iort_contract.VESC_FIELDS.items() if 1 in field.ros}
+    expected = {name for name, field in VESC_FIELDS.items() if 1 in field.ros}
     assert expected <= set(decoded)
     assert (decoded["temperature_pcb"], decoded["ntc_temp_mos1"], decoded["ntc_temp_mos6"]) == (30.5, 21, 26)
     assert (decoded["current_motor"], decoded["duty_cycle"], decoded["speed"]) == (-12.34, -0.305, 8123)

@@ -24,8 +24,9 @@ from bench.sections import (
     utilisation,
 )
 from bench.sections.utilisation import BATCHES
-from iort_contract import BROKER, LAMBDA, RULE, Batch, encode, live_topic, record_topic
+from iort_contract.messages.batch import Batch, encode_batch
 from iort_contract.ros1.definition import parse
+from iort_contract.topics import BROKER, LAMBDA, RULE, live_topic, record_topic
 
 
 def test_report_lines_of_lambda_are_read():
@@ -200,7 +201,9 @@ def mixed_run(arrived):
 
 
 def batch(seq, n):
-    return encode(Batch("0badcafe", seq, [1_700_000_000_000_000 + i for i in range(n)], {"x": [1.0] * n}))
+    return encode_batch(
+        Batch("0badcafe", seq, [1_700_000_000_000_000 + i for i in range(n)], {"x": [1.0] * n})
+    )
 
 
 def test_mixed_robot_counts_a_batch_once_and_what_came_late():

@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-import iort_contract
 from functions.shared import cut_off, stored
 from iort_agent import rate_limiter
 from iort_contract import limits
+from iort_contract.messages import commands, files
 from iort_contract.ros1.message import MAX_LAYOUT
 from local.gaps.broker.connect_timeout import CONNECT_S
 from local.gaps.broker.message_size import AWS_MESSAGE_BYTES
@@ -29,6 +29,9 @@ UNITS = {
     "upload_gb_a_day": (1, "GB"),
 }
 
+# The modules that define limits.
+MODULES = (limits, commands, files)
+
 
 def test_each_limit_is_told_as_it_is() -> None:
     table = {name: row for row in rows(section("### Of this project")) for name in named(row[2])}
@@ -38,7 +41,7 @@ def test_each_limit_is_told_as_it_is() -> None:
         "BURST": cut_off.BURST,
         "A_SECOND": cut_off.A_SECOND,
         "upload_gb_a_day": Settings.__dataclass_fields__["upload_gb_a_day"].default,
-        **{name: getattr(of, name) for of in (limits, iort_contract) for name in table if hasattr(of, name)},
+        **{name: getattr(of, name) for of in MODULES for name in table if hasattr(of, name)},
     }
     assert table.keys() == told.keys()
     for name, value in told.items():
@@ -51,7 +54,7 @@ def test_each_limit_is_told_as_it_is() -> None:
 def test_no_limit_of_the_contract_is_left_out() -> None:
     text = section("## Limits")
     every = {name for name in vars(limits) if name.isupper() and not name.startswith("_")}
-    every |= {name for name in iort_contract.__all__ if name.startswith("MAX_")}
+    every |= {name for of in MODULES for name in vars(of) if name.startswith("MAX_")}
     assert {name for name in every if f"`{name}`" not in text} == set()
 
 

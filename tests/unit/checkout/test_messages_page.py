@@ -12,9 +12,9 @@ from typing import Any
 
 import pytest
 
-import iort_contract
-from iort_contract import Batch, Messages
-from iort_contract.ros1.message import RosType
+from iort_contract.codec.columns import CODEC, DICTIONARY, SERIALIZED_CODEC, inflate
+from iort_contract.messages.batch import Batch, decode_batch, encode_batch
+from iort_contract.ros1.message import Messages, RosType
 from tests.messages_page import EXAMPLES, PAGE
 from tests.ros1_types import Message
 
@@ -29,7 +29,7 @@ UNREADABLE = RosType("/text", "std_msgs/String", "1" * 32, "no definition at all
 @pytest.fixture(scope="module")
 def page() -> Mapping[str, Any]:
     """The names that the page's writer and reader define."""
-    names: dict[str, Any] = {"DICTIONARY": iort_contract.DICTIONARY}
+    names: dict[str, Any] = {"DICTIONARY": DICTIONARY}
     for block in re.findall(r"```python\n(.*?)```", PAGE, re.DOTALL):
         exec(block, names)
     return names
@@ -37,7 +37,7 @@ def page() -> Mapping[str, Any]:
 
 def batch_of(columns: Mapping[str, Sequence[Any]], messages: Messages | None = None) -> dict[str, Any]:
     batch = Batch("0badcafe", 7, TIMES_US, columns, 0, messages)
-    return dict(json.loads(iort_contract.encode(batch)))
+    return dict(json.loads(encode_batch(batch)))
 
 
 def made(offsets_ns: Sequence[int], frames: Sequence[bytes]) -> list[bytes]:
@@ -51,14 +51,14 @@ def made(offsets_ns: Sequence[int], frames: Sequence[bytes]) -> list[bytes]:
 
 
 def body_of(batch: Batch) -> bytes:
-    envelope = json.loads(iort_contract.encode(batch))
-    return iort_contract.inflate(envelope["samples"], envelope["codec"])
+    envelope = json.loads(encode_batch(batch))
+    return inflate(envelope["samples"], envelope["codec"])
 
 
 def test_its_examples_are_bodies_of_batches() -> None:
     times = [0, 20_000, 40_001]
     example = EXAMPLES["batch"]
-    assert f"    {iort_contract.inflate(example['samples'], example['codec']).decode()}\n" in PAGE
+    assert f"    {inflate(example['samples'], example['codec']).decode()}\n" in PAGE
 
     lone = Message("a/X", {"a/X": "Header header\nint32 a"})
     kind = RosType("/x", lone.kind, "0" * 32, lone.definition)
@@ -77,7 +77,7 @@ def test_its_examples_are_bodies_of_batches() -> None:
 
 def test_its_dictionary_is_the_codecs() -> None:
     (text,) = re.findall(r"<!-- dictionary -->\n```text\n(.*?)```", PAGE, re.DOTALL)
-    assert text.replace("\n", "").encode() == iort_contract.DICTIONARY
+    assert text.replace("\n", "").encode() == DICTIONARY
 
 
 @pytest.mark.parametrize(
@@ -85,17 +85,15 @@ def test_its_dictionary_is_the_codecs() -> None:
 )
 def test_what_its_writer_writes_is_a_batch(page: Mapping[str, Any], values: list[Any]) -> None:
     written = page["written"]("0badcafe", 7, TIMES_US, {"speed": values, "on": [True] * 3})
-    assert iort_contract.decode(written) == Batch(
-        "0badcafe", 7, TIMES_US, {"speed": values, "on": [True] * 3}
-    )
+    assert decode_batch(written) == Batch("0badcafe", 7, TIMES_US, {"speed": values, "on": [True] * 3})
     assert page["opened"](json.loads(written))[1]["speed"] == values
 
 
 def test_a_writer_may_leave_the_dictionary_out() -> None:
     batch = batch_of({"speed": [1, 2, 3]})
-    body = iort_contract.inflate(batch["samples"], batch["codec"])
+    body = inflate(batch["samples"], batch["codec"])
     plain = {**batch, "samples": base64.b64encode(zlib.compress(body)).decode()}
-    assert iort_contract.decode(json.dumps(plain)) == iort_contract.decode(json.dumps(batch))
+    assert decode_batch(json.dumps(plain)) == decode_batch(json.dumps(batch))
 
 
 @pytest.mark.parametrize("speeds", [[1, 2.5, None], [4614, 4613.5, 4620.25], [7, 9, -1], ["x", True, 0.1]])
@@ -113,7 +111,7 @@ def test_its_reader_makes_messages_of_numbers_again(
 ) -> None:
     raw = made(offsets_ns, frames)
     batch = batch_of({}, Messages(STAMPED.id, STAMPED.layout, raw))
-    assert batch["codec"] == iort_contract.CODEC
+    assert batch["codec"] == CODEC
     times_us, columns, behind = page["opened"](batch)
     assert json.loads(behind)[0] == STAMPED.id
     assert list(page["made_again"](times_us, columns, behind, NUMBERS)) == raw
@@ -126,7 +124,7 @@ def test_its_reader_reads_messages_as_they_were_published(
 ) -> None:
     raw = [struct.pack("<I", len(text)) + text for text in texts]
     batch = batch_of({"data.key": ["a", None, "b"]}, Messages(kind.id, kind.layout, raw))
-    assert batch["codec"] == iort_contract.SERIALIZED_CODEC
+    assert batch["codec"] == SERIALIZED_CODEC
     times_us, columns, behind = page["opened"](batch)
     assert (times_us, columns) == (TIMES_US, {"data.key": ["a", None, "b"]})
     assert page["as_published"](batch["n"], behind) == raw

@@ -10,28 +10,52 @@ from typing import Any
 import pytest
 from awsiot import iotidentity
 
-import iort_contract
 from functions.echo import pong
 from iort_agent.control.runtime_settings import FIELDS, RULES, Tuning, overlay
-from iort_contract import (
-    AGENT_FIELDS,
-    AGENT_VERSION,
-    COMMANDS,
-    ROBOT_PARAMETER,
-    SERIAL_PARAMETER,
-    Address,
-    Batch,
+from iort_contract.limits import ContractError
+from iort_contract.messages import account as accounts
+from iort_contract.messages.batch import Batch, decode_batch, encode_batch
+from iort_contract.messages.commands import (
     Command,
-    ContractError,
+    FleetMessage,
+    decode_command,
+    decode_fleet,
+    encode_command,
+    encode_fleet,
+)
+from iort_contract.messages.event import rule_event
+from iort_contract.messages.files import (
+    Address,
     File,
     FileAnswer,
     FileRequest,
-    FleetMessage,
-    LiveSample,
-    MessageType,
-    build_topic,
+    decode_file_answer,
+    decode_file_request,
+    encode_file_answer,
+    encode_file_request,
+    file_key,
 )
-from iort_contract.messages import account as accounts
+from iort_contract.messages.live import (
+    LiveSample,
+    Pong,
+    decode_live,
+    decode_pong,
+    encode_live,
+    encode_ping,
+    live_update,
+)
+from iort_contract.messages.message_type import MessageType, message_type
+from iort_contract.tables import (
+    AGENT_VERSION,
+    OVER_SHARE,
+    PUT_OFF,
+    PUT_OFF_LAST_MS,
+    PUT_OFF_SINCE_MS,
+    ROBOT_PARAMETER,
+    SERIAL_PARAMETER,
+)
+from iort_contract.topics import ACCEPTED, COMMANDS, build_topic
+from iort_contract.vesc import AGENT_FIELDS
 from iort_station.fleet.shadow import State, outcome
 from tests.messages_page import EXAMPLES, PAGE, keys_after, named, rows, section
 
@@ -40,7 +64,7 @@ SAMPLE = {"speed": 25.2, "voltage_input": 11.9, "fault_code": 0}
 LIVE = LiveSample(RUN, 12, T_US, T_US + 4_000, SAMPLE, offset_us=-1_500)
 HASH = "a591a6d40bf420404a011733cfb7b190d62c65bf0bcda32b57b277d9ad9f146e"
 FILE = File("notes.txt", "log", "text/plain", 12, HASH, T_US)
-ASKED, KEY = "5f0c2b7a9e1d4c38", iort_contract.file_key("car7", FILE)
+ASKED, KEY = "5f0c2b7a9e1d4c38", file_key("car7", FILE)
 URL = f"https://iort-files.s3.eu-west-1.amazonaws.com/{KEY}?X-Amz-Signature=0"
 ADDRESS = Address(1, URL, {"content-type": "text/plain", "content-length": "12"})
 BATCH = Batch(
@@ -57,14 +81,12 @@ COMMAND = Command(
     answer=True,
 )
 SAID = FleetMessage(RUN, 7, T_US, {"pose": {"position": {"x": 1.5, "y": 0.0, "z": 0.0}}}, -1_500)
-PING = iort_contract.encode_ping(17, T_US)
-PONG = pong(iort_contract.rule_event(PING, build_topic("ping", "car7", "lambda"), T_US // 1000 + 30))[1]
+PING = encode_ping(17, T_US)
+PONG = pong(rule_event(PING, build_topic("ping", "car7", "lambda"), T_US // 1000 + 30))[1]
 REFUSED = FileAnswer(
     ASKED, refused="no more than 50000000000 bytes a day, and only of registered robots", again_s=3600
 )
-UPDATE = json.dumps(
-    iort_contract.live_update("car7", "vesc", LIVE, T_US // 1000 + 30, T_US + 41_000)
-).encode()
+UPDATE = json.dumps(live_update("car7", "vesc", LIVE, T_US // 1000 + 30, T_US + 41_000)).encode()
 
 
 def as_object(decode: Callable[[str], Any]) -> Callable[[dict[str, Any]], Any]:
@@ -73,25 +95,25 @@ def as_object(decode: Callable[[str], Any]) -> Callable[[dict[str, Any]], Any]:
 
 # The example's name: what the code writes, what reads it, and what it then reads.
 WRITTEN: dict[str, tuple[bytes, Callable[[dict[str, Any]], Any], Any]] = {
-    "batch": (iort_contract.encode(BATCH), as_object(iort_contract.decode), BATCH),
-    "live": (iort_contract.encode_live(LIVE), as_object(iort_contract.decode_live), LIVE),
-    "ping": (PING, as_object(iort_contract.decode_pong), iort_contract.Pong(17, T_US, None)),
-    "pong": (PONG, as_object(iort_contract.decode_pong), iort_contract.Pong(17, T_US, T_US // 1000 + 30)),
-    "command": (iort_contract.encode_command(COMMAND), as_object(iort_contract.decode_command), COMMAND),
-    "fleet": (iort_contract.encode_fleet(SAID), as_object(iort_contract.decode_fleet), SAID),
+    "batch": (encode_batch(BATCH), as_object(decode_batch), BATCH),
+    "live": (encode_live(LIVE), as_object(decode_live), LIVE),
+    "ping": (PING, as_object(decode_pong), Pong(17, T_US, None)),
+    "pong": (PONG, as_object(decode_pong), Pong(17, T_US, T_US // 1000 + 30)),
+    "command": (encode_command(COMMAND), as_object(decode_command), COMMAND),
+    "fleet": (encode_fleet(SAID), as_object(decode_fleet), SAID),
     "file": (
-        iort_contract.encode_file_request(FileRequest(ASKED, FILE, {1: HASH})),
-        as_object(iort_contract.decode_file_request),
+        encode_file_request(FileRequest(ASKED, FILE, {1: HASH})),
+        as_object(decode_file_request),
         FileRequest(ASKED, FILE, {1: HASH}),
     ),
     "answer": (
-        iort_contract.encode_file_answer(FileAnswer(ASKED, KEY, addresses=[ADDRESS])),
-        as_object(iort_contract.decode_file_answer),
+        encode_file_answer(FileAnswer(ASKED, KEY, addresses=[ADDRESS])),
+        as_object(decode_file_answer),
         FileAnswer(ASKED, KEY, addresses=(ADDRESS,)),
     ),
     "refused": (
-        iort_contract.encode_file_answer(REFUSED),
-        as_object(iort_contract.decode_file_answer),
+        encode_file_answer(REFUSED),
+        as_object(decode_file_answer),
         REFUSED,
     ),
 }
@@ -211,15 +233,15 @@ def test_a_bound_of_a_key_is_where_the_page_says(
 def test_boot_is_what_the_page_says() -> None:
     assert "8 to 32 of `0-9a-f`" in section("## What all messages share")
     for good, bad in (("0" * 8, "0" * 7), ("f" * 32, "f" * 33), ("a" * 8, "A" * 8)):
-        assert iort_contract.decode_live(json.dumps({**EXAMPLES["live"], "boot": good})).boot == good
+        assert decode_live(json.dumps({**EXAMPLES["live"], "boot": good})).boot == good
         with pytest.raises(ContractError):
-            iort_contract.decode_live(json.dumps({**EXAMPLES["live"], "boot": bad}))
+            decode_live(json.dumps({**EXAMPLES["live"], "boot": bad}))
 
 
 @pytest.mark.parametrize(("name", "sample"), SAMPLES.items())
 def test_the_samples_of_a_robots_own_streams(name: str, sample: accounts.Account | MessageType) -> None:
     assert EXAMPLES[name] == sample.sample()
-    read = iort_contract.message_type if name == "type" else accounts.account
+    read = message_type if name == "type" else accounts.account
     assert read(EXAMPLES[name]) == sample
     if name == "account":
         text = section("## A robot's own streams")
@@ -239,7 +261,7 @@ def test_the_shadows_documents_are_what_the_agent_takes_and_says() -> None:
     assert {key: reported[key] for key in tuning.as_document()} == tuning.as_document()
     assert reported.keys() == {*tuning.as_document(), "rejected", COMMANDS, AGENT_VERSION}
     state = State(1, {}, reported)
-    assert outcome(state, "drive", COMMAND.session, COMMAND.seq) == iort_contract.ACCEPTED
+    assert outcome(state, "drive", COMMAND.session, COMMAND.seq) == ACCEPTED
     assert [refusal.name for refusal in state.refusals()] == ["live.rate_hz"]
     wishes, said = section("## The shadow").split("<!-- example: reported -->")
     assert {name for row in rows(wishes) for name in named(row[0])} == {*RULES, f"{FIELDS}.<stream>"}
@@ -275,10 +297,10 @@ def camel(name: str) -> str:
 @pytest.mark.parametrize(
     "name",
     [
-        iort_contract.OVER_SHARE,
-        iort_contract.PUT_OFF,
-        iort_contract.PUT_OFF_SINCE_MS,
-        iort_contract.PUT_OFF_LAST_MS,
+        OVER_SHARE,
+        PUT_OFF,
+        PUT_OFF_SINCE_MS,
+        PUT_OFF_LAST_MS,
     ],
 )
 def test_what_the_cloud_writes_into_the_shadow_is_on_the_page(name: str) -> None:

@@ -7,8 +7,9 @@ import math
 
 from hypothesis import strategies as st
 
-import iort_contract
-from iort_contract import Batch, ContractError, LiveSample
+from iort_contract.limits import MAX_BATCH_SPAN_US, MAX_FIELDS, MAX_SAMPLES, ContractError
+from iort_contract.messages.batch import Batch, decode_batch, encode_batch
+from iort_contract.messages.live import LiveSample, decode_live, encode_live
 
 LIMIT_US = 2**53 - 1
 BOOT = "0123abcd"
@@ -27,10 +28,8 @@ values = st.none() | st.booleans() | integers | finite | st.text(max_size=20)
 @st.composite
 def batches(draw, kinds=values):
     # Of one time there may be several.
-    offsets = draw(
-        st.lists(st.integers(0, iort_contract.MAX_BATCH_SPAN_US - 1) | st.integers(0, 3), max_size=12)
-    )
-    first = draw(st.integers(0, LIMIT_US - iort_contract.MAX_BATCH_SPAN_US) | st.just(0))
+    offsets = draw(st.lists(st.integers(0, MAX_BATCH_SPAN_US - 1) | st.integers(0, 3), max_size=12))
+    first = draw(st.integers(0, LIMIT_US - MAX_BATCH_SPAN_US) | st.just(0))
     n = 1 + len(offsets)
     # Columns as recordings have them, of one kind, and of any mixture.
     column = st.one_of(
@@ -67,7 +66,7 @@ anything = st.floats() | st.sampled_from([math.nan, math.inf, -math.inf]) | valu
 
 GOOD = Batch(BOOT, 4, [0, 5], {"speed": [1.5, 2.5]}, 0)
 GOOD_LIVE = LiveSample(BOOT, 4, 0, 5, {"speed": 1.5}, 0)
-MOST_NONFINITE = iort_contract.MAX_SAMPLES * iort_contract.MAX_FIELDS
+MOST_NONFINITE = MAX_SAMPLES * MAX_FIELDS
 
 BAD_HEADERS = [
     ({"boot": "0123ABCD"}, "boot"),
@@ -93,9 +92,9 @@ def decode_or_refuse(decoder, message):
         str(error).encode()  # it can be logged, whatever was in the message
         return
     if isinstance(taken, Batch):
-        assert iort_contract.decode(iort_contract.encode(taken)) == taken
+        assert decode_batch(encode_batch(taken)) == taken
     elif isinstance(taken, LiveSample):
-        assert iort_contract.decode_live(iort_contract.encode_live(taken)) == taken
+        assert decode_live(encode_live(taken)) == taken
 
 
 json_values = st.recursive(

@@ -12,8 +12,11 @@ from decimal import Decimal
 import pytest
 from hypothesis import assume, given
 
-import iort_contract
-from iort_contract import Batch, ContractError
+from iort_contract.codec.columns import inflate
+from iort_contract.limits import MAX_BATCH_SPAN_US, MAX_MESSAGE_BYTES, MAX_SAMPLES, ContractError
+from iort_contract.messages.batch import Batch, decode_batch, encode_batch, split_batch
+from iort_contract.messages.live import encode_live
+from iort_contract.vesc import VESC_FIELDS
 from tests.unit.contract.contract_values import (
     BAD_HEADERS,
     BOOT,
@@ -29,7 +32,7 @@ from tests.unit.contract.contract_values import (
 
 
 def body_of(envelope):
-    return iort_contract.inflate(envelope["samples"], envelope["codec"])
+    return inflate(envelope["samples"], envelope["codec"])
 
 
 def stored(message):
@@ -49,41 +52,41 @@ def assert_same_batch(decoded, batch):
 
 @given(batches())
 def test_batch_round_trip(batch):
-    message = iort_contract.encode(batch)
-    assert_same_batch(iort_contract.decode(message), batch)
-    assert_same_batch(iort_contract.decode(message.decode()), batch)
-    assert_same_batch(iort_contract.decode(json.loads(message)), batch)
-    assert_same_batch(iort_contract.decode(stored(message)), batch)
+    message = encode_batch(batch)
+    assert_same_batch(decode_batch(message), batch)
+    assert_same_batch(decode_batch(message.decode()), batch)
+    assert_same_batch(decode_batch(json.loads(message)), batch)
+    assert_same_batch(decode_batch(stored(message)), batch)
     assert batch.t_us == batch.times_us[0]
 
 
 @given(batches())
 def test_encoding_again_gives_the_same_message(batch):
-    message = iort_contract.encode(batch)
-    assert iort_contract.encode(iort_contract.decode(message)) == message
+    message = encode_batch(batch)
+    assert encode_batch(decode_batch(message)) == message
 
 
 @pytest.mark.parametrize("n", [1, 2, 50, 1000])
 def test_batch_of_a_drive(n):
-    columns = {name: [i / 7 for i in range(n)] for name in iort_contract.VESC_FIELDS}
+    columns = {name: [i / 7 for i in range(n)] for name in VESC_FIELDS}
     batch = Batch(BOOT, 7, [i * 999 for i in range(n)], columns)
-    assert iort_contract.decode(iort_contract.encode(batch)) == batch
+    assert decode_batch(encode_batch(batch)) == batch
 
 
 def test_whole_floats_become_integers_on_the_wire():
     batch = Batch(BOOT, 0, [0], {"a": [3.0], "b": [-0.0], "c": [1e300], "d": [True], "e": [0.5]})
-    message = iort_contract.encode(batch)
+    message = encode_batch(batch)
     assert body_of(json.loads(message)) == (
         b'{"dt":[0],"fields":{"a":[0,3],"b":[0,0],"c":[null,1e+300],"d":[null,true],"e":[1,5]}}'
     )
-    assert list(map(type, (c[0] for c in iort_contract.decode(message).columns.values()))) == [
+    assert list(map(type, (c[0] for c in decode_batch(message).columns.values()))) == [
         int, int, float, bool, float,
     ]  # fmt: skip
 
 
 def test_the_envelope_names_what_it_holds():
     batch = Batch(BOOT, 3, [1_000, 1_250, 1_900], {"speed": [1, 2.5, None]})
-    envelope = json.loads(iort_contract.encode(batch))
+    envelope = json.loads(encode_batch(batch))
     assert {key: envelope[key] for key in envelope if key != "samples"} == {
         "v": 2,
         "batch": f"0000000000001000-{BOOT}-3",
@@ -95,20 +98,20 @@ def test_the_envelope_names_what_it_holds():
 
 def test_nonfinite_is_said_only_where_there_is_any():
     for count in (0, 3):
-        envelope = json.loads(iort_contract.encode(replace(GOOD, nonfinite=count)))
+        envelope = json.loads(encode_batch(replace(GOOD, nonfinite=count)))
         assert envelope.get("nonfinite", 0) == count
         assert ("nonfinite" in envelope) == bool(count)
-        assert iort_contract.decode({**envelope, "nonfinite": count}).nonfinite == count
+        assert decode_batch({**envelope, "nonfinite": count}).nonfinite == count
 
 
 def test_samples_of_one_time_stay_as_many_and_as_they_came():
     batch = Batch(BOOT, 0, [5, 5, 5, 6], {"a": [3, 1, 2, 0]})
-    assert iort_contract.decode(iort_contract.encode(batch)) == batch
+    assert decode_batch(encode_batch(batch)) == batch
 
 
 @given(batches(kinds=anything))
 def test_nonfinite_becomes_null_and_is_counted(batch):
-    message = iort_contract.encode(batch)
+    message = encode_batch(batch)
     strict(body_of(strict(message)))
     expected = {name: list(map(nulled, column)) for name, column in batch.columns.items()}
     new = sum(
@@ -117,19 +120,19 @@ def test_nonfinite_becomes_null_and_is_counted(batch):
         for value, was in map(lambda *pair: pair, expected[name], column)
     )
     clean = replace(batch, columns=expected, nonfinite=batch.nonfinite + new)
-    assert_same_batch(iort_contract.decode(message), clean)
+    assert_same_batch(decode_batch(message), clean)
 
 
 def test_bits_of_a_float_survive():
     numbers = [struct.unpack("<d", struct.pack("<Q", bits))[0] for bits in (1, 2**52 - 1, 0x7FEFFFFFFFFFFFFF)]
     batch = Batch(BOOT, 0, [0, 1, 2], {"x": numbers})
-    assert iort_contract.decode(iort_contract.encode(batch)).columns["x"] == numbers
+    assert decode_batch(encode_batch(batch)).columns["x"] == numbers
 
 
 @given(batches())
 def test_halves_make_up_the_whole(batch):
     assume(len(batch.times_us) > 1)
-    first, second = iort_contract.split(batch)
+    first, second = split_batch(batch)
     assert (first.seq, second.seq) == (batch.seq, batch.seq + 1)
     assert first.boot == second.boot == batch.boot
     assert first.nonfinite + second.nonfinite == batch.nonfinite
@@ -138,12 +141,12 @@ def test_halves_make_up_the_whole(batch):
     assert list(first.columns) == list(second.columns) == list(batch.columns)
     for name, column in batch.columns.items():
         assert [*first.columns[name], *second.columns[name]] == column
-    assert_same_batch(iort_contract.decode(iort_contract.encode(first)), first)
+    assert_same_batch(decode_batch(encode_batch(first)), first)
 
 
 def test_one_sample_does_not_split():
     with pytest.raises(ContractError, match="one sample of 1 fields"):
-        iort_contract.split(Batch(BOOT, 0, [0], {"a": [1]}))
+        split_batch(Batch(BOOT, 0, [0], {"a": [1]}))
 
 
 BAD_VALUES = [
@@ -166,11 +169,11 @@ BAD_VALUES = [
     [
         *BAD_HEADERS,
         ({"times_us": []}, "samples, got 0"),
-        ({"times_us": range(iort_contract.MAX_SAMPLES + 1)}, "samples, got 50001"),
+        ({"times_us": range(MAX_SAMPLES + 1)}, "samples, got 50001"),
         ({"times_us": [5, 0]}, "in order"),
         ({"times_us": [0, 7, 6]}, "in order"),
         ({"times_us": [-1, 0]}, "time must be from 1970 on, got -1 us"),
-        ({"times_us": [0, iort_contract.MAX_BATCH_SPAN_US]}, "span"),
+        ({"times_us": [0, MAX_BATCH_SPAN_US]}, "span"),
         ({"times_us": [2**53, 2**53 + 1]}, "sample time"),
         ({"times_us": [0, 1.0]}, "sample time"),
         ({"times_us": [False, True]}, "sample time"),
@@ -189,25 +192,25 @@ BAD_VALUES = [
 )
 def test_batch_refused(changed, named):
     with pytest.raises(ContractError, match=named):
-        iort_contract.encode(replace(GOOD, **changed))
+        encode_batch(replace(GOOD, **changed))
 
 
 @pytest.mark.parametrize(("value", "named"), BAD_VALUES, ids=[f"value{i}" for i in range(len(BAD_VALUES))])
 def test_value_refused(value, named):
     with pytest.raises(ContractError, match=named):
-        iort_contract.encode(replace(GOOD, columns={"speed": [None, value]}))
+        encode_batch(replace(GOOD, columns={"speed": [None, value]}))
     with pytest.raises(ContractError, match=named):
-        iort_contract.encode_live(replace(GOOD_LIVE, sample={"speed": value}))
+        encode_live(replace(GOOD_LIVE, sample={"speed": value}))
 
 
 def test_columns_too_large_to_be_read_are_not_written():
     n = 1_100
     batch = Batch(BOOT, 0, list(range(n)), {"text": ["x" * 4_000] * n})
-    assert len(zlib.compress(b"x" * 4_000 * n)) < iort_contract.MAX_MESSAGE_BYTES, "it would fit in a message"
+    assert len(zlib.compress(b"x" * 4_000 * n)) < MAX_MESSAGE_BYTES, "it would fit in a message"
     with pytest.raises(ContractError, match="columns"):
-        iort_contract.encode(batch)
-    for half in iort_contract.split(batch):
-        assert iort_contract.decode(iort_contract.encode(half)) == half
+        encode_batch(batch)
+    for half in split_batch(batch):
+        assert decode_batch(encode_batch(half)) == half
 
 
 def test_dataclasses_are_frozen():

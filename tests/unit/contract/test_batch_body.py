@@ -13,8 +13,10 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-import iort_contract
-from iort_contract import ContractError
+from iort_contract.codec.columns import PLAIN_CODEC
+from iort_contract.limits import MAX_COLUMNS_BYTES, MAX_MESSAGE_BYTES, MAX_SAMPLES, ContractError
+from iort_contract.messages.batch import decode_batch, encode_batch
+from iort_contract.messages.live import decode_live, encode_live
 from tests.unit.contract.contract_values import BOOT, DEEP, GOOD, GOOD_LIVE, decode_or_refuse, json_values
 
 
@@ -22,14 +24,12 @@ def enveloped(body, **changed):
     """A good envelope of two samples around any body, in the codec whose columns are their values alone;
     tests/unit/contract/test_columns.py has the other."""
     packed = base64.b64encode(zlib.compress(body)).decode()
-    return dict(
-        json.loads(iort_contract.encode(GOOD)), codec=iort_contract.PLAIN_CODEC, samples=packed, **changed
-    )
+    return dict(json.loads(encode_batch(GOOD)), codec=PLAIN_CODEC, samples=packed, **changed)
 
 
 @given(st.binary(max_size=100) | json_values.map(lambda value: json.dumps(value).encode()))
 def test_any_body(body):
-    decode_or_refuse(iort_contract.decode, enveloped(body))
+    decode_or_refuse(decode_batch, enveloped(body))
 
 
 @settings(max_examples=300)
@@ -46,7 +46,7 @@ def test_body_with_one_part_replaced(data, value):
     else:
         target = body["dt"] if where.startswith("dt") else body["fields"]["a"]
         target[int(where[-1])] = value
-    decode_or_refuse(iort_contract.decode, enveloped(json.dumps(body).encode()))
+    decode_or_refuse(decode_batch, enveloped(json.dumps(body).encode()))
 
 
 BODIES = [
@@ -89,47 +89,43 @@ BODIES = [
 def test_body_refused(body, named):
     # Of time 1, so that a step of 4,300 nines makes a number too long for Python to print.
     with pytest.raises(ContractError, match=named):
-        iort_contract.decode(enveloped(body, batch=f"{1:016}-{BOOT}-4"))
+        decode_batch(enveloped(body, batch=f"{1:016}-{BOOT}-4"))
 
 
 def test_too_many_fields_are_refused():
     body = json.dumps({"dt": [0, 5], "fields": {f"f{i}": [1, 2] for i in range(513)}})
     with pytest.raises(ContractError, match="fields, got 513"):
-        iort_contract.decode(enveloped(body.encode()))
+        decode_batch(enveloped(body.encode()))
     with pytest.raises(ContractError, match="sample"):
-        iort_contract.decode_live(
-            json.dumps(
-                dict(
-                    json.loads(iort_contract.encode_live(GOOD_LIVE)), sample={f"f{i}": 1 for i in range(513)}
-                )
-            )
+        decode_live(
+            json.dumps(dict(json.loads(encode_live(GOOD_LIVE)), sample={f"f{i}": 1 for i in range(513)}))
         )
 
 
 def test_the_last_of_duplicate_keys_counts():
     body = b'{"dt":[9],"fields":{"b":[1]},"dt":[0,5],"fields":{"a":[9,9],"a":[1,2]}}'
-    assert iort_contract.decode(enveloped(body)).columns == {"a": [1, 2]}
+    assert decode_batch(enveloped(body)).columns == {"a": [1, 2]}
 
 
 def test_body_of_the_greatest_size_is_read_and_no_larger():
     n = 8_388_608 // 4096
     times = {"dt": [0] + [1] * (n - 1)}
-    room = iort_contract.MAX_COLUMNS_BYTES - len(json.dumps({**times, "fields": {"a": [""] * n}}))
+    room = MAX_COLUMNS_BYTES - len(json.dumps({**times, "fields": {"a": [""] * n}}))
     texts = ["x" * (room // n + (i < room % n)) for i in range(n)]
     body = json.dumps({**times, "fields": {"a": texts}}).encode()
-    assert iort_contract.decode(enveloped(body, n=n)).columns == {"a": texts}
+    assert decode_batch(enveloped(body, n=n)).columns == {"a": texts}
     with pytest.raises(ContractError, match="at most 8388608 bytes"):
-        iort_contract.decode(enveloped(body + b" ", n=n))
+        decode_batch(enveloped(body + b" ", n=n))
 
 
 def test_zip_bomb_is_not_inflated():
     message = json.dumps(enveloped(b" " * 64 * 1024 * 1024)).encode()
-    assert len(message) < iort_contract.MAX_MESSAGE_BYTES
+    assert len(message) < MAX_MESSAGE_BYTES
     tracemalloc.start()
     try:
         with pytest.raises(ContractError, match="at most 8388608 bytes"):
-            iort_contract.decode(message)
-        assert tracemalloc.get_traced_memory()[1] < 3 * iort_contract.MAX_COLUMNS_BYTES
+            decode_batch(message)
+        assert tracemalloc.get_traced_memory()[1] < 3 * MAX_COLUMNS_BYTES
     finally:
         tracemalloc.stop()
 
@@ -153,19 +149,19 @@ PACKED = zlib.compress(b'{"dt":[0,5],"fields":{}}')
 def test_packed_samples_refused(packed, named):
     envelope = dict(enveloped(b""), samples=base64.b64encode(packed).decode())
     with pytest.raises(ContractError, match=named):
-        iort_contract.decode(envelope)
+        decode_batch(envelope)
 
 
 @pytest.mark.parametrize("text", ["é", "a", "====", "eJ\n", "eJ y", "-_-_", "\ud800", "eA==eA=="])
 def test_samples_that_are_not_base64_are_refused(text):
     with pytest.raises(ContractError, match="samples"):
-        iort_contract.decode(dict(enveloped(b""), samples=text))
+        decode_batch(dict(enveloped(b""), samples=text))
 
 
 @pytest.mark.parametrize("samples", [None, 7, [], {}, True, Decimal(1)])
 def test_samples_that_are_not_text_are_refused(samples):
     with pytest.raises(ContractError, match="samples must be base64 text"):
-        iort_contract.decode(dict(enveloped(b""), samples=samples))
+        decode_batch(dict(enveloped(b""), samples=samples))
 
 
 @pytest.mark.parametrize(
@@ -178,7 +174,7 @@ def test_samples_that_are_not_text_are_refused(samples):
         ({"codec": "columns"}, "got 'columns'"),
         ({"n": 0}, "must say 1 to 50000 samples, got 0"),
         ({"n": 3}, "must have 3 dt"),
-        ({"n": iort_contract.MAX_SAMPLES + 1}, "samples, got 50001"),
+        ({"n": MAX_SAMPLES + 1}, "samples, got 50001"),
         ({"n": Decimal("1E+125")}, "n must be an integer, got Decimal"),
         ({"n": Decimal("NaN")}, "n must be an integer, got Decimal"),
         ({"n": Decimal("sNaN")}, "n must be an integer, got Decimal"),
@@ -192,4 +188,4 @@ def test_samples_that_are_not_text_are_refused(samples):
 )
 def test_envelope_refused(changed, named):
     with pytest.raises(ContractError, match=re.escape(named)):
-        iort_contract.decode(dict(json.loads(iort_contract.encode(GOOD)), **changed))
+        decode_batch(dict(json.loads(encode_batch(GOOD)), **changed))

@@ -8,8 +8,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-import iort_contract
-from iort_contract import BatchId, ContractError, batch_id, batches_between
+from iort_contract.limits import ContractError
+from iort_contract.messages.batch import Batch, BatchId, batch_id, batches_between, decode_batch, encode_batch
 from tests.unit.contract.contract_values import BOOT, LIMIT_US, boots, seqs
 
 times = st.integers(0, LIMIT_US)
@@ -81,10 +81,6 @@ def test_what_is_no_id_is_refused(text):
 
 def test_batches_of_one_time_have_keys_of_their_own():
     """Two publishers, or a recording that is played twice: the same time, another number or another run."""
-    same_time = [
-        iort_contract.Batch(boot, seq, [7], {}) for boot in ("0badcafe", "deadbeef") for seq in (0, 9, 10)
-    ]
+    same_time = [Batch(boot, seq, [7], {}) for boot in ("0badcafe", "deadbeef") for seq in (0, 9, 10)]
     assert len({str(batch.id) for batch in same_time}) == len(same_time)
-    assert {iort_contract.decode(iort_contract.encode(batch)).id for batch in same_time} == {
-        b.id for b in same_time
-    }
+    assert {decode_batch(encode_batch(batch)).id for batch in same_time} == {b.id for b in same_time}

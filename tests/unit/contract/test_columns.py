@@ -14,10 +14,12 @@ import pytest
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
-import iort_contract
-from iort_contract import Batch, ContractError
 from iort_contract.checks import wire_column
-from iort_contract.codec.columns import packed, unpacked
+from iort_contract.codec.columns import DICTIONARY, PLAIN_CODEC, packed, unpacked
+from iort_contract.limits import ContractError
+from iort_contract.messages.batch import Batch, decode_batch, encode_batch
+from iort_contract.topics import RTT_FIELDS
+from iort_contract.vesc import AGENT_FIELDS, VESC_FIELDS
 
 BOOT = "0123abcd"
 EDGE = 2**53
@@ -67,10 +69,10 @@ def test_a_column_comes_back_to_the_bit(column):
 def test_a_batch_comes_back_the_same_as_by_the_codec_before(column, seq):
     n = len(column)
     batch = Batch(BOOT, seq, list(range(0, 20 * n, 20)), {"speed": column, "flag": [True] * n})
-    envelope = json.loads(iort_contract.encode(batch))
+    envelope = json.loads(encode_batch(batch))
     fields = {name: wire_column(name, values)[0] for name, values in batch.columns.items()}
     before = plain_message(envelope, {"dt": [0] + [20] * (n - 1), "fields": fields})
-    now, then = iort_contract.decode(envelope), iort_contract.decode(before)
+    now, then = decode_batch(envelope), decode_batch(before)
     assert now == then
     for name in batch.columns:
         assert bits(now.columns[name]) == bits(then.columns[name])
@@ -92,18 +94,18 @@ FROZEN = "71f73f6da111bb52e14b827789e70220e1689946c9378dbab0ed3390b2cf0b95"
 
 
 def test_what_was_stored_before_this_codec_is_read_for_ever():
-    assert iort_contract.decode(STORED) == Batch(
+    assert decode_batch(STORED) == Batch(
         BOOT, 7, [1000, 1020, 1275], {"a": [1, 0.2, None], "b": ["o", True, False]}
     )
 
 
 def test_the_dictionary_is_that_with_which_stored_batches_were_compressed():
-    assert hashlib.sha256(iort_contract.DICTIONARY).hexdigest() == FROZEN
-    names = set(re.findall(r'"(\w+)":', iort_contract.DICTIONARY.decode()))
+    assert hashlib.sha256(DICTIONARY).hexdigest() == FROZEN
+    names = set(re.findall(r'"(\w+)":', DICTIONARY.decode()))
     assert {
-        *iort_contract.VESC_FIELDS,
-        *iort_contract.AGENT_FIELDS,
-        *iort_contract.RTT_FIELDS.values(),
+        *VESC_FIELDS,
+        *AGENT_FIELDS,
+        *RTT_FIELDS.values(),
     } <= names
 
 
@@ -127,9 +129,9 @@ def test_what_a_column_looks_like(column, expected):
 def message_of(*fields, n=2):
     """A message of this codec around columns as they are."""
     body = {"dt": [0] + [5] * (n - 1), "fields": {f"f{i}": column for i, column in enumerate(fields)}}
-    deflater = zlib.compressobj(zdict=iort_contract.DICTIONARY)
+    deflater = zlib.compressobj(zdict=DICTIONARY)
     deflated = deflater.compress(json.dumps(body).encode()) + deflater.flush()
-    good = json.loads(iort_contract.encode(Batch(BOOT, 0, [5 * i for i in range(n)], {"a": [1] * n})))
+    good = json.loads(encode_batch(Batch(BOOT, 0, [5 * i for i in range(n)], {"a": [1] * n})))
     return {**good, "samples": base64.b64encode(deflated).decode()}
 
 
@@ -168,12 +170,12 @@ WRONG = [
 def test_columns_that_nobody_writes_are_refused(column, named):
     message = message_of(column)
     with pytest.raises(ContractError, match=re.escape(named)):
-        iort_contract.decode(message)
+        decode_batch(message)
 
 
 def test_a_sum_that_comes_back_through_64_bits_is_refused():
     with pytest.raises(ContractError, match="must fit in 53 bits"):
-        iort_contract.decode(message_of([0, 1, *[2**62] * 4, 1], n=6))
+        decode_batch(message_of([0, 1, *[2**62] * 4, 1], n=6))
 
 
 @pytest.mark.parametrize("first", ["x" * 1_000_000, [1] * 10_000])
@@ -183,7 +185,7 @@ def test_sums_of_what_is_no_number_are_not_made(first):
     tracemalloc.start()
     try:
         with pytest.raises(ContractError, match="must be integers"):
-            iort_contract.decode(message)
+            decode_batch(message)
         assert tracemalloc.get_traced_memory()[1] < 20 * len(json.dumps(first))
     finally:
         tracemalloc.stop()
@@ -192,13 +194,13 @@ def test_sums_of_what_is_no_number_are_not_made(first):
 def test_columns_take_no_more_memory_than_before():
     """Steps of one character make a value each, so half the text is allowed."""
     with pytest.raises(ContractError, match="inflate to at most 4194304 bytes"):
-        iort_contract.decode(message_of(*[[1] * 50_001] * 45, n=50_000))
+        decode_batch(message_of(*[[1] * 50_001] * 45, n=50_000))
     batch = Batch(BOOT, 0, list(range(1_100)), {"a": ["x" * 4096] * 1_100})
     with pytest.raises(ContractError, match="columns of a batch must be at most 4194304 bytes"):
-        iort_contract.encode(batch)
+        encode_batch(batch)
 
 
 def test_the_dictionary_is_needed():
-    envelope = json.loads(iort_contract.encode(Batch(BOOT, 0, [0], {"a": [1]})))
+    envelope = json.loads(encode_batch(Batch(BOOT, 0, [0], {"a": [1]})))
     with pytest.raises(ContractError, match="must be base64 of zlib"):
-        iort_contract.decode({**envelope, "codec": iort_contract.PLAIN_CODEC})
+        decode_batch({**envelope, "codec": PLAIN_CODEC})

@@ -10,8 +10,15 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-import iort_contract
-from iort_contract import Command, ContractError, FleetMessage
+from iort_contract.limits import ContractError
+from iort_contract.messages.commands import (
+    Command,
+    FleetMessage,
+    decode_command,
+    decode_fleet,
+    encode_command,
+    encode_fleet,
+)
 
 T0 = 1_700_000_000_000_000
 MESSAGES = st.dictionaries(
@@ -34,13 +41,13 @@ def test_a_command_there_and_back(
     session: str, times: tuple[int, int], seq: int, holds: tuple[int, int | None], message: Any
 ) -> None:
     command = Command(session, min(times), seq, max(times), holds[0], message, holds[1])
-    assert iort_contract.decode_command(iort_contract.encode_command(command)) == command
+    assert decode_command(encode_command(command)) == command
 
 
 @given(st.integers(0, 2**53), TIMES, MESSAGES)
 def test_a_fleet_message_there_and_back(seq: int, sent: int, message: Any) -> None:
     heard = FleetMessage("0badcafe", seq, sent, message)
-    assert iort_contract.decode_fleet(iort_contract.encode_fleet(heard)) == heard
+    assert decode_fleet(encode_fleet(heard)) == heard
 
 
 @pytest.mark.parametrize(
@@ -55,7 +62,7 @@ def test_a_fleet_message_there_and_back(seq: int, sent: int, message: Any) -> No
 def test_a_command_that_is_not_allowed(change: dict[str, Any]) -> None:
     good = Command("feedbeef", T0, 0, T0, 500, {"data": 1}, 300)
     with pytest.raises(ContractError):
-        iort_contract.encode_command(replace(good, **change))
+        encode_command(replace(good, **change))
 
 
 ANYTHING = st.none() | st.booleans() | st.integers(-1, 2) | st.floats() | st.text(max_size=9) | st.just({})
@@ -64,6 +71,6 @@ ANYTHING = st.none() | st.booleans() | st.integers(-1, 2) | st.floats() | st.tex
 @given(st.dictionaries(st.sampled_from(KEYS), ANYTHING) | st.binary(max_size=40))
 def test_anything_else_is_refused_with_the_contracts_error(content: Any) -> None:
     payload = content if isinstance(content, bytes) else json.dumps(content).encode()
-    for read in (iort_contract.decode_command, iort_contract.decode_fleet):
+    for read in (decode_command, decode_fleet):
         with pytest.raises(ContractError):
             read(payload)

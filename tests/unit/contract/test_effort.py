@@ -8,12 +8,13 @@ import zlib
 
 import pytest
 
-import iort_contract
-from iort_contract import Batch, ContractError
+from iort_contract.codec.columns import PLAIN_CODEC
 from iort_contract.codec.complexity_guard import check_effort
+from iort_contract.limits import MAX_BATCH_VALUES, ContractError
+from iort_contract.messages.batch import Batch, decode_batch, encode_batch
 
 BOOT = "0123abcd"
-MOST = iort_contract.MAX_BATCH_VALUES
+MOST = MAX_BATCH_VALUES
 
 
 def full(fields, value):
@@ -36,34 +37,34 @@ def full(fields, value):
 )
 def test_as_many_values_as_are_allowed_are_read(fields, value):
     batch = full(fields, value)
-    assert iort_contract.decode(iort_contract.encode(batch)).columns == batch.columns
+    assert decode_batch(encode_batch(batch)).columns == batch.columns
 
 
 def test_the_longest_texts_are_read_whatever_they_hold():
     texts = ["," * 4096, '"' * 4096, "\\" * 4096, '\\"' * 2048, "[" * 4096, "{" * 4096, "é" * 4096]
     batch = Batch(BOOT, 0, range(7 * 20), {"a": texts * 20})
-    assert iort_contract.decode(iort_contract.encode(batch)).columns == batch.columns
+    assert decode_batch(encode_batch(batch)).columns == batch.columns
 
 
 def test_columns_that_somebody_spaces_out_are_read():
     columns = {"dt": [0] + [1] * 9_999, "fields": {"a.b": [0.5] * 10_000, "c": ["x", None] * 5_000}}
     body = json.dumps(columns, separators=("," + " " * 9, ": ")).encode()
     assert len(body) > 2 * MOST
-    assert len(iort_contract.decode(enveloped(body, 10_000)).times_us) == 10_000
+    assert len(decode_batch(enveloped(body, 10_000)).times_us) == 10_000
     # On one line: behind that is what makes messages of them.
     with pytest.raises(ContractError, match="not JSON"):
-        iort_contract.decode(enveloped(json.dumps(columns, indent=8).encode(), 10_000))
+        decode_batch(enveloped(json.dumps(columns, indent=8).encode(), 10_000))
 
 
 @pytest.mark.parametrize(("samples", "fields"), [(MOST // 2 + 1, 2), (98, 512)])
 def test_more_values_are_refused_on_either_side(samples, fields):
     said = f"at most {MOST} values, got {samples} samples of {fields} fields"
     with pytest.raises(ContractError, match=said):
-        iort_contract.encode(Batch(BOOT, 0, range(samples), {f"f{i}": [1] * samples for i in range(fields)}))
+        encode_batch(Batch(BOOT, 0, range(samples), {f"f{i}": [1] * samples for i in range(fields)}))
     columns = b",".join(b'"f%d":[%s0]' % (i, b"0," * (samples - 1)) for i in range(fields))
     body = b'{"dt":[0%s],"fields":{%s}}' % (b",1" * (samples - 1), columns)
     with pytest.raises(ContractError, match=said):
-        iort_contract.decode(enveloped(body, samples))
+        decode_batch(enveloped(body, samples))
 
 
 DEAR = {
@@ -87,22 +88,22 @@ def test_what_is_dear_to_read_is_refused_before_it_is_read(body):
     with pytest.raises(ContractError, match=r"samples must (be columns|hold at most)"):
         check_effort(body)
     with pytest.raises(ContractError, match="samples must"):
-        iort_contract.decode(enveloped(body, 1))
+        decode_batch(enveloped(body, 1))
 
 
 def test_names_are_no_place_for_megabytes():
     longest = "a" + ".b" * 511 + "c"
     batch = Batch(BOOT, 0, [0], {longest: [1]})
-    assert iort_contract.decode(iort_contract.encode(batch)) == batch
+    assert decode_batch(encode_batch(batch)) == batch
     for name in (longest + "d", "a" + ".b" * 1_000_000):
         with pytest.raises(ContractError, match="at most 1024 characters"):
-            iort_contract.encode(Batch(BOOT, 0, [0], {name: [1]}))
+            encode_batch(Batch(BOOT, 0, [0], {name: [1]}))
         with pytest.raises(ContractError, match="at most 1024 characters"):
-            iort_contract.decode(enveloped(b'{"dt":[0],"fields":{"%s":[1]}}' % name.encode(), 1))
+            decode_batch(enveloped(b'{"dt":[0],"fields":{"%s":[1]}}' % name.encode(), 1))
 
 
 def enveloped(body, n):
     """A good envelope around any body, in the codec whose columns are their values alone."""
-    good = json.loads(iort_contract.encode(Batch(BOOT, 0, [0], {"a": [1]})))
+    good = json.loads(encode_batch(Batch(BOOT, 0, [0], {"a": [1]})))
     packed = base64.b64encode(zlib.compress(body)).decode()
-    return {**good, "n": n, "codec": iort_contract.PLAIN_CODEC, "samples": packed}
+    return {**good, "n": n, "codec": PLAIN_CODEC, "samples": packed}

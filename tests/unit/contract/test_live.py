@@ -10,8 +10,10 @@ import pytest
 from hypothesis import example, given
 from hypothesis import strategies as st
 
-import iort_contract
-from iort_contract import ContractError, LiveSample
+from iort_contract.limits import MAX_PUBNUB_BYTES, ContractError
+from iort_contract.messages.event import MESSAGE_BASE64, event_message, rule_event
+from iort_contract.messages.live import LiveSample, decode_live, encode_live, live_update
+from iort_contract.vesc import VESC_FIELDS
 from tests.unit.contract.contract_values import (
     BAD_HEADERS,
     BOOT,
@@ -34,8 +36,8 @@ lives = st.builds(LiveSample, boots, seqs, times, times, samples, st.integers(0,
 
 @given(lives)
 def test_live_round_trip(live):
-    message = iort_contract.encode_live(live)
-    for decoded in map(iort_contract.decode_live, (message, message.decode(), handed_over(message))):
+    message = encode_live(live)
+    for decoded in map(decode_live, (message, message.decode(), handed_over(message))):
         assert replace(decoded, sample={}) == replace(live, sample={})
         assert list(decoded.sample) == list(live.sample)
         assert all(same(live.sample[name], decoded.sample[name]) for name in live.sample)
@@ -43,24 +45,22 @@ def test_live_round_trip(live):
 
 def handed_over(message):
     """As the live rule gives it to Lambda 1, and Lambda 1 takes it."""
-    event = iort_contract.rule_event(message, "live/iort/car/vesc", 1_700_000_000_000)
-    return iort_contract.event_message(json.loads(json.dumps(event)))
+    event = rule_event(message, "live/iort/car/vesc", 1_700_000_000_000)
+    return event_message(json.loads(json.dumps(event)))
 
 
-@pytest.mark.parametrize(
-    "event", [{}, {iort_contract.MESSAGE_BASE64: 7}, {iort_contract.MESSAGE_BASE64: "a%"}]
-)
+@pytest.mark.parametrize("event", [{}, {MESSAGE_BASE64: 7}, {MESSAGE_BASE64: "a%"}])
 def test_an_event_of_another_kind_holds_no_live_message(event):
-    with pytest.raises(ContractError, match=iort_contract.MESSAGE_BASE64):
-        iort_contract.event_message(event)
+    with pytest.raises(ContractError, match=MESSAGE_BASE64):
+        event_message(event)
 
 
 @given(st.dictionaries(names, anything, max_size=8))
 @example({"a": math.nan, "b": math.inf, "c": -math.inf})
 def test_live_nonfinite_becomes_null_and_is_counted(sample):
-    message = iort_contract.encode_live(LiveSample(BOOT, 0, 0, 0, sample, 5))
+    message = encode_live(LiveSample(BOOT, 0, 0, 0, sample, 5))
     strict(message)
-    decoded = iort_contract.decode_live(message)
+    decoded = decode_live(message)
     assert decoded.sample == {name: nulled(value) for name, value in sample.items()}
     assert decoded.nonfinite == 5 + sum(nulled(v) is None and v is not None for v in sample.values())
 
@@ -81,18 +81,18 @@ def test_live_nonfinite_becomes_null_and_is_counted(sample):
 )
 def test_live_refused(changed, named):
     with pytest.raises(ContractError, match=named):
-        iort_contract.encode_live(replace(GOOD_LIVE, **changed))
+        encode_live(replace(GOOD_LIVE, **changed))
 
 
 def test_live_update_carries_every_hop():
     live = LiveSample(BOOT, 9, 1_000, 2_000, {"speed": 1})
-    update = iort_contract.live_update("car", "vesc", live, 3, 4_000)
+    update = live_update("car", "vesc", live, 3, 4_000)
     hops = {"sent_us": 2_000, "received_ms": 3, "lambda_us": 4_000}
     assert update["hops"] == hops
-    known = iort_contract.live_update("car", "vesc", replace(live, offset_us=-5), 3, 4_000)
+    known = live_update("car", "vesc", replace(live, offset_us=-5), 3, 4_000)
     assert known["hops"] == {**hops, "offset_us": -5}
     assert (update["robot"], update["stream"], update["t"], update["seq"]) == ("car", "vesc", 1_000, 9)
     assert update["sample"] == {"speed": 1}
-    full = dict.fromkeys(iort_contract.VESC_FIELDS, -1234.56789)
-    largest = iort_contract.live_update("c" * 64, "vesc", replace(live, sample=full), 2**53, 2**53)
-    assert len(json.dumps(largest)) * 3 < iort_contract.MAX_PUBNUB_BYTES
+    full = dict.fromkeys(VESC_FIELDS, -1234.56789)
+    largest = live_update("c" * 64, "vesc", replace(live, sample=full), 2**53, 2**53)
+    assert len(json.dumps(largest)) * 3 < MAX_PUBNUB_BYTES

@@ -11,11 +11,12 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-import iort_contract
-from iort_contract import ContractError
+from iort_contract.limits import ContractError
+from iort_contract.messages.batch import decode_batch, encode_batch
+from iort_contract.messages.live import decode_live, decode_pong, encode_live
 from tests.unit.contract.contract_values import DEEP, GOOD, GOOD_LIVE, batches, decode_or_refuse, json_values
 
-DECODERS = [iort_contract.decode, iort_contract.decode_live, iort_contract.decode_pong]
+DECODERS = [decode_batch, decode_live, decode_pong]
 decoders = st.sampled_from(DECODERS)
 
 
@@ -50,7 +51,7 @@ awkward = st.sampled_from(
 
 
 def envelopes():
-    return st.sampled_from([iort_contract.encode(GOOD), iort_contract.encode_live(GOOD_LIVE)]).map(json.loads)
+    return st.sampled_from([encode_batch(GOOD), encode_live(GOOD_LIVE)]).map(json.loads)
 
 
 @given(decoders, st.binary(max_size=200))
@@ -92,11 +93,9 @@ def test_one_key_replaced_in_text(data, value):
         decode_or_refuse(decoder, json.dumps(envelope))
 
 
-@pytest.mark.parametrize(
-    "good", [iort_contract.encode(GOOD), iort_contract.encode_live(GOOD_LIVE)], ids=["batch", "live"]
-)
+@pytest.mark.parametrize("good", [encode_batch(GOOD), encode_live(GOOD_LIVE)], ids=["batch", "live"])
 def test_one_key_removed(good):
-    decoder = iort_contract.decode if b"codec" in good else iort_contract.decode_live
+    decoder = decode_batch if b"codec" in good else decode_live
     for key in json.loads(good):
         envelope = json.loads(good)
         del envelope[key]
@@ -107,21 +106,21 @@ def test_one_key_removed(good):
 @settings(max_examples=300)
 @given(batches(), st.data())
 def test_message_damaged_anywhere(batch, data):
-    message = bytearray(iort_contract.encode(batch))
+    message = bytearray(encode_batch(batch))
     at = data.draw(st.integers(0, len(message) - 1))
     message[at] = data.draw(st.integers(0, 255))
-    decode_or_refuse(iort_contract.decode, bytes(message))
-    decode_or_refuse(iort_contract.decode, bytes(message[:at]))
+    decode_or_refuse(decode_batch, bytes(message))
+    decode_or_refuse(decode_batch, bytes(message[:at]))
 
 
 @settings(max_examples=200)
 @given(st.data())
 def test_compressed_samples_damaged(data):
-    envelope = json.loads(iort_contract.encode(GOOD))
+    envelope = json.loads(encode_batch(GOOD))
     packed = bytearray(base64.b64decode(envelope["samples"]))
     at = data.draw(st.integers(0, len(packed) - 1))
     packed[at] ^= data.draw(st.integers(1, 255))
-    decode_or_refuse(iort_contract.decode, dict(envelope, samples=base64.b64encode(packed).decode()))
+    decode_or_refuse(decode_batch, dict(envelope, samples=base64.b64encode(packed).decode()))
 
 
 @pytest.mark.parametrize("decoder", DECODERS)
@@ -151,7 +150,7 @@ def test_message_refused(decoder, message):
 
 def test_error_of_a_long_value_is_short():
     with pytest.raises(ContractError) as caught:
-        iort_contract.decode(dict(json.loads(iort_contract.encode(GOOD)), codec="x" * 10_000))
+        decode_batch(dict(json.loads(encode_batch(GOOD)), codec="x" * 10_000))
     assert len(str(caught.value)) < 200
 
 

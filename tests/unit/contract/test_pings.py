@@ -9,17 +9,19 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-import iort_contract
-from iort_contract import ContractError
+from iort_contract.cloud import pong_template
+from iort_contract.limits import ContractError
+from iort_contract.messages.live import decode_pong, encode_ping
+from iort_contract.topics import PONG, RULE, build_topic
 from tests.unit.contract.contract_values import seqs, times
 
 
 @given(seqs, times, st.text(st.characters(), max_size=20), st.none() | st.integers(0, 2**53 // 1000))
 def test_pong_round_trip(ping_id, sent_us, padding, received_ms):
-    message = iort_contract.encode_ping(ping_id, sent_us, padding)
+    message = encode_ping(ping_id, sent_us, padding)
     if received_ms is not None:  # as the rule does
         message = json.dumps(dict(json.loads(message), received_ms=received_ms)).encode()
-    assert iort_contract.decode_pong(message) == (ping_id, sent_us, received_ms)
+    assert decode_pong(message) == (ping_id, sent_us, received_ms)
 
 
 @pytest.mark.parametrize(
@@ -28,7 +30,7 @@ def test_pong_round_trip(ping_id, sent_us, padding, received_ms):
 )
 def test_ping_refused(ping_id, sent_us):
     with pytest.raises(ContractError, match=r"ping id|sent_us"):
-        iort_contract.encode_ping(ping_id, sent_us)
+        encode_ping(ping_id, sent_us)
 
 
 @pytest.mark.parametrize(
@@ -44,9 +46,9 @@ def test_ping_refused(ping_id, sent_us):
 )
 def test_pong_refused(pong):
     with pytest.raises(ContractError):
-        iort_contract.decode_pong(pong)
+        decode_pong(pong)
 
 
 def test_pong_goes_to_the_robot_that_asked():
-    topic = iort_contract.pong_template("iort").replace("${topic(3)}", "car")
-    assert topic == iort_contract.build_topic(iort_contract.PONG, "car", iort_contract.RULE)
+    topic = pong_template("iort").replace("${topic(3)}", "car")
+    assert topic == build_topic(PONG, "car", RULE)

@@ -14,13 +14,21 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-import iort_contract
-from iort_contract import Batch, ContractError, Messages, MessageType, RosMessage, RosType, messages_of
-from iort_contract.limits import MAX_FIELD_CHARACTERS, MessageError
-from iort_contract.ros1.columns import MAX_LAYOUT, as_columns, decoder_of, from_columns, view
+from iort_contract.codec.columns import CODEC, DICTIONARY, SERIALIZED_CODEC, inflate
+from iort_contract.limits import (
+    MAX_BATCH_VALUES,
+    MAX_COLUMNS_BYTES,
+    MAX_FIELD_CHARACTERS,
+    MAX_FIELDS,
+    ContractError,
+    MessageError,
+)
+from iort_contract.messages.batch import Batch, decode_batch, encode_batch, messages_of, split_batch
+from iort_contract.messages.message_type import MessageType
+from iort_contract.ros1.columns import as_columns, decoder_of, from_columns, view
 from iort_contract.ros1.decode import HEADER as HEAD
 from iort_contract.ros1.definition import layout, parse
-from iort_contract.ros1.message import cut, filled
+from iort_contract.ros1.message import MAX_LAYOUT, Messages, RosMessage, RosType, cut, filled, type_id
 from iort_contract.ros1.serialized import pack, unpack
 from tests.unit.contract.contract_values import BOOT, json_values
 from tests.unit.contract.ros1_messages import HEADER, LINE, STAMPED, header, text, u32
@@ -42,12 +50,12 @@ def batch_of(kind: RosType, raws: Sequence[bytes], beside: Any = None, step_us: 
 
 
 def codec_of(batch: Batch) -> str:
-    return str(json.loads(iort_contract.encode(batch))["codec"])
+    return str(json.loads(encode_batch(batch))["codec"])
 
 
 def again(batch: Batch, layouts: Any = None) -> list[bytes]:
     """The messages out of the wire's batch, and out of a table's item."""
-    message = iort_contract.encode(batch)
+    message = encode_batch(batch)
     _, messages = messages_of(message, LAYOUTS if layouts is None else layouts)
     assert messages is not None
     assert batch.messages is not None
@@ -73,8 +81,8 @@ def header_of(seq: int, sec: int, nanosec: int, frame: str) -> bytes:
 
 def test_messages_of_numbers_are_columns_and_the_same_bytes_again() -> None:
     batch = batch_of(FLAT, [flat(x=i / 10, n=i, on=i % 2) for i in range(50)])
-    assert codec_of(batch) == iort_contract.CODEC
-    decoded = iort_contract.decode(iort_contract.encode(batch))
+    assert codec_of(batch) == CODEC
+    decoded = decode_batch(encode_batch(batch))
     assert decoded.messages is None
     assert list(decoded.columns) == ["x", "y", "n", "on", "big"]
     assert decoded.columns["x"] == [i / 10 for i in range(50)]
@@ -109,10 +117,10 @@ QUIET, SIGNALLING = 0x7FF8000000000001, 0x7FF0000000000001
 def test_what_a_column_would_change_is_kept_as_it_is(odd: bytes) -> None:
     raws = [flat(), odd, flat(n=4)]
     batch = batch_of(FLAT, raws)
-    assert codec_of(batch) == iort_contract.SERIALIZED_CODEC
+    assert codec_of(batch) == SERIALIZED_CODEC
     # Whoever has the batch needs no layout of anybody's.
     assert again(batch, {}) == raws
-    decoded = iort_contract.decode(iort_contract.encode(batch))
+    decoded = decode_batch(encode_batch(batch))
     assert decoded.columns["n"][::2] == [3, 4]
 
 
@@ -121,7 +129,7 @@ def test_what_a_column_would_change_is_kept_as_it_is(odd: bytes) -> None:
 def test_any_bytes_of_a_type_of_numbers_come_back(raws: list[bytes]) -> None:
     batch = batch_of(FLAT, raws)
     assert again(batch) == raws
-    decoded = iort_contract.decode(iort_contract.encode(batch))
+    decoded = decode_batch(encode_batch(batch))
     expected, nulled = view(Messages(FLAT.id, FLAT.layout, raws))
     assert (decoded.columns, decoded.nonfinite) == (expected, nulled)
 
@@ -143,9 +151,9 @@ def test_any_bytes_of_a_type_of_numbers_come_back(raws: list[bytes]) -> None:
 )
 def test_headers_come_back_whatever_they_say(raws: list[bytes]) -> None:
     batch = batch_of(STAMPED_FLAT, raws)
-    assert codec_of(batch) == iort_contract.CODEC
+    assert codec_of(batch) == CODEC
     assert again(batch) == raws
-    assert list(iort_contract.decode(iort_contract.encode(batch)).columns) == ["x", "n"]
+    assert list(decode_batch(encode_batch(batch)).columns) == ["x", "n"]
 
 
 @pytest.mark.parametrize(
@@ -162,25 +170,25 @@ def test_headers_come_back_whatever_they_say(raws: list[bytes]) -> None:
 )
 def test_headers_that_nobody_sends_come_back_too(odd: bytes) -> None:
     batch = batch_of(STAMPED_FLAT, [stamped(0), odd])
-    assert codec_of(batch) == iort_contract.SERIALIZED_CODEC
+    assert codec_of(batch) == SERIALIZED_CODEC
     assert again(batch, {}) == [stamped(0), odd]
 
 
 def test_columns_take_less_than_the_messages_would() -> None:
     """A drive's numbers; what has no pattern is kept as bytes, which its text would be twice as long as."""
     smooth = batch_of(STAMPED_FLAT, [stamped(i, ns=i * 7 % 1000) for i in range(500)])
-    assert codec_of(smooth) == iort_contract.CODEC
+    assert codec_of(smooth) == CODEC
     raws = smooth.messages.raw  # type: ignore[union-attr]  # it was given some
     packed = len(zlib.compress(pack(Messages(STAMPED_FLAT.id, STAMPED_FLAT.layout, raws))))
-    assert len(iort_contract.encode(smooth)) * 3 // 4 < packed
+    assert len(encode_batch(smooth)) * 3 // 4 < packed
     noise = random.Random(1)
     noisy = batch_of(FLAT, [flat(x=noise.random()) for _ in range(50)])
-    assert codec_of(noisy) == iort_contract.SERIALIZED_CODEC
+    assert codec_of(noisy) == SERIALIZED_CODEC
 
 
 def test_the_layout_must_be_known_and_be_the_types() -> None:
     batch = batch_of(FLAT, [flat()])
-    message = iort_contract.encode(batch)
+    message = encode_batch(batch)
     with pytest.raises(ContractError, match=f"type .{FLAT.id}. is unknown"):
         messages_of(message, {})
     for wrong, named in (
@@ -195,7 +203,7 @@ def test_the_layout_must_be_known_and_be_the_types() -> None:
 
 def test_samples_that_were_never_messages_have_none() -> None:
     batch = Batch(BOOT, 0, [T0], {"x": [1]})
-    assert messages_of(iort_contract.encode(batch), LAYOUTS) == (batch, None)
+    assert messages_of(encode_batch(batch), LAYOUTS) == (batch, None)
 
 
 # What may stand behind the columns of a batch of two samples, and is of no type of ours.
@@ -313,7 +321,7 @@ def test_a_field_whose_name_nobody_may_ask_for_is_kept_and_not_shown() -> None:
     raws = [struct.pack("<dB", 0.5, i) for i in range(3)]
     batch = batch_of(kind, raws)
     assert again(batch, {kind.id: kind.layout}) == raws
-    assert dict(iort_contract.decode(iort_contract.encode(batch)).columns) == {"n": [0, 1, 2]}
+    assert dict(decode_batch(encode_batch(batch)).columns) == {"n": [0, 1, 2]}
 
 
 def test_a_definition_that_is_too_long_for_a_batch_is_recorded_without_a_view() -> None:
@@ -345,13 +353,13 @@ def test_a_definition_that_is_too_long_for_a_batch_is_recorded_without_a_view() 
 )  # fmt: skip
 def test_other_messages_are_kept_byte_for_byte(kind: RosType, raws: list[bytes]) -> None:
     batch = batch_of(kind, raws)
-    assert codec_of(batch) == iort_contract.SERIALIZED_CODEC
+    assert codec_of(batch) == SERIALIZED_CODEC
     assert again(batch, {}) == raws
 
 
 def test_the_view_of_arrays_that_change_their_length_has_nothing_where_there_is_nothing() -> None:
     raws = [u32(2) + text("a") + text("b") + u32(0), u32(1) + text("c") + u32(1) + struct.pack("<d", 0.5)]
-    found = iort_contract.decode(iort_contract.encode(batch_of(NAMES, raws)))
+    found = decode_batch(encode_batch(batch_of(NAMES, raws)))
     assert found.columns == {"names.0": ["a", "c"], "names.1": ["b", None], "x.0": [None, 0.5]}
     assert found.messages is not None
     assert found.times_us == [T0, T0 + 1000]
@@ -359,7 +367,7 @@ def test_the_view_of_arrays_that_change_their_length_has_nothing_where_there_is_
 
 def test_values_that_are_not_finite_are_counted_in_the_view() -> None:
     raws = [flat(x=math.nan), flat(x=-0.0), flat(y=math.inf)]
-    found = iort_contract.decode(iort_contract.encode(batch_of(FLAT, raws)))
+    found = decode_batch(encode_batch(batch_of(FLAT, raws)))
     assert (found.columns["x"], found.columns["y"]) == ([None, 0, 1.5], [0.5, 0.5, None])
     assert found.nonfinite == 2
 
@@ -367,33 +375,33 @@ def test_values_that_are_not_finite_are_counted_in_the_view() -> None:
 def test_what_stands_beside_messages_is_in_their_samples() -> None:
     raws = [u32(0) + u32(0), u32(1) + text("a") + u32(0)]
     batch = batch_of(NAMES, raws, {"data.key": ["k", None], "data.at": [0, 4]})
-    found, messages = messages_of(iort_contract.encode(batch), {})
+    found, messages = messages_of(encode_batch(batch), {})
     assert found.columns == {"names.0": [None, "a"], "data.key": ["k", None], "data.at": [0, 4]}
     assert messages is not None
     assert list(messages.raw) == raws
     # Of numbers alone, too.
     numbers = batch_of(FLAT, [flat()], {"note": ["n"]})
-    assert codec_of(numbers) == iort_contract.SERIALIZED_CODEC
+    assert codec_of(numbers) == SERIALIZED_CODEC
     assert again(numbers, {}) == [flat()]
 
 
 def test_halves_have_their_messages() -> None:
     batch = batch_of(NAMES, [u32(0) + u32(0)] * 3, {"note": ["a", "b", "c"]})
-    first, second = iort_contract.split(batch)
+    first, second = split_batch(batch)
     assert (len(again(first, {})), len(again(second, {}))) == (1, 2)
-    assert iort_contract.decode(iort_contract.encode(second)).columns["note"] == ["b", "c"]
+    assert decode_batch(encode_batch(second)).columns["note"] == ["b", "c"]
     with pytest.raises(ContractError, match="1 samples must have as many messages, got 2"):
-        iort_contract.encode(Batch(BOOT, 0, [T0], {}, 0, Messages(NAMES.id, "", [b"", b""])))
+        encode_batch(Batch(BOOT, 0, [T0], {}, 0, Messages(NAMES.id, "", [b"", b""])))
 
 
 def test_messages_too_large_for_a_batch_are_halved_to_what_is_read_again() -> None:
     batch = batch_of(UNKNOWN, [b"x" * 700_000] * 4)
     with pytest.raises(ContractError, match="messages of a batch must be at most 2097152 bytes, got 2800000"):
-        iort_contract.encode(batch)
-    for half in iort_contract.split(batch):
+        encode_batch(batch)
+    for half in split_batch(batch):
         assert again(half, {}) == [b"x" * 700_000] * 2
-    alone = batch_of(UNKNOWN, [b"x" * iort_contract.MAX_COLUMNS_BYTES])
-    assert again(alone, {}) == [b"x" * iort_contract.MAX_COLUMNS_BYTES]
+    alone = batch_of(UNKNOWN, [b"x" * MAX_COLUMNS_BYTES])
+    assert again(alone, {}) == [b"x" * MAX_COLUMNS_BYTES]
 
 
 @settings(max_examples=200)
@@ -444,31 +452,31 @@ def test_a_head_that_nobody_writes_is_refused(body: bytes, named: str) -> None:
 
 
 def test_what_stands_behind_the_columns_must_be_text() -> None:
-    good = json.loads(iort_contract.encode(batch_of(FLAT, [flat()])))
-    body = iort_contract.inflate(good["samples"], iort_contract.CODEC)
+    good = json.loads(encode_batch(batch_of(FLAT, [flat()])))
+    body = inflate(good["samples"], CODEC)
     for behind, taken in ((b"[1]", True), (b"\xff\xfe", False)):
-        deflater = zlib.compressobj(zdict=iort_contract.DICTIONARY)
+        deflater = zlib.compressobj(zdict=DICTIONARY)
         packed = deflater.compress(body.partition(b"\n")[0] + b"\n" + behind) + deflater.flush()
         envelope = {**good, "samples": base64.b64encode(packed).decode()}
         if taken:
-            assert iort_contract.decode(envelope).columns["x"] == [1.5]
+            assert decode_batch(envelope).columns["x"] == [1.5]
         else:
             with pytest.raises(ContractError, match="must be text"):
-                iort_contract.decode(envelope)
+                decode_batch(envelope)
 
 
 @settings(max_examples=200)
 @given(st.sampled_from([FLAT, STAMPED_FLAT, NAMES]), st.data())
 def test_a_batch_of_messages_damaged_anywhere_is_read_or_refused(kind: RosType, data: Any) -> None:
     raws = {FLAT: [flat()] * 2, STAMPED_FLAT: [stamped(0), stamped(1)], NAMES: [u32(0, 0)] * 2}[kind]
-    envelope = json.loads(iort_contract.encode(batch_of(kind, raws)))
-    body = bytearray(iort_contract.inflate(envelope["samples"], envelope["codec"]))
+    envelope = json.loads(encode_batch(batch_of(kind, raws)))
+    body = bytearray(inflate(envelope["samples"], envelope["codec"]))
     at = data.draw(st.integers(0, len(body) - 1))
     body[at] = data.draw(st.integers(0, 255))
     for damaged in (bytes(body), bytes(body[:at])):
-        deflater = zlib.compressobj(zdict=iort_contract.DICTIONARY)
+        deflater = zlib.compressobj(zdict=DICTIONARY)
         packed = base64.b64encode(deflater.compress(damaged) + deflater.flush()).decode()
-        for codec in (iort_contract.CODEC, iort_contract.SERIALIZED_CODEC):
+        for codec in (CODEC, SERIALIZED_CODEC):
             try:
                 _, messages = messages_of({**envelope, "codec": codec, "samples": packed}, LAYOUTS)
             except ContractError:
@@ -481,10 +489,10 @@ def test_a_message_of_millions_of_values_costs_no_more_than_a_view() -> None:
     kind = RosType("/t", "a_msgs/A", "1", "B[] b\n" + LINE + "MSG: a_msgs/B\nint8[] a\n")
     one = u32(64) + (u32(64) + bytes(64)) * 64
     batch = batch_of(kind, [one] * 400)
-    found = iort_contract.decode(json.dumps(json.loads(forced(batch))))
-    assert len(found.columns) <= iort_contract.MAX_FIELDS
+    found = decode_batch(json.dumps(json.loads(forced(batch))))
+    assert len(found.columns) <= MAX_FIELDS
     assert sum(len(column) - column.count(None) for column in found.columns.values()) <= (
-        2 * iort_contract.MAX_BATCH_VALUES + iort_contract.MAX_FIELDS
+        2 * MAX_BATCH_VALUES + MAX_FIELDS
     )
     assert found.messages is not None
     assert list(found.messages.raw) == [one] * 400
@@ -494,7 +502,7 @@ def forced(batch: Batch) -> bytes:
     """The batch as somebody encodes it who does not count its values."""
     assert batch.messages is not None
     dt = [0] + [1000] * (len(batch.times_us) - 1)
-    deflater = zlib.compressobj(zdict=iort_contract.DICTIONARY)
+    deflater = zlib.compressobj(zdict=DICTIONARY)
     body = json.dumps({"dt": dt, "fields": {}}).encode() + b"\n" + pack(batch.messages)
     samples = base64.b64encode(deflater.compress(body) + deflater.flush()).decode()
     envelope = {"v": 2, "batch": str(batch.id), "n": len(dt), "codec": "ros1", "samples": samples}
@@ -505,8 +513,8 @@ def test_batches_of_more_values_than_are_allowed_are_halved() -> None:
     kind = RosType("/t", "a_msgs/A", "1", "".join(f"uint8[64] a{i}\n" for i in range(8)))
     batch = batch_of(kind, [bytes(512)] * 98)
     with pytest.raises(ContractError, match="98 samples of 512 fields"):
-        iort_contract.encode(batch)
-    for half in iort_contract.split(batch):
+        encode_batch(batch)
+    for half in split_batch(batch):
         assert again(half, {kind.id: kind.layout}) == [bytes(512)] * 49
 
 
@@ -536,8 +544,7 @@ def test_a_layout_says_all_that_decoding_needs(definition: str) -> None:
 
 def test_a_type_is_told_by_its_topic_its_name_and_its_checksum() -> None:
     named = {
-        iort_contract.type_id(*one)
-        for one in [("/a", "b", "c"), ("/a", "b", "d"), ("/a", "c", "c"), ("", "/ab", "c")]
+        type_id(*one) for one in [("/a", "b", "c"), ("/a", "b", "d"), ("/a", "c", "c"), ("", "/ab", "c")]
     }
     assert len(named) == 4
     assert all(len(name) == 8 and int(name, 16) >= 0 for name in named)

@@ -9,7 +9,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from iort_contract import Batch, BatchId, flat_second
+from iort_contract.codec.seconds import flat_second
+from iort_contract.messages.batch import Batch, BatchId
 from iort_contract.statistics import Vehicle, count_holes, derive, missing_before, summarize_second
 
 S = 1_000_000

@@ -6,8 +6,18 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-import iort_contract
-from iort_contract import ContractError
+from iort_contract.cloud import channel, fleet_name, pong_template, pubnub_parameter, rule_sql
+from iort_contract.limits import ContractError
+from iort_contract.topics import (
+    LANES,
+    build_topic,
+    check_namespace,
+    check_robot,
+    check_stream,
+    parse_topic,
+    record_topic,
+    rule_name,
+)
 
 robots = st.from_regex(r"[A-Za-z0-9_-]{1,64}", fullmatch=True)
 namespaces = st.from_regex(r"[a-z][a-z0-9]{0,15}", fullmatch=True)
@@ -44,10 +54,10 @@ HOSTILE = [
 ]
 
 
-@given(st.sampled_from(iort_contract.LANES), robots, robots, namespaces)
+@given(st.sampled_from(LANES), robots, robots, namespaces)
 def test_topic_round_trip(lane, robot, name, namespace):
-    topic = iort_contract.build_topic(lane, robot, name, namespace)
-    parsed = iort_contract.parse_topic(topic)
+    topic = build_topic(lane, robot, name, namespace)
+    parsed = parse_topic(topic)
     assert parsed == (lane, namespace, robot, name)
     assert str(parsed) == topic
     assert len(topic.encode()) <= 256, "the topic limit of AWS IoT Core"
@@ -55,35 +65,31 @@ def test_topic_round_trip(lane, robot, name, namespace):
 
 @given(robots, robots, namespaces)
 def test_record_topic_is_basic_ingest_to_the_record_rule(robot, stream, namespace):
-    dollar_aws, rules, rule, rest = iort_contract.record_topic(robot, stream, namespace).split("/", 3)
-    assert (dollar_aws, rules, rule) == ("$aws", "rules", iort_contract.rule_name("record", namespace))
-    assert iort_contract.parse_topic(rest) == ("dt", namespace, robot, stream)
+    dollar_aws, rules, rule, rest = record_topic(robot, stream, namespace).split("/", 3)
+    assert (dollar_aws, rules, rule) == ("$aws", "rules", rule_name("record", namespace))
+    assert parse_topic(rest) == ("dt", namespace, robot, stream)
 
 
 @pytest.mark.parametrize("name", HOSTILE, ids=ascii)
 def test_hostile_names_are_refused_everywhere(name):
     for refused in (
-        lambda: iort_contract.check_robot(name),
-        lambda: iort_contract.check_stream(name),
-        lambda: iort_contract.check_namespace(name),
-        lambda: iort_contract.build_topic("dt", name, "vesc"),
-        lambda: iort_contract.build_topic("dt", "car", name),
-        lambda: iort_contract.build_topic("dt", "car", "vesc", name),
-        lambda: iort_contract.build_topic(name, "car", "vesc"),
-        lambda: iort_contract.record_topic(name, "vesc"),
-        lambda: (
-            iort_contract.parse_topic(f"dt/iort/{name}/vesc")
-            if isinstance(name, str)
-            else iort_contract.parse_topic(name)
-        ),
-        lambda: iort_contract.channel(name),
-        lambda: iort_contract.rule_name(name),
-        lambda: iort_contract.rule_name("record", name),
-        lambda: iort_contract.rule_sql(name),
-        lambda: iort_contract.rule_sql("record", name),
-        lambda: iort_contract.pong_template(name),
-        lambda: iort_contract.pubnub_parameter(name),
-        lambda: iort_contract.fleet_name(name),
+        lambda: check_robot(name),
+        lambda: check_stream(name),
+        lambda: check_namespace(name),
+        lambda: build_topic("dt", name, "vesc"),
+        lambda: build_topic("dt", "car", name),
+        lambda: build_topic("dt", "car", "vesc", name),
+        lambda: build_topic(name, "car", "vesc"),
+        lambda: record_topic(name, "vesc"),
+        lambda: parse_topic(f"dt/iort/{name}/vesc") if isinstance(name, str) else parse_topic(name),
+        lambda: channel(name),
+        lambda: rule_name(name),
+        lambda: rule_name("record", name),
+        lambda: rule_sql(name),
+        lambda: rule_sql("record", name),
+        lambda: pong_template(name),
+        lambda: pubnub_parameter(name),
+        lambda: fleet_name(name),
     ):
         with pytest.raises(ContractError):
             refused()
@@ -92,7 +98,7 @@ def test_hostile_names_are_refused_everywhere(name):
 @given(st.text(st.characters(), max_size=70))
 def test_any_name_is_refused_or_safe(name):
     try:
-        iort_contract.check_robot(name)
+        check_robot(name)
     except ContractError:
         return
     assert set(name.encode("ascii")) <= set(
@@ -104,13 +110,13 @@ def test_any_name_is_refused_or_safe(name):
 @given(st.text(st.characters(), max_size=40) | robots.map("dt/iort/{}/vesc".format))
 def test_any_topic_is_refused_or_built_alike(topic):
     try:
-        parsed = iort_contract.parse_topic(topic)
+        parsed = parse_topic(topic)
     except ContractError:
         return
-    assert iort_contract.build_topic(parsed.lane, parsed.robot, parsed.name, parsed.namespace) == topic
+    assert build_topic(parsed.lane, parsed.robot, parsed.name, parsed.namespace) == topic
 
 
 @pytest.mark.parametrize("namespace", ["Iort", "1iort", "io-rt", "io_rt", "a" * 17])
 def test_namespace_is_stricter(namespace):
     with pytest.raises(ContractError, match="namespace"):
-        iort_contract.check_namespace(namespace)
+        check_namespace(namespace)

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import pytest
 
-import iort_contract
-from iort_contract import Batch
+from iort_contract.messages.batch import Batch, encode_batch
+from iort_contract.vesc import FAULT_CODES, FAULTS, VESC_FIELDS, absent
 from tests.unit.contract.contract_values import BOOT
 
 # The messages of the drivers, in their order.
@@ -54,19 +54,17 @@ UNITS = {"V", "A", "degC", "1", "erpm", "1e-4 Ah", "1e-4 Wh", "counts", "enum", 
 
 @pytest.mark.parametrize(("version", "expected"), [(1, ROS1), (2, ROS2)])
 def test_fields_are_those_of_the_message(version, expected):
-    assert {name for name, field in iort_contract.VESC_FIELDS.items() if version in field.ros} == set(
-        expected
-    )
+    assert {name for name, field in VESC_FIELDS.items() if version in field.ros} == set(expected)
 
 
 def test_ros1_message_has_13_fields():
     assert len(ROS1) == len(set(ROS1)) == 13
 
 
-@pytest.mark.parametrize("field", iort_contract.VESC_FIELDS.values(), ids=lambda field: field.name)
+@pytest.mark.parametrize("field", VESC_FIELDS.values(), ids=lambda field: field.name)
 def test_field(field):
-    assert iort_contract.VESC_FIELDS[field.name] is field
-    assert iort_contract.encode(Batch(BOOT, 0, [0], {field.name: [0]}))
+    assert VESC_FIELDS[field.name] is field
+    assert encode_batch(Batch(BOOT, 0, [0], {field.name: [0]}))
     assert field.unit in UNITS
     assert field.meaning.strip() == field.meaning != ""
     assert set(field.ros) <= {1, 2}
@@ -75,11 +73,11 @@ def test_field(field):
 
 
 def test_faults_are_the_firmwares_whole_list():
-    assert list(iort_contract.FAULTS) == list(range(34))
-    assert iort_contract.FAULT_CODES["OVER_TEMP_FET"] == iort_contract.FAULT_CODES["OVER_TEMP_MOTOR"] - 1 == 5
-    assert iort_contract.FAULT_CODES["ABS_OVERSPEED"] == 33
-    assert len(set(iort_contract.FAULTS.values())) == 34
-    assert set(iort_contract.FAULT_CODES.values()) == iort_contract.FAULTS.keys()
+    assert list(FAULTS) == list(range(34))
+    assert FAULT_CODES["OVER_TEMP_FET"] == FAULT_CODES["OVER_TEMP_MOTOR"] - 1 == 5
+    assert FAULT_CODES["ABS_OVERSPEED"] == 33
+    assert len(set(FAULTS.values())) == 34
+    assert set(FAULT_CODES.values()) == FAULTS.keys()
 
 
 @pytest.mark.parametrize(
@@ -100,4 +98,4 @@ def test_faults_are_the_firmwares_whole_list():
     ],
 )
 def test_a_sensor_that_is_not_fitted(field, value, expected):
-    assert iort_contract.absent(field, value) is expected
+    assert absent(field, value) is expected

@@ -5,9 +5,9 @@ from __future__ import annotations
 import json
 from collections import defaultdict
 
-import iort_contract
 from functions.shared.processing import process
-from iort_contract import Batch
+from iort_contract.messages.batch import Batch
+from iort_contract.vesc import VESC_FIELDS
 from tests.fakes import (
     TELEMETRY,
     TOPIC_OF_CAR,
@@ -93,5 +93,5 @@ def drive_of(path):
         for connection, stamp_ns, raw in reader.messages():
             if connection.msgtype.endswith("VescStateStamped"):
                 state = reader.deserialize(raw, connection.msgtype).state
-                sample = {name: getattr(state, name, None) for name in iort_contract.VESC_FIELDS}
+                sample = {name: getattr(state, name, None) for name in VESC_FIELDS}
                 yield stamp_ns // 1000, {k: v for k, v in sample.items() if v is not None}

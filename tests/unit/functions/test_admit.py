@@ -12,7 +12,8 @@ import pytest
 from botocore.stub import Stubber
 
 from functions import admit
-from iort_contract import (
+from iort_contract.dynamodb import plain
+from iort_contract.tables import (
     ADMIT_CLAIM,
     ADMIT_FINGERPRINT,
     ADMIT_UNTIL_S,
@@ -21,7 +22,6 @@ from iort_contract import (
     CONNECTED_MS,
     SERIAL,
 )
-from iort_contract.dynamodb import plain
 from tests.fakes import ROBOTS
 
 LATER_S = int(time.time()) + 3600

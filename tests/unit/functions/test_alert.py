@@ -9,7 +9,7 @@ import boto3
 import pytest
 
 from functions.alert import QUIET_S, Notices, causes, process
-from iort_contract import ContractError
+from iort_contract.limits import ContractError
 from tests.fakes import NAMES
 
 NOW_S = 1_700_000_000

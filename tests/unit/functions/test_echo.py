@@ -8,17 +8,20 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-import iort_contract
 from functions import echo
-from iort_contract import LAMBDA, PING, PONG, RECEIVED_MS, TOPIC, ContractError, build_topic, decode_pong
+from iort_contract.limits import ContractError
+from iort_contract.messages.event import rule_event
+from iort_contract.messages.live import PING_FIELDS, decode_pong, encode_ping
+from iort_contract.tables import RECEIVED_MS, TOPIC
+from iort_contract.topics import LAMBDA, PING, PONG, build_topic
 
 robots = st.from_regex(r"[A-Za-z0-9_-]{1,64}", fullmatch=True)
 
 
 def event(robot="car", namespace="iort", ping_id=7, sent_us=1_700_000_000_000_000, padding=""):
     """What the echo rule makes of a ping."""
-    ping = iort_contract.encode_ping(ping_id, sent_us, padding)
-    return iort_contract.rule_event(ping, build_topic(PING, robot, LAMBDA, namespace), 1_700_000_000_123)
+    ping = encode_ping(ping_id, sent_us, padding)
+    return rule_event(ping, build_topic(PING, robot, LAMBDA, namespace), 1_700_000_000_123)
 
 
 @given(
@@ -30,7 +33,7 @@ def test_the_pong_has_what_the_ping_had(robot, namespace, ping_id, padding):
     assert decode_pong(payload) == (ping_id, 1_700_000_000_000_000, 1_700_000_000_123)
     content = json.loads(payload)
     assert content.get("padding", "") == padding
-    assert set(content) <= {*iort_contract.PING_FIELDS, RECEIVED_MS}
+    assert set(content) <= {*PING_FIELDS, RECEIVED_MS}
 
 
 @pytest.mark.parametrize(
@@ -44,7 +47,7 @@ def test_a_topic_that_is_not_ours_is_refused(topic):
 @pytest.mark.parametrize("message", [b"no JSON", b"\xff", b"[]", b"1", b"", b"[" * 100_000])
 def test_what_is_no_ping_fails_and_so_goes_to_the_quarantine(message):
     with pytest.raises(ContractError, match="ping is"):
-        echo.handler(iort_contract.rule_event(message, build_topic(PING, "car", LAMBDA), 1), None)
+        echo.handler(rule_event(message, build_topic(PING, "car", LAMBDA), 1), None)
 
 
 def test_the_handler_publishes_and_counts(monkeypatch, capsys):

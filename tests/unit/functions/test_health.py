@@ -6,7 +6,9 @@ import pytest
 
 from functions.shared.health import measure, together
 from functions.shared.metrics import MOST_VALUES
-from iort_contract import AGENT_STREAM, METRICS, RTT_STREAM, Batch
+from iort_contract.cloud import METRICS
+from iort_contract.messages.batch import Batch
+from iort_contract.topics import AGENT_STREAM, RTT_STREAM
 
 
 def batch(columns, *, times_us=None):

@@ -12,7 +12,6 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-import iort_contract
 from functions import live
 from functions.live import LiveSettings, RefusedError, age_ms, process
 from functions.quarantine import entries
@@ -20,7 +19,13 @@ from functions.shared.cut_off import BURST, CutOff
 from functions.shared.delay_estimator import Legs
 from functions.shared.metrics import Gathered
 from functions.shared.pubnub_client import PublishError, PubNubPublisher
-from iort_contract import LIVE, LIVE_MAX_AGE_MS, RECEIVED_MS, TOPIC, LiveSample, build_topic
+from iort_contract.cloud import METRICS, pubnub_parameter
+from iort_contract.cloud import channel as pubnub_channel
+from iort_contract.limits import LIVE_MAX_AGE_MS, MAX_PUBNUB_BYTES, SCHEMA_VERSION, ContractError
+from iort_contract.messages.event import MESSAGE_BASE64, event_message, rule_event
+from iort_contract.messages.live import LiveSample, encode_live
+from iort_contract.tables import BY_FUNCTION, RECEIVED_MS, TOPIC
+from iort_contract.topics import LIVE, build_topic
 
 T_US = 1_700_000_000_000_000
 SENT_US = T_US + 4_000
@@ -34,9 +39,9 @@ def event(stream="vesc", robot="car", namespace="iort", **changes):
     """What the live rule makes of a live message."""
     sample = changes.pop("sample", SAMPLE)
     ours = {name: changes.pop(name) for name in (TOPIC, RECEIVED_MS) if name in changes}
-    message = json.loads(iort_contract.encode_live(LiveSample("0123abcd", 3, T_US, SENT_US, sample)))
+    message = json.loads(encode_live(LiveSample("0123abcd", 3, T_US, SENT_US, sample)))
     raw = json.dumps({**message, **changes}).encode()
-    return {**iort_contract.rule_event(raw, build_topic(LIVE, robot, stream, namespace), RECEIVED), **ours}
+    return {**rule_event(raw, build_topic(LIVE, robot, stream, namespace), RECEIVED), **ours}
 
 
 class Channels:
@@ -66,7 +71,7 @@ def counted(capsys):
             entry = json.loads(line, parse_constant=pytest.fail)
             (directive,) = entry["_aws"]["CloudWatchMetrics"]
             for metric in directive["Metrics"]:
-                assert metric["Name"] in iort_contract.METRICS["live"]
+                assert metric["Name"] in METRICS["live"]
                 value = entry[metric["Name"]]
                 value = sum(value) if isinstance(value, list) else value
                 totals[metric["Name"]] = totals.get(metric["Name"], 0) + value
@@ -79,9 +84,9 @@ def test_the_chosen_fields_go_to_the_cars_channel_with_every_hops_time(counted):
     channels = Channels()
     show(event(), channels)
     ((channel, message),) = channels.sent
-    assert channel == iort_contract.channel("car")
+    assert channel == pubnub_channel("car")
     assert message == {
-        "v": iort_contract.SCHEMA_VERSION,
+        "v": SCHEMA_VERSION,
         "robot": "car",
         "stream": "vesc",
         "boot": "0123abcd",
@@ -123,13 +128,13 @@ def test_what_is_shown_live_is_null_where_no_sensor_is_fitted():
 def test_another_deployment_has_channels_of_its_own():
     channels = Channels()
     show(event(namespace="lab2"), channels)
-    assert channels.sent[0][0] == iort_contract.channel("car", "lab2")
+    assert channels.sent[0][0] == pubnub_channel("car", "lab2")
 
 
 def test_the_robot_is_the_topics_whatever_the_message_claims():
     channels = Channels()
     show(event(robot="mine", channel="iort.other"), channels)
-    assert channels.sent[0][0] == iort_contract.channel("mine")
+    assert channels.sent[0][0] == pubnub_channel("mine")
     assert channels.sent[0][1]["robot"] == "mine"
 
 
@@ -165,12 +170,12 @@ def test_stale_by_its_time_in_the_car_and_in_the_cloud(
     assert "CarToLambdaMs" not in totals
 
 
-MESSAGE = iort_contract.encode_live(LiveSample("0123abcd", 3, T_US, SENT_US, SAMPLE))
+MESSAGE = encode_live(LiveSample("0123abcd", 3, T_US, SENT_US, SAMPLE))
 
 
 def handed(message):
     """An event with any bytes in it."""
-    return iort_contract.rule_event(message, build_topic(LIVE, "car", "vesc"), RECEIVED)
+    return rule_event(message, build_topic(LIVE, "car", "vesc"), RECEIVED)
 
 
 def saying(**changes):
@@ -203,8 +208,8 @@ MALFORMED = [
     saying(sent_us="now"),
     saying(offset_us="0"),
     saying(offset_us=None),
-    {**event(), iort_contract.MESSAGE_BASE64: "%"},
-    {**event(), iort_contract.MESSAGE_BASE64: {}},
+    {**event(), MESSAGE_BASE64: "%"},
+    {**event(), MESSAGE_BASE64: {}},
     {**event(), RECEIVED_MS: None},
     {**event(), RECEIVED_MS: "soon"},
     {**event(), RECEIVED_MS: math.inf},
@@ -311,10 +316,10 @@ def test_what_is_refused_goes_to_the_queue_and_fails_no_invocation(malformed, co
     served(malformed)
     (entry,) = entries(served.queue.kept[0], lambda _info: [])
     assert len(served.queue.kept) == 1
-    assert entry.source == f"{iort_contract.BY_FUNCTION} iort-processing-Live-1"
+    assert entry.source == f"{BY_FUNCTION} iort-processing-Live-1"
     assert entry.reason.startswith("Refused: ")
-    with contextlib.suppress(AttributeError, iort_contract.ContractError):
-        assert entry.payload == iort_contract.live_message(malformed)
+    with contextlib.suppress(AttributeError, ContractError):
+        assert entry.payload == event_message(malformed)
     assert counted() == {"LiveRefused": 1}
 
 
@@ -403,7 +408,7 @@ KEYS = {"publish_key": "pub-c-secret", "subscribe_key": "sub-c-secret"}
     [({}, "ps.pndsn.com", True), ({"origin": "127.0.0.1:9", "tls": False}, "127.0.0.1:9", False)],
 )
 def test_the_keys_come_from_a_secure_parameter(aws, extra, origin, tls):
-    name = iort_contract.pubnub_parameter()
+    name = pubnub_parameter()
     value = json.dumps({**KEYS, **extra})
     boto3.client("ssm").put_parameter(Name=name, Type="SecureString", Value=value)
     config = PubNubPublisher.from_parameter(name)._client.config
@@ -413,7 +418,7 @@ def test_the_keys_come_from_a_secure_parameter(aws, extra, origin, tls):
 
 
 def test_the_publisher_is_made_once_an_environment(aws, monkeypatch):
-    name = iort_contract.pubnub_parameter("lab2")
+    name = pubnub_parameter("lab2")
     boto3.client("ssm").put_parameter(Name=name, Type="SecureString", Value=json.dumps(KEYS))
     monkeypatch.setenv("PUBNUB_PARAMETER", name)
     live._publisher.cache_clear()
@@ -426,10 +431,10 @@ def test_the_publisher_is_made_once_an_environment(aws, monkeypatch):
 def test_a_message_too_large_is_refused_before_it_is_sent():
     publisher = PubNubPublisher(**KEYS)
     with pytest.raises(PublishError, match=r"at most 32768 bytes after URL encoding, got \d+"):
-        publisher.publish("iort.car", {"text": "x" * iort_contract.MAX_PUBNUB_BYTES})
+        publisher.publish("iort.car", {"text": "x" * MAX_PUBNUB_BYTES})
     # Measured as PubNub measures: a quote is three bytes in a URL.
     with pytest.raises(PublishError, match="after URL encoding"):
-        publisher.publish("iort.car", {"text": '"' * (iort_contract.MAX_PUBNUB_BYTES // 6)})
+        publisher.publish("iort.car", {"text": '"' * (MAX_PUBNUB_BYTES // 6)})
 
 
 def test_whatever_the_sdk_raises_is_a_publish_error_without_keys(monkeypatch):

@@ -7,8 +7,8 @@ import time
 
 import pytest
 
-import iort_contract
 from functions.shared.metrics import Gathered, emit
+from iort_contract.cloud import METRIC_NAMESPACE, METRICS
 
 
 @pytest.fixture(autouse=True)
@@ -17,7 +17,7 @@ def deployment(monkeypatch):
 
 
 def test_every_metric_of_the_contract_is_a_valid_line(capsys):
-    for function, names in iort_contract.METRICS.items():
+    for function, names in METRICS.items():
         before_ms = time.time_ns() // 1_000_000
         emit(function, **dict.fromkeys(names, 2.5))
         line = json.loads(capsys.readouterr().out)
@@ -26,7 +26,7 @@ def test_every_metric_of_the_contract_is_a_valid_line(capsys):
         assert before_ms <= metadata["Timestamp"] <= before_ms + 60_000
         assert isinstance(metadata["Timestamp"], int)
         (directive,) = metadata["CloudWatchMetrics"]
-        assert directive["Namespace"] == iort_contract.METRIC_NAMESPACE
+        assert directive["Namespace"] == METRIC_NAMESPACE
         assert directive["Dimensions"] == [["Deployment", "Function"]]
         assert (line["Deployment"], line["Function"]) == ("lab2", function)
         assert {metric["Name"] for metric in directive["Metrics"]} == set(names)

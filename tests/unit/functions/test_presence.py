@@ -9,10 +9,10 @@ from decimal import Decimal
 import boto3
 import pytest
 
-import iort_contract
 from functions import presence
-from iort_contract import ContractError
+from iort_contract.cloud import METRICS
 from iort_contract.dynamodb import plain
+from iort_contract.limits import ContractError
 from tests.fakes import ROBOTS
 
 MINUTE_MS = 60_000
@@ -186,9 +186,7 @@ def test_what_dynamodb_refuses_is_tried_again_by_lambda(table, monkeypatch):
 def test_counts(table, capsys):
     table(connected(), disconnected(), disconnected())
     lines = [json.loads(line) for line in capsys.readouterr().out.splitlines()]
-    counted = [
-        {name: line[name] for name in iort_contract.METRICS["presence"] if name in line} for line in lines
-    ]
+    counted = [{name: line[name] for name in METRICS["presence"] if name in line} for line in lines]
     assert counted == [{"RobotsConnected": 1}, {"RobotsDisconnected": 1}, {"PresenceIgnored": 1}]
 
 

@@ -10,7 +10,7 @@ import zlib
 import pytest
 
 from functions.query import answer
-from iort_contract import Batch
+from iort_contract.messages.batch import Batch
 from iort_station import data
 from iort_station.data.batches import RefusedItems
 from iort_station.data.blocks import values

@@ -6,11 +6,12 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-import iort_contract
 from functions.shared.tables import attribute
-from iort_contract import Batch, flat_second
+from iort_contract.codec.seconds import flat_second
 from iort_contract.dynamodb import plain
+from iort_contract.messages.batch import Batch
 from iort_contract.statistics import summarize_second
+from iort_contract.tables import EXPIRES_S, OMITTED, SECOND, STATS, TOPIC
 
 # Fields that are called like what else a second holds, and like one another's statistics.
 COUNTS = ["n", "batches", "gaps", "topic", "second", "expires_s", "omitted"]
@@ -27,7 +28,7 @@ three = {"min_size": 3, "max_size": 3}
 def test_a_second_is_read_as_it_was_made(columns):
     packed = summarize_second(0, [Batch("0badcafe", 0, [0, 10, 20], columns)], None)
     assert packed is not None
-    packed[iort_contract.EXPIRES_S] = 1_800_000_000
+    packed[EXPIRES_S] = 1_800_000_000
     made = flat_second(packed)
     for name, column in columns.items():
         known = [value for value in column if value is not None]
@@ -35,7 +36,7 @@ def test_a_second_is_read_as_it_was_made(columns):
             assert made[f"{name}_last"] == known[-1]
         if known and {type(value) for value in known} <= {int, float}:
             assert (made[f"{name}_min"], made[f"{name}_max"]) == (min(known), max(known))
-    assert not packed.keys() & {iort_contract.TOPIC, iort_contract.SECOND, iort_contract.OMITTED}
+    assert not packed.keys() & {TOPIC, SECOND, OMITTED}
     # And through the table, whose numbers are Decimals.
     stored = plain({name: attribute(value) for name, value in packed.items()})
     assert flat_second(stored) == plain({name: attribute(value) for name, value in made.items()})
@@ -53,7 +54,7 @@ def test_a_second_that_was_stored_flat_is_read_as_it_is():
         ({"a": [7, 7, 7]}, {"a": [7]}),
         ({"a": ["x", "y", None]}, {"a_last": "y"}),
         ({"a": [1, 2, "y"]}, {"a_last": "y"}),
-        ({"gaps": [1, 1, 1]}, {f"gaps_{statistic}": 1 for statistic in iort_contract.STATS}),
+        ({"gaps": [1, 1, 1]}, {f"gaps_{statistic}": 1 for statistic in STATS}),
     ],
 )
 def test_what_a_second_looks_like(columns, expected):

@@ -7,40 +7,24 @@ import json
 
 import pytest
 
-import iort_contract
 from functions import alert, echo, presence
-from iort_contract import (
-    AGENT_VERSION,
-    EXPIRES_S,
-    FAULT_FIELD,
-    FILE,
-    LAMBDA,
-    LIVE,
-    MESSAGE_BASE64,
-    PING,
-    RECEIVED_MS,
-    RECORD,
-    ROBOT,
-    RULE,
-    RULES,
-    SHADOW,
-    TOPIC,
-    VOLTAGE_FIELD,
-    Batch,
-    LiveSample,
-    build_topic,
-    rule_sql,
-)
+from iort_contract.cloud import rule_sql
+from iort_contract.messages.batch import Batch, decode_batch, decode_item, encode_batch
+from iort_contract.messages.event import MESSAGE_BASE64, event_message
+from iort_contract.messages.live import LiveSample, decode_pong, encode_live, encode_ping
+from iort_contract.tables import AGENT_VERSION, ENVELOPE, EXPIRES_S, NONFINITE, RECEIVED_MS, ROBOT, TOPIC
+from iort_contract.topics import FILE, LAMBDA, LIVE, PING, PONG, RECORD, RULE, RULES, SHADOW, build_topic
+from iort_contract.vesc import FAULT_FIELD, VOLTAGE_FIELD
 from tests.iot_sql import Message, evaluate
 from verify.spoofing import spoofed
 
 NOW_MS = 1_700_000_000_123
 T_US = 1_700_000_000_000_000
 RETENTION_S = 3600
-BATCH = iort_contract.encode(Batch("0badcafe", 3, [T_US], {"speed": [1.5]}, nonfinite=2))
+BATCH = encode_batch(Batch("0badcafe", 3, [T_US], {"speed": [1.5]}, nonfinite=2))
 SAMPLE = {FAULT_FIELD: 3, VOLTAGE_FIELD: 9.5}
-LIVE_MESSAGE = iort_contract.encode_live(LiveSample("0badcafe", 3, T_US, T_US, SAMPLE))
-PING_MESSAGE = iort_contract.encode_ping(7, T_US, "padding")
+LIVE_MESSAGE = encode_live(LiveSample("0badcafe", 3, T_US, T_US, SAMPLE))
+PING_MESSAGE = encode_ping(7, T_US, "padding")
 REPORT = json.dumps({"state": {"reported": {AGENT_VERSION: "1.2.3", ROBOT: "b"}}}).encode()
 CONNECTED = json.dumps(
     {"clientId": "a", "eventType": "connected", "timestamp": NOW_MS, "versionNumber": 1}
@@ -81,9 +65,9 @@ def test_a_rule_makes_of_a_spoofed_message_what_it_makes_of_an_honest_one(of_rul
     honest = of_rule(rule, WHOSE[rule], message)
     told = of_rule(rule, WHOSE[rule], spoofed(message, "b", lane, name))
     if MESSAGE_BASE64 in honest:
-        assert iort_contract.event_message(honest) == message
+        assert event_message(honest) == message
         # The message itself may say what it likes.
-        assert iort_contract.event_message(told) == spoofed(message, "b", lane, name)
+        assert event_message(told) == spoofed(message, "b", lane, name)
         honest, told = ({**one, MESSAGE_BASE64: ""} for one in (honest, told))
     assert told == honest
     assert told[RECEIVED_MS] == NOW_MS
@@ -93,29 +77,29 @@ def test_a_rule_makes_of_a_spoofed_message_what_it_makes_of_an_honest_one(of_rul
 
 def test_lambda_2_gets_the_robot_of_the_topic_and_its_batch(of_rule):
     item = of_rule("record", WHOSE["record"], spoofed(BATCH, "b", RECORD, "vesc"))
-    topic, batch = iort_contract.decode_item(item)
-    assert (topic.robot, batch) == ("a", iort_contract.decode(BATCH))
-    assert set(item) == {*iort_contract.ENVELOPE, TOPIC, RECEIVED_MS, EXPIRES_S}
+    topic, batch = decode_item(item)
+    assert (topic.robot, batch) == ("a", decode_batch(BATCH))
+    assert set(item) == {*ENVELOPE, TOPIC, RECEIVED_MS, EXPIRES_S}
 
 
 def test_a_batch_without_nonfinite_has_none_in_the_table(of_rule):
-    message = iort_contract.encode(Batch("0badcafe", 3, [T_US], {"speed": [1.5]}))
+    message = encode_batch(Batch("0badcafe", 3, [T_US], {"speed": [1.5]}))
     item = of_rule("record", WHOSE["record"], message)
-    assert iort_contract.NONFINITE not in item
-    assert iort_contract.decode_item(item)[1] == iort_contract.decode(message)
+    assert NONFINITE not in item
+    assert decode_item(item)[1] == decode_batch(message)
 
 
 def test_the_echo_goes_to_the_robot_of_the_topic_with_the_clouds_time(of_rule):
     event = of_rule("echo", WHOSE["echo"], spoofed(PING_MESSAGE, "b", PING, LAMBDA))
     topic, payload = echo.pong(event)
-    assert topic == build_topic(iort_contract.PONG, "a", LAMBDA)
-    assert iort_contract.decode_pong(payload) == (7, T_US, NOW_MS)
+    assert topic == build_topic(PONG, "a", LAMBDA)
+    assert decode_pong(payload) == (7, T_US, NOW_MS)
     assert json.loads(payload) == {**json.loads(PING_MESSAGE), RECEIVED_MS: NOW_MS}
 
 
 def test_the_rules_pong_has_the_clouds_time(of_rule):
     answer = of_rule("pong", WHOSE["pong"], spoofed(PING_MESSAGE, "b", PING, RULE))
-    assert iort_contract.decode_pong(json.dumps(answer)) == (7, T_US, NOW_MS)
+    assert decode_pong(json.dumps(answer)) == (7, T_US, NOW_MS)
 
 
 @pytest.mark.parametrize("rule", ["fault", "battery"])

@@ -6,11 +6,11 @@ import random
 
 import pytest
 
-import iort_contract
 from functions import summarize
 from functions.shared import processing
-from iort_contract import Batch
+from iort_contract.codec.seconds import flat_second
 from iort_contract.dynamodb import plain
+from iort_contract.messages.batch import Batch
 from tests.fakes import (
     NAMES,
     ROBOTS,
@@ -41,7 +41,7 @@ def test_the_handler_against_the_tables_of_the_template(dynamodb, monkeypatch, c
     finally:
         processing.stored_tables.cache_clear()
         processing._refusals.cache_clear()
-    items = [iort_contract.flat_second(plain(item)) for item in dynamodb.scan(TableName=SUMMARY)["Items"]]
+    items = [flat_second(plain(item)) for item in dynamodb.scan(TableName=SUMMARY)["Items"]]
     assert sum(item["n"] for item in items) == 39 * 50
     by_second = {int(item["second"]) - SECOND: item for item in items}
     assert {s for s, item in by_second.items() if item["missing_batches"]} == {8}

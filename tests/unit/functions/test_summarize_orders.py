@@ -9,7 +9,7 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from iort_contract import split
+from iort_contract.messages.batch import split_batch
 from iort_contract.statistics import missing_before
 from tests.fakes import (
     ROBOTS,
@@ -136,7 +136,7 @@ def test_a_batch_sent_in_two_halves_leaves_the_same_samples(drive):
     # The batches of a drive may overlap here, and two that start at once would be one item.
     taken = {b.t_us for b in drive}
     for b in drive:
-        halves = split(b) if len(b.times_us) > 1 and split(b)[1].t_us not in taken else (b,)
+        halves = split_batch(b) if len(b.times_us) > 1 and split_batch(b)[1].t_us not in taken else (b,)
         taken.add(halves[-1].t_us)
         halved.deliver(*halves)
     for second, item in whole.summary().items():

@@ -9,11 +9,12 @@ import zlib
 
 import pytest
 
-import iort_contract
 from functions.shared import tables as tables_module
 from functions.shared.processing import process
-from iort_contract import BatchId
+from iort_contract.codec.columns import DICTIONARY
 from iort_contract.dynamodb import TableError
+from iort_contract.limits import MAX_AHEAD_US, MAX_COLUMNS_BYTES
+from iort_contract.messages.batch import BatchId, encode_batch
 from tests.fakes import (
     ROBOTS,
     FakeDynamoDB,
@@ -24,17 +25,17 @@ from tests.unit.functions.summarizing import T0, S, Stream, batch, clean, counte
 
 def poison(**changes):
     """An item that looks like a batch; a value of None leaves the attribute out."""
-    envelope = json.loads(iort_contract.encode(batch(T0 + 10 * S + 1, 3, seq=7))) | changes
+    envelope = json.loads(encode_batch(batch(T0 + 10 * S + 1, 3, seq=7))) | changes
     return item_of_message(json.dumps({k: v for k, v in envelope.items() if v is not None}).encode())
 
 
 def packed(body):
     """As the samples of a batch are compressed."""
-    deflater = zlib.compressobj(zdict=iort_contract.DICTIONARY)
+    deflater = zlib.compressobj(zdict=DICTIONARY)
     return base64.b64encode(deflater.compress(body) + deflater.flush()).decode()
 
 
-bomb = base64.b64encode(zlib.compress(b" " * (iort_contract.MAX_COLUMNS_BYTES + 2))).decode()
+bomb = base64.b64encode(zlib.compress(b" " * (MAX_COLUMNS_BYTES + 2))).decode()
 POISON = {
     "not base64": poison(samples="%%%"),
     "not zlib": poison(samples="AAAA"),
@@ -63,7 +64,7 @@ POISON = {
     "topic of the live lane": {**poison(), "topic": {"S": "live/iort/car/vesc"}},
     "in the name of another": {**poison(), "robot": {"S": "other"}},
     "before 1970": poison(batch=f"-{1:015}-aaaaaaaa-7"),
-    "years ahead": poison(batch=str(BatchId(T0 + 2 * iort_contract.MAX_AHEAD_US, "aaaaaaaa", 7))),
+    "years ahead": poison(batch=str(BatchId(T0 + 2 * MAX_AHEAD_US, "aaaaaaaa", 7))),
 }
 
 
@@ -133,7 +134,7 @@ def test_a_vehicle_whose_parameters_are_wrong_stops_nothing(stream, caplog):
 def test_an_attribute_of_more_digits_than_boto3_reads_keeps_no_batch_from_its_summary(stream):
     """DynamoDB holds numbers up to 9.99e125, however many digits it writes them with."""
     odd = {"N": "-1" + "0" * 125}
-    item = item_of_message(iort_contract.encode(batch(T0, 3, a=[1.5] * 3)))
+    item = item_of_message(encode_batch(batch(T0, 3, a=[1.5] * 3)))
     odd_item = {**item, "far": odd, "deep": {"M": {"far": {"L": [odd]}}}}
     assert stream.summarize([stream.store_item(odd_item)]) == {"batchItemFailures": []}
     assert stream.column("n") == {0: 3}

@@ -14,25 +14,30 @@ from botocore.config import Config
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-import iort_contract
 from functions import upload
 from functions.quarantine import entries
 from functions.shared.bucket import Bucket
 from functions.shared.upload_quota import Allotment
-from iort_contract import (
-    FILE,
-    FILES_BYTES,
+from iort_contract.limits import MAX_MESSAGE_BYTES, ContractError
+from iort_contract.messages.event import rule_event
+from iort_contract.messages.files import (
+    MAX_ADDRESSES,
     MAX_FILE_BYTES,
     PART_BYTES,
-    PING,
-    PONG,
+    UPLOAD_URL_S,
     Address,
-    ContractError,
     File,
     FileAnswer,
     FileRequest,
-    build_topic,
+    decode_file_answer,
+    decode_file_request,
+    encode_file_answer,
+    encode_file_request,
+    file_key,
+    parse_file_key,
 )
+from iort_contract.tables import FILES_BYTES, ROBOT
+from iort_contract.topics import FILE, PING, PONG, build_topic
 
 NAME, ROBOTS = "files", "robots"
 NOW_S = 1_700_000_000.0
@@ -69,8 +74,8 @@ SMALL = asking(b"small", 1)
 
 def test_a_request_survives_the_wire():
     for request in (SMALL, asking(bytes(PART_BYTES + 1), 1, 2, done=True)):
-        wire = iort_contract.encode_file_request(request)
-        assert iort_contract.decode_file_request(wire) == request
+        wire = encode_file_request(request)
+        assert decode_file_request(wire) == request
 
 
 @pytest.mark.parametrize(
@@ -98,13 +103,13 @@ def test_a_request_survives_the_wire():
     ],
 )
 def test_a_file_that_is_not_allowed_is_refused_on_both_sides(wrong):
-    envelope = json.loads(iort_contract.encode_file_request(SMALL))
+    envelope = json.loads(encode_file_request(SMALL))
     envelope["file"].update(wrong)
     with pytest.raises(ContractError):
-        iort_contract.decode_file_request(envelope)
+        decode_file_request(envelope)
     if "t" not in wrong:
         with pytest.raises(ContractError):
-            iort_contract.encode_file_request(replace(SMALL, file=replace(SMALL.file, **wrong)))
+            encode_file_request(replace(SMALL, file=replace(SMALL.file, **wrong)))
 
 
 @pytest.mark.parametrize(
@@ -124,17 +129,17 @@ def test_a_file_that_is_not_allowed_is_refused_on_both_sides(wrong):
 )
 def test_a_request_that_is_not_allowed_is_refused(wrong):
     with pytest.raises(ContractError):
-        iort_contract.decode_file_request({**json.loads(iort_contract.encode_file_request(SMALL)), **wrong})
+        decode_file_request({**json.loads(encode_file_request(SMALL)), **wrong})
 
 
 def test_no_more_addresses_are_asked_for_than_fit_a_message():
     content = file_of(b"")
     large = replace(content, size=PART_BYTES * 20)
     with pytest.raises(ContractError, match="at most 16"):
-        iort_contract.encode_file_request(FileRequest(ID, large, dict.fromkeys(range(1, 18), "a" * 64)))
+        encode_file_request(FileRequest(ID, large, dict.fromkeys(range(1, 18), "a" * 64)))
     longest = Address(10_000, "https://x/" + "u" * 3000, {"x-amz-checksum-sha256": "c" * 44})
-    answer = FileAnswer(ID, "k" * 500, addresses=[longest] * iort_contract.MAX_ADDRESSES)
-    assert len(iort_contract.encode_file_answer(answer)) < iort_contract.MAX_MESSAGE_BYTES
+    answer = FileAnswer(ID, "k" * 500, addresses=[longest] * MAX_ADDRESSES)
+    assert len(encode_file_answer(answer)) < MAX_MESSAGE_BYTES
 
 
 @pytest.mark.parametrize(
@@ -149,7 +154,7 @@ def test_no_more_addresses_are_asked_for_than_fit_a_message():
     ],
 )
 def test_an_answer_survives_the_wire(answer):
-    assert iort_contract.decode_file_answer(iort_contract.encode_file_answer(answer)) == answer
+    assert decode_file_answer(encode_file_answer(answer)) == answer
 
 
 @pytest.mark.parametrize(
@@ -168,18 +173,18 @@ def test_an_answer_survives_the_wire(answer):
 def test_an_answer_that_is_not_one_is_refused(wrong):
     envelope = {"v": 1, "id": ID, "key": "robots/car/x", "stored": False}
     with pytest.raises(ContractError):
-        iort_contract.decode_file_answer(json.dumps({**envelope, **wrong}))
+        decode_file_answer(json.dumps({**envelope, **wrong}))
 
 
 def test_the_key_is_the_robots_the_times_and_the_contents():
-    key = iort_contract.file_key("car", SMALL.file)
+    key = file_key("car", SMALL.file)
     assert key == f"robots/car/2023/11/14/221320-{sha256(b'small')[:12]}/drive.bag"
-    assert iort_contract.file_key("car", file_of(b"other")) != key
+    assert file_key("car", file_of(b"other")) != key
     with pytest.raises(ContractError):
-        iort_contract.file_key("../car", SMALL.file)
-    assert iort_contract.parse_file_key(key) == ("car", 1_700_000_000, sha256(b"small")[:12], "drive.bag")
+        file_key("../car", SMALL.file)
+    assert parse_file_key(key) == ("car", 1_700_000_000, sha256(b"small")[:12], "drive.bag")
     deep = replace(SMALL.file, name="rosbag2_1/metadata.yaml")
-    assert iort_contract.parse_file_key(iort_contract.file_key("car", deep)).name == deep.name
+    assert parse_file_key(file_key("car", deep)).name == deep.name
 
 
 @pytest.mark.parametrize(
@@ -196,7 +201,7 @@ def test_the_key_is_the_robots_the_times_and_the_contents():
 )
 def test_a_key_that_is_not_ours_is_refused(key):
     with pytest.raises(ContractError):
-        iort_contract.parse_file_key(key)
+        parse_file_key(key)
 
 
 # --- the function -----------------------------------------------------------------------------------
@@ -238,11 +243,11 @@ def dynamodb(aws):
     client = boto3.client("dynamodb")
     client.create_table(
         TableName=ROBOTS,
-        KeySchema=[{"AttributeName": iort_contract.ROBOT, "KeyType": "HASH"}],
-        AttributeDefinitions=[{"AttributeName": iort_contract.ROBOT, "AttributeType": "S"}],
+        KeySchema=[{"AttributeName": ROBOT, "KeyType": "HASH"}],
+        AttributeDefinitions=[{"AttributeName": ROBOT, "AttributeType": "S"}],
         BillingMode="PAY_PER_REQUEST",
     )
-    client.put_item(TableName=ROBOTS, Item={iort_contract.ROBOT: {"S": "car"}})
+    client.put_item(TableName=ROBOTS, Item={ROBOT: {"S": "car"}})
     return client
 
 
@@ -263,8 +268,8 @@ def test_a_small_files_address_allows_this_content_once_and_nothing_else(ask):
     query = {name: value for name, (value,) in parse_qs(url.query).items()}
     # The region's own host: an address on the global one would be redirected.
     assert (url.scheme, url.netloc) == ("https", f"{NAME}.s3.eu-west-1.amazonaws.com")
-    assert url.path == "/" + iort_contract.file_key("car", SMALL.file)
-    assert query["X-Amz-Expires"] == str(iort_contract.UPLOAD_URL_S)
+    assert url.path == "/" + file_key("car", SMALL.file)
+    assert query["X-Amz-Expires"] == str(UPLOAD_URL_S)
     signed = set(query["X-Amz-SignedHeaders"].split(";"))
     assert signed == {"host", *address.headers}
     checksum = base64.b64encode(hashlib.sha256(b"small").digest()).decode()
@@ -284,7 +289,7 @@ def test_a_parts_address_allows_this_part_and_nothing_else(ask):
 
 
 def test_what_is_stored_is_not_asked_for_again(ask, s3):
-    s3.put_object(Bucket=NAME, Key=iort_contract.file_key("car", SMALL.file), Body=b"small")
+    s3.put_object(Bucket=NAME, Key=file_key("car", SMALL.file), Body=b"small")
     answer = ask(SMALL)
     assert (answer.stored, answer.addresses) == (True, ())
     # A key that only begins the same is another.
@@ -301,7 +306,7 @@ def put(s3, key, upload_id, part, content):
 
 def test_a_large_file_goes_on_where_it_was_and_ends_as_one_object(ask, s3):
     content = bytes(2 * PART_BYTES) + b"rest"
-    key, parts = iort_contract.file_key("car", file_of(content)), parts_of(content)
+    key, parts = file_key("car", file_of(content)), parts_of(content)
     assert [one.part for one in ask(asking(content, 1, 2, 3)).addresses] == [1, 2, 3]
     (begun,) = s3.list_multipart_uploads(Bucket=NAME)["Uploads"]
     for part in (1, 3):
@@ -322,7 +327,7 @@ def test_a_large_file_goes_on_where_it_was_and_ends_as_one_object(ask, s3):
 
 def test_parts_of_another_content_never_become_the_file(ask, s3):
     content = bytes(PART_BYTES) + b"rest"
-    key = iort_contract.file_key("car", file_of(content))
+    key = file_key("car", file_of(content))
     ask(asking(content, 1, 2))
     (begun,) = s3.list_multipart_uploads(Bucket=NAME)["Uploads"]
     put(s3, key, begun["UploadId"], 1, bytes(PART_BYTES))
@@ -344,7 +349,7 @@ def test_a_day_has_so_many_bytes_and_a_large_file_counts_once(ask, dynamodb):
     assert "bytes a day" in refused.refused
     assert refused.again_s == 3600
     assert ask(SMALL, **limit, now_s=NOW_S + 86_400).addresses
-    row = dynamodb.get_item(TableName=ROBOTS, Key={iort_contract.ROBOT: {"S": "car"}})["Item"]
+    row = dynamodb.get_item(TableName=ROBOTS, Key={ROBOT: {"S": "car"}})["Item"]
     assert row[FILES_BYTES] == {"N": "5"}
     # To ask whether it is there costs nothing.
     assert ask(replace(SMALL, parts={}), **limit).refused is None
@@ -352,7 +357,7 @@ def test_a_day_has_so_many_bytes_and_a_large_file_counts_once(ask, dynamodb):
 
 def test_a_robot_that_is_not_registered_gets_no_address(ask, dynamodb):
     assert ask(SMALL, "stranger").refused
-    assert "Item" not in dynamodb.get_item(TableName=ROBOTS, Key={iort_contract.ROBOT: {"S": "stranger"}})
+    assert "Item" not in dynamodb.get_item(TableName=ROBOTS, Key={ROBOT: {"S": "stranger"}})
 
 
 class Context:
@@ -395,16 +400,16 @@ def published(monkeypatch, s3, dynamodb):
 
 def event(request, robot="car", **changes):
     """What the upload rule makes of a request with some of it changed."""
-    message = json.dumps({**json.loads(iort_contract.encode_file_request(request)), **changes}).encode()
-    return iort_contract.rule_event(message, build_topic(PING, robot, FILE), 1_700_000_000_123)
+    message = json.dumps({**json.loads(encode_file_request(request)), **changes}).encode()
+    return rule_event(message, build_topic(PING, robot, FILE), 1_700_000_000_123)
 
 
 def test_the_handler_answers_the_robot_of_the_topic_and_counts(published, capsys, s3):
     upload.handler(event(SMALL), Context)
-    key = iort_contract.file_key("car", SMALL.file)
+    key = file_key("car", SMALL.file)
     s3.put_object(Bucket=NAME, Key=key, Body=b"small")
     upload.handler(event(asking(b"small", done=True)), Context)
-    asked, stored = (iort_contract.decode_file_answer(one["payload"]) for one in published)
+    asked, stored = (decode_file_answer(one["payload"]) for one in published)
     assert {(one["topic"], one["qos"]) for one in published} == {(build_topic(PONG, "car", FILE), 1)}
     assert (asked.key, asked.stored, stored.stored) == (key, False, True)
     first, second = map(json.loads, capsys.readouterr().out.splitlines())
@@ -416,7 +421,7 @@ def test_the_handler_answers_the_robot_of_the_topic_and_counts(published, capsys
 
 def test_the_handler_says_what_is_wrong_with_a_request(published, capsys):
     upload.handler(event(SMALL, parts={"9": "x"}), Context)
-    (answer,) = (iort_contract.decode_file_answer(one["payload"]) for one in published)
+    (answer,) = (decode_file_answer(one["payload"]) for one in published)
     assert answer.id == ID
     assert answer.refused == "part must be 1 to 1, got 9"
     assert answer.again_s is None
@@ -436,11 +441,11 @@ requests = st.dictionaries(st.sampled_from(["v", "id", "file", "parts", "parts_s
 def test_every_malformed_request_is_answered_or_kept(published, queue, message):
     published.clear()
     queue.bodies.clear()
-    upload.handler(iort_contract.rule_event(message, build_topic(PING, "car", FILE), 1), Context)
+    upload.handler(rule_event(message, build_topic(PING, "car", FILE), 1), Context)
     assert (len(published), len(queue.bodies)) in {(1, 0), (0, 1)}
     for one in published:
         # The robot knows it for the answer to what it asked.
-        assert iort_contract.decode_file_answer(one["payload"]).id == json.loads(message)["id"]
+        assert decode_file_answer(one["payload"]).id == json.loads(message)["id"]
     for body in queue.bodies:
         (entry,) = entries(body, list)
         assert (entry.source, entry.robot, entry.payload) == ("function upload", "car", message)
@@ -450,7 +455,7 @@ def test_every_malformed_request_is_answered_or_kept(published, queue, message):
 def test_what_the_queue_does_not_take_fails_the_invocation(published, queue):
     queue.takes = False
     with pytest.raises(ContractError):
-        upload.handler(iort_contract.rule_event(b"{}", build_topic(PING, "car", FILE), 1), Context)
+        upload.handler(rule_event(b"{}", build_topic(PING, "car", FILE), 1), Context)
 
 
 def test_the_clients_are_those_of_the_environment(aws, monkeypatch):

@@ -5,13 +5,13 @@ from __future__ import annotations
 import json
 from typing import Any
 
-import iort_contract
-from iort_contract import BATCH, NONFINITE, Batch
+from iort_contract.messages.batch import Batch, encode_batch
+from iort_contract.tables import BATCH, NONFINITE
 
 
 def old_envelope(batch: Batch, **changes: Any) -> dict[str, Any]:
     """The batch as a message of version 1, with some of it changed. Samples were written as they are now."""
-    envelope = json.loads(iort_contract.encode(batch))
+    envelope = json.loads(encode_batch(batch))
     del envelope[BATCH]
     head = {"v": 1, "boot": batch.boot, "seq": batch.seq, "t": batch.t_us}
     return {**envelope, **head, NONFINITE: envelope.get(NONFINITE, 0), **changes}

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import json
 
-from iort_contract import Batch, encode
 from iort_contract.messages.account import SourceAccount, StreamAccount
+from iort_contract.messages.batch import Batch, encode_batch
 from iort_station.operations.accounts import held_against, last_of
 from iort_station.operations.audit import audit
 
@@ -16,7 +16,7 @@ HOUR_US = 3_600_000_000
 def told(seq, *samples, t_us=T_US, received_us=T_US):
     columns = {name: [sample[name] for sample in samples] for name in samples[0]}
     batch = Batch(BOOT, seq, [t_us] * len(samples), columns)
-    return {**json.loads(encode(batch)), "received_ms": received_us // 1000}
+    return {**json.loads(encode_batch(batch)), "received_ms": received_us // 1000}
 
 
 def scan(taken, *, ended=False):

@@ -7,8 +7,8 @@ import time
 
 import pytest
 
-import iort_contract
-from iort_contract import Batch, build_topic
+from iort_contract.messages.batch import Batch, encode_batch
+from iort_contract.topics import RECORD, build_topic
 from iort_station.errors import StationError
 from iort_station.recordings.adopt import Left, adopt, source_table
 from tests.fakes import TELEMETRY, item_of_message
@@ -66,7 +66,7 @@ def old(dynamodb):
     )
 
     def put(*messages, robot="car", stream="vesc", namespace="iort", expires_s=LATER, **more):
-        topic = build_topic(iort_contract.RECORD, robot, stream, namespace)
+        topic = build_topic(RECORD, robot, stream, namespace)
         for message in messages:
             dynamodb.put_item(TableName=OLD, Item={**item_of_message(message, topic, expires_s), **more})
 
@@ -96,9 +96,7 @@ def in_order(items):
 
 def of_today(i, topic=None):
     """What the record rule of today stores of the batch."""
-    return item_of_message(
-        iort_contract.encode(batch(i)), topic or build_topic(iort_contract.RECORD, "car", "vesc"), LATER
-    )
+    return item_of_message(encode_batch(batch(i)), topic or build_topic(RECORD, "car", "vesc"), LATER)
 
 
 def test_every_batch_is_stored_as_if_it_came_today(dynamodb, old):
@@ -110,7 +108,7 @@ def test_every_batch_is_stored_as_if_it_came_today(dynamodb, old):
     assert done.samples == {("car", "vesc"): 180, ("car-2", "tf"): 3}
     assert (done.left, done.expired, sum(read)) == ([], 0, 61)
     expected = [of_today(i) for i in range(60)]
-    expected.append(of_today(0, build_topic(iort_contract.RECORD, "car-2", "tf")))
+    expected.append(of_today(0, build_topic(RECORD, "car-2", "tf")))
     assert stored(dynamodb) == in_order(expected)
     assert stored(dynamodb, OLD) == before
 

@@ -7,7 +7,7 @@ import json
 import numpy as np
 import pytest
 
-from iort_contract import Batch
+from iort_contract.messages.batch import Batch
 from iort_station.data.blocks import values
 from iort_station.errors import StationError
 from iort_station.page.answers import MAX_ROWS, answers, history

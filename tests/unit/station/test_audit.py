@@ -7,7 +7,7 @@ import random
 from hypothesis import given
 from hypothesis import strategies as st
 
-from iort_contract import Batch, BatchId
+from iort_contract.messages.batch import Batch, BatchId
 from iort_station.operations.audit import audit, last_figures
 from tests.fakes import item_of
 

@@ -12,7 +12,7 @@ from bench import message_sizes
 from functions.shared.health import measure
 from functions.shared.metrics import Gathered, emit
 from iort_agent.lanes.pings import CLOCK_EVERY_S
-from iort_contract import METRICS
+from iort_contract.cloud import METRICS
 from iort_station.cli.main import app
 from iort_station.cost import line_items, model, report, scale
 from iort_station.cost.fixed_costs import (

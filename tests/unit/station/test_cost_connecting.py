@@ -14,7 +14,7 @@ from iort_agent.config.file import Config
 from iort_agent.mqtt.dispatch import Dispatcher
 from iort_agent.mqtt.reconnect import SHORTEST_S
 from iort_agent.spool.memory import MemorySpool
-from iort_contract import SHADOW
+from iort_contract.topics import SHADOW
 from iort_station.cost import model, scale
 from iort_station.cost.prices import QUOTAS
 from iort_station.cost.usage import Usage

@@ -10,7 +10,7 @@ import boto3
 import pytest
 from typer.testing import CliRunner
 
-from iort_contract import File, file_key
+from iort_contract.messages.files import File, file_key
 from iort_station.cli.main import app
 from iort_station.cli.where import Where
 from iort_station.cloud import Cloud

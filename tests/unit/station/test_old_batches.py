@@ -9,9 +9,9 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-import iort_contract
-from iort_contract import Batch, ContractError, decode
 from iort_contract.dynamodb import plain
+from iort_contract.limits import ContractError
+from iort_contract.messages.batch import Batch, decode_batch, encode_batch
 from iort_station.recordings.old_batches import is_old, upgraded, upgraded_item
 from tests.fakes import item_of_message
 from tests.unit.station.old_messages import old_envelope, old_message
@@ -32,7 +32,7 @@ WRITTEN = {
 
 
 def test_what_the_agent_of_before_wrote_is_read_as_it_was():
-    batch = decode(upgraded(WRITTEN))
+    batch = decode_batch(upgraded(WRITTEN))
     assert batch.id == (T0, "0badcafe", 12)
     assert list(batch.times_us) == [T0, T0 + 20_000, T0 + 40_001]
     assert batch.columns == {
@@ -51,8 +51,8 @@ def test_what_the_agent_of_before_wrote_is_read_as_it_was():
 )
 def test_any_batch_is_the_same_after_it(seq, t_us, speeds):
     times = [t_us] * len(speeds)
-    sent = iort_contract.encode(Batch("0123456789abcdef", seq, times, {"speed": speeds}))
-    new = upgraded(old_envelope(decode(sent)))
+    sent = encode_batch(Batch("0123456789abcdef", seq, times, {"speed": speeds}))
+    new = upgraded(old_envelope(decode_batch(sent)))
     assert new == json.loads(sent)
 
 
@@ -67,7 +67,7 @@ def test_an_item_keeps_all_that_no_batch_has_to_the_letter():
         "v": {"N": "2"},
         "batch": {"S": f"{T0:016}-0badcafe-7"},
     }
-    assert decode(plain(new)) == decode(iort_contract.encode(BATCH))
+    assert decode_batch(plain(new)) == decode_batch(encode_batch(BATCH))
 
 
 @pytest.mark.parametrize(

@@ -6,8 +6,10 @@ import hashlib
 
 import pytest
 
-from iort_contract import CLAIM_FIELDS, Batch, Messages, MessageType, RosType
-from iort_contract.ros1.message import cut
+from iort_contract.messages.batch import Batch
+from iort_contract.messages.files import CLAIM_FIELDS
+from iort_contract.messages.message_type import MessageType
+from iort_contract.ros1.message import Messages, RosType, cut
 from iort_station.data.selection import select
 from iort_station.recordings.published import Export
 from tests.fakes import TELEMETRY, item_of, serialize

@@ -8,22 +8,18 @@ from pathlib import Path
 
 import pytest
 
-import iort_contract
-from iort_contract import (
-    Batch,
+from iort_contract.dynamodb import plain
+from iort_contract.limits import ContractError
+from iort_contract.messages.batch import Batch, batch_id, decode_batch, decode_item, messages_of
+from iort_contract.messages.commands import (
     Command,
-    ContractError,
     FleetMessage,
-    LiveSample,
-    batch_id,
-    decode,
     decode_command,
     decode_fleet,
-    decode_item,
-    decode_live,
-    messages_of,
+    encode_command,
+    encode_fleet,
 )
-from iort_contract.dynamodb import plain
+from iort_contract.messages.live import LiveSample, decode_live, encode_live
 from iort_station.data.batches import RefusedItems, blocks
 from iort_station.operations.audit import audit
 from tests.fakes import item_of, serialize
@@ -62,7 +58,7 @@ def by_contract(reader):
 
 READERS = {
     "Lambda 2": by_contract(decode_item),
-    "decode": by_contract(decode),
+    "decode": by_contract(decode_batch),
     "messages": by_contract(lambda item: messages_of(item, {})),
     "columns": by_columns,
 }
@@ -99,14 +95,14 @@ def saying(message, **changes):
 
 
 def test_one_form_of_a_runs_name_holds_in_every_lane_and_on_the_page():
-    live = iort_contract.encode_live(LiveSample(RUN, 1, T_US, T_US, {}))
-    fleet = iort_contract.encode_fleet(FleetMessage(RUN, 1, T_US, {}))
-    command = iort_contract.encode_command(Command(RUN, T_US, 1, T_US, 100, {}))
+    live = encode_live(LiveSample(RUN, 1, T_US, T_US, {}))
+    fleet = encode_fleet(FleetMessage(RUN, 1, T_US, {}))
+    command = encode_command(Command(RUN, T_US, 1, T_US, 100, {}))
     page = re.search(r"^const BOOT = /\^(.*)\$/;$", PAGE.read_text(), re.MULTILINE)
     assert page is not None
     for name, allowed in [(RUN, True), ("0" * 32, True)] + [(one, False) for one in NO_RUNS]:
         said = {
-            "record": by_contract(decode)(stored(batch=f"{T_US}-{name}-3")),
+            "record": by_contract(decode_batch)(stored(batch=f"{T_US}-{name}-3")),
             "live": read(decode_live, saying(live, boot=name)),
             "fleet": read(decode_fleet, saying(fleet, boot=name)),
             "cmd": read(decode_command, saying(command, session=name)),

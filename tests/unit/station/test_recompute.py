@@ -9,7 +9,7 @@ import pytest
 
 from functions.shared.processing import process
 from functions.shared.processing import recompute as summarize_again
-from iort_contract import Batch
+from iort_contract.messages.batch import Batch
 from iort_station.errors import StationError
 from iort_station.fleet import robots
 from iort_station.operations import recompute

@@ -7,14 +7,15 @@ from types import SimpleNamespace
 
 import pytest
 
-import iort_contract
-from iort_contract import BY_LATER, BY_RULE, BY_STREAM, Batch, build_topic
+from iort_contract.messages.batch import Batch, encode_batch
+from iort_contract.tables import BY_LATER, BY_RULE, BY_STREAM, PUT_OFF
+from iort_contract.topics import RECORD, build_topic
 from iort_station.operations.quarantine import DeadLetter
 from iort_station.operations.replay import Fate, replay
 from tests.fakes import item_of, item_of_message
 from tests.unit.station.old_messages import old_message
 
-TOPIC = build_topic(iort_contract.RECORD, "car", "vesc")
+TOPIC = build_topic(RECORD, "car", "vesc")
 NOW_MS = 1_700_000_000_000
 GOOD = Batch("0123abcd", 0, [1_700_000_000_000_000], {"speed": [1.5]})
 
@@ -73,7 +74,7 @@ class Queues(FakeCloud):
 
 
 def test_what_was_put_off_and_failed_waits_once_more():
-    body = json.dumps({iort_contract.PUT_OFF: [[TOPIC, str(GOOD.id)]]})
+    body = json.dumps({PUT_OFF: [[TOPIC, str(GOOD.id)]]})
     cloud = Queues({"late": (BY_LATER, body.encode())})
     listed = [DeadLetter("car", "late", BY_LATER, TOPIC, "some", 1, 1, 1, 0)]
     assert [outcome.fate for outcome in replay(cloud, listed)] == [Fate.REPLAYED]
@@ -149,7 +150,7 @@ def test_what_is_in_the_old_table_alone_is_not_given_to_lambda_2():
 
 @pytest.mark.parametrize("prefix", ["", "$aws/rules/iort_record/"])
 def test_a_batch_is_replayed_whether_or_not_its_topic_has_basic_ingests_prefix(prefix):
-    payload = iort_contract.encode(GOOD)
+    payload = encode_batch(GOOD)
     cloud = FakeCloud({"a": (f"{BY_RULE} iort_record", payload)}, topic=prefix + TOPIC)
     listed = DeadLetter(
         "car", "a", f"{BY_RULE} iort_record", prefix + TOPIC, "some", 2_000_000_000_000, 1, 1, 0
@@ -159,5 +160,5 @@ def test_a_batch_is_replayed_whether_or_not_its_topic_has_basic_ingests_prefix(p
 
 
 def test_keys_that_the_rule_would_not_store_keep_no_batch_from_replay():
-    odd = {**json.loads(iort_contract.encode(GOOD)), "robot": "another", "topic": "dt/iort/another/vesc"}
+    odd = {**json.loads(encode_batch(GOOD)), "robot": "another", "topic": "dt/iort/another/vesc"}
     assert outcomes(odd=(f"{BY_RULE} iort_record", json.dumps(odd).encode())) == [Fate.WOULD]

@@ -12,10 +12,12 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-import iort_contract
 from bench.message_sizes import stored_bytes
-from iort_contract import Batch
 from iort_contract.checks import wire_column
+from iort_contract.codec.columns import CODEC, DICTIONARY, PLAIN_CODEC
+from iort_contract.limits import MAX_BATCH_VALUES
+from iort_contract.messages.batch import Batch, decode_batch, encode_batch
+from iort_contract.ros1.message import Messages, RosType
 from iort_station.data.batches import RefusedItems, blocks, stored
 from iort_station.data.blocks import join
 from iort_station.data.selection import Selection
@@ -62,12 +64,12 @@ HOSTILE = {
 }
 
 
-@pytest.mark.parametrize("codec", [iort_contract.CODEC, iort_contract.PLAIN_CODEC])
+@pytest.mark.parametrize("codec", [CODEC, PLAIN_CODEC])
 @pytest.mark.parametrize("body", HOSTILE.values(), ids=HOSTILE)
 def test_what_a_stranger_stored_is_refused_and_its_neighbours_are_read(body, codec):
-    if codec == iort_contract.CODEC:
+    if codec == CODEC:
         body = body.replace('"f0":[', '"f0":[null,')
-    deflater = zlib.compressobj(zdict=iort_contract.DICTIONARY if codec == iort_contract.CODEC else b"")
+    deflater = zlib.compressobj(zdict=DICTIONARY if codec == CODEC else b"")
     deflated = deflater.compress(body.encode()) + deflater.flush()
     good = message_of([0, 1, 2])
     strange = {**good, "codec": codec, "samples": base64.b64encode(deflated).decode()}
@@ -77,7 +79,7 @@ def test_what_a_stranger_stored_is_refused_and_its_neighbours_are_read(body, cod
 
 
 def test_more_values_than_a_batch_may_hold_are_refused_and_its_neighbours_are_read():
-    n, good = iort_contract.MAX_BATCH_VALUES // 2 + 1, message_of([0, 1, 2])
+    n, good = MAX_BATCH_VALUES // 2 + 1, message_of([0, 1, 2])
     large = message_of([0] * (n + 1), [0] * (n + 1), n=n)
     found, refused = read(good, {**large, "batch": id_at(1)})
     assert refused.count == 1
@@ -100,7 +102,7 @@ def test_an_item_whose_key_is_no_batchs_is_refused_and_its_neighbours_are_read(k
 def test_samples_of_one_time_are_all_given_in_the_order_of_their_batches():
     parts = [Batch(BOOT, seq, [t, t, t + 5], {"a": [10 * seq, 10 * seq + 1, 10 * seq + 2]})
              for seq, t in enumerate([1_000, 1_000, 1_005])]  # fmt: skip
-    items = [item_of_message(iort_contract.encode(batch)) for batch in parts]
+    items = [item_of_message(encode_batch(batch)) for batch in parts]
     for pages in ([items], [items[:1], items[1:]], [[item] for item in items]):
         found = list(blocks(pages, RefusedItems()))
         times = [t for block in found for t in block.times_us.tolist()]
@@ -109,8 +111,8 @@ def test_samples_of_one_time_are_all_given_in_the_order_of_their_batches():
         assert values == [0, 1, 10, 11, 2, 12, 20, 21, 22]
 
 
-FLAT = iort_contract.RosType("/t", "a_msgs/A", "1", "float64 x\nuint8 n")
-TEXTS = iort_contract.RosType("/u", "a_msgs/B", "2", "string[] s\nfloat64 x")
+FLAT = RosType("/t", "a_msgs/A", "1", "float64 x\nuint8 n")
+TEXTS = RosType("/u", "a_msgs/B", "2", "string[] s\nfloat64 x")
 
 
 def test_messages_are_samples_too_and_can_be_passed_over():
@@ -118,12 +120,12 @@ def test_messages_are_samples_too_and_can_be_passed_over():
     texts = [u32(1) + text("a") + struct.pack("<d", 0.5), u32(0) + struct.pack("<d", 1.5), b"odd"]
     odd = [struct.pack("<dB", float("nan"), 7)] * 2
     given = [
-        Batch(BOOT, 0, [10, 20, 30], {}, 0, iort_contract.Messages(FLAT.id, FLAT.layout, rows)),
-        Batch(BOOT, 1, [110, 120, 130], {}, 0, iort_contract.Messages(TEXTS.id, TEXTS.layout, texts)),
-        Batch(BOOT, 2, [210, 220], {}, 0, iort_contract.Messages(FLAT.id, FLAT.layout, odd)),
+        Batch(BOOT, 0, [10, 20, 30], {}, 0, Messages(FLAT.id, FLAT.layout, rows)),
+        Batch(BOOT, 1, [110, 120, 130], {}, 0, Messages(TEXTS.id, TEXTS.layout, texts)),
+        Batch(BOOT, 2, [210, 220], {}, 0, Messages(FLAT.id, FLAT.layout, odd)),
         Batch(BOOT, 3, [310], {"x": [9.5]}),
     ]
-    items = [item_of_message(iort_contract.encode(batch)) for batch in given]
+    items = [item_of_message(encode_batch(batch)) for batch in given]
     refused = RefusedItems()
     whole = join(list(blocks([items], refused)))
     assert whole.times_us.tolist() == [10, 20, 30, 110, 120, 130, 210, 220, 310]
@@ -144,7 +146,7 @@ def test_the_station_reads_what_the_contract_reads(parts, data):
     messages, expected, refused = [], [], 0
     for seq, column in enumerate(parts):
         times = [seq * 1_000_000 + 20 * i for i in range(len(column))]
-        message = json.loads(iort_contract.encode(Batch(BOOT, seq, times, {"a": column})))
+        message = json.loads(encode_batch(Batch(BOOT, seq, times, {"a": column})))
         kind = data.draw(st.sampled_from(["new", "old", "bad"]))
         if kind == "old":
             body = {"dt": [0] + [20] * (len(times) - 1), "fields": {"a": wire_column("a", column)[0]}}
@@ -156,7 +158,7 @@ def test_the_station_reads_what_the_contract_reads(parts, data):
             message = {**message, "samples": damaged["samples"]}
             refused += 1
         else:
-            expected += iort_contract.decode(message).columns["a"]
+            expected += decode_batch(message).columns["a"]
         messages.append(message)
     found, told = read(*messages)
     got = [value for block in found for value in block.columns["a"].tolist()]
@@ -180,8 +182,8 @@ def test_a_real_drive_fits_in_a_write_unit_and_comes_back():
         second = list(group)
         names = list(second[0][1])
         batch = Batch(BOOT, 0, [t for t, _ in second], {n: [s[n] for _, s in second] for n in names})
-        message = iort_contract.encode(batch)
-        decoded = iort_contract.decode(message)
+        message = encode_batch(batch)
+        decoded = decode_batch(message)
         assert {n: list(map(float, c)) for n, c in decoded.columns.items()} == {
             n: list(map(float, c)) for n, c in batch.columns.items()
         }

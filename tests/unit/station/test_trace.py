@@ -6,7 +6,8 @@ import itertools
 
 import pytest
 
-from iort_contract import Batch, LiveSample, live_update
+from iort_contract.messages.batch import Batch
+from iort_contract.messages.live import LiveSample, live_update
 from iort_station.cli.verbs.trace import bar
 from iort_station.operations.trace import (
     CAR,

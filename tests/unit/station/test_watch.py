@@ -6,18 +6,18 @@ from typing import Any
 
 from rich.console import Console
 
-import iort_contract
+from iort_contract.limits import Value
+from iort_contract.messages.live import LiveSample, live_update
 from iort_contract.statistics import Vehicle
+from iort_contract.vesc import VESC_STREAM
 from iort_station.page.watch import GONE_S, MAX_ROBOTS, STALE_S, FleetWatch
 
 NOW_US = 1_700_000_000_000_000
 
 
-def update(robot: str = "car1", **sample: iort_contract.Value) -> dict[str, Any]:
-    live = iort_contract.LiveSample("0badcafe", 0, NOW_US - 12_000, NOW_US - 10_000, sample)
-    return iort_contract.live_update(
-        robot, iort_contract.VESC_STREAM, live, NOW_US // 1000 - 6, NOW_US - 2_000
-    )
+def update(robot: str = "car1", **sample: Value) -> dict[str, Any]:
+    live = LiveSample("0badcafe", 0, NOW_US - 12_000, NOW_US - 10_000, sample)
+    return live_update(robot, VESC_STREAM, live, NOW_US // 1000 - 6, NOW_US - 2_000)
 
 
 def text(fleet: FleetWatch, width: int = 120, now_us: int = NOW_US) -> str:

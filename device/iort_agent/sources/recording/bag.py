@@ -13,7 +13,6 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, ContextManager, Iterator, Mapping, NamedTuple, Optional, Sequence
 
-import iort_contract
 from iort_agent.clock import Clock
 from iort_agent.errors import SourceError
 from iort_agent.schema import choice, existing_path, flag, number, pairs, setting, text
@@ -21,9 +20,13 @@ from iort_agent.sources import REFUSE, UPLOAD, Emit
 from iort_agent.sources.recording.player import NOW, ORIGINAL, Message, Open, Playback, play
 from iort_agent.sources.recording.tool_csv import VescLog
 from iort_agent.sources.recording.unreadable import Wrapped, check_kind
-from iort_contract import RosMessage, RosType
+from iort_contract.limits import ContractError, MessageError, Value
+from iort_contract.messages.message_type import MessageType
 from iort_contract.ros1.decode import HEADER, Decoder
 from iort_contract.ros1.definition import parse
+from iort_contract.ros1.message import RosMessage, RosType
+from iort_contract.topics import TYPES_STREAM, check_stream
+from iort_contract.vesc import VESC_STREAM
 
 _log = logging.getLogger(__name__)
 
@@ -44,13 +47,13 @@ class BagConfig:
 
     path: Path = setting(existing_path(folder=True))
     topics: tuple[tuple[str, str], ...] | None = setting(
-        pairs(text(iort_contract.check_stream), what="a mapping of ROS topic to stream name"), default=None
+        pairs(text(check_stream), what="a mapping of ROS topic to stream name"), default=None
     )
     speed: float = setting(number(0, 1000), 1.0)
     stamps: str = setting(choice(NOW, ORIGINAL), NOW)
     loop: bool = setting(flag(), default=False)
     duration_s: float | None = setting(number(0.001, 1e9, unit="s"), None)
-    stream: str = setting(text(iort_contract.check_stream), iort_contract.VESC_STREAM)
+    stream: str = setting(text(check_stream), VESC_STREAM)
     large: str = setting(choice(REFUSE, UPLOAD), REFUSE)
 
     def streams(self) -> Sequence[str]:
@@ -184,10 +187,10 @@ class Recording:
                 kind = kinds[named] = self._kind(stream, connection)
             stamp_ns = _stamp_ns(raw, recorded_ns) if kind.stamped else recorded_ns
             if not said and kind.sample is not None:
-                yield Message(iort_contract.TYPES_STREAM, at_ns, stamp_ns, kind.sample)
+                yield Message(TYPES_STREAM, at_ns, stamp_ns, kind.sample)
             contents: dict[str, Any] = {}
             if kind.large is not None:
-                with suppress(iort_contract.MessageError):
+                with suppress(MessageError):
                     values: dict[str, Any] = dict(kind.large.decode(raw)[0])
                     contents = {name: v for name, v in values.items() if isinstance(v, bytes) and v}
             yield Message(stream, at_ns, stamp_ns, RosMessage(raw, kind.whole, large=contents))
@@ -208,8 +211,8 @@ class Recording:
         parsed = parse(kind, definition)
         sample = None
         try:
-            sample = iort_contract.MessageType(stream, connection.topic, kind, md5sum, definition).sample()
-        except iort_contract.ContractError as error:
+            sample = MessageType(stream, connection.topic, kind, md5sum, definition).sample()
+        except ContractError as error:
             _log.warning("%s: topic %s: %s", self._path, connection.topic, error)
         return _Kind(whole, sample, parsed.stamped(), Decoder(parsed, large=True) if self._large else None)
 
@@ -221,7 +224,7 @@ class _Kind(NamedTuple):
     """The type of a topic's messages, and the sample that says so."""
 
     whole: RosType
-    sample: Optional[Mapping[str, iort_contract.Value]]  # noqa: UP045 - evaluated, on Python 3.8 too
+    sample: Optional[Mapping[str, Value]]  # noqa: UP045 - evaluated, on Python 3.8 too
     stamped: bool
     large: Optional[Decoder]  # noqa: UP045 - as above
 

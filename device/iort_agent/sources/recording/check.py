@@ -5,9 +5,9 @@ from __future__ import annotations
 import threading
 from typing import NamedTuple
 
-import iort_contract
 from iort_agent.errors import SourceError
 from iort_agent.sources.recording.bag import BagSource
+from iort_contract.topics import TYPES_STREAM
 
 
 class Looked(NamedTuple):
@@ -29,7 +29,7 @@ def look_into(source: BagSource, wanted: set[str], within_s: float) -> Looked:
         try:
             with source.open() as messages:
                 for message in messages:
-                    if message.stream != iort_contract.TYPES_STREAM:
+                    if message.stream != TYPES_STREAM:
                         streams.add(message.stream)
                     if wanted <= streams or stop.is_set():
                         return

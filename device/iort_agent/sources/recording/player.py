@@ -5,9 +5,10 @@ from __future__ import annotations
 import threading
 from typing import Callable, ContextManager, Iterator, Mapping, NamedTuple, Optional
 
-import iort_contract
 from iort_agent.clock import Clock, Pace
 from iort_agent.sources import Emit
+from iort_contract.limits import Value
+from iort_contract.topics import TYPES_STREAM
 
 NOW, ORIGINAL = "now", "original"
 # Between the rounds of a recording with a single message.
@@ -20,7 +21,7 @@ class Message(NamedTuple):
     stream: str
     at_ns: int
     stamp_ns: int
-    values: Mapping[str, iort_contract.Value]
+    values: Mapping[str, Value]
 
 
 # Opens the recording anew for each round; what is opened is the messages, in the order recorded.
@@ -59,7 +60,7 @@ def play(recording: Open, how: Playback, clock: Clock, emit: Emit, stop: threadi
                     t_us = clock.now_us()
                 emit(message.stream, t_us, message.values)
                 # A type comes with the first message of it, and is none.
-                played += message.stream != iort_contract.TYPES_STREAM
+                played += message.stream != TYPES_STREAM
         if not how.loop or not played:
             return
         # One mean gap on, so that a loop does not put two samples on one time.

@@ -16,7 +16,6 @@ from dataclasses import dataclass
 from typing import Any, Mapping, Sequence
 from urllib.parse import urlsplit
 
-import iort_contract
 from iort_agent.clock import Clock
 from iort_agent.errors import SourceError
 from iort_agent.ros1.write import Writer
@@ -29,8 +28,8 @@ from iort_agent.sources.rosbridge.connection import TIMES, RosbridgeConnection, 
 from iort_agent.sources.rosbridge.continuity import Numbers, Repeats
 from iort_agent.sources.rosbridge.rosapi import AGAIN_S, Rosapi, Structure
 from iort_agent.throttled_log import Seldom
-from iort_contract import Value
-from iort_contract.limits import MessageError
+from iort_contract.limits import MessageError, Value
+from iort_contract.topics import check_stream
 
 _log = logging.getLogger(__name__)
 
@@ -50,7 +49,7 @@ class TopicConfig:
     it, all. ``throttle_ms`` is the least time between messages, kept by the server.
     """
 
-    stream: str = setting(text(iort_contract.check_stream))
+    stream: str = setting(text(check_stream))
     time: str = setting(choice(HEADER, ARRIVAL))
     type: str | None = setting(text(), default=None)
     fields: tuple[str, ...] | None = setting(

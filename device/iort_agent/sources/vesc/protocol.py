@@ -14,7 +14,7 @@ import binascii
 import struct
 from typing import Callable, NamedTuple
 
-from iort_contract import Value
+from iort_contract.limits import Value
 
 COMM_FW_VERSION = 0
 COMM_GET_VALUES = 4

@@ -21,7 +21,6 @@ import threading
 from dataclasses import dataclass
 from typing import Any, Mapping, Sequence
 
-import iort_contract
 from iort_agent.clock import Clock
 from iort_agent.errors import SourceError
 from iort_agent.schema import number, setting, text
@@ -36,6 +35,8 @@ from iort_agent.sources.vesc.protocol import (
     frame,
     request,
 )
+from iort_contract.topics import check_stream
+from iort_contract.vesc import VESC_STREAM
 
 _log = logging.getLogger(__name__)
 
@@ -60,7 +61,7 @@ class VescConfig:
     port: str = setting(text())
     baudrate: int = setting(number(1200, 4_000_000, whole=True, unit="baud"), 115200)
     rate_hz: float = setting(number(1, 1000, unit="Hz"), 50.0)
-    stream: str = setting(text(iort_contract.check_stream), iort_contract.VESC_STREAM)
+    stream: str = setting(text(check_stream), VESC_STREAM)
     can_id: int | None = setting(number(0, 254, whole=True), None)
     timeout_s: float = setting(number(0.01, 5, unit="s"), 0.2)
 

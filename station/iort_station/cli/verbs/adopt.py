@@ -8,7 +8,8 @@ from typing import Annotated
 import typer
 from rich.progress import Progress
 
-from iort_contract import ContractError, check_robot
+from iort_contract.limits import ContractError
+from iort_contract.topics import check_robot
 from iort_station.cli.console import Console
 from iort_station.cli.progress import say
 from iort_station.errors import StationError

@@ -11,7 +11,8 @@ import typer
 from rich.table import Table
 from rich.text import Text
 
-from iort_contract import ContractError, check_robot, check_stream
+from iort_contract.limits import ContractError
+from iort_contract.topics import check_robot, check_stream
 from iort_station.cli.console import Console
 from iort_station.cli.verbs.options import bounds
 from iort_station.data import inventory

@@ -14,7 +14,7 @@ from iort_station.cli.verbs.options import From, Last, Range, Robot, To
 from iort_station.errors import StationError
 
 if TYPE_CHECKING:
-    from iort_contract import MessageType
+    from iort_contract.messages.message_type import MessageType
     from iort_station.cloud import Cloud
     from iort_station.data.selection import Selection
     from iort_station.recordings.recordings import Recording, Write

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from iort_contract import NO_SENSOR_DEGC
+from iort_contract.vesc import NO_SENSOR_DEGC
 from iort_station.cli.console import Console
 from iort_station.cli.progress import reading, say
 from iort_station.cli.verbs.options import Every, From, Last, Range, Robot, Stream, To, names

@@ -11,7 +11,7 @@ from typing import Annotated, Any
 import typer
 from rich.table import Table
 
-from iort_contract import (
+from iort_contract.tables import (
     ADMISSION,
     ADMIT_UNTIL_S,
     ADMITTED_CERTIFICATE,

@@ -9,8 +9,9 @@ from typing import Annotated, Any
 
 import typer
 
-import iort_contract
-from iort_contract import ACCEPTED, CMD, MAX_LEASE_MS, MAX_VALID_MS, Command, ContractError
+from iort_contract.limits import ContractError
+from iort_contract.messages.commands import MAX_LEASE_MS, MAX_VALID_MS, Command, encode_command
+from iort_contract.topics import ACCEPTED, CMD, build_topic
 from iort_station.cli.console import Console
 from iort_station.errors import StationError
 from iort_station.fleet.shadow import Shadow, outcome
@@ -47,7 +48,7 @@ def send(
     shadow = Shadow(cloud, robot)
     now_us = time.time_ns() // 1000
     try:
-        topic = iort_contract.build_topic(CMD, robot, name, cloud.namespace)
+        topic = build_topic(CMD, robot, name, cloud.namespace)
         command = Command(
             session=secrets.token_hex(8),
             started_us=now_us,
@@ -58,7 +59,7 @@ def send(
             lease_ms=lease_ms,
             answer=True,
         )
-        payload = iort_contract.encode_command(command)
+        payload = encode_command(command)
     except ContractError as error:
         raise StationError(str(error)) from error
     shadow.data.publish(topic=topic, qos=1, payload=payload)

@@ -11,8 +11,9 @@ from typing import Annotated, Any
 import typer
 from rich.table import Table
 
-from iort_contract import RTT_STREAM, VESC_STREAM
 from iort_contract.page import PUBNUB_ORIGIN
+from iort_contract.topics import RTT_STREAM
+from iort_contract.vesc import VESC_STREAM
 from iort_station.cli.console import Console
 from iort_station.data.inventory import check_registered
 from iort_station.errors import StationError

@@ -14,8 +14,9 @@ from rich.console import Group
 from rich.live import Live
 from rich.text import Text
 
-from iort_contract import ROBOT, T_US, ContractError
+from iort_contract.limits import ContractError
 from iort_contract.statistics import Vehicle
+from iort_contract.tables import ROBOT, T_US
 from iort_station.cli.console import Console
 from iort_station.cli.progress import say
 from iort_station.fleet import registry
