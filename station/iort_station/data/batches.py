@@ -146,12 +146,12 @@ def _block(batches: Iterable[Opened], refused: RefusedItems, wanted: Wanted) -> 
         run = list(same)
         try:
             if not is_serialized:
-                parts.append(_decode_together(run, list(filter(wanted, names))))
+                parts.append(decode_together(run, list(filter(wanted, names))))
                 continue
         except ContractError:
             # The lists tell which batch is invalid.
             pass
-        parts += _decode_each(run, refused, wanted)
+        parts += decode_each(run, refused, wanted)
     return join(parts)
 
 
@@ -159,7 +159,7 @@ def _form(batch: Opened) -> tuple[list[str], bool]:
     return list(batch.written), batch.serialized is not None
 
 
-def _decode_each(run: Iterable[Opened], refused: RefusedItems, wanted: Wanted) -> Iterator[Block]:
+def decode_each(run: Iterable[Opened], refused: RefusedItems, wanted: Wanted) -> Iterator[Block]:
     """The list back end: one batch at a time."""
     batches: list[Batch] = []
     for one in run:
@@ -178,7 +178,7 @@ def _decode_each(run: Iterable[Opened], refused: RefusedItems, wanted: Wanted) -
         yield Block(times, columns)
 
 
-def _decode_together(run: Sequence[Opened], names: Sequence[str]) -> Block:
+def decode_together(run: Sequence[Opened], names: Sequence[str]) -> Block:
     """The numpy back end: batches of the same fields; raises `ContractError` if any is invalid."""
     counts = [len(batch.times_us) for batch in run]
     times = np.fromiter(chain.from_iterable(batch.times_us for batch in run), dtype=np.int64)

@@ -14,11 +14,11 @@ from hypothesis import strategies as st
 
 from bench.message_sizes import stored_bytes
 from iort_contract.checks import wire_column
-from iort_contract.codec.columns import CODEC, DICTIONARY, PLAIN_CODEC
-from iort_contract.limits import MAX_BATCH_VALUES
-from iort_contract.messages.batch import Batch, decode_batch, encode_batch
+from iort_contract.codec.columns import CODEC, DICTIONARY, PLAIN_CODEC, packed
+from iort_contract.limits import MAX_BATCH_VALUES, ContractError
+from iort_contract.messages.batch import Batch, Opened, decode_batch, encode_batch
 from iort_contract.ros1.message import Messages, RosType
-from iort_station.data.batches import RefusedItems, blocks, stored
+from iort_station.data.batches import RefusedItems, blocks, decode_each, decode_together, stored
 from iort_station.data.blocks import join
 from iort_station.data.selection import Selection
 from tests.fakes import item_of_message
@@ -164,6 +164,51 @@ def test_the_station_reads_what_the_contract_reads(parts, data):
     got = [value for block in found for value in block.columns["a"].tolist()]
     assert told.count == refused
     assert list(map(as_read, got)) == list(map(as_read, expected))
+
+
+entries = st.integers(-(2**64), 2**64) | st.sampled_from(
+    [None, True, False, "a", 0.5, 1e300, 2.0, 2**53 - 1, 2**53, 1 - 2**53, -(2**53), 2**54 - 2, []]
+)
+
+
+@st.composite
+def written_columns(draw, n):
+    """A column as an encoder writes it, or nearly, or anything."""
+    written = draw(st.sampled_from([packed(draw(columns_of(n))), [0, *[1] * n]]))
+    if draw(st.booleans()):
+        at = draw(st.integers(0, n))
+        written = [*written[:at], draw(entries | st.integers(-3, 25)), *written[at + 1 :]]
+    return written if draw(st.integers(0, 9)) else draw(st.lists(entries, max_size=n + 2))
+
+
+def columns_of(n):
+    number = st.integers(-(10**6), 10**6).map(lambda whole: whole / 100)
+    return st.lists(st.none() | number, min_size=n, max_size=n) | st.lists(number, min_size=n, max_size=n)
+
+
+@settings(max_examples=300)
+@given(st.data())
+def test_the_numpy_back_end_and_the_list_back_end_agree(data):
+    """Both refuse a run of batches, or both decode it to the same values."""
+    run = []
+    for seq in range(data.draw(st.integers(1, 3))):
+        n = data.draw(st.integers(1, 4))
+        times = [seq * 1_000_000 + i for i in range(n)]
+        written = {name: data.draw(written_columns(n)) for name in ("a", "b")}
+        run.append(Opened(BOOT, seq, times, 0, written, None, ""))
+    refused = RefusedItems()
+    expected = list(decode_each(run, refused, lambda _name: True))
+    try:
+        together = decode_together(run, ["a", "b"])
+    except ContractError:
+        assert refused.count
+        return
+    assert not refused.count
+    (each,) = expected
+    assert together.times_us.tolist() == each.times_us.tolist()
+    for name in ("a", "b"):
+        got, wanted = (list(map(as_read, one.columns[name].tolist())) for one in (together, each))
+        assert got == wanted
 
 
 def as_read(value):
