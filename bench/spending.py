@@ -11,7 +11,7 @@ from iort_agent.rate_limiter import BYTES_PER_S
 from iort_contract.topics import PING_PATHS
 from iort_station.cloud import Cloud
 from iort_station.cost import line_items, model
-from iort_station.cost.line_items import Item
+from iort_station.cost.line_items import LineItem
 from iort_station.cost.usage import Usage
 
 # AWS' units: a message and an action are metered by 5 KB, writes by 1 KB, reads by 4 KB and by half where
@@ -25,7 +25,7 @@ _MINUTES_CONNECTED = 30
 
 def estimate(cloud: Cloud, sections: Sequence[str]) -> dict[str, float]:
     """Return a generous estimate in dollars for each section, AWS alone, at the cost model's prices."""
-    counted: dict[str, Callable[[], list[Item]]] = {
+    counted: dict[str, Callable[[], list[LineItem]]] = {
         "round_trips": _round_trips,
         "dashboard": lambda: _driven(dashboard.SECONDS * 2),
         "utilisation": _utilisation,
@@ -36,7 +36,7 @@ def estimate(cloud: Cloud, sections: Sequence[str]) -> dict[str, float]:
     return {key: line_items.total(counted[key]()) for key in sections if key in counted}
 
 
-def _round_trips() -> list[Item]:
+def _round_trips() -> list[LineItem]:
     messages, rules, answers = 0, 0, 0
     for size, rate_hz in product(round_trips.SIZES.values(), round_trips.RATES_HZ):
         if size * rate_hz <= BYTES_PER_S:
@@ -55,13 +55,13 @@ def _round_trips() -> list[Item]:
     ]
 
 
-def _driven(seconds: float) -> list[Item]:
+def _driven(seconds: float) -> list[LineItem]:
     hours = seconds / 3600
     items = model.bill(Usage(ping_hz=1, agent_every_s=1))
     return [item._replace(units=item.units * hours) for item in items]
 
 
-def _utilisation() -> list[Item]:
+def _utilisation() -> list[LineItem]:
     calls = utilisation.CALLS * utilisation.ROUNDS * 4
     sized = [
         item
@@ -72,7 +72,7 @@ def _utilisation() -> list[Item]:
     return [*_invoked(calls, 512), *sized, _item("write", written + calls * _SUMMARY_WRITES)]
 
 
-def _query(telemetry_bytes: int) -> list[Item]:
+def _query(telemetry_bytes: int) -> list[LineItem]:
     batches = ceil(query.POINTS / 50) + query.HOUR_POINTS // 50
     reads = query.REPEATS + 1
     stored = batches * _BATCH_WRITES * _WRITE
@@ -86,17 +86,17 @@ def _query(telemetry_bytes: int) -> list[Item]:
     ]
 
 
-def _abilities() -> list[Item]:
+def _abilities() -> list[LineItem]:
     # A metric of its own, for the hour that AWS bills.
     return [_item("metric", 1 / 730), _item("message", 500), _item("write", 500), *_invoked(100, 512)]
 
 
-def _invoked(calls: int, memory_mb: int) -> list[Item]:
+def _invoked(calls: int, memory_mb: int) -> list[LineItem]:
     return [_item("invocation", calls), _item("compute_x86", calls * memory_mb / 1024 * _BILLED_S * 5)]
 
 
-def _item(price: str, units: float) -> Item:
-    return Item("", "", "", price, units)
+def _item(price: str, units: float) -> LineItem:
+    return LineItem("", "", "", price, units)
 
 
 def _telemetry_bytes(cloud: Cloud) -> int:
