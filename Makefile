@@ -1,10 +1,12 @@
 # One command for each habit. `make demo` and `make test` set everything up by themselves.
 PYTHON ?= python3
 BIN := .venv/bin
+# The environment's bytecode is its own. Without it each of a hundred processes compiles every module again.
+export PYTHONDONTWRITEBYTECODE :=
 # cdk.json runs `python app.py`.
 bootstrap preflight deploy diff destroy: export PATH := $(CURDIR)/$(BIN):$(PATH)
 
-.PHONY: help demo test test-oldest check setup prove-mixed wheels bench bench-guard bench-agent bench-page screenshots bench-fleet bench-cold verify-aws layer bootstrap preflight deploy diff destroy lock clean
+.PHONY: help demo test test-oldest check setup prove-mixed wheels bench bench-guard bench-agent bench-page screenshots bench-fleet bench-cold verify-aws docs-parts layer bootstrap preflight deploy diff destroy lock clean
 
 help: ## show this
 	@grep -hE '^[a-z-]+:.*## ' Makefile | sed -E 's/^([a-z-]+):.*## /\1\t/' | expand -t 14
@@ -62,6 +64,9 @@ screenshots: setup ## take the pictures of docs/images anew
 verify-aws: layer ## ask your AWS account what the design rests on: ONLY=rules,files YES=1 KEEP=1 BY=name
 	@$(BIN)/python -m verify.run $(if $(ONLY),--only $(ONLY)) $(if $(TARGET),--target $(TARGET)) \
 		$(if $(YES),--yes) $(if $(KEEP),--keep) $(if $(BY),--by "$(BY)") $(if $(OUT),--out $(OUT))
+
+docs-parts: setup ## fill the generated parts of README.md and docs/ again
+	@$(BIN)/python -m scripts.docs_parts
 
 layer: ## build Lambda 1's layer for AWS
 	@$(PYTHON) scripts/setup.py --layer lambda

@@ -14,14 +14,15 @@ from decimal import Decimal
 from typing import Any
 
 from iort_agent.sources.vehicle import Vehicle, VehicleConfig
+from iort_contract.catalog.derived import Vehicle as Gain
+from iort_contract.catalog.streams import AGENT_FIELDS
+from iort_contract.catalog.vesc import VESC_STREAM
 from iort_contract.limits import Value
 from iort_contract.messages.batch import Batch, encode_batch
 from iort_contract.messages.live import LiveSample, encode_live, encode_ping, live_update
-from iort_contract.statistics import Vehicle as Gain
 from iort_contract.statistics import summarize_second
 from iort_contract.tables import EXPIRES_S, RECEIVED_MS, SECOND, TOPIC
 from iort_contract.topics import RECORD, build_topic, record_topic
-from iort_contract.vesc import AGENT_FIELDS, VESC_STREAM
 from iort_station.cost.sizes import Measured
 
 _BOOT, _ROBOT = "0badcafe0badcafe", "car-0001"

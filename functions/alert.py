@@ -18,9 +18,9 @@ from typing import Any, TypeGuard
 import boto3
 
 from functions.shared.metrics import emit
+from iort_contract.catalog.vesc import FAULT_FIELD, FAULTS, VOLTAGE_FIELD
 from iort_contract.tables import ALERT_PREFIX, RECEIVED_MS, ROBOT, TOPIC
 from iort_contract.topics import parse_topic
-from iort_contract.vesc import FAULT_FIELD, FAULTS, VOLTAGE_FIELD
 
 QUIET_S = 900
 

@@ -16,13 +16,13 @@ from functions.shared.dead_letter import Refusals, refused_event
 from functions.shared.delay_estimator import Legs
 from functions.shared.metrics import Gathered, emit
 from functions.shared.pubnub_client import PublishError, PubNubPublisher
+from iort_contract.catalog.vesc import absent
 from iort_contract.cloud import channel
 from iort_contract.limits import LIVE_MAX_AGE_MS, ContractError
 from iort_contract.messages.event import event_message
 from iort_contract.messages.live import LiveSample, decode_live, live_update
 from iort_contract.tables import RECEIVED_MS, TOPIC
 from iort_contract.topics import parse_topic
-from iort_contract.vesc import absent
 
 _log = logging.getLogger(__name__)
 _log.setLevel(logging.INFO)

@@ -23,8 +23,9 @@ from rich.console import Console
 from iort_agent.clock import SystemClock
 from iort_agent.errors import SourceError
 from iort_agent.sources.recording.bag import BagConfig, BagSource
-from iort_contract.topics import OWN_STREAMS, PING_PATHS, RTT_STREAM
-from iort_contract.vesc import VESC_STREAM
+from iort_contract.catalog.streams import OWN_STREAMS, RTT_STREAM
+from iort_contract.catalog.vesc import VESC_STREAM
+from iort_contract.topics import PING_PATHS
 from iort_station.errors import StationError
 from iort_station.fleet import robots
 from iort_station.operations import delivery

@@ -9,8 +9,9 @@ from typing import Any
 
 from rich.table import Table
 
+from iort_contract.catalog.streams import RTT_FIELDS
 from iort_contract.messages.batch import Batch
-from iort_contract.topics import BROKER, LAMBDA, PING_PATHS, RTT_FIELDS, RULE
+from iort_contract.topics import BROKER, LAMBDA, PING_PATHS, RULE
 
 # Round trips and the time from car to dashboard in ms, measured in 2018 between a car in Stockholm and AWS in
 # Dublin, with a network ping of 50 ms (KTH thesis of 2018, table 6.4).

@@ -1,9 +1,9 @@
 """Builds Lambda 1's layer into build/layer/<for>: the packages of requirements/layer.txt, and their bytecode.
 
-    python -m scripts.layer {local,lambda} [--compiler PYTHON]
+    python -m scripts.layer {local,lambda}
 
 The packages depend only on the target's Python and platform, not on this machine. Bytecode fits only one
-version of Python, so a compiler of that version is needed; without it Lambda compiles at every cold start.
+version of Python, so that version is needed here; without it Lambda compiles at every cold start.
 """
 
 from __future__ import annotations
@@ -19,6 +19,7 @@ from pathlib import Path
 from stacks.target import PLATFORM, PYTHON
 
 ROOT = Path(__file__).resolve().parent.parent
+UV = Path(sys.executable).with_name("uv")
 # No C compiler is needed: pubnub, which publishes no wheel, is pure Python.
 # The build uses the locked setuptools of .venv, not today's newest.
 LOCKED = (
@@ -43,16 +44,22 @@ def main() -> None:
     """Build one layer."""
     parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
     parser.add_argument("name", choices=["local", "lambda"], help="for this machine, or for AWS")
-    parser.add_argument("--compiler", metavar="PYTHON", help=f"a Python {PYTHON}, for lambda")
-    asked = parser.parse_args()
-    local = asked.name == "local"
-    compiler = sys.executable if local else asked.compiler
-    build(
-        ROOT / "build" / "layer" / asked.name,
-        ROOT / "requirements" / "layer.txt",
-        LOCAL if local else LAMBDA,
-        compiler,
-    )
+    name = parser.parse_args().name
+    target, compiler = (LOCAL, sys.executable) if name == "local" else (LAMBDA, interpreter(PYTHON))
+    if compiler is None:
+        print(f"setup: no bytecode: Python {PYTHON} is missing here, and uv could not fetch it.")
+        print(
+            "setup: Cold starts take longer. Install it, remove build/setup/layer-lambda, and run this again."
+        )
+    build(ROOT / "build" / "layer" / name, ROOT / "requirements" / "layer.txt", target, compiler)
+
+
+def interpreter(version: str) -> str | None:
+    """A Python of a version: this machine's, or one that uv fetches. None if there is neither."""
+    code = "import sys; print(sys.executable)"
+    command = [str(UV), "run", "--quiet", "--no-project", "--python", version, "python", "-c", code]
+    done = subprocess.run(command, stdout=subprocess.PIPE, text=True, check=False)
+    return done.stdout.strip() if done.returncode == 0 else None
 
 
 def build(folder: Path, requirements: Path, target: Target, compiler: str | None) -> None:
@@ -62,7 +69,7 @@ def build(folder: Path, requirements: Path, target: Target, compiler: str | None
     platform = ["--python-platform", target.platform] if target.platform else []
     subprocess.run(
         [
-            *(Path(sys.executable).with_name("uv"), "pip", "install", "--quiet", *LOCKED),
+            *(UV, "pip", "install", "--quiet", *LOCKED),
             *("--python", sys.executable, "--python-version", target.python, *platform),
             *("--target", packages, "--link-mode", "copy", "--requirements", requirements),
         ],

@@ -2,7 +2,7 @@
 
     python3 scripts/setup.py [--layer lambda] [--checkov] [--oldest any|/path/to/python3.8]
 
-It needs only Python 3.10 or newer with the venv module. It skips steps whose inputs are unchanged since their
+It needs only Python 3.10 or newer with the venv module. It skips a step whose inputs are unchanged since its
 last success, so another run is cheap.
 """
 
@@ -12,38 +12,54 @@ import argparse
 import hashlib
 import importlib.util
 import os
-import re
+import shlex
 import shutil
 import subprocess
 import sys
 import time
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Iterator
 from pathlib import Path
+from typing import NamedTuple
 
 ROOT = Path(__file__).resolve().parent.parent
-VENV, BUILD = ROOT / ".venv", ROOT / "build"
-PYTHON, UV = VENV / "bin" / "python", VENV / "bin" / "uv"
+STAMPS = ROOT / "build" / "setup"
 # The base interpreter, even if this runs in a virtual environment, such as the one created here.
 BASE_PYTHON = Path(getattr(sys, "_base_executable", sys.executable)).resolve()
 OLDEST = (3, 10)
 # ROS Noetic's Python, for the robot.
 OLDEST_OF_ROBOT = "3.8"
 LEAST_FREE_BYTES = 3 * 1024**3
-# No compiler is needed: pubnub, which publishes no wheel, is pure Python.
-# The build uses the locked setuptools of .venv, not today's newest.
-LOCKED = (
-    *("--require-hashes", "--no-deps", "--only-binary", ":all:"),
-    *("--no-binary", "pubnub", "--no-build-isolation"),
+PYENV = Path(os.environ.get("PYENV_ROOT") or Path.home() / ".pyenv") / "versions"
+PATH = os.environ.get("PATH", os.defpath)
+ENVIRONMENT = {
+    # The venv's own node and npm come before the machine's.
+    "PATH": os.pathsep.join([str(ROOT / ".venv" / "bin"), PATH]),
+    "npm_config_cache": str(ROOT / "build" / "npm-cache"),
+    "npm_config_update_notifier": "false",
+    "UV_PYTHON_INSTALL_DIR": str(ROOT / "build" / "python"),
+    # pyenv's own before the path: its shims fail for a version that is not activated.
+    "UV_PYTHON_SEARCH_PATH": os.pathsep.join([*map(str, sorted(PYENV.glob("*/bin"))), PATH]),
+}
+LOCKED = "--quiet --require-hashes --only-binary :all:"
+SYNC = f".venv/bin/uv pip sync {LOCKED} --python"
+# Without the network: the locked setuptools builds what comes from the checkout.
+EDITABLE = (
+    ".venv/bin/uv pip install --quiet --no-deps --no-build-isolation --editable contract --editable device"
 )
-# Each is installed from its folder.
-DISTRIBUTIONS = ("contract", "device", "station")
-STARTED = time.monotonic()
-# npm and uv keep their own caches; our files stay inside the checkout.
-CACHES = {"npm_config_cache": str(BUILD / "npm-cache"), "npm_config_update_notifier": "false"}
 
 
 class SetupError(Exception):
     """A step that failed; the text says what to do."""
+
+
+class Step(NamedTuple):
+    """Commands that run again when the ``inputs``, patterns below the checkout, have changed."""
+
+    name: str
+    title: str
+    inputs: tuple[str, ...]
+    commands: tuple[str, ...]
+    advice: str = "Is the package registry reachable?"
 
 
 def main() -> None:
@@ -52,34 +68,62 @@ def main() -> None:
     parser.add_argument("--layer", choices=["lambda"], help="also build the layer that `cdk deploy` needs")
     parser.add_argument("--checkov", action="store_true", help="also install what `make check` needs")
     parser.add_argument("--oldest", metavar="PYTHON", help="also install the robot's tests for Python 3.8")
-    asked = parser.parse_args()
+    asked, began = parser.parse_args(), time.monotonic()
     try:
         check_machine()
-        step("virtual environment", [], make_venv, stamp="venv")
-        locked = [ROOT / "requirements" / name for name in ("build.txt", "dev.txt")]
-        step("Python packages", locked, install_python, stamp="python")
-        installed = [ROOT / folder / "pyproject.toml" for folder in DISTRIBUTIONS]
-        step("the project itself", installed, install_project, stamp="project")
-        step("CDK and page packages", [ROOT / "package-lock.json"], install_node, stamp="node")
-        page = [*sorted((ROOT / "station" / "web").rglob("*")), ROOT / "package-lock.json"]
-        step("live page", page, build_page, stamp="page")
-        names = ("requirements/layer.txt", "scripts/layer.py", "stacks/target.py")
-        layer = [ROOT / name for name in names]
-        step("Lambda layer, this machine", layer, lambda: build_layer("local"), stamp="layer-local")
-        if asked.layer:
-            step("Lambda layer, AWS", layer, build_layer_for_aws, stamp="layer-lambda")
-        if asked.checkov:
-            locked = [ROOT / "requirements" / "checkov.txt"]
-            step("checkov, in an environment of its own", locked, install_checkov, stamp="checkov")
-        if asked.oldest:
-            locked = [ROOT / "requirements" / "oldest.txt", *installed]
-            given = None if asked.oldest == "any" else asked.oldest
-            title = f"the robot's tests, for Python {OLDEST_OF_ROBOT}"
-            step(title, locked, lambda: install_oldest(given), stamp="oldest")
+        for step in steps(layer=bool(asked.layer), checkov=asked.checkov, oldest=asked.oldest):
+            run(step, began)
     except SetupError as error:
         sys.exit(f"setup: {error}")
     except KeyboardInterrupt:
         sys.exit("\nsetup: stopped; the same command goes on from here")
+
+
+def steps(*, layer: bool, checkov: bool, oldest: str | None) -> Iterator[Step]:
+    """Every step in its order."""
+    base = shlex.quote(str(BASE_PYTHON))
+    build = "--disable-pip-version-check --no-deps --no-compile -r requirements/build.txt"
+    venv = (f"{base} -m venv --clear .venv", f".venv/bin/python -m pip install {LOCKED} {build}")
+    yield Step("venv", "virtual environment", ("requirements/build.txt",), venv)
+    # pubnub, which publishes no wheel, is pure Python. Modules are compiled on their first import: to compile
+    # all of them here would take longest of all.
+    packages = (
+        f"{SYNC} .venv --no-binary pubnub --no-build-isolation requirements/dev.txt",
+        f"{EDITABLE} --editable station --python .venv",
+    )
+    yield Step("python", "Python packages", ("requirements/dev.txt", "*/pyproject.toml"), packages)
+    locked = "package-lock.json"
+    yield Step("node", "CDK and page packages", (locked,), (".venv/bin/npm ci --no-progress",))
+    yield Step("page", "live page", ("station/web/**/*", locked), (".venv/bin/npm run build",))
+    made_of = ("requirements/layer.txt", "scripts/layer.py", "stacks/target.py")
+    local = (".venv/bin/python -m scripts.layer local",)
+    yield Step("layer-local", "Lambda layer, this machine", made_of, local)
+    if layer:
+        aws = (".venv/bin/python -m scripts.layer lambda",)
+        yield Step("layer-lambda", "Lambda layer, AWS", made_of, aws)
+    if checkov:
+        apart = (
+            f".venv/bin/uv venv --clear --python {base} build/checkov",
+            f"{SYNC} build/checkov requirements/checkov.txt",
+        )
+        # Its requirements contradict ours.
+        title = "checkov, in an environment of its own"
+        yield Step("checkov", title, ("requirements/checkov.txt",), apart)
+    if oldest:
+        python = OLDEST_OF_ROBOT if oldest == "any" else shlex.quote(oldest)
+        right = f"import sys; assert '%d.%d' % sys.version_info[:2] == '{OLDEST_OF_ROBOT}', sys.version"
+        robot = (
+            f".venv/bin/uv venv --clear --python {python} build/oldest",
+            f'build/oldest/bin/python -c "{right}"',
+            f"{SYNC} build/oldest requirements/oldest.txt",
+            f"{EDITABLE} --python build/oldest",
+        )
+        advice = (
+            f"If Python {OLDEST_OF_ROBOT} is missing here, install it, or name it with `make test-oldest "
+            f"OLDEST=/path/to/python{OLDEST_OF_ROBOT}`. Else: is the package registry reachable?"
+        )
+        inputs = ("requirements/oldest.txt", "contract/pyproject.toml", "device/pyproject.toml")
+        yield Step("oldest", f"the robot's tests, for Python {OLDEST_OF_ROBOT}", inputs, robot, advice)
 
 
 def check_machine() -> None:
@@ -99,156 +143,40 @@ def check_machine() -> None:
         raise SetupError(f"{ROOT} must have {LEAST_FREE_BYTES // 1024**3} GB free: free some")
 
 
-def step(title: str, inputs: Iterable[Path], action: Callable[[], None], *, stamp: str) -> None:
-    """Run ``action`` unless it succeeded before with the same inputs."""
-    mark = BUILD / "setup" / stamp
-    key = hashlib.sha256(f"{BASE_PYTHON} {sys.version}".encode())
-    for path in inputs:
-        if path.is_file():
-            key.update(str(path).encode() + path.read_bytes())
-    if mark.exists() and mark.read_text() == key.hexdigest() and PYTHON.exists():
+def run(step: Step, began: float) -> None:
+    """Run a step's commands, unless they succeeded before with the same inputs and the same Python."""
+    stamp, log = STAMPS / step.name, STAMPS / "log"
+    key = hashlib.sha256(f"{BASE_PYTHON} {sys.version} {step.commands}".encode())
+    for path in sorted(path for pattern in step.inputs for path in ROOT.glob(pattern) if path.is_file()):
+        key.update(str(path).encode() + path.read_bytes())
+    if (ROOT / ".venv").exists() and stamp.exists() and stamp.read_text() == key.hexdigest():
         return
-    mark.parent.mkdir(parents=True, exist_ok=True)
-    print(f"setup: {title} ...", end="", flush=True)
-    began = time.monotonic()
-    action()
-    mark.write_text(key.hexdigest())
+    if step.name == "venv":
+        # A new environment has none of the packages that the other steps installed.
+        shutil.rmtree(STAMPS, ignore_errors=True)
+    STAMPS.mkdir(parents=True, exist_ok=True)
+    print(f"setup: {step.title} ...", end="", flush=True)
+    step_began = time.monotonic()
+    for command in step.commands:
+        with log.open("wb") as output:
+            done = subprocess.run(
+                shlex.split(command),
+                cwd=ROOT,
+                env={**os.environ, **ENVIRONMENT},
+                stdin=subprocess.DEVNULL,
+                stdout=output,
+                stderr=subprocess.STDOUT,
+                check=False,
+            )
+        said = log.read_text(errors="replace").splitlines()
+        if done.returncode:
+            tail = "\n".join(said[-15:])
+            raise SetupError(f"`{command}` failed:\n{tail}\n{step.advice} Log: {log}")
+        # Lines that begin so are for the user; the others stay in the log.
+        print("".join(f"\n{line}" for line in said if line.startswith("setup: ")), end="", flush=True)
+    stamp.write_text(key.hexdigest())
     now = time.monotonic()
-    print(f" {now - began:.0f} s ({now - STARTED:.0f} s so far)", flush=True)
-
-
-def make_venv() -> None:
-    """Create .venv from scratch, with this Python."""
-    shutil.rmtree(BUILD / "setup", ignore_errors=True)
-    (BUILD / "setup").mkdir(parents=True)
-    run([BASE_PYTHON, "-m", "venv", "--clear", VENV])
-
-
-def install_python() -> None:
-    """Install the locked packages; every file is checked against its hash.
-
-    Python compiles a module on its first import. Compiling all of them here took longer than everything else,
-    and most are never imported.
-    """
-    # Install uv first; pip comes with Python.
-    pip = ("-m", "pip", "--disable-pip-version-check", "--quiet", "install", "--no-compile")
-    run([PYTHON, *pip, *LOCKED[:4], "-r", "requirements/build.txt"])
-    install(VENV, *LOCKED, "-r", "requirements/dev.txt")
-
-
-def install_project() -> None:
-    """Install iort-agent and iort into .venv/bin, editable from the checkout."""
-    editable = [part for folder in DISTRIBUTIONS for part in ("--editable", folder)]
-    install(VENV, "--no-deps", "--no-build-isolation", *editable)
-
-
-def install_node() -> None:
-    """Install the packages of package-lock.json, with the npm from PyPI."""
-    run([VENV / "bin" / "npm", "ci", "--no-progress"])
-
-
-def build_page() -> None:
-    """Bundle the live page into the station."""
-    run([VENV / "bin" / "npm", "run", "build"])
-
-
-def build_layer(target: str, *more: str) -> None:
-    """Build Lambda 1's layer for this machine or for AWS: scripts/layer.py, which runs in .venv."""
-    run([PYTHON, "-m", "scripts.layer", target, *more])
-
-
-def build_layer_for_aws() -> None:
-    """Build the layer with bytecode, if Lambda's version of Python is available."""
-    version = re.findall(r'^PYTHON = "(.+)"', (ROOT / "stacks" / "target.py").read_text(), re.MULTILINE)[0]
-    try:
-        compiler = ["--compiler", python_of(version)]
-    except SetupError:
-        compiler = []
-        print(f" without bytecode: Python {version} is missing here, and uv could not fetch it.")
-        print("setup: Cold starts take longer. To fix it, install that Python and remove")
-        print("setup: build/setup/layer-lambda ...", end="", flush=True)
-    build_layer("lambda", *compiler)
-
-
-def install_checkov() -> None:
-    """Install checkov, whose requirements contradict ours, into build/checkov."""
-    run([UV, "venv", "--clear", "--python", BASE_PYTHON, BUILD / "checkov"])
-    install(BUILD / "checkov", *LOCKED, "-r", "requirements/checkov.txt")
-
-
-def install_oldest(given: str | None) -> None:
-    """Install the agent and its tests for the oldest Python of a robot, into build/oldest."""
-    try:
-        python = given or python_of(OLDEST_OF_ROBOT)
-    except SetupError as error:
-        raise SetupError(
-            f"Python {OLDEST_OF_ROBOT} is missing here, and uv could not fetch it: install it, or name it "
-            f"with `make test-oldest OLDEST=/path/to/python{OLDEST_OF_ROBOT}`\n{error}"
-        ) from error
-    if version_of(python) != OLDEST_OF_ROBOT:
-        raise SetupError(f"{python} must be Python {OLDEST_OF_ROBOT}")
-    run([UV, "venv", "--clear", "--python", python, BUILD / "oldest"])
-    install(BUILD / "oldest", *LOCKED[:4], "-r", "requirements/oldest.txt")
-    robot = ("--editable", "contract", "--editable", "device")
-    install(BUILD / "oldest", "--no-deps", "--no-build-isolation", *robot)
-
-
-def python_of(version: str) -> str:
-    """An interpreter of a version: this machine's, or one that uv fetches into build/. Raises
-    `SetupError`."""
-    pyenv = Path(os.environ.get("PYENV_ROOT") or Path.home() / ".pyenv") / "versions"
-    # pyenv's own before the path: pyenv's shims fail for a version that is not activated.
-    places = [*map(str, sorted(pyenv.glob("*/bin"))), os.environ.get("PATH", os.defpath)]
-    os.environ["UV_PYTHON_SEARCH_PATH"] = os.pathsep.join(places)
-    os.environ["UV_PYTHON_INSTALL_DIR"] = str(BUILD / "python")
-    find: list[str | Path] = [UV, "python", "find", "--system", "--no-python-downloads", version]
-    try:
-        return last_line(run(find))
-    except SetupError:
-        run([UV, "python", "install", "--no-bin", version])
-        return last_line(run(find))
-
-
-def version_of(python: str) -> str:
-    """A Python's version, such as 3.8; empty if it is not a Python."""
-    try:
-        return last_line(run([python, "-c", "import sys; print('%d.%d' % sys.version_info[:2])"]))
-    except (OSError, SetupError):
-        return ""
-
-
-def last_line(text: str) -> str:
-    """The last line of a program's output, after its warnings."""
-    return text.rstrip().rpartition("\n")[2]
-
-
-def install(environment: Path, *arguments: str) -> None:
-    """Install into a virtual environment, with uv."""
-    run([UV, "pip", "install", "--quiet", "--python", environment / "bin" / "python", *arguments])
-
-
-def run(command: Sequence[str | Path]) -> str:
-    """Run a command and return its output; raises `SetupError` with the end of the output if it fails."""
-    log = BUILD / "setup" / "log"
-    log.parent.mkdir(parents=True, exist_ok=True)
-    # The venv's own node and npm come before the machine's.
-    path = f"{VENV / 'bin'}{os.pathsep}{os.environ.get('PATH', os.defpath)}"
-    with log.open("wb") as output:
-        done = subprocess.run(
-            list(map(str, command)),
-            cwd=ROOT,
-            env={**os.environ, "PATH": path, **CACHES},
-            stdin=subprocess.DEVNULL,
-            stdout=output,
-            stderr=subprocess.STDOUT,
-            check=False,
-        )
-    said = log.read_text(errors="replace")
-    if done.returncode:
-        tail = "\n".join(said.splitlines()[-15:])
-        shown = " ".join(map(str, command))
-        raise SetupError(f"`{shown}` failed:\n{tail}\nIs the package registry reachable? Log: {log}")
-    return said
+    print(f" {now - step_began:.0f} s ({now - began:.0f} s so far)", flush=True)
 
 
 if __name__ == "__main__":

@@ -12,10 +12,10 @@ from typing import Any
 
 from aws_cdk import App, RemovalPolicy
 
+from iort_contract.catalog.vesc import VESC_FIELDS, VESC_STREAM
 from iort_contract.cloud import LOW_VOLTAGE_V
 from iort_contract.limits import DEFAULT_NAMESPACE, ContractError
 from iort_contract.topics import check_namespace
-from iort_contract.vesc import VESC_FIELDS, VESC_STREAM
 
 ROOT = Path(__file__).resolve().parent.parent
 

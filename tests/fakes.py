@@ -11,13 +11,13 @@ from boto3.dynamodb.types import TypeSerializer
 from botocore.exceptions import ClientError
 
 from functions.shared.tables import Tables
+from iort_contract.catalog.vesc import VESC_STREAM
 from iort_contract.checks import json_object
 from iort_contract.codec.seconds import flat_second
 from iort_contract.dynamodb import plain
 from iort_contract.messages.batch import Batch, encode_batch
 from iort_contract.tables import BATCH, EXPIRES_S, RECEIVED_MS, ROBOT, SECOND, TOPIC
 from iort_contract.topics import RECORD, build_topic
-from iort_contract.vesc import VESC_STREAM
 
 serialize = TypeSerializer().serialize
 

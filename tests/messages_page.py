@@ -6,7 +6,7 @@ import json
 import re
 from typing import Any, NamedTuple
 
-from scripts.fields import ROOT
+from scripts.docs_parts import ROOT
 
 PAGE = (ROOT / "docs" / "messages.md").read_text()
 _EXAMPLE = re.compile(r"<!-- example: (\w+) -->\n```json\n(.*?)```\n(.*?)(?=<!-- example|\Z)", re.DOTALL)

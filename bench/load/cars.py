@@ -18,11 +18,11 @@ from typing import Any
 
 from bench.load import camera
 from iort_agent.sources.vehicle import Vehicle, VehicleConfig
+from iort_contract.catalog.vesc import VESC_STREAM
 from iort_contract.cloud import channel
 from iort_contract.limits import Value
 from iort_contract.messages.live import LiveSample, live_update
 from iort_contract.tables import ROBOT
-from iort_contract.vesc import VESC_STREAM
 
 RATE_HZ = 10.0
 # Length of a simulation step; with larger ones the driver swerves.

@@ -8,9 +8,9 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 from bench.load.fleet_load import SAMPLES as BATCH_SAMPLES
+from iort_contract.catalog.vesc import VESC_STREAM
 from iort_contract.messages.batch import batch_id
 from iort_contract.tables import BATCH, RECEIVED_MS, SECOND
-from iort_contract.vesc import VESC_STREAM
 from iort_station.cloud import Cloud
 from iort_station.data.batches import summary_table, topic_of
 from iort_station.operations import delivery

@@ -21,10 +21,10 @@ from awscrt import mqtt5
 from awsiot import mqtt5_client_builder
 
 from iort_agent.sources.vehicle import Vehicle, VehicleConfig
+from iort_contract.catalog.vesc import VESC_STREAM
 from iort_contract.limits import Value
 from iort_contract.messages.batch import Batch, encode_batch
 from iort_contract.topics import record_topic
-from iort_contract.vesc import VESC_STREAM
 
 Columns = dict[str, list[Value]]
 SAMPLES = 50

@@ -22,8 +22,8 @@ from bench.load.fleet_arrivals import Tell, stored, summarized
 from bench.load.fleet_load import SAMPLES as BATCH_SAMPLES
 from bench.load.fleet_load import Load
 from bench.meters import usage
+from iort_contract.catalog.vesc import VESC_STREAM
 from iort_contract.tables import SECOND
-from iort_contract.vesc import VESC_STREAM
 from iort_station.cloud import Cloud
 from iort_station.data.batches import summary_table, topic_of
 from iort_station.fleet import robots

@@ -11,11 +11,11 @@ from boto3.dynamodb.types import TypeSerializer
 
 from bench.target import Target
 from iort_agent.sources.vehicle import Vehicle, VehicleConfig
+from iort_contract.catalog.vesc import VESC_STREAM
 from iort_contract.limits import Value
 from iort_contract.messages.batch import Batch, encode_batch
 from iort_contract.tables import EXPIRES_S, RECEIVED_MS, TOPIC
 from iort_contract.topics import RECORD, build_topic
-from iort_contract.vesc import VESC_STREAM
 
 RATE_HZ = 50
 _KEPT_S = 86_400

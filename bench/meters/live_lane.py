@@ -16,9 +16,9 @@ import yaml
 from bench.floors.mosquitto import HOST, Mosquitto
 from bench.meters.watcher import listening, live_us
 from bench.ros.graph import RosGraph
+from iort_contract.catalog.vesc import VESC_STREAM
 from iort_contract.limits import LIVE_MAX_RATE_HZ
 from iort_contract.topics import LIVE, build_topic, live_topic
-from iort_contract.vesc import VESC_STREAM
 from local.figures import Spread
 
 TOPIC = "/sensors/core"

@@ -18,9 +18,10 @@ from iort_agent.lanes.pings import Pings
 from iort_agent.mqtt.aws import IotCore
 from iort_agent.mqtt.dispatch import Dispatcher
 from iort_agent.rate_limiter import Allowance
+from iort_contract.catalog.streams import RTT_FIELDS
 from iort_contract.limits import Value
 from iort_contract.messages.live import encode_ping
-from iort_contract.topics import BROKER, PING, PONG, RTT_FIELDS, build_topic
+from iort_contract.topics import BROKER, PING, PONG, build_topic
 from iort_station.fleet.robots import Bundle
 
 RAW = "raw client"

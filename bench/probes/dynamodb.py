@@ -6,10 +6,10 @@ import uuid
 from concurrent.futures import ThreadPoolExecutor
 
 from bench.probes.probe_fixture import AbilityMissingError, ProbeFixture, equal, until
+from iort_contract.catalog.vesc import VESC_STREAM
 from iort_contract.messages.batch import batches_between
 from iort_contract.tables import BATCH
 from iort_contract.topics import build_topic
-from iort_contract.vesc import VESC_STREAM
 from iort_station.operations import delivery
 
 WRITERS = 8

@@ -9,9 +9,9 @@ from contextlib import ExitStack
 
 from bench.floors.raw_mqtt import RawClient
 from bench.probes.probe_fixture import AbilityMissingError, ProbeFixture, equal, until
+from iort_contract.catalog.vesc import VESC_STREAM
 from iort_contract.tables import RECEIVED_MS
 from iort_contract.topics import BROKER, CMD, FLEET, LAMBDA, PING, RULE, SHADOW, record_topic
-from iort_contract.vesc import VESC_STREAM
 from iort_station.operations import quarantine
 
 CLIENTS = 20

@@ -16,10 +16,10 @@ from bench.errors import BenchError
 from bench.floors.raw_mqtt import RawClient
 from bench.target import Target
 from bench.temporary_function import temporary_function
+from iort_contract.catalog.vesc import VESC_STREAM
 from iort_contract.messages.batch import Batch, encode_batch
 from iort_contract.messages.live import LiveSample, encode_live, encode_ping
 from iort_contract.topics import LIVE, PING, PONG, build_topic, record_topic
-from iort_contract.vesc import VESC_STREAM
 from iort_station.operations import delivery
 
 WAIT_S = 30.0

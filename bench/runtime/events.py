@@ -10,13 +10,13 @@ from typing import Any
 
 from boto3.dynamodb.types import TypeSerializer
 
+from iort_contract.catalog.vesc import VESC_STREAM
 from iort_contract.messages.batch import Batch, encode_batch
 from iort_contract.messages.event import rule_event
 from iort_contract.messages.files import File, FileRequest, encode_file_request
 from iort_contract.messages.live import LiveSample, encode_live, encode_ping
 from iort_contract.tables import BATCH, PUT_OFF, RECEIVED_MS, ROBOT_PARAMETER, SERIAL_PARAMETER, TOPIC
 from iort_contract.topics import FILE, LAMBDA, LIVE, PING, RECORD, build_topic
-from iort_contract.vesc import VESC_STREAM
 
 ROBOT = "car"
 

@@ -16,8 +16,8 @@ from bench.report import plots
 from bench.report.result import Plot, Ratio, Section, Table
 from bench.report.spread import spread
 from bench.target import Say, Target
+from iort_contract.catalog.vesc import VESC_STREAM
 from iort_contract.page import PUBNUB_ORIGIN
-from iort_contract.vesc import VESC_STREAM
 from iort_station.operations import audit, trace
 from iort_station.page import keys
 from iort_station.page.listener import Listener

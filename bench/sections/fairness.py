@@ -17,10 +17,10 @@ from bench.load.worst_case import worst_batches
 from bench.report.result import Ratio, Section, Table
 from bench.report.spread import Spread, spread
 from bench.target import Say, Target
+from iort_contract.catalog.vesc import VESC_STREAM
 from iort_contract.messages.live import LiveSample, encode_live
 from iort_contract.tables import SECOND
 from iort_contract.topics import LIVE, build_topic, record_topic
-from iort_contract.vesc import VESC_STREAM
 from iort_station.data.batches import summary_table, topic_of
 
 # AWS IoT accepts this many publishes a second from a connection.

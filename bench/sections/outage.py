@@ -20,10 +20,10 @@ from bench.report.result import Plot, Ratio, Section, Table
 from bench.report.spread import spread
 from bench.target import Say, Target
 from iort_agent.config.file import load_config
+from iort_contract.catalog.streams import OWN_STREAMS
+from iort_contract.catalog.vesc import VESC_STREAM
 from iort_contract.messages.batch import batch_id
 from iort_contract.tables import BATCH
-from iort_contract.topics import OWN_STREAMS
-from iort_contract.vesc import VESC_STREAM
 from iort_station.fleet import robots
 from iort_station.fleet.robots import Bundle
 from iort_station.operations import audit, delivery

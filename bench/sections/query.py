@@ -24,9 +24,9 @@ from bench.report import plots, thesis
 from bench.report.result import NOT_MEASURED, Plot, Ratio, Section, Table
 from bench.report.spread import ratio, spread
 from bench.target import Say, Target
+from iort_contract.catalog.vesc import VESC_STREAM
 from iort_contract.tables import RECEIVED_MS, TOPIC
 from iort_contract.topics import RECORD, build_topic
-from iort_contract.vesc import VESC_STREAM
 from iort_station import data
 from iort_station.operations import delivery
 

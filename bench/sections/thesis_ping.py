@@ -19,9 +19,9 @@ from bench.report.result import NOT_MEASURED, Plot, Ratio, Section, Table
 from bench.report.spread import ratio, spread
 from bench.report.thesis import PING_MS, SOURCE
 from bench.target import Say, Target
+from iort_contract.catalog.vesc import VESC_STREAM
 from iort_contract.tables import T_US
 from iort_contract.topics import BROKER, PING_PATHS
-from iort_contract.vesc import VESC_STREAM
 from iort_station.fleet.robots import Bundle
 from iort_station.page import keys
 from iort_station.page.listener import Listener

@@ -27,11 +27,11 @@ from bench.report.spread import spread
 from bench.target import Say, Target
 from bench.temporary_function import temporary_function
 from iort_agent.sources.vehicle import Vehicle, VehicleConfig
+from iort_contract.catalog.vesc import VESC_STREAM
 from iort_contract.messages.event import rule_event
 from iort_contract.messages.live import LiveSample, encode_live
 from iort_contract.tables import BATCH, REPLAY, TOPIC
 from iort_contract.topics import LIVE, build_topic
-from iort_contract.vesc import VESC_STREAM
 from iort_station.operations import delivery
 
 SIZES_MB = (128, 256, 512, 1024, 1769)

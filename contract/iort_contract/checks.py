@@ -21,7 +21,7 @@ from iort_contract.limits import (
 from iort_contract.tables import NONFINITE
 
 # A ROS field name, or a path of them; a number in a path is an array's index.
-_FIELD_NAME = re.compile(r"[A-Za-z][A-Za-z0-9_]*(\.[A-Za-z0-9_]+)*")
+FIELD_NAME = re.compile(r"[A-Za-z][A-Za-z0-9_]*(\.[A-Za-z0-9_]+)*")
 
 
 def checked(pattern: re.Pattern[str], name: object, what: str, allowed: str) -> str:
@@ -93,7 +93,7 @@ def check_field(name: str) -> str:
         raise ContractError(
             f"field name must be at most {MAX_FIELD_CHARACTERS} characters, got {shown(name)}"
         )
-    return checked(_FIELD_NAME, name, "field name", "a ROS field name or a dotted path of them")
+    return checked(FIELD_NAME, name, "field name", "a ROS field name or a dotted path of them")
 
 
 def _is_text(value: str) -> bool:

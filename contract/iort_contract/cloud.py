@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from iort_contract.catalog.vesc import FAULT_FIELD, VOLTAGE_FIELD
 from iort_contract.checks import shown
 from iort_contract.limits import DEFAULT_NAMESPACE, ContractError
 from iort_contract.messages.event import MESSAGE_BASE64
@@ -20,7 +21,6 @@ from iort_contract.topics import (
     check_namespace,
     check_robot,
 )
-from iort_contract.vesc import FAULT_FIELD, VOLTAGE_FIELD
 
 # The broker publishes connects and disconnects here.
 _PRESENCE = "$aws/events/presence"

@@ -75,7 +75,7 @@ class TopicTable:
         attributes: Sequence[str] = (),
         page_items: int | None = None,
         newest_first: bool = False,
-        after: Item | None = None,
+        after: Mapping[str, Any] | None = None,
         scan: bool = False,
     ) -> Iterator[Page]:
         """Pages of a topic's items in the order of their keys; each page is read on demand.
@@ -106,14 +106,15 @@ class TopicTable:
         if newest_first:
             request["ScanIndexForward"] = False
         read = self._client.scan if scan else self._client.query
+        if after is not None:
+            request["ExclusiveStartKey"] = after
         while True:
-            if after is not None:
-                request["ExclusiveStartKey"] = after
             answer = read(**request)
-            after = answer.get("LastEvaluatedKey")
-            yield Page(answer["Items"], after)
-            if after is None:
+            page = Page(answer["Items"], answer.get("LastEvaluatedKey"))
+            yield page
+            if page.after is None:
                 return
+            request["ExclusiveStartKey"] = page.after
 
     def first(self, topic: str, *, newest: bool = False, attributes: Sequence[str] = ()) -> Item | None:
         """The topic's oldest item, or its newest; None if the topic has none."""

@@ -14,6 +14,8 @@ DEFAULT_NAMESPACE = "iort"
 MAX_MESSAGE_BYTES = 127 * 1024
 # PubNub refuses a message above 32 KiB, measured after URL encoding.
 MAX_PUBNUB_BYTES = 32 * 1024
+# The page and `iort watch` show an older value as stale, and a robot unheard of for longer as gone.
+STALE_S, GONE_S = 1.5, 4.5
 # Lambda 1 drops a live message older than this: the dashboard shows the present.
 LIVE_MAX_AGE_MS = 2_000
 # A car sends its clock offset only if it is accurate enough for this check: within a quarter of the age

@@ -5,30 +5,22 @@ from __future__ import annotations
 import math
 from bisect import bisect_left
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
 from operator import sub
 from statistics import mean, median
 from typing import TypeGuard
 
+from iort_contract.catalog.derived import Vehicle, derive
+from iort_contract.catalog.vesc import ABSENT_FROM, absent
 from iort_contract.codec.seconds import Statistics, packed_second
 from iort_contract.limits import Value
 from iort_contract.messages.batch import Batch, BatchId
 from iort_contract.tables import ABSENT, BATCHES, GAPS, MISSING_BATCHES, NONFINITE, SAMPLES
-from iort_contract.vesc import ABSENT_FROM, absent
 
 # A step this many times the median is a gap: one lost sample makes 2; the jitter of a loaded Jetson reached
 # 2.5 on a recorded drive at 50 Hz.
 _HOLE = 3.0
 _SECOND_US = 1_000_000
 _NUMBERS = {int, float}
-
-
-@dataclass(frozen=True)
-class Vehicle:
-    """Parameters that convert a VESC's values to the car's: ``erpm = gain * m/s + offset`` (vesc.yaml)."""
-
-    speed_to_erpm_gain: float
-    speed_to_erpm_offset: float = 0.0
 
 
 def summarize_second(
@@ -39,8 +31,8 @@ def summarize_second(
 
     ``batches`` are those of one stream, in order of time: all with a sample in the second, and the one
     before, which shows gaps and missing batches. The result has ``n``, ``batches``, ``missing_batches``,
-    ``gaps``, ``nonfinite`` and every field, with the derived ``speed_mps`` and ``power_w`` if fields and
-    vehicle allow (`iort_contract.codec.seconds`). ``absent`` counts values of sensors that are not fitted,
+    ``gaps``, ``nonfinite`` and every field, with the derived fields if fields and vehicle allow
+    (`iort_contract.codec.seconds`). ``absent`` counts values of sensors that are not fitted,
     which are null here.
     """
     start_us, end_us = second * _SECOND_US, (second + 1) * _SECOND_US
@@ -123,20 +115,6 @@ def count_holes(times_us: Sequence[int]) -> int:
     return 0 if max(steps) <= limit else sum(step > limit for step in steps)
 
 
-def derive(columns: Mapping[str, Sequence[Value]], vehicle: Vehicle | None) -> dict[str, list[Value]]:
-    """Speed in m/s (needs the vehicle) and electrical power in W, one value per sample."""
-    derived: dict[str, list[Value]] = {}
-    speed = columns.get("speed")
-    if speed is not None and vehicle is not None:
-        gain, offset = vehicle.speed_to_erpm_gain, vehicle.speed_to_erpm_offset
-        derived["speed_mps"] = _finite([None if v is None else (v - offset) / gain for v in _numeric(speed)])
-    volts, amperes = columns.get("voltage_input"), columns.get("current_input")
-    if volts is not None and amperes is not None:
-        pairs = zip(_numeric(volts), _numeric(amperes), strict=True)
-        derived["power_w"] = _finite([None if v is None or a is None else float(v) * a for v, a in pairs])
-    return derived
-
-
 def _statistics(column: Sequence[Value]) -> Statistics:
     """Min, mean, max and last of a numeric column, or one value if all are equal; the last value of any other
     column; None for an empty one."""
@@ -165,15 +143,6 @@ def _mean(numbers: Sequence[int | float]) -> float:
         return math.fsum(numbers) / len(numbers)
     except OverflowError:  # the sum is over 1.8e308, but the mean never is
         return float(mean(numbers))
-
-
-def _numeric(column: Sequence[Value]) -> Sequence[int | float | None]:
-    """The column with None for values that are not numbers."""
-    return column if _are_numbers(column) else [value if _is_number(value) else None for value in column]
-
-
-def _finite(values: Sequence[float | None]) -> list[Value]:
-    return [None if value is None or not math.isfinite(value) else value for value in values]
 
 
 def _are_numbers(column: Sequence[Value]) -> TypeGuard[Sequence[int | float]]:

@@ -8,7 +8,7 @@ from typing import NamedTuple
 from iort_contract.checks import checked, shown
 from iort_contract.limits import DEFAULT_NAMESPACE, ContractError
 
-_NAME = re.compile(r"[A-Za-z0-9_-]{1,64}")
+NAME = re.compile(r"[A-Za-z0-9_-]{1,64}")
 # Rule names allow no dash and must differ between stages, so the namespace is stricter.
 _NAMESPACE = re.compile(r"[a-z][a-z0-9]{0,15}")
 
@@ -18,17 +18,6 @@ BROKER, RULE, LAMBDA = "broker", "rule", "lambda"
 # Another question on the lanes ping and pong: upload addresses of a file.
 FILE = "file"
 PING_PATHS = (BROKER, RULE, LAMBDA)
-# Round trips are a stream like any other: one sample per pong, with None in the other paths' fields.
-RTT_STREAM = "rtt"
-RTT_FIELDS = {path: f"{path}_ms" for path in PING_PATHS}
-# The agent's own figures; the fields are AGENT_FIELDS.
-AGENT_STREAM = "agent"
-# The ROS types of a stream's messages: `MessageType`.
-TYPES_STREAM = "types"
-# The agent's counts of taken, stored and unrecorded samples: contract/iort_contract/messages/account.py.
-ACCOUNT_STREAM = "account"
-# The streams that every robot may have without configuration.
-OWN_STREAMS = frozenset({RTT_STREAM, AGENT_STREAM, TYPES_STREAM, ACCOUNT_STREAM})
 # The named shadow of a robot's thing with the agent's settings.
 SHADOW = "agent"
 # In the shadow: the results of commands that asked for an answer.
@@ -52,12 +41,12 @@ class Topic(NamedTuple):
 
 def check_robot(name: str) -> str:
     """Return ``name`` if it is a valid robot name: thing name, client id and topic level alike."""
-    return checked(_NAME, name, "robot name", "1 to 64 of A-Z a-z 0-9 _ -")
+    return checked(NAME, name, "robot name", "1 to 64 of A-Z a-z 0-9 _ -")
 
 
 def check_stream(name: str) -> str:
     """Return ``name`` if it is a valid stream name, or last level of any topic."""
-    return checked(_NAME, name, "stream name", "1 to 64 of A-Z a-z 0-9 _ -")
+    return checked(NAME, name, "stream name", "1 to 64 of A-Z a-z 0-9 _ -")
 
 
 def check_namespace(name: str) -> str:

@@ -8,8 +8,8 @@ from iort_agent.clock import Clock
 from iort_agent.lanes.batch import StreamCounts
 from iort_agent.sources import Emit
 from iort_agent.spool.memory import Spool
+from iort_contract.catalog.streams import ACCOUNT_STREAM
 from iort_contract.messages.account import ACCOUNT_EVERY_S, SourceAccount, StreamAccount
-from iort_contract.topics import ACCOUNT_STREAM
 
 # Losses are told within a second.
 _LOSS_S = 1.0

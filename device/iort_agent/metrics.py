@@ -16,8 +16,8 @@ from iort_agent.lanes.clock_offset import ClockOffset
 from iort_agent.mqtt.uplink import Uplink
 from iort_agent.schema import flag, number, setting
 from iort_agent.spool.memory import Spool
+from iort_contract.catalog.streams import AGENT_FIELDS
 from iort_contract.limits import Value
-from iort_contract.vesc import AGENT_FIELDS
 
 _STATM = Path("/proc/self/statm")
 

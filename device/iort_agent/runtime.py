@@ -26,7 +26,7 @@ from iort_agent.sources import Emit
 from iort_agent.sources.run import SourceRun
 from iort_agent.spool.memory import Spool
 from iort_agent.streams import Streams
-from iort_contract.topics import AGENT_STREAM, OWN_STREAMS
+from iort_contract.catalog.streams import AGENT_STREAM, OWN_STREAMS
 
 _log = logging.getLogger(__name__)
 

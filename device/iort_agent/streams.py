@@ -11,8 +11,9 @@ from iort_agent.lanes.batch import Batcher, StreamCounts
 from iort_agent.lanes.batch_encoder import Packer
 from iort_agent.lanes.live import LiveLane
 from iort_agent.spool.memory import Spool
+from iort_contract.catalog.streams import TYPES_STREAM
 from iort_contract.limits import Value
-from iort_contract.topics import TYPES_STREAM, check_stream
+from iort_contract.topics import check_stream
 
 _MOST_TYPES = 1024
 

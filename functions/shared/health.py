@@ -6,21 +6,13 @@ from collections.abc import Iterable, Iterator, Mapping, Sequence
 from itertools import chain
 
 from functions.shared.metrics import MOST_VALUES
+from iort_contract.catalog.streams import AGENT_STREAM, RTT_FIELDS, RTT_STREAM
+from iort_contract.catalog.vesc import FAULT_FIELD, TEMPERATURES, VOLTAGE_FIELD, measured_degc
 from iort_contract.messages.batch import Batch
 from iort_contract.statistics import count_holes, numbers_of
-from iort_contract.topics import AGENT_STREAM, PING_PATHS, RTT_FIELDS, RTT_STREAM
-from iort_contract.vesc import FAULT_FIELD, VOLTAGE_FIELD, absent
+from iort_contract.topics import PING_PATHS
 
 Measured = Mapping[str, float | list[float]]
-# The controllers' own temperatures; a driver that does not measure one leaves it at 0.
-_TEMPERATURES = (
-    "temperature_pcb",
-    "temp_fet",
-    "temp_motor",
-    "ntc_temp_mos1",
-    "ntc_temp_mos2",
-    "ntc_temp_mos3",
-)
 
 
 def measure(stream: str, batches: Sequence[Batch]) -> Measured:
@@ -35,17 +27,13 @@ def measure(stream: str, batches: Sequence[Batch]) -> Measured:
         backlog = _numbers(batches, "backlog_batches")
         return {"AgentReports": sum(len(batch.times_us) for batch in batches), "BacklogBatches": backlog[-1:]}
     volts = [value for value in _numbers(batches, VOLTAGE_FIELD) if value > 0]
-    hot = [
-        value
-        for name in _TEMPERATURES
-        for value in _numbers(batches, name)
-        if value and not absent(name, value)
-    ]
+    found = (measured_degc(name, value) for name in TEMPERATURES for value in _numbers(batches, name))
+    degc = [value for value in found if value is not None]
     return {
         "SampleGaps": sum(count_holes(batch.times_us) for batch in batches),
         "FaultSamples": sum(map(bool, _numbers(batches, FAULT_FIELD))),
         "BatteryVolts": [min(volts)] if volts else [],
-        "TemperatureDegC": [max(hot)] if hot else [],
+        "TemperatureDegC": [max(degc)] if degc else [],
     }
 
 

@@ -11,11 +11,11 @@ from typing import Any
 
 from botocore.exceptions import ClientError
 
+from iort_contract.catalog.derived import Vehicle
 from iort_contract.codec.seconds import Statistics
 from iort_contract.dynamodb import SummaryTable, TelemetryTable, plain, starting_between
 from iort_contract.limits import ContractError
 from iort_contract.messages.batch import BatchId, batch_id
-from iort_contract.statistics import Vehicle
 from iort_contract.tables import BATCH, OMITTED, ROBOT, SECOND, STREAMS, TOPIC, VEHICLE_CACHE_S
 
 _log = logging.getLogger(__name__)

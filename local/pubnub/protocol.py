@@ -28,7 +28,7 @@ class Refusal(Exception):  # noqa: N818 - an answer, not a fault
         )
 
 
-async def read(request: web.BaseRequest) -> str:
+async def content(request: web.BaseRequest) -> str:
     """The body of a request, inflated."""
     try:
         body = await request.read()
@@ -47,7 +47,7 @@ async def read(request: web.BaseRequest) -> str:
         raise Refusal(400, "Invalid Encoding") from None
 
 
-def text(quoted: str) -> str:
+def unquoted(quoted: str) -> str:
     """A part of the path, unquoted."""
     try:
         return unquote(quoted, errors="strict")

@@ -10,7 +10,7 @@ from typing import Any
 from typing_extensions import Self
 
 from iort_agent.clock import SystemClock
-from iort_contract.topics import TYPES_STREAM
+from iort_contract.catalog.streams import TYPES_STREAM
 
 
 class Running:

@@ -21,7 +21,7 @@ from iort_agent.spool.file import SpoolFile
 from iort_agent.spool.memory import PROCESS
 from iort_agent.spool.reservation import Reservation
 from iort_agent.spool.sqlite import SqliteSpool
-from iort_contract.vesc import VESC_STREAM
+from iort_contract.catalog.vesc import VESC_STREAM
 from tests.agent_fakes import ManualClock
 from tests.unit.agent.test_agent import config_file
 

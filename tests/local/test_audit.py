@@ -6,10 +6,11 @@ import json
 
 from typer.testing import CliRunner
 
+from iort_contract.catalog.streams import ACCOUNT_STREAM
 from iort_contract.messages.account import SourceAccount, StreamAccount
 from iort_contract.messages.batch import Batch, batch_id, encode_batch
 from iort_contract.tables import BATCH, TOPIC
-from iort_contract.topics import ACCOUNT_STREAM, RECORD, build_topic, record_topic
+from iort_contract.topics import RECORD, build_topic, record_topic
 from iort_station.cli.main import app
 from iort_station.operations import audit
 from tests.local.conftest import run_agent, until

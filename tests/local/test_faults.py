@@ -19,8 +19,8 @@ from pathlib import Path
 
 import pytest
 
+from iort_contract.catalog.streams import AGENT_STREAM
 from iort_contract.limits import LIVE_MAX_AGE_MS
-from iort_contract.topics import AGENT_STREAM
 from iort_station.fleet import robots
 from iort_station.operations import audit, delivery
 from local.cloud import EmbeddedCloud

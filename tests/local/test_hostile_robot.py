@@ -10,10 +10,10 @@ import pytest
 
 from bench.meters.usage import descendants
 from functions.shared.cut_off import BURST
+from iort_contract.catalog.vesc import VESC_STREAM
 from iort_contract.messages.files import decode_file_answer
 from iort_contract.messages.live import LiveSample, encode_live
 from iort_contract.topics import FILE, LIVE, PING, PONG, build_topic, record_topic
-from iort_contract.vesc import VESC_STREAM
 from iort_station.operations import quarantine
 from iort_station.page.listener import Listener
 from tests.local.conftest import until

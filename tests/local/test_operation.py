@@ -15,8 +15,7 @@ from xmlrpc.server import SimpleXMLRPCServer
 import pytest
 
 from iort_agent.verbs.check import OK, Finding, _ros_master
-from iort_contract.topics import AGENT_STREAM
-from iort_contract.vesc import AGENT_FIELDS
+from iort_contract.catalog.streams import AGENT_FIELDS, AGENT_STREAM
 from iort_station.operations import delivery
 from local.cloud import ROOT
 from tests.local.conftest import until

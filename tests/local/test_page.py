@@ -11,7 +11,7 @@ from contextlib import contextmanager, suppress
 from datetime import datetime, timezone
 from pathlib import Path
 
-from iort_contract.vesc import VESC_STREAM
+from iort_contract.catalog.vesc import VESC_STREAM
 from iort_station.cloud import EMBEDDED
 from iort_station.page.answers import answers
 from iort_station.page.listener import Listener

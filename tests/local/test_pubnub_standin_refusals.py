@@ -12,7 +12,6 @@ import pytest
 from pubnub.exceptions import PubNubException
 
 from iort_contract.limits import MAX_PUBNUB_BYTES
-from local.pubnub import standin as server
 from local.pubnub.standin import PubNubStandIn
 from tests.local.pubnub_sdk import WAIT_S, ask, poll, publish
 
@@ -33,22 +32,26 @@ def test_gzip(standin, body, answer):
     assert json.loads(text)[:2] == answer
 
 
-def test_too_many_polls_are_refused(standin, monkeypatch):
-    monkeypatch.setattr(server, "MAX_POLLS", 0)
-    response, _ = ask(standin, "/v2/subscribe/sub/iort.car/0?tt=1")
+def test_too_many_polls_are_refused():
+    with PubNubStandIn(max_polls=0) as standin:
+        response, _ = ask(standin, "/v2/subscribe/sub/iort.car/0?tt=1")
     assert response.status == 429
 
 
-def test_subscriber_that_does_not_read_is_cut_off(monkeypatch):
-    monkeypatch.setattr(server, "WRITE_S", 0.2)
+def test_subscriber_that_does_not_read_is_cut_off():
     cut = threading.Event()
 
     class Watched(PubNubStandIn):
-        def _cut(self, request):
-            super()._cut(request)
-            cut.set()
+        async def handle(self, request):
+            try:
+                return await super().handle(request)
+            finally:
+                # The first poll, from 0, is a client that closes its connection itself.
+                gone = request.transport is None or request.transport.is_closing()
+                if gone and request.query.get("tt", "0") != "0":
+                    cut.set()
 
-    with Watched() as standin, socket.socket() as slow:
+    with Watched(write_s=0.2) as standin, socket.socket() as slow:
         token, _ = poll(standin, "iort.car", 0)
         publisher = http.client.HTTPConnection(standin.host, standin.port, timeout=WAIT_S)
         for _ in range(100):

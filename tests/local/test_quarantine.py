@@ -9,10 +9,10 @@ import time
 import pytest
 from typer.testing import CliRunner
 
+from iort_contract.catalog.vesc import VESC_STREAM
 from iort_contract.messages.batch import Batch, encode_batch
 from iort_contract.tables import BY_FUNCTION, BY_STREAM, ENTRY, SAMPLES
 from iort_contract.topics import FILE, LAMBDA, LIVE, PING, build_topic, record_topic, rule_name
-from iort_contract.vesc import VESC_STREAM
 from iort_station.cli.main import app
 from iort_station.cloud import EMBEDDED
 from iort_station.data.batches import summary_table, topic_of
@@ -169,7 +169,7 @@ def test_errors_are_listed_and_shown(bundle, iort, entry_of):
     assert "\x1b[2J" not in shown.stdout
     as_json = json.loads(iort("errors", entry.id, "--json").stdout)
     assert base64.b64decode(as_json["payload_base64"]) == entry.payload
-    assert "nothing in quarantine has the id" in str(iort("errors", "0" * 16).exception)
+    assert "no dead letter has the id" in str(iort("errors", "0" * 16).exception)
 
 
 def test_a_throttled_batch_is_put_back_once_and_only_then_deleted(embedded, bundle, iort, entry_of):

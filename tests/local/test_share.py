@@ -9,10 +9,10 @@ import time
 import pytest
 
 from bench.load.worst_case import worst_batches
+from iort_contract.catalog.vesc import VESC_STREAM
 from iort_contract.messages.batch import Batch, encode_batch
 from iort_contract.tables import OVER_SHARE, SECOND
 from iort_contract.topics import record_topic
-from iort_contract.vesc import VESC_STREAM
 from iort_station.data.batches import summary_table, topic_of
 from iort_station.fleet import shadow
 from iort_station.operations import delivery

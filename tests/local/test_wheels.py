@@ -9,7 +9,7 @@ from urllib.request import urlopen
 import pytest
 import yaml
 
-from iort_contract.vesc import VESC_STREAM
+from iort_contract.catalog.vesc import VESC_STREAM
 from iort_station.cloud import EMBEDDED
 from local.cloud import EmbeddedCloud
 from scripts import wheels

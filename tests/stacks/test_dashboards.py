@@ -9,10 +9,11 @@ import re
 import pytest
 
 from functions.shared.health import measure
+from iort_contract.catalog.streams import AGENT_STREAM, RTT_STREAM
 from iort_contract.cloud import METRIC_NAMESPACE, METRICS
 from iort_contract.limits import DEFAULT_NAMESPACE
 from iort_contract.messages.batch import Batch
-from iort_contract.topics import AGENT_STREAM, RTT_STREAM, RULES, rule_name
+from iort_contract.topics import RULES, rule_name
 from iort_station.cost.fixed_costs import (
     FREE_DASHBOARD_METRICS,
     FREE_DASHBOARDS,

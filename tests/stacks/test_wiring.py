@@ -14,6 +14,7 @@ from pathlib import Path
 import pytest
 from aws_cdk import App, Stack
 
+from iort_contract.catalog.vesc import VESC_FIELDS, VESC_STREAM
 from iort_contract.cloud import pubnub_parameter
 from iort_contract.limits import DEFAULT_NAMESPACE
 from iort_contract.topics import (
@@ -33,7 +34,6 @@ from iort_contract.topics import (
     record_topic,
     rule_name,
 )
-from iort_contract.vesc import VESC_FIELDS, VESC_STREAM
 from stacks.encryption import Encryption
 from stacks.function import function
 from stacks.settings import ROOT, Settings, SettingsError

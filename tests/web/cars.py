@@ -7,10 +7,11 @@ import json
 import time
 from typing import TYPE_CHECKING, Any
 
+from iort_contract.catalog.derived import F1TENTH
+from iort_contract.catalog.vesc import VESC_STREAM
 from iort_contract.cloud import channel as pubnub_channel
 from iort_contract.limits import Value
 from iort_contract.messages.live import LiveSample, live_update
-from iort_contract.vesc import VESC_STREAM
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
@@ -18,7 +19,7 @@ if TYPE_CHECKING:
     from local.pubnub.standin import PubNubStandIn
 
 PUBLISH_KEY, SUBSCRIBE_KEY = "pub-local", "sub-local"
-GAIN = 4614.0
+GAIN = F1TENTH.speed_to_erpm_gain
 SAMPLE: dict[str, Value] = {
     "voltage_input": 11.65,
     "temperature_pcb": 29.9,

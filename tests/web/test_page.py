@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any, Literal
 
 import pytest
 
+from iort_contract.catalog.vesc import TEMPERATURES
 from iort_contract.limits import Value
 from iort_station.page.server import PageServer
 from local.pubnub.standin import PubNubStandIn
@@ -53,6 +54,14 @@ def test_values_shown_are_values_sent(page: Page, car: Car) -> None:
     readings = {"speed": expected["speed_mps"], "current_input": "-5.27", "duty_cycle": "-12.7"}
     for name, text in readings.items():
         assert plain(page.inner_text(f"[data-reading='{name}']")) == text
+
+
+def test_the_hottest_is_of_all_the_temperatures_that_the_alarm_counts(page: Page, car: Car) -> None:
+    for hot in TEMPERATURES:
+        show(page, car.send({**dict.fromkeys(TEMPERATURES, 0), "temperature_pcb": -4.5, hot: 81.5}))
+        assert shown(page, "temperature") == "81.5"
+    show(page, car.send({**dict.fromkeys(TEMPERATURES, 0), "temperature_pcb": -4.5}))
+    assert shown(page, "temperature") == "-4.5"
 
 
 def test_charge_and_energy_have_the_unit_of_the_driver_that_sent_them(page: Page, car: Car) -> None:

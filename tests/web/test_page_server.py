@@ -6,6 +6,7 @@ import gzip
 import http.client
 import json
 import socket
+import threading
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -13,9 +14,8 @@ from urllib.parse import urlsplit
 
 import pytest
 
-from iort_contract.vesc import DERIVED_UNITS, FAULTS, VESC_FIELDS
 from iort_station.errors import StationError
-from iort_station.page.page import BUILT, config, field_table
+from iort_station.page.page import BUILT, config
 from iort_station.page.server import PageServer
 
 TOLD: dict[str, Any] = {
@@ -58,7 +58,6 @@ def ask(
         ("/page.js", "text/javascript; charset=utf-8"),
         ("/style.css", "text/css; charset=utf-8"),
         ("/config.json", "application/json"),
-        ("/fields.json", "application/json"),
     ],
 )
 def test_files_come_with_their_type_and_the_policy(built: Path, path: str, kind: str) -> None:
@@ -100,9 +99,41 @@ def test_nothing_else_is_served(built: Path, path: str) -> None:
     assert "default-src 'none'" in answer.headers["Content-Security-Policy"]
 
 
+def test_a_file_that_the_browser_has_is_not_sent_again(built: Path) -> None:
+    with PageServer(**TOLD, built=built) as page:
+        etag = ask(page, "/page.js")[0].headers["ETag"]
+        again, body = ask(page, "/page.js", headers={"If-None-Match": etag, "Accept-Encoding": "gzip"})
+        other, _ = ask(page, "/style.css", headers={"If-None-Match": etag})
+    assert (again.status, again.headers["ETag"], body) == (304, etag, b"")
+    assert "default-src 'none'" in again.headers["Content-Security-Policy"]
+    assert other.status == 200
+
+
+def test_a_slow_answer_delays_neither_a_file_nor_the_end(built: Path) -> None:
+    asked, done = threading.Event(), threading.Event()
+
+    def slow(_asked: Mapping[str, str]) -> dict[str, Any]:
+        asked.set()
+        done.wait()
+        return {}
+
+    try:
+        with (
+            PageServer(**TOLD, built=built, answers={"slow": slow}) as page,
+            socket.create_connection((page.host, page.port)) as waiting,
+        ):
+            waiting.sendall(b"GET /slow.json HTTP/1.1\r\nHost: localhost\r\n\r\n")
+            assert asked.wait(60)
+            assert ask(page, "/page.js")[0].status == 200
+            page.stop()
+            assert waiting.recv(1) == b""
+    finally:
+        done.set()
+
+
 def test_it_takes_no_other_method(built: Path) -> None:
     with PageServer(**TOLD, built=built) as page:
-        assert ask(page, "/", "POST")[0].status == 501
+        assert ask(page, "/", "POST")[0].status == 405
 
 
 def test_the_page_is_told_where_to_listen_and_nothing_more(built: Path) -> None:
@@ -118,15 +149,6 @@ def test_an_answer_with_numbers_that_json_does_not_have_comes_with_null(built: P
         answer, body = ask(page, "/history.json")
     assert answer.status == 200
     assert json.loads(body) == {"mean": [1.5, None, None], "of": {"x": None}, "n": 3}
-
-
-def test_the_page_reads_the_contracts_fields(built: Path) -> None:
-    with PageServer(**TOLD, built=built) as page:
-        table = json.loads(ask(page, "/fields.json")[1])
-    assert table == field_table()
-    assert table["fields"].keys() >= VESC_FIELDS.keys() | DERIVED_UNITS.keys()
-    assert table["fields"]["speed"]["unit"] == "erpm"
-    assert table["faults"]["5"] == FAULTS[5]
 
 
 @pytest.mark.parametrize(
@@ -198,7 +220,7 @@ def test_it_serves_ipv6(built: Path) -> None:
 
 @pytest.mark.parametrize(
     "path",
-    ["/", "/page.js", "/config.json", "/fields.json", "/double.json?n=1", "/no", "http://elsewhere/page.js"],
+    ["/", "/page.js", "/config.json", "/double.json?n=1", "/no", "http://elsewhere/page.js"],
 )
 @pytest.mark.parametrize("host", ["127.0.0.1", "0.0.0.0"])
 def test_no_path_answers_to_somebody_elses_name(built: Path, path: str, host: str) -> None:

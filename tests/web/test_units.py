@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 
 import pytest
 
-from iort_contract.vesc import VESC_STREAM
+from iort_contract.catalog.vesc import VESC_STREAM
 from iort_station.page.server import PageServer
 from local.deployment import ROOT
 from tests.browser import drawn, plain, show, shown, until

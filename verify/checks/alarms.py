@@ -9,9 +9,9 @@ from datetime import datetime, timedelta, timezone
 from typing import Any
 
 from bench.target import Target
+from iort_contract.catalog.vesc import FAULT_FIELD, VESC_STREAM
 from iort_contract.messages.live import LiveSample, encode_live
 from iort_contract.topics import LIVE, build_topic
-from iort_contract.vesc import FAULT_FIELD, VESC_STREAM
 from verify.assumption import Basis
 from verify.check import WITH_KEY, Check
 from verify.errors import VerifyError

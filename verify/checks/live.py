@@ -11,12 +11,12 @@ from itertools import count
 from typing import Any
 
 from bench.target import Target
+from iort_contract.catalog.vesc import VESC_STREAM
 from iort_contract.cloud import pubnub_parameter
 from iort_contract.limits import DEFAULT_NAMESPACE
 from iort_contract.messages.live import LiveSample, encode_live
 from iort_contract.tables import RECEIVED_MS
 from iort_contract.topics import live_topic
-from iort_contract.vesc import VESC_STREAM
 from iort_station.cloud import Cloud
 from iort_station.errors import StationError
 from iort_station.page import keys

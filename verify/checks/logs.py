@@ -10,10 +10,10 @@ from typing import Any
 from bench.meters.invocations import configure
 from bench.target import Target
 from bench.temporary_function import temporary_function
+from iort_contract.catalog.vesc import VESC_STREAM
 from iort_contract.cloud import METRIC_DEPLOYMENT, METRIC_FUNCTION, METRIC_NAMESPACE
 from iort_contract.messages.batch import Batch, encode_batch
 from iort_contract.topics import record_topic
-from iort_contract.vesc import VESC_STREAM
 from verify.assumption import Basis
 from verify.check import Check
 from verify.errors import VerifyError

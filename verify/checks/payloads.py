@@ -6,11 +6,11 @@ import json
 from typing import Any
 
 from bench.target import Target
+from iort_contract.catalog.vesc import VESC_STREAM
 from iort_contract.limits import MAX_MESSAGE_BYTES
 from iort_contract.messages.live import encode_ping
 from iort_contract.tables import TOPIC
 from iort_contract.topics import FLEET, LIVE, PING, PONG, RECORD, RULE, build_topic, live_topic, record_topic
-from iort_contract.vesc import VESC_STREAM
 from iort_station.operations import quarantine
 from iort_station.operations.quarantine import DeadLetter
 from verify.assumption import Basis

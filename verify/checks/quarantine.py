@@ -8,10 +8,10 @@ import time
 from typing import Any
 
 from bench.target import Target
+from iort_contract.catalog.vesc import VESC_STREAM
 from iort_contract.messages.batch import Batch, batch_id, encode_batch
 from iort_contract.tables import BATCH
 from iort_contract.topics import RECORD, build_topic, record_topic, rule_name
-from iort_contract.vesc import VESC_STREAM
 from iort_station.operations import delivery, quarantine
 from iort_station.operations.quarantine import DeadLetter
 from iort_station.operations.replay import replay

@@ -11,12 +11,12 @@ from collections.abc import Callable, Mapping
 from typing import Any
 
 from bench.target import Target
+from iort_contract.catalog.vesc import FAULT_FIELD, VESC_STREAM, VOLTAGE_FIELD
 from iort_contract.messages.batch import Batch, encode_batch
 from iort_contract.messages.files import File, FileRequest, encode_file_request, file_key
 from iort_contract.messages.live import LiveSample, encode_live, encode_ping
 from iort_contract.tables import AGENT_VERSION, ALERT_PREFIX, EXPIRES_S, RECEIVED_MS, TOPIC
 from iort_contract.topics import FILE, LAMBDA, LIVE, RECORD, RULE, SHADOW, build_topic
-from iort_contract.vesc import FAULT_FIELD, VESC_STREAM, VOLTAGE_FIELD
 from iort_station.fleet import registry
 from verify.assumption import Basis
 from verify.bundles import listener, pair_of

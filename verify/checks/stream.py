@@ -10,10 +10,10 @@ from typing import Any
 
 from bench.target import Target
 from bench.temporary_function import temporary_function
+from iort_contract.catalog.vesc import VESC_STREAM
 from iort_contract.messages.batch import Batch, batch_id, encode_batch
 from iort_contract.tables import BATCH
 from iort_contract.topics import RECORD, build_topic, record_topic
-from iort_contract.vesc import VESC_STREAM
 from iort_station.operations import quarantine
 from iort_station.operations.replay import replay
 from verify.assumption import Basis

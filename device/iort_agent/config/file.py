@@ -28,8 +28,9 @@ from iort_agent.schema import (
 from iort_agent.sources import SourceConfig
 from iort_agent.sources.registry import SOURCES, uploads_large
 from iort_agent.spool.config import QueueConfig
+from iort_contract.catalog.streams import OWN_STREAMS
 from iort_contract.limits import DEFAULT_NAMESPACE
-from iort_contract.topics import OWN_STREAMS, check_namespace, check_robot
+from iort_contract.topics import check_namespace, check_robot
 
 
 @dataclass(frozen=True)

@@ -29,6 +29,7 @@ from iort_agent.clock import Clock
 from iort_agent.errors import UplinkError
 from iort_agent.mqtt.uplink import Uplink
 from iort_agent.rate_limiter import LIVE, URGENT, Allowance
+from iort_contract.catalog.vesc import FAULT_FIELD
 from iort_contract.limits import (
     LIVE_BROKER_EVERY_S,
     LIVE_MAX_AGE_MS,
@@ -40,7 +41,6 @@ from iort_contract.limits import (
 from iort_contract.messages.live import LiveSample, encode_live
 from iort_contract.topics import LIVE as LIVE_LANE
 from iort_contract.topics import build_topic, live_topic
-from iort_contract.vesc import FAULT_FIELD
 
 _log = logging.getLogger(__name__)
 _FASTEST_S = 1 / LIVE_MAX_RATE_HZ

@@ -11,9 +11,10 @@ from iort_agent.errors import UplinkError
 from iort_agent.mqtt.uplink import Message, Uplink
 from iort_agent.rate_limiter import STEADY, Allowance
 from iort_agent.sources import Emit
+from iort_contract.catalog.streams import RTT_FIELDS, RTT_STREAM
 from iort_contract.limits import ContractError, Value
 from iort_contract.messages.live import decode_pong, encode_ping
-from iort_contract.topics import BROKER, PING, PONG, RTT_FIELDS, RTT_STREAM, RULE, build_topic, parse_topic
+from iort_contract.topics import BROKER, PING, PONG, RULE, build_topic, parse_topic
 
 TIMEOUT_S = 10.0
 # Where round trips through a rule are not measured, a ping now and then still finds the clock's offset,

@@ -18,13 +18,14 @@ from iort_agent.ros1.node import ANY_TYPE, DEFAULT_NODE, Node, definition_of, sh
 from iort_agent.schema import Where, choice, items, pairs, section, setting, text
 from iort_agent.sources import REFUSE, UPLOAD, Emit
 from iort_agent.throttled_log import Seldom
+from iort_contract.catalog.streams import TYPES_STREAM
 from iort_contract.limits import ContractError, MessageError, Value
 from iort_contract.messages.message_type import MessageType
 from iort_contract.ros1.decode import HEADER as HEADER_STRUCT
 from iort_contract.ros1.decode import Decoder
 from iort_contract.ros1.definition import parse
 from iort_contract.ros1.message import RosMessage, RosType
-from iort_contract.topics import TYPES_STREAM, check_stream
+from iort_contract.topics import check_stream
 
 _log = logging.getLogger(__name__)
 

@@ -11,8 +11,8 @@ from iort_agent.clock import Clock, Pace
 from iort_agent.schema import number, section, setting, text
 from iort_agent.sources import Emit
 from iort_agent.sources.vehicle import Vehicle, VehicleConfig
+from iort_contract.catalog.vesc import VESC_STREAM
 from iort_contract.topics import check_stream
-from iort_contract.vesc import VESC_STREAM
 
 _MAX_STEP_S = 0.02
 

@@ -11,6 +11,7 @@ import random
 from dataclasses import dataclass
 
 from iort_agent.schema import number, setting
+from iort_contract.catalog.derived import F1TENTH
 from iort_contract.limits import Value
 
 _G = 9.81
@@ -30,7 +31,7 @@ class VehicleConfig:
     mass_kg: float = setting(number(0.1, 5000, unit="kg"), 3.7)
     drag_area_m2: float = setting(number(0, 5, unit="m2, drag coefficient times area"), 0.03)
     rolling_resistance: float = setting(number(0, 0.5), 0.03)
-    speed_to_erpm_gain: float = setting(number(1, 1e6, unit="erpm per m/s"), 4614.0)
+    speed_to_erpm_gain: float = setting(number(1, 1e6, unit="erpm per m/s"), F1TENTH.speed_to_erpm_gain)
     pole_pairs: int = setting(number(1, 50, whole=True), 2)
     motor_kv: float = setting(number(1, 20_000, unit="rpm/V"), 3500.0)
     motor_resistance_ohm: float = setting(number(0.0001, 10, unit="ohm"), 0.03)

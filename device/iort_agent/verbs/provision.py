@@ -25,10 +25,10 @@ from iort_agent.identity.pending import Pending, forget, keep, kept
 from iort_agent.mqtt.exchange import Exchange
 from iort_agent.private_files import write_below
 from iort_agent.status.server import ask
+from iort_contract.catalog.vesc import VESC_STREAM
 from iort_contract.limits import ContractError
 from iort_contract.tables import ROBOT_PARAMETER, SERIAL_PARAMETER
 from iort_contract.topics import check_robot
-from iort_contract.vesc import VESC_STREAM
 
 _log = logging.getLogger(__name__)
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import sys
+from importlib import import_module
 from importlib.metadata import version
 from pathlib import Path
 from typing import Annotated, NoReturn
@@ -11,46 +12,15 @@ import typer
 from botocore.exceptions import BotoCoreError, ClientError
 
 from iort_contract.limits import DEFAULT_NAMESPACE
+from iort_station.cli import verbs
 from iort_station.cli.console import visible
-from iort_station.cli.verbs import (
-    adopt,
-    audit,
-    config,
-    cost,
-    dashboard,
-    errors,
-    export,
-    files,
-    plot,
-    pubnub,
-    query,
-    robots,
-    send,
-    site,
-    trace,
-    watch,
-)
 from iort_station.cli.where import Where
 from iort_station.cloud import EMBEDDED, EMBEDDED_VARIABLE
 from iort_station.errors import StationError
 
 app = typer.Typer(no_args_is_help=True, add_completion=True, help="The operator's station of iort.")
-app.add_typer(robots.commands, name="robots")
-app.add_typer(files.commands, name="files")
-app.add_typer(pubnub.commands)
-app.add_typer(dashboard.commands)
-app.add_typer(cost.commands)
-app.add_typer(audit.commands)
-app.add_typer(query.commands)
-app.add_typer(export.commands)
-app.add_typer(plot.commands)
-app.add_typer(trace.commands)
-app.add_typer(watch.commands)
-app.add_typer(site.commands)
-app.add_typer(errors.commands)
-app.add_typer(adopt.commands)
-app.add_typer(send.commands)
-app.add_typer(config.commands)
+for _name in verbs.COMMANDS:
+    app.add_typer(import_module(f"{verbs.__name__}.{_name}").commands)
 
 
 def _print_version(asked: bool) -> None:  # noqa: FBT001 - typer passes it by position

@@ -13,9 +13,9 @@ from typing import Any, NamedTuple, TypeAlias
 import numpy as np
 from numpy.typing import NDArray
 
+from iort_contract.catalog.vesc import VESC_FIELDS
 from iort_contract.codec.columns import EXACT
 from iort_contract.limits import Value
-from iort_contract.vesc import VESC_FIELDS
 
 Column: TypeAlias = NDArray[Any]
 # A mean of codes or ids says nothing; the highest hides no fault.

@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from iort_contract import expression
+from iort_contract.catalog.derived import SOURCES, Vehicle, calculable
 from iort_contract.expression import (
     ARITHMETIC,
     COMPARISONS,
@@ -23,7 +24,6 @@ from iort_contract.expression import (
     Node,
     Some,
 )
-from iort_contract.statistics import Vehicle
 from iort_station.data.blocks import Column, values
 from iort_station.errors import StationError
 
@@ -49,22 +49,15 @@ def holds(node: Node, columns: Columns, n: int) -> NDArray[np.bool_]:
 
 
 def derive(columns: Columns, vehicle: Vehicle | None) -> dict[str, Column]:
-    """The derived fields, as `iort_contract.statistics.derive` computes them from lists."""
-    derived: dict[str, Column] = {}
-    speed = _numbers(columns.get("speed"))
+    """The derived fields, as `iort_contract.catalog.derived.derive` computes them from lists."""
+    numbers = {name: column for name, column in columns.items() if column.dtype.kind == "f"}
     with np.errstate(all="ignore"):
-        if speed is not None and vehicle is not None:
-            derived["speed_mps"] = _finite(
-                (speed - vehicle.speed_to_erpm_offset) / vehicle.speed_to_erpm_gain
+        return {
+            entry.name: _finite(
+                entry.formula(**{name: numbers[name] for name in SOURCES[entry.name]}, **parameters)
             )
-        volts, amperes = _numbers(columns.get("voltage_input")), _numbers(columns.get("current_input"))
-        if volts is not None and amperes is not None:
-            derived["power_w"] = _finite(volts * amperes)
-    return derived
-
-
-def _numbers(column: Column | None) -> Column | None:
-    return column if column is not None and column.dtype.kind == "f" else None
+            for entry, parameters in calculable(numbers, vehicle)
+        }
 
 
 def _finite(column: Column) -> Column:

@@ -7,17 +7,17 @@ from collections.abc import Set as AbstractSet
 from contextlib import suppress
 from dataclasses import replace
 
+from iort_contract.catalog.derived import PARAMETERS, SOURCES, Vehicle
+from iort_contract.catalog.streams import ACCOUNT_STREAM, OWN_STREAMS, TYPES_STREAM
+from iort_contract.catalog.vesc import VESC_STREAM
 from iort_contract.limits import ContractError
 from iort_contract.messages.batch import batch_id
 from iort_contract.messages.message_type import MessageType, message_type
-from iort_contract.statistics import Vehicle
 from iort_contract.tables import BATCH, ROBOT, STREAMS
-from iort_contract.topics import ACCOUNT_STREAM, OWN_STREAMS, TYPES_STREAM
-from iort_contract.vesc import VESC_STREAM
 from iort_station.cloud import Cloud
 from iort_station.data.batches import RefusedItems, blocks, stored, telemetry_table, topic_of
 from iort_station.data.blocks import Block, values
-from iort_station.data.selection import MADE_OF, Selection
+from iort_station.data.selection import Selection
 from iort_station.data.units import VESC_KIND
 from iort_station.errors import StationError
 from iort_station.fleet import registry
@@ -59,11 +59,15 @@ def unknown_fields(cloud: Cloud, selection: Selection, there: AbstractSet[str]) 
     """The error for a selection that names a field other than those ``there``, naming the known ones."""
     unknown = sorted(selection.named() - there)
     stored_fields = _fields(cloud, selection)
-    possible = stored_fields | {name for name, parts in MADE_OF.items() if stored_fields.issuperset(parts)}
-    if "speed_mps" in possible.intersection(unknown):
-        return StationError(
-            f"speed_mps needs the speed_to_erpm_gain of {selection.robot}, which the registry lacks"
-        )
+    possible = stored_fields | {
+        name for name, sources in SOURCES.items() if stored_fields.issuperset(sources)
+    }
+    for name in unknown:
+        if name in possible and PARAMETERS[name]:
+            parameter = PARAMETERS[name][0]
+            return StationError(
+                f"{name} needs the {parameter} of {selection.robot}, which the registry lacks"
+            )
     return StationError(
         f"{selection.robot} has no {', '.join(unknown)} in {selection.stream} in this range; "
         f"it has {', '.join(sorted(possible))}"

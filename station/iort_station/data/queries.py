@@ -11,9 +11,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from iort_contract.catalog.derived import DERIVED
+from iort_contract.catalog.vesc import ABSENT_FROM, VESC_FIELDS, absent
 from iort_contract.messages.message_type import MessageType
 from iort_contract.tables import STATS
-from iort_contract.vesc import ABSENT_FROM, DERIVED_UNITS, VESC_FIELDS, absent
 from iort_station.cloud import Cloud
 from iort_station.data import inventory, query_function
 from iort_station.data.batches import PageProgress, RefusedItems, blocks, stored
@@ -151,7 +152,7 @@ def samples(
     pages = stored(cloud, selection, scan=scan, progress=progress)
     found = blocks(pages, refused or RefusedItems(), selection.needs, messages=messages)
     named = selection.named()
-    derived = sorted(named & DERIVED_UNITS.keys())
+    derived = sorted(named & DERIVED.keys())
     vehicle = inventory.vehicle_of(cloud, selection.robot) if derived else None
     there: set[str] = set()
     some = False

@@ -2,18 +2,25 @@
 
 from __future__ import annotations
 
-import base64
 import json
 import ssl
 import urllib.request
-import zlib
 from collections import Counter
-from collections.abc import Iterator, Mapping
-from typing import Any
+from collections.abc import Iterator
+from dataclasses import replace
 
 import numpy as np
 
-from iort_contract.codec.columns import PLAIN_CODEC
+from iort_contract.limits import ContractError
+from iort_contract.messages.query import (
+    FIRST_US,
+    LAST_US,
+    QueryAnswer,
+    QueryRequest,
+    decode_query_answer,
+    encode_query_request,
+    unpacked_samples,
+)
 from iort_station.cloud import Cloud
 from iort_station.data import inventory
 from iort_station.data.batches import PageProgress, RefusedItems
@@ -37,31 +44,31 @@ def samples(
 
     Raises `StationError` if the function fails, and at the end for a field that no sample has.
     """
-    request: dict[str, Any] = {
-        "robot": selection.robot,
-        "stream": selection.stream,
-        "start_us": selection.start_us,
-        "end_us": selection.end_us,
-        "fields": None if selection.fields is None else list(selection.fields),
-        "where": selection.where,
-        "scan": scan,
-    }
+    request = QueryRequest(
+        selection.robot,
+        selection.stream,
+        FIRST_US if selection.start_us is None else selection.start_us,
+        LAST_US if selection.end_us is None else selection.end_us,
+        selection.fields,
+        selection.where,
+        scan,
+    )
     function = cloud.output("processing", "QueryFunction")
     parts: list[Block] = []
     there: set[str] = set()
     while True:
-        reply = _invoke(cloud, function, request)
-        part = _unpacked(cloud, reply)
+        answer = _invoke(cloud, function, request)
+        part = _unpacked(cloud, answer)
         parts.append(part)
-        there |= set(reply["fields"])
-        refused.count += reply["refused"]
-        refused.reason = refused.reason or reply["reason"]
-        absent.update(reply["absent"])
+        there |= set(answer.fields)
+        refused.count += answer.refused
+        refused.reason = refused.reason or answer.reason
+        absent.update(answer.absent)
         if progress is not None and len(part.times_us):
-            progress(reply["items"], int(part.times_us[-1]))
-        if reply["token"] is None:
+            progress(answer.items, int(part.times_us[-1]))
+        if answer.token is None:
             break
-        request["token"] = reply["token"]
+        request = replace(request, token=answer.token)
     if there and not selection.named() <= there:
         raise inventory.unknown_fields(cloud, selection, there)
     # A batch may overlap the next one, which another invocation may have read.
@@ -71,27 +78,26 @@ def samples(
         yield Block(block.times_us, {name: block.columns[name] for name in names})
 
 
-def _invoke(cloud: Cloud, function: str, request: Mapping[str, Any]) -> dict[str, Any]:
-    answer = cloud.client("lambda").invoke(FunctionName=function, Payload=json.dumps(request).encode())
-    text = answer["Payload"].read()
-    reply: dict[str, Any] = json.loads(text)
-    if "FunctionError" in answer:
-        raise StationError(f"the query function failed: {reply.get('errorMessage', text[:500])}")
-    if "error" in reply:
-        raise StationError(f"the query function refused: {reply['error']}")
-    if reply["codec"] != PLAIN_CODEC:
-        raise StationError(
-            f"the query function must answer in {PLAIN_CODEC}, got {reply['codec']}: "
-            "deploy the current stacks"
-        )
-    return reply
+def _invoke(cloud: Cloud, function: str, request: QueryRequest) -> QueryAnswer:
+    reply = cloud.client("lambda").invoke(FunctionName=function, Payload=encode_query_request(request))
+    text = reply["Payload"].read()
+    if "FunctionError" in reply:
+        message = json.loads(text).get("errorMessage", text[:500])
+        raise StationError(f"the query function failed: {message}")
+    try:
+        answer = decode_query_answer(text)
+    except ContractError as error:
+        raise StationError(f"{error}: deploy the current stacks") from error
+    if answer.error:
+        raise StationError(f"the query function refused: {answer.error}")
+    return answer
 
 
-def _unpacked(cloud: Cloud, reply: Mapping[str, Any]) -> Block:
-    packed = base64.b64decode(reply["samples"]) if "samples" in reply else _download(cloud, reply["url"])
-    body = json.loads(zlib.decompress(packed))
-    times = np.cumsum(np.array(body["dt"], dtype=np.int64))
-    return Block(times, {name: column_of(column) for name, column in body["fields"].items()})
+def _unpacked(cloud: Cloud, answer: QueryAnswer) -> Block:
+    packed = _download(cloud, str(answer.url)) if answer.samples is None else answer.samples
+    times_us, columns = unpacked_samples(packed)
+    times = np.array(times_us, dtype=np.int64)
+    return Block(times, {name: column_of(column) for name, column in columns.items()})
 
 
 def _download(cloud: Cloud, url: str) -> bytes:

@@ -7,14 +7,12 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field
 
 from iort_contract import expression
+from iort_contract.catalog.derived import SOURCES
 from iort_contract.expression import ExpressionError, Node
 from iort_contract.limits import ContractError
 from iort_contract.topics import check_robot, check_stream
 from iort_station.errors import StationError
 from iort_station.times import Time, time_us
-
-# The stored fields behind each derived field.
-MADE_OF = {"speed_mps": ("speed",), "power_w": ("voltage_input", "current_input")}
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -42,7 +40,7 @@ class Selection:
         if self.fields is None:
             return True
         named = self.named()
-        return name in named or any(name in parts for made, parts in MADE_OF.items() if made in named)
+        return name in named or any(name in sources for made, sources in SOURCES.items() if made in named)
 
     def holds_time(self, t_us: int) -> bool:
         """Whether the range includes a time."""

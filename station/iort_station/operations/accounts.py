@@ -7,11 +7,11 @@ from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from typing import Any
 
+from iort_contract.catalog.streams import ACCOUNT_STREAM
 from iort_contract.limits import ContractError
 from iort_contract.messages.account import ACCOUNT_EVERY_S, SourceAccount, StreamAccount, account, lost
 from iort_contract.messages.batch import Batch, decode_batch
 from iort_contract.tables import RECEIVED_MS
-from iort_contract.topics import ACCOUNT_STREAM
 from iort_station.cloud import Cloud
 from iort_station.operations.audit import Audit, RunAudit, Shortfall
 from iort_station.operations.delivery import items

@@ -11,11 +11,11 @@ from dataclasses import dataclass
 from itertools import pairwise
 from typing import Any, NamedTuple
 
+from iort_contract.catalog.streams import AGENT_STREAM
 from iort_contract.dynamodb import plain, starting_between
 from iort_contract.limits import ContractError
 from iort_contract.messages.batch import Batch, BatchId, batch_id, decode_batch
 from iort_contract.tables import BATCH, RECEIVED_MS, SAMPLES
-from iort_contract.topics import AGENT_STREAM
 from iort_station.cloud import Cloud
 from iort_station.data.batches import telemetry_table, topic_of
 

@@ -11,10 +11,11 @@ import time
 from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
 from datetime import datetime, timezone
-from typing import Any, NamedTuple
+from typing import Any, Literal, NamedTuple
 
 from botocore.exceptions import ClientError
 
+from iort_contract.messages.page import Alarm, Dashboard, Series, Widget
 from iort_station.cloud import Cloud
 from iort_station.errors import StationError
 
@@ -35,8 +36,8 @@ def dashboards(cloud: Cloud) -> list[str]:
     return sorted(names, key=lambda name: (not name.lower().startswith(ours), name))
 
 
-def dashboard(cloud: Cloud, name: str, *, minutes: int, now_s: float | None = None) -> dict[str, Any]:
-    """A dashboard's widgets with the last ``minutes`` of their metrics, as answers.ts describes it.
+def dashboard(cloud: Cloud, name: str, *, minutes: int, now_s: float | None = None) -> Dashboard:
+    """A dashboard's widgets with the last ``minutes`` of their metrics.
 
     Raises `StationError` where there is none of that name, or its body cannot be read.
     """
@@ -48,10 +49,7 @@ def dashboard(cloud: Cloud, name: str, *, minutes: int, now_s: float | None = No
         "name": name,
         "from_s": from_s,
         "to_s": to_s,
-        "widgets": [
-            {"number": number, **_widget(client, widget, from_s, to_s)}
-            for number, widget in enumerate(widgets)
-        ],
+        "widgets": [_widget(client, number, widget, from_s, to_s) for number, widget in enumerate(widgets)],
     }
 
 
@@ -105,12 +103,16 @@ def count(widgets: Sequence[Mapping[str, Any]]) -> Counted:
     return Counted(named, searches)
 
 
-def _widget(client: Any, widget: Mapping[str, Any], from_s: int, to_s: int) -> dict[str, Any]:
+def _widget(client: Any, number: int, widget: Mapping[str, Any], from_s: int, to_s: int) -> Widget:
     properties: Mapping[str, Any] = widget.get("properties", {})
-    place = {key: int(widget.get(key, default)) for key, default in _PLACE.items()}
     period_s = int(properties.get("period", _PERIOD_S))
-    drawn = {
-        **place,
+    drawn: Widget = {
+        "number": number,
+        "x": int(widget.get("x", 0)),
+        "y": int(widget.get("y", 0)),
+        "width": int(widget.get("width", 6)),
+        "height": int(widget.get("height", 6)),
+        "kind": "other",
         "title": str(properties.get("title", "")),
         "text": "",
         "series": [],
@@ -125,12 +127,8 @@ def _widget(client: Any, widget: Mapping[str, Any], from_s: int, to_s: int) -> d
         # Its rows are asked for by themselves: Logs Insights takes its time. See cloudwatch_logs.py.
         return {**drawn, "kind": "log"}
     if widget.get("type") != "metric" or "metrics" not in properties:
-        return {
-            **drawn,
-            "kind": "other",
-            "text": f"a widget of type {widget.get('type')}: see the AWS console",
-        }
-    kind = "number" if properties.get("view") == "singleValue" else "series"
+        return {**drawn, "text": f"a widget of type {widget.get('type')}: see the AWS console"}
+    kind: Literal["number", "series"] = "number" if properties.get("view") == "singleValue" else "series"
     queries, shown = _queries(properties, period_s)
     if not queries:
         return {**drawn, "kind": kind}
@@ -139,11 +137,11 @@ def _widget(client: Any, widget: Mapping[str, Any], from_s: int, to_s: int) -> d
         series = _series(client, queries, shown, from_s, to_s)
     except ClientError as error:
         text = f"CloudWatch refuses this widget's metrics: {_reason(error)}"
-        return {**drawn, "kind": "other", "text": text}
+        return {**drawn, "text": text}
     return {**drawn, "kind": kind, "series": series, "period_s": period_s}
 
 
-def _with_alarms(client: Any, drawn: dict[str, Any], properties: Mapping[str, Any]) -> dict[str, Any]:
+def _with_alarms(client: Any, drawn: Widget, properties: Mapping[str, Any]) -> Widget:
     """The widget with the state of its alarms, in its own order; one that is gone is left out."""
     names = [str(arn).partition(":alarm:")[2] for arn in properties.get("alarms", [])]
     try:
@@ -155,8 +153,8 @@ def _with_alarms(client: Any, drawn: dict[str, Any], properties: Mapping[str, An
             )["MetricAlarms"]
         ]
     except ClientError as error:
-        return {**drawn, "kind": "other", "text": f"CloudWatch does not tell its alarms: {_reason(error)}"}
-    alarms = [
+        return {**drawn, "text": f"CloudWatch does not tell its alarms: {_reason(error)}"}
+    alarms: list[Alarm] = [
         {
             "name": alarm["AlarmName"],
             "about": alarm.get("AlarmDescription", ""),
@@ -171,9 +169,6 @@ def _with_alarms(client: Any, drawn: dict[str, Any], properties: Mapping[str, An
 
 def _reason(error: ClientError) -> str:
     return str(error.response.get("Error", {}).get("Message", error))
-
-
-_PLACE = {"x": 0, "y": 0, "width": 6, "height": 6}
 
 
 def _queries(
@@ -221,7 +216,7 @@ def _series(
     shown: Mapping[str, Mapping[str, Any]],
     from_s: int,
     to_s: int,
-) -> list[dict[str, Any]]:
+) -> list[Series]:
     # A SEARCH answers with a result a metric found: all with the query's id, told apart by their labels,
     # and those of one label by their place.
     found: dict[tuple[str, str, int], dict[float, float]] = {}
@@ -240,7 +235,7 @@ def _series(
                 values = found.setdefault((*key, seen[key]), {})
                 values.update(zip(stamps, result["Values"], strict=True))
                 seen[key] += 1
-    series = []
+    series: list[Series] = []
     for query_id, options in shown.items():
         several = [(label, values) for (id_, label, _), values in found.items() if id_ == query_id]
         for label, values in several or [("", {})]:

@@ -11,6 +11,7 @@ import time
 from collections.abc import Mapping
 from typing import Any
 
+from iort_contract.messages.page import Logs
 from iort_station.cloud import Cloud
 from iort_station.errors import StationError
 from iort_station.operations.cloudwatch import body_of
@@ -25,8 +26,8 @@ _SOURCE = re.compile(r"""\s*SOURCE\s+(['"])(?P<group>[^'"]+)\1\s*(\||$)""")
 _POINTER = "@ptr"
 
 
-def rows(cloud: Cloud, name: str, number: int, *, minutes: int, now_s: float | None = None) -> dict[str, Any]:
-    """What the widget ``number`` of a dashboard finds in the last ``minutes``, as answers.ts describes it.
+def rows(cloud: Cloud, name: str, number: int, *, minutes: int, now_s: float | None = None) -> Logs:
+    """What the widget ``number`` of a dashboard finds in the last ``minutes``.
 
     Raises `StationError` where there is no such log widget, or Logs Insights has no answer. Of the account's
     other dashboards a page shows the metrics alone: logs say more than whoever can reach it may need to know.

@@ -8,6 +8,7 @@ from collections.abc import Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from typing import Any, NamedTuple
 
+from iort_contract.catalog.streams import OWN_STREAMS
 from iort_contract.tables import (
     EXPIRES_S,
     RECEIVED_MS,
@@ -17,7 +18,6 @@ from iort_contract.tables import (
     TOPIC,
     VEHICLE_CACHE_S,
 )
-from iort_contract.topics import OWN_STREAMS
 from iort_station.cloud import Cloud
 from iort_station.data import inventory, summary
 from iort_station.data.batches import ATTRIBUTES, Item, PageProgress, stored

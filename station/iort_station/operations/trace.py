@@ -14,9 +14,10 @@ from dataclasses import dataclass
 from statistics import quantiles
 from typing import Any, NamedTuple
 
+from iort_contract.catalog.streams import RTT_FIELDS
 from iort_contract.messages.batch import Batch
 from iort_contract.tables import RECEIVED_MS, T_US
-from iort_contract.topics import PING_PATHS, RTT_FIELDS
+from iort_contract.topics import PING_PATHS
 from iort_station.errors import StationError
 
 # timestamp() in a rule is whole milliseconds, cut off: the middle is wrong by half of one at most.

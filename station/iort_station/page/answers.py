@@ -1,6 +1,6 @@
 """What the live page may ask its server: cars' parameters, a car's past, and CloudWatch's dashboards.
 
-Each answer is a function of the request's parameters; station/web/src/answers.ts is the other end.
+Each answer is a function of the request's parameters; its type is in `iort_contract.messages.page`.
 """
 
 from __future__ import annotations
@@ -11,6 +11,8 @@ from typing import Any
 import numpy as np
 
 from iort_contract.messages.files import CLAIM_FIELDS
+from iort_contract.messages.page import Answer, HistoryAnswer
+from iort_contract.messages.page import Column as PageColumn
 from iort_contract.topics import check_robot
 from iort_station import data
 from iort_station.cloud import Cloud
@@ -26,7 +28,7 @@ MAX_ROWS = 5_000
 _SAMPLES_US = 3_600_000_000
 
 
-def answers(cloud: Cloud) -> dict[str, Callable[[Mapping[str, str]], dict[str, Any]]]:
+def answers(cloud: Cloud) -> dict[str, Callable[[Mapping[str, str]], Answer]]:
     """Every answer by its name."""
     return {
         "robots": lambda _asked: {"robots": registry.presence(cloud)},
@@ -46,7 +48,7 @@ def answers(cloud: Cloud) -> dict[str, Callable[[Mapping[str, str]], dict[str, A
     }
 
 
-def history(cloud: Cloud, asked: Mapping[str, str]) -> dict[str, Any]:
+def history(cloud: Cloud, asked: Mapping[str, str]) -> HistoryAnswer:
     """The samples of ``robot`` and ``stream`` from ``from_us`` to ``to_us``, in at most ``rows`` rows.
 
     A row that stands for several samples has the least, the mean and the most of every number, of a claim
@@ -72,7 +74,7 @@ def history(cloud: Cloud, asked: Mapping[str, str]) -> dict[str, Any]:
         bins = (found.times_us - found.times_us[0]) // row_us
         starts = np.flatnonzero(np.append(True, bins[1:] != bins[:-1]))
     several = summary or row_us > 0
-    fields = {
+    fields: dict[str, PageColumn] = {
         name: _rows(each, starts, n, several=several) for name, each in columns.items() if name not in claims
     }
     for name, key in claims.items():
@@ -109,7 +111,7 @@ def _claims(columns: Mapping[str, Any]) -> dict[str, str]:
     }
 
 
-def _rows(of: tuple[Column, Column, Column], starts: Any, n: int, *, several: bool) -> dict[str, list[Any]]:
+def _rows(of: tuple[Column, Column, Column], starts: Any, n: int, *, several: bool) -> PageColumn:
     mean, least, most = of
     if mean.dtype.kind != "f":
         ends = _last_known(mean, starts)

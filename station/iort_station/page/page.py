@@ -10,13 +10,12 @@ import math
 import re
 from importlib.resources import files
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
-from iort_contract.limits import SCHEMA_VERSION, ContractError
+from iort_contract.limits import ContractError
+from iort_contract.messages.page import Config
 from iort_contract.page import PUBNUB_ORIGIN
-from iort_contract.topics import RTT_FIELDS, check_namespace, check_robot
-from iort_contract.vesc import AGENT_FIELDS, DERIVED_UNITS, FAULTS, VESC_FIELDS, VESC_STREAM
-from iort_station.data.units import ROS_UNITS, agent_unit
+from iort_contract.topics import check_namespace, check_robot
 from iort_station.errors import StationError
 
 if TYPE_CHECKING:
@@ -59,7 +58,7 @@ def config(
     vehicles: Mapping[str, Mapping[str, float]] | None = None,
     token: str = "",
     answers: bool = False,
-) -> dict[str, Any]:
+) -> Config:
     """What the page is told, ``/config.json``; raises `StationError` for what it must not be told.
 
     ``vehicles`` maps a robot to its parameters; with ``speed_to_erpm_gain`` (and ``_offset``) the page
@@ -96,26 +95,4 @@ def config(
         "vehicles": known,
         "token": token,
         "answers": answers,
-    }
-
-
-def field_table() -> dict[str, Any]:
-    """The contract's field table as the page reads it, ``/fields.json``."""
-    fields = {
-        f.name: {"unit": f.unit, "meaning": f.meaning} | ({"ros2_unit": f.ros2_unit} if f.ros2_unit else {})
-        for f in VESC_FIELDS.values()
-    }
-    fields |= {name: {"unit": unit, "meaning": ""} for name, unit in DERIVED_UNITS.items()}
-    fields |= {
-        name: {"unit": "ms", "meaning": f"round trip over the path {path}"}
-        for path, name in RTT_FIELDS.items()
-    }
-    fields |= {name: {"unit": agent_unit(name), "meaning": meaning} for name, meaning in AGENT_FIELDS.items()}
-    faults = {str(code): name for code, name in FAULTS.items()}
-    return {
-        "version": SCHEMA_VERSION,
-        "stream": VESC_STREAM,
-        "fields": fields,
-        "ros_units": ROS_UNITS,
-        "faults": faults,
     }

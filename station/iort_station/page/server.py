@@ -3,57 +3,56 @@
     with PageServer(namespace="iort", subscribe_key="sub-c-...", origin="ps.pndsn.com") as page:
         print(page.url)
 
-The page learns where to listen from ``/config.json`` and what the fields mean from ``/fields.json``.
-Neither holds a key that can publish.
+The page reads from ``/config.json`` where to listen; it holds no key that can publish.
 """
 
 from __future__ import annotations
 
+import asyncio
 import errno
 import gzip
+import hashlib
 import ipaddress
 import json
 import math
 import re
-import socket
-import socketserver
 import threading
 from collections.abc import Callable, Iterable, Mapping
-from http import HTTPStatus
-from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
+from concurrent.futures import Future
 from pathlib import Path
-from types import TracebackType
 from typing import Any, NamedTuple
-from urllib.parse import parse_qsl
 
+from aiohttp import ETag, web
 from botocore.exceptions import BotoCoreError, ClientError
 from typing_extensions import Self
 
 from iort_contract.limits import ContractError
 from iort_contract.page import HEADERS, PUBNUB_ORIGIN, security_policy
 from iort_station.errors import StationError
-from iort_station.page.page import BUILT, TYPES, built_files, config, field_table
+from iort_station.page.background import BackgroundServer
+from iort_station.page.page import BUILT, TYPES, built_files, config
 
 Answer = Callable[[Mapping[str, str]], Mapping[str, Any]]
 
-# An open connection without a request is given up after this long.
+# A connection without a request is closed after this time.
 IDLE_S = 30.0
 _HOST = re.compile(r"(\[[0-9A-Fa-f:.]+\]|[^:\[\]]+)(:[0-9]*)?")
 
 
-class _File(NamedTuple):
+class _Body(NamedTuple):
     kind: str
-    body: bytes
+    plain: bytes
     packed: bytes
+    etag: str
 
 
-class PageServer:
-    """The page's web server, in threads of its own, until the ``with`` block ends.
+class PageServer(BackgroundServer):
+    """The page's web server, in threads of its own.
 
-    It listens on loopback unless told otherwise; ``port=0`` takes a free port. ``answers`` maps a name to
-    what answers ``/<name>.json`` from the parameters of the request. It answers to localhost, to addresses
-    and to ``names``, by which else it is reached, and to no other Host. Raises `StationError`
-    when the page is not built, when the port is taken, and for a configuration it must not serve.
+    It listens on loopback by default. ``answers`` maps a name to the function that answers ``/<name>.json``
+    from the parameters of the request. The server accepts a Host that is localhost, an address or one of
+    ``names``, and no other. Raises `StationError` if the page is not built, if the port is in use, and for a
+    configuration that it must not serve.
     """
 
     def __init__(
@@ -71,6 +70,9 @@ class PageServer:
         names: Iterable[str] = (),
         built: Path = BUILT,
     ) -> None:
+        super().__init__(host, port, keepalive_timeout=IDLE_S)
+        self._answers = {f"/{name}.json": answer for name, answer in (answers or {}).items()}
+        self._names = frozenset(name.lower() for name in ("localhost", host, *names))
         told = config(
             namespace=namespace,
             subscribe_key=subscribe_key,
@@ -80,174 +82,121 @@ class PageServer:
             token=token,
             answers=bool(answers),
         )
-        self._answers = dict(answers or {})
-        self.host, self.port = host, port
-        self._names = frozenset(name.lower() for name in ("localhost", host, *names))
-        self._files = _load(built)
-        self._files["/config.json"] = _json_file(told)
-        self._files["/fields.json"] = _json_file(field_table())
-        self._policy = security_policy(origin=origin, tls=tls)
-        self._server: _Server | None = None
-        self._thread: threading.Thread | None = None
+        # Only these can be requested: no path reaches the file system.
+        self._files = {
+            f"/{name}": _body(TYPES[Path(name).suffix], content)
+            for name, content in built_files(built).items()
+        }
+        self._files["/"] = self._files["/index.html"]
+        self._files["/config.json"] = _json(told)
+        self._headers = {
+            **HEADERS,
+            "Cache-Control": "no-cache",
+            "Content-Security-Policy": security_policy(origin=origin, tls=tls),
+            "Server": "iort",
+            "Vary": "Accept-Encoding",
+        }
 
     @property
     def url(self) -> str:
-        """Where a browser on this machine finds the page."""
+        """The page's address for a browser on this machine."""
         host = {"0.0.0.0": "127.0.0.1", "::": "::1"}.get(self.host, self.host)  # noqa: S104 - compared
         return f"http://[{host}]:{self.port}/" if ":" in host else f"http://{host}:{self.port}/"
 
     def start(self) -> Self:
-        """Listen, and return once the page can be asked for."""
-        if self._server is not None:
-            raise StationError("the page is being served already")
+        """Listen, and return once the page can be requested."""
+        where = f"cannot serve the page on {self.host} port {self.port}"
+        if not 0 <= self.port <= 65_535:
+            raise StationError(f"{where}: the port must be 0 to 65535")
         try:
-            self._server = _Server(
-                (self.host, self.port), self._names, self._files, self._answers, self._policy
-            )
-        except (OSError, OverflowError) as error:
-            where = f"{self.host} port {self.port}"
-            if isinstance(error, OSError) and error.errno == errno.EADDRINUSE:
-                raise StationError(
-                    f"cannot serve the page on {where}: the port is in use; choose another, or 0 for any"
-                ) from error
-            raise StationError(f"cannot serve the page on {where}: {error}") from error
-        self.port = int(self._server.server_address[1])
-        self._thread = threading.Thread(
-            target=self._server.serve_forever, kwargs={"poll_interval": 0.1}, name="page", daemon=True
-        )
-        self._thread.start()
-        return self
+            return super().start()
+        except OSError as error:
+            if error.errno == errno.EADDRINUSE:
+                raise StationError(f"{where}: the port is in use; choose another, or 0 for any") from error
+            raise StationError(f"{where}: {error}") from error
 
-    def stop(self) -> None:
-        """Stop listening; a second call does nothing."""
-        if self._server is not None and self._thread is not None:
-            self._server.shutdown()
-            self._thread.join()
-            self._server.server_close()
-            self._server = self._thread = None
+    async def handle(self, request: web.BaseRequest) -> web.StreamResponse:
+        """Answer with a file, or with the result of one of ``answers``."""
+        if not self._accepts(request.headers.get("Host", "")):
+            refused = "this server answers to localhost, to addresses and to what --name says"
+            return self._response(request, _json({"error": refused}), 403)
+        if request.method not in {"GET", "HEAD"}:
+            return self._response(request, _body(TYPES[".txt"], b"405 Method Not Allowed\n"), 405)
+        path = request.raw_path.partition("?")[0]
+        answer = self._answers.get(path)
+        if answer is not None:
+            parameters = dict(request.query)
+            status, body = await _off_the_loop(lambda: _answered(answer, parameters))
+            return self._response(request, body, status)
+        file = self._files.get(path)
+        if file is None:
+            return self._response(request, _body(TYPES[".txt"], b"404 Not Found\n"), 404)
+        response = self._response(request, file, 200)
+        # Weak, because the same content may be sent with or without gzip.
+        response.etag = ETag(file.etag, is_weak=True)
+        if any(known.value in {file.etag, "*"} for known in request.if_none_match or ()):
+            response.set_status(304)
+            response.body = None
+        return response
 
-    def __enter__(self) -> Self:
-        return self.start()
+    def _accepts(self, host: str) -> bool:
+        """Whether a request's Host is ours.
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
-        self.stop()
-
-
-class _Server(ThreadingHTTPServer):
-    daemon_threads = True
-    block_on_close = False
-
-    def __init__(
-        self,
-        address: tuple[str, int],
-        names: frozenset[str],
-        files: Mapping[str, _File],
-        answers: Mapping[str, Answer],
-        policy: str,
-    ) -> None:
-        if ":" in address[0]:
-            self.address_family = socket.AF_INET6
-        self.names, self.files, self.answers, self.policy = names, files, answers, policy
-        super().__init__(address, _Handler)
-
-    def server_bind(self) -> None:
-        # HTTPServer's own asks the name service who we are, which can take seconds.
-        socketserver.TCPServer.server_bind(self)
-
-    def answers_to(self, host: str) -> bool:
-        """Whether a request's Host is ours. An address is: a page elsewhere that has its own name point here,
-        and would read the keys and the fleet's data, comes with that name."""
+        In DNS rebinding, a page elsewhere has its own name point here, to read the keys and the fleet's data.
+        Its requests carry that name, never an address.
+        """
         found = _HOST.fullmatch(host)
         if found is None:
             return False
         try:
             ipaddress.ip_address(found[1].strip("[]"))
         except ValueError:
-            return found[1].lower() in self.names
+            return found[1].lower() in self._names
         return True
 
-    def handle_error(self, request: socket.socket | tuple[bytes, socket.socket], client_address: Any) -> None:
-        """A browser that went away in the middle of an answer is no error of ours."""
+    def _response(self, request: web.BaseRequest, body: _Body, status: int) -> web.Response:
+        headers = {**self._headers, "Content-Type": body.kind}
+        if "gzip" in request.headers.get("Accept-Encoding", ""):
+            return web.Response(
+                body=body.packed, status=status, headers={**headers, "Content-Encoding": "gzip"}
+            )
+        return web.Response(body=body.plain, status=status, headers=headers)
 
 
-class _Handler(BaseHTTPRequestHandler):
-    server: _Server
-    protocol_version = "HTTP/1.1"
-    server_version, sys_version = "iort", ""
-    timeout = IDLE_S
-    error_content_type = "text/plain; charset=utf-8"
-    error_message_format = "%(code)d %(message)s\n"
+async def _off_the_loop(work: Callable[[], tuple[int, _Body]]) -> tuple[int, _Body]:
+    """Run ``work`` in a daemon thread, so that a slow answer delays neither other requests nor the exit."""
+    done: Future[tuple[int, _Body]] = Future()
+    done.set_running_or_notify_cancel()
 
-    def do_GET(self) -> None:
-        if not self.server.answers_to(self.headers.get("Host", "")):
-            refused = "this server answers to localhost, to addresses and to what --name says"
-            self._send(HTTPStatus.FORBIDDEN, _json_file({"error": refused}))
-            return
-        path, _, query = self.path.partition("?")
-        answer = self.server.answers.get(path.removeprefix("/").removesuffix(".json"))
-        if answer is not None and path.endswith(".json"):
-            self._answer(answer, dict(parse_qsl(query)))
-            return
-        file = self.server.files.get(path)
-        if file is None:
-            self.send_error(HTTPStatus.NOT_FOUND)
-            return
-        self._send(HTTPStatus.OK, file)
-
-    def _answer(self, answer: Answer, parameters: Mapping[str, str]) -> None:
+    def run() -> None:
         try:
-            status, value = HTTPStatus.OK, answer(parameters)
-        except (StationError, ContractError) as error:
-            status, value = HTTPStatus.BAD_REQUEST, {"error": str(error)}
-        except (BotoCoreError, ClientError) as error:
-            status, value = HTTPStatus.BAD_GATEWAY, {"error": f"AWS refused a call: {error}"}
-        self._send(status, _json_file(value, level=1))
+            done.set_result(work())
+        except BaseException as error:  # noqa: BLE001 - raised where the answer is awaited
+            done.set_exception(error)
 
-    def _send(self, status: HTTPStatus, file: _File) -> None:
-        packed = "gzip" in self.headers.get("Accept-Encoding", "")
-        body = file.packed if packed else file.body
-        self.send_response(status)
-        self.send_header("Content-Type", file.kind)
-        self.send_header("Content-Length", str(len(body)))
-        self.send_header("Vary", "Accept-Encoding")
-        if packed:
-            self.send_header("Content-Encoding", "gzip")
-        self.end_headers()
-        if self.command != "HEAD":
-            self.wfile.write(body)
-
-    do_HEAD = do_GET  # noqa: N815 - the library's name
-
-    def end_headers(self) -> None:
-        for name, value in HEADERS.items():
-            self.send_header(name, value)
-        self.send_header("Cache-Control", "no-cache")
-        self.send_header("Content-Security-Policy", self.server.policy)
-        super().end_headers()
-
-    def log_message(self, format: str, *args: Any) -> None:  # noqa: A002 - the library's name
-        """Requests are not news."""
+    threading.Thread(target=run, name="page answer", daemon=True).start()
+    return await asyncio.wrap_future(done)
 
 
-def _load(built: Path) -> dict[str, _File]:
-    """Every file of the build by its address, so that nothing else can be asked for."""
-    files = {f"/{name}": _file(TYPES[Path(name).suffix], body) for name, body in built_files(built).items()}
-    files["/"] = files["/index.html"]
-    return files
+def _answered(answer: Answer, parameters: Mapping[str, str]) -> tuple[int, _Body]:
+    try:
+        return 200, _json(answer(parameters), level=1)
+    except (StationError, ContractError) as error:
+        return 400, _json({"error": str(error)})
+    except (BotoCoreError, ClientError) as error:
+        return 502, _json({"error": f"AWS refused a call: {error}"})
 
 
-def _json_file(value: Mapping[str, Any], level: int = 6) -> _File:
+def _json(value: Mapping[str, Any], level: int = 6) -> _Body:
     try:
         text = json.dumps(value, allow_nan=False, separators=(",", ":"))
     except ValueError:
         text = json.dumps(_finite(value), allow_nan=False, separators=(",", ":"))
-    return _file(TYPES[".json"], text.encode(), level)
+    return _body(TYPES[".json"], text.encode(), level)
 
 
 def _finite(value: Any) -> Any:
-    """The same, with null for each number that JSON does not have."""
+    """The value, with null for each number that JSON does not have."""
     if isinstance(value, Mapping):
         return {name: _finite(one) for name, one in value.items()}
     if isinstance(value, (list, tuple)):
@@ -255,5 +204,5 @@ def _finite(value: Any) -> Any:
     return None if isinstance(value, float) and not math.isfinite(value) else value
 
 
-def _file(kind: str, body: bytes, level: int = 6) -> _File:
-    return _File(kind, body, gzip.compress(body, level, mtime=0))
+def _body(kind: str, content: bytes, level: int = 6) -> _Body:
+    return _Body(kind, content, gzip.compress(content, level, mtime=0), hashlib.sha256(content).hexdigest())

@@ -12,7 +12,7 @@ from botocore.exceptions import ClientError
 
 from iort_station.cloud import Cloud
 from iort_station.errors import StationError
-from iort_station.page.page import BUILT, TYPES, built_files, field_table
+from iort_station.page.page import BUILT, TYPES, built_files
 
 # Names do not change with their content, so a browser asks each time whether they are still the same.
 _CACHE = "no-cache"
@@ -24,7 +24,7 @@ def files(told: Mapping[str, Any], built: Path = BUILT) -> dict[str, bytes]:
 
     Raises `StationError` where the page is not built.
     """
-    tables = {"config.json": told, "fields.json": field_table()}
+    tables = {"config.json": told}
     return built_files(built) | {
         name: json.dumps(value, allow_nan=False).encode() for name, value in tables.items()
     }

@@ -10,16 +10,13 @@ from typing import Any
 from rich.table import Table
 from rich.text import Text
 
-from iort_contract.limits import SCHEMA_VERSION, ContractError
-from iort_contract.statistics import Vehicle
+from iort_contract.catalog.derived import Vehicle
+from iort_contract.catalog.vesc import FAULTS, hottest_degc
+from iort_contract.limits import GONE_S, SCHEMA_VERSION, STALE_S, ContractError
 from iort_contract.tables import ROBOT, T_US
 from iort_contract.topics import check_robot, check_stream
-from iort_contract.vesc import FAULTS
 
-# As on the page: older values are stale, and a car unheard of for longer is gone.
-STALE_S, GONE_S = 1.5, 4.5
 MAX_ROBOTS = 256
-_TEMPERATURES = ("temperature_pcb", "temp_fet", "temp_motor")
 _STATES = {"online": "green", "stale": "yellow", "gone": "red"}
 
 
@@ -47,12 +44,6 @@ class Car:
         """A field of the newest sample, where it is a number."""
         value = self.sample.get(name)
         return float(value) if isinstance(value, (int, float)) and not isinstance(value, bool) else None
-
-    def hottest_degc(self) -> float | None:
-        """The highest temperature; drivers leave those that they do not have at 0."""
-        return max(
-            (value for name in _TEMPERATURES if (value := self.number(name)) is not None), default=None
-        )
 
     def fault(self) -> str:
         """The fault's name; empty without one."""
@@ -117,7 +108,7 @@ class FleetWatch:
                 "state": Text(state, style=_STATES[state]),
                 "speed": self._speed(car),
                 "V": _figure(car.number("voltage_input"), 1),
-                "°C": _figure(car.hottest_degc(), 0),
+                "°C": _figure(hottest_degc(car.sample), 0),
                 "delay": f"{car.delay_ms:.0f} ms",
                 "age": f"{car.age_s(now_us):.1f} s",
             }

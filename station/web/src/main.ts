@@ -1,14 +1,15 @@
 // The page: listens to the whole fleet, shows one view of it, and costs nothing while hidden.
 
-import { now } from "./clock";
-import { load, type Config, type FieldTable } from "./config";
-import { byId, byName, el, setAttribute } from "./dom";
-import { Feed } from "./feed";
-import { Fleet } from "./fleet";
+import { FIELD_TABLE, type Config, type FieldTable } from "./base/contract";
+import { now } from "./base/clock";
+import { load } from "./server/config";
+import { byId, byName, el, setAttribute } from "./base/dom";
+import { Feed } from "./live/feed";
+import { Fleet } from "./live/fleet";
 import { observer } from "./observer";
-import { readRoute, route, type Route } from "./route";
-import { StatusBar } from "./statusbar";
-import { startTheme } from "./theme";
+import { readRoute, route, type Route } from "./base/route";
+import { StatusBar } from "./widgets/status_bar";
+import { startTheme } from "./base/theme";
 import { CarView } from "./views/car";
 import { CloudWatchView } from "./views/cloudwatch";
 import { FleetView } from "./views/fleet";
@@ -146,9 +147,9 @@ class Page {
 const GONE_SHOWN_S = CLOCK_S;
 
 load()
-  .then(({ config, table }) => {
+  .then((config) => {
     startTheme(byId("theme"));
-    return new Page(config, table);
+    return new Page(config, FIELD_TABLE);
   })
   .catch((error: unknown) => {
     setAttribute(byId("link"), "data-state", "lost");

@@ -1,8 +1,9 @@
 // What tests and the curious may read; every access makes a copy, so nothing can be changed through it.
 
-import { now } from "./clock";
-import type { Feed } from "./feed";
-import { BOUNDS, GONE_S, STALE_S, type Fleet } from "./fleet";
+import { now } from "./base/clock";
+import type { Feed } from "./live/feed";
+import { BOUNDS, type Fleet } from "./live/fleet";
+import { GONE_S, STALE_S } from "./base/contract";
 
 export function observer(fleet: Fleet, feed: Feed, tick_s: number): object {
   const robots = (): object =>

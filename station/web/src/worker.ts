@@ -1,17 +1,17 @@
 // Everything between the network and the page's picture of the fleet: PubNub's subscription, the decoding
 // and the checking of every message, away from the thread that draws.
 
-import { now } from "./clock";
-import { Link } from "./link";
-import { parseUpdate } from "./message";
-import type { Arrival, FromWorker, Listening, ToWorker } from "./wire";
+import { now } from "./base/clock";
+import { PubNubLink } from "./live/pubnub_link";
+import { parseUpdate } from "./live/update";
+import type { Arrival, FromWorker, Listening, ToWorker } from "./live/worker_messages";
 
 // What comes within this long is handed over together: each handing over wakes the page.
 const TOGETHER_MS = 25;
 // What waits for a page that is busy; the oldest goes when it is more.
 const MOST_WAITING = 2_000;
 
-let link: Link | undefined;
+let link: PubNubLink | undefined;
 let arrivals: Arrival[] = [];
 let refused = 0;
 let lastRefusal = "";
@@ -30,7 +30,7 @@ function hand(): void {
 }
 
 function start(listening: Listening): void {
-  link = new Link(
+  link = new PubNubLink(
     listening,
     now,
     (channel, message, timetoken) => {

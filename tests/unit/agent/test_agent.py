@@ -24,11 +24,10 @@ from iort_agent.sources import Emit
 from iort_agent.sources.recording.bag import BagConfig
 from iort_agent.spool.memory import REJECT_NEW, MemorySpool
 from iort_agent.status.state import Status, document, read
+from iort_contract.catalog.streams import AGENT_FIELDS, TYPES_STREAM
 from iort_contract.limits import MAX_FIELDS
 from iort_contract.messages.batch import decode_batch
 from iort_contract.messages.message_type import MessageType, message_type
-from iort_contract.topics import TYPES_STREAM
-from iort_contract.vesc import AGENT_FIELDS
 from tests.agent_fakes import Loopback, Published
 
 T0 = 1_700_000_000_000_000

@@ -15,10 +15,10 @@ from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
 from iort_agent.errors import SourceError
 from iort_agent.sources.recording.bag import _VESC_STATE_ROS2, VESC_TYPE, BagConfig
+from iort_contract.catalog.streams import TYPES_STREAM
+from iort_contract.catalog.vesc import VESC_FIELDS
 from iort_contract.messages.message_type import message_type
 from iort_contract.ros1.message import type_id
-from iort_contract.topics import TYPES_STREAM
-from iort_contract.vesc import VESC_FIELDS
 from tests.agent_fakes import ManualClock
 from tests.recordings import recording
 

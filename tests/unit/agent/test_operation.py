@@ -32,8 +32,8 @@ from iort_agent.status.server import StatusServer, ask, fetch
 from iort_agent.status.state import Status, read
 from iort_agent.status.text import render
 from iort_agent.verbs.check import FAIL, check
+from iort_contract.catalog.streams import AGENT_FIELDS
 from iort_contract.limits import CLOCK_MAX_UNCERTAINTY_MS
-from iort_contract.vesc import AGENT_FIELDS
 from tests.agent_fakes import Loopback, ManualClock
 
 

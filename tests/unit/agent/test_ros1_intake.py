@@ -12,9 +12,9 @@ import pytest
 
 from iort_agent.errors import SourceError
 from iort_agent.sources.ros1 import Intake, Ros1Config, TopicConfig
+from iort_contract.catalog.streams import TYPES_STREAM
 from iort_contract.messages.message_type import MessageType, message_type
 from iort_contract.ros1.message import RosMessage
-from iort_contract.topics import TYPES_STREAM
 from tests.agent_fakes import ManualClock
 from tests.unit.contract.ros1_messages import LINE, STAMPED, header, u32
 

@@ -11,7 +11,7 @@ import pytest
 
 from iort_agent.sources.sim import SimConfig
 from iort_agent.sources.vehicle import VehicleConfig
-from iort_contract.vesc import VESC_FIELDS
+from iort_contract.catalog.vesc import VESC_FIELDS
 from tests.agent_fakes import ManualClock
 
 T0 = 1_700_000_000_000_000

@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 
 from iort_agent.sources.vesc import protocol
 from iort_agent.sources.vesc.protocol import FrameParser, ProtocolError, decode_firmware, decode_values, frame
-from iort_contract.vesc import VESC_FIELDS
+from iort_contract.catalog.vesc import VESC_FIELDS
 from tests.vesc_standin import FIRMWARE, framed, values
 
 payloads = st.one_of(

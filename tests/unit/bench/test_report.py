@@ -11,7 +11,7 @@ from bench import guard
 from bench.report import plots, writer
 from bench.report.result import Plot, Ratio, Section, Table
 from bench.report.spread import ratio, spread
-from scripts.headline import REPORT, ROOT, filled
+from scripts.docs_parts import REPORT
 
 MACHINE = {
     "date": "2026-01-02T03:04:05+00:00",
@@ -156,11 +156,6 @@ def test_guard_reads_the_report_that_is_kept():
     kept = json.loads(REPORT.read_text())
     assert len(guard.ratios(kept)) > 10
     assert guard.regressions(kept, kept) == []
-
-
-def test_readme_has_the_headline_of_the_report_that_is_kept():
-    kept, readme = json.loads(REPORT.read_text()), (ROOT / "README.md").read_text()
-    assert filled(readme, kept) == readme, "run python scripts/headline.py"
 
 
 def test_report_that_is_kept_names_no_host_and_no_folder():

@@ -24,6 +24,8 @@ UNITS = {
     "MAX_AHEAD_US": (86_400_000_000, "days"),
     "LIVE_BROKER_EVERY_S": (1, "s"),
     "UPLOAD_URL_S": (1, "s"),
+    "STALE_S": (1, "s"),
+    "GONE_S": (1, "s"),
     **dict.fromkeys(("LIVE_MAX_AGE_MS", "CLOCK_MAX_UNCERTAINTY_MS", "FLEET_MAX_AGE_MS"), (1, "ms")),
     **dict.fromkeys(("MAX_VALID_MS", "MAX_LEASE_MS"), (1, "ms")),
     "upload_gb_a_day": (1, "GB"),

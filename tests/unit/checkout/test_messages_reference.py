@@ -55,7 +55,6 @@ from iort_contract.tables import (
     SERIAL_PARAMETER,
 )
 from iort_contract.topics import ACCEPTED, COMMANDS, build_topic
-from iort_contract.vesc import AGENT_FIELDS
 from iort_station.fleet.shadow import State, outcome
 from tests.messages_page import EXAMPLES, PAGE, keys_after, named, rows, section
 
@@ -248,11 +247,6 @@ def test_the_samples_of_a_robots_own_streams(name: str, sample: accounts.Account
         assert {key for row in rows(text) for key in named(row[0])} == EXAMPLES[name].keys()
 
 
-def test_the_agents_own_figures_are_all_told() -> None:
-    text = section("## A robot's own streams").split("**`agent`**")[1]
-    assert {named(row[0])[0]: row[1] for row in rows(text)} == AGENT_FIELDS
-
-
 def test_the_shadows_documents_are_what_the_agent_takes_and_says() -> None:
     base = Tuning(True, True, 10.0, 0, "info")
     tuning, rejected = overlay(base, EXAMPLES["desired"]["state"]["desired"], {})
@@ -262,7 +256,7 @@ def test_the_shadows_documents_are_what_the_agent_takes_and_says() -> None:
     assert reported.keys() == {*tuning.as_document(), "rejected", COMMANDS, AGENT_VERSION}
     state = State(1, {}, reported)
     assert outcome(state, "drive", COMMAND.session, COMMAND.seq) == ACCEPTED
-    assert [refusal.name for refusal in state.refusals()] == ["live.rate_hz"]
+    assert [refusal.name for refusal in state.rejections()] == ["live.rate_hz"]
     wishes, said = section("## The shadow").split("<!-- example: reported -->")
     assert {name for row in rows(wishes) for name in named(row[0])} == {*RULES, f"{FIELDS}.<stream>"}
     assert {name for row in rows(said) for name in named(row[0])} == reported.keys()

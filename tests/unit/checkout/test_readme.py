@@ -4,13 +4,9 @@ from __future__ import annotations
 
 import re
 
-from scripts.fields import ROOT, filled
+from scripts.docs_parts import ROOT
 
 README = (ROOT / "README.md").read_text()
-
-
-def test_field_table_is_the_contracts():
-    assert filled(README) == README
 
 
 def test_car_yaml_names_settings_that_the_agent_knows(tmp_path):

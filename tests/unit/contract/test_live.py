@@ -10,10 +10,10 @@ import pytest
 from hypothesis import example, given
 from hypothesis import strategies as st
 
+from iort_contract.catalog.vesc import VESC_FIELDS
 from iort_contract.limits import MAX_PUBNUB_BYTES, ContractError
 from iort_contract.messages.event import MESSAGE_BASE64, event_message, rule_event
 from iort_contract.messages.live import LiveSample, decode_live, encode_live, live_update
-from iort_contract.vesc import VESC_FIELDS
 from tests.unit.contract.contract_values import (
     BAD_HEADERS,
     BOOT,

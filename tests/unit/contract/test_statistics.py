@@ -9,9 +9,10 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from iort_contract.catalog.derived import Vehicle, derive
 from iort_contract.codec.seconds import flat_second
 from iort_contract.messages.batch import Batch, BatchId
-from iort_contract.statistics import Vehicle, count_holes, derive, missing_before, summarize_second
+from iort_contract.statistics import count_holes, missing_before, summarize_second
 
 S = 1_000_000
 SECOND = 1_700_000_000

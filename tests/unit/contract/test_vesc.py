@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import pytest
 
+from iort_contract.catalog.vesc import FAULT_CODES, FAULTS, VESC_FIELDS, absent
 from iort_contract.messages.batch import Batch, encode_batch
-from iort_contract.vesc import FAULT_CODES, FAULTS, VESC_FIELDS, absent
 from tests.unit.contract.contract_values import BOOT
 
 # The messages of the drivers, in their order.

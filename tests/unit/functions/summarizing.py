@@ -6,8 +6,8 @@ import json
 from collections import defaultdict
 
 from functions.shared.processing import process
+from iort_contract.catalog.vesc import VESC_FIELDS
 from iort_contract.messages.batch import Batch
-from iort_contract.vesc import VESC_FIELDS
 from tests.fakes import (
     TELEMETRY,
     TOPIC_OF_CAR,

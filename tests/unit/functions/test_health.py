@@ -6,9 +6,10 @@ import pytest
 
 from functions.shared.health import measure, together
 from functions.shared.metrics import MOST_VALUES
+from iort_contract.catalog.streams import AGENT_STREAM, RTT_STREAM
+from iort_contract.catalog.vesc import TEMPERATURES, hottest_degc
 from iort_contract.cloud import METRICS
 from iort_contract.messages.batch import Batch
-from iort_contract.topics import AGENT_STREAM, RTT_STREAM
 
 
 def batch(columns, *, times_us=None):
@@ -72,3 +73,13 @@ def test_several_robots_are_one_line_of_log_and_none_of_their_values_is_cut_off(
     assert [len(line["BatteryVolts"]) for line in many] == [MOST_VALUES, 1]
     assert sum(line.get("SampleGaps", 0) for line in many) == MOST_VALUES + 1
     assert list(together([])) == [{}]
+
+
+def test_hottest_is_the_same_in_the_alarm_and_in_the_watch() -> None:
+    for hot in TEMPERATURES:
+        sample = {**dict.fromkeys(TEMPERATURES, 20.0), hot: 81.5}
+        measured = measure("vesc", [batch({name: [value] for name, value in sample.items()})])
+        assert measured["TemperatureDegC"] == [81.5] == [hottest_degc(sample)]
+    unread = {"temperature_pcb": 0, "temp_fet": -60.0, "temp_motor": None, "ntc_temp_mos1": True}
+    assert hottest_degc(unread) is None
+    assert hottest_degc({**unread, "ntc_temp_mos2": -3.5}) == -3.5

@@ -13,10 +13,10 @@ from functions.shared import allowances, share
 from functions.shared.allowances import Allowances
 from functions.shared.processing import Bounds, process
 from functions.shared.share import KEYS, OverShareError, PutOff, Share, Told, waiting
+from iort_contract.catalog.vesc import VESC_STREAM
 from iort_contract.dynamodb import TableError
 from iort_contract.tables import OVER_SHARE, PUT_OFF
 from iort_contract.topics import RECORD, SHADOW, build_topic
-from iort_contract.vesc import VESC_STREAM
 from tests.unit.functions.summarizing import T0, S, Stream, batch, counted
 
 GOOD, BAD = (build_topic(RECORD, robot, VESC_STREAM) for robot in ("good", "bad"))

@@ -26,7 +26,7 @@ from iort_station.cost.fixed_costs import (
 from iort_station.cost.prices import PRICES
 from iort_station.cost.usage import CLOCK_PING_S, Usage
 from iort_station.errors import StationError
-from scripts.costs import FILES, ROOT, filled
+from scripts.docs_parts import ROOT
 
 _ONE = Usage()
 
@@ -219,11 +219,6 @@ def test_the_documents_count_what_is_watched_as_the_model_does():
         f"| {platform} metrics every {PAGE_REFRESH_S} s | $0.01 for 1,000 metrics | none |",
     ):
         assert line in text
-
-
-def test_documents_hold_the_tables_that_the_model_makes():
-    for path in FILES:
-        assert filled(path.read_text()) == path.read_text(), f"{path.name}: run python scripts/costs.py"
 
 
 def test_command_prints_json_that_adds_up(tmp_path):

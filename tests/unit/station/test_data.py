@@ -10,13 +10,14 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from functions.shared.tables import attribute
+from iort_contract.catalog.derived import Vehicle
+from iort_contract.catalog.derived import derive as derive_lists
+from iort_contract.catalog.streams import TYPES_STREAM
 from iort_contract.codec.seconds import flat_second, packed_second
 from iort_contract.limits import MAX_BATCH_SPAN_US
 from iort_contract.messages.batch import Batch
 from iort_contract.messages.message_type import MessageType
-from iort_contract.statistics import Vehicle
-from iort_contract.statistics import derive as derive_lists
-from iort_contract.topics import TYPES_STREAM, build_topic
+from iort_contract.topics import build_topic
 from iort_station import data
 from iort_station.data import conditions, select
 from iort_station.errors import StationError

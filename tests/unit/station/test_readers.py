@@ -27,7 +27,7 @@ from tests.fakes import item_of, serialize
 T_US = 1_700_000_000_000_000
 RUN = "0badcafe"
 NO_RUNS = ["run-1", "0BADCAFE", "0badcaf", "0" * 33, "", "0badcafe ", "0badcafg"]
-PAGE = Path(__file__).parents[3] / "station" / "web" / "src" / "message.ts"
+PAGE = Path(__file__).parents[3] / "station" / "web" / "src" / "base" / "contract.ts"
 
 
 def stored(**changes):
@@ -98,7 +98,7 @@ def test_one_form_of_a_runs_name_holds_in_every_lane_and_on_the_page():
     live = encode_live(LiveSample(RUN, 1, T_US, T_US, {}))
     fleet = encode_fleet(FleetMessage(RUN, 1, T_US, {}))
     command = encode_command(Command(RUN, T_US, 1, T_US, 100, {}))
-    page = re.search(r"^const BOOT = /\^(.*)\$/;$", PAGE.read_text(), re.MULTILINE)
+    page = re.search(r"^export const BOOT = /\^(.*)\$/;$", PAGE.read_text(), re.MULTILINE)
     assert page is not None
     for name, allowed in [(RUN, True), ("0" * 32, True)] + [(one, False) for one in NO_RUNS]:
         said = {

@@ -18,7 +18,7 @@ from iort_agent.lanes.batch_encoder import Packer
 from iort_agent.sources.ros1 import Intake, TopicConfig
 from iort_agent.spool.memory import MemorySpool
 from iort_contract.topics import RECORD, build_topic
-from iort_station.cli.verbs.export import _write
+from iort_station.cli.verbs.data.export import _write
 from iort_station.data.selection import select
 from iort_station.recordings import recordings
 from tests.agent_fakes import ManualClock

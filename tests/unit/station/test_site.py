@@ -25,7 +25,7 @@ def built(tmp_path):
 
 def test_the_build_and_the_configuration_and_nothing_else(built):
     content = files(TOLD, built)
-    assert content.keys() == {"index.html", "page.js", "config.json", "fields.json"}
+    assert content.keys() == {"index.html", "page.js", "config.json"}
     told = json.loads(content["config.json"])
     assert told["answers"] is False
     assert told["token"] == "abc_DEF-1="

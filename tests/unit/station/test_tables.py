@@ -12,7 +12,7 @@ import pytest
 from rich.console import Console
 
 from iort_station.cli import tables
-from iort_station.cli.verbs.options import Range
+from iort_station.cli.options import Range
 from iort_station.data import Result
 from iort_station.errors import StationError
 

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import pytest
 
+from iort_contract.catalog.streams import AGENT_STREAM, RTT_STREAM
+from iort_contract.catalog.vesc import VESC_STREAM
 from iort_contract.messages.message_type import MessageType
-from iort_contract.topics import AGENT_STREAM, RTT_STREAM
-from iort_contract.vesc import VESC_STREAM
 from iort_station.data.units import unit
 
 

@@ -20,13 +20,14 @@ from iort_agent.sources import REFUSE, UPLOAD, Emit
 from iort_agent.sources.recording.player import NOW, ORIGINAL, Message, Open, Playback, play
 from iort_agent.sources.recording.tool_csv import VescLog
 from iort_agent.sources.recording.unreadable import Wrapped, check_kind
+from iort_contract.catalog.streams import TYPES_STREAM
+from iort_contract.catalog.vesc import VESC_STREAM
 from iort_contract.limits import ContractError, MessageError, Value
 from iort_contract.messages.message_type import MessageType
 from iort_contract.ros1.decode import HEADER, Decoder
 from iort_contract.ros1.definition import parse
 from iort_contract.ros1.message import RosMessage, RosType
-from iort_contract.topics import TYPES_STREAM, check_stream
-from iort_contract.vesc import VESC_STREAM
+from iort_contract.topics import check_stream
 
 _log = logging.getLogger(__name__)
 

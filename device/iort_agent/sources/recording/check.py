@@ -7,7 +7,7 @@ from typing import NamedTuple
 
 from iort_agent.errors import SourceError
 from iort_agent.sources.recording.bag import BagSource
-from iort_contract.topics import TYPES_STREAM
+from iort_contract.catalog.streams import TYPES_STREAM
 
 
 class Looked(NamedTuple):

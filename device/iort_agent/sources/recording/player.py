@@ -7,8 +7,8 @@ from typing import Callable, ContextManager, Iterator, Mapping, NamedTuple, Opti
 
 from iort_agent.clock import Clock, Pace
 from iort_agent.sources import Emit
+from iort_contract.catalog.streams import TYPES_STREAM
 from iort_contract.limits import Value
-from iort_contract.topics import TYPES_STREAM
 
 NOW, ORIGINAL = "now", "original"
 # Between the rounds of a recording with a single message.

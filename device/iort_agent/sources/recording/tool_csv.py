@@ -19,8 +19,8 @@ from typing import TYPE_CHECKING, Any, Callable, Iterator, Mapping, NamedTuple, 
 
 from iort_agent.errors import SourceError
 from iort_agent.sources.recording.player import ORIGINAL, Message
+from iort_contract.catalog.vesc import FAULT_CODES
 from iort_contract.limits import MAX_FIELDS, Value
-from iort_contract.vesc import FAULT_CODES
 
 if TYPE_CHECKING:
     from typing_extensions import Self

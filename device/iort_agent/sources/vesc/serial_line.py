@@ -35,8 +35,8 @@ from iort_agent.sources.vesc.protocol import (
     frame,
     request,
 )
+from iort_contract.catalog.vesc import VESC_STREAM
 from iort_contract.topics import check_stream
-from iort_contract.vesc import VESC_STREAM
 
 _log = logging.getLogger(__name__)
 

@@ -1,27 +1,27 @@
 // One car in full: gauges, charts, the delay by hop, planes, faults, and every field of every stream.
 
-import type { Shown } from "../chart";
-import type { FieldTable } from "../config";
-import { byName, el, setAttribute, Text } from "../dom";
-import { FaultLog } from "../faultlog";
-import { median, MEDIAN_S, numeric, WINDOW_S, type Fleet, type Robot, type Stream } from "../fleet";
-import { age, AS_SENT, linear, spec, type Linear } from "../format";
-import { Gauge } from "../gauge";
-import { Panel } from "../panel";
-import { Plane, type Track } from "../plane";
-import { Ring } from "../ring";
-import { fieldKey, StreamSection } from "../tiles";
-import { Waterfall } from "../waterfall";
-import { DELAY_PANEL, GAUGES, PLANES, VESC_PANELS, type PlaneSpec } from "./carspec";
+import type { FieldTable } from "../base/contract";
+import type { Shown } from "../charts/live_chart";
+import { byName, el, setAttribute, Text } from "../base/dom";
+import { FaultLog } from "../widgets/fault_log";
+import { median, MEDIAN_S, numeric, WINDOW_S, type Fleet, type Robot, type Stream } from "../live/fleet";
+import { age, AS_SENT, linear, spec, type Linear } from "../base/format";
+import { Gauge } from "../charts/gauge";
+import { ChartPanel } from "../charts/chart_panel";
+import { XYChart, type Track } from "../charts/xy_chart";
+import { Ring } from "../live/ring";
+import { fieldKey, StreamSection } from "../widgets/field_tiles";
+import { Waterfall } from "../charts/waterfall";
+import { DELAY_PANEL, GAUGES, XY_CHARTS, VESC_PANELS, type XYChartSpec } from "../charts/car_charts";
 
 const MOST_CHOSEN = 6;
 // Values are written at most 25 times a second.
 const SCREENS = 25 * MEDIAN_S;
 
-interface ShownPlane {
-  readonly spec: PlaneSpec;
+interface ShownXYChart {
+  readonly spec: XYChartSpec;
   readonly node: HTMLElement;
-  readonly plane: Plane;
+  readonly plane: XYChart;
   source: { readonly stream: Stream; readonly x: string; readonly y: string; readonly as: Linear } | undefined;
   unit: string;
 }
@@ -36,13 +36,13 @@ export class CarView {
   private readonly charts = el("div", { class: "charts" });
   private readonly chosenCharts = el("div", { class: "charts" });
   private readonly streams = el("div", { class: "streams" });
-  private readonly panels: readonly Panel[];
-  private readonly delay: Panel;
-  private readonly planes: readonly ShownPlane[];
+  private readonly panels: readonly ChartPanel[];
+  private readonly delay: ChartPanel;
+  private readonly planes: readonly ShownXYChart[];
   private readonly waterfall = new Waterfall();
   private readonly faults = new FaultLog();
   private readonly sections = new Map<Stream, StreamSection>();
-  private readonly chosen = new Map<string, { readonly panel: Panel; readonly stream: Stream; readonly field: string; ros2: boolean }>();
+  private readonly chosen = new Map<string, { readonly panel: ChartPanel; readonly stream: Stream; readonly field: string; ros2: boolean }>();
   private robot: Robot | undefined;
   private drawn = -1;
   /** When a message was drawn, and how long that was after its arrival, in milliseconds. */
@@ -56,15 +56,15 @@ export class CarView {
     this.gauges = GAUGES.map((each) => new Gauge(each));
     this.gaugeRow.append(...this.gauges.map(({ node }) => node));
     const aside = el("aside", { class: "aside" });
-    this.panels = VESC_PANELS.map((options) => new Panel(this.charts, options));
+    this.panels = VESC_PANELS.map((options) => new ChartPanel(this.charts, options));
     aside.append(this.waterfall.node);
-    this.delay = new Panel(aside, DELAY_PANEL);
+    this.delay = new ChartPanel(aside, DELAY_PANEL);
     const planeRow = el("div", { class: "planes" });
-    this.planes = PLANES.map((spec) => {
+    this.planes = XY_CHARTS.map((spec) => {
       const host = el("div", { class: "plot", "aria-hidden": "true" });
       const node = el("section", { class: "panel", "aria-label": spec.title }, el("header", {}, el("h3", {}, spec.title), el("p", { class: "note" }, `last ${WINDOW_S} s`)), host);
       planeRow.append(node);
-      const shown: ShownPlane = { spec, node, plane: new Plane(host, { ...spec, x: () => spec.x + shown.unit }), source: undefined, unit: "" };
+      const shown: ShownXYChart = { spec, node, plane: new XYChart(host, { ...spec, x: () => spec.x + shown.unit }), source: undefined, unit: "" };
       return shown;
     });
     planeRow.append(this.faults.node);
@@ -125,7 +125,7 @@ export class CarView {
     if (this.chosen.size >= MOST_CHOSEN) this.close(this.chosen.keys().next().value!);
     const { label, unit, digits, ...as } = spec(field, this.table, stream.ros2);
     const reading = { name: key, unit, from: ([value = NaN]: readonly number[]) => value, ...(digits === undefined ? {} : { digits }) };
-    const panel = new Panel(this.chosenCharts, {
+    const panel = new ChartPanel(this.chosenCharts, {
       title: label,
       readings: [reading],
       chart: { lines: [{ colour: "--accent" }], span: 1e-3 },
@@ -226,7 +226,7 @@ function shown(stream: Stream | undefined, fields: readonly string[]): Shown | u
   return stream && { history: stream.history, columns: fields.map((field) => stream.columns.get(field)) };
 }
 
-function track({ stream, x, y, as }: NonNullable<ShownPlane["source"]>, now: number): Track {
+function track({ stream, x, y, as }: NonNullable<ShownXYChart["source"]>, now: number): Track {
   const column = (field: string): Float64Array => stream.history.column(stream.columns.get(field) ?? 0, now - WINDOW_S);
   const across = column(x);
   return { x: as === AS_SENT ? across : across.map((value) => linear(value, as)), y: column(y) };

@@ -1,11 +1,11 @@
 // CloudWatch's dashboards as they are deployed, drawn from the metrics that the cloud has.
 
-import { ask, AnswerError, type Alarm, type Dashboard, type Series, type Widget } from "../answers";
-import type { Config } from "../config";
-import { el, Text } from "../dom";
-import { clockTime, dayTime, NOTHING, number, zone } from "../format";
-import { LogTable } from "../logtable";
-import { TimeChart, type Curve } from "../timechart";
+import type { Alarm, Config, Dashboard, Series, Widget } from "../base/contract";
+import { ask, AnswerError } from "../server/answers";
+import { el, Text } from "../base/dom";
+import { clockTime, dayTime, NOTHING, number, zone } from "../base/format";
+import { LogTable } from "../widgets/log_table";
+import { RangeChart, type Curve } from "../charts/range_chart";
 
 const REFRESH_S = 30;
 const RANGES = [["15 min", 15], ["1 h", 60], ["3 h", 180], ["24 h", 1440]] as const;
@@ -18,7 +18,7 @@ export class CloudWatchView {
   private readonly range = el("select", { id: "minutes", name: "minutes" });
   private readonly note = new Text("history-note", "p", { role: "status" });
   private readonly grid = el("div", { class: "widgets" });
-  private charts: TimeChart[] = [];
+  private charts: RangeChart[] = [];
   private logs = new Map<string, LogTable>();
   private timer: number | undefined;
   private loading: AbortController | undefined;
@@ -162,13 +162,13 @@ function alarm({ name, about, state, reason, since_s }: Alarm): HTMLElement {
   );
 }
 
-function chart(host: HTMLElement, { series, period_s }: Widget, range: readonly [number, number]): TimeChart {
+function chart(host: HTMLElement, { series, period_s }: Widget, range: readonly [number, number]): RangeChart {
   const times = [...new Set(series.flatMap(({ times_s }) => times_s))].sort((a, b) => a - b);
   const curves: Curve[] = series.map(({ label, right }, i) => {
     const dash = DASHES[Math.floor(i / COLOURS.length) % DASHES.length];
     return { label, right, colour: COLOURS[i % COLOURS.length]!, points: true, ...(dash ? { dash } : {}) };
   });
-  return new TimeChart(host, { curves, zero: true, sync: "cloudwatch", hole_s: period_s * 1.5 }, [times, ...series.map((each) => aligned(each, times))], range);
+  return new RangeChart(host, { curves, zero: true, sync: "cloudwatch", hole_s: period_s * 1.5 }, [times, ...series.map((each) => aligned(each, times))], range);
 }
 
 function aligned({ times_s, values }: Series, times: readonly number[]): (number | null)[] {

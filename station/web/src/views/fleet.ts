@@ -1,18 +1,18 @@
 // Every car: one card each, in the order of their names, so that a card stays where it is.
 
-import { Absent } from "../absent";
-import type { Config, FieldTable } from "../config";
-import { byName, el, setAttribute, Text } from "../dom";
-import { numeric, type Fleet, type Robot } from "../fleet";
-import { age, linear, milliseconds, NOTHING, number } from "../format";
-import { route } from "../route";
-import { Sparkline } from "../sparkline";
-import { hottest } from "./carspec";
+import type { Config, FieldTable } from "../base/contract";
+import { AbsentCars } from "../widgets/absent_cars";
+import { byName, el, setAttribute, Text } from "../base/dom";
+import { numeric, type Fleet, type Robot } from "../live/fleet";
+import { age, linear, milliseconds, NOTHING, number } from "../base/format";
+import { route } from "../base/route";
+import { Sparkline } from "../charts/sparkline";
+import { hottest } from "../charts/car_charts";
 
 export class FleetView {
   readonly node: HTMLElement;
   private readonly nav = el("nav", { class: "cars", id: "cars", "aria-label": "Cars" });
-  private readonly absent: Absent;
+  private readonly absent: AbsentCars;
   private readonly cards = new Map<string, Card>();
 
   constructor(
@@ -20,7 +20,7 @@ export class FleetView {
     private readonly fleet: Fleet,
     private readonly table: FieldTable,
   ) {
-    this.absent = new Absent(config, fleet);
+    this.absent = new AbsentCars(config, fleet);
     this.node = el("div", { class: "fleet" }, this.nav, this.absent.node);
     this.nav.addEventListener("keydown", (event) => this.key(event));
   }

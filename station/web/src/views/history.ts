@@ -1,15 +1,15 @@
 // What a car did: a range from the cloud's table, to scrub through and to hold against what it does now.
 
-import { ask, AnswerError, type Drive } from "../answers";
-import { claim, claimed, partsOf } from "../claims";
-import type { Config, FieldTable } from "../config";
-import { el, setAttribute, Text } from "../dom";
-import type { Fleet } from "../fleet";
-import { age, asSpeed, dayTime, linear, number, spec, zone, type Spec } from "../format";
-import { Picture } from "../picture";
-import { route } from "../route";
-import { TimeChart } from "../timechart";
-import { Comparison } from "./comparison";
+import type { Config, HistoryAnswer, FieldTable } from "../base/contract";
+import { ask, AnswerError } from "../server/answers";
+import { claim, claimed, partsOf } from "../live/attachments";
+import { el, setAttribute, Text } from "../base/dom";
+import type { Fleet } from "../live/fleet";
+import { age, asSpeed, dayTime, linear, number, spec, zone, type Spec } from "../base/format";
+import { Thumbnail } from "../widgets/thumbnail";
+import { route } from "../base/route";
+import { RangeChart } from "../charts/range_chart";
+import { Comparison } from "../widgets/comparison";
 
 const RANGES = [["1 min", 60], ["5 min", 300], ["15 min", 900], ["1 h", 3600]] as const;
 const FIRST_FIELDS = ["speed", "voltage_input", "current_motor", "current_input", "duty_cycle", "temperature_pcb"];
@@ -36,10 +36,10 @@ export class HistoryView {
   private readonly pictures = el("div", { class: "tiles pictures" });
   private readonly comparison: Comparison;
   /** Of each field of bytes its picture, and the rows in which the car has kept one. */
-  private readonly kept = new Map<string, { readonly picture: Picture; readonly rows: readonly number[] }>();
-  private readonly shown = new Map<string, { readonly node: HTMLElement; readonly chart: TimeChart }>();
+  private readonly kept = new Map<string, { readonly picture: Thumbnail; readonly rows: readonly number[] }>();
+  private readonly shown = new Map<string, { readonly node: HTMLElement; readonly chart: RangeChart }>();
   private robot: string | undefined;
-  private drive: Drive | undefined;
+  private drive: HistoryAnswer | undefined;
   private loading: AbortController | undefined;
   private playing: number | undefined;
 
@@ -142,7 +142,7 @@ export class HistoryView {
     const began = performance.now();
     try {
       const asked = { robot: this.robot!, stream: this.stream.value, from_us: String(from_s * 1e6), to_us: String(to_s * 1e6), rows: String(ROWS) };
-      const drive = await ask<Drive>("history", asked, loading.signal);
+      const drive = await ask<HistoryAnswer>("history", asked, loading.signal);
       if (loading.signal.aborted) return;
       this.set(drive, [from_s, to_s]);
       const each = drive.row_s > 0 ? `, drawn as the mean of ${drive.row_s < 1 ? `${number(drive.row_s * 1000, 0)} ms` : age(drive.row_s)} each within its least and most` : "";
@@ -161,7 +161,7 @@ export class HistoryView {
     this.result.hidden = true;
   }
 
-  private set(drive: Drive, asked: readonly [number, number]): void {
+  private set(drive: HistoryAnswer, asked: readonly [number, number]): void {
     const before = new Set(this.shown.keys());
     this.clear();
     if (drive.samples === 0) return;
@@ -195,14 +195,14 @@ export class HistoryView {
   }
 
   /** Pictures for the fields of bytes; all other fields. */
-  private look(drive: Drive): string[] {
+  private look(drive: HistoryAnswer): string[] {
     const all = new Map(Object.entries(drive.fields));
     const ofBytes = claimed(all);
     this.kept.clear();
     for (const field of ofBytes) {
       const keys = drive.fields[`${field}.key`]!.mean;
       const rows = [...keys.keys()].filter((row) => keys[row] !== null);
-      this.kept.set(field, { picture: new Picture(spec(field, this.table).label, field), rows });
+      this.kept.set(field, { picture: new Thumbnail(spec(field, this.table).label, field), rows });
     }
     this.pictures.replaceChildren(...[...this.kept.values()].map(({ picture }) => picture.node));
     const claims = new Set(ofBytes.flatMap(partsOf));
@@ -222,12 +222,12 @@ export class HistoryView {
     const as = this.spec(field);
     const { label, unit } = as;
     const { mean, least, most } = drive.fields[field]!;
-    const scaled = (values: Drive["fields"][string]["mean"]): (number | null)[] => values.map((value) => (typeof value === "number" ? linear(value, as) : null));
+    const scaled = (values: HistoryAnswer["fields"][string]["mean"]): (number | null)[] => values.map((value) => (typeof value === "number" ? linear(value, as) : null));
     const plot = el("div", { class: "plot", "aria-hidden": "true" });
     const node = el("section", { class: "panel", "aria-label": label }, el("header", {}, el("h3", {}, label), el("p", { class: "reading" }, el("span", { class: "unit" }, unit))), plot);
     this.charts.append(node);
     const band = least !== undefined && most !== undefined;
-    const chart = new TimeChart(
+    const chart = new RangeChart(
       plot,
       {
         curves: [{ label, colour: "--accent" }],

@@ -1,0 +1,59 @@
+"""The kinds of entry: a field, a derived field, a stream."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any, Callable
+
+
+@dataclass(frozen=True)
+class Field:
+    """A field of a stream.
+
+    ``group`` joins fields of one kind. ``ros`` names the ROS drivers that report it (VESC only).
+    ``ros2_unit`` is the ROS 2 driver's unit if it differs.
+    """
+
+    name: str
+    unit: str
+    meaning: str
+    group: str = ""
+    ros: tuple[int, ...] = ()
+    ros2_unit: str | None = None
+
+
+@dataclass(frozen=True)
+class Derived:
+    """A field that is calculated from others, in the summary, in queries and in notebooks.
+
+    ``formula`` takes fields and vehicle parameters by their names. It uses operators alone, so the same code
+    calculates with numbers and with numpy's arrays.
+    """
+
+    name: str
+    unit: str
+    meaning: str
+    formula: Callable[..., Any]
+
+    @property
+    def arguments(self) -> tuple[str, ...]:
+        """The names of the formula's arguments, in order."""
+        code = self.formula.__code__
+        return code.co_varnames[: code.co_argcount]
+
+
+@dataclass(frozen=True)
+class Stream:
+    """A stream whose fields are known. ``own`` marks a stream of the agent, which needs no configuration."""
+
+    name: str
+    meaning: str
+    fields: tuple[Field, ...] = ()
+    own: bool = False
+
+    def unit(self, name: str, *, ros2: bool = False) -> str:
+        """A field's unit, or the ROS 2 driver's; empty if the field is unknown."""
+        found = next((field for field in self.fields if field.name == name), None)
+        if found is None:
+            return ""
+        return (found.ros2_unit if ros2 else None) or found.unit

@@ -1,0 +1,47 @@
+"""The streams with known fields. A new field of the agent is an entry here; of the VESC, in `vesc`."""
+
+from __future__ import annotations
+
+from iort_contract.catalog.entries import Field, Stream
+from iort_contract.catalog.vesc import VESC
+from iort_contract.topics import PING_PATHS
+
+RTT_STREAM, AGENT_STREAM, TYPES_STREAM, ACCOUNT_STREAM = "rtt", "agent", "types", "account"
+# One sample per pong, with null in the other paths' fields.
+RTT_FIELDS = {path: f"{path}_ms" for path in PING_PATHS}
+
+CATALOG = {
+    stream.name: stream
+    for stream in (
+        VESC,
+        Stream(
+            RTT_STREAM,
+            "round trips of pings",
+            tuple(Field(name, "ms", f"round trip over the path {path}") for path, name in RTT_FIELDS.items()),
+            own=True,
+        ),
+        Stream(
+            AGENT_STREAM,
+            "the agent's own figures; counts grow from 0 at its start",
+            (
+                Field("cpu_percent", "%", "share of one core, since the sample before"),
+                Field("rss_mb", "MB", "memory in use"),
+                Field("samples_per_s", "samples/s", "samples from all sources, since the sample before"),
+                Field("backlog_batches", "batches", "batches in the spool"),
+                Field("backlog_bytes", "bytes", "bytes in the spool"),
+                Field("dropped_batches", "batches", "batches dropped because the spool was full"),
+                Field("connects", "connections", "connections made"),
+                Field("clock_offset_ms", "ms", "cloud's clock minus the car's; null before the first pong"),
+                Field("clock_uncertainty_ms", "ms", "uncertainty of the clock offset, either way"),
+                Field("files_waiting", "files", "files waiting to be uploaded"),
+                Field("files_sent_bytes", "bytes", "bytes of files sent"),
+            ),
+            own=True,
+        ),
+        Stream(TYPES_STREAM, "the ROS types of the streams' messages: `MessageType`", own=True),
+        Stream(ACCOUNT_STREAM, "samples taken, stored and not recorded: messages/account.py", own=True),
+    )
+}
+# The streams that every robot may have without configuration.
+OWN_STREAMS = frozenset(stream.name for stream in CATALOG.values() if stream.own)
+AGENT_FIELDS = {field.name: field for field in CATALOG[AGENT_STREAM].fields}

@@ -1,0 +1,137 @@
+"""The messages to the live page: its configuration, and its server's answers.
+
+Each is sent as JSON. `make docs-parts` writes TypeScript's types into station/web/src/base/contract.ts.
+"""
+
+from __future__ import annotations
+
+from typing import Literal, TypedDict, Union
+
+from iort_contract.limits import Value
+
+
+class Config(TypedDict):
+    """``config.json``: where to listen. ``token`` is PubNub's access token, or empty. ``answers`` says
+    whether the server answers questions about the past; a static site does not. ``vehicles`` maps a
+    robot to its `Vehicle`'s parameters."""
+
+    namespace: str
+    subscribe_key: str
+    origin: str
+    tls: bool
+    token: str
+    answers: bool
+    vehicles: dict[str, dict[str, float]]
+
+
+class RobotPresence(TypedDict):
+    """Whether a robot is connected, and since when it is or is not; null if it never was."""
+
+    online: bool
+    since_ms: int | None
+
+
+class RobotsAnswer(TypedDict):
+    """Answers ``robots``."""
+
+    robots: dict[str, RobotPresence]
+
+
+class VehiclesAnswer(TypedDict):
+    """Answers ``vehicles``: as in `Config`."""
+
+    vehicles: dict[str, dict[str, float]]
+
+
+class StreamsAnswer(TypedDict):
+    """Answers ``streams``: the names of a robot's streams."""
+
+    streams: list[str]
+
+
+class DashboardsAnswer(TypedDict):
+    """Answers ``dashboards``: their names."""
+
+    dashboards: list[str]
+
+
+class _Mean(TypedDict):
+    mean: list[Value]
+
+
+class Column(_Mean, total=False):
+    """A field's values; with minimum and maximum if a row stands for many samples."""
+
+    least: list[Value]
+    most: list[Value]
+
+
+class HistoryAnswer(TypedDict):
+    """Answers ``history``: a stream's samples in a range. ``row_s`` is the time that a row covers; 0
+    if each row is a sample. ``ros2`` says whether charge and energy have the ROS 2 driver's units."""
+
+    times_s: list[float]
+    fields: dict[str, Column]
+    samples: int
+    ros2: bool
+    row_s: float
+
+
+class Series(TypedDict):
+    """A line of a chart; ``right`` for the right axis."""
+
+    label: str
+    right: bool
+    times_s: list[float]
+    values: list[float]
+
+
+class Alarm(TypedDict):
+    """A CloudWatch alarm."""
+
+    name: str
+    about: str
+    state: Literal["OK", "ALARM", "INSUFFICIENT_DATA"]
+    reason: str
+    since_s: float
+
+
+class _Drawn(TypedDict):
+    x: int
+    y: int
+    width: int
+    height: int
+    title: str
+    kind: Literal["series", "number", "alarms", "log", "text", "other"]
+    text: str
+    period_s: int
+    series: list[Series]
+    alarms: list[Alarm]
+
+
+class Widget(_Drawn):
+    """A dashboard's widget; ``number`` is its place in the dashboard's body."""
+
+    number: int
+
+
+class Dashboard(TypedDict):
+    """Answers ``dashboard``: a CloudWatch dashboard with its values."""
+
+    name: str
+    from_s: int
+    to_s: int
+    widgets: list[Widget]
+
+
+class Logs(TypedDict):
+    """Answers ``log``: the result of a log widget; ``found`` may exceed the number of rows."""
+
+    columns: list[str]
+    rows: list[list[str]]
+    found: int
+    from_s: int
+    to_s: int
+
+
+Answer = Union[RobotsAnswer, VehiclesAnswer, StreamsAnswer, HistoryAnswer, DashboardsAnswer, Dashboard, Logs]

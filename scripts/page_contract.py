@@ -1,0 +1,139 @@
+"""The constants and types of the contract as TypeScript for the page; scripts/docs_parts.py writes them."""
+
+from __future__ import annotations
+
+import json
+import re
+import types
+from collections.abc import Iterator
+from typing import Any, ForwardRef, Literal, Union, get_args, get_origin, get_type_hints, is_typeddict
+
+from iort_contract import checks, limits, topics
+from iort_contract.catalog.derived import DERIVED
+from iort_contract.catalog.entries import Derived, Field
+from iort_contract.catalog.ros_types import ROS_UNITS
+from iort_contract.catalog.streams import CATALOG
+from iort_contract.catalog.vesc import FAULTS, TEMPERATURES, VESC_STREAM
+from iort_contract.messages import page
+from iort_contract.messages.files import CLAIM_FIELDS
+
+
+class Symbol:
+    """Stands for an argument of a formula; the operators on it give the formula's text."""
+
+    def __init__(self, text: str) -> None:
+        self.text = text
+
+
+def _operator(symbol: str, *, swapped: bool = False) -> Any:
+    def operate(left: Symbol, right: Symbol | float) -> Symbol:
+        sides = [f"({t})" if " " in t else t for t in (left.text, str(getattr(right, "text", right)))]
+        return Symbol(f" {symbol} ".join(reversed(sides) if swapped else sides))
+
+    return operate
+
+
+for _name, _text in {"add": "+", "sub": "-", "mul": "*", "truediv": "/", "pow": "**"}.items():
+    setattr(Symbol, f"__{_name}__", _operator(_text))
+    setattr(Symbol, f"__r{_name}__", _operator(_text, swapped=True))
+
+
+def formula(entry: Derived) -> str:
+    """A derived field's formula as text, which Python and TypeScript read alike."""
+    return str(entry.formula(*map(Symbol, entry.arguments)).text)
+
+
+def page_contract() -> None:
+    """The constants and types of the contract that the page's code uses."""
+    print("\n".join([*_constants(), *_types()]).rstrip())
+
+
+def _constants() -> Iterator[str]:
+    for module, names in {
+        limits: ("SCHEMA_VERSION", "MAX_FIELDS", "MAX_FIELD_CHARACTERS", "STALE_S", "GONE_S"),
+        topics: ("NAME",),
+        checks: ("BOOT", "FIELD_NAME"),
+    }.items():
+        for name in names:
+            value = getattr(module, name)
+            literal = f"/^(?:{value.pattern})$/" if isinstance(value, re.Pattern) else json.dumps(value)
+            yield f"export const {name} = {literal};"
+    yield f"export const TEMPERATURES = {json.dumps(TEMPERATURES)} as const;"
+    yield f"export const ATTACHMENT_PARTS = {json.dumps(list(CLAIM_FIELDS))} as const;"
+    for entry in DERIVED.values():
+        arguments = ", ".join(f"{name}: number" for name in entry.arguments)
+        yield f"/** {entry.meaning}, {entry.unit} */"
+        yield f"export const {entry.name} = ({arguments}): number => {formula(entry)};"
+    table = {
+        "version": limits.SCHEMA_VERSION,
+        "stream": VESC_STREAM,
+        "fields": {field.name: _described(field) for field in _fields()},
+        "ros_units": ROS_UNITS,
+        "faults": {str(code): name for code, name in FAULTS.items()},
+    }
+    yield f"export const FIELD_TABLE: FieldTable = {json.dumps(table, indent=2, ensure_ascii=False)};"
+    yield _FIELD_TABLE
+
+
+def _fields() -> Iterator[Field | Derived]:
+    for stream in CATALOG.values():
+        yield from stream.fields
+    yield from DERIVED.values()
+
+
+def _described(field: Field | Derived) -> dict[str, str]:
+    ros2_unit = getattr(field, "ros2_unit", None)
+    described = {"unit": field.unit, "meaning": field.meaning}
+    return described | {"ros2_unit": ros2_unit} if ros2_unit else described
+
+
+_FIELD_TABLE = """
+export interface FieldEntry {
+  readonly unit: string;
+  readonly ros2_unit?: string;
+  readonly meaning: string;
+}
+
+export interface FieldTable {
+  /** The schema version; messages of another version are refused. */
+  readonly version: number;
+  /** The stream with the VESC's fields. */
+  readonly stream: string;
+  readonly fields: Readonly<Record<string, FieldEntry>>;
+  /** Field -> unit of the fields x, y and z within it. */
+  readonly ros_units: Readonly<Record<string, string>>;
+  readonly faults: Readonly<Record<string, string>>;
+}
+
+export type Value = null | boolean | number | string;
+"""
+
+
+def _types() -> Iterator[str]:
+    """An interface for each message of `iort_contract.messages.page`."""
+    for name, message in vars(page).items():
+        if is_typeddict(message) and not name.startswith("_"):
+            comment = " ".join((message.__doc__ or "").split())
+            yield f"/** {comment} */\nexport interface {name} {{"
+            for key, hint in get_type_hints(message).items():
+                optional = "" if key in message.__required_keys__ else "?"
+                yield f"  readonly {key}{optional}: {_type(hint)};"
+            yield "}\n"
+
+
+def _type(hint: Any) -> str:
+    if hint == limits.Value:
+        return "Value"
+    if isinstance(hint, ForwardRef) or is_typeddict(hint):
+        return str(hint.__name__)
+    origin, arguments = get_origin(hint), get_args(hint)
+    if origin is Literal:
+        return " | ".join(map(json.dumps, arguments))
+    if origin in {Union, types.UnionType}:
+        return " | ".join(map(_type, arguments))
+    if origin is list:
+        inner = _type(arguments[0])
+        return f"readonly {f'({inner})' if ' ' in inner else inner}[]"
+    if origin is dict:
+        return f"Readonly<Record<string, {_type(arguments[1])}>>"
+    return {str: "string", int: "number", float: "number", bool: "boolean", type(None): "null"}[hint]

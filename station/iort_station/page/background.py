@@ -1,0 +1,86 @@
+"""An aiohttp server in a thread of its own, for programs that are not asynchronous."""
+
+from __future__ import annotations
+
+import asyncio
+import socket
+import threading
+from types import TracebackType
+from typing import Any
+
+from aiohttp import web
+from typing_extensions import Self
+
+
+class BackgroundServer:
+    """Calls `handle` for every request, from `start` to `stop` or within a ``with`` block.
+
+    ``port=0`` takes a free port. ``options`` are those of `aiohttp.web.Server`.
+    """
+
+    def __init__(self, host: str, port: int, **options: Any) -> None:
+        self.host, self.port = host, port
+        self._options = options
+        self._thread: threading.Thread | None = None
+        self._loop: asyncio.AbstractEventLoop
+        self._stopping: asyncio.Event
+
+    async def handle(self, request: web.BaseRequest) -> web.StreamResponse:
+        """Answer a request."""
+        raise NotImplementedError
+
+    def start(self) -> Self:
+        """Listen, and return once connections are accepted. Raises `OSError` if the port is not free."""
+        if self._thread is not None:
+            raise RuntimeError("the server is running already")
+        family = socket.AF_INET6 if ":" in self.host else socket.AF_INET
+        both = self.host == "::" and socket.has_dualstack_ipv6()
+        listening = socket.create_server((self.host, self.port), family=family, dualstack_ipv6=both)
+        self.port = listening.getsockname()[1]
+        started = threading.Event()
+        self._thread = threading.Thread(
+            target=lambda: asyncio.run(self._serve(listening, started)), name=type(self).__name__, daemon=True
+        )
+        self._thread.start()
+        started.wait()
+        return self
+
+    def stop(self) -> None:
+        """Drop every connection and end the thread. A second call has no effect."""
+        if self._thread is not None:
+            self._loop.call_soon_threadsafe(self._stopping.set)
+            self._thread.join()
+            self._thread = None
+
+    def __enter__(self) -> Self:
+        return self.start()
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self.stop()
+
+    async def _serve(self, listening: socket.socket, started: threading.Event) -> None:
+        self._loop, self._stopping = asyncio.get_running_loop(), asyncio.Event()
+        server = web.Server(self.handle, handler_cancellation=True, access_log=None, **self._options)
+        runner = web.ServerRunner(server, shutdown_timeout=1)
+        await runner.setup()
+        await web.SockSite(runner, listening).start()
+        started.set()
+        await self._stopping.wait()
+        # Stop accepting before dropping connections: asyncio loses one that comes while it closes.
+        self._loop.remove_reader(listening)
+        await _drop_connections(server)
+        await runner.cleanup()
+
+
+async def _drop_connections(server: web.Server) -> None:
+    """Drop every connection, also one that `web.Server` has accepted and does not list yet."""
+    for _ in range(100):  # one or two rounds suffice; asyncio.run cancels the rest after a second
+        others = asyncio.all_tasks() - {asyncio.current_task()}
+        if not others:
+            return
+        for connection in server.connections:
+            if connection.transport is not None:
+                connection.transport.abort()
+        await asyncio.wait(others, timeout=0.01)

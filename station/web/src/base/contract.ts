@@ -1,0 +1,352 @@
+// The contract's constants and types. Generated: `make docs-parts` fills it.
+// [[[cog page_contract() ]]]
+export const SCHEMA_VERSION = 1;
+export const MAX_FIELDS = 512;
+export const MAX_FIELD_CHARACTERS = 1024;
+export const STALE_S = 1.5;
+export const GONE_S = 4.5;
+export const NAME = /^(?:[A-Za-z0-9_-]{1,64})$/;
+export const BOOT = /^(?:[0-9a-f]{8,32})$/;
+export const FIELD_NAME = /^(?:[A-Za-z][A-Za-z0-9_]*(\.[A-Za-z0-9_]+)*)$/;
+export const TEMPERATURES = ["temperature_pcb", "temp_fet", "temp_motor", "ntc_temp_mos1", "ntc_temp_mos2", "ntc_temp_mos3"] as const;
+export const ATTACHMENT_PARTS = ["key", "sha256", "size", "content_type", "thumbnail"] as const;
+/** speed of the car, m/s */
+export const speed_mps = (speed: number, speed_to_erpm_gain: number, speed_to_erpm_offset: number): number => (speed - speed_to_erpm_offset) / speed_to_erpm_gain;
+/** electrical power from the battery, negative while regenerating, W */
+export const power_w = (voltage_input: number, current_input: number): number => voltage_input * current_input;
+export const FIELD_TABLE: FieldTable = {
+  "version": 1,
+  "stream": "vesc",
+  "fields": {
+    "voltage_input": {
+      "unit": "V",
+      "meaning": "battery voltage at the controller"
+    },
+    "temperature_pcb": {
+      "unit": "degC",
+      "meaning": "temperature of the controller's board"
+    },
+    "temp_fet": {
+      "unit": "degC",
+      "meaning": "temperature of the MOSFETs (driver may leave 0)"
+    },
+    "temp_motor": {
+      "unit": "degC",
+      "meaning": "temperature of the motor (driver may leave 0)"
+    },
+    "current_motor": {
+      "unit": "A",
+      "meaning": "motor current, negative while braking"
+    },
+    "current_input": {
+      "unit": "A",
+      "meaning": "battery current, negative while regenerating"
+    },
+    "avg_id": {
+      "unit": "A",
+      "meaning": "direct-axis current"
+    },
+    "avg_iq": {
+      "unit": "A",
+      "meaning": "quadrature-axis current"
+    },
+    "speed": {
+      "unit": "erpm",
+      "meaning": "electrical speed of the motor, revolutions per minute"
+    },
+    "duty_cycle": {
+      "unit": "1",
+      "meaning": "share of the battery voltage on the motor, -1 to 1"
+    },
+    "charge_drawn": {
+      "unit": "1e-4 Ah",
+      "meaning": "charge drawn since power-on",
+      "ros2_unit": "Ah"
+    },
+    "charge_regen": {
+      "unit": "1e-4 Ah",
+      "meaning": "charge recovered since power-on",
+      "ros2_unit": "Ah"
+    },
+    "energy_drawn": {
+      "unit": "1e-4 Wh",
+      "meaning": "energy drawn since power-on",
+      "ros2_unit": "Wh"
+    },
+    "energy_regen": {
+      "unit": "1e-4 Wh",
+      "meaning": "energy recovered since power-on",
+      "ros2_unit": "Wh"
+    },
+    "displacement": {
+      "unit": "counts",
+      "meaning": "tachometer, net"
+    },
+    "distance_traveled": {
+      "unit": "counts",
+      "meaning": "tachometer, absolute"
+    },
+    "fault_code": {
+      "unit": "enum",
+      "meaning": "0 none, otherwise see FAULTS"
+    },
+    "pid_pos_now": {
+      "unit": "deg",
+      "meaning": "rotor position of the position controller"
+    },
+    "controller_id": {
+      "unit": "id",
+      "meaning": "CAN id of the controller"
+    },
+    "ntc_temp_mos1": {
+      "unit": "degC",
+      "meaning": "temperature of MOSFET 1"
+    },
+    "ntc_temp_mos2": {
+      "unit": "degC",
+      "meaning": "temperature of MOSFET 2"
+    },
+    "ntc_temp_mos3": {
+      "unit": "degC",
+      "meaning": "temperature of MOSFET 3"
+    },
+    "avg_vd": {
+      "unit": "V",
+      "meaning": "direct-axis voltage"
+    },
+    "avg_vq": {
+      "unit": "V",
+      "meaning": "quadrature-axis voltage"
+    },
+    "broker_ms": {
+      "unit": "ms",
+      "meaning": "round trip over the path broker"
+    },
+    "rule_ms": {
+      "unit": "ms",
+      "meaning": "round trip over the path rule"
+    },
+    "lambda_ms": {
+      "unit": "ms",
+      "meaning": "round trip over the path lambda"
+    },
+    "cpu_percent": {
+      "unit": "%",
+      "meaning": "share of one core, since the sample before"
+    },
+    "rss_mb": {
+      "unit": "MB",
+      "meaning": "memory in use"
+    },
+    "samples_per_s": {
+      "unit": "samples/s",
+      "meaning": "samples from all sources, since the sample before"
+    },
+    "backlog_batches": {
+      "unit": "batches",
+      "meaning": "batches in the spool"
+    },
+    "backlog_bytes": {
+      "unit": "bytes",
+      "meaning": "bytes in the spool"
+    },
+    "dropped_batches": {
+      "unit": "batches",
+      "meaning": "batches dropped because the spool was full"
+    },
+    "connects": {
+      "unit": "connections",
+      "meaning": "connections made"
+    },
+    "clock_offset_ms": {
+      "unit": "ms",
+      "meaning": "cloud's clock minus the car's; null before the first pong"
+    },
+    "clock_uncertainty_ms": {
+      "unit": "ms",
+      "meaning": "uncertainty of the clock offset, either way"
+    },
+    "files_waiting": {
+      "unit": "files",
+      "meaning": "files waiting to be uploaded"
+    },
+    "files_sent_bytes": {
+      "unit": "bytes",
+      "meaning": "bytes of files sent"
+    },
+    "speed_mps": {
+      "unit": "m/s",
+      "meaning": "speed of the car"
+    },
+    "power_w": {
+      "unit": "W",
+      "meaning": "electrical power from the battery, negative while regenerating"
+    }
+  },
+  "ros_units": {
+    "linear_acceleration": "m/s^2",
+    "angular_velocity": "rad/s",
+    "twist.linear": "m/s",
+    "twist.angular": "rad/s",
+    "position": "m",
+    "translation": "m"
+  },
+  "faults": {
+    "0": "none",
+    "1": "over voltage",
+    "2": "under voltage",
+    "3": "gate driver (DRV8302)",
+    "4": "absolute over-current",
+    "5": "MOSFET over-temperature",
+    "6": "motor over-temperature",
+    "7": "gate driver over voltage",
+    "8": "gate driver under voltage",
+    "9": "controller under voltage",
+    "10": "booting from a watchdog reset",
+    "11": "encoder SPI",
+    "12": "sin/cos encoder below its minimum amplitude",
+    "13": "sin/cos encoder above its maximum amplitude",
+    "14": "flash corruption",
+    "15": "high offset of current sensor 1",
+    "16": "high offset of current sensor 2",
+    "17": "high offset of current sensor 3",
+    "18": "unbalanced currents",
+    "19": "hardware brake input",
+    "20": "resolver, loss of tracking",
+    "21": "resolver, degradation of signal",
+    "22": "resolver, loss of signal",
+    "23": "flash corruption, application configuration",
+    "24": "flash corruption, motor configuration",
+    "25": "encoder without magnet",
+    "26": "encoder magnet too strong",
+    "27": "phase filter",
+    "28": "encoder fault",
+    "29": "low-voltage output",
+    "30": "encoder slip",
+    "31": "overspeed",
+    "32": "underspeed",
+    "33": "absolute overspeed"
+  }
+};
+
+export interface FieldEntry {
+  readonly unit: string;
+  readonly ros2_unit?: string;
+  readonly meaning: string;
+}
+
+export interface FieldTable {
+  /** The schema version; messages of another version are refused. */
+  readonly version: number;
+  /** The stream with the VESC's fields. */
+  readonly stream: string;
+  readonly fields: Readonly<Record<string, FieldEntry>>;
+  /** Field -> unit of the fields x, y and z within it. */
+  readonly ros_units: Readonly<Record<string, string>>;
+  readonly faults: Readonly<Record<string, string>>;
+}
+
+export type Value = null | boolean | number | string;
+
+/** ``config.json``: where to listen. ``token`` is PubNub's access token, or empty. ``answers`` says whether the server answers questions about the past; a static site does not. ``vehicles`` maps a robot to its `Vehicle`'s parameters. */
+export interface Config {
+  readonly namespace: string;
+  readonly subscribe_key: string;
+  readonly origin: string;
+  readonly tls: boolean;
+  readonly token: string;
+  readonly answers: boolean;
+  readonly vehicles: Readonly<Record<string, Readonly<Record<string, number>>>>;
+}
+
+/** Whether a robot is connected, and since when it is or is not; null if it never was. */
+export interface RobotPresence {
+  readonly online: boolean;
+  readonly since_ms: number | null;
+}
+
+/** Answers ``robots``. */
+export interface RobotsAnswer {
+  readonly robots: Readonly<Record<string, RobotPresence>>;
+}
+
+/** Answers ``vehicles``: as in `Config`. */
+export interface VehiclesAnswer {
+  readonly vehicles: Readonly<Record<string, Readonly<Record<string, number>>>>;
+}
+
+/** Answers ``streams``: the names of a robot's streams. */
+export interface StreamsAnswer {
+  readonly streams: readonly string[];
+}
+
+/** Answers ``dashboards``: their names. */
+export interface DashboardsAnswer {
+  readonly dashboards: readonly string[];
+}
+
+/** A field's values; with minimum and maximum if a row stands for many samples. */
+export interface Column {
+  readonly mean: readonly Value[];
+  readonly least?: readonly Value[];
+  readonly most?: readonly Value[];
+}
+
+/** Answers ``history``: a stream's samples in a range. ``row_s`` is the time that a row covers; 0 if each row is a sample. ``ros2`` says whether charge and energy have the ROS 2 driver's units. */
+export interface HistoryAnswer {
+  readonly times_s: readonly number[];
+  readonly fields: Readonly<Record<string, Column>>;
+  readonly samples: number;
+  readonly ros2: boolean;
+  readonly row_s: number;
+}
+
+/** A line of a chart; ``right`` for the right axis. */
+export interface Series {
+  readonly label: string;
+  readonly right: boolean;
+  readonly times_s: readonly number[];
+  readonly values: readonly number[];
+}
+
+/** A CloudWatch alarm. */
+export interface Alarm {
+  readonly name: string;
+  readonly about: string;
+  readonly state: "OK" | "ALARM" | "INSUFFICIENT_DATA";
+  readonly reason: string;
+  readonly since_s: number;
+}
+
+/** A dashboard's widget; ``number`` is its place in the dashboard's body. */
+export interface Widget {
+  readonly x: number;
+  readonly y: number;
+  readonly width: number;
+  readonly height: number;
+  readonly title: string;
+  readonly kind: "series" | "number" | "alarms" | "log" | "text" | "other";
+  readonly text: string;
+  readonly period_s: number;
+  readonly series: readonly Series[];
+  readonly alarms: readonly Alarm[];
+  readonly number: number;
+}
+
+/** Answers ``dashboard``: a CloudWatch dashboard with its values. */
+export interface Dashboard {
+  readonly name: string;
+  readonly from_s: number;
+  readonly to_s: number;
+  readonly widgets: readonly Widget[];
+}
+
+/** Answers ``log``: the result of a log widget; ``found`` may exceed the number of rows. */
+export interface Logs {
+  readonly columns: readonly string[];
+  readonly rows: readonly (readonly string[])[];
+  readonly found: number;
+  readonly from_s: number;
+  readonly to_s: number;
+}
+// [[[end]]]

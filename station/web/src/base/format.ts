@@ -1,0 +1,121 @@
+// How values are written: unit, scale and digits follow from the contract's field table.
+
+import type { FieldTable, Value } from "./contract";
+
+/** What is shown of a value sent: it times `scale`, and `shift` more. */
+export interface Linear {
+  readonly scale: number;
+  readonly shift: number;
+}
+
+export const AS_SENT: Linear = { scale: 1, shift: 0 };
+export const times = (scale: number): Linear => ({ scale, shift: 0 });
+export const linear = (value: number, { scale, shift }: Linear): number => value * scale + shift;
+
+export interface Spec extends Linear {
+  readonly label: string;
+  readonly meaning: string;
+  readonly unit: string;
+  /** Digits after the point, where fixed. */
+  readonly digits: number | undefined;
+  readonly texts?: Readonly<Record<string, string>>;
+}
+
+export const NOTHING = "–";
+
+const DIGITS: Readonly<Record<string, number>> = {
+  V: 2, A: 2, degC: 1, erpm: 0, deg: 1, counts: 0, Ah: 4, Wh: 3, id: 0, "m/s": 2, W: 1, ms: 0, "%": 1, "m/s^2": 2, "rad/s": 2, m: 2, MB: 1, batches: 0, bytes: 0,
+};
+const UNITS: Readonly<Record<string, string>> = { degC: "°C", deg: "°", enum: "", id: "", "m/s^2": "m/s²" };
+const CAPITALS = new Set(["pcb", "fet", "ntc", "pid", "id", "iq", "vd", "vq", "imu", "gps", "cpu", "mos1", "mos2", "mos3"]);
+
+/** How to write a field; `ros2` for the ROS 2 driver's units. */
+export function spec(field: string, table: FieldTable, ros2 = false): Spec {
+  const known = Object.hasOwn(table.fields, field) ? table.fields[field] : undefined;
+  const label = humanise(field);
+  if (!known) {
+    const plain = rosUnit(field, table);
+    return { label, meaning: "", unit: UNITS[plain] ?? plain, ...AS_SENT, digits: DIGITS[plain] };
+  }
+  const { meaning } = known;
+  const unit = (ros2 ? known.ros2_unit : undefined) ?? known.unit;
+  if (field === "fault_code") return { label, meaning: "", unit: "", ...AS_SENT, digits: 0, texts: table.faults };
+  // A share is read best in percent, and 1e-4 Ah in Ah.
+  if (unit === "1") return { label, meaning, unit: "%", ...times(100), digits: 1 };
+  const scaled = /^1e(-?\d+) (.+)$/.exec(unit);
+  const plain = scaled ? scaled[2]! : unit;
+  return {
+    label,
+    meaning,
+    unit: UNITS[plain] ?? plain,
+    ...times(scaled ? 10 ** Number(scaled[1]) : 1),
+    digits: DIGITS[plain],
+  };
+}
+
+function rosUnit(field: string, { ros_units }: FieldTable): string {
+  const within = /^(.+)\.[xyz]$/.exec(field)?.[1];
+  const name = within && Object.keys(ros_units).find((each) => within === each || within.endsWith(`.${each}`));
+  return name ? ros_units[name]! : "";
+}
+
+/** A field of the motor controller's stream as the car's speed, where that is what it is and the car is known. */
+export function asSpeed(field: string, spec: Spec, speed: Linear | undefined): Spec {
+  return field === "speed" && spec.unit === "erpm" && speed ? { ...spec, ...speed, unit: "m/s", digits: 2 } : spec;
+}
+
+export function write(value: Value | undefined, spec: Spec): string {
+  const { digits, texts } = spec;
+  if (value === null || value === undefined) return NOTHING;
+  if (typeof value === "number") return texts?.[String(value)] ?? number(linear(value, spec), digits);
+  return String(value);
+}
+
+/** A number with a real minus sign, and thin spaces between thousands. */
+export function number(value: number, digits?: number): string {
+  if (!Number.isFinite(value)) return NOTHING;
+  const magnitude = Math.abs(value);
+  let text: string;
+  if (digits !== undefined && magnitude < 1e12) text = magnitude.toFixed(digits);
+  else if (magnitude !== 0 && (magnitude >= 1e12 || magnitude < 1e-4)) text = magnitude.toExponential(3);
+  else text = Number.isInteger(magnitude) ? String(magnitude) : magnitude.toPrecision(6).replace(/\.?0+$/, "");
+  const [whole = "", rest] = text.split(".");
+  if (whole.length > 4 && !text.includes("e")) text = whole.replace(/\B(?=(\d{3})+$)/g, "\u202f") + (rest ? `.${rest}` : "");
+  return value < 0 && /[1-9]/.test(text) ? `\u2212${text}` : text;
+}
+
+/** An age or a duration: 0.3 s, 12 s, 3 min, 2 h. */
+export function age(seconds: number): string {
+  if (seconds < 9.95) return `${Math.max(0, seconds).toFixed(1)} s`;
+  if (seconds < 99.5) return `${seconds.toFixed(0)} s`;
+  return seconds < 5940 ? `${(seconds / 60).toFixed(0)} min` : `${(seconds / 3600).toFixed(0)} h`;
+}
+
+export function milliseconds(value: number): string {
+  return number(value, Math.abs(value) < 9.95 ? 1 : 0);
+}
+
+function humanise(field: string): string {
+  const words = field.split(/[_.]/).map((word) => (CAPITALS.has(word) ? word.toUpperCase() : word));
+  const text = words.join(" ");
+  return text.charAt(0).toUpperCase() + text.slice(1);
+}
+
+/** The time zone that times are shown in, at a time: UTC, CET, GMT+2. */
+export function zone(seconds: number): string {
+  const parts = new Intl.DateTimeFormat("en-GB", { timeZoneName: "short" }).formatToParts(seconds * 1000);
+  return parts.find(({ type }) => type === "timeZoneName")?.value ?? "local time";
+}
+
+/** The time of day here: 14:03:27. */
+export function clockTime(seconds: number): string {
+  return new Date(seconds * 1000).toLocaleTimeString("en-GB");
+}
+
+/** The same, with the day where it is not today: Fri 20 Nov 14:03:27. */
+export function dayTime(seconds: number, options: Intl.DateTimeFormatOptions = {}): string {
+  const at = new Date(seconds * 1000);
+  const time = at.toLocaleTimeString("en-GB", { hour: "2-digit", minute: "2-digit", second: "2-digit", ...options });
+  const day = at.toDateString() === new Date().toDateString() ? "" : `${at.toLocaleDateString("en-GB", { weekday: "short", day: "numeric", month: "short" })} `;
+  return day + time;
+}

@@ -1,0 +1,98 @@
+// What every chart has in common: fonts, colours, axes and round numbers.
+
+import type uPlot from "uplot";
+import { colour } from "../base/theme";
+
+export interface Paint {
+  text: string;
+  grid: string;
+}
+
+export const calm = window.matchMedia("(prefers-reduced-motion: reduce)");
+
+export function paint(): Paint {
+  return { text: colour("--muted"), grid: colour("--grid") };
+}
+
+export function rem(times: number): number {
+  return times * parseFloat(getComputedStyle(document.documentElement).fontSize);
+}
+
+export function axis(colours: () => Paint, size: number, gap: number, more: uPlot.Axis): uPlot.Axis {
+  return {
+    font: `${Math.round(rem(0.72))}px ${getComputedStyle(document.body).fontFamily}`,
+    size: rem(size),
+    gap: rem(gap),
+    stroke: () => colours().text,
+    grid: { stroke: () => colours().grid, width: 1 },
+    ticks: { show: false },
+    ...more,
+  };
+}
+
+/** What every plot of ours leaves out of uPlot. */
+export const PLAIN = {
+  legend: { show: false },
+  select: { show: false, left: 0, top: 0, width: 0, height: 0 },
+} as const;
+
+/** Keeps a plot as large as its host, and tells when it is on the screen. */
+export function fit(host: HTMLElement, plot: uPlot, changed: (visible: boolean) => void): void {
+  new ResizeObserver(() => {
+    if (host.clientWidth > 0) plot.setSize({ width: host.clientWidth, height: host.clientHeight });
+    changed(true);
+  }).observe(host);
+  new IntersectionObserver((entries) => changed(entries.at(-1)?.isIntersecting ?? true)).observe(host);
+}
+
+export function labels(splits: readonly number[]): string[] {
+  const step = splits.length > 1 ? Math.abs(splits[1]! - splits[0]!) : 1;
+  const digits = Math.max(0, Math.min(3, Math.ceil(-Math.log10(step) - 1e-9)));
+  return splits.map((value) => {
+    if (Math.abs(value) >= 10_000) return `${signed(value / 1000, Math.abs(step) % 1000 ? 1 : 0)}k`;
+    return signed(value, Math.abs(value / step - Math.round(value / step)) > 0.01 ? digits + 1 : digits);
+  });
+}
+
+function signed(value: number, digits: number): string {
+  const text = Math.abs(value).toFixed(digits);
+  return value < 0 && /[1-9]/.test(text) ? `\u2212${text}` : text;
+}
+
+export function roundStep(step: number): number {
+  const power = 10 ** Math.floor(Math.log10(step));
+  const share = step / power;
+  return (share <= 1 ? 1 : share <= 2 ? 2 : share <= 5 ? 5 : 10) * power;
+}
+
+/** Round numbers around `least` to `most`, at least `span` apart; with `zero` they hold zero. */
+export function roundRange(least: number, most: number, span: number, zero: boolean): [number, number] {
+  if (zero) [least, most] = [Math.min(0, least), Math.max(0, most)];
+  const missing = span - (most - least);
+  if (missing > 0 && zero && least === 0) most += missing;
+  else if (missing > 0) [least, most] = [least - missing / 2, most + missing / 2];
+  const step = roundStep((most - least) / 8);
+  return [Math.floor(least / step + 1e-9) * step, Math.ceil(most / step - 1e-9) * step];
+}
+
+export function faint(rgb: string, share = 0.09): string {
+  return rgb.startsWith("rgb(") ? rgb.replace("rgb(", "rgba(").replace(")", `, ${share})`) : rgb;
+}
+
+/** Where a line must not run: over a value that is missing, and over a time without samples. */
+export function holes(hole_s: () => number) {
+  return (plot: uPlot, series: number, first: number, last: number, gaps: uPlot.Series.Gaps): uPlot.Series.Gaps => {
+    const times = plot.data[0];
+    const values = plot.data[series]!;
+    let shown = -1;
+    for (let i = Math.max(0, first - 1); i <= last; i += 1) {
+      const value = values[i];
+      if (value === null || value === undefined || Number.isNaN(value)) continue;
+      if (shown >= 0 && (shown < i - 1 || times[i]! - times[shown]! > hole_s())) {
+        gaps.push([plot.valToPos(times[shown]!, "x", true), plot.valToPos(times[i]!, "x", true)]);
+      }
+      shown = i;
+    }
+    return gaps;
+  };
+}

@@ -1,0 +1,106 @@
+// A heading with readings, and a chart below it. Under the pointer, the readings are of that time.
+
+import { LiveChart, type LiveChartOptions, type Shown } from "./live_chart";
+import { el, setAttribute, Text } from "../base/dom";
+import { age, AS_SENT, linear, number, type Linear } from "../base/format";
+
+/** A value in a panel's heading, computed from those of the panel's lines as they are drawn. */
+export interface Reading {
+  readonly name: string;
+  readonly label?: string;
+  readonly unit: string;
+  readonly digits?: number;
+  /** The line whose key stands beside it. */
+  readonly line?: number;
+  readonly from: (values: readonly number[]) => number;
+}
+
+export interface ChartPanelOptions {
+  readonly title: string;
+  readonly readings: readonly Reading[];
+  readonly chart: LiveChartOptions;
+  /** Present where the viewer may put it away. */
+  readonly onClose?: () => void;
+}
+
+export class ChartPanel {
+  readonly node: HTMLElement;
+  private readonly texts: Text[];
+  private readonly note = new Text("note");
+  private readonly chart: LiveChart;
+  private readonly units: Text[];
+  private hovered = false;
+  private as: Linear = AS_SENT;
+
+  constructor(
+    host: HTMLElement,
+    private readonly options: ChartPanelOptions,
+  ) {
+    const { title, readings, chart, onClose } = options;
+    this.texts = readings.map(({ name }) => new Text("num", "span", { "data-reading": name }));
+    this.units = readings.map(({ unit }) => {
+      const text = new Text("unit");
+      text.set(unit);
+      return text;
+    });
+    const close = onClose && el("button", { type: "button", class: "close", "aria-label": `Close ${title}` }, "×");
+    close?.addEventListener("click", onClose!);
+    const heading = el(
+      "header",
+      {},
+      el("h3", {}, title),
+      this.note.node,
+      ...readings.map(({ label, line }, i) =>
+        el(
+          "p",
+          { class: "reading" },
+          ...(line === undefined ? [] : [el("span", { class: `key ${chart.lines[line]!.colour.slice(2)}` })]),
+          ...(label ? [el("span", { class: "label" }, label)] : []),
+          this.texts[i]!.node,
+          this.units[i]!.node,
+        ),
+      ),
+      ...(close ? [close] : []),
+    );
+    const plot = el("div", { class: "plot", "aria-hidden": "true" });
+    this.node = el("section", { class: "panel", "aria-label": title }, heading, plot);
+    host.append(this.node);
+    this.chart = new LiveChart(plot, {
+      ...chart,
+      onPoint: (point) => {
+        this.hovered = point !== undefined;
+        setAttribute(this.node, "data-hover", String(this.hovered));
+        if (point) {
+          this.read(point.values);
+          this.note.set(`${age(point.ago)} ago`);
+        }
+      },
+    });
+  }
+
+  /** What to show, as what, and the unit that this gives, where it is not the usual one. */
+  show(shown: Shown | undefined, as: Linear, unit?: string): void {
+    this.as = as;
+    this.chart.show(shown, as);
+    this.options.readings.forEach((reading, i) => this.units[i]!.set(unit ?? reading.unit));
+  }
+
+  update(values: readonly number[]): void {
+    if (this.hovered) return;
+    this.read(values.map((value) => linear(value, this.as)));
+    this.note.set("");
+    this.chart.wake();
+  }
+
+  due(now: number): boolean {
+    return this.chart.due(now);
+  }
+
+  draw(now: number): void {
+    this.chart.draw(now);
+  }
+
+  private read(values: readonly number[]): void {
+    this.options.readings.forEach(({ digits, from }, i) => this.texts[i]!.set(number(from(values), digits)));
+  }
+}

@@ -1,0 +1,206 @@
+// A chart of the last 30 seconds that scrolls: uPlot, drawn only when there is something new to see.
+
+import uPlot from "uplot";
+import { WINDOW_S } from "../live/fleet";
+import { AS_SENT, linear, type Linear } from "../base/format";
+import { axis, calm, faint, fit, holes, labels, paint, PLAIN, rem, roundRange } from "./axes";
+import type { Ring } from "../live/ring";
+import { colour, onTheme } from "../base/theme";
+
+export interface Line {
+  /** The custom property that holds its colour. */
+  readonly colour: string;
+  readonly dash?: readonly number[];
+  /** A faint area between the line and zero. */
+  readonly fill?: boolean;
+}
+
+export interface LiveChartOptions {
+  readonly lines: readonly Line[];
+  /** The least height of the axis, so that noise is not drawn as a mountain. */
+  readonly span: number;
+  /** The axis always holds zero. */
+  readonly zero?: boolean;
+  /** Told what is under the pointer: seconds ago and a value a line; undefined when it leaves. */
+  readonly onPoint?: (point: { readonly ago: number; readonly values: readonly number[] } | undefined) => void;
+}
+
+/** What a chart shows: columns of a history, one a line; undefined where there is none yet. */
+export interface Shown {
+  readonly history: Ring;
+  readonly columns: readonly (number | undefined)[];
+}
+
+// A line is broken where nothing came for so long.
+const HOLE_S = 1;
+// Moving by less than this many points of the screen is not worth a picture, nor are more than 25 a second.
+const STEP_PX = 0.75;
+const FRAME_S = 0.04;
+
+const shared = uPlot.sync("charts");
+
+export class LiveChart {
+  private readonly plot: uPlot;
+  private shown: Shown | undefined;
+  private as: Linear = AS_SENT;
+  private dirty = true;
+  private drawnAt = -Infinity;
+  private drawnEmpty = false;
+  private visible = true;
+  private right = 0;
+  private low = 0;
+  private high = 1;
+  private palette: string[] = [];
+  private paint = paint();
+
+  constructor(
+    host: HTMLElement,
+    private readonly options: LiveChartOptions,
+  ) {
+    this.readColours();
+    const colours = () => this.paint;
+    this.plot = new uPlot(
+      {
+        ...PLAIN,
+        width: Math.max(1, host.clientWidth),
+        height: Math.max(1, host.clientHeight),
+        pxAlign: 0,
+        padding: [rem(0.5), rem(0.9), 0, 0],
+        cursor: {
+          y: false,
+          drag: { x: false, y: false, setScale: false },
+          points: { size: 7, width: 0 },
+          sync: { key: shared.key, setSeries: false },
+        },
+        scales: { x: { time: false, auto: false }, y: { auto: true, range: (_, low, high) => this.range(low, high) } },
+        axes: [
+          axis(colours, 1.5, 0.3, {
+            splits: (_, __, low) => [0, 10, 20, 30].map((step) => low + step),
+            values: () => ["\u221230 s", "\u221220", "\u221210", "now"],
+          }),
+          axis(colours, 3.1, 0.4, { space: rem(2.2), values: (_, splits) => labels(splits) }),
+        ],
+        series: [
+          {},
+          ...options.lines.map((line, i) => ({
+            stroke: () => this.palette[i]!,
+            width: 1.75,
+            pxAlign: 0,
+            points: { show: false },
+            gaps: holes(() => HOLE_S),
+            ...(line.dash ? { dash: [...line.dash] } : {}),
+            ...(line.fill ? { fill: () => faint(this.palette[i]!), fillTo: 0 } : {}),
+          })),
+        ],
+        hooks: {
+          draw: [(plot) => this.drawHeads(plot)],
+          setCursor: [(plot) => this.point(plot)],
+        },
+      },
+      this.data(0),
+      host,
+    );
+    fit(host, this.plot, (visible) => {
+      this.visible = visible;
+      this.dirty = true;
+    });
+    onTheme(() => {
+      this.readColours();
+      this.dirty = true;
+    });
+  }
+
+  /** What to show from now on, undefined for nothing, and as what. */
+  show(shown: Shown | undefined, as: Linear): void {
+    const same = this.shown?.history === shown?.history && String(this.shown?.columns) === String(shown?.columns);
+    if (same && this.as.scale === as.scale && this.as.shift === as.shift) return;
+    [this.shown, this.as] = [shown, as];
+    this.dirty = true;
+    this.drawnEmpty = false;
+    this.low = this.high = NaN;
+  }
+
+  /** Whether the picture would differ by enough to be seen, or must be drawn for another reason. */
+  due(now: number): boolean {
+    if (!this.visible || now - this.drawnAt < FRAME_S) return false;
+    if (this.dirty) return true;
+    return !this.drawnEmpty && ((edge(now) - this.right) / WINDOW_S) * this.plot.bbox.width >= STEP_PX;
+  }
+
+  draw(now: number): void {
+    if (!this.visible) return;
+    const right = edge(now);
+    const data = this.data(right - WINDOW_S);
+    [this.right, this.drawnAt, this.dirty] = [right, now, false];
+    this.drawnEmpty = this.shown === undefined || !(this.shown.history.last(0) > right - WINDOW_S);
+    this.plot.batch(() => {
+      this.plot.setData(data, false);
+      this.plot.setScale("x", { min: right - WINDOW_S, max: right });
+    });
+  }
+
+  /** There is something to draw again, after a time in which there was not. */
+  wake(): void {
+    if (this.drawnEmpty) this.dirty = true;
+  }
+
+  private data(from: number): uPlot.AlignedData {
+    const { shown, as } = this;
+    if (!shown) return [new Float64Array(0), ...this.options.lines.map(() => new Float64Array(0))];
+    const times = shown.history.column(0, from);
+    const columns = shown.columns.map((column) => {
+      if (column === undefined) return new Float64Array(times.length).fill(NaN);
+      const values = shown.history.column(column, from);
+      return as.scale === 1 && as.shift === 0 ? values : values.map((value) => linear(value, as));
+    });
+    return [times, ...columns];
+  }
+
+  /** The axis: round numbers that hold the data, reached in a few frames rather than at once. */
+  private range(low: number | null, high: number | null): [number, number] {
+    const [least, most] = low === null || high === null || !(low <= high) ? [0, 0] : [low, high];
+    const [toLow, toHigh] = roundRange(least, most, this.options.span, this.options.zero ?? false);
+    const ease = (from: number, to: number): number =>
+      calm.matches || Number.isNaN(from) || Math.abs(to - from) < (toHigh - toLow) * 0.004 ? to : from + (to - from) * 0.3;
+    this.low = ease(this.low, toLow);
+    this.high = ease(this.high, toHigh);
+    return [this.low, this.high];
+  }
+
+  /** A dot at the newest value of every line, where the eye waits for news. */
+  private drawHeads(plot: uPlot): void {
+    const times = plot.data[0];
+    const at = times[times.length - 1];
+    if (at === undefined || at < this.right - WINDOW_S) return;
+    const { ctx } = plot;
+    const radius = 2.6 * uPlot.pxRatio;
+    plot.series.slice(1).forEach((_, i) => {
+      const value = plot.data[i + 1]?.[times.length - 1];
+      if (value === undefined || value === null || Number.isNaN(value)) return;
+      ctx.beginPath();
+      ctx.arc(plot.valToPos(at, "x", true), plot.valToPos(value, "y", true), radius, 0, 2 * Math.PI);
+      ctx.fillStyle = this.palette[i]!;
+      ctx.fill();
+    });
+  }
+
+  private point(plot: uPlot): void {
+    const { idx, left } = plot.cursor;
+    if (!this.options.onPoint) return;
+    if (idx === null || idx === undefined || left === undefined || left < 0) this.options.onPoint(undefined);
+    else {
+      const ago = this.right - (plot.data[0][idx] ?? NaN);
+      this.options.onPoint({ ago, values: plot.data.slice(1).map((values) => values[idx] ?? NaN) });
+    }
+  }
+
+  private readColours(): void {
+    this.palette = this.options.lines.map((line) => colour(line.colour));
+    this.paint = paint();
+  }
+}
+
+/** The right edge: now, or the next full second for those who want less motion. */
+function edge(now: number): number {
+  return calm.matches ? Math.ceil(now) : now;
+}

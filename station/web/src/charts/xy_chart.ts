@@ -1,0 +1,158 @@
+// One quantity over another: the newest point, and the way it came, which fades.
+
+import uPlot from "uplot";
+import { axis, faint, fit, labels, paint, PLAIN, rem, roundRange } from "./axes";
+import { colour, onTheme } from "../base/theme";
+
+export interface XYChartOptions {
+  /** A text, or what gives one when the plane is drawn. */
+  readonly x: string | (() => string);
+  readonly y: string;
+  /** The least extent of each axis. */
+  readonly span: readonly [number, number];
+  /** Both axes hold zero. */
+  readonly zero?: boolean;
+  /** A step is as long on both axes, as on a map. */
+  readonly equal?: boolean;
+}
+
+/** Points in order of time, the newest last. */
+export interface Track {
+  readonly x: ArrayLike<number>;
+  readonly y: ArrayLike<number>;
+}
+
+const FRAME_S = 0.1;
+const SHADES = 12;
+
+export class XYChart {
+  private readonly plot: uPlot;
+  private track: Track = { x: [], y: [] };
+  private visible = true;
+  private drawnAt = -Infinity;
+  private ink = "";
+  private paint = paint();
+  private bounds: { x: [number, number]; y: [number, number] };
+
+  constructor(
+    host: HTMLElement,
+    private readonly options: XYChartOptions,
+  ) {
+    this.bounds = { x: [0, options.span[0]], y: [0, options.span[1]] };
+    this.ink = colour("--accent");
+    const colours = () => this.paint;
+    const named = (label: string | (() => string), font = `${Math.round(rem(0.72))}px ${getComputedStyle(document.body).fontFamily}`): uPlot.Axis => ({
+      label,
+      labelFont: font,
+      labelSize: rem(1.1),
+      labelGap: 0,
+    });
+    this.plot = new uPlot(
+      {
+        ...PLAIN,
+        width: Math.max(1, host.clientWidth),
+        height: Math.max(1, host.clientHeight),
+        padding: [rem(0.5), rem(0.9), 0, 0],
+        cursor: { show: false },
+        scales: {
+          x: { time: false, auto: false, range: () => this.bounds.x },
+          y: { auto: false, range: () => this.bounds.y },
+        },
+        axes: [
+          axis(colours, 1.4, 0.3, { ...named(options.x), values: (_, splits) => labels(splits), space: rem(3) }),
+          axis(colours, 2.9, 0.4, { ...named(options.y), values: (_, splits) => labels(splits), space: rem(2) }),
+        ],
+        series: [{}, { show: true, paths: () => null, points: { show: false } }],
+        hooks: { draw: [(plot) => this.drawTrack(plot)] },
+      },
+      [[0], [0]],
+      host,
+    );
+    fit(host, this.plot, (visible) => {
+      this.visible = visible;
+      this.drawnAt = -Infinity;
+    });
+    onTheme(() => {
+      [this.ink, this.paint] = [colour("--accent"), paint()];
+      this.drawnAt = -Infinity;
+    });
+  }
+
+  draw(now: number, track: () => Track): void {
+    if (!this.visible || now - this.drawnAt < FRAME_S) return;
+    this.drawnAt = now;
+    this.track = track();
+    this.setBounds();
+    this.plot.batch(() => {
+      this.plot.setScale("x", { min: this.bounds.x[0], max: this.bounds.x[1] });
+      this.plot.setScale("y", { min: this.bounds.y[0], max: this.bounds.y[1] });
+      this.plot.redraw(false, true);
+    });
+  }
+
+  private setBounds(): void {
+    const { span, zero = false, equal } = this.options;
+    let [x, y] = [extent(this.track.x), extent(this.track.y)];
+    if (equal) {
+      const { width, height } = this.plot.bbox;
+      const scale = Math.max((x[1] - x[0]) / width, (y[1] - y[0]) / height, span[0] / width, span[1] / height) * 1.08;
+      const around = ([low, high]: [number, number], size: number): [number, number] => {
+        const middle = (low + high) / 2;
+        return [middle - (size * scale) / 2, middle + (size * scale) / 2];
+      };
+      [x, y] = [around(x, width), around(y, height)];
+    } else {
+      x = roundRange(x[0], x[1], span[0], zero);
+      y = roundRange(y[0], y[1], span[1], zero);
+    }
+    this.bounds = { x, y };
+  }
+
+  private drawTrack(plot: uPlot): void {
+    const { x, y } = this.track;
+    const { ctx } = plot;
+    const { left, top, width, height } = plot.bbox;
+    ctx.save();
+    ctx.beginPath();
+    ctx.rect(left, top, width, height);
+    ctx.clip();
+    ctx.lineWidth = 1.75 * uPlot.pxRatio;
+    ctx.lineJoin = "round";
+    // From old to new in a few shades: a stroke a point would cost more than all the rest.
+    for (let shade = 0; shade < SHADES; shade += 1) {
+      const from = Math.floor((x.length * shade) / SHADES);
+      const to = Math.min(x.length - 1, Math.floor((x.length * (shade + 1)) / SHADES));
+      ctx.beginPath();
+      let down = false;
+      for (let i = from; i <= to; i += 1) {
+        const [px, py] = [plot.valToPos(x[i]!, "x", true), plot.valToPos(y[i]!, "y", true)];
+        if (Number.isNaN(px + py)) down = false;
+        else if (down) ctx.lineTo(px, py);
+        else {
+          ctx.moveTo(px, py);
+          down = true;
+        }
+      }
+      ctx.strokeStyle = faint(this.ink, 0.08 + (0.92 * (shade + 1)) / SHADES);
+      ctx.stroke();
+    }
+    const last = x.length - 1;
+    if (last >= 0 && !Number.isNaN(x[last]! + y[last]!)) {
+      ctx.beginPath();
+      ctx.arc(plot.valToPos(x[last]!, "x", true), plot.valToPos(y[last]!, "y", true), 4.5 * uPlot.pxRatio, 0, 2 * Math.PI);
+      ctx.fillStyle = this.ink;
+      ctx.fill();
+    }
+    ctx.restore();
+  }
+}
+
+function extent(values: ArrayLike<number>): [number, number] {
+  let [low, high] = [Infinity, -Infinity];
+  for (let i = 0; i < values.length; i += 1) {
+    const value = values[i]!;
+    if (value < low) low = value;
+    if (value > high) high = value;
+  }
+  return low <= high ? [low, high] : [0, 0];
+}

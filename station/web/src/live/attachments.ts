@@ -1,0 +1,46 @@
+// What a message was too large for: the sample holds a claim for each field of bytes (docs/files.md), five
+// fields that say where the content is and, of a picture, hold a small one.
+
+import { ATTACHMENT_PARTS, type Value } from "../base/contract";
+
+export interface Claim {
+  readonly key: string;
+  readonly size: number;
+  readonly contentType: string;
+  /** Base64 of a JPEG; none where the content is no picture, or the car makes none. */
+  readonly thumbnail: string | undefined;
+}
+
+type Sample = Pick<ReadonlyMap<string, unknown>, "has" | "keys">;
+
+/** The fields of bytes in a sample: those that have a claim's fields, all of them. */
+export function claimed(sample: Sample): string[] {
+  const end = ".thumbnail";
+  const found = [];
+  for (const name of sample.keys()) {
+    const field = name.endsWith(end) ? name.slice(0, -end.length) : "";
+    if (field && ATTACHMENT_PARTS.every((part) => sample.has(`${field}.${part}`))) found.push(field);
+  }
+  return found;
+}
+
+export const partsOf = (field: string): string[] => ATTACHMENT_PARTS.map((part) => `${field}.${part}`);
+
+/** The claim on a field; undefined where the car has left this content out. */
+export function claim(field: string, value: (name: string) => Value | undefined): Claim | undefined {
+  const [key, , size, contentType, thumbnail] = partsOf(field).map(value);
+  if (typeof key !== "string") return undefined;
+  return {
+    key,
+    size: typeof size === "number" ? size : NaN,
+    contentType: typeof contentType === "string" ? contentType : "",
+    thumbnail: typeof thumbnail === "string" ? thumbnail : undefined,
+  };
+}
+
+/** 3072 B, 1.2 MB: as `iort files list` writes it. */
+export function bytes(size: number): string {
+  if (!Number.isFinite(size)) return "";
+  const [unit, each] = size >= 1e6 ? ["MB", 1e6] : size >= 1e3 ? ["kB", 1e3] : ["B", 1];
+  return `${(size / Number(each)).toFixed(each === 1 ? 0 : 1)} ${unit}`;
+}

@@ -1,0 +1,48 @@
+// The page's end of its worker: starts it, and hands what it hears to the fleet.
+
+import type { Config, FieldTable } from "../base/contract";
+import { now } from "../base/clock";
+import type { Fleet } from "./fleet";
+import type { FromWorker, LinkState, ToWorker } from "./worker_messages";
+
+export class Feed {
+  state: LinkState = { kind: "connecting" };
+  private readonly worker = new Worker("worker.js");
+
+  constructor(config: Config, table: FieldTable, fleet: Fleet, onState: (state: LinkState) => void) {
+    this.worker.addEventListener("message", ({ data }: MessageEvent<FromWorker>) => {
+      if (data.kind === "arrivals") {
+        fleet.take(data.arrivals, data.refused, data.lastRefusal);
+        this.tell({ kind: "taken" });
+      } else {
+        this.state = data.state;
+        onState(data.state);
+      }
+    });
+    this.worker.addEventListener("error", (event) => {
+      this.state = { kind: "lost", since: now(), retryAt: now(), reason: `the page's worker failed: ${event.message}` };
+      onState(this.state);
+    });
+    const { namespace, subscribe_key, origin, tls, token } = config;
+    const { version } = table;
+    this.tell({ kind: "start", listening: { namespace, version, subscribe_key, origin, tls, token, user: userId() } });
+    document.addEventListener("visibilitychange", () => this.tell({ kind: "visible", visible: !document.hidden }));
+  }
+
+  private tell(message: ToWorker): void {
+    this.worker.postMessage(message);
+  }
+}
+
+/** One id a browser: PubNub bills by users, and a reload is not a new one. */
+function userId(): string {
+  const fresh = `page-${Array.from(crypto.getRandomValues(new Uint8Array(8)), (b) => b.toString(16).padStart(2, "0")).join("")}`;
+  try {
+    const known = localStorage.getItem("iort.user");
+    if (known && /^page-[0-9a-f]{16}$/.test(known)) return known;
+    localStorage.setItem("iort.user", fresh);
+  } catch {
+    // A browser that stores nothing is a new user each time.
+  }
+  return fresh;
+}

@@ -1,0 +1,17 @@
+// Questions to the server that serves the page; the answers' types are in contract.ts.
+
+export class AnswerError extends Error {}
+
+/** Ask the server; raises `AnswerError` with words for the viewer where there is no answer. */
+export async function ask<T>(name: string, parameters: Readonly<Record<string, string>>, signal?: AbortSignal): Promise<T> {
+  let answer: Response;
+  try {
+    answer = await fetch(`${name}.json?${new URLSearchParams(parameters).toString()}`, { cache: "no-store", ...(signal ? { signal } : {}) });
+  } catch (error) {
+    if (signal?.aborted) throw error;
+    throw new AnswerError("The page's server does not answer. Is `iort dashboard` still running?");
+  }
+  const body = (await answer.json().catch(() => ({}))) as { error?: unknown };
+  if (!answer.ok) throw new AnswerError(typeof body.error === "string" ? body.error : `The server answered ${answer.status}.`);
+  return body as T;
+}

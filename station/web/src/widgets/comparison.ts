@@ -1,0 +1,62 @@
+// Two columns of values: at the time that the viewer looks at, and now.
+
+import type { Value } from "../base/contract";
+import { el, Text } from "../base/dom";
+import type { Stream } from "../live/fleet";
+import { NOTHING, number, write, type Spec } from "../base/format";
+
+interface Row {
+  readonly spec: Spec;
+  readonly then: Text;
+  readonly now: Text;
+  readonly change: Text;
+  value: Value;
+}
+
+export class Comparison {
+  readonly node: HTMLElement;
+  private readonly body = el("tbody");
+  private readonly rows = new Map<string, Row>();
+  private live: Stream | undefined;
+
+  constructor() {
+    const head = el("tr", {}, ...["Field", "Then", "Now", "Change", ""].map((name) => el("th", { scope: "col" }, name)));
+    this.node = el("section", { class: "panel compare", "aria-label": "Then and now" }, el("table", {}, el("thead", {}, head), this.body));
+  }
+
+  of(fields: readonly (readonly [string, Spec])[]): void {
+    this.rows.clear();
+    this.body.replaceChildren();
+    for (const [field, spec] of fields) {
+      const row = { spec, then: new Text("num"), now: new Text("num"), change: new Text("num"), value: null };
+      this.rows.set(field, row);
+      this.body.append(
+        el(
+          "tr",
+          { "data-field": field },
+          el("th", { scope: "row", title: row.spec.meaning || field }, row.spec.label),
+          ...[row.then, row.now, row.change].map(({ node }) => el("td", {}, node)),
+          el("td", { class: "unit" }, row.spec.unit),
+        ),
+      );
+    }
+  }
+
+  then(values: ReadonlyMap<string, Value>): void {
+    for (const [field, row] of this.rows) {
+      row.value = values.get(field) ?? null;
+      row.then.set(write(row.value, row.spec));
+    }
+    this.now(this.live);
+  }
+
+  now(stream: Stream | undefined): void {
+    this.live = stream;
+    for (const [field, row] of this.rows) {
+      const value = stream?.sample.get(field);
+      row.now.set(write(value, row.spec));
+      const change = typeof value === "number" && typeof row.value === "number" ? (value - row.value) * row.spec.scale : NaN;
+      row.change.set(Number.isNaN(change) || row.spec.texts ? NOTHING : `${change > 0 ? "+" : ""}${number(change, row.spec.digits)}`);
+    }
+  }
+}

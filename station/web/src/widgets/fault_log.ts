@@ -1,0 +1,46 @@
+// The faults that this page has heard of since it was opened, the newest first.
+
+import { el, setAttribute, Text } from "../base/dom";
+import type { Fault, Robot } from "../live/fleet";
+import { age, clockTime, zone } from "../base/format";
+
+const SHOWN = 6;
+
+interface Row {
+  readonly node: HTMLElement;
+  readonly cells: readonly Text[];
+}
+
+/** A fixed number of rows, so that a new fault moves nothing else on the page. */
+export class FaultLog {
+  readonly node: HTMLElement;
+  private readonly note = new Text("note", "p");
+  private readonly rows: readonly Row[];
+
+  constructor() {
+    this.rows = Array.from({ length: SHOWN }, () => {
+      const cells = ["fault-at", "fault-name", "fault-for"].map((name) => new Text(name, "td"));
+      return { node: el("tr", {}, ...cells.map(({ node }) => node)), cells };
+    });
+    const head = el("tr", {}, ...[`Since, ${zone(Date.now() / 1000)}`, "Fault", "For"].map((name) => el("th", { scope: "col" }, name)));
+    this.node = el(
+      "section",
+      { class: "panel faults", "aria-label": "Fault log" },
+      el("header", {}, el("h3", {}, "Fault log"), this.note.node),
+      el("table", {}, el("thead", {}, head), el("tbody", {}, ...this.rows.map(({ node }) => node))),
+    );
+  }
+
+  refresh(robot: Robot): void {
+    const newest = robot.faults.slice(-SHOWN).reverse();
+    const count = robot.faults.length;
+    this.note.set(count === 0 ? "none since this page was opened" : count > SHOWN ? `the newest ${SHOWN} of ${count}` : "since this page was opened");
+    this.rows.forEach(({ node, cells }, i) => {
+      const fault: Fault | undefined = newest[i];
+      setAttribute(node, "data-state", fault ? (fault.over ? "over" : "on") : "none");
+      cells[0]!.set(fault ? clockTime(fault.since) : "");
+      cells[1]!.set(fault?.name ?? "");
+      cells[2]!.set(fault ? `${age(fault.until - fault.since)}${fault.over ? "" : ", on"}` : "");
+    });
+  }
+}

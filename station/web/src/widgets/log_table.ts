@@ -1,0 +1,76 @@
+// A log widget: what its query finds, as a table. Asked for by itself, because Logs Insights takes seconds.
+
+import type { Logs } from "../base/contract";
+import { ask, AnswerError } from "../server/answers";
+import { el, Text } from "../base/dom";
+import { clockTime, dayTime, zone } from "../base/format";
+
+// AWS bills a query by what it reads.
+const AGAIN_S = 60;
+
+export class LogTable {
+  readonly node: HTMLElement;
+  private readonly note = new Text("note", "p", { role: "status" });
+  private readonly host = el("div", { class: "log", role: "region", tabindex: "0" });
+  private askedAt = -Infinity;
+  // A query may take longer than the dashboard beside it stays the newest.
+  private asking: AbortController | undefined;
+
+  constructor(
+    private readonly parameters: Readonly<Record<string, string>>,
+    title: string,
+  ) {
+    this.host.setAttribute("aria-label", title);
+    this.node = el("div", { class: "log-widget" }, this.host, this.note.node);
+  }
+
+  /** Ask anew, unless that has just been done; what was found before stays until there is an answer. */
+  async refresh(): Promise<void> {
+    const now = performance.now() / 1000;
+    if (this.asking || now - this.askedAt < AGAIN_S) return;
+    const asking = new AbortController();
+    [this.askedAt, this.asking] = [now, asking];
+    if (!this.host.hasChildNodes()) this.note.set("Reading the logs …");
+    try {
+      this.draw(await ask<Logs>("log", this.parameters, asking.signal));
+    } catch (error) {
+      this.askedAt = -Infinity;
+      if (!asking.signal.aborted) this.note.set(error instanceof AnswerError ? error.message : String(error));
+    } finally {
+      this.asking = undefined;
+    }
+  }
+
+  /** Wait for no answer any longer. */
+  stop(): void {
+    this.asking?.abort();
+  }
+
+  private draw({ columns, rows, found, to_s }: Logs): void {
+    const until = `until ${clockTime(to_s)} ${zone(to_s)}`;
+    this.note.set(found > rows.length ? `the first ${rows.length} of ${found} lines, ${until}` : found === 0 ? `Nothing in this range, ${until}.` : until);
+    this.host.replaceChildren(
+      ...(rows.length === 0
+        ? []
+        : [
+            el(
+              "table",
+              {},
+              el("thead", {}, el("tr", {}, ...columns.map((column) => el("th", { scope: "col" }, column.replace(/^@/, ""))))),
+              el("tbody", {}, ...rows.map((row) => el("tr", {}, ...row.map((value, i) => cell(columns[i]!, value))))),
+            ),
+          ]),
+    );
+  }
+}
+
+function cell(column: string, value: string): HTMLElement {
+  if (column === "@timestamp") {
+    // "2026-05-04 10:00:00.123", in UTC.
+    const at = Date.parse(`${value.replace(" ", "T")}Z`) / 1000;
+    return el("td", { class: "num", title: `${value} UTC` }, Number.isNaN(at) ? value : dayTime(at));
+  }
+  // "123456789012:/aws/lambda/name": the account is the viewer's own.
+  if (column === "@log") return el("td", { title: value }, value.replace(/^\d+:/, ""));
+  return el("td", { class: "words" }, value);
+}

@@ -1,0 +1,69 @@
+// The bar above and the line below every view: who is there, whether the connection holds, what was refused.
+
+import type { Config, FieldTable } from "../base/contract";
+import { byId, setAttribute } from "../base/dom";
+import type { Fleet } from "../live/fleet";
+import { age, number } from "../base/format";
+import { now } from "../base/clock";
+import type { LinkState } from "../live/worker_messages";
+
+const ANNOUNCE_S = 8;
+const WORDS = { connecting: "Connecting", paused: "Paused", live: "Connected", lost: "Connection lost" } as const;
+
+export class StatusBar {
+  private reconnected: { readonly at: number; readonly downFor: number } | undefined;
+
+  constructor(
+    config: Config,
+    private readonly fleet: Fleet,
+    private readonly table: FieldTable,
+  ) {
+    write("empty-channel", `${config.namespace}.*`);
+    write("empty-origin", config.origin);
+  }
+
+  linked(state: LinkState): void {
+    if (state.kind === "live" && state.downFor !== undefined) this.reconnected = { at: now(), downFor: state.downFor };
+  }
+
+  clock(at: number, link: LinkState): void {
+    const { fleet } = this;
+    const count = { live: 0, stale: 0, gone: 0 };
+    for (const robot of fleet.robots.values()) count[robot.freshness(at)] += 1;
+    const counts = (["live", "stale", "gone"] as const).filter((state) => count[state] > 0);
+    const words = counts.map((state) => `${count[state]} ${state === "live" ? "online" : state}`);
+    // Of a car that is gone nobody knows.
+    const faulty = [...fleet.robots.values()].filter((robot) => robot.freshness(at) !== "gone" && robot.fault(this.table) !== undefined).length;
+    write("count", words.join(" · "));
+    write("faulty", faulty === 0 ? "" : `${faulty} with a fault`);
+    write("received", number(fleet.received));
+    write("malformed", number(fleet.malformed));
+    byId("malformed").title = fleet.lastRefusal ? `the last one: ${fleet.lastRefusal}` : "";
+    write("late", number(fleet.outOfOrder));
+    setAttribute(byId("link"), "data-state", link.kind);
+    write("link-text", WORDS[link.kind]);
+    this.announce(link, at);
+  }
+
+  private announce(link: LinkState, at: number): void {
+    let words = "";
+    let detail = "";
+    if (link.kind === "lost") {
+      words = `Connection lost: ${link.reason}.`;
+      const wait = link.retryAt - at;
+      detail = `${age(at - link.since)} ago. ${wait > 0.5 ? `Trying again in ${Math.ceil(wait)} s` : "Trying again now"}.`;
+    } else if (this.reconnected && at - this.reconnected.at < ANNOUNCE_S) {
+      words = `Connected again after ${age(this.reconnected.downFor)}.`;
+    }
+    const banner = byId("banner");
+    setAttribute(banner, "data-state", link.kind);
+    banner.hidden = words === "";
+    write("banner-text", words);
+    write("banner-detail", detail);
+  }
+}
+
+function write(id: string, text: string): void {
+  const node = byId(id);
+  if (node.textContent !== text) node.textContent = text;
+}

@@ -1,0 +1,97 @@
+// A thumbnail on a canvas. It is decoded from its bytes and never by address, so that the page's policy can
+// go on to allow no pictures but its own; and never before its size is known, because three kilobytes can
+// claim to be a picture of a billion pixels.
+
+import { bytes, type Claim } from "../live/attachments";
+import { el, setAttribute, Text } from "../base/dom";
+import { age } from "../base/format";
+
+// The cars' are of 96 pixels; see device/iort_agent/lanes/thumbnail.py.
+const MOST_PIXELS = 256;
+// Of a frame, whatever it is coded by; the three of the range that are none are tables (ITU T.81, table B.1).
+const START_OF_FRAME = (marker: number): boolean => marker >= 0xc0 && marker <= 0xcf && ![0xc4, 0xc8, 0xcc].includes(marker);
+// What may come before it: tables, the application's own and comments. All of them say their length; behind
+// what does not, a decoder would look for the next marker elsewhere than this does.
+const BEFORE_FRAME = (marker: number): boolean => [0xc4, 0xdb, 0xdd, 0xfe].includes(marker) || (marker >= 0xe0 && marker <= 0xef);
+
+export class Thumbnail {
+  readonly node: HTMLElement;
+  private readonly canvas = el("canvas", { role: "img" });
+  private readonly state = new Text("picture-state");
+  private readonly taken = new Text("picture-taken num");
+  private readonly about = new Text("picture-about");
+  private shown: string | undefined;
+
+  constructor(private readonly label: string, field: string) {
+    this.node = el(
+      "figure",
+      { class: "tile picture", "data-picture": field },
+      el("figcaption", {}, el("span", { class: "tile-label" }, label), this.taken.node),
+      el("div", { class: "picture-frame" }, this.canvas, this.state.node),
+      this.about.node,
+    );
+    this.canvas.hidden = true;
+    this.state.set("no picture yet");
+  }
+
+  /** Show what a claim has; none keeps what stands there, as the car keeps not every picture. */
+  set(claim: Claim | undefined): void {
+    if (!claim) return;
+    const { key, size, contentType, thumbnail } = claim;
+    this.about.set([contentType, bytes(size)].filter(Boolean).join(", "));
+    setAttribute(this.node, "title", `iort files get: ${key}`);
+    if (thumbnail === undefined) this.blank(contentType.startsWith("image/") ? "the car makes no thumbnails" : "no picture");
+    else if (thumbnail !== this.shown) void this.decode(thumbnail);
+  }
+
+  /** When the content was taken, in words. */
+  when(text: string): void {
+    this.taken.set(text);
+  }
+
+  /** How old it is, live. */
+  old(seconds: number): void {
+    this.when(Number.isFinite(seconds) ? `${age(seconds)} old` : "");
+  }
+
+  private blank(state: string): void {
+    this.shown = undefined;
+    this.canvas.hidden = true;
+    this.state.set(state);
+  }
+
+  private async decode(base64: string): Promise<void> {
+    this.shown = base64;
+    const jpeg = jpegOf(base64);
+    const bitmap = jpeg && (await createImageBitmap(new Blob([jpeg], { type: "image/jpeg" })).catch(() => undefined));
+    // Another one has come meanwhile.
+    if (this.shown !== base64) return bitmap?.close();
+    if (!bitmap) return this.blank("a thumbnail that is no picture");
+    [this.canvas.width, this.canvas.height] = [bitmap.width, bitmap.height];
+    this.canvas.getContext("2d")?.drawImage(bitmap, 0, 0);
+    bitmap.close();
+    this.canvas.hidden = false;
+    this.state.set("");
+    setAttribute(this.canvas, "aria-label", `${this.label}, ${this.canvas.width} by ${this.canvas.height} pixels`);
+  }
+}
+
+/** The bytes of a JPEG that says to be small; undefined for anything else. */
+export function jpegOf(base64: string): Uint8Array<ArrayBuffer> | undefined {
+  let data: Uint8Array<ArrayBuffer>;
+  try {
+    data = Uint8Array.from(atob(base64), (letter) => letter.charCodeAt(0));
+  } catch {
+    return undefined;
+  }
+  if (data[0] !== 0xff || data[1] !== 0xd8) return undefined;
+  // Segments: a marker of two bytes, and a length that counts itself, until the frame's, which has its size.
+  const view = new DataView(data.buffer);
+  for (let at = 2; at + 9 <= data.length && data[at] === 0xff; at += 2 + view.getUint16(at + 2)) {
+    if (BEFORE_FRAME(data[at + 1]!)) continue;
+    if (!START_OF_FRAME(data[at + 1]!)) return undefined;
+    const [height, width] = [view.getUint16(at + 5), view.getUint16(at + 7)];
+    return Math.min(height, width) > 0 && Math.max(height, width) <= MOST_PIXELS ? data : undefined;
+  }
+  return undefined;
+}

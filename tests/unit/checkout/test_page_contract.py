@@ -1,0 +1,28 @@
+"""What the page's code has from the contract; test_docs_parts.py holds that it is up to date."""
+
+from __future__ import annotations
+
+import json
+import re
+
+from iort_contract.catalog.derived import DERIVED
+from iort_contract.catalog.vesc import FAULTS, VESC
+from scripts.docs_parts import PAGE
+from scripts.page_contract import formula
+
+
+def test_the_page_has_each_field_with_its_unit() -> None:
+    source = PAGE.read_text()
+    (table,) = re.findall(r"FIELD_TABLE: FieldTable = (\{.*?^\});", source, re.DOTALL | re.MULTILINE)
+    fields, faults = json.loads(table)["fields"], json.loads(table)["faults"]
+    assert fields.keys() >= {field.name for field in VESC.fields} | DERIVED.keys()
+    assert fields["charge_drawn"]["ros2_unit"] == "Ah"
+    assert faults["5"] == FAULTS[5]
+
+
+def test_a_formula_is_told_as_it_calculates() -> None:
+    values = {"speed": 9300.0, "speed_to_erpm_gain": 4614.0, "speed_to_erpm_offset": 3.0}
+    values |= {"voltage_input": 12.0, "current_input": -3.0}
+    for entry in DERIVED.values():
+        arguments = {name: values[name] for name in entry.arguments}
+        assert eval(formula(entry), {}, arguments) == entry.formula(**arguments)  # our own entries
