@@ -17,23 +17,34 @@ from iort_contract.catalog.vesc import FAULTS, TEMPERATURES, VESC_STREAM
 from iort_contract.messages import page
 from iort_contract.messages.files import CLAIM_FIELDS
 
+_PRECEDENCE = {"+": 1, "-": 1, "*": 2, "/": 2}
+_ATOM = 3
+
 
 class Symbol:
     """Stands for an argument of a formula; the operators on it give the formula's text."""
 
-    def __init__(self, text: str) -> None:
+    def __init__(self, text: str, precedence: int = _ATOM) -> None:
         self.text = text
+        self.precedence = precedence
 
 
 def _operator(symbol: str, *, swapped: bool = False) -> Any:
-    def operate(left: Symbol, right: Symbol | float) -> Symbol:
-        sides = [f"({t})" if " " in t else t for t in (left.text, str(getattr(right, "text", right)))]
-        return Symbol(f" {symbol} ".join(reversed(sides) if swapped else sides))
+    precedence = _PRECEDENCE[symbol]
+
+    def operate(one: Symbol, other: Symbol | float) -> Symbol:
+        sides = one, other if isinstance(other, Symbol) else Symbol(f"{other}")
+        left, right = reversed(sides) if swapped else sides
+        texts = (
+            left.text if left.precedence >= precedence else f"({left.text})",
+            right.text if right.precedence > precedence else f"({right.text})",
+        )
+        return Symbol(f" {symbol} ".join(texts), precedence)
 
     return operate
 
 
-for _name, _text in {"add": "+", "sub": "-", "mul": "*", "truediv": "/", "pow": "**"}.items():
+for _name, _text in {"add": "+", "sub": "-", "mul": "*", "truediv": "/"}.items():
     setattr(Symbol, f"__{_name}__", _operator(_text))
     setattr(Symbol, f"__r{_name}__", _operator(_text, swapped=True))
 

@@ -21,7 +21,7 @@ from iort_agent.agent import make_agent
 from iort_agent.clock import SystemClock
 from iort_agent.config.file import Config
 from iort_agent.mqtt.dispatch import Dispatcher
-from iort_agent.sources.ros1 import Intake, TopicConfig
+from iort_agent.sources.intake import Intake, TopicConfig
 from iort_agent.sources.sim import SimConfig
 from iort_agent.spool.config import QueueConfig
 from iort_agent.spool.sqlite import make_spool

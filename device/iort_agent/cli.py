@@ -162,8 +162,9 @@ def run(options: argparse.Namespace) -> int:
 
 def check(options: argparse.Namespace) -> int:
     """`iort-agent check`: status 1 if something would not work."""
-    from iort_agent.verbs.check import FAIL, render  # noqa: PLC0415 - it loads the network's library
+    from iort_agent.sources import FAIL  # noqa: PLC0415 - only this verb needs it
     from iort_agent.verbs.check import check as findings_of  # noqa: PLC0415 - as above
+    from iort_agent.verbs.check import render  # noqa: PLC0415 - it loads the network's library
 
     config = load_config(options.config)
     findings = []

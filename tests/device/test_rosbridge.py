@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import logging
+import math
 import sys
 import threading
 import time
@@ -82,7 +83,7 @@ def test_messages_become_samples(server: RosbridgeStandin, log: pytest.LogCaptur
     assert running.said == [], "of what type they are, only the server could say"
     assert before < times[0] <= times[-1] < time.time_ns() // 1000
     assert [record.getMessage()[:70] for record in log.records if record.levelname == "WARNING"] == [
-        f"topic {CORE}: the server does not say what its messages consist"
+        f"topic {CORE}: the server does not tell the structure of its mes"
     ]
 
 
@@ -102,9 +103,9 @@ def test_what_a_message_may_hold(server: RosbridgeStandin) -> None:
         server.publish("/odd", message)
         server.publish("/odd", {"a": float("nan"), "b": 1})
         running.wait_for(2)
+    assert math.isnan(running.samples[0][2].pop("pose.position.y")), "null is what the server makes of NaN"
     assert running.samples[0][2] == {
         "pose.position.x": 1.5,
-        "pose.position.y": None,
         "covariance.0": 0.1,
         "covariance.1": 0.2,
         "name": "left",
@@ -123,7 +124,7 @@ def test_selected_fields_only(server: RosbridgeStandin, log: pytest.LogCaptureFi
         server.publish("/odd", message)
         running.wait_for(2)
     assert running.samples[0][2] == {"pose.x": 1, "pose.y": 2, "ranges.77": 77}
-    assert log.text.count("have no field height") == 1
+    assert log.text.count("has no field height") == 1
 
 
 @pytest.mark.parametrize("parts", [("secs", "nsecs"), ("sec", "nanosec")])
@@ -140,7 +141,7 @@ def test_the_stamp_of_either_ros(server: RosbridgeStandin, parts: tuple[str, str
     ("message", "words", "reason"),
     [
         (state(1, secs=12, nsecs=0), "s off the clock; using the time of arrival", "unbelieved_stamps"),
-        ({"data": 1}, "no time in them; using the time of arrival", "no_stamp"),
+        ({"data": 1}, "they have no time; using the time of arrival", "no_stamp"),
         ({"header": {"stamp": 7}, "data": 1}, "using the time of arrival", "no_stamp"),
     ],
 )
@@ -369,29 +370,6 @@ def test_something_else_listens_there(log: pytest.LogCaptureFixture) -> None:
         topics = ((CORE, TopicConfig(stream="vesc", time="arrival")),)
         with Running(Quick(RosbridgeConfig(url=url, topics=topics))):
             eventually(lambda: "is no rosbridge server" in log.text)
-
-
-def test_publishing(server: RosbridgeStandin) -> None:
-    with Running(config(server)) as running:
-        connection = running.source.connection
-        server.wait_for("subscribe")
-        connection.publish("/drive", "std_msgs/Float64", {"data": 1.5})
-        connection.publish("/drive", "std_msgs/Float64", {"data": 2.5})
-        assert server.wait_for("publish", 2)["msg"] == {"data": 2.5}
-        assert [op["op"] for op in server.operations if op["op"] in ("advertise", "publish")] == [
-            "advertise", "publish", "publish",
-        ]  # fmt: skip
-        with pytest.raises(SourceError, match="/drive cannot be published"):
-            connection.publish("/drive", "std_msgs/Float64", {"data": float("nan")})
-        server.__exit__()
-        eventually(lambda: connection._socket is None)
-        with pytest.raises(SourceError, match="not connected"):
-            connection.publish("/drive", "std_msgs/Float64", {"data": 3.5})
-        server.__enter__()
-        server.wait_for("subscribe", 2)
-        connection.publish("/drive", "std_msgs/Float64", {"data": 4.5})
-        server.wait_for("advertise", 2)
-        server.wait_for("publish", 3)
 
 
 def test_without_websocket_client_it_says_what_to_install(

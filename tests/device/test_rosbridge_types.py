@@ -48,7 +48,7 @@ def test_messages_go_the_way_of_ros_1_where_their_type_is_known(*, old: bool) ->
                 message["header"]["seq"] = seq
                 server.publish(CORE, message)
             running.wait_for(3)
-        assert len(running.source._intakes[CORE]._writer.write(message)) == 4 + 8 + 4 + 9 + 8 + 4
+        assert len(running.source._hearings[CORE]._writer.write(message)) == 4 + 8 + 4 + 9 + 8 + 4
     assert [values for _, _, values in running.samples] == [
         {"speed": seq + 0.5, "fault_code": 0} for seq in range(3)
     ]
@@ -72,12 +72,12 @@ def test_structure_is_kept_where_the_plain_sample_loses_it() -> None:
         )
         server.publish("/scan", {"header": header, "ranges": [1.5, None], "raw": "AQI=", "when": []})
         running.wait_for(1)
-        intake = running.source._intakes["/scan"]
+        hearing = running.source._hearings["/scan"]
         assert running.samples[0][2].keys() == {"ranges.0", "ranges.1"}
         assert running.samples[0][2]["ranges.1"] != running.samples[0][2]["ranges.1"]
         # What is no column is in the message all the same.
         assert running.samples[0][2].raw == raw
-        assert intake.report() == {"messages": 1, "not_a_number": 1}
+        assert hearing.report() == {"messages": 1, "not_a_number": 1}
 
 
 def test_without_rosapi_the_plain_sample_is_sent_and_counted(server: RosbridgeStandin) -> None:

@@ -14,7 +14,8 @@ from xmlrpc.server import SimpleXMLRPCServer
 
 import pytest
 
-from iort_agent.verbs.check import OK, Finding, _ros_master
+from iort_agent.sources import OK, Finding
+from iort_agent.sources.ros1 import Ros1Config
 from iort_contract.catalog.streams import AGENT_FIELDS, AGENT_STREAM
 from iort_station.operations import delivery
 from local.cloud import ROOT
@@ -89,13 +90,13 @@ def ros_master(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
 
 
 def test_a_ros_master(ros_master):
-    *_, found = _ros_master("ros")
+    *_, found = Ros1Config(topics=()).check("ros")
     assert (found.level, "process 4711" in found.text) == (OK, True)
 
 
 def test_no_ros_master(monkeypatch):
     monkeypatch.setenv("ROS_MASTER_URI", "http://127.0.0.1:9")
-    found: list[Finding] = list(_ros_master("ros"))
+    found: list[Finding] = list(Ros1Config(topics=()).check("ros"))
     assert found[-1].level == "fail"
     assert "roscore" in found[-1].todo
 

@@ -20,8 +20,7 @@ from iort_agent.control.downlink import make_downlink
 from iort_agent.lanes.clock_offset import Offset
 from iort_agent.mqtt.dispatch import Dispatcher
 from iort_agent.rate_limiter import Allowance
-from iort_agent.ros1.node import DEFAULT_NODE
-from iort_agent.ros1.publish import Ros1Graph
+from iort_agent.ros1.node import DEFAULT_NODE, shared
 from iort_agent.schema import Where, load
 from iort_contract.messages.commands import Command, FleetMessage, encode_command, encode_fleet
 from tests.agent_fakes import Loopback
@@ -37,7 +36,7 @@ logging.basicConfig(stream=sys.stderr, level="INFO", format="%(levelname)s %(mes
 file = Path(sys.argv[1])
 settings, where, clock = json.loads(file.read_text()), Where(file), SystemClock()
 uplink = Loopback(clock, Dispatcher())
-graph = Ros1Graph(DEFAULT_NODE, clock)
+graph = shared(DEFAULT_NODE, clock)
 downlink = make_downlink(
     load(DownlinkConfig, settings.get("downlink", {}), where),
     share_rule()(settings["share"], where) if "share" in settings else (),
@@ -66,7 +65,7 @@ for seq, line in zip(itertools.count(), sys.stdin):
     elif verb == "await":
         # A subscriber knows of a connection before its publisher does, and rospy tells nobody.
         topic, _, count = rest.partition(" ")
-        while graph._node.listeners(topic) < int(count):
+        while graph.listeners(topic) < int(count):
             time.sleep(0.01)
         say("heard")
     elif verb == "pose":

@@ -98,7 +98,7 @@ def test_a_lost_connection_and_the_agents_end_stop_the_car(driven: tuple[Process
 def test_nonsense_is_refused(driven: tuple[Process, Process]) -> None:
     downlink, listener = driven
     downlink.say('send 300 {"twist": {"linear": {"x": "fast"}}}')
-    downlink.until_said("twist.linear.x: found 'fast'; allowed is a number")
+    downlink.until_said("twist.linear.x: must be a number, got 'fast'")
     drive(downlink, 2.5)
     listener.until(lambda: 2.5 in speeds(listener), "command")
     assert speeds(listener)[0] == 2.5

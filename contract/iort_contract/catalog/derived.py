@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from dataclasses import asdict, dataclass, fields
+from dataclasses import dataclass, fields
 from itertools import repeat
 from typing import Any, Collection, Iterable, Iterator, Mapping, Sequence
 
@@ -53,9 +53,11 @@ def calculable(
     columns: Collection[str], vehicle: Vehicle | None
 ) -> Iterator[tuple[Derived, Mapping[str, float]]]:
     """The derived fields that these columns and the vehicle allow, each with its parameters."""
-    known = {} if vehicle is None else asdict(vehicle)
+    known = {} if vehicle is None else vars(vehicle)
     for name, entry in DERIVED.items():
-        if all(source in columns for source in SOURCES[name]) and known.keys() >= set(PARAMETERS[name]):
+        if all(source in columns for source in SOURCES[name]) and all(
+            parameter in known for parameter in PARAMETERS[name]
+        ):
             yield entry, {parameter: known[parameter] for parameter in PARAMETERS[name]}
 
 

@@ -26,7 +26,7 @@ class Field:
 class Derived:
     """A field that is calculated from others, in the summary, in queries and in notebooks.
 
-    ``formula`` takes fields and vehicle parameters by their names. It uses operators alone, so the same code
+    ``formula`` takes fields and vehicle parameters by their names. It uses + - * / alone, so the same code
     calculates with numbers and with numpy's arrays.
     """
 

@@ -17,11 +17,13 @@ from iort_contract.checks import (
     json_object,
     offset_entry,
     shown,
+    text,
     wire_column,
     wire_sample,
 )
 from iort_contract.limits import MAX_FIELDS, SCHEMA_VERSION, ContractError, Value
 from iort_contract.tables import NONFINITE, RECEIVED_MS, ROBOT, T_US
+from iort_contract.topics import check_robot, check_stream
 
 # The fields of a ping; the answer repeats them.
 PING_FIELDS = ("v", "id", "sent_us", "padding")
@@ -67,9 +69,9 @@ def encode_live(live: LiveSample) -> bytes:
     return COMPACT.encode(message).encode()
 
 
-def decode_live(message: bytes | str) -> LiveSample:
+def decode_live(message: bytes | str | Mapping[str, Any]) -> LiveSample:
     """Decode a live message; raises `ContractError` for everything that `encode_live` cannot write."""
-    envelope = json_object(message, "live message")
+    envelope = message if isinstance(message, Mapping) else json_object(message, "live message")
     check_version(envelope)
     seq, nonfinite = integer(envelope, "seq"), integer(envelope, NONFINITE)
     boot = check_header(envelope.get("boot"), seq, nonfinite)
@@ -103,6 +105,32 @@ def live_update(
         "hops": {**hops, **offset_entry(live.offset_us)},
         "sample": dict(live.sample),
     }
+
+
+class LiveUpdate(NamedTuple):
+    """A live sample as PubNub's subscribers receive it, with the cloud's times of receipt and of sending."""
+
+    robot: str
+    stream: str
+    live: LiveSample
+    received_ms: int
+    lambda_us: int
+
+
+def decode_live_update(message: Any) -> LiveUpdate:
+    """Decode a `live_update`; raises `ContractError` for anything else."""
+    if not isinstance(message, Mapping) or not isinstance(message.get("hops"), Mapping):
+        raise ContractError(f"live update must be an object with hops, got {shown(message)}")
+    hops = message["hops"]
+    times = {name: hops[name] for name in ("sent_us", "offset_us") if name in hops}
+    live = decode_live({**message, NONFINITE: 0, **times})
+    return LiveUpdate(
+        robot=check_robot(text(message, ROBOT)),
+        stream=check_stream(text(message, "stream")),
+        live=live,
+        received_ms=integer(hops, RECEIVED_MS),
+        lambda_us=check_time(integer(hops, "lambda_us"), "lambda_us"),
+    )
 
 
 def encode_ping(ping_id: int, sent_us: int, padding: str = "") -> bytes:

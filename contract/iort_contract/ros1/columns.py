@@ -51,7 +51,7 @@ def values_a_message(messages: Messages) -> int:
     if not messages.layout:
         return 0
     try:
-        return len(decoder_of(messages.layout).decode(max(messages.raw, key=len))[0])
+        return len(decoder_of(messages.layout).decode(max(messages.raw, key=len)))
     except MessageError:
         return 0
 
@@ -71,7 +71,7 @@ def view(messages: Messages) -> tuple[dict[str, list[Value]], int]:
         for i, raw in enumerate(messages.raw):
             enough = max(viewed, decoder.walked - walked) >= _MAX_VIEWED
             try:
-                values = {} if enough else decoder.decode(raw)[0]
+                values = {} if enough else decoder.decode(raw)
             except MessageError:
                 values = {}
             viewed += len(values)

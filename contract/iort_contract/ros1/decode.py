@@ -1,451 +1,322 @@
-"""Decodes a ROS 1 message to one flat sample, by its definition: field path -> value.
+"""Decodes a ROS 1 message to a flat sample, by its definition: field path -> value.
 
-A definition is compiled once to a list of steps. Neighbouring fixed-size fields become one `struct.Struct`,
-with padding for unselected fields. Nested messages flatten to dotted paths and arrays to indexes:
-``pose.position.x``, ``covariance.0``; time and duration become ``sec`` and ``nanosec`` as in ROS 2. A leading
-header is left out: its stamp is the sample's time. A message of a header and exactly one nested message
-(VescStateStamped, PoseStamped) gives that message's fields without a prefix.
+This is the only rule of flattening. Nested messages give dotted paths and arrays give indexes:
+``pose.position.x``, ``covariance.0``. Time and duration become ``sec`` and ``nanosec``, as in ROS 2. A
+leading header is left out, because its stamp is the sample's time. A message of a header and exactly one
+nested message (VescStateStamped, PoseStamped) gives that message's fields without a prefix.
 
-The sample is a view; the record holds the message. The view leaves out, and counts, fields that no table
-shows: arrays of more than `MAX_ELEMENTS`, ``uint8[]`` of any length, texts that the contract refuses, fields
-beyond `MAX_FIELDS`. An element named in the selection (``ranges.540``) is taken from any array. With
-``large``, a ``uint8[]`` stays bytes.
+The sample is a view; the record holds the message. The view leaves out and counts the fields that no table
+shows: arrays of more than `MAX_ELEMENTS`, ``uint8[]`` of any length, texts of more than `MAX_TEXT`
+characters, fields beyond `MAX_FIELDS`.
 """
 
 from __future__ import annotations
 
+import re
 import struct
+from functools import lru_cache
 from itertools import islice
-from typing import Any, Callable, Dict, Optional, Sequence, Tuple
+from typing import Dict, Iterator, NamedTuple, Sequence, Union
 
 from iort_contract.limits import MAX_FIELDS, MessageError, Value
-from iort_contract.ros1.definition import LETTERS, STRING, VARIABLE, Definition, Field
+from iort_contract.ros1.definition import LETTERS, STRING, VARIABLE, Definition, Field, Fields
 
 MAX_ELEMENTS = 64
 MAX_TEXT = 4096
-# Elements of variable size are walked one by one; a message with more is not decoded.
+# A message with more elements of variable size in one array is not decoded.
 _MAX_WALKED = 20_000
-# The limit of named places in a decoder: a few lines can nest to more than anybody can walk.
-_MAX_NAMED = 20_000
+# A message of a fixed size has at most this many bytes.
+_MAX_FIXED_BYTES = 2**31
+# With a selection, this many fields are decoded before the rest of the message is skipped.
+_MAX_SEARCHED = 20_000
+_MAX_CACHED = 1000
 
-# Reads from the bytes at an offset into the sample; returns the offset after the last byte read.
-Step = Callable[[bytes, int, Dict[str, Value]], int]
-# Whether a path is selected itself, and whether anything below it is.
-Wanted = Callable[[str], bool]
-
-_LENGTH = struct.Struct("<I")
-# A header: seq, the stamp's seconds and nanoseconds, and the length of the frame_id that follows.
+# A header begins with seq, the stamp's seconds and nanoseconds, and the length of the frame_id.
 HEADER = struct.Struct("<IIII")
+_LENGTH = struct.Struct("<I")
 _BLOBS = ("uint8", "char")
 _BEYOND = f"(fields beyond {MAX_FIELDS})"
 
 
-# The sample; the header's stamp in microseconds, if it exists and was asked for; and a leading header's
-# frame_id as bytes. The frame_id is nearly always the same, and the bytes can be compared without decoding.
-Decoded = Tuple[Dict[str, Value], Optional[int], Optional[bytes]]
+def stamp_ns(message: bytes) -> int | None:
+    """The header stamp of a stamped message; None if the message is too short to have one."""
+    if len(message) < HEADER.size:
+        return None
+    _, sec, nanosec, _ = HEADER.unpack_from(message)
+    return int(sec) * 1_000_000_000 + int(nanosec)
 
 
 class Decoder:
-    """Decodes the messages of one definition. ``select`` are the selected paths; None selects all.
+    """Decodes the messages of one definition.
 
-    ``stamped`` says whether messages begin with a header. ``unknown`` are selected paths that the message
-    does not have; ``left_out`` counts omitted values by path. ``flat`` is the layout of a message of numbers
-    only, at fixed places after its header, and their names; None for all others.
+    ``select`` names the wanted paths, or their beginnings; None selects all. An element that is named
+    (``ranges.540``) is taken from an array of any length. With ``large``, a ``uint8[]`` stays bytes.
+
+    ``stamped`` is true if messages begin with a header. ``unknown`` are selected paths that the message does
+    not have. ``left_out`` counts the omitted values by path. ``walked`` counts the elements of variable size
+    that were read one by one, times their fields: the main cost of decoding. ``flat`` is the struct of a
+    message that has only numbers after its header, and their names; None for other messages.
     """
 
     def __init__(
-        self,
-        definition: Definition,
-        *,
-        select: Sequence[str] | None = None,
-        stamp: bool = False,
-        large: bool = False,
+        self, definition: Definition, *, select: Sequence[str] | None = None, large: bool = False
     ) -> None:
-        self._kind = definition.kind
         self.stamped = definition.stamped()
-        self._stamp = stamp and self.stamped
         self.left_out: dict[str, int] = {}
-        compiler = _Compiler(definition, select, self.left_out, large=large)
-        try:
-            self._steps = compiler.message(headed=self.stamped)
-        except struct.error as error:
-            raise MessageError(f"{self._kind}: the message would be too large: {error}") from error
-        self.unknown = sorted(set(select or ()) - compiler.used)
-        self._walked = compiler.walked
+        self.walked = 0
+        self._kind = definition.kind
+        self._types = definition.types
+        self._select = select
+        self._large = large
+        self._limit = MAX_FIELDS if select is None else _MAX_SEARCHED
+        self._extents: dict[str, _Extent | None] = {**_NUMBERS, STRING: None}
+        self._parts: dict[str, list[_Part]] = {}
+        self._chosen: dict[str, bool] = {}
+        body = definition.fields()[1 if self.stamped else 0 :]
+        if self.stamped and len(body) == 1 and body[0].length is None and body[0].kind in self._types:
+            body = self._types[body[0].kind]
+        extent = self._extent(self._kind)
+        if extent is not None and extent.size > _MAX_FIXED_BYTES:
+            raise MessageError(f"{self._kind}: the message would be too large: {extent.size} bytes")
+        self._body = self._compile(body)
+        self.unknown = sorted(path for path in select or () if not self._has(path.split("."), body))
         self.flat: tuple[struct.Struct, list[str]] | None = None
-        if len(self._steps) == 1:
-            self.flat = compiler.fixed.get(self._steps[0])
+        if len(self._body) == 1 and isinstance(self._body[0], _Run) and self._body[0].numbers <= MAX_FIELDS:
+            self.flat = self._body[0].named("") if self._body[0].numbers else None
 
-    @property
-    def walked(self) -> int:
-        """The number of walked elements of variable size, counting each of their fields. It is the main cost
-        of decoding."""
-        return self._walked[0]
-
-    def decode(self, data: bytes) -> Decoded:
-        """Decode a message; raises `MessageError` if the bytes do not fit the definition."""
-        # The header is read inline, not by steps: after a pause each call costs as much as its work.
+    def decode(self, data: bytes) -> dict[str, Value]:
+        """The message as a sample; raises `MessageError` if the bytes do not fit the definition."""
         values: dict[str, Value] = {}
-        at, stamp_us, frame = 0, None, None
+        at = 0
         try:
             if self.stamped:
-                _, sec, nanosec, length = HEADER.unpack_from(data)
-                at = HEADER.size + length
-                frame = data[HEADER.size : at]
-                if self._stamp:
-                    # Seconds and the rest apart, since a float of seconds would lose the last digits.
-                    stamp_us = sec * 1_000_000 + nanosec // 1000
-            for step in self._steps:
-                at = step(data, at, values)
+                at = HEADER.size + HEADER.unpack_from(data)[3]
+            at = self._read(self._body, "", data, at, values)
         except struct.error as error:
             raise MessageError(f"{self._kind}: the message of {len(data)} bytes is truncated") from error
         if at != len(data):
             raise MessageError(f"{self._kind}: the message must have {at} bytes, got {len(data)}")
+        if self._select is not None:
+            values = {path: value for path, value in values.items() if self.wanted(path)}
         if len(values) > MAX_FIELDS:
-            self.left_out[_BEYOND] = self.left_out.get(_BEYOND, 0) + 1
+            self._leave_out(_BEYOND)
             values = dict(islice(values.items(), MAX_FIELDS))
-        return values, stamp_us, frame
+        return values
 
+    # Reading. A path of None skips the value.
 
-class _Compiler:
-    """Turns types into steps. An unselected field is skipped, in one step if its size is fixed."""
-
-    def __init__(
-        self,
-        definition: Definition,
-        select: Sequence[str] | None,
-        left_out: dict[str, int],
-        *,
-        large: bool,
-    ) -> None:
-        self._definition = definition
-        self._large = large
-        self._select = select
-        self._left_out = left_out
-        self._sizes: dict[str, int | None] = {}
-        self._skips: dict[str, list[Step]] = {}
-        self._emitted = self._named = 0
-        self.used: set[str] = set()
-        self.walked = [0]
-        self.fixed: dict[Step, tuple[struct.Struct, list[str]]] = {}
-
-    def message(self, *, headed: bool) -> list[Step]:
-        """The steps of a whole message, after a leading header. A message of a header and one nested message
-        gives the nested message."""
-        run = _Run(self.fixed)
-        body = self._definition.fields()[1 if headed else 0 :]
-        lone = headed and len(body) == 1
-        for field in body:
-            if lone and field.length is None and field.kind in self._definition.types:
-                self._fields(run, field.kind, "")
+    def _read(self, parts: Sequence[_Part], prefix: str | None, data: bytes, at: int, out: _Sample) -> int:
+        for part in parts:
+            # The next values would be cut from a full sample.
+            shown = prefix is not None and len(out) <= self._limit
+            if isinstance(part, _Run):
+                if shown:
+                    reader, names = part.named(prefix or "")
+                    out.update(zip(names, reader.unpack_from(data, at)))
+                at += part.size
+                continue
+            path = f"{prefix}{part.name}" if shown else None
+            if part.length is None:
+                at = self._value(part.kind, path, data, at, out)
             else:
-                self._field(run, field, field.name)
-        return run.finish()
+                at = self._array(part, path, data, at, out)
+        return at
 
-    def _fields(self, run: _Run, kind: str, prefix: str) -> None:
-        for field in self._definition.fields(kind):
-            self._field(run, field, prefix + field.name)
-
-    def _field(self, run: _Run, field: Field, path: str) -> None:
-        self._named += 1
-        if self._full() or not self._within(path):
-            self._skip(run, field)
-        elif field.length is None:
-            self._single(run, field.kind, path)
-        elif field.length == VARIABLE:
-            run.step(self._variable(field.kind, path))
-        else:
-            self._array(run, field, path, field.length)
-
-    def _full(self) -> bool:
-        """Whether the sample is full; later fields are skipped as a whole."""
-        return self._emitted > MAX_FIELDS or self._named > _MAX_NAMED
-
-    def _single(self, run: _Run, kind: str, path: str) -> None:
-        if kind in self._definition.types:
-            self._fields(run, kind, f"{path}.")
-            return
-        wanted = self._wanted(path)
-        if wanted:
-            self._emitted += 1
-            if self._emitted > MAX_FIELDS:
-                if self._emitted == MAX_FIELDS + 1:
-                    run.step(_noted(_BEYOND, self._left_out))
-                wanted = False
+    def _value(self, kind: str, path: str | None, data: bytes, at: int, out: _Sample) -> int:
+        if kind in self._types:
+            return self._read(self._of(kind), None if path is None else f"{path}.", data, at, out)
         if kind == STRING:
-            run.step(_text(path, self._left_out) if wanted else _skip_text)
-        else:
-            run.fixed(LETTERS[kind], path if wanted else None)
+            (n,) = _LENGTH.unpack_from(data, at)
+            if path is not None:
+                # ROS 1 does not define the encoding of a text.
+                text = data[at + 4 : at + 4 + n].decode("utf-8", "replace") if n <= 4 * MAX_TEXT else None
+                if text is None or len(text) > MAX_TEXT:
+                    self._leave_out(path)
+                else:
+                    out[path] = text
+            return at + 4 + int(n)
+        assert path is not None
+        (out[path],) = struct.unpack_from(f"<{LETTERS[kind]}", data, at)
+        return at
 
-    def _array(self, run: _Run, field: Field, path: str, length: int) -> None:
-        """An array of fixed length, decoded as single fields."""
-        whole = self._wanted(path)
-        if whole and length > MAX_ELEMENTS:
-            run.step(_noted(path, self._left_out))
-        taken = range(length) if whole and length <= MAX_ELEMENTS else self._indexes(path, length)
-        done = 0
-        for i in taken:
-            if self._full():
-                break
-            self._skip(run, Field(field.name, field.kind, i - done))
-            self._single(run, field.kind, f"{path}.{i}")
-            done = i + 1
-        self._skip(run, Field(field.name, field.kind, length - done))
-
-    def _variable(self, kind: str, path: str) -> Step:
-        """An array whose length is in each message."""
-        size = self._size(kind)
-        left_out, walked = self._left_out, self.walked
-        whole, few = self._wanted(path), self._indexes(path, None)
-        blob = kind in _BLOBS
-        if blob and whole and self._large:
-            return _bytes(path)
-        elements: dict[int, list[Step]] = {}
-        structs: dict[int, struct.Struct] = {}
-        names: list[str] = []
-        skip = self._skipped(kind)
-        letter = LETTERS.get(kind)
-        self._named += MAX_ELEMENTS if letter else 1
-
-        def steps(i: int) -> list[Step]:
-            # Created on the first message of this length: most arrays stay short.
-            if i not in elements:
-                if self._full():
-                    return skip
-                elements[i] = self._element(kind, f"{path}.{i}")
-            return elements[i]
-
-        def step(data: bytes, at: int, out: dict[str, Value]) -> int:
+    def _array(self, field: Field, path: str | None, data: bytes, at: int, out: _Sample) -> int:
+        kind, n = field.kind, field.length or 0
+        blob = n == VARIABLE and kind in _BLOBS
+        if n == VARIABLE:
             (n,) = _LENGTH.unpack_from(data, at)
             at += 4
-            all_of_it = whole and not blob and n <= MAX_ELEMENTS
-            if whole and not all_of_it:
-                left_out[path] = left_out.get(path, 0) + 1
-            # The following values do not fit anyway.
-            all_of_it = all_of_it and len(out) <= MAX_FIELDS
-            if size is not None and at + n * size > len(data):
-                raise struct.error
-            if all_of_it and letter:
-                reader = structs.get(n)
-                if reader is None:
-                    reader = structs[n] = struct.Struct(f"<{n}{letter}")
-                    names.extend(f"{path}.{i}" for i in range(len(names), n))
-                out.update(zip(names, reader.unpack_from(data, at)))
-                return at + int(reader.size)
-            if size is not None:
-                for i in range(n) if all_of_it else (i for i in few if i < n):
-                    _walk(steps(i), data, at + i * size, out)
-                return at + int(n) * size
-            if n > _MAX_WALKED:
-                raise MessageError(f"{path}: too many elements to decode: {n}")
-            walked[0] += n * len(skip)
-            for i in range(n):
-                at = _walk(steps(i) if all_of_it or i in few else skip, data, at, out)
-            return at
+        extent = self._extent(kind)
+        if extent is not None and at + n * extent.size > len(data):
+            raise struct.error
+        shown: Sequence[int] = ()
+        if path is not None and blob and self._large:
+            out[path] = bytes(data[at : at + n])  # type: ignore[assignment]  # for the attachments
+        elif path is not None and n <= MAX_ELEMENTS and not blob:
+            shown = range(n)
+        elif path is not None:
+            shown = [i for i in _indexes(tuple(self._select or ()), _label(path)) if i < n]
+            self._leave_out(path)
+        if kind in LETTERS and isinstance(shown, range):
+            out.update(zip(_element_names(path or ""), struct.unpack_from(f"<{n}{LETTERS[kind]}", data, at)))
+        elif extent is not None:
+            for i in shown if extent.numbers else ():
+                if len(out) <= self._limit:
+                    self._value(kind, f"{path}.{i}", data, at + i * extent.size, out)
+        if extent is not None:
+            return at + n * extent.size
+        if n > _MAX_WALKED:
+            raise MessageError(f"{path or kind}: too many elements to decode: {n}")
+        self.walked += n * (len(self._of(kind)) if kind in self._types else 1)
+        for i in range(n):
+            here = f"{path}.{i}" if i in shown and len(out) <= self._limit else None
+            at = self._value(kind, here, data, at, out)
+        return at
 
-        return step
+    def _leave_out(self, path: str) -> None:
+        label = _label(path)
+        if label == _BEYOND or self.wanted(label):
+            self.left_out[label] = self.left_out.get(label, 0) + 1
 
-    def _element(self, kind: str, path: str) -> list[Step]:
-        run = _Run({})
-        emitted, self._emitted = self._emitted, 0
-        self._single(run, kind, path)
-        self._emitted = emitted
-        return run.finish()
+    # Compiling. Each type is compiled once.
 
-    def _skip(self, run: _Run, field: Field) -> None:
-        size = self._size(field.kind)
-        if field.length == VARIABLE:
-            run.step(_skip_many(size, self._skipped(field.kind), self.walked))
-        elif size is not None:
-            run.pad(size * (1 if field.length is None else field.length))
-        elif field.length is None:
-            for step in self._skipped(field.kind):
-                run.step(step)
-        elif field.length:
-            run.step(_repeated(self._skipped(field.kind), field.length))
+    def _of(self, kind: str) -> list[_Part]:
+        if kind not in self._parts:
+            self._parts[kind] = self._compile(self._types[kind])
+        return self._parts[kind]
 
-    def _skipped(self, kind: str) -> list[Step]:
-        """The steps that skip one value of a type, created once."""
-        if kind not in self._skips:
-            run = _Run({})
-            if self._size(kind) is not None:
-                self._skip(run, Field("", kind, None))
-            elif kind == STRING:
-                run.step(_skip_text)
-            else:
-                inner = _Run({})
-                for nested in self._definition.fields(kind):
-                    self._skip(inner, nested)
-                # One step, whatever its content.
-                run.step(_repeated(inner.finish(), 1))
-            self._skips[kind] = run.finish()
-        return self._skips[kind]
+    def _compile(self, fields: Fields) -> list[_Part]:
+        """Put neighbouring numbers together."""
+        parts: list[_Part] = []
+        for field in fields:
+            extent = self._extent_of(field)
+            if extent is None or extent.numbers > MAX_FIELDS:
+                parts.append(field)
+                continue
+            if not parts or not isinstance(parts[-1], _Run):
+                parts.append(_Run(self))
+            run = parts[-1]
+            assert isinstance(run, _Run)
+            run.add(field, extent)
+        return parts
 
-    def _size(self, kind: str) -> int | None:
-        """The size of a type in bytes, or None if it varies."""
-        if kind in LETTERS:
-            return struct.calcsize(f"<{LETTERS[kind]}")
-        if kind == STRING:
-            return None
-        if kind not in self._sizes:
-            total: int | None = 0
-            for field in self._definition.fields(kind):
-                if field.length == 0:
-                    continue
-                size = None if field.length == VARIABLE else self._size(field.kind)
-                if size is None:
-                    total = None
-                    break
-                total = (total or 0) + size * (1 if field.length is None else field.length)
-            self._sizes[kind] = total
-        return self._sizes[kind]
+    def _extent(self, kind: str) -> _Extent | None:
+        """The extent of a type; None if its size varies."""
+        if kind not in self._extents:
+            extents = [self._extent_of(field) for field in self._types[kind]]
+            fixed = [extent for extent in extents if extent is not None]
+            whole = _Extent(sum(one.size for one in fixed), sum(one.numbers for one in fixed))
+            self._extents[kind] = whole if len(fixed) == len(extents) else None
+        return self._extents[kind]
+
+    def _extent_of(self, field: Field) -> _Extent | None:
+        if field.length == 0:
+            return _Extent(0, 0)
+        extent = None if field.length == VARIABLE else self._extent(field.kind)
+        if extent is None or field.length is None:
+            return extent
+        # A long array is read apart, as its elements are left out.
+        numbers = extent.numbers * field.length if field.length <= MAX_ELEMENTS else MAX_FIELDS + 1
+        return _Extent(extent.size * field.length, numbers)
+
+    def leaves(self, field: Field, path: str) -> Iterator[tuple[str, str]]:
+        """The kinds and the paths of a field's numbers, if it has no more than `MAX_FIELDS`."""
+        extent = self._extent_of(field)
+        if extent is None or not extent.numbers:
+            return
+        for i in range(1 if field.length is None else field.length):
+            here = path if field.length is None else f"{path}.{i}"
+            if field.kind in LETTERS:
+                yield field.kind, here
+            for nested in self._types.get(field.kind, ()):
+                yield from self.leaves(nested, f"{here}.{nested.name}")
 
     # The selection.
 
-    def _wanted(self, path: str) -> bool:
-        """Whether the path is selected, by its own name or by a parent's."""
+    def wanted(self, path: str) -> bool:
+        """Whether a path is selected."""
         if self._select is None:
             return True
-        for name in self._select:
-            if path == name or path.startswith(f"{name}."):
-                self.used.add(name)
-                return True
-        return False
+        if path not in self._chosen:
+            if len(self._chosen) >= _MAX_SEARCHED:
+                self._chosen.clear()
+            self._chosen[path] = any(path == name or path.startswith(f"{name}.") for name in self._select)
+        return self._chosen[path]
 
-    def _within(self, path: str) -> bool:
-        """Whether the path, or a path in it, is selected."""
-        return self._wanted(path) or any(name.startswith(f"{path}.") for name in self._select or ())
+    def _has(self, parts: Sequence[str], fields: Fields) -> bool:
+        """Whether a path can be in the messages."""
+        field = next((field for field in fields if field.name == parts[0]), None)
+        rest = parts[1:]
+        if field is None or not rest:
+            return field is not None
+        if field.length is not None:
+            if not rest[0].isdecimal() or 0 <= field.length <= int(rest[0]):
+                return False
+            rest = rest[1:]
+        return not rest or self._has(rest, self._types.get(field.kind, ()))
 
-    def _indexes(self, path: str, length: int | None) -> list[int]:
-        """The array elements that are selected by number."""
-        numbers = set()
-        for name in self._select or ():
-            if name.startswith(f"{path}."):
-                index = name[len(path) + 1 :].partition(".")[0]
-                if index.isdecimal() and (length is None or int(index) < length):
-                    numbers.add(int(index))
-                    if length is None:
-                        self.used.add(name)
-        return sorted(numbers)
+
+class _Extent(NamedTuple):
+    """The bytes of a value of fixed size, and how many numbers it has."""
+
+    size: int
+    numbers: int
+
+
+_NUMBERS = {kind: _Extent(struct.calcsize(f"<{letter}"), 1) for kind, letter in LETTERS.items()}
 
 
 class _Run:
-    """Collects neighbouring fixed-size fields into one struct."""
+    """Neighbouring numbers, read by one `struct.Struct`; it is created for the first sample that needs it."""
 
-    def __init__(self, fixed: dict[Step, tuple[struct.Struct, list[str]]]) -> None:
-        self._of = fixed
-        self._steps: list[Step] = []
-        self._format: list[str] = []
-        self._names: list[str] = []
+    def __init__(self, decoder: Decoder) -> None:
+        self.size = self.numbers = 0
+        self._decoder = decoder
+        self._fields: list[Field] = []
+        self._leaves: list[tuple[str, str]] = []
+        self._named: dict[str, tuple[struct.Struct, list[str]]] = {}
 
-    def fixed(self, letter: str, name: str | None) -> None:
-        if name is None:
-            self.pad(struct.calcsize(f"<{letter}"))
-        else:
-            self._format.append(letter)
-            self._names.append(name)
+    def add(self, field: Field, extent: _Extent) -> None:
+        """Put a field at the end."""
+        self._fields.append(field)
+        self.size += extent.size
+        self.numbers += extent.numbers
 
-    def pad(self, size: int) -> None:
-        if size:
-            self._format.append(f"{size}x")
+    def named(self, prefix: str) -> tuple[struct.Struct, list[str]]:
+        """What reads the selected numbers, and their paths."""
+        if prefix not in self._named:
+            if len(self._named) >= _MAX_CACHED:
+                self._named.clear()
+            leaves = [(kind, f"{prefix}{path}") for kind, path in self._leaves or self._expand()]
+            names = [path for _, path in leaves if self._decoder.wanted(path)]
+            letters = [
+                LETTERS[kind] if self._decoder.wanted(path) else f"{_NUMBERS[kind].size}x"
+                for kind, path in leaves
+            ]
+            self._named[prefix] = struct.Struct("<" + "".join(letters)), names
+        return self._named[prefix]
 
-    def step(self, step: Step) -> None:
-        self.finish()
-        self._steps.append(step)
-
-    def finish(self) -> list[Step]:
-        if self._format:
-            reader = struct.Struct("<" + "".join(self._format))
-            step = _fixed(reader, self._names) if self._names else _skip_bytes(reader.size)
-            if len(self._format) == len(self._names):
-                self._of[step] = reader, self._names
-            self._steps.append(step)
-            self._format, self._names = [], []
-        return self._steps
-
-
-# The steps.
+    def _expand(self) -> list[tuple[str, str]]:
+        self._leaves = [leaf for field in self._fields for leaf in self._decoder.leaves(field, field.name)]
+        return self._leaves
 
 
-def _walk(steps: list[Step], data: bytes, at: int, out: dict[str, Value]) -> int:
-    for step in steps:
-        at = step(data, at, out)
-    return at
+_Part = Union[_Run, Field]
+_Sample = Dict[str, Value]
 
 
-def _fixed(reader: struct.Struct, names: list[str]) -> Step:
-    unpack, size = reader.unpack_from, reader.size
-
-    def step(data: bytes, at: int, out: dict[str, Any]) -> int:
-        out.update(zip(names, unpack(data, at)))
-        return at + size
-
-    return step
+@lru_cache(maxsize=_MAX_CACHED)
+def _label(path: str) -> str:
+    """The path without the indexes of elements."""
+    return re.sub(r"\.\d+", "", path, flags=re.ASCII)
 
 
-def _text(path: str, left_out: dict[str, int]) -> Step:
-    def step(data: bytes, at: int, out: dict[str, Value]) -> int:
-        (n,) = _LENGTH.unpack_from(data, at)
-        at += 4
-        # ROS 1 does not define the encoding of a text.
-        text = data[at : at + n].decode("utf-8", "replace") if n <= 4 * MAX_TEXT else None
-        if text is None or len(text) > MAX_TEXT:
-            left_out[path] = left_out.get(path, 0) + 1
-        else:
-            out[path] = text
-        return at + int(n)
-
-    return step
+@lru_cache(maxsize=_MAX_CACHED)
+def _element_names(path: str) -> list[str]:
+    return [f"{path}.{i}" for i in range(MAX_ELEMENTS)]
 
 
-def _bytes(path: str) -> Step:
-    def step(data: bytes, at: int, out: dict[str, Any]) -> int:
-        (n,) = _LENGTH.unpack_from(data, at)
-        at += 4
-        if at + n > len(data):
-            raise struct.error
-        out[path] = bytes(data[at : at + n])
-        return at + int(n)
-
-    return step
-
-
-def _noted(path: str, left_out: dict[str, int]) -> Step:
-    def step(_data: bytes, at: int, _out: dict[str, Value]) -> int:
-        left_out[path] = left_out.get(path, 0) + 1
-        return at
-
-    return step
-
-
-def _skip_text(data: bytes, at: int, _out: dict[str, Value]) -> int:
-    return at + 4 + int(_LENGTH.unpack_from(data, at)[0])
-
-
-def _skip_bytes(size: int) -> Step:
-    return lambda _data, at, _out: at + size
-
-
-def _skip_many(size: int | None, element: list[Step], walked: list[int]) -> Step:
-    def step(data: bytes, at: int, out: dict[str, Value]) -> int:
-        (n,) = _LENGTH.unpack_from(data, at)
-        at += 4
-        if size is not None:
-            return at + int(n) * size
-        if n > _MAX_WALKED:
-            raise MessageError(f"too many elements to decode: {n}")
-        walked[0] += n * len(element)
-        for _ in range(n):
-            at = _walk(element, data, at, out)
-        return at
-
-    return step
-
-
-def _repeated(element: list[Step], times: int) -> Step:
-    def step(data: bytes, at: int, out: dict[str, Value]) -> int:
-        for _ in range(times):
-            at = _walk(element, data, at, out)
-        return at
-
-    return step
+@lru_cache(maxsize=_MAX_CACHED)
+def _indexes(select: tuple[str, ...], label: str) -> list[int]:
+    """The elements of an array that are selected by number."""
+    pattern = re.compile(r"(?:\.\d+)*\.".join(label.split(".")) + r"\.(\d+)(?![^.])", re.ASCII)
+    return sorted({int(match.group(1)) for match in map(pattern.match, select) if match})

@@ -1,13 +1,14 @@
 """Parses ROS 1 message definitions: the fields of a message, in the wire's order.
 
-The text is the one that a publisher sends in its connection header and that a bag keeps: the message's own
-definition, then each nested type's after a line of ``=`` and ``MSG: package/Type``.
+A publisher sends the text in its connection header, and a bag keeps it: the message's own definition, then
+each nested type's after a line of ``=`` and ``MSG: package/Type``.
 """
 
 from __future__ import annotations
 
+import hashlib
 import re
-from typing import NamedTuple, Tuple
+from typing import Iterator, NamedTuple, Tuple
 
 from iort_contract.limits import MessageError
 
@@ -43,12 +44,22 @@ class Field(NamedTuple):
     kind: str
     length: int | None
 
+    def __str__(self) -> str:
+        """The field's line in a definition."""
+        length = "" if self.length is None else "[]" if self.length == VARIABLE else f"[{self.length}]"
+        return f"{self.kind}{length} {self.name}"
+
 
 Fields = Tuple[Field, ...]
+# Times are nested messages.
+TIMES = {
+    TIME: (Field("sec", "uint32", None), Field("nanosec", "uint32", None)),
+    DURATION: (Field("sec", "int32", None), Field("nanosec", "int32", None)),
+}
 
 
 class Definition(NamedTuple):
-    """A message type and every type in it. Times are nested messages of ``sec`` and ``nanosec``."""
+    """A message type and every type in it."""
 
     kind: str
     types: dict[str, Fields]
@@ -65,21 +76,9 @@ class Definition(NamedTuple):
 
 def parse(kind: str, text: str) -> Definition:
     """Parse a definition; raises `MessageError` if it is invalid."""
-    first, *others = _SEPARATOR.split(text)
-    types: dict[str, Fields] = {
-        TIME: (Field("sec", "uint32", None), Field("nanosec", "uint32", None)),
-        DURATION: (Field("sec", "int32", None), Field("nanosec", "int32", None)),
-    }
-    if len(others) > _MAX_TYPES:
-        raise MessageError(f"{kind}: definition must have at most {_MAX_TYPES} types")
-    for section in others:
-        head, _, body = section.strip().partition("\n")
-        name = head[len("MSG:") :].strip() if head.startswith("MSG:") else ""
-        if "/" not in name:
-            raise MessageError(f"{kind}: a nested type must begin with MSG: package/Type, got {head[:60]!r}")
-        types[name] = _fields(name, body)
-    types[kind] = _fields(kind, first)
-    definition = Definition(kind, types)
+    definition = Definition(kind, {**TIMES})
+    for name, body in _sections(kind, text):
+        definition.types[name] = tuple(_fields(name, body))
     _check(definition, kind, (), set())
     return definition
 
@@ -90,46 +89,71 @@ def layout(definition: Definition) -> str:
     for kind in order:
         nested = {field.kind: None for field in definition.types[kind]}
         order += [name for name in nested if "/" in name and name not in order]
-    first, *others = (
-        "".join(f"{f.kind}{_brackets(f.length)} {f.name}\n" for f in definition.types[kind]) for kind in order
-    )
-    rest = (f"{'=' * 80}\nMSG: {kind}\n{text}" for kind, text in zip(order[1:], others))
-    return first + "".join(rest)
+    first, *others = ("".join(f"{field}\n" for field in definition.types[kind]) for kind in order)
+    return first + "".join(f"{'=' * 80}\nMSG: {kind}\n{body}" for kind, body in zip(order[1:], others))
 
 
-def _brackets(length: int | None) -> str:
-    if length is None:
-        return ""
-    return "[]" if length == VARIABLE else f"[{length}]"
+def md5sum(definition: Definition, text: str) -> str:
+    """ROS' MD5 of a definition with this text: of the constants, then the fields, a nested type by its
+    MD5."""
+    done: dict[str, str] = {}
+    bodies = dict(_sections(definition.kind, text))
+
+    def md5(kind: str) -> str:
+        if kind not in done:
+            lines = _constants(bodies[kind])
+            for field in definition.types[kind]:
+                lines.append(f"{md5(field.kind)} {field.name}" if "/" in field.kind else str(field))
+            # The MD5 is ROS' name for a definition, and no secret.
+            done[kind] = hashlib.md5("\n".join(lines).encode()).hexdigest()  # noqa: S324 - as above
+        return done[kind]
+
+    return md5(definition.kind)
 
 
-def _fields(kind: str, text: str) -> Fields:
-    package = kind.partition("/")[0]
+def _constants(body: str) -> list[str]:
     found = []
+    for line in body.splitlines():
+        clean = line.split("#", 1)[0].strip()
+        if "=" in clean:
+            kind, name = clean.split("=", 1)[0].split()
+            # A text has no comment behind it: all of the line is the text.
+            value = (line if kind == STRING else clean).split("=", 1)[1].strip()
+            found.append(f"{kind} {name}={value}")
+    return found
+
+
+def _sections(kind: str, text: str) -> Iterator[tuple[str, str]]:
+    """Each nested type and its text, then the message's own, which wins over a section of its name."""
+    first, *others = _SEPARATOR.split(text)
+    if len(others) > _MAX_TYPES:
+        raise MessageError(f"{kind}: definition must have at most {_MAX_TYPES} types")
+    for section in others:
+        head, _, body = section.strip().partition("\n")
+        name = head[len("MSG:") :].strip() if head.startswith("MSG:") else ""
+        if "/" not in name:
+            raise MessageError(f"{kind}: a nested type must begin with MSG: package/Type, got {head[:60]!r}")
+        yield name, body
+    yield kind, first
+
+
+def _fields(kind: str, text: str) -> Iterator[Field]:
+    package = kind.partition("/")[0]
     for line in text.splitlines():
         stripped = line.split("#", 1)[0].strip()
-        if not stripped:
-            continue
         match = _LINE.match(stripped)
-        if match is None or (not match.group(4) and match.end() != len(stripped)):
+        if stripped and (match is None or (not match.group(4) and match.end() != len(stripped))):
             raise MessageError(f"{kind}: the definition has an invalid line {stripped[:60]!r}")
-        base, length, name, constant = match.groups()
-        if constant:
+        if match is None or match.group(4):
             continue
+        base, length, name, _ = match.groups()
         if length and int(length) > _MAX_ARRAY:
             raise MessageError(f"{kind}: {name} has {length} elements")
-        found.append(
-            Field(name, _full_name(base, package), None if length is None else int(length or VARIABLE))
-        )
-    return tuple(found)
-
-
-def _full_name(name: str, package: str) -> str:
-    if name in LETTERS or name in (STRING, TIME, DURATION):
-        return name
-    if name == "Header":
-        return HEADER_TYPE
-    return name if "/" in name else f"{package}/{name}"
+        if base == "Header":
+            base = HEADER_TYPE
+        elif "/" not in base and base not in LETTERS and base not in (STRING, TIME, DURATION):
+            base = f"{package}/{base}"
+        yield Field(name, base, None if length is None else int(length or VARIABLE))
 
 
 def _check(definition: Definition, kind: str, within: tuple[str, ...], good: set[str]) -> None:

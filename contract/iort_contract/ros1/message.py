@@ -80,7 +80,7 @@ class RosMessage(Mapping[str, Value]):
         if self._values is None:
             decoder = self.kind.decoder
             try:
-                values = decoder.decode(self.raw)[0] if decoder is not None else {}
+                values = decoder.decode(self.raw) if decoder is not None else {}
             except MessageError:
                 values = {}
             self._values = {**values, **self.beside}

@@ -26,7 +26,7 @@ from iort_agent.schema import (
     variant,
 )
 from iort_agent.sources import SourceConfig
-from iort_agent.sources.registry import SOURCES, uploads_large
+from iort_agent.sources.registry import SOURCES
 from iort_agent.spool.config import QueueConfig
 from iort_contract.catalog.streams import OWN_STREAMS
 from iort_contract.limits import DEFAULT_NAMESPACE
@@ -71,7 +71,7 @@ def load_config(file: Path) -> Config:
         raise ConfigError(f"{file}: is empty")
     config = load(Config, content, where)
     _check_streams(config, where.child("sources"))
-    if config.files.large_folder is None and any(uploads_large(source) for source in config.sources):
+    if config.files.large_folder is None and any(source.uploads_large() for source in config.sources):
         raise (
             where.child("files")
             .child("large_folder")

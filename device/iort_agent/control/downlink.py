@@ -20,8 +20,8 @@ from iort_agent.lanes.clock_offset import Offset
 from iort_agent.mqtt.uplink import Message, Uplink
 from iort_agent.rate_limiter import STEADY, Allowance
 from iort_agent.ros1.json_message import decode, encode
-from iort_agent.ros1.node import DEFAULT_NODE
-from iort_agent.ros1.publish import Graph, Ros1Graph
+from iort_agent.ros1.node import DEFAULT_NODE, Graph
+from iort_agent.ros1.node import shared as shared_node
 from iort_agent.sources.ros1 import Ros1Config
 from iort_agent.throttled_log import Seldom
 from iort_contract.limits import ContractError, MessageError
@@ -66,7 +66,7 @@ def make_downlink(
         return None
     if graph is None:
         node = next((source.node for source in sources if isinstance(source, Ros1Config)), DEFAULT_NODE)
-        graph = Ros1Graph(node, clock)
+        graph = shared_node(node, clock)
     return Downlink(config, share, clock=clock, graph=graph, **shared)
 
 

@@ -1,16 +1,19 @@
-"""JSON as a ROS 1 message and back, by the message's own definition, strictly.
+"""JSON as a ROS 1 message and back, by the message's own definition.
 
-Nothing is guessed: a field that the type does not have, one that is missing, a number that does not
-fit, an array of another length are each a `MessageError` that names the field. Two things may be left
-out: the header of a stamped message, which then says now, a header's seq, and, with ``partial``, any field,
-which then is zero. Times are ``{"sec": 1, "nanosec": 2}``; ROS 1's own ``secs`` and ``nsecs`` are taken too.
+Two writers of JSON are known. People and programs write commands: those are `encode`d strictly, as nothing in
+a command may be guessed. A rosbridge server writes what a publisher sent: a `Writer` that is not ``strict``
+takes its base64 for ``uint8[]`` and its null for NaN. Both take ROS 1's and ROS 2's names for the parts of a
+time, and a header without a seq, as ROS 2 has none.
 """
 
 from __future__ import annotations
 
+import binascii
 import math
 import struct
-from typing import Any, Mapping
+from contextlib import suppress
+from operator import itemgetter
+from typing import Any, Callable, List, Mapping, NamedTuple, Sequence, Union
 
 from iort_contract.limits import MessageError
 from iort_contract.ros1.definition import (
@@ -25,86 +28,196 @@ from iort_contract.ros1.definition import (
 )
 
 _LENGTH = struct.Struct("<I")
-# A message of JSON within the broker's limit has no more elements; nested empties could.
+# A message of JSON within the broker's limit has no more elements; nested empty ones could have.
 _MAX_ELEMENTS = 100_000
 _MAX_NANOSEC = 999_999_999
-# As genpy and roslibjs call the fields of a time.
-_SPELLINGS = {"secs": "sec", "nsecs": "nanosec"}
+# The names that ROS 1 and roslibjs give to the parts of a time.
+_ROS1_TIME = {"secs": "sec", "nsecs": "nanosec"}
+# rosbridge sends arrays of these as base64.
+_BYTES = ("uint8", "char")
+# `struct` packs any object as a bool; as an unsigned byte it must be true, false or a number.
+_LETTERS = {**LETTERS, "bool": "B"}
 
 
 def encode(
     definition: Definition, message: Mapping[str, Any], *, now_us: int, partial: bool = False
 ) -> bytes:
-    """The message's bytes. Raises `MessageError` for what the definition does not allow."""
+    """The message's bytes. Raises `MessageError`, which names the field, for a message of another type.
+
+    A missing header is filled with the time now; with ``partial``, every missing field is zero.
+    """
     if definition.stamped() and isinstance(message, dict) and "header" not in message:
         sec, microseconds = divmod(now_us, 1_000_000)
         stamp = {"sec": sec, "nanosec": microseconds * 1000}
         message = {**message, "header": {"seq": 0, "stamp": stamp, "frame_id": ""}}
-    writer = _Writer(definition, partial=partial)
-    writer.put(Field("", definition.kind, None), message, "")
-    return b"".join(writer.parts)
+    return Writer(definition, strict=True, partial=partial).write(message)
 
 
 def decode(definition: Definition, data: bytes) -> dict[str, Any]:
-    """The message as JSON has it. Raises `MessageError` where the bytes do not fit the definition."""
+    """The message as JSON. Raises `MessageError` if the bytes do not fit the definition."""
     try:
-        message, at = _get(definition, Field("", definition.kind, None), data, 0)
+        message, at = _read(definition, Field("", definition.kind, None), data, 0)
     except struct.error as error:
-        raise MessageError(f"{definition.kind}: the message of {len(data)} bytes is cut short") from error
+        raise MessageError(f"{definition.kind}: the message of {len(data)} bytes is truncated") from error
     if at != len(data):
-        raise MessageError(f"{definition.kind}: the message has {len(data)} bytes, its definition {at}")
+        raise MessageError(f"{definition.kind}: the message must have {at} bytes, got {len(data)}")
     assert isinstance(message, dict)
     return message
 
 
-class _Writer:
-    def __init__(self, definition: Definition, *, partial: bool) -> None:
-        self.parts: list[bytes] = []
-        self._definition = definition
-        self._partial = partial
+class _Numbers(NamedTuple):
+    """Neighbouring fields with one number each: they are packed by one call, if all are there and fit."""
 
-    def put(self, field: Field, value: Any, path: str) -> None:
+    get: Callable[[Any], Sequence[Any]]
+    struct: struct.Struct
+    fields: Sequence[Field]
+
+
+_Plan = List[Union[_Numbers, Field]]
+
+
+class Writer:
+    """Writes the messages of one definition; not for several threads at once. ``nulls`` counts the numbers
+    that were null and are NaN in the message."""
+
+    def __init__(self, definition: Definition, *, strict: bool = False, partial: bool = False) -> None:
+        self.nulls = 0
+        self._definition = definition
+        self._strict = strict
+        self._partial = partial
+        self._plans: dict[str, _Plan] = {}
+        self._parts: list[bytes] = []
+
+    def write(self, message: Any) -> bytes:
+        """The message's bytes. Raises `MessageError`, which names the field, for a message of another
+        type."""
+        self._parts = []
+        try:
+            self._message(self._definition.kind, message, "")
+        except RecursionError as error:
+            raise MessageError(f"{self._definition.kind}: the message is nested too deeply") from error
+        return b"".join(self._parts)
+
+    def _message(self, kind: str, value: Any, path: str) -> None:
+        if kind not in self._plans:
+            self._plans[kind] = _plan(self._definition, kind, strict=self._strict)
+        fields = self._definition.fields(kind)
+        if type(value) is not dict:
+            raise _wrong(path, value, f"an object of {', '.join(f.name for f in fields) or 'no fields'}")
+        if kind in (TIME, DURATION):
+            value = _time(value, path, strict=self._strict)
+        unknown = sorted(map(str, value.keys() - {field.name for field in fields}))
+        if unknown:
+            raise MessageError(f"{_join(path, unknown[0])}: {kind} has no such field")
+        for part in self._plans[kind]:
+            if isinstance(part, Field):
+                self._member(kind, part, value, path)
+                continue
+            try:
+                self._parts.append(part.struct.pack(*part.get(value)))
+            except (KeyError, struct.error, OverflowError):
+                # Field by field: for a null, for an optional field, or for the error.
+                for field in part.fields:
+                    self._member(kind, field, value, path)
+
+    def _member(self, kind: str, field: Field, message: Mapping[str, Any], path: str) -> None:
+        below = _join(path, field.name)
+        if field.name in message:
+            self._put(field, message[field.name], below)
+        elif self._partial or (kind == HEADER_TYPE and field.name == "seq"):
+            self._put(field, _zero(field), below)
+        else:
+            raise MessageError(f"{below}: is missing")
+
+    def _put(self, field: Field, value: Any, path: str) -> None:
         if field.length is not None:
             self._array(field, value, path)
         elif field.kind in LETTERS:
-            self.parts.append(_number(field.kind, value, path))
+            self._parts.append(self._number(field.kind, value, path))
         elif field.kind == STRING:
             text = _text(value, path)
-            self.parts.append(_LENGTH.pack(len(text)) + text)
+            self._parts.append(_LENGTH.pack(len(text)) + text)
         else:
             self._message(field.kind, value, path)
-
-    def _message(self, kind: str, value: Any, path: str) -> None:
-        fields = self._definition.fields(kind)
-        if not isinstance(value, dict):
-            raise _wrong(path, value, f"an object of {', '.join(f.name for f in fields) or 'no fields'}")
-        if kind in (TIME, DURATION):
-            value = _time(value, path)
-        names = {field.name for field in fields}
-        unknown = sorted(str(name) for name in value.keys() - names)
-        if unknown:
-            raise MessageError(f"{_join(path, unknown[0])}: {kind} has no such field")
-        for field in fields:
-            below = _join(path, field.name)
-            if field.name in value:
-                self.put(field, value[field.name], below)
-            elif self._partial or (kind == HEADER_TYPE and field.name == "seq"):
-                self.put(field, _zero(field), below)
-            else:
-                raise MessageError(f"{below}: is missing")
 
     def _array(self, field: Field, value: Any, path: str) -> None:
         element = Field(field.name, field.kind, None)
         if value is _ZEROS:
             value = [_zero(element)] * (field.length or 0)
-        if not isinstance(value, list) or len(value) > _MAX_ELEMENTS:
+        if type(value) is str and field.kind in _BYTES and not self._strict:
+            try:
+                value = binascii.a2b_base64(value)
+            except ValueError as error:
+                raise _wrong(path, value, "base64") from error
+        elif type(value) is not list or (self._strict and len(value) > _MAX_ELEMENTS):
             raise _wrong(path, value, f"a list of up to {_MAX_ELEMENTS}")
         if field.length == VARIABLE:
-            self.parts.append(_LENGTH.pack(len(value)))
+            self._parts.append(_LENGTH.pack(len(value)))
         elif len(value) != field.length:
-            raise MessageError(f"{path}: has {len(value)} elements, and must have {field.length}")
+            raise MessageError(f"{path}: must have {field.length} elements, got {len(value)}")
+        if field.kind in LETTERS and not self._strict:
+            # If that fails: element by element, for a null or for the error.
+            with suppress(struct.error, OverflowError):
+                letters = f"<{len(value)}{_LETTERS[field.kind]}"
+                self._parts.append(value if type(value) is bytes else struct.pack(letters, *value))
+                return
         for i, item in enumerate(value):
-            self.put(element, item, f"{path}.{i}")
+            self._put(element, item, f"{path}.{i}")
+
+    def _number(self, kind: str, value: Any, path: str) -> bytes:
+        letter = LETTERS[kind]
+        if letter in "fd":
+            value = self._float(kind, value, path)
+        elif letter == "?" and type(value) is not bool:
+            raise _wrong(path, value, "true or false")
+        elif letter != "?":
+            # A browser writes 1 for 1.0 and cannot tell them apart, so a whole number may be an integer.
+            if self._strict and type(value) is float and value.is_integer():
+                value = int(value)
+            if type(value) is not int:
+                raise _wrong(path, value, "an integer")
+        try:
+            return struct.pack(f"<{letter}", value)
+        except (struct.error, OverflowError) as error:
+            raise _wrong(path, value, f"a number that fits in {kind}") from error
+
+    def _float(self, kind: str, value: Any, path: str) -> float:
+        if value is None and not self._strict:
+            self.nulls += 1
+            return math.nan
+        if type(value) not in (int, float):
+            raise _wrong(path, value, "a number")
+        try:
+            value = float(value)
+        except OverflowError:
+            value = math.inf
+        if self._strict and not math.isfinite(value):
+            raise _wrong(path, value, f"a number that fits in {kind}")
+        return float(value)
+
+
+def _plan(definition: Definition, kind: str, *, strict: bool) -> _Plan:
+    """A type's fields, with neighbouring numbers together. A strict writer looks at each number."""
+    plan: _Plan = []
+    numbers: list[Field] = []
+    for field in [*definition.fields(kind), None]:
+        if field is not None and field.kind in LETTERS and field.length is None and not strict:
+            numbers.append(field)
+            continue
+        if numbers:
+            letters = "".join(_LETTERS[number.kind] for number in numbers)
+            names = [number.name for number in numbers]
+            # Of one name, itemgetter gives the value and no tuple.
+            get = itemgetter(*names) if len(names) > 1 else _one(names[0])
+            plan.append(_Numbers(get, struct.Struct(f"<{letters}"), numbers))
+            numbers = []
+        if field is not None:
+            plan.append(field)
+    return plan
+
+
+def _one(name: str) -> Callable[[Any], Sequence[Any]]:
+    return lambda message: (message[name],)
 
 
 _ZEROS = object()
@@ -120,39 +233,13 @@ def _zero(field: Field) -> Any:
     return "" if field.kind == STRING else {}
 
 
-def _number(kind: str, value: Any, path: str) -> bytes:
-    letter = LETTERS[kind]
-    if letter == "?":
-        if type(value) is not bool:
-            raise _wrong(path, value, "true or false")
-    elif letter in ("f", "d"):
-        if type(value) not in (int, float):
-            raise _wrong(path, value, "a number")
-        try:
-            value = float(value)
-        except OverflowError:
-            value = math.inf
-        if not math.isfinite(value):
-            raise _wrong(path, value, f"a number that fits in {kind}")
-    else:
-        # A browser writes 1 for 1.0 and cannot tell; what is whole may be an integer.
-        if type(value) is float and value.is_integer():
-            value = int(value)
-        if type(value) is not int:
-            raise _wrong(path, value, "an integer")
-    try:
-        return struct.pack(f"<{letter}", value)
-    except (struct.error, OverflowError) as error:
-        raise _wrong(path, value, f"a number that fits in {kind}") from error
-
-
-def _time(value: Mapping[str, Any], path: str) -> Mapping[str, Any]:
+def _time(value: Mapping[str, Any], path: str, *, strict: bool) -> dict[str, Any]:
     """A time or duration under the names that the definition has."""
-    found = {_SPELLINGS.get(name, name): each for name, each in value.items()}
-    if len(found) != len(value):
-        raise MessageError(f"{path}: has both spellings of a field, {', '.join(value)}")
+    if value.keys() & _ROS1_TIME.keys() and value.keys() & set(_ROS1_TIME.values()):
+        raise MessageError(f"{path}: must have one spelling of a time, got {', '.join(value)}")
+    found = {_ROS1_TIME.get(name, name): each for name, each in value.items()}
     nanosec = found.get("nanosec", 0)
-    if isinstance(nanosec, (int, float)) and not 0 <= nanosec <= _MAX_NANOSEC:
+    if strict and isinstance(nanosec, (int, float)) and not 0 <= nanosec <= _MAX_NANOSEC:
         raise _wrong(_join(path, "nanosec"), nanosec, f"an integer from 0 to {_MAX_NANOSEC}")
     return found
 
@@ -167,28 +254,27 @@ def _text(value: Any, path: str) -> bytes:
 
 
 def _wrong(path: str, value: Any, allowed: str) -> MessageError:
-    shown = repr(value) if not isinstance(value, (dict, list)) else type(value).__name__
-    return MessageError(f"{path or 'the message'}: found {shown[:60]}; allowed is {allowed}")
+    got = repr(value) if not isinstance(value, (dict, list)) else type(value).__name__
+    return MessageError(f"{path or 'the message'}: must be {allowed}, got {got[:60]}")
 
 
 def _join(path: str, name: str) -> str:
     return f"{path}.{name}" if path else name
 
 
-def _get(definition: Definition, field: Field, data: bytes, at: int) -> tuple[Any, int]:
+def _read(definition: Definition, field: Field, data: bytes, at: int) -> tuple[Any, int]:
     if field.length is not None:
         n = field.length
         if n == VARIABLE:
             (n,) = _LENGTH.unpack_from(data, at)
             at += 4
         if n > _MAX_ELEMENTS:
-            raise MessageError(f"{field.name}: has {n} elements")
-        out = []
-        element = Field(field.name, field.kind, None)
+            raise MessageError(f"{field.name}: must have at most {_MAX_ELEMENTS} elements, got {n}")
+        items = []
         for _ in range(n):
-            item, at = _get(definition, element, data, at)
-            out.append(item)
-        return out, at
+            item, at = _read(definition, Field(field.name, field.kind, None), data, at)
+            items.append(item)
+        return items, at
     if field.kind in LETTERS:
         reader = struct.Struct(f"<{LETTERS[field.kind]}")
         return reader.unpack_from(data, at)[0], at + reader.size
@@ -199,5 +285,5 @@ def _get(definition: Definition, field: Field, data: bytes, at: int) -> tuple[An
         return data[at + 4 : at + 4 + n].decode("utf-8", "replace"), at + 4 + n
     message = {}
     for nested in definition.fields(field.kind):
-        message[nested.name], at = _get(definition, nested, data, at)
+        message[nested.name], at = _read(definition, nested, data, at)
     return message, at

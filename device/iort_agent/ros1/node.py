@@ -1,48 +1,48 @@
-"""The agent's node in a ROS 1 graph: one in a process, as rospy has it, shared by all who need it.
+"""The agent's node in a ROS 1 graph: one in a process, as rospy requires, shared by all its users.
 
-rospy registers with the master once and never again, so that a node is deaf after the master's
-restart, or connects to no publisher that came while it was away. The node's own thread asks the master
-every few seconds what it knows and registers again what it has forgotten, without dropping the
-connections that still stand. It also waits for a master that is not there yet, and for another node of
-its name to go: a master ends the older one of two. Nobody who uses the node ever waits for either.
+rospy registers with the master only once, so a node hears nothing after the master's restart, and connects to
+no publisher that started meanwhile. The node's own thread asks the master every few seconds what it knows,
+and registers again what it has forgotten, without dropping the connections that still stand. The thread also
+waits for a master that is not there yet, and for another node of the same name to go: a master ends the older
+one of two. The users of the node wait for none of this.
 """
 
 from __future__ import annotations
 
-import http.client
 import importlib
 import logging
 import random
 import sys
 import threading
 import xmlrpc.client
-from typing import Any, Callable, Mapping
+from typing import Any, Callable, Mapping, Protocol
 
 from iort_agent.clock import Clock, SystemClock
 from iort_agent.errors import SourceError
+from iort_agent.ros1 import master
+from iort_agent.ros1.types import Installed, installed, rospy
 from iort_contract.limits import MessageError
 from iort_contract.ros1.definition import Definition, parse
 
 _log = logging.getLogger(__name__)
 
 DEFAULT_NODE = "iort_agent"
-ANY_TYPE = "*"
+_ANY_TYPE = "*"
 _POLL_S = 4.0
 _WAIT_S = 1.0
-# Two that took the name from each other must not try again at the same moment, nor often.
+# Two nodes that take the name from each other must not try again at the same moment, nor often.
 _MAX_RETREAT_S = 60.0
-_MASTER_TIMEOUT_S = 3.0
-# rospy hands the last messages to threads of its own, and says of none when it is written.
+# rospy hands the last messages to its own threads, and does not tell when they are written.
 _LAST_WRITE_S = 0.2
+_JOIN_S = 3.0
 _QUEUE = 10
-# rospy logs a traceback for every publisher that goes; what matters of it, we say.
+# rospy logs a traceback for every publisher that goes; this module logs what matters.
 _LOGGERS = {
     "rospy": logging.CRITICAL,
     "rosout": logging.ERROR,
     "topicmanager": logging.ERROR,
     "xmlrpc": logging.ERROR,
 }
-_MASTER_ERRORS = (OSError, xmlrpc.client.Error, http.client.HTTPException)
 
 # Takes a message: the publisher's connection header, and the message's bytes.
 OnBytes = Callable[[Mapping[str, str], bytes], None]
@@ -50,21 +50,40 @@ OnBytes = Callable[[Mapping[str, str], bytes], None]
 _lock = threading.Lock()
 _shared: list[Node] = []
 
-_HELP = (
-    "the agent's Python cannot import rospy. ROS 1 installs it for the system's Python only: "
-    "`source /opt/ros/noetic/setup.bash` (Debian: apt install python3-rospy), then "
-    "`/usr/bin/python3 -m venv --system-site-packages <folder>` and install the agent into that"
-)
+
+class Graph(Protocol):
+    """Topics to publish and to hear, in the messages' own bytes; `Node` is the real one. No call blocks."""
+
+    def definition(self, kind: str) -> Definition:
+        """The definition of an installed type. Raises `SourceError` if it is not installed."""
+
+    def advertise(self, topic: str, kind: str) -> None:
+        """Become a publisher of the topic; again has no effect. Raises as `definition`."""
+
+    def publish(self, topic: str, data: bytes) -> bool:
+        """Publish a message on an advertised topic; False if there is no graph to publish in."""
+
+    def subscribe(self, topic: str, handler: OnBytes) -> None:
+        """Receive a topic's messages, of any type, in another thread."""
+
+    def waits(self) -> str | None:
+        """Why the graph cannot be joined, for a person."""
+
+    def start(self) -> None:
+        """Join the graph as soon as it is there."""
+
+    def close(self) -> None:
+        """Leave the graph once the published messages are written."""
 
 
 def shared(name: str = DEFAULT_NODE, clock: Clock | None = None) -> Node:
-    """The process' node, to be released by everybody who asked for it.
+    """The process' node; each caller must `Node.close` it.
 
-    Raises `SourceError` without rospy, and for a second name: a process is one node.
+    Raises `SourceError` without rospy, and for a second name, because a process is one node.
     """
     with _lock:
         if not _shared:
-            _shared.append(Node(name, _rospy(), clock or SystemClock()))
+            _shared.append(Node(name, rospy(), clock or SystemClock()))
         node = _shared[0]
         if node.name != name:
             raise SourceError(f"the agent is the ROS node {node.name} already, and cannot be {name} too")
@@ -72,48 +91,16 @@ def shared(name: str = DEFAULT_NODE, clock: Clock | None = None) -> Node:
         return node
 
 
-def _rospy() -> Any:
-    """rospy, imported anew where it was shut down: a node begins once for each import."""
-    core = sys.modules.get("rospy.core")
-    if core is not None and core.is_shutdown_requested():
-        for module in [name for name in sys.modules if name.partition(".")[0] == "rospy"]:
-            del sys.modules[module]
-    try:
-        return importlib.import_module("rospy")
-    except ImportError as error:
-        raise SourceError(f"{_HELP} ({error})") from error
-
-
-def definition_of(kind: str) -> tuple[Definition, Any]:
-    """An installed message type's definition and class. Raises `SourceError` if it is not there."""
-    try:
-        found = importlib.import_module("roslib.message").get_message_class(kind)
-    except ImportError as error:
-        raise SourceError(f"{_HELP} ({error})") from error
-    except Exception as error:
-        raise SourceError(f"the ROS message type {kind} cannot be loaded: {error}") from error
-    if found is None:
-        package = kind.partition("/")[0]
-        raise SourceError(
-            f"the ROS message type {kind} is not installed: build its package, {package}, and source the "
-            f"workspace, or apt install python3-{package.replace('_', '-')}"
-        )
-    try:
-        return parse(kind, found._full_text), found  # noqa: SLF001 - rospy's own name for it
-    except MessageError as error:
-        raise SourceError(str(error)) from error
-
-
 class Node:
-    """Use `shared`. Subscriptions and publishers may be asked for before there is a master."""
+    """Use `shared`. Subscriptions and publishers may be requested before there is a master."""
 
     def __init__(self, name: str, rospy: Any, clock: Clock) -> None:
         self.name = name
         self.users = 0
         self.failed: str | None = None
-        self.waits: str | None = None
         self.sim_time = False
         self.ready = threading.Event()
+        self._waits: str | None = None
         self._rospy = rospy
         self._clock = clock
         self._lock = threading.Lock()
@@ -123,12 +110,12 @@ class Node:
         self._subscribers: dict[str, Any] = {}
         self._wanted: dict[str, Any] = {}
         self._publishers: dict[str, Any] = {}
+        self._types: dict[str, tuple[Installed, Definition]] = {}
         self._absent = False
         self._displaced = False
         self._losses = 0
-        # Where the other node of our name was seen.
+        # The address of another node of our name.
         self._holder: str | None = None
-        rosgraph = importlib.import_module("rosgraph")
         # The command line's remappings, as every ROS node reads them.
         names = importlib.import_module("rosgraph.names")
         mappings = names.load_mappings(sys.argv)
@@ -139,21 +126,21 @@ class Node:
             for topic, other in mappings.items()
             if not topic.startswith("__")
         }
-        self._uri: str = rosgraph.get_master_uri()
+        self._uri: str = importlib.import_module("rosgraph").get_master_uri()
         try:
-            self._master = _proxy(self._uri)
+            self._master = master.Master(self._uri, self._me)
         except OSError as error:
             raise SourceError(f"ROS_MASTER_URI is {self._uri!r}: {error}") from error
         self._thread = threading.Thread(target=self._run, name="ros1 node", daemon=True)
 
     def start(self) -> None:
-        """Begin, unless somebody has already."""
+        """Join the graph as soon as it is there; again has no effect."""
         with self._lock:
             if not self._thread.is_alive() and not self._stop.is_set():
                 self._thread.start()
 
-    def release(self) -> None:
-        """Say that one user needs the node no longer; with the last, it leaves the graph."""
+    def close(self) -> None:
+        """Give up the node as one of its users; with the last user it leaves the graph."""
         with _lock:
             self.users -= 1
             if self.users:
@@ -163,37 +150,55 @@ class Node:
         self._wake.set()
         if self._publishers:
             threading.Event().wait(_LAST_WRITE_S)
-        # Also ends rospy's waiting for a master, in which our thread may be.
+        # This also ends rospy's own waiting for a master, in which our thread may be.
         self._rospy.signal_shutdown("the agent has ended")
-        self._thread.join(_MASTER_TIMEOUT_S)
+        self._thread.join(_JOIN_S)
+
+    def waits(self) -> str | None:
+        """Why the graph cannot be joined: another node of our name."""
+        return self._waits
 
     def resolve(self, topic: str) -> str:
-        """What a topic is called in the graph: the command line may remap it. All else takes this name."""
+        """The topic's name in the graph, as the command line may remap it."""
         return self._remapped.get(topic, topic)
 
     def subscribe(self, topic: str, handler: OnBytes) -> None:
-        """Receive a topic's messages of whatever type, in threads of rospy's."""
+        """Receive a topic's messages, of any type, in rospy's threads."""
         with self._lock:
-            self._handlers.setdefault(topic, []).append(handler)
+            self._handlers.setdefault(self.resolve(topic), []).append(handler)
         self._wake.set()
 
     def unsubscribe(self, topic: str, handler: OnBytes) -> None:
-        """Receive no more."""
+        """Stop receiving."""
         with self._lock:
-            handlers = self._handlers.get(topic, [])
+            handlers = self._handlers.get(self.resolve(topic), [])
             if handler in handlers:
                 handlers.remove(handler)
         self._wake.set()
 
-    def advertise(self, topic: str, message_class: Any) -> None:
-        """Be a publisher of the topic, whose subscribers then connect: `publish` alone is too late."""
+    def definition(self, kind: str) -> Definition:
+        """The definition of an installed type. Raises `SourceError` if it is not installed."""
+        if kind not in self._types:
+            found = installed(kind)
+            try:
+                self._types[kind] = found, parse(kind, found.text)
+            except MessageError as error:
+                raise SourceError(str(error)) from error
+        return self._types[kind][1]
+
+    def advertise(self, topic: str, kind: str) -> None:
+        """Become a publisher of the topic, to which subscribers then connect: `publish` alone is too late.
+
+        The topic is not latched, because an old command must not run later.
+        """
+        self.definition(kind)
         with self._lock:
-            self._wanted.setdefault(topic, message_class)
+            self._wanted.setdefault(self.resolve(topic), self._types[kind][0].message_class)
         self._wake.set()
 
     def publish(self, topic: str, data: bytes) -> bool:
-        """Publish a message's bytes on an advertised topic; whether the node was there to do it."""
-        publisher = self._publishers.get(topic)
+        """Publish a message's bytes on an advertised topic; False if the node is not in the graph."""
+        publisher = self._publishers.get(self.resolve(topic))
         if publisher is None:
             return False
         message = publisher.data_class()
@@ -206,15 +211,13 @@ class Node:
 
     def connections(self, topic: str) -> int:
         """How many publishers a subscribed topic is connected to."""
-        subscriber = self._subscribers.get(topic)
-        return int(subscriber.get_num_connections()) if subscriber is not None else 0
+        return _connections(self._subscribers.get(self.resolve(topic)))
 
     def listeners(self, topic: str) -> int:
         """How many subscribers an advertised topic is connected to."""
-        publisher = self._publishers.get(topic)
-        return int(publisher.get_num_connections()) if publisher is not None else 0
+        return _connections(self._publishers.get(self.resolve(topic)))
 
-    # What follows runs in the node's own thread.
+    # All below runs in the node's own thread.
 
     def _run(self) -> None:
         try:
@@ -223,13 +226,13 @@ class Node:
                 self._await_name()
                 if not self._stop.is_set():
                     self._take_part()
-        except Exception as error:  # noqa: BLE001 - rospy raises about anything, and its thread is ours
+        except Exception as error:  # noqa: BLE001 - rospy may raise anything, and its thread is ours
             if not self._stop.is_set():
                 _log.exception("the ROS node failed")
                 self._fail(f"{type(error).__name__}: {error}")
 
     def _take_part(self) -> None:
-        """Be in the graph until the agent ends, or somebody ends the node."""
+        """Stay in the graph until the agent ends, or somebody ends the node."""
         try:
             self._begin()
             while not self._stop.is_set() and not self._displaced:
@@ -240,7 +243,7 @@ class Node:
                 self._change()
                 self.ready.set()
                 if not self._clock.wait(self._wake, _POLL_S):
-                    self._look_after()
+                    self._poll()
         except Exception:
             if not self._displaced:
                 raise
@@ -252,41 +255,42 @@ class Node:
             self.failed = f"the ROS node {self._me} has ended: {why}"
 
     def _retreat(self) -> None:
-        """Leave the graph to the node that took the name, ready to begin anew."""
-        self.waits = f"another node took the name {self._me}; set sources[].node"
-        _log.warning("%s: this one leaves the graph, and comes back when the other has gone", self.waits)
+        """Leave the graph to the node that took the name, and prepare to begin again."""
+        self._waits = f"another node took the name {self._me}; set sources[].node"
+        _log.warning("%s: this one leaves the graph, and comes back when the other has gone", self._waits)
         self.ready.clear()
         self._rospy.signal_shutdown("another node took the name")
         with self._lock:
             self._subscribers, self._publishers = {}, {}
-        self._rospy = _rospy()
+        self._rospy = rospy()
         self._displaced = False
         self._losses += 1
         most_s = min(_MAX_RETREAT_S, 2.0**self._losses)
         self._clock.wait(self._stop, random.uniform(0, most_s))  # noqa: S311 - jitter, not secrets
 
     def _await_name(self) -> None:
-        """Wait while another living node has our name: whoever registers later ends the one before."""
+        """Wait while another living node has our name, because the later one ends the earlier one."""
         while not self._stop.is_set():
             try:
                 self._holder = self._living_namesake()
-            except _MASTER_ERRORS:
+            except master.ERRORS:
                 self._clock.wait(self._stop, _WAIT_S)
                 self._await_master()
                 continue
             if self._holder is None:
                 break
             waits = f"another node is called {self._me} at {self._holder}; set sources[].node"
-            if waits != self.waits:
+            if waits != self._waits:
                 _log.warning("%s: waiting for it to go", waits)
-            self.waits, self._losses = waits, 0
+            self._waits, self._losses = waits, 0
             self._clock.wait(self._stop, _WAIT_S)
-        self.waits = None
+        self._waits = None
 
     def _living_namesake(self) -> str | None:
-        """Where a node of our name answers; a dead one's registration stays at the master for ever."""
-        _, _, registered = self._master.lookupNode(self._me, self._me)
-        # A master that was restarted does not know yet whom we wait for.
+        """The address at which a node of our name answers. The master keeps a dead node's address for
+        ever."""
+        _, _, registered = self._master.proxy.lookupNode(self._me, self._me)
+        # A restarted master does not know yet the node that we wait for.
         for uri in (registered, self._holder):
             if uri and self._answers(uri):
                 return str(uri)
@@ -294,45 +298,38 @@ class Node:
 
     def _answers(self, uri: str) -> bool:
         try:
-            status, _, name = _proxy(uri).getName(self._me)
+            status, _, name = master.proxy(uri).getName(self._me)
         except xmlrpc.client.Fault:
-            return True  # only rospy's nodes say their names
-        except _MASTER_ERRORS:
+            return True  # only rospy's nodes tell their names
+        except master.ERRORS:
             return False
         # Another node may have the port by now.
         return bool(status == 1 and name == self._me)
 
     def _on_shutdown(self, reason: str) -> None:
-        # The master ends a node only where another one takes its name.
+        # The master ends a node only when another one takes its name.
         self._displaced = self._displaced or "[/master]" in reason
         self._wake.set()
 
     def _await_master(self) -> None:
-        said = False
+        told = False
         while not self._stop.is_set():
-            why = self._unreachable()
+            why = self._master.unreachable()
             if why is None:
                 return
-            if not said:
+            if not told:
                 _log.warning("no ROS master at %s (%s), waiting for it", self._uri, why)
-            said = True
+            told = True
             self._clock.wait(self._stop, _WAIT_S)
-
-    def _unreachable(self) -> str | None:
-        try:
-            self._ask("getPid")
-        except _MASTER_ERRORS as error:
-            return str(error)
-        return None
 
     def _begin(self) -> None:
         rospy = self._rospy
-        # rospy would set up Python's logging anew, from a file of its own.
+        # rospy would configure Python's logging from its own file.
         rospy.core.configure_logging = lambda *_args, **_settings: None
         for name, level in _LOGGERS.items():
             logging.getLogger(name).setLevel(level)
         rospy.core.add_preshutdown_hook(self._on_shutdown)
-        # Signals are the agent's, names are resolved here already, and it has no use for /clock.
+        # The agent handles signals, names are resolved already, and /clock is of no use to the agent.
         rospy.init_node(
             self._base, argv=[self._base], disable_signals=True, disable_rosout=True, disable_rostime=True
         )
@@ -340,7 +337,7 @@ class Node:
         _log.info("ROS node %s at %s", rospy.get_name(), self._uri)
 
     def _change(self) -> None:
-        """Let rospy have the subscriptions and publishers that are wanted."""
+        """Give rospy the wanted subscriptions and publishers."""
         with self._lock:
             handlers = {topic: tuple(handlers) for topic, handlers in self._handlers.items()}
             wanted = dict(self._wanted)
@@ -363,23 +360,25 @@ class Node:
         for handler in self._handlers[topic]:
             handler(message._connection_header, message._buff)  # noqa: SLF001 - rospy's only names for them
 
-    def _look_after(self) -> None:
+    def _poll(self) -> None:
         try:
-            # All in one request: this is all that the node costs while no message comes.
-            questions: Any = xmlrpc.client.MultiCall(self._master)
+            # One request for all: this is the node's only work while no message comes.
+            questions: Any = xmlrpc.client.MultiCall(self._master.proxy)
             questions.getSystemState(self._me)
             questions.getParam(self._me, "/use_sim_time")
             questions.lookupNode(self._me, self._me)
             (_, _, (publishers, subscribers, _)), (status, _, sim_time), (_, _, uri) = tuple(questions())
             self.sim_time = status == 1 and bool(sim_time)
-            self._absent = self._told_of_return()
+            if self._absent:
+                _log.info("the ROS master at %s answers again", self._uri)
+            self._absent = False
             if uri and uri != self._rospy.get_node_uri() and self._answers(uri):
                 # To register again would end the other one.
                 self._displaced = True
                 return
             forgotten = self._register_again(dict(publishers), dict(subscribers))
             self._connect(dict(publishers))
-        except _MASTER_ERRORS as error:
+        except master.ERRORS as error:
             if not self._absent:
                 _log.warning("the ROS master at %s does not answer: %s", self._uri, error)
             self._absent = True
@@ -387,58 +386,36 @@ class Node:
             if forgotten:
                 _log.warning("the ROS master had forgotten %s: registered again", ", ".join(forgotten))
 
-    def _told_of_return(self) -> bool:
-        if self._absent:
-            _log.info("the ROS master at %s answers again", self._uri)
-        return False
-
     def _register_again(self, publishers: Mapping[str, Any], subscribers: Mapping[str, Any]) -> list[str]:
         me, api = self._me, self._rospy.get_node_uri()
-        forgotten = []
-        for topic in self._subscribers:
-            if me not in subscribers.get(topic, ()):
-                self._tell(topic, self._ask("registerSubscriber", topic, ANY_TYPE, api))
-                forgotten.append(topic)
-        for topic in self._publishers:
-            if me not in publishers.get(topic, ()):
-                self._ask("registerPublisher", topic, self._wanted[topic]._type, api)  # noqa: SLF001 - as below
-                forgotten.append(topic)
-        return forgotten
+        unheard = [topic for topic in self._subscribers if me not in subscribers.get(topic, ())]
+        unpublished = [topic for topic in self._publishers if me not in publishers.get(topic, ())]
+        for topic in unheard:
+            self._tell(topic, self._master.ask("registerSubscriber", topic, _ANY_TYPE, api))
+        for topic in unpublished:
+            kind = self._wanted[topic]._type  # noqa: SLF001 - genpy's own name for it
+            self._master.ask("registerPublisher", topic, kind, api)
+        return unheard + unpublished
 
     def _connect(self, publishers: Mapping[str, Any]) -> None:
-        """Try again where there are more publishers than connections: rospy tries each once."""
-        for topic in self._subscribers:
+        """Try again if there are more publishers than connections, because rospy tries each only once."""
+        for topic, subscriber in self._subscribers.items():
             names = publishers.get(topic, ())
-            if len(names) > self.connections(topic):
-                found = [self._master.lookupNode(self._me, name) for name in names]
+            if len(names) > _connections(subscriber):
+                found = [self._master.proxy.lookupNode(self._me, name) for name in names]
                 self._tell(topic, [uri for status, _, uri in found if status == 1])
 
     def _tell(self, topic: str, uris: list[str]) -> None:
-        """Tell rospy of a topic's publishers as a master does: it connects to those it does not know."""
+        """Tell rospy of a topic's publishers as a master does: it connects to the unknown ones."""
         if uris:
-            _proxy(self._rospy.get_node_uri()).publisherUpdate("/master", topic, uris)
+            master.proxy(self._rospy.get_node_uri()).publisherUpdate("/master", topic, uris)
 
-    def _ask(self, method: str, *arguments: Any) -> Any:
-        status, text, value = getattr(self._master, method)(self._me, *arguments)
-        if status != 1:
-            raise xmlrpc.client.ResponseError(f"{method}: {text}")
-        return value
+
+def _connections(endpoint: Any) -> int:
+    return int(endpoint.get_num_connections()) if endpoint is not None else 0
 
 
 def _bytes_of(any_message: Any, message_class: Any) -> Any:
-    """A class for rospy to publish bytes under a type's name, without making objects of them."""
+    """A class with which rospy publishes bytes under a type's name, without making objects of them."""
     names = ("_type", "_md5sum", "_full_text")
     return type("Bytes", (any_message,), {name: getattr(message_class, name) for name in names})
-
-
-class _Transport(xmlrpc.client.Transport):
-    """A master that hangs must not hang us."""
-
-    def make_connection(self, host: Any) -> http.client.HTTPConnection:
-        connection = super().make_connection(host)
-        connection.timeout = _MASTER_TIMEOUT_S
-        return connection
-
-
-def _proxy(uri: str) -> Any:
-    return xmlrpc.client.ServerProxy(uri, transport=_Transport())

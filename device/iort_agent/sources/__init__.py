@@ -1,20 +1,31 @@
-"""Where samples come from. Each kind of source is one file here and one line in `registry`."""
+"""Where samples come from: each kind of source is one file or folder here, and one line in `registry`. A
+source may use the ROS 1 node and the tools of all rooms; it knows no other room of the agent."""
 
 from __future__ import annotations
 
 import threading
-from typing import Any, Callable, Mapping, Protocol, Sequence
+from typing import Any, Callable, Iterator, Mapping, NamedTuple, Protocol, Sequence
 
 from iort_agent.clock import Clock
 from iort_contract.limits import Value
 
-# What becomes of bytes in a message, such as an image: nothing, or a file with a claim in the sample.
+# Bytes in a message, such as an image: left out, or uploaded as a file with an attachment in the sample.
 REFUSE, UPLOAD = "refuse", "upload"
 
-# Takes a sample: stream, microseconds since the epoch, field -> value. The mapping is handed over:
-# the source must not change it afterwards. A value may be bytes where the source's configuration says
-# `UPLOAD`. Never blocks, never raises.
+# Takes a sample: stream, microseconds since the epoch, field -> value. The source must not change the mapping
+# afterwards. A value may be bytes if the source's configuration says `UPLOAD`. Never blocks, never raises.
 Emit = Callable[[str, int, Mapping[str, Value]], None]
+
+OK, WARN, FAIL = "ok", "warn", "fail"
+
+
+class Finding(NamedTuple):
+    """One line of `iort-agent check`; ``todo`` says what to do unless all is well."""
+
+    what: str
+    level: str
+    text: str
+    todo: str = ""
 
 
 class Source(Protocol):
@@ -27,17 +38,26 @@ class Source(Protocol):
         """
 
     def report(self) -> Mapping[str, Any]:
-        """What became of what it read, in counts of its own; for the status and the report."""
+        """The source's own counts, for the status and the report; ``waits`` says what it waits for."""
+        return {}
 
 
 class SourceConfig(Protocol):
-    """The settings of one source."""
+    """The section of car.yaml for one source."""
 
     def streams(self) -> Sequence[str]:
-        """The streams it will write, as far as known beforehand; no other source may."""
+        """The streams that it will write, as far as known beforehand; no other source may."""
 
     def build(self, clock: Clock) -> Source:
         """Make the source; touches neither files nor devices yet."""
 
     def describe(self) -> str:
         """The source in a few words, for the log."""
+
+    def check(self, title: str) -> Iterator[Finding]:
+        """Whether the source would give samples, for `iort-agent check`."""
+        yield Finding(title, OK, "needs nothing")
+
+    def uploads_large(self) -> bool:
+        """Whether the source sends large values as files."""
+        return False

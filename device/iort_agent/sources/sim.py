@@ -5,11 +5,11 @@ from __future__ import annotations
 import math
 import threading
 from dataclasses import dataclass
-from typing import Any, Mapping, Sequence
+from typing import Sequence
 
 from iort_agent.clock import Clock, Pace
 from iort_agent.schema import number, section, setting, text
-from iort_agent.sources import Emit
+from iort_agent.sources import Emit, Source, SourceConfig
 from iort_agent.sources.vehicle import Vehicle, VehicleConfig
 from iort_contract.catalog.vesc import VESC_STREAM
 from iort_contract.topics import check_stream
@@ -18,7 +18,7 @@ _MAX_STEP_S = 0.02
 
 
 @dataclass(frozen=True)
-class SimConfig:
+class SimConfig(SourceConfig):
     """A simulated car. The same ``seed`` drives the same lap; without ``duration_s`` it never stops."""
 
     stream: str = setting(text(check_stream), VESC_STREAM)
@@ -40,16 +40,12 @@ class SimConfig:
         return SimSource(self, clock)
 
 
-class SimSource:
+class SimSource(Source):
     """Emits exactly ``rate_hz * duration_s`` samples, each at its absolute deadline."""
 
     def __init__(self, config: SimConfig, clock: Clock) -> None:
         self._config = config
         self._clock = clock
-
-    def report(self) -> Mapping[str, Any]:
-        """Nothing that the streams' own counts do not say."""
-        return {}
 
     def run(self, emit: Emit, stop: threading.Event) -> None:
         """Drive until the duration is over or ``stop`` is set."""

@@ -4,34 +4,26 @@ agent its connection."""
 from __future__ import annotations
 
 import http.client
-import importlib.util
 import os
 import shutil
 import socket
 import ssl
 import stat
 import time
-import urllib.parse
-import xmlrpc.client
 from contextlib import closing
 from email.utils import parsedate_to_datetime
 from pathlib import Path
-from typing import Any, Iterator, NamedTuple
+from typing import Iterator
 
-from iort_agent.clock import SystemClock
 from iort_agent.config.file import Config
 from iort_agent.errors import IdentityError, NotRunningError
 from iort_agent.identity.certificate import Certificate, check_pair, read_certificate
 from iort_agent.lanes.record import TODO, too_many
-from iort_agent.sources.recording.check import look_into
+from iort_agent.sources import FAIL, OK, WARN, Finding
 from iort_agent.status.server import ask
 from iort_agent.status.state import Status
 
-OK, WARN, FAIL = "ok", "warn", "fail"
-
 _TIMEOUT_S = 5.0
-# A recording is looked into for so long.
-_LOOK_S = 10.0
 _EXPIRES_SOON_S = 30 * 86_400
 # An agent of this age cannot run earlier than this: 2026-01-01.
 _EARLIEST_S = 1_767_225_600
@@ -42,15 +34,6 @@ _TLS_PORT_WITH_ALPN = 443
 _CONNACK = {0x00: "accepted", 0x85: "client id not valid", 0x87: "not authorized", 0x89: "server busy"}
 
 
-class Finding(NamedTuple):
-    """One line of the answer; ``todo`` says what to do unless all is well."""
-
-    what: str
-    level: str
-    text: str
-    todo: str = ""
-
-
 def check(config: Config, status_socket: Path) -> Iterator[Finding]:
     """Look at everything that the configuration names, one finding after another."""
     running = _running(status_socket)
@@ -58,7 +41,7 @@ def check(config: Config, status_socket: Path) -> Iterator[Finding]:
     yield from _clock(config, running)
     yield from _endpoint(config, running)
     for i, source in enumerate(config.sources):
-        yield from source_findings(f"source {i}", source)
+        yield from source.check(f"source {i} ({source.describe()})")
     yield from _queue(config)
     yield _lanes(config)
     if running is None:
@@ -216,93 +199,6 @@ def _connack(secure: socket.socket, robot: str) -> Finding:
         return Finding("broker", FAIL, f"hangs up on {robot}", todo)
     said = _CONNACK.get(answer[3], f"reason {answer[3]:#x}")
     return Finding("broker", FAIL, f"refuses {robot}: {said}", todo)
-
-
-def source_findings(what: str, source: Any) -> Iterator[Finding]:
-    """Whether one source of a configuration would give samples."""
-    kind = type(source).__name__
-    title = f"{what} ({source.describe()})"
-    if kind == "Ros1Config":
-        yield from _ros_master(title)
-    elif kind == "VescConfig":
-        yield from _serial_port(title, Path(source.port))
-    elif kind == "RosbridgeConfig":
-        yield _listener(title, source.url)
-    elif kind == "BagConfig":
-        yield from _recording(title, source)
-    else:
-        yield Finding(title, OK, "needs nothing")
-
-
-def _ros_master(title: str) -> Iterator[Finding]:
-    if importlib.util.find_spec("rospy") is None:
-        todo = "source /opt/ros/noetic/setup.bash, in an environment made with --system-site-packages"
-        yield Finding(title, FAIL, "Python finds no rospy", todo)
-    uri = os.environ.get("ROS_MASTER_URI", "http://localhost:11311")
-    todo = "start `roscore`, or set ROS_MASTER_URI (in the unit: /etc/iort/environment)"
-    try:
-        parts = urllib.parse.urlsplit(uri)
-        connection = http.client.HTTPConnection(parts.hostname or "", parts.port or 11311, timeout=_TIMEOUT_S)
-        with closing(connection):
-            body = xmlrpc.client.dumps(("/iort_check",), "getPid")
-            connection.request("POST", "/RPC2", body, {"Content-Type": "text/xml"})
-            answer: Any = xmlrpc.client.loads(connection.getresponse().read())[0]
-        code, said, pid = answer[0]
-    except (OSError, http.client.HTTPException, xmlrpc.client.Error, ValueError, TypeError) as error:
-        yield Finding(title, FAIL, f"no ROS master at {uri}: {error}", todo)
-        return
-    except Exception as error:  # noqa: BLE001 - what XML parsers raise is their own
-        yield Finding(title, FAIL, f"what answers at {uri} is no ROS master: {error}", todo)
-        return
-    level, text = (OK, f"ROS master at {uri}, process {pid}") if code == 1 else (FAIL, f"{uri}: {said}")
-    yield Finding(title, level, text, todo)
-
-
-def _serial_port(title: str, port: Path) -> Iterator[Finding]:
-    if importlib.util.find_spec("serial") is None:
-        yield Finding(title, FAIL, "Python finds no pyserial", "pip install 'iort-agent[serial]'")
-    if not port.exists():
-        todo = "is the VESC plugged in and switched on? The agent waits for it. `ls /dev/serial/by-id`"
-        yield Finding(title, FAIL, f"{port} is not there", todo)
-    elif not stat.S_ISCHR(port.stat().st_mode):
-        yield Finding(title, FAIL, f"{port} is no serial port")
-    elif not os.access(port, os.R_OK | os.W_OK):
-        todo = "sudo usermod -aG dialout $USER, then log in again"
-        yield Finding(title, FAIL, f"{port} may not be opened", todo)
-    else:
-        yield Finding(title, OK, f"{port} is there")
-
-
-def _listener(title: str, url: str) -> Finding:
-    parts = urllib.parse.urlsplit(url)
-    try:
-        port = parts.port or (443 if parts.scheme == "wss" else 80)
-        socket.create_connection((parts.hostname or "", port), _TIMEOUT_S).close()
-    except (OSError, ValueError) as error:
-        return Finding(title, FAIL, f"{url}: {error}", "start rosbridge_server there")
-    return Finding(title, OK, f"{url} listens")
-
-
-def _recording(title: str, config: Any) -> Iterator[Finding]:
-    path: Path = config.path
-    if not path.exists():
-        yield Finding(title, FAIL, f"{path} is not there")
-        return
-    if not os.access(path, os.R_OK):
-        yield Finding(title, FAIL, f"{path} may not be read", f"chmod a+r {path}")
-        return
-    wanted = set(config.streams())
-    looked = look_into(config.build(SystemClock()), wanted, _LOOK_S)
-    if looked.error:
-        yield Finding(title, FAIL, looked.error)
-        return
-    if looked.streams:
-        yield Finding(title, OK, f"has messages of {', '.join(looked.streams)}")
-    missing = ", ".join(sorted(wanted.difference(looked.streams)))
-    if missing and looked.ended:
-        yield Finding(title, FAIL, f"there is no message of {missing} in it", "see `topics`")
-    elif missing:
-        yield Finding(title, WARN, f"no message of {missing} was found within {_LOOK_S:g} s")
 
 
 def _queue(config: Config) -> Iterator[Finding]:

@@ -16,7 +16,7 @@ from typing import Any, NamedTuple
 
 from iort_contract.catalog.streams import RTT_FIELDS
 from iort_contract.messages.batch import Batch
-from iort_contract.tables import RECEIVED_MS, T_US
+from iort_contract.messages.live import decode_live_update
 from iort_contract.topics import PING_PATHS
 from iort_station.errors import StationError
 
@@ -78,16 +78,16 @@ CAR, RULE, LAMBDA, PUBNUB, HERE = (
 
 
 def times(update: Mapping[str, Any], pubnub_us: int, here_us: int) -> Times:
-    """The times that an update carries; raises KeyError or TypeError for what is not one."""
-    hops = update["hops"]
+    """The times that an update carries; raises `ContractError` for anything else."""
+    heard = decode_live_update(update)
     return Times(
-        sample_us=update[T_US],
-        sent_us=hops["sent_us"],
-        rule_us=hops[RECEIVED_MS] * 1000 + _STAMP_US,
-        lambda_us=hops["lambda_us"],
+        sample_us=heard.live.t_us,
+        sent_us=heard.live.sent_us,
+        rule_us=heard.received_ms * 1000 + _STAMP_US,
+        lambda_us=heard.lambda_us,
         pubnub_us=pubnub_us,
         here_us=here_us,
-        car_to_cloud_us=hops.get("offset_us"),
+        car_to_cloud_us=heard.live.offset_us,
     )
 
 

@@ -12,9 +12,8 @@ from rich.text import Text
 
 from iort_contract.catalog.derived import Vehicle
 from iort_contract.catalog.vesc import FAULTS, hottest_degc
-from iort_contract.limits import GONE_S, SCHEMA_VERSION, STALE_S, ContractError
-from iort_contract.tables import ROBOT, T_US
-from iort_contract.topics import check_robot, check_stream
+from iort_contract.limits import GONE_S, STALE_S, ContractError
+from iort_contract.messages.live import decode_live_update
 
 MAX_ROBOTS = 256
 _STATES = {"online": "green", "stale": "yellow", "gone": "red"}
@@ -63,20 +62,21 @@ class FleetWatch:
     def take(self, update: Any, _pubnub_us: int, now_us: int) -> None:
         """Take an update as it came from PubNub; one that is none is counted in `refused`."""
         try:
-            robot, sample, stamps = read(update)
+            heard = decode_live_update(update)
         except ContractError:
             self.refused += 1
             return
+        robot, live = heard.robot, heard.live
         with self._lock:
             if robot not in self._cars and len(self._cars) >= MAX_ROBOTS:
                 del self._cars[min(self._cars.values(), key=lambda car: car.heard_us).robot]
             car = self._cars.setdefault(robot, Car(robot))
             car.heard_us = now_us
             # By the car's clock a sample is as old as it was on leaving, and has been under way since.
-            car.delay_ms = (now_us - stamps["sent_us"] - stamps["offset_us"]) / 1000
-            in_car_us = stamps["sent_us"] - stamps["t_us"]
+            car.delay_ms = (now_us - live.sent_us - (live.offset_us or 0)) / 1000
+            in_car_us = live.sent_us - live.t_us
             car.taken_us = now_us - max(0, in_car_us) - max(0, round(car.delay_ms * 1000))
-            car.sample.update(sample)
+            car.sample.update(live.sample)
 
     def cars(self) -> list[Car]:
         """The cars by name, those with numbers in the order of the numbers."""
@@ -124,22 +124,6 @@ class FleetWatch:
         if vehicle is None:
             return f"{erpm:.0f} erpm"
         return f"{(erpm - vehicle.speed_to_erpm_offset) / vehicle.speed_to_erpm_gain:.1f} m/s"
-
-
-def read(update: Any) -> tuple[str, dict[str, Any], dict[str, int]]:
-    """Whose an update is, its sample and its times; raises `ContractError` for what is no update."""
-    try:
-        if update["v"] != SCHEMA_VERSION:
-            raise ContractError("another schema version")
-        robot, _ = check_robot(update[ROBOT]), check_stream(update["stream"])
-        hops = update["hops"]
-        stamps = {"t_us": update[T_US], "sent_us": hops["sent_us"], "offset_us": hops.get("offset_us", 0)}
-        sample = dict(update["sample"])
-    except (AttributeError, KeyError, TypeError, ValueError) as error:
-        raise ContractError(f"no live update: {error}") from error
-    if not all(type(stamp) is int for stamp in stamps.values()):
-        raise ContractError("a time that is no integer")
-    return robot, sample, stamps
 
 
 def _figure(value: float | None, digits: int) -> str:

@@ -226,12 +226,12 @@ def test_a_recordings_pictures_are_handed_over_where_it_says_upload(tmp_path):
 def test_a_live_topics_bytes_are_handed_over_where_it_says_upload():
     definition = parse("sensor_msgs/CompressedImage", "string format\nuint8[] data\nuint8 last")
     message = struct.pack("<I4sI", 4, b"jpeg", len(PICTURE)) + PICTURE + b"\x07"
-    values = Decoder(definition, large=True).decode(message)[0]
+    values = Decoder(definition, large=True).decode(message)
     assert values == {"format": "jpeg", "data": PICTURE, "last": 7}
     refusing = Decoder(definition)
-    assert refusing.decode(message)[0] == {"format": "jpeg", "last": 7}
+    assert refusing.decode(message) == {"format": "jpeg", "last": 7}
     assert refusing.left_out == {"data": 1}
-    assert Decoder(definition, select=["format"], large=True).decode(message)[0] == {"format": "jpeg"}
+    assert Decoder(definition, select=["format"], large=True).decode(message) == {"format": "jpeg"}
     with pytest.raises(MessageError, match="truncated"):
         Decoder(definition, large=True).decode(message[:100])
 

@@ -27,9 +27,9 @@ def test_a_command_becomes_a_ros_message() -> None:
     [
         ({}, "data: is missing"),
         ({"data": 1.0, "speed": 2}, "speed: std_msgs/Float64 has no such field"),
-        ({"data": "1"}, "data: found '1'; allowed is a number"),
-        ({"data": True}, "data: found True"),
-        ({"data": None}, "data: found None"),
+        ({"data": "1"}, "data: must be a number, got '1'"),
+        ({"data": True}, "data: must be a number, got True"),
+        ({"data": None}, "data: must be a number, got None"),
     ],
 )
 def test_what_is_not_the_type_is_refused_counted_and_told_once(
@@ -82,7 +82,7 @@ def test_who_asks_is_told_what_became_of_his_command() -> None:
     assert rig.answers == [
         ("speed", 1, None),
         ("speed", 1, "repeated or out of order, sent 0.000 s ago, to within 0.000 s"),
-        ("speed", 3, "data: found 'fast'; allowed is a number"),
+        ("speed", 3, "data: must be a number, got 'fast'"),
         ("speed", 4, "stale, sent 0.600 s ago, to within 0.000 s"),
     ]
 

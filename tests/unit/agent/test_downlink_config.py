@@ -17,7 +17,7 @@ from tests.unit.agent.downlink_rig import CONFIG, Rig
         ({"motion": {"stop": 0}}, r"cmd\.speed\.motion\.stop: found 0 .*mapping"),
         ({"motion": {}}, r"motion\.stop: required"),
         ({"motion": {"stop": {}, "lease_s": 60}}, "lease_s: found 60"),
-        ({"topic": "speed"}, r"cmd\.speed\.topic: ROS topic 'speed'"),
+        ({"topic": "speed"}, r"cmd\.speed\.topic: ROS topic must be .*, got 'speed'"),
         ({"type": "Float64"}, "allowed is package/Type"),
         ({"partial": 1}, "partial: found 1"),
     ],
@@ -33,7 +33,7 @@ def test_a_wrong_configuration(change: Any, error: str) -> None:
         ({"cmd": {"a/b": CONFIG["cmd"]["say"]}}, "got 'a/b'"),
         ({"fleet": {"pose": {"topic": "/pose", "type": "a/B"}}}, "{robot} in it"),
         ({"fleet": {"pose": {"topic": "/{robot}/{robot}", "type": "a/B"}}}, "{robot} in it"),
-        ({"share": {"pose": {"name": "pose"}}}, "ROS topic 'pose'"),
+        ({"share": {"pose": {"name": "pose"}}}, "ROS topic must be .*, got 'pose'"),
         ({"share": {"/a": {"name": "pose"}, "/b": {"name": "pose"}}}, "shared as pose already"),
     ],
 )

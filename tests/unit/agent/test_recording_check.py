@@ -12,10 +12,10 @@ import pytest
 
 from iort_agent.config.file import load_config
 from iort_agent.errors import SourceError
+from iort_agent.sources import FAIL, OK, Finding
 from iort_agent.sources.recording.bag import BagConfig
-from iort_agent.sources.recording.check import look_into
+from iort_agent.sources.recording.look import look_into
 from iort_agent.sources.recording.player import Message
-from iort_agent.verbs.check import FAIL, OK, Finding, source_findings
 from tests.unit.agent.test_agent import config_file
 from tests.unit.agent.test_bag import START, STORAGES, play, write_ros1, write_ros2
 from tests.unit.agent.test_vesc_csv import row, write
@@ -23,7 +23,7 @@ from tests.unit.agent.test_vesc_csv import row, write
 
 def found(folder: Path, path: Path, settings: str = "") -> Finding:
     config = load_config(config_file(folder, f"{{type: bag, path: {path}, {settings}}}"))
-    (finding,) = source_findings("source 0", config.sources[0])
+    (finding,) = config.sources[0].check("source 0")
     return finding
 
 
@@ -52,7 +52,7 @@ def test_a_topic_that_is_not_there(tmp_path: Path) -> None:
 
 def test_a_topic_without_a_message(tmp_path: Path) -> None:
     finding = found(tmp_path, write_ros1(tmp_path / "a.bag", count=0))
-    assert (finding.level, finding.text) == (FAIL, "there is no message of vesc in it")
+    assert (finding.level, finding.text) == (FAIL, "it has no message of vesc")
 
 
 @pytest.mark.parametrize(
@@ -186,7 +186,7 @@ class Endless:
 @pytest.mark.parametrize("stuck", [False, True])
 def test_it_is_looked_into_for_a_bounded_time(stuck: bool) -> None:
     source: Any = Endless(stuck=stuck)
-    looked = look_into(source, {"vesc", "imu"}, 0.05)
+    looked = look_into(source.open, {"vesc", "imu"}, 0.05)
     assert looked == ([] if stuck else ["vesc"], False, "")
     source.gone.set()
     assert source.closed.wait(10), "what it began goes on"
@@ -194,11 +194,11 @@ def test_it_is_looked_into_for_a_bounded_time(stuck: bool) -> None:
 
 def test_the_rest_is_not_read(tmp_path: Path) -> None:
     source: Any = Endless(stuck=False)
-    assert look_into(source, {"vesc"}, 60) == (["vesc"], False, "")
+    assert look_into(source.open, {"vesc"}, 60) == (["vesc"], False, "")
     assert source.closed.is_set()
 
 
 def test_an_error_of_the_library_is_one_of_the_recording(tmp_path: Path) -> None:
     source = BagConfig(path=tmp_path / "gone.bag").build(None)  # type: ignore[arg-type]  # nothing is played
-    looked = look_into(source, {"vesc"}, 60)
+    looked = look_into(source.open, {"vesc"}, 60)
     assert "gone.bag" in looked.error

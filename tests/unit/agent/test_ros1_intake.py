@@ -11,7 +11,8 @@ from typing import Any
 import pytest
 
 from iort_agent.errors import SourceError
-from iort_agent.sources.ros1 import Intake, Ros1Config, TopicConfig
+from iort_agent.sources.intake import Intake
+from iort_agent.sources.ros1 import Ros1Config, TopicConfig
 from iort_contract.catalog.streams import TYPES_STREAM
 from iort_contract.messages.message_type import MessageType, message_type
 from iort_contract.ros1.message import RosMessage
@@ -28,7 +29,7 @@ class Desk:
         self.samples: list[tuple[str, int, dict[str, Any]]] = []
         self.types: list[MessageType] = []
         config = TopicConfig(**{"stream": "s", "time": "header", **settings})
-        self.intake = Intake("/t", config, emit=self._emit, clock=self.clock)
+        self.intake = Intake("/t", config, emit=self._emit, clock=self.clock, large=config.large)
 
     def _emit(self, stream: str, t_us: int, values: Any) -> None:
         if stream != TYPES_STREAM:

@@ -7,9 +7,9 @@ from typing import Any
 import pytest
 from hypothesis import given, settings
 
-from iort_agent.sources.rosbridge.rosapi import ANSWER_S, Rosapi, Structure, from_text, from_typedefs, md5sum
+from iort_agent.sources.rosbridge.rosapi import ANSWER_S, Rosapi, Structure, from_text, from_typedefs
 from iort_contract.limits import MessageError
-from iort_contract.ros1.definition import Definition
+from iort_contract.ros1.definition import Definition, md5sum, parse
 from tests.agent_fakes import ManualClock
 from tests.unit.agent.downlink_rig import POSE
 from tests.unit.contract.ros1_values import HEADER, definitions, text_of
@@ -52,7 +52,7 @@ uint16 service
     ],
 )
 def test_the_md5sum_is_ros_own(kind: str, text: str, expected: str) -> None:
-    assert md5sum(kind, text) == expected
+    assert md5sum(parse(kind, text), text) == expected
 
 
 def typedef(kind: str, *fields: tuple[str, str, int], **members: Any) -> dict[str, Any]:
@@ -81,7 +81,7 @@ def as_typedefs(definition: Definition) -> list[dict[str, Any]]:
 def test_the_fields_are_the_definition(definition: Definition) -> None:
     found = from_typedefs(definition.kind, as_typedefs(definition))
     assert found.definition.types == definition.types
-    assert found.md5sum == md5sum(definition.kind, text_of(definition))
+    assert found.md5sum == md5sum(definition, text_of(definition))
 
 
 def test_what_ros_2_says_is_the_message_of_ros_1() -> None:

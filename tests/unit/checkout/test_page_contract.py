@@ -6,6 +6,7 @@ import json
 import re
 
 from iort_contract.catalog.derived import DERIVED
+from iort_contract.catalog.entries import Derived
 from iort_contract.catalog.vesc import FAULTS, VESC
 from scripts.docs_parts import PAGE
 from scripts.page_contract import formula
@@ -26,3 +27,9 @@ def test_a_formula_is_told_as_it_calculates() -> None:
     for entry in DERIVED.values():
         arguments = {name: values[name] for name in entry.arguments}
         assert eval(formula(entry), {}, arguments) == entry.formula(**arguments)  # our own entries
+
+
+def test_a_formulas_text_has_the_brackets_that_it_needs() -> None:
+    entry = Derived("x", "", "", lambda a, b, c: 2 * (a - (b - c)) / (a / b) + a * b * c - (1 - a))
+    text = formula(entry)
+    assert text == "2 * (a - (b - c)) / (a / b) + a * b * c - (1 - a)"

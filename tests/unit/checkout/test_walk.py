@@ -16,7 +16,7 @@ from iort_agent.lanes.batch import Batcher, StreamCounts
 from iort_agent.lanes.batch_encoder import Packer
 from iort_agent.lanes.record import RecordLane
 from iort_agent.rate_limiter import Allowance
-from iort_agent.sources.ros1 import Intake, TopicConfig
+from iort_agent.sources.intake import Intake, TopicConfig
 from iort_agent.spool.config import QueueConfig
 from iort_agent.spool.sqlite import make_spool
 from iort_contract.tables import RECEIVED_MS

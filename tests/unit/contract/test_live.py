@@ -13,7 +13,13 @@ from hypothesis import strategies as st
 from iort_contract.catalog.vesc import VESC_FIELDS
 from iort_contract.limits import MAX_PUBNUB_BYTES, ContractError
 from iort_contract.messages.event import MESSAGE_BASE64, event_message, rule_event
-from iort_contract.messages.live import LiveSample, decode_live, encode_live, live_update
+from iort_contract.messages.live import (
+    LiveSample,
+    decode_live,
+    decode_live_update,
+    encode_live,
+    live_update,
+)
 from tests.unit.contract.contract_values import (
     BAD_HEADERS,
     BOOT,
@@ -96,3 +102,19 @@ def test_live_update_carries_every_hop():
     full = dict.fromkeys(VESC_FIELDS, -1234.56789)
     largest = live_update("c" * 64, "vesc", replace(live, sample=full), 2**53, 2**53)
     assert len(json.dumps(largest)) * 3 < MAX_PUBNUB_BYTES
+
+
+def test_a_live_update_comes_as_it_was_sent():
+    live = LiveSample("0123abcd", 3, 5_000, 6_000, {"speed": 1.5, "name": None}, offset_us=-7)
+    sent = json.loads(json.dumps(live_update("car", "vesc", live, 8, 9_000)))
+    assert decode_live_update(sent) == ("car", "vesc", live, 8, 9_000)
+    for bad in (
+        7,
+        {},
+        {**sent, "v": 9},
+        {**sent, "robot": "a/b"},
+        {**sent, "hops": {}},
+        {**sent, "sample": 3},
+    ):
+        with pytest.raises(ContractError):
+            decode_live_update(bad)

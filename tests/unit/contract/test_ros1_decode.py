@@ -13,10 +13,10 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from iort_agent.sources.flatten import flatten
 from iort_contract.limits import MessageError
-from iort_contract.ros1.decode import MAX_ELEMENTS, MAX_TEXT, Decoder
+from iort_contract.ros1.decode import MAX_ELEMENTS, MAX_TEXT, Decoder, stamp_ns
 from iort_contract.ros1.definition import VARIABLE, parse
+from tests.flatten import flatten
 from tests.recordings import recording
 from tests.unit.contract.ros1_messages import HEADER, LINE, STAMPED, header, text, u32
 
@@ -28,7 +28,7 @@ def nested_header(path: str) -> dict[str, Any]:
 
 
 def decoded(definition: str, data: bytes, **how: Any) -> dict[str, Any]:
-    return Decoder(parse("a_msgs/A", definition), **how).decode(data)[0]
+    return Decoder(parse("a_msgs/A", definition), **how).decode(data)
 
 
 @pytest.mark.parametrize(
@@ -77,15 +77,13 @@ def test_decode(definition: str, data: bytes, values: dict[str, Any]) -> None:
     assert [type(v) for v in found.values()] == [type(v) for v in values.values()]
 
 
-def test_the_stamp_is_exact_to_the_microsecond() -> None:
-    decoder = Decoder(parse("a_msgs/A", STAMPED + "uint8 u"), stamp=True)
-    assert decoder.decode(header(1_700_000_000, 999_999_999) + b"\x01") == (
-        {"u": 1},
-        1_700_000_000_999_999,
-        b"base_link",
-    )
-    assert Decoder(parse("a_msgs/A", STAMPED + "uint8 u")).decode(header() + b"\x01")[1] is None
-    assert Decoder(parse("a_msgs/A", "uint8 u"), stamp=True).decode(b"\x01")[1] is None
+def test_the_stamp_is_exact_to_the_nanosecond() -> None:
+    decoder = Decoder(parse("a_msgs/A", STAMPED + "uint8 u"))
+    data = header(1_700_000_000, 999_999_999) + b"\x01"
+    assert (decoder.stamped, decoder.decode(data)) == (True, {"u": 1})
+    assert stamp_ns(data) == 1_700_000_000_999_999_999
+    assert stamp_ns(data[:15]) is None
+    assert not Decoder(parse("a_msgs/A", "uint8 u")).stamped
 
 
 SELECTABLE = (
@@ -122,7 +120,7 @@ SELECT_DATA = (
 )  # fmt: skip
 def test_only_what_is_selected(select: list[str], values: dict[str, Any], unknown: list[str]) -> None:
     decoder = Decoder(parse("a_msgs/A", SELECTABLE), select=select)
-    assert decoder.decode(SELECT_DATA)[0] == values
+    assert decoder.decode(SELECT_DATA) == values
     assert decoder.unknown == unknown
     assert not decoder.left_out
 
@@ -132,10 +130,10 @@ def test_what_is_no_telemetry_is_left_out_and_counted() -> None:
     data = u32(3) + b"abc" + u32(65) + bytes(65 * 4) + bytes(800) + text("x" * (MAX_TEXT + 1)) + b"\x01"
     decoder = Decoder(parse("a_msgs/A", definition))
     for _ in range(2):
-        assert decoder.decode(data)[0] == {"last": 1}
+        assert decoder.decode(data) == {"last": 1}
     assert decoder.left_out == {"image": 2, "ranges": 2, "grid": 2, "s": 2}
     small = u32(0) + u32(MAX_ELEMENTS) + bytes(MAX_ELEMENTS * 4) + bytes(800) + text("") + b"\x01"
-    assert len(decoder.decode(small)[0]) == MAX_ELEMENTS + 2
+    assert len(decoder.decode(small)) == MAX_ELEMENTS + 2
 
 
 BEYOND = "(fields beyond 512)"
@@ -160,7 +158,7 @@ def test_fields_beyond_512_are_cut_from_the_view_and_counted(
     within = b"\1" + (u32(20) + bytes(20 * 64)) if "c\n" not in definition else b""
     data = bytes(size) if size is not None else within or b"\1" + u32(4) + 4 * (u32(9) + bytes(9 * 64))
     for times in (1, 2):
-        values = decoder.decode(data)[0]
+        values = decoder.decode(data)
         assert (len(values), list(values)[:2]) == (512, first)
         assert decoder.left_out == {BEYOND: times}
     assert decoder.flat is None
@@ -198,7 +196,7 @@ def test_arrays_within_arrays_cost_no_more_than_a_view(n: int, fields: int) -> N
     decoder = Decoder(parse("a_msgs/A", definition))
     tracemalloc.start()
     try:
-        assert len(decoder.decode(data)[0]) == fields
+        assert len(decoder.decode(data)) == fields
         assert tracemalloc.get_traced_memory()[1] < 20_000_000
     finally:
         tracemalloc.stop()
@@ -215,7 +213,8 @@ def test_arrays_within_arrays_cost_no_more_than_a_view(n: int, fields: int) -> N
         ("uint8[] a", u32(2**32 - 1), "truncated"),
         ("string[] a", u32(20_000), "truncated"),
         ("string[] a", u32(2**32 - 1), "too many elements to decode: 4294967295"),
-        ("string[1000000] a", b"", "truncated"),
+        ("string[1000] a", b"", "truncated"),
+        ("string[1000000] a", b"", "too many elements to decode: 1000000"),
     ],
 )
 def test_bytes_that_do_not_fit(definition: str, data: bytes, error: str) -> None:
@@ -265,14 +264,14 @@ def test_a_real_recording_is_what_rosbags_reads() -> None:
             kind = connection.msgtype.replace("/msg/", "/")
             # Of the newest rosbags for Python 3.8 it is the text itself.
             definition = getattr(connection.msgdef, "data", connection.msgdef)
-            decoder = Decoder(parse(kind, definition), stamp=True)
+            decoder = Decoder(parse(kind, definition))
             for _, _, raw in reader.readers[0].messages([connection]):
                 message = reader.deserialize(raw, connection.msgtype)
-                values, stamp_us, _ = decoder.decode(raw)
+                values = decoder.decode(raw)
                 assert values == flatten(message, members)
-                if stamp_us is not None:
+                if decoder.stamped:
                     stamp = message.header.stamp
-                    assert stamp_us == stamp.sec * 1_000_000 + stamp.nanosec // 1000
+                    assert stamp_ns(raw) == stamp.sec * 1_000_000_000 + stamp.nanosec
                 counts[connection.topic] = counts.get(connection.topic, 0) + 1
     assert counts == {"/sensors/core": 2244, "/sensors/servo_position_command": 879}
 
@@ -359,9 +358,9 @@ def test_any_message_is_what_rosbags_wrote(case: tuple[str, list[Any], list[Any]
         if field.kind == "uint8" and field.length == VARIABLE
     )
     expected = {name: value for name, value in expected.items() if not name.startswith(blobs)}
-    assert Decoder(parsed).decode(data)[0] == expected
+    assert Decoder(parsed).decode(data) == expected
     for name, value in expected.items():
-        assert Decoder(parsed, select=[name]).decode(data)[0] == {name: value}
+        assert Decoder(parsed, select=[name]).decode(data) == {name: value}
 
 
 @given(st.binary(max_size=60), st.sampled_from([None, ["b.1.x"]]))

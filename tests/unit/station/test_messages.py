@@ -6,7 +6,6 @@ import numpy as np
 import pytest
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
-from iort_agent.sources.flatten import flatten
 from iort_contract.catalog.streams import TYPES_STREAM
 from iort_contract.limits import ContractError
 from iort_contract.messages.batch import Batch
@@ -16,6 +15,7 @@ from iort_station.data.blocks import Block, column_of
 from iort_station.errors import StationError
 from iort_station.recordings.messages import Maker, made_of, types
 from tests.fakes import TELEMETRY, item_of
+from tests.flatten import flatten
 from tests.unit.station.test_data import cloud_of
 
 LINE = "=" * 80 + "\n"

@@ -15,7 +15,7 @@ from rosbags.typesys import Stores, get_typestore
 
 from iort_agent.lanes.batch import Batcher, StreamCounts
 from iort_agent.lanes.batch_encoder import Packer
-from iort_agent.sources.ros1 import Intake, TopicConfig
+from iort_agent.sources.intake import Intake, TopicConfig
 from iort_agent.spool.memory import MemorySpool
 from iort_contract.topics import RECORD, build_topic
 from iort_station.cli.verbs.data.export import _write

@@ -6,6 +6,7 @@ Needs no ROS.
 from __future__ import annotations
 
 import logging
+import os
 import re
 import threading
 from contextlib import suppress
@@ -13,10 +14,11 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, ContextManager, Iterator, Mapping, NamedTuple, Optional, Sequence
 
-from iort_agent.clock import Clock
+from iort_agent.clock import Clock, SystemClock
 from iort_agent.errors import SourceError
 from iort_agent.schema import choice, existing_path, flag, number, pairs, setting, text
-from iort_agent.sources import REFUSE, UPLOAD, Emit
+from iort_agent.sources import FAIL, OK, REFUSE, UPLOAD, WARN, Emit, Finding, SourceConfig
+from iort_agent.sources.recording.look import look_into
 from iort_agent.sources.recording.player import NOW, ORIGINAL, Message, Open, Playback, play
 from iort_agent.sources.recording.tool_csv import VescLog
 from iort_agent.sources.recording.unreadable import Wrapped, check_kind
@@ -24,7 +26,7 @@ from iort_contract.catalog.streams import TYPES_STREAM
 from iort_contract.catalog.vesc import VESC_STREAM
 from iort_contract.limits import ContractError, MessageError, Value
 from iort_contract.messages.message_type import MessageType
-from iort_contract.ros1.decode import HEADER, Decoder
+from iort_contract.ros1.decode import Decoder, stamp_ns
 from iort_contract.ros1.definition import parse
 from iort_contract.ros1.message import RosMessage, RosType
 from iort_contract.topics import check_stream
@@ -32,12 +34,14 @@ from iort_contract.topics import check_stream
 _log = logging.getLogger(__name__)
 
 VESC_TYPE = "vesc_msgs/msg/VescStateStamped"
+# `iort-agent check` looks into a recording for this long.
+_LOOK_S = 10.0
 # A header's stamp this far from when the message was recorded is a clock not yet set, or a simulation's.
 _BELIEVABLE_NS = 3600 * 1_000_000_000
 
 
 @dataclass(frozen=True)
-class BagConfig:
+class BagConfig(SourceConfig):
     """A recording to play.
 
     ``topics`` maps ROS topics to streams; without it, every VescStateStamped becomes ``stream``, as does
@@ -68,6 +72,31 @@ class BagConfig:
     def build(self, clock: Clock) -> BagSource:
         """Make the source; the file is opened when it runs."""
         return BagSource(self, clock)
+
+    def uploads_large(self) -> bool:
+        """Whether bytes are sent as files."""
+        return self.large == UPLOAD
+
+    def check(self, title: str) -> Iterator[Finding]:
+        """Whether the recording can be read, and has a message of every stream."""
+        if not self.path.exists():
+            yield Finding(title, FAIL, f"{self.path} is not there")
+            return
+        if not os.access(self.path, os.R_OK):
+            yield Finding(title, FAIL, f"{self.path} may not be read", f"chmod a+r {self.path}")
+            return
+        wanted = set(self.streams())
+        looked = look_into(self.build(SystemClock()).open, wanted, _LOOK_S)
+        if looked.error:
+            yield Finding(title, FAIL, looked.error)
+            return
+        if looked.streams:
+            yield Finding(title, OK, f"has messages of {', '.join(looked.streams)}")
+        missing = ", ".join(sorted(wanted.difference(looked.streams)))
+        if missing and looked.ended:
+            yield Finding(title, FAIL, f"it has no message of {missing}", "see `topics`")
+        elif missing:
+            yield Finding(title, WARN, f"no message of {missing} was found within {_LOOK_S:g} s")
 
 
 class BagSource:
@@ -186,15 +215,15 @@ class Recording:
             said = kind is not None
             if kind is None:
                 kind = kinds[named] = self._kind(stream, connection)
-            stamp_ns = _stamp_ns(raw, recorded_ns) if kind.stamped else recorded_ns
+            measured_ns = _stamp_ns(raw, recorded_ns) if kind.stamped else recorded_ns
             if not said and kind.sample is not None:
-                yield Message(TYPES_STREAM, at_ns, stamp_ns, kind.sample)
+                yield Message(TYPES_STREAM, at_ns, measured_ns, kind.sample)
             contents: dict[str, Any] = {}
             if kind.large is not None:
                 with suppress(MessageError):
-                    values: dict[str, Any] = dict(kind.large.decode(raw)[0])
+                    values: dict[str, Any] = dict(kind.large.decode(raw))
                     contents = {name: v for name, v in values.items() if isinstance(v, bytes) and v}
-            yield Message(stream, at_ns, stamp_ns, RosMessage(raw, kind.whole, large=contents))
+            yield Message(stream, at_ns, measured_ns, RosMessage(raw, kind.whole, large=contents))
 
     def _kind(self, stream: str, connection: Any) -> _Kind:
         """What the messages of a topic are, as ROS 1 has it."""
@@ -249,12 +278,9 @@ def _with_seq(definition: str, md5sum: str, name: str) -> tuple[str, str]:
 
 
 def _stamp_ns(raw: bytes, recorded_ns: int) -> int:
-    """The header's stamp, or when the message was recorded if that is none to believe."""
-    if len(raw) < HEADER.size:
-        return recorded_ns
-    _, sec, nanosec, _ = HEADER.unpack_from(raw)
-    stamp_ns = int(sec) * 1_000_000_000 + int(nanosec)
-    return stamp_ns if abs(stamp_ns - recorded_ns) < _BELIEVABLE_NS else recorded_ns
+    """The header's stamp, or the time of recording if the stamp is missing or not believable."""
+    t_ns = stamp_ns(raw)
+    return t_ns if t_ns is not None and abs(t_ns - recorded_ns) < _BELIEVABLE_NS else recorded_ns
 
 
 # Of vesc_msgs for ROS 2: recordings of Foxy and Humble hold no definitions. The order is the wire's.

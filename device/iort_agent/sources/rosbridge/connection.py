@@ -1,24 +1,21 @@
 """A connection to a rosbridge server that comes back whenever it is lost, with its subscriptions.
 
-Why not roslibpy: it needs Python 3.9 and twelve packages around twisted, and its subscriptions are not
-always restored (its issues 108 and 114). The protocol is JSON with an operation each for subscribing,
-advertising, publishing and calling; websocket-client carries it, without dependencies, and Debian packages
-it.
+roslibpy is no choice: it needs Python 3.9 and twelve packages around twisted, and does not always restore its
+subscriptions (its issues 108 and 114). websocket-client carries the protocol, has no dependencies, and is in
+Debian.
 
-What the server does (rosbridge_suite 0.11.17): clients share one ROS subscription a topic. ``subscribe`` to
-a topic without a type that nobody has advertised is forgotten without an answer; said again it does no harm
-in ROS 1. ``unsubscribe`` by the last client ends the ROS subscription, and what is published until the next
-has reached the publishers is lost; so it is done only where the server must be thought deaf.
+Clients of one server (rosbridge_suite 0.11.17) share one ROS subscription a topic. The server forgets
+``subscribe`` without an answer if it has no type and nobody has advertised the topic; to repeat it does no
+harm in ROS 1. ``unsubscribe`` by the last client ends the ROS subscription, and the messages until the next
+one are lost; so it is sent only if the server seems deaf.
 """
 
 from __future__ import annotations
 
-import contextlib
 import json
 import logging
 import random
 import threading
-from socket import SHUT_RDWR
 from typing import Any, Mapping, NamedTuple, Protocol, Sequence
 
 from iort_agent.clock import Clock
@@ -30,21 +27,20 @@ _log = logging.getLogger(__name__)
 _CONNECT_S = 5.0
 # A receive returns after this at the latest, so that a stop is noticed.
 _RECEIVE_S = 0.25
-# What comes so soon after a new subscription would have come without it, had the server not been deaf.
+# A message so soon after a new subscription would have come without it, if the server had not been deaf.
 _AT_ONCE_S = 5.0
-# A topic is silent only after so many of its own longest intervals.
+# A topic is silent only after this many of its own longest intervals.
 _INTERVALS = 4.0
 
 
 class Times(NamedTuple):
-    """How long what is waited for, in seconds.
+    """Timeouts and intervals in seconds.
 
-    A ping after `ping_s` without a word; without one after `dead_s`, the connection is dead. A topic that has
-    not been heard may not have existed when it was subscribed to: it is asked for again every `ask_again_s`.
-    After `patience_s` without a message, on a topic never heard in this connection or on all at once, the
-    server may have gone deaf, as when the ROS master was started again; twice as long for each time after, up
-    to `max_patience_s`. A robot has one agent, so its server may be tried often: `backoff_s`, at first and at
-    most.
+    A ping is sent after `ping_s` without a frame; after `dead_s` the connection is dead. A topic without a
+    message may not have existed at the subscription: it is subscribed to again every `ask_again_s`. After
+    `patience_s` without a message, on a topic that was silent in all of this connection or on all topics, the
+    server may be deaf, as after a restart of the ROS master; the time doubles up to `max_patience_s`. A robot
+    has one agent, so its server may be tried often: `backoff_s` is the first and the longest backoff.
     """
 
     ping_s: float = 5.0
@@ -60,7 +56,7 @@ TIMES = Times()
 
 
 class Topic(NamedTuple):
-    """What is asked of the server: ``kind`` is the message's type; without it the topic must exist."""
+    """A subscription: ``kind`` is the message's type; without it the topic must exist."""
 
     name: str
     kind: str | None = None
@@ -68,26 +64,26 @@ class Topic(NamedTuple):
 
 
 class Listener(Protocol):
-    """Is told what comes, in the connection's thread. Nothing of it may raise."""
+    """Is called in the connection's thread, and must not raise."""
 
     def connected(self) -> None:
         """A connection has been made; the subscriptions follow."""
 
     def subscribed(self, topic: str) -> None:
-        """A topic has been subscribed to, at first or anew: what is latched comes again."""
+        """A subscription has begun or begun again: a latched message comes again."""
 
     def message(self, topic: str, message: Any, data: bytes, arrival_us: int) -> bool:
-        """Take a message of a topic; ``data`` is the text that it came in. Whether it is a new one."""
+        """Take a message of a topic, and its text ``data``; returns whether it is a new one."""
 
     def answer(self, said: Mapping[str, Any]) -> None:
         """Take the answer to a call."""
 
     def look(self) -> None:
-        """Called once a second or so."""
+        """Called about once a second."""
 
 
 class RosbridgeConnection:
-    """`run` in a thread of its own; `publish` from any thread."""
+    """`run` it in a thread of its own."""
 
     def __init__(
         self, url: str, clock: Clock, *, topics: Sequence[Topic], listener: Listener, times: Times
@@ -96,15 +92,14 @@ class RosbridgeConnection:
         self._url = url
         self._clock = clock
         self._times = times
-        self._topics = {topic.name: _Hearing(topic, times) for topic in topics}
+        self._subscriptions = {topic.name: _Subscription(topic, times) for topic in topics}
         self._listener = listener
-        self._seldom = Seldom(_log, clock)
-        self._lock = threading.Lock()
+        self._throttled = Seldom(_log, clock)
         self._socket: Any = None
-        self._advertised: dict[str, str] = {}
-        self._patience = self._times.patience_s
+        self._fragments: list[str] = []
+        self._patience = times.patience_s
         self._all_due = 0.0
-        # The time in which nothing could come, and since when nothing can.
+        # The time without a connection, and since when there is none.
         self._interruptions = 0
         self._dark_s = 0.0
         self._dark_since: float | None = None
@@ -112,84 +107,65 @@ class RosbridgeConnection:
     def run(self, stop: threading.Event) -> None:
         """Be connected until ``stop`` is set. Raises `SourceError` without websocket-client."""
         library = _load_websocket()
-        backoff = self._times.backoff_s[0]
+        first_s, longest_s = self._times.backoff_s
+        backoff_s = first_s
         while not stop.is_set():
             began = self._clock.monotonic()
             try:
                 self._session(library, stop)
             except (OSError, library.WebSocketException) as error:
-                self._say(_why(error, library))
+                why = _why(error, library)
+                self._throttled.warn(f"connection: {why[:80]}", f"{self._url}: {why}; trying again")
             finally:
-                self._close()
-            if self._clock.monotonic() - began > self._times.backoff_s[1]:
-                backoff = self._times.backoff_s[0]
-            # Full jitter: a fleet must not come back in step.
-            self._clock.wait(stop, random.uniform(0, backoff))  # noqa: S311 - jitter, not secrets
-            backoff = min(self._times.backoff_s[1], backoff * 2)
-
-    def publish(self, topic: str, kind: str, message: Mapping[str, Any]) -> None:
-        """Publish a message. Raises `SourceError` while there is no connection; nothing is kept for later."""
-        try:
-            operation = json.dumps({"op": "publish", "topic": topic, "msg": message}, allow_nan=False)
-        except (TypeError, ValueError) as error:
-            raise SourceError(f"{self._url}: {topic} cannot be published: {error}") from error
-        with self._lock:
-            if self._socket is None:
-                raise SourceError(f"{self._url}: not connected, so nothing can be published on {topic}")
-            try:
-                if self._advertised.get(topic) != kind:
-                    self._socket.send(json.dumps({"op": "advertise", "topic": topic, "type": kind}))
-                    self._advertised[topic] = kind
-                self._socket.send(operation)
-            except Exception as error:
-                # Half a frame may be out; after that, nothing on this connection means anything.
-                with contextlib.suppress(OSError):
-                    self._socket.sock.shutdown(SHUT_RDWR)
-                raise SourceError(f"{self._url}: {topic} cannot be published: {error}") from error
+                if self._socket is not None:
+                    self._socket.shutdown()
+                self._socket = None
+            if self._clock.monotonic() - began > longest_s:
+                backoff_s = first_s
+            # Full jitter, so that a fleet does not come back in step.
+            self._clock.wait(stop, random.uniform(0, backoff_s))  # noqa: S311 - jitter, not secrets
+            backoff_s = min(longest_s, backoff_s * 2)
 
     def send(self, operation: Mapping[str, Any]) -> None:
         """Send an operation; only for the listener, in the connection's thread."""
-        with self._lock:
-            self._socket.send(json.dumps(operation))
+        self._socket.send(json.dumps(operation))
 
     def counts(self) -> dict[str, int]:
-        """What went wrong, by reason."""
-        return self._seldom.counts()
+        """The problems, by reason."""
+        return self._throttled.counts()
 
     def report(self, topic: str) -> dict[str, Any]:
         """How often a topic's messages could not come, and for how many seconds.
 
-        ``interruptions`` and ``dark_s`` are of the connection, and of a server that turned out to be deaf;
-        ``resubscribed`` is how often the topic's subscription was ended and made again.
+        ``interruptions`` and ``dark_s`` count lost connections and a deaf server; ``resubscribed`` is how
+        often the topic's subscription was ended and made again.
         """
-        hearing, since = self._topics[topic], self._dark_since
+        subscription, since = self._subscriptions[topic], self._dark_since
         now_s = 0.0 if since is None else self._clock.monotonic() - since
         counts = {
-            "interruptions": self._interruptions + hearing.interruptions,
-            "dark_s": round(self._dark_s + now_s + hearing.dark_s, 3),
-            "resubscribed": hearing.resubscribed,
+            "interruptions": self._interruptions + subscription.interruptions,
+            "dark_s": round(self._dark_s + now_s + subscription.dark_s, 3),
+            "resubscribed": subscription.resubscribed,
         }
         return {name: count for name, count in counts.items() if count}
 
     def _session(self, library: Any, stop: threading.Event) -> None:
-        socket = library.create_connection(
-            self._url, timeout=_CONNECT_S, enable_multithread=True, skip_utf8_validation=True
+        socket = self._socket = library.create_connection(
+            self._url, timeout=_CONNECT_S, skip_utf8_validation=True
         )
         socket.settimeout(_RECEIVE_S)
-        with self._lock:
-            self._socket, self._advertised = socket, {}
+        self._fragments = []
         self.connects += 1
         _log.info("%s: connected", self._url)
         self._listener.connected()
-        now = last_word = last_look = self._clock.monotonic()
-        self._patience, self._all_due = self._times.patience_s, now + self._times.patience_s
-        for hearing in self._topics.values():
-            hearing.connected(now)
-            self._subscribe(hearing.topic)
+        now = last_frame = last_look = self._clock.monotonic()
+        self._heard(now)
+        for subscription in self._subscriptions.values():
+            subscription.connected(now)
+            self._subscribe(subscription.topic)
         if self._dark_since is not None:
             self._dark_s += self._clock.monotonic() - self._dark_since
             self._dark_since = None
-        fragments: list[str] = []
         try:
             while not stop.is_set():
                 try:
@@ -198,104 +174,108 @@ class RosbridgeConnection:
                     opcode, frame = None, None
                 arrival_us, now = self._clock.now_us(), self._clock.monotonic()
                 if opcode is not None:
-                    last_word = now
+                    last_frame = now
                 if opcode in (library.ABNF.OPCODE_TEXT, library.ABNF.OPCODE_BINARY):
-                    self._take(frame.data, arrival_us, now, fragments)
+                    self._take(frame.data, arrival_us, now)
                 elif opcode == library.ABNF.OPCODE_CLOSE:
                     raise library.WebSocketConnectionClosedException("the server closed the connection")
                 if now - last_look >= self._times.look_s:
                     last_look = now
-                    self._look(socket, now, last_word)
+                    self._look(now, last_frame)
         finally:
             if not stop.is_set():
                 self._interruptions += 1
-                self._dark_since = last_word
+                self._dark_since = last_frame
 
-    def _look(self, socket: Any, now: float, last_word: float) -> None:
-        """Once a second: is the server still there, and does it hear what is published?"""
-        if now - last_word >= self._times.dead_s:
+    def _heard(self, now: float) -> None:
+        self._patience, self._all_due = self._times.patience_s, now + self._times.patience_s
+
+    def _look(self, now: float, last_frame: float) -> None:
+        """Check once a second that the server is there, and that it hears what is published."""
+        if now - last_frame >= self._times.dead_s:
             raise TimeoutError(f"no answer for {self._times.dead_s:g} s")
-        if now - last_word >= self._times.ping_s:
-            with self._lock:
-                socket.ping()
-        hearings = list(self._topics.values())
-        if now >= self._all_due and all(hearing.silent(now) for hearing in hearings):
-            self._seldom.warn("silent", f"{self._url}: nothing comes on any topic: subscribing afresh")
+        if now - last_frame >= self._times.ping_s:
+            self._socket.ping()
+        subscriptions = list(self._subscriptions.values())
+        if now >= self._all_due and all(subscription.silent(now) for subscription in subscriptions):
+            self._throttled.warn("silent", f"{self._url}: nothing comes on any topic: subscribing afresh")
             self._patience = min(self._times.max_patience_s, self._patience * 2)
             self._all_due = now + self._patience
-            for hearing in hearings:
-                self._resubscribe(hearing, now)
-        for hearing in hearings:
-            if hearing.heard:
-                continue
-            if now >= hearing.due:
-                name = hearing.topic.name
-                self._seldom.warn(
-                    f"silent {name}", f"{self._url}: nothing comes on {name}: subscribing afresh"
-                )
-                self._resubscribe(hearing, now)
-            elif now >= hearing.ask_again:
-                hearing.ask_again = now + self._times.ask_again_s
-                self._subscribe(hearing.topic)
+            for subscription in subscriptions:
+                self._resubscribe(subscription, now)
+        for subscription in subscriptions:
+            name = subscription.topic.name
+            if not subscription.heard and now >= subscription.due:
+                why = f"{self._url}: nothing comes on {name}: subscribing afresh"
+                self._throttled.warn(f"silent {name}", why)
+                self._resubscribe(subscription, now)
+            elif not subscription.heard and now >= subscription.ask_again:
+                subscription.ask_again = now + self._times.ask_again_s
+                self._subscribe(subscription.topic)
         self._listener.look()
 
-    def _resubscribe(self, hearing: _Hearing, now: float) -> None:
-        hearing.resubscribing(now)
-        self.send({"op": "unsubscribe", "id": f"iort:{hearing.topic.name}", "topic": hearing.topic.name})
-        self._subscribe(hearing.topic)
+    def _resubscribe(self, subscription: _Subscription, now: float) -> None:
+        name = subscription.topic.name
+        subscription.resubscribing(now)
+        self.send({"op": "unsubscribe", "id": f"iort:{name}", "topic": name})
+        self._subscribe(subscription.topic)
 
     def _subscribe(self, topic: Topic) -> None:
         wanted: dict[str, Any] = {"op": "subscribe", "id": f"iort:{topic.name}", "topic": topic.name}
         if topic.kind is not None:
             wanted["type"] = topic.kind
-        # Without a queue, a throttled topic gives its newest message, not one from a while ago.
+        # Without a queue, a throttled topic gives its newest message, not an old one.
         self.send({**wanted, "throttle_rate": topic.throttle_ms, "queue_length": 0})
         self._listener.subscribed(topic.name)
 
-    def _take(self, data: bytes, arrival_us: int, now: float, fragments: list[str]) -> None:
+    def _take(self, data: bytes, arrival_us: int, now: float) -> None:
         try:
             said = json.loads(data)
             operation = said["op"]
             if operation == "fragment":
-                whole = _whole(said, fragments)
+                whole = self._whole(said)
                 if whole is not None:
-                    self._take(whole, arrival_us, now, fragments)
+                    self._take(whole, arrival_us, now)
                 return
             if operation == "publish":
-                hearing, message = self._topics.get(str(said["topic"])), said["msg"]
+                subscription, message = self._subscriptions.get(str(said["topic"])), said["msg"]
         except (ValueError, KeyError, TypeError, RecursionError) as error:
-            self._seldom.warn("malformed", f"{self._url}: a message is no rosbridge message: {error!r}")
+            self._throttled.warn("malformed", f"{self._url}: a message is no rosbridge message: {error!r}")
             return
         if operation == "publish":
-            if hearing is not None:
-                hearing.heard = True
-                # What is latched comes with a subscription, and says nothing of what is published.
-                if self._listener.message(hearing.topic.name, message, data, arrival_us):
-                    hearing.hear(now)
-                    self._patience, self._all_due = self._times.patience_s, now + self._times.patience_s
+            if subscription is not None:
+                subscription.heard = True
+                # A latched message comes with a subscription, and tells nothing of what is published.
+                if self._listener.message(subscription.topic.name, message, data, arrival_us):
+                    subscription.hear(now)
+                    self._heard(now)
         elif operation == "service_response":
             self._listener.answer(said)
         elif operation == "status":
             if said.get("level") in ("error", "warning"):
                 what = str(said.get("msg", ""))[:500]
-                self._seldom.warn(f"server: {what[:80]}", f"{self._url}: the server says: {what}")
+                self._throttled.warn(f"server: {what[:80]}", f"{self._url}: the server says: {what}")
         else:
-            what = f"{self._url}: the server sends the operation {operation!r:.40}, which is not known"
-            self._seldom.warn("unknown", what)
+            what = f"{self._url}: the server sends the unknown operation {operation!r:.40}"
+            self._throttled.warn("unknown", what)
 
-    def _close(self) -> None:
-        with self._lock:
-            socket, self._socket = self._socket, None
-        if socket is not None:
-            socket.shutdown()
+    def _whole(self, said: Mapping[str, Any]) -> bytes | None:
+        """The message that the server has cut because of its length, after its last part."""
+        fragments, number = self._fragments, int(said["num"])
+        if number == 0:
+            fragments.clear()
+        elif number != len(fragments):
+            raise ValueError(f"part {number} of a message came after {len(fragments)} others")
+        fragments.append(str(said["data"]))
+        if len(fragments) < int(said["total"]):
+            return None
+        whole = "".join(fragments).encode()
+        fragments.clear()
+        return whole
 
-    def _say(self, what: str) -> None:
-        """What keeps the connection from being there, once a minute for as long as it is the same."""
-        self._seldom.warn(f"connection: {what[:80]}", f"{self._url}: {what}; trying again")
 
-
-class _Hearing:
-    """What has been heard of one topic, and when it is subscribed to again."""
+class _Subscription:
+    """When a topic was heard, and when it is subscribed to again."""
 
     def __init__(self, topic: Topic, times: Times) -> None:
         self.topic = topic
@@ -304,12 +284,12 @@ class _Hearing:
         self.dark_s = 0.0
         self.heard = False
         self.due = self.ask_again = 0.0
-        # Whether it was heard before, and in this connection.
+        # Whether it was heard at all, and in this connection.
         self._ever = self._going = False
         self._patience = self._times.patience_s
         self._last = 0.0
         self._longest_s = 0.0
-        # Since when nothing came, when the topic was last subscribed to afresh; and when that was.
+        # At the last fresh subscription: since when nothing had come, and the time of it.
         self._doubted: tuple[float, float] | None = None
 
     def connected(self, now: float) -> None:
@@ -339,26 +319,11 @@ class _Hearing:
 
     def resubscribing(self, now: float) -> None:
         if self._ever:
-            # What came before is known, so what comes at once has been there all the time.
+            # The earlier messages are known, so a message that comes at once was published all the time.
             self.resubscribed += 1
             self._doubted = (self._last, now)
         self._patience = min(self._times.max_patience_s, self._patience * 2)
         self.due, self.ask_again = now + self._patience, now + self._times.ask_again_s
-
-
-def _whole(said: Mapping[str, Any], fragments: list[str]) -> bytes | None:
-    """The message that a server has cut because of its length, once its last part is there."""
-    number, total = int(said["num"]), int(said["total"])
-    if number == 0:
-        fragments.clear()
-    elif number != len(fragments):
-        raise ValueError(f"part {number} of a message came after {len(fragments)} others")
-    fragments.append(str(said["data"]))
-    if len(fragments) < total:
-        return None
-    whole = "".join(fragments).encode()
-    fragments.clear()
-    return whole
 
 
 def _load_websocket() -> Any:
@@ -373,7 +338,7 @@ def _load_websocket() -> Any:
 
 
 def _why(error: Exception, library: Any) -> str:
-    """What keeps the connection from being there, in words that help."""
+    """Why there is no connection, in words that help."""
     if isinstance(error, ConnectionRefusedError):
         return "nobody listens there: is rosbridge_server running?"
     if isinstance(error, library.WebSocketBadStatusException):

@@ -1,14 +1,13 @@
-"""What the messages of a rosbridge server consist of, asked of the rosapi node that runs beside it.
+"""The structure of a topic's messages, asked of the rosapi node beside a rosbridge server.
 
-A ROS 1 server gives the definitions' own text (``/rosapi/topics_and_raw_types``), from which the md5sum
-follows as ROS computes it. An older one, and ROS 2, give the fields alone (``/rosapi/message_details``): of
-those a ROS 1 text is written. There the constants are without type and order, so they are left out, and the
-md5sum of a type that has any is not the publisher's.
+A ROS 1 server gives the text of a definition (``/rosapi/topics_and_raw_types``), from which the MD5 follows.
+An older server, and ROS 2, give only the fields (``/rosapi/message_details``), from which a ROS 1 text is
+written. Their constants have no type and no order, so they are left out, and the MD5 of a type with constants
+differs from the publisher's.
 """
 
 from __future__ import annotations
 
-import hashlib
 import json
 import logging
 import re
@@ -16,7 +15,18 @@ from typing import Any, Callable, Generator, Mapping, NamedTuple, Optional, Tupl
 
 from iort_agent.clock import Clock
 from iort_contract.limits import MessageError
-from iort_contract.ros1.definition import DURATION, HEADER_TYPE, LETTERS, STRING, TIME, Definition, parse
+from iort_contract.ros1.definition import (
+    DURATION,
+    HEADER_TYPE,
+    LETTERS,
+    STRING,
+    TIME,
+    VARIABLE,
+    Definition,
+    Field,
+    md5sum,
+    parse,
+)
 
 _log = logging.getLogger(__name__)
 
@@ -27,7 +37,7 @@ AGAIN_S = 30.0
 
 _RULE = "=" * 80
 _BUILTIN = {*LETTERS, STRING, TIME, DURATION}
-# As ROS 2 calls them, where they are called otherwise.
+# ROS 2's names for ROS 1's types.
 _NAMES = {
     "boolean": "bool",
     "octet": "byte",
@@ -36,8 +46,9 @@ _NAMES = {
     "wstring": STRING,
     "builtin_interfaces/Time": TIME,
     "builtin_interfaces/Duration": DURATION,
+    "roslib/Header": HEADER_TYPE,
+    "Header": HEADER_TYPE,
 }
-_HEADER = ("std_msgs/Header", "roslib/Header", "Header")
 _NAME = re.compile(r"[A-Za-z]\w*", re.ASCII)
 _KIND = re.compile(r"[A-Za-z]\w*/[A-Za-z]\w*", re.ASCII)
 
@@ -52,58 +63,50 @@ class Structure(NamedTuple):
 
 
 def from_text(kind: str, text: str) -> Structure:
-    """The structure in a definition's own text. Raises `MessageError` for what is none."""
+    """The structure in a definition's own text. Raises `MessageError` if it is invalid."""
     definition = parse(kind, text)
-    return Structure(kind, md5sum(kind, text), text, definition)
+    return Structure(kind, md5sum(definition, text), text, definition)
 
 
 def from_typedefs(kind: str, typedefs: Any) -> Structure:
-    """The structure in an answer of ``message_details``. Raises `MessageError` for what is none."""
-    kind = ros1_kind(kind)
+    """The structure in an answer of ``message_details``. Raises `MessageError` if it is invalid."""
+    kind = _ros1_kind(kind)
     try:
         bodies = dict(_body(typedef) for typedef in reversed(typedefs))
     except (AttributeError, KeyError, TypeError, ValueError) as error:
-        raise MessageError(
-            f"{kind}: rosapi's answer has not the members of its TypeDef: {error!r}"
-        ) from error
-    bodies = {name: body for name, body in bodies.items() if name not in _BUILTIN}
+        raise MessageError(f"{kind}: rosapi's answer must be TypeDefs: {error!r}") from error
     if kind not in bodies:
         raise MessageError(f"{kind}: rosapi's answer lacks it")
-    nested = [f"{_RULE}\nMSG: {name}\n{body}" for name, body in bodies.items() if name != kind]
+    nested = [
+        f"{_RULE}\nMSG: {name}\n{body}"
+        for name, body in bodies.items()
+        if name != kind and name not in _BUILTIN
+    ]
     return from_text(kind, "".join([bodies[kind], *nested]))
 
 
-def ros1_kind(kind: str) -> str:
-    """The name of a type as ROS 1 has it: ROS 2 puts ``msg`` in the middle."""
+def _ros1_kind(kind: str) -> str:
+    """ROS 1's name of a type: ROS 2 puts ``msg`` in the middle, and has other names for some."""
     package, _, name = kind.partition("/")
-    return f"{package}/{name.rpartition('/')[2]}" if name else kind
+    kind = f"{package}/{name.rpartition('/')[2]}" if name else kind
+    return _NAMES.get(kind, kind)
 
 
 def _body(typedef: Mapping[str, Any]) -> tuple[str, str]:
-    kind = ros1_kind(str(typedef["type"]))
-    kind = HEADER_TYPE if kind in _HEADER else kind
-    kind = _NAMES.get(kind, kind)
+    kind = _ros1_kind(str(typedef["type"]))
     lines = []
     for name, base, length in zip(typedef["fieldnames"], typedef["fieldtypes"], typedef["fieldarraylen"]):
+        # ROS 2 bounds texts and sequences: string<10>, and "double, 3" of a sequence<double, 3>.
+        nested = _ros1_kind(re.sub(r"<.*|,.*", "", base).strip())
+        if nested not in _BUILTIN:
+            _checked(nested, _KIND)
+        # rosapi writes -1 for a single value and 0 for a variable array.
+        count = None if length == -1 else int(length) or VARIABLE
         # ROS 2 gives the names of Python's slots.
-        lines.append(f"{_field_type(base)}{_brackets(length)} {_checked(name.lstrip('_'), _NAME)}\n")
+        lines.append(f"{Field(_checked(name.lstrip('_'), _NAME), nested, count)}\n")
     if kind == HEADER_TYPE and "uint32 seq\n" not in lines:
         lines.insert(0, "uint32 seq\n")
     return kind, "".join(lines)
-
-
-def _field_type(base: str) -> str:
-    # ROS 2 bounds texts and sequences: string<10>, and "double, 3" of a sequence<double, 3>.
-    plain = re.sub(r"<.*|,.*", "", base).strip()
-    kind = HEADER_TYPE if plain in _HEADER else ros1_kind(plain)
-    kind = _NAMES.get(kind, kind)
-    return kind if kind in _BUILTIN else _checked(kind, _KIND)
-
-
-def _brackets(length: Any) -> str:
-    if length == -1:
-        return ""
-    return f"[{int(length) or ''}]"
 
 
 def _checked(name: str, pattern: re.Pattern[str]) -> str:
@@ -112,45 +115,7 @@ def _checked(name: str, pattern: re.Pattern[str]) -> str:
     return name
 
 
-def md5sum(kind: str, text: str) -> str:
-    """The md5sum of a definition, by ROS' rule: the constants, then the fields, nested types by theirs."""
-    first, *others = re.split(r"^={20,}\s*$", text, flags=re.MULTILINE)
-    bodies = {kind: first}
-    for section in others:
-        head, _, body = section.strip().partition("\n")
-        bodies[head[len("MSG:") :].strip()] = body
-    return _md5sum(kind, bodies, {})
-
-
-def _md5sum(kind: str, bodies: Mapping[str, str], done: dict[str, str]) -> str:
-    if kind in done:
-        return done[kind]
-    constants, fields = [], []
-    for line in bodies[kind].splitlines():
-        clean = line.split("#", 1)[0].strip()
-        if "=" in clean:
-            base, name = clean.split("=", 1)[0].split()
-            # Of a text constant everything counts, also what looks like a comment.
-            value = (line if base == STRING else clean).split("=", 1)[1].strip()
-            constants.append(f"{base} {name}={value}")
-        elif clean:
-            base, name = clean.split()
-            bare = base.split("[", 1)[0]
-            if bare in _BUILTIN:
-                fields.append(f"{base} {name}")
-                continue
-            if bare in _HEADER:
-                bare = HEADER_TYPE
-            nested = bare if "/" in bare else f"{kind.partition('/')[0]}/{bare}"
-            fields.append(f"{_md5sum(nested, bodies, done)} {name}")
-    # MD5 is ROS' name for a definition, no secret.
-    done[kind] = hashlib.md5("\n".join(constants + fields).encode()).hexdigest()  # noqa: S324 - as ROS does
-    return done[kind]
-
-
-# --- asking ----------------------------------------------------------------------------------------
-
-# Yields a service and its arguments, is sent the values of the answer, None where there was none.
+# Yields a service and its arguments, and is sent the values of the answer, or None without an answer.
 _Search = Generator[Tuple[str, str], Optional[Mapping[str, Any]], Optional[Structure]]
 Send = Callable[[Mapping[str, Any]], None]
 Found = Callable[[str, Optional[Structure]], None]
@@ -164,12 +129,11 @@ class Rosapi:
         self._found = found
         self._clock = clock
         self._listed: dict[str, tuple[str, str]] = {}
-        # A call's identity -> when it is given up, what it was, and the topics that wait for its answer.
         self._calls: dict[str, _Call] = {}
         self._count = 0
 
     def restart(self) -> None:
-        """Forget what another connection's server said, and what it was asked."""
+        """Forget the answers of another connection's server, and the open calls."""
         self._listed.clear()
         self._calls.clear()
 
@@ -189,7 +153,7 @@ class Rosapi:
         self._go_on(call, values if good else None)
 
     def look(self) -> None:
-        """Give up what is not answered."""
+        """Give up the calls that nobody answers."""
         now = self._clock.monotonic()
         for name, call in list(self._calls.items()):
             if now >= call.due:
@@ -239,10 +203,10 @@ class Rosapi:
         try:
             structure = from_typedefs(kind, values.get("typedefs"))
         except (MessageError, KeyError, ValueError) as error:
-            _log.warning("topic %s: what rosapi says of %s cannot be used: %r", topic, kind, error)
+            _log.warning("topic %s: rosapi's answer for %s cannot be used: %r", topic, kind, error)
             return None
         if any(typedef.get("constnames") for typedef in values["typedefs"]):
-            _log.warning("topic %s: %s has constants, so its md5sum is not its publisher's", topic, kind)
+            _log.warning("topic %s: %s has constants, so its MD5 differs from the publisher's", topic, kind)
         return structure
 
     def _list(self, values: Mapping[str, Any] | None) -> None:
@@ -252,6 +216,8 @@ class Rosapi:
 
 
 class _Call(NamedTuple):
+    """A call: when it is given up, and the topics that wait for its answer."""
+
     service: str
     arguments: str
     due: float

@@ -1,60 +1,47 @@
 """ROS topics over the rosbridge WebSocket protocol, which serves ROS 1 and ROS 2 robots alike.
 
-JSON has no types, so they are asked of the server's rosapi, and each message is made the ROS 1 message that
-it was; it then goes the way of the ROS 1 source. Where rosapi does not answer, a sample is made of the JSON,
-as `iort_agent.sources.flatten` does, and counted as ``structure_not_kept``: a ``uint8[]`` is a text there,
-arrays of more than `MAX_ELEMENTS` and texts that the contract would refuse are left out, unless they are what
-`fields` selects, and a ROS 1 time is named as in ROS 2.
+JSON has no types, so the server's rosapi is asked for them. Each message is made into the ROS 1 message that
+it was, and goes the way of the ROS 1 source. If rosapi does not answer, the structure is `inferred` from the
+JSON; only the sample is sent then, and counted as ``structure_not_kept``.
 """
 
 from __future__ import annotations
 
-import logging
+import socket
 import threading
 from collections import deque
 from dataclasses import dataclass
-from typing import Any, Mapping, Sequence
-from urllib.parse import urlsplit
+from typing import Any, Iterator, Mapping, Sequence
+from urllib.parse import SplitResult, urlsplit
 
 from iort_agent.clock import Clock
-from iort_agent.errors import SourceError
-from iort_agent.ros1.write import Writer
-from iort_agent.schema import Where, choice, items, number, pairs, section, setting, text
-from iort_agent.sources import Emit, ros1
-from iort_agent.sources.flatten import HEADER as HEADER_FIELD
-from iort_agent.sources.flatten import flatten
-from iort_agent.sources.ros1 import ARRIVAL, BELIEVABLE_US, HEADER
+from iort_agent.ros1.json_message import Writer
+from iort_agent.schema import Where, number, pairs, section, setting, text
+from iort_agent.sources import FAIL, OK, Emit, Finding, SourceConfig, intake
+from iort_agent.sources.intake import Intake, Kind
 from iort_agent.sources.rosbridge.connection import TIMES, RosbridgeConnection, Times, Topic
 from iort_agent.sources.rosbridge.continuity import Numbers, Repeats
+from iort_agent.sources.rosbridge.inferred import infer
 from iort_agent.sources.rosbridge.rosapi import AGAIN_S, Rosapi, Structure
-from iort_agent.throttled_log import Seldom
-from iort_contract.limits import MessageError, Value
-from iort_contract.topics import check_stream
+from iort_contract.limits import MessageError
 
-_log = logging.getLogger(__name__)
-
-MAX_ELEMENTS = 64
-_MAX_TEXT = 4096
-# What is kept of a topic until its type is known.
+# Messages of a topic that are kept until its type is known.
 _MAX_HELD, _MAX_HELD_BYTES = 2_000, 8_000_000
+_MAX_INFERRED = 16
+_CHECK_S = 5.0
 
 
 @dataclass(frozen=True)
-class TopicConfig:
-    """What becomes of a topic.
+class TopicConfig(intake.TopicConfig):
+    """How a topic is recorded.
 
-    ``type`` lets the server subscribe before anybody publishes. ``time`` must be said: ``header`` is when
-    it was measured, by the clock of the computer that did; ``arrival`` is when the agent received it, by
-    its own clock. ``fields`` are the paths wanted, or what they begin with (``pose.position``); without
-    it, all. ``throttle_ms`` is the least time between messages, kept by the server.
+    ``type`` lets the server subscribe before anybody publishes. ``time`` is required: ``header`` is the time
+    of the measurement, by the clock of the computer that measured; ``arrival`` is the time of receipt, by the
+    agent's clock. ``fields`` are the wanted paths, or their beginnings (``pose.position``); without it, all.
+    ``throttle_ms`` is the shortest time between messages, kept by the server.
     """
 
-    stream: str = setting(text(check_stream))
-    time: str = setting(choice(HEADER, ARRIVAL))
     type: str | None = setting(text(), default=None)
-    fields: tuple[str, ...] | None = setting(
-        items(text(), at_least=1, what="a list of at least one field"), default=None
-    )
     throttle_ms: int = setting(number(0, 3_600_000, whole=True, unit="ms"), 0)
 
 
@@ -73,7 +60,7 @@ def _websocket_url(value: Any, where: Where) -> str:
 
 
 @dataclass(frozen=True)
-class RosbridgeConfig:
+class RosbridgeConfig(SourceConfig):
     """Topics of a rosbridge server."""
 
     url: str = setting(_websocket_url)
@@ -82,7 +69,7 @@ class RosbridgeConfig:
     )
 
     def streams(self) -> Sequence[str]:
-        """The streams named; several topics may share one."""
+        """The streams of the topics; several topics may share one."""
         return sorted({topic.stream for _, topic in self.topics})
 
     def describe(self) -> str:
@@ -93,6 +80,17 @@ class RosbridgeConfig:
         """Make the source; the connection is made when it runs."""
         return RosbridgeSource(self, clock)
 
+    def check(self, title: str) -> Iterator[Finding]:
+        """Whether somebody listens at the address."""
+        parts: SplitResult = urlsplit(self.url)
+        try:
+            port = parts.port or (443 if parts.scheme == "wss" else 80)
+            socket.create_connection((parts.hostname or "", port), _CHECK_S).close()
+        except OSError as error:
+            yield Finding(title, FAIL, f"{self.url}: {error}", "start rosbridge_server there")
+        else:
+            yield Finding(title, OK, f"{self.url} listens")
+
 
 class RosbridgeSource:
     """Emits each message of the topics; the listener of its connection."""
@@ -100,40 +98,41 @@ class RosbridgeSource:
     def __init__(self, config: RosbridgeConfig, clock: Clock, times: Times = TIMES) -> None:
         self._config = config
         self._clock = clock
-        self._intakes: dict[str, Intake] = {}
+        self._hearings: dict[str, _Hearing] = {}
         topics = [Topic(name, topic.type, topic.throttle_ms) for name, topic in config.topics]
         self.connection = RosbridgeConnection(config.url, clock, topics=topics, listener=self, times=times)
         self._rosapi = Rosapi(self.connection.send, self._found, clock)
-        # Topic -> when its structure is asked for, once something has come; None while it is being asked for.
+        # Topic -> the time to ask for its structure, once a message comes; None while it is being asked for.
         self._ask_at: dict[str, float | None] = {}
 
     def run(self, emit: Emit, stop: threading.Event) -> None:
-        """Be subscribed until ``stop`` is set. Raises `SourceError` without websocket-client."""
+        """Subscribe until ``stop`` is set. Raises `SourceError` without websocket-client."""
         for name, topic in self._config.topics:
-            self._intakes[name] = Intake(name, topic, emit=emit, clock=self._clock)
+            taken = Intake(name, topic, emit=emit, clock=self._clock)
+            self._hearings[name] = _Hearing(topic, taken, self._clock)
         try:
             self.connection.run(stop)
         finally:
-            for intake in self._intakes.values():
-                intake.structure(None)
+            for hearing in self._hearings.values():
+                hearing.structure(None)
 
     def report(self) -> dict[str, Any]:
-        """What became of the messages, by topic."""
+        """The counts of the messages, by topic."""
         return {
-            name: {**intake.report(), **self.connection.report(name)}
-            for name, intake in self._intakes.items()
+            name: {**hearing.report(), **self.connection.report(name)}
+            for name, hearing in self._hearings.items()
         }
 
     def connected(self) -> None:
-        """Another server may know other types: they are asked for again."""
+        """Ask for the types again, since another server may know others."""
         self._rosapi.restart()
-        for intake in self._intakes.values():
-            intake.hold()
-        self._ask_at = dict.fromkeys(self._intakes, 0.0)
+        for hearing in self._hearings.values():
+            hearing.hold()
+        self._ask_at = dict.fromkeys(self._hearings, 0.0)
 
     def subscribed(self, topic: str) -> None:
-        """A topic has been subscribed to."""
-        self._intakes[topic].subscribed()
+        """A subscription begins, with which a latched message may come again."""
+        self._hearings[topic].repeats.subscribed(self._clock.monotonic())
 
     def message(self, topic: str, message: Any, data: bytes, arrival_us: int) -> bool:
         """Take a message; whether it is a new one."""
@@ -141,14 +140,14 @@ class RosbridgeSource:
         if due is not None and self._clock.monotonic() >= due:
             self._ask_at[topic] = None
             self._rosapi.ask(topic, dict(self._config.topics)[topic].type)
-        return self._intakes[topic].take(message, data, arrival_us)
+        return self._hearings[topic].take(message, data, arrival_us)
 
     def answer(self, said: Mapping[str, Any]) -> None:
         """Take an answer, which may be rosapi's."""
         self._rosapi.answer(said)
 
     def look(self) -> None:
-        """Called once a second or so."""
+        """Called about once a second."""
         self._rosapi.look()
 
     def _found(self, topic: str, structure: Structure | None) -> None:
@@ -156,58 +155,49 @@ class RosbridgeSource:
             self._ask_at[topic] = self._clock.monotonic() + AGAIN_S
         else:
             self._ask_at.pop(topic, None)
-        self._intakes[topic].structure(structure)
+        self._hearings[topic].structure(structure)
 
 
-class Intake:
-    """One topic's messages, from JSON to samples."""
+class _Hearing:
+    """One topic's messages, from JSON to the bytes that its intake takes."""
 
-    def __init__(self, topic: str, config: TopicConfig, *, emit: Emit, clock: Clock) -> None:
-        self._topic = topic
+    def __init__(self, config: TopicConfig, taken: Intake, clock: Clock) -> None:
+        self.repeats = Repeats()
         self._config = config
-        self._emit = emit
+        self._intake = taken
         self._clock = clock
-        self._seldom = Seldom(_log, clock)
-        self._repeats = Repeats()
         self._numbers = Numbers()
         self._messages = 0
-        # What came before the structure is known; None where nothing is held.
+        # The messages that came before the structure is known; None if none are held.
         self._held: deque[tuple[Any, int]] | None = None
         self._held_bytes = 0
         self._writer: Writer | None = None
         self._structure: Structure | None = None
         self._header: Mapping[str, str] = {}
-        self._ros1 = ros1.Intake(
-            topic,
-            ros1.TopicConfig(stream=config.stream, time=config.time, fields=config.fields),
-            emit=emit,
-            clock=clock,
-        )
-
-    def subscribed(self) -> None:
-        """A subscription begins, with which a latched message may come again."""
-        self._repeats.subscribed(self._clock.monotonic())
+        self._inferred: dict[str, tuple[Kind, Writer]] = {}
 
     def hold(self) -> None:
-        """Keep the messages until `structure` says what they consist of."""
+        """Keep the messages until `structure` is called."""
         self._held = deque() if self._held is None else self._held
 
     def take(self, message: Any, data: bytes, arrival_us: int) -> bool:
-        """Take a message and the text that it came in; whether it is a new one. Never raises."""
-        stamp = _header(message).get("stamp")
+        """Take a message and its text; whether it is a new one. Never raises."""
+        header = message.get("header") if isinstance(message, dict) else None
+        header = header if isinstance(header, dict) else {}
+        stamp = header.get("stamp")
         stamped = isinstance(stamp, dict) and any(stamp.values())
-        if self._repeats.came_before(data, self._clock.monotonic(), stamped=stamped):
-            self._seldom.warn("latched_again", f"topic {self._topic}: a latched message came again; not sent")
+        if self.repeats.came_before(data, self._clock.monotonic(), stamped=stamped):
+            self._intake.warn("latched_again", "a latched message came again; not sent")
             return False
         self._messages += 1
         if not isinstance(message, dict):
-            self._seldom.warn("malformed", f"topic {self._topic}: a message is {message!r:.60}, no object")
+            self._intake.warn("malformed", f"a message must be an object, got {message!r:.60}")
             return True
-        seq = _header(message).get("seq")
+        seq = header.get("seq")
         if type(seq) is int and not self._config.throttle_ms:
             self._numbers.take(seq)
         if self._held is None:
-            self._emit_message(message, arrival_us)
+            self._record(message, arrival_us)
             return True
         self._held.append((message, arrival_us))
         self._held_bytes += len(data)
@@ -216,7 +206,7 @@ class Intake:
         return True
 
     def structure(self, structure: Structure | None) -> None:
-        """What the messages consist of; None where that is not known, and what was known before holds."""
+        """Set the structure of the messages; None if it is not known, and the one known before stays."""
         if structure is not None and structure != self._structure:
             self._structure, self._writer = structure, Writer(structure.definition)
             self._header = {
@@ -224,110 +214,43 @@ class Intake:
             }  # fmt: skip
         held, self._held, self._held_bytes = self._held, None, 0
         for message, arrival_us in held or ():
-            self._emit_message(message, arrival_us)
+            self._record(message, arrival_us)
 
     def report(self) -> dict[str, Any]:
-        """What became of the messages."""
-        ros = {name: count for name, count in self._ros1.report().items() if count and name != "messages"}
-        counts = {**ros, **self._seldom.counts()}
+        """The counts of the messages."""
+        counts = {name: count for name, count in self._intake.report().items() if count}
         if self._numbers.missed:
             counts["missed"] = self._numbers.missed
-        return {"messages": self._messages, **counts}
+        return {**counts, "messages": self._messages}
 
-    def _emit_message(self, message: dict[str, Any], arrival_us: int) -> None:
-        data = self._bytes(message)
-        if data is None:
-            self._emit_flat(message, arrival_us)
-            return
-        self._ros1.take(self._header, data, arrival_us)
-
-    def _bytes(self, message: dict[str, Any]) -> bytes | None:
-        """The message as ROS 1 had it; None where its type is not known, or another."""
-        writer = self._writer
-        if writer is None:
-            why = "the server does not say what its messages consist of"
-        else:
-            nulls = writer.nulls
+    def _record(self, message: dict[str, Any], arrival_us: int) -> None:
+        why = "the server does not tell the structure of its messages"
+        if self._writer is not None:
             try:
-                data = writer.write(message)
+                data = self._write(self._writer, message)
             except MessageError as error:
                 why = str(error)
             else:
-                if writer.nulls != nulls:
-                    why = "the server sends null for NaN and the infinities; NaN is stored"
-                    self._seldom.warn("not_a_number", f"topic {self._topic}: {why}")
-                return data
-        self._seldom.warn("structure_not_kept", f"topic {self._topic}: {why}; only single values are stored")
-        return None
-
-    def _emit_flat(self, message: dict[str, Any], arrival_us: int) -> None:
+                self._intake.take(self._header, data, arrival_us)
+                return
+        self._intake.warn("structure_not_kept", f"{why}; only single values are stored")
         try:
-            values = self._values(message)
-        except (SourceError, RecursionError) as error:
-            self._seldom.warn("refused", f"topic {self._topic}: {error}")
-            return
-        if not values:
-            self._seldom.warn("empty", f"topic {self._topic}: there is no field in its messages to send")
-            return
-        t_us = _stamp_us(message)
-        if self._config.time == ARRIVAL or t_us is None or abs(t_us - arrival_us) >= BELIEVABLE_US:
-            if self._config.time == HEADER:
-                self._ros1.flag(t_us, arrival_us)
-            t_us = arrival_us
-        self._emit(self._config.stream, t_us, values)
+            definition, normal, stamped = infer(message)
+            key = repr(definition.fields()) + repr(definition.types) + str(stamped)
+            if key not in self._inferred:
+                if len(self._inferred) >= _MAX_INFERRED:
+                    self._inferred.clear()
+                decoder = self._intake.decoder(definition.kind, definition)
+                self._inferred[key] = Kind(None, "", decoder, stamped), Writer(definition)
+            kind, writer = self._inferred[key]
+            self._intake.record(kind, self._write(writer, normal), arrival_us)
+        except (MessageError, RecursionError) as error:
+            self._intake.warn("refused", str(error))
 
-    def _values(self, message: dict[str, Any]) -> dict[str, Value]:
-        wanted = self._config.fields
-        # What is selected may be an element of an array that is left out otherwise.
-        values = flatten(message, _members if wanted else _short_members)
-        if wanted:
-            chosen = {
-                path: value
-                for path, value in values.items()
-                if any(path == name or path.startswith(f"{name}.") for name in wanted)
-            }
-            for name in wanted:
-                if not any(path == name or path.startswith(f"{name}.") for path in chosen):
-                    self._seldom.warn("missing", f"topic {self._topic}: its messages have no field {name}")
-            values = chosen
-        long = [path for path, value in values.items() if isinstance(value, str) and len(value) > _MAX_TEXT]
-        for path in long:
-            del values[path]
-            self._seldom.warn("left_out", f"topic {self._topic}: {path} is too long a text and is left out")
-        return values
-
-
-def _header(message: Any) -> dict[str, Any]:
-    header = message.get(HEADER_FIELD) if isinstance(message, dict) else None
-    return header if isinstance(header, dict) else {}
-
-
-def _stamp_us(message: dict[str, Any]) -> int | None:
-    """The header's stamp; None if it has none."""
-    stamp = _members(_header(message).get("stamp")) or {}
-    sec, nanosec = stamp.get("sec"), stamp.get("nanosec")
-    if type(sec) is not int or type(nanosec) is not int:
-        return None
-    return sec * 1_000_000 + nanosec // 1000
-
-
-def _members(value: Any) -> dict[str, Any] | None:
-    """The fields of a message in JSON, as `flatten` takes them."""
-    if not isinstance(value, dict):
-        return None
-    # Only ROS 1 has these names for the parts of a time.
-    if value.keys() == {"secs", "nsecs"}:
-        return {"sec": value["secs"], "nanosec": value["nsecs"]}
-    return value
-
-
-def _short_members(value: Any) -> dict[str, Any] | None:
-    """As `_members`, without long arrays, which are no telemetry."""
-    fields = _members(value)
-    if fields is None:
-        return None
-    return {
-        name: member
-        for name, member in fields.items()
-        if not (isinstance(member, list) and len(member) > MAX_ELEMENTS)
-    }
+    def _write(self, writer: Writer, message: dict[str, Any]) -> bytes:
+        nulls = writer.nulls
+        data = writer.write(message)
+        if writer.nulls != nulls:
+            why = "the server sends null for NaN and the infinities; NaN is stored"
+            self._intake.warn("not_a_number", why)
+        return data

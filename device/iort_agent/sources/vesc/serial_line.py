@@ -15,16 +15,20 @@ two programs reading one port each get half of the bytes.
 from __future__ import annotations
 
 import errno
+import importlib.util
 import logging
+import os
 import random
+import stat
 import threading
 from dataclasses import dataclass
-from typing import Any, Mapping, Sequence
+from pathlib import Path
+from typing import Any, Iterator, Mapping, Sequence
 
 from iort_agent.clock import Clock
 from iort_agent.errors import SourceError
 from iort_agent.schema import number, setting, text
-from iort_agent.sources import Emit
+from iort_agent.sources import FAIL, OK, Emit, Finding, SourceConfig
 from iort_agent.sources.vesc.protocol import (
     COMM_FW_VERSION,
     COMM_GET_VALUES,
@@ -51,7 +55,7 @@ _REPORT_S = 60.0
 
 
 @dataclass(frozen=True)
-class VescConfig:
+class VescConfig(SourceConfig):
     """A VESC on a serial port.
 
     ``can_id`` asks the controller with that id on the CAN bus, through the one on the port. ``timeout_s``
@@ -77,6 +81,22 @@ class VescConfig:
     def build(self, clock: Clock) -> VescSource:
         """Make the source; the port is opened when it runs."""
         return VescSource(self, clock)
+
+    def check(self, title: str) -> Iterator[Finding]:
+        """Whether pyserial and the port are there, and the port may be opened."""
+        if importlib.util.find_spec("serial") is None:
+            yield Finding(title, FAIL, "Python finds no pyserial", "pip install 'iort-agent[serial]'")
+        port = Path(self.port)
+        if not port.exists():
+            todo = "is the VESC plugged in and switched on? The agent waits for it. `ls /dev/serial/by-id`"
+            yield Finding(title, FAIL, f"{port} is not there", todo)
+        elif not stat.S_ISCHR(port.stat().st_mode):
+            yield Finding(title, FAIL, f"{port} is no serial port")
+        elif not os.access(port, os.R_OK | os.W_OK):
+            todo = "sudo usermod -aG dialout $USER, then log in again"
+            yield Finding(title, FAIL, f"{port} may not be opened", todo)
+        else:
+            yield Finding(title, OK, f"{port} is there")
 
 
 @dataclass

@@ -16,13 +16,14 @@ from rich.text import Text
 
 from iort_contract.catalog.derived import Vehicle
 from iort_contract.limits import ContractError
+from iort_contract.messages.live import decode_live_update
 from iort_contract.tables import ROBOT, T_US
 from iort_station.cli.console import Console
 from iort_station.cli.progress import say
 from iort_station.fleet import registry
 from iort_station.page import keys
 from iort_station.page.listener import Listener
-from iort_station.page.watch import FleetWatch, read
+from iort_station.page.watch import FleetWatch
 
 commands = typer.Typer()
 _REFRESH_S = 0.25
@@ -68,14 +69,15 @@ class _Lines:
 
     def take(self, update: Any, _pubnub_us: int, now_us: int) -> None:
         try:
-            robot, sample, stamps = read(update)
+            heard = decode_live_update(update)
         except ContractError as error:
-            say(f"an update that is none: {error}")
+            say(f"an invalid update: {error}")
             return
-        delay_ms = (now_us - stamps["sent_us"] - stamps["offset_us"]) / 1000
-        line = {ROBOT: robot, "stream": update["stream"], T_US: stamps["t_us"], "delay_ms": delay_ms}
+        live = heard.live
+        delay_ms = (now_us - live.sent_us - (live.offset_us or 0)) / 1000
+        line = {ROBOT: heard.robot, "stream": heard.stream, T_US: live.t_us, "delay_ms": delay_ms}
         try:
-            print(json.dumps({**line, "sample": sample}), flush=True)
+            print(json.dumps({**line, "sample": live.sample}), flush=True)
         except BrokenPipeError:
             # Python would complain once more at its end, when it flushes.
             os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())

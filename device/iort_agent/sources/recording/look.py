@@ -1,4 +1,4 @@
-"""Looks into a recording as far as it takes to know that it can be played."""
+"""Looks into a recording as far as needed to know that it can be played."""
 
 from __future__ import annotations
 
@@ -6,28 +6,28 @@ import threading
 from typing import NamedTuple
 
 from iort_agent.errors import SourceError
-from iort_agent.sources.recording.bag import BagSource
+from iort_agent.sources.recording.player import Open
 from iort_contract.catalog.streams import TYPES_STREAM
 
 
 class Looked(NamedTuple):
-    """The streams of which a message was read; whether the recording ended before all wanted ones were; and
-    what is wrong with it, empty where nothing is known to be."""
+    """``streams`` have a message; ``ended`` is true if the recording ended before all wanted streams had one;
+    ``error`` is empty if nothing is wrong."""
 
     streams: list[str]
     ended: bool
     error: str
 
 
-def look_into(source: BagSource, wanted: set[str], within_s: float) -> Looked:
-    """Open the recording and read until a message of every wanted stream has come, or the time is over."""
+def look_into(recording: Open, wanted: set[str], within_s: float) -> Looked:
+    """Read until every wanted stream has a message, or the time is over."""
     streams: set[str] = set()
     errors: list[str] = []
     ended, done, stop = threading.Event(), threading.Event(), threading.Event()
 
     def look() -> None:
         try:
-            with source.open() as messages:
+            with recording() as messages:
                 for message in messages:
                     if message.stream != TYPES_STREAM:
                         streams.add(message.stream)
@@ -36,12 +36,12 @@ def look_into(source: BagSource, wanted: set[str], within_s: float) -> Looked:
                 ended.set()
         except SourceError as error:
             errors.append(str(error))
-        except Exception as error:  # noqa: BLE001 - whatever a bag library raises
+        except Exception as error:  # noqa: BLE001 - a bag library may raise anything
             errors.append(f"{type(error).__name__}: {error}")
         finally:
             done.set()
 
-    # A large index is read in one go, which nothing but the end of the process can break off.
+    # A large index is read in one call, which only the end of the process can interrupt.
     threading.Thread(target=look, name="check", daemon=True).start()
     done.wait(within_s)
     stop.set()

@@ -1,0 +1,55 @@
+"""rospy and the message types that are installed on this machine. Nothing here is imported before it is
+used."""
+
+from __future__ import annotations
+
+import importlib
+import sys
+from typing import Any, NamedTuple
+
+from iort_agent.errors import SourceError
+
+_HELP = (
+    "the agent's Python cannot import rospy. ROS 1 installs it for the system's Python only: "
+    "`source /opt/ros/noetic/setup.bash` (Debian: apt install python3-rospy), then "
+    "`/usr/bin/python3 -m venv --system-site-packages <folder>` and install the agent into that"
+)
+
+
+class Installed(NamedTuple):
+    """An installed message type: its genpy class, and the text of its definition."""
+
+    message_class: Any
+    text: str
+
+
+def rospy() -> Any:
+    """rospy, imported afresh after a shutdown, because a node can begin only once for each import.
+
+    Raises `SourceError` without rospy.
+    """
+    core = sys.modules.get("rospy.core")
+    if core is not None and core.is_shutdown_requested():
+        for module in [name for name in sys.modules if name.partition(".")[0] == "rospy"]:
+            del sys.modules[module]
+    try:
+        return importlib.import_module("rospy")
+    except ImportError as error:
+        raise SourceError(f"{_HELP} ({error})") from error
+
+
+def installed(kind: str) -> Installed:
+    """The installed type of a name. Raises `SourceError` if it is not installed."""
+    try:
+        found = importlib.import_module("roslib.message").get_message_class(kind)
+    except ImportError as error:
+        raise SourceError(f"{_HELP} ({error})") from error
+    except Exception as error:
+        raise SourceError(f"the ROS message type {kind} cannot be loaded: {error}") from error
+    if found is None:
+        package = kind.partition("/")[0]
+        raise SourceError(
+            f"the ROS message type {kind} is not installed: build its package, {package}, and source the "
+            f"workspace, or apt install python3-{package.replace('_', '-')}"
+        )
+    return Installed(found, found._full_text)  # noqa: SLF001 - genpy's own name for it

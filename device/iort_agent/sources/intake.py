@@ -1,0 +1,246 @@
+"""One ROS topic's messages, from their bytes to samples, wherever the bytes come from.
+
+Messages are recorded as published, so that an export gives what was published, whatever the type is. Only
+selected fields are decoded here. This module needs no ROS.
+"""
+
+from __future__ import annotations
+
+import logging
+import threading
+from dataclasses import dataclass
+from typing import Any, Mapping, NamedTuple, Optional
+
+from iort_agent.clock import Clock
+from iort_agent.errors import SourceError
+from iort_agent.ros1.types import installed
+from iort_agent.schema import choice, items, setting, text
+from iort_agent.sources import REFUSE, UPLOAD, Emit
+from iort_agent.throttled_log import Seldom
+from iort_contract.catalog.streams import TYPES_STREAM
+from iort_contract.limits import ContractError, MessageError, Value
+from iort_contract.messages.message_type import MessageType
+from iort_contract.ros1.decode import Decoder, stamp_ns
+from iort_contract.ros1.definition import Definition, parse
+from iort_contract.ros1.message import RosMessage, RosType
+from iort_contract.topics import check_stream
+
+_log = logging.getLogger(__name__)
+
+HEADER, ARRIVAL = "header", "arrival"
+# A stamp further from the wall clock comes from a clock that is not set, or from a simulation.
+BELIEVABLE_US = 3600 * 1_000_000
+_SILENT_S = 5.0
+# A topic changes its definition when somebody rebuilds a package, not all the time.
+_MAX_KINDS = 32
+_MAX_PUBLISHERS = 32
+# The MD5 of a type without fields, whose definition may be empty.
+_MD5_OF_NOTHING = "d41d8cd98f00b204e9800998ecf8427e"
+
+
+@dataclass(frozen=True)
+class TopicConfig:
+    """How a topic is recorded.
+
+    ``time`` is required: ``header`` is the time of the measurement, by the clock of the computer that
+    measured; ``arrival`` is the time of receipt, by the agent's clock. A message that a latching publisher
+    repeats to a new connection is left out in both cases, and counted as ``latched_again``. ``fields`` are
+    the wanted paths, or their beginnings (``pose.position``); without it, all.
+    """
+
+    stream: str = setting(text(check_stream))
+    time: str = setting(choice(HEADER, ARRIVAL))
+    fields: tuple[str, ...] | None = setting(
+        items(text(), at_least=1, what="a list of at least one field"), default=None
+    )
+
+
+class Kind(NamedTuple):
+    """A type of the topic's messages.
+
+    ``whole`` is None if the messages are not recorded as published. ``decoder`` is for selected fields, and
+    for bytes that are stored elsewhere.
+    """
+
+    whole: Optional[RosType]  # noqa: UP045 - a NamedTuple's types are evaluated, on Python 3.8 too
+    text: str
+    decoder: Optional[Decoder]  # noqa: UP045 - as above
+    stamped: bool
+
+
+class Intake:
+    """Takes one topic's messages. Safe to use from several threads."""
+
+    def __init__(
+        self, topic: str, config: TopicConfig, *, emit: Emit, clock: Clock, large: str = REFUSE
+    ) -> None:
+        self.sim_time = False
+        self.throttled = Seldom(_log, clock)
+        self._topic = topic
+        self._config = config
+        self._large = large == UPLOAD
+        self._emit = emit
+        self._clock = clock
+        self._header: Mapping[str, str] | None = None
+        # Publisher -> its connection, whose type has been sent.
+        self._connections: dict[str, Mapping[str, str]] = {}
+        self._kind: Kind | None = None
+        self._kinds: dict[tuple[str, str], Kind] = {}
+        # Publisher -> its connection, and the last message that came by it.
+        self._latched: dict[str, tuple[Mapping[str, str], bytes]] = {}
+        self._lock = threading.Lock()
+        self._messages = self._seen = 0
+        self._heard = clock.monotonic()
+        self._silent = False
+
+    def take(self, header: Mapping[str, str], data: bytes, arrival_us: int | None = None) -> None:
+        """Take a message with the header of its connection; ``arrival_us`` is now unless given. Never
+        raises."""
+        if arrival_us is None:
+            arrival_us = self._clock.now_us()
+        if header.get("latching") == "1" and self._came_before(header, data):
+            self.warn("latched_again", "a latched message came again; not sent")
+            return
+        self._messages += 1
+        # Two publishers of one topic are two threads; almost always there is one.
+        with self._lock:
+            if header is not self._header:
+                self._turn_to(header, arrival_us)
+            kind = self._kind
+        assert kind is not None
+        self.record(kind, data, arrival_us)
+
+    def record(self, kind: Kind, data: bytes, arrival_us: int) -> None:
+        """Emit a message of a type."""
+        t_us = None
+        if kind.stamped and self._config.time == HEADER:
+            t_ns = stamp_ns(data)
+            t_us = None if t_ns is None else t_ns // 1000
+        values = self._sample(kind, data)
+        if t_us is None or self.sim_time or not -BELIEVABLE_US < t_us - arrival_us < BELIEVABLE_US:
+            if self._config.time == HEADER:
+                self._warn_of_stamp(t_us, arrival_us)
+            t_us = arrival_us
+        if values is not None:
+            self._emit(self._config.stream, t_us, values)
+
+    def warn(self, reason: str, why: str) -> None:
+        """Count and log something about the topic's messages."""
+        self.throttled.warn(reason, f"topic {self._topic}: {why}")
+
+    def look(self, connections: int) -> None:
+        """Log when the topic falls silent, and when it is heard again."""
+        now = self._clock.monotonic()
+        if self._messages != self._seen:
+            self._seen, self._heard = self._messages, now
+            if self._silent:
+                _log.info("topic %s is heard again", self._topic)
+            self._silent = False
+        elif not self._silent and now - self._heard >= _SILENT_S:
+            self._silent = True
+            there = f"connected to {connections} publisher(s)" if connections else "nobody publishes it"
+            _log.warning("topic %s has been silent for %g s: %s", self._topic, _SILENT_S, there)
+
+    def report(self) -> dict[str, Any]:
+        """The counts of the topic's messages."""
+        left_out: dict[str, int] = {}
+        # A message that is recorded whole has everything, whatever its view leaves out.
+        for kind in list(self._kinds.values()) if self._config.fields else ():
+            for path, count in kind.decoder.left_out.items() if kind.decoder is not None else ():
+                left_out[path] = left_out.get(path, 0) + count
+        counts = {"messages": self._messages, "silent": self._silent, "left_out": left_out}
+        return {**counts, **self.throttled.counts()}
+
+    def decoder(self, kind: str, definition: Definition) -> Decoder:
+        """The decoder of a type, for the selected fields."""
+        decoder = Decoder(definition, select=self._config.fields, large=self._large)
+        if decoder.unknown:
+            _log.warning("topic %s: %s has no field %s", self._topic, kind, ", ".join(decoder.unknown))
+        return decoder
+
+    def _sample(self, kind: Kind, data: bytes) -> Mapping[str, Value] | None:
+        """The message, or the selected fields."""
+        values: dict[str, Any] = {}
+        if kind.decoder is not None:
+            try:
+                values = kind.decoder.decode(data)
+            except MessageError as error:
+                if kind.whole is None or self._config.fields:
+                    self.warn("malformed", str(error))
+                    return None
+                self.warn("undecodable", f"kept as it is: {error}")
+        if kind.whole is not None and (kind.decoder is None or not self._config.fields):
+            contents = {name: value for name, value in values.items() if isinstance(value, bytes) and value}
+            return RosMessage(data, kind.whole, large=contents)
+        if not values:
+            self.warn("empty", "its messages have no field to send")
+            return None
+        return values
+
+    def _came_before(self, header: Mapping[str, str], data: bytes) -> bool:
+        """Whether a latching publisher repeats the message to a new connection: old data, whatever its
+        time."""
+        publisher = header.get("callerid", "")
+        with self._lock:
+            connection, last = self._latched.get(publisher, (header, b""))
+            if publisher not in self._latched and len(self._latched) >= _MAX_PUBLISHERS:
+                self._latched.clear()
+            self._latched[publisher] = header, data
+        return connection is not header and last == data
+
+    def _turn_to(self, header: Mapping[str, str], t_us: int) -> None:
+        """Take the messages of another connection, which may be a new one."""
+        self._kind = kind = self._kind_of(header)
+        self._header = header
+        publisher = header.get("callerid", "")
+        if self._connections.get(publisher) is header:
+            return
+        if len(self._connections) >= _MAX_PUBLISHERS:
+            self._connections.clear()
+        self._connections[publisher] = header
+        named = header.get("type", ""), header.get("md5sum", "")
+        message_type = MessageType(self._config.stream, self._topic, *named, kind.text)
+        try:
+            self._emit(TYPES_STREAM, t_us, message_type.sample())
+        except ContractError as error:
+            _log.warning("topic %s: its type is not recorded: %s", self._topic, error)
+
+    def _kind_of(self, header: Mapping[str, str]) -> Kind:
+        key = (header.get("type", ""), header.get("md5sum", ""))
+        known, text = self._kinds.get(key), header.get("message_definition", "")
+        # One of two publishers may have sent no definition, and the other sends it.
+        if known is None or key[1] == "*" or (not known.text.strip() and text.strip()):
+            if len(self._kinds) >= _MAX_KINDS:
+                self._kinds.clear()
+            self._kinds[key] = self._make_kind(*key, text)
+        return self._kinds[key]
+
+    def _make_kind(self, kind: str, md5sum: str, text: str) -> Kind:
+        decoder, stamped, why = None, False, ""
+        _log.info("topic %s: %s, %s", self._topic, kind, md5sum)
+        try:
+            # Some small clients send no definition; then only the installed class has it.
+            if not text.strip() and md5sum != _MD5_OF_NOTHING:
+                text = installed(kind).text
+            definition = parse(kind, text)
+            stamped = definition.stamped()
+            if self._config.fields or self._large:
+                decoder = self.decoder(kind, definition)
+        except (MessageError, SourceError) as error:
+            why = str(error)
+        whole = RosType(self._topic, kind, md5sum, text)
+        if why or whole.error:
+            self.warn(
+                "undecodable", f"its messages are kept, but cannot be looked into: {why or whole.error}"
+            )
+        return Kind(whole, text, decoder, stamped)
+
+    def _warn_of_stamp(self, t_us: int | None, arrival_us: int) -> None:
+        if t_us is None:
+            reason, why = "no_stamp", "its messages have no header, so they have no time"
+        elif self.sim_time:
+            reason, why = "unbelieved_stamps", "its time is a simulation's (/use_sim_time)"
+        else:
+            off_s = (t_us - arrival_us) / 1e6
+            reason, why = "unbelieved_stamps", f"its stamps are {off_s:.0f} s off the clock"
+        self.warn(reason, f"{why}; using the time of arrival")

@@ -1,0 +1,170 @@
+"""docs/how-to-extend.md works: each way is followed in a copy of the checkout, with the page's own blocks."""
+
+from __future__ import annotations
+
+import json
+import os
+import re
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from scripts.docs_parts import ROOT
+
+PAGE = (ROOT / "docs" / "how-to-extend.md").read_text()
+SECTIONS = dict(re.findall(r"^## (.*?)\n(.*?)(?=^## |\Z)", PAGE, re.DOTALL | re.MULTILINE))
+BLOCK = re.compile(r"^```(\w+)\n(.*?)^```$", re.DOTALL | re.MULTILINE)
+FOLDERS = (
+    "bench",
+    "contract",
+    "device",
+    "docs",
+    "functions",
+    "local",
+    "scripts",
+    "stacks",
+    "station",
+    "tests",
+)
+SKIPPED = ("__pycache__", "*.egg-info", "build", "built", "images", "bench-*", "node_modules")
+
+
+class Copy:
+    """A copy of the checkout."""
+
+    def __init__(self, root: Path) -> None:
+        self.root = root
+        for name in FOLDERS:
+            shutil.copytree(ROOT / name, root / name, ignore=shutil.ignore_patterns(*SKIPPED))
+        for name in ("README.md", "app.py", "cdk.json"):
+            shutil.copy(ROOT / name, root / name)
+
+    def follow(self, section: str) -> list[str]:
+        """Apply a section's blocks; returns the paths of the files that it touched."""
+        touched = []
+        for kind, text in BLOCK.findall(SECTIONS[section]):
+            head, _, body = text.partition("\n")
+            if kind == "diff":
+                path = head.removeprefix("--- ")
+                self._insert(self.root / path, body.splitlines())
+            elif kind == "python":
+                path = head.removeprefix("# ")
+                assert not (self.root / path).exists()
+                (self.root / path).write_text(body)
+            else:
+                continue
+            touched.append(path)
+        assert touched
+        return touched
+
+    def _insert(self, file: Path, lines: list[str]) -> None:
+        before = "".join(f"{line[1:]}\n" for line in lines if line[:1] == " ")
+        after = "".join(f"{line[1:]}\n" for line in lines)
+        text = file.read_text()
+        assert text.count(before) == 1, f"{file} must have once:\n{before}"
+        file.write_text(text.replace(before, after))
+
+    def run(self, *command: str) -> str:
+        """What a Python command prints, with the copy's packages."""
+        path = [str(self.root / name) for name in ("", "contract", "device", "station")]
+        environment = {
+            **os.environ,
+            "PYTHONPATH": os.pathsep.join(path),
+            "AWS_DEFAULT_REGION": "eu-central-1",
+        }
+        done = subprocess.run(
+            [sys.executable, *command],
+            check=False,
+            cwd=self.root,
+            env=environment,
+            capture_output=True,
+            text=True,
+            timeout=120,
+        )
+        assert done.returncode == 0, done.stderr
+        return done.stdout
+
+    def show(self, expression: str, *imports: str) -> object:
+        """The value of an expression, in a process that has the copy's packages."""
+        program = "\n".join([*imports, "import json", f"print(json.dumps({expression}))"])
+        return json.loads(self.run("-c", program))
+
+
+@pytest.fixture
+def copy(tmp_path: Path) -> Copy:
+    return Copy(tmp_path / "checkout")
+
+
+def test_the_page_has_a_way_for_each_thing() -> None:
+    assert set(re.findall(r"^\| \[(.*?)\]", PAGE, re.MULTILINE)) == {name.lower() for name in SECTIONS}
+
+
+def test_a_field(copy: Copy) -> None:
+    assert len(set(copy.follow("A field"))) == 1
+    assert copy.show("unit('vesc', 'temp_battery_max')", "from iort_station.data.units import unit") == "degC"
+    hottest = "from iort_contract.catalog.vesc import hottest_degc"
+    assert copy.show("hottest_degc({'temp_battery': 81.5, 'temp_fet': 40})", hottest) == 81.5
+    copy.run("-m", "scripts.docs_parts")
+    assert "| `temp_battery` | degC |" in (copy.root / "README.md").read_text()
+    assert '"temp_battery"' in (copy.root / "station/web/src/base/contract.ts").read_text()
+
+
+def test_a_derived_field(copy: Copy) -> None:
+    assert len(set(copy.follow("A derived field"))) == 1
+    columns = "{'duty_cycle': [0.5, None], 'voltage_input': [12.0, 12.0], 'current_motor': [10, 10]}"
+    batch = f"Batch('0badcafe', 0, [1_000_000, 1_020_000], {columns})"
+    second = copy.show(
+        f"summarize_second(1, [{batch}], None)",
+        "from iort_contract.messages.batch import Batch",
+        "from iort_contract.statistics import summarize_second",
+    )
+    assert isinstance(second, dict)
+    assert second["motor_power_w"] == [60.0]
+    arrays = "{name: np.array(column, dtype=float) for name, column in " + columns + ".items()}"
+    found = copy.show(
+        f"values(derive({arrays}, None)['motor_power_w'])",
+        "import numpy as np",
+        "from iort_station.data.conditions import derive, values",
+    )
+    assert found == [60.0, None]
+    needs = "select('car', 'vesc', where='motor_power_w > 5').needs('duty_cycle')"
+    assert copy.show(needs, "from iort_station.data.selection import select") is True
+    copy.run("-m", "scripts.docs_parts")
+    formula = "`duty_cycle * voltage_input * current_motor`"
+    assert f"| {formula} |" in (copy.root / "README.md").read_text()
+    assert "export const motor_power_w = " in (copy.root / "station/web/src/base/contract.ts").read_text()
+
+
+def test_a_verb(copy: Copy) -> None:
+    assert len(set(copy.follow("A verb"))) == 2
+    iort = "from iort_station.cli.main import main; main()"
+    assert "speed\terpm\n" in copy.run("-c", iort, "fields")
+    assert "List the known fields of a stream" in copy.run("-c", iort, "--help")
+
+
+def test_a_source(copy: Copy, tmp_path: Path) -> None:
+    assert len(set(copy.follow("A source"))) == 2
+    (section,) = (text for kind, text in BLOCK.findall(SECTIONS["A source"]) if kind == "yaml")
+    for name in ("certificate.pem", "private.key"):
+        (tmp_path / name).touch()
+    keys = "robot: car\nendpoint: example.com\ncertificate: certificate.pem\nprivate_key: private.key\n"
+    (tmp_path / "car.yaml").write_text(keys + section)
+    found = copy.show(
+        "run()",
+        "import threading",
+        "from pathlib import Path",
+        "from iort_agent.clock import SystemClock",
+        "from iort_agent.config.file import load_config",
+        "def run():",
+        f"    (source,) = load_config(Path({str(tmp_path / 'car.yaml')!r})).sources",
+        "    stop, samples = threading.Event(), []",
+        "    def emit(stream, t_us, sample):",
+        "        samples.append((stream, sorted(sample)))",
+        "        stop.set()",
+        "    source.build(SystemClock()).run(emit, stop)",
+        "    return samples",
+    )
+    assert found == [["clock", ["second_of_day"]]]
