@@ -6,6 +6,7 @@ and many batches at a time: the same checks, twice as fast.
 
 from __future__ import annotations
 
+from array import array
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from itertools import chain, groupby
@@ -181,7 +182,8 @@ def decode_each(run: Iterable[Opened], refused: RefusedItems, wanted: Wanted) ->
 def decode_together(run: Sequence[Opened], names: Sequence[str]) -> Block:
     """The numpy back end: batches of the same fields; raises `ContractError` if any is invalid."""
     counts = [len(batch.times_us) for batch in run]
-    times = np.fromiter(chain.from_iterable(batch.times_us for batch in run), dtype=np.int64)
+    times_us = chain.from_iterable(batch.times_us for batch in run)
+    times = np.fromiter(times_us, dtype=np.int64, count=sum(counts))
     return Block(times, {name: _column(name, [b.written[name] for b in run], counts) for name in names})
 
 
@@ -206,10 +208,11 @@ def _from_steps(name: str, written: Sequence[list[Any]]) -> Column:
     numpy sums all of them at once; then each column loses the sum of those before it. int64 sums are exact
     modulo 2**64, and a valid column's sums stay within 53 bits.
     """
-    steps = np.array(list(chain.from_iterable(written)))
-    # Booleans count as 1 and 0, as in the lists.
-    if steps.dtype != np.int64:
-        raise not_integers(name)
+    try:
+        # An array takes integers and booleans only, and is faster than numpy at that.
+        steps = np.frombuffer(array("q", list(chain.from_iterable(written))), dtype=np.int64)
+    except (TypeError, OverflowError) as error:
+        raise not_integers(name) from error
     lengths = np.fromiter(map(len, written), dtype=np.int64)
     starts = np.cumsum(lengths) - lengths
     decimals = steps[starts]

@@ -81,7 +81,7 @@ def test_a_query_that_fails_says_so(status: str) -> None:
 
 def test_nothing_else_can_be_asked_of_the_logs() -> None:
     for number in (0, 2):
-        with pytest.raises(StationError, match="none of logs"):
+        with pytest.raises(StationError, match="not a log widget"):
             cloudwatch_logs.rows(Insights(), NAME, number, minutes=15)
     with pytest.raises(StationError, match="must name a log group"):
         cloudwatch_logs.rows(
