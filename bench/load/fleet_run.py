@@ -22,13 +22,14 @@ from bench.load.fleet_load import SAMPLES as BATCH_SAMPLES
 from bench.load.fleet_load import Load
 from bench.meters import usage
 from bench.report.result import Table
-from iort_contract.attributes import plain
 from iort_contract.catalog.vesc import VESC_STREAM
 from iort_contract.messages.batch import batch_id
-from iort_contract.tables import BATCH, RECEIVED_MS, SAMPLES, SECOND
+from iort_contract.tables import BATCH, RECEIVED_MS, SECOND
 from iort_station.cloud import Cloud
-from iort_station.data.items import of_topic
+from iort_station.data.batches import summary_table, topic_of
 from iort_station.fleet import robots
+from iort_station.operations import delivery
+from iort_station.operations.audit import headers
 from local.cloud import EmbeddedCloud
 from local.figures import Spread
 
@@ -228,7 +229,7 @@ class _Stored:
 
 
 def _stored(cloud: Cloud, robot: str, sent_ms: Sequence[int]) -> _Stored:
-    return _Stored(list(_items(cloud, "TelemetryTable", robot, BATCH, RECEIVED_MS)), sent_ms)
+    return _Stored(list(headers(cloud, robot, VESC_STREAM)), sent_ms)
 
 
 def _summarized(cloud: Cloud, expected: dict[str, int]) -> int:
@@ -244,7 +245,7 @@ def _summarized(cloud: Cloud, expected: dict[str, int]) -> int:
             ends = _ends(cloud, name)
             over = time.monotonic() - since > _CATCH_UP_S
             if over or (ends and (ends[1] - ends[0] + 1) * BATCH_SAMPLES >= samples):
-                counted = sum(int(item[SAMPLES]) for item in _items(cloud, "SummaryTable", name, SAMPLES))
+                counted = delivery.samples_summarized(cloud, name, VESC_STREAM)
             if counted >= samples or over:
                 break
             if looked_at != (counted, ends):
@@ -257,15 +258,6 @@ def _summarized(cloud: Cloud, expected: dict[str, int]) -> int:
 
 def _ends(cloud: Cloud, robot: str) -> list[int]:
     """Return the first and the last summarised second of a robot; empty if it has none."""
-    query, seconds = (
-        cloud.client("dynamodb").query,
-        of_topic(cloud, "SummaryTable", robot, VESC_STREAM, SECOND),
-    )
-    answers = (query(**seconds, ScanIndexForward=forward, Limit=1) for forward in (True, False))
-    return [int(item[SECOND]["N"]) for answer in answers for item in answer["Items"]]
-
-
-def _items(cloud: Cloud, table: str, robot: str, *fields: str) -> Iterator[dict[str, Any]]:
-    pages = cloud.client("dynamodb").get_paginator("query")
-    for page in pages.paginate(**of_topic(cloud, table, robot, VESC_STREAM, *fields)):
-        yield from map(plain, page["Items"])
+    table, topic = summary_table(cloud), topic_of(cloud, robot, VESC_STREAM)
+    ends = (table.first(topic, newest=newest, attributes=(SECOND,)) for newest in (False, True))
+    return [int(item[SECOND]["N"]) for item in ends if item is not None]
