@@ -16,7 +16,8 @@ import time
 from pathlib import Path
 from statistics import quantiles
 
-from bench.ros.vesc_message import DEFINITION, TYPE, body
+from bench.ros.mixed_robot import topics
+from bench.ros.vesc_message import TYPE, body
 from iort_agent.agent import Agent
 from iort_agent.clock import SystemClock
 from iort_agent.config import Config
@@ -45,7 +46,7 @@ def main() -> None:
         spool = make_spool(config.queue, clock)
         agent = Agent(config, uplink=uplink, spool=spool, clock=clock)
         intake = Intake("/sensors/core", TopicConfig("vesc", "header"), emit=agent.streams.emit, clock=clock)
-        header = {"type": TYPE, "md5sum": "bench", "message_definition": DEFINITION}
+        header = {"type": TYPE, "md5sum": "bench", "message_definition": topics()["/sensors/core"].definition}
         cycles = []
         for i in range(samples):
             now_ns = time.time_ns()
