@@ -247,10 +247,12 @@ class IotCore:
     def _on_connected(self, _: Any) -> None:
         keep_state()
         send_at_once(self._port)
+        self._switch(connected=True)
         self._connects += 1
         self._causes.connected()
         _log.info("connected to %s as %s", self._endpoint, self._client_id)
-        self._switch(connected=True)
+        self._dispatcher.post(self._subscriptions.renew)
+        self._tell(connected=True)
 
     def _on_refused(self, data: Any) -> None:
         if not self._stop.is_set():
@@ -287,13 +289,14 @@ class IotCore:
         else:
             self._last_error = said(packet) if packet is not None else explain(data.exception)
             _log.warning("connection to %s lost: %s", self._endpoint, self._last_error)
+        self._tell(connected=False)
         self._down.set()
 
     def _switch(self, *, connected: bool) -> None:
         self._connected = connected
         self._since = self._clock.monotonic()
-        if connected:
-            self._dispatcher.post(self._subscriptions.renew)
+
+    def _tell(self, *, connected: bool) -> None:
         for handler in self._handlers:
             self._dispatcher.post(functools.partial(handler, connected))
 
