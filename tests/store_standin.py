@@ -22,7 +22,7 @@ from iort_contract.messages.files import (
     part_range,
 )
 from iort_contract.topics import FILE, PING, PONG, build_topic
-from local.certificates import Identity
+from local.certificates import Authority
 from tests.agent_fakes import Loopback
 
 
@@ -122,7 +122,7 @@ class _Server(http.server.ThreadingHTTPServer):
 @contextmanager
 def store(uplink: Loopback, folder: Path) -> Iterator[tuple[Store, Path]]:
     """The stand-in, and the certificate to trust."""
-    certificate, key = Identity.make("store", "127.0.0.1").write(folder, "store")
+    certificate, key = Authority().write(folder, "store", "127.0.0.1")
     context = ssl.SSLContext(ssl.PROTOCOL_TLS_SERVER)
     context.load_cert_chain(certificate, key)
     with _Server(("127.0.0.1", 0), _Handler) as server:

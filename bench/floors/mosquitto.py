@@ -16,7 +16,7 @@ import yaml
 from typing_extensions import Self
 
 from bench.errors import BenchError
-from local.certificates import Identity
+from local.certificates import Authority
 
 HOST = "127.0.0.1"
 # The robot that `Mosquitto.car` configures.
@@ -49,7 +49,7 @@ class Mosquitto:
 
     def __init__(self, program: str, folder: Path) -> None:
         self._program, self._folder = program, folder
-        self._authority = Identity.make("iort bench", HOST, authority=True)
+        self._authority = Authority()
         with socket.socket() as probe:
             probe.bind((HOST, 0))
             self.port = int(probe.getsockname()[1])
@@ -60,7 +60,7 @@ class Mosquitto:
         return self._folder / "ca.pem"
 
     def __enter__(self) -> Self:
-        self._authority.write(self._folder, "ca")
+        self._authority.write_own(self.ca)
         self.identity("broker")
         config = self._folder / "mosquitto.conf"
         config.write_text(_SETTINGS.format(port=self.port, host=HOST, folder=self._folder))
@@ -87,7 +87,7 @@ class Mosquitto:
 
     def identity(self, name: str) -> tuple[Path, Path]:
         """A new certificate and its key, as files."""
-        return Identity.make(name, HOST, signer=self._authority).write(self._folder, name)
+        return self._authority.write(self._folder, name, HOST)
 
     def car(self, topics: Mapping[str, Mapping[str, str]]) -> Path:
         """Write and return the configuration of an agent that subscribes to these topics of ROS 1."""
