@@ -37,6 +37,7 @@ from iort_contract.topics import FILE, LAMBDA, LIVE, PING, build_topic
 from iort_station.cloud import EMBEDDED, Cloud, without_proxy
 from iort_station.page import keys
 from iort_station.page.keys import PubNubKeys
+from local import patched
 from local.certificates import Authority
 from local.deployment import ROOT, deploy
 from local.errors import LocalError
@@ -182,6 +183,7 @@ class EmbeddedCloud:
             "MINISTACK_SSL_KEY": str(key),
             "AWS_CA_BUNDLE": str(certificate),
             "PYTHONDONTWRITEBYTECODE": "1",
+            "PYTHONPATH": str(patched.folder()),
         }
         self.emulator = Child(
             "the emulator",

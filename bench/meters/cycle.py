@@ -16,7 +16,8 @@ import time
 from pathlib import Path
 from statistics import quantiles
 
-from bench.ros.vesc_message import DEFINITION, TYPE, body
+from bench.ros.mixed_robot import topics
+from bench.ros.vesc_message import TYPE, body
 from iort_agent.agent import make_agent
 from iort_agent.clock import SystemClock
 from iort_agent.config.file import Config
@@ -47,7 +48,7 @@ def main() -> None:
         intake = Intake(
             "/sensors/core", TopicConfig("vesc", "header"), emit=agent.parts.streams.emit, clock=clock
         )
-        header = {"type": TYPE, "md5sum": "bench", "message_definition": DEFINITION}
+        header = {"type": TYPE, "md5sum": "bench", "message_definition": topics()["/sensors/core"].definition}
         cycles = []
         for i in range(samples):
             now_ns = time.time_ns()

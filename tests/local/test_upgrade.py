@@ -15,7 +15,7 @@ from iort_station.data import data
 from iort_station.operations import delivery, quarantine
 from tests.local.conftest import until
 from tests.unit.station.old_messages import old_envelope, old_message
-from verify.robot import Robot
+from verify.tools.robot import Robot
 
 RUN = "0badcafe"
 BATCHES, EACH = 30, 10

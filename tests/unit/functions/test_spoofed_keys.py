@@ -16,7 +16,7 @@ from iort_contract.messages.live import LiveSample, decode_pong, encode_live, en
 from iort_contract.tables import AGENT_VERSION, ENVELOPE, EXPIRES_S, NONFINITE, RECEIVED_MS, ROBOT, TOPIC
 from iort_contract.topics import FILE, LAMBDA, LIVE, PING, PONG, RECORD, RULE, RULES, SHADOW, build_topic
 from tests.iot_sql import Message, evaluate
-from verify.spoofing import spoofed
+from verify.tools.spoofing import spoofed
 
 NOW_MS = 1_700_000_000_123
 T_US = 1_700_000_000_000_000
