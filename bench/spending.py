@@ -7,7 +7,7 @@ from itertools import product
 from math import ceil
 
 from bench.sections import dashboard, outage, query, round_trips, utilisation
-from iort_agent.rate_limiter import BYTES_PER_S
+from iort_agent.mqtt.rate_limiter import BYTES_PER_S
 from iort_contract.topics import PING_PATHS
 from iort_station.cloud import Cloud
 from iort_station.cost import line_items, model

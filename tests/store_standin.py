@@ -11,7 +11,7 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
-from iort_agent.mqtt.uplink import Message
+from iort_agent.mqtt.uplink import MqttMessage
 from iort_contract.messages.files import (
     Address,
     FileAnswer,
@@ -47,7 +47,7 @@ class Store:
         self.robot = robot
         uplink.subscribe(build_topic(PING, robot, FILE), self._on_request)
 
-    def _on_request(self, message: Message) -> None:
+    def _on_request(self, message: MqttMessage) -> None:
         request = decode_file_request(message.payload)
         self.requests.append(request)
         if self.silent:

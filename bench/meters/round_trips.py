@@ -14,11 +14,13 @@ from typing_extensions import Self
 from bench.errors import BenchError
 from bench.floors.raw_mqtt import RawClient
 from iort_agent.clock import SystemClock
-from iort_agent.config.file import load_config
+from iort_agent.config import load_config
+from iort_agent.lanes.config import PingConfig
 from iort_agent.lanes.pings import Pings
 from iort_agent.mqtt.aws import IotCore
 from iort_agent.mqtt.dispatch import Dispatcher
-from iort_agent.rate_limiter import Allowance
+from iort_agent.mqtt.rate_limiter import RateLimiter
+from iort_agent.mqtt.uplink import Link
 from iort_contract.catalog.streams import RTT_FIELDS
 from iort_contract.limits import Value
 from iort_contract.messages.live import encode_ping
@@ -130,15 +132,10 @@ class _Connected:
             if isinstance(value, (int, float)):
                 trips.append(float(value))
 
+        limiter = RateLimiter(self.clock, publishes_per_s=1e6, bytes_per_s=1e9)
         pings = Pings(
-            robot=self.config.robot,
-            namespace=self.config.namespace,
-            paths=[path],
-            rate_hz=rate_hz,
-            padding_bytes=max(0, size - _ENVELOPE),
-            uplink=self.uplink,
-            clock=self.clock,
-            allowance=Allowance(self.clock, publishes_per_s=1e6, bytes_per_s=1e9),
+            Link(self.config.robot, self.config.namespace, self.uplink, self.clock, limiter),
+            PingConfig(rate_hz, (path,), max(0, size - _ENVELOPE)),
             emit=emit,
             on_stamp=lambda _sent, _received, _stamp_ms: None,
         )

@@ -19,7 +19,7 @@ from bench.report import plots
 from bench.report.result import NOT_MEASURED, Section
 from bench.report.spread import spread
 from bench.target import Say, Target
-from iort_agent.config.file import load_config
+from iort_agent.config import load_config
 from iort_contract.catalog.streams import OWN_STREAMS
 from iort_contract.catalog.vesc import VESC_STREAM
 from iort_contract.messages.batch import batch_id

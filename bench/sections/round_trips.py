@@ -16,7 +16,7 @@ from bench.report.result import NOT_MEASURED, Section
 from bench.report.spread import ratio, rounded, text
 from bench.sections import thesis_ping
 from bench.target import Say, Target
-from iort_agent.rate_limiter import BYTES_PER_S
+from iort_agent.mqtt.rate_limiter import BYTES_PER_S
 from iort_contract.topics import BROKER, LAMBDA, PING_PATHS, RULE
 from local.figures import THESIS
 

@@ -26,7 +26,7 @@ from rosbags.rosbag1 import Reader
 
 from iort_agent.clock import SystemClock
 from iort_agent.files.file import read
-from iort_agent.files.http import Outcome, Pace, Sender, trusting
+from iort_agent.files.http import ByteRate, Outcome, Sender, trusting
 from iort_contract.messages.files import (
     FILES_PREFIX,
     PART_BYTES,
@@ -315,7 +315,7 @@ def test_an_address_that_has_expired_is_one_to_ask_for_again(embedded, bucket, r
     path.write_bytes(CONTENT)
     local = read(tmp_path, PurePath(path.name), stop=threading.Event())
     clock = SystemClock()
-    sender = Sender(trust=trusting(Path(cloud.ca_bundle)), pace=Pace(clock, 0))
+    sender = Sender(trust=trusting(Path(cloud.ca_bundle)), rate=ByteRate(clock, 0))
     address = Address(1, url, {"content-length": str(len(CONTENT))})
 
     def sent():

@@ -35,12 +35,12 @@ class Killed(Exchange):
             super().register(token, parameters)
         os.kill(os.getpid(), signal.SIGKILL)
 
-run = identity.Run(exchange=Killed)
+seams = identity.Seams(exchange=Killed)
 verb, file, other = sys.argv[2:]
 if verb == "provision":
-    identity.provision(Path(file), robot=other, run=run)
+    identity.provision(Path(file), robot=other, seams=seams)
 else:
-    identity.renew(Path(file), Path(other), status_socket=Path("none.sock"), run=run)
+    identity.renew(Path(file), Path(other), status_socket=Path("none.sock"), seams=seams)
 """
 NAME = ".provisioning.json"
 

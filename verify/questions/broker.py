@@ -104,7 +104,7 @@ def _burst(robot: Robot, topic: str, per_s: int) -> dict[str, Any]:
     "broker.publishes_a_second",
     expected={"at_90_a_second": _ALL_TAKEN},
     source=_QUOTAS,
-    relied_on_by=("device/iort_agent/rate_limiter.py",),
+    relied_on_by=("device/iort_agent/mqtt/rate_limiter.py",),
 )
 def publishes_a_second(target: Target) -> Seen:
     """A connection may publish 90 times a second, the agent's share of AWS' 100. AWS discards messages

@@ -9,8 +9,8 @@ import zlib
 from pathlib import Path
 from typing import Collection, Iterable, Mapping, NamedTuple
 
+from iort_agent.common.private_files import make_private
 from iort_agent.errors import AgentError
-from iort_agent.private_files import make_private
 from iort_agent.spool.memory import FULL, Dropped, Entry
 
 _APPLICATION_ID = 0x696F7274  # "iort"

@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from iort_contract.messages.files import CLAIM_FIELDS
+from iort_contract.messages.files import ATTACHMENT_FIELDS
 from iort_contract.messages.page import Answer, HistoryAnswer
 from iort_contract.messages.page import Column as PageColumn
 from iort_contract.topics import check_robot
@@ -105,8 +105,8 @@ def _claims(columns: Mapping[str, Any]) -> dict[str, str]:
     return {
         f"{field}.{part}": f"{field}.key"
         for field in fields
-        if all(f"{field}.{part}" in columns for part in CLAIM_FIELDS)
-        for part in CLAIM_FIELDS
+        if all(f"{field}.{part}" in columns for part in ATTACHMENT_FIELDS)
+        for part in ATTACHMENT_FIELDS
     }
 
 

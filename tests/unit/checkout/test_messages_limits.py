@@ -5,7 +5,7 @@ from __future__ import annotations
 from ministack.services import iot
 
 from functions.shared import cut_off, stored
-from iort_agent import rate_limiter
+from iort_agent.mqtt import rate_limiter
 from iort_contract import limits
 from iort_contract.messages import commands, files
 from iort_contract.ros1.message import MAX_LAYOUT

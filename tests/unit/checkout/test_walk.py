@@ -15,7 +15,7 @@ from iort_agent.clock import SystemClock
 from iort_agent.lanes.batch import Batcher, StreamCounts
 from iort_agent.lanes.batch_encoder import Packer
 from iort_agent.lanes.record import RecordLane
-from iort_agent.rate_limiter import Allowance
+from iort_agent.mqtt.rate_limiter import RateLimiter
 from iort_agent.sources.intake import Intake, TopicConfig
 from iort_agent.spool.config import QueueConfig
 from iort_agent.spool.sqlite import make_spool
@@ -82,7 +82,12 @@ def send(folder: Path, t_us: int, walked: set[str]) -> bytes:
     clock, uplink, counts, stop = SystemClock(), Uplink(), StreamCounts(), threading.Event()
     spool = make_spool(QueueConfig(path=folder / "queue.db"), clock)
     lane = RecordLane(
-        robot="car", namespace="iort", spool=spool, uplink=uplink, clock=clock, allowance=Allowance(clock)
+        robot="car",
+        namespace="iort",
+        spool=spool,
+        uplink=uplink,
+        clock=clock,
+        rate_limiter=RateLimiter(clock),
     )
     packer = Packer(stream="speed", boot="0badcafe0badcafe", spool=spool, counts=counts)
     batcher = Batcher(packer.store, batch_s=1, clock=clock, counts=counts)

@@ -1,18 +1,14 @@
-"""The agent's configuration: one YAML file, read once, into frozen dataclasses."""
+"""The agent's configuration: one YAML file, read once into frozen dataclasses. It collects the rooms'
+sections."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
 
-from iort_agent.control.config import DownlinkConfig, ShareConfig, share_rule
-from iort_agent.errors import ConfigError
-from iort_agent.files.folder import FilesConfig
-from iort_agent.lanes.config import LiveConfig, PingConfig, RecordConfig
-from iort_agent.logs import LOG_LEVELS
-from iort_agent.metrics import MetricsConfig
-from iort_agent.schema import (
-    Where,
+from iort_agent.common.logs import LOG_LEVELS
+from iort_agent.common.schema import (
+    Place,
     any_path,
     choice,
     existing_path,
@@ -25,9 +21,14 @@ from iort_agent.schema import (
     text,
     variant,
 )
+from iort_agent.control.config import DownlinkConfig, ShareConfig, share_rule
+from iort_agent.errors import ConfigError
+from iort_agent.files.config import FilesConfig
+from iort_agent.lanes.config import LiveConfig, PingConfig, RecordConfig
 from iort_agent.sources import SourceConfig
 from iort_agent.sources.registry import SOURCES
 from iort_agent.spool.config import QueueConfig
+from iort_agent.status.metrics import MetricsConfig
 from iort_contract.catalog.streams import OWN_STREAMS
 from iort_contract.limits import DEFAULT_NAMESPACE
 from iort_contract.topics import check_namespace, check_robot
@@ -35,10 +36,10 @@ from iort_contract.topics import check_namespace, check_robot
 
 @dataclass(frozen=True)
 class Config:
-    """Everything the agent is told. Paths in the file are relative to the file.
+    """The whole configuration. Paths in the file are relative to the file.
 
-    Without a ``root_ca`` the broker is held against the system's trust store, which knows AWS';
-    without a ``status_socket`` it is agent.sock beside the file.
+    Without ``root_ca``, the system's trust store must contain the broker's authority, as it does AWS'. The
+    default ``status_socket`` is agent.sock beside the file.
     """
 
     robot: str = setting(text(check_robot))
@@ -64,29 +65,27 @@ class Config:
 
 
 def load_config(file: Path) -> Config:
-    """The configuration in a file. Raises `ConfigError`, naming file, key, value and what is allowed."""
-    where = Where(file)
+    """Read a configuration file. Raises `ConfigError`, which names file, key, value and what is allowed."""
+    place = Place(file)
     content = read_yaml(file)
     if content is None:
         raise ConfigError(f"{file}: is empty")
-    config = load(Config, content, where)
-    _check_streams(config, where.child("sources"))
+    config = load(Config, content, place)
+    _check_streams(config, place.child("sources"))
     if config.files.large_folder is None and any(source.uploads_large() for source in config.sources):
-        raise (
-            where.child("files")
-            .child("large_folder")
-            .problem("required, and missing: a source says `large: upload`, and this is where its bytes wait")
+        raise place.child("files.large_folder").problem(
+            "required, and missing: a source says `large: upload`, and its contents wait in this folder"
         )
     if "://" in config.endpoint or "/" in config.endpoint:
-        raise where.child("endpoint").error(config.endpoint, "a host name, without scheme or path")
+        raise place.child("endpoint").error(config.endpoint, "a host name, without scheme or path")
     return config
 
 
-def _check_streams(config: Config, where: Where) -> None:
-    """Two sources must not write into one stream: their samples would mix into one time series."""
+def _check_streams(config: Config, place: Place) -> None:
+    """Two sources must not write one stream: their samples would mix into one time series."""
     taken: list[str] = sorted(OWN_STREAMS)
     for i, source in enumerate(config.sources):
         for stream in source.streams():
             if stream in taken:
-                raise where.item(i).problem(f"the stream {stream} is taken: {', '.join(taken)} are in use")
+                raise place.item(i).problem(f"the stream {stream} is taken: {', '.join(taken)} are in use")
         taken += source.streams()

@@ -1,4 +1,4 @@
-"""Log lines for a terminal or for journald, and the last ones that matter, for `iort-agent status`."""
+"""Log lines for a terminal or for journald, and the latest warnings and errors for `iort-agent status`."""
 
 from __future__ import annotations
 
@@ -9,15 +9,14 @@ from collections import deque
 from dataclasses import dataclass
 from typing import Any
 
-# syslog's words for it: 3 error, 4 warning, 6 info, 7 debug.
-_SYSLOG = ((logging.CRITICAL, 2), (logging.ERROR, 3), (logging.WARNING, 4), (logging.INFO, 6), (0, 7))
+_SYSLOG_LEVELS = ((logging.CRITICAL, 2), (logging.ERROR, 3), (logging.WARNING, 4), (logging.INFO, 6), (0, 7))
 _KEPT = 5
 LOG_LEVELS = ("debug", "info", "warning", "error")
 
 
 def neutral(text: str) -> str:
-    """The text on one line: line ends, a terminal's escapes and other characters that show as nothing are
-    written as escapes. Names and answers from elsewhere may hold any."""
+    """The text on one line, with escapes for line ends and control characters. Names and answers from
+    elsewhere may contain them."""
     if text.isprintable():
         return text
     return "".join(c if c.isprintable() else c.encode("unicode_escape").decode() for c in text)
@@ -25,7 +24,7 @@ def neutral(text: str) -> str:
 
 @dataclass(frozen=True)
 class Trouble:
-    """A warning or an error that was logged."""
+    """A logged warning or error."""
 
     at_s: float
     level: str
@@ -33,7 +32,7 @@ class Trouble:
 
 
 class Troubles(logging.Handler):
-    """Keeps the last few warnings, and the last few errors, which no warning displaces."""
+    """Keeps the latest warnings, and separately the latest errors, so that no warning displaces an error."""
 
     def __init__(self) -> None:
         super().__init__(logging.WARNING)
@@ -41,40 +40,35 @@ class Troubles(logging.Handler):
         self._errors: deque[Trouble] = deque(maxlen=_KEPT)
 
     def emit(self, record: logging.LogRecord) -> None:
-        """Keep a record's text."""
         lines = self._errors if record.levelno >= logging.ERROR else self._warnings
         text = neutral(record.getMessage())
         lines.append(Trouble(round(record.created, 3), record.levelname.lower(), text))
 
     def last(self) -> list[Trouble]:
-        """The newest last."""
+        """The kept lines, the newest last."""
         return sorted([*self._errors, *self._warnings], key=lambda line: line.at_s)
 
 
 class LineFormatter(logging.Formatter):
-    """A line a record, and below it, indented, those of its traceback: no text of elsewhere can begin one."""
+    """One line for a record, and its traceback indented below. Foreign text cannot start a line."""
 
     def formatMessage(self, record: logging.LogRecord) -> str:  # noqa: N802 - the library's name
-        """The record's line."""
         return neutral(super().formatMessage(record))
 
     def formatException(self, ei: Any) -> str:  # noqa: N802 - the library's name
-        """The traceback's lines."""
         return "\n".join(f"  {neutral(line)}" for line in super().formatException(ei).split("\n"))
 
 
 class JournalFormatter(LineFormatter):
-    """Lines as journald reads them from a service: the level in front, no time; every line of a
-    traceback has the level."""
+    """Lines for journald: each starts with its syslog level; journald adds the time."""
 
     def format(self, record: logging.LogRecord) -> str:
-        """The record's text with its level."""
-        prefix = f"<{next(number for level, number in _SYSLOG if record.levelno >= level)}>"
+        prefix = f"<{next(number for level, number in _SYSLOG_LEVELS if record.levelno >= level)}>"
         return "\n".join(prefix + line for line in super().format(record).split("\n"))
 
 
 def set_up(level: str) -> Troubles:
-    """Log to standard error from now on; what is kept for `iort-agent status`."""
+    """Log to standard error from now on. Returns the handler that keeps the latest warnings and errors."""
     lines, troubles = logging.StreamHandler(sys.stderr), Troubles()
     lines.setFormatter(
         JournalFormatter("%(message)s")
@@ -87,12 +81,12 @@ def set_up(level: str) -> Troubles:
 
 
 def set_level(level: str) -> None:
-    """Log from this level on."""
+    """Log records of this level and above."""
     logging.getLogger().setLevel(level.upper())
 
 
 def is_journal() -> bool:
-    """Whether standard error goes to journald, which says so by device and inode."""
+    """Whether standard error goes to journald, which tells services its device and inode."""
     try:
         status = os.fstat(sys.stderr.fileno())
     except (OSError, ValueError, AttributeError):

@@ -6,9 +6,9 @@ import threading
 from typing import Iterable, Mapping
 
 from iort_agent.clock import Clock
-from iort_agent.control.runtime_settings import Tuning
 from iort_agent.lanes.batch import Batcher, StreamCounts
 from iort_agent.lanes.batch_encoder import Packer
+from iort_agent.lanes.config import RuntimeSettings
 from iort_agent.lanes.live import LiveLane
 from iort_agent.spool.memory import Spool
 from iort_contract.catalog.streams import TYPES_STREAM
@@ -22,15 +22,22 @@ class Streams:
     """The streams of one run. Safe to use from several threads."""
 
     def __init__(
-        self, *, boot: str, batch_s: float, tuning: Tuning, live: LiveLane, spool: Spool, clock: Clock
+        self,
+        *,
+        boot: str,
+        batch_s: float,
+        settings: RuntimeSettings,
+        live: LiveLane,
+        spool: Spool,
+        clock: Clock,
     ) -> None:
         self._boot, self._batch_s = boot, batch_s
         self._live, self._spool, self._clock = live, spool, clock
-        self.tuning = tuning
+        self.settings = settings
         self._lock = threading.Lock()
         self._batchers: dict[str, Batcher] = {}
         self._counts: dict[str, StreamCounts] = {}
-        # The message types that sources have told, under lock.
+        # The message types that sources have emitted, under lock.
         self._types: dict[tuple[Value, ...], Mapping[str, Value]] = {}
         self._fields: dict[str, Iterable[str]] = {}
 
@@ -41,30 +48,30 @@ class Streams:
             self._keep_type(values)
             self.record(stream, t_us, values)
             return
-        if self.tuning.fields and stream in self.tuning.fields:
+        if self.settings.fields and stream in self.settings.fields:
             self._fields.setdefault(stream, values.keys())
-            values = {name: values[name] for name in self.tuning.fields[stream] if name in values}
-        # First, since its delay counts.
+            values = {name: values[name] for name in self.settings.fields[stream] if name in values}
+        # First, because its delay counts.
         self._live.offer(stream, t_us, values)
         self.record(stream, t_us, values)
 
     def record(self, stream: str, t_us: int, values: Mapping[str, Value]) -> None:
-        """Take a sample for the record lane alone."""
+        """Take a sample for the record lane only."""
         batcher = self._batchers.get(stream)
         if batcher is None:
             batcher = self._new_batcher(stream, values)
-        if self.tuning.record_enabled:
+        if self.settings.record_enabled:
             batcher.add(t_us, values)
 
-    def tune(self, tuning: Tuning) -> None:
-        """Follow other settings from now on."""
-        resumes = tuning.record_enabled and not self.tuning.record_enabled
-        self.tuning = tuning
+    def apply(self, settings: RuntimeSettings) -> None:
+        """Use other settings from now on."""
+        resumes = settings.record_enabled and not self.settings.record_enabled
+        self.settings = settings
         if resumes:
             self.repeat_types()
 
     def tick(self) -> None:
-        """Close the batches of silent streams; call it several times a second."""
+        """Close the batches of silent streams; called several times a second."""
         for batcher in list(self._batchers.values()):
             batcher.tick()
 
@@ -74,8 +81,8 @@ class Streams:
             batcher.flush()
 
     def repeat_types(self) -> None:
-        """Record the message types once more. A reader needs them to turn columns into messages again, and
-        those recorded before may have been dropped by the queue, or expired, or never recorded."""
+        """Record the message types again. A reader needs them to turn columns into messages, and the earlier
+        records may be missing: dropped by the queue, expired, or never made."""
         with self._lock:
             types = list(self._types.values())
         for values in types:
@@ -86,13 +93,13 @@ class Streams:
         return dict(self._fields)
 
     def counts(self) -> dict[str, StreamCounts]:
-        """The counts of each stream, which go on changing."""
+        """The counts of each stream, which keep changing."""
         return self._counts.copy()
 
     def counted(self) -> dict[str, tuple[StreamCounts, int]]:
         """The counts of each stream at one moment, and the number of its next batch."""
         found = {name: batcher.counts() for name, batcher in list(self._batchers.items())}
-        # The spool's number of this moment may be a batch further than the counts.
+        # The spool's own next number may already count a later batch.
         return {name: (counts, counts.first_seq + counts.batches) for name, counts in found.items()}
 
     def refused(self) -> int:

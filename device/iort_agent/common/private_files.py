@@ -1,7 +1,7 @@
-"""Files in folders that others may write into: below the folder no link is followed, and what is written has
-its name when it is whole, and is its owner's alone.
+"""Reads and writes files in folders that other users may write into.
 
-``root`` is trusted, as the configuration names it; ``name`` is the path below it.
+No link below ``root`` is followed. A written file gets its name when it is complete, and only its owner may
+read it. ``root`` is trusted, because the configuration names it; ``name`` is the path below it.
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ from pathlib import Path, PurePath
 from typing import BinaryIO, Iterator
 
 _FOLDER = os.O_RDONLY | os.O_DIRECTORY | os.O_CLOEXEC
-# A pipe that somebody put there is opened and refused; without O_NONBLOCK it would be waited for.
+# O_NONBLOCK: opening a pipe that somebody put there must not wait for a writer.
 _READ = os.O_RDONLY | os.O_NOFOLLOW | os.O_NONBLOCK | os.O_CLOEXEC
 _WRITE = os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_NOFOLLOW | os.O_CLOEXEC
 _MODE, _FOLDER_MODE = 0o600, 0o700
@@ -22,9 +22,9 @@ _MODE, _FOLDER_MODE = 0o600, 0o700
 
 @contextlib.contextmanager
 def folder_of(root: Path, name: PurePath, *, make: bool = False) -> Iterator[int]:
-    """A descriptor of the folder that a file is in; folders that are missing are made where ``make`` is set.
+    """Open the folder of a file and yield its descriptor; with ``make``, create missing folders.
 
-    Raises `OSError` where there is none, or a link in its place.
+    Raises `OSError` if a folder is missing or is a link.
     """
     folder = os.open(root, _FOLDER)
     try:
@@ -41,7 +41,7 @@ def folder_of(root: Path, name: PurePath, *, make: bool = False) -> Iterator[int
 
 
 def open_below(root: Path, name: PurePath) -> BinaryIO:
-    """The file, to be read. Raises `OSError` for a link and for what is no regular file."""
+    """Open a file to read. Raises `OSError` if it is a link or not a regular file."""
     with folder_of(root, name) as folder:
         descriptor = os.open(name.name, _READ, dir_fd=folder)
     if not stat.S_ISREG(os.fstat(descriptor).st_mode):
@@ -59,14 +59,15 @@ def write_below(
     mtime_ns: int | None = None,
     sync: bool = False,
 ) -> int:
-    """Put a file in its place, also where another or a link is; its time in ns, as the file system keeps it.
+    """Write a file, or replace the file or link of that name. Returns its modification time in nanoseconds,
+    as the file system rounds it.
 
-    With ``sync`` the content is on the disk before it has its name. Raises `OSError`.
+    With ``sync`` the content is on the disk before the file gets its name. Raises `OSError`.
     """
     with folder_of(root, name, make=True) as folder:
-        # A name that nobody can guess, so that nobody can take it first.
-        beside = f".{secrets.token_hex(16)}.tmp"
-        descriptor = os.open(beside, _WRITE, _MODE, dir_fd=folder)
+        # Nobody can guess this name, so nobody can take it first.
+        temporary = f".{secrets.token_hex(16)}.tmp"
+        descriptor = os.open(temporary, _WRITE, _MODE, dir_fd=folder)
         try:
             with os.fdopen(descriptor, "wb") as file:
                 file.write(content)
@@ -77,19 +78,19 @@ def write_below(
                 if sync:
                     os.fsync(descriptor)
                 written_ns = os.fstat(descriptor).st_mtime_ns
-            os.replace(beside, name.name, src_dir_fd=folder, dst_dir_fd=folder)
+            os.replace(temporary, name.name, src_dir_fd=folder, dst_dir_fd=folder)
         except BaseException:
             with contextlib.suppress(OSError):
-                os.unlink(beside, dir_fd=folder)
+                os.unlink(temporary, dir_fd=folder)
             raise
     return written_ns
 
 
 def make_private(path: Path) -> None:
-    """Have a file at the path that its owner alone may read, empty if it is new, before another library
-    opens it by its name. Raises `OSError` where a link is in its place."""
+    """Make sure that only the owner may read a file that another library opens by its name; create it if it
+    is missing. Raises `OSError` if it is a link."""
     try:
-        # Only a new file is opened: to close one that SQLite has open in this process ends SQLite's locks.
+        # An existing file is not opened: closing a file that SQLite has open would release SQLite's locks.
         os.close(os.open(path, _WRITE, _MODE))
     except FileExistsError:
         found = os.lstat(path)

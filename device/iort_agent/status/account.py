@@ -1,4 +1,4 @@
-"""Tells what this run took, stored and did not record, for `iort audit` to hold against the table."""
+"""Reports what this run took, stored and did not record; `iort audit` compares it with the table."""
 
 from __future__ import annotations
 
@@ -6,54 +6,46 @@ from typing import Any, Callable, Iterator, Mapping, Sequence, Tuple
 
 from iort_agent.clock import Clock
 from iort_agent.lanes.batch import StreamCounts
-from iort_agent.sources import Emit
+from iort_agent.lanes.streams import Streams
 from iort_agent.spool.memory import Spool
 from iort_contract.catalog.streams import ACCOUNT_STREAM
 from iort_contract.messages.account import ACCOUNT_EVERY_S, SourceAccount, StreamAccount
 
-# Losses are told within a second.
+# A loss is reported within a second.
 _LOSS_S = 1.0
-# Counts of what was given: no cause of anything.
-_GIVEN = frozenset({"messages", "samples", "rows", "opened", "silent", "kept", "published"})
+# Counts of what was taken, not of losses.
+_TAKEN = frozenset({"messages", "samples", "rows", "opened", "silent", "kept", "published"})
 
-# Of each stream its counts, taken at one moment, and the number of its next batch.
-Counted = Callable[[], Mapping[str, Tuple[StreamCounts, int]]]
+# A source's name, and a function that returns its counts.
 Reports = Sequence[Tuple[str, Callable[[], Mapping[str, Any]]]]
 
 
 class Accounts:
-    """Emits the accounts of every stream and source when asked."""
+    """Emits the accounts of every stream and every source. ``expected`` are the streams of the sources."""
 
     def __init__(
-        self,
-        *,
-        clock: Clock,
-        spool: Spool,
-        streams: Sequence[str],
-        counted: Counted,
-        refused: Callable[[], int],
-        reports: Reports,
-        emit: Emit,
+        self, *, clock: Clock, spool: Spool, streams: Streams, expected: Sequence[str], reports: Reports
     ) -> None:
         self._clock, self._spool, self._streams = clock, spool, streams
-        self._counted, self._refused, self._reports, self._emit = counted, refused, reports, emit
+        self._expected, self._reports = expected, reports
         self._told = clock.monotonic()
         self._lost = 0
 
     def tick(self) -> None:
-        """Tell if it is time; call it several times a second."""
+        """Report if it is time; called several times a second."""
         passed = self._clock.monotonic() - self._told
         if passed >= ACCOUNT_EVERY_S or (passed >= _LOSS_S and self._losses() != self._lost):
             self.tell()
 
     def tell(self, *, ended: bool = False) -> None:
-        """Emit a sample a stream and a source; ``ended`` with the last, once every batch is closed."""
+        """Emit a sample for each stream and each source. The last one says ``ended``; it comes after every
+        batch is closed."""
         self._told, self._lost = self._clock.monotonic(), self._losses()
         now_us = self._clock.now_us()
-        counted = self._counted()
-        for name in sorted({*self._streams, *counted} - {ACCOUNT_STREAM}):
+        counted = self._streams.counted()
+        for name in sorted({*self._expected, *counted} - {ACCOUNT_STREAM}):
             counts, next_seq = counted.get(name, (StreamCounts(), 0))
-            of = StreamAccount(
+            account = StreamAccount(
                 stream=name,
                 taken=counts.samples,
                 stored=counts.stored,
@@ -63,23 +55,23 @@ class Accounts:
                 next_seq=next_seq,
                 ended=ended,
             )
-            self._emit(ACCOUNT_STREAM, now_us, of.sample())
+            self._streams.record(ACCOUNT_STREAM, now_us, account.sample())
         dropped = self._spool.dropped()
         queue = {"dropped_batches": dropped.batches, "dropped_samples": dropped.samples}
         for source, report in [("queue", queue), *((name, report()) for name, report in self._reports)]:
             found = {path: count for path, count in _counts(report, "") if count}
             if found:
-                self._emit(ACCOUNT_STREAM, now_us, SourceAccount(source, found).sample())
+                self._streams.record(ACCOUNT_STREAM, now_us, SourceAccount(source, found).sample())
 
     def _losses(self) -> int:
-        return self._refused() + self._spool.dropped().samples
+        return self._streams.refused() + self._spool.dropped().samples
 
 
 def _counts(report: Mapping[str, Any], prefix: str) -> Iterator[tuple[str, int]]:
-    """The counts in a source's report, by their path in it."""
+    """The counts in a source's report, by their dotted path."""
     for name, value in report.items():
         path = f"{prefix}{name}"
         if isinstance(value, Mapping):
             yield from _counts(value, f"{path}.")
-        elif type(value) in (int, float) and name not in _GIVEN:
+        elif type(value) in (int, float) and name not in _TAKEN:
             yield path, round(value)

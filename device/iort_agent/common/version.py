@@ -6,7 +6,7 @@ from importlib.metadata import PackageNotFoundError, version
 
 
 def agent_version() -> str:
-    """The version of the distribution iort-agent, or that there is none."""
+    """The version of the distribution iort-agent; a text that says so if it is not installed."""
     try:
         return version("iort-agent")
     except PackageNotFoundError:

@@ -1,4 +1,4 @@
-"""The shadow: wishes, refusals and reports, over an uplink in memory."""
+"""The shadow: desired settings, rejections and reports, over an uplink in memory."""
 
 from __future__ import annotations
 
@@ -10,36 +10,36 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from iort_agent.control.runtime_settings import Tuning, overlay
-from iort_agent.control.shadow import Remote, _difference, _merged
+from iort_agent.common.state import OverShare
+from iort_agent.control.runtime_settings import overlay
+from iort_agent.control.shadow import Shadow, _difference, _merged
+from iort_agent.lanes.config import RuntimeSettings
 from iort_agent.mqtt.dispatch import Dispatcher
-from iort_agent.rate_limiter import Allowance
 from iort_contract.messages.commands import Command
-from tests.agent_fakes import Loopback, ManualClock
+from tests.agent_fakes import Loopback, ManualClock, link_of
 
-BASE = Tuning(record_enabled=True, live_enabled=True, live_rate_hz=10.0, ping_rate_hz=0.0, log_level="info")
+BASE = RuntimeSettings(
+    record_enabled=True, live_enabled=True, live_rate_hz=10.0, ping_rate_hz=0.0, log_level="info"
+)
 PREFIX = "$aws/things/car1/shadow/name/agent"
 DOCUMENT = BASE.as_document()
 
 
 class Rig:
-    """A robot and its shadow, kept as AWS keeps it."""
+    """A robot and its shadow, which behaves as AWS'."""
 
     def __init__(self, **desired: Any) -> None:
         self.clock, self.dispatcher = ManualClock(), Dispatcher()
         self.uplink = Loopback(self.clock, self.dispatcher)
-        self.applied: list[Tuning] = []
-        self.shadow: dict[str, Any] = {"desired": desired, "reported": {}} if desired else {}
+        self.applied: list[RuntimeSettings] = []
+        self.document: dict[str, Any] = {"desired": desired, "reported": {}} if desired else {}
         self.version = 1 if desired else 0
-        self.remote = Remote(
-            robot="car1",
+        self.shadow = Shadow(
+            link_of(self.uplink, self.clock),
             base=BASE,
             apply=self.applied.append,
             known_fields=lambda: {"vesc": {"speed", "voltage_input"}},
             version="1.2.3",
-            uplink=self.uplink,
-            clock=self.clock,
-            allowance=Allowance(self.clock),
         )
         self.seen = 0
         self.uplink.connect()
@@ -48,7 +48,7 @@ class Rig:
     def settle(self) -> None:
         for _ in range(4):
             self.dispatcher.run_pending()
-            self.remote.tick()
+            self.shadow.tick()
             for message in self.uplink.published[self.seen :]:
                 self.answer(message.topic, message.payload)
             self.seen = len(self.uplink.published)
@@ -58,17 +58,17 @@ class Rig:
             if not self.version:
                 self.deliver("get/rejected", {"code": 404, "message": "No shadow exists"})
             else:
-                self.deliver("get/accepted", {"state": self.shadow, "version": self.version})
+                self.deliver("get/accepted", {"state": self.document, "version": self.version})
         elif topic.endswith("/update"):
             self.change(json.loads(payload)["state"])
 
     def change(self, state: dict[str, Any], *, arrives: bool = True) -> None:
-        self.shadow = _merged(self.shadow, state)
+        self.document = _merged(self.document, state)
         self.version += 1
         if arrives:
             self.deliver("update/accepted", {"state": state, "version": self.version})
 
-    def wish(self, *, arrives: bool = True, **desired: Any) -> None:
+    def desire(self, *, arrives: bool = True, **desired: Any) -> None:
         self.change({"desired": desired}, arrives=arrives)
         self.settle()
 
@@ -77,29 +77,29 @@ class Rig:
 
     @property
     def reported(self) -> Any:
-        return self.shadow.get("reported")
+        return self.document.get("reported")
 
 
-def test_without_a_shadow_it_makes_one() -> None:
+def test_without_a_shadow_the_agent_creates_it() -> None:
     rig = Rig()
     said = {key: value for key, value in DOCUMENT.items() if value != {}}
     assert rig.reported == {**said, "agent_version": "1.2.3"}
     assert rig.applied == []
 
 
-def test_a_wish_from_before_comes_into_force() -> None:
+def test_an_earlier_desired_setting_is_applied() -> None:
     rig = Rig(live={"rate_hz": 2}, record={"enabled": False})
     assert rig.applied[-1].live_rate_hz == 2
     assert rig.reported["live"] == {"enabled": True, "rate_hz": 2}
     assert rig.reported["record"] == {"enabled": False}
 
 
-def test_a_wish_meanwhile_and_its_withdrawal() -> None:
+def test_a_desired_setting_is_applied_and_removed() -> None:
     rig = Rig()
-    rig.wish(log_level="debug", fields={"vesc": ["speed"]})
+    rig.desire(log_level="debug", fields={"vesc": ["speed"]})
     assert rig.applied[-1].log_level == "debug"
     assert rig.reported["fields"] == {"vesc": ["speed"]}
-    rig.wish(log_level=None, fields=None)
+    rig.desire(log_level=None, fields=None)
     assert rig.applied[-1] == BASE
     assert rig.reported["log_level"] == "info"
     assert not rig.reported["fields"]
@@ -110,10 +110,10 @@ def test_a_wish_meanwhile_and_its_withdrawal() -> None:
 
 
 @pytest.mark.parametrize(
-    ("wish", "name", "reason"),
+    ("desired", "name", "reason"),
     [
-        ({"live": {"rate_hz": 50}}, "live.rate_hz", "found 50 (a number); allowed is a number from 0.01"),
-        ({"live": {"rate_hz": True}}, "live.rate_hz", "found True"),
+        ({"live": {"rate_hz": 50}}, "live.rate_hz", "must be a number from 0.01 to 10 (Hz), got 50"),
+        ({"live": {"rate_hz": True}}, "live.rate_hz", "got True"),
         ({"live": 3}, "live", "cannot be changed"),
         ({"record": {"enabled": "no"}}, "record.enabled", "true or false"),
         ({"log_level": "loud"}, "log_level", "one of debug, info"),
@@ -121,15 +121,15 @@ def test_a_wish_meanwhile_and_its_withdrawal() -> None:
         ({"fields": {"vesc": "speed"}}, "fields.vesc", "a list of field names"),
         ({"fields": {"a b": ["speed"]}}, "fields.a b", "stream name"),
         ({"fields": {"imu": ["a b"]}}, "fields.imu[0]", "field name"),
-        ({"robot": "car2"}, "robot", "cannot be changed; allowed is"),
+        ({"robot": "car2"}, "robot", "cannot be changed; must be one of"),
         ({"live": {"rate": 1}}, "live.rate", "did you mean live.rate_hz?"),
     ],
 )  # fmt: skip
-def test_a_bad_wish_is_refused_with_its_reason_and_the_others_hold(
-    wish: dict[str, Any], name: str, reason: str
+def test_a_wrong_setting_is_rejected_with_a_reason_and_the_others_apply(
+    desired: dict[str, Any], name: str, reason: str
 ) -> None:
     rig = Rig()
-    rig.wish(**wish, ping={"rate_hz": 5})
+    rig.desire(**desired, ping={"rate_hz": 5})
     key = name.partition("[")[0]
     assert reason in rig.reported["rejected"][key]["reason"]
     assert f"shadow agent: {name}" in rig.reported["rejected"][key]["reason"]
@@ -137,27 +137,27 @@ def test_a_bad_wish_is_refused_with_its_reason_and_the_others_hold(
     assert rig.reported["live"] == DOCUMENT["live"]
 
 
-def test_a_wish_for_what_is_in_force_ends_the_refusal() -> None:
+def test_a_desired_value_that_is_in_force_ends_the_rejection() -> None:
     rig = Rig()
-    rig.wish(live={"rate_hz": 50})
+    rig.desire(live={"rate_hz": 50})
     assert rig.reported["rejected"]
-    # Equal to what is reported: AWS sends no delta for it.
-    rig.wish(live={"rate_hz": 10})
+    # It equals the reported value: AWS sends no delta for it.
+    rig.desire(live={"rate_hz": 10})
     assert not rig.reported["rejected"]
 
 
-def test_what_was_missed_is_fetched() -> None:
+def test_a_missed_change_is_fetched() -> None:
     rig = Rig()
-    rig.wish(arrives=False, live={"rate_hz": 3})
+    rig.desire(arrives=False, live={"rate_hz": 3})
     assert rig.applied == []
-    rig.wish(ping={"rate_hz": 1})
+    rig.desire(ping={"rate_hz": 1})
     assert (rig.applied[-1].live_rate_hz, rig.applied[-1].ping_rate_hz) == (3, 1)
 
 
-def test_a_wish_made_while_offline_is_fetched_at_the_next_connect() -> None:
+def test_a_setting_desired_while_offline_is_fetched_at_the_next_connect() -> None:
     rig = Rig()
     rig.uplink.cut()
-    rig.wish(arrives=False, live={"rate_hz": 3})
+    rig.desire(arrives=False, live={"rate_hz": 3})
     rig.uplink.connect()
     rig.settle()
     assert rig.reported["live"]["rate_hz"] == 3
@@ -165,10 +165,10 @@ def test_a_wish_made_while_offline_is_fetched_at_the_next_connect() -> None:
 
 def test_old_and_odd_messages_change_nothing() -> None:
     rig = Rig()
-    rig.wish(live={"rate_hz": 3})
+    rig.desire(live={"rate_hz": 3})
     rig.deliver("update/accepted", {"state": {"desired": {"live": {"rate_hz": 9}}}, "version": 1})
     rig.settle()
-    assert [tuning.live_rate_hz for tuning in rig.applied] == [3], "older than what it has"
+    assert [settings.live_rate_hz for settings in rig.applied] == [3], "older than what it has"
     rig.uplink.cut()
     rig.settle()
     count = len(rig.uplink.published)
@@ -189,20 +189,20 @@ def test_old_and_odd_messages_change_nothing() -> None:
         rig.deliver("update/rejected", odd)
     rig.uplink.deliver(f"{PREFIX}/update/accepted", b"\xff")
     rig.settle()
-    assert rig.remote.tuning.live_rate_hz in (3, 10)
+    assert rig.shadow.settings.live_rate_hz in (3, 10)
     assert rig.applied[0].live_rate_hz == 3
 
 
-def test_a_robot_over_its_share_logs_it_once_and_takes_it_for_no_wish(
+def test_a_robot_over_its_share_logs_it_once_and_does_not_reject_it(
     caplog: pytest.LogCaptureFixture,
 ) -> None:
     rig = Rig()
     for batches in (1, 40):
-        rig.wish(over_share={"since_ms": 1000, "last_ms": 1000 + batches, "batches": batches})
-    assert rig.remote.over_share == {"since_ms": 1000, "last_ms": 1040, "batches": 40}
-    assert rig.shadow["reported"].get("rejected", {}) == {}
+        rig.desire(over_share={"since_ms": 1000, "last_ms": 1000 + batches, "batches": batches})
+    assert rig.shadow.over_share == OverShare(since_ms=1000, last_ms=1040, batches=40)
+    assert rig.document["reported"].get("rejected", {}) == {}
     assert caplog.text.count("summaries are made later") == 1
-    rig.wish(over_share={"since_ms": 90_000, "last_ms": 90_000, "batches": 1})
+    rig.desire(over_share={"since_ms": 90_000, "last_ms": 90_000, "batches": 1})
     assert caplog.text.count("summaries are made later") == 2
 
 
@@ -211,14 +211,14 @@ def test_a_robot_over_its_share_logs_it_once_and_takes_it_for_no_wish(
     [5, [], {"batches": 3}, {"since_ms": 1, "last_ms": 1e3, "batches": 1}]
     + [{"since_ms": 1, "last_ms": last_ms, "batches": 1} for last_ms in (-1, 10**15, True)],
 )
-def test_odd_words_about_its_share_are_passed_over(said: Any) -> None:
-    assert Rig(over_share=said).remote.over_share is None
+def test_malformed_reports_about_its_share_are_ignored(said: Any) -> None:
+    assert Rig(over_share=said).shadow.over_share is None
 
 
-def test_a_report_that_gets_no_answer_is_sent_again() -> None:
+def test_an_unanswered_report_is_repeated() -> None:
     rig = Rig()
     rig.uplink.verdict = lambda message: "no" if message.topic.endswith("/update") else None
-    rig.wish(live={"rate_hz": 3})
+    rig.desire(live={"rate_hz": 3})
     assert rig.reported["live"]["rate_hz"] == 10
     rig.uplink.verdict = lambda _: None
     rig.clock.advance(31)
@@ -226,9 +226,9 @@ def test_a_report_that_gets_no_answer_is_sent_again() -> None:
     assert rig.reported["live"]["rate_hz"] == 3
 
 
-def test_a_long_value_is_not_reported_whole() -> None:
+def test_a_long_value_is_reported_shortened() -> None:
     rig = Rig()
-    rig.wish(log_level="x" * 5000)
+    rig.desire(log_level="x" * 5000)
     assert len(json.dumps(rig.reported)) < 2000
 
 
@@ -241,7 +241,7 @@ OBJECT = st.dictionaries(st.text(max_size=2), JSON, max_size=4)
 
 
 def bare(value: Any) -> Any:
-    """Without empty objects, which a shadow does not keep apart from none."""
+    """Without empty objects: a shadow does not distinguish them from missing ones."""
     if not isinstance(value, dict):
         return value
     inner = {key: bare(item) for key, item in value.items()}
@@ -249,28 +249,28 @@ def bare(value: Any) -> Any:
 
 
 @given(OBJECT, OBJECT)
-def test_a_difference_merged_into_the_old_is_the_new(old: dict[str, Any], new: dict[str, Any]) -> None:
+def test_merging_the_difference_into_the_old_gives_the_new(old: dict[str, Any], new: dict[str, Any]) -> None:
     assert bare(_merged(old, _difference(old, new))) == bare(new)
 
 
 @given(OBJECT)
-def test_no_wish_whatever_brings_it_down(wished: dict[str, Any]) -> None:
-    tuning, rejected = overlay(BASE, wished, {})
-    assert 0.01 <= tuning.live_rate_hz <= 10
+def test_no_desired_value_raises(desired: dict[str, Any]) -> None:
+    settings, rejected = overlay(BASE, desired, {})
+    assert 0.01 <= settings.live_rate_hz <= 10
     json.dumps(rejected)
 
 
-def test_what_became_of_commands_is_reported_and_a_new_run_forgets_it() -> None:
+def test_outcomes_of_commands_are_reported_until_the_run_ends() -> None:
     rig = Rig(live={"rate_hz": 2})
     command = Command("feedbeef", 1, 7, 2, 500, {}, answer=True)
-    rig.remote.answer("drive", command, None)
+    rig.shadow.answer("drive", command, None)
     rig.settle()
     assert rig.reported["commands"]["drive"] == {"session": "feedbeef", "seq": 7, "outcome": "accepted"}
-    rig.remote.answer("drive", replace(command, seq=8), "stale" * 100)
+    rig.shadow.answer("drive", replace(command, seq=8), "stale" * 100)
     rig.settle()
     assert rig.reported["commands"]["drive"]["seq"] == 8
     assert len(rig.reported["commands"]["drive"]["outcome"]) < 250
-    rig.remote._answers.clear()
-    rig.remote._follow()
+    rig.shadow._answers.clear()
+    rig.shadow._follow()
     rig.settle()
     assert not rig.reported.get("commands")

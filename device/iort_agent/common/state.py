@@ -1,13 +1,13 @@
 """The types of the agent's status (`iort-agent status`) and of its report (`iort-agent run --report`).
 
-Both are written as JSON, with the fields' names as keys.
+Both are written as JSON, with the fields' names as keys. The rooms fill in the parts that describe them.
 """
 
 import dataclasses
 from dataclasses import dataclass
 from typing import Any, Dict, List, Mapping, Optional, Tuple, Type, TypeVar, Union, get_type_hints
 
-from iort_agent.logs import Trouble
+from iort_agent.common.logs import Trouble
 
 T = TypeVar("T")
 
@@ -22,9 +22,9 @@ class Connection:
     connected: bool
     since_s: float
     connects: int
-    last_error: Optional[str]
-    certificate_id: Optional[str]
-    endpoint: str
+    last_error: Optional[str] = None
+    certificate_id: Optional[str] = None
+    endpoint: str = ""
 
 
 @dataclass(frozen=True)
@@ -98,7 +98,7 @@ class Queue:
 
 @dataclass(frozen=True)
 class Files:
-    """The uploads. ``current`` is the file on its way; ``large`` counts the attachments."""
+    """The uploads. ``current`` is the file being sent; ``large`` counts the attachments."""
 
     waiting: int
     uploaded: int
@@ -106,7 +106,7 @@ class Files:
     current: Optional[str]
     current_bytes: int
     last_error: Optional[str]
-    large: Optional[Counts]
+    large: Optional[Counts] = None
 
 
 @dataclass(frozen=True)
@@ -207,8 +207,7 @@ def document(told: Union[Status, Report]) -> Dict[str, Any]:
 def read(cls: Type[T], found: Mapping[str, Any]) -> T:
     """The dataclass of a JSON document. Ignores keys that it does not know; raises `KeyError` for one that
     is missing."""
-    values = {name: _value(hint, found[name]) for name, hint in get_type_hints(cls).items()}
-    return cls(**values)
+    return cls(**{name: _value(hint, found[name]) for name, hint in get_type_hints(cls).items()})
 
 
 def _value(hint: Any, found: Any) -> Any:

@@ -1,4 +1,4 @@
-"""What the agent costs and achieves: its own figures, as samples of a stream like any other."""
+"""The agent's own figures, as samples of a stream like any other."""
 
 from __future__ import annotations
 
@@ -10,11 +10,11 @@ from pathlib import Path
 from typing import Mapping
 
 from iort_agent.clock import Clock
-from iort_agent.files.folder import Uploads
+from iort_agent.common.schema import flag, number, setting
+from iort_agent.files.uploads import Uploads
 from iort_agent.lanes.batch import StreamCounts
-from iort_agent.lanes.clock_offset import ClockOffset
+from iort_agent.lanes.clock_offset import OffsetEstimator
 from iort_agent.mqtt.uplink import Uplink
-from iort_agent.schema import flag, number, setting
 from iort_agent.spool.memory import Spool
 from iort_contract.catalog.streams import AGENT_FIELDS
 from iort_contract.limits import Value
@@ -24,14 +24,14 @@ _STATM = Path("/proc/self/statm")
 
 @dataclass(frozen=True)
 class MetricsConfig:
-    """The agent's own figures, a sample every ``every_s`` of the stream `AGENT_STREAM`."""
+    """The agent's own figures: one sample of the stream `iort_contract.AGENT_STREAM` every ``every_s``."""
 
     enabled: bool = setting(flag(), default=True)
     every_s: float = setting(number(1, 3600, unit="s"), 10.0)
 
 
 class Rates:
-    """Samples a second of each stream, and for how long each has been silent."""
+    """Samples a second of each stream, and the time since its last sample."""
 
     def __init__(self, clock: Clock) -> None:
         self._clock = clock
@@ -41,7 +41,7 @@ class Rates:
         self.per_s: dict[str, float] = {}
 
     def update(self, counts: Mapping[str, StreamCounts]) -> None:
-        """Note the counts; call it about once a second."""
+        """Take the counts; called about once a second."""
         now = self._clock.monotonic()
         passed = now - self._at
         if passed <= 0:
@@ -55,12 +55,12 @@ class Rates:
                 self._changed[name] = now
 
     def silent_s(self, stream: str) -> float:
-        """Seconds since a sample came, to within the time between two updates."""
+        """Seconds since the last sample, to within the time between two updates."""
         return round(self._clock.monotonic() - self._changed.get(stream, self._at), 1)
 
 
 class AgentMetrics:
-    """Makes one sample after another."""
+    """Makes the samples."""
 
     def __init__(
         self,
@@ -68,7 +68,7 @@ class AgentMetrics:
         clock: Clock,
         spool: Spool,
         uplink: Uplink,
-        offset: ClockOffset,
+        offset: OffsetEstimator,
         uploads: Uploads | None = None,
     ) -> None:
         self._clock, self._spool, self._uplink, self._offset = clock, spool, uplink, offset
@@ -76,11 +76,11 @@ class AgentMetrics:
         self._at, self._cpu_s, self._samples = clock.monotonic(), time.process_time(), 0
 
     def sample(self, samples: int) -> dict[str, Value]:
-        """The figures now; ``samples`` is how many the sources have given so far."""
+        """The figures since the last call; ``samples`` counts what all sources have given so far."""
         now, cpu_s = self._clock.monotonic(), time.process_time()
         passed = max(now - self._at, 1e-3)
         backlog, dropped, offset = self._spool.backlog(), self._spool.dropped(), self._offset.estimate()
-        files = self._uploads.counts() if self._uploads is not None else None
+        files = self._uploads.status() if self._uploads is not None else None
         values: dict[str, Value] = {
             "cpu_percent": round((cpu_s - self._cpu_s) / passed * 100, 2),
             "rss_mb": rss_mb(),
@@ -100,7 +100,7 @@ class AgentMetrics:
 
 
 def rss_mb() -> float:
-    """Memory in use by this process; where there is no /proc, the most it ever used."""
+    """The memory that this process uses; without /proc, the most that it has used."""
     try:
         pages = int(_STATM.read_text(encoding="ascii").split()[1])
     except (OSError, ValueError, IndexError):
