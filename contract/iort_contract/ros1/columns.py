@@ -15,7 +15,7 @@ from functools import lru_cache
 from typing import Any, Mapping, NamedTuple, Sequence
 
 from iort_contract.checks import COMPACT, shown, wire_column
-from iort_contract.codec.columns import CODEC, packed, unpacked
+from iort_contract.codec.columns import packed, unpacked
 from iort_contract.limits import (
     MAX_BATCH_VALUES,
     MAX_FIELD_CHARACTERS,
@@ -150,11 +150,11 @@ def from_columns(
         raw = [rows[i * size : (i + 1) * size] for i in range(n)]
         if decoder.stamped:
             seq, stamp, frame = head
-            seqs = range(seq, seq + n) if type(seq) is int else unpacked(CODEC, "seq", seq, n)
+            seqs = range(seq, seq + n) if type(seq) is int else unpacked("seq", seq, n)
             offsets: Sequence[Any] = (
                 [int(stamp[3 * i : 3 * i + 3]) for i in range(n)]
                 if isinstance(stamp, str)
-                else unpacked(CODEC, "stamp", stamp, n)
+                else unpacked("stamp", stamp, n)
             )
             # A single value stands for all messages.
             texts = [frame] * n if isinstance(frame, str) else frame
