@@ -32,10 +32,10 @@ def build(app: App, settings: Settings) -> list[Acknowledged]:
     storage = Storage(app, settings)
     quarantine = Quarantine(app, settings, storage)
     fleet = Fleet(app, settings, storage=storage, quarantine=quarantine)
-    processing = Processing(app, settings, storage=storage, quarantine=quarantine)
-    functions = {**processing.called, "presence": fleet.presence}
-    ingest = Ingest(app, settings, storage=storage, quarantine=quarantine, functions=functions)
-    watched = (storage, quarantine, fleet, processing, ingest)
+    called = {"presence": fleet.presence}
+    processing = Processing(app, settings, storage=storage, quarantine=quarantine, called=called)
+    Ingest(app, settings, storage=storage, quarantine=quarantine, functions=processing.called)
+    watched = (storage, quarantine, fleet, processing)
     Monitoring(app, settings, stacks=watched, topic=processing.alarms)
     if settings.site:
         Site(app, settings)

@@ -9,11 +9,9 @@ from aws_cdk import aws_iam as iam
 from aws_cdk import aws_iot as iot
 from aws_cdk import aws_lambda as lambda_
 
-from iort_contract.catalog.environments import Environment
-from iort_contract.catalog.rules import RULES, Call, Republish, Rule, Store
+from iort_contract.catalog.rules import RULES, Republish, Rule, Store
 from stacks.parts import iot_core
 from stacks.parts.base import PlatformStack
-from stacks.parts.function import function, invoked_by_rule
 from stacks.quarantine import Quarantine
 from stacks.settings import Settings
 from stacks.storage import Storage
@@ -22,12 +20,8 @@ Action = iot.CfnTopicRule.ActionProperty
 
 
 class Ingest(PlatformStack):
-    """The rules that take messages from the broker, and the functions of rules that no other stack has made:
-    they need no grants but their log's.
-
-    Messages that an action rejects go to a queue of the quarantine, with their bytes (base64OriginalPayload)
-    and the reason.
-    """
+    """The rules that take messages from the broker. Messages that an action rejects go to a queue of the
+    quarantine, with their bytes (base64OriginalPayload) and the reason."""
 
     def __init__(
         self,
@@ -39,7 +33,7 @@ class Ingest(PlatformStack):
         functions: Mapping[str, lambda_.Function],
     ) -> None:
         super().__init__(app, "ingest", settings, storage.encryption)
-        self._given, self._functions = functions.keys(), dict(functions)
+        self._functions = functions
         self._tables = {"telemetry": storage.telemetry}
         self._queues = {"rejected": quarantine.rejected}
         for rule in RULES.values():
@@ -47,8 +41,6 @@ class Ingest(PlatformStack):
 
     def _rule(self, rule: Rule) -> None:
         name = rule.name.capitalize()
-        if isinstance(rule.action, Call) and rule.action.function not in self._given:
-            name += "Rule"  # its function, which is made here, may have the rule's name
         role = iot_core.role(self, f"{name}Role")
         failures = self._queues[rule.error_queue]
         failures.grant(role, "sqs:SendMessage")
@@ -58,7 +50,7 @@ class Ingest(PlatformStack):
         elif isinstance(rule.action, Republish):
             action = self._republish(rule.action, role)
         else:
-            called = self._functions.get(rule.action.function) or self._made(rule.action.function, rule)
+            called = self._functions[rule.action.function]
             action = Action(lambda_=iot.CfnTopicRule.LambdaActionProperty(function_arn=called.function_arn))
         made = iot.CfnTopicRule(
             self,
@@ -68,7 +60,7 @@ class Ingest(PlatformStack):
                 sql=rule.statement(
                     self.settings.namespace,
                     retention_s=self.settings.retention_s,
-                    low_voltage_v=self.settings.thresholds.low_voltage_v,
+                    low_voltage_v=self.settings.low_voltage_v,
                 ),
                 aws_iot_sql_version="2016-03-23",
                 actions=[action],
@@ -103,9 +95,3 @@ class Ingest(PlatformStack):
                 role_arn=role.role_arn, topic=republish.topic(namespace), qos=0
             )
         )
-
-    def _made(self, name: str, rule: Rule) -> lambda_.Function:
-        made = function(self, name.capitalize(), Environment(self.settings.namespace))
-        invoked_by_rule(made, self._queues[rule.error_queue])
-        self._functions[name] = made
-        return made

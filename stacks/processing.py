@@ -3,6 +3,8 @@ each with its own role and log."""
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+
 from aws_cdk import App, CfnOutput, Duration
 from aws_cdk import aws_iam as iam
 from aws_cdk import aws_lambda as lambda_
@@ -20,6 +22,7 @@ from iort_contract.catalog.environments import (
     SummarizeEnvironment,
     UploadEnvironment,
 )
+from iort_contract.catalog.rules import RULES, Call
 from iort_contract.cloud import RESULTS_PREFIX, pubnub_parameter
 from iort_contract.messages.files import FILES_PREFIX
 from iort_contract.tables import ALERT_PREFIX, FILES_BYTES, FILES_DAY, STREAMS
@@ -35,10 +38,21 @@ _SUMMARIZE_S = 60
 
 
 class Processing(PlatformStack):
-    """The functions, with the grants that each one needs. ``called`` are those that rules call; ``alarms`` is
-    the topic of every alarm and every car's alert."""
+    """The functions, with the grants that each one needs.
 
-    def __init__(self, app: App, settings: Settings, *, storage: Storage, quarantine: Quarantine) -> None:
+    ``called`` are those of all rules, also of other stacks; one that is not described here needs no grants
+    but its log's. ``alarms`` is the topic of every alarm and every car's alert.
+    """
+
+    def __init__(
+        self,
+        app: App,
+        settings: Settings,
+        *,
+        storage: Storage,
+        quarantine: Quarantine,
+        called: Mapping[str, lambda_.Function],
+    ) -> None:
         super().__init__(app, "processing", settings, storage.encryption)
         self._storage, self._rejected = storage, quarantine.rejected
         live = self._live()
@@ -49,7 +63,15 @@ class Processing(PlatformStack):
         echo, upload = self._echo(), self._upload()
         self._query()
         self.alarms = self._alarms()
-        self.called = {"live": live, "echo": echo, "upload": upload, "alert": self._alert()}
+        self.called = {**called, "live": live, "echo": echo, "upload": upload, "alert": self._alert()}
+        for rule in RULES.values():
+            if isinstance(rule.action, Call) and rule.action.function not in self.called:
+                self.called[rule.action.function] = self._plain(rule.action.function)
+
+    def _plain(self, name: str) -> lambda_.Function:
+        made = function(self, name.capitalize(), Environment(self.settings.namespace))
+        invoked_by_rule(made, self._rejected)
+        return made
 
     def _live(self) -> lambda_.Function:
         name = pubnub_parameter(self.settings.namespace)
@@ -193,7 +215,7 @@ class Processing(PlatformStack):
                 namespace=self.settings.namespace,
                 robots_table=self._storage.robots.table_name,
                 alarm_topic=self.alarms.topic_arn,
-                low_voltage_v=self.settings.thresholds.low_voltage_v,
+                low_voltage_v=self.settings.low_voltage_v,
             ),
         )
         self._storage.may_keep(alert, f"{ALERT_PREFIX}*")
@@ -203,8 +225,7 @@ class Processing(PlatformStack):
         return alert
 
     def _echo(self) -> lambda_.Function:
-        echo = function(self, "Echo", Environment(self.settings.namespace))
-        invoked_by_rule(echo, self._rejected)
+        echo = self._plain("echo")
         allow(echo, ["iot:Publish"], self._pongs(LAMBDA))
         return echo
 

@@ -49,7 +49,7 @@ class Alarms(Construct):
     def _add(self, name: str, alarm: Alarm, metric: cloudwatch.IMetric) -> None:
         limit = alarm.threshold
         if isinstance(limit, str):
-            limit = getattr(self._settings.thresholds, limit)
+            limit = getattr(self._settings, limit)
         operator = cloudwatch.ComparisonOperator
         made = cloudwatch.Alarm(
             self,

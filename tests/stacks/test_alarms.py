@@ -65,7 +65,7 @@ def test_the_thresholds_are_the_settings(production, synthesized):
     alarms = {
         a["AlarmName"]: a["Threshold"] for a in synthesized.resources("AWS::CloudWatch::Alarm").values()
     }
-    limits = Settings().thresholds
+    limits = Settings()
     assert alarms["iort-BatteryVolts"] == limits.low_voltage_v == LOW_VOLTAGE_V
     assert alarms["iort-TemperatureDegC"] == limits.high_temperature_degc
     assert alarms["iort-CarToLambdaMs"] == limits.car_to_lambda_ms

@@ -150,7 +150,7 @@ def metrics_insights(target: Target) -> Seen:
         "first_line": "ROBOT: fault 5, MOSFET over-temperature",
         "says": ["when", "stream"],
     },
-    relied_on_by=("functions/alert.py", "stacks/storage.py", "contract/iort_contract/cloud.py"),
+    relied_on_by=("functions/alert.py", "stacks/storage.py", "contract/iort_contract/catalog/rules.py"),
 )
 def alert(target: Target) -> Seen:
     """A car's fault goes from the rule fault to the alert function, which may note it in the car's row, and

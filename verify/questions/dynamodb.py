@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Any
+from typing import cast
 
 from botocore.exceptions import ClientError
 
@@ -89,7 +89,7 @@ def failed_condition(target: Target) -> Seen:
             ReturnValuesOnConditionCheckFailure="ALL_OLD",
         )
     except ClientError as error:
-        item: Any = error.response.get("Item", {})
+        item = cast("dict[str, object]", error.response.get("Item", {}))
         return {
             "code": error.response["Error"]["Code"],
             "status": error.response["ResponseMetadata"]["HTTPStatusCode"],

@@ -28,7 +28,7 @@ _AWS_MESSAGE_BYTES = 128 * 1024
     expected={"refused_by": "function", "topic_as_subscribed": True, "byte_by_byte": True},
     source=f"{_GUIDE}/binary-payloads.html",
     relied_on_by=(
-        "contract/iort_contract/cloud.py",
+        "contract/iort_contract/catalog/rules.py",
         "functions/live.py",
         "local/patches/unreadable_payload.patch",
     ),

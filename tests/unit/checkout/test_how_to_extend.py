@@ -13,9 +13,7 @@ from typing import Any
 
 import pytest
 
-from iort_contract.messages.live import LiveSample, encode_live
 from scripts.docs_parts import ROOT
-from tests.iot_sql import Message, evaluate
 
 PAGE = (ROOT / "docs" / "how-to-extend.md").read_text()
 SECTIONS = dict(re.findall(r"^## (.*?)\n(.*?)(?=^## |\Z)", PAGE, re.DOTALL | re.MULTILINE))
@@ -150,52 +148,53 @@ def test_a_derived_field(copy: Copy) -> None:
     assert "export const motor_power_w = " in (copy.root / "station/web/src/base/contract.ts").read_text()
 
 
-def test_a_rule(cloud: Copy) -> None:
-    (rule,) = resources(cloud, "ingest", "AWS::IoT::TopicRule", "HotRule")
-    sql = rule["TopicRulePayload"]["Sql"]
-    live = encode_live(LiveSample("0badcafe", 1, 1_000, 2_000, {"temp_fet": 81.5}))
-    event = evaluate(sql, Message("live/iort/car7/vesc", live, 3))
-    assert event["temp_fet"] == 81.5
-    cold = encode_live(LiveSample("0badcafe", 1, 1_000, 2_000, {"temp_fet": 20}))
-    assert evaluate(sql, Message("live/iort/car7/vesc", cold, 3)) is None
-    printed = cloud.run("-c", f"from functions.hot import handler; handler({event!r}, None)")
-    assert printed == "car7: 81.5 degC\n"
-    (made,) = resources(cloud, "ingest", "AWS::Lambda::Function", "Hot")
-    assert made["Handler"] == "functions.hot.handler"
+def templates(copy: Copy) -> dict[str, dict[str, Any]]:
+    """The resources of each stack of the copy, by logical id."""
+    layer = copy.root / "build" / "layer" / "lambda"
+    layer.mkdir(parents=True)
+    (layer / "nothing.py").touch()
+    copy.run("app.py")
+    return {
+        path.name.removesuffix(".template.json"): json.loads(path.read_text())["Resources"]
+        for path in (copy.root / "cdk.out").glob("*.template.json")
+    }
 
 
-def test_a_function(cloud: Copy) -> None:
-    (made,) = resources(cloud, "processing", "AWS::Lambda::Function", "Online")
-    assert made["Handler"] == "functions.online.handler"
-    assert made["Environment"]["Variables"].keys() == {"NAMESPACE", "ROBOTS_TABLE"}
-    found = cloud.show(
-        "online(Client(), 'robots')",
-        "from functions.online import online",
-        "class Client:",
-        "    def get_paginator(self, name): return self",
-        "    def paginate(self, TableName): return self",
-        "    def search(self, path):",
-        "        return [{'robot': {'S': 'a'}, 'online': {'BOOL': True}}, {'robot': {'S': 'b'}}]",
+def of_type(resources: dict[str, Any], kind: str, name: str) -> Any:
+    """The properties of the one resource of a type whose logical id begins so."""
+    (found,) = (one for key, one in resources.items() if one["Type"] == kind and key.startswith(name))
+    return found["Properties"]
+
+
+def test_a_rule(copy: Copy) -> None:
+    assert len(set(copy.follow("A rule"))) == 3
+    stacks = templates(copy)
+    rule = of_type(stacks["iort-ingest"], "AWS::IoT::TopicRule", "Horn")
+    assert rule["TopicRulePayload"]["Sql"].endswith("FROM 'live/iort/+/+' WHERE sample.horn > 0")
+    assert rule["TopicRulePayload"]["ErrorAction"]
+    function = of_type(stacks["iort-processing"], "AWS::Lambda::Function", "Horn")
+    assert function["Handler"] == "functions.horn.handler"
+    assert of_type(stacks["iort-monitoring"], "AWS::CloudWatch::Alarm", "AlarmsHornErrors")
+    assert "HornsSounded" in json.dumps(
+        of_type(stacks["iort-monitoring"], "AWS::CloudWatch::Dashboard", "DashboardsRobots")
     )
-    assert found == ["a"]
+    handler = (
+        "from functions.horn import handler; import os; os.environ['NAMESPACE'] = 'iort'; handler({}, None)"
+    )
+    assert json.loads(copy.run("-c", handler))["HornsSounded"] == 1
+    copy.run("-m", "scripts.docs_parts")
+    assert "| `horn` | counts who sounds the horn |" in (copy.root / "docs/processing.md").read_text()
 
 
-@pytest.fixture(scope="module")
-def cloud(tmp_path_factory: pytest.TempPathFactory) -> Copy:
-    """A copy with a rule and a function more, and its templates: the slow part, done once for both."""
-    copy = Copy(tmp_path_factory.mktemp("cloud") / "checkout")
-    assert len(set(copy.follow("A rule"))) == 2
-    assert len(set(copy.follow("A function"))) == 2
-    copy.run("-c", SYNTHESIZE)
-    return copy
-
-
-def resources(copy: Copy, stack: str, kind: str, start: str) -> list[dict[str, Any]]:
-    """The resources of a kind in a stack of the copy, whose logical ids start with a name."""
-    template = json.loads((copy.root / "cdk.out" / f"iort-{stack}.template.json").read_text())
-    named = re.compile(rf"{start}[0-9A-F]{{8}}|{start}")
-    found = template["Resources"].items()
-    return [r["Properties"] for name, r in found if r["Type"] == kind and named.fullmatch(name)]
+def test_a_function(copy: Copy) -> None:
+    assert len(set(copy.follow("A function"))) == 3
+    stacks = templates(copy)
+    function = of_type(stacks["iort-processing"], "AWS::Lambda::Function", "Count")
+    assert function["Environment"]["Variables"].keys() == {"NAMESPACE", "TELEMETRY_TABLE"}
+    policy = of_type(stacks["iort-processing"], "AWS::IAM::Policy", "CountRole")
+    actions = [one["Action"] for one in policy["PolicyDocument"]["Statement"]]
+    assert "dynamodb:Query" in actions
+    assert copy.show("callable(handler)", "from functions.count import handler") is True
 
 
 def test_a_verb(copy: Copy) -> None:

@@ -43,7 +43,7 @@ def test_each_limit_is_told_as_it_is() -> None:
         "SECOND_BATCHES": stored.SECOND_BATCHES,
         "REFUSALS": live.REFUSALS,
         "REFUSALS_A_SECOND": live.REFUSALS_A_SECOND,
-        "upload_gb_a_day": Settings.__dataclass_fields__["upload_gb_a_day"].default,
+        "upload_gb_a_day": Settings.model_fields["upload_gb_a_day"].default,
         **{name: getattr(of, name) for of in MODULES for name in table if hasattr(of, name)},
     }
     assert table.keys() == told.keys()
