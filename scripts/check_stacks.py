@@ -19,6 +19,7 @@ import sys
 import time
 from collections import defaultdict
 from collections.abc import Iterable, Iterator
+from contextlib import contextmanager
 from functools import cache
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -75,29 +76,21 @@ def main() -> None:
         layer = Path(folder) / "layer"
         (layer / "python").mkdir(parents=True)
         for stage, given in STAGES.items():
-            began = time.monotonic()
-            out = Path(folder) / stage
-            settings = Settings(layer=layer, **given)
-            known[stage] = synthesize(settings, out)
-            found += nag(out)
-            print(f"check: stage {stage} synthesized, cdk-nag ({time.monotonic() - began:.0f} s)", flush=True)
-        began = time.monotonic()
+            with timed(f"stage {stage} synthesized, cdk-nag"):
+                known[stage] = synthesize(Settings(layer=layer, **given), Path(folder) / stage)
+                found += nag(Path(folder) / stage)
         # cdk-nag's and checkov's findings depend only on the parameters of the stages.
-        for name, given in VARIATIONS.items():
-            app = App(outdir=str(Path(others) / name))
-            build(app, Settings(layer=layer, **given))
-            app.synth()
-        print(
-            f"check: {len(VARIATIONS)} variations synthesized ({time.monotonic() - began:.0f} s)", flush=True
-        )
+        with timed(f"{len(VARIATIONS)} variations synthesized"):
+            for name, given in VARIATIONS.items():
+                app = App(outdir=str(Path(others) / name))
+                build(app, Settings(layer=layer, **given))
+                app.synth()
         found += own(Path(folder), Path(others))
-        began = time.monotonic()
-        found += lint(Path(folder), Path(others))
-        print(f"check: cfn-lint ({time.monotonic() - began:.0f} s)", flush=True)
+        with timed("cfn-lint"):
+            found += lint(Path(folder), Path(others))
         if asked.checkov:
-            began = time.monotonic()
-            found += checkov(asked.checkov, Path(folder))
-            print(f"check: checkov ({time.monotonic() - began:.0f} s)", flush=True)
+            with timed("checkov"):
+                found += checkov(asked.checkov, Path(folder))
     findings = [finding.text for finding in found if not finding.acknowledged]
     findings += stale(known, found, unjudged=() if asked.checkov else ("CKV",))
     text = document(known)
@@ -111,6 +104,14 @@ def main() -> None:
                 [*findings, f"{len(findings)} open: fix, or acknowledge in stacks/checks/acknowledged.py"]
             )
         )
+
+
+@contextmanager
+def timed(what: str) -> Iterator[None]:
+    """Print what has been done, and the seconds that it took."""
+    began = time.monotonic()
+    yield
+    print(f"check: {what} ({time.monotonic() - began:.0f} s)", flush=True)
 
 
 def synthesize(settings: Settings, out: Path) -> list[Acknowledged]:

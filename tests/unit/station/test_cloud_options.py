@@ -8,8 +8,8 @@ from urllib.request import proxy_bypass
 import pytest
 from typer.testing import CliRunner
 
+from iort_station.cli.cloud_options import CloudOptions
 from iort_station.cli.main import app, said
-from iort_station.cli.where import Where
 from iort_station.cloud import Cloud, find_embedded
 from iort_station.errors import StationError
 from iort_station.page import keys
@@ -29,7 +29,7 @@ def newcomer(monkeypatch, tmp_path):
 def found(tmp_path):
     def cloud(**options):
         given = {"namespace": "iort", "profile": None, "region": None, "local": False, **options}
-        return Where(**given, embedded=tmp_path / "cloud.json").cloud()
+        return CloudOptions(**given, embedded=tmp_path / "cloud.json").cloud()
 
     return cloud
 
@@ -53,13 +53,13 @@ def test_an_embedded_cloud_is_found_from_any_folder_of_its_checkout(tmp_path):
 def test_away_from_a_checkout_local_says_how_to_name_the_file(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     with pytest.raises(StationError, match=r"no embedded cloud is running.*IORT_EMBEDDED names its file"):
-        Where("iort", None, None, local=True, embedded=None).cloud()
+        CloudOptions("iort", None, None, local=True, embedded=None).cloud()
 
 
 def test_the_environment_names_an_embedded_cloud(tmp_path):
     named = {"IORT_EMBEDDED": str(tmp_path / "cloud.json")}
     done = CliRunner().invoke(app, ["--local", "robots", "list"], env=named)
-    assert f"no embedded cloud is running: {tmp_path / 'cloud.json'} is not there" in str(done.exception)
+    assert f"no embedded cloud is running: {tmp_path / 'cloud.json'} does not exist" in str(done.exception)
 
 
 def test_a_region_without_credentials_says_how_to_give_them(found, monkeypatch):
@@ -146,5 +146,5 @@ def test_a_file_that_cannot_be_written_is_named(tmp_path):
 
 
 def test_a_stack_that_is_not_deployed_is_named_with_its_region(aws):
-    with pytest.raises(StationError, match=r"iort-storage is not deployed in eu-west-1: `make deploy`"):
+    with pytest.raises(StationError, match=r"iort-storage is not deployed in eu-west-1: run `make deploy`"):
         Cloud().output("storage", "TelemetryTable")
