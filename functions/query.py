@@ -7,7 +7,6 @@ returns a token to continue.
 
 from __future__ import annotations
 
-import os
 import uuid
 from collections import Counter
 from collections.abc import Callable, Mapping
@@ -15,12 +14,12 @@ from dataclasses import dataclass
 from functools import cache
 from typing import Any
 
-import boto3
-from botocore.config import Config
-
+from functions.shared import clients
+from functions.shared.environment import variables
 from functions.shared.tables import Tables
 from iort_contract import expression
 from iort_contract.catalog.derived import DERIVED, derive
+from iort_contract.catalog.environments import QueryEnvironment
 from iort_contract.cloud import RESULTS_PREFIX
 from iort_contract.dynamodb import plain, with_samples_between
 from iort_contract.expression import ExpressionError, MismatchError, Node
@@ -197,34 +196,19 @@ def _answer(
 
 @cache
 def _tables() -> Tables:
-    return Tables(
-        boto3.client("dynamodb"),
-        telemetry=os.environ["TELEMETRY_TABLE"],
-        summary="",  # it may not read this table
-        robots=os.environ["ROBOTS_TABLE"],
-    )
-
-
-@cache
-def _s3() -> Any:
-    # As in functions/upload.py: the global host redirects, which invalidates a signature.
-    config = Config(signature_version="s3v4", s3={"addressing_style": "virtual"})
-    return boto3.client("s3", config=config)
+    given = variables(QueryEnvironment)
+    # It may not read the summary table.
+    return Tables(clients.dynamodb(), telemetry=given.telemetry_table, summary="", robots=given.robots_table)
 
 
 def _store(samples: bytes) -> str:
-    place = {"Bucket": os.environ["FILES_BUCKET"], "Key": f"{RESULTS_PREFIX}{uuid.uuid4().hex}.json.zlib"}
-    _s3().put_object(**place, Body=samples, ContentType="application/zlib")
-    url: str = _s3().generate_presigned_url("get_object", Params=place, ExpiresIn=_URL_S)
-    return url
+    bucket, key = variables(QueryEnvironment).files_bucket, f"{RESULTS_PREFIX}{uuid.uuid4().hex}.json.zlib"
+    clients.s3().put_object(Bucket=bucket, Key=key, Body=samples, ContentType="application/zlib")
+    place = {"Bucket": bucket, "Key": key}
+    return clients.s3().generate_presigned_url("get_object", Params=place, ExpiresIn=_URL_S)
 
 
 def handler(event: dict[str, Any], context: Any) -> dict[str, Any]:
     """Entry point of an invocation by the operator."""
-    return answer(
-        event,
-        _tables(),
-        _store,
-        context.get_remaining_time_in_millis,
-        namespace=os.environ["NAMESPACE"],
-    )
+    left_ms = context.get_remaining_time_in_millis
+    return answer(event, _tables(), _store, left_ms, namespace=variables(QueryEnvironment).namespace)

@@ -114,7 +114,7 @@ class Cloud:
         key = service, region
         if key not in self._clients:
             try:
-                self._clients[key] = self._session.client(
+                self._clients[key] = self._session.client(  # type: ignore[call-overload]  # any service's name
                     service,
                     region_name=region,
                     endpoint_url=self.endpoint_url,

@@ -28,7 +28,7 @@ _AWS_MESSAGE_BYTES = 128 * 1024
     expected={"refused_by": "function", "topic_as_subscribed": True, "byte_by_byte": True},
     source=f"{_GUIDE}/binary-payloads.html",
     relied_on_by=(
-        "contract/iort_contract/cloud.py",
+        "contract/iort_contract/catalog/rules.py",
         "functions/live.py",
         "local/patches/unreadable_payload.patch",
     ),
@@ -50,7 +50,7 @@ def live_no_json(target: Target) -> Seen:
 @question(
     "payloads.record_no_json",
     expected={"stored": 0, "refused_by": ["rule"]},
-    relied_on_by=("stacks/ingest.py", "stacks/alarms.py"),
+    relied_on_by=("stacks/ingest.py", "stacks/monitoring/alarms.py"),
 )
 def record_no_json(target: Target) -> Seen:
     """The rule record stores nothing from a payload that is not JSON, or from a batch without a key. The

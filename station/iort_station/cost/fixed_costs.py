@@ -11,7 +11,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 
-from iort_contract.cloud import METRICS
+from iort_contract.catalog.metrics import METRICS, metrics_of
 from iort_station.cost.prices import MONTH_HOURS, PRICES, Price
 from iort_station.cost.usage import Usage
 
@@ -35,7 +35,7 @@ def deployment_dollars_per_month(usage: Usage, prices: Mapping[str, Price] = PRI
     """Dollars by purpose: metrics, alarms, dashboards, queue polls, and if set Device Defender's audit and
     the account's own key."""
     hours, robots = MONTH_HOURS, usage.robots if usage.robot_metrics else 0
-    metrics = sum(map(len, METRICS.values())) + robots * len(METRICS["health"])
+    metrics = len(METRICS) + robots * len(metrics_of("health"))
     dashboards = dashboard_metrics(usage)
     counts = {
         "metrics": ("metric", max(0, metrics - FREE_METRICS)),

@@ -97,7 +97,7 @@ def _block(items: Sequence[Item]) -> Block:
     return Block(times, {name: column_of([row.get(name) for row in rows]) for name in ordered})
 
 
-def _value(value: Mapping[str, Any]) -> Any:
+def _value(value: Any) -> Any:
     if "L" in value:
         return [_value(each) for each in value["L"]]
     return float(value["N"]) if "N" in value else _deserialize(value)

@@ -125,7 +125,7 @@ def test_counts_what_is_no_batch():
     [
         ({"robot": "a/b"}, "robot name"),
         ({"where": "speed >"}, "invalid expression"),
-        ({"start_us": "now"}, "integer of microseconds"),
+        ({"start_us": "now"}, "must be an integer"),
         ({"fields": [1]}, "list of names"),
         ({"where": 7}, ""),
         ({"where": "speed > '3'"}, "speed is a number, '3' is a text"),

@@ -10,10 +10,10 @@ from typer.testing import CliRunner
 
 from bench import message_sizes
 from bench.load.simulated import simulated_drive
-from functions.shared.health import measure
 from functions.shared.metrics import Gathered, emit
+from functions.shared.summary.health import measure
 from iort_agent.lanes.pings import CLOCK_EVERY_S
-from iort_contract.cloud import METRICS
+from iort_contract.catalog.metrics import METRICS
 from iort_station.cli.main import app
 from iort_station.cost import line_items, model, report, scale
 from iort_station.cost.fixed_costs import (
@@ -212,7 +212,7 @@ def test_the_documents_count_what_is_watched_as_the_model_does():
     text = (ROOT / "docs" / "cloud.md").read_text()
     platform, robots = _ONE.dashboards
     for line in (
-        f"| {sum(map(len, METRICS.values()))} | $0.30 each | {FREE_METRICS} |",
+        f"| {len(METRICS)} | $0.30 each | {FREE_METRICS} |",
         f"| {_ONE.alarms} | $0.10 each | {FREE_ALARMS} |",
         f"| 4, of up to {_ONE.insights_metrics} metrics | $0.10 for each",
         f"| 2, of {platform} and {robots} metrics | $3 each | {FREE_DASHBOARDS}, of up to",

@@ -11,8 +11,8 @@ import pytest
 from typer.testing import CliRunner
 
 from iort_contract.messages.files import File, file_key
+from iort_station.cli.cloud_options import CloudOptions
 from iort_station.cli.main import app
-from iort_station.cli.where import Where
 from iort_station.cloud import Cloud
 from iort_station.errors import StationError
 from iort_station.fleet import files
@@ -171,7 +171,7 @@ def test_empty_leaves_nothing(cloud, store, s3):
 
 @pytest.fixture
 def iort(cloud, monkeypatch):
-    monkeypatch.setattr(Where, "cloud", lambda _self: cloud)
+    monkeypatch.setattr(CloudOptions, "cloud", lambda _self: cloud)
 
     def run(*arguments, status=0, **how):
         done = CliRunner().invoke(app, ["files", *arguments], **how)

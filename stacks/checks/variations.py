@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from typing import Any
 
-from stacks.settings import ALL_LOGS, PROD, Thresholds
+from stacks.settings import ALL_LOGS, PROD
 
 # Parameters with two values each, to change and to change back; the base has every default. Settings that
 # only change properties of different resources change together: an app takes seconds to synthesize.
@@ -27,7 +27,10 @@ FLIPS: dict[str, dict[str, Any]] = {
         "robot_metrics": True,
         "function_logs": ALL_LOGS,
         "tags": {"team": "lab"},
-        "thresholds": Thresholds(low_voltage_v=13.2, stream_behind_s=30),
+        "low_voltage_v": 13.2,
+        "high_temperature_degc": 70.0,
+        "stream_behind_s": 30.0,
+        "car_to_lambda_ms": 1_000.0,
     },
 }
 KEY: dict[str, Any] = {"customer_key": True}

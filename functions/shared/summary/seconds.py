@@ -11,7 +11,7 @@ from collections import defaultdict
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 
-from functions.shared.stored import Reader, Stored
+from functions.shared.summary.stored import Reader, Stored
 from functions.shared.tables import Tables
 from iort_contract.codec.seconds import Statistics
 from iort_contract.limits import MAX_BATCH_SPAN_US

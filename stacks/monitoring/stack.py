@@ -3,36 +3,26 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any
 
-from aws_cdk import Stack
+from aws_cdk import App, Stack
 from aws_cdk import aws_budgets as budgets
 from aws_cdk import aws_sns as sns
-from constructs import Construct
 
-from stacks.alarms import Alarms
-from stacks.dashboards import Dashboards
+from stacks.monitoring.alarms import Alarms
+from stacks.monitoring.dashboards import Dashboards
+from stacks.monitoring.watched import Watched
+from stacks.parts.base import PlatformStack
 from stacks.settings import Settings
-from stacks.watched import Watched
 
 
-class Monitoring(Stack):
+class Monitoring(PlatformStack):
     """Watches every function, table and queue of ``stacks``; alarms notify ``topic``."""
 
-    def __init__(
-        self,
-        scope: Construct,
-        construct_id: str,
-        *,
-        settings: Settings,
-        stacks: Sequence[Stack],
-        topic: sns.ITopic,
-        **kwargs: Any,
-    ) -> None:
-        super().__init__(scope, construct_id, **kwargs)
+    def __init__(self, app: App, settings: Settings, *, stacks: Sequence[Stack], topic: sns.ITopic) -> None:
+        super().__init__(app, "monitoring", settings)
         watched = Watched.of(stacks)
-        alarms = Alarms(self, "Alarms", settings=settings, watched=watched, topic=topic)
-        Dashboards(self, "Dashboards", settings=settings, watched=watched, alarms=alarms.every)
+        alarms = Alarms(self, settings, watched=watched, topic=topic)
+        Dashboards(self, settings, watched=watched, alarms=alarms.every)
         if settings.budget_usd:
             self._budget(settings)
 

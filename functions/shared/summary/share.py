@@ -7,14 +7,19 @@ import logging
 import math
 import time
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from botocore.exceptions import BotoCoreError, ClientError
 
-from functions.shared.allowances import Allowances
+from functions.shared.queues import send_all
+from functions.shared.rate_limiter import RateLimiter
 from iort_contract.limits import ContractError
 from iort_contract.tables import BATCH, OVER_SHARE, PUT_OFF, PUT_OFF_LAST_MS, PUT_OFF_SINCE_MS, TOPIC
 from iort_contract.topics import SHADOW, parse_topic
+
+if TYPE_CHECKING:
+    from types_boto3_iot_data import IoTDataPlaneClient
+    from types_boto3_sqs import SQSClient
 
 _log = logging.getLogger(__name__)
 # CPU seconds of a robot: per second, and as a burst. A normal car takes a hundredth.
@@ -24,8 +29,6 @@ REQUESTS_S = 0.002
 # The keys of a message. The dearest batch, of 60 s, takes 2.6 s of a processor with the seconds beside
 # it, and the later function has 0.29 of one for 60 s.
 KEYS = 4
-# SendMessageBatch takes as many.
-_MESSAGES = 10
 # A robot is notified again after this time; after a longer time within its share, it is notified anew.
 TELL_S, OVER_S = 30.0, 60.0
 _ROBOTS = 1000
@@ -53,7 +56,7 @@ class Share:
         spent_s: Callable[[], float] = time.thread_time,
     ) -> None:
         self._burst_s, self._spent_s = burst_s, spent_s
-        self._allowances = Allowances(burst=burst_s, a_second=a_second)
+        self._limiter = RateLimiter(burst=burst_s, a_second=a_second)
 
     @classmethod
     def unlimited(cls) -> Share:
@@ -62,27 +65,33 @@ class Share:
 
     def over(self, robot: str, at_s: float) -> bool:
         """Whether the robot's next batch has to wait."""
-        return self._allowances.left(robot, at_s) <= 0
+        return self._limiter.left(robot, at_s) <= 0
 
     def meter(self, robot: str, at_s: float) -> Meter:
         """Measure this thread's work for a robot from now on."""
-        return Meter(self._allowances, self._spent_s, robot, at_s, least_s=-self._burst_s)
+        return Meter(self._limiter, self._spent_s, robot, at_s, least_s=-self._burst_s)
 
 
 class Meter:
     """Charges the work of the thread that created it to a robot."""
 
     def __init__(
-        self, allowances: Allowances, spent_s: Callable[[], float], robot: str, at_s: float, *, least_s: float
+        self,
+        limiter: RateLimiter,
+        spent_s: Callable[[], float],
+        robot: str,
+        at_s: float,
+        *,
+        least_s: float,
     ) -> None:
-        self._allowances, self._spent_s = allowances, spent_s
+        self._limiter, self._spent_s = limiter, spent_s
         self._robot, self._at_s, self._least_s = robot, at_s, least_s
         self._from_s = spent_s()
 
     def charge(self, beside_s: float = 0.0) -> float:
         """Charge the work since the last call, plus ``beside_s``; return the rest."""
         before_s, self._from_s = self._from_s, self._spent_s()
-        return self._allowances.spend(self._robot, self._at_s, self._from_s - before_s + beside_s)
+        return self._limiter.spend(self._robot, self._at_s, self._from_s - before_s + beside_s)
 
     def check(self) -> None:
         """Charge, and raise `OverShareError` if the robot has spent its allowance twice. Work that began
@@ -105,10 +114,9 @@ def robot_of_change(change: Change) -> str:
 
 
 class PutOff:
-    """The queue of waiting batches' keys; the telemetry table has the batches. ``client`` is a boto3 SQS
-    client."""
+    """The queue of waiting batches' keys; the telemetry table has the batches."""
 
-    def __init__(self, client: Any, *, queue_url: str) -> None:
+    def __init__(self, client: SQSClient, queue_url: str) -> None:
         self._client, self._queue_url = client, queue_url
 
     def put(self, changes: Iterable[Change]) -> list[Change]:
@@ -116,28 +124,15 @@ class PutOff:
         by_robot: dict[str, list[Change]] = {}
         for change in changes:
             by_robot.setdefault(robot_of_change(change), []).append(change)
-        messages = [
+        groups = [
             (robot, several[start : start + KEYS])
             for robot, several in by_robot.items()
             for start in range(0, len(several), KEYS)
         ]
-        left: list[Change] = []
-        for start in range(0, len(messages), _MESSAGES):
-            left += self._left(messages[start : start + _MESSAGES])
-        return left
-
-    def _left(self, messages: Sequence[tuple[str, Sequence[Change]]]) -> list[Change]:
         # AWS recognises a noisy robot by its group, and serves the others first: "SQS fair queues".
-        entries = [
-            {"Id": str(number), "MessageBody": _message(several), "MessageGroupId": robot}
-            for number, (robot, several) in enumerate(messages)
-        ]
-        try:
-            answer = self._client.send_message_batch(QueueUrl=self._queue_url, Entries=entries)
-        except (BotoCoreError, ClientError) as error:
-            _log.warning("batches over their robot's share stay in the stream: %s", error)
-            return [change for _, several in messages for change in several]
-        return [change for entry in answer.get("Failed", []) for change in messages[int(entry["Id"])][1]]
+        messages = [{"MessageBody": _message(several), "MessageGroupId": robot} for robot, several in groups]
+        left = send_all(self._client, self._queue_url, messages)
+        return [change for place in sorted(left) for change in groups[place][1]]
 
 
 def _message(changes: Sequence[Change]) -> str:
@@ -151,10 +146,9 @@ def waiting(body: str) -> list[tuple[str, str]]:
 
 
 class Told:
-    """Notifies robots in their shadow that they are over their share; ``client`` is a boto3 iot-data
-    client."""
+    """Notifies robots in their shadow that they are over their share."""
 
-    def __init__(self, client: Any) -> None:
+    def __init__(self, client: IoTDataPlaneClient) -> None:
         self._client = client
         self._robots: dict[str, tuple[float, float, float, int]] = {}
 

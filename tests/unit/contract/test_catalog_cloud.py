@@ -7,12 +7,13 @@ import re
 
 import pytest
 
-from iort_contract.cloud import METRICS, rule_sql
+from iort_contract.catalog import metrics
+from iort_contract.catalog.metrics import METRICS, ROBOT_CHARTS
+from iort_contract.catalog.rules import RULES
 from iort_contract.messages.batch import Batch, encode_batch
-from iort_contract.messages.event import MESSAGE_BASE64
-from iort_contract.messages.live import PING_FIELDS, encode_ping
-from iort_contract.tables import ENVELOPE, EXPIRES_S, RECEIVED_MS, ROBOT, TOPIC
-from iort_contract.topics import FILE, LANES, PING_PATHS, RULES, build_topic, rule_name
+from iort_contract.messages.live import encode_ping
+from iort_contract.tables import ENVELOPE, EXPIRES_S, MESSAGE_BASE64, PING_FIELDS, RECEIVED_MS, ROBOT, TOPIC
+from iort_contract.topics import FILE, LANES, PING_PATHS, build_topic
 
 
 def matches(pattern, topic):
@@ -33,7 +34,7 @@ RULE_TOPICS = {
 @pytest.mark.parametrize("rule", RULE_TOPICS)
 @pytest.mark.parametrize("namespace", ["iort", "stage2"])
 def test_rule_listens_to_its_own_topics_of_the_contract(rule, namespace):
-    sql = rule_sql(rule, namespace)
+    sql = RULES[rule].statement(namespace)
     [pattern] = re.findall(r"FROM '([^']*)'", sql)
     assert pattern.split("/")[:2] == [RULE_TOPICS[rule][0], namespace]
     every = [(lane, name) for lane in LANES for name in ("vesc", FILE, *PING_PATHS)]
@@ -46,7 +47,7 @@ def test_rule_listens_to_its_own_topics_of_the_contract(rule, namespace):
 
 @pytest.mark.parametrize("rule", RULES)
 def test_no_key_of_a_message_can_stand_where_the_cloud_s_own_stands(rule):
-    sql = rule_sql(rule)
+    sql = RULES[rule].statement()
     selected = re.sub(r"\bencode\(\*, 'base64'\)", "encode()", sql[len("SELECT ") : sql.index(" FROM ")])
     names = [part.rsplit(" AS ", 1)[-1] for part in selected.split(", ")]
     assert len(names) == len(set(names))
@@ -71,16 +72,23 @@ def test_the_record_rule_stores_what_a_batch_says_and_a_pong_what_a_ping_says():
     batch = Batch("0badcafe", 0, [1], {"speed": [1.5]}, nonfinite=1)
     assert tuple(json.loads(encode_batch(batch))) == ENVELOPE
     assert tuple(json.loads(encode_ping(1, 1, "x"))) == PING_FIELDS
-    assert rule_sql("record").startswith(f"SELECT {', '.join(ENVELOPE)}, topic() AS topic, ")
-    assert rule_sql("pong").startswith(f"SELECT {', '.join(PING_FIELDS)}, timestamp() AS ")
+    assert RULES["record"].statement().startswith(f"SELECT {', '.join(ENVELOPE)}, topic() AS topic, ")
+    assert RULES["pong"].statement().startswith(f"SELECT {', '.join(PING_FIELDS)}, timestamp() AS ")
 
 
 def test_rule_names_are_allowed_by_aws():
     for namespace in ("iort", "a" * 16):
         for rule in RULES:
-            assert re.fullmatch(r"[a-zA-Z0-9_]{1,128}", rule_name(rule, namespace))
+            assert re.fullmatch(r"[a-zA-Z0-9_]{1,128}", RULES[rule].physical_name(namespace))
 
 
-def test_metric_names_are_unique():
-    every = [name for group in METRICS.values() for name in group]
-    assert len(every) == len(set(every))
+def test_a_statement_has_the_deployments_parameters():
+    stored = RULES["record"].statement("lab", retention_s=60)
+    assert "+ 60 AS expires_s FROM 'dt/lab/+/+'" in stored
+    assert RULES["battery"].statement(low_voltage_v=14).endswith("sample.voltage_input < 14")
+    assert not [rule for rule in RULES.values() if "{" in rule.statement()]
+
+
+def test_every_metric_has_a_chart_that_is_drawn():
+    drawn = {chart for row in ROBOT_CHARTS for chart in row} | {metrics.QUEUES_CHART, metrics.LIVE_CHART}
+    assert {metric.chart for metric in METRICS.values()} == drawn

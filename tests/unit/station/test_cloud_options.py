@@ -8,8 +8,8 @@ from urllib.request import proxy_bypass
 import pytest
 from typer.testing import CliRunner
 
+from iort_station.cli.cloud_options import CloudOptions
 from iort_station.cli.main import app, said
-from iort_station.cli.where import Where
 from iort_station.cloud import Cloud, find_embedded
 from iort_station.errors import StationError
 from iort_station.page import keys
@@ -29,7 +29,7 @@ def newcomer(monkeypatch, tmp_path):
 def found(tmp_path):
     def cloud(**options):
         given = {"namespace": "iort", "profile": None, "region": None, "local": False, **options}
-        return Where(**given, embedded=tmp_path / "cloud.json").cloud()
+        return CloudOptions(**given, embedded=tmp_path / "cloud.json").cloud()
 
     return cloud
 
@@ -53,7 +53,7 @@ def test_an_embedded_cloud_is_found_from_any_folder_of_its_checkout(tmp_path):
 def test_away_from_a_checkout_local_says_how_to_name_the_file(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     with pytest.raises(StationError, match=r"no embedded cloud is running.*IORT_EMBEDDED names its file"):
-        Where("iort", None, None, local=True, embedded=None).cloud()
+        CloudOptions("iort", None, None, local=True, embedded=None).cloud()
 
 
 def test_the_environment_names_an_embedded_cloud(tmp_path):

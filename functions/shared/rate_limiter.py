@@ -9,7 +9,7 @@ from collections import OrderedDict
 _ROBOTS = 10_000
 
 
-class Allowances:
+class RateLimiter:
     """Each robot may spend ``burst`` at once, and ``a_second`` more with every second. Robots share nothing.
 
     It keeps the ten thousand robots that spent last. It is safe for several threads.

@@ -12,7 +12,7 @@ from decimal import Decimal
 from typing import Any
 
 from functions.shared.dead_letter import Refused
-from functions.shared.share import REQUESTS_S, Change, Share, robot_of_change
+from functions.shared.summary.share import REQUESTS_S, Change, Share, robot_of_change
 from iort_contract.dynamodb import plain
 from iort_contract.limits import ContractError
 from iort_contract.messages.batch import Batch, BatchId, decode_item

@@ -21,7 +21,7 @@ _CONNECT_S = 5.0
 
 
 @dataclass
-class Where:
+class CloudOptions:
     """The options that select a cloud; commands read it from ``context.obj``."""
 
     namespace: str
