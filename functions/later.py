@@ -23,7 +23,7 @@ def records(tables: Tables, body: str) -> list[dict[str, Any]]:
     """The stream records of the batches that a message names, without those that have expired."""
     found: list[dict[str, Any]] = []
     for number, (topic, batch) in enumerate(waiting(body)):
-        item = tables.item(topic, batch)
+        item = tables.telemetry.get(topic, batch)
         if item is not None:
             change: dict[str, Mapping[str, Any] | str] = {
                 "Keys": {name: item[name] for name in (TOPIC, BATCH)},

@@ -10,7 +10,7 @@ from iort_contract.catalog.vesc import VESC_STREAM
 from iort_contract.limits import MAX_MESSAGE_BYTES
 from iort_contract.messages.live import encode_ping
 from iort_contract.topics import FLEET, LIVE, PING, PONG, RULE, build_topic, live_topic, record_topic
-from iort_station.operations.quarantine import Entry
+from iort_station.operations.quarantine import DeadLetter
 from verify.question import Seen, question
 from verify.tools.robots import pair_of
 from verify.tools.telemetry import entries, items, only_entry
@@ -62,7 +62,7 @@ def record_no_json(target: Target) -> Seen:
         # A batch without its key is refused later than the other payload.
         pair.publish(record_topic(robot, VESC_STREAM, cloud.namespace), b'{"v": 1}')
 
-        def of_the_batch() -> list[Entry]:
+        def of_the_batch() -> list[DeadLetter]:
             found = entries(target, robot)
             return found if any(entry.payload == b'{"v": 1}' for entry in found) else []
 

@@ -13,7 +13,7 @@ from typing import Any
 
 from functions.shared.dead_letter import Refused
 from functions.shared.summary.share import REQUESTS_S, Change, Share, robot_of_change
-from iort_contract.attributes import plain
+from iort_contract.dynamodb import plain
 from iort_contract.limits import ContractError
 from iort_contract.messages.batch import Batch, BatchId, decode_item
 from iort_contract.tables import RECEIVED_MS

@@ -34,7 +34,7 @@ from functions.shared.summary.stored import SECOND_BATCHES
 from functions.shared.tables import Tables
 from iort_contract.catalog.environments import LaterEnvironment
 from iort_contract.codec.seconds import Statistics
-from iort_contract.table_writer import TableError
+from iort_contract.dynamodb import TableError
 from iort_contract.tables import RECOMPUTE_FROM_S, RECOMPUTED, REPLAY
 from iort_contract.topics import parse_topic
 

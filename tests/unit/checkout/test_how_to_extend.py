@@ -31,6 +31,15 @@ FOLDERS = (
     "tests",
 )
 SKIPPED = ("__pycache__", "*.egg-info", "build", "built", "images", "bench-*", "node_modules")
+SYNTHESIZE = """
+from pathlib import Path
+from aws_cdk import App
+from app import build
+from stacks.settings import Settings
+app = App(outdir="cdk.out")
+build(app, Settings(layer=Path("scripts")))
+app.synth()
+"""
 
 
 class Copy:
@@ -62,7 +71,7 @@ class Copy:
         return touched
 
     def _insert(self, file: Path, lines: list[str]) -> None:
-        before = "".join(f"{line[1:]}\n" for line in lines if line[:1] == " ")
+        before = "".join(f"{line[1:]}\n" for line in lines if not line.startswith("+"))
         after = "".join(f"{line[1:]}\n" for line in lines)
         text = file.read_text()
         assert text.count(before) == 1, f"{file} must have once:\n{before}"
@@ -83,7 +92,7 @@ class Copy:
             env=environment,
             capture_output=True,
             text=True,
-            timeout=120,
+            timeout=300,
         )
         assert done.returncode == 0, done.stderr
         return done.stdout

@@ -12,7 +12,7 @@ import pytest
 from botocore.stub import Stubber
 
 from functions import admit
-from iort_contract.attributes import plain
+from iort_contract.dynamodb import plain
 from iort_contract.tables import (
     ADMIT_CLAIM,
     ADMIT_FINGERPRINT,

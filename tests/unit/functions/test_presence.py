@@ -10,8 +10,8 @@ import boto3
 import pytest
 
 from functions import presence
-from iort_contract.attributes import plain
 from iort_contract.catalog.metrics import metrics_of
+from iort_contract.dynamodb import plain
 from iort_contract.limits import ContractError
 from tests.fakes import ROBOTS
 

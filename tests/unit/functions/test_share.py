@@ -15,7 +15,7 @@ from functions.shared.summary import share
 from functions.shared.summary.processing import Bounds, process
 from functions.shared.summary.share import KEYS, OverShareError, PutOff, Share, Told, waiting
 from iort_contract.catalog.vesc import VESC_STREAM
-from iort_contract.table_writer import TableError
+from iort_contract.dynamodb import TableError
 from iort_contract.tables import OVER_SHARE, PUT_OFF
 from iort_contract.topics import RECORD, SHADOW, build_topic
 from tests.unit.functions.summarizing import T0, S, Stream, batch, counted

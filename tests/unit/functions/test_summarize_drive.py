@@ -7,8 +7,8 @@ import random
 import pytest
 
 from functions import summarize
-from iort_contract.attributes import plain
 from iort_contract.codec.seconds import flat_second
+from iort_contract.dynamodb import plain
 from iort_contract.messages.batch import Batch
 from tests.fakes import (
     NAMES,

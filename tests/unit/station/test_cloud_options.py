@@ -59,7 +59,7 @@ def test_away_from_a_checkout_local_says_how_to_name_the_file(tmp_path, monkeypa
 def test_the_environment_names_an_embedded_cloud(tmp_path):
     named = {"IORT_EMBEDDED": str(tmp_path / "cloud.json")}
     done = CliRunner().invoke(app, ["--local", "robots", "list"], env=named)
-    assert f"no embedded cloud is running: {tmp_path / 'cloud.json'} is not there" in str(done.exception)
+    assert f"no embedded cloud is running: {tmp_path / 'cloud.json'} does not exist" in str(done.exception)
 
 
 def test_a_region_without_credentials_says_how_to_give_them(found, monkeypatch):
@@ -146,5 +146,5 @@ def test_a_file_that_cannot_be_written_is_named(tmp_path):
 
 
 def test_a_stack_that_is_not_deployed_is_named_with_its_region(aws):
-    with pytest.raises(StationError, match=r"iort-storage is not deployed in eu-west-1: `make deploy`"):
+    with pytest.raises(StationError, match=r"iort-storage is not deployed in eu-west-1: run `make deploy`"):
         Cloud().output("storage", "TelemetryTable")

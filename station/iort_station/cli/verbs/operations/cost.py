@@ -147,7 +147,7 @@ def _as_json(usage: Usage, listed: Listed | None) -> dict[str, Any]:
     paper = scale.on_paper(usage, prices)
     ours, thesis = model.bill(usage, prices), model.thesis_bill(usage, prices)
 
-    def items(found: list[line_items.Item]) -> list[dict[str, Any]]:
+    def items(found: list[line_items.LineItem]) -> list[dict[str, Any]]:
         return [{**item._asdict(), "dollars_per_robot_hour": item.dollars} for item in found]
 
     return {

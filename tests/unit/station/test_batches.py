@@ -14,18 +14,19 @@ from hypothesis import strategies as st
 
 from bench.message_sizes import stored_bytes
 from iort_contract.checks import wire_column
-from iort_contract.codec.columns import CODEC, DICTIONARY, PLAIN_CODEC
-from iort_contract.limits import MAX_BATCH_VALUES
-from iort_contract.messages.batch import Batch, decode_batch, encode_batch
+from iort_contract.codec.columns import CODEC, DICTIONARY, PLAIN_CODEC, packed
+from iort_contract.limits import MAX_BATCH_VALUES, ContractError
+from iort_contract.messages.batch import Batch, Opened, decode_batch, encode_batch
 from iort_contract.ros1.message import Messages, RosType
-from iort_station.data import reading
+from iort_station.data.batches import RefusedItems, blocks, decode_each, decode_together, stored
 from iort_station.data.blocks import join
-from iort_station.data.stored import Refused, blocks
+from iort_station.data.selection import Selection
 from tests.fakes import item_of_message
 from tests.recordings import recording
 from tests.unit.contract.ros1_messages import text, u32
 from tests.unit.contract.test_columns import BOOT, WRONG, columns, message_of, plain_message
 from tests.unit.functions.summarizing import drive_of
+from tests.unit.station.test_data import cloud_of
 
 
 def id_at(second):
@@ -34,7 +35,7 @@ def id_at(second):
 
 def read(*messages):
     """The blocks of messages in one page, and what was refused."""
-    refused = Refused()
+    refused = RefusedItems()
     items = [item_of_message(json.dumps(message).encode()) for message in messages]
     return list(blocks([items], refused)), refused
 
@@ -89,10 +90,12 @@ def test_more_values_than_a_batch_may_hold_are_refused_and_its_neighbours_are_re
 def test_an_item_whose_key_is_no_batchs_is_refused_and_its_neighbours_are_read(key):
     items = [item_of_message(json.dumps(message_of([0, 1, 2])).encode()) for _ in range(2)]
     items[1]["batch"] = {"S": key}
-    refused, told = Refused(), []
-    pages = reading.told([items], lambda *seen: told.append(seen))
+    refused, told = RefusedItems(), []
+    cloud = cloud_of()
+    cloud.table.query = lambda **_: {"Items": items}
+    pages = stored(cloud, Selection(robot="car", stream="vesc"), progress=lambda *seen: told.append(seen))
     (block,) = blocks(pages, refused)
-    # When it begins nobody can tell, so what was read so far is not called later than it.
+    # The start of an item without a valid key is unknown, so no time is reported as read.
     assert (block.columns["f0"].tolist(), refused.count, told) == ([1, 3], 1, [(2, 0)])
 
 
@@ -101,7 +104,7 @@ def test_samples_of_one_time_are_all_given_in_the_order_of_their_batches():
              for seq, t in enumerate([1_000, 1_000, 1_005])]  # fmt: skip
     items = [item_of_message(encode_batch(batch)) for batch in parts]
     for pages in ([items], [items[:1], items[1:]], [[item] for item in items]):
-        found = list(blocks(pages, Refused()))
+        found = list(blocks(pages, RefusedItems()))
         times = [t for block in found for t in block.times_us.tolist()]
         values = [value for block in found for value in block.columns["a"].tolist()]
         assert times == [1_000] * 4 + [1_005] * 4 + [1_010]
@@ -123,7 +126,7 @@ def test_messages_are_samples_too_and_can_be_passed_over():
         Batch(BOOT, 3, [310], {"x": [9.5]}),
     ]
     items = [item_of_message(encode_batch(batch)) for batch in given]
-    refused = Refused()
+    refused = RefusedItems()
     whole = join(list(blocks([items], refused)))
     assert whole.times_us.tolist() == [10, 20, 30, 110, 120, 130, 210, 220, 310]
     assert list(map(as_read, whole.columns["x"].tolist())) == [
@@ -161,6 +164,51 @@ def test_the_station_reads_what_the_contract_reads(parts, data):
     got = [value for block in found for value in block.columns["a"].tolist()]
     assert told.count == refused
     assert list(map(as_read, got)) == list(map(as_read, expected))
+
+
+entries = st.integers(-(2**64), 2**64) | st.sampled_from(
+    [None, True, False, "a", 0.5, 1e300, 2.0, 2**53 - 1, 2**53, 1 - 2**53, -(2**53), 2**54 - 2, []]
+)
+
+
+@st.composite
+def written_columns(draw, n):
+    """A column as an encoder writes it, or nearly, or anything."""
+    written = draw(st.sampled_from([packed(draw(columns_of(n))), [0, *[1] * n]]))
+    if draw(st.booleans()):
+        at = draw(st.integers(0, n))
+        written = [*written[:at], draw(entries | st.integers(-3, 25)), *written[at + 1 :]]
+    return written if draw(st.integers(0, 9)) else draw(st.lists(entries, max_size=n + 2))
+
+
+def columns_of(n):
+    number = st.integers(-(10**6), 10**6).map(lambda whole: whole / 100)
+    return st.lists(st.none() | number, min_size=n, max_size=n) | st.lists(number, min_size=n, max_size=n)
+
+
+@settings(max_examples=300)
+@given(st.data())
+def test_the_numpy_back_end_and_the_list_back_end_agree(data):
+    """Both refuse a run of batches, or both decode it to the same values."""
+    run = []
+    for seq in range(data.draw(st.integers(1, 3))):
+        n = data.draw(st.integers(1, 4))
+        times = [seq * 1_000_000 + i for i in range(n)]
+        written = {name: data.draw(written_columns(n)) for name in ("a", "b")}
+        run.append(Opened(BOOT, seq, times, 0, written, None, ""))
+    refused = RefusedItems()
+    expected = list(decode_each(run, refused, lambda _name: True))
+    try:
+        together = decode_together(run, ["a", "b"])
+    except ContractError:
+        assert refused.count
+        return
+    assert not refused.count
+    (each,) = expected
+    assert together.times_us.tolist() == each.times_us.tolist()
+    for name in ("a", "b"):
+        got, wanted = (list(map(as_read, one.columns[name].tolist())) for one in (together, each))
+        assert got == wanted
 
 
 def as_read(value):

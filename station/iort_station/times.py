@@ -1,4 +1,4 @@
-"""Times as people write them, in microseconds since the epoch."""
+"""Times and durations as people write them, in microseconds."""
 
 from __future__ import annotations
 
@@ -25,19 +25,21 @@ _EPOCH = datetime(1970, 1, 1, tzinfo=timezone.utc)
 
 
 def duration_us(text: str) -> int:
-    """The length of ``100ms``, ``1s``, ``10m``, ``1.5h`` or ``7d``; raises `StationError`."""
+    """Parse a duration such as ``100ms``, ``1s``, ``10m``, ``1.5h`` or ``7d``; raises `StationError`."""
     match = _DURATION.fullmatch(text.strip())
     length_us = round(float(match[1]) * _UNITS_US[match[2]]) if match else 0
     if length_us < 1:
-        raise StationError(f"duration {text!r}: allowed is a number and us, ms, s, m, h, d or w, such as 10m")
+        raise StationError(
+            f"duration must be a number with us, ms, s, m, h, d or w, such as 10m, got {text!r}"
+        )
     return length_us
 
 
 def time_us(value: Time, now_us: int) -> int:
-    """The time of microseconds since the epoch, a datetime, or a text: ``now``, ``-10m``,
-    ``2026-05-04T10:00:00+02:00``; without a zone the time is this machine's local one.
+    """Parse a time: microseconds since the epoch, a datetime, or a text such as ``now``, ``-10m`` or
+    ``2026-05-04T10:00:00+02:00``. A time without a zone is local to this machine.
 
-    Raises `StationError` for what is none of them.
+    Raises `StationError`.
     """
     if isinstance(value, int):
         return value
@@ -49,24 +51,21 @@ def time_us(value: Time, now_us: int) -> int:
     if text.startswith("-"):
         return now_us - duration_us(text[1:])
     try:
-        # Python 3.10 reads neither Z nor a time of other than 3 or 6 decimals.
+        # Python 3.10 reads neither Z nor fractions other than 3 or 6 digits.
         normal = re.sub(r"\.(\d{1,6})\d*", lambda m: "." + m[1].ljust(6, "0"), text)
         return time_us(datetime.fromisoformat(re.sub(r"[zZ]$", "+00:00", normal)), now_us)
     except (ValueError, OverflowError) as error:
         raise StationError(
-            f"time {value!r}: allowed is now, -10m and the like, or ISO 8601 such as 2026-05-04T10:00:00Z"
+            f"time must be now, -10m for ten minutes ago, or ISO 8601 such as 2026-05-04T10:00:00Z, "
+            f"got {value!r}"
         ) from error
 
 
 def has_zone(text: str) -> bool:
-    """Whether a text says its time zone, or needs none."""
-    return (
-        text.strip() == "now"
-        or text.strip().startswith("-")
-        or bool(
-            re.search(r"([zZ]|[+-]\d\d(:?\d\d)?)$", text.strip().partition("T")[2] or text.partition(" ")[2])
-        )
-    )
+    """Whether a time's text has a time zone, or needs none."""
+    text = text.strip()
+    clock = text.partition("T")[2] or text.partition(" ")[2]
+    return text == "now" or text.startswith("-") or re.search(r"([zZ]|[+-]\d\d(:?\d\d)?)$", clock) is not None
 
 
 def iso(t_us: int) -> str:
@@ -75,7 +74,7 @@ def iso(t_us: int) -> str:
 
 
 def iso_s(t_us: int) -> str:
-    """The time as ISO 8601 in UTC, down to the second that it lies in."""
+    """The time as ISO 8601 in UTC, cut to the second."""
     return _iso(t_us, "seconds")
 
 

@@ -1,4 +1,4 @@
-"""The summary that Lambda 2 has written, a second a sample."""
+"""The summary that Lambda 2 has written, with one sample per second."""
 
 from __future__ import annotations
 
@@ -9,6 +9,7 @@ from boto3.dynamodb.types import TypeDeserializer
 
 from iort_contract import expression
 from iort_contract.codec.seconds import flat_second
+from iort_contract.dynamodb import seconds_between
 from iort_contract.tables import (
     ABSENT,
     BATCHES,
@@ -22,31 +23,32 @@ from iort_contract.tables import (
     TOPIC,
 )
 from iort_station.cloud import Cloud
-from iort_station.data import reading
-from iort_station.data.blocks import Block, objects
-from iort_station.data.conditions import Column, holds
-from iort_station.data.reading import Item, Told
+from iort_station.data.batches import Item, PageProgress, ahead, summary_table, topic_of
+from iort_station.data.blocks import Block, column_of, objects
+from iort_station.data.conditions import holds
 from iort_station.data.selection import Selection
 from iort_station.errors import StationError
 
-# What a second says of its samples as a whole.
-_OF_ALL = (SAMPLES, BATCHES, MISSING_BATCHES, GAPS, NONFINITE, ABSENT)
+# The counts of a second.
+_COUNTS = (SAMPLES, BATCHES, MISSING_BATCHES, GAPS, NONFINITE, ABSENT)
 _deserialize = TypeDeserializer().deserialize
 
 
 def seconds(
-    cloud: Cloud, selection: Selection, *, scan: bool = False, progress: Told | None = None
+    cloud: Cloud, selection: Selection, *, scan: bool = False, progress: PageProgress | None = None
 ) -> Iterator[Block]:
-    """The selection's seconds, a block a page; times are those at which they begin.
+    """The seconds that start in the selection's range, one block per page; times are their starts.
 
-    A field stands for its ``_min``, ``_mean``, ``_max`` and ``_last``, as far as it has them. Raises
-    `StationError` for a field that no second has.
+    A field stands for its ``_min``, ``_mean``, ``_max`` and ``_last``. Raises `StationError` for a field that
+    no second has.
     """
     there: dict[str, None] = {}
-    for items in reading.told(reading.seconds(cloud, selection, scan=scan), progress):
+    for items in stored(cloud, selection, scan=scan):
         if not items:
             continue
         block = _block(items)
+        if progress is not None:
+            progress(len(items), int(block.times_us[-1]))
         there |= dict.fromkeys(block.columns)
         if selection.condition is not None:
             block = block.take(holds(selection.condition, block.columns, len(block.times_us)))
@@ -55,7 +57,7 @@ def seconds(
             block = Block(block.times_us, {name: block.columns[name] for name in chosen})
         if len(block.times_us):
             yield block
-    # A condition compares one number a second, so it says which.
+    # A condition must name a single statistic.
     compared = expression.names(selection.condition) if selection.condition is not None else set()
     unknown = sorted(
         {name for name in selection.named() if not _stands_for(name, there)} | (compared - there.keys())
@@ -67,6 +69,19 @@ def seconds(
         )
 
 
+def stored(cloud: Cloud, selection: Selection, *, scan: bool = False) -> Iterator[Sequence[Item]]:
+    """Pages of the summary's seconds that start in the selection's range, in order of time."""
+    first_s = None if selection.start_us is None else -(-selection.start_us // 1_000_000)
+    last_s = None if selection.end_us is None else (selection.end_us - 1) // 1_000_000
+    topic = topic_of(cloud, selection.robot, selection.stream)
+    pages = summary_table(cloud).pages(topic, seconds_between(first_s, last_s), scan=scan)
+    if not scan:
+        yield from ahead(page.items for page in pages)
+    else:
+        # A scan has no order.
+        yield sorted((item for page in pages for item in page.items), key=lambda item: int(item[SECOND]["N"]))
+
+
 def _stands_for(name: str, there: Mapping[str, Any]) -> list[str]:
     if name in there:
         return [name]
@@ -76,18 +91,13 @@ def _stands_for(name: str, there: Mapping[str, Any]) -> list[str]:
 def _block(items: Sequence[Item]) -> Block:
     rows = [flat_second({name: _value(value) for name, value in item.items()}) for item in items]
     names = dict.fromkeys(name for row in rows for name in row if name not in {TOPIC, SECOND, EXPIRES_S})
-    whole = [name for name in _OF_ALL if name in names]
+    whole = [name for name in _COUNTS if name in names]
     ordered = [*whole, *sorted(name for name in names if name not in whole)]
     times = objects([row[SECOND] for row in rows]).astype("int64") * 1_000_000
-    return Block(times, {name: _column([row.get(name) for row in rows]) for name in ordered})
+    return Block(times, {name: column_of([row.get(name) for row in rows]) for name in ordered})
 
 
 def _value(value: Any) -> Any:
     if "L" in value:
         return [_value(each) for each in value["L"]]
     return float(value["N"]) if "N" in value else _deserialize(value)
-
-
-def _column(values: Sequence[Any]) -> Column:
-    numbers = all(value is None or isinstance(value, float) for value in values)
-    return objects(values).astype(float) if numbers else objects(values)
