@@ -17,8 +17,10 @@ STATS = ("min", "mean", "max", "last")
 # that were not finite.
 SAMPLES, BATCHES, MISSING_BATCHES = "n", "batches", "missing_batches"
 GAPS, NONFINITE = "gaps", "nonfinite"
+# In the first batches of a run: the runs before it, and the last number of each.
+PREVIOUS = "previous"
 # The keys of a batch's envelope; the record rule stores these and no others.
-ENVELOPE = ("v", BATCH, SAMPLES, NONFINITE, "codec", "samples")
+ENVELOPE = ("v", BATCH, SAMPLES, NONFINITE, PREVIOUS, "codec", "samples")
 # Only if not zero: values of sensors that are not fitted (contract/iort_contract/vesc.py).
 ABSENT = "absent"
 # In a second over DynamoDB's 400 KB: the number of attributes left out, the largest first.

@@ -1,13 +1,13 @@
 """Proof of delivery: the numbers of a stream's batches, expected, stored, missing, twice and late.
 
-The car numbers each stream's batches without a hole, over restarts too where its queue has a file. So a
-number that lies between two stored ones and is not stored itself is a batch that was lost, or is still in
-the car.
+Each run of the agent numbers its batches of a stream from 0 without gaps, and its first batches name the runs
+before it with their last numbers, as far as its queue knows. A number that is not stored is a batch that was
+lost, or is still in the car. Agents before that numbered on over restarts where the queue had a file.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import pairwise
 from typing import Any, NamedTuple
@@ -15,8 +15,8 @@ from typing import Any, NamedTuple
 from iort_contract.attributes import plain
 from iort_contract.catalog.streams import AGENT_STREAM
 from iort_contract.limits import ContractError
-from iort_contract.messages.batch import Batch, batch_id, batches_between, decode_batch
-from iort_contract.tables import BATCH, RECEIVED_MS, SAMPLES, TOPIC
+from iort_contract.messages.batch import Batch, RunEnd, batch_id, batches_between, decode_batch, run_ends
+from iort_contract.tables import BATCH, PREVIOUS, RECEIVED_MS, SAMPLES, TOPIC
 from iort_contract.topics import RECORD, build_topic
 from iort_station.cloud import Cloud
 from iort_station.data.items import of_topic
@@ -34,6 +34,7 @@ class Stored(NamedTuple):
     t_us: int
     samples: int
     received_ms: int
+    previous: tuple[RunEnd, ...] | None
 
 
 class Missing(NamedTuple):
@@ -74,6 +75,13 @@ class Run:
         return self.batches + sum(gap.batches for gap in self.missing)
 
 
+class LostRun(NamedTuple):
+    """A run that a later one names, and of whose batches none is stored."""
+
+    boot: str
+    batches: int
+
+
 class Shortfall(NamedTuple):
     """A difference between what a run says it took and what is stored: how many samples, None where nobody
     can know, and why."""
@@ -85,7 +93,7 @@ class Shortfall(NamedTuple):
 
 @dataclass(frozen=True)
 class Audit:
-    """Of one stream: its runs in the order of their numbers.
+    """Of one stream: its runs in the order of their receipt, and the runs of which nothing is stored.
 
     ``before_first`` numbers lie before the first stored one: expired, outside of the range asked for, or
     lost. ``refused`` items are not batches. ``in_car`` and ``dropped`` are what the agent last said of
@@ -101,11 +109,13 @@ class Audit:
     dropped: int | None = None
     taken: int | None = None
     shortfalls: tuple[Shortfall, ...] = ()
+    lost_runs: tuple[LostRun, ...] = ()
 
     @property
     def missing(self) -> int:
         """Batches missing in all runs."""
-        return sum(gap.batches for run in self.runs for gap in run.missing)
+        stored_runs = sum(gap.batches for run in self.runs for gap in run.missing)
+        return stored_runs + sum(run.batches for run in self.lost_runs)
 
     @property
     def complete(self) -> bool:
@@ -131,20 +141,54 @@ def audit(
             boots.setdefault(stored.boot, []).append(stored)
     # In the order in which the cloud got them: a car's clock may have been set back between two runs.
     in_order = sorted(boots.values(), key=lambda found: min(s.received_ms for s in found))
+    ends = _ends(in_order)
     runs: list[Run] = []
     before_first = 0
+    numbered_on: Run | None = None
     for found in in_order:
-        run = _run(found, late_ms)
-        lead = _before(runs[-1] if runs else None, run)
+        run = _run(found, ends.get(found[0].boot, -1), late_ms)
+        from_0 = any(stored.previous is not None for stored in found)
+        first = _first(None if from_0 else numbered_on, run)
         if not runs and not from_start:
             before_first = run.first_seq
-        elif lead is not None:
-            run.missing.insert(0, lead)
+        elif run.first_seq > first:
+            after_us = runs[-1].last_us if runs else None
+            run.missing.insert(0, Missing(first, run.first_seq - 1, after_us, run.first_us))
         runs.append(run)
-    return Audit(stream, runs, before_first, refused)
+        numbered_on = numbered_on if from_0 else run
+    lost_runs = tuple(_lost_runs(in_order, ends, from_start=from_start))
+    return Audit(stream, runs, before_first, refused, lost_runs=lost_runs)
 
 
-def _run(found: list[Stored], late_ms: int) -> Run:
+def _ends(runs: Iterable[Sequence[Stored]]) -> dict[str, int]:
+    """The last number of each run that a batch names."""
+    ends: dict[str, int] = {}
+    for found in runs:
+        for boot, seq in (end for stored in found for end in stored.previous or ()):
+            ends[boot] = max(seq, ends.get(boot, -1))
+    return ends
+
+
+def _lost_runs(
+    in_order: Sequence[Sequence[Stored]], ends: Mapping[str, int], *, from_start: bool
+) -> Iterator[LostRun]:
+    """The named runs of which nothing is stored. Those before the first stored one have expired, or are out
+    of the range, or were lost."""
+    names = [found[0].boot for found in in_order]
+    seen = set(names)
+    for i, found in enumerate(in_order):
+        for previous in (stored.previous for stored in found if stored.previous):
+            named = [end.boot for end in previous]
+            # A run that was stored earlier and is not named is older than those that are.
+            within = from_start or not set(names[:i]) <= set(named)
+            for boot in named:
+                within |= boot in names
+                if within and boot not in seen:
+                    seen.add(boot)
+                    yield LostRun(boot, ends[boot] + 1)
+
+
+def _run(found: Sequence[Stored], last: int, late_ms: int) -> Run:
     by_seq: dict[int, Stored] = {}
     duplicated = 0
     for stored in found:
@@ -152,6 +196,8 @@ def _run(found: list[Stored], late_ms: int) -> Run:
         by_seq[stored.seq] = stored
     seqs = sorted(by_seq)
     missing = [Missing(a + 1, b - 1, by_seq[a].t_us, by_seq[b].t_us) for a, b in pairwise(seqs) if b > a + 1]
+    if last > seqs[-1]:
+        missing.append(Missing(seqs[-1] + 1, last, by_seq[seqs[-1]].t_us, None))
     took_ms = [stored.received_ms - stored.t_us // 1000 for stored in found]
     excess_ms = [took - min(took_ms) for took in took_ms]
     return Run(
@@ -170,21 +216,18 @@ def _run(found: list[Stored], late_ms: int) -> Run:
     )
 
 
-def _before(previous: Run | None, run: Run) -> Missing | None:
-    """What is missing between two runs. A number that starts again lower is a queue that was lost, of
-    which only the start can be told."""
-    continued = previous is not None and run.first_seq > previous.last_seq
-    first = previous.last_seq + 1 if previous is not None and continued else 0
-    if run.first_seq == first:
-        return None
-    return Missing(first, run.first_seq - 1, previous.last_us if previous else None, run.first_us)
+def _first(previous: Run | None, run: Run) -> int:
+    """The number that a run began with: 0, or the one after those of the run before, where runs numbered on.
+    A number that starts again lower is a queue that was lost."""
+    return previous.last_seq + 1 if previous is not None and run.first_seq > previous.last_seq else 0
 
 
 def _stored(item: Mapping[str, Any]) -> Stored | None:
     """The item as a batch; None if it is not one."""
     try:
         t_us, boot, seq = batch_id(item[BATCH])
-        stored = Stored(boot, seq, t_us, int(item[SAMPLES]), int(item[RECEIVED_MS]))
+        previous = run_ends(item[PREVIOUS]) if PREVIOUS in item else None
+        stored = Stored(boot, seq, t_us, int(item[SAMPLES]), int(item[RECEIVED_MS]), previous)
     except (ContractError, KeyError, TypeError, ValueError, ArithmeticError):
         return None
     return stored if stored.samples >= 1 else None
@@ -205,12 +248,12 @@ class Range:
 
 def headers(cloud: Cloud, robot: str, stream: str, within: Range) -> Iterator[dict[str, Any]]:
     """The stored batches without their samples, page by page: what an audit needs and no more."""
-    names = {"#topic": TOPIC, "#batch": BATCH, "#n": SAMPLES, "#at": RECEIVED_MS}
+    names = {"#topic": TOPIC, "#batch": BATCH, "#n": SAMPLES, "#at": RECEIVED_MS, "#previous": PREVIOUS}
     pages = cloud.client("dynamodb").get_paginator("query")
     for page in pages.paginate(
         TableName=cloud.output("storage", "TelemetryTable"),
         KeyConditionExpression="#topic = :topic AND #batch BETWEEN :first AND :last",
-        ProjectionExpression="#batch, #n, #at",
+        ProjectionExpression="#batch, #n, #at, #previous",
         ExpressionAttributeNames=names,
         ExpressionAttributeValues={
             ":topic": {"S": build_topic(RECORD, robot, stream, cloud.namespace)},

@@ -116,6 +116,8 @@ def _show(one: Audit) -> None:
             _out.print(f"  missing {gap.first:,} to {gap.last:,}: between {after} and {before}")
         if len(run.missing) > _LISTED:
             _out.print(f"  and {len(run.missing) - _LISTED} more gaps; --json has them all")
+    for lost in one.lost_runs:
+        _out.print(f"  run {lost.boot[:8]}: none of its {lost.batches:,} batches is stored", style="red")
     if one.before_first:
         _out.print(
             f"  the first stored number is {one.before_first:,}: before it is expired, out of range or lost"
@@ -182,6 +184,7 @@ def _as_json(one: Audit) -> dict[str, Any]:
         **asdict(one),
         "runs": runs,
         "shortfalls": shortfalls,
+        "lost_runs": [run._asdict() for run in one.lost_runs],
         "missing": one.missing,
         "complete": one.complete,
     }
