@@ -5,9 +5,9 @@ from __future__ import annotations
 from typing import Any, Callable, Iterator, Mapping, Sequence, Tuple
 
 from iort_agent.clock import Clock
-from iort_agent.lanes.batch import StreamCounts
+from iort_agent.lanes.batch_encoder import StreamCounts
 from iort_agent.sources import Emit
-from iort_agent.spool.memory import Spool
+from iort_agent.spool.interface import Spool
 from iort_contract.catalog.streams import ACCOUNT_STREAM
 from iort_contract.messages.account import ACCOUNT_EVERY_S, SourceAccount, StreamAccount
 
@@ -16,8 +16,6 @@ _LOSS_S = 1.0
 # Counts of what was given: no cause of anything.
 _GIVEN = frozenset({"messages", "samples", "rows", "opened", "silent", "kept", "published"})
 
-# Of each stream its counts, taken at one moment, and the number of its next batch.
-Counted = Callable[[], Mapping[str, Tuple[StreamCounts, int]]]
 Reports = Sequence[Tuple[str, Callable[[], Mapping[str, Any]]]]
 
 
@@ -30,13 +28,13 @@ class Accounts:
         clock: Clock,
         spool: Spool,
         streams: Sequence[str],
-        counted: Counted,
+        counts: Callable[[], Mapping[str, StreamCounts]],
         refused: Callable[[], int],
         reports: Reports,
         emit: Emit,
     ) -> None:
         self._clock, self._spool, self._streams = clock, spool, streams
-        self._counted, self._refused, self._reports, self._emit = counted, refused, reports, emit
+        self._counts, self._refused, self._reports, self._emit = counts, refused, reports, emit
         self._told = clock.monotonic()
         self._lost = 0
 
@@ -50,29 +48,33 @@ class Accounts:
         """Emit a sample a stream and a source; ``ended`` with the last, once every batch is closed."""
         self._told, self._lost = self._clock.monotonic(), self._losses()
         now_us = self._clock.now_us()
-        counted = self._counted()
+        counted = self._counts()
         for name in sorted({*self._streams, *counted} - {ACCOUNT_STREAM}):
-            counts, next_seq = counted.get(name, (StreamCounts(), 0))
+            counts = counted.get(name, StreamCounts())
             of = StreamAccount(
                 stream=name,
                 taken=counts.samples,
                 stored=counts.stored,
                 refused=counts.refused,
                 nulled=counts.nulled,
-                first_seq=counts.first_seq,
-                next_seq=next_seq,
+                first_seq=0,
+                next_seq=counts.batches,
                 ended=ended,
             )
             self._emit(ACCOUNT_STREAM, now_us, of.sample())
         dropped = self._spool.dropped()
-        queue = {"dropped_batches": dropped.batches, "dropped_samples": dropped.samples}
+        queue = {
+            "dropped_batches": dropped.batches,
+            "dropped_samples": dropped.samples,
+            "damaged_files": self._spool.damaged,
+        }
         for source, report in [("queue", queue), *((name, report()) for name, report in self._reports)]:
             found = {path: count for path, count in _counts(report, "") if count}
             if found:
                 self._emit(ACCOUNT_STREAM, now_us, SourceAccount(source, found).sample())
 
     def _losses(self) -> int:
-        return self._refused() + self._spool.dropped().samples
+        return self._refused() + self._spool.dropped().samples + self._spool.damaged
 
 
 def _counts(report: Mapping[str, Any], prefix: str) -> Iterator[tuple[str, int]]:

@@ -23,7 +23,7 @@ from iort_agent.mqtt.uplink import Uplink
 from iort_agent.rate_limiter import Allowance
 from iort_agent.runtime import Parts, Runtime
 from iort_agent.sources.run import SourceRun
-from iort_agent.spool.memory import Spool
+from iort_agent.spool.interface import Spool
 from iort_agent.streams import Streams
 from iort_agent.version import agent_version
 
@@ -87,7 +87,7 @@ def make_agent(
         clock=clock,
         spool=spool,
         streams=[stream for source in sources for stream in source.streams],
-        counted=streams.counted,
+        counts=streams.counts,
         refused=streams.refused,
         reports=[
             # Two sources may have the same description.

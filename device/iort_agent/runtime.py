@@ -24,7 +24,7 @@ from iort_agent.metrics import AgentMetrics, Rates
 from iort_agent.mqtt.uplink import Uplink
 from iort_agent.sources import Emit
 from iort_agent.sources.run import SourceRun
-from iort_agent.spool.memory import Spool
+from iort_agent.spool.interface import Spool
 from iort_agent.streams import Streams
 from iort_contract.catalog.streams import AGENT_STREAM, OWN_STREAMS
 

@@ -21,7 +21,7 @@ from iort_agent.cli import main
 from iort_agent.clock import SystemClock
 from iort_agent.config.file import load_config
 from iort_agent.errors import AgentError, NotRunningError
-from iort_agent.lanes.batch import StreamCounts
+from iort_agent.lanes.batch_encoder import StreamCounts
 from iort_agent.lanes.clock_offset import ClockOffset
 from iort_agent.logs import JournalFormatter, LineFormatter, Troubles, is_journal
 from iort_agent.metrics import AgentMetrics, Rates, rss_mb
@@ -190,7 +190,7 @@ def test_a_sample_of_the_agent_has_the_contracts_fields() -> None:
     clock = ManualClock()
     spool, uplink = MemorySpool(max_bytes=1000), Loopback(clock, Dispatcher())
     metrics = AgentMetrics(clock=clock, spool=spool, uplink=uplink, offset=ClockOffset(clock))
-    spool.put("vesc", 0, b"x" * 100, samples=1)
+    spool.put("vesc", "0badcafe", 0, b"x" * 100, samples=1)
     uplink.connect()
     clock.advance(2)
     values = metrics.sample(100)
@@ -367,7 +367,7 @@ def test_a_queue_that_may_not_be_written_is_found_and_leaves_the_agent_running(
     with unprivileged():
         findings = {one.what: one for one in check(config, Path("agent.sock"))}
         spool = make_spool(config.queue, SystemClock())
-        spool.put("vesc", spool.next_seq("vesc"), b"x", samples=1)
+        spool.put("vesc", "0badcafe", 0, b"x", samples=1)
         (kept, alarm) = spool.next(0), spool.alarm
         spool.close()
     assert findings["queue"].level == FAIL
