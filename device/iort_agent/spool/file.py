@@ -81,6 +81,7 @@ class QueueLock:
 
     def note_owner(self) -> None:
         """Note this process as the queue's, once the queue's file is known to be one."""
+        self.ours = True
         with contextlib.suppress(OSError):  # the lock holds without it, on a full disk too
             os.ftruncate(self._fds[0], 0)
             os.pwrite(self._fds[0], b"%d" % os.getpid(), 0)
@@ -223,10 +224,10 @@ class SpoolFile:
         rows = "id > ? AND id <= ? ORDER BY id LIMIT ?"
         return read_batches(self.connection, rows, (after, to, READ_ENTRIES))
 
-    def oldest(self, max_batches: int) -> list[tuple[int, int, int]]:
-        """Id, samples and bytes of the oldest batches."""
-        sizes = "SELECT id, samples, bytes FROM batches INDEXED BY sizes ORDER BY id LIMIT ?"
-        return self.connection.execute(sizes, (max_batches,)).fetchall()
+    def oldest(self, after: int, max_batches: int) -> list[tuple[int, int, int]]:
+        """Id, samples and bytes of the oldest batches with an id greater than ``after``."""
+        sizes = "SELECT id, samples, bytes FROM batches INDEXED BY sizes WHERE id > ? ORDER BY id LIMIT ?"
+        return self.connection.execute(sizes, (after, max_batches)).fetchall()
 
     def move_ids(self, offset: int) -> None:
         """Add the offset, which is no less than any id, to the ids."""

@@ -342,8 +342,12 @@ class SqliteSpool:
         """Drop the oldest batches in the file while there are more than ``max_bytes``."""
         with self._lock:
             excess = self._in_file.payload_bytes + self._memory.backlog().payload_bytes - self._max_bytes
+        after = 0
         while self._overwrite and excess > 0:
-            oldest = file.oldest(_TRIM_ENTRIES + len(self._gone))
+            oldest = file.oldest(after, _TRIM_ENTRIES)
+            if not oldest:
+                raise sqlite3.DatabaseError("batches are missing")
+            after = oldest[-1][0]
             with self._lock:
                 for entry_id, samples, size in oldest:
                     if excess <= 0 or entry_id in self._gone:
@@ -376,7 +380,7 @@ class SqliteSpool:
             self._read_to = entries[-1].id if entries else to
             self._page.update((entry.id, entry) for entry in entries if entry.id not in self._gone)
             missing = self._in_file.batches - len(self._page)
-            if self._read_to >= to == self._last_in_file and missing:
+            if self._read_to >= to == self._last_in_file and missing > 0:
                 raise sqlite3.DatabaseError(f"{missing} batches are missing")
 
     # --- when the disk does not work --------------------------------------------------------------

@@ -349,6 +349,20 @@ def test_batches_that_vanish_from_the_file_are_counted(path: Path) -> None:
         assert "2 batches are missing" in (spool.alarm or "")
 
 
+def test_a_full_queue_whose_batches_vanished_takes_new_ones(path: Path) -> None:
+    with running(path, max_bytes=100) as spool:
+        fill(spool, 10)
+        spool.work()
+        assert spool._file is not None
+        spool._file.connection.execute("DELETE FROM batches WHERE seq > 0")
+        fill(spool, 3, first=10)
+        spool.work()
+        assert "batches are missing" in (spool.alarm or "")
+        spool.work()
+        assert kept(spool) == [10, 11, 12]
+        assert spool.dropped() == (10, 50)
+
+
 @pytest.mark.parametrize("at", ["copying", "renaming"])
 def test_a_kill_while_a_new_file_is_made_loses_nothing(path: Path, at: str) -> None:
     class Killed(SpoolFile):
