@@ -9,14 +9,9 @@ from iort_agent.spool.interface import OVERWRITE_OLDEST, Backlog, Dropped, Entry
 from iort_contract.messages.batch import RunEnd
 
 
-def changed(kept: Backlog, batches: int, samples: int, payload_bytes: int) -> Backlog:
-    """What is kept, after so much has come or, below 0, gone."""
-    return Backlog(kept.batches + batches, kept.samples + samples, kept.payload_bytes + payload_bytes)
-
-
 class MemorySpool:
-    """A spool that ends with the process. ``max_bytes`` bounds the payloads; ``last_id`` is the id of the
-    last batch that was put."""
+    """A spool that ends with the process. ``max_bytes`` bounds the ``payload_bytes``; ``last_id`` is the
+    id of the last batch that was put."""
 
     alarm: str | None = None
     damaged = 0
@@ -29,9 +24,13 @@ class MemorySpool:
         self._lock = threading.Lock()
         self._handlers: list[OnStored] = []
         self._entries: OrderedDict[int, Entry] = OrderedDict()
-        self._kept = Backlog(0, 0, 0)
+        self.payload_bytes = self._samples = 0
         self._dropped = Dropped(0, 0)
         self._arrived: set[str] = set()
+
+    def __len__(self) -> int:
+        """How many batches are kept."""
+        return len(self._entries)
 
     def on_stored(self, handler: OnStored) -> None:
         """Call the handler after every put."""
@@ -48,13 +47,14 @@ class MemorySpool:
             self.last_id += 1
             entry = Entry(self.last_id, stream, seq, payload, samples)
             size = len(payload)
-            while self._overwrite and size <= self.max_bytes < self._kept.payload_bytes + size:
+            while self._overwrite and size <= self.max_bytes < self.payload_bytes + size:
                 self._drop(self._remove(next(iter(self._entries))))
-            if self._kept.payload_bytes + size > self.max_bytes:
+            if self.payload_bytes + size > self.max_bytes:
                 self._drop(entry)
                 return
             self._entries[entry.id] = entry
-            self._kept = changed(self._kept, 1, samples, size)
+            self.payload_bytes += size
+            self._samples += samples
         for handler in self._handlers:
             handler()
 
@@ -91,7 +91,7 @@ class MemorySpool:
     def backlog(self) -> Backlog:
         """What is kept now."""
         with self._lock:
-            return self._kept
+            return Backlog(len(self._entries), self._samples, self.payload_bytes)
 
     def dropped(self) -> Dropped:
         """What was dropped since the start."""
@@ -103,7 +103,8 @@ class MemorySpool:
 
     def _remove(self, entry_id: int) -> Entry:
         entry = self._entries.pop(entry_id)
-        self._kept = changed(self._kept, -1, -entry.samples, -len(entry.payload))
+        self.payload_bytes -= len(entry.payload)
+        self._samples -= entry.samples
         return entry
 
     def _drop(self, entry: Entry) -> None:

@@ -22,12 +22,12 @@ import sqlite3
 import threading
 from collections import OrderedDict
 from pathlib import Path
-from typing import Callable
+from typing import Callable, Iterable
 
 from iort_agent.clock import Clock
 from iort_agent.errors import AgentError
 from iort_agent.spool.config import QueueConfig
-from iort_agent.spool.file import READ_BYTES, QueueLock, SpoolFile
+from iort_agent.spool.file import READ_BYTES, READ_ENTRIES, QueueLock, SpoolFile
 from iort_agent.spool.interface import (
     OVERWRITE_OLDEST,
     PROCESS,
@@ -37,7 +37,7 @@ from iort_agent.spool.interface import (
     OnStored,
     Spool,
 )
-from iort_agent.spool.memory import MemorySpool, changed
+from iort_agent.spool.memory import MemorySpool
 from iort_agent.spool.salvage import is_damage, rebuild, rebuilt
 from iort_contract.messages.batch import RunEnd
 
@@ -161,8 +161,7 @@ class SqliteSpool:
                 room = self._max_bytes - self._in_file.payload_bytes
                 self._memory.max_bytes = min(self._memory_bytes, room)
             self._memory.put(stream, boot, seq, payload, samples=samples)
-            waiting = self._memory.backlog()
-            is_full = waiting.batches >= GROUP_ENTRIES or waiting.payload_bytes >= GROUP_BYTES
+            is_full = len(self._memory) >= GROUP_ENTRIES or self._memory.payload_bytes >= GROUP_BYTES
             waited_s = self._clock.monotonic() - self._wrote_at
             self._schedule(0.0 if is_full else max(0.0, GROUP_S - waited_s))
 
@@ -186,7 +185,7 @@ class SqliteSpool:
         with self._lock:
             entry = self._page.pop(entry_id, None)
             if entry is not None:
-                self._in_file = changed(self._in_file, -1, -entry.samples, -len(entry.payload))
+                self._in_file = _changed(self._in_file, -1, -entry.samples, -len(entry.payload))
                 self._gone.add(entry_id)
                 self._schedule(ACKS_S)
             else:
@@ -222,9 +221,9 @@ class SqliteSpool:
             return
         self._closed, self._retry_at = True, None
         self.work()
-        if self._memory.backlog().batches:
+        if len(self._memory):
             self.work()  # into a new file, if the old one was damaged
-        left = self._memory.backlog().batches
+        left = len(self._memory)
         if left:
             _log.error("queue: %d batches could not be written to %s and are lost", left, self._path)
         if self._file is not None:
@@ -247,7 +246,7 @@ class SqliteSpool:
         with self._lock:
             if self._retry_at is not None:
                 self._schedule(0.0)
-            elif self._memory.backlog().batches:
+            elif len(self._memory):
                 self._schedule(GROUP_S)
             elif self._gone or self._told or self._wrote_at != wrote_at:
                 # What was just written is acknowledged by then, without waking the thread for it.
@@ -320,28 +319,30 @@ class SqliteSpool:
             self._ends = {stream: end for stream, end in self._ends.items() if ends.get(stream) != end}
             if entries:
                 self._move_to_file(entries)
-            return bool(self._memory.backlog().batches)
+            return len(self._memory) > 0
 
     def _move_to_file(self, entries: list[Entry]) -> None:
         """Batches are in the file now: they leave the memory spool, but for those that may be wanted soon."""
-        page_bytes = sum(len(entry.payload) for entry in self._page.values())
-        if self._read_to >= self._last_in_file and page_bytes < READ_BYTES:
+        has_room = len(self._page) < READ_ENTRIES and _bytes(self._page.values()) < READ_BYTES
+        if has_room and self._read_to >= self._last_in_file:
             self._read_to = max(self._read_to, entries[-1].id)
+        is_behind = bool(self._page) and entries[0].id < next(reversed(self._page))
         self._last_in_file = max(self._last_in_file, entries[-1].id)
         for entry in entries:
             if self._memory.take(entry.id) is None:
                 # It was acknowledged or dropped meanwhile.
                 self._gone.add(entry.id)
                 continue
-            self._in_file = changed(self._in_file, 1, entry.samples, len(entry.payload))
+            self._in_file = _changed(self._in_file, 1, entry.samples, len(entry.payload))
             if entry.id <= self._read_to:
                 self._page[entry.id] = entry
-        self._page = OrderedDict(sorted(self._page.items()))
+        if is_behind:
+            self._page = OrderedDict(sorted(self._page.items()))
 
     def _trim(self, file: SpoolFile) -> None:
         """Drop the oldest batches in the file while there are more than ``max_bytes``."""
         with self._lock:
-            excess = self._in_file.payload_bytes + self._memory.backlog().payload_bytes - self._max_bytes
+            excess = self._in_file.payload_bytes + self._memory.payload_bytes - self._max_bytes
         after = 0
         while self._overwrite and excess > 0:
             oldest = file.oldest(after, _TRIM_ENTRIES)
@@ -355,7 +356,7 @@ class SqliteSpool:
                     excess -= size
                     self._gone.add(entry_id)
                     self._page.pop(entry_id, None)
-                    self._in_file = changed(self._in_file, -1, -samples, -size)
+                    self._in_file = _changed(self._in_file, -1, -samples, -size)
                     self._drop(1, samples)
 
     def _read(self) -> None:
@@ -496,3 +497,12 @@ class SqliteSpool:
         if self._queue_lock is not None:
             self._queue_lock.close()
             self._queue_lock = None
+
+
+def _changed(kept: Backlog, batches: int, samples: int, payload_bytes: int) -> Backlog:
+    """What is kept, after so much has come or, below 0, gone."""
+    return Backlog(kept.batches + batches, kept.samples + samples, kept.payload_bytes + payload_bytes)
+
+
+def _bytes(entries: Iterable[Entry]) -> int:
+    return sum(len(entry.payload) for entry in entries)

@@ -10,6 +10,7 @@ import shutil
 import sqlite3
 import subprocess
 import sys
+import zlib
 from pathlib import Path
 from typing import Any
 
@@ -522,19 +523,13 @@ def version_1(path: Path) -> list[bytes]:
     with contextlib.closing(sqlite3.connect(path)) as db:
         db.executescript(VERSION_1)
         for i, payload in enumerate(payloads):
-            crc = SpoolFileCrc(41 + i, payload)
+            crc = zlib.crc32(payload, zlib.crc32(f"vesc {41 + i} 1 ".encode()))
             row = (7 + i, "vesc", 41 + i, 1, len(payload), crc, payload)
             db.execute("INSERT INTO batches VALUES (?, ?, ?, ?, ?, ?, ?)", row)
         db.commit()
     slot = json.dumps({"reserved": {"vesc": 297}, "turn": 2, "clean": True}).ljust(32 * 1024)
     Path(f"{path}.seq").write_text(slot)
     return payloads
-
-
-def SpoolFileCrc(seq: int, payload: bytes) -> int:  # noqa: N802
-    import zlib
-
-    return zlib.crc32(payload, zlib.crc32(f"vesc {seq} 1 ".encode()))
 
 
 def test_what_waits_in_a_file_of_version_1_is_sent_and_its_run_is_named(path: Path) -> None:
