@@ -14,33 +14,32 @@ It measures at 50 Hz and at 1000 Hz:
 
 from __future__ import annotations
 
-import argparse
 import json
 import os
-import platform
 import subprocess
 import sys
 import tempfile
 import time
 from dataclasses import asdict, dataclass
-from datetime import datetime, timezone
 from pathlib import Path
-from typing import Any
 
 from rich.console import Console
-from rich.table import Table
 
+from bench.command import made, parser, write
 from bench.errors import BenchError
 from bench.floors import mosquitto
 from bench.meters import live_lane, usage
+from bench.meters.waiting import reached
+from bench.report.result import Table
 from bench.ros.graph import PYTHONPATH, RosError, RosGraph, python_with_rospy
+from bench.ros.mixed_robot import CORE
+from iort_contract.catalog.vesc import VESC_STREAM
 from iort_station.cloud import Cloud
 from iort_station.fleet import robots
 from iort_station.operations import delivery
 from local.cloud import EmbeddedCloud
 from local.errors import LocalError
 
-TOPIC = "/sensors/core"
 RATES_HZ = (50, 1000)
 # What the figures are held against, here and in the README.
 CPU_US = {50: 300.0, 1000: 100.0}
@@ -64,126 +63,104 @@ class Run:
 
 def main() -> None:
     """Measure and print; exit status 1 if a sample was lost."""
-    parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
-    parser.add_argument("--seconds", type=int, default=30, help="how long each rate is measured")
-    parser.add_argument("--soak", type=int, metavar="S", help="measure 1000 Hz alone, for so long")
-    parser.add_argument("--json", type=Path, metavar="FILE", help="write the figures as JSON too")
-    options = parser.parse_args()
+    arguments = parser(__doc__)
+    arguments.add_argument("--seconds", type=int, default=30, help="how long each rate is measured")
+    arguments.add_argument("--soak", type=int, metavar="S", help="measure 1000 Hz alone, for so long")
+    options = arguments.parse_args()
     console = Console()
+    runs, lanes = [], []
     try:
         python = python_with_rospy()
-        cycle = json.loads(_output([python, "-m", "bench.meters.cycle", "20000"]))
-        runs = []
+        cycle = _cycle(python)
         with EmbeddedCloud(progress=lambda step: console.print(f"  {step}", style="dim")) as embedded:
             for rate_hz in (1000,) if options.soak else RATES_HZ:
                 seconds = options.soak or options.seconds
                 console.print(f"{rate_hz} Hz for {seconds} s ...")
                 runs.append(_measure(embedded.cloud, python, rate_hz, seconds))
-        lean = []
         program = mosquitto.found()
         if program is None:
             console.print("mosquitto is not installed (apt install mosquitto): left out", style="yellow")
         for rate_hz in RATES_HZ if program is not None and not options.soak else ():
             console.print(f"mosquitto, {rate_hz} Hz for {options.seconds} s ...")
-            lean.append(live_lane.measure(str(program), python, rate_hz, options.seconds))
+            lanes.append(live_lane.measure(str(program), python, rate_hz, options.seconds))
     except (BenchError, LocalError) as error:
         sys.exit(f"bench-agent: {error}")
-    console.print(_table(runs, cycle, lean))
-    if options.json:
-        options.json.write_text(json.dumps(_report(runs, cycle, lean), indent=2) + "\n")
+    _table(runs, cycle, lanes).show(console)
+    write(
+        options.json,
+        {
+            **made(),
+            "targets": {**TARGETS, "cpu_us": CPU_US},
+            "cycle_ms": cycle,
+            "runs": [asdict(run) for run in runs],
+            "mosquitto": [asdict(lane) for lane in lanes],
+        },
+    )
     sys.exit(1 if any(run.lost for run in runs) else 0)
 
 
 def _measure(cloud: Cloud, python: str, rate_hz: int, seconds: int) -> Run:
     robot, count = f"bench-{rate_hz}", rate_hz * (seconds + _WARM_UP_S)
     with tempfile.TemporaryDirectory() as name, RosGraph(python, Path(name)) as graph:
-        folder = Path(name)
-        source = {"type": "ros1", "topics": {TOPIC: {"stream": "vesc", "time": "header"}}}
-        bundle = robots.add(
-            cloud, robot, out=folder, settings={"sources": [source], "queue": {"path": "spool.db"}}
-        )
+        topics = {live_lane.TOPIC: {"stream": VESC_STREAM, "time": "header"}}
+        settings = {"sources": [{"type": "ros1", "topics": topics}], "queue": {"path": "spool.db"}}
+        bundle = robots.add(cloud, robot, out=Path(name), settings=settings)
         agent = graph.start("iort_agent.cli", "run", "--config", bundle.config)
-        floor = graph.start("bench.floors.ros_floor", TOPIC)
-        publisher = graph.publisher(TOPIC, rate_hz, count)
-        publisher.begin()
+        floor = graph.start("bench.floors.ros_floor", live_lane.TOPIC)
+        publisher = graph.publisher(CORE, seconds + _WARM_UP_S, rate_hz=rate_hz)
+        publisher.ready()
+        publisher.go()
         publisher.publish_for(_WARM_UP_S)
-        before = usage.of(agent.pid), usage.of(floor.pid)
-        began = time.monotonic()
+        before, began = (usage.of(agent.pid), usage.of(floor.pid)), time.monotonic()
         publisher.publish_for(seconds - 1)
         measured = (time.monotonic() - began) * rate_hz
         after = usage.of(agent.pid), usage.of(floor.pid)
         publisher.finish()
-        stored = _stored(cloud, robot, count)
+
+        def stored() -> int:
+            return sum(len(batch.times_us) for batch in delivery.batches(cloud, robot, VESC_STREAM))
+
+        reached(lambda: stored() >= count, within_s=_CATCH_UP_S, poll_s=0.5)
+        lost = count - stored()
         agent.terminate()
         agent.wait()
-    return Run(
-        rate_hz=rate_hz,
-        samples=count,
-        lost=count - stored,
-        agent_cpu_us=round((after[0].cpu_s - before[0].cpu_s) / measured * 1e6, 1),
-        floor_cpu_us=round((after[1].cpu_s - before[1].cpu_s) / measured * 1e6, 1),
-        rss_mb_first=round(before[0].rss_mb, 1),
-        rss_mb_last=round(after[0].rss_mb, 1),
+    agent_us, floor_us = (
+        round((then.cpu_s - first.cpu_s) / measured * 1e6, 1)
+        for first, then in zip(before, after, strict=True)
     )
+    rss_mb = round(before[0].rss_mb, 1), round(after[0].rss_mb, 1)
+    return Run(rate_hz, count, lost, agent_us, floor_us, *rss_mb)
 
 
-def _stored(cloud: Cloud, robot: str, count: int) -> int:
-    """Count the samples in the table, after all have arrived or the wait is over."""
-    deadline = time.monotonic() + _CATCH_UP_S
-    while True:
-        stored = sum(len(batch.times_us) for batch in delivery.batches(cloud, robot, "vesc"))
-        if stored >= count or time.monotonic() > deadline:
-            return stored
-        time.sleep(0.5)
-
-
-def _output(command: list[str]) -> str:
+def _cycle(python: str) -> dict[str, float]:
     environment = {**os.environ, "PYTHONPATH": PYTHONPATH}
+    command = [python, "-m", "bench.meters.cycle", "20000"]
     done = subprocess.run(command, env=environment, capture_output=True, text=True, check=False)
     if done.returncode:
         raise RosError(f"{' '.join(command)} failed:\n{done.stderr[-1000:]}")
-    return done.stdout
+    found: dict[str, float] = json.loads(done.stdout)
+    return found
 
 
-def _table(runs: list[Run], cycle: dict[str, float], lean: list[live_lane.Lane]) -> Table:
-    table = Table(title="The agent", title_justify="left", title_style="bold")
-    for column in ("figure", "measured", "target", "floor, same run"):
-        table.add_column(column, justify="left" if column == "figure" else "right")
+def _table(runs: list[Run], cycle: dict[str, float], lanes: list[live_lane.Lane]) -> Table:
+    rows = []
     for run in runs:
-        rate = f"at {run.rate_hz} Hz"
-        target = CPU_US[run.rate_hz]
-        table.add_row(
-            f"processor a sample {rate}",
-            f"{run.agent_cpu_us:.0f} us",
-            f"{target:.0f} us",
-            f"{run.floor_cpu_us:.0f} us (x{run.agent_cpu_us / run.floor_cpu_us:.1f})",
+        rate, ours, floor = f"at {run.rate_hz} Hz", run.agent_cpu_us, run.floor_cpu_us
+        target = f"{CPU_US[run.rate_hz]:.0f} us"
+        rows.append(
+            [f"processor a sample {rate}", f"{ours:.0f} us", target, f"{floor:.0f} us (x{ours / floor:.1f})"]
         )
         rss = f"{run.rss_mb_first:.1f} to {run.rss_mb_last:.1f} MB"
-        table.add_row(f"memory {rate}, first to last", rss, f"{TARGETS['rss_mb']:.0f} MB", "")
-        table.add_row(f"samples lost {rate}", f"{run.lost} of {run.samples:,}", "0", "")
-    for lane in lean:
-        table.add_row(
-            f"ROS publish to MQTT subscriber at {lane.rate_hz} Hz, mosquitto",
-            lane.shown(lane.agent_ms),
-            f"{TARGETS['live_ms_p50']} ms",
-            lane.shown(lane.floor_ms),
-        )
+        rows.append([f"memory {rate}, first to last", rss, f"{TARGETS['rss_mb']:.0f} MB", ""])
+        rows.append([f"samples lost {rate}", f"{run.lost} of {run.samples:,}", "0", ""])
+    for lane in lanes:
+        name = f"ROS publish to MQTT subscriber at {lane.rate_hz} Hz, mosquitto"
+        # To a hundredth of a ms: the two differ by no more.
+        delays = lane.agent_ms.text(2), f"{TARGETS['live_ms_p50']} ms", lane.floor_ms.text(2)
+        rows.append([name, *delays])
     p50 = f"{cycle['p50']:.4f} ms (p95 {cycle['p95']:.4f})"
-    table.add_row("node's cycle, callback to spool", p50, f"{TARGETS['cycle_ms_p50']} ms", "thesis: 2 ms")
-    return table
-
-
-def _report(runs: list[Run], cycle: dict[str, float], lean: list[live_lane.Lane]) -> dict[str, Any]:
-    return {
-        "date": datetime.now(timezone.utc).isoformat(timespec="seconds"),
-        "machine": f"{platform.machine()}, {os.cpu_count()} cores, {platform.platform()}",
-        "python": platform.python_version(),
-        "load_1min": os.getloadavg()[0],
-        "targets": {**TARGETS, "cpu_us": CPU_US},
-        "cycle_ms": cycle,
-        "runs": [asdict(run) for run in runs],
-        "mosquitto": [asdict(lane) for lane in lean],
-    }
+    rows.append(["node's cycle, callback to spool", p50, f"{TARGETS['cycle_ms_p50']} ms", "thesis: 2 ms"])
+    return Table("The agent", ["figure", "measured", "target", "floor, same run"], rows)
 
 
 if __name__ == "__main__":

@@ -10,9 +10,7 @@ the table scales the time by this share, for a processor as fast as this one. No
 
 from __future__ import annotations
 
-import argparse
 import compileall
-import json
 import platform
 import shutil
 import sys
@@ -23,15 +21,16 @@ from statistics import median
 from tempfile import TemporaryDirectory
 
 from rich.console import Console
-from rich.table import Table
 
 from bench import ROOT
-from bench.runtime.deployed import functions
-from bench.runtime.environment import Function, RuntimeFailedError, link_runtime, started
-from bench.runtime.events import events
+from bench.command import parser, write
+from bench.report.result import Table
 from bench.sections.utilisation import ONE_VCPU_MB
 from scripts.layer import compile_all
 from stacks.settings import Settings
+from tests.runtime.deployed import functions
+from tests.runtime.environment import Function, RuntimeFailedError, link_runtime, started
+from tests.runtime.events import events
 
 LAYER = ROOT / "build" / "layer" / "local"
 # What has bytecode: what is deployed is the second.
@@ -58,38 +57,31 @@ class Start:
 
 def main() -> None:
     """Measure and print."""
-    parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
-    parser.add_argument("--rounds", type=int, default=5, help="starts of each kind")
-    parser.add_argument("--json", type=Path, metavar="FILE", help="write the figures as JSON too")
-    asked = parser.parse_args()
+    arguments = parser(__doc__)
+    arguments.add_argument("--rounds", type=int, default=5, help="starts of each kind")
+    options = arguments.parse_args()
     console = Console()
     if not LAYER.is_dir():
         sys.exit(f"bench-cold: {LAYER} is not there: run `make setup`")
     try:
-        found = list(measure(asked.rounds, console))
+        found = list(measure(options.rounds, console))
     except RuntimeFailedError as error:
         sys.exit(f"bench-cold: {error}")
-    table = Table(title=f"Cold starts, Python {platform.python_version()}, {platform.machine()}")
-    for title in (
-        "function",
-        "memory",
-        "bytecode",
-        "start",
-        "first event",
-        "at its share",
-        "resident",
-    ):
-        table.add_column(title, justify="left" if title == "function" else "right")
-    for one in found:
-        table.add_row(
-            *(one.function, f"{one.memory_mb} MB", one.compiled),
-            *(f"{one.start_cpu_ms:.0f} ms", f"{one.first_cpu_ms:.0f} ms"),
-            *(f"{one.cold_ms / 1000:.2f} s", f"{one.peak_mb:.0f} MB"),
-        )
-    console.print(table)
-    if asked.json:
-        figures = [{**asdict(one), "cold_ms": one.cold_ms} for one in found]
-        asked.json.write_text(json.dumps(figures, indent=1) + "\n")
+    rows = [
+        [
+            one.function,
+            f"{one.memory_mb} MB",
+            one.compiled,
+            f"{one.start_cpu_ms:.0f} ms",
+            f"{one.first_cpu_ms:.0f} ms",
+            f"{one.cold_ms / 1000:.2f} s",
+            f"{one.peak_mb:.0f} MB",
+        ]
+        for one in found
+    ]
+    head = ["function", "memory", "bytecode", "start", "first event", "at its share", "resident"]
+    Table(f"Cold starts, Python {platform.python_version()}, {platform.machine()}", head, rows).show(console)
+    write(options.json, [{**asdict(one), "cold_ms": one.cold_ms} for one in found])
 
 
 def measure(rounds: int, console: Console) -> Iterator[Start]:

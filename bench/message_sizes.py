@@ -1,4 +1,4 @@
-"""Measures how large the messages and items of a drive are, by encoding a simulated drive.
+"""Measures the sizes of messages and items, by encoding a simulated drive.
 
     python -m bench.message_sizes
 
@@ -13,7 +13,8 @@ from dataclasses import replace
 from decimal import Decimal
 from typing import Any
 
-from iort_agent.sources.vehicle import Vehicle, VehicleConfig
+from bench.load.simulated import simulated_drive
+from iort_agent.sources.vehicle import VehicleConfig
 from iort_contract.catalog.derived import Vehicle as Gain
 from iort_contract.catalog.streams import AGENT_FIELDS
 from iort_contract.catalog.vesc import VESC_STREAM
@@ -27,7 +28,7 @@ from iort_station.cost.sizes import Measured
 
 _BOOT, _ROBOT = "0badcafe0badcafe", "car-0001"
 _T_US, _MS = 1_750_000_000_000_000, 1_750_000_000_000
-# A drive is looked at when the car is warm and its counters have grown.
+# The drive begins after a minute, when the motor is warm and the counters have grown.
 _WARM_S = 60
 
 
@@ -46,9 +47,9 @@ def main() -> None:
 
 def batch_sizes(rate_hz: float, batch_s: float) -> Measured:
     """The sizes of a batch of a VESC's stream, and of the summary of a second at this rate."""
-    samples = drive(rate_hz, max(1, round(rate_hz * batch_s)))
+    samples = simulated_drive(max(1, round(rate_hz * batch_s)), rate_hz=rate_hz, after_s=_WARM_S)
     message = encode_batch(batch_of(samples, rate_hz))
-    second = batch_of(drive(rate_hz, max(1, round(rate_hz))), rate_hz)
+    second = batch_of(simulated_drive(max(1, round(rate_hz)), rate_hz=rate_hz, after_s=_WARM_S), rate_hz)
     return Measured(
         samples=len(samples),
         record=len(message) + len(record_topic(_ROBOT, VESC_STREAM)),
@@ -58,8 +59,8 @@ def batch_sizes(rate_hz: float, batch_s: float) -> Measured:
 
 
 def message_sizes() -> dict[str, int]:
-    """The sizes of what holds one sample, by the field of `iort_station.cost.sizes.Sizes`."""
-    (first,) = drive(50.0, 1)
+    """The sizes of messages and items with one sample, by the field of `iort_station.cost.sizes.Sizes`."""
+    (first,) = simulated_drive(1, after_s=_WARM_S)
     live = LiveSample(_BOOT, 100_000, _T_US, _T_US + 500, first)
     flat = {"boot": _BOOT, "seq": 100_000, "t": _T_US, **first}
     return {
@@ -103,18 +104,6 @@ def _value_bytes(value: Any) -> int:
 def _rule() -> dict[str, Value]:
     topic = build_topic(RECORD, _ROBOT, VESC_STREAM)
     return {TOPIC: topic, RECEIVED_MS: _MS, EXPIRES_S: _MS // 1000}
-
-
-def drive(rate_hz: float, count: int) -> list[Mapping[str, Value]]:
-    """So many samples of a simulated drive."""
-    vehicle = Vehicle(VehicleConfig(), seed=1)
-    for _ in range(round(_WARM_S * 50)):
-        vehicle.step(0.02)
-    samples: list[Mapping[str, Value]] = []
-    for _ in range(count):
-        vehicle.step(min(0.02, 1 / rate_hz))
-        samples.append(vehicle.sample())
-    return samples
 
 
 def batch_of(samples: Sequence[Mapping[str, Value]], rate_hz: float) -> Batch:

@@ -10,23 +10,20 @@ minute of the soak. Processor time, because on a machine that is shared the wall
 from __future__ import annotations
 
 import argparse
-import json
-import os
-import platform
 import subprocess
 import sys
 import time
 from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager
 from dataclasses import asdict, dataclass
-from pathlib import Path
 from typing import Any
 
 from rich.console import Console
-from rich.table import Table
 
+from bench.command import made, parser, write
 from bench.errors import BenchError
 from bench.meters import chromium
+from bench.report.result import Table
 from iort_station.fleet.robots import F1TENTH
 from iort_station.page.server import PageServer
 from local.pubnub.standin import PubNubStandIn
@@ -50,17 +47,27 @@ class View:
 
 def main() -> None:
     """Measure and print; exit status 1 if the main thread is busier than `MAX_BUSY`."""
-    options = _options()
+    arguments = parser(__doc__)
+    arguments.add_argument("--cars", type=int, default=20)
+    arguments.add_argument("--seconds", type=float, default=30.0, help="of each view")
+    arguments.add_argument("--soak", type=float, default=300.0, help="seconds of watching the memory")
+    options = arguments.parse_args()
     console = Console()
     try:
         views, heap, bounds = _watched(console, options)
     except BenchError as error:
         sys.exit(f"bench-page: {error}")
-    _print(console, views, heap, options.cars)
-    if options.json:
-        machine = {"python": platform.python_version(), "cpus": os.cpu_count()}
-        figures = {"views": [asdict(view) for view in views], "heap_mb": heap, "bounds": bounds, **machine}
-        options.json.write_text(json.dumps(figures, indent=2) + "\n")
+    rows = [
+        [view.name, f"{view.main_thread:.1%} of a processor", f"{view.messages_per_s:.0f}"] for view in views
+    ]
+    title = f"The page with {options.cars} cars at 10 Hz"
+    Table(title, ["view", "main thread busy", "messages/s"], rows).show(console)
+    told = ", ".join(f"{mb:.1f}" for mb in heap)
+    console.print(f"JavaScript heap after a collection, MB, every {_STEP_S:.0f} s: {told}", highlight=False)
+    write(
+        options.json,
+        {**made(), "views": [asdict(view) for view in views], "heap_mb": heap, "bounds": bounds},
+    )
     sys.exit(1 if any(view.main_thread > MAX_BUSY for view in views) else 0)
 
 
@@ -94,15 +101,6 @@ def _watched(console: Console, options: argparse.Namespace) -> tuple[list[View],
         return views, heap, page.evaluate("iort.bounds")
 
 
-def _options() -> argparse.Namespace:
-    parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
-    parser.add_argument("--cars", type=int, default=20)
-    parser.add_argument("--seconds", type=float, default=30.0, help="of each view")
-    parser.add_argument("--soak", type=float, default=300.0, help="seconds of watching the memory")
-    parser.add_argument("--json", type=Path, help="write the figures as JSON")
-    return parser.parse_args()
-
-
 @contextmanager
 def _cars(origin: str, count: int) -> Iterator[None]:
     """Run the cars in their own process, which ends when its input does."""
@@ -129,17 +127,6 @@ def _metrics(probe: Any) -> dict[str, float]:
 def _heap_mb(probe: Any) -> float:
     probe.send("HeapProfiler.collectGarbage")
     return float(_metrics(probe)["JSHeapUsedSize"]) / 1e6
-
-
-def _print(console: Console, views: list[View], heap: list[float], cars: int) -> None:
-    table = Table(title=f"The page with {cars} cars at 10 Hz", title_justify="left")
-    for name in ("view", "main thread busy", "messages/s"):
-        table.add_column(name, justify="left" if name == "view" else "right")
-    for view in views:
-        table.add_row(view.name, f"{view.main_thread:.1%} of a processor", f"{view.messages_per_s:.0f}")
-    console.print(table)
-    told = ", ".join(f"{mb:.1f}" for mb in heap)
-    console.print(f"JavaScript heap after a collection, MB, every {_STEP_S:.0f} s: {told}", highlight=False)
 
 
 if __name__ == "__main__":

@@ -20,11 +20,9 @@ from pathlib import Path
 from botocore.exceptions import BotoCoreError, ClientError
 from rich.console import Console
 from rich.markup import escape
-from rich.prompt import Confirm
-from rich.table import Table
 
 from bench import ROOT, spending
-from bench.interrupts import wound_up
+from bench.command import confirm, wound_up
 from bench.report import machine, writer
 from bench.report.result import Section
 from bench.sections import SECTIONS
@@ -64,7 +62,7 @@ def run(options: argparse.Namespace, cloud: Cloud | None = None) -> None:
         ):
             dollars = spending.estimate(target.cloud, options.only) if target.kind == AWS else {}
             if dollars and not options.yes:
-                _confirm(console, dollars)
+                confirm(console, _announced(dollars), StationError)
             for number, key in enumerate(options.only, 1):
                 console.print(
                     f"{time.monotonic() - began:6.1f} s  [bold]{key}[/]  ({number} of {len(options.only)})",
@@ -77,7 +75,7 @@ def run(options: argparse.Namespace, cloud: Cloud | None = None) -> None:
     finally:
         if sections:
             writer.write(options.out, sections, here, options.target)
-    _show(console, sections)
+    writer.headline(sections).show(console)
     console.print(f"{options.out / 'report.md'}  after {time.monotonic() - began:.0f} s", highlight=False)
     if failed:
         console.print(f"not measured: {', '.join(failed)}", style="red")
@@ -85,19 +83,13 @@ def run(options: argparse.Namespace, cloud: Cloud | None = None) -> None:
     sys.exit(1 if any(r.reached is False for s in sections for r in s.ratios) else 0)
 
 
-def _confirm(console: Console, dollars: dict[str, float]) -> None:
-    """Ask before the run spends money. Raises `StationError` without a terminal or without consent."""
+def _announced(dollars: dict[str, float]) -> str:
     parts = ", ".join(f"{key} {usd:.3f}" for key, usd in dollars.items())
-    console.print(
+    return (
         f"This costs about ${sum(dollars.values()):.2f} in your account ({parts}) at the list prices of "
         f"{AS_OF} in {REGION}, and PubNub's transactions. Robots, certificates, functions and a table named "
-        "bench-... are made and removed again; utilisation changes Lambda 1's memory and puts it back.",
-        highlight=False,
+        "bench-... are made and removed again; utilisation changes Lambda 1's memory and puts it back."
     )
-    if not sys.stdin.isatty():
-        raise StationError("no terminal to ask at: agree with --yes (make bench TARGET=aws YES=1)")
-    if not Confirm.ask("Go on?", console=console, default=False):
-        raise StationError("nothing was measured")
 
 
 def _measure(key: str, target: Target, console: Console, sections: list[Section], failed: list[str]) -> None:
@@ -115,16 +107,6 @@ def _measure(key: str, target: Target, console: Console, sections: list[Section]
         return
     section.seconds = time.monotonic() - began
     sections.append(section)
-
-
-def _show(console: Console, sections: list[Section]) -> None:
-    rows = writer.headline(sections)
-    table = Table(title=rows.title, title_justify="left", title_style="bold")
-    for i, name in enumerate(rows.head):
-        table.add_column(name, justify="right" if i else "left")
-    for row in rows.rows:
-        table.add_row(*(cell.replace("**", "") for cell in row), style="red" if row[-1] == "**no**" else "")
-    console.print(table)
 
 
 def _options() -> argparse.Namespace:

@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import argparse
 import io
-import subprocess
 import sys
 import tempfile
 import threading
@@ -21,6 +20,7 @@ from typing import Any, Literal
 
 from bench import ROOT
 from bench.errors import BenchError
+from bench.load.agent_process import AgentProcess
 from bench.load.cars import Publisher, SimulatedCar, drive
 from bench.meters import chromium
 from iort_station.fleet import robots
@@ -128,7 +128,6 @@ def _driving(cloud: EmbeddedCloud, folder: Path) -> Iterator[None]:
     source = {"type": "sim", "rate_hz": 50, "duration_s": DRIVE_S * 3}
     settings = {"sources": [source], "ping": {"rate_hz": 2}}
     bundle = robots.add(cloud.cloud, _REAL, out=folder, settings=settings)
-    agent = [str(Path(sys.executable).parent / "iort-agent"), "run", "--config", str(bundle.config)]
     pubnub = cloud.keys
     publisher = Publisher(
         origin=pubnub.origin, publish_key=pubnub.publish_key, subscribe_key=pubnub.subscribe_key
@@ -142,7 +141,7 @@ def _driving(cloud: EmbeddedCloud, folder: Path) -> Iterator[None]:
         threading.Timer(50, lambda: setattr(cars[_FAULTY], "fault_code", 5)),
         threading.Timer(55, lambda: cars.pop(_STOPS)),
     ]
-    with (folder / "agent.log").open("w") as log, subprocess.Popen(agent, cwd=ROOT, stderr=log) as process:
+    with AgentProcess(bundle, drain_s=0.0):
         driving.start()
         for event in events:
             event.start()
@@ -153,8 +152,6 @@ def _driving(cloud: EmbeddedCloud, folder: Path) -> Iterator[None]:
                 event.cancel()
             stop.set()
             driving.join()
-            publisher.close()
-            process.terminate()
 
 
 def _write(path: Path, png: bytes) -> None:

@@ -7,7 +7,7 @@ from itertools import product
 from math import ceil
 
 from bench.sections import dashboard, outage, query, round_trips, utilisation
-from iort_agent.rate_limiter import BYTES_PER_S
+from iort_agent.mqtt.rate_limiter import BYTES_PER_S
 from iort_contract.topics import PING_PATHS
 from iort_station.cloud import Cloud
 from iort_station.cost import line_items, model
@@ -29,8 +29,9 @@ def estimate(cloud: Cloud, sections: Sequence[str]) -> dict[str, float]:
         "round_trips": _round_trips,
         "dashboard": lambda: _driven(dashboard.SECONDS * 2),
         "utilisation": _utilisation,
-        "query": lambda: _query(_telemetry_bytes(cloud)),
-        "abilities": _abilities,
+        "query": lambda: _query(cloud),
+        # A metric of its own, for the hour that AWS bills.
+        "abilities": lambda: [*_items(metric=1 / 730, message=500, write=500), *_invoked(100, 512)],
         "outage": lambda: _driven(outage.BEFORE_S + outage.CUT_S + outage.AFTER_S),
     }
     return {key: line_items.total(counted[key]()) for key in sections if key in counted}
@@ -46,57 +47,41 @@ def _round_trips() -> list[Item]:
             messages += 2 * metered * (len(PING_PATHS) + 1)
             rules += 2 * metered
             answers += pings
+    connected = 4 * _MINUTES_CONNECTED
     return [
-        _item("message", messages),
-        _item("rule", rules),
-        _item("action", rules),
+        *_items(message=messages, rule=rules, action=rules, connection=connected),
         *_invoked(answers, 256),
-        _item("connection", 4 * _MINUTES_CONNECTED),
     ]
 
 
 def _driven(seconds: float) -> list[Item]:
-    hours = seconds / 3600
     items = model.bill(Usage(ping_hz=1, agent_every_s=1))
-    return [item._replace(units=item.units * hours) for item in items]
+    return [item._replace(units=item.units * seconds / 3600) for item in items]
 
 
 def _utilisation() -> list[Item]:
-    calls = utilisation.CALLS * utilisation.ROUNDS * 4
-    sized = [
-        item
-        for size in utilisation.SIZES_MB
-        for item in _invoked(utilisation.CALLS * utilisation.ROUNDS, size)
-    ]
+    calls = utilisation.CALLS * utilisation.ROUNDS
+    sized = [item for size in utilisation.SIZES_MB for item in _invoked(calls, size)]
     written = utilisation.BATCHES * (_BATCH_WRITES + _SUMMARY_WRITES)
-    return [*_invoked(calls, 512), *sized, _item("write", written + calls * _SUMMARY_WRITES)]
+    return [*_invoked(calls * 4, 512), *sized, *_items(write=written + calls * 4 * _SUMMARY_WRITES)]
 
 
-def _query(telemetry_bytes: int) -> list[Item]:
+def _query(cloud: Cloud) -> list[Item]:
     batches = ceil(query.POINTS / 50) + query.HOUR_POINTS // 50
     reads = query.REPEATS + 1
     stored = batches * _BATCH_WRITES * _WRITE
-    thesis = query.POINTS * 512
     # Two ways scan the whole table, whatever else is in it, and the thesis' way twice its own.
-    scanned = 2 * (telemetry_bytes + stored) + 2 * thesis + 3 * stored
-    return [
-        _item("write", query.POINTS + batches * (_BATCH_WRITES + _SUMMARY_WRITES)),
-        _item("read", ceil(reads * scanned / _READ)),
-        *_invoked(batches + 2 * reads, 512),
-    ]
-
-
-def _abilities() -> list[Item]:
-    # A metric of its own, for the hour that AWS bills.
-    return [_item("metric", 1 / 730), _item("message", 500), _item("write", 500), *_invoked(100, 512)]
+    scanned = 2 * (_telemetry_bytes(cloud) + stored) + 2 * query.POINTS * 512 + 3 * stored
+    written = query.POINTS + batches * (_BATCH_WRITES + _SUMMARY_WRITES)
+    return [*_items(write=written, read=ceil(reads * scanned / _READ)), *_invoked(batches + 2 * reads, 512)]
 
 
 def _invoked(calls: int, memory_mb: int) -> list[Item]:
-    return [_item("invocation", calls), _item("compute_x86", calls * memory_mb / 1024 * _BILLED_S * 5)]
+    return _items(invocation=calls, compute_x86=calls * memory_mb / 1024 * _BILLED_S * 5)
 
 
-def _item(price: str, units: float) -> Item:
-    return Item("", "", "", price, units)
+def _items(**units: float) -> list[Item]:
+    return [Item("", "", "", price, count) for price, count in units.items()]
 
 
 def _telemetry_bytes(cloud: Cloud) -> int:

@@ -12,8 +12,8 @@ from functools import cache
 from typing import Any
 
 from functions.shared.cut_off import CutOff
-from functions.shared.dead_letter import Refusals, refused_event
-from functions.shared.delay_estimator import Legs
+from functions.shared.dead_letter import DeadLetterQueue, refused_event
+from functions.shared.delay_estimator import DelayEstimator
 from functions.shared.metrics import Gathered, emit
 from functions.shared.pubnub_client import PublishError, PubNubPublisher
 from iort_contract.catalog.vesc import absent
@@ -43,7 +43,7 @@ class LiveSettings:
         return cls({stream: frozenset(fields) for stream, fields in named.items()})
 
 
-def age_ms(robot: str, live: LiveSample, received_ms: int, now_us: int, legs: Legs) -> float:
+def age_ms(robot: str, live: LiveSample, received_ms: int, now_us: int, legs: DelayEstimator) -> float:
     """How old a robot's sample is, regardless of the car's clock.
 
     A car that knows its clock offset sends it in the message, so the whole way is measured on one clock. For
@@ -67,7 +67,7 @@ def process(
     settings: LiveSettings,
     publish: Publish,
     *,
-    legs: Legs,
+    legs: DelayEstimator,
     counted: Gathered,
     now_us: int,
 ) -> None:
@@ -161,8 +161,8 @@ def _publisher() -> PubNubPublisher:
 
 
 @cache
-def _legs() -> Legs:
-    return Legs()
+def _legs() -> DelayEstimator:
+    return DelayEstimator()
 
 
 @cache
@@ -176,8 +176,8 @@ def _cut_off() -> CutOff:
 
 
 @cache
-def _refusals() -> Refusals:
-    return Refusals.at_once(os.environ["REJECTED_QUEUE"])
+def _refusals() -> DeadLetterQueue:
+    return DeadLetterQueue.at_once(os.environ["REJECTED_QUEUE"])
 
 
 def handler(event: dict[str, Any], context: Any) -> None:

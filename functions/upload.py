@@ -13,7 +13,7 @@ import boto3
 from botocore.config import Config
 
 from functions.shared.bucket import Bucket, parts_sha256
-from functions.shared.dead_letter import Refusals, refused_event
+from functions.shared.dead_letter import DeadLetterQueue, refused_event
 from functions.shared.metrics import emit
 from functions.shared.upload_quota import Allotment
 from iort_contract.checks import json_object
@@ -106,8 +106,8 @@ def _iot_data() -> Any:
 
 
 @cache
-def _refusals() -> Refusals:
-    return Refusals.at_once(os.environ["REJECTED_QUEUE"])
+def _refusals() -> DeadLetterQueue:
+    return DeadLetterQueue.at_once(os.environ["REJECTED_QUEUE"])
 
 
 def handler(event: dict[str, Any], context: Any) -> None:

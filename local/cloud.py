@@ -37,7 +37,8 @@ from iort_contract.topics import FILE, LAMBDA, LIVE, PING, build_topic
 from iort_station.cloud import EMBEDDED, Cloud, without_proxy
 from iort_station.page import keys
 from iort_station.page.keys import PubNubKeys
-from local.certificates import Identity
+from local import patched
+from local.certificates import Authority
 from local.deployment import ROOT, deploy
 from local.errors import LocalError
 from local.processes import Child
@@ -94,7 +95,7 @@ class EmbeddedCloud:
         self._take_folder()
         without_proxy(self.host)
         ports = {name: self._port(name) for name in ("gateway", "mqtt", "pubnub")}
-        certificate, key = Identity.make("iort embedded cloud", self.host).write(self.folder, "gateway")
+        certificate, key = Authority().write(self.folder, "gateway", self.host)
         self.cloud = Cloud(
             namespace=self.namespace,
             region=_REGION,
@@ -182,6 +183,7 @@ class EmbeddedCloud:
             "MINISTACK_SSL_KEY": str(key),
             "AWS_CA_BUNDLE": str(certificate),
             "PYTHONDONTWRITEBYTECODE": "1",
+            "PYTHONPATH": str(patched.folder()),
         }
         self.emulator = Child(
             "the emulator",

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import hashlib
 import os
 import shlex
 import shutil
@@ -12,6 +11,7 @@ from pathlib import Path
 
 from iort_station.cloud import Cloud
 from local.errors import LocalError
+from local.kept import kept
 from local.processes import run
 
 ROOT = Path(__file__).resolve().parent.parent
@@ -20,7 +20,6 @@ _STEP_S = 180.0
 # The sources of a synthesized assembly. If they have not changed, the kept assembly is deployed.
 _MADE_OF = ("app.py", "cdk.json", "requirements/dev.txt", "requirements/layer.txt", "scripts/layer.py")
 _MADE_OF_FOLDERS = ("stacks", "functions", "contract/iort_contract")
-_KEPT = 4
 
 
 def deploy(cloud: Cloud, folder: Path, progress: Callable[[str], None]) -> None:
@@ -33,8 +32,8 @@ def deploy(cloud: Cloud, folder: Path, progress: Callable[[str], None]) -> None:
         app = f"{shlex.quote(sys.executable)} app.py"
         cdk.run("synth", "--app", app, "--output", str(output), "--quiet", *context)
 
-    kept = assembly(ROOT, ROOT / "build" / "assembly", namespace=cloud.namespace, synthesize=synthesize)
-    cdk.put(kept, account=_ACCOUNT)
+    stacks = assembly(ROOT, ROOT / "build" / "assembly", namespace=cloud.namespace, synthesize=synthesize)
+    cdk.put(stacks, account=_ACCOUNT)
 
 
 class CommandLine:
@@ -86,30 +85,7 @@ class CommandLine:
 
 def assembly(root: Path, folder: Path, *, namespace: str, synthesize: Callable[[Path], None]) -> Path:
     """The synthesized stacks of the checkout: kept ones, or new ones from ``synthesize``."""
-    kept = folder / _key(root, namespace)
-    if kept.is_dir():
-        kept.touch()
-        return kept
-    folder.mkdir(parents=True, exist_ok=True)
-    making = kept.with_suffix(f".{os.getpid()}")
-    shutil.rmtree(making, ignore_errors=True)
-    synthesize(making)
-    try:
-        making.rename(kept)
-    except OSError:
-        # Another process has made the same one meanwhile.
-        shutil.rmtree(making, ignore_errors=True)
-    by_age = sorted(folder.iterdir(), key=lambda path: path.stat().st_mtime)
-    for old in by_age[:-_KEPT]:
-        shutil.rmtree(old, ignore_errors=True)
-    return kept
-
-
-def _key(root: Path, namespace: str) -> str:
-    digest = hashlib.sha256(f"{sys.version} {namespace}".encode())
     sources = [root / name for name in _MADE_OF]
     for name in _MADE_OF_FOLDERS:
         sources += sorted((root / name).rglob("*.py"))
-    for source in sources:
-        digest.update(f"{source.relative_to(root)}\0".encode() + source.read_bytes())
-    return digest.hexdigest()[:16]
+    return kept(folder, namespace, sources, synthesize)

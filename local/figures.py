@@ -38,9 +38,13 @@ class Spread:
         return cls(round(percents[49], 3), round(percents[94], 3), len(values))
 
     def __str__(self) -> str:
+        return self.text(1)
+
+    def text(self, digits: int) -> str:
+        """``1.2 ms (p95 2.1)``, or a dash without values."""
         if self.p50 is None or self.p95 is None:
             return _NOT_MEASURED
-        return f"{self.p50:.1f} ms (p95 {self.p95:.1f})"
+        return f"{self.p50:.{digits}f} ms (p95 {self.p95:.{digits}f})"
 
 
 @dataclass(frozen=True)

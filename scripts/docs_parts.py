@@ -17,9 +17,8 @@ import typer
 from cogapp import Cog
 from typer.cli import get_docs_for_click
 
-from bench.fleet_costs import fleets
+from bench.report.fleet_costs import fleets
 from bench.report.result import Ratio
-from bench.report.writer import ratio_row
 from iort_contract.catalog.derived import DERIVED
 from iort_contract.catalog.streams import AGENT_FIELDS
 from iort_contract.catalog.vesc import VESC
@@ -84,7 +83,7 @@ def headline() -> None:
     on = f"{machine['cores']} cores of {machine['cpu']}, target {kept['target']}"
     print(f"Made on {machine['date'][:10]} on {on}:\n")
     ratios = [Ratio(**ratio) for section in kept["sections"] for ratio in section["ratios"]]
-    rows = [ratio_row(ratio) for ratio in ratios if ratio.target is not None]
+    rows = [ratio.as_row() for ratio in ratios if ratio.target is not None]
     _table(("ratio, side by side in one run", "measured", "target", "reached"), rows)
 
 

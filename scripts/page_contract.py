@@ -15,7 +15,7 @@ from iort_contract.catalog.ros_types import ROS_UNITS
 from iort_contract.catalog.streams import CATALOG
 from iort_contract.catalog.vesc import FAULTS, TEMPERATURES, VESC_STREAM
 from iort_contract.messages import page
-from iort_contract.messages.files import CLAIM_FIELDS
+from iort_contract.messages.files import ATTACHMENT_FIELDS
 
 _PRECEDENCE = {"+": 1, "-": 1, "*": 2, "/": 2}
 _ATOM = 3
@@ -70,7 +70,7 @@ def _constants() -> Iterator[str]:
             literal = f"/^(?:{value.pattern})$/" if isinstance(value, re.Pattern) else json.dumps(value)
             yield f"export const {name} = {literal};"
     yield f"export const TEMPERATURES = {json.dumps(TEMPERATURES)} as const;"
-    yield f"export const ATTACHMENT_PARTS = {json.dumps(list(CLAIM_FIELDS))} as const;"
+    yield f"export const ATTACHMENT_PARTS = {json.dumps(list(ATTACHMENT_FIELDS))} as const;"
     for entry in DERIVED.values():
         arguments = ", ".join(f"{name}: number" for name in entry.arguments)
         yield f"/** {entry.meaning}, {entry.unit} */"

@@ -31,7 +31,7 @@ SQL_FUNCTIONS = frozenset(
         "traceid",
     }
 )
-# What local/gaps/rules/republish_topic.py expands in a republish action's topic.
+# What local/patches/republish_topic.patch expands in a republish action's topic.
 _TEMPLATE = re.compile(r"\$\{\s*topic\(\s*\d*\s*\)\s*\}")
 _CALL = re.compile(r"\b([A-Za-z_]\w*)\s*\(")
 # Words that may precede a bracket without being a function.

@@ -7,9 +7,11 @@ from functools import partial
 from typing import Callable, NamedTuple, Optional
 
 from iort_agent.clock import Clock
+from iort_agent.common.state import Connection
 from iort_agent.errors import UplinkError
 from iort_agent.mqtt.dispatch import Dispatcher
-from iort_agent.mqtt.uplink import Done, Message, OnConnection, OnMessage, UplinkStatus, matches
+from iort_agent.mqtt.rate_limiter import RateLimiter
+from iort_agent.mqtt.uplink import Done, Link, MqttMessage, OnConnection, OnMessage, Uplink, matches
 
 
 class ManualClock:
@@ -29,7 +31,7 @@ class ManualClock:
         return self._monotonic
 
     def advance(self, seconds: float) -> None:
-        """Let both clocks go on."""
+        """Advance both clocks."""
         with self._lock:
             self._now_us += round(seconds * 1_000_000)
             self._monotonic += seconds
@@ -39,7 +41,7 @@ class ManualClock:
         self._now_us = now_us
 
     def wait(self, event: threading.Event, seconds: float | None) -> bool:
-        """Pass the time at once, unless the event is set already. Without a limit: really wait."""
+        """Pass the time at once, unless the event is set. Without a limit, really wait."""
         if seconds is None:
             return event.wait()
         if event.is_set():
@@ -49,22 +51,22 @@ class ManualClock:
 
 
 class Published(NamedTuple):
-    """A message that the broker has got."""
+    """A message that the broker has received."""
 
     topic: str
     payload: bytes
     qos: int
 
 
-# What the broker makes of a publish: None to accept, otherwise why not.
+# Why the broker refuses a publish; None to accept it.
 Verdict = Callable[[Published], Optional[str]]
 
 
 class Loopback:
     """A broker in memory that can be cut, slowed and made to refuse.
 
-    Publishes come back to matching subscriptions. ``hold`` keeps acknowledgements back, ``stalled``
-    what is told of writes, too.
+    Publishes come back to matching subscriptions. ``hold`` delays acknowledgements, ``stalled`` also the
+    notice that a message was written.
     """
 
     def __init__(self, clock: Clock, dispatcher: Dispatcher, *, connected: bool = True) -> None:
@@ -80,6 +82,7 @@ class Loopback:
         self.hold = self.stalled = False
         self.verdict: Verdict = lambda _: None
         self.stopped = False
+        self.endpoint = "localhost:8883"
 
     def on_connection(self, handler: OnConnection) -> None:
         """Tell the handler of every `connect` and `cut`."""
@@ -97,9 +100,10 @@ class Loopback:
         """Whether it is connected."""
         return self._connected
 
-    def status(self) -> UplinkStatus:
+    def status(self) -> Connection:
         """How the connection stands."""
-        return UplinkStatus(self._connected, self._clock.monotonic() - self._switched, self._connects)
+        since_s = self._clock.monotonic() - self._switched
+        return Connection(self._connected, since_s, self._connects, endpoint=self.endpoint)
 
     def publish(self, topic: str, payload: bytes, *, qos: int, done: Done) -> None:
         """Accept, refuse or hold the message, and hand it to the subscriptions."""
@@ -117,19 +121,19 @@ class Loopback:
         elif qos:
             self._finish(done, None)
         else:
-            # The hardest that `Done` allows.
+            # `Done` allows a call within `publish`.
             done(None)
         self.deliver(topic, payload)
 
     def deliver(self, topic: str, payload: bytes) -> None:
         """Let a message arrive, as if another client had published it."""
-        message = Message(topic, payload, self._clock.monotonic())
+        message = MqttMessage(topic, payload, self._clock.monotonic())
         for topic_filter, handler in self._subscriptions.items():
             if matches(topic_filter, topic):
                 self._dispatcher.post(partial(handler, message))
 
     def release(self, *, error: str | None = None, count: int | None = None) -> None:
-        """Acknowledge what was held back, or fail it; the first ``count`` of it or all."""
+        """Acknowledge the delayed publishes, or fail them: the first ``count`` or all."""
         ready = self._waiting[:count]
         del self._waiting[:count]
         for done in ready:
@@ -140,7 +144,7 @@ class Loopback:
         self._switch(connected=True)
 
     def cut(self) -> None:
-        """Lose the connection; what was held back fails, as with the real client."""
+        """Lose the connection; delayed publishes fail, as with the real client."""
         self._switch(connected=False)
         self.release(error="the connection was lost")
 
@@ -165,3 +169,8 @@ class Loopback:
 
     def _finish(self, done: Done, error: UplinkError | None) -> None:
         self._dispatcher.post(lambda: done(error))
+
+
+def link_of(uplink: Uplink, clock: Clock, *, robot: str = "car1") -> Link:
+    """The link of a robot in the default namespace, with the limits of AWS."""
+    return Link(robot, "iort", uplink, clock, RateLimiter(clock))

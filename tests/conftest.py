@@ -5,12 +5,14 @@ from __future__ import annotations
 import os
 from collections.abc import Generator, Mapping
 from dataclasses import dataclass
+from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
 import pytest
 from hypothesis import HealthCheck, settings
 
+from local import patched
 from tests.browser import browser, open_page  # noqa: F401 - fixtures
 
 # How long an example takes says something about the machine only.
@@ -59,6 +61,12 @@ def group(nodeid: str) -> str:
 
 
 @pytest.hookimpl(optionalhook=True)
+def pytest_configure() -> None:
+    """Tests import the ministack that the embedded cloud runs: the installed one with local/patches/."""
+    if find_spec("ministack"):
+        patched.use()
+
+
 def pytest_xdist_make_scheduler(config: pytest.Config, log: Any) -> Any:
     """Under `make test`, groups are spread over the workers. (Marks cannot say it: of xdist 3.8, they
     no longer reach the scheduler under pytest 9.)"""

@@ -11,7 +11,7 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
-from iort_agent.mqtt.uplink import Message
+from iort_agent.mqtt.uplink import MqttMessage
 from iort_contract.messages.files import (
     Address,
     FileAnswer,
@@ -22,7 +22,7 @@ from iort_contract.messages.files import (
     part_range,
 )
 from iort_contract.topics import FILE, PING, PONG, build_topic
-from local.certificates import Identity
+from local.certificates import Authority
 from tests.agent_fakes import Loopback
 
 
@@ -47,7 +47,7 @@ class Store:
         self.robot = robot
         uplink.subscribe(build_topic(PING, robot, FILE), self._on_request)
 
-    def _on_request(self, message: Message) -> None:
+    def _on_request(self, message: MqttMessage) -> None:
         request = decode_file_request(message.payload)
         self.requests.append(request)
         if self.silent:
@@ -122,7 +122,7 @@ class _Server(http.server.ThreadingHTTPServer):
 @contextmanager
 def store(uplink: Loopback, folder: Path) -> Iterator[tuple[Store, Path]]:
     """The stand-in, and the certificate to trust."""
-    certificate, key = Identity.make("store", "127.0.0.1").write(folder, "store")
+    certificate, key = Authority().write(folder, "store", "127.0.0.1")
     context = ssl.SSLContext(ssl.PROTOCOL_TLS_SERVER)
     context.load_cert_chain(certificate, key)
     with _Server(("127.0.0.1", 0), _Handler) as server:

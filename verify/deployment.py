@@ -19,10 +19,11 @@ from local.deployment import ROOT
 from local.errors import LocalError
 from local.processes import run
 from stacks.settings import DEV
-from verify.checks.removal import POLICY
 from verify.errors import VerifyError
-from verify.preflight_deployed import STACKS, stack
-from verify.waiting import until
+from verify.preflight.deployed import STACKS, stack
+from verify.preflight.finding import listed
+from verify.questions.certificates import POLICY
+from verify.tools.waiting import until
 
 # Without CloudFront a stage takes five minutes; AWS keeps a policy for five more after its robots.
 _DEPLOY_S, _DESTROY_S = 1_800.0, 1_800.0
@@ -120,11 +121,9 @@ class Deployment:
             files.empty(self._cloud)
 
     def _delete_policies(self) -> None:
-        """Of a question that was interrupted while AWS kept its policy."""
+        """Delete the policies of a question that was interrupted while AWS kept its policy."""
         iot = self._cloud.client("iot")
-        pages = iot.get_paginator("list_policies").paginate()
-        names = [one["policyName"] for page in pages for one in page["policies"]]
-        for name in names:
+        for name in [one["policyName"] for one in listed(iot, "list_policies", "policies")]:
             if name.startswith(f"{self._cloud.namespace}-{POLICY}"):
                 iot.delete_policy(policyName=name)
 

@@ -1,17 +1,24 @@
-"""The report of a run, as JSON and as Markdown, without account numbers and secrets."""
+"""The report of a run, as JSON and as Markdown, without account numbers and secrets.
+
+`make verify-aws KEEP=1` keeps AWS' answers in the repository: tests compare the embedded cloud with them, and
+docs/assumptions.md names who measured them and when.
+"""
 
 from __future__ import annotations
 
 import json
 import re
 from collections import Counter
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any
 
-from verify.check import NOTE, Answer, Verdict, compared
+from bench.report.result import Table
+from verify.errors import VerifyError
+from verify.question import NOTE, Answer, Verdict, compared
 
+KEPT = Path(__file__).resolve().parent / "aws.json"
 # An account number, an access key's id, PubNub's keys, a private key, a session token.
 _SECRETS = (
     (re.compile(r"\b\d{12}\b"), "<account>"),
@@ -24,15 +31,37 @@ _SECRETS = (
 
 @dataclass(frozen=True, kw_only=True)
 class Run:
-    """The asker, the cloud and the time; ``findings`` are the preflight's lines."""
+    """The asker, the cloud and the time; ``preflight`` are the preflight's lines."""
 
     target: str
     region: str
     by: str
     date: str
     version: str
-    findings: Sequence[str] = ()
-    leftovers: Sequence[str] = ()
+    preflight: Sequence[str] = ()
+    left_over: Sequence[str] = ()
+
+
+@dataclass(frozen=True, kw_only=True)
+class Measured:
+    """The answers of one run on AWS; ``seen`` maps a question's name to its answer."""
+
+    by: str = ""
+    date: str = ""
+    region: str = ""
+    seen: Mapping[str, Mapping[str, Any]] = field(default_factory=dict)
+
+
+def load(path: Path = KEPT) -> Measured:
+    """The kept answers; empty without a file. Raises `VerifyError` for a file of another form."""
+    if not path.exists():
+        return Measured()
+    try:
+        report = json.loads(path.read_text())
+        seen = {one["name"]: one["seen"] for one in report["answers"] if one["seen"] is not None}
+        return Measured(by=report["by"], date=report["date"], region=report["region"], seen=seen)
+    except (KeyError, TypeError, ValueError) as error:
+        raise VerifyError(f"{path} must be a report of verify: {error!r}") from error
 
 
 def redacted(text: str) -> str:
@@ -45,65 +74,61 @@ def redacted(text: str) -> str:
 def write(folder: Path, run: Run, answers: Sequence[Answer]) -> None:
     """Write ``report.json`` and ``report.md`` into the folder."""
     folder.mkdir(parents=True, exist_ok=True)
-    # A time with twelve digits or more is not an account; by `Check`, answers hold no times.
-    (folder / "report.json").write_text(redacted(as_json(run, answers)))
-    (folder / "report.md").write_text(redacted(as_markdown(run, answers)))
+    # A time with twelve digits or more is not an account; by `Question`, answers hold no times.
+    (folder / "report.json").write_text(redacted(_as_json(run, answers)))
+    (folder / "report.md").write_text(redacted(_as_markdown(run, answers)))
 
 
-def as_json(run: Run, answers: Sequence[Answer]) -> str:
-    """The form that `verify.measured` reads."""
-    report: dict[str, Any] = {
-        "target": run.target,
-        "region": run.region,
-        "by": run.by,
-        "date": run.date,
-        "version": run.version,
-        "preflight": list(run.findings),
-        "left_over": list(run.leftovers),
-        "answers": [
-            {
-                "name": answer.check.name,
-                "verdict": answer.verdict.value,
-                "assumed": answer.check.assumed,
-                "expected": answer.check.expected,
-                "seen": answer.seen,
-                "reason": answer.reason,
-                "took_s": round(answer.took_s, 1),
-            }
-            for answer in answers
-        ],
-    }
-    return json.dumps(report, indent=1) + "\n"
-
-
-def as_markdown(run: Run, answers: Sequence[Answer]) -> str:
-    """The report for people: the verdicts first, then all answers that differ."""
-    lines = [
-        f"# What {run.target} answered",
-        "",
-        f"{run.date}, {run.region}, {run.version}, asked by {run.by or 'nobody named'}: {summary(answers)}.",
-        "",
+def _as_json(run: Run, answers: Sequence[Answer]) -> str:
+    """The form that `load` reads."""
+    told = [
+        {
+            "name": answer.question.name,
+            "verdict": answer.verdict.value,
+            "assumed": answer.question.assumed,
+            "expected": answer.question.expected,
+            "seen": answer.seen,
+            "reason": answer.reason,
+            "took_s": round(answer.took_s, 1),
+        }
+        for answer in answers
     ]
-    lines += [f"- preflight: {finding}" for finding in run.findings]
-    lines += [f"- left over: {name}" for name in run.leftovers]
-    lines += ["", "| question | verdict | took | note |", "|---|---|---|---|"]
-    for one in answers:
-        row = (one.check.name, one.verdict.value, f"{one.took_s:.1f} s", _cell(one.reason or _notes(one)))
-        lines.append(f"| {' | '.join(row)} |")
+    return json.dumps({**asdict(run), "answers": told}, indent=1) + "\n"
+
+
+def _as_markdown(run: Run, answers: Sequence[Answer]) -> str:
+    """The report for people: the verdicts first, then all answers that differ."""
+    rows = [
+        [one.question.name, one.verdict.value, f"{one.took_s:.1f} s", _cell(one.reason or _notes(one))]
+        for one in answers
+    ]
+    parts = [
+        f"# What {run.target} answered\n",
+        (
+            f"{run.date}, {run.region}, {run.version}, asked by {run.by or 'nobody named'}: "
+            f"{summary(answers)}.\n"
+        ),
+        *(f"- preflight: {finding}" for finding in run.preflight),
+        *(f"- left over: {name}" for name in run.left_over),
+        "",
+        Table("", ["question", "verdict", "took", "note"], rows).as_markdown(),
+    ]
     for one in answers:
         if one.verdict is Verdict.DIFFERS:
-            lines += ["", f"## {one.check.name}", "", one.check.assumed, ""]
-            lines += ["| key | expected | seen |", "|---|---|---|"]
-            lines += [f"| {key} | {want} | {got} |" for key, want, got in differences(one)]
-    return "\n".join(lines) + "\n"
+            differing = [[_cell(cell) for cell in row] for row in differences(one)]
+            parts += ["", f"## {one.question.name}", "", one.question.assumed, ""]
+            parts.append(Table("", ["key", "expected", "seen"], differing).as_markdown())
+    return "\n".join(parts) + "\n"
 
 
 def differences(answer: Answer) -> list[tuple[str, str, str]]:
     """Each key of an answer that is not as expected: its name, the expected and the seen value."""
     expected, seen = compared(answer.expected or {}), compared(answer.seen or {})
-    keys = [*expected, *(key for key in seen if key not in expected)]
-    rows = [(key, json.dumps(expected.get(key)), json.dumps(seen.get(key))) for key in keys]
-    return [(key, _cell(want), _cell(got)) for key, want, got in rows if want != got]
+    rows = [
+        (key, json.dumps(expected.get(key)), json.dumps(seen.get(key)))
+        for key in dict.fromkeys((*expected, *seen))
+    ]
+    return [row for row in rows if row[1] != row[2]]
 
 
 def summary(answers: Sequence[Answer]) -> str:
@@ -113,11 +138,9 @@ def summary(answers: Sequence[Answer]) -> str:
 
 
 def _notes(answer: Answer) -> str:
-    seen = answer.seen or {}
-    return ", ".join(
-        f"{name.removeprefix(NOTE)} {json.dumps(seen[name])}" for name in seen if name.startswith(NOTE)
-    )
+    notes = ((name, value) for name, value in (answer.seen or {}).items() if name.startswith(NOTE))
+    return ", ".join(f"{name.removeprefix(NOTE)} {json.dumps(value)}" for name, value in notes)
 
 
 def _cell(text: str) -> str:
-    return re.sub(r"\s+", " ", text).replace("|", "\\|")[:400]
+    return " ".join(text.split())[:400]

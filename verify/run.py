@@ -23,9 +23,8 @@ from pathlib import Path
 from botocore.exceptions import BotoCoreError, ClientError
 from rich.console import Console
 from rich.markup import escape
-from rich.prompt import Confirm
 
-from bench.interrupts import wound_up
+from bench.command import confirm, wound_up
 from bench.report import machine
 from bench.target import AWS, EMBEDDED, Target, open_target
 from iort_station.cloud import Cloud
@@ -34,12 +33,13 @@ from iort_station.errors import StationError
 from local.deployment import ROOT
 from local.errors import LocalError
 from stacks.settings import Settings
-from verify import measured, preflight, price, report
-from verify.check import FIRST, WITH_KEY, Answer, Check, Verdict, ask
-from verify.checks import ALL
-from verify.checks.live import keys_lent
+from verify import price, report
 from verify.deployment import Deployment
 from verify.errors import VerifyError
+from verify.preflight import command as preflight
+from verify.question import FIRST, WITH_KEY, Answer, Question, Verdict, ask
+from verify.questions import ALL
+from verify.questions.live import keys_lent
 
 OUT = ROOT / "build" / "verify"
 _STYLES = {
@@ -86,7 +86,7 @@ def run(options: argparse.Namespace, cloud: Cloud | None = None, deployment: Dep
             deployment = deployment or Deployment(cloud, options.out, say)
             findings.extend(_looked(cloud, console))
             if not options.yes:
-                _confirm(console, cloud)
+                confirm(console, _announced(cloud), VerifyError)
         try:
             if deployment:
                 deployment.deploy({})
@@ -100,7 +100,7 @@ def run(options: argparse.Namespace, cloud: Cloud | None = None, deployment: Dep
                 region = target.cloud.client("iot").meta.region_name
                 # One by one, so that the report has all answers before an interrupt.
                 answers.extend(_asked(options.only, FIRST, target, console))
-                if deployment and any(check.phase == WITH_KEY for check in options.only):
+                if deployment and any(question.phase == WITH_KEY for question in options.only):
                     deployment.deploy({"customer_key": "true"})
                 answers.extend(_asked(options.only, WITH_KEY, target, console))
         finally:
@@ -108,29 +108,39 @@ def run(options: argparse.Namespace, cloud: Cloud | None = None, deployment: Dep
             if deployment:
                 leftovers = deployment.destroy()
             if answers:
-                report.write(options.out, _described(options, region, findings, leftovers), answers)
+                here = machine.describe()
+                described = report.Run(
+                    target="AWS" if options.target == AWS else "the embedded cloud",
+                    region=region,
+                    by=options.by,
+                    date=here["date"],
+                    version=here["commit"],
+                    preflight=findings,
+                    left_over=leftovers,
+                )
+                report.write(options.out, described, answers)
             with suppress(OSError):
                 for line in leftovers:
                     console.print(f"left over: {line}", style="red", markup=False)
     console.print(f"{report.summary(answers)}: {options.out / 'report.md'}", highlight=False)
     if options.keep:
-        shutil.copyfile(options.out / "report.json", measured.KEPT)
+        shutil.copyfile(options.out / "report.json", report.KEPT)
         console.print(
-            f"kept in {measured.KEPT.relative_to(ROOT)}: `python -m verify.page` writes docs/assumptions.md"
+            f"kept in {report.KEPT.relative_to(ROOT)}: `python -m verify.page` writes docs/assumptions.md"
         )
     verdicts = {answer.verdict for answer in answers}
     return 2 if Verdict.FAILED in verdicts or leftovers else int(Verdict.DIFFERS in verdicts)
 
 
-def _asked(checks: Sequence[Check], phase: str, target: Target, console: Console) -> Iterator[Answer]:
+def _asked(questions: Sequence[Question], phase: str, target: Target, console: Console) -> Iterator[Answer]:
     """Ask the questions of a phase in order, and print each verdict."""
     # The embedded cloud must give AWS' measured answers.
-    known = measured.load() if target.kind == EMBEDDED else measured.Measured()
-    these = [check for check in checks if check.phase == phase]
-    for number, check in enumerate(these, 1):
-        answer = ask(check, target, time.monotonic, known.expected(check.name))
+    known = report.load() if target.kind == EMBEDDED else report.Measured()
+    these = [question for question in questions if question.phase == phase]
+    for number, question in enumerate(these, 1):
+        answer = ask(question, target, time.monotonic, known.seen.get(question.name))
         console.print(
-            f"  {number:2d} of {len(these)}  [bold]{check.name}[/]  "
+            f"  {number:2d} of {len(these)}  [bold]{question.name}[/]  "
             f"[{_STYLES[answer.verdict]}]{answer.verdict.value}[/]  {answer.took_s:.1f} s",
             highlight=False,
         )
@@ -152,33 +162,11 @@ def _looked(cloud: Cloud, console: Console) -> list[str]:
     return lines
 
 
-def _confirm(console: Console, cloud: Cloud) -> None:
-    """Ask before money is spent. Raises `VerifyError` without a terminal, or if the answer is no."""
-    console.print(
+def _announced(cloud: Cloud) -> str:
+    return (
         f"This takes about half an hour and costs {price.told(price.estimate())} at the list prices of "
-        f"{AS_OF}. "
-        f"It creates the stacks of namespace {cloud.namespace}, asks them, and removes them with all their "
-        "data. A key of the account's own is scheduled for deletion, which AWS does not charge for.",
-        highlight=False,
-    )
-    if not sys.stdin.isatty():
-        raise VerifyError("no terminal to ask for confirmation: use --yes (`make verify-aws YES=1`)")
-    if not Confirm.ask("Go on?", console=console, default=False):
-        raise VerifyError("nothing was created")
-
-
-def _described(
-    options: argparse.Namespace, region: str, findings: Sequence[str], leftovers: Sequence[str]
-) -> report.Run:
-    here = machine.describe()
-    return report.Run(
-        target="AWS" if options.target == AWS else "the embedded cloud",
-        region=region,
-        by=options.by,
-        date=here["date"],
-        version=here["commit"],
-        findings=findings,
-        leftovers=leftovers,
+        f"{AS_OF}. It creates the stacks of namespace {cloud.namespace}, asks them, and removes them with "
+        "all their data. A key of the account's own is scheduled for deletion, which AWS does not charge for."
     )
 
 
@@ -199,12 +187,12 @@ def _options() -> argparse.Namespace:
     return options
 
 
-def _selected(text: str) -> tuple[Check, ...]:
+def _selected(text: str) -> tuple[Question, ...]:
     wanted = set(text.split(","))
-    chosen = tuple(check for check in ALL if {check.name, check.name.split(".")[0]} & wanted)
-    known = {check.name for check in chosen} | {check.name.split(".")[0] for check in chosen}
+    chosen = tuple(question for question in ALL if {question.name, question.subject} & wanted)
+    known = {question.name for question in chosen} | {question.subject for question in chosen}
     if unknown := sorted(wanted - known):
-        names = ", ".join(dict.fromkeys(check.name.split(".")[0] for check in ALL))
+        names = ", ".join(dict.fromkeys(question.subject for question in ALL))
         raise argparse.ArgumentTypeError(f"no question {', '.join(unknown)}; subjects are {names}")
     return chosen
 

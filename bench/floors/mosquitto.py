@@ -9,15 +9,18 @@ import shutil
 import socket
 import subprocess
 import time
+from collections.abc import Mapping
 from pathlib import Path
-from types import TracebackType
 
+import yaml
 from typing_extensions import Self
 
 from bench.errors import BenchError
-from local.certificates import Identity
+from local.certificates import Authority
 
 HOST = "127.0.0.1"
+# The robot that `Mosquitto.car` configures.
+ROBOT = "bench"
 _START_S = 20.0
 # Messages leave at once, as they do from AWS IoT Core and the agent.
 _SETTINGS = """
@@ -46,7 +49,7 @@ class Mosquitto:
 
     def __init__(self, program: str, folder: Path) -> None:
         self._program, self._folder = program, folder
-        self._authority = Identity.make("iort bench", HOST, authority=True)
+        self._authority = Authority()
         with socket.socket() as probe:
             probe.bind((HOST, 0))
             self.port = int(probe.getsockname()[1])
@@ -57,7 +60,7 @@ class Mosquitto:
         return self._folder / "ca.pem"
 
     def __enter__(self) -> Self:
-        self._authority.write(self._folder, "ca")
+        self._authority.write_own(self.ca)
         self.identity("broker")
         config = self._folder / "mosquitto.conf"
         config.write_text(_SETTINGS.format(port=self.port, host=HOST, folder=self._folder))
@@ -78,12 +81,27 @@ class Mosquitto:
             else:
                 return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    def __exit__(self, *_: object) -> None:
         self._process.terminate()
         self._process.wait()
 
     def identity(self, name: str) -> tuple[Path, Path]:
         """A new certificate and its key, as files."""
-        return Identity.make(name, HOST, signer=self._authority).write(self._folder, name)
+        return self._authority.write(self._folder, name, HOST)
+
+    def car(self, topics: Mapping[str, Mapping[str, str]]) -> Path:
+        """Write and return the configuration of an agent that subscribes to these topics of ROS 1."""
+        certificate, key = self.identity(ROBOT)
+        settings = {
+            "robot": ROBOT,
+            "endpoint": HOST,
+            "port": self.port,
+            "certificate": str(certificate),
+            "private_key": str(key),
+            "root_ca": str(self.ca),
+            "sources": [{"type": "ros1", "topics": {name: dict(one) for name, one in topics.items()}}],
+            "queue": {"path": "spool.db"},
+        }
+        config = self._folder / "car.yaml"
+        config.write_text(yaml.safe_dump(settings))
+        return config

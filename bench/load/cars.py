@@ -6,8 +6,7 @@ python -m bench.load.cars --origin 127.0.0.1:8000 --publish-key P --subscribe-ke
 from __future__ import annotations
 
 import argparse
-import http.client
-import json
+import http
 import math
 import secrets
 import sys
@@ -15,6 +14,8 @@ import threading
 import time
 from collections.abc import Mapping
 from typing import Any
+
+import urllib3
 
 from bench.load import camera
 from iort_agent.sources.vehicle import Vehicle, VehicleConfig
@@ -97,21 +98,14 @@ class Publisher:
     """A persistent connection to the stand-in."""
 
     def __init__(self, *, origin: str, publish_key: str, subscribe_key: str) -> None:
-        self._connection = http.client.HTTPConnection(origin, timeout=30)
-        self._path = f"/publish/{publish_key}/{subscribe_key}/0"
+        self._pool = urllib3.PoolManager(timeout=30)
+        self._url = f"http://{origin}/publish/{publish_key}/{subscribe_key}/0"
 
     def publish(self, update: Mapping[str, Any]) -> None:
         """Publish on the robot's channel."""
-        path = f"{self._path}/{channel(update[ROBOT])}/0"
-        self._connection.request("POST", path, json.dumps(update), {"Content-Type": "application/json"})
-        answer = self._connection.getresponse()
-        answer.read()
+        answer = self._pool.request("POST", f"{self._url}/{channel(update[ROBOT])}/0", json=dict(update))
         if answer.status != http.HTTPStatus.OK:
             raise OSError(f"the stand-in answered {answer.status}")
-
-    def close(self) -> None:
-        """Close the connection."""
-        self._connection.close()
 
 
 def drive(cars: list[SimulatedCar], publisher: Publisher, stop: threading.Event) -> None:
@@ -144,7 +138,6 @@ def main() -> None:
     sys.stdin.read()
     stop.set()
     driving.join()
-    publisher.close()
 
 
 if __name__ == "__main__":

@@ -1,7 +1,7 @@
 """Many simulated robots in one process, each with its own certificate, session and record lane.
 
-Reads a `Load` as JSON from standard input. Writes one JSON object a line to standard output: progress, and at
-the end a `Sent`. Run by `bench.fleet`.
+Its argument is a file with a `Load` as JSON. Writes one JSON object a line to standard output: progress, and
+at the end a `Sent`. Run by `bench.load.fleet_run`.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ from typing import Any
 from awscrt import mqtt5
 from awsiot import mqtt5_client_builder
 
-from iort_agent.sources.vehicle import Vehicle, VehicleConfig
+from bench.load.simulated import simulated_drive
 from iort_contract.catalog.vesc import VESC_STREAM
 from iort_contract.limits import Value
 from iort_contract.messages.batch import Batch, encode_batch
@@ -72,12 +72,12 @@ class Robot:
         self._columns = columns
         self._topic = record_topic(name, VESC_STREAM, load.namespace)
         self._boot, self._first_us = os.urandom(4).hex(), 0
-        self.connected, self.stopped = threading.Event(), threading.Event()
+        self.connected = threading.Event()
         self.lost = self.resent = 0
         self.sent_ms: list[int] = []
         self.ack_ms: list[float] = []
         self.acknowledged: set[int] = set()
-        self._client = mqtt5_client_builder.mtls_from_path(
+        self.client = mqtt5_client_builder.mtls_from_path(
             str(folder / "certificate.pem"),
             str(folder / "private.key"),
             endpoint=load.host,
@@ -90,16 +90,7 @@ class Robot:
             max_reconnect_delay_ms=5_000,
             on_lifecycle_connection_success=lambda _: self.connected.set(),
             on_lifecycle_disconnection=self._on_lost,
-            on_lifecycle_stopped=lambda _: self.stopped.set(),
         )
-
-    def start(self) -> None:
-        """Begin to connect."""
-        self._client.start()
-
-    def stop(self) -> None:
-        """End the session."""
-        self._client.stop()
 
     def _on_lost(self, _: Any) -> None:
         self.lost += 1
@@ -128,21 +119,14 @@ class Robot:
                 self.resent += 1
                 threading.Timer(1.0, self._publish, (seq, payload, began)).start()
 
-        self._client.publish(packet).add_done_callback(done)
+        self.client.publish(packet).add_done_callback(done)
 
 
 def laps() -> list[Columns]:
     """Return a minute of a simulated car, split into seconds."""
-    vehicle = Vehicle(VehicleConfig(), seed=1)
-    found = []
-    for _ in range(_LAPS):
-        columns: Columns = {}
-        for _ in range(SAMPLES):
-            vehicle.step(_STEP_US / 1e6)
-            for name, value in vehicle.sample().items():
-                columns.setdefault(name, []).append(value)
-        found.append(columns)
-    return found
+    samples = simulated_drive(_LAPS * SAMPLES)
+    seconds = [samples[i : i + SAMPLES] for i in range(0, len(samples), SAMPLES)]
+    return [{name: [sample[name] for sample in second] for name in second[0]} for second in seconds]
 
 
 def drive(load: Load) -> Sent:
@@ -153,7 +137,7 @@ def drive(load: Load) -> Sent:
         for i, (name, folder) in enumerate(load.robots.items())
     ]
     for i, robot in enumerate(robots):
-        robot.start()
+        robot.client.start()
         # Connect in small groups, like a fleet that is switched on by hand.
         if i % 10 == 9:
             _connected(robots[i - 9 : i + 1])
@@ -175,7 +159,7 @@ def drive(load: Load) -> Sent:
     while any(len(r.acknowledged) < len(r.sent_ms) for r in robots) and time.monotonic() < until:
         pause.wait(0.1)
     for robot in robots:
-        robot.stop()
+        robot.client.stop()
     return Sent(
         batches={robot.name: len(robot.sent_ms) for robot in robots},
         resent=sum(robot.resent for robot in robots),
@@ -198,8 +182,8 @@ def _say(**what: Any) -> None:
 
 
 def main() -> None:
-    """Drive the load of standard input."""
-    sent = drive(Load(**json.loads(sys.stdin.readline())))
+    """Drive the load of the argument."""
+    sent = drive(Load(**json.loads(Path(sys.argv[1]).read_text())))
     _say(sent=asdict(sent))
 
 

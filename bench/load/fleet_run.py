@@ -1,4 +1,4 @@
-"""One run of a fleet: every robot registered, driven by a process of its own, and counted."""
+"""One run of a fleet: every robot registered, driven by a process of its own, and counted in the tables."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ import sys
 import tempfile
 import threading
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass
 from pathlib import Path
@@ -18,17 +18,24 @@ from botocore.exceptions import BotoCoreError, ClientError
 
 from bench import ROOT
 from bench.errors import BenchError
-from bench.load.fleet_arrivals import Tell, stored, summarized
 from bench.load.fleet_load import SAMPLES as BATCH_SAMPLES
 from bench.load.fleet_load import Load
 from bench.meters import usage
+from bench.report.result import Table
+from iort_contract.attributes import plain
 from iort_contract.catalog.vesc import VESC_STREAM
-from iort_contract.tables import SECOND
+from iort_contract.messages.batch import batch_id
+from iort_contract.tables import BATCH, RECEIVED_MS, SAMPLES, SECOND
 from iort_station.cloud import Cloud
 from iort_station.data.items import of_topic
 from iort_station.fleet import robots
 from local.cloud import EmbeddedCloud
 from local.figures import Spread
+
+# Takes the name of the step when it begins.
+Tell = Callable[[str], None]
+# After so long without a change no more summaries come.
+_CATCH_UP_S = 120.0
 
 
 @dataclass(frozen=True)
@@ -80,48 +87,67 @@ class Fleet:
         return {**asdict(self), "samples_lost": self.samples_lost, "good": self.good}
 
 
+def table(runs: Sequence[Fleet]) -> Table:
+    """Return the figures, with a column for each run."""
+    figures: dict[str, Callable[[Fleet], object]] = {
+        "seconds": lambda run: run.seconds,
+        "batches sent": lambda run: f"{run.batches_sent:,}",
+        "batches stored": lambda run: f"{run.batches_stored:,}",
+        "samples sent": lambda run: f"{run.samples_sent:,}",
+        "samples summarised": lambda run: f"{run.samples_summarized:,}",
+        "samples lost": lambda run: f"{run.samples_lost:,}",
+        "out of order": lambda run: run.topics_out_of_order,
+        "sent again, sessions lost": lambda run: f"{run.resent}, {run.lost_sessions}",
+        "robot to rule": lambda run: run.delay_ms,
+        "robot to acknowledgement": lambda run: run.ack_ms,
+        "summary behind by": lambda run: f"{run.summary_behind_s.p50} s (p95 {run.summary_behind_s.p95})",
+        "Lambda 2 done after the last batch": lambda run: f"{run.catch_up_s:.1f} s",
+    }
+    rows = [[name, *(str(figure(run)) for run in runs)] for name, figure in figures.items()]
+    parts = list(runs[0].cpu_percent)
+    rows += [[f"CPU, {part}", *(f"{run.cpu_percent[part]:.0f} %" for run in runs)] for part in parts]
+    rows += [[f"memory, {part}", *(f"{run.rss_mb[part]:.0f} MB" for run in runs)] for part in parts]
+    head = ["", *(f"{run.robots} robot{'s' * (run.robots > 1)}" for run in runs)]
+    title = f"Robots with a certificate and a session each, a batch of {BATCH_SAMPLES} samples a second"
+    return Table(title, head, rows)
+
+
 def measure(embedded: EmbeddedCloud, count: int, seconds: int, tell: Tell, *, prefix: str = "bench") -> Fleet:
-    """Register ``count`` robots, drive them, and count what arrived; ``tell`` gets the progress."""
+    """Register ``count`` robots, drive them, and count what arrived."""
     cloud, names = embedded.cloud, [f"{prefix}-{count}-{i:04}" for i in range(count)]
     with tempfile.TemporaryDirectory() as folder:
-        bundles = {}
-        for i, name in enumerate(names):
-            bundles[name] = str(robots.add(cloud, name, out=Path(folder)).folder)
-            tell((i + 1) / count, "registering robots")
+        tell(f"{count} robots: registering")
+        bundles = {name: str(robots.add(cloud, name, out=Path(folder)).folder) for name in names}
+        tell(f"{count} robots: connecting")
         load = Load(bundles, cloud.namespace, cloud.mqtt_endpoint, cloud.mqtt_port, seconds)
         emulator = embedded.emulator.pid
-        with _generator(load) as generator:
-            for said in generator:
-                if "pid" in said:
-                    break
-                tell(said["connected"] / count, "connecting")
-            pid, began = said["pid"], time.monotonic()
-            before = _usage(pid, emulator)
+        file = Path(folder) / "load.json"
+        file.write_text(json.dumps(asdict(load)))
+        with _generator(file) as generator:
+            pid, began = next(said["pid"] for said in generator if "pid" in said), time.monotonic()
+            tell(f"{count} robots: driving")
+            before = after = _usage(pid, emulator)
+            took_s, sent = 1.0, None
             with _summary_age(cloud, names[0]) as behind:
-                after, took_s = before, 1.0
-                for said in generator:
-                    if "sent" in said:
-                        break
+                while sent is None:
+                    sent = next(generator).get("sent")
                     # The generator's memory disappears with the process, which ends when all is sent.
-                    after, took_s = _usage(pid, emulator), time.monotonic() - began
-                    tell(said["second"] / seconds, "driving")
-        sent = said["sent"]
+                    if sent is None:
+                        after, took_s = _usage(pid, emulator), time.monotonic() - began
     batches = sent["batches"]
-    expected = sum(batches.values()) * BATCH_SAMPLES
     began = time.monotonic()
-    in_summary = summarized(cloud, {name: batches[name] * BATCH_SAMPLES for name in names}, tell)
+    tell(f"{count} robots: waiting for the summaries")
+    in_summary = _summarized(cloud, {name: batches[name] * BATCH_SAMPLES for name in names})
     catch_up_s = time.monotonic() - began
-    arrived = []
-    for i, name in enumerate(names):
-        arrived.append(stored(cloud, name, sent["sent_ms"][name]))
-        tell((i + 1) / count, "counting the batches")
+    tell(f"{count} robots: counting the batches")
+    arrived = [_stored(cloud, name, sent["sent_ms"][name]) for name in names]
     return Fleet(
         robots=count,
         seconds=seconds,
-        batches_sent=expected // BATCH_SAMPLES,
+        batches_sent=sum(batches.values()),
         batches_stored=sum(each.batches for each in arrived),
         batches_lost=sum(each.missing for each in arrived),
-        samples_sent=expected,
+        samples_sent=sum(batches.values()) * BATCH_SAMPLES,
         samples_summarized=in_summary,
         topics_out_of_order=sum(not each.ordered for each in arrived),
         resent=sent["resent"],
@@ -139,24 +165,16 @@ def measure(embedded: EmbeddedCloud, count: int, seconds: int, tell: Tell, *, pr
 
 
 @contextmanager
-def _generator(load: Load) -> Iterator[Iterator[dict[str, Any]]]:
+def _generator(load: Path) -> Iterator[Iterator[dict[str, Any]]]:
     """Run the process that drives the robots; yield its output, a dictionary for each line."""
-    command = [sys.executable, "-m", "bench.load.fleet_load"]
-    with subprocess.Popen(
-        command, cwd=ROOT, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True
-    ) as process:
+    command = [sys.executable, "-m", "bench.load.fleet_load", str(load)]
+
+    def said() -> Iterator[dict[str, Any]]:
+        yield from map(json.loads, process.stdout or ())
+        raise BenchError(f"the load generator ended with status {process.wait()}")
+
+    with subprocess.Popen(command, cwd=ROOT, stdout=subprocess.PIPE, text=True) as process:
         try:
-            if process.stdin is None or process.stdout is None:
-                raise BenchError("the load generator has no pipes")
-            process.stdin.write(json.dumps(asdict(load)) + "\n")
-            process.stdin.flush()
-            lines = process.stdout
-
-            def said() -> Iterator[dict[str, Any]]:
-                for line in lines:
-                    yield json.loads(line)
-                raise BenchError(f"the load generator ended with status {process.wait()}")
-
             yield said()
         finally:
             process.terminate()
@@ -175,17 +193,16 @@ def _summary_age(cloud: Cloud, robot: str) -> Iterator[list[float]]:
     """Collect the age of the newest summarised second of a robot, in seconds, once a second."""
     seen: list[float] = []
     over = threading.Event()
-    newest = of_topic(cloud, "SummaryTable", robot, VESC_STREAM, SECOND)
 
     def watch() -> None:
         while not over.wait(1.0):
             try:
-                answer = cloud.client("dynamodb").query(**newest, ScanIndexForward=False, Limit=1)
+                newest = _ends(cloud, robot)[1:]
             except (BotoCoreError, ClientError):
                 # An overloaded cloud answers late or not at all; only the stored items count.
                 continue
             # A second is over when the next one begins.
-            seen.extend(round(time.time() - int(item[SECOND]["N"]) - 1, 3) for item in answer["Items"])
+            seen.extend(round(time.time() - second - 1, 3) for second in newest)
 
     watcher = threading.Thread(target=watch, daemon=True)
     watcher.start()
@@ -194,3 +211,61 @@ def _summary_age(cloud: Cloud, robot: str) -> Iterator[list[float]]:
     finally:
         over.set()
         watcher.join()
+
+
+class _Stored:
+    """A robot's batches in the table, compared with those that it sent.
+
+    ``ordered`` is True if they arrived and are stored in the order of their numbers.
+    """
+
+    def __init__(self, items: Sequence[dict[str, Any]], sent_ms: Sequence[int]) -> None:
+        seqs = [batch_id(item[BATCH]).seq for item in items]
+        received = [int(item[RECEIVED_MS]) for item in items]
+        self.batches, self.missing = len(items), len(set(range(len(sent_ms))) - set(seqs))
+        self.ordered = seqs == sorted(seqs) and received == sorted(received)
+        self.delays_ms = [float(ms - sent_ms[seq]) for seq, ms in zip(seqs, received, strict=True)]
+
+
+def _stored(cloud: Cloud, robot: str, sent_ms: Sequence[int]) -> _Stored:
+    return _Stored(list(_items(cloud, "TelemetryTable", robot, BATCH, RECEIVED_MS)), sent_ms)
+
+
+def _summarized(cloud: Cloud, expected: dict[str, int]) -> int:
+    """Count the samples in the summaries of all robots, after all have arrived or no more come.
+
+    It waits for one robot after the other, since all lag equally.
+    """
+    total, since = 0, time.monotonic()
+    for name, samples in expected.items():
+        counted, looked_at = 0, None
+        while True:
+            # Counting is expensive: count only when the summaries reach the last second that was sent.
+            ends = _ends(cloud, name)
+            over = time.monotonic() - since > _CATCH_UP_S
+            if over or (ends and (ends[1] - ends[0] + 1) * BATCH_SAMPLES >= samples):
+                counted = sum(int(item[SAMPLES]) for item in _items(cloud, "SummaryTable", name, SAMPLES))
+            if counted >= samples or over:
+                break
+            if looked_at != (counted, ends):
+                since = since if looked_at is None else time.monotonic()
+            looked_at = counted, ends
+            threading.Event().wait(0.5)
+        total += counted
+    return total
+
+
+def _ends(cloud: Cloud, robot: str) -> list[int]:
+    """Return the first and the last summarised second of a robot; empty if it has none."""
+    query, seconds = (
+        cloud.client("dynamodb").query,
+        of_topic(cloud, "SummaryTable", robot, VESC_STREAM, SECOND),
+    )
+    answers = (query(**seconds, ScanIndexForward=forward, Limit=1) for forward in (True, False))
+    return [int(item[SECOND]["N"]) for answer in answers for item in answer["Items"]]
+
+
+def _items(cloud: Cloud, table: str, robot: str, *fields: str) -> Iterator[dict[str, Any]]:
+    pages = cloud.client("dynamodb").get_paginator("query")
+    for page in pages.paginate(**of_topic(cloud, table, robot, VESC_STREAM, *fields)):
+        yield from map(plain, page["Items"])

@@ -9,32 +9,30 @@ from typing import Any
 
 from boto3.dynamodb.types import TypeSerializer
 
+from bench.load.simulated import RATE_HZ, simulated_drive
+from bench.meters.waiting import wait_for
 from bench.target import Target
-from iort_agent.sources.vehicle import Vehicle, VehicleConfig
 from iort_contract.catalog.vesc import VESC_STREAM
 from iort_contract.limits import Value
 from iort_contract.messages.batch import Batch, encode_batch
 from iort_contract.tables import EXPIRES_S, RECEIVED_MS, TOPIC
 from iort_contract.topics import RECORD, build_topic
+from iort_station.operations import delivery
 
-RATE_HZ = 50
 _KEPT_S = 86_400
+_CATCH_UP_S = 120.0
 Sample = tuple[int, dict[str, Value]]
 
 
 def simulated(points: int) -> list[Sample]:
     """Return the time in microseconds and the fields of every sample of a drive that ended a minute ago."""
-    vehicle = Vehicle(VehicleConfig(), seed=1)
     first_us = (int(time.time()) - points // RATE_HZ - 60) * 1_000_000
-    samples = []
-    for i in range(points):
-        vehicle.step(1 / RATE_HZ)
-        samples.append((first_us + i * 1_000_000 // RATE_HZ, vehicle.sample()))
-    return samples
+    times = (first_us + i * 1_000_000 // RATE_HZ for i in range(points))
+    return list(zip(times, simulated_drive(points), strict=True))
 
 
 def store(target: Target, robot: str, samples: Sequence[Sample]) -> list[dict[str, Any]]:
-    """Put one batch a second into the table; return the items."""
+    """Put one batch a second into the table, and wait until Lambda 2 has summarised all; return the items."""
     serialize = TypeSerializer().serialize
     client, table = target.cloud.client("dynamodb"), target.cloud.output("storage", "TelemetryTable")
     topic = build_topic(RECORD, robot, VESC_STREAM, target.cloud.namespace)
@@ -47,4 +45,9 @@ def store(target: Target, robot: str, samples: Sequence[Sample]) -> list[dict[st
         item |= {TOPIC: topic, RECEIVED_MS: second[-1][0] // 1000, EXPIRES_S: expires_s}
         items.append({name: serialize(value) for name, value in item.items()})
         client.put_item(TableName=table, Item=items[-1])
+    wait_for(
+        lambda: delivery.samples_summarized(target.cloud, robot, VESC_STREAM) >= len(samples),
+        "Lambda 2 to summarise what was stored",
+        _CATCH_UP_S,
+    )
     return items

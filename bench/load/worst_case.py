@@ -18,8 +18,8 @@ from collections.abc import Iterator
 from typing import NamedTuple
 
 from rich.console import Console
-from rich.table import Table
 
+from bench.report.result import Table
 from iort_contract.codec.columns import CODEC, DICTIONARY, PLAIN_CODEC
 from iort_contract.limits import MAX_BATCH_VALUES, ContractError
 from iort_contract.messages.batch import Batch, BatchId, decode_batch, encode_batch
@@ -120,17 +120,12 @@ def _message(codec: str, n: int, body: bytes) -> bytes:
 
 def main() -> None:
     """Measure and print."""
-    table = Table("batch", "on the wire", "processor time", "held", "refused")
+    rows = []
     for case in cases():
-        cost = measure(case.message)
-        table.add_row(
-            case.what,
-            f"{len(case.message) / 1024:.1f} KB",
-            f"{cost.ms:.0f} ms",
-            f"{cost.held_mb:.1f} MB",
-            cost.refused[:40],
-        )
-    Console().print(table)
+        cost, size = measure(case.message), len(case.message) / 1024
+        figures = f"{size:.1f} KB", f"{cost.ms:.0f} ms", f"{cost.held_mb:.1f} MB", cost.refused[:40]
+        rows.append([case.what, *figures])
+    Table("", ["batch", "on the wire", "processor time", "held", "refused"], rows).show(Console())
 
 
 if __name__ == "__main__":

@@ -16,10 +16,11 @@ import time
 from pathlib import Path
 from statistics import quantiles
 
-from bench.ros.vesc_message import DEFINITION, TYPE, body
-from iort_agent.agent import make_agent
+from bench.ros.mixed_robot import topics
+from bench.ros.vesc_message import TYPE, body
+from iort_agent.agent import Agent
 from iort_agent.clock import SystemClock
-from iort_agent.config.file import Config
+from iort_agent.config import Config
 from iort_agent.mqtt.dispatch import Dispatcher
 from iort_agent.sources.intake import Intake, TopicConfig
 from iort_agent.sources.sim import SimConfig
@@ -43,11 +44,9 @@ def main() -> None:
             queue=QueueConfig(path=Path(folder) / "spool.db"),
         )
         spool = make_spool(config.queue, clock)
-        agent = make_agent(config, uplink=uplink, spool=spool, clock=clock)
-        intake = Intake(
-            "/sensors/core", TopicConfig("vesc", "header"), emit=agent.parts.streams.emit, clock=clock
-        )
-        header = {"type": TYPE, "md5sum": "bench", "message_definition": DEFINITION}
+        agent = Agent(config, uplink=uplink, spool=spool, clock=clock)
+        intake = Intake("/sensors/core", TopicConfig("vesc", "header"), emit=agent.streams.emit, clock=clock)
+        header = {"type": TYPE, "md5sum": "bench", "message_definition": topics()["/sensors/core"].definition}
         cycles = []
         for i in range(samples):
             now_ns = time.time_ns()

@@ -8,7 +8,6 @@ from __future__ import annotations
 import base64
 import json
 import re
-import threading
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -16,7 +15,8 @@ from dataclasses import dataclass, field
 from typing import Any
 
 from bench.errors import BenchError
-from bench.meters import cpu
+from bench.meters import usage
+from bench.meters.waiting import reached
 from bench.target import Target
 
 _LOGS_S = 60.0
@@ -48,9 +48,8 @@ def measure(target: Target, function: str, event: Event, calls: int, found: Meas
     began_ms = int(time.time() * 1000)
     before = _cpu(target)
     told = [invoke(target, function, event(i)) for i in range(calls)]
-    after = _cpu(target)
-    if before is not None and after is not None:
-        found.cpu_ms.append(cpu.spent_ms(before, after) / calls)
+    if target.embedded is not None:
+        found.cpu_ms.append(usage.spent_ms(before, _cpu(target)) / calls)
     # AWS' answers end with the REPORT line; the embedded cloud writes it to the log, which nobody else uses.
     reports = [line for line in told if line is not None]
     if len(reports) < calls:
@@ -59,8 +58,10 @@ def measure(target: Target, function: str, event: Event, calls: int, found: Meas
     found.init_ms += [float(match[1]) for line in reports if (match := _INIT.search(line))]
 
 
-def _cpu(target: Target) -> dict[int, int] | None:
-    return None if target.embedded is None else cpu.of_tree(target.embedded.emulator.pid)
+def _cpu(target: Target) -> dict[int, int]:
+    return (
+        {} if target.embedded is None else usage.threads_ns(usage.descendants(target.embedded.emulator.pid))
+    )
 
 
 def invoke(target: Target, function: str, event: dict[str, Any]) -> str | None:
@@ -81,26 +82,20 @@ def report_line(tail: str) -> str | None:
 
 def _logged(target: Target, function: str, began_ms: int, calls: int) -> list[str]:
     """Wait for the REPORT lines since ``began_ms`` in the function's log, and return them."""
-    client = target.cloud.client("lambda")
-    logging = client.get_function_configuration(FunctionName=function).get("LoggingConfig", {})
-    group = logging.get("LogGroup", f"/aws/lambda/{function}")
-    deadline = time.monotonic() + _LOGS_S
-    while True:
-        pages = target.cloud.client("logs").get_paginator("filter_log_events")
-        lines = [
-            event["message"]
-            for page in pages.paginate(logGroupName=group, startTime=began_ms, filterPattern="REPORT")
-            for event in page["events"]
-        ]
-        reports = [line for line in lines if _REPORT.match(line)]
-        if not reports and time.monotonic() > deadline:
-            raise BenchError(
-                f"{group} has no REPORT line after {_LOGS_S:.0f} s: deploy with function_logs=all"
-            )
-        if len(reports) >= calls or time.monotonic() > deadline:
-            return reports
-        # A log has no notification of new lines.
-        threading.Event().wait(0.5)
+    configuration = target.cloud.client("lambda").get_function_configuration(FunctionName=function)
+    group = configuration.get("LoggingConfig", {}).get("LogGroup", f"/aws/lambda/{function}")
+    logs = target.cloud.client("logs").get_paginator("filter_log_events")
+    reports: list[str] = []
+
+    def all_there() -> bool:
+        pages = logs.paginate(logGroupName=group, startTime=began_ms, filterPattern="REPORT")
+        lines = (event["message"] for page in pages for event in page["events"])
+        reports[:] = [line for line in lines if _REPORT.match(line)]
+        return len(reports) >= calls
+
+    if not reached(all_there, within_s=_LOGS_S, poll_s=0.5) and not reports:
+        raise BenchError(f"{group} has no REPORT line after {_LOGS_S:.0f} s: deploy with function_logs=all")
+    return reports
 
 
 def configure(client: Any, function: str, **change: Any) -> None:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import threading
 import time
 from collections.abc import Mapping
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import ExitStack
 from typing import Any
 
@@ -13,11 +14,13 @@ from typing_extensions import Self
 from bench.errors import BenchError
 from bench.floors.raw_mqtt import RawClient
 from iort_agent.clock import SystemClock
-from iort_agent.config.file import load_config
+from iort_agent.config import load_config
+from iort_agent.lanes.config import PingConfig
 from iort_agent.lanes.pings import Pings
 from iort_agent.mqtt.aws import IotCore
 from iort_agent.mqtt.dispatch import Dispatcher
-from iort_agent.rate_limiter import Allowance
+from iort_agent.mqtt.rate_limiter import RateLimiter
+from iort_agent.mqtt.uplink import Link
 from iort_contract.catalog.streams import RTT_FIELDS
 from iort_contract.limits import Value
 from iort_contract.messages.live import encode_ping
@@ -65,36 +68,30 @@ class RoundTrips:
 
     def measure(self, *, size: int, rate_hz: int, lasts_s: float) -> dict[str, list[float]]:
         """Return the round trips in ms over each path and of the floor, measured for ``lasts_s`` seconds."""
-        found: dict[str, list[float]] = {}
-        # Each has its own part of the period, so that none waits for another's message.
         names = (*self._uplinks, RAW)
-        starts_s = {name: i / len(names) / rate_hz for i, name in enumerate(names)}
         began = time.perf_counter() + _SET_UP_S
-        pause = threading.Event()
-
-        def ours(path: str) -> None:
-            found[path] = self._uplinks[path].measure(path, rate_hz, size, began + starts_s[path], lasts_s)
-
-        def floor() -> None:
-            payload = encode_ping(1, time.time_ns() // 1000, "x" * max(0, size - _ENVELOPE))
-            values = found[RAW] = []
-            due = began + starts_s[RAW]
-            # One at a time: if a round trip takes longer than the period, the next ping leaves when it ends.
-            while due < began + lasts_s:
-                pause.wait(max(0.0, due - time.perf_counter()))
-                values.append(self.raw.round_trip(self._topic, payload) * 1000)
-                due = max(due + 1 / rate_hz, time.perf_counter())
-
-        threads = [threading.Thread(target=ours, args=(path,)) for path in self._uplinks]
-        threads.append(threading.Thread(target=floor))
-        for thread in threads:
-            thread.start()
-        for thread in threads:
-            thread.join()
-        missing = [name for name in names if not found.get(name)]
-        if missing:
+        with ThreadPoolExecutor(len(names)) as pool:
+            # Each has its own part of the period, so that none waits for another's message.
+            begins = {name: began + i / len(names) / rate_hz for i, name in enumerate(names)}
+            running = {}
+            for name in names:
+                measure = self._raw if name == RAW else self._uplinks[name].measure
+                running[name] = pool.submit(measure, name, rate_hz, size, begins[name], lasts_s)
+            found = {name: trips.result() for name, trips in running.items()}
+        if missing := [name for name, trips in found.items() if not trips]:
             raise BenchError(f"nothing was measured over {', '.join(missing)}")
         return found
+
+    def _raw(self, _: str, rate_hz: float, size: int, begins: float, seconds: float) -> list[float]:
+        payload = encode_ping(1, time.time_ns() // 1000, "x" * max(0, size - _ENVELOPE))
+        values: list[float] = []
+        due, pause = begins, threading.Event()
+        # One at a time: if a round trip takes longer than the period, the next ping leaves when it ends.
+        while due < begins + seconds:
+            pause.wait(max(0.0, due - time.perf_counter()))
+            values.append(self.raw.round_trip(self._topic, payload) * 1000)
+            due = max(due + 1 / rate_hz, time.perf_counter())
+        return values
 
 
 class _Connected:
@@ -135,15 +132,10 @@ class _Connected:
             if isinstance(value, (int, float)):
                 trips.append(float(value))
 
+        limiter = RateLimiter(self.clock, publishes_per_s=1e6, bytes_per_s=1e9)
         pings = Pings(
-            robot=self.config.robot,
-            namespace=self.config.namespace,
-            paths=[path],
-            rate_hz=rate_hz,
-            padding_bytes=max(0, size - _ENVELOPE),
-            uplink=self.uplink,
-            clock=self.clock,
-            allowance=Allowance(self.clock, publishes_per_s=1e6, bytes_per_s=1e9),
+            Link(self.config.robot, self.config.namespace, self.uplink, self.clock, limiter),
+            PingConfig(rate_hz, (path,), max(0, size - _ENVELOPE)),
             emit=emit,
             on_stamp=lambda _sent, _received, _stamp_ms: None,
         )

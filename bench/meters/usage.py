@@ -1,8 +1,10 @@
-"""Reads processor time and memory of a process and its descendants from Linux' /proc."""
+"""Reads processor time and memory of processes and their threads from Linux' /proc."""
 
 from __future__ import annotations
 
 import os
+from collections.abc import Iterable
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -23,24 +25,23 @@ class Usage:
 
 def of(pid: int) -> Usage:
     """Return the usage of one process with its ended children; 0 for an ended process."""
-    try:
-        fields = Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()
-    except OSError:
+    fields = _stat(pid)
+    if not fields:
         return Usage(0.0, 0.0)
     # proc(5): utime, stime, cutime and cstime are fields 14 to 17, rss is 24; the state is 3.
-    ticks = sum(int(field) for field in fields[11:15])
-    return Usage(ticks / _TICKS, int(fields[21]) * _PAGE_MB)
+    return Usage(sum(map(int, fields[11:15])) / _TICKS, int(fields[21]) * _PAGE_MB)
+
+
+def below(pid: int) -> Usage:
+    """Return the usage of all descendants of ``pid`` together."""
+    return sum(map(of, descendants(pid)), Usage(0.0, 0.0))
 
 
 def descendants(pid: int) -> list[int]:
     """Return every process below ``pid``, without ``pid``."""
     parents: dict[int, list[int]] = {}
     for entry in Path("/proc").iterdir():
-        if entry.name.isdecimal():
-            try:
-                fields = (entry / "stat").read_text().rpartition(")")[2].split()
-            except OSError:
-                continue
+        if entry.name.isdecimal() and (fields := _stat(int(entry.name))):
             parents.setdefault(int(fields[1]), []).append(int(entry.name))
     found, todo = [], [pid]
     while todo:
@@ -50,6 +51,23 @@ def descendants(pid: int) -> list[int]:
     return found
 
 
-def below(pid: int) -> Usage:
-    """Return the usage of all descendants of ``pid`` together."""
-    return sum((of(child) for child in descendants(pid)), Usage(0.0, 0.0))
+def threads_ns(pids: Iterable[int]) -> dict[int, int]:
+    """Return the processor time so far of every thread of the processes, in ns by Linux' scheduler."""
+    found: dict[int, int] = {}
+    for file in (file for pid in pids for file in Path(f"/proc/{pid}/task").glob("*/schedstat")):
+        # A thread may end meanwhile.
+        with suppress(OSError, IndexError):
+            found[int(file.parent.name)] = int(file.read_text().split()[0])
+    return found
+
+
+def spent_ms(before: dict[int, int], after: dict[int, int]) -> float:
+    """Return the ms between two readings; a new thread counts whole, an ended one not at all."""
+    return sum(now - before.get(thread, 0) for thread, now in after.items()) / 1e6
+
+
+def _stat(pid: int) -> list[str]:
+    try:
+        return Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()
+    except OSError:
+        return []

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import threading
 import time
 import uuid
 from collections.abc import Callable
@@ -14,8 +13,8 @@ from typing_extensions import Self
 
 from bench.errors import BenchError
 from bench.floors.raw_mqtt import RawClient
-from bench.target import Target
-from bench.temporary_function import temporary_function
+from bench.meters.waiting import reached
+from bench.target import Target, temporary_function
 from iort_contract.catalog.vesc import VESC_STREAM
 from iort_contract.messages.batch import Batch, encode_batch
 from iort_contract.messages.live import LiveSample, encode_live, encode_ping
@@ -42,13 +41,10 @@ def equal(found: Any, expected: Any) -> None:
         raise AbilityMissingError(f"must be {expected!r:.80}, got {found!r:.80}")
 
 
-def until(true: Callable[[], bool], what: str, seconds: float = WAIT_S) -> None:
-    """Wait until ``true`` returns True. Raises `AbilityMissingError` after ``seconds``."""
-    deadline = time.monotonic() + seconds
-    while not true():
-        if time.monotonic() > deadline:
-            raise AbilityMissingError(f"waited {seconds:.0f} s for {what}")
-        threading.Event().wait(0.1)
+def until(true: Callable[[], object], what: str, seconds: float = WAIT_S) -> None:
+    """Wait until ``true`` says so. Raises `AbilityMissingError` after ``seconds``."""
+    if not reached(true, within_s=seconds):
+        raise AbilityMissingError(f"waited {seconds:.0f} s for {what}")
 
 
 class ProbeFixture:
@@ -112,10 +108,10 @@ class ProbeFixture:
         """Return the first robot's batches in the telemetry table."""
         return list(delivery.batches(self.cloud, self.a, VESC_STREAM))
 
-    def live_until(self, client: RawClient, true: Callable[[], bool], what: str) -> None:
+    def live_until(self, client: RawClient, true: Callable[[], object], what: str) -> None:
         """Publish live samples until ``true``; the first may be stale before a cold function starts."""
 
-        def heard() -> bool:
+        def heard() -> object:
             self._seq += 1
             now_us = time.time_ns() // 1000
             live = encode_live(LiveSample("0badcafe", self._seq, now_us, now_us, {"speed": 1}))

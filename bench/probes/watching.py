@@ -18,7 +18,7 @@ LISTENERS = 4
 def live_sample(fixture: ProbeFixture) -> str:
     """A live sample reaches a subscriber."""
     with fixture.target.listener(fixture.a) as listener, fixture.client(0) as client:
-        fixture.live_until(client, lambda: bool(listener.heard), "the subscriber to hear a sample")
+        fixture.live_until(client, lambda: listener.heard, "the subscriber to hear a sample")
         return f"a live sample came to a subscriber after {listener.heard[0].delay_ms:.0f} ms"
 
 

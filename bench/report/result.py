@@ -2,19 +2,42 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import asdict, dataclass, field
 from typing import Any
 
+import rich.table
+from rich.console import Console
+from rich.markup import escape
+
 NOT_MEASURED = "-"
+Row = Sequence[str]
 
 
 @dataclass(frozen=True)
 class Table:
-    """A table of the report: cells are text."""
+    """A table: cells are text. ``**text**`` is bold in Markdown, and makes a row red on a terminal."""
 
     title: str
-    head: list[str]
-    rows: list[list[str]]
+    head: Row
+    rows: Sequence[Row]
+
+    def as_markdown(self) -> str:
+        """Return the table without its title."""
+        lines = [self.head, ["---", *["---:"] * (len(self.head) - 1)], *self.rows]
+        return "\n".join(
+            "| " + " | ".join(cell.replace("|", "\\|") for cell in line) + " |" for line in lines
+        )
+
+    def show(self, console: Console) -> None:
+        """Print the table on a terminal."""
+        shown = rich.table.Table(title=self.title, title_justify="left", title_style="bold")
+        for i, name in enumerate(self.head):
+            shown.add_column(name, justify="right" if i else "left")
+        for row in self.rows:
+            cells = [escape(cell.replace("**", "")) for cell in row]
+            shown.add_row(*cells, style="red" if any(cell.startswith("**") for cell in row) else "")
+        console.print(shown)
 
 
 @dataclass(frozen=True)
@@ -51,6 +74,14 @@ class Ratio:
             return None
         return self.value >= self.target if self.at_least else self.value <= self.target
 
+    def as_row(self) -> list[str]:
+        """Return name, value, target and whether it is reached, as text."""
+        unit = "" if self.unit == "x" else f" {self.unit}"
+        sign = "at least" if self.at_least else "at most"
+        target = "" if self.target is None else f"{sign} {self.target:g}{unit}"
+        reached = "" if self.reached is None else "yes" if self.reached else "**no**"
+        return [self.name, f"{self.value:g}{unit}", target, reached]
+
 
 @dataclass
 class Section:
@@ -64,6 +95,19 @@ class Section:
     notes: list[str] = field(default_factory=list)
     raw: dict[str, Any] = field(default_factory=dict)
     seconds: float = 0.0
+
+    def table(self, title: str, head: Row, rows: Iterable[Row]) -> None:
+        """Add a table."""
+        self.tables.append(Table(title, list(head), [list(row) for row in rows]))
+
+    def ratio(self, name: str, value: float | None, target: float | None, **settings: Any) -> None:
+        """Add a figure, unless it was not measured."""
+        if value is not None:
+            self.ratios.append(Ratio(name, value, target, **settings))
+
+    def plot(self, name: str, title: str, draw: Callable[[str], str]) -> None:
+        """Add a picture; ``draw`` makes its SVG for a title (`bench.report.plots`)."""
+        self.plots.append(Plot(name, title, draw(title)))
 
     def as_json(self) -> dict[str, Any]:
         """Return the section without its pictures, which have their own files."""

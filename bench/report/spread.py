@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass
 from statistics import median, quantiles
+
+from bench.report.result import NOT_MEASURED
 
 
 @dataclass(frozen=True)
@@ -33,6 +35,22 @@ def spread(repeats: Sequence[Sequence[float]]) -> Spread | None:
         return None
     cuts = quantiles(values, n=100, method="inclusive") if len(values) > 1 else values * 99
     return Spread(len(values), median(values), cuts[94], cuts[98], min(medians), max(medians))
+
+
+def text(repeats: Sequence[Sequence[float]], unit: str = "ms", digits: int = 2) -> str:
+    """Return the spread as text; a dash without values."""
+    found = spread(repeats)
+    return found.text(unit, digits) if found else NOT_MEASURED
+
+
+def rounded(ways: Mapping[str, Sequence[Sequence[float]]], digits: int) -> dict[str, dict[str, float]]:
+    """Return the spread of each way as numbers, for the values behind a report."""
+    spreads = {name: spread(repeats) for name, repeats in ways.items()}
+    return {
+        name: {key: round(value, digits) for key, value in asdict(one).items()}
+        for name, one in spreads.items()
+        if one
+    }
 
 
 def ratio(ours: Sequence[Sequence[float]], floor: Sequence[Sequence[float]]) -> float | None:

@@ -7,35 +7,32 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-from bench.report.result import Ratio, Section, Table
+from bench.report.result import Section, Table
 
 NAME = "report"
 
 
 def headline(sections: Sequence[Section]) -> Table:
     """Return a table of all ratios with their targets."""
-    rows = [ratio_row(ratio) for section in sections for ratio in section.ratios]
+    rows = [ratio.as_row() for section in sections for ratio in section.ratios]
     return Table(
         "Ratios, each measured side by side in this run", ["figure", "measured", "target", "reached"], rows
     )
 
 
-def ratio_row(ratio: Ratio) -> list[str]:
-    """Return name, value, target and whether it is reached, as text."""
-    unit = "" if ratio.unit == "x" else f" {ratio.unit}"
-    sign = "at least" if ratio.at_least else "at most"
-    target = "" if ratio.target is None else f"{sign} {ratio.target:g}{unit}"
-    reached = "" if ratio.reached is None else "yes" if ratio.reached else "**no**"
-    return [ratio.name, f"{ratio.value:g}{unit}", target, reached]
-
-
 def markdown(sections: Sequence[Section], machine: dict[str, Any], target: str) -> str:
     """The report as Markdown; it shows the pictures that `write` puts beside it."""
-    parts = ["# The measured platform", "", _made(machine, target), "", _table(headline(sections))]
+    packages = ", ".join(f"{name} {version}" for name, version in machine["packages"].items())
+    made = (
+        f"Made by `make bench` on {machine['date'][:10]} on the target {target}: {machine['cores']} cores of "
+        f"{machine['cpu']}, {machine['memory']}, {machine['kernel']}, Python {machine['python']}, load "
+        f"{machine['load_1min']} at its start; commit {machine['commit']}; {packages}."
+    )
+    parts = ["# The measured platform", "", made, "", headline(sections).as_markdown()]
     for section in sections:
         parts += ["", f"## {section.title}", ""]
         for table in section.tables:
-            parts += [f"**{table.title}**", "", _table(table), ""]
+            parts += [f"**{table.title}**", "", table.as_markdown(), ""]
         for plot in section.plots:
             parts += [f"![{plot.title}]({NAME}-{plot.name}.svg)", ""]
         parts += [f"{note}\n" for note in section.notes]
@@ -54,17 +51,3 @@ def write(folder: Path, sections: Sequence[Section], machine: dict[str, Any], ta
     (folder / f"{NAME}.md").write_text(markdown(sections, machine, target))
     found = {"target": target, "machine": machine, "sections": [section.as_json() for section in sections]}
     (folder / f"{NAME}.json").write_text(json.dumps(found, indent=1, default=str) + "\n")
-
-
-def _made(machine: dict[str, Any], target: str) -> str:
-    packages = ", ".join(f"{name} {version}" for name, version in machine["packages"].items())
-    return (
-        f"Made by `make bench` on {machine['date'][:10]} on the target {target}: {machine['cores']} cores of "
-        f"{machine['cpu']}, {machine['memory']}, {machine['kernel']}, Python {machine['python']}, load "
-        f"{machine['load_1min']} at its start; commit {machine['commit']}; {packages}."
-    )
-
-
-def _table(table: Table) -> str:
-    lines = [table.head, ["---", *["---:"] * (len(table.head) - 1)], *table.rows]
-    return "\n".join("| " + " | ".join(cell.replace("|", "\\|") for cell in line) + " |" for line in lines)

@@ -10,7 +10,6 @@ import subprocess
 import time
 import xmlrpc.client
 from pathlib import Path
-from types import TracebackType
 
 from typing_extensions import Self
 
@@ -83,9 +82,7 @@ class RosGraph:
             else:
                 return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    def __exit__(self, *_: object) -> None:
         for process in reversed(self._processes):
             process.kill()
             process.communicate()
@@ -94,9 +91,12 @@ class RosGraph:
         """Run a module under the Python that has rospy."""
         return self.run([self._python, "-m", module, *map(str, arguments)])
 
-    def publisher(self, topic: str, rate_hz: int, count: int) -> Publisher:
-        """Return a publisher of ``count`` messages, which waits for `Publisher.begin`."""
-        return Publisher(self.start("bench.ros.publisher", topic, rate_hz, count))
+    def publisher(
+        self, node: str, seconds: float, subscribers: int = 2, rate_hz: float | None = None
+    ) -> Publisher:
+        """Return a node of the robot, which publishes its topics for ``seconds`` after `Publisher.go`."""
+        rate = [] if rate_hz is None else [rate_hz]
+        return Publisher(self.start("bench.ros.publisher", node, seconds, subscribers, *rate))
 
     def run(self, command: list[str]) -> subprocess.Popen[str]:
         """Run a command in the graph."""
@@ -119,11 +119,6 @@ class Publisher:
 
     def __init__(self, process: subprocess.Popen[str]) -> None:
         self._process = process
-
-    def begin(self) -> None:
-        """Wait for all subscribers, then start to publish."""
-        self.ready()
-        self.go()
 
     def ready(self) -> None:
         """Wait for all subscribers."""

@@ -12,43 +12,8 @@ from dataclasses import dataclass
 from typing import Any
 
 from bench.ros import vesc_message
+from tests.ros.mixed_robot import MESSAGES
 
-_SEPARATOR = "\n" + "=" * 80 + "\n"
-_PARTS = {
-    "std_msgs/Header": "uint32 seq\ntime stamp\nstring frame_id",
-    "geometry_msgs/Point": "float64 x\nfloat64 y\nfloat64 z",
-    "geometry_msgs/Vector3": "float64 x\nfloat64 y\nfloat64 z",
-    "geometry_msgs/Quaternion": "float64 x\nfloat64 y\nfloat64 z\nfloat64 w",
-    "geometry_msgs/Pose": "Point position\nQuaternion orientation",
-    "geometry_msgs/Twist": "Vector3 linear\nVector3 angular",
-    "geometry_msgs/PoseWithCovariance": "Pose pose\nfloat64[36] covariance",
-    "geometry_msgs/TwistWithCovariance": "Twist twist\nfloat64[36] covariance",
-    "geometry_msgs/Transform": "Vector3 translation\nQuaternion rotation",
-    "geometry_msgs/TransformStamped": "Header header\nstring child_frame_id\nTransform transform",
-    "nav_msgs/MapMetaData": (
-        "time map_load_time\nfloat32 resolution\nuint32 width\nuint32 height\ngeometry_msgs/Pose origin"
-    ),
-    "diagnostic_msgs/KeyValue": "string key\nstring value",
-    "diagnostic_msgs/DiagnosticStatus": (
-        "byte OK=0\nbyte level\nstring name\nstring message\nstring hardware_id\nKeyValue[] values"
-    ),
-    # A message of a lab's own: a header that is not its first field.
-    "lab_msgs/Contact": "Header header\nfloat32 force\nbool touching",
-}
-_IMU = (
-    "Header header\ngeometry_msgs/Quaternion orientation\nfloat64[9] orientation_covariance\n"
-    "geometry_msgs/Vector3 angular_velocity\nfloat64[9] angular_velocity_covariance\n"
-    "geometry_msgs/Vector3 linear_acceleration\nfloat64[9] linear_acceleration_covariance"
-)
-_SCAN = (
-    "Header header\nfloat32 angle_min\nfloat32 angle_max\nfloat32 angle_increment\nfloat32 time_increment\n"
-    "float32 scan_time\nfloat32 range_min\nfloat32 range_max\nfloat32[] ranges\nfloat32[] intensities"
-)
-_ODOM = (
-    "Header header\nstring child_frame_id\ngeometry_msgs/PoseWithCovariance pose\n"
-    "geometry_msgs/TwistWithCovariance twist"
-)
-_POSE = ("geometry_msgs/Pose", "geometry_msgs/Point", "geometry_msgs/Quaternion")
 _RANGES, _MAP_CELLS = 720, 200
 _ARM, _GRIPPER = tuple(f"joint_{i}" for i in range(1, 7)), ("finger_left", "finger_right")
 _FRAMES = (("odom", "base_link"), ("base_link", "laser"))
@@ -56,10 +21,6 @@ _noise = random.Random(1).random  # noqa: S311 - a sensor's noise, no secret
 HEADER, ARRIVAL = "header", "arrival"
 # Classes of a topic's type and its parts by name.
 Classes = Mapping[str, Any]
-
-
-def _text(own: str, *parts: str) -> str:
-    return own + "".join(f"{_SEPARATOR}MSG: {part}\n{_PARTS[part]}" for part in parts)
 
 
 @dataclass(frozen=True)
@@ -72,15 +33,19 @@ class Topic:
     name: str
     stream: str
     kind: str
-    definition: str
     rate_hz: int
     fill: Callable[[Any, Classes, int], None]
     frame: str = ""
 
     @property
+    def definition(self) -> str:
+        """The text of the type and of its parts, as a publisher sends it."""
+        return MESSAGES[self.kind].definition
+
+    @property
     def time(self) -> str:
-        """Return the kind of time that the agent uses for the topic."""
-        return HEADER if self.definition.startswith("Header header") else ARRIVAL
+        """Where the agent takes a sample's time from."""
+        return HEADER if MESSAGES[self.kind].stamped else ARRIVAL
 
 
 def _vesc(message: Any, _: Classes, i: int) -> None:
@@ -172,63 +137,28 @@ def _nothing(_: Any, __: Classes, ___: int) -> None:
     pass
 
 
-_STATES = "Header header\nstring[] name\nfloat64[] position\nfloat64[] velocity\nfloat64[] effort"
-_JOINTS = ("sensor_msgs/JointState", _text(_STATES, "std_msgs/Header"))
-# The topics of each node.
-NODES: dict[str, tuple[Topic, ...]] = {
+_CORE = Topic("/sensors/core", "vesc", vesc_message.TYPE, 50, _vesc, "base_link")
+# The topics of each node of the mixed robot.
+MIXED: dict[str, tuple[Topic, ...]] = {
     "base": (
-        Topic("/sensors/core", "vesc", vesc_message.TYPE, vesc_message.DEFINITION, 50, _vesc, "base_link"),
-        Topic(
-            "/imu", "imu", "sensor_msgs/Imu",
-            _text(_IMU, "std_msgs/Header", "geometry_msgs/Quaternion", "geometry_msgs/Vector3"),
-            1000, _imu, "imu",
-        ),
-        Topic(
-            "/tf", "tf", "tf2_msgs/TFMessage",
-            _text(
-                "geometry_msgs/TransformStamped[] transforms", "geometry_msgs/TransformStamped",
-                "std_msgs/Header", "geometry_msgs/Transform", "geometry_msgs/Vector3",
-                "geometry_msgs/Quaternion",
-            ),
-            50, _tf,
-        ),
-        Topic("/joint_states", "joints", *_JOINTS, 50, _joints(_ARM)),
-        Topic("/scan", "scan", "sensor_msgs/LaserScan", _text(_SCAN, "std_msgs/Header"), 20, _scan, "laser"),
-        Topic(
-            "/odom", "odom", "nav_msgs/Odometry",
-            _text(
-                _ODOM, "std_msgs/Header", "geometry_msgs/PoseWithCovariance", *_POSE,
-                "geometry_msgs/TwistWithCovariance", "geometry_msgs/Twist", "geometry_msgs/Vector3",
-            ),
-            50, _odom, "odom",
-        ),
-        Topic(
-            "/diagnostics", "diagnostics", "diagnostic_msgs/DiagnosticArray",
-            _text(
-                "Header header\nDiagnosticStatus[] status", "std_msgs/Header",
-                "diagnostic_msgs/DiagnosticStatus", "diagnostic_msgs/KeyValue",
-            ),
-            1, _diagnostics,
-        ),
-        Topic("/tick", "tick", "std_msgs/Empty", "", 5, _nothing),
-        Topic(
-            "/contact", "contact", "lab_msgs/LabelledContact",
-            _text("string label\nContact grip", "lab_msgs/Contact", "std_msgs/Header"),
-            10, _contact,
-        ),
-        Topic(
-            "/map", "map", "nav_msgs/OccupancyGrid",
-            _text(
-                "Header header\nMapMetaData info\nint8[] data", "std_msgs/Header", "nav_msgs/MapMetaData",
-                *_POSE,
-            ),
-            0, _map, "map",
-        ),
+        _CORE,
+        Topic("/imu", "imu", "sensor_msgs/Imu", 1000, _imu, "imu"),
+        Topic("/tf", "tf", "tf2_msgs/TFMessage", 50, _tf),
+        Topic("/joint_states", "joints", "sensor_msgs/JointState", 50, _joints(_ARM)),
+        Topic("/scan", "scan", "sensor_msgs/LaserScan", 20, _scan, "laser"),
+        Topic("/odom", "odom", "nav_msgs/Odometry", 50, _odom, "odom"),
+        Topic("/diagnostics", "diagnostics", "diagnostic_msgs/DiagnosticArray", 1, _diagnostics),
+        Topic("/tick", "tick", "std_msgs/Empty", 5, _nothing),
+        Topic("/contact", "contact", "lab_msgs/LabelledContact", 10, _contact),
+        Topic("/map", "map", "nav_msgs/OccupancyGrid", 0, _map, "map"),
     ),
-    "gripper": (Topic("/joint_states", "joints", *_JOINTS, 50, _joints(_GRIPPER)),),
-}  # fmt: skip
+    "gripper": (Topic("/joint_states", "joints", "sensor_msgs/JointState", 50, _joints(_GRIPPER)),),
+}
+# Every node of the bench: `CORE` is a robot of one topic, which is measured at several rates.
+CORE = "core"
+NODES = {**MIXED, CORE: (_CORE,)}
 
 
 def topics() -> dict[str, Topic]:
-    """Return each topic of all nodes once, by name."""
-    return {topic.name: topic for node in NODES.values() for topic in node}
+    """Return each topic of the mixed robot once, by name."""
+    return {topic.name: topic for node in MIXED.values() for topic in node}

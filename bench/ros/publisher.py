@@ -1,40 +1,72 @@
-"""Publishes VescStateStamped at a rate with time stamps of now; runs under a Python with rospy.
+"""One node of the bench's robot; runs under a Python with rospy.
 
-python -m bench.ros.publisher TOPIC RATE_HZ COUNT
+python -m bench.ros.publisher NODE SECONDS SUBSCRIBERS [RATE_HZ]
+
+Waits for the subscribers of each of its topics, then for a line on its input. Publishes each topic at its
+rate, or at RATE_HZ, with time stamps of now. At the end it prints the number of messages by topic, as JSON.
 """
 
+import heapq
+import json
 import sys
 import threading
 import time
+from typing import Any
 
 import genpy.dynamic
 import rospy
 
-from bench.ros.vesc_message import DEFINITION, FIELDS, TYPE, values
+from bench.ros.mixed_robot import HEADER, NODES, Topic
+
+# Messages that a subscriber's connection may hold: a second of the fastest topic.
+_QUEUE = 1000
+
+
+class Line:
+    """One topic, with its publisher and its next message."""
+
+    def __init__(self, topic: Topic, rate_hz: float) -> None:
+        self.topic, self.rate_hz, self.sent = topic, rate_hz, 0
+        self._classes: Any = genpy.dynamic.generate_dynamic(topic.kind, topic.definition)
+        self._message = self._classes[topic.kind]()
+        self.publisher = rospy.Publisher(
+            topic.name, type(self._message), queue_size=_QUEUE, tcp_nodelay=True, latch=rate_hz == 0
+        )
+
+    def publish(self) -> None:
+        """Publish the next message."""
+        self.topic.fill(self._message, self._classes, self.sent)
+        if self.topic.time == HEADER:
+            self._message.header.stamp = genpy.Time.from_sec(time.time())
+            self._message.header.frame_id = self.topic.frame
+        self.publisher.publish(self._message)
+        self.sent += 1
 
 
 def main() -> None:
-    """Wait for two subscribers, the agent and the bare one, then publish."""
-    topic, rate_hz, count = sys.argv[1], float(sys.argv[2]), int(sys.argv[3])
-    kind = genpy.dynamic.generate_dynamic(TYPE, DEFINITION)[TYPE]
-    rospy.init_node("bench_publisher", disable_signals=True)
-    publisher = rospy.Publisher(topic, kind, queue_size=2000, tcp_nodelay=True)
+    """Publish until the seconds are over."""
+    node, seconds, subscribers = sys.argv[1], float(sys.argv[2]), int(sys.argv[3])
+    rospy.init_node(node, disable_signals=True)
+    rate_hz = float(sys.argv[4]) if len(sys.argv) > 4 else None
+    lines = [Line(topic, topic.rate_hz if rate_hz is None else rate_hz) for topic in NODES[node]]
     pause = threading.Event()
-    while publisher.get_num_connections() < 2:
+    while any(line.publisher.get_num_connections() < subscribers for line in lines):
         pause.wait(0.01)
     print("ready", flush=True)
     sys.stdin.readline()
-    message = kind()
     began = time.monotonic()
-    for i in range(count):
-        ahead = began + i / rate_hz - time.monotonic()
-        if ahead > 0:
-            pause.wait(ahead)
-        for name, value in zip(FIELDS, values(i), strict=True):
-            setattr(message.state, name, value)
-        message.header.stamp = genpy.Time.from_sec(time.time())
-        publisher.publish(message)
-    print("done", flush=True)
+    # When which line is next.
+    due = [(0.0, i) for i in range(len(lines))]
+    while due:
+        at_s, i = heapq.heappop(due)
+        line = lines[i]
+        ahead_s = began + at_s - time.monotonic()
+        if ahead_s > 0:
+            pause.wait(ahead_s)
+        line.publish()
+        if line.rate_hz and line.sent / line.rate_hz < seconds:
+            heapq.heappush(due, (line.sent / line.rate_hz, i))
+    print(json.dumps({line.topic.name: line.sent for line in lines}), flush=True)
     sys.stdin.readline()
 
 

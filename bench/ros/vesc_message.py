@@ -9,24 +9,7 @@ FIELDS = (
     "voltage_input temperature_pcb current_motor current_input speed duty_cycle charge_drawn charge_regen "
     "energy_drawn energy_regen displacement distance_traveled"
 ).split()
-_SEPARATOR = "=" * 80
-DEFINITION = "\n".join(
-    [
-        "Header header",
-        "VescState state",
-        _SEPARATOR,
-        "MSG: std_msgs/Header",
-        "uint32 seq",
-        "time stamp",
-        "string frame_id",
-        _SEPARATOR,
-        "MSG: vesc_msgs/VescState",
-        *(f"float64 {name}" for name in FIELDS),
-        "int32 fault_code",
-    ]
-)
-
-
+STATE = "\n".join([*(f"float64 {name}" for name in FIELDS), "int32 fault_code"])
 # The firmware sends integers; the driver divides these fields by the number, and the others by 1.
 _PARTS = {
     "voltage_input": 10,

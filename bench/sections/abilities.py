@@ -7,12 +7,12 @@ stacks. The report has the thesis' entry on the same point beside each answer, t
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from typing import NamedTuple
 
 from bench.probes import dynamodb, functions, iot_core, watching
 from bench.probes.probe_fixture import AbilityMissingError, ProbeFixture
 from bench.report import thesis
-from bench.report.result import Ratio, Section, Table
+from bench.report.result import Section, Table
 from bench.report.thesis import UNSAID, said
 from bench.target import Say, Target
 
@@ -22,12 +22,12 @@ _PATTERN, _PROTOCOL = said(thesis.AWS_IOT, "pattern"), said(thesis.AWS_IOT, "pro
 _COMPUTE, _NO_STORAGE = said(thesis.AWS_IOT, "compute"), said(thesis.AWS_IOT, "storage")
 _STORAGE = said(thesis.DYNAMODB, "storage")
 _STREAMS = f"Lambda's {said(thesis.LAMBDA, 'protocol')}"
-_PUSH_AND_PULL = said(thesis.LAMBDA, "pattern")
 _MONITORING = said(thesis.CLOUDWATCH, "monitoring")
+_MANY, _ELASTIC = said(thesis.AWS_IOT, "concurrency"), said(thesis.DYNAMODB, "elasticity")
+_WRITERS = f"{dynamodb.WRITERS} writers at once, nothing throttled"
 
 
-@dataclass(frozen=True)
-class Probe:
+class Probe(NamedTuple):
     """One cell: ``ask`` tries the ability and returns what it saw, or raises."""
 
     service: str
@@ -37,7 +37,7 @@ class Probe:
 
 
 # The cells of each table of the thesis.
-PROBES = {
+PROBES: dict[thesis.Criteria, tuple[Probe, ...]] = {
     thesis.FUNCTIONALITY: (
         Probe(_IOT_CORE, "pushes a robot's message to another robot", _PATTERN, iot_core.robot_to_robot),
         Probe(_IOT_CORE, "transforms messages by rule", _COMPUTE, iot_core.rule_republishes),
@@ -59,27 +59,12 @@ PROBES = {
         Probe(_IOT_CORE, "rule republishes", _PATTERN, iot_core.rule_republishes),
         Probe(_IOT_CORE, "what a rule cannot store goes to a queue", UNSAID, iot_core.what_fails_is_kept),
         Probe(_DYNAMODB, "stream into Lambda into another table", _STREAMS, dynamodb.stream_of_changes),
-        Probe(_LAMBDA, "into PubNub", _PUSH_AND_PULL, watching.live_sample),
+        Probe(_LAMBDA, "into PubNub", said(thesis.LAMBDA, "pattern"), watching.live_sample),
     ),
     thesis.SCALABILITY: (
-        Probe(
-            _IOT_CORE,
-            f"{iot_core.CLIENTS} connections at once",
-            said(thesis.AWS_IOT, "concurrency"),
-            iot_core.many_connections,
-        ),
-        Probe(
-            _DYNAMODB,
-            f"{dynamodb.WRITERS} writers at once, nothing throttled",
-            said(thesis.DYNAMODB, "concurrency"),
-            dynamodb.many_writers,
-        ),
-        Probe(
-            _DYNAMODB,
-            "paid by request, no capacity to set",
-            said(thesis.DYNAMODB, "elasticity"),
-            dynamodb.on_demand,
-        ),
+        Probe(_IOT_CORE, f"{iot_core.CLIENTS} connections at once", _MANY, iot_core.many_connections),
+        Probe(_DYNAMODB, _WRITERS, said(thesis.DYNAMODB, "concurrency"), dynamodb.many_writers),
+        Probe(_DYNAMODB, "paid by request, no capacity to set", _ELASTIC, dynamodb.on_demand),
         Probe(_LAMBDA, "in instances", said(thesis.LAMBDA, "concurrency"), functions.many_instances),
         Probe(_LAMBDA, "in size", said(thesis.LAMBDA, "elasticity"), functions.memory_size),
         Probe(_PUBNUB, f"{watching.LISTENERS} subscribers hear the same", UNSAID, watching.many_subscribers),
@@ -104,7 +89,7 @@ def run(target: Target, say: Say) -> Section:
             head = ["ability", "service", "here", "thesis, 2018", "what the probe saw"]
             section.tables += [Table(title, head, rows), criteria.as_table()]
     count = sum(map(len, answers.values()))
-    section.ratios.append(Ratio("abilities that a probe did not find", failed, 0, f"of {count}"))
+    section.ratio("abilities that a probe did not find", failed, 0, unit=f"of {count}")
     section.notes.append(
         f"Beside each answer stands the entry of the {thesis.SOURCE} on the same point. Its rows on ROS and "
         "its columns modular and stateless say nothing that a probe of the cloud could try."

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 from dataclasses import asdict, replace
 
-from bench.fleet_costs import fleets
 from bench.report import plots
-from bench.report.result import Plot, Ratio, Section, Table
+from bench.report.fleet_costs import fleets
+from bench.report.result import Section
 from bench.target import Say, Target
 from iort_station.cost import line_items, model, report
 from iort_station.cost.prices import AS_OF, REGION
@@ -33,22 +33,20 @@ def run(target: Target, say: Say) -> Section:
         ("What each setting does", report.what_if(usage)),
         ("On paper: needs of AWS' default quotas", fleets(usage)),
     ):
-        section.tables.append(Table(title, list(rows.head), [list(row) for row in rows.body]))
+        section.table(title, rows.head, rows.body)
     thesis = line_items.total(model.thesis_bill(usage))
     rates = (10.0, 5.0, 2.0, 1.0, 0.0)
     ours = {rate: line_items.total(model.bill(replace(usage, live_hz=rate))) for rate in rates}
     # The thesis pays for its live view with every sample; ours is given for both ends of the live rate.
-    section.ratios += [
-        Ratio(f"cost {what} / a message a sample", round(ours[rate] / thesis, 4), 0.05, tolerance=_COMPUTED)
-        for what, rate in (
-            ("with the live lane at 10 Hz", 10.0),
-            ("with the live lane at 1 Hz", 1.0),
-            ("of the record lane alone", 0.0),
-        )
-    ]
-    title = "Dollars a robot-hour on AWS"
+    for what, rate in (
+        ("with the live lane at 10 Hz", 10.0),
+        ("with the live lane at 1 Hz", 1.0),
+        ("of the record lane alone", 0.0),
+    ):
+        share = round(ours[rate] / thesis, 4)
+        section.ratio(f"cost {what} / a message a sample", share, 0.05, tolerance=_COMPUTED)
     shown = {"a message a sample": thesis, **{f"iort, live at {rate:g} Hz": ours[rate] for rate in rates}}
-    section.plots.append(Plot("cost", title, plots.bars(title, shown, unit="dollars")))
+    section.plot("cost", "Dollars a robot-hour on AWS", plots.bars(shown, unit="dollars"))
     section.notes.append("PubNub is apart, since its plans differ by far more than everything else here.")
     section.raw = {"usage": asdict(usage), "thesis": thesis, "ours": {str(k): v for k, v in ours.items()}}
     return section

@@ -13,8 +13,8 @@ from bench.errors import BenchError
 from bench.load.agent_process import AgentProcess
 from bench.meters import chromium
 from bench.report import plots
-from bench.report.result import Plot, Ratio, Section, Table
-from bench.report.spread import spread
+from bench.report.result import Section
+from bench.report.spread import spread, text
 from bench.target import Say, Target
 from iort_contract.catalog.vesc import VESC_STREAM
 from iort_contract.page import PUBNUB_ORIGIN
@@ -97,43 +97,37 @@ def run(target: Target, say: Say) -> Section:
 
 
 def _report(section: Section, hops: trace.Trace, heard: list[float], shown: list[float]) -> None:
-    to_subscriber = spread(_chunks(heard))
-    to_pixel = spread(_chunks(shown))
+    to_subscriber, to_pixel = spread(_chunks(heard)), spread(_chunks(shown))
     thesis = f"{THESIS['dashboard']} ms"
-    rows = [
-        ["car to PubNub subscriber", to_subscriber.text() if to_subscriber else "-", thesis],
-        ["car to painted frame in Chromium", to_pixel.text() if to_pixel else "no Chromium here", thesis],
-    ]
-    section.tables.append(
-        Table(
-            "From the sample in the car, by this machine's one clock where the car is simulated on it",
-            ["way", "median (p95, p99; range of the medians of three stretches)", "thesis, 2018"],
-            rows,
-        )
-    )
-    section.tables.append(
-        Table(
-            "Hop by hop",
-            ["hop", "median", "p95", "clocks may falsify it by"],
+    section.table(
+        "From the sample in the car, by this machine's one clock where the car is simulated on it",
+        ["way", "median (p95, p99; range of the medians of three stretches)", "thesis, 2018"],
+        [
+            ["car to PubNub subscriber", text(_chunks(heard)), thesis],
             [
-                [
-                    hop.name,
-                    f"{hop.p50_ms:.2f} ms",
-                    f"{hop.p95_ms:.2f} ms",
-                    "not known" if hop.uncertainty_ms is None else f"{hop.uncertainty_ms:.2f} ms",
-                ]
-                for hop in [*hops.hops, hops.whole]
+                "car to painted frame in Chromium",
+                to_pixel.text() if to_pixel else "no Chromium here",
+                thesis,
             ],
-        )
+        ],
     )
+    rows = [
+        [
+            hop.name,
+            f"{hop.p50_ms:.2f} ms",
+            f"{hop.p95_ms:.2f} ms",
+            "not known" if hop.uncertainty_ms is None else f"{hop.uncertainty_ms:.2f} ms",
+        ]
+        for hop in [*hops.hops, hops.whole]
+    ]
+    section.table("Hop by hop", ["hop", "median", "p95", "clocks may falsify it by"], rows)
     curves = {"PubNub subscriber": heard, "painted frame": shown}
-    title = "From the sample in the car"
-    section.plots.append(Plot("dashboard", title, plots.cdf(title, curves)))
+    section.plot("dashboard", "From the sample in the car", plots.cdf(curves))
     # To the subscriber it is a few milliseconds through five processes, which vary more than a frame does.
     for way, found, tolerance in (("subscriber", to_subscriber, 8.0), ("pixel", to_pixel, 2.5)):
-        if found:
-            name, ratio = f"car to {way} / thesis' {_THESIS_MS} ms", round(found.p50 / _THESIS_MS, 4)
-            section.ratios.append(Ratio(name, ratio, 1.0, tolerance=tolerance, by_machine=True))
+        share = round(found.p50 / _THESIS_MS, 4) if found else None
+        name = f"car to {way} / thesis' {_THESIS_MS} ms"
+        section.ratio(name, share, 1.0, tolerance=tolerance, by_machine=True)
     section.notes.append(
         "A painted frame is the first one after the update's that the browser has handed over; Chromium "
         "draws 60 a second without a display, so half a frame of the delay is waiting for the next."

@@ -10,12 +10,12 @@ import threading
 import time
 from collections.abc import Callable, Iterable
 
-from bench.errors import BenchError
 from bench.floors.raw_mqtt import RawClient
 from bench.load.agent_process import AgentProcess
 from bench.load.worst_case import worst_batches
-from bench.report.result import Ratio, Section, Table
-from bench.report.spread import Spread, spread
+from bench.meters.waiting import reached, wait_for
+from bench.report.result import NOT_MEASURED, Section
+from bench.report.spread import spread
 from bench.target import Say, Target
 from iort_contract.catalog.vesc import VESC_STREAM
 from iort_contract.messages.live import LiveSample, encode_live
@@ -36,6 +36,8 @@ _LOOK_S = 0.05
 _BEGUN_S = 10.0
 
 Message = Callable[[int], bytes]
+# Values in ms by what the other robot sent, a list a stretch.
+Delays = dict[str, list[list[float]]]
 
 
 def bad(number: int) -> bytes:
@@ -51,6 +53,7 @@ def good(number: int) -> bytes:
 
 _ALONE = "nothing"
 KINDS: dict[str, Message | None] = {_ALONE: None, "bad messages": bad, "good messages": good}
+WORST = {_ALONE: 0, **{f"{rate_hz} worst-case batches a second": rate_hz for rate_hz in WORST_HZ}}
 
 
 def run(target: Target, say: Say) -> Section:
@@ -64,17 +67,9 @@ def run(target: Target, say: Say) -> Section:
     )
     other = target.robot("bench-hostile")
     topic = build_topic(LIVE, other.robot, VESC_STREAM, target.cloud.namespace)
-    found: dict[str, list[list[float]]] = {kind: [] for kind in KINDS}
-    with (
-        target.listener(car.robot) as listener,
-        AgentProcess(car),
-        RawClient(other.folder) as client,
-    ):
-        began = time.monotonic()
-        while not listener.heard:
-            if time.monotonic() - began > _WARM_UP_S:
-                raise BenchError("no live update was heard")
-            threading.Event().wait(0.1)
+    found: Delays = {kind: [] for kind in KINDS}
+    with target.listener(car.robot) as listener, AgentProcess(car), RawClient(other.folder) as client:
+        wait_for(lambda: listener.heard, "the first live update")
         # Warm up once with each kind: the first message creates clients and environments.
         for message in KINDS.values():
             _stretch(client, topic, message, 2)
@@ -85,21 +80,16 @@ def run(target: Target, say: Say) -> Section:
                 _stretch(client, topic, message, STRETCH_S)
                 found[kind].append([one.delay_ms for one in listener.heard[heard:]])
     say("summaries")
-    summaries: dict[str, list[list[float]]] = {kind: [] for kind in (_ALONE, *map(_worst, WORST_HZ))}
+    summaries: Delays = {kind: [] for kind in WORST}
     with AgentProcess(car), RawClient(other.folder) as client:
         for _ in range(_REPEATS):
-            for rate_hz in (0, *WORST_HZ):
-                kind = _worst(rate_hz) if rate_hz else _ALONE
+            for kind, rate_hz in WORST.items():
                 say(f"the other robot sends {kind}")
                 summaries[kind].append(_summary_delays(target, car.robot, client, other.robot, rate_hz))
                 _forget(target)
     report(section, found)
     report_summaries(section, summaries)
     return section
-
-
-def _worst(rate_hz: int) -> str:
-    return f"{rate_hz} worst-case batches a second"
 
 
 def _summary_delays(target: Target, car: str, client: RawClient, other: str, rate_hz: int) -> list[float]:
@@ -131,9 +121,7 @@ def _summary_delays(target: Target, car: str, client: RawClient, other: str, rat
         else:
             over.wait(WORST_S)
         # Wait for the summaries of the last seconds too.
-        deadline = time.monotonic() + _WARM_UP_S
-        while int(began_s) + WORST_S not in seen and time.monotonic() < deadline:
-            over.wait(_LOOK_S)
+        reached(lambda: int(began_s) + WORST_S in seen, within_s=_WARM_UP_S, poll_s=_LOOK_S)
     finally:
         over.set()
         watcher.join()
@@ -141,8 +129,7 @@ def _summary_delays(target: Target, car: str, client: RawClient, other: str, rat
 
 
 def _forget(target: Target) -> None:
-    """Throw away what was put off, and let what is begun end: it would take its part of this machine from the
-    next stretch."""
+    """Delete the batches that were put off, and wait for those in work: they would slow the next stretch."""
     queue = target.cloud.output("processing", "PutOffQueue")
     target.cloud.client("sqs").purge_queue(QueueUrl=queue)
     threading.Event().wait(_BEGUN_S)
@@ -162,41 +149,41 @@ def _paced(client: RawClient, topic: str, messages: Iterable[bytes], rate_hz: in
         waiting.wait(max(0.0, began + (number + 1) / rate_hz - time.monotonic()))
 
 
-def report(section: Section, found: dict[str, list[list[float]]]) -> None:
-    """The table and the ratios of the delays in ms, a list a stretch, by what the other robot sent."""
-    spreads: dict[str, Spread | None] = {kind: spread(delays) for kind, delays in found.items()}
-    section.tables.append(
-        Table(
-            f"From a car to a PubNub subscriber, while another robot publishes {RATE_HZ} messages a second",
-            ["the other robot sends", "updates", "median (p95, p99; range of the medians)"],
-            [[kind, str(one.n), one.text()] if one else [kind, "0", "-"] for kind, one in spreads.items()],
-        )
+def report(section: Section, found: Delays) -> None:
+    """Add how late the car's updates were."""
+    title = f"From a car to a PubNub subscriber, while another robot publishes {RATE_HZ} messages a second"
+    names = (
+        f"a car's p95 beside a robot of {RATE_HZ} {{}} a second",
+        f"updates of the car beside {RATE_HZ} {{}} a second",
     )
-    alone = spreads[_ALONE]
-    for kind, one in spreads.items():
-        if one and alone and one is not alone:
-            name = f"a car's p95 beside a robot of {RATE_HZ} {kind} a second / alone"
-            section.ratios.append(Ratio(name, round(one.p95 / alone.p95, 2), _MOST, tolerance=4.0))
-            name = f"updates of the car beside {RATE_HZ} {kind} a second / alone"
-            section.ratios.append(Ratio(name, round(one.n / alone.n, 2), 0.9, at_least=True))
+    _add(section, found, (title, "updates"), names, tolerance=4.0)
     section.raw = dict(found)
 
 
-def report_summaries(section: Section, found: dict[str, list[list[float]]]) -> None:
-    """The table and the ratios of how late summaries are in ms, a list a stretch, by what the other sent."""
-    spreads: dict[str, Spread | None] = {kind: spread(delays) for kind, delays in found.items()}
-    section.tables.append(
-        Table(
-            "From the end of a car's second to its summary",
-            ["the other robot sends", "seconds", "median (p95, p99; range of the medians)"],
-            [[kind, str(one.n), one.text()] if one else [kind, "0", "-"] for kind, one in spreads.items()],
-        )
+def report_summaries(section: Section, found: Delays) -> None:
+    """Add how late the car's summaries were."""
+    names = "p95 of a car's summaries beside a robot of {}", "seconds summarised of the car beside {}"
+    _add(section, found, ("From the end of a car's second to its summary", "seconds"), names, tolerance=2.0)
+    section.raw = {**section.raw, **{f"summaries, {kind}": delays for kind, delays in found.items()}}
+
+
+def _add(
+    section: Section, found: Delays, table: tuple[str, str], names: tuple[str, str], *, tolerance: float
+) -> None:
+    """Add a table, and for each kind a ratio of delays and one of counts to those of a car alone."""
+    spreads = {kind: spread(delays) for kind, delays in found.items()}
+    title, counted = table
+    section.table(
+        title,
+        ["the other robot sends", counted, "median (p95, p99; range of the medians)"],
+        [
+            [kind, *((str(one.n), one.text()) if one else ("0", NOT_MEASURED))]
+            for kind, one in spreads.items()
+        ],
     )
     alone = spreads[_ALONE]
     for kind, one in spreads.items():
         if one and alone and one is not alone:
-            name = f"p95 of a car's summaries beside a robot of {kind} / alone"
-            section.ratios.append(Ratio(name, round(one.p95 / alone.p95, 2), _MOST, tolerance=2.0))
-            name = f"seconds summarised of the car beside {kind} / alone"
-            section.ratios.append(Ratio(name, round(one.n / alone.n, 2), 0.9, at_least=True))
-    section.raw = {**section.raw, **{f"summaries, {kind}": delays for kind, delays in found.items()}}
+            late, count = (f"{name.format(kind)} / alone" for name in names)
+            section.ratio(late, round(one.p95 / alone.p95, 2), _MOST, tolerance=tolerance)
+            section.ratio(count, round(one.n / alone.n, 2), 0.9, at_least=True)

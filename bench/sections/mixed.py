@@ -20,26 +20,21 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-import yaml
-from awscrt import mqtt5
-
 from bench.errors import BenchError
-from bench.floors.mosquitto import HOST, Mosquitto, found
+from bench.floors.mosquitto import Mosquitto, found
 from bench.meters import usage
 from bench.meters.watcher import subscribed
 from bench.report import plots
-from bench.report.result import NOT_MEASURED, Plot, Ratio, Section, Table
-from bench.ros.graph import PACKAGES, SYSTEM_PYTHON, Publisher, RosGraph, python_with_rospy
-from bench.ros.mixed_robot import NODES, topics
+from bench.report.result import NOT_MEASURED, Section
+from bench.ros.graph import PACKAGES, SYSTEM_PYTHON, RosGraph, python_with_rospy
+from bench.ros.mixed_robot import MIXED, topics
 from bench.target import Say, Target
 from iort_contract.messages.batch import decode_batch
 from iort_contract.topics import LIVE, RECORD, parse_topic
 
 SECONDS = 30
 RECORDER, AGENT, FLOOR = "rosbag record", "agent", "bare rospy subscriber"
-_SUBSCRIBERS = 3
 _WARM_UP_S, _CATCH_UP_S, _END_S = 3, 30.0, 30.0
-_ROBOT = "bench"
 _BASIC_INGEST = "$aws/rules/"
 _PACKAGES = f"{PACKAGES} python3-rosbag mosquitto"
 
@@ -98,26 +93,23 @@ def measure(program: str, python: str, seconds: int, say: Say) -> Found:
         Mosquitto(program, Path(name)) as broker,
         RosGraph(python, Path(name)) as graph,
         subscribed(
-            (HOST, broker.port),
-            (*broker.identity("watcher"), broker.ca),
+            broker,
             [f"{_BASIC_INGEST}#", f"{RECORD}/#", f"{LIVE}/#"],
             lambda topic, payload: heard.append((time.monotonic(), topic, payload)),
-            qos=mqtt5.QoS.AT_LEAST_ONCE,
+            qos=1,
         ),
     ):
         folder, rosbag = Path(name), [SYSTEM_PYTHON, str(shutil.which("rosbag"))]
-        config, written, bag = _car(broker, folder), folder / "report.json", folder / "drive.bag"
+        car = broker.car({one.name: {"stream": one.stream, "time": one.time} for one in topics().values()})
+        written, bag = folder / "report.json", folder / "drive.bag"
         processes = {
             RECORDER: graph.run([*rosbag, "record", "--quiet", "-O", str(bag), *topics()]),
             AGENT: graph.start(
-                "iort_agent.cli", "run", "--config", config, "--report", written, "--drain-s", _CATCH_UP_S
+                "iort_agent.cli", "run", "--config", car, "--report", written, "--drain-s", _CATCH_UP_S
             ),
             FLOOR: graph.start("bench.floors.ros_floor", *topics()),
         }
-        lasts_s = seconds + _WARM_UP_S
-        publishers = [
-            Publisher(graph.start("bench.ros.mixed_publisher", node, lasts_s, _SUBSCRIBERS)) for node in NODES
-        ]
+        publishers = [graph.publisher(node, seconds + _WARM_UP_S, len(processes)) for node in MIXED]
         say("waiting for every subscriber of every topic")
         for publisher in publishers:
             publisher.ready()
@@ -138,8 +130,7 @@ def measure(program: str, python: str, seconds: int, say: Say) -> Found:
         threading.Event().wait(1.0)
         result.agent = json.loads(written.read_text())
         result.bag_bytes, result.recorded = bag.stat().st_size, _in_bag(bag)
-        smaller = folder / "bz2"
-        smaller.mkdir()
+        (smaller := folder / "bz2").mkdir()
         compress = [*rosbag, "compress", "--quiet", "--bz2", f"--output-dir={smaller}", str(bag)]
         if graph.run(compress).wait(_END_S + seconds):
             raise BenchError("`rosbag compress` failed")
@@ -148,30 +139,6 @@ def measure(program: str, python: str, seconds: int, say: Say) -> Found:
     result.rss_mb = {who: after[who].rss_mb for who in processes}
     count(result, heard, ended)
     return result
-
-
-def _car(broker: Mosquitto, folder: Path) -> Path:
-    certificate, key = broker.identity(_ROBOT)
-    config = folder / "car.yaml"
-    source = {
-        "type": "ros1",
-        "topics": {one.name: {"stream": one.stream, "time": one.time} for one in topics().values()},
-    }
-    config.write_text(
-        yaml.safe_dump(
-            {
-                "robot": _ROBOT,
-                "endpoint": HOST,
-                "port": broker.port,
-                "certificate": str(certificate),
-                "private_key": str(key),
-                "root_ca": str(broker.ca),
-                "sources": [source],
-                "queue": {"path": "spool.db"},
-            }
-        )
-    )
-    return config
 
 
 def _used(processes: Mapping[str, subprocess.Popen[str]]) -> dict[str, usage.Usage]:
@@ -225,96 +192,45 @@ def report(section: Section, result: Found) -> None:
     measured = messages * result.seconds / (SECONDS + _WARM_UP_S)
     each_us = {who: cpu_s / measured * 1e6 for who, cpu_s in result.cpu_s.items()}
     sent = result.lane_bytes[RECORD]
-    got = {RECORDER: result.recorded, AGENT: result.arrived}
-    lost = {who: result.lost(counted) for who, counted in got.items()}
+    lost = {RECORDER: result.lost(result.recorded), AGENT: result.lost(result.arrived)}
     left_out = result.left_out()
     order = (RECORDER, AGENT, FLOOR)
-    section.tables.append(
-        Table(
-            f"{len(result.published)} topics, {messages:,} messages in {SECONDS + _WARM_UP_S} s",
-            ["figure", *order, f"{AGENT} / {RECORDER}"],
-            [
-                [
-                    "processor a message",
-                    *(f"{each_us[who]:.0f} us" for who in order),
-                    f"{each_us[AGENT] / each_us[RECORDER]:.2f}",
-                ],
-                [
-                    "of one core",
-                    *(f"{result.cpu_s[who] / result.seconds:.1%}" for who in order),
-                    NOT_MEASURED,
-                ],
-                ["memory", *(f"{result.rss_mb[who]:.0f} MB" for who in order), NOT_MEASURED],
-                [
-                    "bytes a message, to the file and to the cloud's record lane",
-                    f"{result.bag_bytes / messages:.0f}",
-                    f"{sent / messages:.0f}",
-                    NOT_MEASURED,
-                    f"{sent / result.bag_bytes:.3f}",
-                ],
-                [
-                    "the same, of the bag after rosbag compress --bz2",
-                    f"{result.bag_bz2_bytes / messages:.0f}",
-                    f"{sent / messages:.0f}",
-                    NOT_MEASURED,
-                    f"{sent / result.bag_bz2_bytes:.3f}",
-                ],
-                [
-                    "messages lost",
-                    *(f"{lost[who]:,} of {messages:,}" for who in (RECORDER, AGENT)),
-                    NOT_MEASURED,
-                    NOT_MEASURED,
-                ],
-            ],
-        )
+
+    def size(name: str, bag_bytes: int) -> list[str]:
+        ours = f"{sent / messages:.0f}"
+        return [name, f"{bag_bytes / messages:.0f}", ours, NOT_MEASURED, f"{sent / bag_bytes:.3f}"]
+
+    cpu = [f"{result.cpu_s[who] / result.seconds:.1%}" for who in order]
+    ours = f"{each_us[AGENT] / each_us[RECORDER]:.2f}"
+    missing = [f"{lost[who]:,} of {messages:,}" for who in (RECORDER, AGENT)]
+    section.table(
+        f"{len(result.published)} topics, {messages:,} messages in {SECONDS + _WARM_UP_S} s",
+        ["figure", *order, f"{AGENT} / {RECORDER}"],
+        [
+            ["processor a message", *(f"{each_us[who]:.0f} us" for who in order), ours],
+            ["of one core", *cpu, NOT_MEASURED],
+            ["memory", *(f"{result.rss_mb[who]:.0f} MB" for who in order), NOT_MEASURED],
+            size("bytes a message, to the file and to the cloud's record lane", result.bag_bytes),
+            size("the same, of the bag after rosbag compress --bz2", result.bag_bz2_bytes),
+            ["messages lost", *missing, NOT_MEASURED, NOT_MEASURED],
+        ],
     )
-    section.tables.append(
-        Table(
-            "By topic",
-            [
-                "topic",
-                "type",
-                "published",
-                "in the bag",
-                "arrived from the agent",
-                "fields left out",
-                "bytes a message",
-            ],
-            [
-                [
-                    name,
-                    topic.kind,
-                    *(
-                        f"{counted[name]:,}"
-                        for counted in (result.published, result.recorded, result.arrived, left_out)
-                    ),
-                    f"{result.stream_bytes[topic.stream] / result.arrived[name]:.0f}"
-                    if result.arrived[name]
-                    else NOT_MEASURED,
-                ]
-                for name, topic in topics().items()
-            ],
-        )
-    )
+    rows = []
+    for name, topic in topics().items():
+        counts = (one[name] for one in (result.published, result.recorded, result.arrived, left_out))
+        arrived = result.arrived[name]
+        each = f"{result.stream_bytes[topic.stream] / arrived:.0f}" if arrived else NOT_MEASURED
+        rows.append([name, topic.kind, *(f"{number:,}" for number in counts), each])
+    head = ["topic", "type", "published", "in the bag", "arrived from the agent", "fields left out"]
+    section.table("By topic", [*head, "bytes a message"], rows)
     title = "Processor time a message of the mixed robot"
-    section.plots.append(Plot("mixed", title, plots.bars(title, {w: each_us[w] for w in order}, unit="us")))
-    section.ratios += [
-        Ratio("mixed robot: messages that the agent lost", lost[AGENT], 0, "messages"),
-        Ratio("mixed robot: fields that the agent left out", left_out.total(), 0, "fields"),
-        Ratio(
-            "mixed robot: the agent's processor / rosbag record's",
-            round(each_us[AGENT] / each_us[RECORDER], 2),
-            None,
-            tolerance=2,
-        ),
-        Ratio(
-            "mixed robot: the agent's processor / a bare rospy subscriber's",
-            round(each_us[AGENT] / each_us[FLOOR], 2),
-            None,
-            tolerance=2,
-        ),
-        Ratio("mixed robot: bytes published / bytes of the bag", round(sent / result.bag_bytes, 3), 1.0),
-    ]
+    section.plot("mixed", title, plots.bars({who: each_us[who] for who in order}, unit="us"))
+    section.ratio("mixed robot: messages that the agent lost", lost[AGENT], 0, unit="messages")
+    section.ratio("mixed robot: fields that the agent left out", left_out.total(), 0, unit="fields")
+    for who, floor in ((RECORDER, "rosbag record's"), (FLOOR, "a bare rospy subscriber's")):
+        times = round(each_us[AGENT] / each_us[who], 2)
+        section.ratio(f"mixed robot: the agent's processor / {floor}", times, None, tolerance=2)
+    section.ratio("mixed robot: bytes published / bytes of the bag", round(sent / result.bag_bytes, 3), 1.0)
     section.notes.append(
         f"The agent's live lane published {result.lane_bytes[LIVE] / 1e6:.1f} MB beside, and the record lane "
         f"{result.batches:,} batches; {result.late:,} samples came over two seconds after the last message. "

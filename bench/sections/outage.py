@@ -8,18 +8,18 @@ from __future__ import annotations
 
 import threading
 import time
-from collections.abc import Iterator
-from contextlib import contextmanager, suppress
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
 from statistics import median
-from typing import Any
 
-from bench.errors import BenchError
 from bench.load.agent_process import AgentProcess
+from bench.meters.waiting import reached, wait_for
 from bench.report import plots
-from bench.report.result import Plot, Ratio, Section, Table
+from bench.report.result import NOT_MEASURED, Section
 from bench.report.spread import spread
 from bench.target import Say, Target
-from iort_agent.config.file import load_config
+from iort_agent.config import load_config
 from iort_contract.catalog.streams import OWN_STREAMS
 from iort_contract.catalog.vesc import VESC_STREAM
 from iort_contract.messages.batch import batch_id
@@ -36,6 +36,21 @@ BEFORE_S, CUT_S, AFTER_S = 8, 60, 30
 _SUMMARY_S = 60.0
 
 
+@dataclass(frozen=True, kw_only=True)
+class Outage:
+    """The counts of samples and batches, and the time and delay in ms of every live update."""
+
+    sent: int
+    lost: int
+    summarized: int
+    duplicated: int
+    missing: int
+    drain_s: float
+    live: list[tuple[int, float]]
+    cut_us: int
+    mended_us: int
+
+
 def run(target: Target, say: Say) -> Section:
     """Drive, cut the connection, restore it; then count the stored samples and the live updates."""
     section = Section("outage", "Outage: no broker for 60 s at 50 Hz")
@@ -43,171 +58,122 @@ def run(target: Target, say: Say) -> Section:
     source = {"type": "sim", "stream": VESC_STREAM, "rate_hz": RATE_HZ, "duration_s": seconds}
     bundle = target.robot(ROBOT, sources=[source], queue={"path": "queue.db"})
     with (
-        _way(target, bundle) as way,
+        _way(target, bundle) as (cut, mend),
         target.listener(bundle.robot) as listener,
         AgentProcess(bundle) as agent,
     ):
-        _wait_for(lambda: bool(listener.heard), "the first live update")
+        wait_for(lambda: listener.heard, "the first live update")
         say(f"driving for {BEFORE_S} s")
         threading.Event().wait(BEFORE_S)
         cut_us = time.time_ns() // 1000
-        way.cut()
+        cut()
         for left_s in range(CUT_S, 0, -10):
             say(f"cut, {left_s} s to go")
             threading.Event().wait(10)
-        way.mend()
+        mend()
         mended_us = time.time_ns() // 1000
         say("draining")
-        report = agent.finished()
+        told = agent.finished()
         heard = list(listener.heard)
-    sent = sum(s["samples"] for name, s in report["streams"].items() if name not in OWN_STREAMS)
+    sent = sum(s["samples"] for name, s in told["streams"].items() if name not in OWN_STREAMS)
+
+    def summarized() -> int:
+        return delivery.samples_summarized(target.cloud, bundle.robot, VESC_STREAM)
+
     # Lost samples never arrive: they are counted after the wait.
-    with suppress(BenchError):
-        _wait_for(
-            lambda: delivery.samples_summarized(target.cloud, bundle.robot, VESC_STREAM) >= sent,
-            "Lambda 2",
-            _SUMMARY_S,
-        )
+    reached(lambda: summarized() >= sent, within_s=_SUMMARY_S)
     items = list(audit.headers(target.cloud, bundle.robot, VESC_STREAM, audit.Range()))
     found = audit.audit(VESC_STREAM, items, from_start=True)
-    stored = sum(int(item["n"]) for item in items)
     delayed = [i for i in items if cut_us <= batch_id(i[BATCH]).t_us < mended_us]
     drained_ms = max((int(item["received_ms"]) for item in delayed), default=mended_us // 1000)
-    live = [(h.t_us, h.delay_ms) for h in heard if h.stream == VESC_STREAM]
-    _report(
-        section,
-        lost=sent - stored,
-        summarized=delivery.samples_summarized(target.cloud, bundle.robot, VESC_STREAM),
+    outage = Outage(
         sent=sent,
+        lost=sent - sum(int(item["n"]) for item in items),
+        summarized=summarized(),
         duplicated=sum(run.duplicated for run in found.runs),
         missing=found.missing,
         drain_s=drained_ms / 1000 - mended_us / 1e6,
-        live=live,
+        live=[(h.t_us, h.delay_ms) for h in heard if h.stream == VESC_STREAM],
         cut_us=cut_us,
         mended_us=mended_us,
     )
+    report(section, outage)
     return section
 
 
-def _report(
-    section: Section,
-    *,
-    lost: int,
-    summarized: int,
-    sent: int,
-    duplicated: int,
-    missing: int,
-    drain_s: float,
-    live: list[tuple[int, float]],
-    cut_us: int,
-    mended_us: int,
-) -> None:
+def report(section: Section, found: Outage) -> None:
+    """Add the table, the picture and the ratios."""
+    cut_us, mended_us, live = found.cut_us, found.mended_us, found.live
+    drained_us = mended_us + max(found.drain_s, 1.0) * 1e6
     before = [delay for t_us, delay in live if t_us < cut_us]
-    back = [t_us for t_us, _ in live if t_us >= mended_us]
-    first_s = (min(back) - mended_us) / 1e6 if back else float("nan")
-    draining = [d for t_us, d in live if t_us >= mended_us and t_us < mended_us + max(drain_s, 1.0) * 1e6]
+    draining = [delay for t_us, delay in live if mended_us <= t_us < drained_us]
     after = [delay for t_us, delay in live if t_us >= mended_us]
+    first_s = min(((t_us - mended_us) / 1e6 for t_us, _ in live if t_us >= mended_us), default=None)
     meanwhile = sum(cut_us + 1e6 < t_us < mended_us for t_us, _ in live)
-    shown = {
-        name: spread([values])
-        for name, values in (("before", before), ("during", draining), ("after", after))
-    }
-    rows = [
-        ["samples sent by the car", f"{sent:,}"],
-        ["samples lost", f"{lost:,}"],
-        ["samples not summarised", f"{sent - summarized:,}"],
-        ["batches missing, by their numbers", str(missing)],
-        ["batches stored twice", str(duplicated)],
-        ["from the way's return to the backlog's last batch in the table", f"{drain_s:.1f} s"],
-        ["from the way's return to the first live sample", f"{first_s:.1f} s" if back else "none was sent"],
-        ["live delay before", shown["before"].text() if shown["before"] else "-"],
+
+    def delays(values: list[float], none: str) -> str:
+        shown = spread([values])
+        return shown.text() if shown else none
+
+    section.table(
+        "A minute without a broker",
+        ["figure", "measured"],
         [
-            "live delay while the backlog drained",
-            shown["during"].text() if shown["during"] else "none was sent",
+            ["samples sent by the car", f"{found.sent:,}"],
+            ["samples lost", f"{found.lost:,}"],
+            ["samples not summarised", f"{found.sent - found.summarized:,}"],
+            ["batches missing, by their numbers", str(found.missing)],
+            ["batches stored twice", str(found.duplicated)],
+            ["from the way's return to the backlog's last batch in the table", f"{found.drain_s:.1f} s"],
+            [
+                "from the way's return to the first live sample",
+                "none was sent" if first_s is None else f"{first_s:.1f} s",
+            ],
+            ["live delay before", delays(before, NOT_MEASURED)],
+            ["live delay while the backlog drained", delays(draining, "none was sent")],
+            ["live delay from the way's return on", delays(after, NOT_MEASURED)],
+            ["live samples of the outage that came late to the dashboard", str(meanwhile)],
         ],
-        ["live delay from the way's return on", shown["after"].text() if shown["after"] else "-"],
-        ["live samples of the outage that came late to the dashboard", str(meanwhile)],
-    ]
-    section.tables.append(Table("A minute without a broker", ["figure", "measured"], rows))
-    section.ratios += [
-        Ratio("samples lost over an outage", lost, 0, "samples"),
-        Ratio("batches stored twice over an outage", duplicated, 0, "batches"),
-        # Most of it is the random wait before the agent's next attempt.
-        Ratio("time to drain / outage", round(drain_s / CUT_S, 4), 0.5, tolerance=4),
-    ]
-    if after and before:
-        section.ratios.append(
-            Ratio("live delay after / before", round(median(after) / median(before), 3), None, tolerance=2)
-        )
-    title = "Live updates over an outage"
-    start = cut_us - BEFORE_S * 1_000_000
-    points = ([(t_us - start) / 1e6 for t_us, _ in live], [delay for _, delay in live])
-    shaded = ((cut_us - start) / 1e6, (mended_us - start) / 1e6)
-    section.plots.append(
-        Plot(
-            "outage",
-            title,
-            plots.points(
-                title,
-                {"live update": points},
-                x_label="s",
-                y_label="ms from car to subscriber",
-                shaded=shaded,
-            ),
-        )
     )
+    section.ratio("samples lost over an outage", found.lost, 0, unit="samples")
+    section.ratio("batches stored twice over an outage", found.duplicated, 0, unit="batches")
+    # Most of it is the random wait before the agent's next attempt.
+    section.ratio("time to drain / outage", round(found.drain_s / CUT_S, 4), 0.5, tolerance=4)
+    if after and before:
+        later = round(median(after) / median(before), 3)
+        section.ratio("live delay after / before", later, None, tolerance=2)
+
+    def seconds(t_us: float) -> float:
+        return (t_us - cut_us) / 1e6 + BEFORE_S
+
+    times, waits = [seconds(t_us) for t_us, _ in live], [delay for _, delay in live]
+    shaded = seconds(cut_us), seconds(mended_us)
+    picture = plots.points("live update", times, waits, y_label="ms from car to subscriber", shaded=shaded)
+    section.plot("outage", "Live updates over an outage", picture)
     section.raw = {
-        "sent": sent,
-        "lost": lost,
-        "drain_s": drain_s,
+        "sent": found.sent,
+        "lost": found.lost,
+        "drain_s": found.drain_s,
         "first_live_s": first_s,
-        "duplicated": duplicated,
+        "duplicated": found.duplicated,
     }
-
-
-class _Proxied:
-    def __init__(self, proxy: Proxy) -> None:
-        self._proxy = proxy
-
-    def cut(self) -> None:
-        self._proxy.mode = REFUSE
-
-    def mend(self) -> None:
-        self._proxy.mode = PASS
-
-
-class _Certificate:
-    """AWS ends the sessions of a certificate that is deactivated, and refuses new ones.
-
-    A refused agent waits for minutes, or until its certificate file changes: `mend` touches the file.
-    """
-
-    def __init__(self, target: Target, bundle: Bundle) -> None:
-        self._iot, self._file = target.cloud.client("iot"), load_config(bundle.config).certificate
-        principals = self._iot.list_thing_principals(thingName=bundle.robot)["principals"]
-        self._certificate = principals[0].rsplit("/", 1)[-1]
-
-    def cut(self) -> None:
-        self._iot.update_certificate(certificateId=self._certificate, newStatus="INACTIVE")
-
-    def mend(self) -> None:
-        self._iot.update_certificate(certificateId=self._certificate, newStatus="ACTIVE")
-        self._file.touch()
 
 
 @contextmanager
-def _way(target: Target, bundle: Bundle) -> Iterator[Any]:
-    if target.embedded is None:
-        yield _Certificate(target, bundle)
+def _way(target: Target, bundle: Bundle) -> Iterator[tuple[Callable[[], None], Callable[[], None]]]:
+    """Yield functions that cut the car's way to the broker and mend it."""
+    if target.embedded is not None:
+        with Proxy(target.cloud.mqtt_endpoint, target.cloud.mqtt_port) as proxy:
+            robots.configure(bundle, {"endpoint": "127.0.0.1", "port": proxy.port})
+            yield lambda: setattr(proxy, "mode", REFUSE), lambda: setattr(proxy, "mode", PASS)
         return
-    with Proxy(target.cloud.mqtt_endpoint, target.cloud.mqtt_port) as proxy:
-        robots.configure(bundle, {"endpoint": "127.0.0.1", "port": proxy.port})
-        yield _Proxied(proxy)
+    iot, file = target.cloud.client("iot"), load_config(bundle.config).certificate
+    principals = iot.list_thing_principals(thingName=bundle.robot)["principals"]
+    number = principals[0].rsplit("/", 1)[-1]
 
+    def mend() -> None:
+        iot.update_certificate(certificateId=number, newStatus="ACTIVE")
+        # A refused agent waits for minutes, or until its certificate file changes.
+        file.touch()
 
-def _wait_for(true: Any, what: str, seconds: float = 30.0) -> None:
-    deadline = time.monotonic() + seconds
-    while not true():
-        if time.monotonic() > deadline:
-            raise BenchError(f"waited {seconds:.0f} s for {what}")
-        threading.Event().wait(0.1)
+    yield lambda: iot.update_certificate(certificateId=number, newStatus="INACTIVE"), mend

@@ -8,15 +8,14 @@ from __future__ import annotations
 
 import threading
 from collections.abc import Mapping
-from dataclasses import asdict
-from typing import Any
+from statistics import median
 
 from bench.errors import BenchError
 from bench.load.agent_process import AgentProcess
 from bench.meters.round_trips import RAW, RoundTrips
 from bench.report import plots
-from bench.report.result import NOT_MEASURED, Plot, Ratio, Section, Table
-from bench.report.spread import ratio, spread
+from bench.report.result import NOT_MEASURED, Section
+from bench.report.spread import ratio, rounded, spread, text
 from bench.report.thesis import PING_MS, SOURCE
 from bench.target import Say, Target
 from iort_contract.catalog.vesc import VESC_STREAM
@@ -49,7 +48,7 @@ def measure(target: Target, bundles: Mapping[str, Bundle], floor: Bundle, say: S
                 for rate_hz in RATES_HZ:
                     say(f"{WITH}, {rate_hz} Hz, {repeat + 1} of {_REPEATS}")
                     for way, values in lines.measure(size=SIZE, rate_hz=rate_hz, lasts_s=_LASTS_S).items():
-                        found.setdefault(_key(way, rate_hz), []).append(values)
+                        found.setdefault(f"{way} at {rate_hz} Hz", []).append(values)
             found[ECHO] = [[lines.raw.ping() * 1000 for _ in range(20)]]
         if lines.lost:
             raise BenchError(f"{WITH}: {lines.lost} pings did not come back")
@@ -60,9 +59,8 @@ def measure(target: Target, bundles: Mapping[str, Bundle], floor: Bundle, say: S
 
 def _to_subscriber(target: Target, port: int) -> list[float]:
     """Return the delays in ms from the sample in a driving car to the subscriber, by one clock."""
-    bundle = target.robot(
-        "bench-far", port=port, sources=[{"type": "sim", "stream": VESC_STREAM, "rate_hz": 50}]
-    )
+    source = {"type": "sim", "stream": VESC_STREAM, "rate_hz": 50}
+    bundle = target.robot("bench-far", port=port, sources=[source])
     pubnub = keys.load(target.cloud).reading()
     host, _, its_port = pubnub.pop("origin").partition(":")
     delays_ms: list[float] = []
@@ -88,74 +86,40 @@ def _to_subscriber(target: Target, port: int) -> list[float]:
 
 def report(section: Section, found: Mapping[str, Repeats]) -> None:
     """Add the table, the picture and the ratios."""
-    head = ["way", *(f"at {rate_hz} Hz" for rate_hz in RATES_HZ), "thesis, 2018"]
-    rows = [
-        [f"{name}, {WITH}", *(_text(found.get(_key(way, rate_hz))) for rate_hz in RATES_HZ), thesis]
-        for way, name, thesis in (
-            *((path, f"robot - {path}", f"{THESIS[path]} ms") for path in PING_PATHS),
-            (RAW, "floor: raw MQTT client", NOT_MEASURED),
-        )
-    ]
-    live = _text(found[DASHBOARD])
-    rows.append(
-        [f"car to PubNub subscriber, {WITH}", NOT_MEASURED, live, NOT_MEASURED, f"{THESIS[DASHBOARD]} ms"]
+    names = {path: f"robot - {path}" for path in PING_PATHS} | {RAW: RAW, DASHBOARD: "car to subscriber"}
+    theirs = {way: f"{most} ms" for way, most in THESIS.items()}
+
+    def row(name: str, way: str, thesis: str) -> list[str]:
+        values = (found.get(f"{way} at {rate_hz} Hz", []) for rate_hz in RATES_HZ)
+        return [f"{name}, {WITH}", *(text(each, digits=1) for each in values), thesis]
+
+    rows = [row(names[path], path, theirs[path]) for path in PING_PATHS]
+    rows.append(row("floor: raw MQTT client", RAW, NOT_MEASURED))
+    live, echo = (text(found[way], digits=1) for way in (DASHBOARD, ECHO))
+    rows.append([f"car to PubNub subscriber, {WITH}", NOT_MEASURED, live, NOT_MEASURED, theirs[DASHBOARD]])
+    rows.append([f"{ECHO}, {WITH}", echo, NOT_MEASURED, NOT_MEASURED, f"{PING_MS} ms (ping)"])
+    section.table(
+        f"With the thesis' ping, 0.5 KB {WITH}: median (p95, p99; range)",
+        ["way", *(f"at {rate_hz} Hz" for rate_hz in RATES_HZ), "thesis, 2018"],
+        rows,
     )
-    rows.append([f"{ECHO}, {WITH}", _text(found[ECHO]), NOT_MEASURED, NOT_MEASURED, f"{PING_MS} ms (ping)"])
-    section.tables.append(
-        Table(f"On the thesis' ground, 0.5 KB {WITH}: median (p95, p99; range)", head, rows)
-    )
-    usual = {path: found[_key(path, 10)] for path in (*PING_PATHS, RAW)} | {DASHBOARD: found[DASHBOARD]}
+    usual = {way: found[f"{way} at 10 Hz"] for way in (*PING_PATHS, RAW)} | {DASHBOARD: found[DASHBOARD]}
     spreads = {way: one for way, values in usual.items() if (one := spread(values)) is not None}
-    title = f"0.5 KB at 10 Hz {WITH}, and the {SOURCE}"
-    named = {
-        way: "car to subscriber" if way == DASHBOARD else way if way == RAW else f"robot - {way}"
-        for way in spreads
+    ranges: dict[str, dict[str, tuple[float, float]]] = {
+        "iort, median to p95": {names[way]: (one.p50, one.p95) for way, one in spreads.items()},
+        "thesis": {names[way]: THESIS_MS[way] for way in spreads if way in THESIS_MS},
     }
-    section.plots.append(
-        Plot(
-            "round-trips-far",
-            title,
-            plots.ranges(
-                title,
-                [*named.values()],
-                {
-                    "iort, median to p95": {named[way]: (one.p50, one.p95) for way, one in spreads.items()},
-                    "thesis": {named[way]: THESIS_MS[way] for way in spreads if way in THESIS_MS},
-                },
-                unit="ms",
-            ),
-        )
-    )
+    title = f"0.5 KB at 10 Hz {WITH}, and the {SOURCE}"
+    section.plot("round-trips-far", title, plots.ranges([names[way] for way in spreads], ranges, unit="ms"))
     beside = ratio(usual[BROKER], usual[RAW])
-    if beside is not None:
-        section.ratios.append(Ratio(f"broker round trip / raw MQTT client, {WITH}", round(beside, 3), 1.1))
-    for way, name in named.items():
-        if way in THESIS_MS:
-            most = THESIS_MS[way][1]
-            section.ratios.append(
-                Ratio(
-                    f"{name} {WITH} / thesis' {most} ms",
-                    round(spreads[way].p50 / most, 3),
-                    1.0,
-                    by_machine=True,
-                )
-            )
+    section.ratio(f"broker round trip / raw MQTT client, {WITH}", beside and round(beside, 3), 1.1)
+    for way in (*PING_PATHS, DASHBOARD):
+        most = THESIS_MS[way][1]
+        share = round(median(value for values in usual[way] for value in values) / most, 3)
+        section.ratio(f"{names[way]} {WITH} / thesis' {most} ms", share, 1.0, by_machine=True)
     section.notes.append(
         f"The thesis' figures hold a ping of {PING_MS} ms between car and cloud; {WITH}, by a proxy before "
         "the broker, ours hold the same. The way to the subscriber has as much again between PubNub and the "
         "subscriber. The raw client sends one message at a time, so at most 20 a second there."
     )
-    section.raw["far"] = {
-        way: {key: round(value, 3) for key, value in asdict(one).items()}
-        for way, values in found.items()
-        if (one := spread(values)) is not None
-    }
-
-
-def _key(way: str, rate_hz: int) -> str:
-    return f"{way} at {rate_hz} Hz"
-
-
-def _text(values: Any) -> str:
-    shown = spread(values) if values else None
-    return NOT_MEASURED if shown is None else shown.text("ms", 1)
+    section.raw["far"] = rounded(found, 3)

@@ -10,7 +10,6 @@ from __future__ import annotations
 import json
 import subprocess
 import sys
-import threading
 import time
 from contextlib import ExitStack
 from dataclasses import asdict
@@ -20,19 +19,18 @@ from typing import Any
 from bench import ROOT
 from bench.errors import BenchError
 from bench.load import stored_drive
+from bench.load.simulated import RATE_HZ
 from bench.meters.invocations import Event, Measured, configure, invoke, measure, reporting
 from bench.report import plots, thesis
-from bench.report.result import NOT_MEASURED, Plot, Ratio, Section, Table
+from bench.report.result import NOT_MEASURED, Section
 from bench.report.spread import spread
-from bench.target import Say, Target
-from bench.temporary_function import temporary_function
+from bench.target import Say, Target, temporary_function
 from iort_agent.sources.vehicle import Vehicle, VehicleConfig
 from iort_contract.catalog.vesc import VESC_STREAM
 from iort_contract.messages.event import rule_event
 from iort_contract.messages.live import LiveSample, encode_live
 from iort_contract.tables import BATCH, REPLAY, TOPIC
 from iort_contract.topics import LIVE, build_topic
-from iort_station.operations import delivery
 
 SIZES_MB = (128, 256, 512, 1024, 1769)
 # "At 1,769 MB, a function has the equivalent of one vCPU": Lambda, "Configure memory".
@@ -41,11 +39,9 @@ ROBOT = "bench-functions"
 ROUNDS = 3
 CALLS = 60
 BATCHES = 100
-_CATCH_UP_S = 60.0
 _LIVE, _ONE, _EMPTY = "Lambda 1 (live)", "Lambda 2, an event of 1 batch", "empty function"
 _BACKLOG = f"Lambda 2, an event of {BATCHES} batches"
 _THESIS = {_LIVE: f"{thesis.LAMBDA_1[256]} (256 MB)", _ONE: thesis.LAMBDA_2}
-_NODE = f"{thesis.NODE_CYCLE_MS} ms"
 # What an invocation costs by itself.
 _NOTHING = "def handler(event, context):\n    return None\n"
 
@@ -53,7 +49,8 @@ _NOTHING = "def handler(event, context):\n    return None\n"
 def run(target: Target, say: Say) -> Section:
     """Invoke the functions in turns, warm and cold; then the node's cycle."""
     section = Section("utilisation", "Utilisation (table 6.5)")
-    batches = _store(target, say)
+    say("storing a drive")
+    batches = stored_drive.store(target, target.name(ROBOT), stored_drive.simulated(BATCHES * RATE_HZ))
     # The newest batch alone is what a driving car makes of the stream; all of them, a backlog.
     one, many = _stream_event(batches[-1:]), _stream_event(batches)
     events: dict[str, Event] = {
@@ -82,76 +79,52 @@ def run(target: Target, say: Say) -> Section:
         }
     say("the node's cycle")
     cycle = _cycle()
-    _report(section, found, cold, sizes, cycle)
+    report(section, found, cold, sizes, cycle)
     return section
 
 
-def _report(
+def report(
     section: Section,
     found: dict[str, Measured],
     cold: dict[str, Measured],
     sizes: dict[int, Measured],
     cycle: dict[str, float],
 ) -> None:
-    rows = []
-    for name, one in found.items():
-        frozen = cold.get(name)
-        rows.append(
+    """Add the tables, the picture and the ratios."""
+    rows = [
+        [
+            name,
+            _duration(one),
+            f"{median(one.cpu_ms):.2f} ms" if one.cpu_ms else NOT_MEASURED,
+            _cold_text(cold[name]) if name in cold else NOT_MEASURED,
+            _THESIS.get(name, NOT_MEASURED),
+        ]
+        for name, one in found.items()
+    ]
+    node = f"{cycle['p50']:.4f} ms (p95 {cycle['p95']:.4f})"
+    rows.append(["robot's node, a cycle", node, "", "", f"{thesis.NODE_CYCLE_MS} ms"])
+    head = ["function", "duration, warm: median (p95, p99)", "processor time", "cold", "thesis, 2018"]
+    section.table("An invocation", head, rows)
+    if sizes:
+        section.table(
+            "Lambda 1 by memory size",
+            ["memory", "duration, warm", "thesis, 2018"],
             [
-                name,
-                _duration(one),
-                f"{median(one.cpu_ms):.2f} ms" if one.cpu_ms else NOT_MEASURED,
-                _cold_text(frozen) if frozen else NOT_MEASURED,
-                _THESIS.get(name, NOT_MEASURED),
-            ]
+                [f"{mb} MB", _duration(one), thesis.LAMBDA_1.get(mb, NOT_MEASURED)]
+                for mb, one in sizes.items()
+            ],
         )
-    rows.append(["robot's node, a cycle", f"{cycle['p50']:.4f} ms (p95 {cycle['p95']:.4f})", "", "", _NODE])
-    section.tables.append(
-        Table(
-            "An invocation",
-            ["function", "duration, warm: median (p95, p99)", "processor time", "cold", "thesis, 2018"],
-            rows,
-        )
-    )
-    projected = _projected(found)
-    if not sizes:
-        section.tables.append(
-            Table(
-                "Projection, not a measurement: processor time by the share of a vCPU of each memory size",
-                ["function", *(f"{size} MB" for size in SIZES_MB)],
-                [[name, *(f"{ms:.1f} ms" for ms in values)] for name, values in projected.items()],
-            )
+    else:
+        section.table(
+            "Projection, not a measurement: processor time by the share of a vCPU of each memory size",
+            ["function", *(f"{size} MB" for size in SIZES_MB)],
+            [[name, *(f"{ms:.1f} ms" for ms in values)] for name, values in _projected(found).items()],
         )
         section.notes.append(
             f"On the embedded cloud the memory size changes nothing. The projection is processor time x "
             f"{ONE_VCPU_MB} MB / memory, by AWS' word that {ONE_VCPU_MB} MB have one vCPU; waiting for "
             "DynamoDB or PubNub is not in it, and this machine's core is not AWS'."
         )
-    else:
-        section.tables.append(
-            Table(
-                "Lambda 1 by memory size",
-                ["memory", "duration, warm", "thesis, 2018"],
-                [
-                    [f"{mb} MB", _duration(one), thesis.LAMBDA_1.get(mb, NOT_MEASURED)]
-                    for mb, one in sizes.items()
-                ],
-            )
-        )
-    _ratios(section, found, cycle)
-    figures = {name: median(one.cpu_ms) for name, one in found.items() if one.cpu_ms}
-    if figures:
-        title = "Processor time an invocation, warm"
-        section.plots.append(Plot("utilisation", title, plots.bars(title, figures, unit="ms")))
-    section.raw = {
-        "warm": {name: asdict(one) for name, one in found.items()},
-        "cold": {name: asdict(one) for name, one in cold.items()},
-        "memory": {str(mb): asdict(one) for mb, one in sizes.items()},
-        "cycle_ms": cycle,
-    }
-
-
-def _ratios(section: Section, found: dict[str, Measured], cycle: dict[str, float]) -> None:
     empty_ms = found[_EMPTY].cpu_ms
     for name, spent_ms, shared_by, most_ms in (
         ("Lambda 1 warm, processor time beyond an empty function", found[_LIVE].cpu_ms, 1, 3.0),
@@ -159,12 +132,18 @@ def _ratios(section: Section, found: dict[str, Measured], cycle: dict[str, float
     ):
         if spent_ms and empty_ms:
             beyond_ms = median(a - b for a, b in zip(spent_ms, empty_ms, strict=True)) / shared_by
-            section.ratios.append(
-                Ratio(name, round(beyond_ms, 3), most_ms, "ms", tolerance=1.6, by_machine=True)
-            )
-    section.ratios.append(
-        Ratio("node's cycle / thesis' 2 ms", round(cycle["p50"] / 2, 5), 0.05, tolerance=3, by_machine=True)
-    )
+            settings = {"unit": "ms", "tolerance": 1.6, "by_machine": True}
+            section.ratio(name, round(beyond_ms, 3), most_ms, **settings)
+    cycles = round(cycle["p50"] / thesis.NODE_CYCLE_MS, 5)
+    section.ratio("node's cycle / thesis' 2 ms", cycles, 0.05, tolerance=3, by_machine=True)
+    if figures := {name: median(one.cpu_ms) for name, one in found.items() if one.cpu_ms}:
+        section.plot("utilisation", "Processor time an invocation, warm", plots.bars(figures, unit="ms"))
+    section.raw = {
+        "warm": {name: asdict(one) for name, one in found.items()},
+        "cold": {name: asdict(one) for name, one in cold.items()},
+        "memory": {str(mb): asdict(one) for mb, one in sizes.items()},
+        "cycle_ms": cycle,
+    }
 
 
 def _projected(found: dict[str, Measured]) -> dict[str, list[float]]:
@@ -220,19 +199,6 @@ def _cold(target: Target, function: str, event: Event, say: Say) -> Measured:
     finally:
         configure(client, function, Environment={"Variables": was})
     return found
-
-
-def _store(target: Target, say: Say) -> list[dict[str, Any]]:
-    """Store a drive of 100 s, wait until Lambda 2 has summarised it, and return its items."""
-    say("storing a drive")
-    robot = target.name(ROBOT)
-    items = stored_drive.store(target, robot, stored_drive.simulated(BATCHES * stored_drive.RATE_HZ))
-    deadline = time.monotonic() + _CATCH_UP_S
-    while delivery.samples_summarized(target.cloud, robot, VESC_STREAM) < BATCHES * stored_drive.RATE_HZ:
-        if time.monotonic() > deadline:
-            raise BenchError("Lambda 2 has not summarised what was stored")
-        threading.Event().wait(0.2)
-    return items
 
 
 def _stream_event(items: list[dict[str, Any]]) -> dict[str, Any]:

@@ -1,1 +1,1 @@
-"""The agent that runs on the robot: sources -> batches -> spool -> AWS IoT, and the live lane beside."""
+"""The agent that runs on the robot: from sources over batches and the spool to AWS IoT, and the live lane."""

@@ -1,124 +1,112 @@
-"""Composes the agent: builds its parts around one uplink and hands them to the runtime."""
+"""Builds the agent's parts around one connection, and connects them. `iort_agent.runtime` runs them."""
 
 from __future__ import annotations
 
 import uuid
-from typing import Any
 
-from iort_agent.account import Accounts
 from iort_agent.clock import Clock
-from iort_agent.config.file import Config
+from iort_agent.common.logs import Troubles, set_level
+from iort_agent.common.version import agent_version
+from iort_agent.config import Config
 from iort_agent.control.downlink import make_downlink
-from iort_agent.control.runtime_settings import Tuning, configured
-from iort_agent.control.shadow import Remote
-from iort_agent.files.folder import make_uploads
-from iort_agent.lanes.attachment import make_claims
-from iort_agent.lanes.clock_offset import ClockOffset
+from iort_agent.control.shadow import Shadow
+from iort_agent.files.uploads import make_uploads
+from iort_agent.lanes.attachment import make_attachments
+from iort_agent.lanes.clock_offset import OffsetEstimator
+from iort_agent.lanes.config import RuntimeSettings
 from iort_agent.lanes.live import LiveLane
 from iort_agent.lanes.pings import Pings
 from iort_agent.lanes.record import RecordLane
-from iort_agent.logs import Troubles, set_level
-from iort_agent.metrics import AgentMetrics, Rates
-from iort_agent.mqtt.uplink import Uplink
-from iort_agent.rate_limiter import Allowance
-from iort_agent.runtime import Parts, Runtime
+from iort_agent.lanes.streams import Streams
+from iort_agent.mqtt.rate_limiter import RateLimiter
+from iort_agent.mqtt.uplink import Link, Uplink
 from iort_agent.sources.run import SourceRun
 from iort_agent.spool.interface import Spool
-from iort_agent.streams import Streams
-from iort_agent.version import agent_version
+from iort_agent.status.account import Accounts
+from iort_agent.status.metrics import AgentMetrics, Rates
 
 
-def make_agent(
-    config: Config, *, uplink: Uplink, spool: Spool, clock: Clock, troubles: Troubles | None = None
-) -> Runtime:
-    """The agent of a configuration, ready to run once."""
-    boot, began = uuid.uuid4().hex[:16], clock.monotonic()
-    limiter = Allowance(clock)
-    names = {"robot": config.robot, "namespace": config.namespace}
-    shared: dict[str, Any] = {**names, "uplink": uplink, "clock": clock, "allowance": limiter}
-    base = configured(record=config.record, live=config.live, ping=config.ping, log_level=config.log_level)
+class Agent:
+    """The parts of one run."""
 
-    record = RecordLane(spool=spool, **shared)
-    offset = ClockOffset(clock)
-    live = LiveLane(boot=boot, rate_hz=config.live.rate_hz, offset_us=offset.known_us, **shared)
-    streams = Streams(
-        boot=boot, batch_s=config.record.batch_s, tuning=base, live=live, spool=spool, clock=clock
-    )
-    pings = Pings(
-        paths=config.ping.paths,
-        rate_hz=config.ping.rate_hz,
-        padding_bytes=config.ping.padding_bytes,
-        emit=streams.record,
-        on_stamp=offset.add,
-        **shared,
-    )
-
-    def tune(tuning: Tuning) -> None:
-        if tuning.log_level != streams.tuning.log_level:
-            set_level(tuning.log_level)
-        live.enabled = tuning.live_enabled
-        live.set_rate(tuning.live_rate_hz)
-        pings.set_rate(tuning.ping_rate_hz)
-        streams.tune(tuning)
-
-    shadow = Remote(
-        robot=config.robot,
-        base=base,
-        apply=tune,
-        known_fields=streams.known_fields,
-        version=agent_version(),
-        uplink=uplink,
-        clock=clock,
-        allowance=limiter,
-    )
-    downlink = make_downlink(
-        config.downlink,
-        config.share,
-        sources=config.sources,
-        boot=boot,
-        offset=offset.known,
-        answer=shadow.answer,
-        **shared,
-    )
-    uploads = make_uploads(config.files, root_ca=config.root_ca, **shared)
-    attachments = make_claims(config.files, robot=config.robot, clock=clock, uploads=uploads)
-    sources = [SourceRun(source, clock) for source in config.sources]
-    accounts = Accounts(
-        clock=clock,
-        spool=spool,
-        streams=[stream for source in sources for stream in source.streams],
-        counts=streams.counts,
-        refused=streams.refused,
-        reports=[
-            # Two sources may have the same description.
-            *((f"{i}: {source.description}", source.report) for i, source in enumerate(sources)),
-            *([("contents", attachments.report)] if attachments is not None else []),
-        ],
-        emit=streams.record,
-    )
-    tune(base)
-    return Runtime(
-        Parts(
-            config=config,
-            boot=boot,
-            began=began,
-            clock=clock,
-            uplink=uplink,
-            spool=spool,
-            streams=streams,
-            record=record,
-            live=live,
-            pings=pings,
-            offset=offset,
-            shadow=shadow,
-            tune=tune,
-            sources=sources,
-            accounts=accounts,
-            metrics=AgentMetrics(clock=clock, spool=spool, uplink=uplink, offset=offset, uploads=uploads),
-            rates=Rates(clock),
-            downlink=downlink,
-            uploads=uploads,
-            attachments=attachments,
-            troubles=troubles,
+    def __init__(
+        self, config: Config, *, uplink: Uplink, spool: Spool, clock: Clock, troubles: Troubles | None = None
+    ) -> None:
+        self.config, self.uplink, self.spool, self.clock = config, uplink, spool, clock
+        self.troubles = troubles
+        self.boot, self.began = uuid.uuid4().hex[:16], clock.monotonic()
+        link = Link(config.robot, config.namespace, uplink, clock, RateLimiter(clock))
+        base = RuntimeSettings(
+            record_enabled=config.record.enabled,
+            live_enabled=config.live.enabled,
+            live_rate_hz=config.live.rate_hz,
+            ping_rate_hz=config.ping.rate_hz,
+            log_level=config.log_level,
         )
-    )
+        self.record = RecordLane(
+            robot=config.robot,
+            namespace=config.namespace,
+            spool=spool,
+            uplink=uplink,
+            clock=clock,
+            rate_limiter=link.rate_limiter,
+        )
+        self.offset = OffsetEstimator(clock)
+        self.live = LiveLane(
+            link, boot=self.boot, rate_hz=config.live.rate_hz, offset_us=self.offset.known_us
+        )
+        self.streams = Streams(
+            boot=self.boot,
+            batch_s=config.record.batch_s,
+            settings=base,
+            live=self.live,
+            spool=spool,
+            clock=clock,
+        )
+        self.pings = Pings(link, config.ping, emit=self.streams.record, on_stamp=self.offset.add)
+        self.shadow = Shadow(
+            link,
+            base=base,
+            apply=self.apply,
+            known_fields=self.streams.known_fields,
+            version=agent_version(),
+        )
+        self.downlink = make_downlink(
+            config.downlink,
+            config.share,
+            link=link,
+            boot=self.boot,
+            sources=config.sources,
+            offset=self.offset.known,
+            answer=self.shadow.answer,
+        )
+        self.uploads = make_uploads(config.files, link, root_ca=config.root_ca)
+        self.attachments = make_attachments(
+            config.files, robot=config.robot, clock=clock, uploads=self.uploads
+        )
+        self.sources = [SourceRun(source, clock) for source in config.sources]
+        self.accounts = Accounts(
+            clock=clock,
+            spool=spool,
+            streams=self.streams,
+            expected=[stream for source in self.sources for stream in source.streams],
+            reports=[
+                # With a number, because two sources may have the same description.
+                *((f"{i}: {source.description}", source.report) for i, source in enumerate(self.sources)),
+                *([("contents", self.attachments.report)] if self.attachments is not None else []),
+            ],
+        )
+        self.metrics = AgentMetrics(
+            clock=clock, spool=spool, uplink=uplink, offset=self.offset, uploads=self.uploads
+        )
+        self.rates = Rates(clock)
+        self.apply(base)
+
+    def apply(self, settings: RuntimeSettings) -> None:
+        """Apply other settings to all parts, at once and from any thread."""
+        if settings.log_level != self.streams.settings.log_level:
+            set_level(settings.log_level)
+        self.live.enabled = settings.live_enabled
+        self.live.set_rate(settings.live_rate_hz)
+        self.pings.set_rate(settings.ping_rate_hz)
+        self.streams.apply(settings)

@@ -14,32 +14,32 @@ import time
 from pathlib import Path
 from typing import Any, Callable, Sequence
 
-from iort_agent.agent import make_agent
+from iort_agent.agent import Agent
 from iort_agent.clock import SystemClock
-from iort_agent.config.file import Config, load_config
+from iort_agent.common.logs import LOG_LEVELS, neutral, set_up
+from iort_agent.common.state import document
+from iort_agent.common.version import agent_version
+from iort_agent.config import Config, load_config
 from iort_agent.errors import AgentError, ConfigError
-from iort_agent.logs import LOG_LEVELS, neutral, set_up
 from iort_agent.reporting import make_report, make_status
 from iort_agent.runtime import Runtime
 from iort_agent.spool.sqlite import make_spool
 from iort_agent.status.server import SOCKET, StatusServer, ask, fetch
-from iort_agent.status.state import document
 from iort_agent.status.text import render as render_status
-from iort_agent.version import agent_version
 
 _log = logging.getLogger("iort-agent")
 
-# A terminal signals the whole group and a supervisor passes it on: that is one wish, not two.
+# A terminal signals the whole process group, and a supervisor passes it on: the two count as one.
 _SAME_SIGNAL_S = 1.0
-# ROS' NAME:=VALUE, which roslaunch adds to every command; those of one underscore are parameters.
+# ROS' NAME:=VALUE, which roslaunch adds to every command. A name with one underscore is a parameter.
 _REMAPPING = re.compile(r"(?:~|/|[A-Za-z]|__?)[\w/]*:=(?!.*:=).*", re.ASCII)
 _PARAMETER = re.compile(r"_[^_]")
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Run a command; the exit status: 0 good, 1 something failed or was lost, 2 wrong use."""
+    """Run a command. Returns the exit status: 0 good, 1 something failed or was lost, 2 wrong use."""
     options = _parse(list(sys.argv[1:] if arguments is None else arguments))
-    # Whatever a command writes is its user's alone; who else is to read it is given the right to.
+    # Only the user may read what a command writes, until the user allows more.
     before = os.umask(0o077)
     try:
         status: int = options.command(options)
@@ -50,7 +50,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     except BrokenPipeError:
         if options.command is run:
             raise
-        # Whoever read our output has seen enough. Python would complain at its end, when it flushes.
+        # The reader of our output has closed it. Otherwise Python would complain when it flushes at the end.
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return 1
     except AgentError as error:
@@ -81,9 +81,9 @@ def _parse(arguments: list[str]) -> argparse.Namespace:
         return added
 
     running = command("run", run, "run the agent until its sources end or a signal comes")
-    running.add_argument("--check-config", action="store_true", help="read the file, say whether it is good")
+    running.add_argument("--check-config", action="store_true", help="check the file and exit")
     running.add_argument(
-        "--report", type=Path, metavar="FILE", help="write what became of it as JSON at the end"
+        "--report", type=Path, metavar="FILE", help="write a report of the run as JSON at the end"
     )
     running.add_argument(
         "--drain-s",
@@ -93,10 +93,10 @@ def _parse(arguments: list[str]) -> argparse.Namespace:
         help="how long to wait at the end until everything is delivered (default 10)",
     )
     running.add_argument("--log-level", choices=LOG_LEVELS, help="instead of the file's log_level")
-    checking = command("check", check, "say what would not work, and what to do about it")
+    checking = command("check", check, "check everything that the file names, and say what to do")
     checking.add_argument("--json", action="store_true", help="as JSON")
-    uploading = command("upload", upload, "upload files, and say under which keys they are kept")
-    uploading.add_argument("files", type=Path, nargs="+", metavar="FILE", help="what to upload")
+    uploading = command("upload", upload, "upload files, and print their keys")
+    uploading.add_argument("files", type=Path, nargs="+", metavar="FILE", help="a file to upload")
     uploading.add_argument("--json", action="store_true", help="as JSON")
     status = command("status", show_status, "show what the running agent does")
     status.add_argument("--json", action="store_true", help="as JSON")
@@ -108,7 +108,7 @@ def _parse(arguments: list[str]) -> argparse.Namespace:
         arguments = ["run", *arguments]
     remappings = []
     if arguments and arguments[0] == "run":
-        # The ROS node reads them where every ROS node does, in sys.argv.
+        # The ROS node reads them from sys.argv, as every ROS node does.
         remappings = [argument for argument in arguments if _REMAPPING.fullmatch(argument)]
         arguments = [argument for argument in arguments if argument not in remappings]
     options = parser.parse_args(arguments)
@@ -119,7 +119,7 @@ def _parse(arguments: list[str]) -> argparse.Namespace:
 def _seconds(value: str) -> float:
     seconds = float(value)
     if not 0 <= seconds <= 86_400:
-        raise argparse.ArgumentTypeError(f"{value}: allowed is 0 to 86400")
+        raise argparse.ArgumentTypeError(f"must be 0 to 86400, got {value}")
     return seconds
 
 
@@ -142,17 +142,18 @@ def run(options: argparse.Namespace) -> int:
     uplink = make_uplink(config, clock)
     spool = make_spool(config.queue, clock)
     try:
-        agent = make_agent(config, uplink=uplink, spool=spool, clock=clock, troubles=troubles)
-        server = StatusServer(_socket(options, config), lambda: document(make_status(agent.parts)))
+        agent = Agent(config, uplink=uplink, spool=spool, clock=clock, troubles=troubles)
+        server = StatusServer(_socket(options, config), lambda: document(make_status(agent)))
         server.start()
-        _end_on_signals(agent)
+        runtime = Runtime(agent)
+        _end_on_signals(runtime)
         try:
-            status = agent.run(drain_s=options.drain_s)
+            status = runtime.run(drain_s=options.drain_s)
         finally:
             server.stop()
     finally:
         spool.close()
-    report = make_report(agent.parts)
+    report = make_report(agent)
     if options.report is not None:
         options.report.write_text(json.dumps(document(report), indent=2) + "\n", encoding="utf-8")
     samples = sum(counts.samples for counts in report.streams.values())
@@ -228,8 +229,8 @@ def _socket(options: argparse.Namespace, config: Config) -> Path:
     return config.status_socket or file.absolute().parent / SOCKET
 
 
-def _end_on_signals(agent: Runtime) -> None:
-    """The first signal ends the agent in good order, a second one at once."""
+def _end_on_signals(runtime: Runtime) -> None:
+    """The first signal ends the agent in good order, the second one at once."""
     first: float | None = None
 
     def on_signal(number: int, _frame: Any) -> None:
@@ -239,8 +240,8 @@ def _end_on_signals(agent: Runtime) -> None:
             first = now
         elif now - first > _SAME_SIGNAL_S:
             os._exit(128 + number)
-        # No logging here: the signal may have interrupted it, and its lock is not ours to wait for.
-        agent.stop()
+        # No logging here: the signal may have interrupted it, and then its lock is never released.
+        runtime.stop()
 
     for number in (signal.SIGINT, signal.SIGTERM):
         signal.signal(number, on_signal)

@@ -1,4 +1,4 @@
-"""Time, injected wherever it matters, so that tests need not sleep."""
+"""Time, as a seam: tests pass a clock that needs no sleep."""
 
 from __future__ import annotations
 
@@ -8,13 +8,13 @@ from typing import Protocol
 
 
 class Clock(Protocol):
-    """Wall time, monotonic time and waiting, which belong together in a test."""
+    """Wall time, monotonic time and waiting; a test needs all three from one clock."""
 
     def now_us(self) -> int:
         """Wall time in microseconds since the Unix epoch; may jump."""
 
     def monotonic(self) -> float:
-        """Seconds that never jump, from an arbitrary start."""
+        """Seconds from an arbitrary start; never jumps."""
 
     def wait(self, event: threading.Event, seconds: float | None) -> bool:
         """Wait until the event is set or the seconds have passed; whether it is set."""
@@ -24,19 +24,16 @@ class SystemClock:
     """The machine's own clock."""
 
     def now_us(self) -> int:
-        """Wall time in microseconds since the Unix epoch."""
         return time.time_ns() // 1000
 
-    # Seconds of the monotonic clock, which every thread shares.
     monotonic = staticmethod(time.monotonic)
 
     def wait(self, event: threading.Event, seconds: float | None) -> bool:
-        """Wait in real time."""
         return event.wait(seconds)
 
 
 class Pace:
-    """Absolute deadlines, ``period_s`` apart, so that small delays do not add up to a drift."""
+    """Deadlines counted from one start, so that small delays do not add up."""
 
     def __init__(self, clock: Clock, stop: threading.Event) -> None:
         self._clock = clock
@@ -44,7 +41,7 @@ class Pace:
         self._start = clock.monotonic()
 
     def until(self, offset_s: float) -> bool:
-        """Wait until ``offset_s`` after the start; False when asked to stop. Late is not made up for."""
+        """Wait until ``offset_s`` after the start. False if ``stop`` is set. A late call returns at once."""
         remaining = self._start + offset_s - self._clock.monotonic()
         if remaining <= 0:
             return not self._stop.is_set()

@@ -1,14 +1,4 @@
-"""Every error of the agent. Errors of libraries are wrapped at the adapter, `from` their cause.
-
-AgentError
-ConfigError    the configuration file says something it may not
-SourceError    a source cannot give samples (a bag unreadable, a type unknown)
-UplinkError    the broker cannot be reached, or refused a message
-IdentityError  certificate or key cannot be read, do not belong together, or cannot be had
- RefusedError  AWS IoT refuses to issue or register a certificate
-UploadError    a file cannot be uploaded
-NotRunningError no agent answers on the status socket
-"""
+"""Every error of the agent. The rooms wrap errors of libraries, `from` their cause."""
 
 from __future__ import annotations
 
@@ -18,7 +8,7 @@ class AgentError(Exception):
 
 
 class ConfigError(AgentError):
-    """A mistake in the configuration; the text names file, key, what was found and what is allowed."""
+    """A mistake in the configuration; the text names file, key, value and what is allowed."""
 
 
 class NotRunningError(AgentError):
@@ -26,19 +16,19 @@ class NotRunningError(AgentError):
 
 
 class SourceError(AgentError):
-    """A source cannot give samples, or no more of them."""
+    """A source cannot give samples, or cannot give more of them."""
 
 
 class UplinkError(AgentError):
-    """The connection, a publish or a subscription failed; the text has the broker's own words."""
+    """The connection, a publish or a subscription failed; the text quotes the broker."""
 
 
 class IdentityError(AgentError):
-    """Certificate or key cannot be used or obtained; the text says which file, or who refused."""
+    """Certificate or key cannot be used or obtained; the text names the file, or who refused."""
 
 
 class RefusedError(IdentityError):
-    """AWS IoT refused to issue or register a certificate; ``code`` is its own."""
+    """AWS IoT refused to issue or register a certificate; ``code`` is AWS' error code."""
 
     def __init__(self, text: str, code: str) -> None:
         super().__init__(text)
@@ -46,9 +36,9 @@ class RefusedError(IdentityError):
 
 
 class UploadError(AgentError):
-    """A file cannot be uploaded; the text says which, and what the cloud or the file system said.
+    """A file cannot be uploaded; the text names the file and quotes the cloud or the file system.
 
-    ``again_s`` is after how many seconds it is worth another try; None: never, as it is.
+    The upload is worth another try after ``again_s`` seconds. None: only after the file has changed.
     """
 
     def __init__(self, text: str, *, again_s: float | None) -> None:

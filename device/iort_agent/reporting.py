@@ -2,127 +2,112 @@
 
 from __future__ import annotations
 
+import dataclasses
 import os
 from typing import Any
 
-from iort_agent.runtime import Parts
-from iort_agent.status.state import (
-    ClockOffset,
-    Connection,
+from iort_agent.agent import Agent
+from iort_agent.common.state import (
     Files,
     Lanes,
     LiveLane,
     LiveReport,
-    OverShare,
     PingLane,
     Queue,
     QueueReport,
     RecordLane,
     Report,
-    RoundTrips,
     Status,
     StreamReport,
     StreamState,
-    read,
 )
 
 
-def make_status(parts: Parts) -> Status:
+def make_status(agent: Agent) -> Status:
     """The agent now."""
-    config, tuning, over_share = parts.config, parts.streams.tuning, parts.shadow.over_share
-    link, backlog, dropped = parts.uplink.status(), parts.spool.backlog(), parts.spool.dropped()
-    offset = parts.offset.estimate()
+    settings, live = agent.streams.settings, agent.live
+    backlog, dropped = agent.spool.backlog(), agent.spool.dropped()
     return Status(
-        robot=config.robot,
-        boot=parts.boot,
+        robot=agent.config.robot,
+        boot=agent.boot,
         pid=os.getpid(),
-        uptime_s=round(parts.clock.monotonic() - parts.began, 1),
-        connection=Connection(*link, endpoint=f"{config.endpoint}:{config.port}"),
+        uptime_s=round(agent.clock.monotonic() - agent.began, 1),
+        connection=agent.uplink.status(),
         lanes=Lanes(
-            record=RecordLane(tuning.record_enabled),
+            record=RecordLane(settings.record_enabled),
             live=LiveLane(
-                enabled=tuning.live_enabled,
-                rate_hz=tuning.live_rate_hz,
-                effective_hz=parts.live.tempo.effective_hz,
-                slowed=parts.live.tempo.slowed,
-                published=parts.live.published,
-                refused=parts.live.refused,
+                enabled=settings.live_enabled,
+                rate_hz=settings.live_rate_hz,
+                effective_hz=live.tempo.effective_hz,
+                slowed=live.tempo.slowed,
+                published=live.published,
+                refused=live.refused,
             ),
-            ping=PingLane(tuning.ping_rate_hz, parts.pings.held_back),
+            ping=PingLane(settings.ping_rate_hz, agent.pings.held_back),
         ),
-        sources=_sources(parts),
-        streams=_streams(parts),
+        sources=_sources(agent),
+        streams=_streams(agent),
         spool=Queue(*backlog, dropped_batches=dropped.batches, dropped_samples=dropped.samples),
-        files=_files(parts),
-        clock=ClockOffset(*offset) if offset is not None else None,
-        pings=_pings(parts),
-        over_share=read(OverShare, over_share) if over_share is not None else None,
-        alarms=_alarms(parts),
-        troubles=parts.troubles.last() if parts.troubles is not None else [],
+        files=_files(agent),
+        clock=agent.offset.estimate(),
+        pings=agent.pings.report(),
+        over_share=agent.shadow.over_share,
+        alarms=_alarms(agent),
+        troubles=agent.troubles.last() if agent.troubles is not None else [],
     )
 
 
-def make_report(parts: Parts) -> Report:
+def make_report(agent: Agent) -> Report:
     """The whole run, at its end."""
-    left, dropped = parts.spool.backlog(), parts.spool.dropped()
+    left, dropped = agent.spool.backlog(), agent.spool.dropped()
     return Report(
-        robot=parts.config.robot,
-        boot=parts.boot,
+        robot=agent.config.robot,
+        boot=agent.boot,
         streams={
-            name: StreamReport(**vars(counts)) for name, counts in sorted(parts.streams.counts().items())
+            name: StreamReport(**vars(counts)) for name, counts in sorted(agent.streams.counts().items())
         },
-        live_published=parts.live.published,
-        live_refused=parts.live.refused,
-        live=LiveReport(*parts.live.tempo, streams_hz=parts.live.rates_hz()),
+        live_published=agent.live.published,
+        live_refused=agent.live.refused,
+        live=LiveReport(*agent.live.tempo, streams_hz=agent.live.rates_hz()),
         spool=QueueReport(left.batches, left.samples, dropped.batches, dropped.samples),
-        pings=_pings(parts) if parts.streams.tuning.ping_rate_hz else {},
-        failed_sources=[source.description for source in parts.sources if source.failed],
-        sources=_sources(parts),
-        downlink=parts.downlink.report() if parts.downlink is not None else None,
-        files=_files(parts),
+        pings=agent.pings.report() if agent.streams.settings.ping_rate_hz else {},
+        failed_sources=[source.description for source in agent.sources if source.failed],
+        sources=_sources(agent),
+        downlink=agent.downlink.report() if agent.downlink is not None else None,
+        files=_files(agent),
     )
 
 
-def _streams(parts: Parts) -> dict[str, StreamState]:
-    live_hz, fields = parts.live.rates_hz(), parts.streams.tuning.fields
+def _streams(agent: Agent) -> dict[str, StreamState]:
+    live_hz, fields = agent.live.rates_hz(), agent.streams.settings.fields
     return {
         name: StreamState(
             **vars(counts),
-            per_s=parts.rates.per_s.get(name, 0.0),
+            per_s=agent.rates.per_s.get(name, 0.0),
             live_hz=live_hz.get(name, 0.0),
-            silent_s=parts.rates.silent_s(name),
+            silent_s=agent.rates.silent_s(name),
             fields=list(fields.get(name, ())),
         )
-        for name, counts in sorted(parts.streams.counts().items())
+        for name, counts in sorted(agent.streams.counts().items())
     }
 
 
-def _sources(parts: Parts) -> list[dict[str, Any]]:
-    return [{"source": source.description, **source.report()} for source in parts.sources]
+def _sources(agent: Agent) -> list[dict[str, Any]]:
+    return [{"source": source.description, **source.report()} for source in agent.sources]
 
 
-def _pings(parts: Parts) -> dict[str, RoundTrips]:
-    return {path: RoundTrips(*trips) for path, trips in parts.pings.report().items()}
-
-
-def _files(parts: Parts) -> Files | None:
-    if parts.uploads is None:
+def _files(agent: Agent) -> Files | None:
+    if agent.uploads is None:
         return None
-    current = parts.uploads.current()
-    return Files(
-        *parts.uploads.counts(),
-        current=current.name,
-        current_bytes=current.sent_bytes,
-        last_error=current.last_error,
-        large=parts.attachments.report() if parts.attachments is not None else None,
-    )
+    large = agent.attachments.report() if agent.attachments is not None else None
+    return dataclasses.replace(agent.uploads.status(), large=large)
 
 
-def _alarms(parts: Parts) -> list[str]:
-    alarms = [alarm for alarm in (parts.spool.alarm, parts.record.alarm) if alarm]
-    alarms += [f"source failed: {source.description}" for source in parts.sources if source.failed]
-    waits = [source.waits() for source in parts.sources]
-    if parts.downlink is not None:
-        waits.append(parts.downlink.waits())
-    # Each once: sources and commands may share a ROS node.
+def _alarms(agent: Agent) -> list[str]:
+    alarms = [alarm for alarm in (agent.spool.alarm, agent.record.alarm) if alarm]
+    alarms += [f"source failed: {source.description}" for source in agent.sources if source.failed]
+    waits = [source.waits() for source in agent.sources]
+    if agent.downlink is not None:
+        waits.append(agent.downlink.waits())
+    # Without repetitions: sources and commands may share a ROS node.
     return alarms + [f"source waits: {why}" for why in dict.fromkeys(waits) if why]

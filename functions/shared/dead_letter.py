@@ -30,14 +30,14 @@ class Refused(NamedTuple):
     image: Mapping[str, Any]
 
 
-class Refusals:
+class DeadLetterQueue:
     """Sends refused records to the quarantine's queue; ``client`` is a boto3 SQS client."""
 
     def __init__(self, client: Any, *, queue_url: str) -> None:
         self._client, self._queue_url = client, queue_url
 
     @classmethod
-    def at_once(cls, queue_url: str) -> Refusals:
+    def at_once(cls, queue_url: str) -> DeadLetterQueue:
         """With a client that gives up quickly: if a function fails, Lambda sends the event to the queue
         itself."""
         config = Config(connect_timeout=2, read_timeout=5, retries={"total_max_attempts": 1})

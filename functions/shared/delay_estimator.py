@@ -19,7 +19,7 @@ class _Run:
     fastest_before_us: int
 
 
-class Legs:
+class DelayEstimator:
     """Compares each message with the fastest of its run in the last 15 to 30 s.
 
     Both contain the difference between the car's clock and the cloud's, so it cancels out. It misses a delay

@@ -16,7 +16,7 @@ from typing import Any
 import boto3
 from botocore.config import Config
 
-from functions.shared.dead_letter import Refusals, Refused
+from functions.shared.dead_letter import DeadLetterQueue, Refused
 from functions.shared.decoded import Decoded, decode_records
 from functions.shared.health import measure, together
 from functions.shared.metrics import emit
@@ -213,8 +213,8 @@ def stored_tables() -> Tables:
 
 
 @cache
-def _refusals() -> Refusals:
-    return Refusals(boto3.client("sqs"), queue_url=os.environ["REJECTED_QUEUE"])
+def _refusals() -> DeadLetterQueue:
+    return DeadLetterQueue(boto3.client("sqs"), queue_url=os.environ["REJECTED_QUEUE"])
 
 
 def processed(

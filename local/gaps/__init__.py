@@ -1,7 +1,7 @@
-"""The differences between ministack and AWS that this project depends on, one file each.
+"""The differences between ministack and AWS for which no small patch exists (local/patches/), one file each.
 
-A gap's docstring says what AWS does, what ministack does instead, which test shows it, and where the patch
-for ministack is. `install` closes the gap in this process. `is_open` tells whether the imported ministack
+A gap's docstring says what AWS does, what ministack does instead, which test shows it, and why it has no
+patch. `install` closes the gap in this process. `is_open` tells whether the imported ministack
 still has it, so that tests/local/test_gaps.py fails when a new release needs a gap no more. The code wraps
 private functions of ministack, which is pinned. It uses the contract, and nothing else of this project.
 """
@@ -13,29 +13,13 @@ from typing import Protocol, cast
 
 # In the order of their installation: a later wrapper is around an earlier one.
 NAMES = (
-    "rules.republish_topic",
-    "rules.sql_floor",
-    "rules.unreadable_payload",
-    "rules.sqs_action_tls",
-    "broker.message_size",
-    "broker.certificate_from_csr",
-    "broker.certificate_status",
-    "broker.delete_connection",
     "broker.client_certificate",
-    "broker.bind_address",
-    "broker.client_hello",
-    "broker.connect_timeout",
     "broker.https_port",
-    "access.send_message_batch",
-    "access.stream_arn",
-    "access.shadow_arn",
     "functions.async_invocations",
     "functions.stream_retries",
     "functions.log_end",
-    "functions.log_levels",
     "storage.query_time",
     "storage.number_checks",
-    "storage.queue_lock",
     "metrics.embedded_metrics",
     "metrics.lambda_metrics",
     "metrics.iot_metrics",

@@ -1,4 +1,4 @@
-"""A source in a thread of its own, and what it has given."""
+"""A source in a thread of its own, and its samples."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from iort_contract.catalog.streams import TYPES_STREAM
 
 
 class Running:
-    """Runs a source while it is entered."""
+    """Runs a source within a `with`."""
 
     def __init__(self, config: Any) -> None:
         self.source = config.build(SystemClock())
@@ -36,7 +36,7 @@ class Running:
         assert self.failed is None
 
     def wait_for(self, count: int, *, more: bool = False) -> None:
-        """Wait until there are so many samples, or so many more than now."""
+        """Wait for a number of samples, in all or from now on."""
         with self._more:
             wanted = count + (len(self.samples) if more else 0)
             assert self._more.wait_for(lambda: len(self.samples) >= wanted, 60), len(self.samples)
@@ -57,7 +57,7 @@ class Running:
 
 
 def eventually(condition: Callable[[], Any]) -> None:
-    """For what nobody tells of."""
+    """Poll a condition that has no event."""
     deadline = time.monotonic() + 60
     while not condition():
         assert time.monotonic() < deadline

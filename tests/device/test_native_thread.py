@@ -1,4 +1,4 @@
-"""The network's thread keeps Python's state: what one callback leaves there, the next one finds."""
+"""The network's thread keeps Python's state: a callback finds what an earlier one left."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from iort_agent.mqtt.native_thread import keep_state
 
 
 def _callbacks_find_their_state(at_the_first: Callable[[], None]) -> bool:
-    """Whether the second callback in a thread of AWS' client finds what the first left there."""
+    """Whether a callback in the thread of AWS' client finds what an earlier one left."""
     left = threading.local()
     found: queue.SimpleQueue[bool] = queue.SimpleQueue()
 
@@ -27,7 +27,7 @@ def _callbacks_find_their_state(at_the_first: Callable[[], None]) -> bool:
 
     with socket.socket() as closed:
         closed.bind(("127.0.0.1", 0))
-        # Bound but not listening: every attempt is refused at once.
+        # Bound but not listening: every connection is refused at once.
         group = io.EventLoopGroup(1)
         client = mqtt5.Client(
             mqtt5.ClientOptions(

@@ -1,4 +1,4 @@
-"""What the agent reads and writes in a folder where somebody else may put links, pipes and files too."""
+"""Reading and writing in a folder where others may put links, pipes and files."""
 
 from __future__ import annotations
 
@@ -12,11 +12,12 @@ from pathlib import PurePath
 import pytest
 
 from iort_agent.cli import main
+from iort_agent.common.private_files import make_private, open_below, write_below
 from iort_agent.errors import UploadError
+from iort_agent.files.config import FilesConfig
 from iort_agent.files.file import from_json, read, to_json
 from iort_agent.files.folder import STATE, Folder
-from iort_agent.lanes.attachment import ClaimCheck
-from iort_agent.private_files import make_private, open_below, write_below
+from iort_agent.lanes.attachment import Attachments
 from iort_agent.spool.file import SpoolFile
 from iort_agent.spool.interface import PROCESS
 from iort_agent.spool.sqlite import RETRY_S, SqliteSpool
@@ -26,10 +27,12 @@ from tests.unit.agent.test_agent import config_file
 
 SECRET = b"another's, and not for the bucket"
 
+LARGE = FilesConfig(large_every_s=0, large_max_mb=0.001)
+
 
 @pytest.fixture
 def secret(tmp_path):
-    """A file that links lead to; it is as it was at the end."""
+    """The target of the links; it must not change."""
     path = tmp_path / "elsewhere" / "secret"
     path.parent.mkdir()
     path.write_bytes(SECRET)
@@ -47,7 +50,7 @@ def folder(tmp_path):
 
 @pytest.fixture
 def open_umask():
-    """As a supervisor may start the agent."""
+    """The umask with which a supervisor may start the agent."""
     before = os.umask(0)
     yield
     os.umask(before)
@@ -61,7 +64,7 @@ def modes(folder):
     return {stat.S_IMODE(path.lstat().st_mode) for path in folder.rglob("*") if path.is_file()}
 
 
-def test_a_link_in_the_place_of_what_is_written_leads_nowhere(folder, secret):
+def test_a_link_in_place_of_a_written_file_is_replaced(folder, secret):
     for name in (STATE, f"{STATE}.tmp"):
         (folder / name).symlink_to(secret)
     (folder / "a.bag").write_bytes(b"1")
@@ -69,7 +72,7 @@ def test_a_link_in_the_place_of_what_is_written_leads_nowhere(folder, secret):
     name = files.next()
     files.uploaded(name, files.local(name, threading.Event()), "key")
     assert not (folder / STATE).is_symlink()
-    # It was kept, and is found again.
+    # The state was kept and is read again.
     assert watched(folder).next() is None
 
 
@@ -87,7 +90,7 @@ def test_a_file_that_became_a_link_is_neither_read_nor_sent(folder, secret):
     with pytest.raises(OSError, match="symbolic"):
         local.open()
     assert from_json(folder, name, saved) is None
-    # And one whose folder became a link.
+    # The same for a file whose folder became a link.
     path.unlink()
     path.parent.rmdir()
     path.parent.symlink_to(secret.parent)
@@ -98,7 +101,7 @@ def test_a_file_that_became_a_link_is_neither_read_nor_sent(folder, secret):
             open_below(folder, gone)
 
 
-def test_a_pipe_in_the_place_of_a_file_is_not_waited_for(folder):
+def test_a_pipe_in_place_of_a_file_does_not_block(folder):
     os.mkfifo(folder / "a.bag")
     os.mkfifo(folder / STATE)
     with pytest.raises(OSError, match="no regular file"):
@@ -124,18 +127,17 @@ def test_nothing_is_removed_through_a_link(folder, secret):
     assert secret.exists()
 
 
-def test_claims_are_written_where_they_belong(folder, secret):
+def test_attachments_are_written_only_below_their_folder(folder, secret):
     (folder / "camera").symlink_to(secret.parent)
-    claims = ClaimCheck(
-        robot="car", folder=folder, every_s=0, max_bytes=1000, clock=ManualClock(),
-        thumbnail=lambda _content, _type: None, stored=lambda: None,
-    )  # fmt: skip
-    assert set(claims.claim_fields("camera", 1, {"image": b"x"}).values()) == {None}
-    assert claims.claim_fields("lidar", 1, {"scan": b"x"})["scan.size"] == 1
-    assert claims.report()["left_out"] == 1
+    attachments = Attachments(
+        "car", folder, LARGE, ManualClock(), stored=lambda: None, thumbnail=lambda *_: None
+    )
+    assert set(attachments.attach_to_fields("camera", 1, {"image": b"x"}).values()) == {None}
+    assert attachments.attach_to_fields("lidar", 1, {"scan": b"x"})["scan.size"] == 1
+    assert attachments.report()["left_out"] == 1
 
 
-def test_what_is_written_is_its_owners_alone_whatever_the_umask(folder, open_umask):
+def test_only_the_owner_may_read_written_files_with_any_umask(folder, open_umask):
     clock = ManualClock()
     spool = SqliteSpool(folder / "queue.db", max_bytes=10**6, clock=clock)
     spool.put(VESC_STREAM, "0badcafe", 0, b"payload", samples=1)
@@ -150,16 +152,13 @@ def test_what_is_written_is_its_owners_alone_whatever_the_umask(folder, open_uma
     files = watched(folder / "uploads")
     files.local(files.next(), threading.Event())
     assert (folder / "uploads" / STATE).exists()
-    claims = ClaimCheck(
-        robot="car", folder=folder, every_s=0, max_bytes=1000, clock=clock,
-        thumbnail=lambda _content, _type: None, stored=lambda: None,
-    )  # fmt: skip
-    claims.claim_fields("lidar", 1, {"scan": b"x"})
+    attachments = Attachments("car", folder, LARGE, clock, stored=lambda: None, thumbnail=lambda *_: None)
+    attachments.attach_to_fields("lidar", 1, {"scan": b"x"})
     assert modes(folder) == {0o600}
     assert stat.S_IMODE((folder / "lidar").stat().st_mode) == 0o700
 
 
-def test_a_queue_that_anybody_may_read_is_closed(folder):
+def test_a_readable_queue_is_made_private(folder):
     path = folder / "queue.db"
     SpoolFile(path, PROCESS).close()
     path.chmod(0o644)
@@ -170,7 +169,7 @@ def test_a_queue_that_anybody_may_read_is_closed(folder):
 @pytest.mark.parametrize(
     "name", ["queue.db", "queue.db-wal", "queue.db-shm", "queue.db.lock", "queue.db.seq"]
 )
-def test_a_link_in_the_place_of_the_queue_is_said_and_batches_go_out(folder, secret, name):
+def test_a_link_in_the_place_of_the_queue_is_told_and_batches_go_out(folder, secret, name):
     (folder / name).symlink_to(secret)
     clock = ManualClock()
     spool = SqliteSpool(folder / "queue.db", max_bytes=10**6, clock=clock)
@@ -178,7 +177,7 @@ def test_a_link_in_the_place_of_the_queue_is_said_and_batches_go_out(folder, sec
     spool.put(VESC_STREAM, "0badcafe", 0, b"payload", samples=1)
     spool.work()
     assert spool.next(0).payload == b"payload"
-    # It is taken away: everything is written.
+    # Everything is written once the link is removed.
     (folder / name).unlink()
     clock.advance(RETRY_S)
     spool.work()
@@ -212,7 +211,7 @@ class Asking(io.StringIO):
         return super().write(text)
 
 
-def test_whatever_a_command_writes_is_its_users_alone(tmp_path, open_umask):
+def test_only_the_user_may_read_what_a_command_writes(tmp_path, open_umask):
     asking = Asking()
     with contextlib.redirect_stdout(asking):
         assert main(["--config", str(config_file(tmp_path, "{type: sim}")), "--check-config"]) == 0

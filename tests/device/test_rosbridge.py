@@ -18,7 +18,7 @@ pytest.importorskip("aiohttp")
 pytest.importorskip("websocket")
 
 from iort_agent.clock import Clock, SystemClock
-from iort_agent.config.file import load_config
+from iort_agent.config import load_config
 from iort_agent.errors import ConfigError, SourceError
 from iort_agent.sources.rosbridge.connection import Times
 from iort_agent.sources.rosbridge.source import RosbridgeConfig, RosbridgeSource, TopicConfig
@@ -114,6 +114,7 @@ def test_what_a_message_may_hold(server: RosbridgeStandin) -> None:
         "lap.nanosec": 4,
     }
     assert running.samples[1][2]["a"] != running.samples[1][2]["a"], "the contract counts it"
+    assert running.source.report()["/odd"]["left_out"] == {"ranges": 1, "blob": 1}
 
 
 def test_selected_fields_only(server: RosbridgeStandin, log: pytest.LogCaptureFixture) -> None:

@@ -1,4 +1,4 @@
-"""The device's side of an upload, against a store that breaks, refuses and forgets."""
+"""Uploads to a fake store that breaks, refuses and forgets."""
 
 from __future__ import annotations
 
@@ -8,14 +8,15 @@ import threading
 
 import pytest
 
-from iort_agent.config.file import load_config
+from iort_agent.common.state import Files
+from iort_agent.config import load_config
 from iort_agent.errors import UploadError
 from iort_agent.files.file import kind_of, read, wire_name
-from iort_agent.files.folder import STATE, Folder, Uploads
-from iort_agent.files.http import Outcome, Pace, Sender, trusting
+from iort_agent.files.folder import STATE, Folder
+from iort_agent.files.http import ByteRate, Outcome, Sender, trusting
 from iort_agent.files.upload import make_uploader
+from iort_agent.files.uploads import Uploads
 from iort_agent.mqtt.dispatch import Dispatcher
-from iort_agent.rate_limiter import Allowance
 from iort_agent.status.server import SOCKET, StatusServer
 from iort_agent.verbs.upload import upload_files
 from iort_contract.limits import SCHEMA_VERSION
@@ -27,12 +28,12 @@ from iort_contract.messages.files import (
     file_key,
 )
 from iort_contract.topics import FILE, PING, build_topic
-from tests.agent_fakes import Loopback, ManualClock
+from tests.agent_fakes import Loopback, ManualClock, link_of
 from tests.store_standin import store
 
 
 class Rig:
-    """A device with a loopback uplink and the store at its other end."""
+    """A device whose loopback uplink ends at the store."""
 
     def __init__(self, there, certificate, uplink, clock):
         self.store, self.certificate, self.uplink, self.clock = there, certificate, uplink, clock
@@ -41,11 +42,7 @@ class Rig:
 
     def make(self):
         return make_uploader(
-            robot="car",
-            namespace="iort",
-            uplink=self.uplink,
-            clock=self.clock,
-            allowance=Allowance(self.clock),
+            link_of(self.uplink, self.clock, robot="car"),
             root_ca=self.certificate,
             rate_kb_s=0,
         )
@@ -61,14 +58,14 @@ class Rig:
 
 
 class WaitingClock(ManualClock):
-    """No time passes before what was sent has been answered, if it ever will be."""
+    """Time passes only when all sent messages are answered."""
 
     def __init__(self, dispatcher):
         super().__init__()
         self._dispatcher = dispatcher
 
     def wait(self, event, seconds):
-        # A request, the answer to it and what that sets are calls that follow one another.
+        # A request, its answer and its effect are consecutive calls.
         for _ in range(4):
             called = threading.Event()
             self._dispatcher.post(called.set)
@@ -133,7 +130,7 @@ def test_a_file_is_hashed_whole_and_by_part(tmp_path, size):
         ("x" * 150 + ".bag", "x" * 96 + ".bag"),
     ],
 )
-def test_every_name_becomes_one_that_is_allowed(path, name, tmp_path):
+def test_every_name_becomes_an_allowed_one(path, name, tmp_path):
     from pathlib import PurePath
 
     assert wire_name(PurePath(path)) == name
@@ -148,7 +145,7 @@ def test_small_and_large_files_arrive(rig, small, large):
         assert rig.store.objects[rig.upload(path)] == path.read_bytes()
     assert rig.store.puts == [1, 1, 2, 3]
     assert rig.uploader.sent_bytes == small.stat().st_size + large.stat().st_size
-    # To upload it again costs a question.
+    # Uploading it again costs one request.
     rig.upload(large)
     assert rig.store.puts == [1, 1, 2, 3]
 
@@ -168,34 +165,34 @@ def test_a_part_that_fails_is_sent_again_and_no_other(rig, large, fault):
     assert rig.store.puts == [1, 2, 2, 3]
 
 
-def test_a_break_in_the_middle_goes_on_with_what_is_missing(rig, large):
+def test_after_a_break_only_the_missing_parts_are_sent(rig, large):
     rig.store.put, put = lambda part, content: rig.stop.set() or put(part, content), rig.store.put
     with pytest.raises(UploadError, match="stopped"):
         rig.upload(large)
     rig.store.put = put
     assert list(rig.store.parts) == [1]
     rig.stop.clear()
-    # Another process: it knows nothing but the file.
+    # A new process knows only the file.
     rig.uploader = rig.make()
     assert rig.store.objects[rig.upload(large)] == large.read_bytes()
     assert rig.store.puts == [1, 2, 3]
 
 
-def test_no_answer_is_asked_for_again_and_a_lost_one_costs_nothing(rig, small):
+def test_a_lost_answer_is_requested_again(rig, small):
     rig.store.silent = 2
     assert rig.store.objects[rig.upload(small)] == b"driven well"
     assert len(rig.store.requests) == 4
     assert len({request.id for request in rig.store.requests}) == 4
 
 
-def test_what_the_cloud_refuses_is_said_with_its_reason(rig, small):
+def test_a_refusal_of_the_cloud_is_raised_with_its_reason(rig, small):
     rig.store.refusals = [("no more than 5 bytes a day", 3600)]
     with pytest.raises(UploadError, match=r"notes.txt: refused: no more than 5 bytes a day") as caught:
         rig.upload(small)
     assert caught.value.again_s == 3600
 
 
-def test_a_server_that_always_fails_is_given_up_for_now(rig, small):
+def test_after_several_failures_the_file_waits(rig, small):
     rig.store.faults = [500] * 100
     with pytest.raises(UploadError, match="the server says 500") as caught:
         rig.upload(small)
@@ -203,30 +200,30 @@ def test_a_server_that_always_fails_is_given_up_for_now(rig, small):
     assert len(rig.store.puts) == 6
 
 
-def test_a_file_that_changes_meanwhile_is_not_mixed(rig, large):
+def test_a_file_that_changes_during_its_upload_is_not_mixed(rig, large):
     local = read(large.parent, large.relative_to(large.parent), stop=rig.stop)
     with large.open("r+b") as file:
         file.write(b"changed")
-    with pytest.raises(UploadError, match="changes while") as caught:
+    with pytest.raises(UploadError, match="changed during its upload") as caught:
         rig.uploader.upload(local, rig.stop)
     assert caught.value.again_s is not None
     assert rig.store.puts == []
-    # The same by size and time, and yet another: what S3 computes tells.
+    # Same size and time, other content: S3's checksum shows it.
     os.utime(large, ns=(local.look.mtime_ns, local.look.mtime_ns))
-    with pytest.raises(UploadError, match="changes while"):
+    with pytest.raises(UploadError, match="changed during its upload"):
         rig.uploader.upload(local, rig.stop)
     assert not rig.store.objects
 
 
-def test_nothing_is_sent_in_the_clear_or_to_whom_we_do_not_trust(rig, small):
-    sender = Sender(trust=trusting(None), pace=Pace(rig.clock, 0))
+def test_nothing_is_sent_unencrypted_or_to_an_untrusted_server(rig, small):
+    sender = Sender(trust=trusting(None), rate=ByteRate(rig.clock, 0))
     local = read(small.parent, small.relative_to(small.parent), stop=rig.stop)
     url = rig.store._url
     address = Address(1, f"{url}/1", {"content-length": "11"})
     put = sender.put(address, local, 0, 11, rig.stop)
     assert put.outcome is Outcome.FAILED
     assert "CERTIFICATE_VERIFY_FAILED" in put.text
-    with pytest.raises(UploadError, match="not https"):
+    with pytest.raises(UploadError, match="must be https"):
         sender.put(address._replace(url=url.replace("https", "http")), local, 0, 11, rig.stop)
     assert rig.store.puts == []
 
@@ -242,11 +239,11 @@ def test_nothing_is_sent_in_the_clear_or_to_whom_we_do_not_trust(rig, small):
         ("HOST/1", {"x-amz-meta": "a\r\nhost: other"}),
     ],
 )
-def test_an_address_that_is_none_is_a_file_that_is_not_uploaded(rig, small, url, headers):
-    sender = Sender(trust=trusting(rig.certificate), pace=Pace(rig.clock, 0))
+def test_an_unusable_address_is_an_upload_error(rig, small, url, headers):
+    sender = Sender(trust=trusting(rig.certificate), rate=ByteRate(rig.clock, 0))
     local = read(small.parent, small.relative_to(small.parent), stop=rig.stop)
     address = Address(1, url.replace("HOST", rig.store._url), headers)
-    with pytest.raises(UploadError, match=r"an address that is"):
+    with pytest.raises(UploadError, match="the cloud's address"):
         sender.put(address, local, 0, 11, rig.stop)
 
 
@@ -260,7 +257,7 @@ def test_an_address_that_is_none_is_a_file_that_is_not_uploaded(rig, small, url,
         '"refused": "no", "again_s": 1e999',
     ],
 )
-def test_an_answer_that_is_none_is_said_and_waited_past(rig, small, odd, caplog):
+def test_a_malformed_answer_is_logged_and_the_next_one_used(rig, small, odd, caplog):
     answer, faults = rig.store._answer, [odd]
 
     def on_request(message):
@@ -273,14 +270,14 @@ def test_an_answer_that_is_none_is_said_and_waited_past(rig, small, odd, caplog)
 
     rig.uplink.subscribe(build_topic(PING, "car", FILE), on_request)
     assert rig.store.objects[rig.upload(small)] == b"driven well"
-    assert "an answer about a file is not one" in caplog.text
+    assert "an answer about a file cannot be read" in caplog.text
 
 
-def test_no_faster_than_it_may(tmp_path):
+def test_the_rate_is_limited(tmp_path):
     clock, stop = ManualClock(), threading.Event()
-    pace, began = Pace(clock, 1000), clock.monotonic()
+    rate, began = ByteRate(clock, 1000), clock.monotonic()
     for _ in range(11):
-        pace.spend(500, stop)
+        rate.spend(500, stop)
     assert clock.monotonic() - began == pytest.approx(5.0)
 
 
@@ -302,7 +299,7 @@ def test_only_finished_files_are_uploaded(rig, bags):
     link.symlink_to(growing)
     uploads = rig.folder(bags)
     assert not uploads.step(rig.stop)
-    assert uploads.waiting() == 1
+    assert uploads.status().waiting == 1
     rig.clock.advance(9)
     growing.write_bytes(b"12")
     assert not uploads.step(rig.stop)
@@ -312,8 +309,7 @@ def test_only_finished_files_are_uploaded(rig, bags):
     assert uploads.step(rig.stop)
     assert list(rig.store.objects.values()) == [b"12"]
     assert not uploads.step(rig.stop)
-    assert uploads.counts() == (0, 1, 2)
-    assert uploads.current() == (None, 0, None)
+    assert uploads.status() == Files(0, 1, 2, current=None, current_bytes=0, last_error=None)
 
 
 def test_a_new_process_neither_uploads_again_nor_reads_again(rig, bags, monkeypatch):
@@ -323,7 +319,7 @@ def test_a_new_process_neither_uploads_again_nor_reads_again(rig, bags, monkeypa
     os.utime(bags / "old.bag", (1, 1))
     uploads = rig.folder(bags, settle_s=0)
     assert uploads.step(rig.stop)
-    # The end comes in the middle of the second.
+    # The process ends during the second file.
     rig.store.put, put = lambda part, content: rig.stop.set() or put(part, content), rig.store.put
     uploads.step(rig.stop)
     rig.store.put = put
@@ -351,7 +347,7 @@ def test_a_new_process_neither_uploads_again_nor_reads_again(rig, bags, monkeypa
         b'{"read": {}, "done": [["a.bag", {"look": 1}]]}',
     ],
 )
-def test_a_damaged_state_costs_time_and_nothing_else(rig, bags, damage):
+def test_after_a_damaged_state_files_are_read_again(rig, bags, damage):
     (bags / "a.bag").write_bytes(b"1")
     assert rig.folder(bags, settle_s=0).step(rig.stop)
     (bags / STATE).write_bytes(damage)
@@ -359,7 +355,7 @@ def test_a_damaged_state_costs_time_and_nothing_else(rig, bags, damage):
     assert rig.store.puts == [1]
 
 
-def test_a_file_that_was_uploaded_is_removed_when_it_is_time_and_only_then(rig, bags):
+def test_an_uploaded_file_is_removed_when_it_is_due(rig, bags):
     path = bags / "a.bag"
     path.write_bytes(b"1")
     uploads = rig.folder(bags, settle_s=0, remove_after_s=3600)
@@ -372,7 +368,7 @@ def test_a_file_that_was_uploaded_is_removed_when_it_is_time_and_only_then(rig, 
     assert not path.exists()
 
 
-def test_a_file_that_changed_since_is_uploaded_again_and_not_removed(rig, bags):
+def test_a_file_that_changed_after_its_upload_is_uploaded_again(rig, bags):
     path = bags / "a.bag"
     path.write_bytes(b"1")
     uploads = rig.folder(bags, settle_s=0, remove_after_s=3600)
@@ -384,24 +380,24 @@ def test_a_file_that_changed_since_is_uploaded_again_and_not_removed(rig, bags):
     assert sorted(rig.store.objects.values()) == [b"1", b"12"]
 
 
-def test_one_refused_file_holds_up_no_other(rig, bags):
+def test_a_refused_file_does_not_delay_others(rig, bags):
     for name, age in (("first.bag", 100), ("second.bag", 200)):
         (bags / name).write_bytes(name.encode())
         os.utime(bags / name, (age, age))
     uploads = rig.folder(bags, settle_s=0)
     rig.store.refusals = [("not today", 60)]
     assert uploads.step(rig.stop)
-    assert "first.bag: refused: not today" in (uploads.current().last_error or "")
+    assert "first.bag: refused: not today" in (uploads.status().last_error or "")
     assert uploads.step(rig.stop)
     assert list(rig.store.objects.values()) == [b"second.bag"]
     assert not uploads.step(rig.stop)
-    assert uploads.waiting() == 1
+    assert uploads.status().waiting == 1
     rig.clock.advance(61)
     assert uploads.step(rig.stop)
     assert b"first.bag" in rig.store.objects.values()
 
 
-def test_a_file_refused_again_and_again_is_asked_for_less_and_less(rig, bags):
+def test_a_file_refused_repeatedly_waits_longer_each_time(rig, bags):
     (bags / "a.bag").write_bytes(b"1")
     uploads = rig.folder(bags, settle_s=0)
     rig.store.refusals = [("again at once", 0)] * 10_000
@@ -412,14 +408,14 @@ def test_a_file_refused_again_and_again_is_asked_for_less_and_less(rig, bags):
             assert not uploads.step(rig.stop)
         rig.clock.advance(1)
     assert tried_s == [0, 5, 15, 35, 75, 155, 315, 615, 915]
-    # It is another one when it has changed.
+    # A changed file counts as a new one.
     (bags / "a.bag").write_bytes(b"12")
     assert uploads.step(rig.stop)
     rig.clock.advance(5)
     assert uploads.step(rig.stop)
 
 
-def test_a_file_that_nobody_thought_of_holds_up_no_other(rig, bags):
+def test_a_file_with_an_unexpected_error_does_not_delay_others(rig, bags):
     for name, age in (("first.bag", 100), ("second.bag", 200)):
         (bags / name).write_bytes(name.encode())
         os.utime(bags / name, (age, age))
@@ -438,7 +434,7 @@ def test_a_file_that_nobody_thought_of_holds_up_no_other(rig, bags):
     assert list(rig.store.objects.values()) == [b"second.bag"]
 
 
-def test_an_error_that_nobody_thought_of_does_not_end_it(rig, bags, caplog):
+def test_an_unexpected_error_does_not_end_the_uploads(rig, bags, caplog):
     (bags / "a.bag").write_bytes(b"1")
     uploads = rig.folder(bags, settle_s=0)
     step, calls = uploads.step, []
@@ -453,11 +449,11 @@ def test_an_error_that_nobody_thought_of_does_not_end_it(rig, bags, caplog):
 
     uploads.step = odd
     uploads.run(rig.stop)
-    assert "going on after an error" in caplog.text
+    assert "continuing after an error" in caplog.text
     assert list(rig.store.objects.values()) == [b"1"]
 
 
-def test_beside_a_running_agent_the_command_says_what_to_do_instead(tmp_path, bags):
+def test_while_an_agent_runs_the_command_gives_advice(tmp_path, bags):
     file = tmp_path / "car.yaml"
     for name in ("certificate.pem", "private.key"):
         (tmp_path / name).write_text("")

@@ -14,7 +14,7 @@ import pytest
 import serial
 
 from iort_agent.clock import SystemClock
-from iort_agent.config.file import load_config
+from iort_agent.config import load_config
 from iort_agent.errors import SourceError
 from iort_agent.sources.vesc.serial_line import VescConfig, _why
 from tests.device.running import Running, eventually
@@ -127,7 +127,7 @@ def test_an_unknown_length_is_said_once_and_never_misread(
     assert running.samples == []
     errors = [record for record in log.records if record.levelno >= logging.WARNING]
     assert len(errors) == 1
-    assert "values of 76 bytes; known are those of 54, 56, 58" in errors[0].getMessage()
+    assert "values must have one of 54, 56, 58, 59, 65, 73, 74 bytes, got 76" in errors[0].getMessage()
 
 
 def test_a_late_answer_is_not_taken_for_the_next_ones(vesc: VescStandin) -> None:

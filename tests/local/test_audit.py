@@ -14,7 +14,7 @@ from iort_contract.topics import RECORD, build_topic, record_topic
 from iort_station.cli.main import app
 from iort_station.operations import audit
 from tests.local.conftest import run_agent, until
-from verify.robot import Robot
+from verify.tools.robot import Robot
 
 T0_US = 1_760_000_000_000_000
 

@@ -39,7 +39,7 @@ def test_robot_is_added_listed_and_removed(iort, tmp_path):
         (("files", "list", "nobody", "--last", "1h", "--json"), "there is no robot nobody"),
         (("files", "get", "nobody"), "there is no robot nobody"),
         (("trace", "nobody"), "there is no robot nobody"),
-        (("pubnub", "--publish-key", "pub-c-1", "--subscribe-key", "sub-c-1"), "keys of its own"),
+        (("pubnub", "--publish-key", "pub-c-1", "--subscribe-key", "sub-c-1"), "with its own keys"),
     ],
 )
 def test_error_says_what_is_wrong(iort, tmp_path, arguments, said):
@@ -67,7 +67,7 @@ def test_no_command_passes_on_what_a_robot_would_have_the_terminal_do(embedded, 
 def test_a_robot_without_files_has_none_and_one_that_is_gone_keeps_them(embedded, iort, bundle):
     robot = bundle().robot
     none = iort("files", "list", robot)
-    assert (none.exit_code, none.stdout, none.stderr) == (0, "", f"no file of {robot} is like this\n")
+    assert (none.exit_code, none.stdout, none.stderr) == (0, "", "no matching files\n")
     bucket = embedded.cloud.output("storage", "FilesBucket")
     file = File("a.bag", "recording", "application/octet-stream", 5, "0" * 64, 1_700_000_000_000_000)
     key = file_key("gone", file)

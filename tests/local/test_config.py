@@ -34,7 +34,7 @@ def test_a_running_agent_is_changed_and_answers(iort, bundle):
         shown = iort("config", car.robot)
         assert shown.exit_code == 0
         assert "ping.rate_hz=1" in shown.output
-        assert "live.rate_hz=10.0  (car.yaml's: the wish is refused)" in shown.output
+        assert "live.rate_hz=10.0  (car.yaml's: the change is rejected)" in shown.output
         assert f"`iort config {car.robot} --unset live.rate_hz` withdraws it" in shown.stderr
         withdrawn = iort("config", car.robot, "--unset", "live.rate_hz", "--unset", "fields.vesc",
                          "--seconds", "120", "--json")  # fmt: skip
@@ -49,7 +49,7 @@ def test_a_robot_that_is_off_has_not_answered_and_the_wish_stands(iort, bundle):
     car = bundle()
     asked = iort("config", car.robot, "live.rate_hz=3", "--seconds", "0.1")
     assert isinstance(asked.exception, StationError)
-    assert "The wish stands; --unset" in str(asked.exception)
+    assert "The change stays requested; --unset" in str(asked.exception)
     assert "has reported no settings yet" in asked.output
 
 
@@ -68,9 +68,9 @@ def test_what_cannot_be_asked_is_said(iort, arguments, said):
 @pytest.mark.parametrize(
     ("arguments", "said"),
     [
-        (("config", "CAR", "live.rate_hz"), "expected NAME=VALUE"),
-        (("send", "CAR", "drive", "{"), "is not JSON"),
-        (("send", "CAR", "drive", "7"), "expected a JSON object"),
+        (("config", "CAR", "live.rate_hz"), "must be NAME=VALUE"),
+        (("send", "CAR", "drive", "{"), "must be JSON"),
+        (("send", "CAR", "drive", "7"), "must be a JSON object"),
         (("send", "CAR", "a/b", "{}"), "got 'a/b'"),
     ],
 )

@@ -23,7 +23,7 @@ from tests.foxglove import flat, opened
 from tests.local.conftest import run_agent, until
 from tests.local.test_query import iort
 from tests.recordings import recording
-from verify.robot import Robot
+from verify.tools.robot import Robot
 
 VESC, SERVO = "/sensors/core", "/sensors/servo_position_command"
 

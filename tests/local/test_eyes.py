@@ -12,7 +12,7 @@ from iort_contract.messages.live import LiveSample, encode_live
 from iort_contract.topics import FILE, LIVE, PING, build_topic, record_topic
 from iort_station.operations import cloudwatch, cloudwatch_logs
 from tests.local.conftest import run_agent, until
-from verify.robot import Robot
+from verify.tools.robot import Robot
 
 FAULT, LOW_V = 5, 9.5
 

@@ -20,12 +20,13 @@ from urllib.parse import urlsplit
 import boto3
 import pytest
 from botocore.config import Config
+from ministack.services import iot
 from PIL import Image
 from rosbags.rosbag1 import Reader
 
 from iort_agent.clock import SystemClock
 from iort_agent.files.file import read
-from iort_agent.files.http import Outcome, Pace, Sender, trusting
+from iort_agent.files.http import ByteRate, Outcome, Sender, trusting
 from iort_contract.messages.files import (
     FILES_PREFIX,
     PART_BYTES,
@@ -41,11 +42,10 @@ from iort_contract.topics import FILE, PING, PONG, build_topic
 from iort_station.fleet import files, robots
 from iort_station.operations import delivery
 from local.deployment import ROOT
-from local.gaps.broker.message_size import AWS_MESSAGE_BYTES
 from tests.images import TOPIC, jpeg, write_bag
 from tests.local.conftest import until
 from tests.local.drives import Agent
-from verify.robot import Robot
+from verify.tools.robot import Robot
 
 CONTENT = b"a small file"
 T_US = 1_700_000_000_000_000
@@ -146,7 +146,7 @@ def test_a_large_file_in_a_watched_folder_survives_the_agents_end(bundle, bucket
 
 def test_pictures_of_a_recording_travel_as_claims(embedded, bundle, bucket, iort, tmp_path):
     pictures = [jpeg(seed) for seed in range(4)]
-    assert min(map(len, pictures)) > AWS_MESSAGE_BYTES
+    assert min(map(len, pictures)) > iot._MAX_PAYLOAD_BYTES
     path = write_bag(tmp_path / "camera.bag", pictures, hz=2)
     source = {"type": "bag", "path": str(path), "topics": {TOPIC: "camera"}, "large": "upload"}
     car = bundle(sources=[source], files={"large_folder": "large", "rate_kb_s": 0})
@@ -315,7 +315,7 @@ def test_an_address_that_has_expired_is_one_to_ask_for_again(embedded, bucket, r
     path.write_bytes(CONTENT)
     local = read(tmp_path, PurePath(path.name), stop=threading.Event())
     clock = SystemClock()
-    sender = Sender(trust=trusting(Path(cloud.ca_bundle)), pace=Pace(clock, 0))
+    sender = Sender(trust=trusting(Path(cloud.ca_bundle)), rate=ByteRate(clock, 0))
     address = Address(1, url, {"content-length": str(len(CONTENT))})
 
     def sent():

@@ -28,7 +28,7 @@ from iort_station.errors import StationError
 from iort_station.fleet import certificates, claims, registry, robots, rotation
 from local.cloud import ROOT
 from tests.local.conftest import until
-from verify.robot import STALE, Robot
+from verify.tools.robot import STALE, Robot
 
 AGENT = Path(sys.executable).parent / "iort-agent"
 WAIT_S = 60
@@ -127,7 +127,7 @@ def test_removing_a_robot_cuts_its_session_for_good(embedded, bundle):
 
 
 def test_a_session_ends_with_its_certificate(embedded, bundle):
-    """AWS does so within minutes; the emulator's gap is closed in local/gaps/broker/certificate_status.py."""
+    """AWS does so within minutes; the emulator's gap is closed in local/patches/certificate_status.patch."""
     car = bundle()
     with Robot(car.folder) as robot:
         robot.online()

@@ -17,7 +17,7 @@ from iort_contract.topics import FILE, LIVE, PING, PONG, build_topic, record_top
 from iort_station.operations import quarantine
 from iort_station.page.listener import Listener
 from tests.local.conftest import until
-from verify.robot import Robot
+from verify.tools.robot import Robot
 
 BAD, GOOD = 80, 20
 

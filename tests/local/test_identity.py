@@ -18,7 +18,7 @@ from iort_station.fleet import claims, robots
 from iort_station.operations import delivery
 from local.cloud import ROOT
 from tests.local.conftest import run_agent, until
-from verify.robot import WAIT_S, Robot
+from verify.tools.robot import WAIT_S, Robot
 
 AGENT = Path(sys.executable).parent / "iort-agent"
 

@@ -20,7 +20,7 @@ from iort_contract.tables import ADMIT_CLAIM, ADMITTED_CERTIFICATE, ADMITTED_MS,
 from iort_station.fleet import claims, registry
 from local.cloud import ROOT
 from tests.local.test_identity import certificates, command
-from verify.robot import Robot
+from verify.tools.robot import Robot
 
 # Ends as a lost battery ends it: before AWS IoT is asked to register, or as soon as it has.
 KILLED = """
@@ -35,12 +35,12 @@ class Killed(Exchange):
             super().register(token, parameters)
         os.kill(os.getpid(), signal.SIGKILL)
 
-run = identity.Run(exchange=Killed)
+seams = identity.Seams(exchange=Killed)
 verb, file, other = sys.argv[2:]
 if verb == "provision":
-    identity.provision(Path(file), robot=other, run=run)
+    identity.provision(Path(file), robot=other, seams=seams)
 else:
-    identity.renew(Path(file), Path(other), status_socket=Path("none.sock"), run=run)
+    identity.renew(Path(file), Path(other), status_socket=Path("none.sock"), seams=seams)
 """
 NAME = ".provisioning.json"
 

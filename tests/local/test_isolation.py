@@ -11,15 +11,15 @@ from pathlib import Path
 
 import pytest
 from botocore.exceptions import ClientError
+from ministack.services import iot
 
 from iort_contract.limits import MAX_MESSAGE_BYTES
 from iort_contract.messages.live import encode_ping
 from iort_contract.topics import CMD, FLEET, PING, PONG, RULE, build_topic
 from iort_station.fleet import claims, robots
-from local.gaps.broker.message_size import AWS_MESSAGE_BYTES
 from tests.isolation import CLAIM, CONNECT, PUBLISH, RECEIVE, ROBOT, ROWS, SUBSCRIBE, A, B, Row
 from verify.errors import VerifyError
-from verify.robot import Robot, payload_for
+from verify.tools.robot import Robot, payload_for
 
 WAIT_S = 60
 # What a broker answers to what it lets pass.
@@ -212,6 +212,6 @@ def test_largest_message_is_taken(folders):
 
 def test_message_above_128_kb_is_refused(embedded):
     data, topic = embedded.cloud.client("iot-data"), build_topic(FLEET, B, "image")
-    data.publish(topic=topic, payload=b"x" * AWS_MESSAGE_BYTES)
+    data.publish(topic=topic, payload=b"x" * iot._MAX_PAYLOAD_BYTES)
     with pytest.raises(ClientError):
-        data.publish(topic=topic, payload=b"x" * (AWS_MESSAGE_BYTES + 1))
+        data.publish(topic=topic, payload=b"x" * (iot._MAX_PAYLOAD_BYTES + 1))

@@ -10,9 +10,6 @@ from pathlib import Path
 import pytest
 from ministack.services import iot
 
-from local.gaps.broker.client_hello import later
-from local.gaps.broker.connect_timeout import expecting_connect, in_time
-
 
 def listening(pid: int) -> set[tuple[str, int]]:
     """The addresses and ports on which a process listens, as Linux says."""
@@ -47,16 +44,13 @@ CONNACK = b"\x20\x02\x00\x00"
 @pytest.fixture
 def ended(monkeypatch):
     """Whether the emulator's own acceptor ends a connection within four times its wait."""
-    monkeypatch.setattr(iot, "_register_client", in_time(iot._register_client))
-
-    class Acceptor(iot._MtlsAcceptor):
-        connection_made = expecting_connect(later(iot._MtlsAcceptor.connection_made), WAIT_S)
+    monkeypatch.setattr(iot, "_MTLS_CONNECT_SECONDS", WAIT_S)
 
     async def run(tls, said):
         # Made beforehand: it takes longer than the wait.
         await iot._mtls_context()
         loop = asyncio.get_running_loop()
-        server = await loop.create_server(Acceptor, host="127.0.0.1", port=0)
+        server = await loop.create_server(iot._MtlsAcceptor, host="127.0.0.1", port=0)
         context = ssl.create_default_context()
         context.check_hostname, context.verify_mode = False, ssl.CERT_NONE
         address = server.sockets[0].getsockname()

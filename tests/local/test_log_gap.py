@@ -11,15 +11,14 @@ from types import SimpleNamespace
 import pytest
 from ministack.core import lambda_runtime
 
-from local.gaps.functions import log_end, log_levels
+from local.gaps.functions import log_end
 
 
 @pytest.fixture(scope="module")
 def installed():
-    """Both gaps closed in this process, and opened again."""
+    """The gap closed in this process, and opened again."""
     kept = lambda_runtime._PYTHON_WORKER_SCRIPT, lambda_runtime.Worker._drain_stderr_bounded
     log_end.install()
-    log_levels.install()
     yield
     lambda_runtime._PYTHON_WORKER_SCRIPT, lambda_runtime.Worker._drain_stderr_bounded = kept
 

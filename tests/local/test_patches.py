@@ -1,71 +1,73 @@
-"""The patches for ministack apply to the pinned version, and each closes its gap."""
+"""Every patch for ministack is still needed, applies to the pinned version, and closes its gap."""
 
 from __future__ import annotations
 
+import inspect
 import json
 import os
-import shutil
+import re
 import subprocess
 import sys
-from pathlib import Path
 
-import ministack
 import pytest
 
-from local import gaps
+from local import patched
 from local.deployment import ROOT
+from local.errors import LocalError
+from tests.local import gap_probes
 
-PATCHES = sorted((ROOT / "local" / "patches").glob("*.patch"))
-NAMES = {name.rsplit(".", 1)[-1]: name for name in gaps.NAMES}
+PATCHES = [patch.stem for patch in patched.PATCHES]
+HEAD = re.compile(
+    r"ministack [\d.]+: [^\n]+\n\n"
+    r"AWS: (?P<aws>.+)\nministack: .+\nTest: (?P<file>\S+)::(?P<test>\w+)\n",
+    re.DOTALL,
+)
 ASK = """
-import json
-from local import gaps
-print(json.dumps({name: gaps.load(name).is_open() for name in gaps.NAMES}))
+import json, sys
+from tests.local import gap_probes
+print(json.dumps({name: bool(getattr(gap_probes, name)()) for name in sys.argv[1:]}))
 """
 
 
-@pytest.fixture(scope="module")
-def package(tmp_path_factory):
-    """A folder with a copy of the installed ministack."""
-    folder = tmp_path_factory.mktemp("patched")
-    source = Path(ministack.__file__).parent
-    shutil.copytree(source, folder / "ministack", ignore=shutil.ignore_patterns("__pycache__"))
-    return folder
-
-
-def git_apply(folder: Path, *arguments: str | Path) -> None:
-    # No repository above the folder may take part.
-    environment = {**os.environ, "GIT_CEILING_DIRECTORIES": str(folder.parent)}
+def lacking(*folders):
+    """What a ministack lacks: the installed one, or the one in a folder."""
+    environment = {**os.environ, "PYTHONPATH": os.pathsep.join(map(str, (*folders, ROOT)))}
+    command = [sys.executable, "-c", ASK, *PATCHES]
     done = subprocess.run(
-        ["git", "apply", *arguments], cwd=folder, env=environment, capture_output=True, text=True, check=False
+        command, cwd=ROOT, env=environment, capture_output=True, text=True, check=False, timeout=120
     )
     assert done.returncode == 0, done.stderr
+    return {name for name, lacks in json.loads(done.stdout.splitlines()[-1]).items() if lacks}
 
 
-@pytest.mark.parametrize("patch", PATCHES, ids=lambda patch: patch.stem)
-def test_a_patch_is_for_a_gap_and_applies_alone(package, patch):
-    assert patch.stem in NAMES
-    head = patch.read_text().split("--- a/")[0]
-    assert "\nAWS: " in head
-    assert "\nministack: " in head
-    git_apply(package, "--check", patch)
+def test_every_patch_has_its_probe():
+    own = {
+        name
+        for name, one in inspect.getmembers(gap_probes, inspect.isfunction)
+        if one.__module__ == gap_probes.__name__
+    }
+    assert own == set(PATCHES)
 
 
-def test_the_patches_close_their_gaps_and_no_others(tmp_path, package):
-    shutil.copytree(package / "ministack", tmp_path / "ministack")
-    for patch in PATCHES:
-        git_apply(tmp_path, patch)
-    environment = {**os.environ, "PYTHONPATH": os.pathsep.join((str(tmp_path), str(ROOT)))}
-    done = subprocess.run(
-        [sys.executable, "-c", ASK],
-        cwd=tmp_path,
-        env=environment,
-        capture_output=True,
-        text=True,
-        check=False,
-        timeout=120,
-    )
-    assert done.returncode == 0, done.stderr
-    still_open = json.loads(done.stdout.splitlines()[-1])
-    closed = {name for name, gap in still_open.items() if not gap}
-    assert closed == {NAMES[patch.stem] for patch in PATCHES}
+def test_the_pinned_ministack_lacks_what_each_patch_adds():
+    assert lacking() == set(PATCHES), "a new ministack does not need every patch of local/patches/"
+
+
+def test_the_patched_ministack_lacks_nothing():
+    assert lacking(patched.folder()) == set()
+
+
+@pytest.mark.parametrize("patch", patched.PATCHES, ids=lambda patch: patch.stem)
+def test_a_patch_applies_alone_and_says_what_it_is_for(patch, tmp_path):
+    head = HEAD.fullmatch(patch.read_text().split("\n--- a/")[0])
+    assert head
+    assert "https://" in head["aws"] or head["aws"].startswith("does not apply;")
+    assert f"def {head['test']}(" in (ROOT / head["file"]).read_text()
+    patched.copy(patched.installed(), tmp_path, [patch])
+
+
+def test_a_patch_that_does_not_fit_is_told(tmp_path):
+    wrong = tmp_path / "wrong.patch"
+    wrong.write_text("--- a/ministack/app.py\n+++ b/ministack/app.py\n@@ -1 +1 @@\n-nothing like it\n+x\n")
+    with pytest.raises(LocalError, match="does not fit"):
+        patched.copy(patched.installed(), tmp_path / "made", [wrong])

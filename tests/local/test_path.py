@@ -24,7 +24,7 @@ from local.figures import round_trips
 from tests.local.conftest import run_agent, until
 from tests.local.drives import Agent
 from tests.recordings import recording
-from verify.robot import Robot
+from verify.tools.robot import Robot
 
 
 def _listener(embedded: EmbeddedCloud, robot: str) -> Listener:

@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 from stacks.settings import Settings
-from verify import preflight
-from verify.preflight_finding import Verdict
+from verify.preflight import command as preflight
+from verify.preflight.finding import Verdict
 
 
 def test_the_embedded_cloud_stops_nothing(embedded):

@@ -18,7 +18,7 @@ from iort_station.cloud import EMBEDDED
 from iort_station.data.items import of_topic
 from iort_station.operations import delivery, quarantine
 from tests.local.conftest import until
-from verify.robot import Robot
+from verify.tools.robot import Robot
 
 RUN = "0badcafe"
 

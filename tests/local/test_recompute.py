@@ -13,7 +13,7 @@ from iort_station.fleet import registry
 from iort_station.operations import delivery, recompute
 from iort_station.operations.recompute import Recomputed
 from tests.local.conftest import until
-from verify.robot import Robot
+from verify.tools.robot import Robot
 
 RUN = "0badcafe"
 SECONDS = 6

@@ -17,7 +17,7 @@ from iort_station.data.items import of_topic
 from iort_station.fleet import shadow
 from iort_station.operations import delivery
 from tests.local.conftest import until
-from verify.robot import Robot
+from verify.tools.robot import Robot
 
 S = 1_000_000
 GOOD = 8

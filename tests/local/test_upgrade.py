@@ -15,7 +15,7 @@ from iort_station.data import data
 from iort_station.operations import delivery, quarantine
 from tests.local.conftest import until
 from tests.unit.station.old_messages import old_envelope, old_message
-from verify.robot import Robot
+from verify.tools.robot import Robot
 
 RUN = "0badcafe"
 BATCHES, EACH = 30, 10
@@ -69,7 +69,7 @@ def test_an_old_table_is_adopted(embedded, bundle, iort, old_table):
         counts = {"robot": car.robot, "stream": "vesc", "batches": BATCHES, "samples": BATCHES * EACH}
         assert said["adopted"] == [counts]
         (left,) = said["left"]
-        assert (left["key"], left["cause"]) == ("-7", "time -7 us: before 1970")
+        assert (left["key"], left["cause"]) == ("-7", "time must be from 1970 on, got -7 us")
 
     def there():
         items = sorted(delivery.items(cloud, car.robot, "vesc"), key=lambda item: item["batch"])
@@ -97,7 +97,7 @@ def test_an_old_table_is_adopted(embedded, bundle, iort, old_table):
     assert there() == (items, speeds, fastest)
     shown = iort("adopt", "telemetry-of-before", "--robot", car.robot)
     assert f"{car.robot} vesc: {BATCHES} batches of {BATCHES * EACH} samples adopted" in shown.stdout
-    assert f"dt/iort/{car.robot}/lost at -7: time -7 us: before 1970" in shown.stdout
+    assert f"dt/iort/{car.robot}/lost at -7: time must be from 1970 on, got -7 us" in shown.stdout
 
 
 def test_without_a_table_it_says_what_to_do(iort):

@@ -24,7 +24,7 @@ from iort_station.fleet import robots
 from local.cloud import EmbeddedCloud
 from local.proxy import FREEZE, PASS, REFUSE, Proxy
 from tests.local.conftest import until
-from verify.robot import Robot
+from verify.tools.robot import Robot
 
 
 @pytest.fixture

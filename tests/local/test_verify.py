@@ -18,11 +18,12 @@ from iort_contract.tables import ROBOT
 from iort_station.errors import StationError
 from iort_station.fleet import robots
 from iort_station.page import keys
-from verify import measured, price, run
-from verify.assumption import Basis
-from verify.check import WITH_KEY, Check, Verdict, ask
-from verify.checks import ALL, live, rules
+from verify import price, report, run
 from verify.errors import VerifyError
+from verify.question import WITH_KEY, Question, Verdict, ask
+from verify.questions import ALL, live
+
+RULES = tuple(one for one in ALL if one.subject == "rules")
 
 
 @pytest.fixture(scope="module")
@@ -34,7 +35,7 @@ def target(embedded, tmp_path_factory):
 
 @pytest.mark.parametrize("check", [one for one in ALL if not one.not_embedded], ids=lambda check: check.name)
 def test_the_embedded_cloud_answers_as_assumed_or_measured(target, check):
-    answer = ask(check, target, time.monotonic, measured.load().expected(check.name))
+    answer = ask(check, target, time.monotonic, report.load().seen.get(check.name))
     assert answer.verdict is Verdict.AS_ASSUMED, (answer.reason, answer.seen)
 
 
@@ -67,7 +68,7 @@ def options(out, **given):
     return argparse.Namespace(
         **{
             "target": AWS,
-            "only": rules.CHECKS,
+            "only": RULES,
             "namespace": "iort",
             "out": out,
             "by": "",
@@ -82,11 +83,11 @@ def test_a_run_deploys_asks_reports_and_destroys(embedded, tmp_path):
     recorder = Recorder()
     assert run.run(options(tmp_path), embedded.cloud, recorder) == 0
     assert recorder.told == [{}, "destroyed"]
-    report = json.loads((tmp_path / "report.json").read_text())
-    assert {one["verdict"] for one in report["answers"]} == {"as assumed"}
-    assert "fine: stacks: 6 of 8 are there, each can be updated" in report["preflight"]
-    assert "000000000000" not in json.dumps(report["preflight"])
-    assert measured.load(tmp_path / "report.json").seen.keys() == {one.name for one in rules.CHECKS}
+    written = json.loads((tmp_path / "report.json").read_text())
+    assert {one["verdict"] for one in written["answers"]} == {"as assumed"}
+    assert "fine: stacks: 6 of 8 are there, each can be updated" in written["preflight"]
+    assert "000000000000" not in json.dumps(written["preflight"])
+    assert report.load(tmp_path / "report.json").seen.keys() == {one.name for one in RULES}
 
 
 def test_without_a_yes_nothing_is_made(embedded, tmp_path):
@@ -103,7 +104,7 @@ def test_what_fails_is_taken_down_and_what_was_answered_is_reported(embedded, tm
             if settings:
                 raise VerifyError("cdk deploy failed")
 
-    recorder, first = Failing(), rules.CHECKS[0]
+    recorder, first = Failing(), RULES[0]
     with_key = replace(first, name="a.question", phase=WITH_KEY)
     with pytest.raises(VerifyError, match="cdk deploy failed"):
         run.run(options(tmp_path, only=(first, with_key)), embedded.cloud, recorder)
@@ -125,9 +126,7 @@ def test_what_is_left_over_after_a_failure_is_told(embedded, tmp_path, capsys):
 
 
 def question(name, seen, ask):
-    return Check(
-        name=name, assumed="It is.", expected=seen, basis=Basis.ASSUMED, relied_on_by=("app.py",), ask=ask
-    )
+    return Question(name=name, assumed="It is.", expected=seen, relied_on_by=("app.py",), ask=ask)
 
 
 def test_a_run_lends_pubnubs_keys_to_every_question(embedded, tmp_path):

@@ -11,8 +11,8 @@ from bench.target import EMBEDDED, Target
 from iort_contract.cloud import fleet_name
 from iort_contract.tables import TOPIC
 from iort_contract.topics import RECORD, rule_name
-from verify.check import Verdict, ask
-from verify.checks import broker, provisioning, rules
+from verify.question import Verdict, ask
+from verify.questions import ALL
 
 
 @pytest.fixture(scope="module")
@@ -28,8 +28,8 @@ def iot(embedded):
 @pytest.fixture
 def asked(target):
     """The answer to a question, by its name."""
-    checks = {check.name: check for check in (*rules.CHECKS, *broker.CHECKS, *provisioning.CHECKS)}
-    return lambda name: ask(checks[name], target, time.monotonic)
+    questions = {question.name: question for question in ALL}
+    return lambda name: ask(questions[name], target, time.monotonic)
 
 
 @pytest.fixture

@@ -16,7 +16,7 @@ from hashlib import sha256
 from pathlib import Path
 
 from iort_agent.clock import SystemClock
-from iort_agent.schema import Where, load
+from iort_agent.common.schema import Place, load
 from iort_agent.sources.ros1 import Ros1Config
 from iort_contract.ros1.message import RosMessage
 
@@ -29,7 +29,7 @@ def say(line: str) -> None:
 
 logging.basicConfig(stream=sys.stderr, level="INFO", format="%(levelname)s %(message)s")
 file = Path(sys.argv[1])
-config = load(Ros1Config, json.loads(file.read_text()), Where(file))
+config = load(Ros1Config, json.loads(file.read_text()), Place(file))
 source, stop = config.build(SystemClock()), threading.Event()
 
 

@@ -15,15 +15,14 @@ import time
 from pathlib import Path
 
 from iort_agent.clock import SystemClock
+from iort_agent.common.schema import Place, load
+from iort_agent.common.state import ClockOffset
 from iort_agent.control.config import DownlinkConfig, share_rule
-from iort_agent.control.downlink import make_downlink
-from iort_agent.lanes.clock_offset import Offset
+from iort_agent.control.downlink import Downlink
 from iort_agent.mqtt.dispatch import Dispatcher
-from iort_agent.rate_limiter import Allowance
 from iort_agent.ros1.node import DEFAULT_NODE, shared
-from iort_agent.schema import Where, load
 from iort_contract.messages.commands import Command, FleetMessage, encode_command, encode_fleet
-from tests.agent_fakes import Loopback
+from tests.agent_fakes import Loopback, link_of
 
 
 def say(line: str) -> None:
@@ -34,24 +33,18 @@ def say(line: str) -> None:
 
 logging.basicConfig(stream=sys.stderr, level="INFO", format="%(levelname)s %(message)s")
 file = Path(sys.argv[1])
-settings, where, clock = json.loads(file.read_text()), Where(file), SystemClock()
+settings, where, clock = json.loads(file.read_text()), Place(file), SystemClock()
 uplink = Loopback(clock, Dispatcher())
 graph = shared(DEFAULT_NODE, clock)
-downlink = make_downlink(
+downlink = Downlink(
     load(DownlinkConfig, settings.get("downlink", {}), where),
     share_rule()(settings["share"], where) if "share" in settings else (),
-    sources=(),
+    link=link_of(uplink, clock),
     graph=graph,
-    robot="car1",
-    namespace="iort",
     boot="0badcafe",
-    uplink=uplink,
-    clock=clock,
-    allowance=Allowance(clock),
-    offset=lambda: Offset(0.0, 0.0),
+    offset=lambda: ClockOffset(0.0, 0.0),
     answer=lambda *_: None,
 )
-assert downlink is not None
 uplink.start()
 downlink.start()
 say("started")

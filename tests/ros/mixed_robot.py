@@ -9,12 +9,11 @@ import math
 import random
 import struct
 from collections.abc import Mapping
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 from bench.ros import vesc_message
 from tests.ros1_types import SIZES, Message, serialize
 
-_VESC_STATE = "\n".join([*(f"float64 {name}" for name in vesc_message.FIELDS), "int32 fault_code"])
 TEXTS = {
     "std_msgs/Empty": "",
     "std_msgs/String": "string data",
@@ -67,9 +66,11 @@ TEXTS = {
         "string hardware_id\nKeyValue[] values"
     ),
     "diagnostic_msgs/DiagnosticArray": "Header header\nDiagnosticStatus[] status",
-    "vesc_msgs/VescState": _VESC_STATE,
+    "vesc_msgs/VescState": vesc_message.STATE,
     "vesc_msgs/VescStateStamped": "Header header\nVescState state",
     # Types of a lab's own. A field called header need not be a std_msgs/Header, nor a header come first.
+    "lab_msgs/Contact": "Header header\nfloat32 force\nbool touching",
+    "lab_msgs/LabelledContact": "string label\nContact grip",
     "lab_msgs/Packet": "uint16 id\nuint8 version\nstring note",
     "lab_msgs/Reading": "Packet header\nfloat64 value\nstd_msgs/Header at",
     "lab_msgs/Part": "Header header\nReading reading",
@@ -139,7 +140,7 @@ NODES: dict[str, list[Topic]] = {
 TOPICS = {topic.name: topic for topics in NODES.values() for topic in topics}
 MESSAGES = {kind: Message(kind, TEXTS) for kind in sorted({*TEXTS, "std_msgs/Header"})}
 
-_EDGES = {
+_EDGES: dict[str, list[Any]] = {
     "float32": [math.nan, math.inf, -0.0],
     "float64": [math.nan, -math.inf, -0.0, 5e-324],
     "uint64": [2**53 + 1, 2**64 - 1],

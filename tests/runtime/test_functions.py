@@ -12,12 +12,12 @@ import pytest
 
 pytest.importorskip("awslambdaric", reason="it has wheels for Linux alone")
 
-from bench.runtime.api import ERROR, PUBNUB_KEY, RESPONSE
-from bench.runtime.deployed import functions
-from bench.runtime.environment import RuntimeFailedError, started
-from bench.runtime.events import events
 from scripts.layer import compile_all
 from stacks.settings import ROOT, Settings
+from tests.runtime.api import ERROR, PUBNUB_KEY, RESPONSE
+from tests.runtime.deployed import functions
+from tests.runtime.environment import RuntimeFailedError, started
+from tests.runtime.events import events
 
 LAYER = ROOT / "build" / "layer" / "local"
 # By function: the answer to its event, and the services that it asked for it.
@@ -46,7 +46,7 @@ TAKES = {
     "admit": {"allowProvisioning": False},
     "live": None,
     "presence": None,
-    "query": {"error": "the request has no robot"},
+    "query": {"error": "robot must be a text, got None"},
 }
 
 

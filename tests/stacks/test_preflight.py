@@ -5,8 +5,8 @@ from __future__ import annotations
 import json
 
 from tests.stacks.test_flips import identity
-from verify.preflight_account import BOOTSTRAP, BOOTSTRAP_PARAMETER
-from verify.preflight_deployed import STACKS
+from verify.preflight.account import BOOTSTRAP, BOOTSTRAP_PARAMETER
+from verify.preflight.deployed import STACKS
 
 # Kinds that have a name of ours, and that the preflight asks for by it.
 ASKED = {

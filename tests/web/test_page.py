@@ -344,7 +344,7 @@ def test_any_number_can_be_charted(page: Page, car: Car) -> None:
     assert panel.count() == 0
 
 
-def test_planes_appear_with_what_they_show(page: Page, car: Car) -> None:
+def test_xy_charts_appear_with_what_they_show(page: Page, car: Car) -> None:
     plane = page.locator("section.panel[aria-label=Trajectory]")
     show(page, car.send())
     assert page.locator("section.panel[aria-label='Speed and motor current']").is_visible()

@@ -155,8 +155,8 @@ def test_an_answer_with_numbers_that_json_does_not_have_comes_with_null(built: P
     ("change", "says"),
     [
         ({"namespace": "Iort!"}, "namespace"),
-        ({"subscribe_key": "pub-c-1"}, "no page may see"),
-        ({"subscribe_key": "sec-c-1"}, "no page may see"),
+        ({"subscribe_key": "pub-c-1"}, "must not be a publish or secret key"),
+        ({"subscribe_key": "sec-c-1"}, "must not be a publish or secret key"),
         ({"subscribe_key": ""}, "subscribe_key"),
         ({"token": "a b"}, "access token"),
         ({"origin": "evil.example; script-src *"}, "origin"),

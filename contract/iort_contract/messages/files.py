@@ -26,7 +26,7 @@ KINDS = ("recording", "image", "log", "message", "other")
 
 # The attachment: these fields replace a field too large for a message, as <field>.<name>. All are null if the
 # content was not kept; the thumbnail is null if the field has none.
-CLAIM_FIELDS = {
+ATTACHMENT_FIELDS = {
     "key": "the content's key in the files' bucket, also before its upload",
     "sha256": "SHA-256 of the content, in hex",
     "size": "bytes of content",
@@ -34,7 +34,7 @@ CLAIM_FIELDS = {
     "thumbnail": "of an image: base64 of a small JPEG",
 }
 # The place of the content in the serialized message, which has an empty array there.
-CLAIM_AT = "at"
+ATTACHMENT_AT = "at"
 
 _FILE_LEVEL = r"[A-Za-z0-9][A-Za-z0-9._-]{0,99}"
 _FILE_NAME = re.compile(rf"{_FILE_LEVEL}(/{_FILE_LEVEL}){{0,3}}")

@@ -1,1 +1,1 @@
-"""What the robot is told: commands, other robots' messages and the operator's settings."""
+"""What the robot receives: commands, messages of other robots and the operator's settings. It uses lanes."""

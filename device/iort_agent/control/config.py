@@ -1,24 +1,24 @@
 """The configuration's sections `downlink` and `share`.
 
 downlink:
-cmd:                                    # cmd/<namespace>/<robot>/<name>
-drive:
-topic: /drive
-type: ackermann_msgs/AckermannDriveStamped
-motion: {lease_s: 0.5, stop: {drive: {speed: 0.0}}}
-fleet:                                  # fleet/<namespace>/+/<name>, of all other robots
-pose: {topic: "/fleet/{robot}/pose", type: geometry_msgs/PoseStamped}
+  cmd:                                    # cmd/<namespace>/<robot>/<name>
+    drive:
+      topic: /drive
+      type: ackermann_msgs/AckermannDriveStamped
+      motion: {lease_s: 0.5, stop: {drive: {speed: 0.0}}}
+  fleet:                                  # fleet/<namespace>/+/<name>, of all other robots
+    pose: {topic: "/fleet/{robot}/pose", type: geometry_msgs/PoseStamped}
 share:                                    # to fleet/<namespace>/<robot>/<name>
-/pose: {name: pose, rate_hz: 5}
+  /pose: {name: pose, rate_hz: 5}
 """
 
 from __future__ import annotations
 
 import re
 from dataclasses import dataclass
-from typing import Any, Callable, Mapping
+from typing import Any, Mapping
 
-from iort_agent.schema import Rule, Where, flag, number, pairs, section, setting, text
+from iort_agent.common.schema import Place, Rule, flag, number, pairs, section, setting, text
 from iort_agent.sources.ros1 import ros_name
 from iort_contract.limits import ContractError
 from iort_contract.messages.commands import FLEET_MAX_AGE_MS, MAX_LEASE_MS, MAX_VALID_MS
@@ -29,38 +29,27 @@ ROBOT_IN_TOPIC = "{robot}"
 
 def _ros_type(value: str) -> str:
     if not re.fullmatch(r"[A-Za-z]\w*/[A-Za-z]\w*", value, re.ASCII):
-        raise ContractError(f"ROS type {value!r}: allowed is package/Type, such as std_msgs/Float64")
+        raise ContractError(f"ROS type must be package/Type, such as std_msgs/Float64, got {value!r}")
     return value
 
 
 def _fleet_topic(value: str) -> str:
     if value.count(ROBOT_IN_TOPIC) != 1:
-        raise ContractError(f"{value!r}: allowed is a ROS topic with {ROBOT_IN_TOPIC} in it, once")
+        raise ContractError(f"must be a ROS topic with one {ROBOT_IN_TOPIC} in it, got {value!r}")
     ros_name(value.replace(ROBOT_IN_TOPIC, "robot"))
     return value
 
 
-def _object(value: Any, where: Where) -> Any:
+def _object(value: Any, place: Place) -> Any:
     if not isinstance(value, dict):
-        raise where.error(value, "a mapping of the ROS message's fields")
+        raise place.error(value, "a mapping of the ROS message's fields")
     return value
-
-
-def _by(check: Callable[[str], str], rule: Rule, what: str) -> Rule:
-    def mapping(value: Any, where: Where) -> Any:
-        found = pairs(rule, what=what)(value, where)
-        for key, _ in found:
-            text(check)(key, where)
-        return found
-
-    return mapping
 
 
 @dataclass(frozen=True)
 class MotionConfig:
-    """A command that moves the robot. ``lease_s``: it goes on at most so long after it was sent; then,
-    on a lost connection and at the agent's end, ``stop`` is published: the message's fields, of which
-    those left out are zero."""
+    """A command that moves the robot. It holds for at most ``lease_s`` after it was sent. Then, and when the
+    connection is lost or the agent ends, ``stop`` is published; its missing fields are zero."""
 
     stop: Mapping[str, Any] = setting(_object)
     lease_s: float = setting(number(0.05, MAX_LEASE_MS / 1000, unit="s"), 0.5)
@@ -68,8 +57,8 @@ class MotionConfig:
 
 @dataclass(frozen=True)
 class CommandConfig:
-    """A command's ROS topic. ``partial``: fields left out are zero, otherwise they are refused.
-    ``max_age_s``: older ones are refused, whatever they allow themselves."""
+    """A command's ROS topic. With ``partial``, missing fields are zero; otherwise such a command is rejected.
+    A command older than ``max_age_s`` is rejected, even if it allows a longer time."""
 
     topic: str = setting(text(ros_name))
     type: str = setting(text(_ros_type))
@@ -80,7 +69,8 @@ class CommandConfig:
 
 @dataclass(frozen=True)
 class FleetConfig:
-    """Other robots' messages of one name: ``{robot}`` in the topic becomes theirs, - becomes _."""
+    """The ROS topic for other robots' messages of one name. ``{robot}`` in it becomes the robot's name, with
+    _ for -."""
 
     topic: str = setting(text(_fleet_topic))
     type: str = setting(text(_ros_type))
@@ -89,36 +79,40 @@ class FleetConfig:
 
 @dataclass(frozen=True)
 class ShareConfig:
-    """A ROS topic's newest message for other robots, at most so often."""
+    """The name under which a ROS topic's newest message is sent to other robots, and the highest rate."""
 
     name: str = setting(text(check_stream))
     rate_hz: float = setting(number(0.01, 20, unit="Hz"), 5.0)
 
 
+_STREAM = text(check_stream)
+_COMMANDS = "a mapping of command to ROS topic and type"
+_FLEET = "a mapping of name to ROS topic and type"
+
+
 @dataclass(frozen=True)
 class DownlinkConfig:
-    """What comes from the broker to ROS. ``clock_skew_s``: so far may an operator's clock be ahead."""
+    """The ROS topics of received messages. An operator's clock may be ahead by ``clock_skew_s``."""
 
     cmd: tuple[tuple[str, CommandConfig], ...] = setting(
-        _by(check_stream, section(CommandConfig), "a mapping of command to ROS topic and type"),
-        (),
+        pairs(section(CommandConfig), what=_COMMANDS, key=_STREAM), ()
     )
     fleet: tuple[tuple[str, FleetConfig], ...] = setting(
-        _by(check_stream, section(FleetConfig), "a mapping of name to ROS topic and type"), ()
+        pairs(section(FleetConfig), what=_FLEET, key=_STREAM), ()
     )
     clock_skew_s: float = setting(number(0, 60, unit="s"), 1.0)
 
 
 def share_rule() -> Rule:
     """The rule for the configuration's section `share`."""
-    shares = _by(ros_name, section(ShareConfig), "a mapping of ROS topic to name and rate")
+    shares = pairs(section(ShareConfig), what="a mapping of ROS topic to name and rate", key=text(ros_name))
 
-    def rule(value: Any, where: Where) -> Any:
-        found = shares(value, where)
+    def rule(value: Any, place: Place) -> Any:
+        found = shares(value, place)
         names = [settings.name for _, settings in found]
         for i, (topic, settings) in enumerate(found):
             if settings.name in names[:i]:
-                raise where.child(topic).problem(f"another topic is shared as {settings.name} already")
+                raise place.child(topic).problem(f"another topic is shared as {settings.name} already")
         return found
 
     return rule

@@ -1,9 +1,9 @@
-"""The named shadow `agent`: the operator's wishes come in, what is in force and what was refused goes out.
+"""The named shadow `agent`: the operator's desired settings come in, the settings in force go out.
 
-What the operator desires lies over the configuration file; a wish withdrawn (null) lets the file's
-value count again. The whole shadow is fetched after every connect and whenever a change was missed;
-between those, every accepted change is followed. Those say more than the deltas do: a wish that
-equals what is reported already makes no delta, though it may end a refusal.
+The desired settings overlay the configuration file; a removed one (null) restores the file's value. The agent
+fetches the whole shadow after every connect and after a missed change, and follows every accepted change in
+between. It does not use deltas: a desired value that equals the reported one makes no delta, although it may
+end a rejection.
 """
 
 from __future__ import annotations
@@ -12,11 +12,11 @@ import json
 import logging
 from typing import Any, Callable, Mapping
 
-from iort_agent.clock import Clock
-from iort_agent.control.runtime_settings import Tuning, overlay
+from iort_agent.common.state import OverShare
+from iort_agent.control.runtime_settings import overlay
 from iort_agent.errors import UplinkError
-from iort_agent.mqtt.uplink import Message, Uplink
-from iort_agent.rate_limiter import Allowance
+from iort_agent.lanes.config import RuntimeSettings
+from iort_agent.mqtt.uplink import Link, MqttMessage
 from iort_contract.messages.commands import Command
 from iort_contract.tables import AGENT_VERSION, OVER_SHARE, PUT_OFF, PUT_OFF_LAST_MS, PUT_OFF_SINCE_MS
 from iort_contract.topics import ACCEPTED, COMMANDS, SHADOW
@@ -24,60 +24,54 @@ from iort_contract.topics import ACCEPTED, COMMANDS, SHADOW
 _log = logging.getLogger(__name__)
 
 _AGAIN_S = 30.0
-# AWS' limit of a shadow document is 8 KB; a value that was refused is quoted up to here.
+# AWS limits a shadow document to 8 KB. A rejected value is quoted up to this length.
 _MAX_VALUE_CHARS = 200
 _NOT_FOUND = 404
-# No count and no time that a calendar has is as large.
+# Larger than any count, and than any time of a calendar.
 _MOST = 10**15
 
 
-class Remote:
-    """Follows the shadow, and says there which version of the agent does so. `tick` is called now and
-    then, the rest by the uplink. ``over_share`` is what the cloud said last of batches that it put off:
-    since when and when last, in its own milliseconds, and how many."""
+class Shadow:
+    """Follows the shadow and reports there. The ticker calls `tick`, the uplink all else. ``over_share`` is
+    the cloud's last report of batches that it put off."""
 
     def __init__(
         self,
+        link: Link,
         *,
-        robot: str,
-        base: Tuning,
-        apply: Callable[[Tuning], None],
+        base: RuntimeSettings,
+        apply: Callable[[RuntimeSettings], None],
         known_fields: Callable[[], Mapping[str, Any]],
         version: str,
-        uplink: Uplink,
-        clock: Clock,
-        allowance: Allowance,
     ) -> None:
-        self._base = self.tuning = base
+        self._base = self.settings = base
         self._apply = apply
         self._known_fields = known_fields
         self._agent_version = version
-        self._uplink = uplink
-        self._clock = clock
-        self._allowance = allowance
-        prefix = f"$aws/things/{robot}/shadow/name/{SHADOW}"
+        self._link, self._uplink, self._clock = link, link.uplink, link.clock
+        prefix = f"$aws/things/{link.robot}/shadow/name/{SHADOW}"
         self._get, self._update = f"{prefix}/get", f"{prefix}/update"
         self._filters = {
             f"{self._get}/accepted": self._on_document,
-            f"{self._get}/rejected": self._on_get_refused,
+            f"{self._get}/rejected": self._on_get_rejected,
             f"{self._update}/accepted": self._on_change,
-            f"{self._update}/rejected": self._on_report_refused,
+            f"{self._update}/rejected": self._on_report_rejected,
         }
-        self.over_share: dict[str, int] | None = None
+        self.over_share: OverShare | None = None
         self._desired: dict[str, Any] = {}
         self._rejected: dict[str, dict[str, Any]] = {}
         self._answers: dict[str, dict[str, Any]] = {}
-        # What the shadow holds of ours, as far as known; None before it was fetched.
+        # The reported part of the shadow, as far as known; None before it was fetched.
         self._reported: dict[str, Any] | None = None
         self._version = 0
         self._fetch_at: float | None = None
         self._report_at: float | None = None
         for topic_filter, handler in self._filters.items():
-            uplink.subscribe(topic_filter, handler)
-        uplink.on_connection(self._on_connection)
+            self._uplink.subscribe(topic_filter, handler)
+        self._uplink.on_connection(self._on_connection)
 
     def tick(self) -> None:
-        """Fetch or report, if that is due and the way back is open."""
+        """Fetch or report, if that is due and the answer can come back."""
         now = self._clock.monotonic()
         if self._fetch_at is not None and now >= self._fetch_at:
             if all(self._uplink.subscribed(topic_filter) for topic_filter in self._filters):
@@ -91,9 +85,9 @@ class Remote:
             else:
                 self._report_at = None
 
-    def answer(self, name: str, command: Command, refusal: str | None) -> None:
-        """Report what became of a command; the newest of each name counts."""
-        outcome = ACCEPTED if refusal is None else _quoted(refusal)
+    def answer(self, name: str, command: Command, rejection: str | None) -> None:
+        """Report the outcome of a command; only the newest of each name is kept."""
+        outcome = ACCEPTED if rejection is None else _quoted(rejection)
         self._answers[name] = {"session": command.session, "seq": command.seq, "outcome": outcome}
         self._report_at = self._clock.monotonic()
 
@@ -101,76 +95,75 @@ class Remote:
         self._fetch_at = self._clock.monotonic() if connected else None
         self._reported = None
 
-    def _on_document(self, message: Message) -> None:
-        """The whole shadow: the answer to a fetch."""
+    def _on_document(self, message: MqttMessage) -> None:
+        """Take the whole shadow, the answer to a fetch."""
         document = _read(message)
         if document is None:
             return
         self._fetch_at = None
         self._version = _version(document)
-        state = document.get("state")
-        state = state if isinstance(state, dict) else {}
+        state = _mapping(document.get("state"))
         self._desired = _mapping(state.get("desired"))
         self._reported = _mapping(state.get("reported"))
         self._follow()
 
-    def _on_get_refused(self, message: Message) -> None:
+    def _on_get_rejected(self, message: MqttMessage) -> None:
         document = _read(message) or {}
         if document.get("code") != _NOT_FOUND:
             _log.warning("the shadow %s cannot be fetched: %s", SHADOW, document.get("message"))
             return
-        # Nobody has wished for anything yet; reporting makes the shadow.
+        # There is no shadow yet; the first report creates it.
         self._fetch_at, self._version = None, 0
         self._desired, self._reported = {}, {}
         self._follow()
 
-    def _on_change(self, message: Message) -> None:
-        """An accepted change, by the operator or by ourselves."""
+    def _on_change(self, message: MqttMessage) -> None:
+        """Take an accepted change, by the operator or by ourselves."""
         document = _read(message)
         if document is None or self._reported is None:
             return
         version = _version(document)
         if version <= self._version:
-            return  # older than what we have
+            return
         if version > self._version + 1:
+            # A change was missed.
             self._fetch_at = self._clock.monotonic()
             return
         self._version = version
-        state = document.get("state")
-        state = state if isinstance(state, dict) else {}
+        state = _mapping(document.get("state"))
         if "reported" in state:
             self._reported = _merged(self._reported, _mapping(state["reported"]))
         if "desired" in state:
             self._desired = _merged(self._desired, _mapping(state["desired"])) if state["desired"] else {}
         self._follow()
 
-    def _on_report_refused(self, message: Message) -> None:
+    def _on_report_rejected(self, message: MqttMessage) -> None:
         document = _read(message) or {}
-        _log.warning("the shadow %s refuses our report: %s", SHADOW, document.get("message"))
+        _log.warning("the shadow %s rejects our report: %s", SHADOW, document.get("message"))
 
     def _follow(self) -> None:
-        """Bring into force what is allowed of the wishes, and report."""
-        self._hear(self._desired.get(OVER_SHARE))
-        wishes = {name: value for name, value in self._desired.items() if name != OVER_SHARE}
-        tuning, rejected = overlay(self._base, wishes, self._known_fields())
-        for name, refusal in rejected.items():
-            if self._rejected.get(name) != refusal:
-                _log.warning("refused: %s", refusal["reason"])
+        """Apply the desired settings that are allowed, and report."""
+        self._note_over_share(_mapping(self._desired.get(OVER_SHARE)))
+        desired = {name: value for name, value in self._desired.items() if name != OVER_SHARE}
+        settings, rejected = overlay(self._base, desired, self._known_fields())
+        for name, rejection in rejected.items():
+            if self._rejected.get(name) != rejection:
+                _log.warning("rejected: %s", rejection["reason"])
         self._rejected = rejected
-        if tuning != self.tuning:
-            _log.info("now in force: %s", json.dumps(tuning.as_document()))
-            self.tuning = tuning
-            self._apply(tuning)
+        if settings != self.settings:
+            _log.info("now in force: %s", json.dumps(settings.as_document()))
+            self.settings = settings
+            self._apply(settings)
         self._report_at = self._clock.monotonic()
 
-    def _hear(self, said: Any) -> None:
-        """Note what the cloud says of the robot's share, and log it once."""
-        said = _mapping(said)
-        names = (PUT_OFF_SINCE_MS, PUT_OFF_LAST_MS, PUT_OFF)
-        if not all(type(said.get(name)) is int and 0 <= said[name] < _MOST for name in names):
+    def _note_over_share(self, said: Mapping[str, Any]) -> None:
+        """Note that the cloud put off batches, and log it once."""
+        values = [said.get(name) for name in (PUT_OFF_SINCE_MS, PUT_OFF_LAST_MS, PUT_OFF)]
+        numbers = [value for value in values if type(value) is int and 0 <= value < _MOST]
+        if len(numbers) < len(values):
             return
-        before, self.over_share = self.over_share, {name: said[name] for name in names}
-        if before is None or before[PUT_OFF_SINCE_MS] != said[PUT_OFF_SINCE_MS]:
+        before, self.over_share = self.over_share, OverShare(*numbers)
+        if before is None or before.since_ms != self.over_share.since_ms:
             _log.warning(
                 "more is recorded than this robot's share of the cloud: summaries are made later, "
                 "and nothing is lost"
@@ -178,33 +171,33 @@ class Remote:
 
     def _state(self) -> dict[str, Any]:
         rejected = {
-            name: {**refusal, "value": _quoted(refusal["value"])} for name, refusal in self._rejected.items()
+            name: {**rejection, "value": _quoted(rejection["value"])}
+            for name, rejection in self._rejected.items()
         }
         return {
-            **self.tuning.as_document(),
+            **self.settings.as_document(),
             "rejected": rejected,
             COMMANDS: dict(self._answers),
             AGENT_VERSION: self._agent_version,
         }
 
     def _publish(self, topic: str, payload: bytes) -> None:
-        self._allowance.spend(topic, payload)
-        self._uplink.publish(topic, payload, qos=1, done=_done)
+        self._link.publish(topic, payload, qos=1, done=_log_error)
 
 
-def _done(error: UplinkError | None) -> None:
-    """`tick` publishes again what was not answered."""
+def _log_error(error: UplinkError | None) -> None:
+    """`tick` repeats a publish without an answer."""
     if error is not None:
         _log.debug("shadow %s: %s", SHADOW, error)
 
 
-def _read(message: Message) -> dict[str, Any] | None:
+def _read(message: MqttMessage) -> dict[str, Any] | None:
     try:
         document = json.loads(message.payload)
     except (ValueError, RecursionError):
         document = None
     if not isinstance(document, dict):
-        _log.warning("shadow %s: a message that is no JSON object", SHADOW)
+        _log.warning("shadow %s: a message is not a JSON object", SHADOW)
         return None
     return document
 
@@ -219,7 +212,7 @@ def _mapping(value: Any) -> dict[str, Any]:
 
 
 def _merged(old: Mapping[str, Any], change: Mapping[str, Any]) -> dict[str, Any]:
-    """As the shadow merges: null removes, objects merge, everything else replaces."""
+    """Merge as the shadow does: null removes, objects merge, everything else replaces."""
     new = dict(old)
     for key, value in change.items():
         if value is None:
@@ -232,7 +225,7 @@ def _merged(old: Mapping[str, Any], change: Mapping[str, Any]) -> dict[str, Any]
 
 
 def _difference(old: Mapping[str, Any], new: Mapping[str, Any]) -> dict[str, Any]:
-    """What to merge into the old to have the new."""
+    """The change that merges the old into the new."""
     change: dict[str, Any] = dict.fromkeys(old.keys() - new.keys())
     for key, value in new.items():
         if isinstance(value, dict) and isinstance(old.get(key), dict):

@@ -1,1 +1,1 @@
-"""Uploads of finished files by signed addresses."""
+"""Uploads of finished files over signed addresses. It uses the connection."""

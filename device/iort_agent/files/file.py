@@ -1,4 +1,4 @@
-"""A file of the robot's, as the contract describes it: name, kind, type, size and what it holds."""
+"""A file of the robot, described as the contract does: name, kind, type, size and hashes."""
 
 from __future__ import annotations
 
@@ -10,8 +10,8 @@ import threading
 from pathlib import Path, PurePath
 from typing import Any, BinaryIO, Mapping, NamedTuple, Sequence
 
+from iort_agent.common.private_files import folder_of, open_below
 from iort_agent.errors import UploadError
-from iort_agent.private_files import folder_of, open_below
 from iort_contract.messages.files import MAX_FILE_BYTES, PART_BYTES, File
 
 _CHUNK_BYTES = 256 * 1024
@@ -19,7 +19,7 @@ _AGAIN_S = 10.0
 _LEVELS, _LEVEL_CHARACTERS = 4, 100
 _PART = re.compile(r"[0-9a-f]{64}")
 
-# What the robots' files are; anything else is "other", of no type in particular.
+# Kind and content type by suffix.
 _SUFFIXES = {
     ".bin": ("message", "application/octet-stream"),
     ".bag": ("recording", "application/x-rosbag"),
@@ -38,15 +38,15 @@ _SUFFIXES = {
 
 
 class Look(NamedTuple):
-    """What tells that a file is still the one it was."""
+    """Size and modification time: a file with another look has changed."""
 
     size: int
     mtime_ns: int
 
 
-class Local(NamedTuple):
-    """A file that was read once: what it is to the contract, and the SHA-256 of each part of it. Below
-    ``root`` no link is followed."""
+class LocalFile(NamedTuple):
+    """A file that was read once: its description, and the SHA-256 of each of its parts. No link below
+    ``root`` is followed."""
 
     root: Path
     name: PurePath
@@ -56,7 +56,6 @@ class Local(NamedTuple):
 
     @property
     def path(self) -> Path:
-        """Where it is."""
         return self.root / self.name
 
     @property
@@ -65,25 +64,35 @@ class Local(NamedTuple):
         return hashlib.sha256(b"".join(bytes.fromhex(part) for part in self.parts)).hexdigest()
 
     def open(self) -> BinaryIO:
-        """The file, to be read again. Raises `OSError`."""
+        """Open it to read. Raises `OSError`."""
         return open_below(self.root, self.name)
 
 
+def unreadable(path: Path, error: OSError, *, again_s: float | None) -> UploadError:
+    """The error for a file that cannot be read."""
+    return UploadError(f"{path}: {error.strerror or error}", again_s=again_s)
+
+
+def changed(path: Path) -> UploadError:
+    """The error for a file that has changed since it was read."""
+    return UploadError(f"{path}: changed during its upload; it is tried again", again_s=_AGAIN_S)
+
+
 def look_at(root: Path, name: PurePath) -> Look:
-    """Size and time of a file. Raises `UploadError` where there is none, or a link in its place."""
+    """Size and time of a file. Raises `UploadError` if it is missing or not a regular file."""
     try:
         with folder_of(root, name) as folder:
             status = os.stat(name.name, dir_fd=folder, follow_symlinks=False)
     except OSError as error:
-        raise UploadError(f"{root / name}: {error.strerror or error}", again_s=None) from error
+        raise unreadable(root / name, error, again_s=None) from error
     if not stat.S_ISREG(status.st_mode):
         raise UploadError(f"{root / name}: is no regular file", again_s=None)
     return Look(status.st_size, status.st_mtime_ns)
 
 
 def wire_name(path: PurePath) -> str:
-    """The name of a file as the contract allows it: other characters become ``_``, what is deeper than
-    four levels moves up."""
+    """The file's name as the contract allows it: other characters become ``_``, and all below the fourth
+    level becomes one level."""
     levels = [_level(part) for part in path.parts]
     if len(levels) > _LEVELS:
         levels = [*levels[: _LEVELS - 1], "_".join(levels[_LEVELS - 1 :])]
@@ -96,18 +105,18 @@ def _level(part: str) -> str:
 
 
 def kind_of(path: PurePath) -> tuple[str, str]:
-    """Kind and content type, by the end of the name."""
+    """Kind and content type, by the suffix."""
     return _SUFFIXES.get(path.suffix.lower(), ("other", "application/octet-stream"))
 
 
-def read(root: Path, name: PurePath, *, stop: threading.Event) -> Local:
-    """Read the file once for what it holds.
+def read(root: Path, name: PurePath, *, stop: threading.Event) -> LocalFile:
+    """Read the file once and compute its hashes.
 
-    Raises `UploadError` where it cannot be read, changes meanwhile, is too large, or ``stop`` is set.
+    Raises `UploadError` if it cannot be read, changes meanwhile, is too large, or ``stop`` is set.
     """
     path, look = root / name, look_at(root, name)
     if look.size > MAX_FILE_BYTES:
-        raise UploadError(f"{path}: has {look.size} bytes; allowed is up to {MAX_FILE_BYTES}", again_s=None)
+        raise UploadError(f"{path}: must have at most {MAX_FILE_BYTES} bytes, got {look.size}", again_s=None)
     whole, parts, read_bytes = hashlib.sha256(), [], 0
     try:
         with open_below(root, name) as file:
@@ -125,7 +134,7 @@ def read(root: Path, name: PurePath, *, stop: threading.Event) -> Local:
             if read_bytes % PART_BYTES or not parts:
                 parts.append(part.hexdigest())
     except OSError as error:
-        raise UploadError(f"{path}: {error.strerror or error}", again_s=_AGAIN_S) from error
+        raise unreadable(path, error, again_s=_AGAIN_S) from error
     if read_bytes != look.size or look_at(root, name) != look:
         raise changed(path)
     kind, content_type = kind_of(path)
@@ -137,30 +146,21 @@ def read(root: Path, name: PurePath, *, stop: threading.Event) -> Local:
         sha256=whole.hexdigest(),
         t_us=max(0, look.mtime_ns // 1000),
     )
-    return Local(root, name, look, file_, parts)
+    return LocalFile(root, name, look, file_, parts)
 
 
-def changed(path: Path) -> UploadError:
-    """The error for a file that is not what it was when it was read."""
-    return UploadError(f"{path}: changes while it is uploaded; it is tried again", again_s=_AGAIN_S)
-
-
-def to_json(local: Local) -> dict[str, Any]:
-    """What `from_json` needs of a file that was read, except where it is."""
+def to_json(local: LocalFile) -> dict[str, Any]:
+    """The file without its path, for `from_json`."""
     return {"look": list(local.look), "file": vars(local.file), "parts": "".join(local.parts)}
 
 
-def from_json(root: Path, name: PurePath, saved: Mapping[str, Any]) -> Local | None:
-    """The file as it was read before; None if it is not the same any more, or nothing was saved."""
+def from_json(root: Path, name: PurePath, saved: Mapping[str, Any]) -> LocalFile | None:
+    """The file as it was read before; None if it has changed since, or if nothing usable was saved."""
     try:
         look = Look(*saved["look"])
         parts = [saved["parts"][i : i + 64] for i in range(0, len(saved["parts"]), 64)]
-        local = Local(root, name, look, File(**saved["file"]), parts)
-        whole = len(parts) == local.file.parts and all(map(_PART.fullmatch, parts))
-    except (KeyError, TypeError):
+        local = LocalFile(root, name, look, File(**saved["file"]), parts)
+        complete = len(parts) == local.file.parts and all(map(_PART.fullmatch, parts))
+        return local if complete and look_at(root, name) == look else None
+    except (KeyError, TypeError, UploadError):
         return None
-    try:
-        same = whole and look_at(root, name) == look
-    except UploadError:
-        return None
-    return local if same else None

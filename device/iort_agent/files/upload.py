@@ -1,6 +1,6 @@
-"""Uploads one file: asks over MQTT where to, sends it by HTTPS, goes on where a break was.
+"""Uploads one file: asks the cloud over MQTT for addresses, sends over HTTPS, and resumes after a break.
 
-Nothing has to be remembered: the file says its own key, and the bucket which parts it has.
+It keeps no state: the file's hash determines its key, and the bucket knows which parts it has.
 """
 
 from __future__ import annotations
@@ -12,57 +12,50 @@ import uuid
 from pathlib import Path
 from typing import Callable
 
-from iort_agent.clock import Clock
 from iort_agent.errors import UploadError
-from iort_agent.files.file import Local, changed, look_at
-from iort_agent.files.http import Outcome, Pace, Sender, trusting
-from iort_agent.mqtt.uplink import Message, Uplink
-from iort_agent.rate_limiter import Allowance
+from iort_agent.files.file import LocalFile, changed, look_at
+from iort_agent.files.http import ByteRate, Outcome, Sender, trusting
+from iort_agent.mqtt.uplink import Link, MqttMessage
 from iort_contract.limits import ContractError
 from iort_contract.messages.files import (
     MAX_ADDRESSES,
-    Address,
     FileAnswer,
     FileRequest,
     decode_file_answer,
     encode_file_request,
     part_range,
 )
-from iort_contract.topics import FILE, PING, PONG, build_topic
+from iort_contract.topics import FILE, PING, PONG
 
 _log = logging.getLogger(__name__)
 
 _ANSWER_S = 15.0
 _LOOK_S = 0.25
-# Tries in a row of which none brought the file any further.
+# Tries in a row without progress, before other files have their turn.
 _TRIES = 6
 _MIN_RETRY_S, _MAX_RETRY_S = 1.0, 60.0
-# After those, the file waits while others have their turn.
 _AGAIN_S = 300.0
 
 Progress = Callable[[int], None]
 
 
-class Asker:
-    """Asks the cloud about files, one question at a time in each thread."""
+class _Requests:
+    """Requests to the cloud, one at a time in each thread."""
 
-    def __init__(
-        self, *, robot: str, namespace: str, uplink: Uplink, clock: Clock, allowance: Allowance
-    ) -> None:
-        self._uplink, self._clock, self._allowance = uplink, clock, allowance
-        self._topic = build_topic(PING, robot, FILE, namespace)
-        self._answers = build_topic(PONG, robot, FILE, namespace)
+    def __init__(self, link: Link) -> None:
+        self._link, self._clock = link, link.clock
+        self._topic, self._answers = link.topic(PING, FILE), link.topic(PONG, FILE)
         self._lock = threading.Lock()
         self._waiting: dict[str, threading.Event] = {}
         self._answered: dict[str, FileAnswer] = {}
-        uplink.subscribe(self._answers, self._on_answer)
+        link.uplink.subscribe(self._answers, self._on_answer)
 
     def ready(self) -> bool:
-        """Whether a question would reach the cloud, and its answer us."""
-        return self._uplink.connected() and self._uplink.subscribed(self._answers)
+        """Whether a request can reach the cloud, and its answer the robot."""
+        return self._link.uplink.connected() and self._link.uplink.subscribed(self._answers)
 
     def ask(self, request: FileRequest, stop: threading.Event) -> FileAnswer | None:
-        """The answer to a request, whose id must be new; None where there is none in time.
+        """The answer to a request; None if it does not come in time. Each request has an id of its own.
 
         Raises `UploadError` for a request that the contract does not allow.
         """
@@ -74,8 +67,7 @@ class Asker:
         with self._lock:
             self._waiting[request.id] = heard
         try:
-            self._allowance.spend(self._topic, payload)
-            self._uplink.publish(self._topic, payload, qos=1, done=lambda _error: None)
+            self._link.publish(self._topic, payload, qos=1)
             until = self._clock.monotonic() + _ANSWER_S
             while not stop.is_set() and self._clock.monotonic() < until:
                 if self._clock.wait(heard, _LOOK_S):
@@ -86,11 +78,11 @@ class Asker:
                 answer = self._answered.pop(request.id, None)
         return answer
 
-    def _on_answer(self, message: Message) -> None:
+    def _on_answer(self, message: MqttMessage) -> None:
         try:
             answer = decode_file_answer(message.payload)
         except ContractError as error:
-            _log.warning("an answer about a file is not one: %s", error)
+            _log.warning("an answer about a file cannot be read: %s", error)
             return
         with self._lock:
             heard = self._waiting.get(answer.id)
@@ -100,38 +92,35 @@ class Asker:
 
 
 class Uploader:
-    """Brings a file into the bucket, or says why not."""
+    """Uploads files, one at a time."""
 
-    def __init__(
-        self, *, asker: Asker, sender: Sender, clock: Clock, chance: random.Random | None = None
-    ) -> None:
-        self._asker, self._sender, self._clock = asker, sender, clock
+    def __init__(self, link: Link, sender: Sender, *, chance: random.Random | None = None) -> None:
+        self._requests, self._sender, self._clock = _Requests(link), sender, link.clock
         self._chance = chance or random.Random()  # noqa: S311 - jitter, not secrets
-
-    def ready(self) -> bool:
-        """Whether there is a connection to ask by."""
-        return self._asker.ready()
+        self.ready = self._requests.ready
 
     @property
     def sent_bytes(self) -> int:
-        """Bytes of files sent so far, also in vain."""
+        """The bytes of files sent so far, also in vain."""
         return self._sender.sent_bytes
 
-    def upload(self, local: Local, stop: threading.Event, progress: Progress = lambda _bytes: None) -> str:
-        """Upload a file that was read; its key in the bucket, once the bucket has all of it.
+    def upload(
+        self, local: LocalFile, stop: threading.Event, progress: Progress = lambda _bytes: None
+    ) -> str:
+        """Upload a file. Returns its key once the bucket has the whole file.
 
-        ``progress`` is told how many of its bytes are there, as they get there. Raises `UploadError`
-        where it is refused, where it changes, after several failures in a row and when ``stop`` is set.
+        ``progress`` is called with the bytes that the bucket has. Raises `UploadError` if the cloud refuses
+        the file, if it changes, after several tries without progress, and when ``stop`` is set.
         """
         transfer = _Transfer(local)
         tries, why = 0, ""
         while not stop.is_set():
-            if not self._asker.ready():
-                # Without a connection nothing is tried, and nothing fails.
+            if not self.ready():
+                # A lost connection is not a failed try.
                 self._clock.wait(stop, _LOOK_S)
                 continue
             before = len(transfer.there)
-            answer = self._asker.ask(transfer.request(), stop)
+            answer = self._requests.ask(transfer.request(), stop)
             if answer is None:
                 why = "no answer from the cloud"
             elif answer.refused is not None:
@@ -154,12 +143,12 @@ class Uploader:
     def _send(
         self, transfer: _Transfer, answer: FileAnswer, stop: threading.Event, progress: Progress
     ) -> str:
-        """Send what there are addresses for; why that ended, empty for: all of it is sent."""
-        transfer.learn(answer)
+        """Send the parts that have an address. Returns why it ended; an empty text if all are sent."""
+        local = transfer.local
+        transfer.take(answer)
         progress(transfer.bytes_there())
         for address in answer.addresses:
-            local = transfer.local
-            first, size = _range(local, address)
+            first, size = transfer.part_range(address.part)
             if look_at(local.root, local.name) != local.look:
                 raise changed(local.path)
             put = self._sender.put(address, local, first, size, stop)
@@ -173,15 +162,15 @@ class Uploader:
 
 
 class _Transfer:
-    """What is known of a file's way into the bucket."""
+    """The parts of a file that the bucket has."""
 
-    def __init__(self, local: Local) -> None:
+    def __init__(self, local: LocalFile) -> None:
         self.local = local
         self.there: set[int] = set()
         self._asked_done = False
 
     def request(self) -> FileRequest:
-        """The next question: where to put what is missing, or that nothing is."""
+        """The next request: addresses for missing parts, or confirmation that none is missing."""
         parts = self.local.parts
         missing = [n for n in range(1, len(parts) + 1) if n not in self.there][:MAX_ADDRESSES]
         self._asked_done = not missing
@@ -192,36 +181,25 @@ class _Transfer:
             parts_sha256=None if missing else self.local.parts_sha256,
         )
 
-    def learn(self, answer: FileAnswer) -> None:
-        """Take over what the bucket has; it knows better."""
+    def take(self, answer: FileAnswer) -> None:
+        """Take over which parts the bucket has."""
         if self._asked_done:
             self.there.clear()
         for first, last in answer.have:
             self.there.update(range(max(1, first), min(last, len(self.local.parts)) + 1))
 
     def bytes_there(self) -> int:
-        """How much of the file is in the bucket."""
-        return sum(part_range(self.local.file, part)[1] for part in self.there)
+        return sum(self.part_range(part)[1] for part in self.there)
+
+    def part_range(self, part: int) -> tuple[int, int]:
+        """First byte and size of a part."""
+        try:
+            return part_range(self.local.file, part)
+        except ContractError as error:
+            raise UploadError(f"{self.local.path}: the cloud's address: {error}", again_s=None) from error
 
 
-def _range(local: Local, address: Address) -> tuple[int, int]:
-    try:
-        return part_range(local.file, address.part)
-    except ContractError as error:
-        raise UploadError(f"{local.path}: asked for what it does not have: {error}", again_s=None) from error
-
-
-def make_uploader(
-    *,
-    robot: str,
-    namespace: str,
-    uplink: Uplink,
-    clock: Clock,
-    allowance: Allowance,
-    root_ca: Path | None,
-    rate_kb_s: float,
-) -> Uploader:
-    """An uploader as `iort_agent.config.file` says; no faster than ``rate_kb_s``, 0 for no limit."""
-    asker = Asker(robot=robot, namespace=namespace, uplink=uplink, clock=clock, allowance=allowance)
-    sender = Sender(trust=trusting(root_ca), pace=Pace(clock, rate_kb_s * 1000))
-    return Uploader(asker=asker, sender=sender, clock=clock)
+def make_uploader(link: Link, *, root_ca: Path | None, rate_kb_s: float) -> Uploader:
+    """An uploader that is no faster than ``rate_kb_s``; 0 is no limit."""
+    rate = ByteRate(link.clock, rate_kb_s * 1000)
+    return Uploader(link, Sender(trust=trusting(root_ca), rate=rate))

@@ -1,1 +1,1 @@
-"""The robot's certificate: how it is got, renewed and checked."""
+"""The robot's certificate: how it is obtained, renewed and checked. It uses only common helpers."""

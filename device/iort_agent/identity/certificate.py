@@ -1,7 +1,7 @@
-"""Read a certificate file: its number at AWS, its validity, and whether a private key belongs to it.
+"""Reads a certificate file: its id at AWS, its validity, and whether a private key belongs to it.
 
-The running agent needs the number alone, which the standard library computes. Only the validity needs the
-library cryptography, which takes 0.1 s to load and 17 MB of memory; it is loaded on first use.
+The running agent needs only the id, which the standard library computes. The validity needs the library
+cryptography, which takes 0.1 s to load and 17 MB of memory, so it is loaded on first use.
 """
 
 from __future__ import annotations
@@ -29,17 +29,17 @@ class Validity(NamedTuple):
 
 
 class Certificate(NamedTuple):
-    """A certificate as it was read; nothing but its PEM armour is checked before `validity`."""
+    """A certificate in DER. Only `validity` checks more than its PEM armour."""
 
     der: bytes
 
     @property
     def id(self) -> str:
-        """AWS' name of the certificate: the SHA-256 of its DER."""
+        """AWS' id of the certificate: the SHA-256 of its DER."""
         return hashlib.sha256(self.der).hexdigest()
 
     def validity(self) -> Validity:
-        """Raises `IdentityError` if this is no X.509 certificate."""
+        """The validity. Raises `IdentityError` if this is no X.509 certificate."""
         x509 = load_x509()
         try:
             read = x509.load_der_x509_certificate(self.der)
@@ -53,7 +53,7 @@ def load_x509() -> Any:
     """Load the module cryptography.x509. Raises `IdentityError` if it cannot be loaded."""
     try:
         with warnings.catch_warnings():
-            # On Python 3.8 it warns on standard error about the Python's age, which the user cannot change.
+            # On Python 3.8 it warns that this Python is old, which the user cannot change.
             warnings.simplefilter("ignore")
             from cryptography import x509  # noqa: PLC0415 - see the module's text
     except ImportError as error:

@@ -1,18 +1,18 @@
-"""A claim: the certificate that is good for getting the robot's own, and what claim.yaml says beside it."""
+"""A provisioning claim: a certificate that can only be exchanged for the robot's own, and its claim.yaml."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
 
-from iort_agent.schema import Where, any_path, existing_path, load, number, read_yaml, setting, text
+from iort_agent.common.schema import Place, any_path, existing_path, load, number, read_yaml, setting, text
 from iort_contract.limits import DEFAULT_NAMESPACE
 from iort_contract.topics import check_namespace, check_robot
 
 
 @dataclass(frozen=True)
 class Claim:
-    """What claim.yaml says. ``config`` is the file to write, or to update where it exists."""
+    """The content of claim.yaml. ``config`` is the configuration file to write or to update."""
 
     endpoint: str = setting(text())
     certificate: Path = setting(existing_path())
@@ -26,5 +26,5 @@ class Claim:
 
 
 def load_claim(file: Path) -> Claim:
-    """The claim in a file. Raises `ConfigError`."""
-    return load(Claim, read_yaml(file), Where(file))
+    """Read a claim file. Raises `ConfigError`."""
+    return load(Claim, read_yaml(file), Place(file))

@@ -8,12 +8,12 @@ from pathlib import Path
 from iort_agent.errors import IdentityError
 from iort_agent.identity.certificate import load_x509
 
-# Where Linux tells the machine's serial number; the first file that exists counts.
+# Place Linux tells the machine's serial number; the first file that exists counts.
 _SERIALS = (Path("/proc/device-tree/serial-number"), Path("/etc/machine-id"))
 
 
 def make_key(robot: str) -> tuple[str, str]:
-    """Make a new key and a request to certify it, both as PEM. Writes no file."""
+    """Make a new private key and its certificate signing request, both as PEM. Writes no file."""
     x509 = load_x509()
     from cryptography.hazmat.primitives import hashes, serialization  # noqa: PLC0415 - as in `load_x509`
     from cryptography.hazmat.primitives.asymmetric import ec  # noqa: PLC0415 - as above
@@ -28,7 +28,7 @@ def make_key(robot: str) -> tuple[str, str]:
 
 
 def machine_serial() -> str:
-    """The machine's serial number; where the hardware has one, a copy of the disk image does not share it."""
+    """The machine's serial number. If the hardware has one, a copy of the disk image does not share it."""
     for path in _SERIALS:
         with contextlib.suppress(OSError, UnicodeDecodeError):
             serial = path.read_text(encoding="ascii").strip("\0 \n")

@@ -1,7 +1,7 @@
-"""A certificate that was issued for the robot and may not be registered yet, kept until it is in its place.
+"""Keeps a certificate that was issued but may not be registered yet, until it is in its place.
 
-AWS IoT admits a name for one certificate. A run that ends between its request and its last file would lose
-that certificate with its key, and the next one would ask for a name that is spent.
+AWS IoT admits a name for one certificate. A run that stops in between would otherwise lose the certificate's
+key, and the next run would request a name that is already used.
 """
 
 from __future__ import annotations
@@ -12,7 +12,7 @@ import logging
 from dataclasses import asdict, dataclass
 from pathlib import Path, PurePath
 
-from iort_agent.private_files import open_below, write_below
+from iort_agent.common.private_files import open_below, write_below
 
 _log = logging.getLogger(__name__)
 
@@ -25,7 +25,8 @@ TOKEN_S = 3600.0
 
 @dataclass(frozen=True)
 class Pending:
-    """Key, certificate and token, for whom they were asked, and when by this machine's clock."""
+    """An issued certificate with its key and token, for whom it is, and this machine's time of the
+    request."""
 
     robot: str
     serial: str
@@ -37,27 +38,23 @@ class Pending:
     asked_s: float
 
     def is_for(self, robot: str, serial: str, endpoint: str, namespace: str) -> bool:
-        """Whether it was asked for this robot, of this deployment."""
-        return (self.robot, self.serial, self.endpoint, self.namespace) == (
-            robot,
-            serial,
-            endpoint,
-            namespace,
-        )
+        """Whether it was issued for this robot of this deployment."""
+        own = (self.robot, self.serial, self.endpoint, self.namespace)
+        return own == (robot, serial, endpoint, namespace)
 
     def may_register(self, now_s: float) -> bool:
-        """Whether the token may still be good; after a clock was set nobody knows."""
+        """Whether the token may still be valid. A request from the future means that the clock was set."""
         return 0 <= now_s - self.asked_s < TOKEN_S
 
 
 def keep(folder: Path, pending: Pending) -> None:
-    """Write it down, on the disk before this returns, readable by its owner alone. Raises `OSError`."""
+    """Write it to the disk, readable by its owner only. Raises `OSError`."""
     folder.mkdir(parents=True, exist_ok=True, mode=0o700)
     write_below(folder, _NAME, json.dumps(asdict(pending)).encode(), sync=True)
 
 
 def kept(folder: Path) -> Pending | None:
-    """What an earlier run left; None where it left nothing that can be read."""
+    """What an earlier run left; None if it left nothing readable."""
     try:
         with open_below(folder, _NAME) as file:
             said = json.loads(file.read(_MAX_BYTES))
@@ -66,7 +63,7 @@ def kept(folder: Path) -> Pending | None:
     except FileNotFoundError:
         return None
     except (OSError, ValueError, TypeError, KeyError, AttributeError) as error:
-        _log.warning("%s is left aside: %s", folder / _NAME, error)
+        _log.warning("%s is ignored: %s", folder / _NAME, error)
         return None
 
 

@@ -1,1 +1,2 @@
-"""From samples to messages: batches, live samples and pings, within what the broker allows."""
+"""From samples to messages: streams, batches, live samples and pings. It uses sources, spool, files and
+mqtt."""

@@ -1,8 +1,8 @@
-"""The claim check: what is too large for a message becomes a file, and the sample says which.
+"""Attachments: a field too large for a message becomes a file, and the sample says which.
 
-A source hands such a field over with the message. Its bytes are written into a folder that
-`iort_agent.files.folder` empties into the bucket, under a key that is known before anything is sent, so that
-the sample need not wait for the upload.
+A source gives the field's bytes with the sample. They are written into a folder, which
+`iort_agent.files.folder` uploads. The file's key is known beforehand, so the sample does not wait for the
+upload.
 """
 
 from __future__ import annotations
@@ -14,96 +14,89 @@ from pathlib import Path, PurePath
 from typing import Any, Callable, Mapping
 
 from iort_agent.clock import Clock
+from iort_agent.common.private_files import write_below
+from iort_agent.common.throttled_log import ThrottledLog
+from iort_agent.files.config import FilesConfig
 from iort_agent.files.file import kind_of, wire_name
-from iort_agent.files.folder import FilesConfig, Uploads
+from iort_agent.files.uploads import Uploads
 from iort_agent.lanes.thumbnail import thumbnail
-from iort_agent.private_files import write_below
 from iort_agent.sources import Emit
-from iort_agent.throttled_log import Seldom
 from iort_contract.limits import Value
-from iort_contract.messages.files import CLAIM_AT, CLAIM_FIELDS, File, file_key
+from iort_contract.messages.files import ATTACHMENT_AT, ATTACHMENT_FIELDS, File, file_key
 from iort_contract.ros1.message import RosMessage, cut
 
 _log = logging.getLogger(__name__)
 
-# How files begin that people want to open by themselves. Other bytes are for who knows the message.
+# First bytes of the files that people want to open. Other bytes are for programs that know the message.
 _BEGINNINGS = ((b"\xff\xd8\xff", ".jpg"), (b"\x89PNG\r\n\x1a\n", ".png"))
 _LOOK_S = 0.1
 
 Thumbnail = Callable[[bytes, str], "str | None"]
 
 
-class ClaimCheck:
-    """Takes bytes out of samples and puts claims in. Safe to use from several threads.
+class Attachments:
+    """Replaces bytes in samples by attachments. Safe to use from several threads.
 
-    Of each stream, at most one content every ``every_s`` of the samples' own time is kept, and no more
-    than ``max_bytes`` wait in the folder; what is not kept is counted, and its claim is null: what was not
-    due, and what there was no room for.
+    Each stream keeps at most one content every ``large_every_s`` of its samples' own time, and at most
+    ``large_max_mb`` wait in the folder. The attachment of a content that is not kept is null; `report` counts
+    those that were not due and those without room.
     """
 
     def __init__(
         self,
-        *,
         robot: str,
         folder: Path,
-        every_s: float,
-        max_bytes: int,
+        files: FilesConfig,
         clock: Clock,
-        thumbnail: Thumbnail,
+        *,
         stored: Callable[[], None],
+        thumbnail: Thumbnail = thumbnail,
     ) -> None:
-        self._robot, self._folder, self._max_bytes = robot, folder, max_bytes
-        self._every_us = round(every_s * 1_000_000)
-        self._clock, self._thumbnail, self._stored = clock, thumbnail, stored
-        self._seldom = Seldom(_log, clock)
+        self._robot, self._folder, self._clock = robot, folder, clock
+        self._every_us = round(files.large_every_s * 1e6)
+        self._max_bytes = round(files.large_max_mb * 1e6)
+        self._stored, self._thumbnail = stored, thumbnail
+        self._throttled = ThrottledLog(_log, clock)
         self._lock = threading.Lock()
         self._last_us: dict[str, int] = {}
         self._bytes = self._measure()
         self.kept = self.left_out = self.not_due = 0
 
     def around(self, emit: Emit) -> Emit:
-        """An `Emit` that puts claims in before the sample goes on."""
+        """An `Emit` that replaces the bytes of each sample first."""
 
-        def emit_claims(stream: str, t_us: int, values: Mapping[str, Any]) -> None:
+        def emit_attached(stream: str, t_us: int, values: Mapping[str, Any]) -> None:
             if isinstance(values, RosMessage):
                 if values.large:
-                    values = self.claim(stream, t_us, values)
+                    values = self.attach_to_message(stream, t_us, values)
             elif any(type(value) is bytes for value in values.values()):
-                values = self.claim_fields(stream, t_us, values)
+                values = self.attach_to_fields(stream, t_us, values)
             emit(stream, t_us, values)
 
-        return emit_claims
+        return emit_attached
 
-    def claim(self, stream: str, t_us: int, message: RosMessage) -> RosMessage:
-        """The message with an empty array for each of its large ones, and a claim beside it, which says where
-        the content is kept and where in the message it was."""
+    def attach_to_message(self, stream: str, t_us: int, message: RosMessage) -> RosMessage:
+        """The message with its large arrays emptied. The attachments beside it say where each content is kept
+        and where in the message it was."""
         keep = self._is_due(stream, t_us)
         raw = message.raw
         beside: dict[str, Value] = {}
         for field, content in message.large.items():
             raw, at = cut(raw, content)
-            beside.update(self._claim(stream, t_us, field, content, keep=keep))
-            beside[f"{field}.{CLAIM_AT}"] = at
+            beside.update(self._attachment(stream, t_us, field, content, keep=keep))
+            beside[f"{field}.{ATTACHMENT_AT}"] = at
         return RosMessage(raw, message.kind, beside=beside)
 
-    def claim_fields(self, stream: str, t_us: int, values: Mapping[str, Any]) -> dict[str, Value]:
-        """Selected fields with a claim for each of bytes; the others as they are."""
+    def attach_to_fields(self, stream: str, t_us: int, values: Mapping[str, Any]) -> dict[str, Value]:
+        """The fields with an attachment for each field of bytes."""
         keep = self._is_due(stream, t_us)
         sample: dict[str, Value] = {}
         for field, value in values.items():
             if type(value) is bytes:
-                sample.update(self._claim(stream, t_us, field, value, keep=keep))
+                sample.update(self._attachment(stream, t_us, field, value, keep=keep))
             else:
                 sample[field] = value
         return sample
-
-    def _claim(self, stream: str, t_us: int, field: str, content: bytes, *, keep: bool) -> dict[str, Value]:
-        claim = self._keep(stream, t_us, field, content) if keep else None
-        if claim is None:
-            self.left_out += keep
-            self.not_due += not keep
-            claim = dict.fromkeys(CLAIM_FIELDS)
-        return {f"{field}.{name}": one for name, one in claim.items()}
 
     def wait_empty(self, timeout_s: float) -> bool:
         """Wait until the folder is uploaded; whether it is."""
@@ -111,34 +104,44 @@ class ClaimCheck:
         while self._measure():
             if self._clock.monotonic() >= until:
                 return False
-            # The folder is emptied file by file, and tells nobody.
+            # Nobody signals that the folder is empty.
             self._clock.wait(never, _LOOK_S)
         return True
 
     def report(self) -> dict[str, Any]:
-        """What became of the contents."""
+        """How many contents were kept, and how many were not, by reason."""
         counts = {"kept": self.kept, "not_due": self.not_due, "left_out": self.left_out}
-        return {**counts, **self._seldom.counts()}
+        return {**counts, **self._throttled.counts()}
 
     def _is_due(self, stream: str, t_us: int) -> bool:
         with self._lock:
             last = self._last_us.get(stream)
-            # A recording that begins anew steps back.
+            # The time of a recording that starts again steps back.
             if last is not None and last <= t_us < last + self._every_us:
                 return False
             self._last_us[stream] = t_us
             return True
 
+    def _attachment(
+        self, stream: str, t_us: int, field: str, content: bytes, *, keep: bool
+    ) -> dict[str, Value]:
+        attachment = self._keep(stream, t_us, field, content) if keep else None
+        if attachment is None:
+            self.left_out += keep
+            self.not_due += not keep
+            attachment = dict.fromkeys(ATTACHMENT_FIELDS)
+        return {f"{field}.{name}": one for name, one in attachment.items()}
+
     def _keep(self, stream: str, t_us: int, field: str, content: bytes) -> dict[str, Value] | None:
         suffix = next((end for begin, end in _BEGINNINGS if content.startswith(begin)), ".bin")
         name = PurePath(stream) / f"{t_us}-{field}{suffix}"
         if not self._has_room(len(content)):
-            self._seldom.warn("full", f"{self._folder} is full: contents of {stream} are not kept")
+            self._throttled.warn("full", f"{self._folder} is full: contents of {stream} are not kept")
             return None
         try:
             written_ns = write_below(self._folder, name, content, mtime_ns=max(0, t_us) * 1000)
         except OSError as error:
-            self._seldom.warn("disk", f"{self._folder}: {error.strerror or error}")
+            self._throttled.warn("disk", f"{self._folder}: {error.strerror or error}")
             return None
         kind, content_type = kind_of(name)
         sha256 = hashlib.sha256(content).hexdigest()
@@ -156,7 +159,7 @@ class ClaimCheck:
     def _has_room(self, size: int) -> bool:
         with self._lock:
             if self._bytes + size > self._max_bytes:
-                # Uploads make room, and do not say so.
+                # Uploads have made room since, and do not tell.
                 self._bytes = self._measure()
             if self._bytes + size > self._max_bytes:
                 return False
@@ -168,21 +171,13 @@ class ClaimCheck:
         return sum(map(_size, self._folder.glob("*/[!.]*")))
 
 
-def make_claims(
+def make_attachments(
     files: FilesConfig, *, robot: str, clock: Clock, uploads: Uploads | None
-) -> ClaimCheck | None:
-    """The claim check that the configuration asks for; None where it asks for none."""
+) -> Attachments | None:
+    """The attachments of a configuration that has a ``large_folder``."""
     if files.large_folder is None or uploads is None:
         return None
-    return ClaimCheck(
-        robot=robot,
-        folder=files.large_folder,
-        every_s=files.large_every_s,
-        max_bytes=round(files.large_max_mb * 1e6),
-        clock=clock,
-        thumbnail=thumbnail,
-        stored=uploads.wake,
-    )
+    return Attachments(robot, files.large_folder, files, clock, stored=uploads.wake)
 
 
 def _size(path: Path) -> int:

@@ -1,17 +1,18 @@
-"""The configuration's sections `record`, `live` and `ping`."""
+"""The configuration's sections `record`, `live` and `ping`, and the settings that may change at run time."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
+from typing import Any, Mapping
 
-from iort_agent.schema import choice, flag, items, number, setting
+from iort_agent.common.schema import choice, flag, items, number, setting
 from iort_contract.limits import LIVE_MAX_RATE_HZ, LIVE_MIN_RATE_HZ
 from iort_contract.topics import PING_PATHS
 
 
 @dataclass(frozen=True)
 class RecordConfig:
-    """The record lane. ``batch_s``: a batch spans at most this; 0 sends each sample by itself."""
+    """The record lane. A batch spans at most ``batch_s``; with 0 each sample is sent by itself."""
 
     enabled: bool = setting(flag(), default=True)
     batch_s: float = setting(number(0, 1, unit="s"), default=1.0)
@@ -19,7 +20,7 @@ class RecordConfig:
 
 @dataclass(frozen=True)
 class LiveConfig:
-    """The live lane. ``rate_hz``: at most so many messages a second of each stream."""
+    """The live lane. ``rate_hz`` is the most messages a second of each stream."""
 
     enabled: bool = setting(flag(), default=True)
     rate_hz: float = setting(
@@ -30,7 +31,7 @@ class LiveConfig:
 
 @dataclass(frozen=True)
 class PingConfig:
-    """Round trips to measure: so many a second over each path, 0 for none."""
+    """The pings. ``rate_hz`` is the number a second over each path; 0 sends none."""
 
     rate_hz: float = setting(number(0, 20, unit="Hz"), 0.0)
     paths: tuple[str, ...] = setting(
@@ -42,3 +43,25 @@ class PingConfig:
         PING_PATHS,
     )
     padding_bytes: int = setting(number(0, 100_000, whole=True, unit="bytes"), 0)
+
+
+@dataclass(frozen=True)
+class RuntimeSettings:
+    """The settings in force. ``fields`` maps a stream to its selected fields; other streams keep all."""
+
+    record_enabled: bool
+    live_enabled: bool
+    live_rate_hz: float
+    ping_rate_hz: float
+    log_level: str
+    fields: Mapping[str, tuple[str, ...]] = field(default_factory=dict)
+
+    def as_document(self) -> dict[str, Any]:
+        """The document that the shadow reports."""
+        return {
+            "record": {"enabled": self.record_enabled},
+            "live": {"enabled": self.live_enabled, "rate_hz": self.live_rate_hz},
+            "ping": {"rate_hz": self.ping_rate_hz},
+            "log_level": self.log_level,
+            "fields": {stream: list(names) for stream, names in sorted(self.fields.items())},
+        }

@@ -1,19 +1,19 @@
-"""How much is recorded a second, and whether the record lane gets it away."""
+"""How much is recorded a second, and whether the record lane can send it."""
 
 from __future__ import annotations
 
 from collections import deque
 from typing import NamedTuple
 
-# Batches come together at the second's edge, so less than some seconds would go up and down.
+# Batches close together at the second's edge, so the mean of fewer seconds would go up and down.
 _WINDOW_S = 10.0
 _EVERY_S = 1.0
-# A backlog below this many seconds of production is that of a second's edge, and so are a few batches.
+# A smaller backlog, in seconds of production or in batches, is normal at a second's edge.
 _BACKLOG_S, _FEW = 2.0, 10
 
 
 class Rate(NamedTuple):
-    """Of one second."""
+    """Batches and payload bytes, a second or in all."""
 
     batches: float
     payload_bytes: float
@@ -24,12 +24,12 @@ class _Mark(NamedTuple):
     # In all: put into the spool, and acknowledged.
     made: Rate
     sent: Rate
-    # The least that waited since the mark before.
+    # The smallest backlog since the mark before.
     least: float
 
 
 class Production:
-    """Fed by `note` several times a second; the rates are of the last ten seconds."""
+    """The rates of the last ten seconds. `note` is called several times a second."""
 
     def __init__(self) -> None:
         self._marks: deque[_Mark] = deque()
@@ -40,7 +40,7 @@ class Production:
         self.behind = False
 
     def note(self, now: float, *, made: Rate, sent: Rate, backlog: float, connected: bool) -> None:
-        """What was made and sent since any time, and how many batches wait now."""
+        """Note what was made and sent in all, and how many batches wait now."""
         if not connected:
             self._connected_since = None
         elif self._connected_since is None:
@@ -63,7 +63,7 @@ class Production:
         if since is None or now - since < _WINDOW_S or backlog <= max(_FEW, self.made.batches * _BACKLOG_S):
             self.behind = False
             return
-        # The least that waited in each half: a bunch of batches that has just come is no growth.
+        # Compare the smallest backlog of each half: batches that have just closed together are no growth.
         half = len(marks) // 2
         before, after = min(m.least for m in marks[:half]), min(m.least for m in marks[half:])
         if after != before:

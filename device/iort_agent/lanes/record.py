@@ -6,7 +6,7 @@ succeeded or failed; then what is left in the spool is sent again from the oldes
 connection the same, once it is back. A batch may therefore arrive twice, which downstream does no
 harm: it has the same key and the same content.
 
-It goes first on its connection: it tells the `Allowance` what it needs, and the others share the rest.
+It goes first on its connection: it tells the `RateLimiter` what it needs, and the others share the rest.
 """
 
 from __future__ import annotations
@@ -22,8 +22,8 @@ from iort_agent.clock import Clock
 from iort_agent.errors import UplinkError
 from iort_agent.lanes.config import RecordConfig
 from iort_agent.lanes.production import Production, Rate
+from iort_agent.mqtt.rate_limiter import PUBLISHES_PER_S, SHARE, RateLimiter
 from iort_agent.mqtt.uplink import Uplink
-from iort_agent.rate_limiter import PUBLISHES_PER_S, SHARE, Allowance
 from iort_agent.sources import SourceConfig
 from iort_agent.spool.interface import Entry, Spool
 from iort_contract.topics import record_topic
@@ -68,7 +68,7 @@ class RecordLane:
         spool: Spool,
         uplink: Uplink,
         clock: Clock,
-        allowance: Allowance,
+        rate_limiter: RateLimiter,
         window: int = WINDOW,
         chance: random.Random | None = None,
     ) -> None:
@@ -77,7 +77,7 @@ class RecordLane:
         self._spool = spool
         self._uplink = uplink
         self._clock = clock
-        self._allowance = allowance
+        self._rate_limiter = rate_limiter
         self._window = window
         self._chance = chance or random.Random()  # noqa: S311 - jitter, not secrets
         self._wake = threading.Event()
@@ -122,7 +122,7 @@ class RecordLane:
                 if entry is None:
                     return None
                 topic = record_topic(self._robot, entry.stream, self._namespace)
-                delay_s = self._allowance.record(topic, entry.payload)
+                delay_s = self._rate_limiter.record(topic, entry.payload)
                 if delay_s > 0:
                     return delay_s
                 self._in_flight.add(entry.id)
@@ -132,14 +132,14 @@ class RecordLane:
         return None
 
     def tick(self) -> None:
-        """Learn how much is recorded, tell the allowance, and see whether all of it gets away."""
+        """Learn how much is recorded, tell the rate_limiter, and see whether all of it gets away."""
         with self._changed:
             acked, left = self._acked, self._spool.backlog()
         made = Rate(
             left.batches + acked.batches + self._spool.dropped().batches,
             left.payload_bytes + acked.payload_bytes,
         )
-        production, (publishes, payloads) = self._production, self._allowance.rates
+        production, (publishes, payloads) = self._production, self._rate_limiter.rates
         production.note(
             self._clock.monotonic(),
             made=made,
@@ -147,7 +147,7 @@ class RecordLane:
             backlog=left.batches,
             connected=self._uplink.connected(),
         )
-        self._allowance.expect(
+        self._rate_limiter.expect(
             production.made, backlog=left.batches > publishes or left.payload_bytes > payloads
         )
         was, self.alarm = self.alarm, self._alarm(left.batches) if production.behind else None
@@ -196,7 +196,7 @@ class RecordLane:
         )  # fmt: skip
 
     def _alarm(self, left: int) -> str:
-        made, sent, limit = self._production.made, self._production.sent, Rate(*self._allowance.rates)
+        made, sent, limit = self._production.made, self._production.sent, Rate(*self._rate_limiter.rates)
         if made.batches > limit.batches or made.payload_bytes > limit.payload_bytes:
             todo = f"the limit allows {_text(limit)}: {TODO}"
         else:

@@ -1,4 +1,4 @@
-"""A small picture of a large one, to stand in a sample. Needs Pillow: pip install 'iort-agent[thumbnail]'."""
+"""Makes a picture small enough for a sample. Needs Pillow: pip install 'iort-agent[thumbnail]'."""
 
 from __future__ import annotations
 
@@ -10,13 +10,13 @@ _log = logging.getLogger(__name__)
 
 _SIZE = (96, 96)
 _QUALITIES = (50, 30, 15)
-# As base64 it must stay a text that a sample may have.
+# In base64 it must fit into a text of a sample.
 _MAX_BYTES = 3072
 _KINDS = ("image/jpeg", "image/png")
 
 
 def thumbnail(content: bytes, content_type: str) -> str | None:
-    """Base64 of a JPEG of at most 96 x 96 pixels; None for what is no picture, or without Pillow."""
+    """A JPEG of at most 96 x 96 pixels in base64; None without Pillow or if the content is no picture."""
     if content_type not in _KINDS:
         return None
     try:
@@ -26,7 +26,7 @@ def thumbnail(content: bytes, content_type: str) -> str | None:
         return None
     try:
         with Image.open(io.BytesIO(content), formats=("JPEG", "PNG")) as picture:
-            # A JPEG is decoded at a fraction of its size, which is most of the time saved.
+            # Decoding a JPEG at a fraction of its size saves most of the time.
             picture.draft("RGB", _SIZE)
             small = picture.convert("RGB")
             small.thumbnail(_SIZE)

@@ -1,1 +1,1 @@
-"""The connection to the broker, and what keeps it alive."""
+"""The connection to the broker: reconnects, subscriptions and its rate limiter. It uses identity."""

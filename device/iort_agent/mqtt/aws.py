@@ -1,11 +1,9 @@
 """The uplink to AWS IoT Core: MQTT 5 over mTLS, with AWS' own client.
 
-The client could reconnect by itself, but knows no shortest wait (measured: 0.25 s between attempts)
-and would never notice a new certificate. So it is stopped after every failure and every loss, and a
-thread of ours starts it again when `iort_agent.mqtt.reconnect` says so. It is told to fail publishes with the
-connection instead of keeping them, because the spool is the only place that keeps batches; and to
-begin a clean session each time, because a broker that lost the session would otherwise leave the
-robot deaf.
+The client's own reconnect has no minimum wait (measured: 0.25 s between attempts) and never notices a new
+certificate. So our thread stops the client after every failure and every loss, and starts it again when
+`iort_agent.mqtt.reconnect` says so. When the connection is lost, publishes fail: only the spool keeps
+batches. Every session is clean: a broker that lost the session would otherwise send the robot nothing more.
 """
 
 from __future__ import annotations
@@ -21,6 +19,7 @@ from awscrt import io, mqtt5
 from awsiot import mqtt5_client_builder
 
 from iort_agent.clock import Clock
+from iort_agent.common.state import Connection
 from iort_agent.errors import IdentityError, UplinkError
 from iort_agent.identity.certificate import Certificate, Validity, read_certificate, stamp
 from iort_agent.mqtt.dispatch import Dispatcher
@@ -29,26 +28,26 @@ from iort_agent.mqtt.native_thread import keep_state
 from iort_agent.mqtt.nodelay import send_at_once
 from iort_agent.mqtt.reconnect import SETTLED_S, SHORTEST_S, Backoff, Causes
 from iort_agent.mqtt.subscriptions import Subscriptions
-from iort_agent.mqtt.uplink import Done, Message, OnConnection, OnMessage, UplinkStatus
+from iort_agent.mqtt.uplink import Done, MqttMessage, OnConnection, OnMessage
 
 _log = logging.getLogger(__name__)
 
-# A frozen broker shows within the keep-alive and the wait for the answer to it.
+# A frozen broker is noticed after the keep-alive and the wait for its answer.
 KEEP_ALIVE_S = 30
 PING_TIMEOUT_S = 10
 _ACK_TIMEOUT_S = 20
-# The client's own reconnects: so late that ours always come first.
+# The client's own reconnects come so late that ours are always first.
 _NEVER_MS = 24 * 3600 * 1000
-# How often to look whether certificate, key or root_ca were replaced.
+# How often to check whether certificate, key or root_ca were replaced.
 _LOOK_S = 2.0
 _CLIENT_STOPS_S = 15.0
 _QOS = (mqtt5.QoS.AT_MOST_ONCE, mqtt5.QoS.AT_LEAST_ONCE)
-_OUR_WISH = "AWS_ERROR_MQTT5_USER_REQUESTED_STOP"
+_WE_STOPPED = "AWS_ERROR_MQTT5_USER_REQUESTED_STOP"
 
 
 class IotCore:
-    """An `iort_agent.mqtt.uplink.Uplink` to one endpoint, as one robot. Without a ``root_ca`` the broker's
-    certificate is held against the system's trust store, which knows AWS'."""
+    """An `iort_agent.mqtt.uplink.Uplink` to one endpoint, as one robot. Without ``root_ca``, the system's
+    trust store must contain the broker's authority, as it does AWS'."""
 
     def __init__(
         self,
@@ -96,7 +95,7 @@ class IotCore:
         self._thread = threading.Thread(target=self._keep_connected, name="uplink", daemon=True)
         self._backoff = backoff or Backoff()
         self._causes = Causes()
-        # Set when the attempt or the connection is over, or somebody wants it to be.
+        # Set when the attempt or the connection has ended, or should end.
         self._down, self._client_stopped = threading.Event(), threading.Event()
         self._stop = threading.Event()
         self._slow = False
@@ -113,36 +112,29 @@ class IotCore:
         )
 
     def on_connection(self, handler: OnConnection) -> None:
-        """Tell the handler of every connect and loss."""
         self._handlers.append(handler)
 
     def subscribe(self, topic_filter: str, handler: OnMessage) -> None:
-        """Receive what matches the filter, from now or the next connect on."""
         self._subscriptions.add(topic_filter, handler)
 
     def subscribed(self, topic_filter: str) -> bool:
-        """Whether the broker has confirmed the subscription on this connection."""
         return topic_filter in self._subscriptions.confirmed
 
     def connected(self) -> bool:
-        """Whether the broker has accepted the connection and it is not known to be lost."""
         return self._connected
 
-    def status(self) -> UplinkStatus:
-        """How the connection stands."""
-        return UplinkStatus(
+    def status(self) -> Connection:
+        return Connection(
             self._connected,
             self._clock.monotonic() - self._since,
             self._connects,
             self._last_error,
             self._certificate.id if self._certificate is not None else None,
+            self._endpoint,
         )
 
     def start(self) -> None:
-        """Connect in the background, and again after every loss.
-
-        Raises `UplinkError` where the certificate or key cannot be used.
-        """
+        """Connect in the background. Raises `UplinkError` if the certificate or the key cannot be used."""
         group = io.EventLoopGroup(1)
         self._bootstrap = io.ClientBootstrap(group, io.DefaultHostResolver(group))
         try:
@@ -154,7 +146,6 @@ class IotCore:
         self._thread.start()
 
     def stop(self, timeout_s: float) -> None:
-        """Unsubscribe, disconnect and end, within the time."""
         if not self._thread.is_alive():
             return
         until = self._clock.monotonic() + timeout_s
@@ -172,7 +163,6 @@ class IotCore:
         self._dispatcher.stop(max(0.1, until - self._clock.monotonic()))
 
     def publish(self, topic: str, payload: bytes, *, qos: int, done: Done) -> None:
-        """Hand a message to the client; ``done`` hears of the PUBACK (QoS 1) or the write (QoS 0)."""
         if not self._connected:
             self._dispatcher.post(lambda: done(UplinkError("not connected")))
             return
@@ -180,18 +170,18 @@ class IotCore:
         if qos:
             self._operate(lambda: self._client.publish(packet), lambda future: done(_publish_error(future)))
         else:
-            # Another thread to hear of it costs as much as the message.
+            # A call in the dispatcher's thread would cost as much as the message.
             self._begin(lambda: self._client.publish(packet)).add_done_callback(
                 lambda future: done(_write_error(future))
             )
 
     def _operate(self, start: Callable[[], Future[Any]], finish: Callable[[Future[Any]], None]) -> None:
-        """Start an operation of the client's; its result, or its refusal, comes by the dispatcher."""
+        """Start an operation of the client; the dispatcher calls ``finish`` with its result or failure."""
         self._begin(start).add_done_callback(lambda result: self._dispatcher.post(lambda: finish(result)))
 
     @staticmethod
     def _begin(start: Callable[[], Future[Any]]) -> Future[Any]:
-        """Start an operation of the client's; a refusal is a result as well."""
+        """Start an operation of the client; an exception becomes a failed future."""
         try:
             return start()
         except Exception as error:  # noqa: BLE001 - the client raises AwsCrtError, TypeError, ...
@@ -199,10 +189,10 @@ class IotCore:
             future.set_exception(error)
             return future
 
-    # What follows is called in the uplink's own thread.
+    # Called in the uplink's own thread.
 
     def _keep_connected(self) -> None:
-        """One attempt after another, until asked to stop."""
+        """Connect again and again until `stop`."""
         while not self._stop.is_set():
             began = self._clock.monotonic()
             self._down.clear()
@@ -223,11 +213,11 @@ class IotCore:
     def _stop_client(self) -> None:
         self._client.stop(mqtt5.DisconnectPacket() if self._connected else None)
         if not self._client_stopped.wait(_CLIENT_STOPS_S):
-            _log.warning("the MQTT client did not stop in time; going on with a new one")
+            _log.warning("the MQTT client did not stop in time; using a new one")
             self._try_new_client()
 
     def _pause(self, began: float) -> None:
-        """Wait until the next attempt is due. Replaced files make it due, a second after the last."""
+        """Wait until the next attempt is due. Replaced files make it due a second after the last one."""
         earliest = began + SHORTEST_S
         due = max(earliest, self._clock.monotonic() + self._backoff.next_s(slow=self._slow))
         while not self._stop.is_set():
@@ -240,27 +230,27 @@ class IotCore:
             self._clock.wait(self._stop, min(left, _LOOK_S))
 
     def _replaced(self) -> bool:
-        """Whether a file differs from what the client was made of; not while one is missing."""
+        """Whether a file has changed since the client was made; False while one is missing."""
         now = stamp(*self._files)
         return now != self._stamp and None not in now
 
     def _try_new_client(self) -> None:
         try:
             self._new_client()
-        except Exception as error:  # noqa: BLE001 - whatever the library makes of a wrong file
+        except Exception as error:  # noqa: BLE001 - the library raises anything for a wrong file
             _log.error(
-                "certificate, private_key or root_ca was replaced by one that cannot be used, "
-                "going on with the one before: %s",
+                "certificate, private_key or root_ca was replaced by one that cannot be used; "
+                "still using the one before: %s",
                 error,
             )
 
     def _new_client(self) -> None:
-        """A client made of the files as they are now."""
+        """Make a client from the files as they are now."""
         self._stamp = stamp(*self._files)
         generation = self._generation + 1
 
         def ours(handler: Callable[[Any], None]) -> Callable[[Any], None]:
-            # What a client that was replaced still has to say is of no interest.
+            # Ignores events of a client that was replaced.
             return lambda data: handler(data) if self._generation == generation else None
 
         client = self._build(
@@ -274,17 +264,17 @@ class IotCore:
         try:
             self._certificate = read_certificate(self._certificate_file)
         except IdentityError as error:
-            # The client accepts the file, so go on without its number and validity.
+            # The client accepts the file, so the agent connects without knowing its id and validity.
             _log.warning("%s", error)
             self._certificate = None
         self._client, self._generation = client, generation
 
-    # What follows is called in the client's own thread, which must not wait.
+    # Called in the client's own thread, which must not wait.
 
     def _on_publish(self, data: Any) -> None:
         at = self._clock.monotonic()
         packet = data.publish_packet
-        self._subscriptions.hand_out(Message(packet.topic, bytes(packet.payload or b""), at))
+        self._subscriptions.hand_out(MqttMessage(packet.topic, bytes(packet.payload or b""), at))
 
     def _on_connected(self, _: Any) -> None:
         keep_state()
@@ -325,13 +315,13 @@ class IotCore:
             self._backoff.reset()
         self._switch(connected=False)
         packet = data.disconnect_packet
-        if self._stop.is_set() or error_name(data.exception) == _OUR_WISH:
+        if self._stop.is_set() or error_name(data.exception) == _WE_STOPPED:
             _log.info("disconnected from %s", self._endpoint)
         elif packet is not None and packet.reason_code == mqtt5.DisconnectReasonCode.SESSION_TAKEN_OVER:
             self._last_error = f"another client has connected as {self._client_id}"
             _log.error(
-                "disconnected: another client has connected as %s. A robot's name may be in use only once; "
-                "both will keep on taking the connection from each other",
+                "disconnected: another client has connected as %s. Only one client may use a robot's name: "
+                "two would take the connection from each other again and again",
                 self._client_id,
             )
         else:
@@ -351,7 +341,7 @@ class IotCore:
         for handler in self._handlers:
             self._dispatcher.post(functools.partial(handler, connected))
 
-    # What follows is called by the dispatcher.
+    # Called by the dispatcher.
 
     def _subscribe(self, topic_filter: str, done: Callable[[Future[Any]], None]) -> None:
         packet = mqtt5.SubscribePacket([mqtt5.Subscription(topic_filter, mqtt5.QoS.AT_LEAST_ONCE)])
@@ -372,7 +362,7 @@ def _publish_error(future: Future[Any]) -> UplinkError | None:
         return error
     puback = future.result().puback
     code = getattr(puback, "reason_code", None)
-    # QoS 0 has no reason code; "no matching subscribers" is a rule's normal answer on some brokers.
+    # QoS 0 has no reason code. Below 128 is a success, such as "no matching subscribers".
     if code is None or code < 128:
         return None
     return UplinkError(said(puback))

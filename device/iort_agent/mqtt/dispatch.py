@@ -13,7 +13,7 @@ Call = Callable[[], None]
 
 
 class Dispatcher:
-    """A queue of calls. `start` runs them in a thread; without it, `run_pending` runs them here."""
+    """A queue of calls. `start` runs them in a thread; `run_pending` runs them in the calling thread."""
 
     def __init__(self) -> None:
         self._calls: queue.SimpleQueue[Call | None] = queue.SimpleQueue()
@@ -24,32 +24,29 @@ class Dispatcher:
         self._calls.put(call)
 
     def start(self) -> None:
-        """Begin to run calls."""
         self._thread.start()
 
     def stop(self, timeout_s: float) -> None:
-        """Run what is queued, then end the thread."""
+        """Run the queued calls, then end the thread."""
         if self._thread.is_alive():
             self._calls.put(None)
             self._thread.join(timeout_s)
 
     def run_pending(self) -> None:
-        """Run what is queued, and what that queues, in this thread."""
+        """Run the queued calls, and those that they queue."""
         while not self._calls.empty():
-            self._call(self._calls.get())
+            call = self._calls.get()
+            if call is not None:
+                _guarded(call)
 
     def _run(self) -> None:
-        while True:
-            call = self._calls.get()
-            if call is None:
-                return
-            self._call(call)
+        while (call := self._calls.get()) is not None:
+            _guarded(call)
 
-    @staticmethod
-    def _call(call: Call | None) -> None:
-        try:
-            if call is not None:
-                call()
-        except Exception:  # noqa: BLE001 - whatever a callback raises
-            # The thread must outlive a mistake in one callback, or the agent would go deaf.
-            _log.exception("a callback failed")
+
+def _guarded(call: Call) -> None:
+    try:
+        call()
+    except Exception:  # noqa: BLE001 - whatever a callback raises
+        # The thread must outlive a mistake in one callback; otherwise the agent would receive nothing more.
+        _log.exception("a callback failed")

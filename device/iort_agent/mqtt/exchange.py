@@ -1,4 +1,4 @@
-"""The connection with a claim, and the two requests by which it becomes a robot's certificate."""
+"""The connection with a provisioning claim, and the two requests that exchange it for a certificate."""
 
 from __future__ import annotations
 
@@ -14,11 +14,11 @@ _WAIT_S = 30.0
 
 
 class _Connection:
-    """A connection of its own to the broker, which is not made again when it ends."""
+    """A connection to the broker that does not reconnect."""
 
     def __init__(self, claim: Claim, certificate: bytes, private_key: bytes, client_id: str) -> None:
         # Reading a configuration must not need the network's library.
-        from awscrt import mqtt5  # noqa: PLC0415 - the network's library
+        from awscrt import mqtt5  # noqa: PLC0415 - see above
         from awsiot import mqtt5_client_builder  # noqa: PLC0415 - as above
 
         self._ended = threading.Event()
@@ -41,12 +41,12 @@ class _Connection:
         )
 
     def open(self) -> bool:
-        """Whether the broker takes it."""
+        """Connect; whether the broker accepted."""
         self.client.start()
         return self._ended.wait(_WAIT_S) and self._connected
 
     def close(self) -> None:
-        """End it, also one that was not taken."""
+        """Disconnect, or give up connecting."""
         self.client.stop()
         self._stopped.wait(_WAIT_S)
 
@@ -63,7 +63,7 @@ class _Connection:
 
 
 class Exchange:
-    """A connection with the claim, and the two requests."""
+    """The connection with a claim, open within a `with`."""
 
     def __init__(self, claim: Claim) -> None:
         self._claim = claim
@@ -98,15 +98,15 @@ class Exchange:
         self._connection.close()
 
     def certify(self, request: str) -> tuple[str, str]:
-        """The certificate for a request, and the token that says it is ours."""
+        """Returns the certificate for a signing request, and the token that proves its ownership."""
         from awsiot import iotidentity  # noqa: PLC0415 - the network's library
 
         asked = iotidentity.CreateCertificateFromCsrRequest(certificate_signing_request=request)
-        answer = self._result("CreateCertificateFromCsr", self._requests.create_certificate_from_csr(asked))
+        answer = _result("CreateCertificateFromCsr", self._requests.create_certificate_from_csr(asked))
         return str(answer.certificate_pem), str(answer.certificate_ownership_token)
 
     def register(self, token: str, parameters: Mapping[str, str]) -> str:
-        """Register the robot with its certificate; the thing's name."""
+        """Register the robot with its certificate. Returns the thing's name."""
         from awsiot import iotidentity  # noqa: PLC0415 - the network's library
 
         asked = iotidentity.RegisterThingRequest(
@@ -114,12 +114,12 @@ class Exchange:
             certificate_ownership_token=token,
             parameters=dict(parameters),
         )
-        return str(self._result("RegisterThing", self._requests.register_thing(asked)).thing_name)
+        return str(_result("RegisterThing", self._requests.register_thing(asked)).thing_name)
 
     def connects(self, robot: str, certificate: str, private_key: str) -> bool:
-        """Whether the broker takes the robot with this certificate, which it does once it is registered.
+        """Whether the broker accepts the robot with this certificate, which it does once it is registered.
 
-        A session that the robot has then ends, as its agent would take it over.
+        It ends a session that the robot has, as the robot's agent would.
         """
         connection = _Connection(self._claim, certificate.encode(), private_key.encode(), robot)
         try:
@@ -127,12 +127,13 @@ class Exchange:
         finally:
             connection.close()
 
-    def _result(self, what: str, future: Any) -> Any:
-        try:
-            return future.result(_WAIT_S + 5)
-        except Exception as error:
-            modeled = getattr(error, "modeled_error", None)
-            if modeled is None:
-                raise IdentityError(f"{what} was refused: {error}") from error
-            code = str(modeled.error_code)
-            raise RefusedError(f"{what} was refused: {code}: {modeled.error_message}", code) from error
+
+def _result(what: str, future: Any) -> Any:
+    try:
+        return future.result(_WAIT_S + 5)
+    except Exception as error:
+        modeled = getattr(error, "modeled_error", None)
+        if modeled is None:
+            raise IdentityError(f"{what} was refused: {error}") from error
+        code = str(modeled.error_code)
+        raise RefusedError(f"{what} was refused: {code}: {modeled.error_message}", code) from error

@@ -1,4 +1,4 @@
-"""Why a connection to the broker failed, in words, and what the person in the lab should look at."""
+"""Explains why a connection to the broker failed, and what the person at the robot should check."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from iort_agent.mqtt.reconnect import Cause
 _TLS_FAILED = "AWS_IO_TLS_ERROR_NEGOTIATION_FAILURE"
 _HUNG_UP = "AWS_ERROR_MQTT_UNEXPECTED_HANGUP"
 _CLOSED = "AWS_IO_SOCKET_CLOSED"
-# CONNACK codes that nothing but a person changes.
+# CONNACK codes that only a person can change.
 _REFUSALS = frozenset(
     {
         mqtt5.ConnectReasonCode.NOT_AUTHORIZED,
@@ -23,7 +23,7 @@ _REFUSALS = frozenset(
     }
 )
 
-# What the person in the lab should look at, by the client's name for what went wrong.
+# Explanations of the client's error names.
 _HINTS = {
     "AWS_IO_DNS_INVALID_NAME": "the endpoint's name does not resolve",
     "AWS_IO_DNS_QUERY_FAILED": "the endpoint's name does not resolve",
@@ -37,9 +37,8 @@ _HINTS = {
     _CLOSED: "the broker or the network closed the connection",
 }
 _ADVICE = (
-    "Nothing recorded is lost meanwhile, as far as the queue reaches. "
-    "`iort-agent check` says more; tried again within minutes, and at once when "
-    "certificate, private_key or root_ca is replaced"
+    "The queue keeps what is recorded meanwhile, as long as it has room. `iort-agent check` says more. "
+    "The agent tries again within minutes, and at once when certificate, private_key or root_ca is replaced"
 )
 
 
@@ -53,9 +52,9 @@ def why_not_connected(
 ) -> Cause:
     """Explain why a connection failed.
 
-    ``validity`` reads the validity of the robot's certificate (None: it cannot be read); it is asked only
-    where the certificate may be the cause. ``now_us`` is the robot's clock. ``hung_up`` says whether the
-    broker hangs up again and again (`iort_agent.mqtt.reconnect.Causes.hung_up`).
+    ``validity`` reads the validity of the robot's certificate (None: it cannot be read), and is called only
+    if the certificate may be the cause. ``now_us`` is the robot's clock. ``hung_up`` tells whether the broker
+    disconnects again and again (`iort_agent.mqtt.reconnect.Causes.hung_up`).
     """
     packet = data.connack_packet
     code = packet.reason_code if packet is not None else None
@@ -78,7 +77,7 @@ def why_not_connected(
                 f"{words}, again and again: it may be restarting, or the robot's certificate is unknown, "
                 "inactive or revoked"
             )
-        # Where TLS was not even agreed on, the broker may just as well be down behind a proxy.
+        # Before TLS, the broker may just as well be down behind a proxy.
         return Cause(f"hangup {name}", f"{text}. {_ADVICE}", slow=name != _CLOSED)
     return Cause(words, words)
 
@@ -98,7 +97,7 @@ def _invalid(validity: Validity | None, now_us: int) -> str | None:
 
 
 def said(packet: Any) -> str:
-    """What the broker said in a CONNACK, DISCONNECT or PUBACK."""
+    """The reason that a CONNACK, DISCONNECT or PUBACK gives."""
     reason = f", {packet.reason_string}" if packet.reason_string else ""
     return f"the broker says {code_name(packet.reason_code)}{reason}"
 
@@ -109,12 +108,12 @@ def code_name(code: Any) -> str:
 
 
 def explain(error: Any) -> str:
-    """What the client says, and what to look at."""
+    """The client's error, explained if it is a known one."""
     name = error_name(error)
     hint = _HINTS.get(name)
     return f"{hint} ({name})" if hint else f"{name}: {getattr(error, 'message', error)}"
 
 
 def error_name(error: Any) -> str:
-    """The client's name for what went wrong."""
+    """The client's name of an error."""
     return str(getattr(error, "name", type(error).__name__))

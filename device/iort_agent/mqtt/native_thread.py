@@ -1,8 +1,8 @@
-"""Keeps Python's state of a thread that is not Python's own, such as the network's.
+"""Keeps Python's state of a thread that C code has started, such as the network's.
 
-Whenever such a thread calls Python, a state is made for it and thrown away behind the call. From Python 3.11
-on that takes and returns memory of the kernel's each time, which makes every other processor look up its
-pages anew: measured at 50 Hz, 100 us for each message of the live lane, a third of what it costs.
+Python makes a state for each call from such a thread and deletes it afterwards. From Python 3.11 on, each
+time maps and unmaps memory, which costs every other processor core, too: 100 us for each live message at 50
+Hz, a third of the message's cost (measured).
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ _kept = threading.local()
 
 
 def keep_state() -> None:
-    """Let the calling thread, which C code has started, have its state until the process ends."""
+    """Keep the calling thread's state until the process ends."""
     if not hasattr(_kept, "state"):
-        # One more than is let go of: Python throws the state away with the last.
+        # Python deletes the state with the last release; this one is never released.
         _kept.state = ctypes.pythonapi.PyGILState_Ensure()

@@ -1,8 +1,8 @@
-"""When to connect again, and what to say about why: no more than one attempt a second, full jitter.
+"""When to reconnect, and when to log why: at most one attempt a second, with full jitter.
 
-A cause that the network may cure by itself is tried again within 1 to 30 s; one that a person must
-cure within 1 to 5 minutes, because AWS counts and throttles what a refused robot does. Each cause is
-said once, with what to do about it, and again only after something else happened.
+The agent retries within 1 to 30 s if the network may recover by itself, and within 1 to 5 minutes if a person
+must act, because AWS counts and throttles the attempts of a refused robot. Each cause is logged once, and
+again only after another cause or a connection.
 """
 
 from __future__ import annotations
@@ -12,14 +12,14 @@ from typing import NamedTuple
 
 SHORTEST_S, LONGEST_S = 1.0, 30.0
 SLOW_SHORTEST_S, SLOW_LONGEST_S = 60.0, 300.0
-# So long must a connection hold before the next loss counts as a new one, with a short wait again.
+# A connection that held for longer than this resets the backoff.
 SETTLED_S = 10.0
-# A broker that hangs up instead of an answer may be restarting; so often in a row it is a refusal.
+# A broker that disconnects without an answer may be restarting. After so many in a row it is a refusal.
 HANGUPS = 3
 
 
 class Cause(NamedTuple):
-    """Why there is no connection. ``kind`` tells one cause from the next; ``slow``: a person must act."""
+    """Why the connection failed. ``kind`` identifies the cause; ``slow``: a person must act."""
 
     kind: str
     text: str
@@ -35,11 +35,11 @@ class Backoff:
         self._slow = False
 
     def reset(self) -> None:
-        """The connection held: begin with short waits again."""
+        """Start with short waits again."""
         self._attempts = 0
 
     def next_s(self, *, slow: bool = False) -> float:
-        """Seconds to wait; the first wait is jittered too, or a fleet would return all at once."""
+        """Seconds to wait. The first wait has jitter, too; otherwise a fleet would reconnect all at once."""
         if slow != self._slow:
             self._slow, self._attempts = slow, 0
         self._attempts = min(self._attempts + 1, 16)
@@ -49,28 +49,28 @@ class Backoff:
 
 
 class Causes:
-    """Remembers what was said."""
+    """Remembers the last logged cause, and counts disconnects without an answer."""
 
     def __init__(self) -> None:
-        self._said: str | None = None
+        self._logged: str | None = None
         self._hangups = 0
         self._before_tls = False
 
     def connected(self) -> None:
-        """Whatever comes now is news."""
-        self._said = None
+        """Forget everything: the next cause is news."""
+        self._logged = None
         self._hangups = 0
 
     def is_news(self, cause: Cause) -> bool:
-        """Whether the cause was not the last one said."""
-        news, self._said = cause.kind != self._said, cause.kind
+        """Whether the cause differs from the last one."""
+        news, self._logged = cause.kind != self._logged, cause.kind
         return news
 
     def hung_up(self, *, before_tls: bool) -> bool:
-        """Count a connection closed without an answer; whether it is time to call it a refusal.
+        """Count a disconnect without an answer; whether there are enough in a row for a refusal.
 
-        A proxy with no broker behind it resets connections. Some of those resets come while TLS begins, and
-        the client calls that a failure of TLS; so what counts is how often in a row TLS had begun, or not.
+        Disconnects before TLS and during TLS count separately: a proxy without a broker behind it resets
+        connections, some of them while TLS begins, which the client reports as a failure of TLS.
         """
         self._hangups = self._hangups + 1 if before_tls == self._before_tls else 1
         self._before_tls = before_tls

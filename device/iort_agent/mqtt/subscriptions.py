@@ -1,4 +1,4 @@
-"""What an uplink is subscribed to: asked for anew after every connect, and again where it was refused."""
+"""The subscriptions of an uplink: requested after every connect, and again after a refusal."""
 
 from __future__ import annotations
 
@@ -10,19 +10,19 @@ from typing import Any, Callable
 
 from iort_agent.mqtt.dispatch import Dispatcher
 from iort_agent.mqtt.failures import code_name, explain
-from iort_agent.mqtt.uplink import Message, OnMessage, matches
+from iort_agent.mqtt.uplink import MqttMessage, OnMessage, matches
 
 _log = logging.getLogger(__name__)
 
 _AGAIN_S, _AGAIN_SLOWLY_S = 10.0, 60.0
 
-# Asks the broker for a topic filter; the callback gets its answer, or the failure, by the dispatcher.
+# Requests a topic filter; the dispatcher calls back with the broker's answer or the failure.
 Subscribe = Callable[[str, Callable[["Future[Any]"], None]], None]
 
 
 class Subscriptions:
-    """Topic filters and who listens to them. ``usable`` says whether asking makes sense now, ``refused``
-    hears in words of the first refusal of each."""
+    """Topic filters and their handlers. ``usable`` tells whether a request makes sense now; ``refused`` is
+    called with a text after the first refusal of each filter."""
 
     def __init__(
         self,
@@ -33,59 +33,50 @@ class Subscriptions:
         refused: Callable[[str], None],
     ) -> None:
         self._dispatcher = dispatcher
-        self._subscribe, self._usable, self._tell_refused = subscribe, usable, refused
+        self._subscribe, self._usable, self._on_refused = subscribe, usable, refused
         self._handlers: dict[str, OnMessage] = {}
-        # What the broker has agreed to on this connection.
+        # The filters that the broker has confirmed on this connection.
         self.confirmed: set[str] = set()
         self._refused: set[str] = set()
         self._losses = 0
 
     def add(self, topic_filter: str, handler: OnMessage) -> None:
-        """Receive what matches the filter, from now or the next connect on."""
+        """Receive what matches the filter: now, or after the next connect."""
         self._handlers[topic_filter] = handler
         if self._usable():
             self._dispatcher.post(self.renew)
 
-    def hand_out(self, message: Message) -> None:
-        """Let the dispatcher call whoever listens; from the network's own thread."""
+    def hand_out(self, message: MqttMessage) -> None:
+        """Let the dispatcher call the matching handlers. Called in the network's own thread."""
         for topic_filter, handler in list(self._handlers.items()):
             if matches(topic_filter, message.topic):
                 self._dispatcher.post(functools.partial(handler, message))
 
     def lost(self) -> None:
-        """The connection is lost, and every subscription with it; from the network's own thread."""
+        """Forget what was confirmed: the connection is lost. Called in the network's own thread."""
         self._losses += 1
         self.confirmed.clear()
 
     def renew(self) -> None:
-        """Ask for what is not confirmed."""
+        """Request the filters that are not confirmed."""
         for topic_filter in list(self._handlers):
             if self._usable() and topic_filter not in self.confirmed:
                 self._subscribe(topic_filter, functools.partial(self._on_answer, topic_filter, self._losses))
 
     def _on_answer(self, topic_filter: str, losses: int, future: Future[Any]) -> None:
-        if losses != self._losses:
-            return  # of a connection before: this one is asked anew
-        error = future.exception()
-        if error is None:
-            packet = future.result()
-            code = packet.reason_codes[0] if packet.reason_codes else None
-            if code is not None and code < 128:
-                if self._usable():
-                    self.confirmed.add(topic_filter)
-                    self._refused.discard(topic_filter)
-                return
-            why = f"the broker says {code_name(code)}" + (
-                f", {packet.reason_string}" if packet.reason_string else ""
-            )
-        else:
-            why = explain(error)
-        if not self._usable():
-            return  # the next connect subscribes anew
-        delay_s = _AGAIN_SLOWLY_S if topic_filter in self._refused else _AGAIN_S
+        # After a loss, or while disconnected, the next connect requests it again.
+        if losses != self._losses or not self._usable():
+            return
+        why = _refusal(future)
+        if why is None:
+            self.confirmed.add(topic_filter)
+            self._refused.discard(topic_filter)
+            return
+        delay_s = _AGAIN_SLOWLY_S
         if topic_filter not in self._refused:
+            delay_s = _AGAIN_S
             self._refused.add(topic_filter)
-            self._tell_refused(f"cannot subscribe to {topic_filter}: {why}")
+            self._on_refused(f"cannot subscribe to {topic_filter}: {why}")
             _log.error(
                 "cannot subscribe to %s, nothing will arrive there; trying again every minute: %s. "
                 "If it is not authorized, the robot's policy is older than this agent",
@@ -94,3 +85,16 @@ class Subscriptions:
         timer = threading.Timer(delay_s, self._dispatcher.post, (self.renew,))
         timer.daemon = True
         timer.start()
+
+
+def _refusal(future: Future[Any]) -> str | None:
+    """Why a subscription failed; None if the broker confirmed it."""
+    error = future.exception()
+    if error is not None:
+        return explain(error)
+    packet = future.result()
+    code = packet.reason_codes[0] if packet.reason_codes else None
+    if code is not None and code < 128:
+        return None
+    reason = f", {packet.reason_string}" if packet.reason_string else ""
+    return f"the broker says {code_name(code)}{reason}"

@@ -12,11 +12,11 @@ from dataclasses import dataclass
 from typing import Any, Mapping, NamedTuple, Optional
 
 from iort_agent.clock import Clock
+from iort_agent.common.schema import choice, items, setting, text
+from iort_agent.common.throttled_log import ThrottledLog
 from iort_agent.errors import SourceError
 from iort_agent.ros1.types import installed
-from iort_agent.schema import choice, items, setting, text
 from iort_agent.sources import REFUSE, UPLOAD, Emit
-from iort_agent.throttled_log import Seldom
 from iort_contract.catalog.streams import TYPES_STREAM
 from iort_contract.limits import ContractError, MessageError, Value
 from iort_contract.messages.message_type import MessageType
@@ -75,7 +75,7 @@ class Intake:
         self, topic: str, config: TopicConfig, *, emit: Emit, clock: Clock, large: str = REFUSE
     ) -> None:
         self.sim_time = False
-        self.throttled = Seldom(_log, clock)
+        self.throttled = ThrottledLog(_log, clock)
         self._topic = topic
         self._config = config
         self._large = large == UPLOAD
@@ -86,6 +86,7 @@ class Intake:
         self._connections: dict[str, Mapping[str, str]] = {}
         self._kind: Kind | None = None
         self._kinds: dict[tuple[str, str], Kind] = {}
+        self._decoders: list[Decoder] = []
         # Publisher -> its connection, and the last message that came by it.
         self._latched: dict[str, tuple[Mapping[str, str], bytes]] = {}
         self._lock = threading.Lock()
@@ -145,8 +146,8 @@ class Intake:
         """The counts of the topic's messages."""
         left_out: dict[str, int] = {}
         # A message that is recorded whole has everything, whatever its view leaves out.
-        for kind in list(self._kinds.values()) if self._config.fields else ():
-            for path, count in kind.decoder.left_out.items() if kind.decoder is not None else ():
+        for decoder in () if self._large and not self._config.fields else tuple(self._decoders):
+            for path, count in decoder.left_out.items():
                 left_out[path] = left_out.get(path, 0) + count
         counts = {"messages": self._messages, "silent": self._silent, "left_out": left_out}
         return {**counts, **self.throttled.counts()}
@@ -156,6 +157,7 @@ class Intake:
         decoder = Decoder(definition, select=self._config.fields, large=self._large)
         if decoder.unknown:
             _log.warning("topic %s: %s has no field %s", self._topic, kind, ", ".join(decoder.unknown))
+        self._decoders = [*self._decoders[-_MAX_KINDS:], decoder]
         return decoder
 
     def _sample(self, kind: Kind, data: bytes) -> Mapping[str, Value] | None:

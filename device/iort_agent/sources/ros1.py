@@ -12,10 +12,10 @@ from dataclasses import dataclass
 from typing import Any, Iterator, Sequence
 
 from iort_agent.clock import Clock
+from iort_agent.common.schema import Place, choice, pairs, section, setting, text
 from iort_agent.errors import SourceError
 from iort_agent.ros1 import master
 from iort_agent.ros1.node import DEFAULT_NODE, Node, shared
-from iort_agent.schema import Where, choice, pairs, section, setting, text
 from iort_agent.sources import FAIL, OK, REFUSE, UPLOAD, Emit, Finding, SourceConfig, intake
 from iort_agent.sources.intake import Intake
 from iort_contract.limits import ContractError
@@ -52,7 +52,7 @@ class TopicConfig(intake.TopicConfig):
     large: str = setting(choice(REFUSE, UPLOAD), REFUSE)
 
 
-def _topics(value: Any, where: Where) -> Any:
+def _topics(value: Any, where: Place) -> Any:
     rule = pairs(section(TopicConfig), what="a mapping of ROS topic to its stream and time")
     for topic in value if isinstance(value, dict) else ():
         text(ros_name)(topic, where)

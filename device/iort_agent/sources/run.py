@@ -1,4 +1,4 @@
-"""One source while the agent runs: how it ended, and whether it failed."""
+"""Runs one source, and keeps how it ended."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ class SourceRun:
         self._ended = False
 
     def run(self, emit: Emit, stop: threading.Event) -> None:
-        """Run until the source ends, fails or is stopped. Raises nothing: the other sources go on."""
+        """Run until the source ends, fails or is stopped. Raises nothing, because the other sources go on."""
         _log.info("source started: %s", self.description)
         try:
             self._source.run(emit, stop)
@@ -38,8 +38,10 @@ class SourceRun:
             self._ended = not stop.is_set()
 
     def check_stored(self, streams: Sequence[tuple[int, int]]) -> None:
-        """Note a failure if the source ended by itself and no sample of it could be stored; ``streams`` are
-        the samples taken and refused of each stream that it gave."""
+        """Set `failed` if the source ended by itself and none of its samples could be stored.
+
+        ``streams`` are the counts of accepted and rejected samples of each of its streams.
+        """
         if not self._ended:
             return
         samples, refused = sum(one[0] for one in streams), sum(one[1] for one in streams)
@@ -51,7 +53,7 @@ class SourceRun:
             self.failed = True
 
     def waits(self) -> str | None:
-        """What the source waits for; None if it does not wait."""
+        """The reason why the source waits; None if it does not wait."""
         why = self._source.report().get("waits")
         return str(why) if why else None
 

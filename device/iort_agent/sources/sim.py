@@ -1,4 +1,4 @@
-"""A simulated car: the physics of `iort_agent.sources.vehicle`, sampled like a real VESC."""
+"""A simulated car: the physics of `iort_agent.sources.vehicle`, sampled as from a real VESC."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from typing import Sequence
 
 from iort_agent.clock import Clock, Pace
-from iort_agent.schema import number, section, setting, text
+from iort_agent.common.schema import number, section, setting, text
 from iort_agent.sources import Emit, Source, SourceConfig
 from iort_agent.sources.vehicle import Vehicle, VehicleConfig
 from iort_contract.catalog.vesc import VESC_STREAM
@@ -19,7 +19,7 @@ _MAX_STEP_S = 0.02
 
 @dataclass(frozen=True)
 class SimConfig(SourceConfig):
-    """A simulated car. The same ``seed`` drives the same lap; without ``duration_s`` it never stops."""
+    """A simulated car. One ``seed`` always drives the same laps; without ``duration_s`` it never stops."""
 
     stream: str = setting(text(check_stream), VESC_STREAM)
     rate_hz: float = setting(number(0.1, 2000, unit="Hz"), 50.0)

@@ -1,7 +1,7 @@
 """The physics of a small electric car, such as F1TENTH's: motor, mass, battery, heat and a driver.
 
-Plausible, not exact: what matters is that speed, duty cycle, currents, voltage sag, counters and
-temperature hang together as on a real VESC, so that whoever looks at a chart is not fooled.
+The model is plausible, not exact. Speed, duty cycle, currents, voltage sag, counters and temperature depend
+on each other as on a real VESC, so that a chart looks real.
 """
 
 from __future__ import annotations
@@ -10,23 +10,23 @@ import math
 import random
 from dataclasses import dataclass
 
-from iort_agent.schema import number, setting
+from iort_agent.common.schema import number, setting
 from iort_contract.catalog.derived import F1TENTH
 from iort_contract.limits import Value
 
 _G = 9.81
 _AMBIENT_DEGC = 24.0
-# The VESC counts six steps of its tachometer an electrical revolution.
+# The VESC's tachometer counts six steps in an electrical revolution.
 _COUNTS_PER_EREV = 6
-# What its logic draws from the battery, and motor friction in newtons at the wheel.
+# The power that the VESC's logic draws from the battery.
 _IDLE_W = 1.5
-# Of the board: its heat capacity and its cooling when the car stands.
+# The board's heat capacity, and its cooling while the car stands.
 _BOARD_J_PER_K, _BOARD_W_PER_K = 60.0, 0.25
 
 
 @dataclass(frozen=True)
 class VehicleConfig:
-    """A car; the defaults are a 1:10 F1TENTH car on a three-cell pack."""
+    """A car; the defaults are a 1:10 F1TENTH car with a three-cell battery."""
 
     mass_kg: float = setting(number(0.1, 5000, unit="kg"), 3.7)
     drag_area_m2: float = setting(number(0, 5, unit="m2, drag coefficient times area"), 0.03)
@@ -45,9 +45,9 @@ class VehicleConfig:
 
 
 class Driver:
-    """Drives laps: straights at full speed, corners slower, a little different every time."""
+    """Drives laps: fast on straights, slower in corners, and a little different each time."""
 
-    # Length in metres and speed as a share of the highest; the last corner is a hairpin.
+    # Length in metres, and speed as a share of the highest; the last corner is a hairpin.
     _LAP: tuple[tuple[float, float], ...] = ((14, 1.0), (5, 0.5), (6, 0.75), (4, 0.42), (11, 0.92), (5, 0.3))
     _LOOKAHEAD_S = 0.6
 
@@ -59,7 +59,7 @@ class Driver:
         self._mood = 1.0
 
     def target_mps(self, speed_mps: float, dt: float) -> float:
-        """The speed wanted now; brakes before the corner, not in it."""
+        """The target speed; the driver brakes before the corner, not in it."""
         self._left_m -= speed_mps * dt
         if self._left_m <= 0:
             self._section = (self._section + 1) % len(self._LAP)
@@ -72,13 +72,13 @@ class Driver:
 
 
 class Vehicle:
-    """A car's state; `step` moves it on, `sample` is what its VESC would report then."""
+    """A car's state: `step` advances it, and `sample` is the report of its VESC."""
 
     def __init__(self, config: VehicleConfig, seed: int) -> None:
         self._config = config
         self._chance = random.Random(seed)  # noqa: S311 - noise, not secrets
         self._driver = Driver(config, self._chance)
-        # From the motor's speed constant; volts, newtons and m/s are tied by the same number.
+        # The motor's speed constant ties volts, newtons and m/s.
         self._volts_per_mps = config.speed_to_erpm_gain / config.pole_pairs / config.motor_kv
         rad_s_per_mps = config.speed_to_erpm_gain / config.pole_pairs * 2 * math.pi / 60
         self._newtons_per_amp = 60 / (2 * math.pi * config.motor_kv) * rad_s_per_mps
@@ -93,11 +93,11 @@ class Vehicle:
         self._drawn_ah = self._regen_ah = self._drawn_wh = self._regen_wh = 0.0
 
     def step(self, dt: float) -> None:
-        """Let ``dt`` seconds pass; small ones, 20 ms or less, keep the driver steady."""
+        """Advance by ``dt`` seconds; steps of at most 20 ms keep the driver steady."""
         c = self._config
         self._steer(dt)
         force = self._current_a * self._newtons_per_amp
-        # Losses of the gears work against the motion whoever drives whom.
+        # The losses of the gears always work against the motion.
         force *= c.drivetrain_efficiency if self._current_a > 0 else 1 / c.drivetrain_efficiency
         drag = 0.5 * 1.2 * c.drag_area_m2 * self._speed_mps**2
         rolling = c.rolling_resistance * c.mass_kg * _G if self._speed_mps > 0 else 0.0
@@ -109,7 +109,7 @@ class Vehicle:
         self._counts_abs += counts
 
     def sample(self) -> dict[str, Value]:
-        """The 13 fields of the ROS 1 driver's VescState, in its units and with its resolution."""
+        """The 13 fields of the ROS 1 driver's VescState, in its units and resolution."""
         noise = self._chance.gauss
         erpm = self._speed_mps * self._config.speed_to_erpm_gain
         return {
@@ -129,12 +129,12 @@ class Vehicle:
         }
 
     def _steer(self, dt: float) -> None:
-        """The driver's foot: motor current in proportion to the missing speed, within the limits."""
+        """Set the motor current in proportion to the missing speed, within the limits."""
         c = self._config
         error = self._driver.target_mps(self._speed_mps, dt) - self._speed_mps
         wanted = error * c.mass_kg * 4 / self._newtons_per_amp
         wanted = max(-c.max_brake_current_a, min(c.max_current_a, wanted))
-        # A foot needs a tenth of a second, and no current brakes a car that stands.
+        # The driver's foot needs a tenth of a second, and no current brakes a standing car.
         self._current_a += (wanted - self._current_a) * min(1.0, dt / 0.1)
         if self._speed_mps == 0:
             self._current_a = max(0.0, self._current_a)
@@ -143,7 +143,7 @@ class Vehicle:
         c = self._config
         motor_volts = self._speed_mps * self._volts_per_mps + self._current_a * c.motor_resistance_ohm
         watts = motor_volts * self._current_a + _IDLE_W
-        # Power at the terminals: V = open - I R and V I = watts, of which the root near no load is real.
+        # At the terminals V = open - I R and V I = watts; the root near no load is the real one.
         open_v = self._open_voltage()
         root = max(0.0, open_v**2 - 4 * c.battery_resistance_ohm * watts)
         self._voltage = (open_v + math.sqrt(root)) / 2
@@ -163,6 +163,6 @@ class Vehicle:
         self._board_degc += (heat_w - cooling_w) / _BOARD_J_PER_K * dt
 
     def _open_voltage(self) -> float:
-        """Of a lithium-polymer pack at rest: a long flat stretch, then a knee."""
+        """The voltage of a lithium-polymer battery at rest: a long flat stretch, then a knee."""
         left = self._charge_left
         return self._config.cells * (3.45 + 0.55 * left + 0.2 * left**8 - 0.45 * (1 - left) ** 12)

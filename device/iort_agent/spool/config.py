@@ -6,11 +6,11 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from iort_agent.schema import Where, choice, number, setting
+from iort_agent.common.schema import Place, choice, number, setting
 from iort_agent.spool.interface import FULL, OVERWRITE_OLDEST, PROCESS, REJECT_NEW
 
 
-def _queue_file(value: Any, where: Where) -> Path | None:
+def _queue_file(value: Any, where: Place) -> Path | None:
     """The path of a file that may be made: in a folder that exists, and not the configuration's own."""
     allowed = "the path of a file, in a folder that exists"
     if value is None:

@@ -11,8 +11,8 @@ import zlib
 from pathlib import Path
 from typing import Collection, Iterable, Mapping
 
+from iort_agent.common.private_files import make_private
 from iort_agent.errors import AgentError
-from iort_agent.private_files import make_private
 from iort_agent.spool.interface import FULL, Backlog, Entry
 from iort_contract.messages.batch import MAX_PREVIOUS, RunEnd, batch_id
 

@@ -1,4 +1,1 @@
-"""The agent's status and report: their types, the socket that gives the status, and its text for a person.
-
-Imports no other room.
-"""
+"""The agent's reports about itself: accounts, metrics and the status socket. It uses every lane."""

@@ -3,102 +3,97 @@
 from __future__ import annotations
 
 import contextlib
+import functools
 import json
 import logging
 import os
 import socket
+import socketserver
 import threading
 from pathlib import Path
 from typing import Any, Callable, Iterator, Mapping
 
+from iort_agent.common.state import Status, read
 from iort_agent.errors import AgentError, NotRunningError
-from iort_agent.status.state import Status, read
 
 _log = logging.getLogger(__name__)
 
 SOCKET = "agent.sock"
 _TIMEOUT_S = 5.0
-# sockaddr_un has room for so many bytes, the terminating zero included.
+_NEVER_S = 86_400.0
+# The longest path of a socket: sockaddr_un has 108 bytes, with the terminating zero.
 _MAX_PATH_BYTES = 107
 
 
 class StatusServer:
-    """Answers every connection with one status. Only its owner may open the socket."""
+    """Answers every connection with the status. Only its owner may open the socket."""
 
     def __init__(self, path: Path, status: Callable[[], Mapping[str, Any]]) -> None:
         self._path = path
         self._status = status
-        self._socket: socket.socket | None = None
+        self._server: _Server | None = None
 
     def start(self) -> None:
-        """Listen. Raises `AgentError` if an agent already answers there; if the socket cannot be made, the
+        """Listen. Raises `AgentError` if an agent already answers there. If the socket cannot be made, the
         agent runs without it."""
         try:
-            self._socket = self._bind()
+            if self._path.is_socket():
+                self._remove_left_over()
+            with _address(self._path) as address:
+                self._server = _Server(address, self._status)
         except OSError as error:
             _log.warning("no status socket: %s: %s; set status_socket", self._path, error.strerror or error)
             return
-        threading.Thread(target=self._serve, args=(self._socket,), name="status", daemon=True).start()
+        serve = functools.partial(self._server.serve_forever, poll_interval=_NEVER_S)
+        threading.Thread(target=serve, name="status", daemon=True).start()
 
     def stop(self) -> None:
         """Remove the socket."""
-        listening, self._socket = self._socket, None
-        if listening is not None:
+        server, self._server = self._server, None
+        if server is not None:
             self._path.unlink(missing_ok=True)
-            # Closing alone would not wake a thread that waits in accept.
+            # The server waits for connections only; this ends its wait.
             with contextlib.suppress(OSError):
-                listening.shutdown(socket.SHUT_RDWR)
-            listening.close()
+                server.socket.shutdown(socket.SHUT_RDWR)
+            server.shutdown()
+            server.server_close()
 
-    def _bind(self) -> socket.socket:
-        listening = socket.socket(socket.AF_UNIX, socket.SOCK_STREAM)
-        try:
-            # On Linux the socket file has these permissions from its first moment on.
-            os.fchmod(listening.fileno(), 0o600)
-            with _address(self._path) as address:
-                try:
-                    listening.bind(address)
-                except OSError:
-                    if not self._path.is_socket():
-                        raise
-                    self._refuse_second()
-                    self._path.unlink(missing_ok=True)
-                    listening.bind(address)
-            listening.listen(4)
-        except BaseException:
-            listening.close()
-            raise
-        return listening
-
-    def _refuse_second(self) -> None:
+    def _remove_left_over(self) -> None:
         try:
             process = process_at(self._path)
         except NotRunningError:
-            return  # an agent that was killed left the file behind
+            # A killed agent left it behind.
+            self._path.unlink(missing_ok=True)
+            return
         raise AgentError(
             f"an agent is already running with this configuration (process {process}); "
-            "two would take the connection from each other"
+            "two would take the connection from each other again and again"
         )
 
-    def _serve(self, listening: socket.socket) -> None:
-        while True:
-            try:
-                connection, _ = listening.accept()
-            except OSError:
-                return  # stopped
-            with connection:
-                try:
-                    connection.settimeout(_TIMEOUT_S)
-                    connection.sendall(json.dumps(self._status()).encode())
-                except OSError:
-                    pass  # the client has gone
-                except Exception:  # noqa: BLE001 - the next client must get an answer again
-                    _log.exception("the status could not be made")
+
+class _Server(socketserver.UnixStreamServer):
+    def __init__(self, address: str, status: Callable[[], Mapping[str, Any]]) -> None:
+        self._status = status
+        super().__init__(address, socketserver.BaseRequestHandler)
+
+    def server_bind(self) -> None:
+        # On Linux the socket file is created with these permissions.
+        os.fchmod(self.fileno(), 0o600)
+        super().server_bind()
+
+    def finish_request(self, request: Any, client_address: Any) -> None:  # noqa: ARG002 - the library's signature
+        request.settimeout(_TIMEOUT_S)
+        # The client may have disconnected.
+        with contextlib.suppress(OSError):
+            request.sendall(json.dumps(self._status()).encode())
+
+    def handle_error(self, request: Any, client_address: Any) -> None:  # noqa: ARG002 - the library's signature
+        _log.exception("the status could not be made")
 
 
 @contextlib.contextmanager
 def _address(path: Path) -> Iterator[str]:
-    """A path of the socket that is short enough for the kernel, whatever the length of its folder's."""
+    """A path of the socket that is short enough for the kernel, even if the folder's path is long."""
     if len(os.fsencode(path)) <= _MAX_PATH_BYTES:
         yield str(path)
         return

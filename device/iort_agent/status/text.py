@@ -1,12 +1,12 @@
-"""The status for a person."""
+"""The status as text for a person."""
 
 from __future__ import annotations
 
 import time
 from typing import Any, Iterator, Mapping
 
-from iort_agent.logs import neutral
-from iort_agent.status.state import Files, LiveLane, Queue, RecordLane, Status
+from iort_agent.common.logs import neutral
+from iort_agent.common.state import Files, LiveLane, Queue, RecordLane, Status
 
 # A stream that is silent for longer is marked.
 _SILENT_S = 5
@@ -73,7 +73,7 @@ def _queue(queue: Queue) -> str:
 
 
 def _source(source: Mapping[str, Any]) -> Iterator[str]:
-    """The counts of a source: a line, one more for each group of counts, and one for each topic that misses
+    """The counts of a source: one line, one more for each group of counts, and one for each topic that lost
     something."""
     counts = {
         name: value
@@ -112,7 +112,7 @@ def _told(counts: Mapping[str, Any], before: str = "") -> str:
 
 
 def _not_recorded(source: Mapping[str, Any]) -> Iterator[tuple[str, str]]:
-    """Each topic of a source that misses something, and what it misses."""
+    """Each topic of a source that lost something, and what it lost."""
     for topic, counts in source.items():
         if not isinstance(counts, dict) or "messages" not in counts:
             continue

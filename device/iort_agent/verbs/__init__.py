@@ -1,1 +1,1 @@
-"""What the verbs of the command line do. They may use every room; only `cli` uses them."""
+"""The commands other than `run`. A verb may use every room."""

@@ -1,5 +1,7 @@
-"""`iort-agent check`: what would not work, before it does not. Changes nothing, and leaves a running
-agent its connection."""
+"""`iort-agent check`: finds what would not work. It changes nothing, and does not disturb a running agent.
+
+Each source checks itself: see `iort_agent.sources.SourceConfig.check`.
+"""
 
 from __future__ import annotations
 
@@ -15,31 +17,31 @@ from email.utils import parsedate_to_datetime
 from pathlib import Path
 from typing import Iterator
 
-from iort_agent.config.file import Config
+from iort_agent.common.state import Status
+from iort_agent.config import Config
 from iort_agent.errors import IdentityError, NotRunningError
 from iort_agent.identity.certificate import Certificate, check_pair, read_certificate
 from iort_agent.lanes.record import TODO, too_many
 from iort_agent.sources import FAIL, OK, WARN, Finding
 from iort_agent.status.server import ask
-from iort_agent.status.state import Status
 
 _TIMEOUT_S = 5.0
 _EXPIRES_SOON_S = 30 * 86_400
-# An agent of this age cannot run earlier than this: 2026-01-01.
+# This agent cannot run before 2026-01-01.
 _EARLIEST_S = 1_767_225_600
 _CLOCK_OFF_S = 5.0
 _LEAST_FREE_BYTES = 50_000_000
 _TLS_PORT_WITH_ALPN = 443
-# What a CONNACK of MQTT 5 says, as far as a robot hears it.
+# The reason codes of an MQTT 5 CONNACK that a robot may get.
 _CONNACK = {0x00: "accepted", 0x85: "client id not valid", 0x87: "not authorized", 0x89: "server busy"}
 
 
 def check(config: Config, status_socket: Path) -> Iterator[Finding]:
-    """Look at everything that the configuration names, one finding after another."""
+    """Check everything that the configuration names, one finding after another."""
     running = _running(status_socket)
     yield from _identity(config)
     yield from _clock(config, running)
-    yield from _endpoint(config, running)
+    yield from broker_findings(config, running)
     for i, source in enumerate(config.sources):
         yield from source.check(f"source {i} ({source.describe()})")
     yield from _queue(config)
@@ -56,9 +58,48 @@ def render(finding: Finding) -> str:
     return f"{finding.level:<5} {finding.what}: {finding.text}{todo}"
 
 
-def broker_findings(config: Config) -> Iterator[Finding]:
-    """Whether the broker takes the robot, as it stands; it takes the connection of an agent that runs."""
-    yield from _endpoint(config, None)
+def broker_findings(config: Config, running: Status | None = None) -> Iterator[Finding]:
+    """Whether the broker accepts the robot. Without ``running``, this ends a running agent's connection."""
+    where = f"{config.endpoint}:{config.port}"
+    try:
+        found = socket.getaddrinfo(config.endpoint, config.port, type=socket.SOCK_STREAM)
+    except OSError as error:
+        todo = "is there a network, and is `endpoint` spelled right?"
+        yield Finding("endpoint", FAIL, f"{config.endpoint} does not resolve: {error}", todo)
+        return
+    yield Finding("endpoint", OK, f"{config.endpoint} is {found[0][4][0]}")
+    try:
+        raw = socket.create_connection((config.endpoint, config.port), _TIMEOUT_S)
+    except OSError as error:
+        todo = "is the port open in the firewall? AWS also listens on 443: set `port: 443`"
+        yield Finding("connection", FAIL, f"{where}: {error}", todo)
+        return
+    yield Finding("connection", OK, where)
+    with closing(raw):
+        try:
+            context = ssl.create_default_context(cafile=config.root_ca)
+            context.load_cert_chain(config.certificate, config.private_key)
+            if config.port == _TLS_PORT_WITH_ALPN:
+                context.set_alpn_protocols(["x-amzn-mqtt-ca"])
+            secure = context.wrap_socket(raw, server_hostname=config.endpoint)
+        except ssl.SSLCertVerificationError as error:
+            todo = (
+                "does `root_ca` belong to this broker? For AWS leave it out. If the certificate is not yet "
+                "valid or expired, the clock is wrong"
+            )
+            yield Finding("TLS", FAIL, f"the broker's certificate: {error.verify_message}", todo)
+            return
+        except (OSError, ValueError) as error:
+            yield Finding("TLS", FAIL, str(error), "see the certificate and the key above")
+            return
+        yield Finding("TLS", OK, f"{secure.version()}, the broker's certificate is good")
+        if running is None:
+            yield _connack(secure, config.robot)
+        elif running.connection.connected:
+            yield Finding("broker", OK, "the running agent is connected")
+        else:
+            why = running.connection.last_error
+            yield Finding("broker", FAIL, f"the running agent is not connected: {why}")
 
 
 def _running(status_socket: Path) -> Status | None:
@@ -122,7 +163,7 @@ def _clock(config: Config, running: Status | None) -> Iterator[Finding]:
 
 
 def _http_offset_s(endpoint: str) -> float | None:
-    """The cloud's clock minus ours, to the second; None where it cannot be had."""
+    """The cloud's clock minus ours, to the second; None without a valid answer."""
     connection = http.client.HTTPSConnection(endpoint, 443, timeout=_TIMEOUT_S)
     try:
         with closing(connection):
@@ -133,52 +174,8 @@ def _http_offset_s(endpoint: str) -> float | None:
         return None
 
 
-def _endpoint(config: Config, running: Status | None) -> Iterator[Finding]:
-    where = f"{config.endpoint}:{config.port}"
-    try:
-        found = socket.getaddrinfo(config.endpoint, config.port, type=socket.SOCK_STREAM)
-    except OSError as error:
-        todo = "is there a network, and is `endpoint` spelled right?"
-        yield Finding("endpoint", FAIL, f"{config.endpoint} does not resolve: {error}", todo)
-        return
-    yield Finding("endpoint", OK, f"{config.endpoint} is {found[0][4][0]}")
-    try:
-        raw = socket.create_connection((config.endpoint, config.port), _TIMEOUT_S)
-    except OSError as error:
-        todo = "is the port open in the firewall? AWS also listens on 443: set `port: 443`"
-        yield Finding("connection", FAIL, f"{where}: {error}", todo)
-        return
-    yield Finding("connection", OK, where)
-    with closing(raw):
-        try:
-            context = ssl.create_default_context(cafile=config.root_ca)
-            context.load_cert_chain(config.certificate, config.private_key)
-            if config.port == _TLS_PORT_WITH_ALPN:
-                context.set_alpn_protocols(["x-amzn-mqtt-ca"])
-            secure = context.wrap_socket(raw, server_hostname=config.endpoint)
-        except ssl.SSLCertVerificationError as error:
-            todo = (
-                "does `root_ca` belong to this broker? For AWS leave it out. If the certificate is not yet "
-                "valid or expired, the clock is wrong"
-            )
-            yield Finding("TLS", FAIL, f"the broker's certificate: {error.verify_message}", todo)
-            return
-        except (OSError, ValueError) as error:
-            yield Finding("TLS", FAIL, str(error), "see the certificate and the key above")
-            return
-        yield Finding("TLS", OK, f"{secure.version()}, the broker's certificate is good")
-        if running is not None:
-            if running.connection.connected:
-                yield Finding("broker", OK, "the running agent is connected")
-            else:
-                why = running.connection.last_error
-                yield Finding("broker", FAIL, f"the running agent is not connected: {why}")
-            return
-        yield _connack(secure, config.robot)
-
-
 def _connack(secure: socket.socket, robot: str) -> Finding:
-    """What the broker says to the robot; only while no agent runs, whose connection it would take."""
+    """The broker's answer to the robot. Only while no agent runs, because this would end its connection."""
     todo = (
         f"the certificate is not active, not attached to the thing {robot}, or its policy refuses: "
         "see `iort robots list`"
@@ -197,15 +194,15 @@ def _connack(secure: socket.socket, robot: str) -> Finding:
         return Finding("broker", FAIL, f"gives {robot} no answer: {error}", todo)
     if len(answer) < 4:
         return Finding("broker", FAIL, f"hangs up on {robot}", todo)
-    said = _CONNACK.get(answer[3], f"reason {answer[3]:#x}")
-    return Finding("broker", FAIL, f"refuses {robot}: {said}", todo)
+    reason = _CONNACK.get(answer[3], f"reason {answer[3]:#x}")
+    return Finding("broker", FAIL, f"refuses {robot}: {reason}", todo)
 
 
 def _queue(config: Config) -> Iterator[Finding]:
     path: Path | None = config.queue.path
     if path is None:
         todo = "set queue.path to a file, for the batches to survive a restart"
-        yield Finding("queue", WARN, "in memory: what is not delivered ends with the agent", todo)
+        yield Finding("queue", WARN, "in memory: undelivered batches end with the agent", todo)
         return
     target = path if path.exists() else path.parent
     if not os.access(target, os.W_OK) or not os.access(path.parent, os.W_OK):

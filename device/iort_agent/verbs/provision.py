@@ -1,7 +1,7 @@
-"""`iort-agent provision` and `renew`: a certificate for a key that was made on the robot and never leaves it.
+"""`iort-agent provision` and `renew`: a certificate for a key that is made on the robot and never leaves it.
 
-A claim, a certificate good for this alone, is exchanged for the robot's own: CreateCertificateFromCsr,
-then RegisterThing with the fleet's template. The operator makes claims with `iort robots claim`.
+The robot exchanges a provisioning claim for its own certificate: CreateCertificateFromCsr, then RegisterThing
+with the fleet's template. The operator makes claims with `iort robots claim`.
 """
 
 from __future__ import annotations
@@ -16,14 +16,14 @@ from typing import Any, Callable, Mapping
 
 import yaml
 
-from iort_agent.config.file import Config, load_config
+from iort_agent.common.private_files import write_below
+from iort_agent.config import Config, load_config
 from iort_agent.errors import ConfigError, IdentityError, NotRunningError, RefusedError
 from iort_agent.identity.certificate import parse_certificate
 from iort_agent.identity.claim import Claim, load_claim
 from iort_agent.identity.machine_key import machine_serial, make_key
 from iort_agent.identity.pending import Pending, forget, keep, kept
 from iort_agent.mqtt.exchange import Exchange
-from iort_agent.private_files import write_below
 from iort_agent.status.server import ask
 from iort_contract.catalog.vesc import VESC_STREAM
 from iort_contract.limits import ContractError
@@ -34,31 +34,31 @@ _log = logging.getLogger(__name__)
 
 _SWITCH_S = 60.0
 _LOOK_S = 0.5
-# Before each further try to register.
+# Waits before each further try to register.
 _AGAIN_S = (1.0, 4.0)
-# AWS IoT's codes, or how they begin, where a token or its certificate is no longer good.
+# How AWS IoT's error codes begin for a token or a certificate that is no longer valid.
 _NO_LONGER = ("Invalid", "ResourceNotFound")
-# What RegisterThing takes as a parameter and a thing as an attribute.
+# The characters that RegisterThing allows in a parameter and a thing in an attribute.
 _SERIAL = re.compile(r"[A-Za-z0-9_.,@/:#-]{1,800}")
 _DEFAULT_SOURCES = [{"type": "sim", "stream": VESC_STREAM, "rate_hz": 50}]
 
 
 @dataclass(frozen=True)
-class Run:
-    """What a run reaches the world by: a claim's connection, which lasts a `with`, and time."""
+class Seams:
+    """Replaced by tests: the claim's connection, and waiting."""
 
     exchange: Callable[[Claim], Exchange] = Exchange
     wait: Callable[[float], None] = time.sleep
 
 
-_RUN = Run()
+_SEAMS = Seams()
 
 
-def provision(file: Path, *, robot: str | None, run: Run = _RUN) -> Path:
-    """Get the robot's own certificate for a claim; the configuration that now names it.
+def provision(file: Path, *, robot: str | None, seams: Seams = _SEAMS) -> Path:
+    """Exchange a claim for the robot's own certificate. Returns the configuration file, which now names it.
 
-    May be stopped at any time and called again: it goes on with the certificate that it was issued.
-    Raises `ConfigError` for a claim file that is wrong, `IdentityError` where the cloud refuses.
+    It may be stopped at any time and called again: it continues with the certificate that was issued.
+    Raises `ConfigError` for a wrong claim file, `IdentityError` if the cloud refuses.
     """
     claim = load_claim(file)
     name = robot or claim.robot
@@ -70,7 +70,7 @@ def provision(file: Path, *, robot: str | None, run: Run = _RUN) -> Path:
         raise ConfigError(str(error)) from error
     config_file = claim.config or file.parent / "car.yaml"
     folder = config_file.parent
-    issued = _register(claim, name, folder, run)
+    issued = _register(claim, name, folder, seams)
     files = {"certificate": folder / "certificate.pem", "private_key": folder / "private.key"}
     _replace(files["private_key"], issued.private_key)
     _replace(files["certificate"], issued.certificate)
@@ -89,15 +89,15 @@ def provision(file: Path, *, robot: str | None, run: Run = _RUN) -> Path:
     return config_file
 
 
-def renew(file: Path, claim_file: Path, *, status_socket: Path, run: Run = _RUN) -> None:
-    """Replace the robot's key and certificate, and keep the old ones until the new ones connected.
+def renew(file: Path, claim_file: Path, *, status_socket: Path, seams: Seams = _SEAMS) -> None:
+    """Replace the robot's key and certificate. The old ones are kept until the new ones have connected.
 
-    A running agent takes the new ones by itself. Raises `IdentityError` where the cloud refuses or
-    the new certificate does not connect; the old one is in its place again then.
+    A running agent notices the new ones. Raises `IdentityError` if the cloud refuses, or if the new
+    certificate does not connect; in that case the old one is restored.
     """
     config = load_config(file)
     folder = config.private_key.parent
-    issued = _register(load_claim(claim_file), config.robot, folder, run)
+    issued = _register(load_claim(claim_file), config.robot, folder, seams)
     files = (config.private_key, config.certificate)
     _replace(config.private_key, issued.private_key)
     _replace(config.certificate, issued.certificate)
@@ -113,56 +113,55 @@ def renew(file: Path, claim_file: Path, *, status_socket: Path, run: Run = _RUN)
         _previous(path).unlink()
 
 
-def _register(claim: Claim, robot: str, folder: Path, run: Run) -> Pending:
-    """A new key, and the certificate for it, attached to the robot's thing: those of an earlier run that was
-    stopped, or others. They stay in the folder, as `pending` keeps them, until `forget`."""
+def _register(claim: Claim, robot: str, folder: Path, seams: Seams) -> Pending:
+    """A key and its certificate, registered for the robot's thing: those of an earlier run that was stopped,
+    or new ones. `pending` keeps them in the folder until `forget`."""
     serial = claim.serial or machine_serial()
     if not _SERIAL.fullmatch(serial):
-        raise IdentityError(f"serial {serial!r}: allowed is A-Z a-z 0-9 _ . , @ / : # -")
+        raise IdentityError(f"serial must be of A-Z a-z 0-9 _ . , @ / : # -, got {serial!r}")
     earlier = kept(folder)
     if earlier is not None and earlier.is_for(robot, serial, claim.endpoint, claim.namespace):
-        if _finish(claim, earlier, run):
+        if _finish(claim, earlier, seams):
             return earlier
-        _log.warning("the certificate that an earlier run was issued is no longer good: asking for another")
+        _log.warning("the certificate of an earlier run is no longer valid: requesting another")
     key, request = make_key(robot)
-    with run.exchange(claim) as connection:
+    with seams.exchange(claim) as connection:
         certificate, token = connection.certify(request)
         asked_s = time.time()
         issued = Pending(robot, serial, claim.endpoint, claim.namespace, key, certificate, token, asked_s)
         keep(folder, issued)
-        _ask(connection, issued, run)
+        _ask(connection, issued, seams)
     return issued
 
 
-def _finish(claim: Claim, earlier: Pending, run: Run) -> bool:
-    """Whether an earlier run's certificate is registered now; False where it never can be.
+def _finish(claim: Claim, earlier: Pending, seams: Seams) -> bool:
+    """Register an earlier run's certificate; False if it can never be registered.
 
-    Raises `IdentityError` where it may be registered later: whom the hook refuses now, it refuses with any
+    Raises `IdentityError` if it may be registered later: whom the hook refuses now, it refuses with any
     certificate.
     """
     expired = not earlier.may_register(time.time())
     try:
-        # Without a network no certificate connects, which says nothing about this one: ask for another only
-        # while the claim connects.
-        with run.exchange(claim) as connection:
+        # Without a network no certificate connects. So request another one only while the claim connects.
+        with seams.exchange(claim) as connection:
             if expired:
                 return _is_registered(connection, earlier)
-            _ask(connection, earlier, run)
+            _ask(connection, earlier, seams)
     except IdentityError as error:
         if _is_no_longer_good(error):
             return False
-        # The claim may have ended meanwhile.
-        if not _is_registered(run.exchange(claim), earlier):
+        # The claim may have expired meanwhile.
+        if not _is_registered(seams.exchange(claim), earlier):
             raise
     return True
 
 
-def _ask(connection: Exchange, issued: Pending, run: Run) -> None:
+def _ask(connection: Exchange, issued: Pending, seams: Seams) -> None:
     parameters = {ROBOT_PARAMETER: issued.robot, SERIAL_PARAMETER: issued.serial}
     try:
-        thing = register_again(lambda: connection.register(issued.token, parameters), wait=run.wait)
+        thing = register_again(lambda: connection.register(issued.token, parameters), wait=seams.wait)
     except IdentityError:
-        # An answer may have been lost, and AWS does not say what a token is answered that was used.
+        # The answer may have been lost. AWS does not document the answer to a used token.
         if not _is_registered(connection, issued):
             raise
         return
@@ -179,10 +178,10 @@ def _is_no_longer_good(error: IdentityError) -> bool:
 
 
 def register_again(register: Callable[[], str], *, wait: Callable[[float], None]) -> str:
-    """Register; where that fails and the token may be good, once more with the same one, and again.
+    """Register, with a few tries while the token may be valid.
 
-    AWS IoT gives the fleet's hook 5 s, and a hook that was too late has given the name to this certificate:
-    for a while no other one would be admitted. Raises the first `IdentityError` in the end.
+    AWS IoT gives the fleet's hook 5 s. A hook that was too late has given the name to this certificate, and
+    for a while admits no other. Raises the first `IdentityError` if all tries fail.
     """
     first: IdentityError | None = None
     for wait_s in (*_AGAIN_S, None):
@@ -200,7 +199,7 @@ def register_again(register: Callable[[], str], *, wait: Callable[[float], None]
 
 
 def _wait_connected(config: Config, certificate_id: str, status_socket: Path) -> None:
-    """Until the robot is connected with the certificate: the agent that runs, or else we ourselves."""
+    """Wait until the running agent is connected with the certificate; if none runs, connect once."""
     deadline = time.monotonic() + _SWITCH_S
     last_error = None
     while time.monotonic() < deadline:
@@ -212,7 +211,7 @@ def _wait_connected(config: Config, certificate_id: str, status_socket: Path) ->
         if connection.connected and connection.certificate_id == certificate_id:
             return
         last_error = connection.last_error
-        # The agent looks at its files now and then, and tells nobody.
+        # The agent checks its files now and then, and tells nobody.
         time.sleep(_LOOK_S)
     raise IdentityError(f"the running agent did not connect with the new certificate: {last_error}")
 
@@ -231,7 +230,7 @@ def _previous(path: Path) -> Path:
 
 
 def _replace(path: Path, content: str) -> None:
-    """Put it in its place and keep what was there, unless an earlier run did so."""
+    """Write a file and keep its previous content, unless an earlier run did so."""
     if path.exists():
         before = path.read_text(encoding="utf-8")
         if before == content:
@@ -241,13 +240,13 @@ def _replace(path: Path, content: str) -> None:
 
 
 def _write_private(path: Path, content: str, mode: int = 0o600) -> None:
-    """Replace the file as a whole, readable by its owner alone from its first moment on."""
+    """Replace the whole file; from the start, only its owner may read it."""
     path.parent.mkdir(parents=True, exist_ok=True, mode=0o700)
     write_below(path.parent, PurePath(path.name), content.encode(), mode=mode, sync=True)
 
 
 def _update_config(file: Path, settings: Mapping[str, Any]) -> None:
-    """Set keys of a configuration, leaving everything else, comments too, as it is; or write a new one."""
+    """Set keys of a configuration and leave everything else, comments included, or write a new one."""
     if not file.exists():
         content = {**settings, "sources": _DEFAULT_SOURCES}
         _write_private(file, yaml.safe_dump(content, sort_keys=False))
@@ -260,12 +259,11 @@ def _update_config(file: Path, settings: Mapping[str, Any]) -> None:
             lines[found[0]] = line
         else:
             lines.insert(0, line)
-    text_ = "\n".join(lines) + "\n"
+    updated = "\n".join(lines) + "\n"
     try:
-        written = yaml.safe_load(text_)
-    except yaml.YAMLError as error:
-        raise ConfigError(f"{file}: cannot be updated, set by hand: {dict(settings)}") from error
-    if any(written.get(name) != value for name, value in settings.items()):
+        good = settings.items() <= yaml.safe_load(updated).items()
+    except yaml.YAMLError:
+        good = False
+    if not good:
         raise ConfigError(f"{file}: cannot be updated, set by hand: {dict(settings)}")
-    mode = file.stat().st_mode & 0o777
-    _write_private(file, text_, mode)
+    _write_private(file, updated, file.stat().st_mode & 0o777)

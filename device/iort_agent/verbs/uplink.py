@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from iort_agent.clock import Clock
-from iort_agent.config.file import Config
+from iort_agent.config import Config
 from iort_agent.mqtt.aws import IotCore
 from iort_agent.mqtt.dispatch import Dispatcher
 

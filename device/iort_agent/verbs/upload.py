@@ -1,4 +1,4 @@
-"""`iort-agent upload`: files, now, by a connection of its own."""
+"""`iort-agent upload`: uploads files at once, over a connection of its own."""
 
 from __future__ import annotations
 
@@ -7,15 +7,16 @@ import signal
 import sys
 import threading
 from pathlib import Path, PurePath
-from typing import Any, Iterator, NamedTuple, Sequence
+from typing import Iterator, NamedTuple, Sequence
 
 from iort_agent.clock import SystemClock
-from iort_agent.config.file import Config
+from iort_agent.common.logs import set_up
+from iort_agent.config import Config
 from iort_agent.errors import NotRunningError, UploadError
 from iort_agent.files.file import read
 from iort_agent.files.upload import Uploader, make_uploader
-from iort_agent.logs import set_up
-from iort_agent.rate_limiter import Allowance
+from iort_agent.mqtt.rate_limiter import RateLimiter
+from iort_agent.mqtt.uplink import Link, Uplink
 from iort_agent.status.server import process_at
 
 _CONNECT_S = 30.0
@@ -23,7 +24,7 @@ _LOOK_S = 0.05
 
 
 class Result(NamedTuple):
-    """What became of a file: its key in the bucket, or why it is not there."""
+    """The outcome for one file: its key in the bucket, or an error."""
 
     path: Path
     key: str | None = None
@@ -31,10 +32,9 @@ class Result(NamedTuple):
 
 
 def upload_files(config: Config, paths: Sequence[Path], *, status_socket: Path) -> Iterator[Result]:
-    """Upload one file after the other, with progress on a terminal.
+    """Upload the files one after the other, and show progress on a terminal.
 
-    Raises `UploadError` where an agent runs, whose connection this one would take away, and where
-    there is no connection.
+    Raises `UploadError` without a connection, and while an agent runs, whose connection this would end.
     """
     _refuse_beside_agent(config, status_socket)
     # Reading a configuration must not need the network's library.
@@ -43,15 +43,8 @@ def upload_files(config: Config, paths: Sequence[Path], *, status_socket: Path) 
     set_up("warning")
     clock, stop = SystemClock(), threading.Event()
     uplink = make_uplink(config, clock)
-    uploader = make_uploader(
-        robot=config.robot,
-        namespace=config.namespace,
-        uplink=uplink,
-        clock=clock,
-        allowance=Allowance(clock),
-        root_ca=config.root_ca,
-        rate_kb_s=config.files.rate_kb_s,
-    )
+    link = Link(config.robot, config.namespace, uplink, clock, RateLimiter(clock))
+    uploader = make_uploader(link, root_ca=config.root_ca, rate_kb_s=config.files.rate_kb_s)
     before = signal.signal(signal.SIGINT, lambda _number, _frame: stop.set())
     uplink.start()
     try:
@@ -64,49 +57,34 @@ def upload_files(config: Config, paths: Sequence[Path], *, status_socket: Path) 
 
 
 def _upload(uploader: Uploader, path: Path, stop: threading.Event) -> Result:
-    show = _Progress(path)
+    size, shows = 0, sys.stderr.isatty()
+
+    def show(there: int) -> None:
+        """Overwrite a line on a terminal."""
+        if shows:
+            percent = 100 * there // max(1, size)
+            print(f"\r{path.name}  {percent:3d} % of {size:,} bytes", end="", file=sys.stderr)
+
     try:
-        # Who gives the command may name a link.
+        # The user may name a link.
         file = Path(os.path.realpath(path))
         local = read(file.parent, PurePath(file.name), stop=stop)
-        show.of(local.look.size)
+        size = local.look.size
         return Result(path, key=uploader.upload(local, stop, show))
     except UploadError as error:
         return Result(path, error=str(error))
     finally:
-        show.end()
-
-
-class _Progress:
-    """A line on a terminal, written over; nothing where there is none."""
-
-    def __init__(self, path: Path) -> None:
-        self._path, self._size = path, 0
-        self._shows = sys.stderr.isatty()
-
-    def of(self, size: int) -> None:
-        """The file was read, and has so many bytes."""
-        self._size = size
-        self(0)
-
-    def __call__(self, there: int) -> None:
-        if self._shows:
-            share = 100 * there // max(1, self._size)
-            print(f"\r{self._path.name}  {share:3d} % of {self._size:,} bytes", end="", file=sys.stderr)
-
-    def end(self) -> None:
-        """Leave the line."""
-        if self._shows:
+        if shows and size:
             print(file=sys.stderr)
 
 
-def _wait_ready(uploader: Uploader, uplink: Any, clock: SystemClock, stop: threading.Event) -> None:
+def _wait_ready(uploader: Uploader, uplink: Uplink, clock: SystemClock, stop: threading.Event) -> None:
     until = clock.monotonic() + _CONNECT_S
     while not uploader.ready():
         if stop.is_set() or clock.monotonic() > until:
             why = uplink.status().last_error or "no answer"
             raise UploadError(f"no connection to the cloud: {why}", again_s=None)
-        # The connection tells whoever asked before it was made; this looks for one that is.
+        # The connection notifies only handlers that were registered before it started.
         clock.wait(stop, _LOOK_S)
 
 

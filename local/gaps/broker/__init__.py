@@ -1,1 +1,1 @@
-"""Gaps of the MQTT broker: listeners, sessions, certificates, message size."""
+"""Gaps of the MQTT broker: who is served, and on which port."""

@@ -19,8 +19,8 @@ from typing import Any
 from ministack.core import lambda_runtime
 
 END = "=== end of the invocation's log, local/gaps/functions/log_end.py ==="
-# The end of the worker's loop: it sends the answer, and the log is complete.
-_ANSWERED = "        _real_stdout.flush()\n\nrun()\n"
+# The end of the worker's loop, with the patch log_levels: it sends the answer, and the log is complete.
+_ANSWERED = "        _real_stdout.flush()\n\n# Lambda's own set-up of logging"
 # For a worker that dies before it prints the end.
 _MAX_WAIT_S = 1.0
 

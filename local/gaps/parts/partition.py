@@ -96,7 +96,7 @@ class Partition(dict[str, Item]):
 
 @dataclass
 class Shown:
-    """What the running Query may see."""
+    """The part of a partition that the running Query may see."""
 
     partition: Partition
     items: Sequence[Item]

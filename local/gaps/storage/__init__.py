@@ -1,1 +1,1 @@
-"""Gaps of DynamoDB and SQS: speed of a Query, messages lost."""
+"""Gaps of DynamoDB: the speed of a Query and of numbers."""

@@ -1,1 +1,1 @@
-"""The command `iort`: its options, its verbs and how answers are printed."""
+"""The command `iort`: its options, its commands in verbs/, tables and plots. It may use every other room."""

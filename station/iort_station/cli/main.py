@@ -1,4 +1,4 @@
-"""The command `iort`: its options, its commands and how it ends."""
+"""The command `iort`: its global options, its commands and its exit status."""
 
 from __future__ import annotations
 
@@ -38,15 +38,14 @@ def _where(
     local: Annotated[
         bool,
         typer.Option(
-            "--local", help="The embedded cloud; also meant when one runs and no AWS option is given."
+            "--local", help="Use the embedded cloud; the default if one runs and no AWS option is given."
         ),
     ] = False,
     embedded: Annotated[
         Path | None,
         typer.Option(
             envvar=EMBEDDED_VARIABLE,
-            help="The file in which an embedded cloud says how to reach it; also by the environment's "
-            f"{EMBEDDED_VARIABLE}. Else {EMBEDDED}, in this folder or one above.",
+            help=f"The file of an embedded cloud. Default: {EMBEDDED}, in this folder or one above.",
         ),
     ] = None,
     _version: Annotated[
@@ -57,12 +56,12 @@ def _where(
 
 
 def said(error: OSError) -> str:
-    """The operating system's error for people: the file and what is wrong with it, no number."""
+    """The operating system's error without its number: the file and the problem."""
     return f"{error.filename}: {error.strerror}" if error.filename and error.strerror else str(error)
 
 
 def main() -> None:
-    """Run the command; an error that is expected is one line on standard error, and status 1."""
+    """Run the command. An expected error prints one line on standard error, and exits with status 1."""
     try:
         app()
     except StationError as error:
@@ -70,7 +69,7 @@ def main() -> None:
     except ClientError as error:
         _end(f"AWS refused a call: {error}")
     except BotoCoreError as error:
-        _end(f"AWS could not be asked: {error}")
+        _end(f"AWS could not be called: {error}")
     except OSError as error:
         _end(said(error))
     except KeyboardInterrupt:

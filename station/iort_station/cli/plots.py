@@ -1,4 +1,4 @@
-"""Pictures of what was recorded: fields over time, where a robot went, how values are distributed.
+"""Pictures of recorded samples: fields over time, trajectories, distributions.
 
 The colours are Okabe and Ito's, which colour-blind people can tell apart; from the ninth series on the
 dashes differ too.
@@ -22,22 +22,25 @@ from iort_station.data.positions import Fields, fixes, local_metres, position_fi
 from iort_station.errors import StationError
 
 COLOURS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#000000", "#B8A800")
+# By default: of a known stream these fields, of another the first few.
+_USUAL = {"vesc": ("speed_mps", "current_motor", "voltage_input", "temperature_pcb")}
+_PANELS = 4
 _DASHES = ("-", "--", ":", "-.")
-# More points than a picture has columns tell nothing more, and make an SVG heavy.
+# More points than columns of pixels show nothing more, and make an SVG large.
 _POINTS = 4_000
-# A step this many times the usual one, and a second at least, is a hole that no line should bridge.
-_HOLE, _HOLE_US = 5, 1_000_000
+# A step of this many times the usual one, and of a second at least, is a gap in the line.
+_GAP, _GAP_US = 5, 1_000_000
 
 
 class Run(NamedTuple):
-    """A result and what it is called in the legend."""
+    """A result and its name in the legend."""
 
     name: str
     result: Result
 
 
 def over_time(runs: Sequence[Run], fields: Sequence[str], *, from_start: bool = False) -> Figure:
-    """A panel a field, a line a run; time is the clock's (UTC), or counted from each run's start."""
+    """Draw a panel for each field and a line for each run, by the clock (UTC) or from each run's start."""
     figure, panels = _panels(len(fields), height=1.9, shared=True)
     for panel, field in zip(panels, fields, strict=True):
         for i, run in enumerate(runs):
@@ -59,11 +62,10 @@ def over_time(runs: Sequence[Run], fields: Sequence[str], *, from_start: bool = 
 
 
 def trajectory(runs: Sequence[Run]) -> Figure:
-    """Where the robots went, seen from above; a ring is where each began, a dot where it ended.
+    """Draw the robots' ways from above, each from a ring to a dot.
 
-    Latitudes and longitudes are drawn as metres to the east and north of the first place known.
-
-    Raises `StationError` for a run without a position: none is made up from speeds.
+    Latitudes and longitudes are drawn as metres to the east and north of the first known place. Raises
+    `StationError` for a run without a position: it is not computed from speeds.
     """
     figure = _figure(7.0, 6.2)
     panel = figure.add_subplot()
@@ -86,7 +88,7 @@ def trajectory(runs: Sequence[Run]) -> Figure:
 def _tracks(
     runs: Sequence[Run],
 ) -> tuple[list[tuple[Any, Any]], tuple[str, str], str]:
-    """Each run's x and y in metres, what they are, and what more there is to say of them."""
+    """Each run's x and y in metres, the names of the axes, and a note for the title."""
     fields = [position_of(run.result) for run in runs]
     if len({each.degrees for each in fields}) > 1:
         raise StationError(
@@ -102,13 +104,13 @@ def _tracks(
     places = [fixes(run.result.columns, each) for run, each in of]
     first = next(((la[i], lo[i]) for la, lo in places for i in np.flatnonzero(~np.isnan(la))[:1]), None)
     if first is None:
-        raise StationError(f"{', '.join(fields[0].names)} hold no place: the receiver had no fix")
+        raise StationError(f"{', '.join(fields[0].names)} hold no position: the receiver had no fix")
     note = f"\n{', '.join(fields[0].names)} around {first[0]:.7f}, {first[1]:.7f}"
     return [local_metres(*place, first) for place in places], ("east", "north"), note
 
 
 def distribution(runs: Sequence[Run], fields: Sequence[str]) -> Figure:
-    """How often each value occurred, a panel a field; the vertical line is the median."""
+    """Draw a histogram for each field; the vertical line is the median."""
     figure, panels = _panels(len(fields), height=2.4, shared=False)
     for panel, field in zip(panels, fields, strict=True):
         columns = [column[~np.isnan(column)] for column in (_column(run, field) for run in runs)]
@@ -128,15 +130,15 @@ def distribution(runs: Sequence[Run], fields: Sequence[str]) -> Figure:
 
 
 def save(figure: Figure, path: Path) -> None:
-    """Write a picture; its ending says which kind: png, svg or pdf. Raises `StationError`."""
+    """Write a picture as png, svg or pdf, by the file's ending. Raises `StationError`."""
     kinds = {".png", ".svg", ".pdf"}
     if path.suffix.lower() not in kinds:
-        raise StationError(f"{path}: allowed is a file ending in {', '.join(sorted(kinds))}")
+        raise StationError(f"the file must end in {', '.join(sorted(kinds))}, got {path}")
     figure.savefig(path, dpi=160, facecolor="white")
 
 
 def position_of(result: Result) -> Fields:
-    """The fields that say where a robot is; raises `StationError` where there are none."""
+    """The fields of a robot's position; raises `StationError` if there are none."""
     fields = position_fields([name for name, column in result.columns.items() if column.dtype.kind == "f"])
     if fields is None:
         raise StationError(
@@ -151,8 +153,14 @@ def numeric(result: Result) -> list[str]:
     return [name for name, column in result.columns.items() if column.dtype.kind in "fb"]
 
 
+def usual(result: Result) -> list[str]:
+    """The fields to draw by default."""
+    known = numeric(result)
+    return [name for name in _USUAL.get(result.stream, ()) if name in known] or known[:_PANELS]
+
+
 def when(t_us: int) -> str:
-    """A run's start, as a legend needs it."""
+    """A run's start for the legend."""
     at = datetime.fromtimestamp(t_us // 1_000_000, tz=timezone.utc)
     return at.strftime("%Y-%m-%d %H:%M:%S")
 
@@ -160,14 +168,12 @@ def when(t_us: int) -> str:
 def _column(run: Run, field: str) -> NDArray[np.float64]:
     column = run.result.columns.get(field)
     if column is None or column.dtype.kind not in "fb":
-        raise StationError(
-            f"{run.name}: {field} cannot be drawn; what can is {', '.join(numeric(run.result))}"
-        )
+        raise StationError(f"{run.name}: {field} cannot be drawn, only {', '.join(numeric(run.result))}")
     return column.astype(np.float64)
 
 
 def _thinned(times_us: Any, values: Any) -> tuple[Any, Any]:
-    """At most some thousand points, of each stretch the lowest and the highest; NaN where a hole is."""
+    """At most `_POINTS` points: the lowest and the highest of each stretch, and NaN in each gap."""
     if len(values) > _POINTS:
         edges = np.linspace(0, len(values), _POINTS // 2 + 1).astype(int)[:-1]
         lows, highs = np.fmin.reduceat(values, edges), np.fmax.reduceat(values, edges)
@@ -177,8 +183,8 @@ def _thinned(times_us: Any, values: Any) -> tuple[Any, Any]:
     if not len(steps):
         return times_us, values
     usual = np.median(steps[steps > 0]) if (steps > 0).any() else 0
-    holes = np.flatnonzero(steps > max(_HOLE_US, _HOLE * usual)) + 1
-    return np.insert(times_us, holes, times_us[holes - 1] + 1), np.insert(values, holes, np.nan)
+    gaps = np.flatnonzero(steps > max(_GAP_US, _GAP * usual)) + 1
+    return np.insert(times_us, gaps, times_us[gaps - 1] + 1), np.insert(values, gaps, np.nan)
 
 
 def _bins(values: Any) -> int:

@@ -1,55 +1,67 @@
-"""A progress bar on standard error for what takes longer than a second; nothing where nobody looks."""
+"""Progress on standard error: a line, or a bar if somebody looks."""
 
 from __future__ import annotations
 
 import sys
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 
-from rich.progress import BarColumn, Progress, TextColumn
+from rich.progress import BarColumn, Progress, ProgressColumn, TextColumn
 
-from iort_station.cli.console import Console, visible
+from iort_station.cli.console import errors, visible
 from iort_station.data.reading import Told
 
+# A bar that would be gone sooner is not shown.
 _PATIENCE_S = 1.0
 
 
+def say(text: str) -> None:
+    """Print a line on standard error, where it does not get into a pipe."""
+    print(visible(f"iort: {text}"), file=sys.stderr, flush=True)
+
+
 @contextmanager
-def reading(what: str, start_us: int | None, end_us: int | None) -> Iterator[Told]:
-    """What a reader tells of its pages, shown as the part of the range that has been read."""
-    console = Console(stderr=True)
-    bar = Progress(
-        TextColumn("{task.description}", markup=False),
-        BarColumn(),
-        TextColumn("{task.fields[items]:,} items"),
-        console=console,
-        transient=True,
-        disable=not console.is_terminal,
-    )
-    known = start_us is not None and end_us is not None
-    task = bar.add_task(what, total=1.0 if known else None, items=0)
-    began, items, shown = time.monotonic(), 0, False
+def bar(title: str, total: float | None, *columns: ProgressColumn) -> Iterator[Callable[[float], None]]:
+    """Show a bar; the function given adds to what is done."""
+    progress = _progress(*columns)
+    task = progress.add_task(title, total=total)
+    try:
+        if errors.is_terminal:
+            progress.start()
+        yield lambda more: progress.advance(task, more)
+    finally:
+        _stop(progress)
+
+
+@contextmanager
+def reading(title: str, start_us: int | None, end_us: int | None) -> Iterator[Told]:
+    """Show how much of a range has been read, if that takes longer than a second."""
+    progress = _progress(TextColumn("{task.fields[items]:,} items"))
+    range_us = (start_us, end_us - start_us) if start_us is not None and end_us is not None else None
+    task = progress.add_task(title, total=1.0 if range_us else None, items=0)
+    began, items = time.monotonic(), 0
 
     def tell(more: int, last_us: int) -> None:
-        nonlocal items, shown
+        nonlocal items
         items += more
-        if start_us is not None and end_us is not None:
-            done = (last_us - start_us) / max(1, end_us - start_us)
-            bar.update(task, completed=min(1.0, max(0.0, done)), items=items)
-        else:
-            bar.update(task, items=items)
-        if not shown and time.monotonic() - began > _PATIENCE_S:
-            shown = True
-            bar.start()
+        share = (last_us - range_us[0]) / max(1, range_us[1]) if range_us else 0.0
+        progress.update(task, completed=min(1.0, max(0.0, share)), items=items)
+        if errors.is_terminal and time.monotonic() - began > _PATIENCE_S:
+            progress.start()
 
     try:
         yield tell
     finally:
-        if shown:
-            bar.stop()
+        _stop(progress)
 
 
-def say(text: str) -> None:
-    """A line on standard error, where it does not get into what is piped on."""
-    print(visible(f"iort: {text}"), file=sys.stderr, flush=True)
+def _progress(*columns: ProgressColumn) -> Progress:
+    shown = (TextColumn("{task.description}", markup=False), BarColumn(), *columns)
+    return Progress(*shown, console=errors, transient=True)
+
+
+def _stop(progress: Progress) -> None:
+    # Where nothing was shown, rich would print an empty line.
+    if progress.live.is_started:
+        progress.stop()

@@ -1,4 +1,4 @@
-"""Results as people and other programs read them: a table, CSV, JSON Lines and Parquet."""
+"""Results as a table, CSV, JSON Lines and Parquet."""
 
 from __future__ import annotations
 
@@ -17,14 +17,14 @@ from iort_station.data.conditions import Column, values
 from iort_station.data.data import Result
 from iort_station.data.positions import in_degrees
 
-# Of a long result a terminal shows the beginning and the end.
+# A terminal shows the beginning and the end of a long result.
 _SHOWN = 20
 _TIME_WIDE = "2026-05-04 10:00:00.000000"
 _GAP = 2
 # Longer texts are folded.
 _TEXT_WIDE = 40
 _CHUNK = 10_000
-# What a spreadsheet takes for a formula's beginning: OWASP, "CSV Injection"; some know them in full width.
+# Characters that begin a formula in a spreadsheet, also in full width: OWASP, "CSV Injection".
 _FORMULA = ("=", "+", "-", "@", "\uff1d", "\uff0b", "\uff0d", "\uff20")
 
 
@@ -35,15 +35,17 @@ def texts_of_time(result: Result) -> list[str]:
 
 
 class Shown(NamedTuple):
-    """A table for people, and the fields that it has no room for."""
+    """A table, and the fields that do not fit into it."""
 
     table: Table
     left_out: list[str]
 
 
 def terminal(result: Result, width: int | None = None) -> Shown:
-    """The first and last samples, with units, in so many characters a line: names that do not fit break
-    after an underscore, and fields that do not fit then are left out."""
+    """The first and last samples, with units, in lines of ``width`` characters.
+
+    If the names do not fit, they break after underscores. Fields that do not fit then are left out.
+    """
     n = len(result)
     chosen = [*range(n)] if n <= 2 * _SHOWN else [*range(_SHOWN), *range(n - _SHOWN, n)]
     times = texts_of_time(Result(result.robot, result.stream, result.times_us[chosen], {}))
@@ -60,7 +62,7 @@ def terminal(result: Result, width: int | None = None) -> Shown:
     if room is not None and sum(_GAP + column.width for column in columns) > room:
         columns = [column._replace(name=column.name.replace("_", "_\n")) for column in columns]
         ends = itertools.accumulate(_GAP + column.width for column in columns)
-        # One is there however narrow it is.
+        # The first field is always shown.
         fitting = max(1, sum(end <= room for end in ends))
         columns, left_out = columns[:fitting], list(result.columns)[fitting:]
     else:
@@ -91,10 +93,9 @@ class _Column(NamedTuple):
 
 
 def to_csv(result: Result, file: IO[str], *, raw: bool = False) -> None:
-    """A header and a line a sample; what is null is empty.
+    """Write a header and a line for each sample; null is empty.
 
-    Names and texts are `harmless`, since whoever reads CSV by a spreadsheet runs what they hold; ``raw``
-    leaves them as they were sent.
+    Names and texts are `harmless`, because a spreadsheet runs formulas. ``raw`` leaves them unchanged.
     """
     writer = csv.writer(file, lineterminator="\n")
     writer.writerow(["time", *(result.columns if raw else map(harmless, result.columns))])
@@ -103,7 +104,7 @@ def to_csv(result: Result, file: IO[str], *, raw: bool = False) -> None:
 
 
 def harmless(value: Any) -> Any:
-    """A text that is no formula to a spreadsheet, nor a control sequence to a terminal; else the value."""
+    """A text without formulas and control sequences; other values unchanged."""
     if not isinstance(value, str):
         return value
     text = visible(value)
@@ -111,7 +112,7 @@ def harmless(value: Any) -> Any:
 
 
 def to_json_lines(result: Result, file: IO[str]) -> None:
-    """An object a line: the time, the same in microseconds, and the fields."""
+    """Write an object a line: the time, the time in microseconds, and the fields."""
     names = list(result.columns)
     times = iter(result.times_us.tolist())
     for rows in _rows(result):
@@ -121,7 +122,7 @@ def to_json_lines(result: Result, file: IO[str]) -> None:
 
 
 def to_parquet(result: Result, file: IO[bytes]) -> None:
-    """A column a field beside ``time`` (microseconds, UTC); units are in the fields' metadata."""
+    """Write ``time`` (microseconds, UTC) and a column for each field, with units in the metadata."""
     # A third of a second of import.
     import pyarrow as pa  # noqa: PLC0415 - see above
     import pyarrow.parquet as pq  # noqa: PLC0415 - as above
@@ -138,7 +139,7 @@ def to_parquet(result: Result, file: IO[bytes]) -> None:
 
 
 def _rows(result: Result) -> Iterator[list[Sequence[Any]]]:
-    """Times and values, a chunk at a time: Python's values take ten times numpy's room."""
+    """Times and values in chunks: Python's values take ten times the memory of numpy's."""
     whole = {name for name, column in result.columns.items() if _is_whole(column)}
     for first in range(0, len(result), _CHUNK):
         chunk = slice(first, first + _CHUNK)
@@ -153,7 +154,7 @@ def _rows(result: Result) -> Iterator[list[Sequence[Any]]]:
 
 
 def _is_whole(column: Column) -> bool:
-    """Whether all numbers of a column are integers: what a robot sends as such arrives as float64."""
+    """Whether all numbers of a column are integers, which arrive as float64."""
     if column.dtype.kind == "f":
         known = column[~np.isnan(column)]
         return bool((known == np.floor(known)).all() and (np.abs(known) < EXACT).all())

@@ -1,4 +1,4 @@
-"""Which cloud an `iort` command means, by the options before its name."""
+"""The cloud of an `iort` command, from the options before its name."""
 
 from __future__ import annotations
 
@@ -14,15 +14,15 @@ from iort_station.cli.progress import say
 from iort_station.cloud import EMBEDDED, EMBEDDED_VARIABLE, Cloud, find_embedded
 from iort_station.errors import StationError
 
-# Whoever has set one of these means an AWS account.
+# Who has set one of these wants an AWS account.
 _AWS_NAMED = ("AWS_PROFILE", "AWS_REGION", "AWS_DEFAULT_REGION", "AWS_ACCESS_KEY_ID")
-# It is on this machine.
+# It runs on this machine.
 _CONNECT_S = 5.0
 
 
 @dataclass
 class Where:
-    """The options that name a cloud; a command finds it in ``context.obj``."""
+    """The options that select a cloud; commands read it from ``context.obj``."""
 
     namespace: str
     profile: str | None
@@ -31,9 +31,9 @@ class Where:
     embedded: Path | None
 
     def cloud(self) -> Cloud:
-        """The cloud that they name: an embedded one that runs here, unless something says AWS.
+        """The selected cloud: an embedded one that runs here, unless an option or variable selects AWS.
 
-        Raises `StationError` where there is neither one nor what AWS asks for.
+        Raises `StationError` if none runs and AWS' credentials are missing.
         """
         said = self.profile or self.region or any(os.environ.get(name) for name in _AWS_NAMED)
         embedded = self.embedded or find_embedded(Path.cwd())
@@ -58,12 +58,12 @@ class Where:
             ) from error
 
     def account(self, *, region: str) -> Cloud:
-        """An AWS account, whatever runs here; in the ``region`` where nothing says another.
+        """An AWS account, never an embedded cloud; ``region`` is the default.
 
-        Raises `StationError` where the embedded cloud is asked for, or credentials are missing.
+        Raises `StationError` if the options select the embedded cloud, or if credentials are missing.
         """
         if self.local:
-            raise StationError("only AWS has this, and --local means the embedded cloud")
+            raise StationError("only AWS has this, and --local selects the embedded cloud")
         cloud = Cloud(namespace=self.namespace, profile=self.profile, region=self.region)
         try:
             named = cloud.region_name
@@ -73,12 +73,12 @@ class Where:
 
 
 def _alive(cloud: Cloud, path: Path) -> Cloud:
-    """The embedded cloud; raises `StationError` where nothing is left of it but its description."""
+    """The embedded cloud; raises `StationError` if it has ended without removing its file."""
     address = urlsplit(cloud.endpoint_url or "")
     try:
         socket.create_connection((address.hostname or "", address.port or 0), _CONNECT_S).close()
     except OSError as error:
         raise StationError(
-            f"the embedded cloud of {path} does not answer, as after a kill: `make demo` starts another"
+            f"the embedded cloud of {path} does not answer: was it killed? `make demo` starts another"
         ) from error
     return cloud

@@ -1,1 +1,1 @@
-"""The live page: its server, its settings, and what keeps it fresh."""
+"""The live page: its server, answers, configuration and listener. It uses every room but the commands."""

@@ -1,4 +1,4 @@
-"""What the live page may ask its server: cars' parameters, a car's past, and CloudWatch's dashboards.
+"""Answers to the live page: the cars' parameters, a car's past, and CloudWatch's dashboards.
 
 Each answer is a function of the request's parameters; its type is in `iort_contract.messages.page`.
 """
@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from iort_contract.messages.files import CLAIM_FIELDS
+from iort_contract.messages.files import ATTACHMENT_FIELDS
 from iort_contract.messages.page import Answer, HistoryAnswer
 from iort_contract.messages.page import Column as PageColumn
 from iort_contract.topics import check_robot
@@ -21,14 +21,14 @@ from iort_station.errors import StationError
 from iort_station.fleet import registry
 from iort_station.operations import cloudwatch, cloudwatch_logs
 
-# A chart has no more points across.
+# No chart is wider, in points.
 MAX_ROWS = 5_000
-# Of ranges longer than this the seconds are read that Lambda 2 has written, not the samples.
+# Longer ranges are read from the summary of each second, not from samples.
 _SAMPLES_US = 3_600_000_000
 
 
 def answers(cloud: Cloud) -> dict[str, Callable[[Mapping[str, str]], Answer]]:
-    """Every answer by its name."""
+    """Every answer, by its name."""
     return {
         "robots": lambda _asked: {"robots": registry.presence(cloud)},
         "vehicles": lambda _asked: {"vehicles": registry.vehicles(cloud)},
@@ -50,14 +50,14 @@ def answers(cloud: Cloud) -> dict[str, Callable[[Mapping[str, str]], Answer]]:
 def history(cloud: Cloud, asked: Mapping[str, str]) -> HistoryAnswer:
     """The samples of ``robot`` and ``stream`` from ``from_us`` to ``to_us``, in at most ``rows`` rows.
 
-    A row that stands for several samples has the least, the mean and the most of every number, of a claim
-    on content the last whole one, and of everything else the last that is not null. Raises `StationError`
-    for a request that cannot be answered.
+    A row of several samples has the minimum, the mean and the maximum of every number, the last complete
+    attachment, and the last value that is not null of everything else. Raises `StationError` for a request
+    that cannot be answered.
     """
     start_us, end_us = (_whole(asked, name, 0, 2**53) for name in ("from_us", "to_us"))
     rows = _whole(asked, "rows", 2, MAX_ROWS)
     if start_us >= end_us:
-        raise StationError("the range ends before it starts")
+        raise StationError("the range must end after its start")
     summary = end_us - start_us > _SAMPLES_US
     robot, stream = _text(asked, "robot"), _text(asked, "stream")
     found = data.query(cloud, robot, stream, start_us, end_us, summary=summary)
@@ -77,7 +77,7 @@ def history(cloud: Cloud, asked: Mapping[str, str]) -> HistoryAnswer:
         name: _rows(each, starts, n, several=several) for name, each in columns.items() if name not in claims
     }
     for name, key in claims.items():
-        # The five fields of one claim belong together, so they are of one sample.
+        # The fields of an attachment belong together, so they come from one sample.
         told, ends = values(found.columns[name]), _last_known(found.columns[key], starts)
         fields[name] = {"mean": [told[end] for end in ends]}
     return {
@@ -90,7 +90,7 @@ def history(cloud: Cloud, asked: Mapping[str, str]) -> HistoryAnswer:
 
 
 def _by_statistic(columns: Mapping[str, Column]) -> dict[str, tuple[Column, Column, Column]]:
-    """The summary's columns, one entry a field: mean, least, most."""
+    """The summary's columns for each field: mean, minimum, maximum."""
     names = [name.removesuffix("_mean") for name in columns if name.endswith("_mean")]
     return {
         name: (columns[f"{name}_mean"], columns[f"{name}_min"], columns[f"{name}_max"])
@@ -100,13 +100,13 @@ def _by_statistic(columns: Mapping[str, Column]) -> dict[str, tuple[Column, Colu
 
 
 def _claims(columns: Mapping[str, Any]) -> dict[str, str]:
-    """The fields of claims on content (docs/files.md) by name, each with that of its claim's key."""
+    """The fields of attachments (docs/files.md), each with the field of its attachment's key."""
     fields = [name.removesuffix(".key") for name in columns if name.endswith(".key")]
     return {
         f"{field}.{part}": f"{field}.key"
         for field in fields
-        if all(f"{field}.{part}" in columns for part in CLAIM_FIELDS)
-        for part in CLAIM_FIELDS
+        if all(f"{field}.{part}" in columns for part in ATTACHMENT_FIELDS)
+        for part in ATTACHMENT_FIELDS
     }
 
 
@@ -123,7 +123,7 @@ def _rows(of: tuple[Column, Column, Column], starts: Any, n: int, *, several: bo
     valued = np.where(known, mean, 0.0)
     with np.errstate(invalid="ignore", over="ignore"):
         average = np.add.reduceat(valued, starts) / number
-        # The sum of a few numbers may be beyond what a number holds, their mean is not.
+        # The sum of large numbers may overflow where their mean does not.
         parts = valued / np.repeat(number, np.diff(np.append(starts, n)))
         average = np.where(np.isinf(average), np.add.reduceat(parts, starts), average)
     return {
@@ -134,8 +134,10 @@ def _rows(of: tuple[Column, Column, Column], starts: Any, n: int, *, several: bo
 
 
 def _last_known(column: Column, starts: Any) -> Any:
-    """Of each row the index of its last value that is not null, or of its last where all are: most claims
-    on pictures are null, and the one that is not is what there is to see."""
+    """For each row the index of its last value that is not null, or of its last value if all are null.
+
+    Most attachments of a camera are null, because the car keeps few of its pictures.
+    """
     n = len(column)
     if not n:
         return starts
@@ -147,13 +149,13 @@ def _last_known(column: Column, starts: Any) -> Any:
 
 def _text(asked: Mapping[str, str], name: str) -> str:
     if not asked.get(name):
-        raise StationError(f"the request names no {name}")
+        raise StationError(f"the request must have the parameter {name}")
     return asked[name]
 
 
 def _whole(asked: Mapping[str, str], name: str, least: int, most: int) -> int:
     text = _text(asked, name)
-    # Sixteen digits hold all that is allowed.
+    # Sixteen digits are enough for every allowed number.
     if not (text.isascii() and text.isdecimal()) or len(text) > 16 or not least <= int(text) <= most:
-        raise StationError(f"{name} {text[:40]!r}: allowed is a whole number from {least} to {most}")
+        raise StationError(f"{name} must be a whole number from {least} to {most}, got {text[:40]!r}")
     return int(text)

@@ -13,7 +13,7 @@ from iort_station.errors import StationError
 
 @dataclass(frozen=True, kw_only=True)
 class PubNubKeys:
-    """A key set; ``origin`` and ``tls`` name a server other than PubNub's own."""
+    """A key set; ``origin`` and ``tls`` select a server other than PubNub's own."""
 
     publish_key: str = field(repr=False)
     subscribe_key: str = field(repr=False)
@@ -21,25 +21,25 @@ class PubNubKeys:
     tls: bool = True
 
     def reading(self) -> dict[str, Any]:
-        """What a listener or a page is given, as keyword arguments; no server where it is PubNub's own."""
+        """Keyword arguments for a listener or a page: the subscribe key, and a server other than PubNub's."""
         server = {"origin": self.origin, "tls": self.tls} if self.origin else {}
         return {"subscribe_key": self.subscribe_key, **server}
 
 
 def typed(publish_key: str, subscribe_key: str) -> PubNubKeys:
-    """The keys of PubNub's own servers as somebody typed them.
+    """Check keys of PubNub's own servers that somebody typed.
 
-    Raises `StationError` for what is no such key, without repeating it: it may be the secret one.
+    Raises `StationError` for any other text, without repeating it: it may be the secret key.
     """
     typed_keys = {"publish": publish_key.strip(), "subscribe": subscribe_key.strip()}
     for kind, key in typed_keys.items():
         if not key.startswith(f"{kind[:3]}-c-"):
-            raise StationError(f"the {kind} key: expected what PubNub's admin portal shows, {kind[:3]}-c-...")
+            raise StationError(f"the {kind} key must be {kind[:3]}-c-..., as PubNub's admin portal shows it")
     return PubNubKeys(publish_key=typed_keys["publish"], subscribe_key=typed_keys["subscribe"])
 
 
 def store(cloud: Cloud, keys: PubNubKeys) -> None:
-    """Write the keys, replacing those that are there."""
+    """Write the keys, in place of stored ones."""
     value = {"publish_key": keys.publish_key, **keys.reading()}
     cloud.client("ssm").put_parameter(
         Name=pubnub_parameter(cloud.namespace), Value=json.dumps(value), Type="SecureString", Overwrite=True
@@ -47,7 +47,7 @@ def store(cloud: Cloud, keys: PubNubKeys) -> None:
 
 
 def load(cloud: Cloud) -> PubNubKeys:
-    """Read the keys; raises `StationError` where none are stored."""
+    """Read the keys; raises `StationError` if none are stored."""
     ssm, name = cloud.client("ssm"), pubnub_parameter(cloud.namespace)
     try:
         answer = ssm.get_parameter(Name=name, WithDecryption=True)

@@ -1,4 +1,4 @@
-"""Listens to the fleet's PubNub channels, as the dashboard does, and keeps what it needs of each update."""
+"""Listens to the fleet's PubNub channels, as the page does."""
 
 from __future__ import annotations
 
@@ -24,8 +24,7 @@ _CONNECT_S = 15.0
 
 
 class Heard(NamedTuple):
-    """One update: whose, which, how long it took from leaving the car to being here, its sample's time
-    (microseconds) and the hops' (`live_update`)."""
+    """One update: its delay from the car to this machine, its sample's time in microseconds, and the hops."""
 
     robot: str
     stream: str
@@ -36,18 +35,17 @@ class Heard(NamedTuple):
     hops: Mapping[str, int]
 
 
-# Takes an update, PubNub's time of taking it and this machine's of receiving it, in microseconds; in
-# the listener's own thread.
+# Takes an update, the time at which PubNub took it and the time of its arrival here, in microseconds. It is
+# called in the listener's own thread.
 OnUpdate = Callable[[dict[str, Any], int, int], None]
 
 
 class Listener:
-    """Subscribed from `__enter__` to `__exit__`; `heard` grows meanwhile, or ``on_update`` is called.
+    """Subscribes within a ``with`` block, and appends to `heard` or calls ``on_update``.
 
-    ``robot`` None is the whole fleet; ``token`` is PubNub's access token, where Access Manager is on.
-
-    The delay compares the car's clock with this machine's, so it is only as good as the two agree.
-    Raises `StationError` where PubNub does not answer.
+    ``robot=None`` listens to the whole fleet; ``token`` is PubNub's access token, if Access Manager is on.
+    The delay compares the car's clock with this machine's, so it is only as good as they agree. Raises
+    `StationError` if PubNub does not answer.
     """
 
     def __init__(
@@ -77,7 +75,7 @@ class Listener:
 
     @property
     def heard(self) -> list[Heard]:
-        """What came so far, in order of arrival."""
+        """The updates so far, in the order of arrival."""
         return self._callback.heard
 
     def __enter__(self) -> Self:

@@ -1,7 +1,7 @@
-"""The live page: its files, and the configuration that it is told.
+"""The live page's files and its configuration.
 
 ``npm run build`` makes it from station/web into the folder `built`. `iort_station.page.server` serves it, and
-`iort_station.page.site` puts it on the web.
+`iort_station.page.site` publishes it on the web.
 """
 
 from __future__ import annotations
@@ -38,7 +38,7 @@ _ORIGIN = re.compile(r"([A-Za-z0-9.-]{1,253}|\[[0-9A-Fa-f:]{2,45}\])(:[0-9]{1,5}
 
 
 def built_files(built: Path = BUILT) -> dict[str, bytes]:
-    """Every file of the built page by its path within; raises `StationError` where it is not built."""
+    """Every file of the built page, by its path; raises `StationError` if the page is not built."""
     index = built / "index.html"
     if not index.is_file():
         raise StationError(f"the live page is not built ({index} is missing): run `make setup`")
@@ -59,11 +59,10 @@ def config(
     token: str = "",
     answers: bool = False,
 ) -> Config:
-    """What the page is told, ``/config.json``; raises `StationError` for what it must not be told.
+    """The page's ``/config.json``; raises `StationError` for a value that the page must not have.
 
-    ``vehicles`` maps a robot to its parameters; with ``speed_to_erpm_gain`` (and ``_offset``) the page
-    shows its speed in m/s beside the motor's erpm. ``token`` is PubNub's access token for a page, which may
-    only read.
+    ``vehicles`` maps a robot to its parameters; with ``speed_to_erpm_gain`` (and ``_offset``) the page shows
+    the speed in m/s instead of the motor's erpm. ``token`` is an access token of PubNub that may only read.
     """
     try:
         check_namespace(namespace)
@@ -71,22 +70,20 @@ def config(
     except ContractError as error:
         raise StationError(f"the page's configuration: {error}") from error
     if not _KEY.fullmatch(subscribe_key):
-        raise StationError("the page's subscribe_key: allowed is 1 to 128 of A-Z a-z 0-9 _ -")
+        raise StationError("the page's subscribe_key must be 1 to 128 of A-Z a-z 0-9 _ -")
     if subscribe_key.startswith(("pub-c-", "sec-c-")):
-        raise StationError("the page's subscribe_key is a publish or secret key, which no page may see")
+        raise StationError("the page's subscribe_key must not be a publish or secret key")
     if token and not _TOKEN.fullmatch(token):
-        raise StationError(
-            "the page's access token: allowed is what PubNub's grant gives, up to 4096 characters"
-        )
+        raise StationError("the page's access token must be one of PubNub's grants, up to 4096 characters")
     if not _ORIGIN.fullmatch(origin):
-        raise StationError(f"the page's origin {origin!r}: allowed is a host, or host:port")
+        raise StationError(f"the page's origin must be a host, or host:port, got {origin!r}")
     for robot, car in known.items():
         gain = car.get("speed_to_erpm_gain")
         if gain is not None and (not math.isfinite(gain) or gain == 0):
-            raise StationError(f"speed_to_erpm_gain of {robot} is {gain}: allowed is a number, not 0")
+            raise StationError(f"speed_to_erpm_gain of {robot} must be a number other than 0, got {gain}")
         offset = car.get("speed_to_erpm_offset", 0)
         if not math.isfinite(offset):
-            raise StationError(f"speed_to_erpm_offset of {robot} is {offset}: allowed is a number")
+            raise StationError(f"speed_to_erpm_offset of {robot} must be a number, got {offset}")
     return {
         "namespace": namespace,
         "subscribe_key": subscribe_key,

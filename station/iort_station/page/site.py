@@ -1,4 +1,4 @@
-"""Puts the page on the web: its files into the bucket of stacks/site.py, and CloudFront told of it."""
+"""Publishes the page on the web: uploads its files to the site's bucket, and renews CloudFront's copies."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from iort_station.cloud import Cloud
 from iort_station.errors import StationError
 from iort_station.page.page import BUILT, TYPES, built_files
 
-# Names do not change with their content, so a browser asks each time whether they are still the same.
+# Names do not change with their content, so a browser must ask each time if a file is still the same.
 _CACHE = "no-cache"
 _MANY = 1_000
 
@@ -22,7 +22,7 @@ _MANY = 1_000
 def files(told: Mapping[str, Any], built: Path = BUILT) -> dict[str, bytes]:
     """Every file of the static page by its key; ``told`` is `iort_station.page.page.config`'s.
 
-    Raises `StationError` where the page is not built.
+    Raises `StationError` if the page is not built.
     """
     tables = {"config.json": told}
     return built_files(built) | {
@@ -31,9 +31,9 @@ def files(told: Mapping[str, Any], built: Path = BUILT) -> dict[str, bytes]:
 
 
 def upload(s3: Any, bucket: str, content: Mapping[str, bytes]) -> list[str]:
-    """Make the bucket hold exactly ``content``; returns the keys that it held besides, which are gone.
+    """Make the bucket hold exactly ``content``; returns the other keys, which are deleted.
 
-    The page itself comes last, when all that it needs is there.
+    The page itself comes last, after the files that it needs.
     """
     for key in sorted(content, key=lambda key: key == "index.html"):
         kind = TYPES[Path(key).suffix]
@@ -49,9 +49,9 @@ def upload(s3: Any, bucket: str, content: Mapping[str, bytes]) -> list[str]:
 
 
 def publish(cloud: Cloud, told: Mapping[str, Any]) -> str:
-    """Upload the page and have CloudFront fetch it anew; returns its address.
+    """Upload the page, renew CloudFront's copies, and return the page's address.
 
-    Raises `StationError` where the stack is not deployed.
+    Raises `StationError` if the stack is not deployed.
     """
     content = files(told)
     bucket, distribution = cloud.output("site", "PageBucket"), cloud.output("site", "PageDistribution")

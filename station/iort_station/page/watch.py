@@ -1,7 +1,8 @@
-"""The newest of every car, from the live updates: what `iort watch` shows."""
+"""The newest values of every car, for `iort watch`."""
 
 from __future__ import annotations
 
+import re
 import threading
 from collections.abc import Mapping
 from dataclasses import dataclass, field
@@ -21,7 +22,7 @@ _STATES = {"online": "green", "stale": "yellow", "gone": "red"}
 
 @dataclass
 class Car:
-    """A car as last heard; times in microseconds since the epoch, by this machine's clock."""
+    """The newest values of a car; times in microseconds since the epoch, by this machine's clock."""
 
     robot: str
     heard_us: int = 0
@@ -36,11 +37,11 @@ class Car:
         return "stale" if now_us - self.taken_us > STALE_S * 1e6 else "online"
 
     def age_s(self, now_us: int) -> float:
-        """How old its newest value is."""
+        """The age of the newest value."""
         return max(0.0, (now_us - self.taken_us) / 1e6)
 
     def number(self, name: str) -> float | None:
-        """A field of the newest sample, where it is a number."""
+        """A field of the newest sample; None if it is not a number."""
         value = self.sample.get(name)
         return float(value) if isinstance(value, (int, float)) and not isinstance(value, bool) else None
 
@@ -51,7 +52,7 @@ class Car:
 
 
 class FleetWatch:
-    """Takes updates in one thread, tells of them in another."""
+    """Takes updates in one thread, and shows them in another."""
 
     def __init__(self, vehicles: Mapping[str, Vehicle]) -> None:
         self._vehicles = vehicles
@@ -60,7 +61,7 @@ class FleetWatch:
         self.refused = 0
 
     def take(self, update: Any, _pubnub_us: int, now_us: int) -> None:
-        """Take an update as it came from PubNub; one that is none is counted in `refused`."""
+        """Take an update from PubNub; an invalid one is counted in `refused`."""
         try:
             heard = decode_live_update(update)
         except ContractError:
@@ -72,19 +73,19 @@ class FleetWatch:
                 del self._cars[min(self._cars.values(), key=lambda car: car.heard_us).robot]
             car = self._cars.setdefault(robot, Car(robot))
             car.heard_us = now_us
-            # By the car's clock a sample is as old as it was on leaving, and has been under way since.
+            # A sample's age is its age on leaving, by the car's clock, and the delay since then.
             car.delay_ms = (now_us - live.sent_us - (live.offset_us or 0)) / 1000
             in_car_us = live.sent_us - live.t_us
             car.taken_us = now_us - max(0, in_car_us) - max(0, round(car.delay_ms * 1000))
             car.sample.update(live.sample)
 
     def cars(self) -> list[Car]:
-        """The cars by name, those with numbers in the order of the numbers."""
+        """The cars by name; car2 comes before car10."""
         with self._lock:
             return sorted(self._cars.values(), key=lambda car: _natural(car.robot))
 
     def table(self, now_us: int, width: int) -> Table:
-        """What there is to see, in ``width`` characters."""
+        """A table of ``width`` characters."""
         wide, narrow = width >= 90, width < 56
         table = Table(box=None, expand=True, pad_edge=False, header_style="dim")
         columns = [
@@ -99,7 +100,7 @@ class FleetWatch:
             left = name in {"car", "state"}
             longest = 16 if narrow and name == "car" else None
             table.add_column(name, justify="left" if left else "right", no_wrap=True, max_width=longest)
-        # What is left over is the fault's.
+        # The fault has the rest of the line.
         table.add_column("fault", no_wrap=True, overflow="ellipsis", style="bold red", ratio=1)
         for car in self.cars():
             state = car.state(now_us)
@@ -131,11 +132,6 @@ def _figure(value: float | None, digits: int) -> str:
 
 
 def _natural(name: str) -> list[tuple[int, str]]:
-    """car2 before car10."""
-    parts: list[tuple[int, str]] = []
-    for char in name:
-        if char.isdecimal() and parts and parts[-1][1] == "":
-            parts[-1] = (parts[-1][0] * 10 + int(char), "")
-        else:
-            parts.append((int(char), "") if char.isdecimal() else (-1, char))
-    return parts
+    """A key that sorts car2 before car10."""
+    parts = re.split(r"([0-9]+)", name)
+    return [(int(part), "") if part.isdecimal() else (-1, part) for part in parts]

@@ -1,4 +1,4 @@
-"""Stored batches out of another table into the telemetry table: an old one, or one restored from a backup."""
+"""Copies stored batches into the telemetry table from an old table, or from one restored from a backup."""
 
 from __future__ import annotations
 
@@ -24,16 +24,16 @@ from iort_station.data.reading import Item, ahead
 from iort_station.errors import StationError
 from iort_station.recordings.old_batches import is_old, upgraded_item
 
-# A unit writes a kilobyte. AWS takes 1,000 a second of a partition, which all of a topic is in: half of them
-# leaves the other half to the robot itself.
+# A write unit writes a kilobyte. AWS accepts 1,000 a second for a partition, which holds a whole topic. Half
+# of them are left to the robot.
 UNITS_PER_S = 500
 _UNIT_BYTES = 1024
-# Of version 1 and of today.
+# The keys of version 1, and of today.
 _KEYS = ([TOPIC, T_US], [TOPIC, BATCH])
 
 
 class Left(NamedTuple):
-    """An item that is not adopted: its key as the table has it, and why."""
+    """An item that is not adopted: its key in the table, and the cause."""
 
     topic: str
     key: str
@@ -42,8 +42,8 @@ class Left(NamedTuple):
 
 @dataclass
 class Adoption:
-    """What became of the table's items. Batches and their samples are counted by robot and stream;
-    ``expired`` items are only not deleted yet."""
+    """The counts of the table's items. Batches and samples are counted by robot and stream; DynamoDB has not
+    yet deleted the ``expired`` items."""
 
     batches: Counter[tuple[str, str]] = field(default_factory=Counter)
     samples: Counter[tuple[str, str]] = field(default_factory=Counter)
@@ -52,9 +52,9 @@ class Adoption:
 
 
 def source_table(cloud: Cloud, name: str | None) -> tuple[str, int]:
-    """The table of that name, or the one that the deployment has kept, and about how many items it has.
+    """The table of that name, or else the one that the deployment has kept, and about how many items it has.
 
-    Raises `StationError` where there is none, or it has no batches, or is the telemetry table itself.
+    Raises `StationError` if the table does not exist, has no batches, or is the telemetry table itself.
     """
     if name is None:
         try:
@@ -85,10 +85,10 @@ def adopt(
     dry_run: bool = False,
     progress: Callable[[int], None] = lambda _items: None,
 ) -> Adoption:
-    """Copy what a table has, of one robot or of all, at so many write units a second. An item is copied
-    with all that it holds, so that doing it again changes nothing. ``progress`` hears how many were read.
+    """Copy a table's items, of one robot or of all, at so many write units a second.
 
-    Raises `StationError` where DynamoDB does not take it; what was copied until then is good.
+    Whole items are copied, so that a second time changes nothing. ``progress`` is called with the number of
+    items read. Raises `StationError` if DynamoDB rejects a write; the items copied until then are good.
     """
     done = Adoption()
     new_table = cloud.output("storage", "TelemetryTable")
@@ -101,7 +101,7 @@ def adopt(
 
 
 def _pages(cloud: Cloud, table: str, robot: str | None) -> Iterator[tuple[int, Sequence[Item]]]:
-    """How many items were read, and those of them that are wanted; a topic's in order of time."""
+    """The number of items read, and the wanted ones; those of a topic are in the order of time."""
     request: dict[str, Any] = {"TableName": table, "ConsistentRead": True}
     if robot is not None:
         whole = build_topic(RECORD, robot, AGENT_STREAM, cloud.namespace)
@@ -132,10 +132,10 @@ def _adoptable(items: Sequence[Item], namespace: str, done: Adoption) -> Iterato
 
 
 def _checked(item: Item, namespace: str) -> tuple[Topic, Batch]:
-    # Without the time of receipt: a batch from years ahead of it is stored as any other.
+    # The time of receipt is left out, because a batch may be years ahead of it.
     topic, batch = decode_item(plain({name: value for name, value in item.items() if name != RECEIVED_MS}))
     if topic.namespace != namespace:
-        raise ContractError(f"of the namespace {topic.namespace}: must be {namespace}")
+        raise ContractError(f"the namespace must be {namespace}, got {topic.namespace}")
     return topic, batch
 
 
@@ -150,5 +150,5 @@ def _write(cloud: Cloud, table: str, items: Sequence[Mapping[str, Any]], units_p
 
 
 def _units(item: Mapping[str, Any]) -> int:
-    """About what an item's write costs: nearly all of it is samples."""
+    """About the write units of an item, which is nearly all samples."""
     return -(-len(str(item)) // _UNIT_BYTES)

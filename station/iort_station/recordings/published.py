@@ -1,4 +1,4 @@
-"""ROS messages as they were published, out of the stored batches."""
+"""Reads ROS messages as published out of the stored batches."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from typing import Any, NamedTuple
 from iort_contract.attributes import plain
 from iort_contract.limits import ContractError
 from iort_contract.messages.batch import Batch, messages_of
-from iort_contract.messages.files import CLAIM_AT, CLAIM_FIELDS
+from iort_contract.messages.files import ATTACHMENT_AT, ATTACHMENT_FIELDS
 from iort_contract.messages.message_type import MessageType
 from iort_contract.ros1.message import filled
 from iort_station.cloud import Cloud
@@ -18,12 +18,12 @@ from iort_station.data.reading import Told
 from iort_station.data.selection import Selection
 from iort_station.data.stored import ATTRIBUTES, Refused
 
-# Gives the content of an uploaded file by its key; None where it is not there.
+# Gives the content of an uploaded file by its key; None if the file is missing.
 Content = Callable[[str], "bytes | None"]
 
 
 class Published(NamedTuple):
-    """A message: the sample's time, the id of its type, its bytes."""
+    """A message: the sample's time, the id of its type, and its bytes."""
 
     t_us: int
     type_id: str
@@ -31,11 +31,10 @@ class Published(NamedTuple):
 
 
 class Export:
-    """Reads a selection's messages. ``types`` are those that the robot has said, by id.
+    """Reads a selection's messages. ``types`` are those that the robot has declared, by id.
 
-    While it reads, it gathers: ``types`` grows by what batches say of theirs where the robot has said
-    nothing; ``others`` counts samples that are no messages; ``empty`` counts messages that have an empty
-    array for a content that is not there.
+    While it reads, ``types`` grows by the types that only batches name. ``others`` counts samples that are
+    not messages; ``empty`` counts messages that have an empty array instead of a missing file.
     """
 
     def __init__(
@@ -65,7 +64,7 @@ class Export:
             self.others += len(inside)
             return ()
         if messages.type_id not in self.types and not messages.layout:
-            self.refused.add(ContractError(f"nobody has said what the type {messages.type_id} is"))
+            self.refused.add(ContractError(f"the type {messages.type_id} is not declared"))
             return ()
         if messages.type_id not in self.types:
             kind, _, definition = messages.layout.partition("\n")
@@ -79,17 +78,19 @@ class Export:
             return ()
 
     def _filled(self, raw: bytes, batch: Batch, i: int) -> bytes:
-        """The message with what was kept as files; what was cut out last comes back first."""
-        places = [name for name in batch.columns if name.endswith(f".{CLAIM_AT}")]
+        """The message with its files' contents: the content that was cut out last comes back first."""
+        places = [name for name in batch.columns if name.endswith(f".{ATTACHMENT_AT}")]
         for place in reversed(places):
-            at, field = batch.columns[place][i], place[: -len(CLAIM_AT) - 1]
-            # A message may have a field of that name itself.
-            if type(at) is not int or not all(f"{field}.{part}" in batch.columns for part in CLAIM_FIELDS):
+            at, field = batch.columns[place][i], place[: -len(ATTACHMENT_AT) - 1]
+            # A message may itself have a field of that name.
+            if type(at) is not int or not all(
+                f"{field}.{part}" in batch.columns for part in ATTACHMENT_FIELDS
+            ):
                 continue
             key, sha256 = (batch.columns[f"{field}.{part}"][i] for part in ("key", "sha256"))
             content = self._content(key) if isinstance(key, str) else None
             if content is None or hashlib.sha256(content).hexdigest() != sha256:
-                # Where those before it were is no longer known.
+                # The places of the contents before it are no longer known.
                 self.empty += 1
                 break
             raw = filled(raw, content, at)

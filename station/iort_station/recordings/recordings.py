@@ -1,28 +1,31 @@
-"""Recordings for other tools: MCAP, which Foxglove opens, and ROS 1 bags, which `rosbag play` plays."""
+"""Writes recordings for other tools: MCAP, which Foxglove opens, and ROS 1 bags, which `rosbag play`
+plays."""
 
 from __future__ import annotations
 
 import os
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, Protocol
 
 from mcap.writer import Writer as McapWriter
 from rosbags.rosbag1 import Writer as BagWriter
-from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
+from iort_contract.limits import MessageError
+from iort_contract.ros1.definition import md5sum as md5sum_of
+from iort_contract.ros1.definition import parse
 from iort_station.errors import StationError
 
 Write = Callable[[int, bytes], None]
 
 
 class Recording(Protocol):
-    """A file that messages are written into."""
+    """A file of messages."""
 
     def topic(self, topic: str, kind: str, definition: str, md5sum: str) -> Write:
-        """Begin a topic's messages of one ROS 1 type; what is returned writes one, with its time in
-        nanoseconds since the epoch. Raises `StationError` for a definition that is none."""
+        """Begin a topic's messages of one ROS 1 type. The function that is returned writes a message, with
+        its time in nanoseconds since the epoch. Raises `StationError` for an invalid definition."""
 
 
 class _Bag:
@@ -39,10 +42,10 @@ class _Bag:
                     kind.replace("/", "/msg/"),
                     msgdef=definition,
                     md5sum=md5sum or checksum(kind, definition),
-                    # A bag keeps two types of one topic apart by who published them.
+                    # A bag tells two types of one topic apart by their publishers.
                     callerid="/iort" if not self._connections else f"/iort_{len(self._connections)}",
                 )
-            except Exception as error:  # whatever a bag library raises
+            except Exception as error:  # a bag library may raise anything
                 raise StationError(f"topic {topic} of type {kind} cannot be written: {error}") from error
         connection = self._connections[named]
         return lambda t_ns, message: self._writer.write(connection, t_ns, message)
@@ -66,26 +69,23 @@ class _Mcap:
 
 
 def checksum(kind: str, definition: str) -> str:
-    """ROS 1's MD5 of a definition. Raises `StationError` for what is none."""
-    name = kind.replace("/", "/msg/")
+    """ROS 1's MD5 of a definition. Raises `StationError` if the definition is invalid."""
     try:
-        store = get_typestore(Stores.EMPTY)
-        store.register(get_types_from_msg(definition, name))
-        return str(store.generate_msgdef(name, ros_version=1)[1])
-    except Exception as error:  # whatever a library raises on a text
+        return md5sum_of(parse(kind, definition), definition)
+    except (MessageError, KeyError, ValueError) as error:
         raise StationError(f"the type {kind} cannot be read: {error}") from error
 
 
 @contextmanager
 def bag(path: Path) -> Iterator[Recording]:
-    """A new ROS 1 bag, there once it is whole; raises `StationError` where the file exists."""
+    """A new ROS 1 bag, which appears once it is whole. Raises `StationError` if the file exists."""
     with _new(path) as part, BagWriter(part) as writer:
         yield _Bag(writer)
 
 
 @contextmanager
 def mcap(path: Path) -> Iterator[Recording]:
-    """A new MCAP file, there once it is whole; raises `StationError` where the file exists."""
+    """A new MCAP file, which appears once it is whole. Raises `StationError` if the file exists."""
     with _new(path) as part, part.open("wb") as file:
         writer = McapWriter(file)
         writer.start(profile="ros1", library="iort")
@@ -95,7 +95,7 @@ def mcap(path: Path) -> Iterator[Recording]:
 
 @contextmanager
 def _new(path: Path) -> Iterator[Path]:
-    """Where to write what becomes ``path``, so that what broke off is never taken for a recording."""
+    """The file to write before it is renamed to ``path``, so that a part is never taken for a recording."""
     if path.exists():
         raise StationError(f"{path} exists")
     part = path.with_name(f".{path.name}.{os.getpid()}.part")
@@ -107,4 +107,3 @@ def _new(path: Path) -> Iterator[Path]:
 
 
 KINDS = {".bag": bag, ".mcap": mcap}
-__all__: Sequence[str] = ("KINDS", "Recording", "bag", "mcap")

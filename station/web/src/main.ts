@@ -15,7 +15,7 @@ import { CloudWatchView } from "./views/cloudwatch";
 import { FleetView } from "./views/fleet";
 import { HistoryView } from "./views/history";
 
-// Ages and states are written this often, values and charts at most as often as this.
+// The period of ages and states, and the shortest period of values and charts.
 const CLOCK_S = 0.25;
 const VALUES_S = 0.04;
 
@@ -78,7 +78,7 @@ class Page {
     this.arrange();
   }
 
-  /** After a car or a stream was heard for the first time, and on another view. */
+  /** Called for a new car, a new stream and another view. */
   private arrange(): void {
     this.shape = this.fleet.shape;
     const robot = "robot" in this.route ? this.route.robot : undefined;
@@ -93,7 +93,7 @@ class Page {
         ...(before && after ? [link("‹", `Previous car, ${before}`, before), link("›", `Next car, ${after}`, after)] : []),
       );
     }
-    // One car of its own view that is not there yet is waited for as the whole fleet is.
+    // The view of a car waits for its car, as the fleet's view waits for the first.
     const waits = this.route.view === "fleet" ? this.fleet.robots.size === 0 : this.route.view === "car" && !this.fleet.robots.has(robot!);
     document.body.dataset["empty"] = String(waits);
     byId("empty-name").textContent = robot ?? "a car";
@@ -109,7 +109,7 @@ class Page {
     return [names.at(at - 1), names[(at + 1) % names.length]];
   }
 
-  /** Left and right change the car, Escape leaves it. */
+  /** Left and right change the car; Escape leaves it. */
   private key(event: KeyboardEvent): void {
     const inField = event.target instanceof HTMLElement && event.target.matches("input, select, textarea");
     if (this.route.view === "fleet" || inField || event.ctrlKey || event.metaKey || event.altKey) return;
@@ -143,7 +143,7 @@ class Page {
   };
 }
 
-/** How long after its last message a car is shown as gone, at the latest. */
+/** The longest delay until a car that is gone is shown so. */
 const GONE_SHOWN_S = CLOCK_S;
 
 load()

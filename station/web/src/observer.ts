@@ -1,9 +1,10 @@
-// What tests and the curious may read; every access makes a copy, so nothing can be changed through it.
+// The page's state for tests and for the browser's console; every access makes a copy, so it is read-only.
 
 import { now } from "./base/clock";
 import type { Feed } from "./live/feed";
-import { BOUNDS, type Fleet } from "./live/fleet";
+import type { Fleet } from "./live/fleet";
 import { GONE_S, STALE_S } from "./base/contract";
+import { BOUNDS } from "./live/robot";
 
 export function observer(fleet: Fleet, feed: Feed, tick_s: number): object {
   const robots = (): object =>

@@ -1,14 +1,14 @@
-// Everything between the network and the page's picture of the fleet: PubNub's subscription, the decoding
-// and the checking of every message, away from the thread that draws.
+// The page's worker: it subscribes to PubNub, and decodes and checks every message, so that the drawing thread
+// does not have to.
 
 import { now } from "./base/clock";
 import { PubNubLink } from "./live/pubnub_link";
 import { parseUpdate } from "./live/update";
 import type { Arrival, FromWorker, Listening, ToWorker } from "./live/worker_messages";
 
-// What comes within this long is handed over together: each handing over wakes the page.
+// Messages of this time are handed over together, because each handover wakes the page.
 const TOGETHER_MS = 25;
-// What waits for a page that is busy; the oldest goes when it is more.
+// The most messages that wait for a busy page; beyond that the oldest is dropped.
 const MOST_WAITING = 2_000;
 
 let link: PubNubLink | undefined;

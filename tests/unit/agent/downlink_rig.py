@@ -9,16 +9,15 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+from iort_agent.common.schema import Place, load
+from iort_agent.common.state import ClockOffset
 from iort_agent.control.config import DownlinkConfig, share_rule
 from iort_agent.control.downlink import Downlink
 from iort_agent.errors import SourceError
-from iort_agent.lanes.clock_offset import Offset
 from iort_agent.mqtt.dispatch import Dispatcher
-from iort_agent.rate_limiter import Allowance
-from iort_agent.schema import Where, load
 from iort_contract.messages.commands import Command, encode_command
 from iort_contract.ros1.definition import Definition, parse
-from tests.agent_fakes import Loopback, ManualClock
+from tests.agent_fakes import Loopback, ManualClock, link_of
 
 RULE = "=" * 80
 HEADER = f"{RULE}\nMSG: std_msgs/Header\nuint32 seq\ntime stamp\nstring frame_id\n"
@@ -118,17 +117,13 @@ class Rig:
         self.uplink = uplink or Loopback(self.clock, self.dispatcher)
         self.graph = FakeGraph()
         self.answers: list[tuple[str, int, str | None]] = []
-        self.offset: Offset | None = Offset(0.0, 0.0)
-        where = Where(Path("car.yaml"))
+        self.offset: ClockOffset | None = ClockOffset(0.0, 0.0)
+        where = Place(Path("car.yaml"))
         self.downlink = Downlink(
             load(DownlinkConfig, {**CONFIG, **config}, where),
             share_rule()(share, where) if share else (),
-            robot=robot,
-            namespace="iort",
+            link=link_of(self.uplink, self.clock, robot=robot),
             boot="0badcafe",
-            uplink=self.uplink,
-            clock=self.clock,
-            allowance=Allowance(self.clock),
             graph=self.graph,
             offset=lambda: self.offset,
             answer=lambda name, command, refusal: self.answers.append((name, command.seq, refusal)),

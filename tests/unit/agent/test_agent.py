@@ -10,21 +10,22 @@ from typing import Any
 
 import pytest
 
-from iort_agent.agent import make_agent
+from iort_agent.agent import Agent
 from iort_agent.cli import main
 from iort_agent.clock import Clock, SystemClock
-from iort_agent.config.file import Config
+from iort_agent.common.state import Status, document, read
+from iort_agent.config import Config
 from iort_agent.errors import SourceError
 from iort_agent.lanes.config import PingConfig, RecordConfig
-from iort_agent.metrics import MetricsConfig
 from iort_agent.mqtt.dispatch import Dispatcher
 from iort_agent.mqtt.uplink import matches
 from iort_agent.reporting import make_report, make_status
+from iort_agent.runtime import Runtime
 from iort_agent.sources import Emit
 from iort_agent.sources.recording.bag import BagConfig
 from iort_agent.spool.interface import REJECT_NEW
 from iort_agent.spool.memory import MemorySpool
-from iort_agent.status.state import Status, document, read
+from iort_agent.status.metrics import MetricsConfig
 from iort_contract.catalog.streams import AGENT_FIELDS, TYPES_STREAM
 from iort_contract.limits import MAX_FIELDS
 from iort_contract.messages.batch import decode_batch
@@ -64,17 +65,18 @@ class Rig:
         self.clock = SystemClock()
         self.uplink = Loopback(self.clock, Dispatcher(), connected=connected)
         self.spool = MemorySpool(max_bytes=settings.pop("max_bytes", 10**9), policy=REJECT_NEW)
-        self.agent = make_agent(
+        self.agent = Agent(
             replace(config, **settings), uplink=self.uplink, spool=self.spool, clock=self.clock
         )
+        self.runtime = Runtime(self.agent)
 
     def report(self) -> dict[str, Any]:
-        """As `--report` writes it."""
-        return document(make_report(self.agent.parts))
+        """The document that `--report` writes."""
+        return document(make_report(self.agent))
 
     def status(self) -> dict[str, Any]:
-        """As the status socket gives it."""
-        return document(make_status(self.agent.parts))
+        """The document of the status socket."""
+        return document(make_status(self.agent))
 
     def recorded(self, stream: str = "vesc") -> list[Any]:
         topic = f"$aws/rules/iort_record/dt/iort/car1/{stream}"
@@ -85,7 +87,7 @@ class Rig:
 
 def test_every_sample_is_recorded_and_the_report_says_so() -> None:
     rig = Rig(drive)
-    assert rig.agent.run(drain_s=10) == 0
+    assert rig.runtime.run(drain_s=10) == 0
     assert rig.recorded() == list(range(500))
     assert rig.seqs == list(range(10))
     report = rig.report()
@@ -99,10 +101,10 @@ def test_every_sample_is_recorded_and_the_report_says_so() -> None:
     assert rig.uplink.stopped
 
 
-def test_the_status_is_read_as_it_was_written() -> None:
+def test_a_status_is_the_same_after_reading_its_json() -> None:
     rig = Rig(drive, ping=PingConfig(rate_hz=20, paths=("broker",)))
-    assert rig.agent.run(drain_s=10) == 0
-    status = make_status(rig.agent.parts)
+    assert rig.runtime.run(drain_s=10) == 0
+    status = make_status(rig.agent)
     assert (status.streams["vesc"].samples, status.lanes.ping.rate_hz) == (500, 20)
     written = json.loads(json.dumps({**document(status), "of a later version": 1}))
     written["over_share"] = {"since_ms": 1, "last_ms": 2, "batches": 3}
@@ -114,44 +116,44 @@ def test_the_status_is_read_as_it_was_written() -> None:
         read(Status, written)
 
 
-def test_a_signal_ends_it_in_good_order() -> None:
+def test_stop_ends_the_run_in_good_order() -> None:
     def endless(emit: Emit, stop: threading.Event) -> None:
         drive(emit, stop)
-        rig.agent.stop()
+        rig.runtime.stop()
         assert stop.wait(10)
 
     rig = Rig(endless)
-    assert rig.agent.run(drain_s=10) == 0
+    assert rig.runtime.run(drain_s=10) == 0
     assert rig.recorded() == list(range(500))
 
 
-def test_what_cannot_be_delivered_in_time_is_told(caplog: pytest.LogCaptureFixture) -> None:
+def test_undelivered_samples_are_reported(caplog: pytest.LogCaptureFixture) -> None:
     rig = Rig(drive, connected=False)
-    assert rig.agent.run(drain_s=0.05) == 1
-    # And two of the agent's own account, from its start and its end.
+    assert rig.runtime.run(drain_s=0.05) == 1
+    # Two of them are the agent's accounts, of its start and its end.
     assert "502 samples in 12 batches could not be delivered within 0.05 s" in caplog.text
     assert rig.report()["spool"]["left_samples"] == 502
 
 
-def test_a_backlog_is_delivered_when_the_connection_comes_at_last() -> None:
+def test_a_backlog_is_delivered_after_a_late_connect() -> None:
     def late(emit: Emit, stop: threading.Event) -> None:
         drive(emit, stop)
         rig.uplink.connect()
 
     rig = Rig(late, connected=False)
-    assert rig.agent.run(drain_s=10) == 0
+    assert rig.runtime.run(drain_s=10) == 0
     assert rig.recorded() == list(range(500))
 
 
 def test_dropped_samples_are_not_a_success(caplog: pytest.LogCaptureFixture) -> None:
     def late(emit: Emit, stop: threading.Event) -> None:
-        # More seconds than are open at once, so that some are closed before there is a connection.
+        # More seconds than may be open at once, so that some close before the connection.
         for i in range(1500):
             emit("vesc", T0 + i * 20_000, {"speed": i})
         rig.uplink.connect()
 
     rig = Rig(late, connected=False, max_bytes=1000)
-    assert rig.agent.run(drain_s=10) == 1
+    assert rig.runtime.run(drain_s=10) == 1
     assert "were dropped: the queue was full" in caplog.text
     report = rig.report()
     assert 0 < len(rig.recorded()) < 1500
@@ -165,14 +167,14 @@ def test_dropped_samples_are_not_a_success(caplog: pytest.LogCaptureFixture) -> 
 @pytest.mark.parametrize(
     ("error", "text"), [(SourceError("no such bag"), "no such bag"), (ZeroDivisionError(), "Traceback")]
 )
-def test_a_source_that_fails_does_not_take_the_others_with_it(
+def test_a_failed_source_does_not_end_the_others(
     error: Exception, text: str, caplog: pytest.LogCaptureFixture
 ) -> None:
     def broken(emit: Emit, stop: threading.Event) -> None:
         raise error
 
     rig = Rig(broken, drive)
-    assert rig.agent.run(drain_s=10) == 1
+    assert rig.runtime.run(drain_s=10) == 1
     assert rig.recorded() == list(range(500))
     assert rig.report()["failed_sources"] == ["script"]
     assert text in caplog.text
@@ -195,38 +197,36 @@ def test_a_source_that_ends_with_nothing_stored_has_failed(
     run: Any, why: str, caplog: pytest.LogCaptureFixture
 ) -> None:
     rig = Rig(run)
-    assert rig.agent.run(drain_s=10) == 1
+    assert rig.runtime.run(drain_s=10) == 1
     assert rig.report()["failed_sources"] == ["script"]
     assert f"source failed: script: {why}" in caplog.text
 
 
-def test_one_sample_that_is_refused_is_no_failure() -> None:
+def test_one_refused_sample_is_not_a_failure() -> None:
     def both(emit: Emit, stop: threading.Event) -> None:
         give_too_wide(emit, stop)
         drive(emit, stop)
 
     rig = Rig(both)
-    assert rig.agent.run(drain_s=10) == 0
+    assert rig.runtime.run(drain_s=10) == 0
     assert rig.report()["streams"]["vesc"]["refused"] == 3
 
 
 def test_a_source_that_was_stopped_before_its_first_sample_has_not_failed() -> None:
     def wait(emit: Emit, stop: threading.Event) -> None:
-        rig.agent.stop()
+        rig.runtime.stop()
         assert stop.wait(10)
 
     rig = Rig(wait)
-    assert rig.agent.run(drain_s=10) == 0
+    assert rig.runtime.run(drain_s=10) == 0
 
 
-def test_a_log_with_too_many_columns_is_a_failure_that_says_so(
-    tmp_path: Path, caplog: pytest.LogCaptureFixture
-) -> None:
+def test_too_many_columns_are_a_logged_failure(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
     path = tmp_path / "ride.csv"
     names = [f"x{i}" for i in range(754)]
     path.write_text("\n".join([";".join(["ms_today", *names]), ";".join(["1000", *["1"] * 754])]) + "\n")
     rig = Rig(sources=(BagConfig(path=path),))
-    assert rig.agent.run(drain_s=10) == 1
+    assert rig.runtime.run(drain_s=10) == 1
     assert "754 of its columns hold numbers" in caplog.text
 
 
@@ -246,7 +246,7 @@ def test_round_trips_are_recorded_like_any_stream() -> None:
             enough.set()
 
     rig.uplink.verdict = count
-    assert rig.agent.run(drain_s=10) == 0
+    assert rig.runtime.run(drain_s=10) == 0
     batches = [decode_batch(m.payload) for m in seen if m.topic == "$aws/rules/iort_record/dt/iort/car1/rtt"]
     values = [value for batch in batches for value in batch.columns["broker_ms"]]
     ping = rig.report()["pings"]["broker"]
@@ -257,7 +257,7 @@ def test_round_trips_are_recorded_like_any_stream() -> None:
 
 def test_the_record_lane_can_be_switched_off() -> None:
     rig = Rig(drive, record=RecordConfig(enabled=False))
-    assert rig.agent.run(drain_s=10) == 0
+    assert rig.runtime.run(drain_s=10) == 0
     assert rig.recorded() == []
     assert rig.report()["live_published"] > 0
 
@@ -265,20 +265,20 @@ def test_the_record_lane_can_be_switched_off() -> None:
 def test_lanes_fields_and_rates_change_while_it_runs() -> None:
     def tuned(emit: Emit, stop: threading.Event) -> None:
         emit("vesc", T0, {"speed": 1, "voltage_input": 40})
-        tuning = rig.agent.parts.streams.tuning
-        rig.agent.parts.tune(replace(tuning, fields={"vesc": ("speed", "gone")}))
+        settings = rig.agent.streams.settings
+        rig.agent.apply(replace(settings, fields={"vesc": ("speed", "gone")}))
         emit("vesc", T0 + 1_000_000, {"speed": 2, "voltage_input": 40})
-        rig.agent.parts.tune(replace(tuning, record_enabled=False, live_enabled=False))
+        rig.agent.apply(replace(settings, record_enabled=False, live_enabled=False))
         live = rig.report()["live_published"]
         for i in range(100):
             emit("vesc", T0 + 2_000_000 + i, {"speed": 3, "voltage_input": 40})
         assert rig.report()["live_published"] <= live + 1
-        rig.agent.parts.tune(tuning)
+        rig.agent.apply(settings)
         emit("vesc", T0 + 3_000_000, {"speed": 4, "voltage_input": 40})
 
     rig = Rig(tuned)
     began = rig.clock.monotonic()
-    assert rig.agent.run(drain_s=10) == 0
+    assert rig.runtime.run(drain_s=10) == 0
     assert rig.clock.monotonic() - began < 10, "it waited for something that does not come"
     assert rig.recorded() == [1, 2, 4]
     topic = "$aws/rules/iort_record/dt/iort/car1/vesc"
@@ -288,16 +288,16 @@ def test_lanes_fields_and_rates_change_while_it_runs() -> None:
     ]  # fmt: skip
 
 
-def test_types_are_said_again_when_recording_begins() -> None:
+def test_types_are_repeated_when_recording_resumes() -> None:
     said = MessageType("vesc", "/vesc", "p/A", "0" * 32, "float64 speed\n")
 
     def late(emit: Emit, stop: threading.Event) -> None:
         emit(TYPES_STREAM, T0, said.sample())
-        rig.agent.parts.tune(replace(rig.agent.parts.streams.tuning, record_enabled=True))
+        rig.agent.apply(replace(rig.agent.streams.settings, record_enabled=True))
         emit("vesc", T0 + 1_000_000, {"speed": 1})
 
     rig = Rig(late, record=RecordConfig(enabled=False))
-    assert rig.agent.run(drain_s=10) == 0
+    assert rig.runtime.run(drain_s=10) == 0
     assert rig.recorded() == [1]
     topic = "$aws/rules/iort_record/dt/iort/car1/types"
     (batch,) = [decode_batch(m.payload) for m in rig.uplink.published if m.topic == topic]
@@ -305,7 +305,7 @@ def test_types_are_said_again_when_recording_begins() -> None:
     assert message_type(sample) == said
 
 
-def test_its_own_figures_are_a_stream() -> None:
+def test_the_agents_metrics_are_a_stream() -> None:
     seen = threading.Event()
 
     def wait(emit: Emit, stop: threading.Event) -> None:
@@ -315,7 +315,7 @@ def test_its_own_figures_are_a_stream() -> None:
     rig = Rig(wait, metrics=MetricsConfig(every_s=0.1), record=RecordConfig(batch_s=0))
     topic = "$aws/rules/iort_record/dt/iort/car1/agent"
     rig.uplink.verdict = lambda message: seen.set() if message.topic == topic else None
-    assert rig.agent.run(drain_s=10) == 0
+    assert rig.runtime.run(drain_s=10) == 0
     batch = next(decode_batch(m.payload) for m in rig.uplink.published if m.topic == topic)
     assert list(batch.columns) == list(AGENT_FIELDS)
     assert not [m for m in rig.uplink.published if m.topic == "live/iort/car1/agent"]
@@ -354,7 +354,7 @@ def test_the_command_checks_a_configuration(tmp_path: Path, capsys: pytest.Captu
     assert "good, robot car1, 1 source" in capsys.readouterr().out
 
 
-def test_roslaunchs_remappings_are_no_wrong_use(tmp_path: Path) -> None:
+def test_remappings_of_roslaunch_are_accepted(tmp_path: Path) -> None:
     config = str(config_file(tmp_path, "{type: sim}"))
     remappings = ["__name:=x", "__log:=/tmp/y.log", "/from:=/to", "~from:=to", "from:=/to", "_rate:=5"]
     assert main(["--config", config, *remappings, "--check-config"]) == 0
@@ -365,7 +365,7 @@ def test_roslaunchs_remappings_are_no_wrong_use(tmp_path: Path) -> None:
         main(["status", "--config", config, "__name:=x"])
 
 
-def test_a_wrong_configuration_is_a_message_and_status_2(
+def test_a_wrong_configuration_prints_a_message_and_exits_with_2(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     assert main(["--config", str(config_file(tmp_path, "{type: sum}"))]) == 2

@@ -1,4 +1,4 @@
-"""A certificate file's number, validity and key."""
+"""A certificate file's id, validity and key."""
 
 from __future__ import annotations
 
@@ -53,7 +53,7 @@ def text(certificate: x509.Certificate) -> str:
         ((1950, 1, 1), (9999, 12, 31)),
     ],
 )
-def test_number_and_validity(before: tuple[int, int, int], after: tuple[int, int, int]) -> None:
+def test_id_and_validity(before: tuple[int, int, int], after: tuple[int, int, int]) -> None:
     first, last = (dt.datetime(*day, tzinfo=dt.timezone.utc) for day in (before, after))
     certificate, _ = made(first, last)
     found = parse_certificate("some text before\n" + text(certificate) + "and behind")
@@ -62,13 +62,13 @@ def test_number_and_validity(before: tuple[int, int, int], after: tuple[int, int
 
 
 @given(st.binary(max_size=300))
-def test_what_is_no_certificate_is_refused(der: bytes) -> None:
+def test_a_file_without_a_certificate_is_rejected(der: bytes) -> None:
     pem = f"-----BEGIN CERTIFICATE-----\n{base64.b64encode(der).decode()}\n-----END CERTIFICATE-----\n"
     with pytest.raises(IdentityError):
         parse_certificate(pem).validity()
 
 
-def test_a_new_key_and_its_request() -> None:
+def test_a_new_key_and_its_signing_request() -> None:
     key, request = make_key("car7")
     read = x509.load_pem_x509_csr(request.encode())
     assert read.is_signature_valid
@@ -89,7 +89,7 @@ def test_the_running_agent_does_not_load_the_library() -> None:
     subprocess.run([sys.executable, "-c", code], input=text(certificate), text=True, check=True)
 
 
-def test_pairs(tmp_path: Path) -> None:
+def test_a_key_belongs_to_its_certificate(tmp_path: Path) -> None:
     year = (dt.datetime(2020, 1, 1), dt.datetime(2040, 1, 1))  # noqa: DTZ001 - the library takes UTC for granted
     (one, one_key), (_, other_key) = made(*year), made(*year)
     for name, content in (("c", text(one)), ("k", one_key), ("o", other_key), ("x", "no key")):
@@ -105,7 +105,7 @@ def test_pairs(tmp_path: Path) -> None:
         read_certificate(tmp_path / "x")
 
 
-def test_a_stamp_tells_of_every_replacement(tmp_path: Path) -> None:
+def test_a_stamp_changes_with_every_replacement(tmp_path: Path) -> None:
     file, other = tmp_path / "a", tmp_path / "b"
     assert stamp(file, None) == (None,)
     file.write_text("1")

@@ -1,4 +1,4 @@
-"""The configuration file: what it may say, and what one is told of what it may not."""
+"""The configuration file: its settings and its errors."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from iort_agent.config.file import load_config
+from iort_agent.config import load_config
 from iort_agent.errors import ConfigError
 from iort_agent.sources.recording.bag import BagConfig
 from iort_agent.sources.sim import SimConfig
@@ -46,7 +46,7 @@ def test_a_short_file_is_enough(folder: Path) -> None:
     assert config.queue.policy == "OverwriteOldestData"
 
 
-def test_everything_can_be_said(folder: Path) -> None:
+def test_every_section_is_read(folder: Path) -> None:
     text = GOOD.replace("  - type: sim\n", "") + (
         "  - {type: bag, path: drive.bag, topics: {/sensors/core: vesc, /imu: imu}, speed: 0,\n"
         "     stamps: original, loop: true, duration_s: 5}\n"
@@ -72,7 +72,7 @@ def test_everything_can_be_said(folder: Path) -> None:
     assert config.ping.paths == ("rule",)
 
 
-def test_a_section_left_empty_has_its_defaults(folder: Path) -> None:
+def test_an_empty_section_has_its_defaults(folder: Path) -> None:
     assert load_config(write(folder, GOOD + "live:\n")).live.rate_hz == 10
 
 
@@ -102,7 +102,10 @@ SIM = "  - type: sim\n"
         (("car1", "car/1"), ["robot: ", "'car/1'", "A-Z a-z 0-9 _ -"]),
         (("robot: car1", "robot: 17"), ["robot: ", "17 (a number)", "a text", "quotes"]),
         (("robot: car1", "robot: {a: 1}"), ["robot: ", "(a mapping)", "a text"]),
-        (("robot:", "robto: x\nrobot:"), ["robto: unknown key", "'x'", "did you mean robot?"]),
+        (
+            ("robot:", "robto: x\nrobot:"),
+            ["robto: unknown key", "must be one of robot, ", "did you mean robot?"],
+        ),
         (("robot:", "robot: x\nrobot:"), ["the key 'robot' is given twice", "line 2"]),
         (
             ("pki/key.pem", "pki/no.pem"),
@@ -110,14 +113,20 @@ SIM = "  - type: sim\n"
         ),
         (("pki/key.pem", "pki"), ["private_key: ", "'pki'", "a file that exists"]),
         (("abc-ats", "https://abc-ats"), ["endpoint: ", "'https://abc-ats", "a host name"]),
-        ((SIM, ""), ["sources: found nothing", "at least one source"]),
-        ((SIM, "  []\n"), ["sources: found [] (a list)", "at least one source"]),
-        ((SIM, "  - sim\n"), ["sources[0]: found 'sim'", "a mapping with the key type"]),
-        ((SIM, "  - {}\n"), ["sources[0].type: found nothing", "bag, ros1, rosbridge, sim, vesc"]),
-        ((SIM, "  - {type: sum}\n"), ["sources[0].type: found 'sum'", "bag, ros1", "did you mean sim?"]),
-        ((SIM, SIM + "    rate_hz: fast\n"), ["sources[0].rate_hz: found 'fast'", "0.1 to 2000 (Hz)"]),
-        ((SIM, SIM + "    rate_hz: .nan\n"), ["sources[0].rate_hz: found nan", "0.1 to 2000"]),
-        ((SIM, SIM + "    seed: 1.5\n"), ["sources[0].seed: found 1.5", "a whole number"]),
+        ((SIM, ""), ["sources: must be ", "got nothing", "at least one source"]),
+        ((SIM, "  []\n"), ["sources: must be ", "got [] (a list)", "at least one source"]),
+        ((SIM, "  - sim\n"), ["sources[0]: must be ", "got 'sim'", "a mapping with the key type"]),
+        ((SIM, "  - {}\n"), ["sources[0].type: must be ", "got nothing", "bag, ros1, rosbridge, sim, vesc"]),
+        (
+            (SIM, "  - {type: sum}\n"),
+            ["sources[0].type: must be ", "got 'sum'", "bag, ros1", "did you mean sim?"],
+        ),
+        (
+            (SIM, SIM + "    rate_hz: fast\n"),
+            ["sources[0].rate_hz: must be ", "got 'fast'", "0.1 to 2000 (Hz)"],
+        ),
+        ((SIM, SIM + "    rate_hz: .nan\n"), ["sources[0].rate_hz: must be ", "got nan", "0.1 to 2000"]),
+        ((SIM, SIM + "    seed: 1.5\n"), ["sources[0].seed: must be ", "got 1.5", "a whole number"]),
         ((SIM, SIM + "    stream: a/b\n"), ["sources[0].stream: ", "'a/b'"]),
         ((SIM, SIM + "    stream: rtt\n"), ["sources[0]: ", "the stream rtt is taken"]),
         ((SIM, SIM + SIM), ["sources[1]: ", "the stream vesc is taken"]),
@@ -126,35 +135,50 @@ SIM = "  - type: sim\n"
             ["sources[0].vehicle.mas_kg: unknown key", "did you mean mass_kg?"],
         ),
         ((SIM, "  - {type: bag}\n"), ["sources[0].path: required"]),
-        ((SIM, "  - {type: bag, path: no.bag}\n"), ["sources[0].path: found 'no.bag'", "exists"]),
-        ((SIM, "  - {type: bag, path: drive.bag, speed: -1}\n"), ["sources[0].speed: found -1", "from 0"]),
-        ((SIM, "  - {type: bag, path: drive.bag, stamps: new}\n"), ["stamps: found 'new'", "now, original"]),
-        ((SIM, "  - {type: bag, path: drive.bag, loop: 1}\n"), ["loop: found 1 (a number)", "true or false"]),
+        ((SIM, "  - {type: bag, path: no.bag}\n"), ["sources[0].path: must be ", "got 'no.bag'", "exists"]),
+        (
+            (SIM, "  - {type: bag, path: drive.bag, speed: -1}\n"),
+            ["sources[0].speed: must be ", "got -1", "from 0"],
+        ),
+        (
+            (SIM, "  - {type: bag, path: drive.bag, stamps: new}\n"),
+            ["stamps: must be ", "got 'new'", "now, original"],
+        ),
+        (
+            (SIM, "  - {type: bag, path: drive.bag, loop: 1}\n"),
+            ["loop: must be ", "got 1 (a number)", "true or false"],
+        ),
         ((SIM, "  - {type: bag, path: drive.bag, topics: [/a]}\n"), ["topics: ", "mapping of ROS topic"]),
         (
             (SIM, "  - {type: bag, path: drive.bag, topics: {/a: 'b c'}}\n"),
             ["sources[0].topics./a: ", "'b c'"],
         ),
-        ((SIM, SIM + "live: {rate_hz: 50}\n"), ["live.rate_hz: found 50", "from 0.01 to 10 (Hz)"]),
-        ((SIM, SIM + "live: yes\n"), ["live: found True (true or false)", "enabled, rate_hz"]),
-        ((SIM, SIM + "record: {batch_s: 2}\n"), ["record.batch_s: found 2", "from 0 to 1 (s)"]),
-        ((SIM, SIM + "ping: {paths: [brokr]}\n"), ["ping.paths[0]: found 'brokr'", "did you mean broker?"]),
-        ((SIM, SIM + "ping: {paths: broker}\n"), ["ping.paths: found 'broker'", "a list"]),
-        ((SIM, SIM + "queue: {policy: Drop}\n"), ["queue.policy: found 'Drop'", "RejectNewData"]),
+        ((SIM, SIM + "live: {rate_hz: 50}\n"), ["live.rate_hz: must be ", "got 50", "from 0.01 to 10 (Hz)"]),
+        ((SIM, SIM + "live: yes\n"), ["live: must be ", "got True (true or false)", "enabled, rate_hz"]),
+        ((SIM, SIM + "record: {batch_s: 2}\n"), ["record.batch_s: must be ", "got 2", "from 0 to 1 (s)"]),
+        (
+            (SIM, SIM + "ping: {paths: [brokr]}\n"),
+            ["ping.paths[0]: must be ", "got 'brokr'", "did you mean broker?"],
+        ),
+        ((SIM, SIM + "ping: {paths: broker}\n"), ["ping.paths: must be ", "got 'broker'", "a list"]),
+        ((SIM, SIM + "queue: {policy: Drop}\n"), ["queue.policy: must be ", "got 'Drop'", "RejectNewData"]),
         (
             (SIM, SIM + "queue: {path: away/queue.db}\n"),
-            ["queue.path: found 'away/queue.db'", "a folder that exists", "there is no ", "/away"],
+            ["queue.path: must be ", "got 'away/queue.db'", "a folder that exists", "there is no ", "/away"],
         ),
-        ((SIM, SIM + "queue: {path: pki}\n"), ["queue.path: found 'pki'", "nothing else already"]),
+        ((SIM, SIM + "queue: {path: pki}\n"), ["queue.path: must be ", "got 'pki'", "nothing else already"]),
         ((SIM, SIM + "queue: {path: car.yaml}\n"), ["queue.path: ", "nothing else already"]),
-        ((SIM, SIM + "queue: {path: 7}\n"), ["queue.path: found 7 (a number)", "the path of a file"]),
-        ((SIM, SIM + "port: 88830\n"), ["port: found 88830", "1 to 65535"]),
+        (
+            (SIM, SIM + "queue: {path: 7}\n"),
+            ["queue.path: must be ", "got 7 (a number)", "the path of a file"],
+        ),
+        ((SIM, SIM + "port: 88830\n"), ["port: must be ", "got 88830", "1 to 65535"]),
         ((SIM, SIM + "namespace: Iort\n"), ["namespace: ", "'Iort'", "lower-case"]),
         ((SIM, "  - type: sim\n   x: 1\n"), ["is not YAML", "line 8"]),
     ],
     ids=lambda case: case[1].strip()[:40] if isinstance(case, tuple) else "",
 )
-def test_a_wrong_file_is_told_where_what_and_what_instead(
+def test_an_error_names_key_value_and_what_is_allowed(
     folder: Path, change: tuple[str, str], parts: list[str]
 ) -> None:
     assert change[0] in GOOD
@@ -166,12 +190,12 @@ def test_a_wrong_file_is_told_where_what_and_what_instead(
 
 
 @pytest.mark.parametrize("text", ["", "# nothing\n", "- a\n", "just text\n"])
-def test_a_file_that_is_no_mapping(folder: Path, text: str) -> None:
-    with pytest.raises(ConfigError, match=r"car\.yaml: (is empty|found)"):
+def test_a_file_must_be_a_mapping(folder: Path, text: str) -> None:
+    with pytest.raises(ConfigError, match=r"car\.yaml: (is empty|must be a mapping)"):
         load_config(write(folder, text))
 
 
-def test_a_file_that_cannot_be_read(folder: Path) -> None:
+def test_an_unreadable_file(folder: Path) -> None:
     with pytest.raises(ConfigError, match=r"no\.yaml: cannot be read: No such file"):
         load_config(folder / "no.yaml")
     (folder / "latin.yaml").write_bytes(b"robot: \xe9")

@@ -1,4 +1,4 @@
-"""Commands on their way to ROS, without ROS and without a network."""
+"""Commands to ROS topics, with fakes for ROS and the network."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from typing import Any
 import pytest
 
 from iort_agent.clock import SystemClock
-from iort_agent.lanes.clock_offset import Offset
+from iort_agent.common.state import ClockOffset
 from tests.unit.agent.downlink_rig import T0, Rig, doubles
 
 
@@ -32,7 +32,7 @@ def test_a_command_becomes_a_ros_message() -> None:
         ({"data": None}, "data: must be a number, got None"),
     ],
 )
-def test_what_is_not_the_type_is_refused_counted_and_told_once(
+def test_a_message_of_another_type_is_rejected_counted_and_logged_once(
     message: Any, reason: str, caplog: pytest.LogCaptureFixture
 ) -> None:
     rig = Rig()
@@ -50,7 +50,7 @@ def test_what_is_not_the_type_is_refused_counted_and_told_once(
     "raw",
     [b"", b"\xff", b"[]", b"{}", b'{"v": 1}', b'{"v":1,"session":"feedbeef","message":{"data":NaN}}'],
 )
-def test_what_is_no_command_is_refused(raw: bytes) -> None:
+def test_a_malformed_command_is_rejected(raw: bytes) -> None:
     rig = Rig()
     rig.send(None, raw=raw)
     assert rig.graph.published == []
@@ -65,14 +65,14 @@ def test_what_is_no_command_is_refused(raw: bytes) -> None:
         ({"lease_ms": None}, "without_lease"),
     ],
 )
-def test_motion_is_refused_when_it_is_not_for_now(changes: Any, reason: str) -> None:
+def test_motion_that_is_late_or_early_is_rejected(changes: Any, reason: str) -> None:
     rig = Rig()
     rig.send({"data": 1.0}, **changes)
     assert rig.graph.published == []
     assert rig.refused() == {f"cmd/iort/car1/speed {reason}": 1}
 
 
-def test_who_asks_is_told_what_became_of_his_command() -> None:
+def test_the_outcome_of_a_command_is_answered() -> None:
     rig = Rig()
     rig.send({"data": 1.0})
     rig.send({"data": 1.0}, answer=True)
@@ -87,11 +87,11 @@ def test_who_asks_is_told_what_became_of_his_command() -> None:
     ]
 
 
-def test_a_deadline_is_judged_by_the_clouds_clock_and_what_may_be_too_old_is() -> None:
+def test_a_deadline_counts_by_the_clouds_clock_and_its_uncertainty() -> None:
     rig = Rig()
     for hour in (-1, 1):
-        # The car's clock is an hour off, and knows it to within a tenth of a second.
-        rig.offset = Offset(hour * 3_600_000.0, 100.0)
+        # The car's clock is an hour wrong, and the offset is known to a tenth of a second.
+        rig.offset = ClockOffset(hour * 3_600_000.0, 100.0)
         cloud_us = rig.clock.now_us() + hour * 3_600_000_000
         for age_us in (0, 400_000, 400_001):
             sent_us = cloud_us - age_us
@@ -101,19 +101,19 @@ def test_a_deadline_is_judged_by_the_clouds_clock_and_what_may_be_too_old_is() -
     assert rig.refused() == {"cmd/iort/car1/say stale": 2}
 
 
-def test_what_waited_in_a_frozen_car_drives_no_further_than_its_lease() -> None:
+def test_a_command_that_waited_in_a_frozen_car_keeps_only_the_rest_of_its_lease() -> None:
     rig = Rig()
     waiting = [T0 + i * 100_000 for i in range(20)]
     rig.clock.advance(2)
     for sent_us in waiting:
         rig.send({"data": 1.0}, started_us=T0, sent_us=sent_us, valid_ms=60_000)
-    # Sent 0.2 and 0.1 s ago, with 0.3 s each: the last word holds for 0.2 s more.
+    # Sent 0.2 and 0.1 s ago, with 0.3 s each: the last one holds for another 0.2 s.
     assert len(rig.graph.published) == 2
     assert rig.refused() == {"cmd/iort/car1/speed stale": 10, "cmd/iort/car1/speed lease_over": 8}
     assert rig.downlink.tick() == pytest.approx(0.2)
 
 
-def test_a_car_that_does_not_know_the_clouds_time_does_not_move_but_speaks(
+def test_without_a_known_offset_only_commands_without_motion_pass(
     caplog: pytest.LogCaptureFixture,
 ) -> None:
     rig = Rig()
@@ -173,7 +173,7 @@ def test_halt_stops_the_car_and_takes_no_more_commands() -> None:
     assert rig.graph.closed
 
 
-def test_a_car_that_does_not_move_is_not_stopped() -> None:
+def test_without_motion_nothing_is_stopped() -> None:
     rig = Rig()
     rig.uplink.cut()
     rig.dispatcher.run_pending()
@@ -181,7 +181,7 @@ def test_a_car_that_does_not_move_is_not_stopped() -> None:
     assert rig.graph.published == []
 
 
-def test_without_ros_a_command_is_refused() -> None:
+def test_without_ros_a_command_is_rejected() -> None:
     rig = Rig()
     rig.graph.up = False
     rig.send({"data": 2.5})

@@ -1,4 +1,4 @@
-"""What a robot takes and shares is written wrong: told at the start, by file and key."""
+"""Errors in the sections `downlink` and `share` name file and key at the start."""
 
 from __future__ import annotations
 
@@ -14,12 +14,12 @@ from tests.unit.agent.downlink_rig import CONFIG, Rig
     ("change", "error"),
     [
         ({"motion": {"stop": {"speed": 0}}}, "stop: speed: std_msgs/Float64 has no such field"),
-        ({"motion": {"stop": 0}}, r"cmd\.speed\.motion\.stop: found 0 .*mapping"),
+        ({"motion": {"stop": 0}}, r"cmd\.speed\.motion\.stop: must be a mapping .* got 0"),
         ({"motion": {}}, r"motion\.stop: required"),
-        ({"motion": {"stop": {}, "lease_s": 60}}, "lease_s: found 60"),
+        ({"motion": {"stop": {}, "lease_s": 60}}, "lease_s: must be .* got 60"),
         ({"topic": "speed"}, r"cmd\.speed\.topic: ROS topic must be .*, got 'speed'"),
-        ({"type": "Float64"}, "allowed is package/Type"),
-        ({"partial": 1}, "partial: found 1"),
+        ({"type": "Float64"}, "must be package/Type"),
+        ({"partial": 1}, "partial: must be true or false, got 1"),
     ],
 )
 def test_a_wrong_configuration(change: Any, error: str) -> None:

@@ -1,12 +1,12 @@
-"""Other robots' messages on their way to ROS, and ours to them, without ROS and without a network."""
+"""Messages between robots, with fakes for ROS and the network."""
 
 from __future__ import annotations
 
 from typing import Any
 
-from iort_agent.lanes.clock_offset import Offset
+from iort_agent.common.state import ClockOffset
 from iort_agent.mqtt.dispatch import Dispatcher
-from iort_agent.mqtt.uplink import Message
+from iort_agent.mqtt.uplink import MqttMessage
 from iort_agent.ros1.json_message import encode
 from iort_contract.messages.commands import FleetMessage, decode_fleet, encode_fleet
 from iort_contract.ros1.definition import parse
@@ -23,13 +23,13 @@ def pose_bytes() -> bytes:
 def test_two_robots_share_their_poses() -> None:
     clock, dispatcher = ManualClock(now_us=T0), Dispatcher()
     broker = Loopback(clock, dispatcher)
-    # One connection holds one handler a filter, so the second robot listens by a filter of its own.
+    # The fake broker keeps one handler for a filter, so both robots share it.
     first = Rig("car-1", share=SHARE, uplink=broker, clock=clock)
     handlers = dict(broker._subscriptions)
     second = Rig("car2", share=SHARE, uplink=broker, clock=clock)
     both = broker._subscriptions["fleet/iort/+/pose"], handlers["fleet/iort/+/pose"]
 
-    def to_both(message: Message) -> None:
+    def to_both(message: MqttMessage) -> None:
         for handle in both:
             handle(message)
 
@@ -60,7 +60,7 @@ def fleet(
     rig.dispatcher.run_pending()
 
 
-def test_of_another_robot_only_what_is_new_passes() -> None:
+def test_only_newer_messages_of_another_robot_pass() -> None:
     rig = Rig()
     for seq, boot, age_us in [(0, "0badcafe", 0), (2, "0badcafe", 0), (1, "0badcafe", 0), (0, "1badcafe", 0),
                               (1, "1badcafe", 3_000_000)]:  # fmt: skip
@@ -70,17 +70,17 @@ def test_of_another_robot_only_what_is_new_passes() -> None:
     assert rig.downlink.report()["fleet"] == {"pose": {"car2": 3}}
 
 
-def test_two_clocks_that_are_off_are_compared_by_the_clouds() -> None:
+def test_two_wrong_clocks_are_compared_through_the_clouds() -> None:
     rig = Rig()
-    rig.offset = Offset(3_600_000.0, 1.0)
-    # Theirs is an hour ahead of ours, and both of them know.
+    rig.offset = ClockOffset(3_600_000.0, 1.0)
+    # Their clock is an hour ahead of ours, and both know their offset.
     for seq, age_us in enumerate((0, 2_000_000, 2_000_001)):
         fleet(rig, "car2", seq, age_us=age_us - 3_600_000_000, offset_us=0)
     assert rig.downlink.report()["fleet"] == {"pose": {"car2": 2}}
     assert rig.refused() == {"fleet pose stale": 1}
 
 
-def test_two_robots_of_one_ros_name_and_too_many() -> None:
+def test_a_taken_ros_name_and_too_many_robots_are_rejected() -> None:
     rig = Rig()
     fleet(rig, "a-b", 0)
     fleet(rig, "a_b", 0)
@@ -89,7 +89,7 @@ def test_two_robots_of_one_ros_name_and_too_many() -> None:
     assert rig.refused() == {"fleet pose name_taken_in_ros": 1, "fleet pose too_many_robots": 1}
 
 
-def test_another_robots_nonsense_is_refused() -> None:
+def test_another_robots_malformed_message_is_rejected() -> None:
     rig = Rig()
     fleet(rig, "car2", 0, message={"pose": {"position": {}}})
     rig.uplink.deliver("fleet/iort/car2/pose", b"nonsense")
@@ -103,7 +103,7 @@ def shared(rig: Rig) -> list[FleetMessage]:
     return [decode_fleet(m.payload) for m in rig.uplink.published if m.topic == "fleet/iort/car1/pose"]
 
 
-def test_shared_at_the_rate_and_the_newest() -> None:
+def test_the_newest_message_is_shared_at_the_rate() -> None:
     rig = Rig(share=SHARE)
     definition = parse("geometry_msgs/PoseStamped", POSE)
     for i in range(100):
@@ -131,7 +131,7 @@ def test_nothing_old_is_shared_after_an_outage() -> None:
     assert shared(rig) == []
 
 
-def test_what_is_no_number_is_not_shared() -> None:
+def test_a_message_with_nan_is_not_shared() -> None:
     rig = Rig(share={"/x": {"name": "pose"}})
     rig.graph.hear("/x", "std_msgs/Float64", doubles(float("nan")))
     rig.graph.hear("/x", "std_msgs/Float64", b"123")

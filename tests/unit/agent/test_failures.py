@@ -1,4 +1,4 @@
-"""What a robot's log says of a connection that was not made."""
+"""The explanation of a failed connection."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ def failed(name: str = HUNG_UP, code: Any = None) -> Any:
             ("validity", True),
             "set the clock",
         ),
-        # Nothing suspicious: whatever the certificate says, it was not the reason.
+        # The certificate cannot be the reason, so it is not read.
         (failed(DNS), GOOD._replace(not_after_s=NOW_S - 1), True, ("", False), "resolve"),
         (failed(code=REFUSED), None, False, ("refused", True), "iort-agent check"),
     ],

@@ -1,4 +1,4 @@
-"""Provisioning: what is tried again, and with what; also by a run after the one that ended."""
+"""Provisioning: repeated tries, within a run and by the next run."""
 
 from __future__ import annotations
 
@@ -10,12 +10,12 @@ import pytest
 
 from iort_agent.errors import IdentityError, RefusedError
 from iort_agent.identity.pending import TOKEN_S, Pending, keep, kept
-from iort_agent.verbs.provision import Run, provision, register_again
+from iort_agent.verbs.provision import Seams, provision, register_again
 from iort_contract.limits import DEFAULT_NAMESPACE
 
 
 class Cloud:
-    """Refuses so often, then registers."""
+    """Refuses a few times, then registers."""
 
     def __init__(self, *refusals: str) -> None:
         self._refusals = list(refusals)
@@ -30,14 +30,14 @@ class Cloud:
 
 
 @pytest.mark.parametrize("refusals", [(), ("too late",), ("too late", "no answer")])
-def test_a_registration_that_failed_is_tried_again_as_it_was(refusals: tuple[str, ...]) -> None:
+def test_a_failed_registration_is_repeated_with_the_same_token(refusals: tuple[str, ...]) -> None:
     cloud = Cloud(*refusals)
     assert register_again(cloud.register, wait=cloud.waited.append) == "car"
     assert cloud.asked == len(refusals) + 1
     assert cloud.waited == [1.0, 4.0][: len(refusals)]
 
 
-def test_what_is_refused_for_good_is_said_as_it_was_said_first() -> None:
+def test_a_final_refusal_raises_the_first_error() -> None:
     cloud = Cloud("not expected", "token is used up", "token is used up", "never asked")
     with pytest.raises(IdentityError, match=r"^not expected$"):
         register_again(cloud.register, wait=cloud.waited.append)
@@ -45,7 +45,7 @@ def test_what_is_refused_for_good_is_said_as_it_was_said_first() -> None:
 
 
 class Exchange:
-    """AWS IoT, as far as it is asked. ``tokens`` are good; a certificate in ``registered`` connects."""
+    """A fake of AWS IoT. ``tokens`` are valid; certificates in ``registered`` connect."""
 
     def __init__(self) -> None:
         self.issued: list[str] = []
@@ -57,8 +57,8 @@ class Exchange:
         self.waited: list[float] = []
 
     @property
-    def run(self) -> Run:
-        return Run(lambda _claim: self, self.waited.append)
+    def seams(self) -> Seams:
+        return Seams(lambda _claim: self, self.waited.append)
 
     def __enter__(self) -> Exchange:  # noqa: PYI034 - Self came with Python 3.11
         if not self.claim_is_good:
@@ -102,7 +102,7 @@ def claim(tmp_path: Path) -> Path:
 
 
 def earlier(folder: Path, *, asked_s: float | None = None, **other: str) -> Pending:
-    """What a run left that was issued the first certificate."""
+    """The state of a run that was issued the first certificate."""
     values = {
         "robot": "car",
         "serial": "s1",
@@ -118,16 +118,16 @@ def earlier(folder: Path, *, asked_s: float | None = None, **other: str) -> Pend
 
 
 def taken_up(claim: Path, aws: Exchange) -> str:
-    """The certificate with which the robot then stands there."""
-    provision(claim, robot="car", run=aws.run)
+    """The certificate that the robot has afterwards."""
+    provision(claim, robot="car", seams=aws.seams)
     assert kept(claim.parent) is None
     return (claim.parent / "certificate.pem").read_text()
 
 
 @pytest.mark.parametrize("at", ["registering", "writing"])
-def test_a_run_that_ends_anywhere_is_taken_up_by_the_next(claim: Path, aws: Exchange, at: str) -> None:
+def test_the_next_run_resumes_after_an_end_at_any_step(claim: Path, aws: Exchange, at: str) -> None:
     class Ended(BaseException):
-        """As if the process ended."""
+        """Ends the process."""
 
     def register(token: str, parameters: Mapping[str, str]) -> str:
         if at == "writing":
@@ -136,13 +136,13 @@ def test_a_run_that_ends_anywhere_is_taken_up_by_the_next(claim: Path, aws: Exch
 
     aws.register = register
     with pytest.raises(Ended):
-        provision(claim, robot="car", run=aws.run)
+        provision(claim, robot="car", seams=aws.seams)
     del aws.register
     assert taken_up(claim, aws) == "certificate 0"
     assert aws.issued == ["certificate 0"]
 
 
-def test_what_aws_says_to_a_token_that_was_used_does_not_matter(claim: Path, aws: Exchange) -> None:
+def test_any_answer_to_a_used_token_is_accepted(claim: Path, aws: Exchange) -> None:
     for refusal in (
         RefusedError("used", "InvalidCertificateOwnershipToken"),
         RefusedError("no", "AccessDenied"),
@@ -153,13 +153,13 @@ def test_what_aws_says_to_a_token_that_was_used_does_not_matter(claim: Path, aws
     assert not aws.issued
 
 
-def test_one_that_was_registered_needs_no_claim(claim: Path, aws: Exchange) -> None:
+def test_a_registered_certificate_needs_no_claim(claim: Path, aws: Exchange) -> None:
     earlier(claim.parent)
     aws.registered, aws.claim_is_good = {"certificate 0"}, False
     assert taken_up(claim, aws) == "certificate 0"
 
 
-def test_a_token_that_is_no_longer_good_is_let_go(claim: Path, aws: Exchange) -> None:
+def test_an_invalid_token_is_dropped(claim: Path, aws: Exchange) -> None:
     aws.issued.append("certificate 0")
     earlier(claim.parent)
     assert taken_up(claim, aws) == "certificate 1"
@@ -167,31 +167,31 @@ def test_a_token_that_is_no_longer_good_is_let_go(claim: Path, aws: Exchange) ->
 
 
 @pytest.mark.parametrize("off_s", [-TOKEN_S, 60.0])
-def test_one_that_is_too_old_by_the_clock_is_not_even_asked_for(
-    claim: Path, aws: Exchange, off_s: float
-) -> None:
+def test_an_expired_token_is_not_sent(claim: Path, aws: Exchange, off_s: float) -> None:
     aws.issued.append("certificate 0")
     earlier(claim.parent, asked_s=time.time() + off_s)
     assert taken_up(claim, aws) == "certificate 1"
     assert aws.asked == ["token 1"]
 
 
-def test_an_old_one_is_kept_while_nothing_connects(claim: Path, aws: Exchange) -> None:
+def test_an_expired_token_is_kept_without_a_network(claim: Path, aws: Exchange) -> None:
     left = earlier(claim.parent, asked_s=time.time() - TOKEN_S)
     aws.claim_is_good = False
     with pytest.raises(IdentityError, match="does not connect"):
-        provision(claim, robot="car", run=aws.run)
+        provision(claim, robot="car", seams=aws.seams)
     assert kept(claim.parent) == left
 
 
 @pytest.mark.parametrize(
     "refusal", [RefusedError("not expected", "AccessDenied"), IdentityError("no answer")]
 )
-def test_what_may_be_admitted_later_is_kept(claim: Path, aws: Exchange, refusal: IdentityError) -> None:
+def test_a_certificate_that_may_be_admitted_later_is_kept(
+    claim: Path, aws: Exchange, refusal: IdentityError
+) -> None:
     left = earlier(claim.parent)
     aws.refusal = refusal
     with pytest.raises(IdentityError, match=str(refusal)):
-        provision(claim, robot="car", run=aws.run)
+        provision(claim, robot="car", seams=aws.seams)
     assert kept(claim.parent) == left
     assert not aws.issued
 
@@ -199,18 +199,18 @@ def test_what_may_be_admitted_later_is_kept(claim: Path, aws: Exchange, refusal:
 @pytest.mark.parametrize(
     "other", [{"robot": "bike"}, {"serial": "s2"}, {"endpoint": "there"}, {"namespace": "a"}]
 )
-def test_another_robots_is_left_alone(claim: Path, aws: Exchange, other: dict[str, str]) -> None:
+def test_another_robots_certificate_is_not_used(claim: Path, aws: Exchange, other: dict[str, str]) -> None:
     earlier(claim.parent, certificate="certificate of another", **other)
     assert taken_up(claim, aws) == "certificate 0"
 
 
 @pytest.mark.parametrize("content", ["", "[]", "{}", '{"robot": "car", "asked_s": "x"}', "null", "\\x00"])
-def test_what_cannot_be_read_is_left_aside(claim: Path, aws: Exchange, content: str) -> None:
+def test_an_unreadable_state_is_ignored(claim: Path, aws: Exchange, content: str) -> None:
     (claim.parent / ".provisioning.json").write_text(content)
     assert taken_up(claim, aws) == "certificate 0"
 
 
-def test_a_link_in_its_place_is_not_followed(claim: Path, aws: Exchange, tmp_path: Path) -> None:
+def test_a_link_in_place_of_the_state_is_not_followed(claim: Path, aws: Exchange, tmp_path: Path) -> None:
     elsewhere = tmp_path / "elsewhere"
     elsewhere.mkdir()
     earlier(elsewhere, certificate="certificate of another")
@@ -220,12 +220,12 @@ def test_a_link_in_its_place_is_not_followed(claim: Path, aws: Exchange, tmp_pat
     assert (elsewhere / ".provisioning.json").read_bytes() == before
 
 
-def test_what_was_there_before_is_kept_however_often_it_ends(claim: Path, aws: Exchange) -> None:
+def test_the_previous_files_are_kept_after_any_number_of_ends(claim: Path, aws: Exchange) -> None:
     (claim.parent / "private.key").write_text("old key")
     (claim.parent / "certificate.pem").write_text("old certificate")
     left = earlier(claim.parent)
     aws.tokens.add("token 0")
-    # It ended between its two files.
+    # The earlier run ended between its two files.
     (claim.parent / "private.key.previous").write_text("old key")
     (claim.parent / "private.key").write_text(left.private_key)
     assert taken_up(claim, aws) == "certificate 0"
@@ -233,7 +233,7 @@ def test_what_was_there_before_is_kept_however_often_it_ends(claim: Path, aws: E
     assert (claim.parent / "certificate.pem.previous").read_text() == "old certificate"
 
 
-def test_an_answer_that_was_lost_is_no_refusal(claim: Path, aws: Exchange) -> None:
+def test_a_lost_answer_is_not_a_refusal(claim: Path, aws: Exchange) -> None:
     def register(token: str, parameters: Mapping[str, str]) -> str:
         Exchange.register(aws, token, parameters)
         raise IdentityError("no answer")

@@ -13,17 +13,18 @@ from typing import Any, NamedTuple
 
 import pytest
 
-from iort_agent.agent import make_agent
+from iort_agent.agent import Agent
 from iort_agent.clock import Clock, SystemClock
-from iort_agent.config.file import Config
+from iort_agent.common.state import document
+from iort_agent.config import Config
 from iort_agent.lanes.config import PingConfig, RecordConfig
 from iort_agent.lanes.production import Production, Rate
 from iort_agent.lanes.record import too_many
 from iort_agent.mqtt.dispatch import Dispatcher
-from iort_agent.rate_limiter import URGENT, Allowance
+from iort_agent.mqtt.rate_limiter import URGENT, RateLimiter
 from iort_agent.reporting import make_report, make_status
+from iort_agent.runtime import Runtime
 from iort_agent.spool.memory import MemorySpool
-from iort_agent.status.state import document
 from iort_agent.status.text import render
 from iort_contract.messages.batch import decode_batch
 from iort_contract.topics import BROKER, LIVE
@@ -31,7 +32,7 @@ from tests.agent_fakes import Loopback, ManualClock, Published
 
 T0 = 1_700_000_000_000_000
 TICK_MS = 200
-# What a drive needs before its rates are those of its last seconds.
+# The time until the rates are those of the last seconds.
 SETTLE_S = 4
 
 
@@ -47,7 +48,7 @@ class Topic(NamedTuple):
 
 
 class Named:
-    """A source that only says which streams it has."""
+    """A source that only names its streams."""
 
     def __init__(self, count: int) -> None:
         self._names = [f"topic{i:03}" for i in range(count)]
@@ -69,7 +70,7 @@ class Named:
 
 
 class Drive:
-    """A real agent whose threads are called in turn, once in a millisecond."""
+    """A real agent whose threads are called in turn, every millisecond."""
 
     def __init__(self, topics: Mapping[str, Topic], **settings: Any) -> None:
         self.topics = topics
@@ -80,7 +81,8 @@ class Drive:
         self.uplink.verdict = self._sees
         self.spool = MemorySpool(max_bytes=10**9)
         config = replace(Config("car1", "host", Path(), Path(), ()), **settings)
-        self.agent = make_agent(config, uplink=self.uplink, spool=self.spool, clock=self.clock)
+        self.agent = Agent(config, uplink=self.uplink, spool=self.spool, clock=self.clock)
+        self.runtime = Runtime(self.agent)
         self.sent: list[Sent] = []
         self.rtt_s = 0.05
         self._acks: list[float] = []
@@ -101,9 +103,9 @@ class Drive:
             if sources:
                 self._offer()
             if self._is_due(pings_hz):
-                self.agent.parts.pings.send(BROKER)
+                self.agent.pings.send(BROKER)
             if self._ms % TICK_MS == 0:
-                self.agent.tick()
+                self.runtime.tick()
             ready = bisect.bisect_right(self._acks, self.clock.monotonic())
             if ready:
                 del self._acks[:ready]
@@ -117,22 +119,22 @@ class Drive:
 
     def _offer(self) -> None:
         for i, (stream, topic) in enumerate(self.topics.items()):
-            # Each at its own milliseconds.
+            # Each stream has its own milliseconds.
             if self._is_due(topic.hz, 7 * i):
-                self.agent.parts.streams.emit(stream, self.clock.now_us(), topic.values())
+                self.agent.streams.emit(stream, self.clock.now_us(), topic.values())
 
     def _record(self) -> None:
-        lane = self.agent.parts.record
+        lane = self.agent.record
         if lane._wake.is_set() or self.clock.monotonic() >= self._record_due:
             lane._wake.clear()
             wait_s = lane.step()
             self._record_due = float("inf") if wait_s is None else self.clock.monotonic() + wait_s
 
     def status(self) -> dict[str, Any]:
-        return document(make_status(self.agent.parts))
+        return document(make_status(self.agent))
 
     def report(self) -> dict[str, Any]:
-        return document(make_report(self.agent.parts))
+        return document(make_report(self.agent))
 
     def cut(self) -> None:
         self._acks.clear()
@@ -142,7 +144,7 @@ class Drive:
         return self.spool.backlog().batches
 
     def live(self, seconds: float) -> dict[str, int]:
-        """How many live messages of each stream went in the last seconds."""
+        """The live messages of each stream in the last seconds."""
         found = dict.fromkeys(self.topics, 0)
         for sent in self.sent:
             levels = sent.topic.split("/")
@@ -151,11 +153,11 @@ class Drive:
         return found
 
     def end(self) -> None:
-        """Let everything arrive, and see that it did, and that no second held too much."""
-        self.agent.parts.streams.flush()
+        """Deliver everything; check that all arrived and that no second exceeded the limits."""
+        self.agent.streams.flush()
         self.run(2, sources=False)
         assert self.backlog() == 0
-        taken = {name: one.samples for name, one in make_report(self.agent.parts).streams.items()}
+        taken = {name: one.samples for name, one in make_report(self.agent).streams.items()}
         arrived = dict.fromkeys(taken, 0)
         for message in self.uplink.published:
             if message.topic.startswith("$aws/rules/iort_record/"):
@@ -165,7 +167,7 @@ class Drive:
         self.check_limits()
 
     def check_limits(self) -> None:
-        """In every second that begins with a publish, both ends included."""
+        """The most in any second that begins with a publish, both ends included."""
         times, total = [sent.at for sent in self.sent], 0
         for i, first in enumerate(self.sent):
             end = bisect.bisect_right(times, first.at + 1)
@@ -198,18 +200,18 @@ def test_recordings_go_first_and_live_shares_the_rest(
     drive.end()
 
 
-def test_few_topics_have_what_they_ask_for_and_nobody_is_warned(caplog: pytest.LogCaptureFixture) -> None:
+def test_few_topics_get_their_rate_without_a_warning(caplog: pytest.LogCaptureFixture) -> None:
     drive = Drive(topics(6, 50))
     drive.run(SETTLE_S)
     drive.run(10)
     assert set(drive.live(10).values()) <= {99, 100, 101}
     assert drive.report()["live"]["effective_hz"] == 10
-    assert "SLOWED" not in render(make_status(drive.agent.parts))
+    assert "SLOWED" not in render(make_status(drive.agent))
     assert not caplog.messages
     drive.end()
 
 
-def test_slow_streams_take_their_own_rate_and_leave_the_rest_to_the_others() -> None:
+def test_slow_streams_use_only_their_own_rate() -> None:
     rates = [1000, 100, 50, 20, 20, 10, 10, 10, 5, 5, *[50] * 8, 1, 1, 0.5, 0.5]
     drive = Drive({f"topic{i:03}": Topic(hz, lambda: {"x": 1.5}) for i, hz in enumerate(rates)})
     drive.run(SETTLE_S)
@@ -223,7 +225,7 @@ def test_slow_streams_take_their_own_rate_and_leave_the_rest_to_the_others() -> 
     drive.end()
 
 
-def test_bytes_are_shared_as_publishes_are() -> None:
+def test_bytes_are_shared_like_publishes() -> None:
     chance = random.Random(1)
     numbers = Drive(topics(10, 20, lambda: {f"f{i:03}": chance.random() for i in range(100)}))
     texts = Drive(topics(10, 20, lambda: {f"f{i}": "x" * 4000 for i in range(8)}))
@@ -258,7 +260,7 @@ def test_live_has_a_tenth_while_a_backlog_drains_and_its_rate_afterwards() -> No
     drive.end()
 
 
-def test_another_fault_goes_soon_whatever_else_there_is() -> None:
+def test_another_fault_code_is_sent_soon_under_any_load() -> None:
     fault = {"code": 0}
     faulty = {f"vesc{i}": Topic(20, lambda: {"fault_code": fault["code"]}) for i in range(3)}
     drive = Drive({**topics(50, 20), **faulty})
@@ -278,7 +280,7 @@ def test_another_fault_goes_soon_whatever_else_there_is() -> None:
     drive.check_limits()
 
 
-def test_pings_have_what_recordings_leave_and_live_what_pings_leave() -> None:
+def test_recordings_come_before_pings_and_pings_before_live() -> None:
     drive = Drive(topics(50, 20), ping=PingConfig(rate_hz=20, paths=(BROKER,)))
     drive.run(SETTLE_S, pings_hz=20)
     before = drive.report()["pings"][BROKER]["sent"]
@@ -294,7 +296,7 @@ def test_pings_have_what_recordings_leave_and_live_what_pings_leave() -> None:
     drive.end()
 
 
-def test_a_slow_network_is_filled_by_what_is_on_its_way() -> None:
+def test_unacknowledged_batches_fill_a_slow_network() -> None:
     drive = Drive(topics(50, 20))
     drive.rtt_s = 0.5
     drive.run(15)
@@ -303,7 +305,7 @@ def test_a_slow_network_is_filled_by_what_is_on_its_way() -> None:
     drive.end()
 
 
-def test_more_than_one_connection_takes_is_said_with_what_to_do(caplog: pytest.LogCaptureFixture) -> None:
+def test_too_much_for_one_connection_raises_an_alarm_with_advice(caplog: pytest.LogCaptureFixture) -> None:
     drive = Drive(topics(120, 2))
     drive.run(9)
     assert drive.status()["alarms"] == []
@@ -312,7 +314,7 @@ def test_more_than_one_connection_takes_is_said_with_what_to_do(caplog: pytest.L
     assert "batches wait, 1" in alarm
     assert "the limit allows 90 batches/s" in alarm
     assert "record fewer topics" in alarm
-    assert f"ALARM     {alarm}" in render(make_status(drive.agent.parts))
+    assert f"ALARM     {alarm}" in render(make_status(drive.agent))
     assert len([text for text in caplog.messages if text.startswith("record: more is recorded")]) == 1
     assert 1 <= sum(drive.live(5).values()) <= 10, "next to nothing is left"
     drive.check_limits()
@@ -320,7 +322,7 @@ def test_more_than_one_connection_takes_is_said_with_what_to_do(caplog: pytest.L
     assert drive.status()["alarms"] == []
 
 
-def test_a_network_that_is_too_slow_is_told_from_a_limit() -> None:
+def test_the_alarm_tells_a_slow_network_from_the_limit() -> None:
     drive = Drive(topics(10, 20))
     drive.rtt_s = 20
     drive.run(30)
@@ -328,7 +330,7 @@ def test_a_network_that_is_too_slow_is_told_from_a_limit() -> None:
     assert "the network is too slow" in alarm
 
 
-def test_a_slowed_lane_is_warned_of_once_and_shown(caplog: pytest.LogCaptureFixture) -> None:
+def test_a_slowed_lane_is_logged_once_and_shown(caplog: pytest.LogCaptureFixture) -> None:
     caplog.set_level(logging.INFO)
     drive = Drive(topics(30, 20))
     drive.run(SETTLE_S)
@@ -336,34 +338,34 @@ def test_a_slowed_lane_is_warned_of_once_and_shown(caplog: pytest.LogCaptureFixt
     drive.run(8)
     drive.uplink.connect()
     drive.run(15)
-    status = make_status(drive.agent.parts)
+    status = make_status(drive.agent)
     told = f"up to 10 Hz, SLOWED to {status.lanes.live.effective_hz:g} Hz a stream by AWS' limit"
     assert told in render(status)
     assert 1.5 < status.streams["topic007"].live_hz < 2.2
     drive.topics = topics(1, 20)
     drive.run(15)
-    assert "SLOWED" not in render(make_status(drive.agent.parts))
+    assert "SLOWED" not in render(make_status(drive.agent))
     told_of = [(r.levelno, r.message[:15]) for r in caplog.records if r.message.startswith("live: ")]
     assert told_of == [(logging.WARNING, "live: slowed do"), (logging.INFO, "live: up to 10 ")]
 
 
-def test_what_overdraws_is_paid_for_and_ends_at_the_limit() -> None:
+def test_overdrafts_are_paid_back_and_end_at_the_limit() -> None:
     clock = ManualClock()
-    allowance = Allowance(clock)
+    rate_limiter = RateLimiter(clock)
     gone = 0
     for _ in range(1000):
-        while allowance.may_go(URGENT, "t", 10):
-            allowance.spend("t", b"x" * 10)
+        while rate_limiter.may_go(URGENT, "t", 10):
+            rate_limiter.spend("t", b"x" * 10)
             gone += 1
         clock.advance(0.001)
     assert gone <= 100
-    assert not allowance.may_go(URGENT, "t", 10)
-    assert allowance.record("t", b"x") > 0
+    assert not rate_limiter.may_go(URGENT, "t", 10)
+    assert rate_limiter.record("t", b"x") > 0
     clock.advance(1)
-    assert allowance.record("t", b"x") == 0
+    assert rate_limiter.record("t", b"x") == 0
 
 
-def test_production_is_known_over_seconds_and_growth_only_where_there_is_a_connection() -> None:
+def test_production_is_a_mean_of_seconds_and_growth_needs_a_connection() -> None:
     for connected in (True, False):
         production, made, sent = Production(), 0.0, 0.0
         for second in range(100):
@@ -384,7 +386,9 @@ def test_production_is_known_over_seconds_and_growth_only_where_there_is_a_conne
     ("streams", "batch_s", "made"),
     [(90, 1.0, None), (91, 1.0, 91), (45, 0.5, None), (46, 0.5, 92), (23, 0.3, 92), (20, 0.0, None)],
 )
-def test_too_many_streams_are_known_beforehand(streams: int, batch_s: float, made: int | None) -> None:
+def test_too_many_streams_are_recognized_from_the_configuration(
+    streams: int, batch_s: float, made: int | None
+) -> None:
     record = RecordConfig(batch_s=batch_s)
     config = Config("car1", "host", Path(), Path(), (Named(streams),), record=record)
     problem = too_many(config.sources, config.record)
@@ -393,15 +397,15 @@ def test_too_many_streams_are_known_beforehand(streams: int, batch_s: float, mad
     assert too_many(config.sources, replace(record, enabled=False)) is None
 
 
-def test_too_many_streams_are_said_at_the_start(caplog: pytest.LogCaptureFixture) -> None:
+def test_too_many_streams_are_logged_at_the_start(caplog: pytest.LogCaptureFixture) -> None:
     clock = SystemClock()
-    agent = make_agent(
+    agent = Agent(
         Config("car1", "host", Path(), Path(), (Named(91),)),
         uplink=Loopback(clock, Dispatcher()),
         spool=MemorySpool(max_bytes=10**6),
         clock=clock,
     )
-    # The source has none of them, which is a failure of its own.
-    assert agent.run(drain_s=10) == 1
+    # The source gives no sample, which is a failure by itself.
+    assert Runtime(agent).run(drain_s=10) == 1
     assert "record: 91 streams are up to 91 batches a second" in caplog.text
     assert "record fewer topics" in caplog.text

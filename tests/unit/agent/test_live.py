@@ -1,13 +1,12 @@
-"""The live lane: the newest only, at once when it may, never more often, never late."""
+"""The live lane: only the newest sample, at once, at most at the rate, and never late."""
 
 from __future__ import annotations
 
 from iort_agent.lanes.live import LiveLane
 from iort_agent.mqtt.dispatch import Dispatcher
-from iort_agent.rate_limiter import Allowance
 from iort_contract.limits import MAX_MESSAGE_BYTES
 from iort_contract.messages.live import LiveSample, decode_live
-from tests.agent_fakes import Loopback, ManualClock
+from tests.agent_fakes import Loopback, ManualClock, link_of
 
 T0 = 1_700_000_000_000_000
 
@@ -21,13 +20,9 @@ class Rig:
         if connected:
             self.uplink.connect()
         self.lane = LiveLane(
-            robot="car1",
-            namespace="iort",
+            link_of(self.uplink, self.clock),
             boot="0123456789abcdef",
             rate_hz=rate_hz,
-            uplink=self.uplink,
-            clock=self.clock,
-            allowance=Allowance(self.clock),
             offset_us=lambda: self.offset_us,
         )
 
@@ -77,7 +72,7 @@ def test_never_more_than_the_rate_however_fast_samples_come() -> None:
     assert 39 <= len(rig.sent()) <= 41
 
 
-def test_samples_a_little_late_do_not_slow_the_rate() -> None:
+def test_slightly_late_samples_do_not_lower_the_rate() -> None:
     rig = Rig()
     for i in range(400):
         rig.offer(i)
@@ -109,7 +104,7 @@ def test_streams_do_not_share_a_rate() -> None:
     assert rig.sent("imu")[0].seq == 0
 
 
-def test_nothing_is_kept_over_an_outage_but_the_newest() -> None:
+def test_only_the_newest_sample_is_kept_over_an_outage() -> None:
     rig = Rig(connected=False)
     for i in range(100):
         rig.offer(i)
@@ -129,7 +124,7 @@ def test_an_old_sample_is_not_sent_after_an_outage() -> None:
     assert rig.speeds() == []
 
 
-def test_a_message_not_yet_written_holds_back_the_next_ones() -> None:
+def test_a_message_being_written_delays_the_next() -> None:
     rig = Rig()
     rig.uplink.stalled = True
     for i in range(50):
@@ -152,7 +147,7 @@ def test_a_bad_sample_is_refused_and_counted() -> None:
     assert rig.speeds() == [1]
 
 
-def test_what_is_too_large_for_a_message_never_reaches_the_broker() -> None:
+def test_a_sample_too_large_for_a_message_is_not_sent() -> None:
     rig = Rig()
     texts = {f"f{i:02}": "x" * 4096 for i in range(31)}
     rig.lane.offer("vesc", T0, {**texts, "last": ""})
@@ -196,7 +191,7 @@ def test_the_rate_and_the_lane_itself_can_be_changed() -> None:
     assert len(rig.sent()) <= count + 1, "what was offered before"
 
 
-def test_a_message_says_how_far_the_cloud_s_clock_is_where_that_is_known() -> None:
+def test_a_message_carries_the_clock_offset_if_it_is_known() -> None:
     rig = Rig()
     rig.offer(1)
     rig.offset_us = -3_600_000_000
@@ -209,7 +204,7 @@ BROKER, DIRECT = "live/iort/car1/vesc", "$aws/rules/iort_live/live/iort/car1/ves
 
 
 def _drive(rig: Rig, seconds: float, **values: object) -> list[str]:
-    """Topics of what a stream at 10 Hz is sent on."""
+    """The topics that a stream at 10 Hz is sent on."""
     before = len(rig.uplink.published)
     for _ in range(round(seconds * 10)):
         rig.lane.offer("vesc", rig.clock.now_us(), values)
@@ -218,20 +213,20 @@ def _drive(rig: Rig, seconds: float, **values: object) -> list[str]:
     return [message.topic for message in rig.uplink.published[before:]]
 
 
-def test_one_message_in_ten_seconds_passes_the_broker_the_first_of_a_run_among_them() -> None:
+def test_the_first_message_and_one_in_ten_seconds_go_to_the_broker() -> None:
     topics = _drive(Rig(), 30, speed=1)
     assert [i for i, topic in enumerate(topics) if topic == BROKER] == [0, 100, 200]
     assert set(topics) == {BROKER, DIRECT}
 
 
-def test_a_fault_passes_the_broker_the_moment_that_it_comes_changes_and_goes() -> None:
+def test_every_change_of_the_fault_code_goes_to_the_broker_at_once() -> None:
     rig = Rig()
     topics = [_drive(rig, 1, fault_code=code) for code in (0, 5, 6, 0)]
     assert [[topic == BROKER for topic in each] for each in topics] == 4 * [[True] + 9 * [False]]
     assert _drive(rig, 10.1, fault_code=5).count(BROKER) == 2, "and again while it lasts"
 
 
-def test_what_was_not_written_is_said_again_at_the_broker() -> None:
+def test_a_lost_broker_message_is_repeated() -> None:
     rig = Rig()
     _drive(rig, 1, fault_code=0)
     rig.uplink.verdict = lambda _: "full"
@@ -240,7 +235,7 @@ def test_what_was_not_written_is_said_again_at_the_broker() -> None:
     assert _drive(rig, 0.2, fault_code=5) == [BROKER, DIRECT]
 
 
-def test_a_fault_shorter_than_a_slow_rate_s_interval_is_said_and_the_rate_stays() -> None:
+def test_a_fault_shorter_than_the_period_is_sent_and_the_rate_stays() -> None:
     rig = Rig(rate_hz=0.1)
     topics = [_drive(rig, seconds, fault_code=code) for seconds, code in ((1, 0), (0.5, 5), (18.6, 0))]
     assert topics[:2] == [[BROKER], [BROKER]]
@@ -248,7 +243,7 @@ def test_a_fault_shorter_than_a_slow_rate_s_interval_is_said_and_the_rate_stays(
     assert [round((live.sent_us - T0) / 1e6, 1) for live in rig.sent()] == [0, 1, 1.5, 5, 15]
 
 
-def test_the_last_word_of_a_stream_that_falls_silent_is_its_fault() -> None:
+def test_the_last_fault_of_a_silent_stream_is_sent() -> None:
     rig = Rig(rate_hz=0.1)
     _drive(rig, 0.1, fault_code=0)
     rig.clock.advance(-0.05)
@@ -258,7 +253,7 @@ def test_the_last_word_of_a_stream_that_falls_silent_is_its_fault() -> None:
     assert rig.uplink.published[-1].topic == BROKER
 
 
-def test_faults_that_come_and_go_are_never_more_than_the_fastest_rate() -> None:
+def test_changing_faults_are_limited_to_the_fastest_rate() -> None:
     rig = Rig(rate_hz=1)
     for i in range(1000):
         rig.lane.offer("vesc", rig.clock.now_us(), {"fault_code": i % 7})
@@ -267,7 +262,7 @@ def test_faults_that_come_and_go_are_never_more_than_the_fastest_rate() -> None:
     assert len(rig.sent()) <= 101
 
 
-def test_a_fault_that_was_not_written_is_said_again_before_a_slow_rate_s_turn() -> None:
+def test_a_lost_fault_is_repeated_before_its_slow_turn() -> None:
     rig = Rig(rate_hz=0.1)
     _drive(rig, 1, fault_code=0)
     rig.uplink.verdict = lambda _: "full"
@@ -276,6 +271,6 @@ def test_a_fault_that_was_not_written_is_said_again_before_a_slow_rate_s_turn() 
     assert _drive(rig, 1, fault_code=5) == [BROKER]
 
 
-def test_a_fault_that_nobody_knows_is_no_other_than_before() -> None:
+def test_a_fault_of_nan_is_not_a_change() -> None:
     topics = [topic for _ in range(3) for topic in _drive(Rig(), 1, fault_code=float("nan"))]
     assert topics.count(BROKER) == 3

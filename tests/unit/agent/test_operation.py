@@ -1,4 +1,4 @@
-"""What the agent says of itself: logs, metrics, clock offset, status."""
+"""What the agent reports about itself: logs, metrics, clock offset, status."""
 
 from __future__ import annotations
 
@@ -19,17 +19,17 @@ from hypothesis import strategies as st
 
 from iort_agent.cli import main
 from iort_agent.clock import SystemClock
-from iort_agent.config.file import load_config
+from iort_agent.common.logs import JournalFormatter, LineFormatter, Troubles, is_journal
+from iort_agent.common.state import Status, read
+from iort_agent.config import load_config
 from iort_agent.errors import AgentError, NotRunningError
 from iort_agent.lanes.batch_encoder import StreamCounts
-from iort_agent.lanes.clock_offset import ClockOffset
-from iort_agent.logs import JournalFormatter, LineFormatter, Troubles, is_journal
-from iort_agent.metrics import AgentMetrics, Rates, rss_mb
+from iort_agent.lanes.clock_offset import OffsetEstimator
 from iort_agent.mqtt.dispatch import Dispatcher
 from iort_agent.spool.memory import MemorySpool
 from iort_agent.spool.sqlite import make_spool
+from iort_agent.status.metrics import AgentMetrics, Rates, rss_mb
 from iort_agent.status.server import StatusServer, ask, fetch
-from iort_agent.status.state import Status, read
 from iort_agent.status.text import render
 from iort_agent.verbs.check import FAIL, check
 from iort_contract.catalog.streams import AGENT_FIELDS
@@ -58,7 +58,7 @@ def test_journald_reads_the_level_of_every_line(level: int, prefix: str) -> None
 HOSTILE = "refused\n<3>forged\r\x1b]52;c;cm0=\x07 \x9b2J \u202e\u2028\udc80 Straße"
 
 
-def test_no_text_of_elsewhere_is_a_line_of_its_own_or_speaks_to_the_terminal() -> None:
+def test_foreign_text_cannot_start_a_line_or_control_the_terminal() -> None:
     shown = r"refused\n<3>forged\r\x1b]52;c;cm0=\x07 \x9b2J \u202e\u2028\udc80 Straße"
     said = record(logging.WARNING, HOSTILE)
     assert JournalFormatter("%(message)s").format(said) == f"<4>{shown}"
@@ -66,17 +66,16 @@ def test_no_text_of_elsewhere_is_a_line_of_its_own_or_speaks_to_the_terminal() -
     troubles = Troubles()
     troubles.emit(said)
     assert troubles.last()[0].text == shown
-    # As the agent sets it up, for whatever is logged by whom.
-    program = (
-        f"from iort_agent.logs import set_up; import logging; set_up('info'); logging.warning({HOSTILE!r})"
-    )
+    # With the agent's set-up, for any logger.
+    set_up = "import logging; from iort_agent.common.logs import set_up; set_up('info')"
+    program = f"{set_up}; logging.warning({HOSTILE!r})"
     command = [sys.executable, "-X", "utf8", "-c", program]
     done = subprocess.run(command, capture_output=True, encoding="utf-8", check=True)
     assert done.stderr.count("\n") == 1
     assert done.stderr.endswith(f"WARNING {shown}\n")
 
 
-def test_the_journal_is_known_by_its_stream(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+def test_the_journal_is_recognized_by_its_stream(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     with (tmp_path / "journal").open("w") as file:
         monkeypatch.setattr(sys, "stderr", file)
         status = os.fstat(file.fileno())
@@ -109,10 +108,10 @@ def test_the_offset_is_within_its_uncertainty(
     true_ms: float, trips: list[tuple[float, float]], chance: random.Random
 ) -> None:
     clock = ManualClock()
-    offset = ClockOffset(clock)
+    offset = OffsetEstimator(clock)
     for trip_ms, share in trips:
         sent = clock.monotonic()
-        # The cloud stamps somewhere on the way, in whole milliseconds.
+        # The cloud stamps in whole milliseconds, at any time on the way.
         stamp_ms = int(clock.now_us() / 1000 + trip_ms * share + true_ms)
         clock.advance(trip_ms / 1000)
         offset.add(sent, clock.monotonic(), stamp_ms)
@@ -123,9 +122,9 @@ def test_the_offset_is_within_its_uncertainty(
     assert found.uncertainty_ms >= min(trip_ms for trip_ms, _ in trips) / 2
 
 
-def test_the_offset_is_right_at_once_when_the_clock_was_set() -> None:
+def test_the_offset_is_right_at_once_after_the_clock_is_set() -> None:
     clock = ManualClock()
-    offset = ClockOffset(clock)
+    offset = OffsetEstimator(clock)
     assert offset.estimate() is None
     sent = clock.monotonic()
     clock.advance(0.01)
@@ -138,9 +137,9 @@ def test_the_offset_is_right_at_once_when_the_clock_was_set() -> None:
     assert after.offset_ms - before.offset_ms == pytest.approx(3_600_000)
 
 
-def test_the_shortest_round_trip_counts_until_it_is_old() -> None:
+def test_the_shortest_round_trip_is_used_until_it_is_old() -> None:
     clock = ManualClock()
-    offset = ClockOffset(clock)
+    offset = OffsetEstimator(clock)
     for trip_ms in (10, 2, 200):
         sent = clock.monotonic()
         clock.advance(trip_ms / 1000)
@@ -154,9 +153,9 @@ def test_the_shortest_round_trip_counts_until_it_is_old() -> None:
     assert aged.uncertainty_ms == pytest.approx(4.5, abs=0.02), "the clocks may have drifted by 3 ms"
 
 
-def test_an_offset_not_known_well_enough_is_not_judged_by() -> None:
+def test_an_uncertain_offset_is_not_used() -> None:
     clock = ManualClock()
-    offset = ClockOffset(clock)
+    offset = OffsetEstimator(clock)
     assert offset.known_us() is None
     for trip_s, known in ((1.5, False), (0.9, True), (8, True)):
         sent = clock.monotonic()
@@ -171,10 +170,10 @@ def test_an_offset_not_known_well_enough_is_not_judged_by() -> None:
     assert offset.known_us() is None, "two oscillators drift apart"
 
 
-def test_a_round_trip_that_excludes_the_best_one_replaces_it() -> None:
-    """A computer that slept stopped its monotonic clock, and its wall clock went on."""
+def test_a_contradicting_round_trip_replaces_the_best_one() -> None:
+    """While a computer sleeps, its monotonic clock stops and its wall clock goes on."""
     clock = ManualClock()
-    offset = ClockOffset(clock)
+    offset = OffsetEstimator(clock)
     slept_us = 0
     for trip_s in (0.002, 0.3):
         sent = clock.monotonic()
@@ -189,7 +188,7 @@ def test_a_round_trip_that_excludes_the_best_one_replaces_it() -> None:
 def test_a_sample_of_the_agent_has_the_contracts_fields() -> None:
     clock = ManualClock()
     spool, uplink = MemorySpool(max_bytes=1000), Loopback(clock, Dispatcher())
-    metrics = AgentMetrics(clock=clock, spool=spool, uplink=uplink, offset=ClockOffset(clock))
+    metrics = AgentMetrics(clock=clock, spool=spool, uplink=uplink, offset=OffsetEstimator(clock))
     spool.put("vesc", "0badcafe", 0, b"x" * 100, samples=1)
     uplink.connect()
     clock.advance(2)
@@ -216,7 +215,7 @@ def test_rates_and_silence() -> None:
     assert (rates.per_s["vesc"], rates.silent_s("vesc")) == (0, 7)
 
 
-def test_the_socket_is_the_owners_alone_and_goes_with_the_agent(tmp_path: Path) -> None:
+def test_only_the_owner_may_open_the_socket_and_it_is_removed_at_the_end(tmp_path: Path) -> None:
     path = tmp_path / "agent.sock"
     server = StatusServer(path, lambda: {"pid": 7})
     before = os.umask(0)
@@ -235,7 +234,7 @@ def test_the_socket_is_the_owners_alone_and_goes_with_the_agent(tmp_path: Path) 
         fetch(path)
 
 
-def test_the_status_of_another_version_is_no_sign_of_a_stopped_agent(tmp_path: Path) -> None:
+def test_a_status_of_another_version_is_not_a_stopped_agent(tmp_path: Path) -> None:
     path = tmp_path / "agent.sock"
     server = StatusServer(path, lambda: {"pid": 7})
     server.start()
@@ -247,7 +246,7 @@ def test_the_status_of_another_version_is_no_sign_of_a_stopped_agent(tmp_path: P
         server.stop()
 
 
-def test_a_long_path_is_no_obstacle(tmp_path: Path) -> None:
+def test_a_long_path_works(tmp_path: Path) -> None:
     folder = tmp_path / ("x" * 100)
     folder.mkdir()
     server = StatusServer(folder / "agent.sock", lambda: {"pid": 1})
@@ -257,7 +256,7 @@ def test_a_long_path_is_no_obstacle(tmp_path: Path) -> None:
     assert not list(folder.iterdir())
 
 
-def test_a_socket_left_by_a_killed_agent_is_taken_over(tmp_path: Path) -> None:
+def test_the_socket_of_a_killed_agent_is_replaced(tmp_path: Path) -> None:
     import socket
 
     path = tmp_path / "agent.sock"
@@ -270,16 +269,14 @@ def test_a_socket_left_by_a_killed_agent_is_taken_over(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("name", ["x" * 120, "no/such/folder/agent.sock"])
-def test_an_agent_without_a_socket_goes_on(
-    name: str, tmp_path: Path, caplog: pytest.LogCaptureFixture
-) -> None:
+def test_an_agent_runs_without_a_socket(name: str, tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
     server = StatusServer(tmp_path / name, dict)
     server.start()
     server.stop()
     assert "set status_socket" in caplog.text
 
 
-def test_a_file_in_the_sockets_place_is_left_alone(tmp_path: Path) -> None:
+def test_a_file_in_place_of_the_socket_is_kept(tmp_path: Path) -> None:
     file = tmp_path / "agent.sock"
     file.write_text("precious")
     server = StatusServer(file, dict)
@@ -313,11 +310,11 @@ def test_status_and_check_by_command(
     assert findings["endpoint"]["level"] == "fail"
 
 
-def test_a_reader_that_has_seen_enough_is_no_error(tmp_path: Path) -> None:
+def test_a_closed_output_is_not_an_error(tmp_path: Path) -> None:
     from tests.unit.agent.test_agent import Rig, config_file, drive
 
     rig = Rig(drive)
-    assert rig.agent.run(drain_s=10) == 0
+    assert rig.runtime.run(drain_s=10) == 0
     config = config_file(tmp_path, "{type: sim}")
     server = StatusServer(tmp_path / "agent.sock", rig.status)
     server.start()
@@ -332,7 +329,7 @@ def test_a_reader_that_has_seen_enough_is_no_error(tmp_path: Path) -> None:
 
 @contextlib.contextmanager
 def unprivileged() -> Iterator[None]:
-    """This process as one that may not write everywhere, if root runs the tests."""
+    """Drop root's right to write everywhere."""
     if os.geteuid() != 0:
         yield
         return
@@ -344,7 +341,7 @@ def unprivileged() -> Iterator[None]:
         os.setresuid(0, 0, 0)
 
 
-def test_a_queue_that_may_not_be_written_is_found_and_leaves_the_agent_running(
+def test_a_read_only_queue_is_found_and_the_agent_runs(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     import socket
@@ -355,7 +352,7 @@ def test_a_queue_that_may_not_be_written_is_found_and_leaves_the_agent_running(
         raise socket.gaierror("Name or service not known")
 
     monkeypatch.setattr(socket, "getaddrinfo", unknown)
-    # By a relative path, since the folders above are their owner's alone.
+    # By a relative path, because only their owner may enter the folders above.
     monkeypatch.chdir(tmp_path)
     folder = tmp_path / "kept"
     folder.mkdir()
@@ -380,7 +377,7 @@ def test_status_of_an_agent_for_a_person() -> None:
     from tests.unit.agent.test_agent import Rig, drive
 
     rig = Rig(drive)
-    assert rig.agent.run(drain_s=10) == 0
+    assert rig.runtime.run(drain_s=10) == 0
     state = rig.status()
     text = render(read(Status, json.loads(json.dumps(state))))
     assert "robot     car1" in text
@@ -418,7 +415,7 @@ def test_status_says_that_the_robot_is_over_its_share() -> None:
     from tests.unit.agent.test_agent import Rig, drive
 
     rig = Rig(drive)
-    assert rig.agent.run(drain_s=10) == 0
+    assert rig.runtime.run(drain_s=10) == 0
     state = rig.status()
     assert "\nshare " not in render(read(Status, state))
     state["over_share"] = {"since_ms": 1_700_000_000_000, "last_ms": 1_700_000_060_000, "batches": 40}
@@ -427,11 +424,11 @@ def test_status_says_that_the_robot_is_over_its_share() -> None:
     )
 
 
-def test_status_says_what_became_of_what_the_sources_read() -> None:
+def test_status_shows_the_counts_of_the_sources() -> None:
     from tests.unit.agent.test_agent import Rig, drive
 
     rig = Rig(drive)
-    assert rig.agent.run(drain_s=10) == 0
+    assert rig.runtime.run(drain_s=10) == 0
     state = rig.status()
     state["sources"] = [
         {"source": "bag ride.csv", "rows": 168, "skipped": {"columns": 100, "time": 40}, "bad_cells": {},

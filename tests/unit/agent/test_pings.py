@@ -11,16 +11,16 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from iort_agent.common.schema import Place, load
+from iort_agent.common.state import RoundTrips
 from iort_agent.errors import ConfigError
 from iort_agent.lanes.config import PingConfig
 from iort_agent.lanes.pings import CLOCK_EVERY_S, CLOCK_FIRST_EVERY_S, TIMEOUT_S, Pings, percentile
 from iort_agent.mqtt.dispatch import Dispatcher
-from iort_agent.rate_limiter import Allowance
-from iort_agent.schema import Where, load
 from iort_contract.limits import MAX_MESSAGE_BYTES
 from iort_contract.tables import RECEIVED_MS
 from iort_contract.topics import PING_PATHS
-from tests.agent_fakes import Loopback, ManualClock
+from tests.agent_fakes import Loopback, ManualClock, link_of
 
 T0 = 1_700_000_000_000_000
 
@@ -39,21 +39,15 @@ class Rig:
         self.samples: list[tuple[str, int, Any]] = []
         self.stamps: list[tuple[float, float, int]] = []
         self.pings = Pings(
-            robot="car1",
-            namespace="iort",
-            paths=paths,
-            rate_hz=rate_hz,
-            padding_bytes=padding_bytes,
-            uplink=self.uplink,
-            clock=self.clock,
-            allowance=Allowance(self.clock),
+            link_of(self.uplink, self.clock),
+            PingConfig(rate_hz, paths, padding_bytes),
             emit=lambda stream, t_us, values: self.samples.append((stream, t_us, values)),
             on_stamp=lambda *stamp: self.stamps.append(stamp),
         )
         self.uplink.connect()
 
     def answer(self, path: str, message: int = -1) -> None:
-        """The cloud's answer to one of the pings sent."""
+        """Deliver the cloud's answer to a sent ping."""
         ping = json.loads(self.uplink.published[message].payload)
         payload = json.dumps({**ping, RECEIVED_MS: 5}).encode()
         self.uplink.deliver(f"pong/iort/car1/{path}", payload)
@@ -66,7 +60,7 @@ def test_a_ping_over_the_broker_comes_straight_back() -> None:
     rig.clock.advance(0.0125)
     rig.dispatcher.run_pending()
     # The time counts from the arrival, not from when the callback ran.
-    assert rig.pings.report()["broker"] == (1, 1, 0, 0.0, 0.0)
+    assert rig.pings.report()["broker"] == RoundTrips(1, 1, 0, 0.0, 0.0)
     assert rig.uplink.published[0].topic == "ping/iort/car1/broker"
     assert rig.uplink.published[0].qos == 0
 
@@ -77,7 +71,7 @@ def test_the_cloud_answers_on_the_pong_topic(path: str) -> None:
     rig.pings.send(path)
     rig.clock.advance(0.0125)
     rig.answer(path)
-    assert rig.pings.report()[path] == (1, 1, 0, 12.5, 12.5)
+    assert rig.pings.report()[path] == RoundTrips(1, 1, 0, 12.5, 12.5)
     ((stream, t_us, values),) = rig.samples
     assert (stream, t_us) == ("rtt", T0 + 12_500)
     others = {f"{name}_ms": None for name in PING_PATHS if name != path}
@@ -97,7 +91,7 @@ def test_lost_pings_are_counted_and_late_answers_ignored() -> None:
     assert len(rig.samples) == 1
 
 
-def test_what_is_no_answer_of_ours_is_ignored() -> None:
+def test_other_answers_are_ignored() -> None:
     rig = Rig()
     rig.pings.send("rule")
     for payload in (b"", b"[]", b'{"id": "x"}', b'{"id": 999, "sent_us": 1}', b"\xff"):
@@ -105,11 +99,11 @@ def test_what_is_no_answer_of_ours_is_ignored() -> None:
     rig.answer("lambda")  # the right number by the wrong path
     rig.answer("rule")
     rig.answer("rule")  # twice
-    assert rig.pings.report()["rule"][:3] == (1, 1, 0)
-    assert rig.pings.report()["lambda"][:3] == (0, 0, 0)
+    assert rig.pings.report()["rule"] == RoundTrips(1, 1, 0, 0.0, 0.0)
+    assert rig.pings.report()["lambda"] == RoundTrips(0, 0, 0, None, None)
 
 
-def test_no_ping_without_a_way_back() -> None:
+def test_no_ping_without_a_subscription_for_its_answer() -> None:
     rig = Rig()
     rig.uplink.cut()
     rig.pings.send("broker")
@@ -133,10 +127,10 @@ def test_paths_take_turns_at_the_rate() -> None:
     assert 480 < len(rig.uplink.published[0].payload) < 560
 
 
-def test_the_largest_ping_that_may_be_asked_for_fits_into_a_message_and_so_does_its_answer(
+def test_the_largest_ping_and_its_answer_fit_into_a_message(
     tmp_path: Path,
 ) -> None:
-    where = Where(tmp_path / "car.yaml")
+    where = Place(tmp_path / "car.yaml")
     largest = 100_000
     assert load(PingConfig, {"padding_bytes": largest}, where).padding_bytes == largest
     with pytest.raises(ConfigError, match=f"0 to {largest}"):
@@ -149,7 +143,7 @@ def test_the_largest_ping_that_may_be_asked_for_fits_into_a_message_and_so_does_
     assert len(json.dumps(pong)) <= MAX_MESSAGE_BYTES
 
 
-def test_the_end_waits_for_answers_but_not_for_ever() -> None:
+def test_the_end_waits_for_answers_for_a_limited_time() -> None:
     rig = Rig()
     rig.pings.send("broker")
     rig.pings.send("rule")
@@ -168,7 +162,7 @@ def test_percentile_is_a_value_with_that_share_below(values: list[float], percen
 
 
 @pytest.mark.parametrize(("rate_hz", "paths"), [(0, PING_PATHS), (0, ("broker",)), (5, ("broker", "lambda"))])
-def test_where_no_trip_through_a_rule_is_measured_a_ping_now_and_then_finds_the_clocks_offset(
+def test_rare_pings_measure_the_clock_offset_if_no_rule_trip_is_measured(
     rate_hz: float, paths: tuple[str, ...]
 ) -> None:
     rig = Rig(rate_hz=rate_hz, paths=paths)
@@ -185,14 +179,14 @@ def test_where_no_trip_through_a_rule_is_measured_a_ping_now_and_then_finds_the_
             if len(times) == 3:
                 rig.answer("rule")
         rig.clock.advance(0.125)
-    # As soon as there is a connection, often until one was answered, then seldom.
+    # Often until the first answer, then rarely.
     first = [5 + i * CLOCK_FIRST_EVERY_S for i in range(4)]
     assert times == [*first, *(first[-1] + i * CLOCK_EVERY_S for i in (1, 2, 3))]
     assert rig.stamps == [(start + times[2], start + times[2], 5)]
     assert rig.samples == [], "it is no measurement of round trips"
 
 
-def test_measured_trips_through_a_rule_are_told_too_and_need_no_other() -> None:
+def test_measured_rule_trips_give_the_clock_offset_without_more_pings() -> None:
     rig = Rig()
     rig.pings.send("rule")
     rig.clock.advance(0.5)

@@ -1,4 +1,4 @@
-"""When to connect again, and what to say about why."""
+"""The backoff, and which causes are logged."""
 
 from __future__ import annotations
 
@@ -50,7 +50,7 @@ def test_a_cause_is_news_once() -> None:
 
 
 @pytest.mark.parametrize("before_tls", [False, True])
-def test_hangups_become_a_refusal_only_in_a_row(before_tls: bool) -> None:
+def test_only_disconnects_in_a_row_become_a_refusal(before_tls: bool) -> None:
     causes = Causes()
     told = [causes.hung_up(before_tls=before_tls) for _ in range(HANGUPS)]
     assert told == [False] * (HANGUPS - 1) + [True]
@@ -58,7 +58,7 @@ def test_hangups_become_a_refusal_only_in_a_row(before_tls: bool) -> None:
     assert not causes.hung_up(before_tls=before_tls)
 
 
-def test_a_reset_that_looks_like_a_failure_of_tls_is_no_refusal() -> None:
+def test_a_reset_that_looks_like_a_tls_failure_is_not_a_refusal() -> None:
     causes = Causes()
     for _ in range(HANGUPS):
         causes.hung_up(before_tls=True)

@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 
 from iort_agent.lanes.record import RecordLane
 from iort_agent.mqtt.dispatch import Dispatcher
-from iort_agent.rate_limiter import Allowance
+from iort_agent.mqtt.rate_limiter import RateLimiter
 from iort_agent.spool.memory import MemorySpool
 from tests.agent_fakes import Loopback, ManualClock
 
@@ -28,7 +28,7 @@ class Rig:
             spool=self.spool,
             uplink=self.uplink,
             clock=self.clock,
-            allowance=Allowance(
+            rate_limiter=RateLimiter(
                 self.clock, publishes_per_s=publishes_per_s, bytes_per_s=bytes_per_s
             ),
             window=window,

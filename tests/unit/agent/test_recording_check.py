@@ -10,7 +10,7 @@ from typing import Any, Iterator
 
 import pytest
 
-from iort_agent.config.file import load_config
+from iort_agent.config import load_config
 from iort_agent.errors import SourceError
 from iort_agent.sources import FAIL, OK, Finding
 from iort_agent.sources.recording.bag import BagConfig

@@ -1,4 +1,4 @@
-"""What an uplink is subscribed to is what the broker has agreed to on the connection that there is."""
+"""Only the current connection's answers confirm a subscription."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ def agreed() -> Future[Any]:
     return future
 
 
-def test_an_answer_of_the_connection_before_says_nothing_of_this_one() -> None:
+def test_an_answer_of_an_earlier_connection_is_ignored() -> None:
     asked: list[Callable[[Future[Any]], None]] = []
     dispatcher = Dispatcher()
     subscriptions = Subscriptions(
@@ -26,7 +26,7 @@ def test_an_answer_of_the_connection_before_says_nothing_of_this_one() -> None:
     )
     subscriptions.add(FILTER, print)
     dispatcher.run_pending()
-    # The dispatcher was busy until after the loss and the next connect.
+    # The dispatcher is busy until after the loss and the next connect.
     subscriptions.lost()
     asked[0](agreed())
     assert not subscriptions.confirmed

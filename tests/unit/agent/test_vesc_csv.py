@@ -206,9 +206,9 @@ def test_original_stamps_without_a_day_are_refused(tmp_path: Path, name: str) ->
         ("1100;46.4;25;1200;0.0281;0;0.5;9;", "9 columns", "columns"),
         (row(86_400_000), "must be from 0 to 86399999", "time"),
         (row(-1), "must be from 0", "time"),
-        (row(1100).replace("1100", ""), "ms_today is ''", "time"),
-        (row(1100).replace("1100", "nan"), "ms_today is 'nan'", "time"),
-        (row(1100).replace("1100", "noon"), "ms_today is 'noon'", "time"),
+        (row(1100).replace("1100", ""), "ms_today must be from 0 to 86399999, got ''", "time"),
+        (row(1100).replace("1100", "nan"), "ms_today must be from 0 to 86399999, got 'nan'", "time"),
+        (row(1100).replace("1100", "noon"), "ms_today must be a number, got 'noon'", "time"),
         ("\x00\x00\x00\x00", "1 columns", "columns"),
     ],
 )
@@ -232,11 +232,11 @@ def test_a_malformed_row_is_skipped_counted_by_cause_and_told_once(
 @pytest.mark.parametrize(
     ("bad", "column", "why"),
     [
-        (row(1001, volts="46.x"), "input_voltage", "input_voltage is '46.x', which is no number"),
-        (row(1001, volts="46,4"), "input_voltage", "input_voltage is '46,4'"),
-        (row(1001, volts="1_000"), "input_voltage", "input_voltage is '1_000'"),
-        (row(1001, roll="left"), "roll", "roll is 'left', which is no number"),
-        (row(1001, fault="FAULT_CODE_GREMLINS"), "fault_code", "no such fault is known as"),
+        (row(1001, volts="46.x"), "input_voltage", "input_voltage must be a number, got '46.x'"),
+        (row(1001, volts="46,4"), "input_voltage", "input_voltage must be a number, got '46,4'"),
+        (row(1001, volts="1_000"), "input_voltage", "input_voltage must be a number, got '1_000'"),
+        (row(1001, roll="left"), "roll", "roll must be a number, got 'left'"),
+        (row(1001, fault="FAULT_CODE_GREMLINS"), "fault_code", "fault_code must be a known fault, got"),
     ],
 )
 def test_a_bad_cell_is_null_and_costs_neither_its_row_nor_its_column(
@@ -343,8 +343,8 @@ def test_empty_cells_are_null_and_nan_stays_for_the_contract_to_count(tmp_path: 
     [
         ("", "no column ms_today"),
         ("time;speed\n1;2\n", "no column ms_today"),
-        (HEADER + "\n", "no row in it that can be read"),
-        (HEADER + "\n1;2\n", "no row in it that can be read"),
+        (HEADER + "\n", "it has no row that can be read"),
+        (HEADER + "\n1;2\n", "it has no row that can be read"),
         (HEADER + ";roll\n", "roll are there twice"),
     ],
 )

@@ -27,7 +27,7 @@ MACHINE = {
 
 
 def _section(*ratios):
-    svg = plots.bars("Bars & <co>", {"a": 1.0, "b": 2.0}, unit="s")
+    svg = plots.bars({"a": 1.0, "b": 2.0}, unit="s")("Bars & <co>")
     return Section(
         "query",
         "Query <b>",
@@ -168,13 +168,13 @@ def test_report_that_is_kept_names_no_host_and_no_folder():
 
 def test_plots_are_small_xml_and_the_same_every_time():
     curves = {"a": [1.0, 2.0, 3.0] * 500, "b": [2.0], "none": []}
-    first, second = (plots.cdf("A & B", curves) for _ in range(2))
+    first, second = (plots.cdf(curves)("A & B") for _ in range(2))
     assert first == second
     assert len(first) < 60_000
     for svg in (
         first,
-        plots.lines("L", [1, 10], {"a": [1, 2]}, x_label="x", y_label="y", log=True),
-        plots.ranges("R", ["a", "b"], {"x": {"a": (1, 2), "b": (3, 3)}, "y": {"b": (4, 5)}}, unit="ms"),
-        plots.points("P", {"a": ([1, 2], [3, 4])}, x_label="x", y_label="y", shaded=(1, 2)),
+        plots.lines([1, 10], {"a": [1, 2]}, x_label="x", y_label="y")("L"),
+        plots.ranges(["a", "b"], {"x": {"a": (1, 2), "b": (3, 3)}, "y": {"b": (4, 5)}}, unit="ms")("R"),
+        plots.points("a", [1, 2], [3, 4], y_label="y", shaded=(1, 2))("P"),
     ):
         assert ET.fromstring(svg).tag.endswith("svg")

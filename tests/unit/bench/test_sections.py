@@ -58,7 +58,7 @@ def test_functions_are_held_to_what_they_cost_beyond_an_empty_one():
         "empty function": Measured([[1.0]], [0.2] * 3),
     }
     section = Section("utilisation", "")
-    utilisation._ratios(section, found, {"p50": 0.004})
+    utilisation.report(section, found, {}, {}, {"p50": 0.004, "p95": 0.005})
     values = {ratio.name: ratio.value for ratio in section.ratios}
     assert values["Lambda 1 warm, processor time beyond an empty function"] == 1.9
     assert values["Lambda 2, processor time a batch of 50 samples"] == 0.5
@@ -70,8 +70,7 @@ def test_outage_tells_what_came_before_during_and_after():
     second = 1_000_000
     live = [(t * second, 5.0) for t in range(8)] + [(70 * second + i * 100_000, 7.0) for i in range(20)]
     section = Section("outage", "")
-    outage._report(
-        section,
+    found = outage.Outage(
         lost=0,
         summarized=4000,
         sent=4000,
@@ -82,6 +81,7 @@ def test_outage_tells_what_came_before_during_and_after():
         cut_us=8 * second,
         mended_us=68 * second,
     )
+    outage.report(section, found)
     values = {ratio.name: ratio.value for ratio in section.ratios}
     assert values["samples lost over an outage"] == 0
     assert values["time to drain / outage"] == 0.05
@@ -98,7 +98,7 @@ def test_thesis_reader_follows_every_page():
         asked.append(arguments)
         return pages[len(asked) - 1]
 
-    assert query._pages(read, Limit=2) == 3
+    assert query.pages(read, Limit=2) == 3
     assert asked == [{"Limit": 2}, {"Limit": 2, "ExclusiveStartKey": "k"}]
 
 
@@ -167,13 +167,13 @@ def test_round_trips_with_the_thesis_ping_stand_beside_its_figures():
 def test_a_query_stands_beside_the_thesis_query_at_the_same_place():
     section = Section("query", "")
     ways = {name: query.Way([1.0], [0.5], [], query.POINTS) for name in query.THESIS_S}
-    query._report(section, ways)
+    query.report(section, ways)
     theirs = {row[0]: row[-1] for row in section.tables[0].rows}
     assert theirs[query.OURS_QUERY] == theirs[query.THESIS_QUERY] == "6.1 s"
     assert theirs[query.OURS_SCAN] == theirs[query.THESIS_SCAN] == "14.1 s"
     assert theirs[query.LAMBDA_QUERY] == "5.5 s (512 MB)"
     hour = query.Way([1.0], [0.5], [], query.HOUR_POINTS)
-    assert query._row(query.OURS_QUERY, hour)[-1] == "-", "the thesis read no hour"
+    assert hour.row(query.OURS_QUERY)[-1] == "-", "the thesis read no hour"
 
 
 def test_mixed_robot_has_the_types_that_its_definitions_say():

@@ -157,7 +157,7 @@ def test_a_source(copy: Copy, tmp_path: Path) -> None:
         "import threading",
         "from pathlib import Path",
         "from iort_agent.clock import SystemClock",
-        "from iort_agent.config.file import load_config",
+        "from iort_agent.config import load_config",
         "def run():",
         f"    (source,) = load_config(Path({str(tmp_path / 'car.yaml')!r})).sources",
         "    stop, samples = threading.Event(), []",

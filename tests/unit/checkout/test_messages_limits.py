@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
+from ministack.services import iot
+
 from functions.shared import cut_off, stored
-from iort_agent import rate_limiter
+from iort_agent.mqtt import rate_limiter
 from iort_contract import limits
 from iort_contract.messages import commands, files
 from iort_contract.ros1.message import MAX_LAYOUT
-from local.gaps.broker.connect_timeout import CONNECT_S
-from local.gaps.broker.message_size import AWS_MESSAGE_BYTES
 from stacks.settings import Settings
 from tests.messages_page import PAGE, named, rows, section
 
@@ -63,11 +63,11 @@ def test_no_limit_of_the_contract_is_left_out() -> None:
 def test_the_brokers_limits_are_those_that_the_agent_and_the_embedded_cloud_keep_to() -> None:
     table = {row[0]: row[1:] for row in rows(section("### Of AWS IoT, and of the embedded cloud"))}
     told = {name: row[0] for name, row in table.items()}
-    assert told["a message's payload"] == f"{AWS_MESSAGE_BYTES // 1024} KiB"
+    assert told["a message's payload"] == f"{iot._MAX_PAYLOAD_BYTES // 1024} KiB"
     assert told["publishes a second of a connection, each way"] == str(rate_limiter.PUBLISHES_PER_S)
     assert told["bytes a second of a connection, each way"] == f"{rate_limiter.BYTES_PER_S // 1024} KiB"
     connect = table["time from the connection to CONNECT"][2]
-    assert connect.startswith(f"{CONNECT_S:g} s,")
+    assert connect.startswith(f"{iot._MTLS_CONNECT_SECONDS:g} s,")
     assert f"below {rate_limiter.PUBLISHES_PER_S * rate_limiter.SHARE:g} publishes" in PAGE
 
 

@@ -11,7 +11,7 @@ import pytest
 from awsiot import iotidentity
 
 from functions.echo import pong
-from iort_agent.control.runtime_settings import FIELDS, RULES, Tuning, overlay
+from iort_agent.control.runtime_settings import FIELDS, RULES, RuntimeSettings, overlay
 from iort_contract.limits import ContractError
 from iort_contract.messages import account as accounts
 from iort_contract.messages.batch import Batch, decode_batch, encode_batch
@@ -248,12 +248,12 @@ def test_the_samples_of_a_robots_own_streams(name: str, sample: accounts.Account
 
 
 def test_the_shadows_documents_are_what_the_agent_takes_and_says() -> None:
-    base = Tuning(True, True, 10.0, 0, "info")
-    tuning, rejected = overlay(base, EXAMPLES["desired"]["state"]["desired"], {})
+    base = RuntimeSettings(True, True, 10.0, 0, "info")
+    settings, rejected = overlay(base, EXAMPLES["desired"]["state"]["desired"], {})
     assert rejected == {}
     reported = EXAMPLES["reported"]["state"]["reported"]
-    assert {key: reported[key] for key in tuning.as_document()} == tuning.as_document()
-    assert reported.keys() == {*tuning.as_document(), "rejected", COMMANDS, AGENT_VERSION}
+    assert {key: reported[key] for key in settings.as_document()} == settings.as_document()
+    assert reported.keys() == {*settings.as_document(), "rejected", COMMANDS, AGENT_VERSION}
     state = State(1, {}, reported)
     assert outcome(state, "drive", COMMAND.session, COMMAND.seq) == ACCEPTED
     assert [refusal.name for refusal in state.refusals()] == ["live.rate_hz"]

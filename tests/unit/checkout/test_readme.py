@@ -10,7 +10,7 @@ README = (ROOT / "README.md").read_text()
 
 
 def test_car_yaml_names_settings_that_the_agent_knows(tmp_path):
-    from iort_agent.config.file import load_config
+    from iort_agent.config import load_config
 
     text = next(block for block in re.findall(r"```yaml\n(.*?)```", README, re.DOTALL))
     (tmp_path / "car.yaml").write_text(text)

@@ -14,7 +14,7 @@ from typing import Any
 from iort_agent.clock import SystemClock
 from iort_agent.lanes.batch_encoder import BatchEncoder
 from iort_agent.lanes.record import RecordLane
-from iort_agent.rate_limiter import Allowance
+from iort_agent.mqtt.rate_limiter import RateLimiter
 from iort_agent.sources.intake import Intake, TopicConfig
 from iort_agent.spool.config import QueueConfig
 from iort_agent.spool.sqlite import make_spool
@@ -81,7 +81,12 @@ def send(folder: Path, t_us: int, walked: set[str]) -> bytes:
     clock, uplink, stop = SystemClock(), Uplink(), threading.Event()
     spool = make_spool(QueueConfig(path=folder / "queue.db"), clock)
     lane = RecordLane(
-        robot="car", namespace="iort", spool=spool, uplink=uplink, clock=clock, allowance=Allowance(clock)
+        robot="car",
+        namespace="iort",
+        spool=spool,
+        uplink=uplink,
+        clock=clock,
+        rate_limiter=RateLimiter(clock),
     )
     encoder = BatchEncoder("speed", boot="0badcafe0badcafe", batch_s=1, spool=spool, clock=clock)
 

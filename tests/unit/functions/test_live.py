@@ -16,7 +16,7 @@ from functions import live
 from functions.live import LiveSettings, RefusedError, age_ms, process
 from functions.quarantine import entries
 from functions.shared.cut_off import BURST, CutOff
-from functions.shared.delay_estimator import Legs
+from functions.shared.delay_estimator import DelayEstimator
 from functions.shared.metrics import Gathered
 from functions.shared.pubnub_client import PublishError, PubNubPublisher
 from iort_contract.cloud import METRICS, pubnub_parameter
@@ -58,7 +58,9 @@ class Channels:
 
 def show(message, publish, *, settings=SETTINGS, legs=None, now_us=NOW_US):
     """What a new environment does with a message: it writes what it counts at once."""
-    process(message, settings, publish, legs=legs or Legs(), counted=Gathered("live"), now_us=now_us)
+    process(
+        message, settings, publish, legs=legs or DelayEstimator(), counted=Gathered("live"), now_us=now_us
+    )
 
 
 @pytest.fixture
@@ -160,7 +162,7 @@ def test_stale_by_its_time_in_the_car_and_in_the_cloud(
     now_us = RECEIVED * 1000 + round(in_cloud_ms * 1000)
     channels = Channels()
     show(event(t=t_us, sent_us=sent_us), channels, now_us=now_us)
-    age = age_ms("car", LiveSample("0123abcd", 0, t_us, sent_us, {}), RECEIVED, now_us, Legs())
+    age = age_ms("car", LiveSample("0123abcd", 0, t_us, sent_us, {}), RECEIVED, now_us, DelayEstimator())
     assert age == in_car_ms + in_cloud_ms
     assert len(channels.sent) == (not stale)
     totals = counted()
@@ -286,7 +288,7 @@ class Served:
 
     def __init__(self, *, takes=True):
         self.channels, self.queue, self.cut_off = Channels(), Queue(takes=takes), CutOff()
-        self.legs, self.counted, self.now_us = Legs(), Gathered("live"), NOW_US
+        self.legs, self.counted, self.now_us = DelayEstimator(), Gathered("live"), NOW_US
 
     def __call__(self, message):
         def one():
@@ -385,7 +387,7 @@ class Context:
 
 def test_the_handler_wires_settings_publisher_queue_and_clock(monkeypatch, counted):
     channels, queue = Channels(), Queue()
-    monkeypatch.setattr(live, "_refusals", lambda: type("Refusals", (), {"keep": staticmethod(queue)}))
+    monkeypatch.setattr(live, "_refusals", lambda: type("DeadLetterQueue", (), {"keep": staticmethod(queue)}))
     monkeypatch.setattr(live, "_settings", lambda: SETTINGS)
     monkeypatch.setattr(
         live, "_publisher", lambda: type("Publisher", (), {"publish": staticmethod(channels)})
@@ -463,7 +465,7 @@ def late(sent_us, received_ms, legs, channels, robot="car"):
 
 @pytest.mark.parametrize("offset_us", [0, 3_600_000_000, -3_600_000_000])
 def test_messages_that_a_stall_held_up_are_stale_whatever_the_cars_clock(capsys, offset_us):
-    channels, legs = Channels(), Legs()
+    channels, legs = Channels(), DelayEstimator()
     start_us = NOW_US
     for i in range(20):
         late(start_us + i * 100_000 + offset_us, (start_us + i * 100_000) // 1000 + 30, legs, channels)
@@ -497,7 +499,7 @@ def test_a_car_that_knows_its_clocks_offset_is_judged_by_it_in_an_environment_wi
 
 
 def test_clock_set_back_is_believed_after_the_window():
-    legs = Legs()
+    legs = DelayEstimator()
     assert legs.excess_us("car", "0badcafe", 0, 0) == 0
     assert legs.excess_us("car", "0badcafe", -5_000_000, 100) == 5_100_000
     for second in range(1, 40):
@@ -507,7 +509,7 @@ def test_clock_set_back_is_believed_after_the_window():
 
 def test_a_robot_that_says_anothers_run_makes_nothing_of_the_others_late(capsys):
     """The name of a run stands in what robots send each other."""
-    channels, legs = Channels(), Legs()
+    channels, legs = Channels(), DelayEstimator()
     late(NOW_US, NOW_US // 1000 + 30, legs, channels)
     late(NOW_US + 3_600_000_000, NOW_US // 1000 + 40, legs, channels, robot="thief")
     late(NOW_US + 100_000, NOW_US // 1000 + 130, legs, channels)
@@ -516,14 +518,14 @@ def test_a_robot_that_says_anothers_run_makes_nothing_of_the_others_late(capsys)
 
 
 def test_another_run_of_a_robot_is_measured_by_itself():
-    legs = Legs()
+    legs = DelayEstimator()
     assert legs.excess_us("car", "0badcafe", 3_600_000_000, 0) == 0
     assert legs.excess_us("car", "cafebabe", 0, 0) == 0
     assert legs.excess_us("car", "cafebabe", 0, 70) == 70_000
 
 
 def test_legs_remember_a_bounded_number_of_robots_and_one_run_of_each():
-    legs = Legs()
+    legs = DelayEstimator()
     for i in range(3000):
         legs.excess_us(f"car{i}", "0badcafe", 0, 0)
         legs.excess_us("hostile", f"{i:08x}", 0, 0)

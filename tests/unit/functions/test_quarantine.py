@@ -11,7 +11,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from functions.quarantine import Entry, Store, Stream, entries, process
-from functions.shared.dead_letter import Refusals, Refused, message
+from functions.shared.dead_letter import DeadLetterQueue, Refused, message
 from iort_contract.tables import BY_FUNCTION, BY_LATER, BY_RULE, BY_STREAM, NO_ROBOT, PUT_OFF
 from iort_contract.topics import RECORD, build_topic
 from tests.fakes import QUARANTINE, TOPIC_OF_CAR
@@ -354,24 +354,24 @@ class FakeQueue:
 def test_what_is_refused_is_sent_as_much_at_a_time_as_a_call_may_carry():
     refused = [Refused(str(n), f"reason {n}", image(n)) for n in range(23)]
     queue = FakeQueue()
-    assert Refusals(queue, queue_url="queue").refuse(refused) == []
+    assert DeadLetterQueue(queue, queue_url="queue").refuse(refused) == []
     assert [len(call) for call in queue.calls] == [10, 10, 3]
     large = [Refused(str(n), "large", {**image(n), "x": {"S": "x" * 90_000}}) for n in range(5)]
     queue = FakeQueue()
-    assert Refusals(queue, queue_url="queue").refuse(large) == []
+    assert DeadLetterQueue(queue, queue_url="queue").refuse(large) == []
     assert [len(call) for call in queue.calls] == [2, 2, 1]
-    assert Refusals(queue, queue_url="queue").refuse([]) == []
+    assert DeadLetterQueue(queue, queue_url="queue").refuse([]) == []
 
 
 def test_what_a_throttled_queue_does_not_take_comes_back():
     refused = [Refused(str(n), f"reason {n}", image(n)) for n in range(12)]
-    assert Refusals(FakeQueue(throttled=True), queue_url="queue").refuse(refused) == refused
+    assert DeadLetterQueue(FakeQueue(throttled=True), queue_url="queue").refuse(refused) == refused
 
 
 def test_what_the_queue_does_not_take_comes_back():
     refused = [Refused(str(n), f"reason {n}", image(n)) for n in range(3)]
     queue = FakeQueue(refuses={"reason 1"})
-    assert Refusals(queue, queue_url="queue").refuse(refused) == [refused[1]]
+    assert DeadLetterQueue(queue, queue_url="queue").refuse(refused) == [refused[1]]
     assert [json.loads(body)["reason"] for body in queue.bodies] == ["reason 0", "reason 2"]
 
 

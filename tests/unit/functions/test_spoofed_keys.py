@@ -25,7 +25,7 @@ from iort_contract.tables import (
 )
 from iort_contract.topics import FILE, LAMBDA, LIVE, PING, PONG, RECORD, RULE, RULES, SHADOW, build_topic
 from tests.iot_sql import Message, evaluate
-from verify.spoofing import spoofed
+from verify.tools.spoofing import spoofed
 
 NOW_MS = 1_700_000_000_123
 T_US = 1_700_000_000_000_000

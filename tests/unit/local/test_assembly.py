@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from local import deployment
+from local import deployment, kept
 
 
 @pytest.fixture
@@ -68,4 +68,4 @@ def test_failed_synthesis_leaves_nothing_to_be_used(checkout):
 def test_old_ones_are_removed(assembly, checkout):
     for i in range(8):
         assembly(f"n{i}")
-    assert len(list((checkout / "build").iterdir())) == deployment._KEPT
+    assert len(list((checkout / "build").iterdir())) == kept._KEPT

@@ -9,7 +9,6 @@ from types import SimpleNamespace
 import pytest
 from ministack.services import iot
 
-from local.gaps.rules.sql_floor import with_floor
 from tests.iot_sql import Message, evaluate
 
 RED = {"color": "red", "temperature": 50}
@@ -28,7 +27,7 @@ def ours(sql, topic, payload):
 
 
 def ministacks(sql, topic, payload):
-    """As the broker does it when a message comes, with the gap that we close."""
+    """As the patched broker does it when a message comes."""
     message = iot._rule_message(payload)
     where = iot._rule_where_clause(sql)
     if where and not iot._eval_where(where, topic, payload, message):
@@ -38,7 +37,6 @@ def ministacks(sql, topic, payload):
 
 @pytest.fixture(params=[ours, ministacks])
 def run(request, monkeypatch):
-    monkeypatch.setattr(iot, "_eval_select_function", with_floor(iot._eval_select_function))
     monkeypatch.setattr(iot, "time", SimpleNamespace(time=lambda: NOW_MS / 1000))
     return request.param
 

@@ -106,14 +106,14 @@ def test_an_empty_range_is_no_error():
 @pytest.mark.parametrize(
     ("change", "says"),
     [
-        ({"robot": ""}, "names no robot"),
+        ({"robot": ""}, "must have the parameter robot"),
         ({"robot": "../x"}, "robot name"),
         ({"robot": "nobody"}, "there is no robot nobody"),
         ({"stream": "odom"}, "has no stream odom"),
         ({"from_us": "-1"}, "from_us"),
         ({"from_us": "9" * 400}, "from_us"),
         ({"from_us": "\u0661"}, "from_us"),
-        ({"to_us": str(START)}, "ends before it starts"),
+        ({"to_us": str(START)}, "must end after its start"),
         ({"rows": "1"}, "rows"),
         ({"rows": str(MAX_ROWS + 1)}, "rows"),
     ],

@@ -72,5 +72,5 @@ def test_every_command_prints_by_it():
     assert printing == {
         ("cli/main.py", "f\"iort {version('iort-station')}\""),
         ("cli/progress.py", "visible(f'iort: {text}')"),
-        ("cli/verbs/page/watch.py", "json.dumps({**line, 'sample': sample})"),
+        ("cli/verbs/page/watch.py", "json.dumps({**line, 'sample': live.sample})"),
     }

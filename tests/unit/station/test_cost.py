@@ -9,6 +9,7 @@ import pytest
 from typer.testing import CliRunner
 
 from bench import message_sizes
+from bench.load.simulated import simulated_drive
 from functions.shared.health import measure
 from functions.shared.metrics import Gathered, emit
 from iort_agent.lanes.pings import CLOCK_EVERY_S
@@ -189,7 +190,7 @@ def test_environments_gather_each_for_itself():
 
 
 def test_the_other_lines_are_about_as_long_as_they_are_written(capsys):
-    batch = message_sizes.batch_of(message_sizes.drive(50, 50), 50)
+    batch = message_sizes.batch_of(simulated_drive(50), 50)
     emit("summarize", BatchesSummarized=2, SamplesSummarized=100)
     emit("health", **measure("vesc", [batch]))
     emit("echo", PongsSent=1)

@@ -8,7 +8,7 @@ from dataclasses import fields
 import pytest
 from typer.testing import CliRunner
 
-from iort_agent.config.file import Config, load_config
+from iort_agent.config import Config, load_config
 from iort_agent.sources.registry import SOURCES
 from iort_station.cli.main import app
 from iort_station.cost.car import _OWN_RATE_HZ, as_configured

@@ -9,10 +9,11 @@ from pathlib import Path
 import pytest
 
 from functions.shared.metrics import emit
-from iort_agent.agent import make_agent
-from iort_agent.config.file import Config
+from iort_agent.agent import Agent
+from iort_agent.config import Config
 from iort_agent.mqtt.dispatch import Dispatcher
 from iort_agent.mqtt.reconnect import SHORTEST_S
+from iort_agent.runtime import Runtime
 from iort_agent.spool.memory import MemorySpool
 from iort_contract.topics import SHADOW
 from iort_station.cost import model, scale
@@ -46,7 +47,7 @@ def test_an_agent_asks_for_as_much_as_the_model_says():
     clock, dispatcher = ManualClock(), Dispatcher()
     uplink = Counting(clock, dispatcher)
     config = Config("car1", "host", Path(), Path(), ())
-    agent = make_agent(config, uplink=uplink, spool=MemorySpool(max_bytes=10**6), clock=clock)
+    agent = Runtime(Agent(config, uplink=uplink, spool=MemorySpool(max_bytes=10**6), clock=clock))
     assert len(uplink.filters) + 1 == model.SUBSCRIPTIONS, "and a command"
     assert all(len(topic) < _METER for topic in uplink.filters)
     uplink.connect()

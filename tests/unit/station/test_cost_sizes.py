@@ -7,6 +7,7 @@ from dataclasses import asdict
 import pytest
 
 from bench import message_sizes
+from bench.load.simulated import simulated_drive
 from iort_agent.sources.vehicle import Vehicle, VehicleConfig
 from iort_station.cost import sizes
 
@@ -47,7 +48,7 @@ def test_a_short_batch_of_a_fast_stream_is_at_most_a_fifth_smaller_than_the_tabl
 
 
 def test_a_drive_is_a_vesc_drive():
-    assert message_sizes.drive(50, 1)[0].keys() == Vehicle(VehicleConfig(), 1).sample().keys()
+    assert simulated_drive(1)[0].keys() == Vehicle(VehicleConfig(), 1).sample().keys()
 
 
 @pytest.mark.parametrize(

@@ -209,7 +209,7 @@ def test_get(iort, store, tmp_path):
         )
     }
     assert "has no file c.bag" in str(iort("get", "car", "c.bag", status=1).exception)
-    assert "no file of car" in str(iort("get", "car", "--name", "*.zip", status=1).exception)
+    assert "no matching files" in str(iort("get", "car", "--name", "*.zip", status=1).exception)
 
 
 def test_empty_asks(iort, store, s3):

@@ -74,7 +74,7 @@ def test_an_item_keeps_all_that_no_batch_has_to_the_letter():
     ("changes", "reason"),
     [
         ({"v": 3}, "schema version must be 1, got 3"),
-        ({"t": -5}, "time -5 us: before 1970"),
+        ({"t": -5}, "time must be from 1970 on, got -5 us"),
         ({"t": 1.5}, "t must be an integer, got 1.5"),
         ({"t": None}, "t must be an integer, got None"),
         ({"seq": -1}, "seq must be an integer from 0, got -1"),

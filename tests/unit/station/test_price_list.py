@@ -266,7 +266,9 @@ def test_later_calls_use_what_was_kept_and_say_of_when(tmp_path):
     listed = Listed("2026-11-22", "eu-north-1", {"rule": 0.3e-6}, {"audit": "not found"})
     keep(listed, kept_at(environment))
     said = " ".join(run(**environment).output.split())
-    assert "AWS' price list as read on 2026-11-22, eu-north-1; of 2025-06-01 as they were: audit;" in said
+    assert (
+        "AWS' price list as read on 2026-11-22, eu-north-1; built-in prices of 2025-06-01 for audit;" in said
+    )
     told = json.loads(run("--json", **environment).output)
     assert (told["prices_as_of"], told["region"]) == ("2026-11-22", "eu-north-1")
     assert told["prices_changed"] == {"rule": [0.15, pytest.approx(0.3)]}

@@ -7,7 +7,7 @@ import hashlib
 import pytest
 
 from iort_contract.messages.batch import Batch
-from iort_contract.messages.files import CLAIM_FIELDS
+from iort_contract.messages.files import ATTACHMENT_FIELDS
 from iort_contract.messages.message_type import MessageType
 from iort_contract.ros1.message import Messages, RosType, cut
 from iort_station.data.selection import select
@@ -93,7 +93,7 @@ WHOLE = u32(len(A)) + A + text("jpeg") + u32(len(B)) + B
 
 def claim(field, at, key, content):
     """What stands beside a message that a content was cut out of."""
-    claim = {name: [None] for name in CLAIM_FIELDS}
+    claim = {name: [None] for name in ATTACHMENT_FIELDS}
     claim |= {"key": [key], "sha256": [hashlib.sha256(content).hexdigest()], "at": [at]}
     return {f"{field}.{name}": column for name, column in claim.items()}
 

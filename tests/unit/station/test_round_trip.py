@@ -17,9 +17,9 @@ from iort_agent.lanes.batch_encoder import BatchEncoder
 from iort_agent.sources.intake import Intake, TopicConfig
 from iort_agent.spool.memory import MemorySpool
 from iort_contract.topics import RECORD, build_topic
-from iort_station.cli.verbs.data.export import _write
 from iort_station.data.selection import select
 from iort_station.recordings import recordings
+from iort_station.recordings.export import write
 from tests.agent_fakes import ManualClock
 from tests.fakes import TELEMETRY, item_of_message
 from tests.ros.mixed_robot import MESSAGES
@@ -62,7 +62,7 @@ def round_trip(definition: Message, sent: Sequence[bytes]) -> list[bytes]:
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / "made.bag"
         with recordings.bag(path) as file:
-            _write(cloud, select("car", "made"), file)
+            write(cloud, select("car", "made"), file)
         with Reader(path) as reader:
             assert {(c.topic, c.digest) for c in reader.connections} == {("/made", definition.md5sum)}
             return [bytes(raw) for _, _, raw in reader.messages()]

@@ -122,8 +122,8 @@ def test_no_key_is_asked_for_before_there_is_a_cloud(tmp_path):
 @pytest.mark.parametrize(
     ("publish", "subscribe", "said"),
     [
-        ("sub-c-1", "pub-c-1", "the publish key: expected what PubNub's admin portal shows, pub-c-"),
-        ("pub-c-1", "sec-c-1", "the subscribe key: expected what PubNub's admin portal shows, sub-c-"),
+        ("sub-c-1", "pub-c-1", "the publish key must be pub-c-..., as PubNub's admin portal shows it"),
+        ("pub-c-1", "sec-c-1", "the subscribe key must be sub-c-..., as PubNub's admin portal shows it"),
         ("", "sub-c-1", "the publish key"),
     ],
 )

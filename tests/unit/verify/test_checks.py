@@ -11,10 +11,10 @@ import pytest
 from botocore.exceptions import ClientError
 
 from bench.target import AWS
-from verify.check import Verdict, ask
-from verify.checks import ALL
+from verify.question import Verdict, ask
+from verify.questions import ALL
 
-CHECKS = {check.name: check for check in ALL}
+QUESTIONS = {question.name: question for question in ALL}
 
 
 class Cloud:
@@ -34,7 +34,7 @@ class Cloud:
 
 def verdict(name, cloud):
     target = SimpleNamespace(kind=AWS, cloud=cloud, name=str, robot=lambda base: SimpleNamespace(robot=base))
-    answer = ask(CHECKS[name], target, itertools.count().__next__)
+    answer = ask(QUESTIONS[name], target, itertools.count().__next__)
     return answer.verdict, answer.seen or answer.reason
 
 

@@ -8,10 +8,10 @@ from types import SimpleNamespace
 from botocore.exceptions import ClientError
 from rich.console import Console
 
-from bench.interrupts import wound_up
+from bench.command import wound_up
 from local.errors import LocalError
 from verify.deployment import Deployment
-from verify.preflight_deployed import STACKS
+from verify.preflight.deployed import STACKS
 
 
 class Account:

@@ -9,8 +9,8 @@ import pytest
 
 from bench.target import EMBEDDED, Target
 from iort_station.cloud import Cloud
-from verify.check import NOTE, Verdict, ask, compared
-from verify.checks import ALL
+from verify.question import NOTE, Verdict, ask, compared
+from verify.questions import ALL
 
 
 @pytest.fixture

@@ -14,8 +14,9 @@ from botocore.exceptions import NoCredentialsError
 from iort_station.cli.console import Console
 from iort_station.errors import StationError
 from stacks.settings import Settings, SettingsError
-from verify import preflight, preflight_account, preflight_deployed
-from verify.preflight_finding import Verdict
+from verify.preflight import account, deployed
+from verify.preflight import command as preflight
+from verify.preflight.finding import Verdict
 
 FINE, WARNING, STOPS = Verdict.FINE, Verdict.WARNING, Verdict.STOPS
 ROLE = "arn:aws:iam::123456789012:role/somebody"
@@ -160,7 +161,7 @@ def stack_answers(states, *, tags=(), resources=None):
     return {"DescribeStacks": describe, "ListStackResources": listed}
 
 
-ALL = dict.fromkeys(preflight_deployed.STACKS, "UPDATE_COMPLETE")
+ALL = dict.fromkeys(deployed.STACKS, "UPDATE_COMPLETE")
 LIVE = ("AWS::Lambda::Function", "Live848578DF", "iort-processing-Live")
 LOG = {"roleArn": ROLE, "defaultLogLevel": "ERROR", "disableAllLogs": False}
 KEY = "iort-storage:ExportsOutputFnGetAttKey961B73FDArn5A860C43"
@@ -400,7 +401,7 @@ CASES = [
 
 
 def function(name):
-    return getattr(preflight_account, name, None) or getattr(preflight_deployed, name)
+    return getattr(account, name, None) or getattr(deployed, name)
 
 
 @pytest.mark.parametrize(("name", "given", "answers", "verdict", "text"), CASES)
@@ -414,7 +415,7 @@ def test_every_item_is_tested_with_every_verdict_that_it_has():
     verdicts = {}
     for name, _, _, verdict, _ in CASES:
         verdicts.setdefault(name, set()).add(verdict)
-    items = {*preflight_account.ITEMS, *preflight_deployed.ITEMS}
+    items = {*account.ITEMS, *deployed.ITEMS}
     assert {function(name) for name in verdicts} == items
     assert all(FINE in seen and len(seen) > 1 for seen in verdicts.values())
 
@@ -473,7 +474,7 @@ def test_a_permission_that_is_missing_is_a_warning_that_names_it():
     ],
 )
 def test_what_is_not_answered_stops_nothing(error, text):
-    finding = preflight_account.bootstrap(Account(GetParameter=error), settings())
+    finding = account.bootstrap(Account(GetParameter=error), settings())
     assert finding.verdict is WARNING
     assert text in finding.found
 

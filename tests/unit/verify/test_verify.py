@@ -10,12 +10,10 @@ import pytest
 from bench.target import AWS, EMBEDDED, Target
 from iort_station.cloud import Cloud
 from local.deployment import ROOT
-from verify import measured, page, report
-from verify.assumption import Basis
-from verify.check import Check, Verdict, ask
-from verify.checks import ALL
+from verify import page, report
 from verify.errors import CannotAskError, VerifyError
-from verify.unasked import UNASKED
+from verify.question import Question, Verdict, ask
+from verify.questions import ALL
 
 RUN = report.Run(target="AWS", region="eu-west-1", by="A. Tester", date="2026-01-01", version="abc")
 
@@ -26,8 +24,8 @@ def check(answer, **given):
             raise answer
         return answer
 
-    usual = {"name": "a.question", "assumed": "One is one.", "expected": {"one": 1}, "basis": Basis.ASSUMED}
-    return Check(**{**usual, "relied_on_by": ("app.py",), "ask": asked, **given})
+    usual = {"name": "a.question", "assumed": "One is one.", "expected": {"one": 1}}
+    return Question(**{**usual, "relied_on_by": ("app.py",), "ask": asked, **given})
 
 
 def verdict(check, kind=AWS, expected=None):
@@ -78,7 +76,7 @@ def test_a_kept_report_is_read_again(tmp_path):
     report.write(
         tmp_path, RUN, [verdict(check({"one": 2})), verdict(check(VerifyError("x"), name="b.question"))]
     )
-    known = measured.load(tmp_path / "report.json")
+    known = report.load(tmp_path / "report.json")
     assert (known.by, known.seen) == ("A. Tester", {"a.question": {"one": 2}})
     text = (tmp_path / "report.md").read_text()
     assert "1 differs, 1 failed" in text
@@ -88,7 +86,7 @@ def test_a_kept_report_is_read_again(tmp_path):
 def test_a_file_of_another_form_is_refused(tmp_path):
     (tmp_path / "report.json").write_text("[]")
     with pytest.raises(VerifyError, match="must be a report of verify"):
-        measured.load(tmp_path / "report.json")
+        report.load(tmp_path / "report.json")
 
 
 @pytest.mark.parametrize(
@@ -111,16 +109,18 @@ def test_no_report_has_a_secret(tmp_path, secret):
 
 
 def test_names_are_unique_and_every_file_is_there():
-    names = [one.name for one in (*ALL, *UNASKED)]
-    assert len(names) == len(set(names))
-    for one in (*ALL, *UNASKED):
-        assert one.relied_on_by
-        assert all((ROOT / path).is_file() for path in one.relied_on_by), one.name
-        assert (one.basis is Basis.DOCUMENTED) == one.source.startswith("https://"), one.name
+    rows = page.rows(page.PAGE.read_text())
+    names = [name for name, *_ in rows]
+    assert len(names) == len(set(names)) > len(ALL)
+    for name, _, basis, relied_on_by, _ in rows:
+        assert relied_on_by
+        assert all((ROOT / path).is_file() for path in relied_on_by.split(", ")), name
+        assert basis == "assumed" or basis.startswith(("documented: https://", "measured (")), name
 
 
 def test_every_gap_of_the_emulator_is_an_assumption():
-    relied = {path for one in (*ALL, *UNASKED) for path in one.relied_on_by}
+    rows = page.rows(page.PAGE.read_text())
+    relied = {path for _, _, _, relied_on_by, _ in rows for path in relied_on_by.split(", ")}
     folder = ROOT / "local" / "gaps"
     files = {path for path in folder.glob("*/*.py") if "\nAWS: does not apply;" not in path.read_text()}
     others = {path for path in files if path.name == "__init__.py" or path.parent.name == "parts"}
@@ -128,12 +128,14 @@ def test_every_gap_of_the_emulator_is_an_assumption():
 
 
 def test_the_page_is_of_these_assumptions():
-    assert page.PAGE.read_text() == page.text(measured.load()), "run `python -m verify.page`"
+    written = page.PAGE.read_text()
+    assert written == page.text(report.load(), written), "run `python -m verify.page`"
 
 
 def test_the_page_says_who_has_measured():
-    known = measured.Measured(
+    known = report.Measured(
         by="B", date="2026-02-02", region="eu-west-1", seen={ALL[0].name: ALL[0].expected}
     )
-    assert "measured by B on 2026-02-02" in page.text(known)
-    assert "measured (as assumed)" in page.text(known)
+    text = page.text(known, page.PAGE.read_text())
+    assert "measured by B on 2026-02-02" in text
+    assert "measured (as assumed)" in text

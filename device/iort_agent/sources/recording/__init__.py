@@ -1,1 +1,1 @@
-"""Recordings played as if they were driven now."""
+"""Recordings as a source: bags and VESC Tool logs, the player, a look into them for `iort-agent check`."""

@@ -1,4 +1,4 @@
-"""Plays a recording, of whatever kind, at its own pace and with the times that are wanted."""
+"""Plays a recording of any kind, at its own pace and with the chosen times."""
 
 from __future__ import annotations
 
@@ -11,12 +11,12 @@ from iort_contract.catalog.streams import TYPES_STREAM
 from iort_contract.limits import Value
 
 NOW, ORIGINAL = "now", "original"
-# Between the rounds of a recording with a single message.
+# The time between the rounds of a recording with a single message.
 _LONE_NS = 1_000_000_000
 
 
 class Message(NamedTuple):
-    """A message of the recording: when it was recorded, from the start, and when it was measured."""
+    """A message: the time of recording, counted from the start, and the time of measurement."""
 
     stream: str
     at_ns: int
@@ -24,7 +24,7 @@ class Message(NamedTuple):
     values: Mapping[str, Value]
 
 
-# Opens the recording anew for each round; what is opened is the messages, in the order recorded.
+# Opens the recording for one round; gives its messages in the order of recording.
 Open = Callable[[], ContextManager[Iterator[Message]]]
 
 
@@ -38,9 +38,9 @@ class Playback(NamedTuple):
 
 
 def play(recording: Open, how: Playback, clock: Clock, emit: Emit, stop: threading.Event) -> None:
-    """Emit the messages until the end, or for ever with ``loop``. Raises what the recording raises."""
+    """Emit the messages until the end, or for ever with ``loop``. Raises the recording's errors."""
     pace = Pace(clock, stop)
-    passed_ns = 0  # of recorded time, in the loops before this one
+    passed_ns = 0  # recorded time of the rounds before this one
     limit_ns = None if how.duration_s is None else round(how.duration_s * 1e9)
     base_us = clock.now_us()
     while True:
@@ -59,9 +59,9 @@ def play(recording: Open, how: Playback, clock: Clock, emit: Emit, stop: threadi
                 else:
                     t_us = clock.now_us()
                 emit(message.stream, t_us, message.values)
-                # A type comes with the first message of it, and is none.
+                # A type comes with its first message, and is not a message.
                 played += message.stream != TYPES_STREAM
         if not how.loop or not played:
             return
-        # One mean gap on, so that a loop does not put two samples on one time.
+        # The next round begins one mean interval later, so that no two samples have one time.
         passed_ns = at_ns + ((at_ns - passed_ns) // (played - 1) if played > 1 else _LONE_NS)

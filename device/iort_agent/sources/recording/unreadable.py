@@ -2,54 +2,53 @@
 
 from __future__ import annotations
 
+from contextlib import contextmanager
 from pathlib import Path
+from typing import Iterator
 
 from iort_agent.errors import SourceError
 
-# How a file begins, whatever it is called; its usual ending; and what it is.
+# The first bytes of a file, its usual suffix, and its kind.
 _KINDS = (
     (b"\x89MCAP0\r\n", ".mcap", "MCAP"),
     (b"#ROSBAG V", ".bag", "a bag of ROS 1"),
     (b"SQLite format 3\0", ".db3", "a database of ROS 2"),
 )
-_CUT_OFF = "the file was cut off: `mcap recover IN.mcap -o OUT.mcap` saves what is in it"
+_INDEX = "`rosbag reindex` mends a recording that was cut off"
+_CUT_OFF = "the file was cut off: `mcap recover IN.mcap -o OUT.mcap` saves its messages"
+_CUT_OFF_SQLITE = "the file was cut off: `sqlite3 IN.db3 .recover | sqlite3 OUT.db3` saves its messages"
 _REINDEX = "`ros2 bag reindex FOLDER` writes its metadata.yaml; or name the .mcap or .db3 file in it"
+_FOLDER = f"a folder of ROS 2 has a metadata.yaml: {_REINDEX}"
 _SERVICES = (
     "it holds service events, whose definitions cannot be read: leave them out, "
     "`mcap filter IN.mcap -o OUT.mcap --exclude-topic-regex '.*/_service_event'`"
 )
-# What rosbags says, and what to do about it.
+# A part of rosbags' error, and what to do about it.
 _ADVICE = (
-    ("index looks damaged", "`rosbag reindex` mends a recording that was cut off"),
-    ("Bag is not indexed", "`rosbag reindex` mends a recording that was cut off"),
+    ("index looks damaged", _INDEX),
+    ("Bag is not indexed", _INDEX),
     ("Profile is not ros2", "a recording of ROS 1 is read as .bag only"),
     ("File end magic is invalid", _CUT_OFF),
     ("Truncated record", _CUT_OFF),
     ("Invalid MCAP footer", _CUT_OFF),
     ("File magic is invalid", "it does not begin as a recording does: was it copied whole?"),
-    ("Expected metadata file", f"a folder of ROS 2 has a metadata.yaml: {_REINDEX}"),
-    # The newest rosbags for Python 3.8 takes such a folder for a file.
-    ("Is a directory", f"a folder of ROS 2 has a metadata.yaml: {_REINDEX}"),
+    ("Expected metadata file", _FOLDER),
+    # The newest rosbags for Python 3.8 takes the folder for a file.
+    ("Is a directory", _FOLDER),
     ("Could not load YAML", _REINDEX),
     ("Could not read metadata", _REINDEX),
     ("metadata key is missing", _REINDEX),
     ("Invalid bag metadata", _REINDEX),
-    (
-        "disk image is malformed",
-        "the file was cut off: `sqlite3 IN.db3 .recover | sqlite3 OUT.db3` saves what is in it",
-    ),
-    ("Unrecognized storage format", "allowed is .bag, .mcap, .db3, .csv, or a folder of ROS 2"),
-    (
-        "SRV: ",
-        _SERVICES,
-    ),
+    ("disk image is malformed", _CUT_OFF_SQLITE),
+    ("Unrecognized storage format", "it must be .bag, .mcap, .db3, .csv, or a folder of ROS 2"),
+    ("SRV: ", _SERVICES),
 )
-# The library puts whole definitions of messages into its errors.
+# The library puts whole message definitions into its errors.
 _LONGEST = 200
 
 
 def check_kind(path: Path) -> None:
-    """Raise `SourceError` for a file whose name says that it is of another kind than it is."""
+    """Raise `SourceError` for a file whose suffix is of another kind than its content."""
     if not path.is_file():
         return
     try:
@@ -62,18 +61,15 @@ def check_kind(path: Path) -> None:
             raise SourceError(f"{path}: is {what} by its content: rename it to {path.stem}{suffix}")
 
 
-class Wrapped:
-    """Turns whatever a bag library raises into `SourceError`: damaged files raise about anything."""
-
-    def __init__(self, what: str) -> None:
-        self._what = what
-
-    def __enter__(self) -> None:
-        pass
-
-    def __exit__(self, _kind: object, error: BaseException | None, _trace: object) -> None:
-        if isinstance(error, Exception) and not isinstance(error, SourceError):
-            advice = next((f"; {what}" for sign, what in _ADVICE if sign in str(error)), "")
-            said = " ".join(str(error).split())
-            said = said if len(said) <= _LONGEST else f"{said[:_LONGEST]}..."
-            raise SourceError(f"{self._what}: {type(error).__name__}: {said}{advice}") from error
+@contextmanager
+def wrapped(what: str) -> Iterator[None]:
+    """Turn every error of a bag library into `SourceError`, because damaged files raise anything."""
+    try:
+        yield
+    except SourceError:
+        raise
+    except Exception as error:
+        advice = next((f"; {what}" for sign, what in _ADVICE if sign in str(error)), "")
+        text = " ".join(str(error).split())
+        text = text if len(text) <= _LONGEST else f"{text[:_LONGEST]}..."
+        raise SourceError(f"{what}: {type(error).__name__}: {text}{advice}") from error

@@ -1,1 +1,1 @@
-"""ROS topics over the rosbridge WebSocket protocol."""
+"""ROS topics over a rosbridge server: the connection, the structures of messages, and the source."""

@@ -19,8 +19,8 @@ import threading
 from typing import Any, Mapping, NamedTuple, Protocol, Sequence
 
 from iort_agent.clock import Clock
+from iort_agent.common.throttled_log import ThrottledLog
 from iort_agent.errors import SourceError
-from iort_agent.throttled_log import Seldom
 
 _log = logging.getLogger(__name__)
 
@@ -94,7 +94,7 @@ class RosbridgeConnection:
         self._times = times
         self._subscriptions = {topic.name: _Subscription(topic, times) for topic in topics}
         self._listener = listener
-        self._throttled = Seldom(_log, clock)
+        self._throttled = ThrottledLog(_log, clock)
         self._socket: Any = None
         self._fragments: list[str] = []
         self._patience = times.patience_s

@@ -1,23 +1,23 @@
-"""What came again, and what did not come: the messages of one topic before and after an interruption."""
+"""Repeated and missing messages of one topic, before and after an interruption."""
 
 from __future__ import annotations
 
 from collections import deque
 
-# What a latching publisher holds comes with the subscription, or not at all.
+# A latched message comes with the subscription, or not at all.
 _AGAIN_S = 10.0
 # A topic has few latching publishers; each holds one message.
 _RECENT = 16
 _MAX_PUBLISHERS = 8
-# A publisher that is so far ahead is another one, not the same after a loss.
+# A number so far ahead comes from another publisher, not from the same one after a loss.
 _MAX_GAP = 100_000
 
 
 class Repeats:
-    """Knows the latched message that a server sends with every subscription, and that came before.
+    """Recognizes the latched message that a server repeats with every subscription.
 
-    It is one of the last that came, word for word. A message without a stamp may be that and new, as a switch
-    that says "on" every second; so a topic that repeats itself at other times is taken as it comes.
+    It equals one of the last messages, word for word. A message without a stamp may be equal and new, like a
+    switch that says "on" every second; so on a topic that repeats itself at other times, it counts as new.
     """
 
     def __init__(self) -> None:
@@ -32,7 +32,7 @@ class Repeats:
         self._until = now + _AGAIN_S
 
     def came_before(self, data: bytes, now: float, *, stamped: bool) -> bool:
-        """Whether the message is what the server had sent before the subscription began."""
+        """Whether the server had sent the message before the subscription began."""
         digest = hash(data)
         if self._again and now >= self._until:
             self._again.clear()
@@ -47,25 +47,22 @@ class Repeats:
 
 
 class Numbers:
-    """Counts the messages that are missing, by the ``header.seq`` that each ROS 1 publisher counts up.
+    """Counts missing messages by ``header.seq``, which each ROS 1 publisher counts up.
 
-    The server does not say whose message it is, so the publishers of a topic are told apart by their numbers.
-    What was counted is taken back when another publisher turns out to have gone on from there.
+    The server does not name a message's publisher, so the publishers of a topic are told apart by their
+    numbers. A gap is no longer counted when another publisher turns out to continue from its beginning.
     """
 
     def __init__(self) -> None:
         self.missed = 0
         # The last number of each publisher, the most recent at the end.
         self._last: list[int] = []
-        # Where a gap began -> how many are missing.
+        # The number before a gap -> how many are missing.
         self._gaps: dict[int, int] = {}
 
     def take(self, seq: int) -> None:
-        """Take the number of the message that came."""
+        """Take a message's number."""
         last = self._last
-        if last and last[-1] == seq - 1:
-            last[-1] = seq
-            return
         if seq in last:
             return
         if seq - 1 in last:

@@ -15,8 +15,8 @@ from typing import Any, Iterator, Mapping, Sequence
 from urllib.parse import SplitResult, urlsplit
 
 from iort_agent.clock import Clock
+from iort_agent.common.schema import Place, number, pairs, section, setting, text
 from iort_agent.ros1.json_message import Writer
-from iort_agent.schema import Where, number, pairs, section, setting, text
 from iort_agent.sources import FAIL, OK, Emit, Finding, SourceConfig, intake
 from iort_agent.sources.intake import Intake, Kind
 from iort_agent.sources.rosbridge.connection import TIMES, RosbridgeConnection, Times, Topic
@@ -45,7 +45,7 @@ class TopicConfig(intake.TopicConfig):
     throttle_ms: int = setting(number(0, 3_600_000, whole=True, unit="ms"), 0)
 
 
-def _websocket_url(value: Any, where: Where) -> str:
+def _websocket_url(value: Any, where: Place) -> str:
     allowed = "the address of a rosbridge server, such as ws://localhost:9090"
     if not isinstance(value, str):
         raise where.error(value, allowed)

@@ -1,1 +1,1 @@
-"""A VESC itself, on its serial line."""
+"""A VESC motor controller on its serial line: the protocol, and the source that polls it."""

@@ -1,18 +1,18 @@
 """The VESC's serial protocol: frames, their checks, and what COMM_GET_VALUES answers. Pure functions.
 
-A frame is ``02 length payload crc crc 03``, or ``03 length length payload crc crc 03`` for a payload of
-255 bytes and more; the CRC is CRC-16/XMODEM of the payload. A payload starts with its command; numbers
-are big-endian integers, scaled. Firmware only ever added fields at the end, so the length tells the
-version; a length that is none of those in `LAYOUTS` is refused, not guessed at.
+A frame is ``02 length payload crc crc 03``, or ``03 length length payload crc crc 03`` for a payload of 255
+bytes and more; the CRC is CRC-16/XMODEM of the payload. A payload starts with its command, and its numbers
+are scaled big-endian integers. Firmware only ever added fields at the end, so the length tells the version; a
+length that is not in `LAYOUTS` is rejected.
 
-Read off vedderb/bldc (packet.c, commands.c) from firmware 2 to 6 and the ROS 2 driver's vesc_packet.cpp.
+The sources are vedderb/bldc (packet.c, commands.c), firmware 2 to 6, and the ROS 2 driver's vesc_packet.cpp.
 """
 
 from __future__ import annotations
 
 import binascii
 import struct
-from typing import Callable, NamedTuple
+from typing import Iterator, NamedTuple
 
 from iort_contract.limits import Value
 
@@ -21,7 +21,7 @@ COMM_GET_VALUES = 4
 COMM_FORWARD_CAN = 34
 
 SHORT, LONG, END = 2, 3, 3
-# The firmware's own limit (PACKET_MAX_PL_LEN) was 1024 once and is 512 today.
+# The firmware's own limit (PACKET_MAX_PL_LEN) was 1024 and is 512 today.
 MAX_PAYLOAD = 1024
 _LONG_FROM = 255
 _MAX_FRAME = MAX_PAYLOAD + 6
@@ -29,54 +29,44 @@ _MAX_BUFFER = 4 * _MAX_FRAME
 
 
 class ProtocolError(ValueError):
-    """A payload that is not what it should be; the text says what it is."""
-
-
-# --- frames ----------------------------------------------------------------------------------------
+    """A payload that the protocol does not allow."""
 
 
 def frame(payload: bytes) -> bytes:
     """The payload as it goes over the line."""
     n = len(payload)
     if not 1 <= n <= MAX_PAYLOAD:
-        raise ProtocolError(f"a payload of {n} bytes: allowed is 1 to {MAX_PAYLOAD}")
+        raise ProtocolError(f"a payload must have 1 to {MAX_PAYLOAD} bytes, got {n} bytes")
     head = bytes((SHORT, n)) if n <= _LONG_FROM else bytes((LONG, n >> 8, n & 0xFF))
     return head + payload + struct.pack(">HB", binascii.crc_hqx(payload, 0), END)
 
 
 class FrameParser:
-    """Finds the frames in a stream of bytes, whatever stands between them.
+    """Finds the frames in a stream of bytes, whatever is between them.
 
-    Every place where a frame may begin is followed up, each by itself, and what turns out to have the
-    right end and CRC is a frame. So neither a stray start byte nor half a frame costs the frames after
-    it a byte or a moment, however the bytes are cut into chunks. Holds a few of the longest frames.
+    The parser follows every place where a frame may begin, and accepts each with the right end and CRC. So a
+    stray start byte or half a frame neither loses nor delays the frames after it, however the bytes are cut
+    into chunks. The parser holds a few of the longest frames.
 
-    ``skipped`` bytes and frames of ``bad_crc`` are counted when the next frame shows that they are none.
+    ``skipped`` bytes and frames of ``bad_crc`` are counted once the next frame shows that they are not part
+    of a frame.
     """
 
     def __init__(self) -> None:
         self.bad_crc = 0
         self.skipped = 0
-        self._clear()
-
-    def _clear(self) -> None:
         self._buffer = bytearray()
-        # Up to where the bytes have been looked at, and up to where they are a frame's or counted as skipped.
-        self._seen = self._told = 0
-        # Where a frame would end -> where it would begin and how long its head would be.
+        # The end of the bytes that have been scanned, and of those that are a frame's or counted as skipped.
+        self._seen = self._counted = 0
+        # The possible end of a frame -> its possible beginnings and the lengths of their heads.
         self._ends: dict[int, list[tuple[int, int]]] = {}
-        # Where something began that had a frame's end and not its CRC; within a frame that is chance.
+        # The beginnings of frames with the right end and a wrong CRC; within a frame they are chance.
         self._failed: list[int] = []
 
     @property
     def pending(self) -> int:
-        """Bytes that a frame may yet be made of."""
-        return len(self._buffer) - self._told
-
-    def reset(self) -> None:
-        """Forget what is begun: nothing that comes now continues it."""
-        self._skip(len(self._buffer))
-        self._clear()
+        """The bytes that may still become a frame."""
+        return len(self._buffer) - self._counted
 
     def feed(self, data: bytes) -> list[bytes]:
         """The payloads of the frames that these bytes complete."""
@@ -105,47 +95,41 @@ class FrameParser:
                 if binascii.crc_hqx(payload, 0) == buffer[i - 2] << 8 | buffer[i - 1]:
                     found.append(payload)
                     self._skip(begin)
-                    self._told = i + 1
+                    self._counted = i + 1
                     self._failed = []
-                elif begin >= self._told:
+                elif begin >= self._counted:
                     self._failed.append(begin)
         self._seen = len(buffer)
 
     def _skip(self, end: int) -> None:
-        """Count the bytes before the end that are no frame's, and the broken frames among them."""
-        self.skipped += max(0, end - self._told)
-        self._told = max(end, self._told)
+        """Count the bytes before the end that are in no frame, and the broken frames among them."""
+        self.skipped += max(0, end - self._counted)
+        self._counted = max(end, self._counted)
         self.bad_crc += sum(begin < end for begin in self._failed)
         self._failed = [begin for begin in self._failed if begin >= end]
 
     def _trim(self) -> None:
-        # Whatever begins before the longest frame that ends here has been decided on.
+        # A frame that begins earlier has ended by now, even the longest.
         gone = len(self._buffer) - _MAX_FRAME
         self._skip(gone)
         del self._buffer[:gone]
         self._seen -= gone
-        self._told -= gone
+        self._counted -= gone
         self._failed = [begin - gone for begin in self._failed]
         self._ends = {
             end - gone: [(begin - gone, head) for begin, head in begins] for end, begins in self._ends.items()
         }
 
 
-# --- requests ----------------------------------------------------------------------------------------
-
-
 def request(command: int, can_id: int | None = None) -> bytes:
-    """The frame that asks for something: the controller on the line, or one behind it on the CAN bus."""
+    """The frame of a command to the controller on the line, or through it to one on the CAN bus."""
     if can_id is None:
         return frame(bytes((command,)))
     return frame(bytes((COMM_FORWARD_CAN, can_id, command)))
 
 
-# --- answers -----------------------------------------------------------------------------------------
-
-
 class Firmware(NamedTuple):
-    """What COMM_FW_VERSION answers; old firmware does not name its hardware."""
+    """The answer to COMM_FW_VERSION; old firmware does not name its hardware."""
 
     major: int
     minor: int
@@ -159,13 +143,13 @@ class Firmware(NamedTuple):
 def decode_firmware(payload: bytes) -> Firmware:
     """The version in an answer to COMM_FW_VERSION. Raises `ProtocolError`."""
     if len(payload) < 3 or payload[0] != COMM_FW_VERSION:
-        raise ProtocolError(f"{len(payload)} bytes are no firmware version")
+        raise ProtocolError(f"a firmware version must have at least 3 bytes, got {len(payload)}")
     name = payload[3:].split(b"\0", 1)[0].decode("ascii", "replace")
     return Firmware(payload[1], payload[2], name if name.isprintable() else "")
 
 
 class _Number(NamedTuple):
-    """A number on the wire: its name, its `struct` code and what it is divided by."""
+    """A number on the wire: its name, its `struct` code, and its divisor."""
 
     name: str
     code: str
@@ -181,8 +165,8 @@ _COUNTERS = (
     _Number("distance_traveled", "i"),
     _Number("fault_code", "B"),
 )
-# Firmware 3 to 6. The ROS 2 message has all but `status`: 1 the controller has stopped the motor
-# because no command came in time, 2 the kill switch is active.
+# Firmware 3 to 6. The ROS 2 message has all but `status`: 1 if the controller has stopped the motor because
+# no command came in time, 2 if the kill switch is active.
 _NUMBERS = (
     _Number("temp_fet", "h", 10.0),
     _Number("temp_motor", "h", 10.0),
@@ -203,7 +187,7 @@ _NUMBERS = (
     _Number("avg_vq", "i", 1000.0),
     _Number("status", "B"),
 )
-# Firmware 2, which the PyPI package pyvesc expects of every controller.
+# Firmware 2, which is the only one that the PyPI package pyvesc knows.
 _NUMBERS_2 = (
     *(_Number(f"ntc_temp_mos{i}", "h", 10.0) for i in range(1, 7)),
     _Number("temperature_pcb", "h", 10.0),
@@ -215,38 +199,27 @@ _NUMBERS_2 = (
     *_COUNTERS,
 )
 
-Decode = Callable[[bytes], "dict[str, Value]"]
+
+class _Layout(NamedTuple):
+    struct: struct.Struct
+    numbers: tuple[_Number, ...]
 
 
-def _decoder(numbers: tuple[_Number, ...]) -> tuple[int, Decode]:
-    """The length of the payload and the function that decodes it."""
-    layout = struct.Struct(">x" + "".join(number.code for number in numbers))
-    scaled = tuple((number.name, number.scale) for number in numbers)
-
-    def decode(payload: bytes) -> dict[str, Value]:
-        return {
-            name: raw if scale == 1.0 else raw / scale
-            for (name, scale), raw in zip(scaled, layout.unpack(payload))
-        }
-
-    return layout.size, decode
+def _layout(numbers: tuple[_Number, ...]) -> _Layout:
+    return _Layout(struct.Struct(">x" + "".join(number.code for number in numbers)), numbers)
 
 
-def _up_to(last: str) -> tuple[_Number, ...]:
-    names = [number.name for number in _NUMBERS]
-    return _NUMBERS[: names.index(last) + 1]
+def _layouts() -> Iterator[_Layout]:
+    yield _layout(_NUMBERS_2)
+    for i, number in enumerate(_NUMBERS, 1):
+        if number.name in _LAST:
+            yield _layout(_NUMBERS[:i])
 
 
-# By the payload's length, the command included: 54, 58, 59, 65, 73, 74 and 56 bytes.
-LAYOUTS: dict[int, Decode] = dict(
-    [
-        *(
-            _decoder(_up_to(last))
-            for last in ("fault_code", "pid_pos_now", "controller_id", "ntc_temp_mos3", "avg_vq", "status")
-        ),
-        _decoder(_NUMBERS_2),
-    ]
-)
+# The last number of each firmware's answer.
+_LAST = ("fault_code", "pid_pos_now", "controller_id", "ntc_temp_mos3", "avg_vq", "status")
+# By the payload's length, the command included: 56, 54, 58, 59, 65, 73 and 74 bytes.
+LAYOUTS = {layout.struct.size: layout for layout in _layouts()}
 
 
 def decode_values(payload: bytes) -> dict[str, Value]:
@@ -254,8 +227,11 @@ def decode_values(payload: bytes) -> dict[str, Value]:
 
     Raises `ProtocolError` for a length that no known firmware sends.
     """
-    decode = LAYOUTS.get(len(payload))
-    if decode is None or payload[0] != COMM_GET_VALUES:
+    layout = LAYOUTS.get(len(payload))
+    if layout is None or payload[0] != COMM_GET_VALUES:
         known = ", ".join(map(str, sorted(LAYOUTS)))
-        raise ProtocolError(f"values of {len(payload)} bytes; known are those of {known}")
-    return decode(payload)
+        raise ProtocolError(f"values must have one of {known} bytes, got {len(payload)} bytes")
+    return {
+        number.name: raw if number.scale == 1.0 else raw / number.scale
+        for number, raw in zip(layout.numbers, layout.struct.unpack(payload))
+    }

@@ -1,15 +1,14 @@
-"""The motor controller itself, over its serial line: asks a VESC for its values at a set rate.
+"""Polls a VESC for its values over its serial line, at a set rate.
 
-One request is under way at a time, each sent at its absolute deadline, or as soon as the answer before
-it is there; a line or a controller slower than ``rate_hz`` skips deadlines, which are counted. Answers
-carry neither time nor number, so a sample's time is the middle between request and answer, by the
-machine's clock: half the round trip, the most it can be wrong by, is about 4 ms at 115200 baud and below
-1 ms over USB. An answer that comes after its timeout is dropped, unless the next request is already out,
-whose answer it is then taken for.
+One request is open at a time. Each is sent at its absolute deadline, or as soon as the answer before it is
+there; a slow line or controller skips deadlines, which are counted. Answers carry neither time nor number, so
+a sample's time is the middle between request and answer, by the machine's clock. The error is at most half
+the round trip: about 4 ms at 115200 baud, and below 1 ms over USB. An answer after its timeout is dropped,
+unless the next request is already out: then it is taken for that one's.
 
-The port is opened by its path again and again until it is there, and again when it goes away: name it
-by ``/dev/serial/by-id/...``, which stays when numbers change. It is locked while it is open, because
-two programs reading one port each get half of the bytes.
+The port is opened by its path again and again until it is there, and again when it goes away: name it by
+``/dev/serial/by-id/...``, which does not change with the numbers. The open port is locked, because two
+programs that read one port each get half of the bytes.
 """
 
 from __future__ import annotations
@@ -26,8 +25,8 @@ from pathlib import Path
 from typing import Any, Iterator, Mapping, Sequence
 
 from iort_agent.clock import Clock
+from iort_agent.common.schema import number, setting, text
 from iort_agent.errors import SourceError
-from iort_agent.schema import number, setting, text
 from iort_agent.sources import FAIL, OK, Emit, Finding, SourceConfig
 from iort_agent.sources.vesc.protocol import (
     COMM_FW_VERSION,
@@ -47,7 +46,7 @@ _log = logging.getLogger(__name__)
 # A read returns after this at the latest, so that a stop is noticed.
 _READ_S = 0.05
 _FIRMWARE_TRIES = 3
-# So long without an answer is worth a line in the log, and then a try with the port opened afresh.
+# After this long without an answer a warning is logged, and after `_REOPEN_S` the port is opened again.
 _SILENT_S = 1.0
 _REOPEN_S = 3.0
 _BACKOFF_S = (0.1, 2.0)
@@ -59,7 +58,7 @@ class VescConfig(SourceConfig):
     """A VESC on a serial port.
 
     ``can_id`` asks the controller with that id on the CAN bus, through the one on the port. ``timeout_s``
-    is how long an answer may take. 115200 baud carry about 130 answers a second; USB knows no baud rate.
+    is how long an answer may take. 115200 baud carry about 130 answers a second; USB has no baud rate.
     """
 
     port: str = setting(text())
@@ -101,11 +100,11 @@ class VescConfig(SourceConfig):
 
 @dataclass
 class VescCounts:
-    """What became of the requests, and what else was on the line.
+    """Counts of requests, answers and noise on the line.
 
-    ``timeouts`` were not answered in time, ``late`` answers came after that, ``skipped_polls`` are
-    deadlines that passed while another request was under way, ``unknown`` answers have a length of no
-    known firmware, ``bad_crc`` frames and ``garbage`` bytes are the line's.
+    ``timeouts`` were not answered in time, and ``late`` answers came after that. ``skipped_polls`` are
+    deadlines that passed while another request was open. ``unknown`` answers have a length of no known
+    firmware. ``bad_crc`` counts frames, ``garbage`` bytes.
     """
 
     samples: int = 0
@@ -119,7 +118,7 @@ class VescCounts:
 
 
 class VescSource:
-    """Emits a sample an answer, for as long as it is not stopped."""
+    """Emits a sample for each answer until it is stopped."""
 
     def __init__(self, config: VescConfig, clock: Clock) -> None:
         self.counts = VescCounts()
@@ -129,13 +128,13 @@ class VescSource:
         self._unknown: set[int] = set()
 
     def report(self) -> Mapping[str, Any]:
-        """Samples, and what was wrong on the line."""
+        """The samples, and the problems of the line."""
         return vars(self.counts)
 
     def run(self, emit: Emit, stop: threading.Event) -> None:
-        """Poll until ``stop`` is set. Raises `SourceError` where pyserial is not installed."""
+        """Poll until ``stop`` is set. Raises `SourceError` without pyserial."""
         library = _load_pyserial()
-        backoff = _BACKOFF_S[0]
+        backoff_s = _BACKOFF_S[0]
         while not stop.is_set():
             samples, opened = self.counts.samples, self.counts.opened
             try:
@@ -145,31 +144,31 @@ class VescSource:
             except library.errors as error:
                 self.trouble(_why(error, was_open=self.counts.opened > opened))
             if self.counts.samples > samples:
-                backoff = _BACKOFF_S[0]
-            # Jitter, because nothing says that ours is the only program waiting for this port.
-            self._clock.wait(stop, backoff * random.uniform(0.5, 1.0))  # noqa: S311 - jitter, not secrets
-            backoff = min(_BACKOFF_S[1], backoff * 2)
+                backoff_s = _BACKOFF_S[0]
+            # Jitter, because other programs may wait for this port, too.
+            self._clock.wait(stop, backoff_s * random.uniform(0.5, 1.0))  # noqa: S311 - jitter, not secrets
+            backoff_s = min(_BACKOFF_S[1], backoff_s * 2)
         _log.info("%s: %s", self._config.port, ", ".join(f"{k} {v}" for k, v in vars(self.counts).items()))
 
     def trouble(self, what: str) -> None:
-        """Say what keeps samples from coming, once for as long as it is the same."""
+        """Log why no samples come, once until it changes."""
         if what != self._trouble:
             _log.warning("%s: %s", self._config.port, what)
         self._trouble = what
 
     def answered(self) -> None:
-        """A sample has come: whatever the trouble was, it is over."""
+        """Count a sample, which ends the trouble."""
         self.counts.samples += 1
         if self._trouble:
             _log.info("%s: samples are coming again", self._config.port)
             self._trouble = ""
 
     def unknown(self, payload: bytes, error: ProtocolError) -> None:
-        """Count an answer that cannot be read, and say so once a length."""
+        """Count an answer that cannot be decoded, and log each length once."""
         self.counts.unknown += 1
         if len(payload) not in self._unknown:
             self._unknown.add(len(payload))
-            _log.error("%s: the controller answers %s; such answers are dropped", self._config.port, error)
+            _log.error("%s: the answer is dropped: %s", self._config.port, error)
 
     def _open(self, library: _Library) -> Any:
         config = self._config
@@ -185,7 +184,7 @@ class VescSource:
 
 
 class _Session:
-    """One opening of the port, until it fails or has been silent for too long."""
+    """The time from opening the port until it fails, or has been silent for too long."""
 
     def __init__(self, config: VescConfig, clock: Clock, source: VescSource, port: Any) -> None:
         self._config = config
@@ -195,33 +194,33 @@ class _Session:
         self._port = port
         self._parser = FrameParser()
         self._garbage = self._bad_crc = 0
-        # What a read waits for; the length of the answers, once it is known, saves most of the reads.
+        # The bytes that a read waits for; the known length of an answer saves most of the reads.
         self._expected = 1
         self._answered = clock.monotonic()
-        self._report = _Report(clock)
+        self._next_report = clock.monotonic() + _REPORT_S
 
     def run(self, emit: Emit, stop: threading.Event) -> None:
         config, clock = self._config, self._clock
-        self._say_firmware(stop)
+        self._log_firmware(stop)
         ask = request(COMM_GET_VALUES, config.can_id)
         self._answered = start = clock.monotonic()
         tick = 0
         while not stop.is_set():
-            wait = start + tick / config.rate_hz - clock.monotonic()
-            if wait > 0 and clock.wait(stop, wait):
+            wait_s = start + tick / config.rate_hz - clock.monotonic()
+            if wait_s > 0 and clock.wait(stop, wait_s):
                 return
             sent = clock.monotonic()
             self._drop_late()
             payload = self._ask(ask, COMM_GET_VALUES, stop)
             if payload is not None:
                 self._take(payload, sent, emit)
-            elif not stop.is_set() and not self._still_hoping():
+            elif not stop.is_set() and not self._is_worth_waiting():
                 return
             # The next deadline, or the newest that has passed already: that one is met late.
             due = max(tick + 1, int((clock.monotonic() - start) * config.rate_hz))
             if due > tick + 1:
                 self._counts.skipped_polls += due - tick - 1
-                self._report.slow(config, self._counts)
+                self._report_slowness()
             tick = due
 
     def _take(self, payload: bytes, sent: float, emit: Emit) -> None:
@@ -237,24 +236,20 @@ class _Session:
         self._source.answered()
         emit(self._config.stream, t_us, values)
 
-    def _still_hoping(self) -> bool:
-        """Count a request without an answer; False when the port had better be opened afresh."""
+    def _is_worth_waiting(self) -> bool:
+        """Count a request without an answer; False if the port should be opened again."""
         self._counts.timeouts += 1
         silent_s = self._clock.monotonic() - self._answered
         if silent_s >= _SILENT_S:
-            behind = (
-                "" if self._config.can_id is None else f", a controller with CAN id {self._config.can_id}"
-            )
-            heard = (
-                " (what comes instead is no frame: is the baud rate right?)"
-                if self._garbage or self._parser.pending
-                else ""
-            )
+            can_id = self._config.can_id
+            behind = "" if can_id is None else f", a controller with CAN id {can_id}"
+            noise = self._garbage or self._parser.pending
+            heard = " (the bytes that come are no frame: is the baud rate right?)" if noise else ""
             self._source.trouble(f"open, but no answer: is it a VESC{behind}, powered, UART enabled?{heard}")
         return silent_s < max(_REOPEN_S, 3 * self._config.timeout_s)
 
-    def _say_firmware(self, stop: threading.Event) -> None:
-        """Ask for the version, for the log alone: one that does not say may still give values."""
+    def _log_firmware(self, stop: threading.Event) -> None:
+        """Ask for the version, only for the log: a controller without an answer may still give values."""
         for _ in range(_FIRMWARE_TRIES):
             payload = self._ask(request(COMM_FW_VERSION, self._config.can_id), COMM_FW_VERSION, stop)
             if payload is not None:
@@ -265,10 +260,10 @@ class _Session:
                 return
             if stop.is_set():
                 return
-        _log.info("%s: open, firmware version not told", self._config.port)
+        _log.info("%s: open, firmware version unknown", self._config.port)
 
     def _ask(self, ask: bytes, command: int, stop: threading.Event) -> bytes | None:
-        """Send a request and wait for its answer; None when there is none in time."""
+        """Send a request and wait for its answer; None after the timeout."""
         self._port.write(ask)
         deadline = self._clock.monotonic() + self._config.timeout_s
         wanted = self._expected
@@ -282,7 +277,7 @@ class _Session:
         return None
 
     def _drop_late(self) -> None:
-        """Read what has come since the last answer was waited for: it is nobody's."""
+        """Drop the answers that came after their timeout."""
         if self._port.in_waiting:
             self._counts.late += sum(payload[0] == COMM_GET_VALUES for payload in self._read(1))
 
@@ -294,28 +289,17 @@ class _Session:
         self._garbage, self._bad_crc = parser.skipped, parser.bad_crc
         return payloads
 
-
-class _Report:
-    """Says at most once a minute that the line is slower than asked for."""
-
-    def __init__(self, clock: Clock) -> None:
-        self._clock = clock
-        self._next = clock.monotonic() + _REPORT_S
-        self._samples = self._skipped = 0
-
-    def slow(self, config: VescConfig, counts: VescCounts) -> None:
+    def _report_slowness(self) -> None:
         now = self._clock.monotonic()
-        if now >= self._next:
-            skipped, given = counts.skipped_polls - self._skipped, counts.samples - self._samples
-            _log.warning(
-                "%s: too slow for %g Hz: %d samples and %d skipped polls since the last such line",
-                config.port, config.rate_hz, given, skipped,
-            )  # fmt: skip
-            self._next, self._samples, self._skipped = now + _REPORT_S, counts.samples, counts.skipped_polls
+        if now >= self._next_report:
+            self._next_report = now + _REPORT_S
+            counts, config = self._counts, self._config
+            text = "%s: too slow for %g Hz: %d samples and %d skipped polls since the start"
+            _log.warning(text, config.port, config.rate_hz, counts.samples, counts.skipped_polls)
 
 
 class _Library:
-    """pyserial, and whatever it raises when a port is not there, goes away or misbehaves."""
+    """pyserial, and the errors of a port that is not there, goes away or misbehaves."""
 
     def __init__(self) -> None:
         import termios  # noqa: PLC0415 - only where there is a port
@@ -337,8 +321,8 @@ def _load_pyserial() -> _Library:
 
 
 def _why(error: Exception, *, was_open: bool) -> str:
-    """What the operating system says, in words that help."""
-    # pyserial keeps the number of some errors, and only chains the error of others.
+    """The operating system's error, in words that help."""
+    # pyserial keeps the number of some errors, and only chains others.
     numbers = {first for e in (error, error.__context__) if e is not None for first in e.args[:1]}
     if numbers & {errno.ENOENT, errno.ENODEV, errno.ENXIO}:
         return "is not there: waiting for it to be plugged in"

@@ -1,4 +1,4 @@
-// Building the page from text only: nothing that a robot sends is ever read as HTML.
+// Builds the page from text nodes: no text from a robot is ever read as HTML.
 
 type Attributes = Readonly<Record<string, string>>;
 
@@ -13,7 +13,7 @@ export function el<K extends keyof HTMLElementTagNameMap>(
   return node;
 }
 
-/** A text that is written only when it changes, which is what keeps a fast page cheap. */
+/** A text that is written only when it changes, because writing costs a layout. */
 export class Text {
   readonly node: HTMLElement;
   private readonly text = document.createTextNode("");

@@ -1,8 +1,8 @@
-// How values are written: unit, scale and digits follow from the contract's field table.
+// Formats values: unit, scale and digits follow from the contract's field table.
 
 import type { FieldTable, Value } from "./contract";
 
-/** What is shown of a value sent: it times `scale`, and `shift` more. */
+/** The shown value is the sent value times `scale`, plus `shift`. */
 export interface Linear {
   readonly scale: number;
   readonly shift: number;
@@ -29,7 +29,7 @@ const DIGITS: Readonly<Record<string, number>> = {
 const UNITS: Readonly<Record<string, string>> = { degC: "°C", deg: "°", enum: "", id: "", "m/s^2": "m/s²" };
 const CAPITALS = new Set(["pcb", "fet", "ntc", "pid", "id", "iq", "vd", "vq", "imu", "gps", "cpu", "mos1", "mos2", "mos3"]);
 
-/** How to write a field; `ros2` for the ROS 2 driver's units. */
+/** The format of a field; `ros2` selects the ROS 2 driver's units. */
 export function spec(field: string, table: FieldTable, ros2 = false): Spec {
   const known = Object.hasOwn(table.fields, field) ? table.fields[field] : undefined;
   const label = humanise(field);
@@ -40,7 +40,7 @@ export function spec(field: string, table: FieldTable, ros2 = false): Spec {
   const { meaning } = known;
   const unit = (ros2 ? known.ros2_unit : undefined) ?? known.unit;
   if (field === "fault_code") return { label, meaning: "", unit: "", ...AS_SENT, digits: 0, texts: table.faults };
-  // A share is read best in percent, and 1e-4 Ah in Ah.
+  // Shares are shown in percent, and 1e-4 Ah in Ah.
   if (unit === "1") return { label, meaning, unit: "%", ...times(100), digits: 1 };
   const scaled = /^1e(-?\d+) (.+)$/.exec(unit);
   const plain = scaled ? scaled[2]! : unit;
@@ -59,7 +59,7 @@ function rosUnit(field: string, { ros_units }: FieldTable): string {
   return name ? ros_units[name]! : "";
 }
 
-/** A field of the motor controller's stream as the car's speed, where that is what it is and the car is known. */
+/** The format of the motor's speed as the car's speed, if the car's parameters are known; else `spec`. */
 export function asSpeed(field: string, spec: Spec, speed: Linear | undefined): Spec {
   return field === "speed" && spec.unit === "erpm" && speed ? { ...spec, ...speed, unit: "m/s", digits: 2 } : spec;
 }
@@ -101,18 +101,18 @@ function humanise(field: string): string {
   return text.charAt(0).toUpperCase() + text.slice(1);
 }
 
-/** The time zone that times are shown in, at a time: UTC, CET, GMT+2. */
+/** This device's time zone at a time: UTC, CET, GMT+2. */
 export function zone(seconds: number): string {
   const parts = new Intl.DateTimeFormat("en-GB", { timeZoneName: "short" }).formatToParts(seconds * 1000);
   return parts.find(({ type }) => type === "timeZoneName")?.value ?? "local time";
 }
 
-/** The time of day here: 14:03:27. */
+/** The local time of day: 14:03:27. */
 export function clockTime(seconds: number): string {
   return new Date(seconds * 1000).toLocaleTimeString("en-GB");
 }
 
-/** The same, with the day where it is not today: Fri 20 Nov 14:03:27. */
+/** The local time of day, with the date unless it is today: Fri 20 Nov 14:03:27. */
 export function dayTime(seconds: number, options: Intl.DateTimeFormatOptions = {}): string {
   const at = new Date(seconds * 1000);
   const time = at.toLocaleTimeString("en-GB", { hour: "2-digit", minute: "2-digit", second: "2-digit", ...options });

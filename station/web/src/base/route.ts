@@ -1,4 +1,4 @@
-// The views and their addresses, which are kept behind the #, so that a static site serves them all.
+// The views and their addresses. They are behind the #, so that a static site serves them all.
 
 export type Route =
   | { readonly view: "fleet" | "cloudwatch" }

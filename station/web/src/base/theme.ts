@@ -1,4 +1,4 @@
-// Dark or light: as the system says, unless the viewer has chosen. Charts ask here for their colours.
+// Dark or light, by the system's setting or the viewer's choice. Charts take their colours from here.
 
 const KEY = "iort.theme";
 const CHOICES = ["auto", "light", "dark"] as const;
@@ -24,7 +24,7 @@ export function startTheme(button: HTMLElement): void {
     try {
       localStorage.setItem(KEY, choice);
     } catch {
-      // It holds until the page is closed.
+      // The choice lasts until the page is closed.
     }
     apply();
   });
@@ -36,7 +36,7 @@ export function onTheme(listener: () => void): void {
   listeners.push(listener);
 }
 
-/** A custom property's colour as the canvas understands it. */
+/** A custom property's colour in a form that a canvas accepts. */
 export function colour(property: string): string {
   probe.style.color = `var(${property})`;
   return getComputedStyle(probe).color;

@@ -1,4 +1,4 @@
-// What every chart has in common: fonts, colours, axes and round numbers.
+// Common parts of the charts: fonts, colours, axes and round numbers.
 
 import type uPlot from "uplot";
 import { colour } from "../base/theme";
@@ -30,13 +30,13 @@ export function axis(colours: () => Paint, size: number, gap: number, more: uPlo
   };
 }
 
-/** What every plot of ours leaves out of uPlot. */
+/** Parts of uPlot that no chart uses. */
 export const PLAIN = {
   legend: { show: false },
   select: { show: false, left: 0, top: 0, width: 0, height: 0 },
 } as const;
 
-/** Keeps a plot as large as its host, and tells when it is on the screen. */
+/** Keep a plot as large as its host, and report whether it is on the screen. */
 export function fit(host: HTMLElement, plot: uPlot, changed: (visible: boolean) => void): void {
   new ResizeObserver(() => {
     if (host.clientWidth > 0) plot.setSize({ width: host.clientWidth, height: host.clientHeight });
@@ -65,7 +65,7 @@ export function roundStep(step: number): number {
   return (share <= 1 ? 1 : share <= 2 ? 2 : share <= 5 ? 5 : 10) * power;
 }
 
-/** Round numbers around `least` to `most`, at least `span` apart; with `zero` they hold zero. */
+/** A range of round numbers around `least` to `most`, of at least `span`; with `zero` it includes zero. */
 export function roundRange(least: number, most: number, span: number, zero: boolean): [number, number] {
   if (zero) [least, most] = [Math.min(0, least), Math.max(0, most)];
   const missing = span - (most - least);
@@ -79,7 +79,7 @@ export function faint(rgb: string, share = 0.09): string {
   return rgb.startsWith("rgb(") ? rgb.replace("rgb(", "rgba(").replace(")", `, ${share})`) : rgb;
 }
 
-/** Where a line must not run: over a value that is missing, and over a time without samples. */
+/** The gaps of a line: missing values, and times without samples. */
 export function holes(hole_s: () => number) {
   return (plot: uPlot, series: number, first: number, last: number, gaps: uPlot.Series.Gaps): uPlot.Series.Gaps => {
     const times = plot.data[0];

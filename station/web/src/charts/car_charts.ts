@@ -1,16 +1,18 @@
-// What the view of a car shows of the motor controller's fields, and how to know what else a car reports.
+// The charts of a car's view. To add one, add an entry to `CHARTS`.
 
 import { power_w, TEMPERATURES } from "../base/contract";
-import type { Robot } from "../live/fleet";
 import { AS_SENT, linear, times, type Linear } from "../base/format";
-import type { GaugeOptions } from "./gauge";
+import type { Robot } from "../live/robot";
 import type { ChartPanelOptions } from "./chart_panel";
+import type { GaugeOptions } from "./gauge";
 import type { XYChartOptions } from "./xy_chart";
 
+/** A number with a bar. */
 export interface GaugeSpec extends GaugeOptions {
+  readonly kind: "gauge";
   /** The fields that need no tile because of this gauge. */
   readonly fields: readonly string[];
-  /** The field whose least and most of the last while are shown. */
+  /** The field whose minimum and maximum of the last 30 s are shown. */
   readonly extent?: string;
   readonly show: (
     newest: (field: string) => number,
@@ -19,57 +21,72 @@ export interface GaugeSpec extends GaugeOptions {
   ) => { readonly value: number; readonly as?: Linear; readonly unit?: string; readonly digits?: number };
 }
 
+/** Lines over the last 30 s. */
+export interface LineSpec extends ChartPanelOptions {
+  readonly kind: "line";
+  /** A field for each line. */
+  readonly fields: readonly string[];
+  /** The scale, and the unit if it depends on the car. */
+  readonly as: (speed: Linear | undefined) => readonly [Linear, string?];
+}
+
+/** One field over another. */
+export interface XYChartSpec extends Omit<XYChartOptions, "x"> {
+  readonly kind: "xy";
+  readonly x: string;
+  readonly title: string;
+  /** The x axis is the motor's speed, shown as the car's speed if the car's parameters are known. */
+  readonly speed?: boolean;
+  /** The two fields to draw; undefined for a stream without them. */
+  readonly axes: (fields: ReadonlyMap<string, number>) => readonly [string, string] | undefined;
+}
+
 const plain = (field: string, scale = 1): Pick<GaugeSpec, "fields" | "extent" | "show"> => ({
   fields: [field],
   extent: field,
   show: (newest) => ({ value: newest(field) * scale, as: times(scale) }),
 });
 
-/** The hottest of the controller's temperatures, as in the contract: a sensor that is not read is 0. */
+/** The controller's hottest temperature, as in the contract: a sensor that is not read is 0. */
 export const hottest = (newest: (field: string) => number): number => {
   const known = TEMPERATURES.map(newest).filter((value) => !Number.isNaN(value) && value !== 0);
   return known.length > 0 ? Math.max(...known) : NaN;
 };
 
-export const GAUGES: readonly GaugeSpec[] = [
+const first = ([value = NaN]: readonly number[]): number => value;
+const asSent = (): readonly [Linear] => [AS_SENT];
+
+// The paths of positions in geometry_msgs, nav_msgs and tf2_msgs, and in flat messages.
+const POSITIONS = ["pose.pose.position.", "pose.position.", "position.", "transform.translation.", "translation.", "pose.", ""];
+
+const CHARTS: readonly (GaugeSpec | LineSpec | XYChartSpec)[] = [
   {
-    name: "speed_mps", label: "Speed", unit: "m/s", digits: 2, from: 0, to: 4,
+    kind: "gauge", name: "speed_mps", label: "Speed", unit: "m/s", digits: 2, from: 0, to: 4,
     fields: [],
     extent: "speed",
     show: (newest, _, speed) =>
       speed ? { value: linear(newest("speed"), speed), as: speed } : { value: newest("speed"), unit: "erpm", digits: 0 },
   },
-  { name: "voltage_input", label: "Battery", unit: "V", digits: 2, from: 9, to: 13, ...plain("voltage_input") },
+  { kind: "gauge", name: "voltage_input", label: "Battery", unit: "V", digits: 2, from: 9, to: 13, ...plain("voltage_input") },
   {
-    name: "temperature", label: "Temperature, hottest", unit: "°C", digits: 1, from: 0, to: 100,
+    kind: "gauge", name: "temperature", label: "Temperature, hottest", unit: "°C", digits: 1, from: 0, to: 100,
     fields: [],
     show: (newest) => ({ value: hottest(newest) }),
   },
-  { name: "current_motor", label: "Motor current", unit: "A", digits: 2, from: -20, to: 40, ...plain("current_motor") },
+  { kind: "gauge", name: "current_motor", label: "Motor current", unit: "A", digits: 2, from: -20, to: 40, ...plain("current_motor") },
   {
-    name: "power_w", label: "Battery power", unit: "W", digits: 1, from: -100, to: 200,
+    kind: "gauge", name: "power_w", label: "Battery power", unit: "W", digits: 1, from: -100, to: 200,
     fields: [],
     show: (newest) => ({ value: power_w(newest("voltage_input"), newest("current_input")) }),
   },
-  { name: "duty_cycle", label: "Duty cycle", unit: "%", digits: 1, from: -20, to: 100, ...plain("duty_cycle", 100) },
+  { kind: "gauge", name: "duty_cycle", label: "Duty cycle", unit: "%", digits: 1, from: -20, to: 100, ...plain("duty_cycle", 100) },
   {
-    name: "delay", label: "Delay, car to page", unit: "ms", digits: 0, from: 0, to: 100,
+    kind: "gauge", name: "delay", label: "Delay, car to page", unit: "ms", digits: 0, from: 0, to: 100,
     fields: [],
     show: (_, robot) => ({ value: robot.newestDelay()?.total ?? NaN }),
   },
-];
-
-interface VescPanel extends ChartPanelOptions {
-  readonly fields: readonly string[];
-  /** As what it is shown, and the unit that this gives, where it depends on the car. */
-  readonly as: (speed: Linear | undefined) => readonly [Linear, string?];
-}
-
-const first = ([value = NaN]: readonly number[]): number => value;
-const asSent = (): readonly [Linear] => [AS_SENT];
-
-export const VESC_PANELS: readonly VescPanel[] = [
   {
+    kind: "line",
     title: "Speed",
     fields: ["speed"],
     readings: [{ name: "speed", unit: "m/s", digits: 2, from: first }],
@@ -77,6 +94,7 @@ export const VESC_PANELS: readonly VescPanel[] = [
     as: (speed) => (speed ? [speed, "m/s"] : [AS_SENT, "erpm"]),
   },
   {
+    kind: "line",
     title: "Battery voltage",
     fields: ["voltage_input"],
     readings: [{ name: "voltage_input", unit: "V", digits: 2, from: first }],
@@ -84,6 +102,7 @@ export const VESC_PANELS: readonly VescPanel[] = [
     as: asSent,
   },
   {
+    kind: "line",
     title: "Current",
     fields: ["current_motor", "current_input"],
     readings: [
@@ -94,34 +113,15 @@ export const VESC_PANELS: readonly VescPanel[] = [
     as: asSent,
   },
   {
+    kind: "line",
     title: "Duty cycle",
     fields: ["duty_cycle"],
     readings: [{ name: "duty_cycle", unit: "%", digits: 1, from: first }],
     chart: { lines: [{ colour: "--duty", fill: true }], span: 10, zero: true },
     as: () => [times(100)],
   },
-];
-
-export const DELAY_PANEL: ChartPanelOptions = {
-  title: "Delay",
-  readings: [{ name: "delay", unit: "ms", digits: 0, from: first }],
-  chart: { lines: [{ colour: "--delay", fill: true }], span: 20, zero: true },
-};
-
-export interface XYChartSpec extends Omit<XYChartOptions, "x"> {
-  readonly x: string;
-  readonly title: string;
-  /** The x axis is the motor's speed, which is the car's where that is known. */
-  readonly speed?: boolean;
-  /** The stream's fields to draw, where it has them. */
-  readonly axes: (fields: ReadonlyMap<string, number>) => readonly [string, string] | undefined;
-}
-
-// What poses are called in geometry_msgs, nav_msgs and tf2_msgs, and in flat messages of one's own.
-const POSITIONS = ["pose.pose.position.", "pose.position.", "position.", "transform.translation.", "translation.", "pose.", ""];
-
-export const XY_CHARTS: readonly XYChartSpec[] = [
   {
+    kind: "xy",
     title: "Speed and motor current",
     x: "speed",
     y: "motor current, A",
@@ -131,6 +131,7 @@ export const XY_CHARTS: readonly XYChartSpec[] = [
     axes: (fields) => (fields.has("speed") && fields.has("current_motor") ? ["speed", "current_motor"] : undefined),
   },
   {
+    kind: "xy",
     title: "Accelerations, G-G",
     x: "lateral, m/s²",
     y: "longitudinal, m/s²",
@@ -142,6 +143,7 @@ export const XY_CHARTS: readonly XYChartSpec[] = [
     },
   },
   {
+    kind: "xy",
     title: "Trajectory",
     x: "x, m",
     y: "y, m",
@@ -153,3 +155,14 @@ export const XY_CHARTS: readonly XYChartSpec[] = [
     },
   },
 ];
+
+export const GAUGES = CHARTS.filter((chart) => chart.kind === "gauge");
+export const LINE_CHARTS = CHARTS.filter((chart) => chart.kind === "line");
+export const XY_CHARTS = CHARTS.filter((chart) => chart.kind === "xy");
+
+/** Beside the delay by hop. */
+export const DELAY_CHART: ChartPanelOptions = {
+  title: "Delay",
+  readings: [{ name: "delay", unit: "ms", digits: 0, from: first }],
+  chart: { lines: [{ colour: "--delay", fill: true }], span: 20, zero: true },
+};

@@ -1,16 +1,16 @@
-// A heading with readings, and a chart below it. Under the pointer, the readings are of that time.
+// A heading with readings above a live chart. While the pointer is on the chart, the readings are of its time.
 
 import { LiveChart, type LiveChartOptions, type Shown } from "./live_chart";
 import { el, setAttribute, Text } from "../base/dom";
 import { age, AS_SENT, linear, number, type Linear } from "../base/format";
 
-/** A value in a panel's heading, computed from those of the panel's lines as they are drawn. */
+/** A value in a panel's heading, computed from the values of the panel's lines. */
 export interface Reading {
   readonly name: string;
   readonly label?: string;
   readonly unit: string;
   readonly digits?: number;
-  /** The line whose key stands beside it. */
+  /** The line whose colour is shown beside the value. */
   readonly line?: number;
   readonly from: (values: readonly number[]) => number;
 }
@@ -19,7 +19,7 @@ export interface ChartPanelOptions {
   readonly title: string;
   readonly readings: readonly Reading[];
   readonly chart: LiveChartOptions;
-  /** Present where the viewer may put it away. */
+  /** Called when the viewer closes the panel; without it, the panel cannot be closed. */
   readonly onClose?: () => void;
 }
 
@@ -78,7 +78,7 @@ export class ChartPanel {
     });
   }
 
-  /** What to show, as what, and the unit that this gives, where it is not the usual one. */
+  /** Set the data, its scale, and the unit if it differs. */
   show(shown: Shown | undefined, as: Linear, unit?: string): void {
     this.as = as;
     this.chart.show(shown, as);

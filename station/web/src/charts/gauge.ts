@@ -1,4 +1,4 @@
-// A number with a bar: where it stands between the extremes, and where it has been for 30 seconds.
+// A number with a bar: its place between the extremes, and its range of the last 30 seconds.
 
 import { el, Text } from "../base/dom";
 import { number } from "../base/format";
@@ -9,7 +9,7 @@ export interface GaugeOptions {
   readonly label: string;
   readonly unit: string;
   readonly digits: number;
-  /** The extremes of the bar, until a value goes beyond them. */
+  /** The extremes of the bar; they grow with the values. */
   readonly from: number;
   readonly to: number;
 }
@@ -39,12 +39,12 @@ export class Gauge {
     this.reset();
   }
 
-  /** Forget the extremes: another car has others. */
+  /** Reset the extremes for another car. */
   reset(): void {
     [this.from, this.to] = [this.options.from, this.options.to];
   }
 
-  /** Show a value, in `unit` if that differs, and the least and the most of the last while. */
+  /** Show a value, and the minimum and maximum of the last 30 s. */
   set(value: number, least: number, most: number, unit = this.options.unit, digits = this.options.digits): void {
     this.value.set(number(value, digits));
     this.unit.set(unit);

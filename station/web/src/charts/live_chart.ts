@@ -1,14 +1,14 @@
-// A chart of the last 30 seconds that scrolls: uPlot, drawn only when there is something new to see.
+// A scrolling chart of the last 30 seconds by uPlot, drawn only when it would change.
 
 import uPlot from "uplot";
-import { WINDOW_S } from "../live/fleet";
+import { WINDOW_S } from "../live/robot";
 import { AS_SENT, linear, type Linear } from "../base/format";
 import { axis, calm, faint, fit, holes, labels, paint, PLAIN, rem, roundRange } from "./axes";
 import type { Ring } from "../live/ring";
 import { colour, onTheme } from "../base/theme";
 
 export interface Line {
-  /** The custom property that holds its colour. */
+  /** The custom property of its colour. */
   readonly colour: string;
   readonly dash?: readonly number[];
   /** A faint area between the line and zero. */
@@ -17,23 +17,23 @@ export interface Line {
 
 export interface LiveChartOptions {
   readonly lines: readonly Line[];
-  /** The least height of the axis, so that noise is not drawn as a mountain. */
+  /** The minimum height of the axis, so that noise stays small. */
   readonly span: number;
   /** The axis always holds zero. */
   readonly zero?: boolean;
-  /** Told what is under the pointer: seconds ago and a value a line; undefined when it leaves. */
+  /** Called with the values under the pointer and their age in seconds; undefined when it leaves. */
   readonly onPoint?: (point: { readonly ago: number; readonly values: readonly number[] } | undefined) => void;
 }
 
-/** What a chart shows: columns of a history, one a line; undefined where there is none yet. */
+/** A history, and a column for each line; undefined if it does not exist yet. */
 export interface Shown {
   readonly history: Ring;
   readonly columns: readonly (number | undefined)[];
 }
 
-// A line is broken where nothing came for so long.
+// A line has a gap after this time without a value.
 const HOLE_S = 1;
-// Moving by less than this many points of the screen is not worth a picture, nor are more than 25 a second.
+// A chart is not drawn for a smaller step, nor more than 25 times a second.
 const STEP_PX = 0.75;
 const FRAME_S = 0.04;
 
@@ -110,7 +110,7 @@ export class LiveChart {
     });
   }
 
-  /** What to show from now on, undefined for nothing, and as what. */
+  /** Set the data, undefined for none, and its scale. */
   show(shown: Shown | undefined, as: Linear): void {
     const same = this.shown?.history === shown?.history && String(this.shown?.columns) === String(shown?.columns);
     if (same && this.as.scale === as.scale && this.as.shift === as.shift) return;
@@ -120,7 +120,7 @@ export class LiveChart {
     this.low = this.high = NaN;
   }
 
-  /** Whether the picture would differ by enough to be seen, or must be drawn for another reason. */
+  /** Whether the chart must be drawn: it would visibly change, or its data or size has changed. */
   due(now: number): boolean {
     if (!this.visible || now - this.drawnAt < FRAME_S) return false;
     if (this.dirty) return true;
@@ -139,7 +139,7 @@ export class LiveChart {
     });
   }
 
-  /** There is something to draw again, after a time in which there was not. */
+  /** Draw again after a time without data. */
   wake(): void {
     if (this.drawnEmpty) this.dirty = true;
   }
@@ -156,7 +156,7 @@ export class LiveChart {
     return [times, ...columns];
   }
 
-  /** The axis: round numbers that hold the data, reached in a few frames rather than at once. */
+  /** The axis' range: round numbers around the data, approached in a few frames. */
   private range(low: number | null, high: number | null): [number, number] {
     const [least, most] = low === null || high === null || !(low <= high) ? [0, 0] : [low, high];
     const [toLow, toHigh] = roundRange(least, most, this.options.span, this.options.zero ?? false);
@@ -167,7 +167,7 @@ export class LiveChart {
     return [this.low, this.high];
   }
 
-  /** A dot at the newest value of every line, where the eye waits for news. */
+  /** Draw a dot at the newest value of every line. */
   private drawHeads(plot: uPlot): void {
     const times = plot.data[0];
     const at = times[times.length - 1];
@@ -200,7 +200,7 @@ export class LiveChart {
   }
 }
 
-/** The right edge: now, or the next full second for those who want less motion. */
+/** The right edge: now, or the next full second for viewers who prefer less motion. */
 function edge(now: number): number {
   return calm.matches ? Math.ceil(now) : now;
 }

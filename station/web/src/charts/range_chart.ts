@@ -1,4 +1,4 @@
-// A chart of a range that is over: uPlot with the time of day below it.
+// A chart of a past range by uPlot, with the time of day below it.
 
 import uPlot from "uplot";
 import { axis, faint, fit, holes, labels, paint, PLAIN, rem, roundRange } from "./axes";
@@ -6,22 +6,22 @@ import { colour, onTheme } from "../base/theme";
 
 export interface Curve {
   readonly label: string;
-  /** The custom property that holds its colour. */
+  /** The custom property of its colour. */
   readonly colour: string;
   readonly dash?: readonly number[];
   readonly right?: boolean;
-  /** Draws a point for every value: for series so sparse that a line would hide how sparse they are. */
+  /** Draw a point for every value: a line would hide how sparse a series is. */
   readonly points?: boolean;
 }
 
 export interface RangeChartOptions {
   readonly curves: readonly Curve[];
   readonly zero?: boolean;
-  /** Charts of one name share their cursor. */
+  /** Charts with the same name share their cursor. */
   readonly sync?: string;
-  /** Lines break where nothing came for so long. */
+  /** A line has a gap after this time without a value. */
   readonly hole_s: number;
-  /** The first curve's least and most are drawn as a band: columns two and three of the data. */
+  /** Draw a band from minimum to maximum of the first curve: columns two and three of the data. */
   readonly band?: boolean;
   readonly onCursor?: (index: number | null) => void;
 }

@@ -1,6 +1,6 @@
-// A line of the last 30 seconds in a few square centimetres, without axes.
+// A small line of the last 30 seconds, without axes.
 
-import { WINDOW_S } from "../live/fleet";
+import { WINDOW_S } from "../live/robot";
 import type { Ring } from "../live/ring";
 import { colour, onTheme } from "../base/theme";
 
@@ -48,7 +48,7 @@ export class Sparkline {
       if (value > high) high = value;
     }
     if (!(low <= high)) return;
-    // Noise of the last digit is not a mountain.
+    // Noise of the last digit stays small.
     const span = Math.max(high - low, Math.abs(high) * 0.02, 1e-9);
     const middle = (low + high) / 2;
     context.beginPath();

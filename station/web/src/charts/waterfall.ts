@@ -1,7 +1,7 @@
-// Where the time goes: a bar a leg of a message's way, each beginning where the one before it ends.
+// The delay by hop: a bar for each hop of a message, which begins at the end of the one before.
 
 import { el, setAttribute, Text } from "../base/dom";
-import { LEGS, MEDIAN_S, type Delay, type Leg, type Robot } from "../live/fleet";
+import { LEGS, MEDIAN_S, type Delay, type Leg, type Robot } from "../live/robot";
 import { milliseconds, NOTHING } from "../base/format";
 
 const NAMES: Readonly<Record<Leg | "screen", readonly [string, string]>> = {
@@ -13,7 +13,7 @@ const NAMES: Readonly<Record<Leg | "screen", readonly [string, string]>> = {
   screen: ["Page shows it", "from its arrival to the next picture"],
 };
 const SHOWN = [...LEGS, "screen"] as const;
-// A clock that is off by less than this is as good as one gets without measuring the offset.
+// A smaller clock offset is normal for clocks that are not measured.
 const CLOCKS_MS = 5;
 
 export class Waterfall {

@@ -1,22 +1,22 @@
-// One quantity over another: the newest point, and the way it came, which fades.
+// One quantity over another: the newest point and its track, which fades.
 
 import uPlot from "uplot";
 import { axis, faint, fit, labels, paint, PLAIN, rem, roundRange } from "./axes";
 import { colour, onTheme } from "../base/theme";
 
 export interface XYChartOptions {
-  /** A text, or what gives one when the plane is drawn. */
+  /** A text, or a function that gives one when the chart is drawn. */
   readonly x: string | (() => string);
   readonly y: string;
-  /** The least extent of each axis. */
+  /** The minimum range of each axis. */
   readonly span: readonly [number, number];
-  /** Both axes hold zero. */
+  /** Both axes include zero. */
   readonly zero?: boolean;
-  /** A step is as long on both axes, as on a map. */
+  /** Both axes have the same scale, as on a map. */
   readonly equal?: boolean;
 }
 
-/** Points in order of time, the newest last. */
+/** Points in the order of time, the newest last. */
 export interface Track {
   readonly x: ArrayLike<number>;
   readonly y: ArrayLike<number>;
@@ -118,7 +118,7 @@ export class XYChart {
     ctx.clip();
     ctx.lineWidth = 1.75 * uPlot.pxRatio;
     ctx.lineJoin = "round";
-    // From old to new in a few shades: a stroke a point would cost more than all the rest.
+    // A few shades from old to new: a stroke for each point would be slow.
     for (let shade = 0; shade < SHADES; shade += 1) {
       const from = Math.floor((x.length * shade) / SHADES);
       const to = Math.min(x.length - 1, Math.floor((x.length * (shade + 1)) / SHADES));

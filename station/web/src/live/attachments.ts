@@ -1,5 +1,5 @@
-// What a message was too large for: the sample holds a claim for each field of bytes (docs/files.md), five
-// fields that say where the content is and, of a picture, hold a small one.
+// Attachments: content that is too large for a message is a file (docs/files.md). The sample has five fields for
+// it, among them the file's key and, for a picture, a thumbnail.
 
 import { ATTACHMENT_PARTS, type Value } from "../base/contract";
 
@@ -7,13 +7,13 @@ export interface Claim {
   readonly key: string;
   readonly size: number;
   readonly contentType: string;
-  /** Base64 of a JPEG; none where the content is no picture, or the car makes none. */
+  /** A JPEG in base64; undefined if the content is not a picture, or if the car makes no thumbnails. */
   readonly thumbnail: string | undefined;
 }
 
 type Sample = Pick<ReadonlyMap<string, unknown>, "has" | "keys">;
 
-/** The fields of bytes in a sample: those that have a claim's fields, all of them. */
+/** The fields of bytes in a sample: those with all fields of an attachment. */
 export function claimed(sample: Sample): string[] {
   const end = ".thumbnail";
   const found = [];
@@ -26,7 +26,7 @@ export function claimed(sample: Sample): string[] {
 
 export const partsOf = (field: string): string[] => ATTACHMENT_PARTS.map((part) => `${field}.${part}`);
 
-/** The claim on a field; undefined where the car has left this content out. */
+/** A field's attachment; undefined if the car has left this content out. */
 export function claim(field: string, value: (name: string) => Value | undefined): Claim | undefined {
   const [key, , size, contentType, thumbnail] = partsOf(field).map(value);
   if (typeof key !== "string") return undefined;
@@ -38,7 +38,7 @@ export function claim(field: string, value: (name: string) => Value | undefined)
   };
 }
 
-/** 3072 B, 1.2 MB: as `iort files list` writes it. */
+/** A size: 3072 B, 1.2 MB. */
 export function bytes(size: number): string {
   if (!Number.isFinite(size)) return "";
   const [unit, each] = size >= 1e6 ? ["MB", 1e6] : size >= 1e3 ? ["kB", 1e3] : ["B", 1];

@@ -1,4 +1,4 @@
-// The page's end of its worker: starts it, and hands what it hears to the fleet.
+// Starts the page's worker, and hands its messages to the fleet.
 
 import type { Config, FieldTable } from "../base/contract";
 import { now } from "../base/clock";
@@ -34,7 +34,7 @@ export class Feed {
   }
 }
 
-/** One id a browser: PubNub bills by users, and a reload is not a new one. */
+/** An id for this browser: PubNub bills by users, and a reload must not be a new user. */
 function userId(): string {
   const fresh = `page-${Array.from(crypto.getRandomValues(new Uint8Array(8)), (b) => b.toString(16).padStart(2, "0")).join("")}`;
   try {
@@ -42,7 +42,7 @@ function userId(): string {
     if (known && /^page-[0-9a-f]{16}$/.test(known)) return known;
     localStorage.setItem("iort.user", fresh);
   } catch {
-    // A browser that stores nothing is a new user each time.
+    // Without storage, every visit is a new user.
   }
   return fresh;
 }

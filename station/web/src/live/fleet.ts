@@ -1,231 +1,19 @@
-// What is known of every car: its streams' newest samples, the last 30 seconds, the delays and the faults.
-// Nothing here touches the page; times are those of clock.ts.
+// Every car that this page has heard. Names come from the network, so the number of cars is bounded.
 
-import { GONE_S, STALE_S } from "../base/contract";
-import type { Config, FieldTable, Value, VehiclesAnswer } from "../base/contract";
-import { ask, AnswerError } from "../server/answers";
-import { claim, claimed, type Claim } from "./attachments";
 import type { Linear } from "../base/format";
-import type { Hops, Update } from "./update";
-import { Ring } from "./ring";
+import { ask, AnswerError } from "../server/answers";
+import type { Config, FieldTable, VehiclesAnswer } from "../base/contract";
+import { BOUNDS, Robot, Stream } from "./robot";
 import type { Arrival } from "./worker_messages";
-
-/** What the charts show, and what a median is taken over. */
-export const WINDOW_S = 30;
-export const MEDIAN_S = 10;
-
-// Names and fields come from the network, so whatever they make grow is bounded: 30 s at 16 Hz (the live
-// lane carries at most 10), and in all 12 MB of columns.
-export const BOUNDS = { rows: 512, delays: 2048, columns: 1536, robots: 256, streams: 32, boots: 8, faults: 100, claims: 4 } as const;
-
-export type Freshness = "live" | "stale" | "gone";
-
-/** The legs of a message's way, in the order of `Robot.delays`' columns after arrival and total. */
-export const LEGS = ["car", "toCloud", "toLambda", "toPubNub", "toPage"] as const;
-export type Leg = (typeof LEGS)[number];
-/** In milliseconds. The total is from leaving the car to arriving here: without the car's own leg. */
-export type Delay = { readonly total: number } & Readonly<Record<Leg, number>>;
-
-export interface Fault {
-  /** When it was first and last heard of, in seconds since the epoch. */
-  readonly since: number;
-  until: number;
-  readonly name: string;
-  readonly stream: string;
-  over: boolean;
-}
-
-/**
- * Where the sample times of a car's clock lie on the page's clock: the smallest difference seen within
- * the last half to whole minute, which is that of the message that travelled fastest.
- */
-class ClockOffset {
-  private current = Infinity;
-  private previous = Infinity;
-  private since = 0;
-
-  reset(): void {
-    this.current = this.previous = Infinity;
-  }
-
-  take(difference: number, now: number): number {
-    if (now - this.since > 30) {
-      [this.previous, this.current, this.since] = [this.current, Infinity, now];
-    }
-    this.current = Math.min(this.current, difference);
-    return Math.min(this.current, this.previous);
-  }
-}
-
-export class Stream {
-  boot = "";
-  seq = -1;
-  t_us = 0;
-  hops: Hops = { sent_us: 0, received_ms: 0, lambda_us: 0, offset_us: 0, offset_known: false };
-  sample: ReadonlyMap<string, Value> = new Map();
-  /** When the newest sample was taken, on the page's clock, if it had come as fast as the fastest. */
-  takenAt = -Infinity;
-  heardAt = -Infinity;
-  received = 0;
-  /** Grows with every sample that becomes the newest. */
-  version = 0;
-  /** Column 0 is `takenAt`; a numeric field's column is in `columns`. */
-  readonly history = new Ring(1, BOUNDS.rows);
-  readonly columns = new Map<string, number>();
-  /** Whether charge and energy have the ROS 2 driver's units: counts of 1e-4 Ah are whole. */
-  ros2 = false;
-  /** Of fields of bytes the newest content that the car has kept, which is not that of every sample. */
-  readonly claims = new Map<string, { readonly claim: Claim; readonly takenAt: number }>();
-  private readonly arrivals = new Ring(1, BOUNDS.rows);
-  private readonly offset = new ClockOffset();
-  private readonly oldBoots: string[] = [];
-  private readonly row: number[] = [];
-
-  constructor(
-    readonly name: string,
-    private readonly table: FieldTable,
-    private readonly mayWiden: () => boolean,
-  ) {}
-
-  /** Take a newer sample; false for one that comes after a newer one, or twice. */
-  take(update: Update, now: number): boolean {
-    if (update.boot === this.boot) {
-      if (update.seq <= this.seq) return false;
-      // The car's clock was set back.
-      if (update.t_us < this.t_us) this.offset.reset();
-    } else {
-      if (this.oldBoots.includes(update.boot)) return false;
-      if (this.boot !== "") this.oldBoots.push(this.boot);
-      if (this.oldBoots.length > BOUNDS.boots) this.oldBoots.shift();
-      this.offset.reset();
-      this.ros2 = false;
-    }
-    ({ boot: this.boot, seq: this.seq, t_us: this.t_us, hops: this.hops, sample: this.sample } = update);
-    const t = update.t_us / 1e6;
-    this.takenAt = Math.min(now, t + this.offset.take(now - t, now));
-    this.heardAt = now;
-    this.received += 1;
-    this.version += 1;
-    this.arrivals.push([now]);
-    for (const [field, value] of update.sample) {
-      if (typeof value === "number" && !Number.isInteger(value) && this.table.fields[field]?.ros2_unit !== undefined) this.ros2 = true;
-    }
-    if (!(this.takenAt <= this.history.last(0))) this.keep(update.sample);
-    for (const field of claimed(update.sample).slice(0, BOUNDS.claims)) {
-      const kept = claim(field, (name) => update.sample.get(name));
-      if (kept && (this.claims.has(field) || this.claims.size < BOUNDS.claims)) this.claims.set(field, { claim: kept, takenAt: this.takenAt });
-    }
-    return true;
-  }
-
-  private keep(sample: ReadonlyMap<string, Value>): void {
-    const { row } = this;
-    row.fill(NaN);
-    row[0] = this.takenAt;
-    for (const [field, value] of sample) {
-      if (typeof value !== "number") continue;
-      let column = this.columns.get(field);
-      if (column === undefined) {
-        if (!this.mayWiden()) continue;
-        column = this.history.widen();
-        this.columns.set(field, column);
-      }
-      row[column] = value;
-    }
-    this.history.push(row);
-  }
-
-  /** Messages a second over the last two seconds. */
-  rate(now: number): number {
-    const times = this.arrivals.column(0, now - 2);
-    let n = 0;
-    for (const time of times) if (time > now - 2) n += 1;
-    return n / 2;
-  }
-}
-
-export class Robot {
-  readonly streams = new Map<string, Stream>();
-  /** Arrival, the total and the legs in milliseconds. */
-  readonly delays = new Ring(2 + LEGS.length, BOUNDS.delays);
-  /** The newest last. */
-  readonly faults: Fault[] = [];
-  heardAt = -Infinity;
-  takenAt = -Infinity;
-  version = 0;
-
-  constructor(readonly name: string) {}
-
-  freshness(now: number): Freshness {
-    if (now - this.heardAt > GONE_S) return "gone";
-    return now - this.takenAt > STALE_S ? "stale" : "live";
-  }
-
-  /** The stream whose fields are the motor controller's, if there is one. */
-  vesc(table: FieldTable): Stream | undefined {
-    const named = this.streams.get(table.stream);
-    if (named) return named;
-    for (const stream of this.streams.values()) {
-      if (stream.sample.has("voltage_input") && stream.sample.has("duty_cycle")) return stream;
-    }
-    return undefined;
-  }
-
-  /** The name of the fault that a stream reports, if any does. */
-  fault(table: FieldTable): string | undefined {
-    for (const { sample } of this.streams.values()) {
-      const name = faultName(sample.get("fault_code"), table);
-      if (name !== undefined) return name;
-    }
-    return undefined;
-  }
-
-  newestDelay(): Delay | undefined {
-    return this.delays.length === 0 ? undefined : asDelay((column) => this.delays.last(column));
-  }
-
-  medianDelay(now: number): Delay | undefined {
-    const from = now - MEDIAN_S;
-    const times = this.delays.column(0, from);
-    const skip = times.length > 0 && times[0]! < from ? 1 : 0;
-    if (times.length - skip === 0) return undefined;
-    return asDelay((column) => median(this.delays.column(column, from).subarray(skip)));
-  }
-
-  /** Keep the log of faults: one entry from the first sample that reports it to the last. */
-  logFault(stream: Stream, table: FieldTable, at: number): void {
-    const code = stream.sample.get("fault_code");
-    if (code === undefined) return;
-    const name = faultName(code, table);
-    const open = this.faults.findLast((fault) => fault.stream === stream.name && !fault.over);
-    if (open && open.name === name) open.until = at;
-    else {
-      if (open) open.over = true;
-      if (name === undefined) return;
-      this.faults.push({ since: at, until: at, name, stream: stream.name, over: false });
-      if (this.faults.length > BOUNDS.faults) this.faults.shift();
-    }
-  }
-}
-
-function faultName(code: Value | undefined, table: FieldTable): string | undefined {
-  if (typeof code !== "number" || code === 0) return undefined;
-  return `${table.faults[String(code)] ?? "unknown fault"} (${code})`;
-}
-
-function asDelay(column: (index: number) => number): Delay {
-  const legs = Object.fromEntries(LEGS.map((leg, i) => [leg, column(2 + i)])) as Record<Leg, number>;
-  return { total: column(1), ...legs };
-}
 
 export class Fleet {
   readonly robots = new Map<string, Robot>();
   received = 0;
   malformed = 0;
   outOfOrder = 0;
-  /** What was wrong with the last message refused. */
+  /** The reason of the last rejected message. */
   lastRefusal = "";
-  /** Grows when a car or a stream is heard for the first time, or forgotten. */
+  /** Grows when a car or a stream is new or forgotten. */
   shape = 0;
   private columns = 0;
   private vehicles: VehiclesAnswer["vehicles"];
@@ -238,7 +26,7 @@ export class Fleet {
     this.vehicles = config.vehicles;
   }
 
-  /** Take what arrived, and how many messages were refused with it. */
+  /** Take arrivals, and the number of messages rejected meanwhile. */
   take(arrivals: readonly Arrival[], refused: number, lastRefusal: string): void {
     this.received += arrivals.length + refused;
     this.malformed += refused;
@@ -273,20 +61,20 @@ export class Fleet {
     robot.delays.push([at, (wall_us - sent_us) / 1e3, ...legs.map((leg_us) => leg_us / 1e3)]);
   }
 
-  /** Metres a second of an erpm, which is gain times them and an offset; undefined for a car that is not known. */
+  /** The conversion from erpm to m/s; undefined if the car's parameters are unknown. */
   speed(robot: string): Linear | undefined {
     const { speed_to_erpm_gain: gain, speed_to_erpm_offset: offset = 0 } = (Object.hasOwn(this.vehicles, robot) && this.vehicles[robot]) || {};
     return gain ? { scale: 1 / gain, shift: offset === 0 ? 0 : -offset / gain } : undefined;
   }
 
-  /** Ask for the cars' parameters again: one was registered after the page was opened. */
+  /** Ask for the cars' parameters again: a car was registered after the page was opened. */
   private async learn(): Promise<void> {
     try {
       this.vehicles = (await ask<VehiclesAnswer>("vehicles", {})).vehicles;
-      // What stands on the page was written without.
+      // The page shows values without the new parameters.
       for (const robot of this.robots.values()) robot.version += 1;
     } catch (error) {
-      // Its speed is shown in erpm, as without a server that answers.
+      // The speed stays in erpm, as without a server.
       if (!(error instanceof AnswerError)) throw error;
     }
   }
@@ -298,7 +86,7 @@ export class Fleet {
       for (const { columns } of silent.streams.values()) this.columns -= columns.size;
     }
     if (this.config.answers && !Object.hasOwn(this.vehicles, name)) {
-      // Twenty cars that come at once are one question.
+      // Several new cars at once are one request.
       this.learning ??= this.learn().finally(() => (this.learning = undefined));
     }
     const robot = new Robot(name);
@@ -306,14 +94,4 @@ export class Fleet {
     this.shape += 1;
     return robot;
   }
-}
-
-export function numeric(value: Value | undefined): number {
-  return typeof value === "number" ? value : NaN;
-}
-
-export function median(values: Float64Array): number {
-  const sorted = values.slice().sort();
-  const middle = sorted.length >> 1;
-  return sorted.length % 2 === 1 ? sorted[middle]! : (sorted[middle - 1]! + sorted[middle]!) / 2;
 }

@@ -1,20 +1,20 @@
-// The connection to PubNub. The SDK gives up after a few failures and, when it comes back, delivers what
-// it missed; a live page must neither give up nor fall behind, so it starts a new subscription each time.
+// The connection to PubNub. The SDK gives up after a few failures, and after a reconnect it delivers old
+// messages. A live page must neither give up nor fall behind, so this starts a new subscription each time.
 
 import type PubNubSdk from "pubnub";
 import type { LinkState, Listening } from "./worker_messages";
 
-// The SDK's licence lets unmodified copies be passed on, so it is not bundled: it comes as its own file.
+// The SDK's licence allows unmodified copies, so the SDK is not bundled: it is a file of its own.
 declare function importScripts(...urls: string[]): void;
 declare const PubNub: typeof PubNubSdk;
 
 const FIRST_RETRY_S = 0.5;
 const LAST_RETRY_S = 5;
 const REFUSED_RETRY_S = 30;
-// With nothing heard for this long, a time request tells a quiet fleet from a dead connection.
+// After this time without a message, a time request tells a quiet fleet from a dead connection.
 const PROBE_S = 8;
 const ANSWER_S = 5;
-// PubNub bills every message to every page, so one that nobody sees stops listening after this long.
+// PubNub bills every message to every page, so a hidden page stops listening after this time.
 const HIDDEN_S = 60;
 
 const REASONS: Readonly<Record<string, string>> = {
@@ -35,7 +35,7 @@ export class PubNubLink {
   private heardAt = 0;
   private probing = false;
   private visible = true;
-  /** Statuses of a subscription that was given up may still arrive. */
+  /** Late statuses of an ended subscription are ignored. */
   private subscribed = false;
 
   constructor(
@@ -81,7 +81,7 @@ export class PubNubLink {
     this.retry = self.setTimeout(() => this.lose("PubNub does not answer", FIRST_RETRY_S), ANSWER_S * 1000);
   }
 
-  /** Whether anybody looks at the page. */
+  /** Take whether the page is visible. */
   seen(visible: boolean): void {
     this.visible = visible;
     self.clearTimeout(this.pause);

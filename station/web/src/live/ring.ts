@@ -1,6 +1,6 @@
 /**
- * The newest `capacity` rows of numbers, in columns that never grow. Each column is twice as long as
- * needed, so that the rows always lie side by side: when the end is reached, they move to the front.
+ * The newest `capacity` rows of numbers, in columns of fixed length. Each column is twice as long as needed, so
+ * that the rows are always contiguous: at the end, they move to the front.
  */
 export class Ring {
   private readonly columns: Float64Array[];
@@ -22,7 +22,7 @@ export class Ring {
     return this.columns.length;
   }
 
-  /** Another column, without values so far; its index. */
+  /** Add an empty column, and return its index. */
   widen(): number {
     this.columns.push(new Float64Array(2 * this.capacity).fill(NaN));
     return this.columns.length - 1;
@@ -39,17 +39,17 @@ export class Ring {
     if (this.length > this.capacity) this.first += 1;
   }
 
-  /** The newest value of a column, NaN where there is none. */
+  /** The newest value of a column; NaN without one. */
   last(column: number): number {
     return this.length > 0 ? (this.columns[column]?.[this.end - 1] ?? NaN) : NaN;
   }
 
-  /** A column from the row before `from` on (so that a line enters from the left); no copy. */
+  /** A column from the row before `from` on, so that a line enters from the left. It is not a copy. */
   column(index: number, from = -Infinity): Float64Array {
     return this.columns[index]!.subarray(Math.max(this.first, this.search(from) - 1), this.end);
   }
 
-  /** The first row whose first column, which only grows, is at least `from`. */
+  /** The first row whose time, in column 0, is at least `from`. */
   private search(from: number): number {
     const times = this.columns[0]!;
     let [low, high] = [this.first, this.end];

@@ -1,5 +1,5 @@
-// The live update as Lambda 1 sends it (iort_contract.live_update), checked field by field: whatever else
-// arrives on the channel is refused with a reason.
+// The live update as Lambda 1 sends it (iort_contract.live_update), checked field by field. Any other
+// message on the channel is rejected with a reason.
 
 import { BOOT, FIELD_NAME, MAX_FIELDS, NAME, type Value } from "../base/contract";
 
@@ -7,7 +7,7 @@ export interface Hops {
   readonly sent_us: number;
   readonly received_ms: number;
   readonly lambda_us: number;
-  /** What to add to the car's times to have the cloud's; 0 where the car does not know. */
+  /** Added to the car's times, it gives the cloud's; 0 if the car has not measured it. */
   readonly offset_us: number;
   readonly offset_known: boolean;
 }
@@ -22,7 +22,7 @@ export interface Update {
   readonly sample: ReadonlyMap<string, Value>;
 }
 
-/** The update, or what is wrong with it. Whose it is follows from the channel, never from the body. */
+/** The update, or the reason of its rejection. The channel names the robot, never the body. */
 export function parseUpdate(namespace: string, version: number, channel: string, message: unknown): Update | string {
   const robot = channel.startsWith(`${namespace}.`) ? channel.slice(namespace.length + 1) : "";
   if (!NAME.test(robot)) return "a channel that names no robot";

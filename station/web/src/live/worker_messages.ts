@@ -1,4 +1,4 @@
-// What the page and its worker say to each other.
+// The messages between the page and its worker.
 
 import type { Update } from "./update";
 
@@ -8,7 +8,7 @@ export type LinkState =
   | { readonly kind: "live"; readonly downFor: number | undefined }
   | { readonly kind: "lost"; readonly since: number; readonly retryAt: number; readonly reason: string };
 
-/** Where to listen, and as whom. */
+/** The settings of the subscription. */
 export interface Listening {
   readonly namespace: string;
   readonly version: number;
@@ -22,15 +22,15 @@ export interface Listening {
 export type ToWorker =
   | { readonly kind: "start"; readonly listening: Listening }
   | { readonly kind: "visible"; readonly visible: boolean }
-  /** The page has taken what was handed over, and is ready for more. */
+  /** The page has processed the last handover, and is ready for the next. */
   | { readonly kind: "taken" };
 
-/** An update, and when it came: on the page's clock in seconds, and by the time of day in microseconds. */
+/** An update and its arrival: on the page's clock in seconds, and as wall time in microseconds. */
 export interface Arrival {
   readonly update: Update;
   readonly at: number;
   readonly wall_us: number;
-  /** When PubNub took it, in microseconds since the epoch, by PubNub's clock. */
+  /** The time at which PubNub took it, in microseconds since the epoch, by PubNub's clock. */
   readonly pubnub_us: number;
 }
 

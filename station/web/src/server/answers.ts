@@ -2,7 +2,7 @@
 
 export class AnswerError extends Error {}
 
-/** Ask the server; raises `AnswerError` with words for the viewer where there is no answer. */
+/** Ask the server; throws `AnswerError` with a text for the viewer if it does not answer. */
 export async function ask<T>(name: string, parameters: Readonly<Record<string, string>>, signal?: AbortSignal): Promise<T> {
   let answer: Response;
   try {

@@ -1,4 +1,4 @@
-// What the server that serves the page tells it: where to listen.
+// The page's configuration from its server.
 
 import type { Config } from "../base/contract";
 

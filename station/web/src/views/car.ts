@@ -1,10 +1,11 @@
-// One car in full: gauges, charts, the delay by hop, planes, faults, and every field of every stream.
+// One car in full: gauges, charts, the delay by hop, XY charts, faults, and every field of every stream.
 
 import type { FieldTable } from "../base/contract";
 import type { Shown } from "../charts/live_chart";
 import { byName, el, setAttribute, Text } from "../base/dom";
 import { FaultLog } from "../widgets/fault_log";
-import { median, MEDIAN_S, numeric, WINDOW_S, type Fleet, type Robot, type Stream } from "../live/fleet";
+import type { Fleet } from "../live/fleet";
+import { median, MEDIAN_S, numeric, WINDOW_S, type Robot, type Stream } from "../live/robot";
 import { age, AS_SENT, linear, spec, type Linear } from "../base/format";
 import { Gauge } from "../charts/gauge";
 import { ChartPanel } from "../charts/chart_panel";
@@ -12,16 +13,16 @@ import { XYChart, type Track } from "../charts/xy_chart";
 import { Ring } from "../live/ring";
 import { fieldKey, StreamSection } from "../widgets/field_tiles";
 import { Waterfall } from "../charts/waterfall";
-import { DELAY_PANEL, GAUGES, XY_CHARTS, VESC_PANELS, type XYChartSpec } from "../charts/car_charts";
+import { DELAY_CHART, GAUGES, XY_CHARTS, LINE_CHARTS, type XYChartSpec } from "../charts/car_charts";
 
 const MOST_CHOSEN = 6;
-// Values are written at most 25 times a second.
+// Values are updated at most 25 times a second.
 const SCREENS = 25 * MEDIAN_S;
 
 interface ShownXYChart {
   readonly spec: XYChartSpec;
   readonly node: HTMLElement;
-  readonly plane: XYChart;
+  readonly chart: XYChart;
   source: { readonly stream: Stream; readonly x: string; readonly y: string; readonly as: Linear } | undefined;
   unit: string;
 }
@@ -38,14 +39,14 @@ export class CarView {
   private readonly streams = el("div", { class: "streams" });
   private readonly panels: readonly ChartPanel[];
   private readonly delay: ChartPanel;
-  private readonly planes: readonly ShownXYChart[];
+  private readonly xyCharts: readonly ShownXYChart[];
   private readonly waterfall = new Waterfall();
   private readonly faults = new FaultLog();
   private readonly sections = new Map<Stream, StreamSection>();
   private readonly chosen = new Map<string, { readonly panel: ChartPanel; readonly stream: Stream; readonly field: string; ros2: boolean }>();
   private robot: Robot | undefined;
   private drawn = -1;
-  /** When a message was drawn, and how long that was after its arrival, in milliseconds. */
+  /** The time at which a message was drawn, and its delay since arrival in milliseconds. */
   private screens = new Ring(2, SCREENS);
 
   constructor(
@@ -56,25 +57,25 @@ export class CarView {
     this.gauges = GAUGES.map((each) => new Gauge(each));
     this.gaugeRow.append(...this.gauges.map(({ node }) => node));
     const aside = el("aside", { class: "aside" });
-    this.panels = VESC_PANELS.map((options) => new ChartPanel(this.charts, options));
+    this.panels = LINE_CHARTS.map((options) => new ChartPanel(this.charts, options));
     aside.append(this.waterfall.node);
-    this.delay = new ChartPanel(aside, DELAY_PANEL);
-    const planeRow = el("div", { class: "planes" });
-    this.planes = XY_CHARTS.map((spec) => {
+    this.delay = new ChartPanel(aside, DELAY_CHART);
+    const xyRow = el("div", { class: "xy-charts" });
+    this.xyCharts = XY_CHARTS.map((spec) => {
       const host = el("div", { class: "plot", "aria-hidden": "true" });
       const node = el("section", { class: "panel", "aria-label": spec.title }, el("header", {}, el("h3", {}, spec.title), el("p", { class: "note" }, `last ${WINDOW_S} s`)), host);
-      planeRow.append(node);
-      const shown: ShownXYChart = { spec, node, plane: new XYChart(host, { ...spec, x: () => spec.x + shown.unit }), source: undefined, unit: "" };
+      xyRow.append(node);
+      const shown: ShownXYChart = { spec, node, chart: new XYChart(host, { ...spec, x: () => spec.x + shown.unit }), source: undefined, unit: "" };
       return shown;
     });
-    planeRow.append(this.faults.node);
+    xyRow.append(this.faults.node);
     this.node = el(
       "article",
       { class: "car", id: "car" },
       el("header", { class: "car-head" }, this.title.node, this.state.node, this.fault, tools),
       this.gaugeRow,
       el("div", { class: "board" }, this.charts, aside),
-      planeRow,
+      xyRow,
       this.chosenCharts,
       this.streams,
     );
@@ -94,7 +95,7 @@ export class CarView {
     this.arrange();
   }
 
-  /** Sections for the streams there are; called when a stream is heard for the first time. */
+  /** Make a section for each stream; called when a stream is new. */
   private arrange(): void {
     const { robot, table } = this;
     if (!robot) return;
@@ -115,7 +116,7 @@ export class CarView {
     }
   }
 
-  /** Chart a field, or no longer. */
+  /** Chart a field, or remove its chart. */
   private choose(stream: Stream, field: string): void {
     const key = fieldKey(stream.name, field);
     if (this.chosen.has(key)) {
@@ -141,7 +142,7 @@ export class CarView {
     this.chosen.delete(key);
   }
 
-  /** What changes with every message. */
+  /** Update what changes with a message. */
   values(now: number): void {
     const { robot, table } = this;
     if (!robot || robot.version === this.drawn) return;
@@ -156,7 +157,7 @@ export class CarView {
       this.gauges[i]!.set(show.value, least, most, show.unit, show.digits);
     });
     this.panels.forEach((panel, i) => {
-      const { fields, as } = VESC_PANELS[i]!;
+      const { fields, as } = LINE_CHARTS[i]!;
       panel.show(shown(vesc, fields), ...as(speed));
       panel.update(fields.map(newest));
     });
@@ -179,7 +180,7 @@ export class CarView {
   }
 
   private findPlanes(robot: Robot, speed: Linear | undefined): void {
-    for (const each of this.planes) {
+    for (const each of this.xyCharts) {
       each.source = undefined;
       if (each.spec.speed) each.unit = speed ? ", m/s" : ", erpm";
       for (const stream of robot.streams.values()) {
@@ -193,7 +194,7 @@ export class CarView {
     }
   }
 
-  /** What changes with time alone. */
+  /** Update what changes with time. */
   clock(now: number, linked: boolean): void {
     const { robot } = this;
     if (!robot) return;
@@ -215,10 +216,10 @@ export class CarView {
   draw(now: number): void {
     if (!this.robot) return;
     const panels = [...(this.charts.hidden ? [] : this.panels), this.delay, ...[...this.chosen.values()].map(({ panel }) => panel)];
-    // All in the same frame: a frame costs more than what is drawn in it.
+    // All in the same frame: a frame costs more than its charts.
     if (!panels.some((panel) => panel.due(now))) return;
     for (const panel of panels) panel.draw(now);
-    for (const { plane, source } of this.planes) if (source) plane.draw(now, () => track(source, now));
+    for (const { chart, source } of this.xyCharts) if (source) chart.draw(now, () => track(source, now));
   }
 }
 
@@ -232,7 +233,7 @@ function track({ stream, x, y, as }: NonNullable<ShownXYChart["source"]>, now: n
   return { x: as === AS_SENT ? across : across.map((value) => linear(value, as)), y: column(y) };
 }
 
-/** The least and the most of a field in the last while. */
+/** The minimum and maximum of a field in the last 30 s. */
 function span(stream: Stream, field: string, now: number, as: Linear): [number, number] {
   const column = stream.columns.get(field);
   if (column === undefined) return [NaN, NaN];

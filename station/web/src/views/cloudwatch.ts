@@ -1,4 +1,4 @@
-// CloudWatch's dashboards as they are deployed, drawn from the metrics that the cloud has.
+// CloudWatch's deployed dashboards, drawn from the cloud's metrics.
 
 import type { Alarm, Config, Dashboard, Series, Widget } from "../base/contract";
 import { ask, AnswerError } from "../server/answers";
@@ -69,7 +69,7 @@ export class CloudWatchView {
       const dashboard = await ask<Dashboard>("dashboard", { name: this.choice.value, minutes: this.range.value }, loading.signal);
       if (loading.signal.aborted) return;
       this.draw(dashboard);
-      // The dashboard ends with the minute that is running.
+      // The dashboard ends with the current minute.
       const at = Date.now() / 1000;
       this.note.set(`as of ${clockTime(at)} ${zone(at)}, again every ${REFRESH_S} s`);
     } catch (error) {
@@ -176,7 +176,7 @@ function aligned({ times_s, values }: Series, times: readonly number[]): (number
   return times.map((at) => known.get(at) ?? null);
 }
 
-/** Headings, and the rest as it is written: text of a dashboard is no more HTML than a robot's. */
+/** Headings and paragraphs; a dashboard's text is never read as HTML. */
 function markdown(text: string): HTMLElement[] {
   return text.split("\n").filter((line) => line.trim() !== "").map((line) => {
     const heading = /^#+\s+(.*)$/.exec(line);

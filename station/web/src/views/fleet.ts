@@ -3,7 +3,8 @@
 import type { Config, FieldTable } from "../base/contract";
 import { AbsentCars } from "../widgets/absent_cars";
 import { byName, el, setAttribute, Text } from "../base/dom";
-import { numeric, type Fleet, type Robot } from "../live/fleet";
+import type { Fleet } from "../live/fleet";
+import { numeric, type Robot } from "../live/robot";
 import { age, linear, milliseconds, NOTHING, number } from "../base/format";
 import { route } from "../base/route";
 import { Sparkline } from "../charts/sparkline";
@@ -58,7 +59,7 @@ export class FleetView {
   private key(event: KeyboardEvent): void {
     const cards = [...this.nav.children] as HTMLElement[];
     const at = cards.indexOf(document.activeElement as HTMLElement);
-    // As many cards as stand in the first row.
+    // The number of cards in the first row.
     const columns = Math.max(1, cards.filter((card) => card.offsetTop === cards[0]!.offsetTop).length);
     const to = { ArrowRight: at + 1, ArrowLeft: at - 1, ArrowDown: at + columns, ArrowUp: at - columns, Home: 0, End: cards.length - 1 }[event.key];
     if (at < 0 || to === undefined) return;
@@ -107,7 +108,7 @@ class Card {
     this.state.set({ live: "online", stale: "stale", gone: "gone", unlinked: "no link" }[shown]);
     this.freshness.set(age(now - (fresh === "gone" ? robot.heardAt : robot.takenAt)));
     const fault = robot.fault(table);
-    // Of a car that is gone nobody knows.
+    // The state of a car that is gone is unknown.
     this.fault.set(fresh === "gone" ? (fault ? `${fault}, when last heard` : "not heard from") : (fault ?? "no fault"));
     setAttribute(this.node, "data-fault", String(fault !== undefined));
     const vesc = robot.vesc(table);

@@ -1,4 +1,4 @@
-// What a car did: a range from the cloud's table, to scrub through and to hold against what it does now.
+// A car's past: a range from the cloud's table, to scrub through and to compare with the live values.
 
 import type { Config, HistoryAnswer, FieldTable } from "../base/contract";
 import { ask, AnswerError } from "../server/answers";
@@ -14,7 +14,7 @@ import { Comparison } from "../widgets/comparison";
 const RANGES = [["1 min", 60], ["5 min", 300], ["15 min", 900], ["1 h", 3600]] as const;
 const FIRST_FIELDS = ["speed", "voltage_input", "current_motor", "current_input", "duty_cycle", "temperature_pcb"];
 const MOST_CHARTS = 12;
-// Rows asked for: about as many as a wide chart has points across.
+// The rows of a request: about the width of a chart in points.
 const ROWS = 1500;
 const STEP_MS = 100;
 
@@ -35,7 +35,7 @@ export class HistoryView {
   private readonly charts = el("div", { class: "charts three" });
   private readonly pictures = el("div", { class: "tiles pictures" });
   private readonly comparison: Comparison;
-  /** Of each field of bytes its picture, and the rows in which the car has kept one. */
+  /** For each field of bytes its thumbnail, and the rows that have one. */
   private readonly kept = new Map<string, { readonly picture: Thumbnail; readonly rows: readonly number[] }>();
   private readonly shown = new Map<string, { readonly node: HTMLElement; readonly chart: RangeChart }>();
   private robot: string | undefined;
@@ -124,7 +124,7 @@ export class HistoryView {
     void this.load(to - range_s, to);
   }
 
-  /** The zone of the times in the form, which in another season is another one. */
+  /** Show the time zone of the form's times; it may change with the season. */
   private sayZone(): void {
     const zones = [this.from, this.to].map(seconds).filter((at) => !Number.isNaN(at)).map(zone);
     this.zone.set([...new Set(zones)].join(" to "));
@@ -145,7 +145,7 @@ export class HistoryView {
       const drive = await ask<HistoryAnswer>("history", asked, loading.signal);
       if (loading.signal.aborted) return;
       this.set(drive, [from_s, to_s]);
-      const each = drive.row_s > 0 ? `, drawn as the mean of ${drive.row_s < 1 ? `${number(drive.row_s * 1000, 0)} ms` : age(drive.row_s)} each within its least and most` : "";
+      const each = drive.row_s > 0 ? `, averaged per ${drive.row_s < 1 ? `${number(drive.row_s * 1000, 0)} ms` : age(drive.row_s)}, band = min to max` : "";
       this.note.set(drive.samples === 0 ? "Nothing was stored in this range." : `${number(drive.samples)} samples in ${age((performance.now() - began) / 1000)}${each}.`);
     } catch (error) {
       if (!loading.signal.aborted) this.note.set(words(error));
@@ -171,7 +171,7 @@ export class HistoryView {
     const charted = fields.filter((field) => drive.fields[field]!.mean.some((value) => typeof value === "number"));
     const wanted = charted.filter((field) => (before.size > 0 ? before.has(field) : FIRST_FIELDS.includes(field)));
     const [first, last] = [drive.times_s[0]!, drive.times_s.at(-1)!];
-    // The range that was asked for may reach far beyond what there is.
+    // The data may cover only a part of the requested range.
     const range: readonly [number, number] = [Math.max(asked[0], first - 0.5), Math.min(asked[1], last + 0.5)];
     this.chips.replaceChildren(
       ...charted.map((field) => {
@@ -194,7 +194,7 @@ export class HistoryView {
     return asSpeed(field, spec(field, this.table, this.drive?.ros2), this.fleet.speed(this.robot ?? ""));
   }
 
-  /** Pictures for the fields of bytes; all other fields. */
+  /** Make thumbnails for the fields of bytes, and return the other fields. */
   private look(drive: HistoryAnswer): string[] {
     const all = new Map(Object.entries(drive.fields));
     const ofBytes = claimed(all);
@@ -258,7 +258,7 @@ export class HistoryView {
     this.at.set(text);
     setAttribute(this.scrub, "aria-valuetext", text);
     for (const [field, { picture, rows }] of this.kept) {
-      // The newest that had been taken by then; before the first there is none, and the first is shown.
+      // The newest thumbnail of that time; before the first one, the first.
       const row = rows.findLast((each) => each <= index) ?? rows[0];
       if (row === undefined) continue;
       picture.set(claim(field, (name) => drive.fields[name]?.mean[row] ?? null));
@@ -295,7 +295,7 @@ function words(error: unknown): string {
   return error instanceof AnswerError ? error.message : `The answer could not be read: ${String(error)}`;
 }
 
-/** A time as the input wants it, in this device's time zone. */
+/** A time in the input's format, in this device's time zone. */
 function local(at: number): string {
   return new Date((at - new Date(at * 1000).getTimezoneOffset() * 60) * 1000).toISOString().slice(0, 19);
 }

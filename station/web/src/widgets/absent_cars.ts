@@ -1,4 +1,4 @@
-// The registered cars that this page has not heard: since when they are away, and the way to their past.
+// The registered cars that this page has not heard: since when they are offline, and a link to their past.
 
 import type { Config, RobotPresence, RobotsAnswer } from "../base/contract";
 import { ask, AnswerError } from "../server/answers";
@@ -20,7 +20,7 @@ export class AbsentCars {
     private readonly fleet: Fleet,
   ) {}
 
-  /** Ask while it is looked at; a page without a server to ask knows of no car but those it hears. */
+  /** Ask while the view is shown; a page without a server knows only the cars that it hears. */
   show(shown: boolean): void {
     window.clearInterval(this.timer);
     if (!shown || !this.config.answers) return;
@@ -28,7 +28,7 @@ export class AbsentCars {
     this.timer = window.setInterval(() => !document.hidden && void this.find(), REFRESH_S * 1000);
   }
 
-  /** List those that are registered and not heard. */
+  /** List the registered cars that are not heard. */
   arrange(): void {
     const away = Object.keys(this.robots).filter((name) => !this.fleet.robots.has(name)).sort(byName);
     const rows = away.map((name) => [name, state(this.robots[name]!)] as const);
@@ -47,7 +47,7 @@ export class AbsentCars {
       this.robots = (await ask<RobotsAnswer>("robots", {})).robots;
       this.arrange();
     } catch (error) {
-      // What was known stays; that the server does not answer is said where it is asked for more.
+      // The list stays as it was; other views report that the server does not answer.
       if (!(error instanceof AnswerError)) throw error;
     }
   }

@@ -1,8 +1,8 @@
-// Two columns of values: at the time that the viewer looks at, and now.
+// A table of values: at the time under the cursor, and now.
 
 import type { Value } from "../base/contract";
 import { el, Text } from "../base/dom";
-import type { Stream } from "../live/fleet";
+import type { Stream } from "../live/robot";
 import { NOTHING, number, write, type Spec } from "../base/format";
 
 interface Row {

@@ -1,7 +1,7 @@
-// The faults that this page has heard of since it was opened, the newest first.
+// The faults since this page was opened, the newest first.
 
 import { el, setAttribute, Text } from "../base/dom";
-import type { Fault, Robot } from "../live/fleet";
+import type { Fault, Robot } from "../live/robot";
 import { age, clockTime, zone } from "../base/format";
 
 const SHOWN = 6;

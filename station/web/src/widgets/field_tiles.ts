@@ -1,15 +1,15 @@
-// A stream's heading, and a tile for each of its fields: the newest value, its unit and its last 30 seconds;
-// of a field of bytes, the newest picture.
+// A stream's heading, and a tile for each of its fields: the newest value, its unit and its last 30 seconds. A field
+// of bytes has its newest thumbnail.
 
-import { STALE_S, type FieldTable } from "../base/contract";
 import { claimed, partsOf } from "../live/attachments";
 import { el, setAttribute, Text } from "../base/dom";
-import { numeric, type Stream } from "../live/fleet";
+import { STALE_S, type FieldTable } from "../base/contract";
+import { numeric, type Stream } from "../live/robot";
 import { age, spec, write, type Spec } from "../base/format";
 import { Thumbnail } from "./thumbnail";
 import { Sparkline } from "../charts/sparkline";
 
-/** The name under which a field is charted: fields of two streams may have the same name. */
+/** A field's key: two streams may have fields of the same name. */
 export const fieldKey = (stream: string, field: string): string => `${stream}/${field}`;
 
 class Tile {
@@ -38,7 +38,7 @@ class Tile {
     if (choose) this.node.addEventListener("click", choose);
   }
 
-  /** Write from now on as this says. */
+  /** Change the format. */
   write(spec: Spec): void {
     this.spec = spec;
     this.unit.set(spec.unit);
@@ -70,7 +70,7 @@ export class StreamSection {
   constructor(
     private readonly stream: Stream,
     private readonly table: FieldTable,
-    /** Shown elsewhere, as gauges. */
+    /** Fields that are shown as gauges. */
     private readonly except: ReadonlySet<string>,
     private readonly choose: (field: string) => void,
   ) {
@@ -82,7 +82,7 @@ export class StreamSection {
     );
   }
 
-  /** The newest values. */
+  /** Show the newest values. */
   values(): void {
     const { stream } = this;
     if (stream.version === this.drawn) return;
@@ -96,7 +96,7 @@ export class StreamSection {
     for (const [field, picture] of this.pictures) picture.set(stream.claims.get(field)?.claim);
   }
 
-  /** What changes with time. */
+  /** Update what changes with time. */
   clock(now: number, charted: ReadonlySet<string>): void {
     const { stream } = this;
     const old = now - stream.takenAt;
@@ -110,7 +110,7 @@ export class StreamSection {
     for (const [field, picture] of this.pictures) picture.old(now - (stream.claims.get(field)?.takenAt ?? NaN));
   }
 
-  /** A tile for every field ever seen of this stream, the contract's first and in its order. */
+  /** Make a tile for every field of this stream, those of the contract first, in its order. */
   private arrange(): void {
     const ofBytes = claimed(this.stream.sample);
     for (const field of ofBytes) {

@@ -1,11 +1,11 @@
-// A log widget: what its query finds, as a table. Asked for by itself, because Logs Insights takes seconds.
+// A log widget: the rows of its query. It has a request of its own, because Logs Insights takes seconds.
 
 import type { Logs } from "../base/contract";
 import { ask, AnswerError } from "../server/answers";
 import { el, Text } from "../base/dom";
 import { clockTime, dayTime, zone } from "../base/format";
 
-// AWS bills a query by what it reads.
+// AWS bills a query by the bytes that it reads.
 const AGAIN_S = 60;
 
 export class LogTable {
@@ -13,7 +13,7 @@ export class LogTable {
   private readonly note = new Text("note", "p", { role: "status" });
   private readonly host = el("div", { class: "log", role: "region", tabindex: "0" });
   private askedAt = -Infinity;
-  // A query may take longer than the dashboard beside it stays the newest.
+  // A query may take longer than the dashboard's refresh period.
   private asking: AbortController | undefined;
 
   constructor(
@@ -24,7 +24,7 @@ export class LogTable {
     this.node = el("div", { class: "log-widget" }, this.host, this.note.node);
   }
 
-  /** Ask anew, unless that has just been done; what was found before stays until there is an answer. */
+  /** Ask again, unless the last request is recent; the old rows stay until the answer. */
   async refresh(): Promise<void> {
     const now = performance.now() / 1000;
     if (this.asking || now - this.askedAt < AGAIN_S) return;
@@ -41,7 +41,7 @@ export class LogTable {
     }
   }
 
-  /** Wait for no answer any longer. */
+  /** Cancel the request. */
   stop(): void {
     this.asking?.abort();
   }

@@ -1,4 +1,4 @@
-// The bar above and the line below every view: who is there, whether the connection holds, what was refused.
+// The bar above and the line below every view: the cars, the connection, the rejected messages.
 
 import type { Config, FieldTable } from "../base/contract";
 import { byId, setAttribute } from "../base/dom";
@@ -32,7 +32,7 @@ export class StatusBar {
     for (const robot of fleet.robots.values()) count[robot.freshness(at)] += 1;
     const counts = (["live", "stale", "gone"] as const).filter((state) => count[state] > 0);
     const words = counts.map((state) => `${count[state]} ${state === "live" ? "online" : state}`);
-    // Of a car that is gone nobody knows.
+    // The state of a car that is gone is unknown.
     const faulty = [...fleet.robots.values()].filter((robot) => robot.freshness(at) !== "gone" && robot.fault(this.table) !== undefined).length;
     write("count", words.join(" · "));
     write("faulty", faulty === 0 ? "" : `${faulty} with a fault`);

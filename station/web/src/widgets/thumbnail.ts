@@ -1,17 +1,16 @@
-// A thumbnail on a canvas. It is decoded from its bytes and never by address, so that the page's policy can
-// go on to allow no pictures but its own; and never before its size is known, because three kilobytes can
-// claim to be a picture of a billion pixels.
+// A thumbnail on a canvas. It is decoded from its bytes and never loaded by address, because the page's policy
+// allows no pictures but its own. Its size is checked first: three kilobytes can claim a billion pixels.
 
 import { bytes, type Claim } from "../live/attachments";
 import { el, setAttribute, Text } from "../base/dom";
 import { age } from "../base/format";
 
-// The cars' are of 96 pixels; see device/iort_agent/lanes/thumbnail.py.
+// The cars' thumbnails have 96 pixels; see device/iort_agent/lanes/thumbnail.py.
 const MOST_PIXELS = 256;
-// Of a frame, whatever it is coded by; the three of the range that are none are tables (ITU T.81, table B.1).
+// The marker of a frame of any coding; three markers of the range are tables (ITU T.81, table B.1).
 const START_OF_FRAME = (marker: number): boolean => marker >= 0xc0 && marker <= 0xcf && ![0xc4, 0xc8, 0xcc].includes(marker);
-// What may come before it: tables, the application's own and comments. All of them say their length; behind
-// what does not, a decoder would look for the next marker elsewhere than this does.
+// Markers that may come before it: tables, the application's own and comments. All have a length; after a marker
+// without one, a decoder would look for the next marker in another place.
 const BEFORE_FRAME = (marker: number): boolean => [0xc4, 0xdb, 0xdd, 0xfe].includes(marker) || (marker >= 0xe0 && marker <= 0xef);
 
 export class Thumbnail {
@@ -34,7 +33,7 @@ export class Thumbnail {
     this.state.set("no picture yet");
   }
 
-  /** Show what a claim has; none keeps what stands there, as the car keeps not every picture. */
+  /** Show an attachment; undefined keeps the last one, because the car does not keep every picture. */
   set(claim: Claim | undefined): void {
     if (!claim) return;
     const { key, size, contentType, thumbnail } = claim;
@@ -44,12 +43,12 @@ export class Thumbnail {
     else if (thumbnail !== this.shown) void this.decode(thumbnail);
   }
 
-  /** When the content was taken, in words. */
+  /** Show the time of the content, in words. */
   when(text: string): void {
     this.taken.set(text);
   }
 
-  /** How old it is, live. */
+  /** Show the age of the content. */
   old(seconds: number): void {
     this.when(Number.isFinite(seconds) ? `${age(seconds)} old` : "");
   }
@@ -64,7 +63,7 @@ export class Thumbnail {
     this.shown = base64;
     const jpeg = jpegOf(base64);
     const bitmap = jpeg && (await createImageBitmap(new Blob([jpeg], { type: "image/jpeg" })).catch(() => undefined));
-    // Another one has come meanwhile.
+    // A newer one has arrived meanwhile.
     if (this.shown !== base64) return bitmap?.close();
     if (!bitmap) return this.blank("a thumbnail that is no picture");
     [this.canvas.width, this.canvas.height] = [bitmap.width, bitmap.height];
@@ -76,7 +75,7 @@ export class Thumbnail {
   }
 }
 
-/** The bytes of a JPEG that says to be small; undefined for anything else. */
+/** The bytes of a JPEG with a small size in its header; undefined for anything else. */
 export function jpegOf(base64: string): Uint8Array<ArrayBuffer> | undefined {
   let data: Uint8Array<ArrayBuffer>;
   try {
@@ -85,7 +84,7 @@ export function jpegOf(base64: string): Uint8Array<ArrayBuffer> | undefined {
     return undefined;
   }
   if (data[0] !== 0xff || data[1] !== 0xd8) return undefined;
-  // Segments: a marker of two bytes, and a length that counts itself, until the frame's, which has its size.
+  // Segments have a marker of two bytes and a length that counts itself; the frame's segment has the size.
   const view = new DataView(data.buffer);
   for (let at = 2; at + 9 <= data.length && data[at] === 0xff; at += 2 + view.getUint16(at + 2)) {
     if (BEFORE_FRAME(data[at + 1]!)) continue;

@@ -1,29 +1,24 @@
-"""`iort plot`: pictures of what was recorded."""
+"""`iort plot`: pictures of recorded samples."""
 
 from __future__ import annotations
 
 from dataclasses import replace
 from enum import Enum
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import Annotated, Any
 
 import typer
 
 from iort_station.cli.options import Every, From, Last, Range, Robot, Stream, To, names
 from iort_station.cli.progress import reading, say
+from iort_station.cloud import Cloud
 from iort_station.errors import StationError
 
-if TYPE_CHECKING:
-    from iort_station.cli.plots import Run
-    from iort_station.cloud import Cloud
-
 commands = typer.Typer()
-_PANELS = 4
-_USUAL = {"vesc": ("speed_mps", "current_motor", "voltage_input", "temperature_pcb")}
 
 
 class Kind(str, Enum):
-    """What a picture shows."""
+    """The content of a picture."""
 
     time = "time"
     trajectory = "trajectory"
@@ -31,7 +26,7 @@ class Kind(str, Enum):
 
 
 class Align(str, Enum):
-    """What several runs have in common."""
+    """The common origin of several runs."""
 
     time = "time"
     start = "start"
@@ -44,29 +39,27 @@ def plot(
     stream: Stream,
     output: Annotated[Path, typer.Option("--output", "-o", help="The picture: .png, .svg or .pdf.")],
     kind: Annotated[
-        Kind, typer.Option(help="Fields over time, where it went, or how values are distributed.")
+        Kind, typer.Option(help="Fields over time, the way from above, or the distribution of values.")
     ] = Kind.time,
-    fields: Annotated[str | None, typer.Option(help="Fields to draw, with commas between.")] = None,
+    fields: Annotated[str | None, typer.Option(help="Comma-separated fields to draw.")] = None,
     start: From = None,
     end: To = None,
     last: Last = None,
-    also: Annotated[
-        list[str] | None, typer.Option("--with", help="Another robot; give it again for more.")
-    ] = None,
+    also: Annotated[list[str] | None, typer.Option("--with", help="Another robot; may be repeated.")] = None,
     runs: Annotated[
         list[str] | None,
-        typer.Option("--run", help="A run's range, FROM/TO; give it again for more, instead of --from."),
+        typer.Option("--run", help="A run's range, FROM/TO, instead of --from and --to; may be repeated."),
     ] = None,
     align: Annotated[
         Align, typer.Option(help="Draw several runs by the clock, or from their start.")
     ] = Align.time,
-    where: Annotated[str | None, typer.Option(help="Samples to draw, as in iort query.")] = None,
+    where: Annotated[str | None, typer.Option(help="Filter, as in iort query.")] = None,
     every: Every = None,
 ) -> None:
     """Draw fields over time, the trajectory or the distribution, of one robot or several.
 
-    A trajectory needs a stream with a position: none is made up from speeds. Latitudes and longitudes are
-    drawn as metres to the east and north of the first place known.
+    A trajectory needs a stream with a position: it is not computed from speeds. Latitudes and longitudes are
+    drawn as metres to the east and north of the first known place.
     """
     # Together they take longer to load than most commands to run.
     from iort_station.cli import plots  # noqa: PLC0415 - see above
@@ -75,72 +68,45 @@ def plot(
     if runs and (start, end, last) != (None, None, None):
         raise StationError("give either --run or --from, --to and --last")
     ranges = [_run(run) for run in runs] if runs else [Range.of(start, end, last)]
-    asked = names(fields)
-    drawn: list[Run] = []
+    wanted = names(fields)
+    drawn: list[plots.Run] = []
     for name in dict.fromkeys([robot, *(also or ())]):
         for within in ranges:
-            found = _read(cloud, name, stream, within, asked, where, every)  # fmt: skip
-            if not len(found.result):
+            result = _read(cloud, name, stream, within, fields=wanted, where=where, every=every)
+            if not len(result):
                 say(f"{name} {stream}: no samples in this range")
                 continue
-            label = f"{name}, {plots.when(int(found.result.times_us[0]))} UTC" if runs else name
-            drawn.append(found._replace(name=label))
+            label = f"{name}, {plots.when(int(result.times_us[0]))} UTC" if runs else name
+            drawn.append(plots.Run(label, result))
     if not drawn:
-        raise StationError("there is nothing to draw")
+        raise StationError("there are no samples to draw")
     if kind is Kind.trajectory:
         figure = plots.trajectory(drawn)
+    elif kind is Kind.time:
+        shown = wanted or plots.usual(drawn[0].result)
+        figure = plots.over_time(drawn, shown, from_start=align is Align.start)
     else:
-        wanted = asked or _chosen(drawn[0], stream)
-        if kind is Kind.time:
-            figure = plots.over_time(drawn, wanted, from_start=align is Align.start)
-        else:
-            figure = plots.distribution(drawn, wanted)
+        figure = plots.distribution(drawn, wanted or plots.usual(drawn[0].result))
     plots.save(figure, output)
     say(f"{output}: {sum(len(run.result) for run in drawn):,} samples")
 
 
-def _read(
-    cloud: Cloud,
-    robot: str,
-    stream: str,
-    within: Range,
-    fields: list[str] | None,
-    where: str | None,
-    every: str | None,
-) -> Run:
-    from iort_station.cli.plots import Run  # noqa: PLC0415 - as above
+def _read(cloud: Cloud, robot: str, stream: str, within: Range, **asked: Any) -> Any:
     from iort_station.data import data, inventory  # noqa: PLC0415 - as above
     from iort_station.data.conditions import derive  # noqa: PLC0415 - as above
 
     with reading(f"{robot} {stream}", within.start_us, within.end_us) as progress:
-        result = data.query(
-            cloud,
-            robot,
-            stream,
-            within.start_us,
-            within.end_us,
-            fields=fields,
-            where=where,
-            every=every,
-            progress=progress,
-        )
+        result = data.query(cloud, robot, stream, within.start_us, within.end_us, progress=progress, **asked)
     columns = dict(result.columns)
-    if fields is None and "speed" in columns:
+    if asked["fields"] is None and "speed" in columns:
         columns |= derive(columns, inventory.vehicle_of(cloud, robot))
-    return Run(robot, replace(result, columns=columns))
-
-
-def _chosen(run: Run, stream: str) -> list[str]:
-    """What to draw of a stream when nobody says."""
-    from iort_station.cli import plots  # noqa: PLC0415 - as above
-
-    there = plots.numeric(run.result)
-    usual = [name for name in _USUAL.get(stream, ()) if name in there]
-    return usual or there[:_PANELS]
+    return replace(result, columns=columns)
 
 
 def _run(text: str) -> Range:
     first, separator, last = text.partition("/")
     if not separator:
-        raise StationError(f"run {text!r}: allowed is FROM/TO, such as 2026-05-04T10:00Z/2026-05-04T10:05Z")
+        raise StationError(
+            f"--run must be FROM/TO, for example 2026-05-04T10:00Z/2026-05-04T10:05Z, got {text!r}"
+        )
     return Range.of(first, last, None)

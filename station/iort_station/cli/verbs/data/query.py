@@ -24,7 +24,7 @@ commands = typer.Typer()
 
 
 class Format(str, Enum):
-    """How a result is written."""
+    """The format of the output."""
 
     table = "table"
     csv = "csv"
@@ -33,7 +33,7 @@ class Format(str, Enum):
 
 
 class On(str, Enum):
-    """Where the samples are chosen."""
+    """Where samples are selected."""
 
     client = "client"
     lambda_ = "lambda"
@@ -49,38 +49,40 @@ def query(
     last: Last = None,
     fields: Annotated[
         str | None,
-        typer.Option(help="Fields, with commas between; speed_mps and power_w are derived."),
+        typer.Option(help="Comma-separated fields; speed_mps and power_w are derived."),
     ] = None,
     where: Annotated[
-        str | None, typer.Option(help="Samples to give, such as 'speed_mps > 1.2 and fault_code == 0'.")
+        str | None, typer.Option(help="Filter, for example 'speed_mps > 1.2 and fault_code == 0'.")
     ] = None,
     every: Every = None,
-    summary: Annotated[bool, typer.Option("--summary", help="The summary's seconds, not samples.")] = False,
-    form: Annotated[Format, typer.Option("--format", help="How to write them.")] = Format.table,
+    summary: Annotated[
+        bool, typer.Option("--summary", help="The summary of each second instead of samples.")
+    ] = False,
+    form: Annotated[Format, typer.Option("--format", help="The output format.")] = Format.table,
     as_json: Annotated[bool, typer.Option("--json", help="The same as --format jsonl.")] = False,
     raw: Annotated[
-        bool, typer.Option("--raw", help="In CSV, texts as they were sent: formulas and control characters.")
+        bool, typer.Option("--raw", help="Leave formulas and control characters in the texts of CSV.")
     ] = False,
     output: Annotated[
-        Path | None, typer.Option("--output", "-o", help="A file; otherwise standard output.")
+        Path | None, typer.Option("--output", "-o", help="The output file. Default: standard output.")
     ] = None,
     on: Annotated[
-        On, typer.Option(help="Choose samples on this machine, or in the cloud's query function.")
+        On, typer.Option(help="Select samples on this machine, or in the cloud's query function.")
     ] = On.client,
     scan: Annotated[
         bool,
-        typer.Option("--scan", help="Scan the whole table instead: slow, to compare with."),
+        typer.Option("--scan", help="Scan the whole table, which is slow; for comparison."),
     ] = False,
 ) -> None:
-    """Give a robot's samples: raw, put together, or the summary's seconds.
+    """Print recorded samples, combined samples, or the summary of each second.
 
-    A range includes its start and not its end. Without one it is the last five minutes.
+    The default range is the last five minutes. A range includes its start and excludes its end.
     """
     # numpy takes longer to load than most commands to run.
     from iort_station.data import data, inventory  # noqa: PLC0415 - see above
 
     if form is Format.parquet and output is None and sys.stdout.isatty():
-        raise StationError("Parquet is no text for a terminal: give --output FILE, or pipe it on")
+        raise StationError("a terminal cannot show Parquet: give --output FILE, or use a pipe")
     cloud, when = context.obj.cloud(), Range.of(start, end, last)
     began = time.monotonic()
     with reading(f"{robot} {stream}", when.start_us, when.end_us) as progress:
@@ -101,10 +103,10 @@ def query(
     took_s = time.monotonic() - began
     _write(result, Format.jsonl if as_json else form, output, raw=raw)
     if result.refused:
-        say(f"{result.refused} stored items are no batches and were left out; the first: {result.reason}")
+        say(f"{result.refused} stored items are not batches and are left out; the first: {result.reason}")
     if result.absent:
         counted = ", ".join(f"{name} {count:,}" for name, count in sorted(result.absent.items()))
-        say(f"null because their sensor is not fitted ({NO_SENSOR_DEGC:g} degC and below): {counted}")
+        say(f"null because the sensor is missing ({NO_SENSOR_DEGC:g} degC and below): {counted}")
     say(f"{len(result):,} {'seconds' if summary and not every else 'samples'} in {took_s:.2f} s")
     if not len(result) and (extent := inventory.extent(cloud, robot, stream)):
         say(f"none in this range; {robot} has {stream} from {extent[0]} to {extent[1]}")
@@ -126,10 +128,10 @@ def _write(result: Result, form: Format, output: Path | None, *, raw: bool) -> N
         elif form is Format.jsonl:
             tables.to_json_lines(result, text)
         else:
-            # A terminal's width is its own; in a file nothing needs to fit.
+            # In a file, every column fits.
             width = None if text.isatty() else 32 + 24 * len(result.columns)
             console = Console(file=text, width=width)
             shown = tables.terminal(result, console.width)
             console.print(shown.table)
             if shown.left_out:
-                say(f"no room for {', '.join(shown.left_out)}: choose with --fields, or --format csv")
+                say(f"no room for {', '.join(shown.left_out)}: choose with --fields, or use --format csv")

@@ -3,20 +3,18 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping, Sequence
-from collections.abc import Set as AbstractSet
+from collections.abc import Mapping
 from typing import Annotated, Any
 
 import typer
 
-from iort_station.cli.console import Console
+from iort_station.cli.console import errors, out, print_json
+from iort_station.cli.options import AsJson
 from iort_station.errors import StationError
 from iort_station.fleet.shadow import Shadow, State, answered
 
 commands = typer.Typer()
-_out = Console()
-_errors = Console(stderr=True)
-# How long a robot that is there may take to have the file's value in force again.
+# How long a robot may take to return to the file's value.
 _WITHDRAWN_S = 3.0
 
 
@@ -31,62 +29,63 @@ def config(
         ),
     ] = None,
     unset: Annotated[
-        list[str] | None, typer.Option(help="A name to withdraw the wish of: car.yaml's value counts again.")
+        list[str] | None, typer.Option(help="A setting to withdraw; car.yaml's value applies again.")
     ] = None,
     seconds: Annotated[float, typer.Option(min=0.1, help="How long to wait for the robot's answer.")] = 30.0,
-    as_json: Annotated[bool, typer.Option("--json", help="As JSON.")] = False,
+    as_json: AsJson = False,
 ) -> None:
-    """Show what is in force on a robot, or change it and wait for its answer.
+    """Show a robot's settings, or change them and wait for its answer.
 
-    Ends with 1 where the robot refuses a change, or does not answer; the wish stands then, and comes into
-    force when the robot is back. A wish that is refused stands too, until --unset withdraws it.
+    Exit status 1 if the robot rejects a change or does not answer. A change without an answer stays
+    requested: the robot applies it when it is back. --unset withdraws a change, also a rejected one.
     """
-    wishes = {**dict(map(_change, changes or [])), **dict.fromkeys(unset or [])}
+    wanted = {**dict(map(_change, changes or [])), **dict.fromkeys(unset or [])}
     shadow = Shadow(context.obj.cloud(), robot)
-    late = False
-    if wishes:
-        before = shadow.read()
-        shadow.wish(wishes)
-        with _errors.status(f"waiting for {robot}"):
-            late = shadow.wait(lambda state: answered(wishes, state), seconds) is None
-            old, wished = before.settings(), before.wished()
-            withdrawn = [n for n, value in wishes.items() if value is None and wished.get(n) == old.get(n)]
-            if withdrawn and not late:
-                # The file's value may be the same, which a robot does not report again.
-                shadow.wait(lambda state: _all_changed(withdrawn, old, state), min(seconds, _WITHDRAWN_S))
+    answer = not wanted or _change_and_wait(shadow, wanted, seconds)
     state = shadow.read()
-    refused = [refusal for refusal in state.refusals() if not wishes or refusal.name in wishes]
+    rejected = [one for one in state.refusals() if not wanted or one.name in wanted]
     if as_json:
-        refusals = {one.name: {"value": one.value, "reason": one.reason} for one in refused}
-        _out.print_json(json.dumps({"settings": state.settings(), "refused": refusals, "answered": not late}))
+        reasons = {one.name: {"value": one.value, "reason": one.reason} for one in rejected}
+        print_json({"settings": state.settings(), "refused": reasons, "answered": answer})
     else:
-        _show(robot, state, wishes, {refusal.name for refusal in refused})
-        for refusal in refused:
-            _errors.print(f"refused: {refusal.reason}", style="red")
-        if refused:
-            options = " ".join(f"--unset {refusal.name}" for refusal in refused)
-            _errors.print(
-                f"what is refused stays wished for; `iort config {robot} {options}` withdraws it",
-                soft_wrap=True,
-            )
-    if late:
+        _show(robot, state, wanted)
+        for one in rejected:
+            errors.print(f"rejected: {one.reason}", style="red")
+        if rejected:
+            options = " ".join(f"--unset {one.name}" for one in rejected)
+            text = f"a rejected change stays requested; `iort config {robot} {options}` withdraws it"
+            errors.print(text, soft_wrap=True)
+    if not answer:
         raise StationError(
             f"{robot} has not answered within {seconds:g} s: is its agent running? "
-            "The wish stands; --unset withdraws one"
+            "The change stays requested; --unset withdraws it"
         )
-    if wishes and refused:
+    if wanted and rejected:
         raise typer.Exit(1)
 
 
-def _all_changed(names: Sequence[str], old: Mapping[str, Any], state: State) -> bool | None:
-    now = state.settings()
-    return all(now.get(name) != old.get(name) for name in names) or None
+def _change_and_wait(shadow: Shadow, wanted: Mapping[str, Any], seconds: float) -> bool:
+    """Request the changes; whether the robot has answered in time."""
+    before = shadow.read()
+    shadow.wish(wanted)
+    with errors.status(f"waiting for {shadow.robot}"):
+        if shadow.wait(lambda state: answered(wanted, state), seconds) is None:
+            return False
+        old, requested = before.settings(), before.wished()
+        withdrawn = [n for n, value in wanted.items() if value is None and requested.get(n) == old.get(n)]
+        if withdrawn:
+            # The file may hold the same value, which the robot does not report again.
+            shadow.wait(
+                lambda state: all(state.settings().get(n) != old.get(n) for n in withdrawn) or None,
+                min(seconds, _WITHDRAWN_S),
+            )
+    return True
 
 
 def _change(text: str) -> tuple[str, Any]:
     name, equals, value = text.partition("=")
     if not name or not equals:
-        raise StationError(f"{text}: expected NAME=VALUE, such as live.rate_hz=5")
+        raise StationError(f"must be NAME=VALUE, for example live.rate_hz=5, got {text}")
     if name.startswith("fields."):
         return name, [field for field in value.split(",") if field]
     try:
@@ -95,13 +94,11 @@ def _change(text: str) -> tuple[str, Any]:
         return name, value
 
 
-def _show(robot: str, state: State, wishes: Mapping[str, Any], refused: AbstractSet[str]) -> None:
+def _show(robot: str, state: State, wanted: Mapping[str, Any]) -> None:
     if not state.reported:
-        _out.print(f"{robot} has reported no settings yet")
-    said = {
-        name: "  (asked for now)" if value is not None else "  (wish withdrawn)"
-        for name, value in wishes.items()
-    } | dict.fromkeys(refused, "  (car.yaml's: the wish is refused)")
+        out.print(f"{robot} has reported no settings yet")
+    said = {name: "  (withdrawn)" if value is None else "  (requested now)" for name, value in wanted.items()}
+    said |= {one.name: "  (car.yaml's: the change is rejected)" for one in state.refusals()}
     for name, value in state.settings().items():
         shown = ",".join(value) if isinstance(value, list) else json.dumps(value).strip('"')
-        _out.print(f"{name}={shown}{said.get(name, '')}")
+        out.print(f"{name}={shown}{said.get(name, '')}")

@@ -12,37 +12,36 @@ import typer
 from iort_contract.limits import ContractError
 from iort_contract.messages.commands import MAX_LEASE_MS, MAX_VALID_MS, Command, encode_command
 from iort_contract.topics import ACCEPTED, CMD, build_topic
-from iort_station.cli.console import Console
+from iort_station.cli.console import errors, out, print_json
+from iort_station.cli.options import AsJson
 from iort_station.errors import StationError
 from iort_station.fleet.shadow import Shadow, outcome
 
 commands = typer.Typer()
-_out = Console()
-_errors = Console(stderr=True)
 
 
 @commands.command("send")
 def send(
     context: typer.Context,
     robot: str,
-    name: Annotated[str, typer.Argument(help="The command: a key of downlink.cmd in its car.yaml.")],
-    message: Annotated[str, typer.Argument(help="The ROS message as JSON, by its type's own fields.")],
+    name: Annotated[str, typer.Argument(help="The command: a key of downlink.cmd in the robot's car.yaml.")],
+    message: Annotated[str, typer.Argument(help="The ROS message as JSON, with the fields of its type.")],
     lease_ms: Annotated[
         int | None,
         typer.Option(
-            min=1, max=MAX_LEASE_MS, help="What moves the robot needs one: for how long it may, from now."
+            min=1, max=MAX_LEASE_MS, help="How long the robot may move, from now; needed if it moves."
         ),
     ] = None,
     valid_ms: Annotated[
-        int, typer.Option(min=1, max=MAX_VALID_MS, help="Refused when it arrives later than this.")
+        int, typer.Option(min=1, max=MAX_VALID_MS, help="The robot rejects it if it arrives later than this.")
     ] = 2_000,
     seconds: Annotated[float, typer.Option(min=0, help="How long to wait for the robot's answer.")] = 10.0,
-    as_json: Annotated[bool, typer.Option("--json", help="As JSON.")] = False,
+    as_json: AsJson = False,
 ) -> None:
-    """Send a command and say what the robot made of it.
+    """Send a command and print the robot's answer.
 
-    Ends with 1 where the robot refuses it or says nothing. Every call is an operator's session of its
-    own, which takes over from those before.
+    Exit status 1 if the robot rejects it or does not answer. Every call is an operator's session of its own,
+    which takes over from earlier ones.
     """
     cloud = context.obj.cloud()
     shadow = Shadow(cloud, robot)
@@ -63,27 +62,27 @@ def send(
     except ContractError as error:
         raise StationError(str(error)) from error
     shadow.data.publish(topic=topic, qos=1, payload=payload)
-    with _errors.status(f"waiting for {robot}"):
+    with errors.status(f"waiting for {robot}"):
         said = shadow.wait(lambda state: outcome(state, name, command.session, command.seq), seconds)
     if as_json:
         sent = {"robot": robot, "command": name, "session": command.session, "seq": command.seq}
-        _out.print_json(json.dumps({**sent, "outcome": said}))
+        print_json({**sent, "outcome": said})
     elif said == ACCEPTED:
-        _out.print(f"{robot} has accepted {name}")
+        out.print(f"{robot} has accepted {name}")
     if said is None:
         raise StationError(
-            f"{robot} has said nothing within {seconds:g} s: is its agent running, and has its car.yaml "
+            f"{robot} has not answered within {seconds:g} s: is its agent running, and has its car.yaml "
             f"downlink.cmd.{name}?"
         )
     if said != ACCEPTED:
-        raise StationError(f"{robot} has refused {name}: {said}")
+        raise StationError(f"{robot} has rejected {name}: {said}")
 
 
 def _message(text: str) -> dict[str, Any]:
     try:
         message = json.loads(text)
     except ValueError as error:
-        raise StationError(f"{text}: is not JSON: {error}") from error
+        raise StationError(f"MESSAGE must be JSON, got {text}: {error}") from error
     if not isinstance(message, dict):
-        raise StationError(f"{text}: expected a JSON object, the ROS message's fields")
+        raise StationError(f"MESSAGE must be a JSON object with the ROS message's fields, got {text}")
     return message

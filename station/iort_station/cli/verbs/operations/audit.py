@@ -1,8 +1,7 @@
-"""`iort audit`: did everything arrive?"""
+"""`iort audit`: proof of delivery."""
 
 from __future__ import annotations
 
-import json
 import time
 from dataclasses import asdict, replace
 from typing import Annotated, Any
@@ -13,8 +12,8 @@ from rich.text import Text
 
 from iort_contract.limits import ContractError
 from iort_contract.topics import check_robot, check_stream
-from iort_station.cli.console import Console
-from iort_station.cli.options import bounds
+from iort_station.cli.console import errors, out, print_json
+from iort_station.cli.options import AsJson, bounds
 from iort_station.data import inventory
 from iort_station.data.times import duration_us, iso, iso_s
 from iort_station.errors import StationError
@@ -22,8 +21,6 @@ from iort_station.operations import accounts, audit
 from iort_station.operations.audit import Audit, Range
 
 commands = typer.Typer()
-_out = Console()
-_errors = Console(stderr=True)
 # How many gaps of a run are listed one by one.
 _LISTED = 20
 
@@ -34,24 +31,22 @@ def audit_(
     robot: str,
     streams: Annotated[
         list[str] | None,
-        typer.Option("--stream", help="A stream; give it again for more. Default: all known."),
+        typer.Option("--stream", help="Only this stream; may be repeated. Default: all known."),
     ] = None,
-    start: Annotated[
-        str | None, typer.Option("--from", help="Samples from here on: ISO 8601, now or -10m.")
-    ] = None,
-    end: Annotated[str | None, typer.Option("--to", help="Samples up to here.")] = None,
-    last: Annotated[str | None, typer.Option(help="The last so much: 5m, 2h, 7d.")] = None,
-    late: Annotated[str, typer.Option(help="What counts as late.")] = "5s",
+    start: Annotated[str | None, typer.Option("--from", help="Start time: ISO 8601, now or -10m.")] = None,
+    end: Annotated[str | None, typer.Option("--to", help="End time (exclusive).")] = None,
+    last: Annotated[str | None, typer.Option(help="The time up to now: 5m, 2h, 7d.")] = None,
+    late: Annotated[str, typer.Option(help="A batch that is slower than this is late.")] = "5s",
     from_start: Annotated[
-        bool, typer.Option("--from-start", help="Numbers before the first stored one are missing too.")
+        bool, typer.Option("--from-start", help="Count numbers before the first stored one as missing.")
     ] = False,
-    as_json: Annotated[bool, typer.Option("--json", help="As JSON.")] = False,
+    as_json: AsJson = False,
 ) -> None:
-    """Prove delivery, of every stream that the robot has, by run of its agent.
+    """Prove that every sample of a robot arrived, for each of its streams and each run of its agent.
 
-    Batch numbers are looked at, and the samples that are stored are held against those that the agent says it
-    took; what it did not record is told by cause. Exit status 0 if every stream is complete and nothing was
-    left out, 1 otherwise, or if nothing is stored.
+    The command checks the sequence numbers of the batches. It compares the stored samples with those that the
+    agent counted, and lists by cause what the agent did not record. Exit status 0 if every stream is complete
+    and the agent left nothing out; 1 otherwise, or if nothing is stored.
     """
     within = Range(*bounds(start, end, last, time.time_ns() // 1000))
     cloud = context.obj.cloud()
@@ -63,11 +58,11 @@ def audit_(
     figures = audit.last_figures(cloud, robot)
     found, now_us = [], time.time_ns() // 1000
     told = accounts.accounts(cloud, robot)
-    with _errors.status("reading") as status:
+    with errors.status("reading") as status:
         for name in names:
             counted = _counting(audit.headers(cloud, robot, name, within), name, status)
             one = audit.audit(name, counted, late_ms=duration_us(late) // 1000, from_start=from_start)
-            # A part of a run cannot be held against what the whole of it took.
+            # The agent counts a whole run, so a part of one cannot be compared.
             if within == Range():
                 one = accounts.held_against(one, told, now_us)
             if one.runs or one.refused or one.taken is not None or streams:
@@ -76,18 +71,17 @@ def audit_(
     found = [replace(one, in_car=in_car, dropped=dropped) for one in found]
     causes = {} if streams else {boot: run.not_recorded() for boot, run in told.items() if run.not_recorded()}
     if as_json:
-        answer = {"streams": [_as_json(one) for one in found], "not_recorded": causes}
-        _out.print_json(json.dumps(answer))
+        print_json({"streams": [_as_json(one) for one in found], "not_recorded": causes})
     elif not found:
-        _errors.print(f"nothing of {robot} is stored in this range")
+        errors.print(f"this range holds nothing of {robot}")
     else:
         for one in found:
             _show(one)
         for boot, sources in causes.items():
             for source, counts in sources.items():
-                _out.print(f"run {boot[:8]}, {source}: not recorded", style="red")
+                out.print(f"run {boot[:8]}, {source}: not recorded", style="red")
                 for cause, count in counts.items():
-                    _out.print(f"  {count:,} {cause}")
+                    out.print(f"  {count:,} {cause}")
     complete = found and not causes and all(one.complete for one in found)
     raise typer.Exit(0 if complete else 1)
 
@@ -105,38 +99,38 @@ def _counting(items: Any, name: str, status: Any) -> Any:
 
 def _show(one: Audit) -> None:
     if not one.runs:
-        _out.print(Text.assemble(f"{one.stream}: ", ("nothing stored in this range", "bold red")))
+        out.print(Text.assemble(f"{one.stream}: ", ("nothing stored in this range", "bold red")))
     else:
-        _out.print(Text.assemble(f"{one.stream}: ", *_said(one)))
-        _out.print(_table(one))
+        out.print(Text.assemble(f"{one.stream}: ", *_said(one)))
+        out.print(_table(one))
     for run in one.runs:
         for gap in run.missing[:_LISTED]:
             after = "the start" if gap.after_us is None else iso(gap.after_us)
             before = "the end" if gap.before_us is None else iso(gap.before_us)
-            _out.print(f"  missing {gap.first:,} to {gap.last:,}: between {after} and {before}")
+            out.print(f"  missing {gap.first:,} to {gap.last:,}: between {after} and {before}")
         if len(run.missing) > _LISTED:
-            _out.print(f"  and {len(run.missing) - _LISTED} more gaps; --json has them all")
+            out.print(f"  and {len(run.missing) - _LISTED} more gaps; --json prints all")
     for lost in one.lost_runs:
-        _out.print(f"  run {lost.boot[:8]}: none of its {lost.batches:,} batches is stored", style="red")
+        out.print(f"  run {lost.boot[:8]}: none of its {lost.batches:,} batches is stored", style="red")
     if one.before_first:
-        _out.print(
+        out.print(
             f"  the first stored number is {one.before_first:,}: before it is expired, out of range or lost"
         )
     for boot, samples, cause in one.shortfalls:
         count = "an unknown number of samples" if samples is None else f"{samples:,} samples"
-        _out.print(f"  run {boot[:8]}: {count} {cause}", style="red")
+        out.print(f"  run {boot[:8]}: {count} {cause}", style="red")
     if one.refused:
-        _out.print(f"  {one.refused:,} items are not batches", style="red")
+        out.print(f"  {one.refused:,} items are not batches", style="red")
     if one.in_car:
-        _out.print(f"  the car's queue held {one.in_car:,} batches when it last said so")
+        out.print(f"  the car's queue held {one.in_car:,} batches at its last report")
     if one.dropped:
-        _out.print(
+        out.print(
             f"  the car has dropped {one.dropped:,} batches: its queue was full, or damaged", style="red"
         )
 
 
 def _said(one: Audit) -> tuple[tuple[str, str], str]:
-    """What is said of it, with the style of it, and what is told besides."""
+    """The verdict with its style, and what the agent counted."""
     told = "" if one.taken is None else f" ({one.taken:,} samples taken by the agent)"
     if one.complete:
         return ("complete", "green"), told
@@ -145,8 +139,8 @@ def _said(one: Audit) -> tuple[tuple[str, str], str]:
 
 
 def _table(one: Audit) -> Table:
-    """A row a run, in 80 columns: its first and last time and number one above the other; below the
-    number of late batches, how late the latest was."""
+    """A row for each run, in 80 columns: first above last, and how late the latest batch was below their
+    number."""
     table = Table(box=None, padding=(0, 1, 0, 0), pad_edge=False)
     for i, name in enumerate(
         ("run", "from, to", "numbers", "expected", "stored", "missing", "twice", "late", "samples")
@@ -184,7 +178,6 @@ def _as_json(one: Audit) -> dict[str, Any]:
         **asdict(one),
         "runs": runs,
         "shortfalls": shortfalls,
-        "lost_runs": [run._asdict() for run in one.lost_runs],
         "missing": one.missing,
         "complete": one.complete,
     }

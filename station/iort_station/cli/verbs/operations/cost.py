@@ -1,8 +1,7 @@
-"""`iort cost`: dollars a robot-hour and a month, and what a larger fleet needs."""
+"""`iort cost`: dollars for a robot-hour and a month, and the quotas of a larger fleet."""
 
 from __future__ import annotations
 
-import json
 import os
 from dataclasses import asdict, replace
 from datetime import datetime, timezone
@@ -12,7 +11,8 @@ from typing import Annotated, Any
 import typer
 from rich.table import Table
 
-from iort_station.cli.console import Console
+from iort_station.cli.console import out, print_json
+from iort_station.cli.options import AsJson
 from iort_station.cli.where import Where
 from iort_station.cost import line_items, model, report, scale
 from iort_station.cost.car import as_configured
@@ -23,7 +23,6 @@ from iort_station.cost.prices import AS_OF, PRICES, REGION
 from iort_station.cost.usage import Usage
 
 commands = typer.Typer()
-_out = Console()
 _DEFAULT = Usage()
 
 
@@ -32,10 +31,10 @@ def cost_(
     context: typer.Context,
     robots: Annotated[int, typer.Option(help="How many robots.")] = 1,
     rate_hz: Annotated[float | None, typer.Option(help="Samples a second, of each stream.")] = None,
-    streams: Annotated[int | None, typer.Option(help="Streams that a robot's sources bring.")] = None,
+    streams: Annotated[int | None, typer.Option(help="Streams from a robot's sources.")] = None,
     live_hz: Annotated[float | None, typer.Option(help="Live messages a second.")] = None,
     batch_s: Annotated[
-        float | None, typer.Option(help="Seconds a batch spans; 0 sends each sample by itself.")
+        float | None, typer.Option(help="Seconds that a batch spans; 0 sends each sample alone.")
     ] = None,
     ping_hz: Annotated[float | None, typer.Option(help="Pings a second over each path.")] = None,
     hours_per_day: Annotated[
@@ -48,44 +47,45 @@ def cost_(
         float, typer.Option(help="Billed milliseconds of Lambda 2.")
     ] = _DEFAULT.summarize_ms,
     connects_per_hour: Annotated[
-        float, typer.Option(help="How often a robot connects in an hour.")
+        float, typer.Option(help="Connections of a robot in an hour.")
     ] = _DEFAULT.connects_per_hour,
     command_hz: Annotated[float, typer.Option(help="Commands a second to a robot.")] = _DEFAULT.command_hz,
     dashboard_hours: Annotated[
-        float, typer.Option(help="Hours a month that somebody looks at CloudWatch on the live page.")
+        float, typer.Option(help="Hours a month that the live page shows CloudWatch.")
     ] = _DEFAULT.dashboard_hours,
     config: Annotated[
-        Path | None, typer.Option(help="A car.yaml: its rates, where no option says another.")
+        Path | None, typer.Option(help="Take the rates of a car.yaml, except those given as options.")
     ] = None,
     deployed: Annotated[
         bool,
         typer.Option(
             "--deployed",
-            help="Memory, concurrency, logs, alarms, dashboards, recovery and key as they are deployed.",
+            help="Take memory, concurrency, logs, alarms, dashboards, recovery and key from the deployment.",
         ),
     ] = False,
     refresh: Annotated[
         bool,
         typer.Option(
             "--refresh",
-            help="Read AWS' price list with your credentials, say what differs, and keep it for later calls.",
+            help="Read AWS' price list with your credentials, print the changes, and keep it.",
         ),
     ] = False,
-    as_json: Annotated[bool, typer.Option("--json", help="As JSON.")] = False,
+    as_json: AsJson = False,
 ) -> None:
-    """What a fleet costs, by service and lane, beside the thesis' layout; list prices of one date."""
+    """Print the cost of a fleet by service and lane, beside the thesis' layout, at list prices."""
     usage = _DEFAULT if config is None else as_configured(_DEFAULT, config)
     listed = _prices(context.obj, refresh=refresh)
     prices = PRICES if listed is None else listed.prices()
     if deployed:
         usage = as_deployed(usage, context.obj.cloud())
-    said: dict[str, Any] = {
+    given = {
         "rate_hz": rate_hz,
         "streams": streams,
         "live_hz": live_hz,
         "batch_s": batch_s,
         "ping_hz": ping_hz,
     }
+    rates: dict[str, Any] = {name: value for name, value in given.items() if value is not None}
     usage = replace(
         usage,
         robots=robots,
@@ -97,16 +97,16 @@ def cost_(
         connects_per_hour=connects_per_hour,
         command_hz=command_hz,
         dashboard_hours=dashboard_hours,
-        **{name: value for name, value in said.items() if value is not None},
+        **rates,
     ).check()
     if as_json:
-        _out.print_json(json.dumps(_as_json(usage, listed)))
+        print_json(_as_json(usage, listed))
         return
     if refresh and listed is not None:
-        _out.print(_table("AWS' price list", report.differences(listed)))
+        out.print(_table("AWS' price list", report.differences(listed)))
         for name, why in listed.kept.items():
-            _out.print(f"{name}: the built-in price is kept. {why}")
-    _out.print(
+            out.print(f"{name}: the built-in price is kept. {why}")
+    out.print(
         f"{_dated(listed)}: "
         f"{usage.robots:,} robot{'s' * (usage.robots != 1)} at {usage.rate_hz:g} Hz"
         f"{f' in each of {usage.streams} streams' if usage.streams > 1 else ''}, "
@@ -118,11 +118,11 @@ def cost_(
         ("What if", report.what_if(usage, prices)),
         ("What it needs of the default quotas", report.quotas(scale.on_paper(usage, prices))),
     ):
-        _out.print(_table(title, rows))
+        out.print(_table(title, rows))
 
 
 def _prices(where: Where, *, refresh: bool) -> Listed | None:
-    """AWS' price list as it is now, or as it was when it was last asked for; None for the built-in prices."""
+    """AWS' price list of now or of the last --refresh; None for the built-in prices."""
     path = kept_at(os.environ)
     if not refresh:
         return load(path)
@@ -135,10 +135,10 @@ def _prices(where: Where, *, refresh: bool) -> Listed | None:
 
 
 def _dated(listed: Listed | None) -> str:
-    """Of when and of where the prices are."""
+    """The date and the region of the prices."""
     if listed is None:
         return f"List prices of {AS_OF} in US dollars, {REGION}"
-    kept = f"; of {AS_OF} as they were: {', '.join(listed.kept)}" if listed.kept else ""
+    kept = f"; built-in prices of {AS_OF} for {', '.join(listed.kept)}" if listed.kept else ""
     return f"AWS' price list as read on {listed.read_on}, {listed.region}{kept}; PubNub's prices of {AS_OF}"
 
 

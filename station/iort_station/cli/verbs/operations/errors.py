@@ -1,120 +1,108 @@
-"""`iort errors` and `iort replay-errors`: what was refused, and putting it back."""
+"""`iort errors` and `iort replay-errors`: rejected messages, and putting them back."""
 
 from __future__ import annotations
 
 import base64
-import json
-import sys
 from collections import Counter
+from collections.abc import Callable
 from dataclasses import asdict
-from datetime import datetime, timezone
 from typing import Annotated, Any
 
 import typer
-from rich.progress import Progress
 from rich.text import Text
 
-from iort_station.cli.console import Console
-from iort_station.cli.options import since_us
+from iort_station.cli.console import errors, out, print_json
+from iort_station.cli.options import AsJson, DryRun, OneRobot, since_us
+from iort_station.cli.progress import bar
+from iort_station.cloud import Cloud
+from iort_station.data.times import iso_s
 from iort_station.operations import quarantine, replay
 from iort_station.operations.quarantine import Entry
 from iort_station.operations.replay import Fate
 
 commands = typer.Typer()
-_out = Console()
-_notes = Console(stderr=True)
 _HEX_WIDTH = 16
-
-Robot = Annotated[str | None, typer.Option(help="Of this robot alone.")]
 Since = Annotated[str | None, typer.Option(help="Last seen since: 10m, 2h, 3d, or ISO 8601.")]
-AsJson = Annotated[bool, typer.Option("--json", help="As JSON.")]
 
 
 @commands.command("errors")
-def errors(
+def errors_(
     context: typer.Context,
     entry_id: Annotated[
         str | None, typer.Argument(metavar="ID", help="Show this message with its bytes.")
     ] = None,
-    robot: Robot = None,
+    robot: OneRobot = None,
     since: Since = None,
     as_json: AsJson = False,
 ) -> None:
-    """List the messages that were refused or could not be processed, or show one."""
+    """List the messages that were rejected or could not be processed, or show one."""
     cloud = context.obj.cloud()
     if entry_id is not None:
         _show(quarantine.find(cloud, entry_id), as_json=as_json)
         return
-    found = sorted(
-        quarantine.entries(cloud, robot=robot, since_ms=_since_ms(since)), key=lambda e: (e.last_ms, e.id)
-    )
+    found = _entries(cloud, robot, since, lambda entry: entry.last_ms)
     waiting = quarantine.waiting(cloud)
     if as_json:
-        _out.print_json(
-            json.dumps({"entries": [_as_json(entry) for entry in found], "waiting": asdict(waiting)})
-        )
+        print_json({"entries": [_as_json(entry) for entry in found], "waiting": asdict(waiting)})
         return
     for entry in found:
         _print(entry)
     if not found:
-        _out.print("nothing in quarantine" + (f" of {robot}" if robot else ""))
+        out.print("nothing in quarantine" + (f" of {robot}" if robot else ""))
     if waiting.rejected:
-        _notes.print(f"{waiting.rejected} more on the way into the table")
+        errors.print(f"{waiting.rejected} more on the way into the table")
     if waiting.last:
-        _notes.print(f"{waiting.last} that the table did not take: `iort replay-errors` tries again")
+        errors.print(f"{waiting.last} that the table did not take: `iort replay-errors` tries again")
 
 
 @commands.command("replay-errors")
 def replay_errors(
     context: typer.Context,
-    robot: Robot = None,
+    robot: OneRobot = None,
     since: Since = None,
-    dry_run: Annotated[bool, typer.Option("--dry-run", help="Only say what would be done.")] = False,
+    dry_run: DryRun = False,
     again: Annotated[
-        bool, typer.Option("--again", help=f"Also what was replayed {replay.MAX_REPLAYS} times already.")
+        bool, typer.Option("--again", help=f"Also messages replayed {replay.MAX_REPLAYS} times already.")
     ] = False,
     as_json: AsJson = False,
 ) -> None:
-    """Put the record lane's messages back, and delete those that arrive; status 1 if any fails again."""
+    """Put the record lane's messages back, and delete those that arrive. Exit status 1 if any fails again."""
     cloud = context.obj.cloud()
     if not dry_run and (moved := quarantine.recover(cloud)):
-        _notes.print(f"{moved} messages that the table did not take are on the way to it again")
-    found = sorted(
-        quarantine.entries(cloud, robot=robot, since_ms=_since_ms(since)), key=lambda e: (e.first_ms, e.id)
-    )
+        errors.print(f"{moved} messages that the table did not take are on the way to it again")
+    found = _entries(cloud, robot, since, lambda entry: entry.first_ms)
     outcomes = []
-    with Progress(console=_notes, transient=True, disable=not _notes.is_terminal) as bar:
-        task = bar.add_task("putting back", total=len(found))
+    with bar("putting back", len(found)) as progress:
         for outcome in replay.replay(cloud, found, dry_run=dry_run, again=again):
             outcomes.append(outcome)
-            bar.advance(task)
+            progress(1)
     if as_json:
-        rows = [{**_as_json(o.entry), "fate": o.fate.value, "detail": o.detail} for o in outcomes]
-        _out.print_json(json.dumps(rows))
+        print_json([{**_as_json(o.entry), "fate": o.fate.value, "detail": o.detail} for o in outcomes])
     else:
         for outcome in outcomes:
             if outcome.fate not in (Fate.REPLAYED, Fate.NOT_FOR_REPLAY):
                 detail = f": {outcome.detail}" if outcome.detail else ""
                 line = f"{outcome.entry.id}  {outcome.entry.robot}  {outcome.fate.value}{detail}"
-                _out.print(_one_line(line), soft_wrap=True)
+                out.print(_one_line(line), soft_wrap=True)
         counts = Counter(outcome.fate for outcome in outcomes)
-        _out.print(", ".join(f"{n} {fate.value}" for fate, n in counts.items()) or "nothing in quarantine")
+        out.print(", ".join(f"{n} {fate.value}" for fate, n in counts.items()) or "nothing in quarantine")
     if any(outcome.fate is Fate.FAILED for outcome in outcomes):
-        sys.exit(1)
+        raise typer.Exit(1)
 
 
-def _since_ms(text: str | None) -> int:
-    """The time in ms since the epoch; raises `StationError` for what is none."""
-    return 0 if text is None else since_us(text) // 1000
+def _entries(cloud: Cloud, robot: str | None, since: str | None, at: Callable[[Entry], int]) -> list[Entry]:
+    since_ms = 0 if since is None else since_us(since) // 1000
+    return sorted(quarantine.entries(cloud, robot=robot, since_ms=since_ms), key=lambda e: (at(e), e.id))
 
 
 def _print(entry: Entry) -> None:
-    """Two lines, which no terminal is too narrow for: reasons are long."""
+    """Print two lines: reasons are too long for a table in a narrow terminal."""
     times = f"{entry.seen} times" + (f", {entry.replays} replays" if entry.replays else "")
-    head = f"  {_utc(entry.last_ms)}  {entry.robot}  {times}"
-    _out.print(Text.assemble((entry.id, "bold"), head), soft_wrap=True)
+    out.print(
+        Text.assemble((entry.id, "bold"), f"  {_utc(entry.last_ms)}  {entry.robot}  {times}"), soft_wrap=True
+    )
     where = " ".join(filter(None, (entry.source, entry.topic)))
-    _out.print(f"    {where}: {_one_line(entry.reason)}", soft_wrap=True)
+    out.print(f"    {where}: {_one_line(entry.reason)}", soft_wrap=True)
 
 
 def _one_line(text: str) -> str:
@@ -124,8 +112,7 @@ def _one_line(text: str) -> str:
 def _show(entry: Entry, *, as_json: bool) -> None:
     payload = entry.payload or b""
     if as_json:
-        base64_payload = base64.b64encode(payload).decode()
-        _out.print_json(json.dumps({**_as_json(entry), "payload_base64": base64_payload}))
+        print_json({**_as_json(entry), "payload_base64": base64.b64encode(payload).decode()})
         return
     for name, value in (
         ("id", entry.id),
@@ -137,18 +124,18 @@ def _show(entry: Entry, *, as_json: bool) -> None:
         ("last", f"{_utc(entry.last_ms)}, {entry.seen} times, {entry.replays} replays"),
         ("bytes", str(len(payload))),
     ):
-        _out.print(Text.assemble((f"{name:<11}", "bold"), value), soft_wrap=True)
-    _out.print()
-    _out.print(as_text(payload), soft_wrap=True)
+        out.print(Text.assemble((f"{name:<11}", "bold"), value), soft_wrap=True)
+    out.print()
+    out.print(as_text(payload), soft_wrap=True)
 
 
 def as_text(payload: bytes) -> str:
-    """The bytes as the text that they are, or in hexadecimal, 16 a line, with what is ASCII beside."""
+    """The bytes as text, or if they are not text, in hexadecimal with ASCII beside it."""
     try:
         text = payload.decode()
     except UnicodeDecodeError:
         text = "\0"
-    # Control characters would be obeyed by the terminal.
+    # A terminal would obey control characters.
     if all(character.isprintable() or character in "\n\t" for character in text):
         return text
     lines = []
@@ -164,4 +151,4 @@ def _as_json(entry: Entry) -> dict[str, Any]:
 
 
 def _utc(ms: int) -> str:
-    return datetime.fromtimestamp(ms / 1000, timezone.utc).strftime("%Y-%m-%d %H:%M:%S")
+    return iso_s(ms * 1000)

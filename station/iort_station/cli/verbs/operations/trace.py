@@ -1,8 +1,7 @@
-"""`iort trace`: where the time goes."""
+"""`iort trace`: the delay of live updates, hop by hop."""
 
 from __future__ import annotations
 
-import json
 import threading
 import time
 from dataclasses import asdict
@@ -14,7 +13,8 @@ from rich.table import Table
 from iort_contract.catalog.streams import RTT_STREAM
 from iort_contract.catalog.vesc import VESC_STREAM
 from iort_contract.page import PUBNUB_ORIGIN
-from iort_station.cli.console import Console
+from iort_station.cli.console import errors, out, print_json
+from iort_station.cli.options import AsJson
 from iort_station.data.inventory import check_registered
 from iort_station.errors import StationError
 from iort_station.operations import audit, trace
@@ -22,8 +22,6 @@ from iort_station.page import keys
 from iort_station.page.listener import Listener
 
 commands = typer.Typer()
-_out = Console()
-_errors = Console(stderr=True)
 # Characters of the other columns, and of the longest and shortest whole bar.
 _OTHERS, _LONGEST, _SHORTEST = 64, 30, 8
 
@@ -32,12 +30,12 @@ _OTHERS, _LONGEST, _SHORTEST = 64, 30, 8
 def trace_(
     context: typer.Context,
     robot: str,
-    stream: Annotated[str, typer.Option(help="Whose live updates.")] = VESC_STREAM,
+    stream: Annotated[str, typer.Option(help="The stream whose live updates to follow.")] = VESC_STREAM,
     updates: Annotated[int, typer.Option(min=1, help="How many updates to wait for.")] = 50,
     seconds: Annotated[float, typer.Option(min=0.1, help="How long to wait for them at most.")] = 15.0,
-    as_json: Annotated[bool, typer.Option("--json", help="As JSON.")] = False,
+    as_json: AsJson = False,
 ) -> None:
-    """Follow a robot's live updates from the sample in the car to here, hop by hop."""
+    """Measure the delay of a robot's live updates, hop by hop, from the sample in the car to this machine."""
     cloud = context.obj.cloud()
     check_registered(cloud, robot)
     found: list[trace.Times] = []
@@ -50,30 +48,24 @@ def trace_(
                 enough.set()
 
     pubnub = keys.load(cloud)
-    listener = Listener(
-        robot=robot,
-        namespace=cloud.namespace,
-        on_update=take,
-        **pubnub.reading(),
-    )
-    with listener, _errors.status(f"listening to {robot}"):
+    listener = Listener(robot=robot, namespace=cloud.namespace, on_update=take, **pubnub.reading())
+    with listener, errors.status(f"listening to {robot}"):
         with trace.pubnub_clock(pubnub.origin or PUBNUB_ORIGIN, tls=pubnub.tls) as ask:
             here_to_pubnub = trace.clock_of(ask, lambda: time.time_ns() // 1000)
         enough.wait(seconds)
     if not found:
         raise StationError(
-            f"nothing of {robot}'s stream {stream} was heard in {seconds:g} s: "
-            "is it driving, and its live lane on?"
+            f"no update of {robot}'s stream {stream} arrived in {seconds:g} s: "
+            "is it driving, and is its live lane on?"
         )
-    figures = audit.last_figures(cloud, robot)
     result = trace.trace(
         found,
         here_to_pubnub=here_to_pubnub,
-        car_uncertainty_ms=figures.get("clock_uncertainty_ms"),
+        car_uncertainty_ms=audit.last_figures(cloud, robot).get("clock_uncertainty_ms"),
         newest_rtt=audit.last_batch(cloud, robot, RTT_STREAM),
     )
     if as_json:
-        _out.print_json(json.dumps(asdict(result)))
+        print_json(asdict(result))
     else:
         _show(robot, result)
 
@@ -82,7 +74,7 @@ def _show(robot: str, result: trace.Trace) -> None:
     table = Table(title=f"{robot}: {result.updates} live updates", title_justify="left")
     for name in ("hop", "median", "95 %", "clocks", ""):
         table.add_column(name, justify="left" if name in {"hop", ""} else "right")
-    width = max(_SHORTEST, min(_LONGEST, _out.width - _OTHERS))
+    width = max(_SHORTEST, min(_LONGEST, out.width - _OTHERS))
     whole = max(result.whole.p50_ms, 1e-3)
     begins = 0.0
     for hop in result.hops:
@@ -90,15 +82,15 @@ def _show(robot: str, result: trace.Trace) -> None:
         begins += max(0.0, hop.p50_ms)
     table.add_section()
     table.add_row(*_cells(result.whole), bar(0, 1, width), style="bold")
-    _out.print(table)
-    _out.print("clocks: by how much a hop may be wrong; ? where two providers' clocks are taken as they are")
+    out.print(table)
+    out.print("clocks: the uncertainty of a hop; ? if two providers' clocks are compared without correction")
     if result.round_trips_ms:
         trips = ", ".join(f"{path} {value:.1f} ms" for path, value in result.round_trips_ms.items())
-        _out.print(f"round trips that the car measured last: {trips}")
+        out.print(f"round trips that the car measured last: {trips}")
 
 
 def bar(begins: float, share: float, width: int) -> str:
-    """A bar from one share of the whole on, which is ``width`` characters, to eighths of one."""
+    """A bar from ``begins`` on, both as shares of ``width`` characters, drawn to an eighth of a character."""
     before = round(min(max(begins, 0.0), 1.0) * width)
     eighths = min(round(max(share, 0.0) * width * 8), (width - before) * 8)
     return " " * before + "█" * (eighths // 8) + " ▏▎▍▌▋▊▉"[eighths % 8].strip()
@@ -106,9 +98,5 @@ def bar(begins: float, share: float, width: int) -> str:
 
 def _cells(hop: trace.Hop) -> tuple[str, ...]:
     clocks = "?" if hop.uncertainty_ms is None else f"± {hop.uncertainty_ms:.1f} ms"
-    return (
-        hop.name,
-        f"{hop.p50_ms:.1f} ms",
-        f"{hop.p95_ms:.1f} ms",
-        "exact" if hop.uncertainty_ms == 0 else clocks,
-    )
+    exact = "exact" if hop.uncertainty_ms == 0 else clocks
+    return hop.name, f"{hop.p50_ms:.1f} ms", f"{hop.p95_ms:.1f} ms", exact

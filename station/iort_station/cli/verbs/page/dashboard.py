@@ -7,32 +7,26 @@ from typing import Annotated
 
 import typer
 
-from iort_station.cli.console import Console
+from iort_station.cli.console import out
+from iort_station.cli.options import Token
 from iort_station.fleet import registry
 from iort_station.page import keys
 
 commands = typer.Typer()
-_out = Console()
 
 
 @commands.command("dashboard")
 def dashboard(
     context: typer.Context,
-    port: Annotated[int, typer.Option(help="The page's port; 0 for a free one.")] = 8080,
+    port: Annotated[int, typer.Option(help="The page's port; 0 takes a free one.")] = 8080,
     host: Annotated[
         str, typer.Option(help="The address to listen on. Whoever reaches it can read the cars' past.")
     ] = "127.0.0.1",
     name: Annotated[
         list[str] | None,
-        typer.Option(help="Another name by which the page is reached than localhost; again for more."),
+        typer.Option(help="Another name of this server than localhost; may be repeated."),
     ] = None,
-    token: Annotated[
-        str,
-        typer.Option(
-            envvar="PUBNUB_ACCESS_TOKEN",
-            help="PubNub's access token to read with, where Access Manager is on.",
-        ),
-    ] = "",
+    token: Token = "",
 ) -> None:
     """Serve the live page until Ctrl-C: the fleet, each car, its past, and CloudWatch's dashboards."""
     # numpy and aiohttp take longer to load than most commands to run.
@@ -40,7 +34,6 @@ def dashboard(
     from iort_station.page.server import PageServer  # noqa: PLC0415 - as above
 
     cloud = context.obj.cloud()
-    pubnub_keys = keys.load(cloud)
     with PageServer(
         namespace=cloud.namespace,
         vehicles=registry.vehicles(cloud),
@@ -49,7 +42,7 @@ def dashboard(
         host=host,
         port=port,
         names=name or (),
-        **pubnub_keys.reading(),
+        **keys.load(cloud).reading(),
     ) as page:
-        _out.print(f"{page.url}  (Ctrl-C stops)")
+        out.print(f"{page.url}  (Ctrl-C stops)")
         threading.Event().wait()

@@ -18,7 +18,8 @@ from iort_contract.catalog.derived import Vehicle
 from iort_contract.limits import ContractError
 from iort_contract.messages.live import decode_live_update
 from iort_contract.tables import ROBOT, T_US
-from iort_station.cli.console import Console
+from iort_station.cli.console import out
+from iort_station.cli.options import Token
 from iort_station.cli.progress import say
 from iort_station.fleet import registry
 from iort_station.page import keys
@@ -32,23 +33,22 @@ _REFRESH_S = 0.25
 @commands.command("watch")
 def watch(
     context: typer.Context,
-    as_json: Annotated[bool, typer.Option("--json", help="A line of JSON for every update.")] = False,
-    seconds: Annotated[float | None, typer.Option(min=0, help="Stop after so long; never otherwise.")] = None,
-    token: Annotated[
-        str, typer.Option(envvar="PUBNUB_ACCESS_TOKEN", help="PubNub's access token to read with.")
-    ] = "",
+    as_json: Annotated[bool, typer.Option("--json", help="Print a line of JSON for every update.")] = False,
+    seconds: Annotated[
+        float | None, typer.Option(min=0, help="Stop after this time. Default: never.")
+    ] = None,
+    token: Token = "",
 ) -> None:
     """Show every car in the terminal, live, until Ctrl-C."""
     cloud = context.obj.cloud()
-    pubnub_keys = keys.load(cloud)
     vehicles = {robot: Vehicle(**car) for robot, car in registry.vehicles(cloud).items()}
     fleet, done = FleetWatch(vehicles), threading.Event()
     listener = Listener(
         robot=None,
         namespace=cloud.namespace,
-        on_update=_Lines(done).take if as_json else fleet.take,
+        on_update=(lambda update, _, now_us: _print_line(update, now_us, done)) if as_json else fleet.take,
         token=token,
-        **pubnub_keys.reading(),
+        **keys.load(cloud).reading(),
     )
     try:
         with listener:
@@ -61,45 +61,34 @@ def watch(
         return
 
 
-class _Lines:
-    """Writes a line an update, until nobody reads them any more."""
-
-    def __init__(self, done: threading.Event) -> None:
-        self._done = done
-
-    def take(self, update: Any, _pubnub_us: int, now_us: int) -> None:
-        try:
-            heard = decode_live_update(update)
-        except ContractError as error:
-            say(f"an invalid update: {error}")
-            return
-        live = heard.live
-        delay_ms = (now_us - live.sent_us - (live.offset_us or 0)) / 1000
-        line = {ROBOT: heard.robot, "stream": heard.stream, T_US: live.t_us, "delay_ms": delay_ms}
-        try:
-            print(json.dumps({**line, "sample": live.sample}), flush=True)
-        except BrokenPipeError:
-            # Python would complain once more at its end, when it flushes.
-            os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
-            self._done.set()
+def _print_line(update: Any, now_us: int, done: threading.Event) -> None:
+    """Print an update; set ``done`` if nobody reads the output any more."""
+    try:
+        heard = decode_live_update(update)
+    except ContractError as error:
+        say(f"an invalid update: {error}")
+        return
+    live = heard.live
+    delay_ms = (now_us - live.sent_us - (live.offset_us or 0)) / 1000
+    line = {ROBOT: heard.robot, "stream": heard.stream, T_US: live.t_us, "delay_ms": delay_ms}
+    try:
+        print(json.dumps({**line, "sample": live.sample}), flush=True)
+    except BrokenPipeError:
+        # Python flushes at its end, and would complain once more.
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        done.set()
 
 
 def _show(fleet: FleetWatch, seconds: float | None, namespace: str) -> None:
-    console = Console()
     end = None if seconds is None else time.monotonic() + seconds
     tick = threading.Event()
-    with Live(console=console, auto_refresh=False, transient=False) as live:
+    with Live(console=out, auto_refresh=False, transient=False) as live:
         while end is None or time.monotonic() < end:
-            cars = fleet.cars()
-            words = (
-                f"{len(cars)} {'car' if len(cars) == 1 else 'cars'}. Ctrl-C stops."
-                if cars
-                else f"waiting for a car on {namespace}.* (Ctrl-C stops)"
-            )
+            count = len(fleet.cars())
+            cars = f"{count} {'car' if count == 1 else 'cars'}. Ctrl-C stops."
+            words = cars if count else f"waiting for a car on {namespace}.* (Ctrl-C stops)"
             if fleet.refused:
                 words += f" {fleet.refused} malformed updates."
-            live.update(
-                Group(fleet.table(time.time_ns() // 1000, console.width), Text(words, style="dim")),
-                refresh=True,
-            )
+            table = fleet.table(time.time_ns() // 1000, out.width)
+            live.update(Group(table, Text(words, style="dim")), refresh=True)
             tick.wait(_REFRESH_S)

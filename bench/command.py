@@ -1,0 +1,76 @@
+"""The parts that all commands share: options, figures as a file, confirmation, and an orderly end."""
+
+from __future__ import annotations
+
+import argparse
+import json
+import signal
+import sys
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager, suppress
+from pathlib import Path
+from typing import Any
+
+from rich.console import Console
+from rich.prompt import Confirm
+
+from bench.report import machine
+
+_INTERRUPTS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
+
+
+def parser(documentation: str | None) -> argparse.ArgumentParser:
+    """Return a parser with the option --json."""
+    made = argparse.ArgumentParser(description=(documentation or "").splitlines()[0])
+    made.add_argument("--json", type=Path, metavar="FILE", help="write the figures as JSON too")
+    return made
+
+
+def made() -> dict[str, Any]:
+    """Return the date, the machine and the versions behind figures."""
+    return {"machine": machine.describe()}
+
+
+def write(path: Path | None, figures: Any) -> None:
+    """Write the figures, if there is a file for them."""
+    if path:
+        path.write_text(json.dumps(figures, indent=2) + "\n")
+
+
+def confirm(console: Console, text: str, error: type[Exception]) -> None:
+    """Say what the run will do, and ask. Raises the error without a terminal, or if the answer is no."""
+    console.print(text, highlight=False)
+    if not sys.stdin.isatty():
+        raise error("no terminal to ask for confirmation: use --yes (`make ... YES=1`)")
+    if not Confirm.ask("Go on?", console=console, default=False):
+        raise error("not confirmed: nothing was done")
+
+
+@contextmanager
+def wound_up(console: Console) -> Iterator[Callable[[], None]]:
+    """Let the first interrupt stop the work in good order, and ignore further ones during the cleanup.
+
+    Yields a function that announces the cleanup: after its call even the first interrupt is ignored.
+    """
+    asked = False
+
+    def putting_back() -> None:
+        nonlocal asked
+        asked = True
+
+    def interrupt(_number: int, _frame: object) -> None:
+        nonlocal asked
+        if asked:
+            # The terminal may have gone.
+            with suppress(OSError):
+                console.print("still restoring the changes", style="yellow")
+            return
+        asked = True
+        raise KeyboardInterrupt
+
+    before = {number: signal.signal(number, interrupt) for number in _INTERRUPTS}
+    try:
+        yield putting_back
+    finally:
+        for number, handler in before.items():
+            signal.signal(number, handler)

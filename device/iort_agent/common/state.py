@@ -1,0 +1,224 @@
+"""The types of the agent's status (`iort-agent status`) and of its report (`iort-agent run --report`).
+
+Both are written as JSON, with the fields' names as keys. The rooms fill in the parts that describe them.
+"""
+
+import dataclasses
+from dataclasses import dataclass
+from typing import Any, Dict, List, Mapping, Optional, Tuple, Type, TypeVar, Union, get_type_hints
+
+from iort_agent.common.logs import Trouble
+
+T = TypeVar("T")
+
+# The counts of a source, of the downlink or of the attachments: each names its own.
+Counts = Dict[str, Any]
+
+
+@dataclass(frozen=True)
+class Connection:
+    """The connection to the broker. ``since_s`` is the time since it was made or lost."""
+
+    connected: bool
+    since_s: float
+    connects: int
+    last_error: Optional[str] = None
+    certificate_id: Optional[str] = None
+    endpoint: str = ""
+
+
+@dataclass(frozen=True)
+class RecordLane:
+    """Whether samples are recorded."""
+
+    enabled: bool
+
+
+@dataclass(frozen=True)
+class LiveLane:
+    """The live lane. ``effective_hz`` is the rate of a stream that the rate limiter slows down."""
+
+    enabled: bool
+    rate_hz: float
+    effective_hz: float
+    slowed: bool
+    published: int
+    refused: int
+
+
+@dataclass(frozen=True)
+class PingLane:
+    """The pings. ``held_back`` counts those that the rate limiter did not let through."""
+
+    rate_hz: float
+    held_back: int
+
+
+@dataclass(frozen=True)
+class Lanes:
+    """The three lanes."""
+
+    record: RecordLane
+    live: LiveLane
+    ping: PingLane
+
+
+@dataclass(frozen=True)
+class StreamReport:
+    """The counts of a stream, as in `iort_agent.lanes.batch_encoder.StreamCounts`."""
+
+    samples: int
+    stored: int
+    batches: int
+    refused: int
+    nulled: int
+
+
+@dataclass(frozen=True)
+class StreamState(StreamReport):
+    """A stream now. ``fields`` are those that the settings keep; empty if they keep all."""
+
+    per_s: float
+    live_hz: float
+    silent_s: float
+    fields: List[str]
+
+
+@dataclass(frozen=True)
+class Queue:
+    """The batches that wait, and those that were dropped."""
+
+    batches: int
+    samples: int
+    bytes: int
+    dropped_batches: int
+    dropped_samples: int
+
+
+@dataclass(frozen=True)
+class Files:
+    """The uploads. ``current`` is the file being sent; ``large`` counts the attachments."""
+
+    waiting: int
+    uploaded: int
+    sent_bytes: int
+    current: Optional[str]
+    current_bytes: int
+    last_error: Optional[str]
+    large: Optional[Counts] = None
+
+
+@dataclass(frozen=True)
+class ClockOffset:
+    """The cloud's clock minus the robot's, and the largest error of this estimate."""
+
+    offset_ms: float
+    uncertainty_ms: float
+
+
+@dataclass(frozen=True)
+class RoundTrips:
+    """The pings over one path, and the percentiles of their round trips."""
+
+    sent: int
+    received: int
+    lost: int
+    p50_ms: Optional[float]
+    p95_ms: Optional[float]
+
+
+@dataclass(frozen=True)
+class OverShare:
+    """Batches over the robot's share of the cloud, and the cloud's time of the first and the last one."""
+
+    since_ms: int
+    last_ms: int
+    batches: int
+
+
+@dataclass(frozen=True)
+class Status:
+    """The agent now. Each of ``sources`` is the source's description, ``source``, and its own counts."""
+
+    robot: str
+    boot: str
+    pid: int
+    uptime_s: float
+    connection: Connection
+    lanes: Lanes
+    sources: List[Counts]
+    streams: Dict[str, StreamState]
+    spool: Queue
+    files: Optional[Files]
+    clock: Optional[ClockOffset]
+    pings: Dict[str, RoundTrips]
+    over_share: Optional[OverShare]
+    alarms: List[str]
+    troubles: List[Trouble]
+
+
+@dataclass(frozen=True)
+class LiveReport:
+    """The rates of the live lane at the end."""
+
+    asked_hz: float
+    effective_hz: float
+    slowed: bool
+    streams_hz: Dict[str, float]
+
+
+@dataclass(frozen=True)
+class QueueReport:
+    """The batches that were left at the end, and those that were dropped."""
+
+    left_batches: int
+    left_samples: int
+    dropped_batches: int
+    dropped_samples: int
+
+
+@dataclass(frozen=True)
+class Report:
+    """One run of the agent, at its end."""
+
+    robot: str
+    boot: str
+    streams: Dict[str, StreamReport]
+    live_published: int
+    live_refused: int
+    live: LiveReport
+    spool: QueueReport
+    pings: Dict[str, RoundTrips]
+    failed_sources: List[str]
+    sources: List[Counts]
+    downlink: Optional[Counts]
+    files: Optional[Files]
+
+
+def document(told: Union[Status, Report]) -> Dict[str, Any]:
+    """The JSON document. A report has no key for a part that the agent does not have."""
+    found = dataclasses.asdict(told)
+    if isinstance(told, Report):
+        found = {name: value for name, value in found.items() if value is not None}
+    return found
+
+
+def read(cls: Type[T], found: Mapping[str, Any]) -> T:
+    """The dataclass of a JSON document. Ignores keys that it does not know; raises `KeyError` for one that
+    is missing."""
+    return cls(**{name: _value(hint, found[name]) for name, hint in get_type_hints(cls).items()})
+
+
+def _value(hint: Any, found: Any) -> Any:
+    """A value of the type that a field has: a dataclass, or a list, dictionary or `Optional` of one."""
+    if dataclasses.is_dataclass(hint):
+        return read(hint, found)  # type: ignore[arg-type]  # a type, as it comes from an annotation
+    kind: Any = getattr(hint, "__origin__", None)
+    inner: Tuple[Any, ...] = getattr(hint, "__args__", ())
+    if kind is Union:
+        return None if found is None else _value(inner[0], found)
+    if kind is list:
+        return [_value(inner[0], item) for item in found]
+    if kind is dict:
+        return {name: _value(inner[1], item) for name, item in found.items()}
+    return found

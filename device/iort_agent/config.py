@@ -1,0 +1,91 @@
+"""The agent's configuration: one YAML file, read once into frozen dataclasses. It collects the rooms'
+sections."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+from iort_agent.common.logs import LOG_LEVELS
+from iort_agent.common.schema import (
+    Place,
+    any_path,
+    choice,
+    existing_path,
+    items,
+    load,
+    number,
+    read_yaml,
+    section,
+    setting,
+    text,
+    variant,
+)
+from iort_agent.control.config import DownlinkConfig, ShareConfig, share_rule
+from iort_agent.errors import ConfigError
+from iort_agent.files.config import FilesConfig
+from iort_agent.lanes.config import LiveConfig, PingConfig, RecordConfig
+from iort_agent.sources import SourceConfig
+from iort_agent.sources.registry import SOURCES
+from iort_agent.spool.config import QueueConfig
+from iort_agent.status.metrics import MetricsConfig
+from iort_contract.catalog.streams import OWN_STREAMS
+from iort_contract.limits import DEFAULT_NAMESPACE
+from iort_contract.topics import check_namespace, check_robot
+
+
+@dataclass(frozen=True)
+class Config:
+    """The whole configuration. Paths in the file are relative to the file.
+
+    Without ``root_ca``, the system's trust store must contain the broker's authority, as it does AWS'. The
+    default ``status_socket`` is agent.sock beside the file.
+    """
+
+    robot: str = setting(text(check_robot))
+    endpoint: str = setting(text())
+    certificate: Path = setting(existing_path())
+    private_key: Path = setting(existing_path())
+    sources: tuple[SourceConfig, ...] = setting(
+        items(variant("type", SOURCES), at_least=1, what="a list of at least one source")
+    )
+    root_ca: Path | None = setting(existing_path(), None)
+    namespace: str = setting(text(check_namespace), DEFAULT_NAMESPACE)
+    port: int = setting(number(1, 65535, whole=True), 8883)
+    record: RecordConfig = setting(section(RecordConfig), RecordConfig())
+    live: LiveConfig = setting(section(LiveConfig), LiveConfig())
+    ping: PingConfig = setting(section(PingConfig), PingConfig())
+    queue: QueueConfig = setting(section(QueueConfig), QueueConfig())
+    files: FilesConfig = setting(section(FilesConfig), FilesConfig())
+    metrics: MetricsConfig = setting(section(MetricsConfig), MetricsConfig())
+    downlink: DownlinkConfig = setting(section(DownlinkConfig), DownlinkConfig())
+    share: tuple[tuple[str, ShareConfig], ...] = setting(share_rule(), ())
+    status_socket: Path | None = setting(any_path(), None)
+    log_level: str = setting(choice(*LOG_LEVELS), "info")
+
+
+def load_config(file: Path) -> Config:
+    """Read a configuration file. Raises `ConfigError`, which names file, key, value and what is allowed."""
+    place = Place(file)
+    content = read_yaml(file)
+    if content is None:
+        raise ConfigError(f"{file}: is empty")
+    config = load(Config, content, place)
+    _check_streams(config, place.child("sources"))
+    if config.files.large_folder is None and any(source.uploads_large() for source in config.sources):
+        raise place.child("files.large_folder").problem(
+            "required, and missing: a source says `large: upload`, and its contents wait in this folder"
+        )
+    if "://" in config.endpoint or "/" in config.endpoint:
+        raise place.child("endpoint").error(config.endpoint, "a host name, without scheme or path")
+    return config
+
+
+def _check_streams(config: Config, place: Place) -> None:
+    """Two sources must not write one stream: their samples would mix into one time series."""
+    taken: list[str] = sorted(OWN_STREAMS)
+    for i, source in enumerate(config.sources):
+        for stream in source.streams():
+            if stream in taken:
+                raise place.item(i).problem(f"the stream {stream} is taken: {', '.join(taken)} are in use")
+        taken += source.streams()

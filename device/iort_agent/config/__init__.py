@@ -1,1 +1,0 @@
-"""car.yaml, read once into frozen dataclasses. Each room has its section; `file` collects them."""

@@ -1,0 +1,30 @@
+"""The two sides that commands, peers and shares connect: the broker and the ROS graph."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Callable
+
+from iort_agent.common.state import ClockOffset
+from iort_agent.common.throttled_log import ThrottledLog
+from iort_agent.mqtt.uplink import Link
+from iort_agent.ros1.node import Graph
+
+
+@dataclass(frozen=True)
+class Bridge:
+    """Both sides. ``offset`` returns the cloud's clock minus ours, if it is known well enough."""
+
+    link: Link
+    graph: Graph
+    offset: Callable[[], ClockOffset | None]
+    rejections: ThrottledLog
+
+    def offset_us(self) -> int | None:
+        """The offset in microseconds."""
+        offset = self.offset()
+        return round(offset.offset_ms * 1000) if offset is not None else None
+
+    def reject(self, what: str, reason: str, why: str) -> None:
+        """Count a rejected message, and log it unless one like it was logged less than a minute ago."""
+        self.rejections.warn(f"{what} {reason}", f"{what}: rejected: {why}")

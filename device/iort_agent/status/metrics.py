@@ -1,0 +1,108 @@
+"""The agent's own figures, as samples of a stream like any other."""
+
+from __future__ import annotations
+
+import os
+import resource
+import time
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Mapping
+
+from iort_agent.clock import Clock
+from iort_agent.common.schema import flag, number, setting
+from iort_agent.files.uploads import Uploads
+from iort_agent.lanes.batch_encoder import StreamCounts
+from iort_agent.lanes.clock_offset import OffsetEstimator
+from iort_agent.mqtt.uplink import Uplink
+from iort_agent.spool.interface import Spool
+from iort_contract.catalog.streams import AGENT_FIELDS
+from iort_contract.limits import Value
+
+_STATM = Path("/proc/self/statm")
+
+
+@dataclass(frozen=True)
+class MetricsConfig:
+    """The agent's own figures: one sample of the stream `iort_contract.AGENT_STREAM` every ``every_s``."""
+
+    enabled: bool = setting(flag(), default=True)
+    every_s: float = setting(number(1, 3600, unit="s"), 10.0)
+
+
+class Rates:
+    """Samples a second of each stream, and the time since its last sample."""
+
+    def __init__(self, clock: Clock) -> None:
+        self._clock = clock
+        self._at = clock.monotonic()
+        self._counts: dict[str, int] = {}
+        self._changed: dict[str, float] = {}
+        self.per_s: dict[str, float] = {}
+
+    def update(self, counts: Mapping[str, StreamCounts]) -> None:
+        """Take the counts; called about once a second."""
+        now = self._clock.monotonic()
+        passed = now - self._at
+        if passed <= 0:
+            return
+        self._at = now
+        for name, count in counts.items():
+            new = count.samples - self._counts.get(name, 0)
+            self._counts[name] = count.samples
+            self.per_s[name] = round(new / passed, 2)
+            if new:
+                self._changed[name] = now
+
+    def silent_s(self, stream: str) -> float:
+        """Seconds since the last sample, to within the time between two updates."""
+        return round(self._clock.monotonic() - self._changed.get(stream, self._at), 1)
+
+
+class AgentMetrics:
+    """Makes the samples."""
+
+    def __init__(
+        self,
+        *,
+        clock: Clock,
+        spool: Spool,
+        uplink: Uplink,
+        offset: OffsetEstimator,
+        uploads: Uploads | None = None,
+    ) -> None:
+        self._clock, self._spool, self._uplink, self._offset = clock, spool, uplink, offset
+        self._uploads = uploads
+        self._at, self._cpu_s, self._samples = clock.monotonic(), time.process_time(), 0
+
+    def sample(self, samples: int) -> dict[str, Value]:
+        """The figures since the last call; ``samples`` counts what all sources have given so far."""
+        now, cpu_s = self._clock.monotonic(), time.process_time()
+        passed = max(now - self._at, 1e-3)
+        backlog, dropped, offset = self._spool.backlog(), self._spool.dropped(), self._offset.estimate()
+        files = self._uploads.status() if self._uploads is not None else None
+        values: dict[str, Value] = {
+            "cpu_percent": round((cpu_s - self._cpu_s) / passed * 100, 2),
+            "rss_mb": rss_mb(),
+            "samples_per_s": round((samples - self._samples) / passed, 2),
+            "backlog_batches": backlog.batches,
+            "backlog_bytes": backlog.payload_bytes,
+            "dropped_batches": dropped.batches,
+            "connects": self._uplink.status().connects,
+            "clock_offset_ms": offset.offset_ms if offset is not None else None,
+            "clock_uncertainty_ms": offset.uncertainty_ms if offset is not None else None,
+            "files_waiting": files.waiting if files is not None else 0,
+            "files_sent_bytes": files.sent_bytes if files is not None else 0,
+        }
+        self._at, self._cpu_s, self._samples = now, cpu_s, samples
+        assert values.keys() == AGENT_FIELDS.keys()
+        return values
+
+
+def rss_mb() -> float:
+    """The memory that this process uses; without /proc, the most that it has used."""
+    try:
+        pages = int(_STATM.read_text(encoding="ascii").split()[1])
+    except (OSError, ValueError, IndexError):
+        return round(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024, 1)
+    return round(pages * os.sysconf("SC_PAGE_SIZE") / 1e6, 1)

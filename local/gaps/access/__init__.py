@@ -1,1 +1,0 @@
-"""Gaps of IAM: the action and the resource that a request is checked for."""

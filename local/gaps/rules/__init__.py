@@ -1,1 +1,0 @@
-"""Gaps of AWS IoT rules: SQL and actions."""

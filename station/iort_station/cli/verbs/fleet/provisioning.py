@@ -1,0 +1,110 @@
+"""`iort robots add, register, claim, rotate, revoke-claims`: names, certificates and provisioning claims."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from iort_contract.catalog.derived import F1TENTH
+from iort_station.cli.console import errors, out
+from iort_station.errors import StationError
+from iort_station.fleet import claims, registry, robots, rotation
+
+commands = typer.Typer()
+
+_Gain = Annotated[float, typer.Option(help="erpm per m/s (vesc.yaml).")]
+_ClaimFolder = Annotated[Path, typer.Option("--out", help="The folder to write the claim into.")]
+
+
+@commands.command("add")
+def add(
+    context: typer.Context,
+    name: str,
+    folder: Annotated[
+        Path, typer.Option("--out", help="Where to write the robot's folder of configuration and keys.")
+    ] = Path(),
+    speed_to_erpm_gain: _Gain = F1TENTH.speed_to_erpm_gain,
+) -> None:
+    """Register a robot and write its folder: car.yaml, certificate and key."""
+    bundle = robots.add(context.obj.cloud(), name, out=folder, vehicle=_vehicle(speed_to_erpm_gain))
+    out.print(f"{name} is registered. Copy {bundle.folder} to it, then run there:\n")
+    out.print(f"  iort-agent run --config {bundle.folder.name}/car.yaml")
+
+
+@commands.command("register")
+def register(
+    context: typer.Context,
+    names: Annotated[list[str], typer.Argument(help="The robots' names.")],
+    serial: Annotated[
+        str | None, typer.Option(help="The serial number of the one machine that may claim the name.")
+    ] = None,
+    days: Annotated[float, typer.Option(help="How many days the name can be claimed.", min=0)] = claims.DAYS,
+    speed_to_erpm_gain: _Gain = F1TENTH.speed_to_erpm_gain,
+) -> None:
+    """Pre-register names. Any robot with one of the fleet's lasting claims can claim each name once."""
+    if serial is not None and len(names) != 1:
+        raise StationError("--serial is for one machine: give one name with it")
+    cloud, vehicle = context.obj.cloud(), _vehicle(speed_to_erpm_gain)
+    for name in names:
+        claims.register(cloud, name, serial=serial, days=days, vehicle=vehicle)
+        out.print(f"{name} is expected for {days:g} days")
+
+
+@commands.command("claim")
+def claim(
+    context: typer.Context,
+    name: Annotated[str | None, typer.Argument(help="The robot's name; not with --lasting.")] = None,
+    folder: _ClaimFolder = Path("claim"),
+    lasting: Annotated[bool, typer.Option(help="Valid until revoked, instead of five minutes.")] = False,
+) -> None:
+    """Write a provisioning claim, which the robot exchanges for a certificate of its own key.
+
+    The claim is for NAME alone, which this command registers or opens again. Without a name, a lasting
+    claim is for the pre-registered names (`iort robots register`), once for each.
+    """
+    if name is None and not lasting:
+        raise StationError("give the robot's name, or --lasting for a claim of many robots")
+    path = claims.claim(context.obj.cloud(), name, out=folder, lasting=lasting)
+    out.print(f"Copy {folder} to the robot, then run there:\n")
+    out.print(f"  iort-agent provision --config {folder.name}/{path.name}")
+
+
+@commands.command("rotate")
+def rotate(
+    context: typer.Context,
+    name: str,
+    folder: _ClaimFolder = Path("claim"),
+    finish: Annotated[
+        bool, typer.Option("--finish", help="The robot has its new certificate: wait, and revoke the old.")
+    ] = False,
+    wait: Annotated[bool, typer.Option(help="Wait for the robot, then revoke the old certificate.")] = True,
+    settled_s: Annotated[
+        float, typer.Option(help="Seconds that the robot must be connected with the new one.", min=0)
+    ] = rotation.SETTLED_S,
+) -> None:
+    """Give a robot a new key and certificate; revoke the old one after the new one is in use.
+
+    The robot can connect at every moment. You may stop the command at any time: `--finish` does the rest.
+    """
+    cloud = context.obj.cloud()
+    if not finish:
+        registry.get(cloud, name)
+        path = claims.claim(cloud, name, out=folder)
+        out.print(f"Copy {folder} to {name} within five minutes, then run there:\n")
+        out.print(f"  iort-agent renew --config car.yaml --claim {folder.name}/{path.name}\n")
+    if finish or wait:
+        with errors.status("waiting") as status:
+            old = rotation.finish(cloud, name, settled_s=settled_s, progress=status.update)
+        out.print(f"{name} has settled with its new certificate; revoked: {len(old)}")
+
+
+@commands.command("revoke-claims")
+def revoke_claims(context: typer.Context) -> None:
+    """Revoke every lasting claim. Robots that were provisioned with one keep their own certificate."""
+    out.print(f"lasting claims revoked: {claims.revoke_all(context.obj.cloud())}")
+
+
+def _vehicle(speed_to_erpm_gain: float) -> dict[str, float]:
+    return robots.checked_vehicle({**robots.F1TENTH, "speed_to_erpm_gain": speed_to_erpm_gain})

@@ -1,0 +1,32 @@
+"""The folders of the page's sources use each other as station/web/README.md says."""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+
+WEB = Path(__file__).resolve().parents[3] / "station" / "web"
+SOURCES = WEB / "src"
+
+
+def allowed() -> dict[str, set[str]]:
+    rows = re.findall(r"^\| `(\w+)` \|.*\| (.*) \|$", (WEB / "README.md").read_text(), re.MULTILINE)
+    folders = {folder for folder, _ in rows}
+    return {
+        folder: folders if "all of them" in uses else {folder, *re.findall(r"`(\w+)`", uses)}
+        for folder, uses in rows
+    }
+
+
+def test_every_folder_is_described_and_has_at_most_a_dozen_files():
+    folders = [folder for folder in SOURCES.iterdir() if folder.is_dir()]
+    assert {folder.name for folder in folders} == set(allowed())
+    assert max(len(list(folder.iterdir())) for folder in [SOURCES, *folders]) <= 12
+
+
+def test_a_folder_uses_only_what_its_row_allows():
+    rules = allowed()
+    for path in SOURCES.glob("*/*.ts"):
+        for imported in re.findall(r'from "(\.[^"]+)"', path.read_text()):
+            target = (path.parent / imported).resolve().relative_to(SOURCES).parts[0]
+            assert target in rules[path.parent.name], f"{path.relative_to(SOURCES)} imports {imported}"

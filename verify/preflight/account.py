@@ -1,0 +1,175 @@
+"""A deployment's requirements for account and region, whatever is deployed there."""
+
+from __future__ import annotations
+
+from botocore.exceptions import BotoCoreError, ClientError
+
+from iort_contract.topics import RULES, rule_name
+from iort_station.cost.scale import on_paper
+from iort_station.cost.usage import Usage
+from iort_station.errors import StationError
+from stacks.settings import Settings
+from verify.preflight.deployed import resources
+from verify.preflight.finding import Clients, Found, code, fine, item, listed, stops, warning
+
+# The CDK's default synthesizer needs this version of the bootstrap stack; a test compares it with the
+# manifest.
+BOOTSTRAP = 6
+BOOTSTRAP_PARAMETER = "/cdk-bootstrap/hnb659fds/version"
+# "PutFunctionConcurrency": a reservation must leave this many executions to all other functions.
+UNRESERVED = 100
+# The quotas should suffice for this fleet.
+ROBOTS = 100
+# Service Quotas' name of AWS IoT Core, and each quota with a fleet's need (cost/scale.py).
+IOT_CORE = "iotcore"
+RULES_QUOTA = "Maximum number of rules per AWS account"
+QUOTAS = {
+    "Maximum concurrent client connections per account": "IoT Core: connections",
+    "Inbound publish requests per second per account": "IoT Core: publishes in",
+    "Rule evaluations per second per AWS account": "IoT Core: rule evaluations",
+}
+CONNECTS_QUOTA = "Connect requests per second per account"
+
+
+@item("credentials", "sts GetCallerIdentity")
+def credentials(clients: Clients, _settings: Settings) -> Found:
+    """Check the credentials and the region."""
+    try:
+        sts = clients.client("sts")
+        answer = sts.get_caller_identity()
+    except (BotoCoreError, ClientError, StationError) as error:
+        return stops(
+            str(error), "set AWS_PROFILE or AWS_ACCESS_KEY_ID and AWS_SECRET_ACCESS_KEY, and AWS_REGION"
+        )
+    return fine(f"account {answer['Account']}, region {sts.meta.region_name}, as {answer['Arn']}")
+
+
+@item("bootstrap", f"ssm GetParameter {BOOTSTRAP_PARAMETER}")
+def bootstrap(clients: Clients, _settings: Settings) -> Found:
+    """Check that the CDK's bootstrap stack exists, and is new enough for our templates."""
+    try:
+        answer = clients.client("ssm").get_parameter(Name=BOOTSTRAP_PARAMETER)
+    except ClientError as error:
+        if code(error) != "ParameterNotFound":
+            raise
+        return stops("this account and region are not bootstrapped", "`make bootstrap`, once")
+    version = int(answer["Parameter"]["Value"])
+    if version < BOOTSTRAP:
+        return stops(f"version must be {BOOTSTRAP} or newer, got {version}", "`make bootstrap` again")
+    return fine(f"version {version}, needed is {BOOTSTRAP}")
+
+
+@item("AWS IoT's log", "iot GetV2LoggingOptions")
+def iot_log(clients: Clients, settings: Settings) -> Found:
+    """Check that the region's one setting is free if `iort_log_level` needs it."""
+    iot = clients.client("iot")
+    try:
+        options = iot.get_v2_logging_options()
+    except ClientError as error:
+        if code(error) != "NotConfiguredException":
+            raise
+        options = {}
+    # CloudFormation's handler treats a disabled log as free.
+    configured = bool(options.get("roleArn")) and not options.get("disableAllLogs")
+    said = f"configured ({options.get('defaultLogLevel', 'no level')})" if configured else "not configured"
+    if not configured or not settings.iot_log_level or settings.embedded:
+        return fine(f"{said}; iot_log_level is {settings.iot_log_level or 'off'}")
+    remedy = "leave `iot_log_level` off, or disable it: `aws iot set-v2-logging-options --disable-all-logs`"
+    return _held(clients, settings, "AWS::IoT::Logging", said, remedy)
+
+
+@item("Device Defender's audit", "iot DescribeAccountAuditConfiguration")
+def audit(clients: Clients, settings: Settings) -> Found:
+    """Check that the region's one configuration is free if `device_defender` needs it."""
+    # CloudFormation's handler also decides by the role: without configuration, AWS answers without one.
+    configured = bool(clients.client("iot").describe_account_audit_configuration().get("roleArn"))
+    said = "configured" if configured else "not configured"
+    wanted = "wanted" if settings.device_defender else "not wanted (device_defender=false)"
+    if not configured or not settings.device_defender or settings.embedded:
+        return fine(f"{said}; {wanted}")
+    remedy = "leave `device_defender` off: the account has its audit"
+    return _held(clients, settings, "AWS::IoT::AccountAuditConfiguration", said, remedy)
+
+
+def _held(clients: Clients, settings: Settings, kind: str, said: str, remedy: str) -> Found:
+    """The finding on a setting that the region has only once, and that is set."""
+    if any(one.kind == kind for one in resources(clients, f"{settings.namespace}-account")):
+        return fine(f"{said}, by this deployment")
+    return stops(
+        f"{said}, not by this deployment: the stack account would fail with 'already exists'", remedy
+    )
+
+
+@item("Lambda's concurrency", "lambda GetAccountSettings")
+def concurrency(clients: Clients, settings: Settings) -> Found:
+    """Check that Lambda 1's reservation leaves enough for the others."""
+    lambda_ = clients.client("lambda")
+    limit = lambda_.get_account_settings()["AccountLimit"]
+    total, unreserved = limit["ConcurrentExecutions"], limit["UnreservedConcurrentExecutions"]
+    wanted, held = settings.reserved_for_live, 0
+    if wanted and unreserved - wanted < UNRESERVED:
+        # An update may hold the reservation already.
+        for one in resources(clients, f"{settings.namespace}-processing"):
+            if one.kind == "AWS::Lambda::Function" and one.logical_id.startswith("Live"):
+                answer = lambda_.get_function_concurrency(FunctionName=one.physical_id)
+                held = answer.get("ReservedConcurrentExecutions", 0)
+    text = f"{total} concurrent executions, {unreserved} of them unreserved; {wanted} are to be reserved"
+    if wanted and unreserved + held - wanted < UNRESERVED:
+        return stops(
+            f"{text}, and Lambda requires {UNRESERVED} unreserved",
+            "ask for more ('Service Quotas', AWS Lambda, 'Concurrent executions'), or -c live_concurrency=0",
+        )
+    if total < UNRESERVED:
+        return warning(text, "ask for more before the fleet grows: docs/cloud.md, Lambda's limit")
+    return fine(text)
+
+
+@item("CloudFront", "cloudfront ListDistributions, where `site` is set")
+def cloudfront(clients: Clients, settings: Settings) -> Found:
+    """Check that CloudFront answers; no read-only call tells if it would create a distribution."""
+    if not settings.site:
+        return fine("not wanted (site=false)")
+    if resources(clients, f"{settings.namespace}-site"):
+        return fine("the stack site is deployed")
+    clients.client("cloudfront").list_distributions(MaxItems="1")
+    return warning(
+        "it answers; its verification of the account cannot be read",
+        "if the stack site fails with 'Your account must be verified', ask AWS Support",
+    )
+
+
+@item(
+    "AWS IoT's quotas", "service-quotas ListServiceQuotas and ListAWSDefaultServiceQuotas, iot ListTopicRules"
+)
+def quotas(clients: Clients, settings: Settings) -> Found:
+    """Check that our rules fit, and how many robots the quotas allow."""
+    service = clients.client("service-quotas")
+    values: dict[str, float] = {}
+    for operation in ("list_aws_default_service_quotas", "list_service_quotas"):
+        quotas = listed(service, operation, "Quotas", ServiceCode=IOT_CORE)
+        values.update((one["QuotaName"], one["Value"]) for one in quotas)
+    ours = {rule_name(rule, settings.namespace) for rule in RULES}
+    others = {rule["ruleName"] for rule in listed(clients.client("iot"), "list_topic_rules", "rules")} - ours
+    if RULES_QUOTA in values and len(others) + len(ours) > values[RULES_QUOTA]:
+        return stops(
+            f"{len(others)} rules of others and {len(ours)} of ours exceed the limit {values[RULES_QUOTA]:g}",
+            "remove rules, or ask for more ('Service Quotas', AWS IoT Core)",
+        )
+    needs = {need.name: need.needed for need in on_paper(Usage()).needs}
+    robots = {name: values[name] / needs[need] for name, need in QUOTAS.items() if name in values}
+    if CONNECTS_QUOTA in values:
+        # After an outage the whole fleet reconnects within a minute.
+        robots[CONNECTS_QUOTA] = values[CONNECTS_QUOTA] * 60
+    missing = (QUOTAS.keys() | {CONNECTS_QUOTA}) - robots.keys()
+    if not robots:
+        return warning("AWS reports none of the quotas", "see 'Service Quotas', AWS IoT Core, in the console")
+    scarce = min(robots, key=lambda name: robots[name])
+    text = f"for {robots[scarce]:,.0f} robots that drive at once; first limit: {scarce}, {values[scarce]:g}"
+    if missing:
+        text += f"; unknown: {', '.join(sorted(missing))}"
+    if robots[scarce] < ROBOTS:
+        return warning(text, "ask for more ('Service Quotas', AWS IoT Core) before the fleet grows")
+    return fine(text)
+
+
+ITEMS = (bootstrap, iot_log, audit, concurrency, cloudfront, quotas)

@@ -1,0 +1,236 @@
+"""Checks the deployment of the same namespace: its stacks, other resources with its names, and settings that
+cannot change in one step."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from typing import Any, NamedTuple
+
+from botocore.exceptions import ClientError
+
+from iort_contract.cloud import claim_name, fleet_name
+from iort_contract.topics import RULES, rule_name
+from stacks.settings import PROD, Settings
+from stacks.storage import OLD_TELEMETRY
+from verify.preflight.finding import Clients, Found, code, fine, item, listed, stops, warning
+
+# Every stack that app.py may create, in the order of deployment; a test compares it with the app.
+STACKS = ("storage", "quarantine", "fleet", "processing", "ingest", "monitoring", "site", "account")
+# In these states neither CloudFormation nor the CDK can continue.
+_STUCK = {
+    "ROLLBACK_COMPLETE": "its first deployment failed: delete it (`aws cloudformation delete-stack`)",
+    "ROLLBACK_FAILED": "its first deployment failed: delete it (`aws cloudformation delete-stack`)",
+    "CREATE_FAILED": "its first deployment failed: delete it (`aws cloudformation delete-stack`)",
+    "DELETE_FAILED": "its deletion failed: its events say what stayed; delete it again",
+    "REVIEW_IN_PROGRESS": "its change set was never executed: delete the stack, it is empty",
+    "UPDATE_ROLLBACK_FAILED": "`aws cloudformation continue-update-rollback`, then deploy again",
+}
+
+
+class Resource(NamedTuple):
+    """A resource of a deployed stack."""
+
+    kind: str
+    logical_id: str
+    physical_id: str
+
+
+def stack(clients: Clients, name: str) -> dict[str, Any] | None:
+    """A stack as CloudFormation describes it; None if it does not exist."""
+    try:
+        answer = clients.client("cloudformation").describe_stacks(StackName=name)
+    except ClientError as error:
+        if code(error) != "ValidationError":
+            raise
+        return None
+    found: dict[str, Any] = answer["Stacks"][0]
+    return found
+
+
+def resources(clients: Clients, name: str) -> list[Resource]:
+    """The resources of a stack; empty if it does not exist."""
+    client = clients.client("cloudformation")
+    try:
+        return [
+            Resource(one["ResourceType"], one["LogicalResourceId"], one["PhysicalResourceId"])
+            for one in listed(client, "list_stack_resources", "StackResourceSummaries", StackName=name)
+            if "PhysicalResourceId" in one and one["ResourceStatus"] != "DELETE_COMPLETE"
+        ]
+    except ClientError as error:
+        if code(error) != "ValidationError":
+            raise
+        return []
+
+
+@item("stacks", "cloudformation DescribeStacks of every stack of the namespace")
+def stacks(clients: Clients, settings: Settings) -> Found:
+    """Check that every existing stack can be updated."""
+    states = {}
+    for noun in STACKS:
+        name = f"{settings.namespace}-{noun}"
+        found = stack(clients, name)
+        if found is not None:
+            states[name] = found["StackStatus"]
+    stuck = {name: state for name, state in states.items() if _todo(state)}
+    if stuck:
+        return stops(
+            ", ".join(f"{name} is {state}" for name, state in stuck.items()),
+            "; ".join(dict.fromkeys(f"{state}: {_todo(state)}" for state in stuck.values())),
+        )
+    return fine(
+        f"{len(states)} of {len(STACKS)} are there, each can be updated" if states else "none: a first one"
+    )
+
+
+def _todo(state: str) -> str:
+    if state in _STUCK:
+        return _STUCK[state]
+    return "somebody else's deployment is running: wait for its end" if state.endswith("IN_PROGRESS") else ""
+
+
+@item(
+    "names",
+    "iot Describe.../GetPolicy/ListTopicRules, cloudwatch ListDashboards: names that are part of the design",
+)
+def names(clients: Clients, settings: Settings) -> Found:
+    """Check that fixed names are free if the stack that creates them does not exist."""
+    taken: list[str] = []
+    if stack(clients, f"{settings.namespace}-fleet") is None:
+        taken += _taken_of_the_fleet(clients, settings)
+    if stack(clients, f"{settings.namespace}-ingest") is None:
+        ours = {rule_name(rule, settings.namespace) for rule in RULES}
+        rules = {one["ruleName"] for one in listed(clients.client("iot"), "list_topic_rules", "rules")}
+        taken += sorted(f"rule {name}" for name in rules & ours)
+    if stack(clients, f"{settings.namespace}-monitoring") is None:
+        ours = {f"{settings.namespace}-{name}" for name in ("platform", "robots")}
+        entries = listed(
+            clients.client("cloudwatch"),
+            "list_dashboards",
+            "DashboardEntries",
+            DashboardNamePrefix=f"{settings.namespace}-",
+        )
+        taken += sorted(f"dashboard {name}" for name in {one["DashboardName"] for one in entries} & ours)
+    if taken:
+        return stops(
+            f"exist without their stack: {', '.join(taken)}",
+            "delete them, or deploy under another name: -c namespace=...",
+        )
+    return fine("free, or used by this deployment")
+
+
+def _taken_of_the_fleet(clients: Clients, settings: Settings) -> Iterator[str]:
+    iot, fleet, claim = clients.client("iot"), fleet_name(settings.namespace), claim_name(settings.namespace)
+    asked: dict[str, Callable[[], Any]] = {
+        f"thing type {fleet}": lambda: iot.describe_thing_type(thingTypeName=fleet),
+        f"thing group {fleet}": lambda: iot.describe_thing_group(thingGroupName=fleet),
+        f"policy {fleet}": lambda: iot.get_policy(policyName=fleet),
+        f"policy {claim}": lambda: iot.get_policy(policyName=claim),
+        f"provisioning template {fleet}": lambda: iot.describe_provisioning_template(templateName=fleet),
+    }
+    for name, ask in asked.items():
+        try:
+            ask()
+        except ClientError as error:  # noqa: PERF203 - each waits for an answer
+            if code(error) != "ResourceNotFoundException":
+                raise
+        else:
+            yield name
+
+
+@item("kept data", "dynamodb ListTables, s3 ListBuckets, sqs ListQueues, logs DescribeLogGroups")
+def kept(clients: Clients, settings: Settings) -> Found:
+    """Look for leftovers of an earlier deployment. The CDK's names end randomly, so they never collide."""
+    known = {one.physical_id for noun in STACKS for one in resources(clients, f"{settings.namespace}-{noun}")}
+    known |= {name.rsplit("/", 1)[-1] for name in known if name.startswith("http")}
+    left = sorted(name for name in _holders(clients, settings.namespace) if name not in known)
+    if not left:
+        return fine("no leftovers")
+    shown = ", ".join(left[:10]) + (f" and {len(left) - 10} more" if len(left) > 10 else "")
+    return warning(
+        f"of an earlier deployment, without conflict: {shown}",
+        "a new deployment begins empty: copy batches with `iort adopt TABLE`, or delete them to save costs",
+    )
+
+
+def _holders(clients: Clients, namespace: str) -> Iterator[str]:
+    """Tables, buckets, queues and log groups with the names that the CDK gives to our stacks."""
+    client = clients.client
+    prefix = f"{namespace}-"
+    queues = listed(client("sqs"), "list_queues", "QueueUrls", QueueNamePrefix=prefix)
+    groups = listed(client("logs"), "describe_log_groups", "logGroups", logGroupNamePrefix=prefix)
+    names = (
+        *listed(client("dynamodb"), "list_tables", "TableNames"),
+        *(bucket["Name"] for bucket in client("s3").list_buckets()["Buckets"]),
+        *(url.rsplit("/", 1)[-1] for url in queues),
+        *(group["logGroupName"] for group in groups),
+    )
+    prefixes = tuple(f"{namespace}-{noun}-" for noun in STACKS)
+    return (name for name in names if name.startswith(prefixes))
+
+
+@item("changed settings", "cloudformation ListExports, ListImports and DescribeStacks, against the settings")
+def changes(clients: Clients, settings: Settings) -> Found:
+    """Check that the settings may follow those of the deployed stacks."""
+    storage = f"{settings.namespace}-storage"
+    deployed = stack(clients, storage)
+    if deployed is None:
+        return fine("nothing is deployed")
+    used = _used_exports(clients, storage)
+    if used["Key"] and not (settings.customer_key or settings.keep_customer_key):
+        return stops(
+            f"customer_key was true and is false now: {_used_by(used['Key'])} the key, whose "
+            "export CloudFormation does not remove, and what is encrypted already would have no key",
+            "in two steps: first -c keep_customer_key=true, later without it (docs/cloud.md)",
+        )
+    if used[OLD_TELEMETRY] and not settings.old_telemetry:
+        return stops(
+            f"deployed is the telemetry table of before batches had ids: {_used_by(used[OLD_TELEMETRY])} it",
+            "in two steps: deploy with -c old_telemetry=true, then `iort adopt` (docs/upgrading.md)",
+        )
+    tags = {tag["Key"]: tag["Value"] for tag in deployed.get("Tags", [])}
+    if tags.get("stage") == PROD != settings.stage:
+        return warning(
+            "the deployed stage is prod, the new one is dev: data would no longer be protected",
+            "pass -c stage=prod, as always; leave it out only to take the deployment down",
+        )
+    wanted = {"site": settings.site, "account": settings.account_wide}
+    gone = [f"{settings.namespace}-{noun}" for noun, want in wanted.items() if not want]
+    gone = [name for name in gone if stack(clients, name) is not None]
+    if gone:
+        return warning(
+            f"deployed, and not among the settings: {', '.join(gone)} (stays as it is)",
+            "give the parameter as before, or delete the stack: `aws cloudformation delete-stack`",
+        )
+    return fine("none that must not be")
+
+
+def _used_exports(clients: Clients, storage: str) -> dict[str, list[str]]:
+    """The stacks that import the storage stack's key or old telemetry table."""
+    client = clients.client("cloudformation")
+    used: dict[str, list[str]] = {"Key": [], OLD_TELEMETRY: []}
+    exports = [one["Name"] for one in listed(client, "list_exports", "Exports")]
+    for what, importers in used.items():
+        # The CDK names an export by its reading, the construct, and a hash.
+        prefixes = tuple(f"{storage}:ExportsOutput{how}{what}" for how in ("FnGetAtt", "Ref"))
+        for name in exports:
+            if name.startswith(prefixes):
+                importers.extend(_importers(client, name))
+    return used
+
+
+def _importers(client: Any, export: str) -> list[str]:
+    try:
+        return list(listed(client, "list_imports", "Imports", ExportName=export))
+    except ClientError as error:
+        # AWS answers with an error if no stack imports it.
+        if "not imported" not in str(error):
+            raise
+        return []
+
+
+def _used_by(importers: list[str]) -> str:
+    names = sorted(set(importers))
+    return f"{', '.join(names)} {'imports' if len(names) == 1 else 'import'}"
+
+
+ITEMS = (stacks, names, kept, changes)

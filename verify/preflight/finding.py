@@ -1,0 +1,111 @@
+"""A finding of the preflight, and its creation from any answer of AWS."""
+
+from __future__ import annotations
+
+import enum
+import re
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from functools import wraps
+from typing import Any, NamedTuple, Protocol
+
+from botocore.exceptions import BotoCoreError, ClientError
+
+from iort_station.errors import StationError
+from stacks.settings import Settings
+
+_DENIED = {"AccessDenied", "AccessDeniedException", "UnauthorizedOperation", "UnauthorizedException"}
+_ACTION = re.compile(r"not authorized to perform:? ([a-z0-9-]+:\w+)", re.IGNORECASE)
+
+
+class Verdict(enum.Enum):
+    """The meaning of a finding for the deployment."""
+
+    FINE = "fine"
+    WARNING = "warning"
+    STOPS = "stops"
+
+
+class Clients(Protocol):
+    """Creates clients of AWS' services; `iort_station.cloud.Cloud` is one."""
+
+    def client(self, service: str) -> Any:
+        """A boto3 client."""
+
+
+class Found(NamedTuple):
+    """An item's result; ``do`` is the remedy."""
+
+    verdict: Verdict
+    text: str
+    do: str = ""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Finding:
+    """One item of the preflight: what was ``asked`` and ``found``, the verdict, and the remedy, ``do``."""
+
+    item: str
+    asked: str
+    found: str
+    verdict: Verdict
+    do: str = ""
+
+
+Item = Callable[[Clients, Settings], Finding]
+
+
+def fine(text: str) -> Found:
+    """Nothing to do."""
+    return Found(Verdict.FINE, text)
+
+
+def warning(text: str, do: str) -> Found:
+    """The deployment would succeed, but its operator should know."""
+    return Found(Verdict.WARNING, text, do)
+
+
+def stops(text: str, do: str) -> Found:
+    """The deployment would fail, or lose something."""
+    return Found(Verdict.STOPS, text, do)
+
+
+def item(name: str, asked: str) -> Callable[[Callable[[Clients, Settings], Found]], Item]:
+    """Turn a function's result into a finding. A missing answer of AWS is a warning and never stops: the
+    deployment itself may need other permissions."""
+
+    def wrap(look: Callable[[Clients, Settings], Found]) -> Item:
+        @wraps(look)
+        def ask(clients: Clients, settings: Settings) -> Finding:
+            try:
+                found = look(clients, settings)
+            except ClientError as error:
+                found = _not_answered(error)
+            except (BotoCoreError, StationError) as error:
+                found = warning(f"not answered: {error}", "look at the network and the region")
+            return Finding(item=name, asked=asked, found=found.text, verdict=found.verdict, do=found.do)
+
+        return ask
+
+    return wrap
+
+
+def listed(client: Any, operation: str, key: str, **arguments: Any) -> Iterator[Any]:
+    """The entries of all pages of a list."""
+    for page in client.get_paginator(operation).paginate(**arguments):
+        yield from page.get(key, ())
+
+
+def code(error: ClientError) -> str:
+    """AWS' name of an error."""
+    return str(error.response["Error"]["Code"])
+
+
+def _not_answered(error: ClientError) -> Found:
+    if code(error) not in _DENIED:
+        return warning(f"not answered: {error}", "ask it by hand, or continue without it")
+    said = _ACTION.search(str(error))
+    action = said[1] if said else error.operation_name
+    return warning(
+        f"not answered: the permission {action} is missing", f"allow {action}, or go on without it"
+    )

@@ -1,0 +1,172 @@
+"""Alarms and alerts: notices reach a person, and CloudWatch accepts the alarms' queries."""
+
+from __future__ import annotations
+
+import json
+import time
+from dataclasses import replace
+from datetime import datetime, timedelta, timezone
+from typing import Any
+
+from bench.target import Target
+from iort_contract.catalog.vesc import FAULT_FIELD, VESC_STREAM
+from iort_contract.messages.live import LiveSample, encode_live
+from iort_contract.topics import LIVE, build_topic
+from verify.errors import VerifyError
+from verify.question import WITH_KEY, Seen, question
+from verify.tools.inbox import inbox
+from verify.tools.robot import Robot
+from verify.tools.telemetry import RUN
+from verify.tools.waiting import until
+
+_REASON = "verify: does it notify?"
+_ALARM = "ALARM"
+_FAULT = 5
+# The alarms that use Metrics Insights: stacks/alarms.py.
+_INSIGHTS = ("ParseError", "ErrorActionFailure", "RuleMessageThrottled", "DestinationDeliveryFailures")
+
+
+def _quiet_alarm(target: Target) -> dict[str, Any]:
+    """An alarm of the deployment that is not in ALARM: only a change of state sends a notice."""
+    pages = target.cloud.client("cloudwatch").get_paginator("describe_alarms")
+    for page in pages.paginate(AlarmNamePrefix=f"{target.cloud.namespace}-", AlarmTypes=["MetricAlarm"]):
+        for alarm in page["MetricAlarms"]:
+            if alarm["StateValue"] != _ALARM:
+                return dict(alarm)
+    raise VerifyError("every alarm of the deployment is in ALARM")
+
+
+_NOTIFIED = {
+    "topic_has_key": False,
+    "type": "Notification",
+    "subject_names_alarm": True,
+    "alarm": True,
+    "description": True,
+    "new_state": _ALARM,
+    "old_state": True,
+    "reason": _REASON,
+}
+
+
+@question(
+    "alarms.set_state",
+    expected=_NOTIFIED,
+    source="https://docs.aws.amazon.com/AmazonCloudWatch/latest/APIReference/API_SetAlarmState.html",
+    relied_on_by=("stacks/alarms.py", "stacks/processing.py"),
+)
+def set_state(target: Target) -> Seen:
+    """An alarm whose state is set to ALARM notifies the alarm topic, and the topic its subscribers, with
+    name, description, both states and the reason."""
+    cloud = target.cloud
+    topic, alarm = cloud.output("processing", "AlarmTopic"), _quiet_alarm(target)
+    name, cloudwatch = alarm["AlarmName"], cloud.client("cloudwatch")
+
+    def ours(mail: dict[str, Any]) -> bool:
+        return mail.get("Subject", "").startswith(_ALARM) and _REASON in mail["Message"]
+
+    with inbox(target, topic) as receive:
+        cloudwatch.set_alarm_state(AlarmName=name, StateValue=_ALARM, StateReason=_REASON)
+        try:
+            mail = receive(ours, "the alarm at the topic's subscriber")
+        finally:
+            cloudwatch.set_alarm_state(
+                AlarmName=name, StateValue=alarm["StateValue"], StateReason=alarm.get("StateReason", "")
+            )
+    told = json.loads(mail["Message"])
+    attributes = cloud.client("sns").get_topic_attributes(TopicArn=topic)["Attributes"]
+    return {
+        "topic_has_key": bool(attributes.get("KmsMasterKeyId")),
+        "type": mail["Type"],
+        "subject_names_alarm": name in mail["Subject"],
+        "alarm": told["AlarmName"] == name,
+        "description": told["AlarmDescription"] == alarm["AlarmDescription"],
+        "new_state": told["NewStateValue"],
+        "old_state": told["OldStateValue"] == alarm["StateValue"],
+        "reason": told["NewStateReason"],
+    }
+
+
+set_state_with_key = replace(
+    set_state,
+    name="alarms.set_state_with_key",
+    assumed=(
+        "The same with a topic encrypted with the account's own key, which admits CloudWatch "
+        "without a condition."
+    ),
+    expected={**_NOTIFIED, "topic_has_key": True},
+    source="https://repost.aws/knowledge-center/cloudwatch-configure-alarm-sns",
+    relied_on_by=("stacks/encryption.py",),
+    phase=WITH_KEY,
+    not_embedded="the embedded cloud is deployed without a key: its topics encrypt nothing",
+)
+
+
+@question(
+    "alarms.metrics_insights",
+    expected={
+        "alarms": len(_INSIGHTS),
+        "evaluation": ["as it should"],
+        "queries": ["Complete"] * len(_INSIGHTS),
+        "messages": [],
+    },
+    source="https://docs.aws.amazon.com/AmazonCloudWatch/latest/monitoring/alarm-evaluation.html",
+    relied_on_by=("stacks/alarms.py", "stacks/metrics.py"),
+    not_embedded="the embedded cloud has no Metrics Insights, and is deployed without these alarms",
+)
+def metrics_insights(target: Target) -> Seen:
+    """An alarm may sum a metric over all of its dimensions by Metrics Insights. If the metric has no data,
+    the query completes, and the alarm leaves its first state."""
+    cloudwatch = target.cloud.client("cloudwatch")
+    names = [f"{target.cloud.namespace}-{name}" for name in _INSIGHTS]
+
+    def alarms() -> list[dict[str, Any]] | None:
+        """The alarms, once CloudWatch has evaluated each."""
+        found = list(cloudwatch.describe_alarms(AlarmNames=names)["MetricAlarms"])
+        looked = all(alarm["StateValue"] != "INSUFFICIENT_DATA" for alarm in found)
+        return found if looked and found else None
+
+    found = until(alarms, "the alarms' first state", within_s=180)
+    now = datetime.now(timezone.utc)
+    queries = [
+        {"Id": f"q{i}", "Expression": alarm["Metrics"][0]["Expression"], "Period": 60}
+        for i, alarm in enumerate(found)
+    ]
+    answer = cloudwatch.get_metric_data(
+        MetricDataQueries=queries, StartTime=now - timedelta(hours=1), EndTime=now
+    )
+    return {
+        "alarms": len(found),
+        "evaluation": sorted({alarm.get("EvaluationState", "as it should") for alarm in found}),
+        "queries": sorted(result["StatusCode"] for result in answer["MetricDataResults"]),
+        "messages": [message["Code"] for message in answer.get("Messages", [])],
+        "note_states": {alarm["AlarmName"]: alarm["StateValue"] for alarm in found},
+    }
+
+
+@question(
+    "alarms.alert",
+    expected={
+        "subject": "NAMESPACE: ROBOT, fault 5, MOSFET over-temperature",
+        "first_line": "ROBOT: fault 5, MOSFET over-temperature",
+        "says": ["when", "stream"],
+    },
+    relied_on_by=("functions/alert.py", "stacks/storage.py", "contract/iort_contract/cloud.py"),
+)
+def alert(target: Target) -> Seen:
+    """A car's fault goes from the rule fault to the alert function, which may note it in the car's row, and
+    from there to the alarm topic's subscribers."""
+    bundle, namespace = target.robot("verify-alert"), target.cloud.namespace
+    topic = target.cloud.output("processing", "AlarmTopic")
+    with inbox(target, topic) as receive, Robot(bundle.folder) as robot:
+        robot.online()
+        now_us = time.time_ns() // 1000
+        live = encode_live(LiveSample(RUN, 0, now_us, now_us, {FAULT_FIELD: _FAULT}))
+        # Not by Basic Ingest, which reaches only the live rule.
+        robot.publish(build_topic(LIVE, robot.name, VESC_STREAM, namespace), live)
+        mail = receive(lambda mail: robot.name in mail["Message"], "the alert at the topic's subscriber")
+    lines = mail["Message"].replace(bundle.robot, "ROBOT").replace(namespace, "NAMESPACE").splitlines()
+    return {
+        "subject": mail["Subject"].replace(bundle.robot, "ROBOT").replace(namespace, "NAMESPACE"),
+        "first_line": lines[0],
+        "says": [line.split()[0] for line in lines if line.startswith(("when ", "stream "))],
+    }

@@ -1,0 +1,132 @@
+"""Lambda: the runtime's versions, and the report of a failed asynchronous invocation."""
+
+from __future__ import annotations
+
+import json
+import time
+
+from bench.target import Target, temporary_function
+from iort_contract.messages.event import rule_event
+from iort_contract.tables import BY_FUNCTION, TOPIC
+from iort_contract.topics import LAMBDA, PING, build_topic
+from verify.errors import VerifyError
+from verify.question import Seen, question
+from verify.tools.telemetry import only_entry
+
+_GUIDE = "https://docs.aws.amazon.com/lambda/latest/dg"
+_MEMORY_MB = 256
+_WITHIN_S = 180.0
+# The newer parameters that functions/ passes to boto3's clients.
+_PARAMETERS = {
+    "CompleteMultipartUpload": ["IfNoneMatch", "MpuObjectSize"],
+    "PutObject": ["ChecksumSHA256", "IfNoneMatch"],
+    "UploadPart": ["ChecksumSHA256"],
+}
+_ENVIRONMENT = ("AWS_LAMBDA_FUNCTION_MEMORY_SIZE", "AWS_LAMBDA_FUNCTION_NAME", "AWS_REGION")
+_RUNTIME = f"""
+import os, sys
+import boto3
+
+def handler(event, context):
+    model = boto3.client("s3", region_name="eu-central-1").meta.service_model
+    return {{
+        "python": list(sys.version_info[:2]),
+        "boto3": boto3.__version__,
+        "unknown": [
+            f"{{operation}}.{{name}}"
+            for operation, names in {_PARAMETERS!r}.items()
+            for name in names
+            if name not in model.operation_model(operation).input_shape.members
+        ],
+        "environment": [name for name in {_ENVIRONMENT!r} if os.environ.get(name)],
+        "memory_mb": int(os.environ["AWS_LAMBDA_FUNCTION_MEMORY_SIZE"]),
+        "remaining_ms": context.get_remaining_time_in_millis(),
+        "arn": context.invoked_function_arn.split(":")[5],
+        "cores": os.cpu_count(),
+        "log_format": os.environ.get("AWS_LAMBDA_LOG_FORMAT"),
+    }}
+"""
+
+
+@question(
+    "functions.runtime",
+    expected={
+        "parameters_that_boto3_does_not_know": [],
+        "environment": list(_ENVIRONMENT),
+        "memory_mb": _MEMORY_MB,
+        "time_is_limited": True,
+        "arn_is_a_functions": True,
+    },
+    relied_on_by=("functions/shared/bucket.py", "stacks/function.py", "functions/live.py"),
+)
+def runtime(target: Target) -> Seen:
+    """boto3 of Lambda's runtime knows every parameter that the functions use, and the environment and the
+    context have memory, name and time left."""
+    client = target.cloud.client("lambda")
+    with temporary_function(target, "runtime", _RUNTIME, memory_mb=_MEMORY_MB, timeout_s=30) as name:
+        answer = client.invoke(FunctionName=name, Payload=b"{}")
+        found = json.loads(answer["Payload"].read())
+        if "FunctionError" in answer:
+            raise VerifyError(f"the function failed: {found}")
+        named = client.get_function_configuration(FunctionName=name)["Runtime"]
+    return {
+        "parameters_that_boto3_does_not_know": found["unknown"],
+        "environment": found["environment"],
+        "memory_mb": found["memory_mb"],
+        "time_is_limited": 0 < found["remaining_ms"] <= 30_000,
+        "arn_is_a_functions": found["arn"] == "function",
+        "note_runtime": named,
+        "note_python": ".".join(map(str, found["python"])),
+        "note_boto3": found["boto3"],
+        "note_cores": found["cores"],
+        "note_log_format": found["log_format"],
+    }
+
+
+@question(
+    "functions.python",
+    expected={"runs_as_named": True},
+    source=f"{_GUIDE}/lambda-runtimes.html",
+    relied_on_by=("stacks/function.py", "scripts/setup.py"),
+    not_embedded="the embedded cloud runs the functions with its host's Python",
+)
+def python(target: Target) -> Seen:
+    """The runtime python3.13 runs Python 3.13, for which the layer is built."""
+    source = "import sys\n\ndef handler(event, context):\n    return 'python%d.%d' % sys.version_info[:2]\n"
+    client = target.cloud.client("lambda")
+    with temporary_function(target, "python", source, memory_mb=_MEMORY_MB, timeout_s=30) as name:
+        named = client.get_function_configuration(FunctionName=name)["Runtime"]
+        runs = json.loads(client.invoke(FunctionName=name, Payload=b"{}")["Payload"].read())
+    return {"runs_as_named": runs == named, "note_python": runs}
+
+
+@question(
+    "functions.failed_invocation",
+    expected={
+        "source": True,
+        "topic": True,
+        "condition": "RetriesExhausted",
+        "says_why": True,
+        "message_as_sent": True,
+    },
+    source=f"{_GUIDE}/invocation-async-retain-records.html",
+    relied_on_by=("functions/quarantine.py", "stacks/processing.py"),
+)
+def failed_invocation(target: Target) -> Seen:
+    """A failed asynchronous invocation without retries reaches the destination with its event, the
+    function's ARN, the condition RetriesExhausted and the error's message."""
+    # The function echo is invoked asynchronously with a message that is not a ping.
+    bundle, cloud = target.robot("verify-failure"), target.cloud
+    name, message = cloud.output("processing", "EchoFunction"), b"\xff no ping"
+    event = rule_event(
+        message, build_topic(PING, bundle.robot, LAMBDA, cloud.namespace), int(time.time() * 1000)
+    )
+    cloud.client("lambda").invoke(FunctionName=name, InvocationType="Event", Payload=json.dumps(event))
+    entry = only_entry(target, bundle.robot, within_s=_WITHIN_S)
+    return {
+        "source": entry.source == f"{BY_FUNCTION} {name}",
+        "topic": entry.topic == event[TOPIC],
+        "condition": entry.reason.split(":")[0],
+        "says_why": "not JSON" in entry.reason,
+        "message_as_sent": entry.payload == message,
+    }

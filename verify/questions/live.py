@@ -1,0 +1,118 @@
+"""The live lane: from a robot to a subscriber of PubNub, with the times of the hops."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import replace
+from functools import partial
+from itertools import count
+
+from bench.target import Target
+from iort_contract.catalog.vesc import VESC_STREAM
+from iort_contract.cloud import pubnub_parameter
+from iort_contract.limits import DEFAULT_NAMESPACE
+from iort_contract.messages.live import LiveSample, encode_live
+from iort_contract.tables import RECEIVED_MS
+from iort_contract.topics import live_topic
+from iort_station.cloud import Cloud
+from iort_station.errors import StationError
+from iort_station.page import keys
+from iort_station.page.listener import Listener
+from verify.errors import CannotAskError
+from verify.question import Seen, question
+from verify.tools.robot import Robot
+from verify.tools.telemetry import RUN
+from verify.tools.waiting import until
+
+_STALE = 0
+# Two clocks of AWS differ by less than the first, the operator's and AWS' by less than the second.
+_SAME_CLOCK_US, _OTHER_CLOCK_US = 100_000, 60_000_000
+
+
+def _sent(robot: Robot, target: Target, number: int, age_s: float = 0.0) -> LiveSample:
+    now_us = time.time_ns() // 1000
+    live = LiveSample(RUN, number, int(now_us - age_s * 1_000_000), now_us, {"speed": float(number)})
+    robot.publish(live_topic(robot.name, VESC_STREAM, target.cloud.namespace), encode_live(live))
+    return live
+
+
+@contextmanager
+def keys_lent(target: Target) -> Iterator[None]:
+    """Store PubNub's keys: a deployment without its own gets those of the namespace iort."""
+    cloud = target.cloud
+    own = _stored(cloud)
+    if own is None:
+        others = _stored(replace(cloud, namespace=DEFAULT_NAMESPACE))
+        if others is None:
+            raise CannotAskError(f"no PubNub keys: `iort pubnub` stores them for {DEFAULT_NAMESPACE}")
+        keys.store(cloud, others)
+    try:
+        yield
+    finally:
+        if own is None:
+            cloud.client("ssm").delete_parameter(Name=pubnub_parameter(cloud.namespace))
+
+
+def _stored(cloud: Cloud) -> keys.PubNubKeys | None:
+    try:
+        return keys.load(cloud)
+    except StationError:
+        return None
+
+
+@question(
+    "live.to_subscriber",
+    expected={
+        "stale_heard": False,
+        "robot": True,
+        "stream": [VESC_STREAM],
+        "hops": sorted(["sent_us", RECEIVED_MS, "lambda_us"]),
+        "left_car_before_rule": True,
+        "at_rule_before_lambda": True,
+    },
+    relied_on_by=(
+        "functions/live.py",
+        "functions/shared/pubnub_client.py",
+        "contract/iort_contract/cloud.py",
+    ),
+)
+def to_subscriber(target: Target) -> Seen:
+    """A live sample goes by Basic Ingest to Lambda 1 and by PubNub to the subscriber of the robot's
+    channel; a sample that is a minute old does not."""
+    bundle = target.robot("verify-live")
+    with keys_lent(target), target.listener(bundle.robot) as listener, Robot(bundle.folder) as robot:
+        robot.online()
+        _sent(robot, target, _STALE, age_s=60)
+        numbers = count(_STALE + 1)
+
+        def shown() -> bool:
+            """Lambda 1 may have to start first, and messages older than 2 s are dropped."""
+            _sent(robot, target, next(numbers))
+            return bool(listener.heard)
+
+        until(shown, "a live sample at the subscriber")
+        last = next(numbers)
+        _sent(robot, target, last)
+        until(partial(_heard, listener, last), "the last live sample at the subscriber")
+        heard = list(listener.heard)
+    hops = [one.hops for one in heard]
+    return {
+        "stale_heard": _heard(listener, _STALE),
+        "robot": {one.robot for one in heard} == {bundle.robot},
+        "stream": sorted({one.stream for one in heard}),
+        "hops": sorted({name for one in hops for name in one}),
+        "left_car_before_rule": all(
+            one["sent_us"] <= one[RECEIVED_MS] * 1000 + _OTHER_CLOCK_US for one in hops
+        ),
+        "at_rule_before_lambda": all(
+            one[RECEIVED_MS] * 1000 <= one["lambda_us"] + _SAME_CLOCK_US for one in hops
+        ),
+        "note_heard": [one.seq for one in heard],
+        "note_delay_ms": [round(one.delay_ms) for one in heard],
+    }
+
+
+def _heard(listener: Listener, number: int) -> bool:
+    return any(one.seq == number for one in listener.heard)

@@ -1,0 +1,174 @@
+"""The telemetry table's stream under a Lambda mapping: records, retries, splits, partial answers."""
+
+from __future__ import annotations
+
+import json
+import time
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
+from typing import Any
+
+from bench.target import Target, temporary_function
+from iort_contract.messages.batch import batch_id
+from iort_contract.tables import BATCH
+from iort_station.operations.replay import replay
+from verify.question import Seen, question
+from verify.tools.telemetry import batch, entries, items, listed, send, topic
+from verify.tools.waiting import until
+
+_GUIDE = "https://docs.aws.amazon.com/lambda/latest/dg"
+_COUNT, _POISONED, _REPORTED = 5, 2, 3
+_WITHIN_S = 170.0
+_SAID = "verify: "
+# Logs the numbers of its batches, and treats them as the check wants.
+_READER = """
+import json
+
+def handler(event, context):
+    records = [record["dynamodb"] for record in event["Records"]]
+    numbers = [int(record["NewImage"]["batch"]["S"].rsplit("-", 1)[1]) for record in records]
+    fields = sorted({name for record in records for name in record})
+    print("%(said)s" + json.dumps({"numbers": numbers, "fields": fields}), flush=True)
+    %(then)s
+"""
+_FAIL = f"""
+    if {_POISONED} in numbers:
+        raise ValueError("poisoned")
+"""
+# Only if older records are in the event: the next event then begins with it.
+_REPORT = f"""
+    if {_REPORTED} in numbers[1:]:
+        number = records[numbers.index({_REPORTED})]["SequenceNumber"]
+        return {{"batchItemFailures": [{{"itemIdentifier": number}}]}}
+"""
+
+
+def _published(target: Target, base: str) -> str:
+    """The name of a new robot, whose batches are in the table, and so in the stream."""
+    bundle, first_us = target.robot(base), int(time.time() - _COUNT) * 1_000_000
+    send(target, bundle, *(batch(number, first_us=first_us) for number in range(_COUNT)))
+    until(lambda: len(items(target, bundle.robot)) == _COUNT, "the batches in the telemetry table")
+    return bundle.robot
+
+
+@contextmanager
+def _read(
+    target: Target, robot: str, name: str, then: str
+) -> Iterator[Callable[[], list[Mapping[str, Any]]]]:
+    """A second reader of the stream for this robot's batches only, with the settings of Lambda 2's mapping
+    except for fewer attempts. It reads from the oldest record, so that all batches come at once."""
+    client, cloud = target.cloud.client("lambda"), target.cloud
+    summarize = cloud.output("processing", "SummarizeFunction")
+    (mapping,) = client.list_event_source_mappings(FunctionName=summarize)["EventSourceMappings"]
+    pattern = {"dynamodb": {"Keys": {"topic": {"S": [topic(target, robot)]}}}}
+    source = _READER % {"said": _SAID, "then": then.strip()}
+    began_ms = int(time.time() * 1000)
+    with temporary_function(target, name, source, memory_mb=128, like="Summarize") as function:
+        made = client.create_event_source_mapping(
+            FunctionName=function,
+            EventSourceArn=mapping["EventSourceArn"],
+            StartingPosition="TRIM_HORIZON",
+            BatchSize=100,
+            MaximumBatchingWindowInSeconds=5,
+            BisectBatchOnFunctionError=mapping["BisectBatchOnFunctionError"],
+            FunctionResponseTypes=mapping["FunctionResponseTypes"],
+            DestinationConfig=mapping["DestinationConfig"],
+            MaximumRetryAttempts=1,
+            FilterCriteria={"Filters": [{"Pattern": json.dumps(pattern)}]},
+        )
+        try:
+            yield lambda: _said(target, summarize, began_ms)
+        finally:
+            client.delete_event_source_mapping(UUID=made["UUID"])
+
+
+def _said(target: Target, like: str, began_ms: int) -> list[Mapping[str, Any]]:
+    """The reader's events, in order, by its lines in Lambda 2's log."""
+    configuration = target.cloud.client("lambda").get_function_configuration(FunctionName=like)
+    pages = (
+        target.cloud.client("logs")
+        .get_paginator("filter_log_events")
+        .paginate(logGroupName=configuration["LoggingConfig"]["LogGroup"], startTime=began_ms)
+    )
+    lines = [event["message"].strip() for page in pages for event in page["events"]]
+    return [json.loads(line[len(_SAID) :]) for line in lines if line.startswith(_SAID)]
+
+
+@question(
+    "stream.bisected",
+    expected={
+        "given_up": [_POISONED],
+        "reasons": ["Lambda 2 failed: RetryAttemptsExhausted"],
+        "passed_in_order": [number for number in range(_COUNT) if number != _POISONED],
+        "fields": [
+            "ApproximateCreationDateTime",
+            "Keys",
+            "NewImage",
+            "SequenceNumber",
+            "SizeBytes",
+            "StreamViewType",
+        ],
+        "replayed": ["replayed"],
+        "left": 0,
+    },
+    source=f"{_GUIDE}/services-dynamodb-errors.html",
+    relied_on_by=("stacks/processing.py", "functions/quarantine.py", "local/gaps/parts/stream_mapping.py"),
+)
+def bisected(target: Target) -> Seen:
+    """If the function fails on a batch of the stream, the batch is split until the poisoned record is
+    alone. After the retries, that record is reported to the mapping's destination, by its place in the
+    stream, where it is read again. The others pass, in order. A record has these fields, and replay puts it
+    back."""
+    robot = _published(target, "verify-bisected")
+    with _read(target, robot, "failing", _FAIL) as said:
+
+        def passed() -> list[int] | None:
+            """The batches of the successful events, once all but one have passed."""
+            good = [event["numbers"] for event in said() if _POISONED not in event["numbers"]]
+            numbers = list(dict.fromkeys(number for event in good for number in event))
+            return numbers if len(numbers) == _COUNT - 1 else None
+
+        until(lambda: listed(target, robot), "the poisoned batch in the quarantine", within_s=_WITHIN_S)
+        good = until(passed, "the batches around the poisoned one", within_s=_WITHIN_S)
+        events = said()
+    given_up = entries(target, robot)
+    outcomes = list(replay(target.cloud, given_up))
+    return {
+        "given_up": [batch_id(json.loads(entry.payload or b"{}")[BATCH]["S"]).seq for entry in given_up],
+        "reasons": [entry.reason for entry in given_up],
+        "passed_in_order": good,
+        "fields": sorted({name for event in events for name in event["fields"]}),
+        "replayed": [outcome.fate.value for outcome in outcomes],
+        "left": len(listed(target, robot)),
+        "note_events": [event["numbers"] for event in events],
+    }
+
+
+@question(
+    "stream.reported",
+    expected={"times_reported": 1, "comes_next": [_REPORTED], "again_before_it": [], "in_quarantine": 0},
+    source=f"{_GUIDE}/services-ddb-batchfailurereporting.html",
+    relied_on_by=("functions/summarize.py", "stacks/processing.py", "local/gaps/parts/stream_mapping.py"),
+)
+def reported(target: Target) -> Seen:
+    """If the function's answer names a record in batchItemFailures, the records before it are done, and the
+    next event begins with it."""
+    robot = _published(target, "verify-reported")
+    with _read(target, robot, "reporting", _REPORT) as said:
+
+        def ended() -> list[list[int]] | None:
+            """The events up to the one that ends the batch without a failure."""
+            events = [list(event["numbers"]) for event in said()]
+            whole = any(_REPORTED not in event[1:] and event[-1] == _COUNT - 1 for event in events)
+            return events if whole else None
+
+        events = until(ended, "the rest of the batch", within_s=_WITHIN_S)
+    reporting = [i for i, event in enumerate(events) if _REPORTED in event[1:]]
+    seen = [number for event in events for number in event]
+    return {
+        "times_reported": len(reporting),
+        "comes_next": [events[i + 1][0] for i in reporting],
+        "again_before_it": [number for number in range(_REPORTED) if seen.count(number) > 1],
+        "in_quarantine": len(listed(target, robot)),
+        "note_events": events,
+    }

@@ -1,0 +1,1 @@
+"""Tools of several questions: robots, batches, files, mails. They may use everything but the questions."""
