@@ -8,21 +8,18 @@ from __future__ import annotations
 
 import os
 import sys
-from typing import Any
 
 try:
-    from aws_cdk import App, CliCredentialsStackSynthesizer, Stack, Tags
+    from aws_cdk import App, Stack, Tags
 except ModuleNotFoundError as missing:
-    sys.exit(
-        f"app.py: {missing.name} is not there for {sys.executable}: `make layer` sets up .venv/bin/python"
-    )
+    sys.exit(f"app.py: no module {missing.name} for {sys.executable}: `make layer` sets up .venv/bin/python")
 
 from stacks.account import Account
-from stacks.acknowledged import Acknowledged, acknowledge
+from stacks.checks.acknowledged import Acknowledged, acknowledge
+from stacks.checks.portable import refuse_what_the_embedded_cloud_drops
 from stacks.fleet import Fleet
 from stacks.ingest import Ingest
-from stacks.monitoring import Monitoring
-from stacks.portable import refuse_what_the_embedded_cloud_drops
+from stacks.monitoring.stack import Monitoring
 from stacks.processing import Processing
 from stacks.quarantine import Quarantine
 from stacks.settings import Settings, SettingsError
@@ -32,47 +29,22 @@ from stacks.storage import Storage
 
 def build(app: App, settings: Settings) -> list[Acknowledged]:
     """Add every stack to the app; returns what is told to the independent checkers."""
-    name = settings.namespace
-
-    def stack(noun: str) -> dict[str, Any]:
-        # The embedded cloud knows one caller, not the roles that bootstrapping makes on AWS.
-        synthesizer = CliCredentialsStackSynthesizer() if settings.embedded else None
-        return {
-            "construct_id": f"{name}-{noun}",
-            "synthesizer": synthesizer,
-            "termination_protection": settings.protected,
-        }
-
-    storage = Storage(app, **stack("storage"), settings=settings)
-    quarantine = Quarantine(app, **stack("quarantine"), settings=settings, storage=storage)
-    fleet = Fleet(app, **stack("fleet"), settings=settings, storage=storage, quarantine=quarantine)
-    processing = Processing(
-        app, **stack("processing"), settings=settings, storage=storage, quarantine=quarantine
-    )
-    Ingest(
-        app,
-        **stack("ingest"),
-        settings=settings,
-        storage=storage,
-        quarantine=quarantine,
-        processing=processing,
-        fleet=fleet,
-    )
-    Monitoring(
-        app,
-        **stack("monitoring"),
-        settings=settings,
-        stacks=(storage, quarantine, fleet, processing),
-        topic=processing.alarms,
-    )
+    storage = Storage(app, settings)
+    quarantine = Quarantine(app, settings, storage)
+    fleet = Fleet(app, settings, storage=storage, quarantine=quarantine)
+    called = {"presence": fleet.presence}
+    processing = Processing(app, settings, storage=storage, quarantine=quarantine, called=called)
+    Ingest(app, settings, storage=storage, quarantine=quarantine, functions=processing.called)
+    watched = (storage, quarantine, fleet, processing)
+    Monitoring(app, settings, stacks=watched, topic=processing.alarms)
     if settings.site:
-        Site(app, **stack("site"), settings=settings)
+        Site(app, settings)
     if settings.account_wide:
         others = [one for one in app.node.children if isinstance(one, Stack)]
-        account = Account(app, **stack("account"), settings=settings)
+        account = Account(app, settings)
         for other in others:
             account.add_stack_dependency(other)
-    for key, value in {"project": name, "stage": settings.stage, **settings.tags}.items():
+    for key, value in {"project": settings.namespace, "stage": settings.stage, **settings.tags}.items():
         Tags.of(app).add(key, value)
     refuse_what_the_embedded_cloud_drops(app)
     return acknowledge(app, settings)

@@ -17,7 +17,8 @@ from rich.console import Console
 
 from bench.command import made, parser, write
 from bench.errors import BenchError
-from bench.load.fleet_run import measure, table
+from bench.load.fleet_figures import table
+from bench.load.fleet_run import measure
 from local.cloud import EmbeddedCloud
 from local.errors import LocalError
 

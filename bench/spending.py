@@ -11,7 +11,7 @@ from iort_agent.mqtt.rate_limiter import BYTES_PER_S
 from iort_contract.topics import PING_PATHS
 from iort_station.cloud import Cloud
 from iort_station.cost import line_items, model
-from iort_station.cost.line_items import Item
+from iort_station.cost.line_items import LineItem
 from iort_station.cost.usage import Usage
 
 # AWS' units: a message and an action are metered by 5 KB, writes by 1 KB, reads by 4 KB and by half where
@@ -25,7 +25,7 @@ _MINUTES_CONNECTED = 30
 
 def estimate(cloud: Cloud, sections: Sequence[str]) -> dict[str, float]:
     """Return a generous estimate in dollars for each section, AWS alone, at the cost model's prices."""
-    counted: dict[str, Callable[[], list[Item]]] = {
+    counted: dict[str, Callable[[], list[LineItem]]] = {
         "round_trips": _round_trips,
         "dashboard": lambda: _driven(dashboard.SECONDS * 2),
         "utilisation": _utilisation,
@@ -37,7 +37,7 @@ def estimate(cloud: Cloud, sections: Sequence[str]) -> dict[str, float]:
     return {key: line_items.total(counted[key]()) for key in sections if key in counted}
 
 
-def _round_trips() -> list[Item]:
+def _round_trips() -> list[LineItem]:
     messages, rules, answers = 0, 0, 0
     for size, rate_hz in product(round_trips.SIZES.values(), round_trips.RATES_HZ):
         if size * rate_hz <= BYTES_PER_S:
@@ -54,19 +54,19 @@ def _round_trips() -> list[Item]:
     ]
 
 
-def _driven(seconds: float) -> list[Item]:
+def _driven(seconds: float) -> list[LineItem]:
     items = model.bill(Usage(ping_hz=1, agent_every_s=1))
     return [item._replace(units=item.units * seconds / 3600) for item in items]
 
 
-def _utilisation() -> list[Item]:
+def _utilisation() -> list[LineItem]:
     calls = utilisation.CALLS * utilisation.ROUNDS
     sized = [item for size in utilisation.SIZES_MB for item in _invoked(calls, size)]
     written = utilisation.BATCHES * (_BATCH_WRITES + _SUMMARY_WRITES)
     return [*_invoked(calls * 4, 512), *sized, *_items(write=written + calls * 4 * _SUMMARY_WRITES)]
 
 
-def _query(cloud: Cloud) -> list[Item]:
+def _query(cloud: Cloud) -> list[LineItem]:
     batches = ceil(query.POINTS / 50) + query.HOUR_POINTS // 50
     reads = query.REPEATS + 1
     stored = batches * _BATCH_WRITES * _WRITE
@@ -76,12 +76,12 @@ def _query(cloud: Cloud) -> list[Item]:
     return [*_items(write=written, read=ceil(reads * scanned / _READ)), *_invoked(batches + 2 * reads, 512)]
 
 
-def _invoked(calls: int, memory_mb: int) -> list[Item]:
+def _invoked(calls: int, memory_mb: int) -> list[LineItem]:
     return _items(invocation=calls, compute_x86=calls * memory_mb / 1024 * _BILLED_S * 5)
 
 
-def _items(**units: float) -> list[Item]:
-    return [Item("", "", "", price, count) for price, count in units.items()]
+def _items(**units: float) -> list[LineItem]:
+    return [LineItem("", "", "", price, count) for price, count in units.items()]
 
 
 def _telemetry_bytes(cloud: Cloud) -> int:

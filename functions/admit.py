@@ -13,12 +13,14 @@ import os
 import time
 from collections.abc import Mapping
 from functools import cache
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple, cast
 
 import botocore.session
 from botocore.config import Config
 
+from functions.shared.environment import variables
 from functions.shared.metrics import emit
+from iort_contract.catalog.environments import RegistryEnvironment
 from iort_contract.limits import ContractError
 from iort_contract.tables import (
     ADMIT_CLAIM,
@@ -33,6 +35,10 @@ from iort_contract.tables import (
     SERIAL_PARAMETER,
 )
 from iort_contract.topics import check_robot
+
+if TYPE_CHECKING:
+    from types_boto3_dynamodb import DynamoDBClient
+    from types_boto3_iot import IoTClient
 
 _log = logging.getLogger(__name__)
 
@@ -70,8 +76,13 @@ def admission(event: Mapping[str, Any], now_ms: int, instead_of: Earlier | None 
     certificate, claim = _text(event, "certificateId"), _claim_id(event)
     its = f"attribute_not_exists({ADMIT_CLAIM}) OR {ADMIT_CLAIM} = :claim OR {ADMIT_FINGERPRINT} = :claim"
     unspent = f"attribute_not_exists({ADMITTED_CERTIFICATE})"
+    earlier_values: dict[str, Any] = {}
     if instead_of is not None:
         unspent = f"{ADMITTED_CERTIFICATE} = :earlier AND {ADMITTED_MS} = :earlier_ms"
+        earlier_values = {
+            ":earlier": {"S": instead_of.certificate},
+            ":earlier_ms": {"N": str(instead_of.admitted_ms)},
+        }
     opened = f"{ADMIT_UNTIL_S} >= :now_s AND ({its}) AND {unspent}"
     machine = f"(attribute_not_exists({SERIAL}) OR {SERIAL} = :serial)"
     return {
@@ -89,16 +100,10 @@ def admission(event: Mapping[str, Any], now_ms: int, instead_of: Earlier | None 
             ":claim": {"S": claim},
             ":now_s": {"N": str(now_ms // 1000)},
             ":now_ms": {"N": str(now_ms)},
-            **_earlier_values(instead_of),
+            **earlier_values,
         },
         "ReturnValuesOnConditionCheckFailure": "ALL_OLD",
     }
-
-
-def _earlier_values(instead_of: Earlier | None) -> dict[str, Any]:
-    if instead_of is None:
-        return {}
-    return {":earlier": {"S": instead_of.certificate}, ":earlier_ms": {"N": str(instead_of.admitted_ms)}}
 
 
 def earlier(row: Mapping[str, Any]) -> Earlier | None:
@@ -150,21 +155,22 @@ def _claim_id(event: Mapping[str, Any]) -> str:
 def _text(values: Mapping[str, Any], name: str) -> str:
     value = values.get(name)
     if not isinstance(value, str) or not 1 <= len(value) <= _MAX_TEXT:
-        raise ContractError(f"{name}: expected a text of up to {_MAX_TEXT} characters")
+        raise ContractError(f"{name} must be a text of up to {_MAX_TEXT} characters")
     return value
 
 
 @cache
-def _dynamodb() -> Any:
+def _dynamodb() -> DynamoDBClient:
     # botocore alone: boto3 adds S3 transfers, a fifth of the time until the first answer.
-    return botocore.session.get_session().create_client("dynamodb", config=_CONFIG)
+    client = botocore.session.get_session().create_client("dynamodb", config=_CONFIG)
+    return cast("DynamoDBClient", client)
 
 
 def _status(certificate: str) -> str | None:
     """A certificate's status at AWS IoT; None if it was deleted."""
     # Its model is large and rarely needed. A single attempt, since the robot asks again.
     config = _CONFIG.merge(Config(retries={"total_max_attempts": 1}))
-    iot = botocore.session.get_session().create_client("iot", config=config)
+    iot = cast("IoTClient", botocore.session.get_session().create_client("iot", config=config))
     try:
         answer = iot.describe_certificate(certificateId=certificate)
     except iot.exceptions.ResourceNotFoundException:
@@ -211,10 +217,9 @@ def _take(update: Mapping[str, Any]) -> Mapping[str, Any] | None:
     """Do the update. If its condition fails, return the row that failed it (empty if none exists)."""
     dynamodb = _dynamodb()
     try:
-        dynamodb.update_item(TableName=os.environ["ROBOTS_TABLE"], **update)
+        dynamodb.update_item(TableName=variables(RegistryEnvironment).robots_table, **update)
     except dynamodb.exceptions.ConditionalCheckFailedException as error:
-        row: Mapping[str, Any] = error.response.get("Item", {})
-        return row
+        return cast("Mapping[str, Any]", error.response.get("Item", {}))
     return None
 
 

@@ -6,21 +6,24 @@ lasts for `QUIET_S`.
 
 from __future__ import annotations
 
-import os
 import time
 from collections.abc import Callable, Mapping
 from contextlib import suppress
 from dataclasses import dataclass
 from datetime import datetime, timezone
 from functools import cache
-from typing import Any, TypeGuard
+from typing import TYPE_CHECKING, Any, TypeGuard
 
-import boto3
-
+from functions.shared import clients
+from functions.shared.environment import variables
 from functions.shared.metrics import emit
+from iort_contract.catalog.environments import AlertEnvironment
 from iort_contract.catalog.vesc import FAULT_FIELD, FAULTS, VOLTAGE_FIELD
 from iort_contract.tables import ALERT_PREFIX, RECEIVED_MS, ROBOT, TOPIC
 from iort_contract.topics import parse_topic
+
+if TYPE_CHECKING:
+    from types_boto3_dynamodb import DynamoDBClient
 
 QUIET_S = 900
 
@@ -46,9 +49,8 @@ def causes(event: Mapping[str, Any], low_voltage_v: float) -> list[Cause]:
         key = f"{ALERT_PREFIX}fault_{'unknown' if meaning is None else int(code)}"
         found.append(Cause(key, f"fault {code:g}, {meaning or 'a code that the contract does not know'}"))
     if _is_number(volts) and 0 < volts < low_voltage_v:
-        found.append(
-            Cause(f"{ALERT_PREFIX}low_voltage", f"battery at {volts:.1f} V, below {low_voltage_v:g} V")
-        )
+        key = f"{ALERT_PREFIX}low_voltage"
+        found.append(Cause(key, f"battery at {volts:.1f} V, below {low_voltage_v:g} V"))
     return found
 
 
@@ -56,7 +58,7 @@ class Notices:
     """The last mail of each car and cause, in the car's row of the registry; a cache in this environment
     saves requests."""
 
-    def __init__(self, client: Any, table: str) -> None:
+    def __init__(self, client: DynamoDBClient, table: str) -> None:
         self._client, self._table = client, table
         self._until_s: dict[tuple[str, str], float] = {}
 
@@ -65,17 +67,10 @@ class Notices:
         which has no row and must not get one again."""
         if now_s < self._until_s.get((robot, key), 0):
             return False
+        values = {":now": {"N": str(now_s)}, ":then": {"N": str(now_s - QUIET_S)}}
+        due = "attribute_not_exists(#key) OR #key <= :then"
         try:
-            self._update(
-                robot,
-                "SET #key = :now",
-                key,
-                "attribute_not_exists(#key) OR #key <= :then",
-                ExpressionAttributeValues={
-                    ":now": {"N": str(now_s)},
-                    ":then": {"N": str(now_s - QUIET_S)},
-                },
-            )
+            self._update(robot, key, "SET #key = :now", due, ExpressionAttributeValues=values)
         except self._client.exceptions.ConditionalCheckFailedException:
             # Another environment sent it, at an unknown time within the quiet period; another look costs a
             # request.
@@ -88,16 +83,16 @@ class Notices:
         """Sending failed: the next caller tries again."""
         self._until_s.pop((robot, key), None)
         with suppress(self._client.exceptions.ConditionalCheckFailedException):
-            self._update(robot, "REMOVE #key", key, "attribute_exists(#key)")
+            self._update(robot, key, "REMOVE #key", "attribute_exists(#key)")
 
-    def _update(self, robot: str, expression: str, key: str, condition: str, **rest: Any) -> None:
+    def _update(self, robot: str, key: str, expression: str, condition: str, **values: Any) -> None:
         self._client.update_item(
             TableName=self._table,
             Key={ROBOT: {"S": robot}},
             UpdateExpression=expression,
             ConditionExpression=f"attribute_exists(#robot) AND ({condition})",
             ExpressionAttributeNames={"#key": key, "#robot": ROBOT},
-            **rest,
+            **values,
         )
 
 
@@ -106,7 +101,7 @@ def process(
 ) -> None:
     """Notify for each cause that is due. If ``notify`` raises, the notice is given back and the error raised.
 
-    Raises `ContractError` for a topic outside the contract.
+    Raises `iort_contract.ContractError` for a topic outside the contract.
     """
     topic = parse_topic(event[TOPIC])
     when = datetime.fromtimestamp(int(event[RECEIVED_MS]) / 1000, timezone.utc)
@@ -135,19 +130,16 @@ def _is_number(value: object) -> TypeGuard[int | float]:
 
 @cache
 def _notices() -> Notices:
-    return Notices(boto3.client("dynamodb"), os.environ["ROBOTS_TABLE"])
-
-
-@cache
-def _sns() -> Any:
-    return boto3.client("sns")
+    return Notices(clients.dynamodb(), variables(AlertEnvironment).robots_table)
 
 
 def _notify(subject: str, text: str) -> None:
     # "Publish", SNS API: a subject is up to 100 ASCII characters.
-    _sns().publish(TopicArn=os.environ["ALARM_TOPIC"], Subject=subject[:100], Message=text)
+    topic = variables(AlertEnvironment).alarm_topic
+    clients.sns().publish(TopicArn=topic, Subject=subject[:100], Message=text)
 
 
 def handler(event: dict[str, Any], _context: object) -> None:
     """Entry point of the Lambda action of the rules fault and battery."""
-    process(event, float(os.environ["LOW_VOLTAGE_V"]), _notices(), _notify, int(time.time()))
+    low_voltage_v = variables(AlertEnvironment).low_voltage_v
+    process(event, low_voltage_v, _notices(), _notify, int(time.time()))

@@ -4,16 +4,13 @@ from __future__ import annotations
 
 import json
 from collections.abc import Mapping
-from functools import cache
 from typing import Any
 
-import boto3
-
+from functions.shared import clients
 from functions.shared.metrics import emit
 from iort_contract.checks import json_object
 from iort_contract.messages.event import event_message
-from iort_contract.messages.live import PING_FIELDS
-from iort_contract.tables import RECEIVED_MS, TOPIC
+from iort_contract.tables import PING_FIELDS, RECEIVED_MS, TOPIC
 from iort_contract.topics import LAMBDA, PONG, build_topic, parse_topic
 
 
@@ -29,13 +26,8 @@ def pong(event: Mapping[str, Any]) -> tuple[str, bytes]:
     return build_topic(PONG, topic.robot, LAMBDA, topic.namespace), answer.encode()
 
 
-@cache
-def _iot_data() -> Any:
-    return boto3.client("iot-data")
-
-
 def handler(event: dict[str, Any], _context: object) -> None:
     """Entry point of the echo rule's Lambda action; a failed message goes to the quarantine."""
     topic, payload = pong(event)
-    _iot_data().publish(topic=topic, qos=0, payload=payload)
+    clients.iot_data().publish(topic=topic, qos=0, payload=payload)
     emit("echo", PongsSent=1)

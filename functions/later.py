@@ -9,8 +9,8 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any
 
-from functions.shared.processing import processed, stored_tables
-from functions.shared.share import waiting
+from functions.shared.summary.processing import processed, stored_tables
+from functions.shared.summary.share import waiting
 from functions.shared.tables import Tables
 from iort_contract.tables import BATCH, TOPIC
 
@@ -23,7 +23,7 @@ def records(tables: Tables, body: str) -> list[dict[str, Any]]:
     """The stream records of the batches that a message names, without those that have expired."""
     found: list[dict[str, Any]] = []
     for number, (topic, batch) in enumerate(waiting(body)):
-        item = tables.item(topic, batch)
+        item = tables.telemetry.get(topic, batch)
         if item is not None:
             change: dict[str, Mapping[str, Any] | str] = {
                 "Keys": {name: item[name] for name in (TOPIC, BATCH)},

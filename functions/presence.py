@@ -8,26 +8,16 @@ hour. Source: AWS IoT Core, "Lifecycle events".
 from __future__ import annotations
 
 import logging
-import os
 from collections.abc import Mapping
-from functools import cache
 from typing import Any
 
-import boto3
-
+from functions.shared import clients
+from functions.shared.environment import variables
 from functions.shared.metrics import emit
+from iort_contract import tables
+from iort_contract.catalog.environments import RegistryEnvironment
 from iort_contract.limits import ContractError
-from iort_contract.tables import (
-    AGENT_VERSION,
-    CERTIFICATE_ID,
-    CONNECTED_MS,
-    DISCONNECT_REASON,
-    DISCONNECTED_MS,
-    LAST_SEEN_MS,
-    ONLINE,
-    ROBOT,
-    SESSION_VERSION,
-)
+from iort_contract.tables import AGENT_VERSION, LAST_SEEN_MS, ROBOT, SESSION_VERSION
 from iort_contract.topics import check_robot
 
 _log = logging.getLogger(__name__)
@@ -48,7 +38,7 @@ def change(event: Mapping[str, Any]) -> dict[str, Any]:
             "Key": {ROBOT: {"S": check_robot(event[ROBOT])}},
             "UpdateExpression": f"SET {AGENT_VERSION} = :version",
             "ConditionExpression": f"attribute_exists({ROBOT})",
-            "ExpressionAttributeValues": {":version": {"S": _text(event[AGENT_VERSION])}},
+            "ExpressionAttributeValues": {":version": _text(event[AGENT_VERSION])},
         }
     kind, at_ms = event.get("eventType"), _number(event, "timestamp")
     values: dict[str, dict[str, Any]] = {
@@ -56,19 +46,18 @@ def change(event: Mapping[str, Any]) -> dict[str, Any]:
         ":version": {"N": str(_number(event, "versionNumber"))},
         ":long_ago": {"N": str(at_ms - _RESTARTED_MS)},
         ":far_ahead": {"N": str(at_ms + _RESTARTED_MS)},
+        ":online": {"BOOL": kind == "connected"},
     }
     # Only a disconnect can follow a connect of the same connection.
     next_ = f"{SESSION_VERSION} < :version"
     if kind == "connected":
-        values[":online"] = {"BOOL": True}
-        values[":certificate"] = {"S": _text(event.get("principalIdentifier"))}
-        update = f"SET {CONNECTED_MS} = :at, {CERTIFICATE_ID} = :certificate"
-        removed = f" REMOVE {DISCONNECT_REASON}"
+        values[":certificate"] = _text(event.get("principalIdentifier"))
+        update = f"SET {tables.CONNECTED_MS} = :at, {tables.CERTIFICATE_ID} = :certificate"
+        removed = f" REMOVE {tables.DISCONNECT_REASON}"
     elif kind == "disconnected":
-        values[":online"] = {"BOOL": False}
         values[":was"] = {"BOOL": True}
-        values[":reason"] = {"S": _text(event.get("disconnectReason", "UNKNOWN"))}
-        update = f"SET {DISCONNECTED_MS} = :at, {DISCONNECT_REASON} = :reason"
+        values[":reason"] = _text(event.get("disconnectReason", "UNKNOWN"))
+        update = f"SET {tables.DISCONNECTED_MS} = :at, {tables.DISCONNECT_REASON} = :reason"
         removed = ""
         next_ = f"({next_} OR ({SESSION_VERSION} = :version AND #online = :was))"
     else:
@@ -85,7 +74,7 @@ def change(event: Mapping[str, Any]) -> dict[str, Any]:
         # A client without a row is not one of our robots: a claim, or another deployment's.
         "ConditionExpression": f"attribute_exists({ROBOT}) AND ({newer})",
         # "online" is a reserved word.
-        "ExpressionAttributeNames": {"#online": ONLINE},
+        "ExpressionAttributeNames": {"#online": tables.ONLINE},
         "ExpressionAttributeValues": values,
     }
 
@@ -97,22 +86,17 @@ def _number(event: Mapping[str, Any], name: str) -> int:
     return value
 
 
-def _text(value: Any) -> str:
+def _text(value: Any) -> dict[str, str]:
     if not isinstance(value, str) or not 1 <= len(value) <= _MAX_TEXT:
-        raise ContractError(f"expected a text of up to {_MAX_TEXT} characters, got {str(value)[:40]!r}")
-    return value
-
-
-@cache
-def _dynamodb() -> Any:
-    return boto3.client("dynamodb")
+        raise ContractError(f"must be a text of up to {_MAX_TEXT} characters, got {str(value)[:40]!r}")
+    return {"S": value}
 
 
 def handler(event: dict[str, Any], _context: object) -> None:
     """Entry point of the rules presence and version. Events without effect are counted."""
-    dynamodb = _dynamodb()
+    dynamodb = clients.dynamodb()
     try:
-        dynamodb.update_item(TableName=os.environ["ROBOTS_TABLE"], **change(event))
+        dynamodb.update_item(TableName=variables(RegistryEnvironment).robots_table, **change(event))
     except (ContractError, dynamodb.exceptions.ConditionalCheckFailedException) as error:
         _log.info("ignored: %s", error)
         emit("presence", PresenceIgnored=1)

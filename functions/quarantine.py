@@ -11,41 +11,29 @@ import binascii
 import hashlib
 import json
 import logging
-import os
 import time
 from collections.abc import Callable, Iterable, Mapping
 from contextlib import suppress
 from dataclasses import dataclass
-from functools import cache
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import boto3
 from botocore.exceptions import BotoCoreError, ClientError
 
+from functions.shared import clients
+from functions.shared.environment import variables
 from functions.shared.metrics import emit
-from functions.shared.share import waiting
+from functions.shared.summary.share import waiting
+from iort_contract import tables
+from iort_contract.catalog.environments import QuarantineEnvironment
 from iort_contract.limits import ContractError
 from iort_contract.messages.event import event_message
-from iort_contract.tables import (
-    BY_FUNCTION,
-    BY_LATER,
-    BY_RULE,
-    BY_STREAM,
-    ENTRY,
-    EXPIRES_S,
-    FIRST_MS,
-    ITEM_BASE64,
-    LAST_MS,
-    NO_ROBOT,
-    PAYLOAD,
-    PUT_OFF,
-    REASON,
-    ROBOT,
-    SEEN,
-    SOURCE,
-    TOPIC,
-)
+from iort_contract.tables import BY_FUNCTION, BY_LATER, BY_RULE, BY_STREAM, ENTRY, ITEM_BASE64, ROBOT, TOPIC
 from iort_contract.topics import LANES, as_subscribed
+
+if TYPE_CHECKING:
+    from types_boto3_dynamodb import DynamoDBClient
+    from types_boto3_dynamodbstreams import DynamoDBStreamsClient
 
 _log = logging.getLogger(__name__)
 _log.setLevel(logging.INFO)
@@ -69,9 +57,9 @@ class Entry:
 
     @property
     def robot(self) -> str:
-        """The robot in the topic; `NO_ROBOT` if the topic names no robot."""
+        """The robot in the topic; `iort_contract.NO_ROBOT` if the topic names no robot."""
         levels = self.topic.split("/")
-        return levels[2] if len(levels) >= 3 and levels[0] in LANES and levels[2] else NO_ROBOT
+        return levels[2] if len(levels) >= 3 and levels[0] in LANES and levels[2] else tables.NO_ROBOT
 
     @property
     def id(self) -> str:
@@ -93,7 +81,7 @@ def entries(body: str, records: Records) -> list[Entry]:
             return [_of_rule(document)]
         if ITEM_BASE64 in document:
             item = base64.b64decode(document[ITEM_BASE64], validate=True)
-            return [_of_item(document[REASON], item)]
+            return [_of_item(document[tables.REASON], item)]
         if "DDBStreamBatchInfo" in document:
             condition = str(document["requestContext"]["condition"])
             found = [
@@ -106,7 +94,7 @@ def entries(body: str, records: Records) -> list[Entry]:
             ]
         if "requestPayload" in document:
             return [_of_invocation(document)]
-        if PUT_OFF in document:
+        if tables.PUT_OFF in document:
             topic, _ = waiting(body)[0]
             return [Entry(BY_LATER, topic, "put off, and not summarised in five attempts", body.encode())]
     except (LookupError, TypeError, ValueError, AttributeError, RecursionError, binascii.Error) as error:
@@ -166,9 +154,9 @@ def _binary(value: Any) -> str:
 
 
 class Store:
-    """The quarantine table; ``client`` is a boto3 DynamoDB client."""
+    """The quarantine table."""
 
-    def __init__(self, client: Any, *, table: str, retention_s: int) -> None:
+    def __init__(self, client: DynamoDBClient, *, table: str, retention_s: int) -> None:
         self._client, self._table, self._retention_s = client, table, retention_s
 
     def put(self, entry: Entry, sent_ms: int) -> None:
@@ -178,26 +166,30 @@ class Store:
         if len(payload) > _MAX_PAYLOAD_BYTES:
             payload = payload[:_MAX_PAYLOAD_BYTES]
             reason = f"cut from {len(entry.payload)} bytes; {reason}"
-        names = (SOURCE, TOPIC, REASON, PAYLOAD, FIRST_MS, LAST_MS, EXPIRES_S, SEEN)
-        expires_s = sent_ms // 1000 + self._retention_s
+        sent = {"N": str(sent_ms)}
+        attributes: dict[str, dict[str, Any]] = {
+            tables.SOURCE: {"S": entry.source},
+            TOPIC: {"S": _unicode(entry.topic)},
+            tables.REASON: {"S": reason},
+            tables.PAYLOAD: {"B": payload},
+            tables.LAST_MS: sent,
+            tables.EXPIRES_S: {"N": str(sent_ms // 1000 + self._retention_s)},
+        }
         self._client.update_item(
             TableName=self._table,
             Key={ROBOT: {"S": _unicode(entry.robot)}, ENTRY: {"S": entry.id}},
             UpdateExpression=(
-                f"SET #{SOURCE} = :source, #{TOPIC} = :topic, #{REASON} = :reason, #{PAYLOAD} = :payload,"
-                f" #{FIRST_MS} = if_not_exists(#{FIRST_MS}, :sent), #{LAST_MS} = :sent,"
-                f" #{EXPIRES_S} = :expires"
-                f" ADD #{SEEN} :one"
+                f"SET {', '.join(f'#{name} = :{name}' for name in attributes)},"
+                f" #{tables.FIRST_MS} = if_not_exists(#{tables.FIRST_MS}, :{tables.LAST_MS})"
+                f" ADD #{tables.SEEN} :one"
             ),
-            ExpressionAttributeNames={f"#{name}": name for name in names},
+            # Some are reserved words.
+            ExpressionAttributeNames={
+                f"#{name}": name for name in (*attributes, tables.FIRST_MS, tables.SEEN)
+            },
             ExpressionAttributeValues={
-                ":source": {"S": entry.source},
-                ":topic": {"S": _unicode(entry.topic)},
-                ":reason": {"S": reason},
-                ":payload": {"B": payload},
-                ":sent": {"N": str(sent_ms)},
-                ":expires": {"N": str(expires_s)},
                 ":one": {"N": "1"},
+                **{f":{name}": value for name, value in attributes.items()},
             },
         )
 
@@ -212,9 +204,9 @@ class StreamError(Exception):
 
 
 class Stream:
-    """Reads records from the telemetry table's stream; ``client`` is a boto3 DynamoDB Streams client."""
+    """Reads records from the telemetry table's stream."""
 
-    def __init__(self, client: Any) -> None:
+    def __init__(self, client: DynamoDBStreamsClient) -> None:
         self._client = client
 
     def records(self, info: Mapping[str, Any]) -> list[Mapping[str, Any]]:
@@ -227,13 +219,12 @@ class Stream:
         found: list[Mapping[str, Any]] = []
         empty = 0
         try:
-            answer = self._client.get_shard_iterator(
+            iterator: str | None = self._client.get_shard_iterator(
                 StreamArn=info["streamArn"],
                 ShardId=info["shardId"],
                 ShardIteratorType="AT_SEQUENCE_NUMBER",
                 SequenceNumber=str(info["startSequenceNumber"]),
-            )
-            iterator = answer["ShardIterator"]
+            )["ShardIterator"]
             while iterator and empty < _EMPTY_ANSWERS:
                 answer = self._client.get_records(ShardIterator=iterator)
                 for record in answer["Records"]:
@@ -269,20 +260,8 @@ def process(event: Mapping[str, Any], store: Store, records: Records) -> dict[st
     return {"batchItemFailures": [{"itemIdentifier": number} for number in failed]}
 
 
-@cache
-def _store() -> Store:
-    return Store(
-        boto3.client("dynamodb"),
-        table=os.environ["QUARANTINE_TABLE"],
-        retention_s=int(os.environ["RETENTION_S"]),
-    )
-
-
-@cache
-def _stream() -> Stream:
-    return Stream(boto3.client("dynamodbstreams"))
-
-
 def handler(event: dict[str, Any], _context: object) -> dict[str, Any]:
     """Entry point of the rejected queue's mapping."""
-    return process(event, _store(), _stream().records)
+    given = variables(QuarantineEnvironment)
+    store = Store(clients.dynamodb(), table=given.quarantine_table, retention_s=given.retention_s)
+    return process(event, store, lambda info: Stream(boto3.client("dynamodbstreams")).records(info))

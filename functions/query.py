@@ -7,25 +7,24 @@ returns a token to continue.
 
 from __future__ import annotations
 
-import os
 import uuid
 from collections import Counter
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from functools import cache
 from typing import Any
 
-import boto3
-from botocore.config import Config
-
+from functions.shared import clients
+from functions.shared.environment import variables
 from functions.shared.tables import Tables
 from iort_contract import expression
-from iort_contract.attributes import plain
 from iort_contract.catalog.derived import DERIVED, derive
+from iort_contract.catalog.environments import QueryEnvironment
 from iort_contract.cloud import RESULTS_PREFIX
+from iort_contract.dynamodb import plain, with_samples_between
 from iort_contract.expression import ExpressionError, MismatchError, Node
-from iort_contract.limits import MAX_BATCH_SPAN_US, ContractError, Value
-from iort_contract.messages.batch import batches_between, decode_batch
+from iort_contract.limits import ContractError, Value
+from iort_contract.messages.batch import decode_batch
 from iort_contract.messages.query import (
     QueryAnswer,
     QueryRequest,
@@ -164,15 +163,17 @@ def _answer(
 ) -> QueryAnswer:
     found = Found(query, tables)
     items = pages = 0
-    token: Mapping[str, Any] | None = None
-    for page, after in _pages(query, tables):
+    token: dict[str, Any] | None = None
+    request = query.request
+    keys = with_samples_between(request.start_us, request.end_us)
+    for page in tables.telemetry.pages(query.topic, keys, after=request.token, scan=request.scan):
         pages += 1
-        token = after
+        token = page.after
         # A page of a car that stands still may inflate beyond the memory, so a page may be split.
-        for number, item in enumerate(page, 1):
+        for number, item in enumerate(page.items, 1):
             items += 1
             found.add(plain(item))
-            if found.values > max_values and number < len(page):
+            if found.values > max_values and number < len(page.items):
                 token = {name: item[name] for name in (TOPIC, BATCH)}
                 break
         if token is not None and (left_ms() < MARGIN_MS or found.values > max_values):
@@ -193,64 +194,21 @@ def _answer(
     )
 
 
-def _pages(
-    query: Query, tables: Tables
-) -> Iterator[tuple[Sequence[Mapping[str, Any]], Mapping[str, Any] | None]]:
-    """Pages of items, each with the key to continue after; None for the last page."""
-    request = query.request
-    first, last = batches_between(request.start_us - MAX_BATCH_SPAN_US + 1, request.end_us - 1)
-    if first > last:
-        return
-    condition = {
-        ("FilterExpression" if request.scan else "KeyConditionExpression"): (
-            "#topic = :topic AND #batch BETWEEN :first AND :last"
-        ),
-        "ExpressionAttributeNames": {"#topic": TOPIC, "#batch": BATCH},
-        "ExpressionAttributeValues": {
-            ":topic": {"S": query.topic},
-            ":first": {"S": first},
-            ":last": {"S": last},
-        },
-    }
-    token: Mapping[str, Any] | None = request.token
-    while True:
-        page = tables.page(condition, token, scan=request.scan)
-        token = page.get("LastEvaluatedKey")
-        yield page["Items"], token
-        if token is None:
-            return
-
-
 @cache
 def _tables() -> Tables:
-    return Tables(
-        boto3.client("dynamodb"),
-        telemetry=os.environ["TELEMETRY_TABLE"],
-        summary="",  # it may not read this table
-        robots=os.environ["ROBOTS_TABLE"],
-    )
-
-
-@cache
-def _s3() -> Any:
-    # As in functions/upload.py: the global host redirects, which invalidates a signature.
-    config = Config(signature_version="s3v4", s3={"addressing_style": "virtual"})
-    return boto3.client("s3", config=config)
+    given = variables(QueryEnvironment)
+    # It may not read the summary table.
+    return Tables(clients.dynamodb(), telemetry=given.telemetry_table, summary="", robots=given.robots_table)
 
 
 def _store(samples: bytes) -> str:
-    place = {"Bucket": os.environ["FILES_BUCKET"], "Key": f"{RESULTS_PREFIX}{uuid.uuid4().hex}.json.zlib"}
-    _s3().put_object(**place, Body=samples, ContentType="application/zlib")
-    url: str = _s3().generate_presigned_url("get_object", Params=place, ExpiresIn=_URL_S)
-    return url
+    bucket, key = variables(QueryEnvironment).files_bucket, f"{RESULTS_PREFIX}{uuid.uuid4().hex}.json.zlib"
+    clients.s3().put_object(Bucket=bucket, Key=key, Body=samples, ContentType="application/zlib")
+    place = {"Bucket": bucket, "Key": key}
+    return clients.s3().generate_presigned_url("get_object", Params=place, ExpiresIn=_URL_S)
 
 
 def handler(event: dict[str, Any], context: Any) -> dict[str, Any]:
     """Entry point of an invocation by the operator."""
-    return answer(
-        event,
-        _tables(),
-        _store,
-        context.get_remaining_time_in_millis,
-        namespace=os.environ["NAMESPACE"],
-    )
+    left_ms = context.get_remaining_time_in_millis
+    return answer(event, _tables(), _store, left_ms, namespace=variables(QueryEnvironment).namespace)

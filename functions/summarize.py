@@ -6,15 +6,17 @@ Batches of a robot over its share are put off to `functions.later`.
 
 from __future__ import annotations
 
-import os
 from functools import cache
 from typing import Any
 
 import boto3
 from botocore.config import Config
 
-from functions.shared.processing import Bounds, processed, recompute, stored_tables
-from functions.shared.share import PutOff, Share, Told
+from functions.shared import clients
+from functions.shared.environment import variables
+from functions.shared.summary.processing import Bounds, processed, recompute, stored_tables
+from functions.shared.summary.share import PutOff, Share, Told
+from iort_contract.catalog.environments import SummarizeEnvironment
 from iort_contract.tables import RECOMPUTE_FROM_S, REPLAY
 
 
@@ -26,7 +28,7 @@ def _bounds() -> Bounds:
 
 @cache
 def _put_off() -> PutOff:
-    return PutOff(boto3.client("sqs"), queue_url=os.environ["PUT_OFF_QUEUE"])
+    return PutOff(clients.sqs(), variables(SummarizeEnvironment).put_off_queue)
 
 
 @cache

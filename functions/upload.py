@@ -3,19 +3,17 @@
 from __future__ import annotations
 
 import logging
-import os
 import time
-from collections.abc import Iterator, Mapping
-from functools import cache
+from collections.abc import Callable, Iterator, Mapping
 from typing import Any
 
-import boto3
-from botocore.config import Config
-
+from functions.shared import clients
 from functions.shared.bucket import Bucket, parts_sha256
 from functions.shared.dead_letter import DeadLetterQueue, refused_event
+from functions.shared.environment import variables
 from functions.shared.metrics import emit
-from functions.shared.upload_quota import Allotment
+from functions.shared.upload_quota import UploadQuota
+from iort_contract.catalog.environments import UploadEnvironment
 from iort_contract.checks import json_object
 from iort_contract.limits import ContractError
 from iort_contract.messages.event import event_message
@@ -36,9 +34,7 @@ _log.setLevel(logging.INFO)
 _AGAIN_S = 3600
 
 
-def answer(
-    robot: str, request: FileRequest, bucket: Bucket, allotment: Allotment, now_s: float
-) -> FileAnswer:
+def answer(robot: str, request: FileRequest, bucket: Bucket, quota: UploadQuota, now_s: float) -> FileAnswer:
     """The state of the file in the bucket, and the addresses for the rest. The robot comes from the topic,
     and the key from robot and file, so that no request can reach another file."""
     file, key = request.file, file_key(robot, request.file)
@@ -47,8 +43,8 @@ def answer(
     upload_id = bucket.upload_of(key) if file.parts > 1 else None
     # A file in one piece counts for each address, a larger file when its upload begins.
     begins = upload_id is None and (file.parts > 1 or bool(request.parts))
-    if begins and not allotment.take(robot, file.size, now_s):
-        why = f"no more than {allotment.bytes_a_day} bytes a day, and only of registered robots"
+    if begins and not quota.take(robot, file.size, now_s):
+        why = f"no more than {quota.bytes_a_day} bytes a day, and only of registered robots"
         return FileAnswer(request.id, refused=why, again_s=_AGAIN_S)
     if file.parts == 1:
         addresses = [bucket.address(key, file)] if request.parts else []
@@ -84,68 +80,57 @@ def ranges(numbers: Mapping[int, Any]) -> Iterator[tuple[int, int]]:
         yield first, last
 
 
-@cache
-def _bucket() -> Bucket:
-    # Virtual addressing gives the region's own host: the global one redirects, which invalidates a signature.
-    config = Config(signature_version="s3v4", s3={"addressing_style": "virtual"})
-    return Bucket(boto3.client("s3", config=config), os.environ["FILES_BUCKET"])
-
-
-@cache
-def _allotment() -> Allotment:
-    return Allotment(
-        boto3.client("dynamodb"),
-        table=os.environ["ROBOTS_TABLE"],
-        bytes_a_day=int(os.environ["UPLOAD_BYTES_A_DAY"]),
-    )
-
-
-@cache
-def _iot_data() -> Any:
-    return boto3.client("iot-data")
-
-
-@cache
-def _refusals() -> DeadLetterQueue:
-    return DeadLetterQueue.at_once(os.environ["REJECTED_QUEUE"])
-
-
-def handler(event: dict[str, Any], context: Any) -> None:
-    """Entry point of the upload rule's Lambda action."""
+def serve(
+    event: Mapping[str, Any],
+    function_arn: str,
+    *,
+    bucket: Bucket,
+    quota: UploadQuota,
+    reply: Callable[[Topic, FileAnswer], None],
+    keep: Callable[[str], bool],
+) -> None:
+    """Answer a request by ``reply``. A malformed one is refused; without an id it cannot be answered, and
+    goes to the quarantine's queue by ``keep``. Raises `ContractError` if the queue does not take it, so that
+    Lambda sends it there."""
     topic = parse_topic(event[TOPIC])
     envelope: dict[str, Any] = {}
     try:
         envelope = json_object(event_message(event), "file request")
         request = decode_file_request(envelope)
     except ContractError as error:
-        _refuse(event, envelope, topic, error, context)
+        _log.warning("refused a request of %s: %s", topic.robot, error)
+        emit("upload", FilesRefused=1)
+        request_id = file_request_id(envelope)
+        if request_id is not None:
+            reply(topic, FileAnswer(request_id, refused=str(error)))
+        elif not keep(refused_event(function_arn, event, str(error))):
+            raise
         return
-    given = answer(topic.robot, request, _bucket(), _allotment(), time.time())
-    done = given.stored and request.parts_sha256 is not None
+    found = answer(topic.robot, request, bucket, quota, time.time())
+    done = found.stored and request.parts_sha256 is not None
     emit(
         "upload",
         FilesAsked=1,
-        FilesRefused=int(given.refused is not None),
+        FilesRefused=int(found.refused is not None),
         FilesStored=int(done),
         StoredBytes=request.file.size if done else 0,
     )
-    _reply(topic.robot, topic.namespace, given)
+    reply(topic, found)
 
 
-def _refuse(
-    event: Mapping[str, Any], said: Mapping[str, Any], topic: Topic, error: ContractError, context: Any
-) -> None:
-    """Tell the robot why. A request without an id goes to the quarantine. Raises `error` if the queue does
-    not take it, so that Lambda sends it."""
-    _log.warning("refused a request of %s: %s", topic.robot, error)
-    emit("upload", FilesRefused=1)
-    request_id = file_request_id(said)
-    if request_id is not None:
-        _reply(topic.robot, topic.namespace, FileAnswer(request_id, refused=str(error)))
-    elif not _refusals().keep(refused_event(context.invoked_function_arn, event, str(error))):
-        raise error
+def _reply(topic: Topic, found: FileAnswer) -> None:
+    answers = build_topic(PONG, topic.robot, FILE, topic.namespace)
+    clients.iot_data().publish(topic=answers, qos=1, payload=encode_file_answer(found))
 
 
-def _reply(robot: str, namespace: str, given: FileAnswer) -> None:
-    topic = build_topic(PONG, robot, FILE, namespace)
-    _iot_data().publish(topic=topic, qos=1, payload=encode_file_answer(given))
+def handler(event: dict[str, Any], context: Any) -> None:
+    """Entry point of the upload rule's Lambda action."""
+    given = variables(UploadEnvironment)
+    serve(
+        event,
+        context.invoked_function_arn,
+        bucket=Bucket(clients.s3(), given.files_bucket),
+        quota=UploadQuota(clients.dynamodb(), table=given.robots_table, bytes_a_day=given.upload_bytes_a_day),
+        reply=_reply,
+        keep=lambda body: DeadLetterQueue(clients.sqs(at_once=True), given.rejected_queue).keep(body),
+    )

@@ -1,12 +1,12 @@
 """Runs the checkers over the stacks of both stages: cfn-lint, cdk-nag, checkov, and our own.
 
-cfn-lint and our own checks also read every variation of the parameters (stacks/variations.py).
+cfn-lint and our own checks also read every variation of the parameters (stacks/checks/variations.py).
 
     python scripts/check_stacks.py [--checkov build/checkov/bin/checkov] [--write]
 
-It needs no credentials and no network. stacks/acknowledged.py lists the findings that the stacks do not
-follow; an entry that no checker reports any more is a finding too. --write generates docs/acknowledged.md
-from it. Our own checks, stacks/checks.py, cannot be acknowledged.
+It needs no credentials and no network. stacks/checks/acknowledged.py lists the findings that the stacks do
+not follow; an entry that no checker reports any more is a finding too. --write generates docs/acknowledged.md
+from it. Our own checks, stacks/checks/invariants.py, cannot be acknowledged.
 """
 
 from __future__ import annotations
@@ -19,6 +19,7 @@ import sys
 import time
 from collections import defaultdict
 from collections.abc import Iterable, Iterator
+from contextlib import contextmanager
 from functools import cache
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -32,11 +33,11 @@ from cdk_nag import AwsSolutionsChecks, ServerlessChecks
 
 from app import build
 from iort_contract.limits import DEFAULT_NAMESPACE
-from stacks.acknowledged import Acknowledged, short
-from stacks.checks import broken
-from stacks.grants import unfit
+from stacks.checks.acknowledged import Acknowledged, short
+from stacks.checks.grants import unfit
+from stacks.checks.invariants import broken
+from stacks.checks.variations import VARIATIONS
 from stacks.settings import Settings
-from stacks.variations import VARIATIONS
 
 DOCUMENT = ROOT / "docs" / "acknowledged.md"
 STAGES: dict[str, dict[str, Any]] = {
@@ -75,29 +76,21 @@ def main() -> None:
         layer = Path(folder) / "layer"
         (layer / "python").mkdir(parents=True)
         for stage, given in STAGES.items():
-            began = time.monotonic()
-            out = Path(folder) / stage
-            settings = Settings(layer=layer, **given)
-            known[stage] = synthesize(settings, out)
-            found += nag(out)
-            print(f"check: stage {stage} synthesized, cdk-nag ({time.monotonic() - began:.0f} s)", flush=True)
-        began = time.monotonic()
+            with timed(f"stage {stage} synthesized, cdk-nag"):
+                known[stage] = synthesize(Settings(layer=layer, **given), Path(folder) / stage)
+                found += nag(Path(folder) / stage)
         # cdk-nag's and checkov's findings depend only on the parameters of the stages.
-        for name, given in VARIATIONS.items():
-            app = App(outdir=str(Path(others) / name))
-            build(app, Settings(layer=layer, **given))
-            app.synth()
-        print(
-            f"check: {len(VARIATIONS)} variations synthesized ({time.monotonic() - began:.0f} s)", flush=True
-        )
+        with timed(f"{len(VARIATIONS)} variations synthesized"):
+            for name, given in VARIATIONS.items():
+                app = App(outdir=str(Path(others) / name))
+                build(app, Settings(layer=layer, **given))
+                app.synth()
         found += own(Path(folder), Path(others))
-        began = time.monotonic()
-        found += lint(Path(folder), Path(others))
-        print(f"check: cfn-lint ({time.monotonic() - began:.0f} s)", flush=True)
+        with timed("cfn-lint"):
+            found += lint(Path(folder), Path(others))
         if asked.checkov:
-            began = time.monotonic()
-            found += checkov(asked.checkov, Path(folder))
-            print(f"check: checkov ({time.monotonic() - began:.0f} s)", flush=True)
+            with timed("checkov"):
+                found += checkov(asked.checkov, Path(folder))
     findings = [finding.text for finding in found if not finding.acknowledged]
     findings += stale(known, found, unjudged=() if asked.checkov else ("CKV",))
     text = document(known)
@@ -107,8 +100,18 @@ def main() -> None:
         findings.append(f"{DOCUMENT.relative_to(ROOT)} is not up to date: scripts/check_stacks.py --write")
     if findings:
         sys.exit(
-            "\n".join([*findings, f"{len(findings)} open: fix, or give a reason in stacks/acknowledged.py"])
+            "\n".join(
+                [*findings, f"{len(findings)} open: fix, or acknowledge in stacks/checks/acknowledged.py"]
+            )
         )
+
+
+@contextmanager
+def timed(what: str) -> Iterator[None]:
+    """Print what has been done, and the seconds that it took."""
+    began = time.monotonic()
+    yield
+    print(f"check: {what} ({time.monotonic() - began:.0f} s)", flush=True)
 
 
 def synthesize(settings: Settings, out: Path) -> list[Acknowledged]:
@@ -216,7 +219,7 @@ def stale(
     everywhere = {(one.rule, one.path): one for acknowledged in known.values() for one in acknowledged}
     for rule, path in sorted(everywhere.keys() - still):
         if not rule.startswith(unjudged):
-            yield f"{rule} on {path}: no checker reports it any more; remove it from stacks/acknowledged.py"
+            yield f"{rule} on {path}: not reported any more; remove it from stacks/checks/acknowledged.py"
 
 
 def output(command: list[str], *, good: Iterable[int]) -> str:
@@ -239,9 +242,9 @@ def document(known: dict[str, list[Acknowledged]]) -> str:
         "# Findings of the checkers that the stacks do not follow",
         "",
         "Generated by `scripts/check_stacks.py --write` from",
-        "[stacks/acknowledged.py](../stacks/acknowledged.py). `make check` runs cfn-lint (W), cdk-nag",
-        "(AwsSolutions, Serverless) and checkov (CKV) over both stages, prod with a customer-managed key,",
-        "and fails on any other finding, or if this page is out of date.",
+        "[stacks/checks/acknowledged.py](../stacks/checks/acknowledged.py). `make check` runs",
+        "cfn-lint (W), cdk-nag (AwsSolutions, Serverless) and checkov (CKV) over both stages, prod",
+        "with a customer-managed key, and fails on any other finding, or if this page is out of date.",
         "",
         "| rule | reason | resources |",
         "|---|---|---|",

@@ -26,12 +26,35 @@ from iort_station.cli.main import app
 from iort_station.cost import report
 from iort_station.cost.prices import AS_OF, REGION
 from iort_station.cost.usage import Usage
+from scripts import cloud_tables
 from scripts.page_contract import formula, page_contract
 
-__all__ = ["agent", "cost", "derived", "fields", "headline", "manual", "page_contract"]
+__all__ = [
+    "agent",
+    "alarms",
+    "cost",
+    "derived",
+    "fields",
+    "headline",
+    "manual",
+    "metrics",
+    "page_contract",
+    "rules",
+    "settings",
+]
 
 ROOT = Path(__file__).resolve().parent.parent
-FILES = tuple(ROOT / name for name in ("README.md", "docs/cost.md", "docs/iort.md", "docs/messages.md"))
+FILES = tuple(
+    ROOT / name
+    for name in (
+        "README.md",
+        "docs/cloud.md",
+        "docs/cost.md",
+        "docs/iort.md",
+        "docs/messages.md",
+        "docs/processing.md",
+    )
+)
 PAGE = ROOT / "station" / "web" / "src" / "base" / "contract.ts"
 REPORT = ROOT / "docs" / "bench" / "report.json"
 
@@ -63,6 +86,28 @@ def agent() -> None:
     """The agent's own figures, from the catalogue."""
     rows = [(f"`{field.name}`", field.unit, field.meaning) for field in AGENT_FIELDS.values()]
     _table(("field", "unit", "meaning"), rows, right=False)
+
+
+def settings() -> None:
+    """The deployment's parameters."""
+    _table(("key", "default", "meaning"), cloud_tables.settings_rows(), right=False)
+
+
+def rules() -> None:
+    """The topic rules, from the catalogue."""
+    _table(("rule", "what it does", "messages go to", "from"), cloud_tables.rule_rows(), right=False)
+
+
+def metrics() -> None:
+    """The metrics of the functions, from the catalogue."""
+    head = ("metric", "function", "unit", "statistic", "chart", "alarm")
+    _table(head, cloud_tables.metric_rows(), right=False)
+
+
+def alarms() -> None:
+    """The alarms, from the catalogue."""
+    head = ("alarm", "what happened", "goes off", "what to do")
+    _table(head, cloud_tables.alarm_rows(), right=False)
 
 
 def cost(name: str) -> None:

@@ -95,7 +95,7 @@ def steps(*, layer: bool, checkov: bool, oldest: str | None) -> Iterator[Step]:
     locked = "package-lock.json"
     yield Step("node", "CDK and page packages", (locked,), (".venv/bin/npm ci --no-progress",))
     yield Step("page", "live page", ("station/web/**/*", locked), (".venv/bin/npm run build",))
-    made_of = ("requirements/layer.txt", "scripts/layer.py", "stacks/target.py")
+    made_of = ("requirements/layer.txt", "scripts/layer.py", "stacks/parts/target.py")
     local = (".venv/bin/python -m scripts.layer local",)
     yield Step("layer-local", "Lambda layer, this machine", made_of, local)
     if layer:

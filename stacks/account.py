@@ -6,14 +6,12 @@ only on request (`device_defender`, `iot_log_level`), and deployed last. The emb
 
 from __future__ import annotations
 
-from typing import Any
-
-from aws_cdk import ArnFormat, Stack
+from aws_cdk import App, ArnFormat
 from aws_cdk import aws_iam as iam
 from aws_cdk import aws_iot as iot
-from constructs import Construct
 
-from stacks import iot_core
+from stacks.parts import iot_core
+from stacks.parts.base import PlatformStack
 from stacks.settings import Settings
 
 # The "Audit checks" of certificates, policies and clients. The others concern role aliases, Cognito and
@@ -47,11 +45,11 @@ _AUDIT_READS = (
 _LOG_GROUP = "AWSIotLogsV2"
 
 
-class Account(Stack):
+class Account(PlatformStack):
     """A daily audit and the log, as the settings ask."""
 
-    def __init__(self, scope: Construct, construct_id: str, *, settings: Settings, **kwargs: Any) -> None:
-        super().__init__(scope, construct_id, **kwargs)
+    def __init__(self, app: App, settings: Settings) -> None:
+        super().__init__(app, "account", settings)
         if settings.device_defender:
             self._audit()
         if settings.iot_log_level:

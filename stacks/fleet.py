@@ -3,48 +3,37 @@
 from __future__ import annotations
 
 import json
-from typing import Any
 
-from aws_cdk import Duration, Stack
+from aws_cdk import App, Duration
 from aws_cdk import aws_iam as iam
 from aws_cdk import aws_iot as iot
 from aws_cdk import aws_lambda as lambda_
-from aws_cdk import aws_lambda_destinations as destinations
-from constructs import Construct
 
+from iort_contract.catalog.environments import RegistryEnvironment
 from iort_contract.cloud import claim_name, fleet_name
 from iort_contract.tables import PRESENCE
-from stacks import iot_core
-from stacks.documents import claim_policy, provisioning_template, robot_policy
-from stacks.function import function
+from stacks.parts import iot_core
+from stacks.parts.base import PlatformStack
+from stacks.parts.documents import claim_policy, provisioning_template, robot_policy
+from stacks.parts.function import allow, function, invoked_by_rule
 from stacks.quarantine import Quarantine
 from stacks.settings import Settings
 from stacks.storage import Storage
 
 
-class Fleet(Stack):
+class Fleet(PlatformStack):
     """The resources to register robots. One policy serves all robots: its variables restrict each certificate
     to the topics of its thing.
 
-    ``admit`` decides if a claim may have the name it asks for; ``presence`` keeps the robots' rows.
+    The function Admit decides if a claim may have the name it asks for; ``presence`` keeps the robots' rows.
     """
 
-    def __init__(
-        self,
-        scope: Construct,
-        construct_id: str,
-        *,
-        settings: Settings,
-        storage: Storage,
-        quarantine: Quarantine,
-        **kwargs: Any,
-    ) -> None:
-        super().__init__(scope, construct_id, **kwargs)
-        self._settings = settings
+    def __init__(self, app: App, settings: Settings, *, storage: Storage, quarantine: Quarantine) -> None:
+        super().__init__(app, "fleet", settings, storage.encryption)
         namespace = settings.namespace
-        self.admit = self._admit(storage)
+        self._environment = RegistryEnvironment(namespace, storage.robots.table_name)
+        admit = self._admit(storage)
         self.presence = self._presence(storage, quarantine)
-        self.functions = (self.admit, self.presence)
         name = fleet_name(namespace)
         robot_type = iot.CfnThingType(
             self,
@@ -74,12 +63,12 @@ class Fleet(Stack):
             enabled=True,
             provisioning_role_arn=role.role_arn,
             pre_provisioning_hook=iot.CfnProvisioningTemplate.ProvisioningHookProperty(
-                payload_version="2020-04-01", target_arn=self.admit.function_arn
+                payload_version="2020-04-01", target_arn=admit.function_arn
             ),
             template_body=json.dumps(provisioning_template(namespace)),
         )
         template_arn = self.format_arn(service="iot", resource="provisioningtemplate", resource_name=name)
-        asking = iot_core.may_call(self, "AdmitPermission", self.admit, source_arn=template_arn)
+        asking = iot_core.may_call(self, "AdmitPermission", admit, source_arn=template_arn)
         # RegisterThing needs them: AWS tests role and hook when it creates the template.
         for needed in (robot_type, robots, policy, role, asking):
             template.node.add_dependency(needed)
@@ -87,38 +76,17 @@ class Fleet(Stack):
     def _admit(self, storage: Storage) -> lambda_.Function:
         # AWS IoT waits 5 s for the answer, cold start included. Lambda assigns CPU by memory: this is one
         # core.
-        admit = function(
-            self,
-            "Admit",
-            settings=self._settings,
-            encryption=storage.encryption,
-            memory_mb=1769,
-            timeout_s=4,
-            environment={"ROBOTS_TABLE": storage.robots.table_name},
-        )
+        admit = function(self, "Admit", self._environment, memory_mb=1769, timeout_s=4)
         storage.robots.grant(admit, "dynamodb:UpdateItem")
         # Reads the status of an admitted certificate, whose id is unknown at deployment.
         certificates = self.format_arn(service="iot", resource="cert", resource_name="*")
-        admit.add_to_role_policy(
-            iam.PolicyStatement(actions=["iot:DescribeCertificate"], resources=[certificates])
-        )
+        allow(admit, ["iot:DescribeCertificate"], certificates)
         return admit
 
     def _presence(self, storage: Storage, quarantine: Quarantine) -> lambda_.Function:
-        presence = function(
-            self,
-            "Presence",
-            settings=self._settings,
-            encryption=storage.encryption,
-            memory_mb=256,
-            environment={"ROBOTS_TABLE": storage.robots.table_name},
-        )
+        presence = function(self, "Presence", self._environment)
         # A late event is sorted in or ignored, so long retries are safe.
-        presence.configure_async_invoke(
-            max_event_age=Duration.hours(6),
-            retry_attempts=2,
-            on_failure=destinations.SqsDestination(quarantine.rejected),
-        )
+        invoked_by_rule(presence, quarantine.rejected, age=Duration.hours(6), retries=2)
         storage.may_keep(presence, *PRESENCE)
         return presence
 

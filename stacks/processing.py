@@ -1,97 +1,115 @@
-"""The functions that compute: Lambda 1 live, Lambda 2 summarize, and later, echo and upload, each with its
-own role and log."""
+"""The functions that compute: Lambda 1 live, Lambda 2 summarize, and later, echo, upload, query and alert,
+each with its own role and log."""
 
 from __future__ import annotations
 
-import json
-from typing import Any
+from collections.abc import Mapping
 
-from aws_cdk import CfnOutput, Duration, Stack
+from aws_cdk import App, CfnOutput, Duration
 from aws_cdk import aws_iam as iam
 from aws_cdk import aws_lambda as lambda_
-from aws_cdk import aws_lambda_destinations as destinations
 from aws_cdk import aws_lambda_event_sources as sources
 from aws_cdk import aws_sns as sns
 from aws_cdk import aws_sns_subscriptions as subscriptions
 from aws_cdk import aws_sqs as sqs
-from constructs import Construct
 
+from iort_contract.catalog.environments import (
+    AlertEnvironment,
+    Environment,
+    LaterEnvironment,
+    LiveEnvironment,
+    QueryEnvironment,
+    SummarizeEnvironment,
+    UploadEnvironment,
+)
+from iort_contract.catalog.rules import RULES, Call
 from iort_contract.cloud import RESULTS_PREFIX, pubnub_parameter
 from iort_contract.messages.files import FILES_PREFIX
 from iort_contract.tables import ALERT_PREFIX, FILES_BYTES, FILES_DAY, STREAMS
 from iort_contract.topics import FILE, LAMBDA, PONG, SHADOW
-from stacks.function import RUNTIME, function
+from stacks.parts.base import PlatformStack
+from stacks.parts.function import RUNTIME, allow, function, invoked_by_rule
+from stacks.parts.queue import queue
 from stacks.quarantine import Quarantine
-from stacks.queue import queue
 from stacks.settings import Settings
 from stacks.storage import Storage
 
 _SUMMARIZE_S = 60
 
 
-class Processing(Stack):
-    """The functions, with the grants that each one needs."""
+class Processing(PlatformStack):
+    """The functions, with the grants that each one needs.
+
+    ``called`` are those of all rules, also of other stacks; one that is not described here needs no grants
+    but its log's. ``alarms`` is the topic of every alarm and every car's alert.
+    """
 
     def __init__(
         self,
-        scope: Construct,
-        construct_id: str,
-        *,
+        app: App,
         settings: Settings,
+        *,
         storage: Storage,
         quarantine: Quarantine,
-        **kwargs: Any,
+        called: Mapping[str, lambda_.Function],
     ) -> None:
-        super().__init__(scope, construct_id, **kwargs)
-        self._settings, self._encryption = settings, storage.encryption
-        self._rejected = quarantine.rejected
-        self.live = self._live()
-        self.put_off = self._put_off()
-        self.summarize = self._summarize(storage)
-        self.later = self._later(storage)
-        self.echo = self._echo()
-        self.upload = self._upload(storage)
-        self.query = self._query(storage)
+        super().__init__(app, "processing", settings, storage.encryption)
+        self._storage, self._rejected = storage, quarantine.rejected
+        live = self._live()
+        # The keys of waiting batches, whose robot is over its share of Lambda 2.
+        put_off = queue(self, "PutOff", reader_timeout_s=_SUMMARIZE_S, failures=self._rejected)
+        self._summarize(put_off)
+        self._later(put_off)
+        echo, upload = self._echo(), self._upload()
+        self._query()
         self.alarms = self._alarms()
-        self.alert = self._alert(storage)
+        self.called = {**called, "live": live, "echo": echo, "upload": upload, "alert": self._alert()}
+        for rule in RULES.values():
+            if isinstance(rule.action, Call) and rule.action.function not in self.called:
+                self.called[rule.action.function] = self._plain(rule.action.function)
+
+    def _plain(self, name: str) -> lambda_.Function:
+        made = function(self, name.capitalize(), Environment(self.settings.namespace))
+        invoked_by_rule(made, self._rejected)
+        return made
 
     def _live(self) -> lambda_.Function:
-        name = pubnub_parameter(self._settings.namespace)
+        name = pubnub_parameter(self.settings.namespace)
+        layer = lambda_.LayerVersion(
+            self,
+            "PubNub",
+            code=lambda_.Code.from_asset(str(self.settings.layer)),
+            compatible_runtimes=[RUNTIME],
+        )
         live = function(
             self,
             "Live",
-            settings=self._settings,
-            encryption=self._encryption,
-            memory_mb=256,
-            environment={
-                "PUBNUB_PARAMETER": name,
-                "LIVE_FIELDS": json.dumps(self._settings.live_fields),
-                "REJECTED_QUEUE": self._rejected.queue_url,
-            },
-            layers=[
-                lambda_.LayerVersion(
-                    self,
-                    "PubNub",
-                    code=lambda_.Code.from_asset(str(self._settings.layer)),
-                    compatible_runtimes=[RUNTIME],
-                )
-            ],
-            reserved_concurrency=self._settings.reserved_for_live,
+            LiveEnvironment(
+                namespace=self.settings.namespace,
+                pubnub_parameter=name,
+                live_fields=self.settings.live_fields,
+                rejected_queue=self._rejected.queue_url,
+            ),
+            layers=[layer],
+            reserved_concurrency=self.settings.reserved_for_live,
         )
-        self._invoked_once(live)
+        invoked_by_rule(live, self._rejected)
         parameter = self.format_arn(service="ssm", resource="parameter", resource_name=name.lstrip("/"))
-        self._allow(live, ["ssm:GetParameter"], parameter)
+        allow(live, ["ssm:GetParameter"], parameter)
         return live
 
-    def _summarize(self, storage: Storage) -> lambda_.Function:
-        summarize = self._summarizing("Summarize", storage, PUT_OFF_QUEUE=self.put_off.queue_url)
-        self._allow(summarize, ["sqs:SendMessage"], self.put_off.queue_arn)
+    def _summarize(self, put_off: sqs.Queue) -> None:
+        environment = SummarizeEnvironment(
+            **vars(self._summarizing_environment()), put_off_queue=put_off.queue_url
+        )
+        summarize = self._summarizing("Summarize", environment)
+        allow(summarize, ["sqs:SendMessage"], put_off.queue_arn)
         # It tells a robot in its shadow that the robot is over its share. AWS IoT: "Action resources".
         shadow = self.format_arn(service="iot", resource="thing", resource_name=f"*/{SHADOW}")
-        self._allow(summarize, ["iot:UpdateThingShadow"], shadow)
+        allow(summarize, ["iot:UpdateThingShadow"], shadow)
         summarize.add_event_source(
             sources.DynamoEventSource(
-                storage.telemetry,
+                self._storage.telemetry,
                 starting_position=lambda_.StartingPosition.TRIM_HORIZON,
                 # Batches of a robot in the window are read and written once.
                 batch_size=500,
@@ -111,91 +129,70 @@ class Processing(Stack):
                 ],
             )
         )
-        return summarize
 
-    def _put_off(self) -> sqs.Queue:
-        """The keys of waiting batches, whose robot is over its share of Lambda 2."""
-        return queue(
-            self,
-            "PutOff",
-            settings=self._settings,
-            encryption=self._encryption,
-            # AWS advises six times the function's timeout.
-            visibility_timeout=Duration.seconds(6 * _SUMMARIZE_S),
-            dead_letter_queue=sqs.DeadLetterQueue(max_receive_count=5, queue=self._rejected),
-        )
-
-    def _later(self, storage: Storage) -> lambda_.Function:
+    def _later(self, put_off: sqs.Queue) -> None:
         # On the embedded cloud all functions share this machine's cores.
-        alone = 1 if self._settings.embedded else 0
-        later = self._summarizing("Later", storage, reserved_concurrency=alone)
-        storage.telemetry.grant(later, "dynamodb:GetItem")
+        alone = 1 if self.settings.embedded else 0
+        later = self._summarizing("Later", self._summarizing_environment(), reserved_concurrency=alone)
+        self._storage.telemetry.grant(later, "dynamodb:GetItem")
         self._rejected.grant_send_messages(later)
-        self.put_off.grant_consume_messages(later)
+        put_off.grant_consume_messages(later)
         # AWS' minimum: waiting batches take no other function's environments.
         lambda_.EventSourceMapping(
             self,
             "PutOffs",
             target=later,
-            event_source_arn=self.put_off.queue_arn,
+            event_source_arn=put_off.queue_arn,
             batch_size=1,
             max_concurrency=2,
         )
-        return later
+
+    def _summarizing_environment(self) -> LaterEnvironment:
+        return LaterEnvironment(
+            namespace=self.settings.namespace,
+            telemetry_table=self._storage.telemetry.table_name,
+            summary_table=self._storage.summary.table_name,
+            robots_table=self._storage.robots.table_name,
+            rejected_queue=self._rejected.queue_url,
+            robot_metrics=self.settings.robot_metrics,
+        )
 
     def _summarizing(
-        self, name: str, storage: Storage, *, reserved_concurrency: int = 0, **environment: str
+        self, name: str, environment: LaterEnvironment, *, reserved_concurrency: int = 0
     ) -> lambda_.Function:
         """A function that reads batches and writes seconds."""
         made = function(
             self,
             name,
-            settings=self._settings,
-            encryption=self._encryption,
+            environment,
             memory_mb=512,
             timeout_s=_SUMMARIZE_S,
             reserved_concurrency=reserved_concurrency,
-            environment={
-                "TELEMETRY_TABLE": storage.telemetry.table_name,
-                "SUMMARY_TABLE": storage.summary.table_name,
-                "ROBOTS_TABLE": storage.robots.table_name,
-                "REJECTED_QUEUE": self._rejected.queue_url,
-                "ROBOT_METRICS": str(self._settings.robot_metrics).lower(),
-                **environment,
-            },
         )
-        storage.telemetry.grant(made, "dynamodb:Query")
-        storage.summary.grant(made, "dynamodb:BatchWriteItem")
-        storage.robots.grant(made, "dynamodb:GetItem")
-        storage.may_keep(made, STREAMS)
+        self._storage.telemetry.grant(made, "dynamodb:Query")
+        self._storage.summary.grant(made, "dynamodb:BatchWriteItem")
+        self._storage.robots.grant(made, "dynamodb:GetItem")
+        self._storage.may_keep(made, STREAMS)
         return made
 
-    def _query(self, storage: Storage) -> lambda_.Function:
-        query = function(
-            self,
-            "Query",
-            settings=self._settings,
-            encryption=self._encryption,
-            # AWS gives a whole core at 1769 MB, and this function only decodes.
-            memory_mb=1769,
-            # Below the caller's connection timeout; a longer query continues in another invocation.
-            timeout_s=18,
-            environment={
-                "TELEMETRY_TABLE": storage.telemetry.table_name,
-                "ROBOTS_TABLE": storage.robots.table_name,
-                "FILES_BUCKET": storage.files.bucket_name,
-            },
+    def _query(self) -> None:
+        environment = QueryEnvironment(
+            namespace=self.settings.namespace,
+            telemetry_table=self._storage.telemetry.table_name,
+            robots_table=self._storage.robots.table_name,
+            files_bucket=self._storage.files.bucket_name,
         )
-        storage.telemetry.grant(query, "dynamodb:Query", "dynamodb:Scan")
-        storage.robots.grant(query, "dynamodb:GetItem")
+        # AWS gives a whole core at 1769 MB, and this function only decodes. The timeout is below the caller's
+        # connection timeout; a longer query continues in another invocation.
+        query = function(self, "Query", environment, memory_mb=1769, timeout_s=18)
+        self._storage.telemetry.grant(query, "dynamodb:Query", "dynamodb:Scan")
+        self._storage.robots.grant(query, "dynamodb:GetItem")
         # A pre-signed address allows only reads that the function itself may do.
-        results = storage.files.arn_for_objects(f"{RESULTS_PREFIX}*")
-        self._allow(query, ["s3:GetObject", "s3:PutObject"], results)
-        return query
+        results = self._storage.files.arn_for_objects(f"{RESULTS_PREFIX}*")
+        allow(query, ["s3:GetObject", "s3:PutObject"], results)
 
     def _alarms(self) -> sns.Topic:
-        """The topic of every alarm and every car's alert."""
-        topic = sns.Topic(self, "Alarms", enforce_ssl=True, **self._encryption.topic)
+        topic = sns.Topic(self, "Alarms", enforce_ssl=True, **self.encryption.topic)
         # A topic with a policy of its own loses the default that lets the account's alarms publish.
         topic.add_to_resource_policy(
             iam.PolicyStatement(
@@ -205,84 +202,57 @@ class Processing(Stack):
                 conditions={"StringEquals": {"aws:SourceAccount": self.account}},
             )
         )
-        if self._settings.alarm_email:
-            topic.add_subscription(subscriptions.EmailSubscription(self._settings.alarm_email))
+        if self.settings.alarm_email:
+            topic.add_subscription(subscriptions.EmailSubscription(self.settings.alarm_email))
         CfnOutput(self, "AlarmTopic", value=topic.topic_arn)
         return topic
 
-    def _alert(self, storage: Storage) -> lambda_.Function:
+    def _alert(self) -> lambda_.Function:
         alert = function(
             self,
             "Alert",
-            settings=self._settings,
-            encryption=self._encryption,
-            memory_mb=256,
-            environment={
-                "ROBOTS_TABLE": storage.robots.table_name,
-                "ALARM_TOPIC": self.alarms.topic_arn,
-                "LOW_VOLTAGE_V": f"{self._settings.thresholds.low_voltage_v:g}",
-            },
+            AlertEnvironment(
+                namespace=self.settings.namespace,
+                robots_table=self._storage.robots.table_name,
+                alarm_topic=self.alarms.topic_arn,
+                low_voltage_v=self.settings.low_voltage_v,
+            ),
         )
-        storage.may_keep(alert, f"{ALERT_PREFIX}*")
-        self._allow(alert, ["sns:Publish"], self.alarms.topic_arn)
+        self._storage.may_keep(alert, f"{ALERT_PREFIX}*")
+        allow(alert, ["sns:Publish"], self.alarms.topic_arn)
         # The car repeats the message within 10 s.
-        alert.configure_async_invoke(
-            max_event_age=Duration.minutes(5),
-            retry_attempts=1,
-            on_failure=destinations.SqsDestination(self._rejected),
-        )
+        invoked_by_rule(alert, self._rejected, age=Duration.minutes(5), retries=1)
         return alert
 
     def _echo(self) -> lambda_.Function:
-        echo = function(self, "Echo", settings=self._settings, encryption=self._encryption, memory_mb=256)
-        self._invoked_once(echo)
-        self._may_answer(echo, f"{PONG}/{self._settings.namespace}/*/{LAMBDA}")
+        echo = self._plain("echo")
+        allow(echo, ["iot:Publish"], self._pongs(LAMBDA))
         return echo
 
-    def _upload(self, storage: Storage) -> lambda_.Function:
+    def _upload(self) -> lambda_.Function:
+        files = self._storage.files
         upload = function(
             self,
             "Upload",
-            settings=self._settings,
-            encryption=self._encryption,
-            memory_mb=256,
-            environment={
-                "FILES_BUCKET": storage.files.bucket_name,
-                "ROBOTS_TABLE": storage.robots.table_name,
-                "REJECTED_QUEUE": self._rejected.queue_url,
-                "UPLOAD_BYTES_A_DAY": str(self._settings.upload_gb_a_day * 10**9),
-            },
+            UploadEnvironment(
+                namespace=self.settings.namespace,
+                files_bucket=files.bucket_name,
+                robots_table=self._storage.robots.table_name,
+                rejected_queue=self._rejected.queue_url,
+                upload_bytes_a_day=self.settings.upload_gb_a_day * 10**9,
+            ),
         )
         # The robot asks again if no answer comes.
-        self._invoked_once(upload)
+        invoked_by_rule(upload, self._rejected)
         # It can sign only for its own rights. It may neither read a file nor delete one.
-        self._allow(
-            upload,
-            ["s3:AbortMultipartUpload", "s3:ListMultipartUploadParts", "s3:PutObject"],
-            storage.files.arn_for_objects(f"{FILES_PREFIX}*"),
-        )
-        self._allow(upload, ["s3:ListBucket", "s3:ListBucketMultipartUploads"], storage.files.bucket_arn)
-        storage.may_keep(upload, FILES_DAY, FILES_BYTES)
-        self._may_answer(upload, f"{PONG}/{self._settings.namespace}/*/{FILE}")
+        signed = ["s3:AbortMultipartUpload", "s3:ListMultipartUploadParts", "s3:PutObject"]
+        allow(upload, signed, files.arn_for_objects(f"{FILES_PREFIX}*"))
+        allow(upload, ["s3:ListBucket", "s3:ListBucketMultipartUploads"], files.bucket_arn)
+        self._storage.may_keep(upload, FILES_DAY, FILES_BYTES)
+        allow(upload, ["iot:Publish"], self._pongs(FILE))
         return upload
 
-    def _may_answer(self, one: lambda_.Function, topic: str) -> None:
-        self._allow(
-            one,
-            ["iot:Publish"],
-            self.format_arn(service="iot", resource="topic", resource_name=topic),
-        )
-
-    @staticmethod
-    def _allow(one: lambda_.Function, actions: list[str], resource: str) -> None:
-        one.add_to_role_policy(iam.PolicyStatement(actions=actions, resources=[resource]))
-
-    def _invoked_once(self, called: lambda_.Function) -> None:
-        """A rule calls it and does not wait. Its answer is late after 2 s (the shortest age that Lambda
-        allows is a minute), so it is never retried. It may send to the queue, so that it can refuse a message
-        without failing."""
-        called.configure_async_invoke(
-            max_event_age=Duration.minutes(1),
-            retry_attempts=0,
-            on_failure=destinations.SqsDestination(self._rejected),
-        )
+    def _pongs(self, path: str) -> str:
+        """The topics of the answers to all robots."""
+        topic = f"{PONG}/{self.settings.namespace}/*/{path}"
+        return str(self.format_arn(service="iot", resource="topic", resource_name=topic))

@@ -8,52 +8,37 @@ there cannot come back to the beginning.
 
 from __future__ import annotations
 
-from typing import Any
-
-from aws_cdk import Duration, Stack
+from aws_cdk import App
 from aws_cdk import aws_lambda as lambda_
-from aws_cdk import aws_sqs as sqs
-from constructs import Construct
 
-from stacks.function import function
-from stacks.queue import queue
+from iort_contract.catalog.environments import QuarantineEnvironment
+from stacks.parts.base import PlatformStack
+from stacks.parts.function import function
+from stacks.parts.queue import queue
 from stacks.settings import Settings
 from stacks.storage import Storage
 
 _TIMEOUT_S = 10
-_ATTEMPTS = 5
 # Concurrent batches of ten messages: a flood of refusals waits in the queue, which is cheaper than the table.
 _CONCURRENCY = 2
 
 
-class Quarantine(Stack):
+class Quarantine(PlatformStack):
     """The queues ``rejected`` and ``last``, and the ``function`` between queue and table."""
 
-    def __init__(
-        self, scope: Construct, construct_id: str, *, settings: Settings, storage: Storage, **kwargs: Any
-    ) -> None:
-        super().__init__(scope, construct_id, **kwargs)
-        self.last = queue(self, "Last", settings=settings, encryption=storage.encryption)
-        self.rejected = queue(
-            self,
-            "Rejected",
-            settings=settings,
-            encryption=storage.encryption,
-            # AWS advises six times the function's time.
-            visibility_timeout=Duration.seconds(6 * _TIMEOUT_S),
-            dead_letter_queue=sqs.DeadLetterQueue(max_receive_count=_ATTEMPTS, queue=self.last),
-        )
+    def __init__(self, app: App, settings: Settings, storage: Storage) -> None:
+        super().__init__(app, "quarantine", settings, storage.encryption)
+        self.last = queue(self, "Last")
+        self.rejected = queue(self, "Rejected", reader_timeout_s=_TIMEOUT_S, failures=self.last)
         self.function = function(
             self,
             "Quarantine",
-            settings=settings,
-            encryption=storage.encryption,
-            memory_mb=256,
+            QuarantineEnvironment(
+                namespace=settings.namespace,
+                quarantine_table=storage.quarantine.table_name,
+                retention_s=settings.retention_s,
+            ),
             timeout_s=_TIMEOUT_S,
-            environment={
-                "QUARANTINE_TABLE": storage.quarantine.table_name,
-                "RETENTION_S": str(settings.retention_days * 86_400),
-            },
         )
         storage.quarantine.grant(self.function, "dynamodb:UpdateItem")
         # A failed batch is reported only by its place in the stream, so its records are read again.

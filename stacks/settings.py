@@ -2,37 +2,28 @@
 
 from __future__ import annotations
 
-import json
-import math
 import re
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field, fields
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any, NoReturn
 
 from aws_cdk import App, RemovalPolicy
+from pydantic import AfterValidator, BaseModel, BeforeValidator, ConfigDict, Field, ValidationError
 
+from iort_contract.catalog.rules import DAY_S, LOW_VOLTAGE_V
 from iort_contract.catalog.vesc import VESC_FIELDS, VESC_STREAM
-from iort_contract.cloud import LOW_VOLTAGE_V
-from iort_contract.limits import DEFAULT_NAMESPACE, ContractError
+from iort_contract.limits import DEFAULT_NAMESPACE
 from iort_contract.topics import check_namespace
 
 ROOT = Path(__file__).resolve().parent.parent
 
 DEV, PROD = "dev", "prod"
-STAGES = (DEV, PROD)
 _RESERVED_FOR_LIVE = 5
-IOT_LOG_LEVELS = ("off", "error", "warn", "info", "debug")
 OWN_LOGS, ALL_LOGS = "own", "all"
-FUNCTION_LOGS = (OWN_LOGS, ALL_LOGS)
 _EMAIL = re.compile(r"[^@\s,]+@[^@\s,]+\.[^@\s,]+")
 # "Tag naming limits and requirements": up to 128 and 256 characters, and aws: is AWS' own.
 _TAG_KEY = re.compile(r"(?!aws:)[\w .:/=+@-]{1,128}", re.IGNORECASE)
 _TAG_VALUE = re.compile(r"[\w .:/=+@-]{0,256}")
-
-
-# Parse one context value; raises `SettingsError`.
-_Reader = Callable[[str, Any], Any]
 
 
 class SettingsError(ValueError):
@@ -40,61 +31,162 @@ class SettingsError(ValueError):
     values."""
 
 
-@dataclass(frozen=True, kw_only=True)
-class Thresholds:
-    """Alarm thresholds; each is a context key of the same name.
+def _whole(low: int, high: int) -> BeforeValidator:
+    def read(value: Any) -> int:
+        # The CDK CLI passes every -c as text, cdk.json a number of either kind.
+        text = str(int(value)) if isinstance(value, float) and value.is_integer() else str(value)
+        if not text.isdecimal() or not low <= int(text) <= high:
+            raise ValueError(f"must be a whole number from {low} to {high}")
+        return int(text)
 
-    The voltage suits a battery of three lithium cells. The temperatures are those of the controller's board
-    and MOSFETs; a VESC throttles from 85 degC.
+    return BeforeValidator(read)
+
+
+def _one_of(*allowed: str) -> BeforeValidator:
+    def read(value: Any) -> str:
+        if value not in allowed:
+            raise ValueError(f"must be {', '.join(allowed[:-1])} or {allowed[-1]}")
+        return str(value)
+
+    return BeforeValidator(read)
+
+
+def _above_zero(value: Any) -> float:
+    try:
+        number = 0.0 if isinstance(value, bool) else float(value)
+    except (TypeError, ValueError):
+        number = 0.0
+    if not 0 < number < float("inf"):
+        raise ValueError("must be a number above 0")
+    return number
+
+
+def _true_or_false(value: Any) -> bool:
+    if str(value).lower() not in ("true", "false"):
+        raise ValueError("must be true or false")
+    return str(value).lower() == "true"
+
+
+def _email(value: Any) -> str | None:
+    if value is None:
+        return None
+    if not _EMAIL.fullmatch(str(value)):
+        raise ValueError("must be one e-mail address")
+    return str(value)
+
+
+def _tags(value: Any) -> dict[str, str]:
+    """Parse tags: an object in cdk.json, ``team=lab,cost-centre=7`` on the command line."""
+    pairs = value
+    if isinstance(value, str):
+        pairs = dict(pair.split("=", 1) for pair in value.split(",")) if _is_pairs(value) else None
+    if not isinstance(pairs, Mapping) or not all(
+        isinstance(text, str) and _TAG_KEY.fullmatch(str(key)) and _TAG_VALUE.fullmatch(text)
+        for key, text in pairs.items()
+    ):
+        raise ValueError("must be key=value,key=value with AWS' tags")
+    return dict(pairs)
+
+
+def _is_pairs(text: str) -> bool:
+    return all("=" in pair for pair in text.split(","))
+
+
+Flag = Annotated[bool, BeforeValidator(_true_or_false)]
+Positive = Annotated[float, BeforeValidator(_above_zero)]
+
+
+class Settings(BaseModel):
+    """Settings that may differ between two deployments of the same stacks; each is a context key.
+
+    docs/cloud.md has a table of the descriptions.
     """
 
-    low_voltage_v: float = LOW_VOLTAGE_V
-    high_temperature_degc: float = 80.0
-    stream_behind_s: float = 60.0
-    car_to_lambda_ms: float = 2_000.0
+    model_config = ConfigDict(frozen=True, extra="forbid")
 
-
-@dataclass(frozen=True, kw_only=True)
-class Settings:
-    """Settings that may differ between two deployments of the same stacks.
-
-    ``namespace`` prefixes topics, rules and stacks. ``stage`` is dev, which deletes all data with its stack,
-    or prod, which keeps and protects tables and files. ``tags`` are put on every resource. ``customer_key``
-    encrypts stored data with a key of the account; ``keep_customer_key`` keeps that key without using it, for
-    data that it has encrypted. ``budget_usd`` is the account's monthly budget (0: none), and ``alarm_email``
-    receives its alerts and every alarm. ``old_telemetry`` keeps the telemetry table of a deployment from
-    before batches had ids. ``robot_metrics`` also counts every robot by itself, at a cost per robot.
-    ``retention_days`` is the lifetime of telemetry and summaries, ``files_days`` of uploaded files (0: for
-    good). ``upload_gb_a_day`` is a robot's daily upload limit, in 1e9 bytes. ``live_concurrency`` is the
-    reserved concurrency of Lambda 1, which also limits it (0: nothing; None: see `reserved_for_live`).
-    ``live_fields`` maps a stream to its fields on the dashboard. ``function_logs`` is "own" for the
-    functions' own lines, or "all" to add Lambda's lines about every invocation. ``device_defender`` and
-    ``iot_log_level`` ("" for none) apply to the whole account. ``site`` adds the stack that puts the page on
-    the web. ``layer`` is the folder of Lambda 1's third-party code. ``embedded`` is true for the embedded
-    cloud, which is deployed with the caller's own credentials.
-    """
-
-    namespace: str = DEFAULT_NAMESPACE
-    stage: str = DEV
-    tags: Mapping[str, str] = field(default_factory=dict)
-    customer_key: bool = False
-    keep_customer_key: bool = False
-    old_telemetry: bool = False
-    robot_metrics: bool = False
-    budget_usd: int = 0
-    alarm_email: str | None = None
-    thresholds: Thresholds = field(default_factory=Thresholds)
-    retention_days: int = 90
-    files_days: int = 0
-    upload_gb_a_day: int = 50
-    live_concurrency: int | None = None
-    live_fields: Mapping[str, list[str]] = field(default_factory=lambda: {VESC_STREAM: list(VESC_FIELDS)})
-    layer: Path = ROOT / "build" / "layer" / "lambda"
-    device_defender: bool = False
-    iot_log_level: str = ""
-    function_logs: str = OWN_LOGS
-    site: bool = False
-    embedded: bool = False
+    stage: Annotated[str, _one_of(DEV, PROD)] = Field(
+        default=DEV,
+        description="`dev`: everything goes with its stack. `prod`: tables, queues, logs, files and the key "
+        "stay when the stack goes; tables have point-in-time recovery and deletion protection, stacks "
+        "termination protection",
+    )
+    namespace: Annotated[str, BeforeValidator(check_namespace)] = Field(
+        default=DEFAULT_NAMESPACE,
+        description="prefix of topics, rules and stacks; another one for a second stage in the same account",
+    )
+    tags: Annotated[dict[str, str], BeforeValidator(_tags)] = Field(
+        default={}, description="`team=lab,cost-centre=7`: on every resource, beside `project` and `stage`"
+    )
+    retention_days: Annotated[int, _whole(1, 3650)] = Field(
+        default=90, description="lifetime of telemetry and summaries"
+    )
+    files_days: Annotated[int, _whole(0, 3650)] = Field(
+        default=0, description="lifetime of uploaded files; 0: for good"
+    )
+    upload_gb_a_day: Annotated[int, _whole(1, 10_000)] = Field(
+        default=50, description="a robot's daily upload limit, in 1e9 bytes"
+    )
+    live_concurrency: Annotated[int, _whole(0, 1000)] | None = Field(
+        default=None,
+        description="reserved concurrency of Lambda 1, which also limits it; 0: nothing. Without a value: 5 "
+        "in `prod`, nothing in `dev` ([why](#lambdas-limit-in-a-new-account))",
+    )
+    customer_key: Flag = Field(
+        default=False,
+        description="one key of the account's own, rotated every year, for tables, queues, files, topic and "
+        "logs ([decision 11](decisions/0011-one-key-through-services.md)): $1 a month and $0.03 per 10,000 "
+        "requests. It goes in two steps: [below](#a-key-of-ones-own)",
+    )
+    keep_customer_key: Flag = Field(
+        default=False, description="keeps that key without using it, for data that it has encrypted"
+    )
+    old_telemetry: Flag = Field(
+        default=False,
+        description="keeps the telemetry table of a deployment from before batches had ids, in every stage, "
+        "beside the new one: [upgrading](upgrading.md)",
+    )
+    alarm_email: Annotated[str | None, BeforeValidator(_email)] = Field(
+        default=None,
+        description="receives alarms, alerts and the budget's mails; AWS asks this address for its consent "
+        "once",
+    )
+    budget_usd: Annotated[int, _whole(0, 1_000_000)] = Field(
+        default=0,
+        description="a monthly budget of the account, 0 for none: a mail at 80 % spent, and when the "
+        "forecast passes all of it. A budget by tag counts nothing until the tag is activated in the "
+        "billing console",
+    )
+    low_voltage_v: Positive = Field(
+        default=LOW_VOLTAGE_V, description="a low battery: three lithium cells; 14 for four"
+    )
+    high_temperature_degc: Positive = Field(
+        default=80.0, description="a hot controller, on its board or MOSFETs; a VESC throttles from 85 degC"
+    )
+    stream_behind_s: Positive = Field(default=60.0, description="how far Lambda 2 may be behind")
+    car_to_lambda_ms: Positive = Field(default=2_000.0, description="live samples older than this are late")
+    function_logs: Annotated[str, _one_of(OWN_LOGS, ALL_LOGS)] = Field(
+        default=OWN_LOGS, description="`all` keeps Lambda's own lines about every invocation, too: see below"
+    )
+    robot_metrics: Flag = Field(
+        default=False, description="every robot's health as metrics of its own: see below"
+    )
+    device_defender: Flag = Field(default=False, description="a daily audit of the account's AWS IoT")
+    iot_log_level: Annotated[
+        str,
+        _one_of("off", "error", "warn", "info", "debug"),
+        AfterValidator(lambda level: level.replace("off", "")),
+    ] = Field(
+        default="",
+        description="AWS IoT's own log: `error`, `warn`, `info` or `debug` ([below](#aws-iots-own-log))",
+    )
+    site: Flag = Field(default=False, description="the page on the web: [page.md](page.md)")
+    embedded: Flag = Field(
+        default=False, description="for the embedded cloud, with the caller's own credentials"
+    )
+    layer: Annotated[Path, BeforeValidator(lambda folder: ROOT / folder)] = Field(
+        default=ROOT / "build" / "layer" / "lambda", description="the folder of Lambda 1's third-party code"
+    )
+    live_fields: dict[str, list[str]] = {VESC_STREAM: list(VESC_FIELDS)}
 
     @property
     def protected(self) -> bool:
@@ -114,6 +206,11 @@ class Settings:
         return self.live_concurrency
 
     @property
+    def retention_s(self) -> int:
+        """The lifetime of telemetry and summaries."""
+        return self.retention_days * DAY_S
+
+    @property
     def account_wide(self) -> bool:
         """Whether any setting of the whole account is on."""
         return not self.embedded and (self.device_defender or bool(self.iot_log_level))
@@ -131,17 +228,11 @@ class Settings:
     @classmethod
     def read(cls, context: Callable[[str], Any]) -> Settings:
         """Read from ``context``, which returns a key's value or None; raises `SettingsError`."""
-        given: dict[str, Any] = {
-            key: read(key, value) for key, read in _READ.items() if (value := context(key)) is not None
-        }
-        given["thresholds"] = Thresholds(
-            **{
-                one.name: _positive(one.name, value)
-                for one in fields(Thresholds)
-                if (value := context(one.name)) is not None
-            }
-        )
-        settings = cls(**given)
+        given = {key: value for key in CONTEXT_KEYS if (value := context(key)) is not None}
+        try:
+            settings = cls(**given)
+        except ValidationError as error:
+            _refuse(error)
         if settings.budget_usd and not settings.alarm_email:
             raise SettingsError("context budget_usd needs alarm_email, which receives the alerts")
         if settings.site and settings.embedded:
@@ -153,105 +244,13 @@ class Settings:
         return settings
 
 
-def _namespace(_key: str, value: Any) -> str:
-    try:
-        return check_namespace(value)
-    except ContractError as error:
-        raise SettingsError(f"context {error}") from error
+# The fields of the dashboard are no context key.
+CONTEXT_KEYS = Settings.model_fields.keys() - {"live_fields"}
 
 
-def _whole(low: int, high: int) -> _Reader:
-    def read(key: str, value: Any) -> int:
-        # The CDK CLI passes every -c as text, cdk.json a number of either kind.
-        text = str(int(value)) if isinstance(value, float) and value.is_integer() else str(value)
-        if not text.isdecimal() or not low <= int(text) <= high:
-            raise SettingsError(f"context {key} must be a whole number from {low} to {high}, got {value!r}")
-        return int(text)
-
-    return read
-
-
-def _one_of(*allowed: str) -> _Reader:
-    def read(key: str, value: Any) -> str:
-        if value not in allowed:
-            raise SettingsError(
-                f"context {key} must be {', '.join(allowed[:-1])} or {allowed[-1]}, got {value!r}"
-            )
-        return str(value)
-
-    return read
-
-
-def _log_level(key: str, value: Any) -> str:
-    level: str = _one_of(*IOT_LOG_LEVELS)(key, value)
-    return "" if level == "off" else level
-
-
-def _positive(key: str, value: Any) -> float:
-    try:
-        number = math.nan if isinstance(value, bool) else float(value)
-    except (TypeError, ValueError):
-        number = math.nan
-    if not 0 < number < math.inf:
-        raise SettingsError(f"context {key} must be a number above 0, got {value!r}")
-    return number
-
-
-def _boolean(key: str, value: Any) -> bool:
-    if str(value).lower() not in ("true", "false"):
-        raise SettingsError(f"context {key} must be true or false, got {value!r}")
-    return str(value).lower() == "true"
-
-
-def _email(key: str, value: Any) -> str:
-    if not isinstance(value, str) or not _EMAIL.fullmatch(value):
-        raise SettingsError(f"context {key} must be one e-mail address, got {value!r}")
-    return value
-
-
-def _tags(key: str, value: Any) -> dict[str, str]:
-    """Parse tags: an object in cdk.json, ``team=lab,cost-centre=7`` on the command line."""
-    tags: Mapping[Any, Any] | None = value if isinstance(value, Mapping) else None
-    if isinstance(value, str):
-        pairs = [pair.split("=", 1) for pair in value.split(",")]
-        tags = {pair[0]: pair[-1] for pair in pairs} if all(len(pair) == 2 for pair in pairs) else None
-    if tags is None or not all(
-        isinstance(name, str)
-        and _TAG_KEY.fullmatch(name)
-        and isinstance(text, str)
-        and _TAG_VALUE.fullmatch(text)
-        for name, text in tags.items()
-    ):
-        raise SettingsError(f"context {key} must be key=value,key=value with AWS' tags, got {_shown(value)}")
-    return dict(tags)
-
-
-def _folder(_key: str, value: Any) -> Path:
-    return ROOT / str(value)
-
-
-def _shown(value: Any) -> str:
-    return repr(value) if isinstance(value, str) else json.dumps(value, default=str)
-
-
-_READ: Mapping[str, _Reader] = {
-    "namespace": _namespace,
-    "stage": _one_of(*STAGES),
-    "retention_days": _whole(1, 3650),
-    "files_days": _whole(0, 3650),
-    "upload_gb_a_day": _whole(1, 10_000),
-    "live_concurrency": _whole(0, 1000),
-    "budget_usd": _whole(0, 1_000_000),
-    "embedded": _boolean,
-    "customer_key": _boolean,
-    "keep_customer_key": _boolean,
-    "device_defender": _boolean,
-    "old_telemetry": _boolean,
-    "robot_metrics": _boolean,
-    "site": _boolean,
-    "iot_log_level": _log_level,
-    "function_logs": _one_of(*FUNCTION_LOGS),
-    "alarm_email": _email,
-    "tags": _tags,
-    "layer": _folder,
-}
+def _refuse(error: ValidationError) -> NoReturn:
+    first = error.errors()[0]
+    text = first["msg"].removeprefix("Value error, ")
+    # The contract's errors show the value, and name the key.
+    text = text if ", got " in text else f"{first['loc'][0]} {text}, got {first['input']!r}"
+    raise SettingsError(f"context {text}") from error

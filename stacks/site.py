@@ -7,25 +7,23 @@ key is in Parameter Store, which no template can read, and no function with righ
 
 from __future__ import annotations
 
-from typing import Any
-
-from aws_cdk import CfnOutput, Duration, Stack
+from aws_cdk import App, CfnOutput, Duration
 from aws_cdk import aws_cloudfront as cloudfront
 from aws_cdk import aws_cloudfront_origins as origins
 from aws_cdk import aws_s3 as s3
-from constructs import Construct
 
 from iort_contract.page import HEADERS, PUBNUB_ORIGIN, security_policy
+from stacks.parts.base import PlatformStack
 from stacks.settings import Settings
 
 _HSTS = Duration.days(365)
 
 
-class Site(Stack):
+class Site(PlatformStack):
     """The page's bucket, which only CloudFront may read, and its distribution, TLS only."""
 
-    def __init__(self, scope: Construct, construct_id: str, *, settings: Settings, **kwargs: Any) -> None:
-        super().__init__(scope, construct_id, **kwargs)
+    def __init__(self, app: App, settings: Settings) -> None:
+        super().__init__(app, "site", settings)
         self.bucket = s3.Bucket(
             self,
             "Page",

@@ -2,18 +2,16 @@
 
 from __future__ import annotations
 
-from typing import Any
-
-from aws_cdk import CfnOutput, Duration, RemovalPolicy, Stack
+from aws_cdk import App, CfnOutput, Duration, RemovalPolicy
 from aws_cdk import aws_dynamodb as dynamodb
 from aws_cdk import aws_iam as iam
 from aws_cdk import aws_s3 as s3
-from constructs import Construct
 
 from iort_contract.cloud import RESULTS_PREFIX
 from iort_contract.messages.files import FILES_PREFIX
 from iort_contract.tables import BATCH, ENTRY, EXPIRES_S, ROBOT, SECOND, T_US, TOPIC
-from stacks.encryption import Encryption
+from stacks.parts.base import PlatformStack
+from stacks.parts.encryption import Encryption
 from stacks.settings import Settings
 
 # Storage at half the price, reads at a cent a gigabyte. S3 allows the move from this day on, and does not
@@ -24,17 +22,16 @@ OLD_TELEMETRY = "Telemetry"
 _TEXT = dynamodb.AttributeType.STRING
 
 
-class Storage(Stack):
+class Storage(PlatformStack):
     """Four tables, paid by request, and a bucket. Every topic is a time series: partition key topic, sort key
     time. The quarantine has one item per message, by robot.
 
     All other stacks use ``encryption`` for their resources.
     """
 
-    def __init__(self, scope: Construct, construct_id: str, *, settings: Settings, **kwargs: Any) -> None:
-        super().__init__(scope, construct_id, **kwargs)
-        self._settings = settings
-        self.encryption = Encryption(self, settings=settings)
+    def __init__(self, app: App, settings: Settings) -> None:
+        super().__init__(app, "storage", settings)
+        self.encryption = Encryption.of(self, settings)
         # Not the old table's name, which had the time alone as its key: see docs/upgrading.md.
         self.telemetry = self._table(
             "Batches",
@@ -73,10 +70,10 @@ class Storage(Stack):
             billing_mode=dynamodb.BillingMode.PAY_PER_REQUEST,
             time_to_live_attribute=EXPIRES_S if expires else None,
             stream=stream,
-            removal_policy=self._settings.removal_policy,
-            deletion_protection=self._settings.protected,
+            removal_policy=self.settings.removal_policy,
+            deletion_protection=self.settings.protected,
             point_in_time_recovery_specification=dynamodb.PointInTimeRecoverySpecification(
-                point_in_time_recovery_enabled=self._settings.protected
+                point_in_time_recovery_enabled=self.settings.protected
             ),
             **self.encryption.table,
         )
@@ -126,7 +123,7 @@ class Storage(Stack):
             s3.LifecycleRule(id="abandoned", abort_incomplete_multipart_upload_after=Duration.days(7)),
             s3.LifecycleRule(id="results", prefix=RESULTS_PREFIX, expiration=Duration.days(1)),
         ]
-        days = self._settings.files_days
+        days = self.settings.files_days
         if not 0 < days <= _RARE_AFTER_DAYS:
             rare = s3.Transition(
                 storage_class=s3.StorageClass.INFREQUENT_ACCESS,
@@ -145,7 +142,7 @@ class Storage(Stack):
             lifecycle_rules=rules,
             # CloudFormation deletes only an empty bucket, so `iort files empty` comes first. The CDK's own
             # way deploys a function that may delete every object, for good.
-            removal_policy=self._settings.removal_policy,
+            removal_policy=self.settings.removal_policy,
             **self.encryption.bucket,
         )
         CfnOutput(self, "FilesBucket", value=bucket.bucket_name)

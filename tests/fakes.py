@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import re
 from collections import Counter
 from collections.abc import Iterator
 from decimal import Decimal
@@ -12,10 +11,10 @@ from boto3.dynamodb.types import TypeSerializer
 from botocore.exceptions import ClientError
 
 from functions.shared.tables import Tables
-from iort_contract.attributes import plain
 from iort_contract.catalog.vesc import VESC_STREAM
 from iort_contract.checks import json_object
 from iort_contract.codec.seconds import flat_second
+from iort_contract.dynamodb import plain
 from iort_contract.messages.batch import Batch, encode_batch
 from iort_contract.tables import BATCH, EXPIRES_S, RECEIVED_MS, ROBOT, SECOND, TOPIC
 from iort_contract.topics import RECORD, build_topic
@@ -43,38 +42,49 @@ class FakeDynamoDB:
     def put(self, table: str, item: dict[str, Any]) -> None:
         self.items[table][_key(table, item)] = item
 
-    def get_paginator(self, operation: str) -> FakeDynamoDB:
-        if operation == "scan":
-            return _Scans(self)  # type: ignore[return-value]  # it paginates as well
-        assert operation == "query"
-        return self
+    def get_paginator(self, operation: str) -> _Scans:
+        assert operation == "scan"
+        return _Scans(self)
 
     def query(self, **query: Any) -> dict[str, Any]:
-        page = next(iter(self.paginate(**query)))
-        return {**page, "Count": len(page["Items"])}
-
-    def paginate(self, **query: Any) -> Iterator[dict[str, Any]]:
         assert query["ConsistentRead"]
         names, values = query["ExpressionAttributeNames"], query["ExpressionAttributeValues"]
         assert names["#topic"] == TOPIC
-        assert set(names.values()) >= set(KEYS[query["TableName"]])
-        topic = values[":topic"]["S"]
-        bounds = {name: _comparable(value) for name, value in values.items() if name != ":topic"}
-        match = re.fullmatch(r"#topic = :topic AND #(?:batch|key) (.+)", query["KeyConditionExpression"])
-        assert match
-        inside = {
-            "< :first": lambda key: key < bounds[":first"],
-            "BETWEEN :first AND :last": lambda key: bounds[":first"] <= key <= bounds[":last"],
-        }[match[1]]
-        found = sorted(key for key in self.items[query["TableName"]] if key[0] == topic and inside(key[1]))
+        table, topic = query["TableName"], values[":topic"]["S"]
+        found = sorted(key for key in self.items[table] if key[0] == topic)
+        if query["KeyConditionExpression"] != "#topic = :topic":
+            assert query["KeyConditionExpression"] == "#topic = :topic AND #key BETWEEN :first AND :last"
+            assert names["#key"] == KEYS[table][1]
+            first, last = _comparable(values[":first"]), _comparable(values[":last"])
+            assert first <= last, "BETWEEN refuses an upper bound below the lower one"
+            found = [key for key in found if first <= key[1] <= last]
         if not query.get("ScanIndexForward", True):
             found.reverse()
-        size = query.get("PaginationConfig", {}).get("PageSize", self.page_items)
-        for start in range(0, max(1, len(found)), size):
-            page = [self.items[query["TableName"]][key] for key in found[start : start + size]]
-            self.calls["query"] += 1
-            self.read += len(page)
-            yield {"Items": page}
+        if "ExclusiveStartKey" in query:
+            after = _key(table, query["ExclusiveStartKey"])
+            forward = query.get("ScanIndexForward", True)
+            found = [key for key in found if (key > after if forward else key < after)]
+        size = query.get("Limit", self.page_items)
+        page = [self.items[table][key] for key in found[:size]]
+        self.calls["query"] += 1
+        self.read += len(page)
+        answer = {"Items": page, "Count": len(page)}
+        # DynamoDB stops at a limit without a look at what comes after.
+        if len(found) > size or (page and len(page) == query.get("Limit")):
+            answer["LastEvaluatedKey"] = {name: page[-1][name] for name in KEYS[table]}
+        return answer
+
+    def scan(self, **scan: Any) -> dict[str, Any]:
+        """A topic's items in one page, in another order than a query's."""
+        self.calls["scan"] += 1
+        values, table = scan["ExpressionAttributeValues"], scan["TableName"]
+        assert "FilterExpression" in scan
+        first, last = _comparable(values[":first"]), _comparable(values[":last"])
+        topic = values[":topic"]["S"]
+        found = [key for key in self.items[table] if key[0] == topic and first <= key[1] <= last][::-1]
+        if "ExclusiveStartKey" in scan:
+            found = found[1 + found.index(_key(table, scan["ExclusiveStartKey"])) :]
+        return {"Items": [self.items[table][key] for key in found]}
 
     def get_item(self, *, TableName: str, Key: dict[str, Any], **_: Any) -> dict[str, Any]:
         self.calls["get_item"] += 1

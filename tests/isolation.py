@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from typing import NamedTuple
 
+from iort_contract.catalog.rules import RULES
 from iort_contract.cloud import claim_name, fleet_name
 from iort_contract.topics import (
     BROKER,
@@ -20,7 +21,6 @@ from iort_contract.topics import (
     PONG,
     RECORD,
     RULE,
-    RULES,
     SHADOW,
     build_topic,
     live_topic,

@@ -10,7 +10,7 @@ import threading
 import time
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import asdict, dataclass
+from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
@@ -18,17 +18,18 @@ from botocore.exceptions import BotoCoreError, ClientError
 
 from bench import ROOT
 from bench.errors import BenchError
+from bench.load.fleet_figures import Fleet
 from bench.load.fleet_load import SAMPLES as BATCH_SAMPLES
 from bench.load.fleet_load import Load
 from bench.meters import usage
-from bench.report.result import Table
-from iort_contract.attributes import plain
 from iort_contract.catalog.vesc import VESC_STREAM
 from iort_contract.messages.batch import batch_id
-from iort_contract.tables import BATCH, RECEIVED_MS, SAMPLES, SECOND
+from iort_contract.tables import BATCH, RECEIVED_MS, SECOND
 from iort_station.cloud import Cloud
-from iort_station.data.items import of_topic
+from iort_station.data.batches import summary_table, topic_of
 from iort_station.fleet import robots
+from iort_station.operations import delivery
+from iort_station.operations.audit import headers
 from local.cloud import EmbeddedCloud
 from local.figures import Spread
 
@@ -36,80 +37,6 @@ from local.figures import Spread
 Tell = Callable[[str], None]
 # After so long without a change no more summaries come.
 _CATCH_UP_S = 120.0
-
-
-@dataclass(frozen=True)
-class Fleet:
-    """One run: what was sent, what arrived and how late, and the cost in processor time and memory.
-
-    ``delay_ms`` is from the robot's publish to the rule's ``received_ms``; ``ack_ms`` to the broker's
-    acknowledgement; ``summary_behind_s`` is the age of the newest summarised second of one robot, sampled
-    once a second; ``catch_up_s`` is how long Lambda 2 went on after the last batch. CPU is in percent of
-    one core while the fleet drives, memory in MB at its end.
-    """
-
-    robots: int
-    seconds: int
-    batches_sent: int
-    batches_stored: int
-    batches_lost: int
-    samples_sent: int
-    samples_summarized: int
-    topics_out_of_order: int
-    resent: int
-    lost_sessions: int
-    generator_late_ms_max: float
-    delay_ms: Spread
-    ack_ms: Spread
-    summary_behind_s: Spread
-    catch_up_s: float
-    cpu_percent: dict[str, float]
-    rss_mb: dict[str, float]
-
-    @property
-    def samples_lost(self) -> int:
-        """Samples that were sent and are missing in the telemetry table or in the summary."""
-        stored = self.samples_sent - self.batches_lost * BATCH_SAMPLES
-        return self.samples_sent - min(stored, self.samples_summarized)
-
-    @property
-    def good(self) -> bool:
-        """True if nothing is lost or stored twice and every topic is in order."""
-        return (
-            self.samples_sent == self.samples_summarized
-            and not self.batches_lost
-            and not self.topics_out_of_order
-            and self.batches_stored == self.batches_sent
-        )
-
-    def as_json(self) -> dict[str, Any]:
-        """Return the figures with the derived ones."""
-        return {**asdict(self), "samples_lost": self.samples_lost, "good": self.good}
-
-
-def table(runs: Sequence[Fleet]) -> Table:
-    """Return the figures, with a column for each run."""
-    figures: dict[str, Callable[[Fleet], object]] = {
-        "seconds": lambda run: run.seconds,
-        "batches sent": lambda run: f"{run.batches_sent:,}",
-        "batches stored": lambda run: f"{run.batches_stored:,}",
-        "samples sent": lambda run: f"{run.samples_sent:,}",
-        "samples summarised": lambda run: f"{run.samples_summarized:,}",
-        "samples lost": lambda run: f"{run.samples_lost:,}",
-        "out of order": lambda run: run.topics_out_of_order,
-        "sent again, sessions lost": lambda run: f"{run.resent}, {run.lost_sessions}",
-        "robot to rule": lambda run: run.delay_ms,
-        "robot to acknowledgement": lambda run: run.ack_ms,
-        "summary behind by": lambda run: f"{run.summary_behind_s.p50} s (p95 {run.summary_behind_s.p95})",
-        "Lambda 2 done after the last batch": lambda run: f"{run.catch_up_s:.1f} s",
-    }
-    rows = [[name, *(str(figure(run)) for run in runs)] for name, figure in figures.items()]
-    parts = list(runs[0].cpu_percent)
-    rows += [[f"CPU, {part}", *(f"{run.cpu_percent[part]:.0f} %" for run in runs)] for part in parts]
-    rows += [[f"memory, {part}", *(f"{run.rss_mb[part]:.0f} MB" for run in runs)] for part in parts]
-    head = ["", *(f"{run.robots} robot{'s' * (run.robots > 1)}" for run in runs)]
-    title = f"Robots with a certificate and a session each, a batch of {BATCH_SAMPLES} samples a second"
-    return Table(title, head, rows)
 
 
 def measure(embedded: EmbeddedCloud, count: int, seconds: int, tell: Tell, *, prefix: str = "bench") -> Fleet:
@@ -228,7 +155,7 @@ class _Stored:
 
 
 def _stored(cloud: Cloud, robot: str, sent_ms: Sequence[int]) -> _Stored:
-    return _Stored(list(_items(cloud, "TelemetryTable", robot, BATCH, RECEIVED_MS)), sent_ms)
+    return _Stored(list(headers(cloud, robot, VESC_STREAM)), sent_ms)
 
 
 def _summarized(cloud: Cloud, expected: dict[str, int]) -> int:
@@ -244,7 +171,7 @@ def _summarized(cloud: Cloud, expected: dict[str, int]) -> int:
             ends = _ends(cloud, name)
             over = time.monotonic() - since > _CATCH_UP_S
             if over or (ends and (ends[1] - ends[0] + 1) * BATCH_SAMPLES >= samples):
-                counted = sum(int(item[SAMPLES]) for item in _items(cloud, "SummaryTable", name, SAMPLES))
+                counted = delivery.samples_summarized(cloud, name, VESC_STREAM)
             if counted >= samples or over:
                 break
             if looked_at != (counted, ends):
@@ -257,15 +184,6 @@ def _summarized(cloud: Cloud, expected: dict[str, int]) -> int:
 
 def _ends(cloud: Cloud, robot: str) -> list[int]:
     """Return the first and the last summarised second of a robot; empty if it has none."""
-    query, seconds = (
-        cloud.client("dynamodb").query,
-        of_topic(cloud, "SummaryTable", robot, VESC_STREAM, SECOND),
-    )
-    answers = (query(**seconds, ScanIndexForward=forward, Limit=1) for forward in (True, False))
-    return [int(item[SECOND]["N"]) for answer in answers for item in answer["Items"]]
-
-
-def _items(cloud: Cloud, table: str, robot: str, *fields: str) -> Iterator[dict[str, Any]]:
-    pages = cloud.client("dynamodb").get_paginator("query")
-    for page in pages.paginate(**of_topic(cloud, table, robot, VESC_STREAM, *fields)):
-        yield from map(plain, page["Items"])
+    table, topic = summary_table(cloud), topic_of(cloud, robot, VESC_STREAM)
+    ends = (table.first(topic, newest=newest, attributes=(SECOND,)) for newest in (False, True))
+    return [int(item[SECOND]["N"]) for item in ends if item is not None]

@@ -21,7 +21,7 @@ from iort_contract.catalog.vesc import VESC_STREAM
 from iort_contract.messages.live import LiveSample, encode_live
 from iort_contract.tables import SECOND
 from iort_contract.topics import LIVE, build_topic, record_topic
-from iort_station.data.items import of_topic
+from iort_station.data.batches import summary_table, topic_of
 
 # AWS IoT accepts this many publishes a second from a connection.
 RATE_HZ = 100
@@ -99,15 +99,15 @@ def _summary_delays(target: Target, car: str, client: RawClient, other: str, rat
     """
     topic = record_topic(other, VESC_STREAM, target.cloud.namespace)
     messages = worst_batches(rate_hz * WORST_S, first_us=time.time_ns() // 10**9 * 10**6)
-    newest = of_topic(target.cloud, "SummaryTable", car, VESC_STREAM, SECOND)
+    table, of_car = summary_table(target.cloud), topic_of(target.cloud, car, VESC_STREAM)
     seen: dict[int, float] = {}
     over = threading.Event()
 
     def watch() -> None:
         while not over.wait(_LOOK_S):
-            answer = target.cloud.client("dynamodb").query(**newest, ScanIndexForward=False, Limit=WORST_S)
+            page = next(table.pages(of_car, attributes=(SECOND,), newest_first=True, page_items=WORST_S))
             now_s = time.time()
-            for item in answer["Items"]:
+            for item in page.items:
                 second = int(item[SECOND]["N"])
                 # The one after it has come too, or a second may not be over.
                 seen.setdefault(second, (now_s - second - 1) * 1000)

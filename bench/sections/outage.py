@@ -82,7 +82,7 @@ def run(target: Target, say: Say) -> Section:
 
     # Lost samples never arrive: they are counted after the wait.
     reached(lambda: summarized() >= sent, within_s=_SUMMARY_S)
-    items = list(audit.headers(target.cloud, bundle.robot, VESC_STREAM, audit.Range()))
+    items = list(audit.headers(target.cloud, bundle.robot, VESC_STREAM))
     found = audit.audit(VESC_STREAM, items, from_start=True)
     delayed = [i for i in items if cut_us <= batch_id(i[BATCH]).t_us < mended_us]
     drained_ms = max((int(item["received_ms"]) for item in delayed), default=mended_us // 1000)

@@ -28,7 +28,7 @@ from bench.target import Say, Target
 from iort_contract.catalog.vesc import VESC_STREAM
 from iort_contract.tables import RECEIVED_MS, TOPIC
 from iort_contract.topics import RECORD, build_topic
-from iort_station.data import data
+from iort_station import data
 
 POINTS = 14_368
 ROBOT, HOUR_ROBOT = "bench-query", "bench-hour"

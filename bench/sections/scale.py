@@ -5,7 +5,8 @@ It runs only on the embedded cloud, which shares this machine's cores. The secti
 
 from __future__ import annotations
 
-from bench.load import fleet_run
+from bench.load.fleet_figures import table
+from bench.load.fleet_run import measure
 from bench.report import plots
 from bench.report.result import Section
 from bench.target import Say, Target
@@ -24,10 +25,10 @@ def run(target: Target, say: Say) -> Section:
         )
         return section
     runs = [
-        fleet_run.measure(target.embedded, count, seconds, say, prefix="bench-scale")
+        measure(target.embedded, count, seconds, say, prefix="bench-scale")
         for count, seconds in FLEETS.items()
     ]
-    section.tables.append(fleet_run.table(runs))
+    section.tables.append(table(runs))
     section.ratio("samples lost in all fleets", sum(run.samples_lost for run in runs), 0, unit="samples")
     last = runs[-1]
     busiest = max(last.cpu_percent, key=lambda part: last.cpu_percent[part])

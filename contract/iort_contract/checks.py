@@ -117,9 +117,15 @@ def check_header(boot: Any, seq: Any, nonfinite: Any) -> str:
         raise ContractError(f"boot must be 8 to 32 of 0-9 a-f, got {shown(boot)}")
     if type(seq) is not int or not 0 <= seq <= MAX_SEQ:
         raise ContractError(f"seq must be an integer from 0, got {shown(seq)}")
+    check_nonfinite(nonfinite)
+    return boot
+
+
+def check_nonfinite(nonfinite: Any) -> int:
+    """Return the count of values that are not finite, if it is valid."""
     if type(nonfinite) is not int or not 0 <= nonfinite <= MAX_SAMPLES * MAX_FIELDS:
         raise ContractError(f"{NONFINITE} must be an integer from 0, got {shown(nonfinite)}")
-    return boot
+    return nonfinite
 
 
 def check_time(t_us: Any, what: str) -> int:
@@ -174,7 +180,9 @@ def text(envelope: Mapping[str, Any], key: str) -> str:
 def json_object(text: Any, what: str) -> dict[str, Any]:
     """Parse a JSON object from text."""
     try:
-        value = json.loads(text, parse_constant=_refuse_constant)
+        if isinstance(text, (bytes, bytearray)):
+            text = text.decode(json.detect_encoding(text), "surrogatepass")
+        value = _DECODER.decode(text)
     except RecursionError as error:
         raise ContractError(f"{what} is nested too deeply") from error
     except (TypeError, ValueError) as error:
@@ -186,6 +194,10 @@ def json_object(text: Any, what: str) -> dict[str, Any]:
 
 def _refuse_constant(name: str) -> None:
     raise ContractError(f"{name} is not JSON")
+
+
+# Created once, like `COMPACT`.
+_DECODER = json.JSONDecoder(parse_constant=_refuse_constant)
 
 
 def shown(value: Any) -> str:

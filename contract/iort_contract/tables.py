@@ -21,7 +21,11 @@ GAPS, NONFINITE = "gaps", "nonfinite"
 PREVIOUS = "previous"
 # The keys of a batch's envelope; the record rule stores these and no others.
 ENVELOPE = ("v", BATCH, SAMPLES, NONFINITE, PREVIOUS, "codec", "samples")
-# Only if not zero: values of sensors that are not fitted (contract/iort_contract/vesc.py).
+# The fields of a ping; the answer repeats them.
+PING_FIELDS = ("v", "id", "sent_us", "padding")
+# A rule's message to a function: one opaque value, so that no key of it can replace one of the cloud's.
+MESSAGE_BASE64 = "message_base64"
+# Only if not zero: values of sensors that are not fitted (contract/iort_contract/catalog/vesc.py).
 ABSENT = "absent"
 # In a second over DynamoDB's 400 KB: the number of attributes left out, the largest first.
 OMITTED = "omitted"

@@ -10,6 +10,7 @@ from iort_contract.limits import DEFAULT_NAMESPACE, ContractError
 
 NAME = re.compile(r"[A-Za-z0-9_-]{1,64}")
 # Rule names allow no dash and must differ between stages, so the namespace is stricter.
+_RULE = re.compile(r"[a-z]{1,32}")
 _NAMESPACE = re.compile(r"[a-z][a-z0-9]{0,15}")
 
 RECORD, LIVE, FLEET, CMD, PING, PONG = "dt", "live", "fleet", "cmd", "ping", "pong"
@@ -95,11 +96,6 @@ def as_subscribed(topic: str, rule: str) -> str:
     return topic[len(prefix) :] if topic.startswith(prefix) else topic
 
 
-RULES = ("record", "live", "pong", "echo", "upload", "presence", "version", "fault", "battery")
-
-
 def rule_name(rule: str, namespace: str = DEFAULT_NAMESPACE) -> str:
     """The physical name of a topic rule; robots need two of them for Basic Ingest."""
-    if rule not in RULES:
-        raise ContractError(f"rule must be one of {', '.join(RULES)}, got {shown(rule)}")
-    return f"{check_namespace(namespace)}_{rule}"
+    return f"{check_namespace(namespace)}_{checked(_RULE, rule, 'rule', 'up to 32 lower-case letters')}"

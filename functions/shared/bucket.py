@@ -5,11 +5,14 @@ from __future__ import annotations
 import base64
 import hashlib
 from collections.abc import Iterator, Mapping
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 from botocore.exceptions import ClientError
 
 from iort_contract.messages.files import UPLOAD_URL_S, Address, File, part_range
+
+if TYPE_CHECKING:
+    from types_boto3_s3 import S3Client
 
 
 class Part(NamedTuple):
@@ -21,9 +24,9 @@ class Part(NamedTuple):
 
 
 class Bucket:
-    """The files' bucket; ``client`` is a boto3 S3 client."""
+    """The files' bucket."""
 
-    def __init__(self, client: Any, name: str) -> None:
+    def __init__(self, client: S3Client, name: str) -> None:
         self._client, self._name = client, name
 
     def has(self, key: str) -> bool:
@@ -102,7 +105,7 @@ class Bucket:
 
     def complete(self, key: str, upload_id: str, parts: Mapping[int, Part], size: int) -> None:
         """Join the parts to one object. If another call has just done so, this does nothing."""
-        named = [
+        named: list[Any] = [
             {"PartNumber": n, "ETag": part.etag, "ChecksumSHA256": _base64(part.sha256)}
             for n, part in sorted(parts.items())
         ]

@@ -24,7 +24,7 @@ class DelayEstimator:
 
     Both contain the difference between the car's clock and the cloud's, so it cancels out. It misses a delay
     that all messages of half a minute share, and that of the first message of a run or of a new environment.
-    It serves the cars that do not know their clock offset (`LiveSample`). After a car's clock
+    It serves the cars that do not know their clock offset (`iort_contract.LiveSample`). After a car's clock
     is set back, its messages look late until the window has passed. Each environment keeps one, for the
     thousand robots that sent last, and the latest run of each: robots know each other's run names, and must
     not act for another.

@@ -4,11 +4,18 @@ from __future__ import annotations
 
 import json
 import math
-import os
 import time
 from collections.abc import Callable, Mapping, Sequence
 
-from iort_contract.cloud import METRIC_DEPLOYMENT, METRIC_FUNCTION, METRIC_NAMESPACE, METRIC_ROBOT, METRICS
+from functions.shared.environment import variables
+from iort_contract.catalog.environments import Environment
+from iort_contract.catalog.metrics import (
+    METRIC_DEPLOYMENT,
+    METRIC_FUNCTION,
+    METRIC_NAMESPACE,
+    METRIC_ROBOT,
+    METRICS,
+)
 
 # "Specification: Embedded metric format": the most values of a metric in one line.
 MOST_VALUES = 100
@@ -31,12 +38,12 @@ def write(function: str, values: Values, at_s: float, robot: str | None = None) 
 
     A list holds several values of one metric; the newest hundred are written. A value beyond CloudWatch's
     limits is set to the limit. With a ``robot`` the values also count for that robot alone. The time is
-    ``at_s``, in seconds since the epoch. ``function`` and the metric names must be in the contract, otherwise
-    KeyError: a dashboard can then not wait for a metric that nothing emits. The deployment's ``NAMESPACE`` is
-    a dimension, so that two stages in one account do not add up. Source of the format: CloudWatch,
-    "Specification: Embedded metric format".
+    ``at_s``, in seconds since the epoch. The deployment's namespace is a dimension, so that two stages in one
+    account do not add up. Raises KeyError for a metric that is not the function's in the catalogue.
     """
-    known = METRICS[function]
+    for name in values:
+        if METRICS[name].function != function:
+            raise KeyError(f"{function}: {name}")
     shown = {
         name: [_bounded(each) for each in value[-MOST_VALUES:]]
         if isinstance(value, Sequence)
@@ -44,17 +51,14 @@ def write(function: str, values: Values, at_s: float, robot: str | None = None) 
         for name, value in values.items()
         if value
     }
-    for name in values:
-        if name not in known:
-            raise KeyError(name)
     if not shown:
         return
-    metrics = [{"Name": name, "Unit": _unit(name)} for name in shown]
-    dimensions = {METRIC_DEPLOYMENT: os.environ["NAMESPACE"], METRIC_FUNCTION: function}
+    dimensions = {METRIC_DEPLOYMENT: variables(Environment).namespace, METRIC_FUNCTION: function}
     sets = [list(dimensions)]
     if robot is not None:
         sets.append([*dimensions, METRIC_ROBOT])
         dimensions[METRIC_ROBOT] = robot
+    metrics = [{"Name": name, "Unit": METRICS[name].unit} for name in shown]
     directive = {"Namespace": METRIC_NAMESPACE, "Dimensions": sets, "Metrics": metrics}
     line = {
         "_aws": {"Timestamp": int(at_s * 1000), "CloudWatchMetrics": [directive]},
@@ -87,12 +91,10 @@ class Gathered:
             if not value:
                 continue
             kept = self._values.setdefault(name, [])
-            if _unit(name) != "Count":
+            if METRICS[name].unit != "Count":
                 kept.append(round(value, 2))
-            elif kept:
-                kept[0] += value
             else:
-                kept.append(value)
+                kept[:] = [sum(kept) + value]
         full = any(len(kept) == MOST_VALUES for kept in self._values.values())
         if full or now_s - self._written_s >= GATHER_S:
             self._flush(now_s)
@@ -107,11 +109,3 @@ class Gathered:
 def _bounded(value: float) -> float:
     # JSON's true is not a metric value, so a bool becomes a number.
     return +max(-_MOST, min(_MOST, value))
-
-
-def _unit(name: str) -> str:
-    if name.endswith("Bytes"):
-        return "Bytes"
-    if name.endswith(("Volts", "DegC")):
-        return "None"
-    return "Milliseconds" if name.endswith("Ms") else "Count"

@@ -7,17 +7,15 @@ import math
 import time
 from collections.abc import Iterator, Mapping
 from contextlib import suppress
-from itertools import islice
 from typing import Any
 
 from botocore.exceptions import ClientError
 
-from iort_contract.attributes import plain
 from iort_contract.catalog.derived import Vehicle
 from iort_contract.codec.seconds import Statistics
+from iort_contract.dynamodb import SummaryTable, TelemetryTable, plain, starting_between
 from iort_contract.limits import ContractError
-from iort_contract.messages.batch import BatchId, batch_id, batches_between
-from iort_contract.table_writer import WRITE_SIZE, write
+from iort_contract.messages.batch import BatchId, batch_id
 from iort_contract.tables import BATCH, OMITTED, ROBOT, SECOND, STREAMS, TOPIC, VEHICLE_CACHE_S
 
 _log = logging.getLogger(__name__)
@@ -57,78 +55,35 @@ class Tables:
 
     def __init__(self, client: Any, *, telemetry: str, summary: str, robots: str) -> None:
         self._client = client
-        self._telemetry, self._summary, self._robots = telemetry, summary, robots
+        self.telemetry, self._summary = TelemetryTable(client, telemetry), SummaryTable(client, summary)
+        self._robots = robots
         self._vehicles: dict[str, tuple[float, Vehicle | None]] = {}
         self._noted: set[tuple[str, str]] = set()
 
     def batches_from(self, topic: str, first_us: int, *, at_once: int) -> Iterator[dict[str, Any]]:
         """A topic's stored batches from a start time on, in order of time. The first page has ``at_once``
         batches, later ones a hundred: callers rarely want a whole drive."""
-        first, last = batches_between(first_us, None)
-        few = self._between(topic, first, last, at_once)
-        read = 0
-        for item in islice(few, at_once):
-            # Sorts after this one: no key ends with a space.
-            read, first = read + 1, f"{item[BATCH]} "
-            yield item
-        if read == at_once:
-            yield from self._between(topic, first, last, _MANY)
-
-    def _between(self, topic: str, first: str, last: str, at_once: int) -> Iterator[dict[str, Any]]:
-        condition = "#batch BETWEEN :first AND :last"
-        return self._query(topic, condition, {":first": first, ":last": last}, at_once=at_once)
+        keys = starting_between(first_us, None)
+        few = next(self.telemetry.pages(topic, keys, page_items=at_once))
+        yield from map(plain, few.items)
+        if few.after is not None:
+            for page in self.telemetry.pages(topic, keys, page_items=_MANY, after=few.after):
+                yield from map(plain, page.items)
 
     def before(self, topic: str, t_us: int) -> Iterator[dict[str, Any]]:
         """A topic's stored batches before a time, the nearest first. Each is read on demand, since the first
         one is nearly always enough."""
-        first, _ = batches_between(t_us, None)
-        return self._query(topic, "#batch < :first", {":first": first}, at_once=1, ScanIndexForward=False)
+        keys = starting_between(None, t_us - 1)
+        for page in self.telemetry.pages(topic, keys, page_items=1, newest_first=True):
+            yield from map(plain, page.items)
 
     def numbers(self, topic: str, first_us: int, last_us: int) -> Iterator[BatchId]:
         """The ids of a topic's batches between two times, in order of time, without their samples."""
-        first, last = batches_between(first_us, last_us)
-        condition = "#batch BETWEEN :first AND :last"
-        values = {":first": first, ":last": last}
-        for item in self._query(topic, condition, values, at_once=_MANY, ProjectionExpression="#batch"):
-            with suppress(ContractError):
-                yield batch_id(item[BATCH])
-
-    def _query(
-        self, topic: str, condition: str, values: Mapping[str, str], *, at_once: int, **how: Any
-    ) -> Iterator[dict[str, Any]]:
-        texts = {name: {"S": value} for name, value in values.items()}
-        pages = self._client.get_paginator("query").paginate(
-            TableName=self._telemetry,
-            ConsistentRead=True,
-            KeyConditionExpression=f"#topic = :topic AND {condition}",
-            ExpressionAttributeNames={"#topic": TOPIC, "#batch": BATCH},
-            ExpressionAttributeValues={":topic": {"S": topic}, **texts},
-            PaginationConfig={"PageSize": at_once},
-            **how,
-        )
-        for page in pages:
-            yield from map(plain, page["Items"])
-
-    def item(self, topic: str, batch: str) -> dict[str, Any] | None:
-        """A batch as DynamoDB stores it, by its key; None if it is missing or expired."""
-        key = {TOPIC: {"S": topic}, BATCH: {"S": batch}}
-        answer = self._client.get_item(TableName=self._telemetry, Key=key, ConsistentRead=True)
-        found: dict[str, Any] | None = answer.get("Item")
-        return found
-
-    def page(
-        self, condition: Mapping[str, Any], after: Mapping[str, Any] | None, *, scan: bool
-    ) -> dict[str, Any]:
-        """One page of the telemetry table as DynamoDB returns it: 1 MB read, before any filter.
-
-        ``condition`` holds the expressions of a Query or a Scan; ``after`` is the last key of the previous
-        page.
-        """
-        request = {"TableName": self._telemetry, "ConsistentRead": True, **condition}
-        if after is not None:
-            request["ExclusiveStartKey"] = after
-        page: dict[str, Any] = (self._client.scan if scan else self._client.query)(**request)
-        return page
+        keys = starting_between(first_us, last_us)
+        for page in self.telemetry.pages(topic, keys, attributes=(BATCH,), page_items=_MANY):
+            for item in page.items:
+                with suppress(ContractError):
+                    yield batch_id(item[BATCH]["S"])
 
     def vehicle(self, robot: str) -> Vehicle | None:
         """The robot's parameters, cached for `VEHICLE_CACHE_S`; None if not registered."""
@@ -170,12 +125,7 @@ class Tables:
 
     def put_seconds(self, seconds: Mapping[tuple[str, int], Mapping[str, Statistics]]) -> None:
         """Write the summaries, keyed by topic and second; raises `TableError` if some stay unwritten."""
-        requests = (
-            {"PutRequest": {"Item": self._second_item(topic, second, summary)}}
-            for (topic, second), summary in seconds.items()
-        )
-        while chunk := list(islice(requests, WRITE_SIZE)):
-            write(self._client, self._summary, chunk)
+        self._summary.put(self._second_item(*key, summary) for key, summary in seconds.items())
 
     def _second_item(self, topic: str, second: int, summary: Mapping[str, Statistics]) -> dict[str, Any]:
         item = fitting({name: attribute(value) for name, value in summary.items()})

@@ -3,53 +3,48 @@
 from __future__ import annotations
 
 import time
-from typing import Any
-
-from botocore.exceptions import ClientError
+from typing import TYPE_CHECKING, Any
 
 from iort_contract.tables import FILES_BYTES, FILES_DAY, ROBOT
 
+if TYPE_CHECKING:
+    from types_boto3_dynamodb import DynamoDBClient
 
-class Allotment:
-    """Counts by day (UTC); ``client`` is a boto3 DynamoDB client."""
 
-    def __init__(self, client: Any, *, table: str, bytes_a_day: int) -> None:
+class UploadQuota:
+    """Counts bytes by day (UTC)."""
+
+    def __init__(self, client: DynamoDBClient, *, table: str, bytes_a_day: int) -> None:
         self._client, self._table, self.bytes_a_day = client, table, bytes_a_day
 
     def take(self, robot: str, size: int, now_s: float) -> bool:
         """Count the size and return True if it fits in today's quota. An unregistered robot has none."""
         if size > self.bytes_a_day:
             return False
+        names = {"#day": FILES_DAY, "#bytes": FILES_BYTES}
         values = {
             ":today": {"S": time.strftime("%Y-%m-%d", time.gmtime(now_s))},
             ":size": {"N": str(size)},
         }
-        counted = self._update(
+        return self._update(
             robot,
-            "ADD #bytes :size",
-            "#day = :today AND #bytes <= :left",
-            {**values, ":left": {"N": str(self.bytes_a_day - size)}},
-        )
-        return counted or self._update(
+            UpdateExpression="ADD #bytes :size",
+            ConditionExpression="#day = :today AND #bytes <= :left",
+            ExpressionAttributeNames=names,
+            ExpressionAttributeValues={**values, ":left": {"N": str(self.bytes_a_day - size)}},
+        ) or self._update(
             robot,
-            "SET #day = :today, #bytes = :size",
-            "attribute_exists(#robot) AND (attribute_not_exists(#day) OR #day <> :today)",
-            values,
+            UpdateExpression="SET #day = :today, #bytes = :size",
+            ConditionExpression=(
+                "attribute_exists(#robot) AND (attribute_not_exists(#day) OR #day <> :today)"
+            ),
+            ExpressionAttributeNames={**names, "#robot": ROBOT},
+            ExpressionAttributeValues=values,
         )
 
-    def _update(self, robot: str, update: str, condition: str, values: dict[str, Any]) -> bool:
-        names = {"#day": FILES_DAY, "#bytes": FILES_BYTES, "#robot": ROBOT}
+    def _update(self, robot: str, **update: Any) -> bool:
         try:
-            self._client.update_item(
-                TableName=self._table,
-                Key={ROBOT: {"S": robot}},
-                UpdateExpression=update,
-                ConditionExpression=condition,
-                ExpressionAttributeNames={k: name for k, name in names.items() if k in update + condition},
-                ExpressionAttributeValues=values,
-            )
-        except ClientError as error:
-            if error.response["Error"]["Code"] != "ConditionalCheckFailedException":
-                raise
+            self._client.update_item(TableName=self._table, Key={ROBOT: {"S": robot}}, **update)
+        except self._client.exceptions.ConditionalCheckFailedException:
             return False
         return True

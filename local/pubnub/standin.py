@@ -84,7 +84,7 @@ class PubNubStandIn(BackgroundServer):
         self.delivered += messages
         try:
             await asyncio.wait_for(_send(request, response), self._write_s)
-        except asyncio.TimeoutError:
+        except (asyncio.TimeoutError, ConnectionResetError):
             if request.transport is not None:
                 request.transport.abort()
         return response

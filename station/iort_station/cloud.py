@@ -1,7 +1,6 @@
-"""Where the operator's cloud is: an AWS account, or the embedded cloud of a checkout.
+"""The operator's cloud: an AWS account, or the embedded cloud of a checkout.
 
-Both are the same to the rest of the station: clients of AWS' services, the names that the stacks
-put out, and the address where robots connect.
+It provides clients of AWS' services, the outputs of the stacks, and the address for robots.
 """
 
 from __future__ import annotations
@@ -22,24 +21,24 @@ from botocore.exceptions import BotoCoreError, ClientError
 from iort_contract.limits import DEFAULT_NAMESPACE
 from iort_station.errors import StationError
 
-# Where the embedded cloud of a checkout says how to reach it, below the checkout's folder.
+# The embedded cloud's description, relative to the checkout.
 EMBEDDED = Path("build/local/cloud.json")
-# The environment variable that names such a file anywhere.
+# The environment variable with the path of such a file.
 EMBEDDED_VARIABLE = "IORT_EMBEDDED"
 
-# An embedded cloud has credentials of its own, and the profile that AWS_PROFILE names need not exist.
+# An embedded cloud has its own credentials; the profile in AWS_PROFILE may not exist.
 _NO_PROFILE = {"profile": (None, None, None, None)}
 _CONFIG = Config(retries={"mode": "standard", "max_attempts": 5}, connect_timeout=5, read_timeout=20)
 
 
 def find_embedded(folder: Path) -> Path | None:
-    """The file of an embedded cloud that runs in the checkout around ``folder``; None if none runs."""
+    """The file of the embedded cloud that runs in the checkout around ``folder``; None if none runs."""
     places = (each / EMBEDDED for each in (folder, *folder.parents))
     return next((place for place in places if place.is_file()), None)
 
 
 def without_proxy(host: str) -> None:
-    """Let no library of this process ask a proxy for ``host``, which is on this machine."""
+    """Exclude ``host`` from the proxies of this process' libraries."""
     known = os.environ.get("no_proxy") or os.environ.get("NO_PROXY", "")
     if host and host not in known.split(","):
         os.environ["no_proxy"] = os.environ["NO_PROXY"] = f"{known},{host}".lstrip(",")
@@ -47,7 +46,8 @@ def without_proxy(host: str) -> None:
 
 @dataclass(frozen=True, kw_only=True)
 class Cloud:
-    """A deployment of the stacks. The fields that are empty follow AWS' usual chain."""
+    """A deployment of the stacks. boto3 finds region and credentials by its usual chain where these are
+    empty."""
 
     namespace: str = DEFAULT_NAMESPACE
     region: str | None = None
@@ -62,18 +62,18 @@ class Cloud:
 
     @classmethod
     def load(cls, path: Path) -> Cloud:
-        """The embedded cloud that wrote ``path``; raises `StationError` where none is running."""
+        """The embedded cloud that wrote ``path``; raises `StationError` if none is running."""
         try:
             cloud = cls(**json.loads(path.read_text()))
         except FileNotFoundError as error:
-            raise StationError(f"no embedded cloud is running: {path} is not there") from error
+            raise StationError(f"no embedded cloud is running: {path} does not exist") from error
         except (OSError, TypeError, ValueError) as error:
-            raise StationError(f"{path} does not describe an embedded cloud: {error}") from error
+            raise StationError(f"{path} must describe an embedded cloud: {error}") from error
         without_proxy(urlsplit(cloud.endpoint_url or "").hostname or "")
         return cloud
 
     def save(self, path: Path) -> None:
-        """Write what `load` reads."""
+        """Write the file that `load` reads."""
         path.write_text(json.dumps(asdict(self)))
 
     @cached_property
@@ -81,14 +81,14 @@ class Cloud:
         return boto3.Session(
             botocore_session=None if self.access_key_id is None else botocore.session.Session(_NO_PROFILE),
             profile_name=self.profile,
-            # Of AWS' tools boto3 alone reads AWS_DEFAULT_REGION only.
+            # boto3 reads only AWS_DEFAULT_REGION, unlike AWS' other tools.
             region_name=self.region or os.environ.get("AWS_REGION"),
             aws_access_key_id=self.access_key_id,
             aws_secret_access_key=self.secret_access_key,
         )
 
     def check(self) -> Cloud:
-        """Itself; raises `StationError` where profile, region or credentials are missing."""
+        """Return itself; raises `StationError` if profile, region or credentials are missing."""
         try:
             region, credentials = self._session.region_name, self._session.get_credentials()
         except BotoCoreError as error:
@@ -107,14 +107,14 @@ class Cloud:
         return {}
 
     def client(self, service: str, region: str | None = None) -> Any:
-        """A boto3 client, made once; of another ``region`` for a service that is in few.
+        """A cached boto3 client; ``region`` is for services that few regions have.
 
-        Raises `StationError` where region or credentials are missing.
+        Raises `StationError` if region or credentials are missing.
         """
         key = service, region
         if key not in self._clients:
             try:
-                self._clients[key] = self._session.client(
+                self._clients[key] = self._session.client(  # type: ignore[call-overload]  # any service's name
                     service,
                     region_name=region,
                     endpoint_url=self.endpoint_url,
@@ -127,7 +127,7 @@ class Cloud:
 
     @property
     def region_name(self) -> str | None:
-        """The region by AWS' usual chain."""
+        """The region that boto3 finds."""
         found = self._session.region_name
         return None if found is None else str(found)
 
@@ -140,18 +140,17 @@ class Cloud:
         return str(answer["endpointAddress"])
 
     def output(self, noun: str, name: str) -> str:
-        """An output of a stack, such as ``("storage", "TelemetryTable")``.
-
-        Raises `StationError` where the stack is not deployed or has no such output.
-        """
+        """An output of a stack, such as ``("storage", "TelemetryTable")``; raises `StationError`."""
         stack = f"{self.namespace}-{noun}"
         try:
             outputs = _outputs(self.client("cloudformation"), stack)
         except ClientError as error:
             if error.response["Error"]["Code"] != "ValidationError":
                 raise StationError(f"stack {stack} cannot be read: {error}") from error
-            where = f"{self._session.region_name}: `make deploy`, or --region and --namespace"
-            raise StationError(f"stack {stack} is not deployed in {where} of where it is") from error
+            raise StationError(
+                f"stack {stack} is not deployed in {self._session.region_name}: run `make deploy`, or choose "
+                "another --region or --namespace"
+            ) from error
         except BotoCoreError as error:
             raise StationError(f"stack {stack} cannot be read: {error}") from error
         if name not in outputs:

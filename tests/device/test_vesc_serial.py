@@ -16,7 +16,8 @@ import serial
 from iort_agent.clock import SystemClock
 from iort_agent.config import load_config
 from iort_agent.errors import SourceError
-from iort_agent.sources.vesc.serial_line import VescConfig, _why
+from iort_agent.sources.vesc.port import why
+from iort_agent.sources.vesc.serial_line import VescConfig
 from tests.device.running import Running, eventually
 from tests.vesc_standin import FIRMWARE, VescStandin, framed, values
 
@@ -230,7 +231,7 @@ def test_what_is_no_serial_port(
 
 def test_a_port_of_another_group_says_which() -> None:
     error = serial.SerialException(13, "could not open port /dev/ttyACM0: Permission denied")
-    assert "usermod -aG dialout" in _why(error, was_open=False)
+    assert "usermod -aG dialout" in why(error, was_open=False)
 
 
 @pytest.mark.parametrize("trouble", ["plugged", "silent", "absent"])

@@ -48,7 +48,7 @@ def test_a_drive_is_proven_and_a_lost_batch_of_any_stream_is_found(embedded, bun
     assert all(one["complete"] for one in streams.values())
     wheels = streams["wheels"]
     assert (wheels["taken"], sum(run["samples"] for run in wheels["runs"])) == (200, 200)
-    found = list(audit.headers(embedded.cloud, car.robot, "wheels", audit.Range()))
+    found = list(audit.headers(embedded.cloud, car.robot, "wheels"))
     assert all("samples" not in item for item in found)
     seq = batch_id(found[3][BATCH]).seq
     samples = int(found[3]["n"])
@@ -61,7 +61,7 @@ def test_a_drive_is_proven_and_a_lost_batch_of_any_stream_is_found(embedded, bun
     (short,) = wheels["shortfalls"]
     assert short["samples"] == samples
     # The last batch of all leaves no gap in the numbers, but the agent's word that it was there.
-    for item in audit.headers(embedded.cloud, car.robot, "wheels", audit.Range()):
+    for item in audit.headers(embedded.cloud, car.robot, "wheels"):
         _delete(embedded, car.robot, "wheels", item)
     (wheels,) = [
         one for one in json.loads(_run(embedded, car.robot).stdout)["streams"] if one["stream"] == "wheels"
@@ -108,7 +108,7 @@ def test_what_the_agent_did_not_record_is_told_by_cause(embedded, bundle):
             assert robot.publish(record_topic(car.robot, ACCOUNT_STREAM), encode_batch(batch)) == "SUCCESS"
         scan = Batch(boot, 0, [T0_US + i for i in range(9)], {"i": list(range(9))})
         assert robot.publish(record_topic(car.robot, "scan"), encode_batch(scan)) == "SUCCESS"
-    until(lambda: list(audit.headers(embedded.cloud, car.robot, "scan", audit.Range())))
+    until(lambda: list(audit.headers(embedded.cloud, car.robot, "scan")))
     done = _run(embedded, car.robot)
     assert done.exit_code == 1
     answer = json.loads(done.stdout)

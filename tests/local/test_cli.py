@@ -35,10 +35,10 @@ def test_robot_is_added_listed_and_removed(iort, tmp_path):
     [
         (("robots", "add", "car/1"), "got 'car/1'"),
         (("robots", "remove", "nobody"), "robot nobody is not registered"),
-        (("files", "list", "nobody"), "there is no robot nobody; there is "),
-        (("files", "list", "nobody", "--last", "1h", "--json"), "there is no robot nobody"),
-        (("files", "get", "nobody"), "there is no robot nobody"),
-        (("trace", "nobody"), "there is no robot nobody"),
+        (("files", "list", "nobody"), "robot nobody is not registered; registered are: "),
+        (("files", "list", "nobody", "--last", "1h", "--json"), "robot nobody is not registered"),
+        (("files", "get", "nobody"), "robot nobody is not registered"),
+        (("trace", "nobody"), "robot nobody is not registered"),
         (("pubnub", "--publish-key", "pub-c-1", "--subscribe-key", "sub-c-1"), "with its own keys"),
     ],
 )

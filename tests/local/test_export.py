@@ -16,8 +16,8 @@ from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 from iort_contract.messages.batch import Batch, encode_batch
 from iort_contract.ros1.decode import HEADER
 from iort_contract.topics import record_topic
+from iort_station import data
 from iort_station.cloud import Cloud
-from iort_station.data import data
 from iort_station.operations import delivery
 from tests.foxglove import flat, opened
 from tests.local.conftest import run_agent, until

@@ -269,7 +269,7 @@ def test_corrupt_spool_is_set_aside(embedded, bundle, proxy, tmp_path, damage):
     assert stored[: len(kept)] == [(seq, samples) for seq, samples, _ in kept]
     found = counted(embedded, car.robot)[sum(samples for _, samples, _ in kept) :]
     assert found == list(range(report["streams"]["vesc"]["samples"]))
-    items = audit.headers(embedded.cloud, car.robot, "vesc", audit.Range())
+    items = audit.headers(embedded.cloud, car.robot, "vesc")
     runs = audit.audit("vesc", items, from_start=True).runs
     missing = [seq for run in runs for gap in run.missing for seq in range(gap.first, gap.last + 1)]
     assert missing == [seq for seq, _, _ in lost[:known]]

@@ -9,7 +9,7 @@ import sys
 
 import pytest
 
-from iort_station.data import data
+from iort_station import data
 from iort_station.fleet import claims, registry, robots
 from iort_station.operations import quarantine
 from iort_station.page.listener import Listener

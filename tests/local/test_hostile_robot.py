@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 
 from bench.meters.usage import descendants
-from functions.shared.cut_off import BURST
+from functions.live import REFUSALS
 from iort_contract.catalog.vesc import VESC_STREAM
 from iort_contract.messages.files import decode_file_answer
 from iort_contract.messages.live import LiveSample, encode_live
@@ -67,7 +67,7 @@ def test_a_robot_refused_over_and_over_leaves_the_others_their_live_lane(embedde
     after = environments(embedded)
     assert before <= after
     assert len(after) <= (os.cpu_count() or 1)
-    found = until(lambda: (now := kept(embedded, bad.robot)) and len(now) >= BURST and now)
+    found = until(lambda: (now := kept(embedded, bad.robot)) and len(now) >= REFUSALS and now)
     assert set(found) <= {b"no JSON %d" % n for n in range(BAD)}
     assert set(found.values()) == {1}
     assert kept(embedded, good.robot) == {}

@@ -28,6 +28,7 @@ import os, signal, sys
 from pathlib import Path
 from iort_agent.mqtt.exchange import Exchange
 from iort_agent.verbs import provision as identity
+from iort_agent.verbs.registration import Seams
 
 class Killed(Exchange):
     def register(self, token, parameters):
@@ -35,7 +36,7 @@ class Killed(Exchange):
             super().register(token, parameters)
         os.kill(os.getpid(), signal.SIGKILL)
 
-seams = identity.Seams(exchange=Killed)
+seams = Seams(exchange=Killed)
 verb, file, other = sys.argv[2:]
 if verb == "provision":
     identity.provision(Path(file), robot=other, seams=seams)

@@ -16,7 +16,7 @@ from iort_contract.limits import CLOCK_MAX_UNCERTAINTY_MS, LIVE_MAX_AGE_MS
 from iort_contract.messages.live import LiveSample, encode_live
 from iort_contract.tables import STATS
 from iort_contract.topics import LIVE, RECORD, build_topic
-from iort_station.data import data
+from iort_station import data
 from iort_station.operations import delivery
 from iort_station.page.listener import Listener
 from local.cloud import EmbeddedCloud

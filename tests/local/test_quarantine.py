@@ -15,7 +15,7 @@ from iort_contract.tables import BY_FUNCTION, BY_STREAM, ENTRY, SAMPLES
 from iort_contract.topics import FILE, LAMBDA, LIVE, PING, build_topic, record_topic, rule_name
 from iort_station.cli.main import app
 from iort_station.cloud import EMBEDDED
-from iort_station.data.items import of_topic
+from iort_station.data.batches import summary_table, topic_of
 from iort_station.operations import delivery, quarantine
 from tests.local.conftest import until
 from verify.tools.robot import Robot
@@ -169,7 +169,7 @@ def test_errors_are_listed_and_shown(bundle, iort, entry_of):
     assert "\x1b[2J" not in shown.stdout
     as_json = json.loads(iort("errors", entry.id, "--json").stdout)
     assert base64.b64decode(as_json["payload_base64"]) == entry.payload
-    assert "nothing in quarantine has the id" in str(iort("errors", "0" * 16).exception)
+    assert "no dead letter has the id" in str(iort("errors", "0" * 16).exception)
 
 
 def test_a_throttled_batch_is_put_back_once_and_only_then_deleted(embedded, bundle, iort, entry_of):
@@ -262,6 +262,6 @@ def test_a_hail_of_nonsense_leaves_the_others_their_summaries(bundle, embedded):
     send(bundle("bad"), *hostile())
     good = bundle("good")
     send(good, batch())
-    items = of_topic(cloud, "SummaryTable", good.robot, VESC_STREAM)
-    (second,) = until(lambda: cloud.client("dynamodb").query(**items)["Items"])
+    table, topic = summary_table(cloud), topic_of(cloud, good.robot, VESC_STREAM)
+    (second,) = until(lambda: next(table.pages(topic)).items)
     assert second[SAMPLES] == {"N": "1"}

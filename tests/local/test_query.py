@@ -15,7 +15,7 @@ from boto3.dynamodb.types import TypeSerializer
 from iort_contract.cloud import RESULTS_PREFIX
 from iort_contract.messages.batch import Batch, encode_batch
 from iort_contract.topics import build_topic
-from iort_station.data import data
+from iort_station import data
 from local.cloud import EmbeddedCloud
 from local.deployment import ROOT
 

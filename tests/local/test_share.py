@@ -13,7 +13,7 @@ from iort_contract.catalog.vesc import VESC_STREAM
 from iort_contract.messages.batch import Batch, encode_batch
 from iort_contract.tables import OVER_SHARE, SECOND
 from iort_contract.topics import record_topic
-from iort_station.data.items import of_topic
+from iort_station.data.batches import summary_table, topic_of
 from iort_station.fleet import shadow
 from iort_station.operations import delivery
 from tests.local.conftest import until
@@ -25,12 +25,8 @@ GOOD = 8
 
 def seconds_of(embedded, robot):
     """The summarised seconds of a robot, in the order in which they are read."""
-    pages = (
-        embedded.cloud.client("dynamodb")
-        .get_paginator("query")
-        .paginate(**of_topic(embedded.cloud, "SummaryTable", robot, VESC_STREAM, SECOND), ConsistentRead=True)
-    )
-    return [int(item[SECOND]["N"]) for page in pages for item in page["Items"]]
+    pages = summary_table(embedded.cloud).pages(topic_of(embedded.cloud, robot, VESC_STREAM))
+    return [int(item[SECOND]["N"]) for page in pages for item in page.items]
 
 
 @pytest.mark.parametrize(("rate_hz", "count"), [(15, 40), (100, 80)])

@@ -11,7 +11,7 @@ from boto3.dynamodb.types import TypeSerializer
 from iort_contract.messages.batch import Batch
 from iort_contract.tables import EXPIRES_S, RECEIVED_MS, TOPIC
 from iort_contract.topics import RECORD, build_topic, record_topic
-from iort_station.data import data
+from iort_station import data
 from iort_station.operations import delivery, quarantine
 from tests.local.conftest import until
 from tests.unit.station.old_messages import old_envelope, old_message

@@ -6,7 +6,7 @@ from iort_contract.cloud import RESULTS_PREFIX
 from iort_contract.messages.files import FILES_PREFIX
 from iort_contract.tables import PRESENCE, STREAMS
 from iort_contract.topics import SHADOW
-from stacks.checks import EVERY_RESOURCE
+from stacks.checks.invariants import EVERY_RESOURCE
 
 IOT = "arn:${AWS::Partition}:iot:${AWS::Region}:${AWS::AccountId}"
 THINGS, CERTIFICATES = f"{IOT}:thing/*", f"{IOT}:cert/*"

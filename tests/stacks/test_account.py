@@ -12,7 +12,7 @@ KINDS = {"AWS::IoT::AccountAuditConfiguration", "AWS::IoT::ScheduledAudit", "AWS
 
 
 def kinds(**settings):
-    stack = Account(App(), "account", settings=Settings(**settings))
+    stack = Account(App(), Settings(**settings))
     resources = assertions.Template.from_stack(stack).to_json().get("Resources", {})
     return {one["Type"] for one in resources.values() if one["Type"].startswith("AWS::IoT::")}
 

@@ -4,9 +4,8 @@ from __future__ import annotations
 
 import re
 
-from iort_contract.cloud import LOW_VOLTAGE_V
+from iort_contract.catalog.rules import LOW_VOLTAGE_V, RULES
 from iort_contract.limits import LIVE_MIN_RATE_HZ
-from iort_contract.topics import RULES
 from iort_station.cost.usage import Usage
 from stacks.settings import ROOT, Settings
 from tests.stacks.aws_metrics import AWS_METRICS
@@ -66,7 +65,7 @@ def test_the_thresholds_are_the_settings(production, synthesized):
     alarms = {
         a["AlarmName"]: a["Threshold"] for a in synthesized.resources("AWS::CloudWatch::Alarm").values()
     }
-    limits = Settings().thresholds
+    limits = Settings()
     assert alarms["iort-BatteryVolts"] == limits.low_voltage_v == LOW_VOLTAGE_V
     assert alarms["iort-TemperatureDegC"] == limits.high_temperature_degc
     assert alarms["iort-CarToLambdaMs"] == limits.car_to_lambda_ms

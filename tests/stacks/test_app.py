@@ -75,7 +75,7 @@ def test_a_python_without_the_cdk_is_one_line(tmp_path):
     command = [sys.executable, "-S", "-E", "-s", str(ROOT / "app.py")]
     done = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, check=False)
     assert done.returncode == 1
-    assert done.stderr.startswith("app.py: aws_cdk is not there for ")
+    assert done.stderr.startswith("app.py: no module aws_cdk for ")
     assert done.stderr.count("\n") == 1
     assert "make layer" in done.stderr
 
@@ -109,7 +109,7 @@ def test_what_the_context_says(settings, tmp_path):
     asked = {"stage": "prod", "customer_key": "true", "budget_usd": "50", "alarm_email": "lab@example.org"}
     given = settings(**asked, low_voltage_v="13.2", tags="team=lab,cost-centre=7")
     assert (given.stage, given.customer_key, given.budget_usd) == ("prod", True, 50)
-    assert (given.alarm_email, given.thresholds.low_voltage_v) == ("lab@example.org", 13.2)
+    assert (given.alarm_email, given.low_voltage_v) == ("lab@example.org", 13.2)
     assert given.tags == {"team": "lab", "cost-centre": "7"} == settings(tags=dict(given.tags)).tags
     # cdk.json's numbers arrive as JavaScript's.
     assert settings(retention_days=7.0, embedded=True) == settings(retention_days="7", embedded="true")

@@ -7,7 +7,7 @@ import json
 
 import pytest
 
-from stacks.acknowledged import Acknowledged, single
+from stacks.checks.acknowledged import Acknowledged, single
 from stacks.settings import ROOT, Settings
 
 
@@ -24,7 +24,7 @@ def test_what_is_acknowledged_of_one_resource_is_there_in_some_stage(synthesized
     for path in single(Settings(alarm_email="lab@example.org")):
         if path.startswith("site/"):
             continue  # an option that only `make check` synthesizes
-        assert any(one.startswith(path) for one in there), f"stacks/acknowledged.py: {path} is not there"
+        assert any(one.startswith(path) for one in there), f"acknowledged.py: {path} is not there"
 
 
 def test_nag_and_lint_find_what_nobody_acknowledged(check_stacks, tmp_path):

@@ -8,12 +8,12 @@ import re
 
 import pytest
 
-from functions.shared.health import measure
+from functions.shared.summary.health import measure
+from iort_contract.catalog.metrics import METRIC_NAMESPACE, METRICS, metrics_of
+from iort_contract.catalog.rules import RULES
 from iort_contract.catalog.streams import AGENT_STREAM, RTT_STREAM
-from iort_contract.cloud import METRIC_NAMESPACE, METRICS
 from iort_contract.limits import DEFAULT_NAMESPACE
 from iort_contract.messages.batch import Batch
-from iort_contract.topics import RULES, rule_name
 from iort_station.cost.fixed_costs import (
     FREE_DASHBOARD_METRICS,
     FREE_DASHBOARDS,
@@ -22,7 +22,6 @@ from iort_station.cost.fixed_costs import (
 )
 from iort_station.cost.usage import Usage
 from iort_station.operations import cloudwatch
-from stacks.metrics import statistic
 from stacks.settings import ROOT
 from tests.stacks.aws_metrics import AWS_METRICS
 
@@ -107,7 +106,7 @@ def emitted():
                 function = ast.literal_eval(node.args[0])
                 named = {keyword.arg for keyword in node.keywords} - {"robot", None}
                 found.setdefault(function, set()).update(named)
-            if isinstance(node, ast.Call) and ast.unparse(node.func) == "counted.add":
+            if isinstance(node, ast.Call) and ast.unparse(node.func) == "self.counted.add":
                 found.setdefault(path.stem, set()).update(keyword.arg for keyword in node.keywords)
     # These have their names computed.
     batch = Batch("0" * 8, 0, [1], {"voltage_input": [12.0]})
@@ -123,8 +122,8 @@ def test_the_dashboards_show_what_the_functions_emit_and_nothing_else(shown):
             assert dimensions.keys() == {"Deployment", "Function"}
             assert dimensions["Deployment"] == DEFAULT_NAMESPACE
             by_function.setdefault(dimensions["Function"], set()).add(metric)
-            assert options["stat"] == statistic(metric)
-    assert by_function == {function: set(names) for function, names in METRICS.items()}
+            assert options["stat"] == METRICS[metric].statistic
+    assert by_function == {metric.function: set(metrics_of(metric.function)) for metric in METRICS.values()}
     assert emitted() == by_function
 
 
@@ -137,7 +136,7 @@ def test_the_dashboards_cover_every_service_of_the_path(shown):
         METRIC_NAMESPACE,
     }
     rules = {dimensions["RuleName"] for _, _, dimensions, _ in shown if "RuleName" in dimensions}
-    assert rules == {rule_name(rule) for rule in RULES}
+    assert rules == {rule.physical_name() for rule in RULES.values()}
 
 
 def test_every_metric_of_aws_is_one_that_aws_has(shown, alarms):
@@ -149,5 +148,5 @@ def test_every_metric_of_aws_is_one_that_aws_has(shown, alarms):
     for namespace, metric, dimensions in [*(one[:3] for one in shown), *of_alarms]:
         if namespace != METRIC_NAMESPACE:
             assert metric in AWS_METRICS[(namespace, *sorted(dimensions))]
-        elif metric not in METRICS[dimensions["Function"]]:
+        elif METRICS[metric].function != dimensions["Function"]:
             raise AssertionError(f"nothing emits {metric}")

@@ -10,8 +10,8 @@ from typing import Any
 
 import pytest
 
-from stacks.settings import _READ
-from stacks.variations import FLIPS, KEY, NOT_FLIPPED, VARIATIONS
+from stacks.checks.variations import FLIPS, KEY, NOT_FLIPPED, VARIATIONS
+from stacks.settings import CONTEXT_KEYS
 from tests.stacks.cloudformation import given_once_for_all, identity, is_replaced
 
 Templates = dict[str, dict[str, Any]]
@@ -62,7 +62,7 @@ def imports(value: Any) -> Iterator[str]:
 
 def test_every_parameter_is_flipped():
     flipped = {name for flip in FLIPS.values() for name in flip}
-    assert flipped | KEY.keys() | NOT_FLIPPED == _READ.keys() | {"thresholds"}
+    assert flipped | KEY.keys() | NOT_FLIPPED == CONTEXT_KEYS
 
 
 @pytest.mark.parametrize("flip", FLIPS)

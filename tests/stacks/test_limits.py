@@ -11,7 +11,7 @@ import pytest
 
 from iort_contract.limits import ContractError
 from iort_contract.topics import check_namespace
-from stacks.variations import LONGEST_NAMESPACE, VARIATIONS
+from stacks.checks.variations import LONGEST_NAMESPACE, VARIATIONS
 from tests.stacks.cloudformation import has_schema, names, schema
 
 # "CloudFormation quotas". The CDK hands every template over by S3: in a request there is room for 51,200.

@@ -8,10 +8,10 @@ import re
 
 from functions.alert import Notices, causes
 from functions.presence import change
-from functions.shared.upload_quota import Allotment
+from functions.shared.upload_quota import UploadQuota
 from iort_contract.tables import ADMISSION
-from stacks.checks import EVERY_RESOURCE
-from stacks.documents import provisioning_template
+from stacks.checks.invariants import EVERY_RESOURCE
+from stacks.parts.documents import provisioning_template
 from tests.stacks.roles import (
     CERTIFICATES,
     IOT,
@@ -84,7 +84,7 @@ class Recorder:
 
 def test_each_function_changes_what_it_may_and_may_change_what_it_does():
     upload, alert, presence = Recorder(), Recorder(), Recorder()
-    Allotment(upload, table="robots", bytes_a_day=9).take("car", 1, 0)
+    UploadQuota(upload, table="robots", bytes_a_day=9).take("car", 1, 0)
     notices = Notices(alert, "robots")
     for cause in causes({"fault_code": 1, "voltage_input": 1.0}, 10.5) + causes({"fault_code": 99}, 10.5):
         notices.take("car", cause.key, 0)

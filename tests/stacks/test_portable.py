@@ -10,12 +10,15 @@ from pathlib import Path
 
 import pytest
 
-from iort_contract.cloud import pong_template, rule_sql
-from iort_contract.topics import RULES
-from stacks.portable import RULE_ACTIONS, SQL_FUNCTIONS, rule_problems, sql_functions
+from iort_contract.catalog.rules import RULES
+from stacks.checks.portable import RULE_ACTIONS, SQL_FUNCTIONS, rule_problems, sql_functions
 from stacks.settings import ROOT
 
-GOOD = {"sql": rule_sql("live"), "actions": [{"lambda": {"functionArn": "arn"}}], "errorAction": {"sqs": {}}}
+GOOD = {
+    "sql": RULES["live"].statement(),
+    "actions": [{"lambda": {"functionArn": "arn"}}],
+    "errorAction": {"sqs": {}},
+}
 
 
 # --- what is refused --------------------------------------------------------------------------------
@@ -24,7 +27,7 @@ GOOD = {"sql": rule_sql("live"), "actions": [{"lambda": {"functionArn": "arn"}}]
 @pytest.mark.parametrize(
     ("sql", "called"),
     [
-        (rule_sql("record"), {"topic", "timestamp", "floor"}),
+        (RULES["record"].statement(), {"topic", "timestamp", "floor"}),
         ("SELECT * FROM 'a/b'", set()),
         ("SELECT Topic (2) AS t, FLOOR(a) FROM 'a'", {"topic", "floor"}),
         ("SELECT 'sqrt(2)' AS text, 'it''s abs(1)' AS b FROM 'sin(1)/#'", set()),
@@ -37,9 +40,12 @@ def test_the_functions_that_sql_calls(sql, called):
 
 
 def test_our_own_rules_have_no_problem():
-    for rule in RULES:
-        assert rule_problems({**GOOD, "sql": rule_sql(rule)}) == []
-    assert rule_problems({**GOOD, "actions": [{"republish": {"topic": pong_template()}}]}) == []
+    for rule in RULES.values():
+        assert rule_problems({**GOOD, "sql": rule.statement()}) == []
+    assert (
+        rule_problems({**GOOD, "actions": [{"republish": {"topic": RULES["pong"].action.topic("iort")}}]})
+        == []
+    )
     assert rule_problems({"sql": GOOD["sql"], "actions": []}) == []
 
 
@@ -75,7 +81,7 @@ def refused(tmp_path_factory):
     from aws_cdk import App, Stack
     from aws_cdk import aws_iot as iot
 
-    from stacks.portable import refuse_what_the_embedded_cloud_drops
+    from stacks.checks.portable import refuse_what_the_embedded_cloud_drops
 
     rule = iot.CfnTopicRule
     app = App(outdir=str(tmp_path_factory.mktemp("cdk.out")))

@@ -6,10 +6,11 @@ import json
 
 import pytest
 
-from iort_contract.cloud import RESULTS_PREFIX, pong_template, rule_sql
+from iort_contract.catalog.rules import RULES
+from iort_contract.cloud import RESULTS_PREFIX
 from iort_contract.messages.files import FILES_PREFIX
 from iort_contract.tables import BATCH, ENTRY, EXPIRES_S, ROBOT, SECOND, TOPIC
-from iort_contract.topics import RULES, rule_name
+from iort_contract.topics import rule_name
 from iort_station.cost.model import RECORDS_A_CALL, WINDOW_S
 from tests.stacks.templates import name
 
@@ -32,7 +33,7 @@ def test_the_rules_are_the_contracts(rules):
     assert set(rules) == {rule_name(rule) for rule in RULES}
     for rule in RULES:
         payload = rules[rule_name(rule)]
-        assert payload["Sql"] == rule_sql(rule, retention_s=90 * 86_400)
+        assert payload["Sql"] == RULES[rule].statement()
         assert payload["AwsIotSqlVersion"] == "2016-03-23"
         assert not payload.get("RuleDisabled")
         # By AWS' SQL an OR with a comparison with null is Undefined, and so selects nothing.
@@ -50,7 +51,7 @@ def test_every_rule_has_one_action_and_it_is_this(rules, reader):
     assert [reader.text(alert["Lambda"]["FunctionArn"]) for alert in alerts] == 2 * ["Alert.Arn"]
     for kept in (presence, version):
         assert reader.text(kept["Lambda"]["FunctionArn"]) == "Presence.Arn"
-    assert (pong["Republish"]["Topic"], pong["Republish"]["Qos"]) == (pong_template(), 0)
+    assert (pong["Republish"]["Topic"], pong["Republish"]["Qos"]) == (RULES["pong"].action.topic("iort"), 0)
     assert {len(each[0]) for each in actions.values()} == {1}
 
 
@@ -270,7 +271,7 @@ def test_files_expire_when_the_setting_says_so(tmp_path, days, kept):
     from stacks.storage import Storage
 
     app = App(outdir=str(tmp_path))
-    Storage(app, "storage", settings=Settings(files_days=days))
+    Storage(app, Settings(files_days=days))
     (template,) = [stack.template for stack in app.synth().stacks]
     (bucket,) = [r["Properties"] for r in template["Resources"].values() if r["Type"] == "AWS::S3::Bucket"]
     rules = bucket["LifecycleConfiguration"]["Rules"]

@@ -8,6 +8,7 @@ import re
 import pytest
 from aws_cdk import Stack
 
+from iort_contract.catalog.rules import RULES
 from iort_contract.cloud import claim_name, fleet_name
 from iort_contract.topics import (
     BROKER,
@@ -19,15 +20,14 @@ from iort_contract.topics import (
     PING_PATHS,
     PONG,
     RECORD,
-    RULES,
     build_topic,
     check_namespace,
     live_topic,
     record_topic,
     rule_name,
 )
-from stacks.documents import claim_policy
-from stacks.documents import robot_policy as robots_policy
+from stacks.parts.documents import claim_policy
+from stacks.parts.documents import robot_policy as robots_policy
 from tests.stacks.roles import IOT
 
 ME = "${iot:Connection.Thing.ThingName}"

@@ -17,7 +17,7 @@ def site() -> dict[str, Any]:
     from stacks.site import Site
 
     app = App()
-    Site(app, "iort-site", settings=Settings())
+    Site(app, Settings())
     template: dict[str, Any] = app.synth().get_stack_by_name("iort-site").template
     return template
 

@@ -12,8 +12,9 @@ import sys
 from pathlib import Path
 
 import pytest
-from aws_cdk import App, Stack
+from aws_cdk import App
 
+from iort_contract.catalog import environments
 from iort_contract.catalog.vesc import VESC_FIELDS, VESC_STREAM
 from iort_contract.cloud import pubnub_parameter
 from iort_contract.limits import DEFAULT_NAMESPACE
@@ -34,8 +35,8 @@ from iort_contract.topics import (
     record_topic,
     rule_name,
 )
-from stacks.encryption import Encryption
-from stacks.function import function
+from stacks.parts.base import PlatformStack
+from stacks.parts.function import function
 from stacks.settings import ROOT, Settings, SettingsError
 from tests.stacks.templates import name
 from tests.stacks.test_dashboards import FUNCTIONS
@@ -173,74 +174,51 @@ def imported(module):
     return found
 
 
-def variables_read(module):
-    read = set()
+def environments_read(module):
+    """The classes by which a function reads its environment. Nothing reads it otherwise, but for one variable
+    that Lambda itself sets."""
+    read = {environments.Environment}
     for one in imported(module):
-        tree = ast.parse(source(one))
-        uses = [n for n in ast.walk(tree) if isinstance(n, ast.Attribute) and n.attr in ("environ", "getenv")]
-        known = [
-            n
-            for n in ast.walk(tree)
-            if isinstance(n, ast.Subscript)
-            and isinstance(n.value, ast.Attribute)
-            and n.value.attr == "environ"
-        ]
-        # Whether it is Lambda that it runs in, which gives this one itself.
-        asked = [
-            n
-            for n in ast.walk(tree)
-            if isinstance(n, ast.Compare)
-            and isinstance(n.left, ast.Constant)
-            and n.left.value == "AWS_LAMBDA_INITIALIZATION_TYPE"
-        ]
-        assert len(uses) == len(known) + len(asked), (
-            f'{one} reads the environment other than by os.environ["X"]'
-        )
-        read |= {ast.literal_eval(n.slice) for n in known}
+        text = source(one)
+        others = text.count("environ[") + text.count("os.environ") + text.count("getenv")
+        others -= text.count('"AWS_LAMBDA_INITIALIZATION_TYPE" in os.environ')
+        assert others == (one == "functions.shared.environment"), one
+        for node in ast.walk(ast.parse(text)):
+            if isinstance(node, ast.Call) and getattr(node.func, "id", "") == "variables":
+                read.add(getattr(environments, ast.unparse(node.args[0])))
     return read
 
 
 @pytest.mark.parametrize("function", HANDLERS)
-def test_a_function_reads_exactly_the_variables_that_it_is_given(functions, function):
+def test_a_function_reads_exactly_the_variables_that_it_is_given(functions, reader, function):
     properties = functions[function]
-    given = set(properties.get("Environment", {}).get("Variables", {}))
-    assert variables_read(properties["Handler"].rpartition(".")[0]) == given
+    given = {key: reader.text(value) for key, value in properties["Environment"]["Variables"].items()}
+    read = environments_read(properties["Handler"].rpartition(".")[0])
+    assert {name for one in read for name in one.read(given).variables()} == given.keys()
 
 
-def test_what_the_variables_say_is_what_the_functions_expect(functions, reader, monkeypatch):
-    from functions.live import LiveSettings
-
-    live = functions["Live"]["Environment"]["Variables"]
-    monkeypatch.setenv("LIVE_FIELDS", live["LIVE_FIELDS"])
-    assert LiveSettings.from_environment().fields == {VESC_STREAM: frozenset(VESC_FIELDS)}
-    assert live["PUBNUB_PARAMETER"] == pubnub_parameter()
-    assert reader.text(live["REJECTED_QUEUE"]) == "Rejected"
-    assert live["NAMESPACE"] == DEFAULT_NAMESPACE
-
-    def given(function):
+def test_what_the_variables_say_is_what_the_functions_expect(functions, reader):
+    def given(function, kind):
         variables = functions[function]["Environment"]["Variables"]
-        assert variables["NAMESPACE"] == DEFAULT_NAMESPACE
-        return {key: reader.text(value) for key, value in variables.items() if key != "NAMESPACE"}
+        return kind.read({key: reader.text(value) for key, value in variables.items()})
 
-    assert given("Later") == {
-        "TELEMETRY_TABLE": "Batches",
-        "SUMMARY_TABLE": "Summary",
-        "ROBOTS_TABLE": "Robots",
-        "REJECTED_QUEUE": "Rejected",
-        "ROBOT_METRICS": "false",
-    }
-    assert given("Summarize") == {**given("Later"), "PUT_OFF_QUEUE": "PutOff"}
-    assert given("Query") == {
-        "TELEMETRY_TABLE": "Batches",
-        "ROBOTS_TABLE": "Robots",
-        "FILES_BUCKET": "Files",
-    }
-    assert given("Upload") == {
-        "FILES_BUCKET": "Files",
-        "ROBOTS_TABLE": "Robots",
-        "REJECTED_QUEUE": "Rejected",
-        "UPLOAD_BYTES_A_DAY": str(50 * 10**9),
-    }
+    name = DEFAULT_NAMESPACE
+    later = environments.LaterEnvironment(
+        name, "Batches", "Summary", "Robots", "Rejected", robot_metrics=False
+    )
+    files = environments.UploadEnvironment(name, "Files", "Robots", "Rejected", 50 * 10**9)
+    query = environments.QueryEnvironment(name, "Batches", "Robots", "Files")
+    fields = {VESC_STREAM: list(VESC_FIELDS)}
+    parameter = pubnub_parameter()
+    assert given("Later", environments.LaterEnvironment) == later
+    assert given("Summarize", environments.SummarizeEnvironment) == environments.SummarizeEnvironment(
+        **vars(later), put_off_queue="PutOff"
+    )
+    assert given("Upload", environments.UploadEnvironment) == files
+    assert given("Query", environments.QueryEnvironment) == query
+    assert given("Live", environments.LiveEnvironment) == environments.LiveEnvironment(
+        name, parameter, fields, "Rejected"
+    )
 
 
 def test_functions_log_what_they_say_and_of_lambda_what_went_wrong(synthesized, functions):
@@ -253,9 +231,8 @@ def test_functions_log_what_they_say_and_of_lambda_what_went_wrong(synthesized, 
 
 def test_lambdas_own_lines_come_back_where_they_are_asked_for(tmp_path):
     app = App(context={"function_logs": "all", "layer": str(tmp_path)})
-    stack, settings = Stack(app, "x"), Settings.from_context(app)
-    encryption = Encryption(stack, settings=settings)
-    function(stack, "Echo", settings=settings, encryption=encryption, memory_mb=256)
+    stack = PlatformStack(app, "x", Settings.from_context(app))
+    function(stack, "Echo", environments.Environment("iort"))
     (made,) = (
         resource["Properties"]
         for resource in app.synth().stacks[0].template["Resources"].values()

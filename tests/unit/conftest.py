@@ -7,6 +7,7 @@ neither boto3 nor moto is installed.
 from __future__ import annotations
 
 import os
+import sys
 
 import pytest
 from pytest_socket import disable_socket, enable_socket
@@ -18,6 +19,17 @@ def no_network():
     disable_socket(allow_unix_socket=True)
     yield
     enable_socket()
+
+
+@pytest.fixture(autouse=True)
+def new_environment():
+    """Every test is a new environment of the functions: they have read no variable and made no client."""
+    yield
+    for name, module in list(sys.modules.items()):
+        if name.startswith("functions."):
+            for made in vars(module).values():
+                if hasattr(made, "cache_clear"):
+                    made.cache_clear()
 
 
 @pytest.fixture(autouse=True)

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 from botocore.exceptions import BotoCoreError, ClientError
 
-from iort_contract.topics import RULES, rule_name
+from iort_contract.catalog.rules import RULES
+from iort_contract.topics import rule_name
 from iort_station.cost.scale import on_paper
 from iort_station.cost.usage import Usage
 from iort_station.errors import StationError

@@ -8,8 +8,9 @@ from typing import Any, NamedTuple
 
 from botocore.exceptions import ClientError
 
+from iort_contract.catalog.rules import RULES
 from iort_contract.cloud import claim_name, fleet_name
-from iort_contract.topics import RULES, rule_name
+from iort_contract.topics import rule_name
 from stacks.settings import PROD, Settings
 from stacks.storage import OLD_TELEMETRY
 from verify.preflight.finding import Clients, Found, code, fine, item, listed, stops, warning

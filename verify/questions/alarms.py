@@ -22,7 +22,7 @@ from verify.tools.waiting import until
 _REASON = "verify: does it notify?"
 _ALARM = "ALARM"
 _FAULT = 5
-# The alarms that use Metrics Insights: stacks/alarms.py.
+# The alarms that use Metrics Insights: stacks/monitoring/alarms.py.
 _INSIGHTS = ("ParseError", "ErrorActionFailure", "RuleMessageThrottled", "DestinationDeliveryFailures")
 
 
@@ -52,7 +52,7 @@ _NOTIFIED = {
     "alarms.set_state",
     expected=_NOTIFIED,
     source="https://docs.aws.amazon.com/AmazonCloudWatch/latest/APIReference/API_SetAlarmState.html",
-    relied_on_by=("stacks/alarms.py", "stacks/processing.py"),
+    relied_on_by=("stacks/monitoring/alarms.py", "stacks/processing.py"),
 )
 def set_state(target: Target) -> Seen:
     """An alarm whose state is set to ALARM notifies the alarm topic, and the topic its subscribers, with
@@ -95,7 +95,7 @@ set_state_with_key = replace(
     ),
     expected={**_NOTIFIED, "topic_has_key": True},
     source="https://repost.aws/knowledge-center/cloudwatch-configure-alarm-sns",
-    relied_on_by=("stacks/encryption.py",),
+    relied_on_by=("stacks/parts/encryption.py",),
     phase=WITH_KEY,
     not_embedded="the embedded cloud is deployed without a key: its topics encrypt nothing",
 )
@@ -110,7 +110,7 @@ set_state_with_key = replace(
         "messages": [],
     },
     source="https://docs.aws.amazon.com/AmazonCloudWatch/latest/monitoring/alarm-evaluation.html",
-    relied_on_by=("stacks/alarms.py", "stacks/metrics.py"),
+    relied_on_by=("stacks/monitoring/alarms.py", "stacks/monitoring/metrics.py"),
     not_embedded="the embedded cloud has no Metrics Insights, and is deployed without these alarms",
 )
 def metrics_insights(target: Target) -> Seen:
@@ -150,7 +150,7 @@ def metrics_insights(target: Target) -> Seen:
         "first_line": "ROBOT: fault 5, MOSFET over-temperature",
         "says": ["when", "stream"],
     },
-    relied_on_by=("functions/alert.py", "stacks/storage.py", "contract/iort_contract/cloud.py"),
+    relied_on_by=("functions/alert.py", "stacks/storage.py", "contract/iort_contract/catalog/rules.py"),
 )
 def alert(target: Target) -> Seen:
     """A car's fault goes from the rule fault to the alert function, which may note it in the car's row, and

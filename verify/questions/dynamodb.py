@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import cast
+
 from botocore.exceptions import ClientError
 
 from bench.target import Target
@@ -87,9 +89,10 @@ def failed_condition(target: Target) -> Seen:
             ReturnValuesOnConditionCheckFailure="ALL_OLD",
         )
     except ClientError as error:
+        item = cast("dict[str, object]", error.response.get("Item", {}))
         return {
             "code": error.response["Error"]["Code"],
             "status": error.response["ResponseMetadata"]["HTTPStatusCode"],
-            "row": error.response.get("Item", {}).get(ROBOT) == {"S": name},
+            "row": item.get(ROBOT) == {"S": name},
         }
     raise VerifyError("the condition did not fail")

@@ -57,7 +57,7 @@ def handler(event, context):
         "time_is_limited": True,
         "arn_is_a_functions": True,
     },
-    relied_on_by=("functions/shared/bucket.py", "stacks/function.py", "functions/live.py"),
+    relied_on_by=("functions/shared/bucket.py", "stacks/parts/function.py", "functions/live.py"),
 )
 def runtime(target: Target) -> Seen:
     """boto3 of Lambda's runtime knows every parameter that the functions use, and the environment and the
@@ -87,7 +87,7 @@ def runtime(target: Target) -> Seen:
     "functions.python",
     expected={"runs_as_named": True},
     source=f"{_GUIDE}/lambda-runtimes.html",
-    relied_on_by=("stacks/function.py", "scripts/setup.py"),
+    relied_on_by=("stacks/parts/function.py", "scripts/setup.py"),
     not_embedded="the embedded cloud runs the functions with its host's Python",
 )
 def python(target: Target) -> Seen:

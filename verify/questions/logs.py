@@ -8,7 +8,7 @@ from datetime import datetime, timedelta, timezone
 
 from bench.meters.invocations import configure
 from bench.target import Target, temporary_function
-from iort_contract.cloud import METRIC_DEPLOYMENT, METRIC_FUNCTION, METRIC_NAMESPACE
+from iort_contract.catalog.metrics import METRIC_DEPLOYMENT, METRIC_FUNCTION, METRIC_NAMESPACE
 from verify.errors import VerifyError
 from verify.question import Seen, question
 from verify.tools.telemetry import batch, send
@@ -18,7 +18,7 @@ _CLOUDWATCH = "https://docs.aws.amazon.com/AmazonCloudWatch/latest/monitoring"
 _GUIDE = "https://docs.aws.amazon.com/lambda/latest/dg"
 _METRIC, _FUNCTION = "BatchesSummarized", "summarize"
 _WITHIN_S = 170.0
-# The filter of the log widget in stacks/dashboards.py.
+# The filter of the log widget in stacks/monitoring/dashboards.py.
 _SHOWN = re.compile("WARN|ERROR|CRITICAL|FATAL|Traceback|Task timed out")
 _WARNED, _RAISED, _PRINTED = "verify warned", "verify raised", "verify printed"
 _SPEAKING = f"""
@@ -54,8 +54,8 @@ def _counted(target: Target, since: datetime) -> float:
     f"{_GUIDE}/monitoring-cloudwatchlogs-log-level.html",
     relied_on_by=(
         "functions/shared/metrics.py",
-        "stacks/function.py",
-        "stacks/alarms.py",
+        "stacks/parts/function.py",
+        "stacks/monitoring/alarms.py",
         "local/gaps/metrics/embedded_metrics.py",
     ),
 )
@@ -85,7 +85,7 @@ def metric(target: Target) -> Seen:
 @question(
     "logs.lines",
     expected={"printed_as_it_is": True, "warning_is_shown": True, "failure_is_shown": True},
-    relied_on_by=("stacks/dashboards.py", "functions/shared/metrics.py"),
+    relied_on_by=("stacks/monitoring/dashboards.py", "functions/shared/metrics.py"),
 )
 def lines(target: Target) -> Seen:
     """With logs in JSON, printed lines stay unchanged; warnings and uncaught errors are lines with their

@@ -10,7 +10,7 @@ from iort_contract.catalog.vesc import VESC_STREAM
 from iort_contract.limits import MAX_MESSAGE_BYTES
 from iort_contract.messages.live import encode_ping
 from iort_contract.topics import FLEET, LIVE, PING, PONG, RULE, build_topic, live_topic, record_topic
-from iort_station.operations.quarantine import Entry
+from iort_station.operations.quarantine import DeadLetter
 from verify.question import Seen, question
 from verify.tools.robots import pair_of
 from verify.tools.telemetry import entries, items, only_entry
@@ -28,7 +28,7 @@ _AWS_MESSAGE_BYTES = 128 * 1024
     expected={"refused_by": "function", "topic_as_subscribed": True, "byte_by_byte": True},
     source=f"{_GUIDE}/binary-payloads.html",
     relied_on_by=(
-        "contract/iort_contract/cloud.py",
+        "contract/iort_contract/catalog/rules.py",
         "functions/live.py",
         "local/patches/unreadable_payload.patch",
     ),
@@ -50,7 +50,7 @@ def live_no_json(target: Target) -> Seen:
 @question(
     "payloads.record_no_json",
     expected={"stored": 0, "refused_by": ["rule"]},
-    relied_on_by=("stacks/ingest.py", "stacks/alarms.py"),
+    relied_on_by=("stacks/ingest.py", "stacks/monitoring/alarms.py"),
 )
 def record_no_json(target: Target) -> Seen:
     """The rule record stores nothing from a payload that is not JSON, or from a batch without a key. The
@@ -62,7 +62,7 @@ def record_no_json(target: Target) -> Seen:
         # A batch without its key is refused later than the other payload.
         pair.publish(record_topic(robot, VESC_STREAM, cloud.namespace), b'{"v": 1}')
 
-        def of_the_batch() -> list[Entry]:
+        def of_the_batch() -> list[DeadLetter]:
             found = entries(target, robot)
             return found if any(entry.payload == b'{"v": 1}' for entry in found) else []
 

@@ -118,7 +118,7 @@ def claim_for_minutes(target: Target) -> Seen:
     "provisioning.claim_that_lasts",
     expected=_MADE,
     source=f"{_PROVISION} and {_HOOK}",
-    relied_on_by=("station/iort_station/fleet/claims.py", "functions/admit.py", "stacks/documents.py"),
+    relied_on_by=("station/iort_station/fleet/claims.py", "functions/admit.py", "stacks/parts/documents.py"),
 )
 def claim_that_lasts(target: Target) -> Seen:
     """A claim certificate with the fleet's claim policy is exchanged in the same way."""

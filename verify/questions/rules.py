@@ -1,4 +1,4 @@
-"""The topic rules with a message that fakes the cloud's keys."""
+"""The topic rules: as the catalogue has them, and with a message that fakes the cloud's keys."""
 
 from __future__ import annotations
 
@@ -10,6 +10,7 @@ import uuid
 from typing import Any
 
 from bench.target import Target
+from iort_contract.catalog.rules import RULES
 from iort_contract.catalog.vesc import FAULT_FIELD, VESC_STREAM, VOLTAGE_FIELD
 from iort_contract.messages.files import File, FileRequest, encode_file_request, file_key
 from iort_contract.messages.live import LiveSample, encode_live, encode_ping
@@ -32,11 +33,35 @@ _TYPES = {"v": "N", "batch": "S", "codec": "S", "n": "N", "samples": "S"} | {
     RECEIVED_MS: "N",
     EXPIRES_S: "N",
 }
-_RULES = "contract/iort_contract/cloud.py"
+_RULES = "contract/iort_contract/catalog/rules.py"
 
 
 def _recent(received_ms: float) -> bool:
     return abs(received_ms / 1000 - time.time()) < 3600
+
+
+@question(
+    "rules.as_catalogued",
+    expected={name: [True, 1, True] for name in RULES},
+    source=f"{_GUIDE}/iot-create-rule.html",
+    relied_on_by=(_RULES, "stacks/ingest.py"),
+)
+def as_catalogued(target: Target) -> Seen:
+    """AWS IoT keeps each rule as the catalogue has it: its SQL letter by letter, one action, and the way into
+    the quarantine."""
+    client, namespace = target.cloud.client("iot"), target.cloud.namespace
+    kept = {
+        name: client.get_topic_rule(ruleName=rule.physical_name(namespace))["rule"]
+        for name, rule in RULES.items()
+    }
+    return {
+        name: [
+            rule["sql"] == RULES[name].statement(namespace),
+            len(rule["actions"]),
+            "sqs" in rule["errorAction"],
+        ]
+        for name, rule in kept.items()
+    }
 
 
 @question(
@@ -50,7 +75,7 @@ def _recent(received_ms: float) -> bool:
         "types": dict(sorted(_TYPES.items())),
     },
     source=f"{_SQL} and {_DYNAMODB_V2}",
-    relied_on_by=(_RULES, "functions/shared/stored.py"),
+    relied_on_by=(_RULES, "functions/shared/summary/stored.py"),
 )
 def record_spoofed(target: Target) -> Seen:
     """The rule record stores the keys of a batch and the cloud's three, each by name. A key of the message

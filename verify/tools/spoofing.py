@@ -6,8 +6,7 @@ import base64
 import json
 
 from iort_contract.limits import DEFAULT_NAMESPACE
-from iort_contract.messages.event import MESSAGE_BASE64
-from iort_contract.tables import AGENT_VERSION, EXPIRES_S, RECEIVED_MS, ROBOT, TOPIC
+from iort_contract.tables import AGENT_VERSION, EXPIRES_S, MESSAGE_BASE64, RECEIVED_MS, ROBOT, TOPIC
 from iort_contract.topics import build_topic
 
 # Times that the cloud never sends: of 1970, and of the year 2286.

@@ -12,7 +12,7 @@ from iort_contract.messages.batch import Batch, encode_batch
 from iort_contract.topics import RECORD, build_topic, record_topic
 from iort_station.fleet.robots import Bundle
 from iort_station.operations import quarantine
-from iort_station.operations.quarantine import Entry
+from iort_station.operations.quarantine import DeadLetter
 from verify.errors import VerifyError
 from verify.tools.robot import Robot
 from verify.tools.waiting import until
@@ -50,17 +50,17 @@ def items(target: Target, robot: str) -> list[dict[str, Any]]:
     return list(answer["Items"])
 
 
-def listed(target: Target, robot: str) -> list[Entry]:
+def listed(target: Target, robot: str) -> list[DeadLetter]:
     """The robot's entries in the quarantine, without their messages."""
     return list(quarantine.entries(target.cloud, robot=robot))
 
 
-def entries(target: Target, robot: str) -> list[Entry]:
+def entries(target: Target, robot: str) -> list[DeadLetter]:
     """The robot's entries in the quarantine, with their messages."""
     return [entry for one in listed(target, robot) if (entry := quarantine.load(target.cloud, one))]
 
 
-def only_entry(target: Target, robot: str, *, within_s: float = 90.0) -> Entry:
+def only_entry(target: Target, robot: str, *, within_s: float = 90.0) -> DeadLetter:
     """Wait for the robot's entry in the quarantine; raises `VerifyError` unless it is the only one."""
     found = until(lambda: entries(target, robot), "the entry in the quarantine", within_s=within_s)
     if len(found) != 1:

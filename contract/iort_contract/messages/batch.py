@@ -12,6 +12,7 @@ from iort_contract.checks import (
     COMPACT,
     check_field,
     check_header,
+    check_nonfinite,
     check_time,
     check_times,
     check_version,
@@ -46,6 +47,8 @@ from iort_contract.topics import RECORD, Topic, parse_topic
 
 _BATCH_ID = re.compile(rf"(\d{{16}})-({BOOT.pattern})-(0|[1-9]\d{{0,15}})", re.ASCII)
 _MAX_BATCH_ID_US = 10**16
+
+
 _RUN_END = re.compile(rf"({BOOT.pattern})-(0|[1-9]\d{{0,15}})", re.ASCII)
 # A batch names at most this many runs before its own.
 MAX_PREVIOUS = 16
@@ -87,6 +90,14 @@ def batch_id(text: Any) -> BatchId:
     return found
 
 
+def batches_between(first_us: int | None, last_us: int | None) -> tuple[str, str]:
+    """The lowest and highest key of batches that start between these times, both inclusive; None is open."""
+    first = min(max(0, first_us or 0), _MAX_BATCH_ID_US - 1)
+    last = _MAX_BATCH_ID_US - 1 if last_us is None else min(max(-1, last_us), _MAX_BATCH_ID_US - 1)
+    # Sorts after all ids of this time: "~" is greater than any character of an id.
+    return (f"{first:016d}", f"{last:016d}~") if last >= 0 else ("~", "~")
+
+
 def run_ends(text: Any) -> tuple[RunEnd, ...]:
     """Parse the runs before a batch's own, separated by spaces; raises `ContractError`."""
     matches = [_RUN_END.fullmatch(one) for one in text.split(" ")] if isinstance(text, str) and text else []
@@ -96,14 +107,6 @@ def run_ends(text: Any) -> tuple[RunEnd, ...]:
     for end in ends:
         check_header(end.boot, end.seq, 0)
     return ends
-
-
-def batches_between(first_us: int | None, last_us: int | None) -> tuple[str, str]:
-    """The lowest and highest key of batches that start between these times, both inclusive; None is open."""
-    first = min(max(0, first_us or 0), _MAX_BATCH_ID_US - 1)
-    last = _MAX_BATCH_ID_US - 1 if last_us is None else min(max(-1, last_us), _MAX_BATCH_ID_US - 1)
-    # Sorts after all ids of this time: "~" is greater than any character of an id.
-    return (f"{first:016d}", f"{last:016d}~") if last >= 0 else ("~", "~")
 
 
 @dataclass(frozen=True)
@@ -210,40 +213,37 @@ def _packed_messages(
     return SERIALIZED_CODEC, packed_samples(dt, beside, pack(messages), SERIALIZED_CODEC)
 
 
-def decode_batch(message: bytes | str | Mapping[str, Any]) -> Batch:
-    """Decode the batch in an envelope: the message as sent, or the attributes of a stored item.
+class Opened(NamedTuple):
+    """A batch whose envelope, times and field names are checked, and whose values are still encoded.
 
-    Messages stored as columns stay columns; `messages_of` rebuilds them. Raises `ContractError`, with the
-    reason, for everything that `encode_batch` cannot have written.
+    ``written`` holds each column as `iort_contract.codec.columns.unpacked` reads it. ``serialized`` holds ROS
+    messages that were stored unchanged; ``about`` describes messages that became columns.
     """
-    return _read(message)[0]
+
+    boot: str
+    seq: int
+    times_us: list[int]
+    nonfinite: int
+    written: Mapping[str, Any]
+    serialized: bytes | None
+    about: str
+    previous: tuple[RunEnd, ...] | None
 
 
-def messages_of(
-    message: bytes | str | Mapping[str, Any], layouts: Mapping[str, str]
-) -> tuple[Batch, Messages | None]:
-    """The batch in an envelope, and its ROS messages byte for byte; None if the samples were never messages.
+def open_batch(message: bytes | str | Mapping[str, Any]) -> Opened:
+    """Check everything in an envelope except the values, which take the most time.
 
-    ``layouts`` has each type's layout by its id. Raises `ContractError` as `decode_batch` does, and for an
-    unknown type.
+    Raises `ContractError`, with the reason.
     """
-    batch, about = _read(message)
-    if batch.messages is not None or not about:
-        return batch, batch.messages
-    return batch, from_columns(batch.columns, about, batch.times_us, layouts)
-
-
-def _read(message: bytes | str | Mapping[str, Any]) -> tuple[Batch, str]:
-    """The batch, and the text after its columns."""
-    envelope = message if isinstance(message, Mapping) else json_object(message, "envelope")
+    # The check for a dict is the fast one.
+    envelope = message if isinstance(message, (dict, Mapping)) else json_object(message, "envelope")
     check_version(envelope, BATCH_VERSION)
     codec = envelope.get("codec")
     if codec not in (CODEC, SERIALIZED_CODEC, PLAIN_CODEC):
         raise ContractError(f"codec must be {CODEC}, {SERIALIZED_CODEC} or {PLAIN_CODEC}, got {shown(codec)}")
     first_us, boot, seq = batch_id(envelope.get(BATCH))
     n = integer(envelope, SAMPLES)
-    nonfinite = integer(envelope, NONFINITE) if NONFINITE in envelope else 0
-    check_header(boot, seq, nonfinite)
+    nonfinite = check_nonfinite(integer(envelope, NONFINITE)) if NONFINITE in envelope else 0
     previous = run_ends(envelope[PREVIOUS]) if PREVIOUS in envelope else None
     if not 1 <= n <= MAX_SAMPLES:
         raise ContractError(f"envelope must say 1 to {MAX_SAMPLES} samples, got {n}")
@@ -258,17 +258,57 @@ def _read(message: bytes | str | Mapping[str, Any]) -> tuple[Batch, str]:
     _check_values(n, len(fields))
     if dt[0] != 0 or not set(map(type, dt)) <= {int}:
         raise ContractError("samples: dt must be integers, the first 0")
-    times = list(accumulate(dt, initial=first_us))[1:]
+    dt[0] = first_us
+    times = list(accumulate(dt))
     check_times(times)
-    columns: dict[str, list[Value]] = {}
-    for name, column in fields.items():
+    for name in fields:
         check_field(name)
-        columns[name] = unpacked(CODEC if codec == SERIALIZED_CODEC else codec, name, column, n)
+    if codec == PLAIN_CODEC:
+        # A column that is no list fails its own check.
+        fields = {
+            name: [None, *column] if isinstance(column, list) else column for name, column in fields.items()
+        }
     if codec == SERIALIZED_CODEC:
-        messages = unpack(behind, n)
-        viewed, nulled = view(messages)
-        return Batch(boot, seq, times, {**viewed, **columns}, nonfinite + nulled, messages, previous), ""
-    return Batch(boot, seq, times, columns, nonfinite, None, previous), _text(behind)
+        return Opened(boot, seq, times, nonfinite, fields, behind, "", previous)
+    return Opened(boot, seq, times, nonfinite, fields, None, _text(behind), previous)
+
+
+def decode_batch(message: bytes | str | Mapping[str, Any]) -> Batch:
+    """Decode the batch in an envelope: the message as sent, or the attributes of a stored item.
+
+    Messages stored as columns stay columns; `messages_of` rebuilds them. Raises `ContractError`, with the
+    reason, for everything that `encode_batch` cannot have written.
+    """
+    return decode_opened(open_batch(message))
+
+
+def decode_opened(opened: Opened) -> Batch:
+    """Decode the values; raises `ContractError`."""
+    boot, seq, times, nonfinite, written, serialized, _, previous = opened
+    n = len(times)
+    columns: dict[str, Sequence[Value]] = {
+        name: unpacked(name, column, n) for name, column in written.items()
+    }
+    if serialized is None:
+        return Batch(boot, seq, times, columns, nonfinite, None, previous)
+    messages = unpack(serialized, n)
+    viewed, nulled = view(messages)
+    return Batch(boot, seq, times, {**viewed, **columns}, nonfinite + nulled, messages, previous)
+
+
+def messages_of(
+    message: bytes | str | Mapping[str, Any], layouts: Mapping[str, str]
+) -> tuple[Batch, Messages | None]:
+    """The batch in an envelope, and its ROS messages byte for byte; None if the samples were never messages.
+
+    ``layouts`` has each type's layout by its id. Raises `ContractError` as `decode_batch` does, and for an
+    unknown type.
+    """
+    opened = open_batch(message)
+    batch = decode_opened(opened)
+    if not opened.about:
+        return batch, batch.messages
+    return batch, from_columns(batch.columns, opened.about, batch.times_us, layouts)
 
 
 def _text(behind: bytes) -> str:

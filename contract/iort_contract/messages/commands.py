@@ -12,13 +12,12 @@ from iort_contract.checks import (
     check_time,
     check_version,
     checked,
-    integer,
     json_object,
     offset_entry,
     shown,
-    text,
 )
 from iort_contract.limits import MAX_MESSAGE_BYTES, SCHEMA_VERSION, ContractError
+from iort_contract.messages.envelope import entries, read
 
 # Upper limits, whatever an operator asks for: a command expires, and a motion must end.
 MAX_VALID_MS, MAX_LEASE_MS = 60_000, 10_000
@@ -56,34 +55,12 @@ class Command:
 def encode_command(command: Command) -> bytes:
     """The command as JSON; raises `ContractError` if it is invalid."""
     _check_command(command)
-    envelope: dict[str, Any] = {
-        "v": SCHEMA_VERSION,
-        "session": command.session,
-        "started_us": command.started_us,
-        "seq": command.seq,
-        "sent_us": command.sent_us,
-        "valid_ms": command.valid_ms,
-    }
-    if command.lease_ms is not None:
-        envelope["lease_ms"] = command.lease_ms
-    if command.answer:
-        envelope["answer"] = True
-    return _message_json({**envelope, "message": command.message})
+    return _message_json({"v": SCHEMA_VERSION, **entries(command)})
 
 
 def decode_command(payload: bytes | str) -> Command:
     """Decode a command; raises `ContractError` for everything that `encode_command` cannot have written."""
-    envelope = _message_envelope(payload, "command")
-    command = Command(
-        session=text(envelope, "session"),
-        started_us=integer(envelope, "started_us"),
-        seq=integer(envelope, "seq"),
-        sent_us=integer(envelope, "sent_us"),
-        valid_ms=integer(envelope, "valid_ms"),
-        message=envelope["message"],
-        lease_ms=integer(envelope, "lease_ms") if "lease_ms" in envelope else None,
-        answer=envelope.get("answer", False),
-    )
+    command = read(Command, _message_envelope(payload, "command"))
     _check_command(command)
     return command
 
@@ -102,26 +79,22 @@ class FleetMessage:
 
 def encode_fleet(fleet: FleetMessage) -> bytes:
     """The message as JSON; raises `ContractError` if it is invalid."""
-    envelope = {
-        "v": SCHEMA_VERSION,
-        "boot": check_header(fleet.boot, fleet.seq, 0),
-        "seq": fleet.seq,
-        "sent_us": check_time(fleet.sent_us, "sent_us"),
-        **offset_entry(fleet.offset_us),
-    }
-    return _message_json({**envelope, "message": fleet.message})
+    _check_fleet(fleet)
+    return _message_json({"v": SCHEMA_VERSION, **entries(fleet)})
 
 
 def decode_fleet(payload: bytes | str) -> FleetMessage:
     """Decode another robot's message; raises `ContractError` for everything that `encode_fleet` cannot
     write."""
-    envelope = _message_envelope(payload, "fleet message")
-    seq = integer(envelope, "seq")
-    boot = check_header(envelope.get("boot"), seq, 0)
-    sent_us = check_time(integer(envelope, "sent_us"), "sent_us")
-    offset_us = integer(envelope, "offset_us") if "offset_us" in envelope else None
-    offset_entry(offset_us)
-    return FleetMessage(boot, seq, sent_us, envelope["message"], offset_us)
+    fleet = read(FleetMessage, _message_envelope(payload, "fleet message"))
+    _check_fleet(fleet)
+    return fleet
+
+
+def _check_fleet(fleet: FleetMessage) -> None:
+    check_header(fleet.boot, fleet.seq, 0)
+    check_time(fleet.sent_us, "sent_us")
+    offset_entry(fleet.offset_us)
 
 
 def _check_command(command: Command) -> None:

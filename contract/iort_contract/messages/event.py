@@ -7,10 +7,7 @@ from typing import Any, Mapping
 
 from iort_contract.checks import shown
 from iort_contract.limits import ContractError
-from iort_contract.tables import RECEIVED_MS, TOPIC
-
-# One opaque value for any content: no key of the message can replace one of the cloud's.
-MESSAGE_BASE64 = "message_base64"
+from iort_contract.tables import MESSAGE_BASE64, RECEIVED_MS, TOPIC
 
 
 def rule_event(message: bytes, topic: str, received_ms: int) -> dict[str, Any]:

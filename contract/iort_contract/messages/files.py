@@ -11,7 +11,7 @@ from typing import Any, Mapping, NamedTuple, Sequence
 
 from iort_contract.checks import BOOT, check_time, check_version, checked, integer, json_object, shown, text
 from iort_contract.limits import SCHEMA_VERSION, ContractError
-from iort_contract.tables import T_US
+from iort_contract.messages.envelope import entries, read
 from iort_contract.topics import check_robot
 
 # Where robots upload to, in the files' bucket.
@@ -150,14 +150,7 @@ def encode_file_request(request: FileRequest) -> bytes:
     envelope: dict[str, Any] = {
         "v": SCHEMA_VERSION,
         "id": request.id,
-        "file": {
-            "name": file.name,
-            "kind": file.kind,
-            "content_type": file.content_type,
-            "size": file.size,
-            "sha256": file.sha256,
-            T_US: file.t_us,
-        },
+        "file": entries(file),
         "parts": {str(part): sha256 for part, sha256 in request.parts.items()},
     }
     if request.parts_sha256 is not None:
@@ -173,14 +166,7 @@ def decode_file_request(message: bytes | str | Mapping[str, Any]) -> FileRequest
     given, parts = envelope.get("file"), envelope.get("parts")
     if not isinstance(given, Mapping) or not isinstance(parts, Mapping):
         raise ContractError("file and parts must be an object each")
-    file = File(
-        name=text(given, "name"),
-        kind=text(given, "kind"),
-        content_type=text(given, "content_type"),
-        size=integer(given, "size"),
-        sha256=text(given, "sha256"),
-        t_us=integer(given, T_US),
-    )
+    file = read(File, given)
     numbered = {int(n) if str(n).isdecimal() and len(str(n)) < 6 else -1: sha for n, sha in parts.items()}
     request = FileRequest(text(envelope, "id"), file, numbered, envelope.get("parts_sha256"))
     _check_file_request(request)

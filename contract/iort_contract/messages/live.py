@@ -25,9 +25,6 @@ from iort_contract.limits import MAX_FIELDS, SCHEMA_VERSION, ContractError, Valu
 from iort_contract.tables import NONFINITE, RECEIVED_MS, ROBOT, T_US
 from iort_contract.topics import check_robot, check_stream
 
-# The fields of a ping; the answer repeats them.
-PING_FIELDS = ("v", "id", "sent_us", "padding")
-
 
 @dataclass(frozen=True)
 class LiveSample:

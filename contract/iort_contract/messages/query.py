@@ -9,9 +9,10 @@ from dataclasses import asdict, dataclass, field, replace
 from itertools import accumulate
 from typing import Any, Mapping, Sequence
 
-from iort_contract.checks import check_field, integer, json_object, shown, text
+from iort_contract.checks import json_object, shown, text
 from iort_contract.codec.columns import PLAIN_CODEC
 from iort_contract.limits import ContractError, Value
+from iort_contract.messages.envelope import entries, read
 from iort_contract.topics import check_robot, check_stream
 
 # The times of a request without a start or an end.
@@ -61,65 +62,40 @@ class QueryAnswer:
 
 def encode_query_request(request: QueryRequest) -> bytes:
     """The request as JSON; raises `ContractError` if it is invalid."""
-    decode_query_request(asdict(request))
-    return json.dumps(asdict(request)).encode()
+    decode_query_request(entries(request))
+    return json.dumps(entries(request)).encode()
 
 
 def decode_query_request(event: Mapping[str, Any]) -> QueryRequest:
-    """Decode a request; raises `ContractError`. Missing entries have their defaults."""
-    fields, where, token = event.get("fields"), event.get("where"), event.get("token")
-    listed = isinstance(fields, (list, tuple)) and all(isinstance(name, str) for name in fields)
-    if fields is not None and not listed:
-        raise ContractError(f"fields must be a list of names, got {shown(fields)}")
-    if token is not None and not isinstance(token, Mapping):
-        raise ContractError(f"token must be an object, got {shown(token)}")
-    return QueryRequest(
-        robot=check_robot(text(event, "robot")),
-        stream=check_stream(text(event, "stream")),
-        start_us=_time_us(event, "start_us", FIRST_US),
-        end_us=_time_us(event, "end_us", LAST_US),
-        fields=None if fields is None else tuple(fields),
-        where=None if where is None else text(event, "where"),
-        scan=bool(event.get("scan")),
-        token=token,
-    )
+    """Decode a request; raises `ContractError`. Missing entries and null have their defaults."""
+    request = read(QueryRequest, {name: value for name, value in event.items() if value is not None})
+    check_robot(request.robot)
+    check_stream(request.stream)
+    start_us, end_us = (max(FIRST_US, min(LAST_US, t_us)) for t_us in (request.start_us, request.end_us))
+    return replace(request, start_us=start_us, end_us=end_us)
 
 
 def encode_query_answer(answer: QueryAnswer) -> dict[str, Any]:
     """The answer as an object for JSON."""
     if answer.error:
         return {"error": answer.error}
-    entries = {"codec": PLAIN_CODEC, **asdict(replace(answer, samples=None))}
+    reply = {"codec": PLAIN_CODEC, **asdict(replace(answer, samples=None))}
     if answer.samples is not None:
-        entries["samples"] = base64.b64encode(answer.samples).decode()
-    return {name: value for name, value in entries.items() if value is not None or name == "token"}
+        reply["samples"] = base64.b64encode(answer.samples).decode()
+    return {name: value for name, value in reply.items() if value is not None or name == "token"}
 
 
 def decode_query_answer(message: bytes | str) -> QueryAnswer:
-    """Decode an answer; raises `ContractError`."""
+    """Decode an answer; raises `ContractError`. Missing entries and null have their defaults."""
     answer = json_object(message, "the query function's answer")
     if answer.get("error"):
         return QueryAnswer(error=text(answer, "error"))
     if answer.get("codec") != PLAIN_CODEC:
         raise ContractError(f"codec must be {PLAIN_CODEC}, got {shown(answer.get('codec'))}")
-    samples, url = answer.get("samples"), answer.get("url")
-    if (samples is None) == (url is None):
+    given = {name: value for name, value in answer.items() if value is not None}
+    if ("samples" in given) == ("url" in given):
         raise ContractError("an answer must have either samples or url")
-    try:
-        return QueryAnswer(
-            n=integer(answer, "n"),
-            items=integer(answer, "items"),
-            pages=integer(answer, "pages"),
-            refused=integer(answer, "refused"),
-            fields=tuple(map(check_field, answer["fields"])),
-            reason=text(answer, "reason"),
-            absent={str(name): int(n) for name, n in answer["absent"].items()},
-            token=answer.get("token"),
-            samples=None if samples is None else base64.b64decode(samples, validate=True),
-            url=None if url is None else text(answer, "url"),
-        )
-    except (AttributeError, KeyError, TypeError, ValueError) as error:
-        raise ContractError(f"the query function's answer is invalid: {error}") from error
+    return read(QueryAnswer, given)
 
 
 def packed_samples(times_us: Sequence[int], columns: Mapping[str, Sequence[Value]]) -> bytes:
@@ -135,12 +111,3 @@ def unpacked_samples(packed: bytes) -> tuple[list[int], Mapping[str, list[Value]
         return list(accumulate(body["dt"])), body["fields"]
     except (KeyError, TypeError, ValueError, zlib.error) as error:
         raise ContractError(f"samples must be what the query function packs: {error}") from error
-
-
-def _time_us(event: Mapping[str, Any], key: str, default: int) -> int:
-    value = event.get(key)
-    if value is None:
-        return default
-    if type(value) is not int:
-        raise ContractError(f"{key} must be an integer of microseconds, got {shown(value)}")
-    return max(FIRST_US, min(LAST_US, value))

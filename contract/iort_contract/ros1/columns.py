@@ -10,11 +10,12 @@ from __future__ import annotations
 
 import json
 import struct
+from contextlib import suppress
 from functools import lru_cache
-from typing import Any, Iterable, Mapping, Sequence
+from typing import Any, Mapping, NamedTuple, Sequence
 
 from iort_contract.checks import COMPACT, shown, wire_column
-from iort_contract.codec.columns import CODEC, packed, unpacked
+from iort_contract.codec.columns import packed, unpacked
 from iort_contract.limits import (
     MAX_BATCH_VALUES,
     MAX_FIELD_CHARACTERS,
@@ -57,40 +58,40 @@ def values_a_message(messages: Messages) -> int:
 
 
 def view(messages: Messages) -> tuple[dict[str, list[Value]], int]:
-    """The messages' samples as columns, None for a missing field; and the count of values that are not
-    finite."""
-    columns: dict[str, list[Value]] = {}
+    """The messages' samples as columns, with None for a missing field; and the number of values that are
+    not finite."""
     if not messages.layout:
         return {}, 0
     decoder = decoder_of(messages.layout)
-    bodies = _bodies(decoder, messages.raw)
-    if decoder.flat is not None and bodies is not None:
-        columns = _columns(decoder, bodies)
-    else:
-        viewed, walked = 0, decoder.walked
-        for i, raw in enumerate(messages.raw):
-            enough = max(viewed, decoder.walked - walked) >= _MAX_VIEWED
-            try:
-                values = {} if enough else decoder.decode(raw)
-            except MessageError:
-                values = {}
-            viewed += len(values)
-            for name, value in values.items():
-                if name not in columns and len(columns) >= MAX_FIELDS:
-                    continue
-                column = columns.setdefault(name, [])
-                column.extend([None] * (i - len(column)))
-                column.append(value)
-        for column in columns.values():
-            column.extend([None] * (len(messages.raw) - len(column)))
-    shown: dict[str, list[Value]] = {}
+    numbers = _numbers(decoder, messages.raw)
+    columns = _walked(decoder, messages.raw) if numbers is None else numbers.columns()
+    viewed: dict[str, list[Value]] = {}
     nulled = 0
     for name, column in columns.items():
         # A query could not use a longer name.
         if len(name) <= MAX_FIELD_CHARACTERS:
-            shown[name], several = wire_column(name, column)
+            viewed[name], several = wire_column(name, column)
             nulled += several
-    return shown, nulled
+    return viewed, nulled
+
+
+def _walked(decoder: Decoder, raws: Sequence[bytes]) -> dict[str, list[Value]]:
+    columns: dict[str, list[Value]] = {}
+    count, walked = 0, decoder.walked
+    for i, raw in enumerate(raws):
+        values: Mapping[str, Value] = {}
+        if max(count, decoder.walked - walked) < _MAX_VIEWED:
+            with suppress(MessageError):
+                values = decoder.decode(raw)
+        count += len(values)
+        for name, value in values.items():
+            if name in columns or len(columns) < MAX_FIELDS:
+                column = columns.setdefault(name, [])
+                column.extend([None] * (i - len(column)))
+                column.append(value)
+    for column in columns.values():
+        column.extend([None] * (len(raws) - len(column)))
+    return columns
 
 
 def as_columns(messages: Messages, times_us: Sequence[int]) -> tuple[dict[str, list[Value]], str] | None:
@@ -99,18 +100,16 @@ def as_columns(messages: Messages, times_us: Sequence[int]) -> tuple[dict[str, l
     if not messages.layout:
         return None
     decoder = decoder_of(messages.layout)
-    bodies = _bodies(decoder, messages.raw)
-    if decoder.flat is None or bodies is None:
+    numbers = _numbers(decoder, messages.raw)
+    if numbers is None or max(map(len, numbers.names)) > MAX_FIELD_CHARACTERS:
         return None
     columns: dict[str, list[Value]] = {}
-    if max(map(len, decoder.flat[1])) > MAX_FIELD_CHARACTERS:
-        return None
-    for name, column in _columns(decoder, bodies).items():
+    for name, column in numbers.columns().items():
         columns[name] = wire_column(name, column)[0]
         # Numbers that are not steps take more as text than as bytes.
         if float in set(map(type, columns[name])) and packed(columns[name])[0] is None:
             return None
-    if b"".join(bodies) != _rows(decoder, columns):
+    if numbers.rows != _rows(numbers.struct, numbers.names, columns):
         return None
     about: list[Any] = [messages.type_id]
     if decoder.stamped:
@@ -145,18 +144,17 @@ def from_columns(
         decoder = decoder_of(layouts[name])
         if decoder.flat is None:
             raise ContractError(f"type {name} must consist of numbers")
-        rows = _rows(decoder, columns)
-        size = decoder.flat[0].size
+        rows, size = _rows(*decoder.flat, columns), decoder.flat[0].size
         if len(rows) != n * size:
             raise ContractError(f"the columns do not fit the type {name}")
         raw = [rows[i * size : (i + 1) * size] for i in range(n)]
         if decoder.stamped:
             seq, stamp, frame = head
-            seqs = range(seq, seq + n) if type(seq) is int else unpacked(CODEC, "seq", seq, n)
+            seqs = range(seq, seq + n) if type(seq) is int else unpacked("seq", seq, n)
             offsets: Sequence[Any] = (
                 [int(stamp[3 * i : 3 * i + 3]) for i in range(n)]
                 if isinstance(stamp, str)
-                else unpacked(CODEC, "stamp", stamp, n)
+                else unpacked("stamp", stamp, n)
             )
             # A single value stands for all messages.
             texts = [frame] * n if isinstance(frame, str) else frame
@@ -184,31 +182,33 @@ def _digits(offsets: Sequence[int]) -> str:
     return "".join(map("{:03d}".format, offsets))
 
 
-def _bodies(decoder: Decoder, raws: Iterable[bytes]) -> list[bytes] | None:
-    """The bodies after the headers, if they have the length of the layout."""
+class _Numbers(NamedTuple):
+    """Messages of numbers only, without their headers: one struct for each, and the names of its numbers."""
+
+    struct: struct.Struct
+    names: Sequence[str]
+    rows: bytes
+
+    def columns(self) -> dict[str, list[Value]]:
+        """The numbers by name."""
+        return dict(zip(self.names, map(list, zip(*self.struct.iter_unpack(self.rows)))))
+
+
+def _numbers(decoder: Decoder, raws: Sequence[bytes]) -> _Numbers | None:
+    """The messages' numbers; None if there is anything else, or if a message has another length."""
     if decoder.flat is None:
         return None
-    size = decoder.flat[0].size
-    if not decoder.stamped:
-        bodies = list(raws)
-    else:
-        try:
-            bodies = [raw[HEADER.size + HEADER.unpack_from(raw)[3] :] for raw in raws]
-        except struct.error:
-            return None
-    return bodies if set(map(len, bodies)) == {size} else None
-
-
-def _columns(decoder: Decoder, bodies: Sequence[bytes]) -> dict[str, list[Value]]:
-    assert decoder.flat is not None
     reader, names = decoder.flat
-    return dict(zip(names, map(list, zip(*reader.iter_unpack(b"".join(bodies))))))
+    try:
+        starts = [HEADER.size + HEADER.unpack_from(raw)[3] if decoder.stamped else 0 for raw in raws]
+    except struct.error:
+        return None
+    bodies = [raw[start:] for raw, start in zip(raws, starts)]
+    return _Numbers(reader, names, b"".join(bodies)) if set(map(len, bodies)) == {reader.size} else None
 
 
-def _rows(decoder: Decoder, columns: Mapping[str, Sequence[Value]]) -> bytes:
-    """The messages' bodies, joined; empty if a value does not fit."""
-    assert decoder.flat is not None
-    writer, names = decoder.flat
+def _rows(writer: struct.Struct, names: Sequence[str], columns: Mapping[str, Sequence[Value]]) -> bytes:
+    """The messages without their headers, joined; empty if a value does not fit."""
     if columns.keys() != set(names):
         return b""
     try:

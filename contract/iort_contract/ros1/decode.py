@@ -16,12 +16,12 @@ import re
 import struct
 from functools import lru_cache
 from itertools import islice
-from typing import Dict, Iterator, NamedTuple, Sequence, Union
+from typing import Dict, Sequence
 
 from iort_contract.limits import MAX_FIELDS, MessageError, Value
 from iort_contract.ros1.definition import LETTERS, STRING, VARIABLE, Definition, Field, Fields
+from iort_contract.ros1.parts import MAX_ELEMENTS, Part, Run, Types
 
-MAX_ELEMENTS = 64
 MAX_TEXT = 4096
 # A message with more elements of variable size in one array is not decoded.
 _MAX_WALKED = 20_000
@@ -69,19 +69,18 @@ class Decoder:
         self._select = select
         self._large = large
         self._limit = MAX_FIELDS if select is None else _MAX_SEARCHED
-        self._extents: dict[str, _Extent | None] = {**_NUMBERS, STRING: None}
-        self._parts: dict[str, list[_Part]] = {}
+        self._compiled = Types(definition.types, self.wanted)
         self._chosen: dict[str, bool] = {}
         body = definition.fields()[1 if self.stamped else 0 :]
         if self.stamped and len(body) == 1 and body[0].length is None and body[0].kind in self._types:
             body = self._types[body[0].kind]
-        extent = self._extent(self._kind)
+        extent = self._compiled.extent(self._kind)
         if extent is not None and extent.size > _MAX_FIXED_BYTES:
             raise MessageError(f"{self._kind}: the message would be too large: {extent.size} bytes")
-        self._body = self._compile(body)
+        self._body = self._compiled.compile(body)
         self.unknown = sorted(path for path in select or () if not self._has(path.split("."), body))
         self.flat: tuple[struct.Struct, list[str]] | None = None
-        if len(self._body) == 1 and isinstance(self._body[0], _Run) and self._body[0].numbers <= MAX_FIELDS:
+        if len(self._body) == 1 and isinstance(self._body[0], Run) and self._body[0].numbers <= MAX_FIELDS:
             self.flat = self._body[0].named("") if self._body[0].numbers else None
 
     def decode(self, data: bytes) -> dict[str, Value]:
@@ -105,11 +104,11 @@ class Decoder:
 
     # Reading. A path of None skips the value.
 
-    def _read(self, parts: Sequence[_Part], prefix: str | None, data: bytes, at: int, out: _Sample) -> int:
+    def _read(self, parts: Sequence[Part], prefix: str | None, data: bytes, at: int, out: _Sample) -> int:
         for part in parts:
             # The next values would be cut from a full sample.
             shown = prefix is not None and len(out) <= self._limit
-            if isinstance(part, _Run):
+            if isinstance(part, Run):
                 if shown:
                     reader, names = part.named(prefix or "")
                     out.update(zip(names, reader.unpack_from(data, at)))
@@ -124,7 +123,7 @@ class Decoder:
 
     def _value(self, kind: str, path: str | None, data: bytes, at: int, out: _Sample) -> int:
         if kind in self._types:
-            return self._read(self._of(kind), None if path is None else f"{path}.", data, at, out)
+            return self._read(self._compiled.parts(kind), None if path is None else f"{path}.", data, at, out)
         if kind == STRING:
             (n,) = _LENGTH.unpack_from(data, at)
             if path is not None:
@@ -145,7 +144,7 @@ class Decoder:
         if n == VARIABLE:
             (n,) = _LENGTH.unpack_from(data, at)
             at += 4
-        extent = self._extent(kind)
+        extent = self._compiled.extent(kind)
         if extent is not None and at + n * extent.size > len(data):
             raise struct.error
         shown: Sequence[int] = ()
@@ -166,7 +165,7 @@ class Decoder:
             return at + n * extent.size
         if n > _MAX_WALKED:
             raise MessageError(f"{path or kind}: too many elements to decode: {n}")
-        self.walked += n * (len(self._of(kind)) if kind in self._types else 1)
+        self.walked += n * (len(self._compiled.parts(kind)) if kind in self._types else 1)
         for i in range(n):
             here = f"{path}.{i}" if i in shown and len(out) <= self._limit else None
             at = self._value(kind, here, data, at, out)
@@ -176,59 +175,6 @@ class Decoder:
         label = _label(path)
         if label == _BEYOND or self.wanted(label):
             self.left_out[label] = self.left_out.get(label, 0) + 1
-
-    # Compiling. Each type is compiled once.
-
-    def _of(self, kind: str) -> list[_Part]:
-        if kind not in self._parts:
-            self._parts[kind] = self._compile(self._types[kind])
-        return self._parts[kind]
-
-    def _compile(self, fields: Fields) -> list[_Part]:
-        """Put neighbouring numbers together."""
-        parts: list[_Part] = []
-        for field in fields:
-            extent = self._extent_of(field)
-            if extent is None or extent.numbers > MAX_FIELDS:
-                parts.append(field)
-                continue
-            if not parts or not isinstance(parts[-1], _Run):
-                parts.append(_Run(self))
-            run = parts[-1]
-            assert isinstance(run, _Run)
-            run.add(field, extent)
-        return parts
-
-    def _extent(self, kind: str) -> _Extent | None:
-        """The extent of a type; None if its size varies."""
-        if kind not in self._extents:
-            extents = [self._extent_of(field) for field in self._types[kind]]
-            fixed = [extent for extent in extents if extent is not None]
-            whole = _Extent(sum(one.size for one in fixed), sum(one.numbers for one in fixed))
-            self._extents[kind] = whole if len(fixed) == len(extents) else None
-        return self._extents[kind]
-
-    def _extent_of(self, field: Field) -> _Extent | None:
-        if field.length == 0:
-            return _Extent(0, 0)
-        extent = None if field.length == VARIABLE else self._extent(field.kind)
-        if extent is None or field.length is None:
-            return extent
-        # A long array is read apart, as its elements are left out.
-        numbers = extent.numbers * field.length if field.length <= MAX_ELEMENTS else MAX_FIELDS + 1
-        return _Extent(extent.size * field.length, numbers)
-
-    def leaves(self, field: Field, path: str) -> Iterator[tuple[str, str]]:
-        """The kinds and the paths of a field's numbers, if it has no more than `MAX_FIELDS`."""
-        extent = self._extent_of(field)
-        if extent is None or not extent.numbers:
-            return
-        for i in range(1 if field.length is None else field.length):
-            here = path if field.length is None else f"{path}.{i}"
-            if field.kind in LETTERS:
-                yield field.kind, here
-            for nested in self._types.get(field.kind, ()):
-                yield from self.leaves(nested, f"{here}.{nested.name}")
 
     # The selection.
 
@@ -255,52 +201,6 @@ class Decoder:
         return not rest or self._has(rest, self._types.get(field.kind, ()))
 
 
-class _Extent(NamedTuple):
-    """The bytes of a value of fixed size, and how many numbers it has."""
-
-    size: int
-    numbers: int
-
-
-_NUMBERS = {kind: _Extent(struct.calcsize(f"<{letter}"), 1) for kind, letter in LETTERS.items()}
-
-
-class _Run:
-    """Neighbouring numbers, read by one `struct.Struct`; it is created for the first sample that needs it."""
-
-    def __init__(self, decoder: Decoder) -> None:
-        self.size = self.numbers = 0
-        self._decoder = decoder
-        self._fields: list[Field] = []
-        self._leaves: list[tuple[str, str]] = []
-        self._named: dict[str, tuple[struct.Struct, list[str]]] = {}
-
-    def add(self, field: Field, extent: _Extent) -> None:
-        """Put a field at the end."""
-        self._fields.append(field)
-        self.size += extent.size
-        self.numbers += extent.numbers
-
-    def named(self, prefix: str) -> tuple[struct.Struct, list[str]]:
-        """What reads the selected numbers, and their paths."""
-        if prefix not in self._named:
-            if len(self._named) >= _MAX_CACHED:
-                self._named.clear()
-            leaves = [(kind, f"{prefix}{path}") for kind, path in self._leaves or self._expand()]
-            names = [path for _, path in leaves if self._decoder.wanted(path)]
-            letters = [
-                LETTERS[kind] if self._decoder.wanted(path) else f"{_NUMBERS[kind].size}x"
-                for kind, path in leaves
-            ]
-            self._named[prefix] = struct.Struct("<" + "".join(letters)), names
-        return self._named[prefix]
-
-    def _expand(self) -> list[tuple[str, str]]:
-        self._leaves = [leaf for field in self._fields for leaf in self._decoder.leaves(field, field.name)]
-        return self._leaves
-
-
-_Part = Union[_Run, Field]
 _Sample = Dict[str, Value]
 
 

@@ -14,7 +14,8 @@ from iort_agent.control.config import DownlinkConfig, ShareConfig
 from iort_agent.control.peers import Peers
 from iort_agent.control.shares import Shares
 from iort_agent.mqtt.uplink import Link
-from iort_agent.ros1.node import DEFAULT_NODE, Graph, shared
+from iort_agent.ros1.graph import Graph
+from iort_agent.ros1.node import DEFAULT_NODE, shared
 from iort_agent.sources.ros1 import Ros1Config
 
 _log = logging.getLogger(__name__)

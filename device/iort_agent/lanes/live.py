@@ -22,15 +22,13 @@ import functools
 import heapq
 import logging
 import threading
-from collections import deque
-from dataclasses import dataclass, field
-from typing import Callable, Mapping, NamedTuple
+from typing import Callable, Mapping
 
 from iort_agent.errors import UplinkError
+from iort_agent.lanes.tempo import Slot, Tempo, TempoMeter, fault_of
 from iort_agent.mqtt.rate_limiter import LIVE, URGENT
 from iort_agent.mqtt.uplink import Link
 from iort_contract import topics
-from iort_contract.catalog.vesc import FAULT_FIELD
 from iort_contract.limits import (
     LIVE_BROKER_EVERY_S,
     LIVE_MAX_AGE_MS,
@@ -44,58 +42,6 @@ from iort_contract.topics import live_topic
 
 _log = logging.getLogger(__name__)
 _FASTEST_S = 1 / LIVE_MAX_RATE_HZ
-# Rates are means of so many seconds. The lane counts as slowed once streams were late in more than half of
-# them, until they were late in none.
-_SECONDS = 5
-
-
-class Tempo(NamedTuple):
-    """The configured rate of a stream, and the mean rate of the streams that the rate limiter keeps
-    waiting."""
-
-    asked_hz: float
-    effective_hz: float
-    slowed: bool
-
-
-class _Mark(NamedTuple):
-    """A stream's counts at one second."""
-
-    at: float
-    offers: int
-    seq: int
-    late: int
-
-
-@dataclass
-class _Slot:
-    """The state of one stream. ``values`` are the newest sample's while it waits."""
-
-    topic: str
-    broker_topic: str
-    # The number of its last turn, since when it waits in line, and how often it waited too long.
-    turn: int
-    queued: float | None = None
-    late: int = 0
-    # When the next message may go: in its turn, with another fault code, and over the broker.
-    due: float = 0.0
-    fault_due: float = 0.0
-    broker_due: float = 0.0
-    fault: Value = None
-    t_us: int = 0
-    values: Mapping[str, Value] | None = None
-    offered: float = 0.0
-    offers: int = 0
-    seq: int = 0
-    payload_bytes: int = 0
-    writing: bool = False
-    written: int = 0
-    hz: float = 0.0
-    marks: deque[_Mark] = field(default_factory=lambda: deque(maxlen=_SECONDS + 1))
-
-    def is_new_fault(self, now: float) -> bool:
-        """Whether the waiting sample has another fault code than the last message, and may go."""
-        return self.values is not None and now >= self.fault_due and _fault(self.values) != self.fault
 
 
 class LiveLane:
@@ -107,17 +53,20 @@ class LiveLane:
         self._clock = link.clock
         self._boot = boot
         self.enabled = True
-        self._rate_hz, self._period_s = rate_hz, 1 / rate_hz
+        self._period_s = 1 / rate_hz
         self._offset_us = offset_us
         self._lock = threading.Lock()
-        self._slots: dict[str, _Slot] = {}
+        self._slots: dict[str, Slot] = {}
         # The due streams: a heap by their last turns, which are unique.
-        self._line: list[tuple[int, _Slot]] = []
+        self._line: list[tuple[int, Slot]] = []
         self._turn = 0
         self._marked = self._clock.monotonic()
-        self._slow_s: deque[bool] = deque(maxlen=_SECONDS)
-        self.tempo = Tempo(rate_hz, rate_hz, slowed=False)
+        self._meter = TempoMeter(rate_hz)
         self.refused = 0
+
+    @property
+    def tempo(self) -> Tempo:
+        return self._meter.tempo
 
     @property
     def published(self) -> int:
@@ -131,12 +80,12 @@ class LiveLane:
     def set_rate(self, rate_hz: float) -> None:
         """Use another rate from now on."""
         with self._lock:
-            self._rate_hz, self._period_s = rate_hz, 1 / rate_hz
+            self._period_s = 1 / rate_hz
             now = self._clock.monotonic()
             for slot in self._slots.values():
                 # A message due late at a slow rate is due soon at a fast one.
                 slot.due = min(slot.due, now + self._period_s)
-            self.tempo = Tempo(rate_hz, min(rate_hz, self.tempo.effective_hz), self.tempo.slowed)
+            self._meter.set_rate(rate_hz)
 
     def offer(self, stream: str, t_us: int, values: Mapping[str, Value]) -> None:
         """Take the newest sample of a stream; it replaces the one that waits."""
@@ -148,11 +97,11 @@ class LiveLane:
             if slot is None:
                 basic_ingest = live_topic(self._link.robot, stream, self._link.namespace)
                 broker_topic = self._link.topic(topics.LIVE, stream)
-                slot = self._slots[stream] = _Slot(basic_ingest, broker_topic, turn=self._turn)
+                slot = self._slots[stream] = Slot(basic_ingest, broker_topic, turn=self._turn)
                 self._turn += 1
             slot.t_us, slot.values, slot.offered = t_us, values, now
             slot.offers += 1
-            if now >= slot.due or slot.is_new_fault(now):
+            if now >= slot.due or slot.is_newfault_of(now):
                 self._take_turn(slot, now)
             self._serve(now)
 
@@ -165,17 +114,17 @@ class LiveLane:
                     continue
                 if now - slot.offered > LIVE_MAX_AGE_MS / 1000:
                     slot.values = None
-                elif now >= slot.due + self._period_s / 2 or slot.is_new_fault(now):
+                elif now >= slot.due + self._period_s / 2 or slot.is_newfault_of(now):
                     self._take_turn(slot, now)
             self._serve(now)
             if now - self._marked >= 1:
                 self._marked = now
-                self._measure(now)
+                self._meter.measure(self._slots.values(), now, connected=self._uplink.connected())
 
-    def _take_turn(self, slot: _Slot, now: float) -> None:
+    def _take_turn(self, slot: Slot, now: float) -> None:
         """Send another fault code at once; put any other sample in line."""
         if (
-            slot.is_new_fault(now)
+            slot.is_newfault_of(now)
             and slot.seq
             and self._rate_limiter.may_go(URGENT, slot.broker_topic, slot.payload_bytes)
         ):
@@ -200,39 +149,7 @@ class LiveLane:
                 slot.late += now - queued > self._period_s / 2
                 self._send(slot, now)
 
-    def _measure(self, now: float) -> None:
-        """Once a second: measure the rate of each stream, and whether the limit kept one waiting."""
-        if not self._uplink.connected():
-            for slot in self._slots.values():
-                slot.marks.clear()
-            return
-        slow_hz, late = [], False
-        for slot in self._slots.values():
-            slot.late += slot.queued is not None and now - slot.queued > max(self._period_s / 2, 1.0)
-            mark = _Mark(now, slot.offers, slot.seq, slot.late)
-            before = slot.marks[-1] if slot.marks else mark
-            slot.marks.append(mark)
-            first = slot.marks[0]
-            if now > first.at:
-                slot.hz = (mark.seq - first.seq) / (now - first.at)
-            # A stream whose samples are all sent loses nothing by waiting.
-            if mark.late > first.late and mark.offers - first.offers > mark.seq - first.seq + 1:
-                slow_hz.append(slot.hz)
-                late = late or mark.late > before.late
-        self._slow_s.append(late)
-        was, asked_hz = self.tempo.slowed, self._rate_hz
-        slowed = any(self._slow_s) if was else sum(self._slow_s) > _SECONDS / 2
-        effective_hz = min(asked_hz, sum(slow_hz) / len(slow_hz)) if slowed and slow_hz else asked_hz
-        self.tempo = Tempo(asked_hz, round(effective_hz, 2), slowed)
-        if slowed and not was:
-            _log.warning(
-                "live: slowed down to %.2g Hz a stream, %g Hz are configured: the connection may send "
-                "100 messages and 512 KB a second, and recordings go first", effective_hz, asked_hz,
-            )  # fmt: skip
-        elif was and not slowed:
-            _log.info("live: up to %g Hz a stream again", asked_hz)
-
-    def _send(self, slot: _Slot, now: float) -> None:
+    def _send(self, slot: Slot, now: float) -> None:
         values = slot.values
         if values is None or slot.writing or not self._uplink.connected():
             return
@@ -262,11 +179,11 @@ class LiveLane:
         slot.fault_due = now + _FASTEST_S
         slot.writing = True
         slot.payload_bytes = len(payload)
-        topic = _topic(slot, _fault(values), now)
+        topic = _topic(slot, fault_of(values), now)
         self._link.publish(topic, payload, qos=0, done=functools.partial(_written, slot))
 
 
-def _written(slot: _Slot, error: UplinkError | None) -> None:
+def _written(slot: Slot, error: UplinkError | None) -> None:
     # Called in the network's own thread or within `_send`, so without the lock. One message of a stream is
     # being written at a time; the last line allows the next.
     if error is None:
@@ -277,13 +194,7 @@ def _written(slot: _Slot, error: UplinkError | None) -> None:
     slot.writing = False
 
 
-def _fault(values: Mapping[str, Value]) -> Value:
-    """The fault code; None for NaN, which never equals itself."""
-    code = values.get(FAULT_FIELD)
-    return code if code == code else None  # noqa: PLR0124 - False for NaN alone
-
-
-def _topic(slot: _Slot, fault: Value, now: float) -> str:
+def _topic(slot: Slot, fault: Value, now: float) -> str:
     """The topic for the next message of a stream."""
     if now < slot.broker_due and fault == slot.fault:
         return slot.topic

@@ -15,13 +15,12 @@ from concurrent.futures import Future
 from pathlib import Path
 from typing import Any, Callable
 
-from awscrt import io, mqtt5
-from awsiot import mqtt5_client_builder
+from awscrt import mqtt5
 
 from iort_agent.clock import Clock
 from iort_agent.common.state import Connection
-from iort_agent.errors import IdentityError, UplinkError
-from iort_agent.identity.certificate import Certificate, Validity, read_certificate, stamp
+from iort_agent.errors import UplinkError
+from iort_agent.mqtt.client import ClientFactory
 from iort_agent.mqtt.dispatch import Dispatcher
 from iort_agent.mqtt.failures import error_name, explain, said, why_not_connected
 from iort_agent.mqtt.native_thread import keep_state
@@ -35,9 +34,6 @@ _log = logging.getLogger(__name__)
 # A frozen broker is noticed after the keep-alive and the wait for its answer.
 KEEP_ALIVE_S = 30
 PING_TIMEOUT_S = 10
-_ACK_TIMEOUT_S = 20
-# The client's own reconnects come so late that ours are always first.
-_NEVER_MS = 24 * 3600 * 1000
 # How often to check whether certificate, key or root_ca were replaced.
 _LOOK_S = 2.0
 _CLIENT_STOPS_S = 15.0
@@ -68,30 +64,18 @@ class IotCore:
         self._client_id = client_id
         self._clock = clock
         self._dispatcher = dispatcher
-        self._certificate_file = certificate
-        self._files = (certificate, private_key, root_ca)
-        self._build = functools.partial(
-            mqtt5_client_builder.mtls_from_path,
-            str(certificate),
-            str(private_key),
+        self._factory = ClientFactory(
             endpoint=endpoint,
             port=port,
-            ca_filepath=None if root_ca is None else str(root_ca),
             client_id=client_id,
-            keep_alive_interval_sec=keep_alive_s,
-            ping_timeout_ms=round(ping_timeout_s * 1000),
-            ack_timeout_sec=_ACK_TIMEOUT_S,
-            session_behavior=mqtt5.ClientSessionBehaviorType.CLEAN,
-            offline_queue_behavior=mqtt5.ClientOperationQueueBehaviorType.FAIL_ALL_ON_DISCONNECT,
-            retry_jitter_mode=mqtt5.ExponentialBackoffJitterMode.NONE,
-            min_reconnect_delay_ms=_NEVER_MS,
-            max_reconnect_delay_ms=_NEVER_MS,
+            certificate=certificate,
+            private_key=private_key,
+            root_ca=root_ca,
+            keep_alive_s=keep_alive_s,
+            ping_timeout_s=ping_timeout_s,
         )
-        self._bootstrap: Any = None
         self._client: Any = None
         self._generation = 0
-        self._stamp = stamp(*self._files)
-        self._certificate: Certificate | None = None
         self._thread = threading.Thread(target=self._keep_connected, name="uplink", daemon=True)
         self._backoff = backoff or Backoff()
         self._causes = Causes()
@@ -129,14 +113,12 @@ class IotCore:
             self._clock.monotonic() - self._since,
             self._connects,
             self._last_error,
-            self._certificate.id if self._certificate is not None else None,
+            self._factory.certificate_id(),
             self._endpoint,
         )
 
     def start(self) -> None:
         """Connect in the background. Raises `UplinkError` if the certificate or the key cannot be used."""
-        group = io.EventLoopGroup(1)
-        self._bootstrap = io.ClientBootstrap(group, io.DefaultHostResolver(group))
         try:
             self._new_client()
         except Exception as error:
@@ -202,8 +184,8 @@ class IotCore:
                 break
             self._client.start()
             while not self._clock.wait(self._down, _LOOK_S):
-                if self._connected and self._replaced():
-                    _log.info("%s was replaced: connecting with it", self._certificate_file)
+                if self._connected and self._factory.replaced():
+                    _log.info("%s was replaced: connecting with it", self._factory.certificate_file)
                     self._backoff.reset()
                     break
             self._stop_client()
@@ -221,18 +203,13 @@ class IotCore:
         earliest = began + SHORTEST_S
         due = max(earliest, self._clock.monotonic() + self._backoff.next_s(slow=self._slow))
         while not self._stop.is_set():
-            if self._replaced():
+            if self._factory.replaced():
                 due = earliest
                 self._try_new_client()
             left = due - self._clock.monotonic()
             if left <= 0:
                 return
             self._clock.wait(self._stop, min(left, _LOOK_S))
-
-    def _replaced(self) -> bool:
-        """Whether a file has changed since the client was made; False while one is missing."""
-        now = stamp(*self._files)
-        return now != self._stamp and None not in now
 
     def _try_new_client(self) -> None:
         try:
@@ -245,28 +222,19 @@ class IotCore:
             )
 
     def _new_client(self) -> None:
-        """Make a client from the files as they are now."""
-        self._stamp = stamp(*self._files)
         generation = self._generation + 1
 
         def ours(handler: Callable[[Any], None]) -> Callable[[Any], None]:
             # Ignores events of a client that was replaced.
             return lambda data: handler(data) if self._generation == generation else None
 
-        client = self._build(
-            client_bootstrap=self._bootstrap,
+        client = self._factory.make(
             on_publish_received=ours(self._on_publish),
             on_lifecycle_connection_success=ours(self._on_connected),
             on_lifecycle_connection_failure=ours(self._on_refused),
             on_lifecycle_disconnection=ours(self._on_lost),
-            on_lifecycle_stopped=ours(self._on_stopped),
+            on_lifecycle_stopped=ours(lambda _: self._client_stopped.set()),
         )
-        try:
-            self._certificate = read_certificate(self._certificate_file)
-        except IdentityError as error:
-            # The client accepts the file, so the agent connects without knowing its id and validity.
-            _log.warning("%s", error)
-            self._certificate = None
         self._client, self._generation = client, generation
 
     # Called in the client's own thread, which must not wait.
@@ -291,7 +259,7 @@ class IotCore:
             cause = why_not_connected(
                 data,
                 client_id=self._client_id,
-                validity=self._validity,
+                validity=self._factory.validity,
                 now_us=self._clock.now_us(),
                 hung_up=self._causes.hung_up,
             )
@@ -302,12 +270,6 @@ class IotCore:
                 level = logging.ERROR if cause.slow else logging.WARNING
             _log.log(level, "cannot connect to %s as %s: %s", self._endpoint, self._client_id, cause.text)
         self._down.set()
-
-    def _validity(self) -> Validity | None:
-        try:
-            return self._certificate.validity() if self._certificate is not None else None
-        except IdentityError:
-            return None
 
     def _on_lost(self, data: Any) -> None:
         self._subscriptions.lost()
@@ -329,9 +291,6 @@ class IotCore:
             _log.warning("connection to %s lost: %s", self._endpoint, self._last_error)
         self._tell(connected=False)
         self._down.set()
-
-    def _on_stopped(self, _: Any) -> None:
-        self._client_stopped.set()
 
     def _switch(self, *, connected: bool) -> None:
         self._connected = connected

@@ -15,11 +15,12 @@ import random
 import sys
 import threading
 import xmlrpc.client
-from typing import Any, Callable, Mapping, Protocol
+from typing import Any, Mapping
 
 from iort_agent.clock import Clock, SystemClock
 from iort_agent.errors import SourceError
 from iort_agent.ros1 import master
+from iort_agent.ros1.graph import OnBytes
 from iort_agent.ros1.types import Installed, installed, rospy
 from iort_contract.limits import MessageError
 from iort_contract.ros1.definition import Definition, parse
@@ -44,36 +45,8 @@ _LOGGERS = {
     "xmlrpc": logging.ERROR,
 }
 
-# Takes a message: the publisher's connection header, and the message's bytes.
-OnBytes = Callable[[Mapping[str, str], bytes], None]
-
 _lock = threading.Lock()
 _shared: list[Node] = []
-
-
-class Graph(Protocol):
-    """Topics to publish and to hear, in the messages' own bytes; `Node` is the real one. No call blocks."""
-
-    def definition(self, kind: str) -> Definition:
-        """The definition of an installed type. Raises `SourceError` if it is not installed."""
-
-    def advertise(self, topic: str, kind: str) -> None:
-        """Become a publisher of the topic; again has no effect. Raises as `definition`."""
-
-    def publish(self, topic: str, data: bytes) -> bool:
-        """Publish a message on an advertised topic; False if there is no graph to publish in."""
-
-    def subscribe(self, topic: str, handler: OnBytes) -> None:
-        """Receive a topic's messages, of any type, in another thread."""
-
-    def waits(self) -> str | None:
-        """Why the graph cannot be joined, for a person."""
-
-    def start(self) -> None:
-        """Join the graph as soon as it is there."""
-
-    def close(self) -> None:
-        """Leave the graph once the published messages are written."""
 
 
 def shared(name: str = DEFAULT_NODE, clock: Clock | None = None) -> Node:

@@ -40,14 +40,8 @@ def _node_name(value: str) -> str:
 
 @dataclass(frozen=True)
 class TopicConfig(intake.TopicConfig):
-    """How a topic is recorded.
-
-    ``time`` is required: ``header`` is the time of the measurement, by the clock of the computer that
-    measured; ``arrival`` is the time of receipt, by the agent's clock. A message that a latching publisher
-    repeats to a new connection is left out in both cases, and counted as ``latched_again``. ``fields`` are
-    the wanted paths, or their beginnings (``pose.position``); without it, all. ``large: upload`` sends bytes
-    (images, point clouds) as files; otherwise they are left out.
-    """
+    """How a topic is recorded, with ``large: upload`` to send bytes (images, point clouds) as files;
+    otherwise they are left out."""
 
     large: str = setting(choice(REFUSE, UPLOAD), REFUSE)
 

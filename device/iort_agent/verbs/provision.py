@@ -10,51 +10,31 @@ import logging
 import os
 import re
 import time
-from dataclasses import dataclass
 from pathlib import Path, PurePath
-from typing import Any, Callable, Mapping
+from typing import Any, Mapping
 
 import yaml
 
 from iort_agent.common.private_files import write_below
 from iort_agent.config import Config, load_config
-from iort_agent.errors import ConfigError, IdentityError, NotRunningError, RefusedError
+from iort_agent.errors import ConfigError, IdentityError, NotRunningError
 from iort_agent.identity.certificate import parse_certificate
-from iort_agent.identity.claim import Claim, load_claim
-from iort_agent.identity.machine_key import machine_serial, make_key
-from iort_agent.identity.pending import Pending, forget, keep, kept
-from iort_agent.mqtt.exchange import Exchange
+from iort_agent.identity.claim import load_claim
+from iort_agent.identity.pending import forget
 from iort_agent.status.server import ask
+from iort_agent.verbs.registration import SEAMS, Seams, register
 from iort_contract.catalog.vesc import VESC_STREAM
 from iort_contract.limits import ContractError
-from iort_contract.tables import ROBOT_PARAMETER, SERIAL_PARAMETER
 from iort_contract.topics import check_robot
 
 _log = logging.getLogger(__name__)
 
 _SWITCH_S = 60.0
 _LOOK_S = 0.5
-# Waits before each further try to register.
-_AGAIN_S = (1.0, 4.0)
-# How AWS IoT's error codes begin for a token or a certificate that is no longer valid.
-_NO_LONGER = ("Invalid", "ResourceNotFound")
-# The characters that RegisterThing allows in a parameter and a thing in an attribute.
-_SERIAL = re.compile(r"[A-Za-z0-9_.,@/:#-]{1,800}")
 _DEFAULT_SOURCES = [{"type": "sim", "stream": VESC_STREAM, "rate_hz": 50}]
 
 
-@dataclass(frozen=True)
-class Seams:
-    """Replaced by tests: the claim's connection, and waiting."""
-
-    exchange: Callable[[Claim], Exchange] = Exchange
-    wait: Callable[[float], None] = time.sleep
-
-
-_SEAMS = Seams()
-
-
-def provision(file: Path, *, robot: str | None, seams: Seams = _SEAMS) -> Path:
+def provision(file: Path, *, robot: str | None, seams: Seams = SEAMS) -> Path:
     """Exchange a claim for the robot's own certificate. Returns the configuration file, which now names it.
 
     It may be stopped at any time and called again: it continues with the certificate that was issued.
@@ -70,7 +50,7 @@ def provision(file: Path, *, robot: str | None, seams: Seams = _SEAMS) -> Path:
         raise ConfigError(str(error)) from error
     config_file = claim.config or file.parent / "car.yaml"
     folder = config_file.parent
-    issued = _register(claim, name, folder, seams)
+    issued = register(claim, name, folder, seams)
     files = {"certificate": folder / "certificate.pem", "private_key": folder / "private.key"}
     _replace(files["private_key"], issued.private_key)
     _replace(files["certificate"], issued.certificate)
@@ -89,7 +69,7 @@ def provision(file: Path, *, robot: str | None, seams: Seams = _SEAMS) -> Path:
     return config_file
 
 
-def renew(file: Path, claim_file: Path, *, status_socket: Path, seams: Seams = _SEAMS) -> None:
+def renew(file: Path, claim_file: Path, *, status_socket: Path, seams: Seams = SEAMS) -> None:
     """Replace the robot's key and certificate. The old ones are kept until the new ones have connected.
 
     A running agent notices the new ones. Raises `IdentityError` if the cloud refuses, or if the new
@@ -97,7 +77,7 @@ def renew(file: Path, claim_file: Path, *, status_socket: Path, seams: Seams = _
     """
     config = load_config(file)
     folder = config.private_key.parent
-    issued = _register(load_claim(claim_file), config.robot, folder, seams)
+    issued = register(load_claim(claim_file), config.robot, folder, seams)
     files = (config.private_key, config.certificate)
     _replace(config.private_key, issued.private_key)
     _replace(config.certificate, issued.certificate)
@@ -111,91 +91,6 @@ def renew(file: Path, claim_file: Path, *, status_socket: Path, seams: Seams = _
     forget(folder)
     for path in files:
         _previous(path).unlink()
-
-
-def _register(claim: Claim, robot: str, folder: Path, seams: Seams) -> Pending:
-    """A key and its certificate, registered for the robot's thing: those of an earlier run that was stopped,
-    or new ones. `pending` keeps them in the folder until `forget`."""
-    serial = claim.serial or machine_serial()
-    if not _SERIAL.fullmatch(serial):
-        raise IdentityError(f"serial must be of A-Z a-z 0-9 _ . , @ / : # -, got {serial!r}")
-    earlier = kept(folder)
-    if earlier is not None and earlier.is_for(robot, serial, claim.endpoint, claim.namespace):
-        if _finish(claim, earlier, seams):
-            return earlier
-        _log.warning("the certificate of an earlier run is no longer valid: requesting another")
-    key, request = make_key(robot)
-    with seams.exchange(claim) as connection:
-        certificate, token = connection.certify(request)
-        asked_s = time.time()
-        issued = Pending(robot, serial, claim.endpoint, claim.namespace, key, certificate, token, asked_s)
-        keep(folder, issued)
-        _ask(connection, issued, seams)
-    return issued
-
-
-def _finish(claim: Claim, earlier: Pending, seams: Seams) -> bool:
-    """Register an earlier run's certificate; False if it can never be registered.
-
-    Raises `IdentityError` if it may be registered later: whom the hook refuses now, it refuses with any
-    certificate.
-    """
-    expired = not earlier.may_register(time.time())
-    try:
-        # Without a network no certificate connects. So request another one only while the claim connects.
-        with seams.exchange(claim) as connection:
-            if expired:
-                return _is_registered(connection, earlier)
-            _ask(connection, earlier, seams)
-    except IdentityError as error:
-        if _is_no_longer_good(error):
-            return False
-        # The claim may have expired meanwhile.
-        if not _is_registered(seams.exchange(claim), earlier):
-            raise
-    return True
-
-
-def _ask(connection: Exchange, issued: Pending, seams: Seams) -> None:
-    parameters = {ROBOT_PARAMETER: issued.robot, SERIAL_PARAMETER: issued.serial}
-    try:
-        thing = register_again(lambda: connection.register(issued.token, parameters), wait=seams.wait)
-    except IdentityError:
-        # The answer may have been lost. AWS does not document the answer to a used token.
-        if not _is_registered(connection, issued):
-            raise
-        return
-    if thing != issued.robot:
-        raise IdentityError(f"the cloud registered {thing}, not {issued.robot}: its template is not ours")
-
-
-def _is_registered(connection: Exchange, issued: Pending) -> bool:
-    return connection.connects(issued.robot, issued.certificate, issued.private_key)
-
-
-def _is_no_longer_good(error: IdentityError) -> bool:
-    return isinstance(error, RefusedError) and error.code.startswith(_NO_LONGER)
-
-
-def register_again(register: Callable[[], str], *, wait: Callable[[float], None]) -> str:
-    """Register, with a few tries while the token may be valid.
-
-    AWS IoT gives the fleet's hook 5 s. A hook that was too late has given the name to this certificate, and
-    for a while admits no other. Raises the first `IdentityError` if all tries fail.
-    """
-    first: IdentityError | None = None
-    for wait_s in (*_AGAIN_S, None):
-        try:
-            return register()
-        except IdentityError as error:  # noqa: PERF203 - it waits for seconds
-            first = first or error
-            if _is_no_longer_good(error):
-                break
-            if wait_s is not None:
-                _log.warning("%s; trying again in %g s", error, wait_s)
-                wait(wait_s)
-    assert first is not None
-    raise first
 
 
 def _wait_connected(config: Config, certificate_id: str, status_socket: Path) -> None:

@@ -13,8 +13,8 @@ from botocore.exceptions import BotoCoreError, ClientError
 
 from iort_contract.limits import DEFAULT_NAMESPACE
 from iort_station.cli import verbs
+from iort_station.cli.cloud_options import CloudOptions
 from iort_station.cli.console import visible
-from iort_station.cli.where import Where
 from iort_station.cloud import EMBEDDED, EMBEDDED_VARIABLE
 from iort_station.errors import StationError
 
@@ -30,7 +30,7 @@ def _print_version(asked: bool) -> None:  # noqa: FBT001 - typer passes it by po
 
 
 @app.callback()
-def _where(
+def _cloud_options(
     context: typer.Context,
     namespace: Annotated[str, typer.Option(help="The deployment's namespace.")] = DEFAULT_NAMESPACE,
     profile: Annotated[str | None, typer.Option(help="AWS profile.")] = None,
@@ -52,7 +52,7 @@ def _where(
         bool, typer.Option("--version", is_eager=True, callback=_print_version, help="Print the version.")
     ] = False,
 ) -> None:
-    context.obj = Where(namespace, profile, region, local, embedded)
+    context.obj = CloudOptions(namespace, profile, region, local, embedded)
 
 
 def said(error: OSError) -> str:

@@ -11,8 +11,8 @@ import typer
 from typing_extensions import Self
 
 from iort_station.cli.progress import say
-from iort_station.data.times import duration_us, has_zone, time_us
 from iort_station.errors import StationError
+from iort_station.times import duration_us, has_zone, time_us
 
 AsJson = Annotated[bool, typer.Option("--json", help="Print JSON.")]
 DryRun = Annotated[bool, typer.Option("--dry-run", help="Only say what would be done.")]

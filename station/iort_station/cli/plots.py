@@ -17,8 +17,8 @@ from matplotlib.dates import AutoDateLocator, ConciseDateFormatter
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
-from iort_station.data.data import Result
-from iort_station.data.positions import Fields, fixes, local_metres, position_fields
+from iort_station.data import Result
+from iort_station.data.positions import PositionFields, fixes, local_metres, position_fields
 from iort_station.errors import StationError
 
 COLOURS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#000000", "#B8A800")
@@ -137,7 +137,7 @@ def save(figure: Figure, path: Path) -> None:
     figure.savefig(path, dpi=160, facecolor="white")
 
 
-def position_of(result: Result) -> Fields:
+def position_of(result: Result) -> PositionFields:
     """The fields of a robot's position; raises `StationError` if there are none."""
     fields = position_fields([name for name, column in result.columns.items() if column.dtype.kind == "f"])
     if fields is None:

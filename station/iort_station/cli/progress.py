@@ -10,7 +10,7 @@ from contextlib import contextmanager
 from rich.progress import BarColumn, Progress, ProgressColumn, TextColumn
 
 from iort_station.cli.console import errors, visible
-from iort_station.data.reading import Told
+from iort_station.data.batches import PageProgress
 
 # A bar that would be gone sooner is not shown.
 _PATIENCE_S = 1.0
@@ -35,7 +35,7 @@ def bar(title: str, total: float | None, *columns: ProgressColumn) -> Iterator[C
 
 
 @contextmanager
-def reading(title: str, start_us: int | None, end_us: int | None) -> Iterator[Told]:
+def reading(title: str, start_us: int | None, end_us: int | None) -> Iterator[PageProgress]:
     """Show how much of a range has been read, if that takes longer than a second."""
     progress = _progress(TextColumn("{task.fields[items]:,} items"))
     range_us = (start_us, end_us - start_us) if start_us is not None and end_us is not None else None

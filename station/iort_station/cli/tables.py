@@ -13,8 +13,8 @@ from rich.table import Table
 
 from iort_contract.codec.columns import EXACT
 from iort_station.cli.console import visible
-from iort_station.data.conditions import Column, values
-from iort_station.data.data import Result
+from iort_station.data import Result
+from iort_station.data.blocks import Column, values
 from iort_station.data.positions import in_degrees
 
 # A terminal shows the beginning and the end of a long result.

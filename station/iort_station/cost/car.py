@@ -1,7 +1,4 @@
-"""What a robot's car.yaml says of its rates, as far as they make a bill.
-
-Only these keys are read; `iort-agent check` on the robot judges the whole file.
-"""
+"""The rates in a robot's car.yaml that make a bill; `iort-agent check` judges the whole file."""
 
 from __future__ import annotations
 
@@ -17,14 +14,14 @@ import yaml
 from iort_station.cost.usage import Usage
 from iort_station.errors import StationError
 
-# The kinds of source that take samples at a rate of their own; a test holds them to the agent.
+# Sources that take samples at a rate of their own, with its default; a test compares them with the agent's.
 _OWN_RATE_HZ = {"sim": 50.0, "vesc": 50.0}
 
 
 def as_configured(usage: Usage, file: Path) -> Usage:
-    """The usage with the rates of a car.yaml; raises `StationError` for a file that cannot be read.
+    """The usage with the rates of a car.yaml; raises `StationError` for an invalid file.
 
-    The file does not say how fast a ROS topic is or a recording was: their rate stays as in ``usage``.
+    The file does not tell the rates of ROS topics and recordings; these stay as in ``usage``.
     """
     car = _Section(file, "", _content(file))
     rates = [rate for source in car.items("sources") for rate in _rates_hz(source)]
@@ -32,7 +29,7 @@ def as_configured(usage: Usage, file: Path) -> Usage:
     live_hz = live.number("rate_hz", usage.live_hz)
     return replace(
         usage,
-        # The limit is of each stream, and a stream sends no more than its source brings.
+        # The limit applies to each stream, which sends at most what its source delivers.
         live_hz=sum(min(live_hz, rate_hz or math.inf) for rate_hz in rates) if live.enabled() else 0.0,
         batch_s=car.section("record").number("batch_s", usage.batch_s),
         ping_hz=car.section("ping").number("rate_hz", usage.ping_hz),
@@ -43,7 +40,7 @@ def as_configured(usage: Usage, file: Path) -> Usage:
 
 
 def _rates_hz(source: _Section) -> list[float | None]:
-    """The rate of each stream of a source; None where the file does not say it."""
+    """The rate of each stream of a source; None if the file does not tell it."""
     kind = source.values.get("type")
     if kind in _OWN_RATE_HZ:
         return [source.number("rate_hz", _OWN_RATE_HZ[kind])]
@@ -53,13 +50,13 @@ def _rates_hz(source: _Section) -> list[float | None]:
 
 
 class _Section:
-    """A mapping in the file; its errors name the file and the key."""
+    """A mapping in the file; errors name the file and the key."""
 
     def __init__(self, file: Path, name: str, values: Any) -> None:
         self._file, self._name = file, name
-        if values is not None and not isinstance(values, Mapping):
-            raise self._error("", "a mapping", values)
         self.values: Mapping[Any, Any] = values or {}
+        if not isinstance(self.values, Mapping):
+            raise self._error("", "a mapping", values)
 
     def section(self, key: str) -> _Section:
         return _Section(self._file, self._path(key), self.values.get(key))

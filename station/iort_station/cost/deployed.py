@@ -1,9 +1,8 @@
-"""What of a `Usage` a deployment says itself."""
+"""The settings of a deployment that make its bill."""
 
 from __future__ import annotations
 
 import re
-from collections.abc import Mapping
 from dataclasses import replace
 from typing import Any
 
@@ -15,34 +14,39 @@ _INSIGHTS = re.compile(r'SELECT SUM\((?P<metric>\w+)\) FROM "(?P<namespace>[\w/]
 
 
 def as_deployed(usage: Usage, cloud: Cloud) -> Usage:
-    """Memory, concurrency, logs, alarms, dashboards, recovery and key as they are deployed; alarms and
-    dashboards are all of the account, since so are CloudWatch's allowances."""
-    return replace(usage, **_functions(cloud), **_watching(cloud), **_tables(cloud))
+    """The usage with memory, concurrency, logs, alarms, dashboards, recovery and key as deployed.
+
+    Alarms and dashboards are the whole account's, like CloudWatch's free allowances.
+    """
+    return replace(usage, **_functions(cloud), **watching(cloud), **_tables(cloud))
 
 
 def _functions(cloud: Cloud) -> dict[str, Any]:
-    found: dict[str, Any] = {}
     client = cloud.client("lambda")
-    for name, key in (("Live", "live_memory_mb"), ("Summarize", "summarize_memory_mb")):
-        function = cloud.output("processing", f"{name}Function")
-        configured = client.get_function_configuration(FunctionName=function)
-        found[key] = configured["MemorySize"]
-        if name == "Live":
-            reserved = client.get_function_concurrency(FunctionName=function)
-            level = configured.get("LoggingConfig", {}).get("SystemLogLevel")
-            found["function_logs"] = "own" if level == "WARN" else "all"
-            found["live_concurrency"] = reserved.get("ReservedConcurrentExecutions", 0)
-    return found
+    names = [cloud.output("processing", f"{name}Function") for name in ("Live", "Summarize")]
+    live, summarize = (client.get_function_configuration(FunctionName=name) for name in names)
+    reserved = client.get_function_concurrency(FunctionName=names[0])
+    level = live.get("LoggingConfig", {}).get("SystemLogLevel")
+    return {
+        "live_memory_mb": live["MemorySize"],
+        "summarize_memory_mb": summarize["MemorySize"],
+        "function_logs": "own" if level == "WARN" else "all",
+        "live_concurrency": reserved.get("ReservedConcurrentExecutions", 0),
+    }
 
 
-def _watching(cloud: Cloud) -> dict[str, Any]:
+def watching(cloud: Cloud) -> dict[str, Any]:
+    """The alarms and dashboards."""
     client = cloud.client("cloudwatch")
     pages = client.get_paginator("describe_alarms").paginate()
     alarms = [alarm for page in pages for alarm in page.get("MetricAlarms", [])]
-    queries = [query for alarm in alarms if (query := _insights(alarm))]
-    names = cloudwatch.dashboards(cloud)
-    # Ours, the robots' last, where `at_rest` counts what its searches find.
-    names.sort(key=lambda name: name == f"{cloud.namespace}-robots")
+    matches = (
+        [_INSIGHTS.match(query.get("Expression", "")) for query in alarm.get("Metrics", [])]
+        for alarm in alarms
+    )
+    queries = [query for query in (next(filter(None, found), None) for found in matches) if query]
+    # The robots' dashboard comes last, where `dashboard_metrics` counts what its searches find.
+    names = sorted(cloudwatch.dashboards(cloud), key=lambda name: name == f"{cloud.namespace}-robots")
     counted = [cloudwatch.count(cloudwatch.body_of(cloud, name)) for name in names]
     return {
         "alarms": len(alarms) - len(queries),
@@ -52,19 +56,8 @@ def _watching(cloud: Cloud) -> dict[str, Any]:
     }
 
 
-def _insights(alarm: Mapping[str, Any]) -> re.Match[str] | None:
-    return next(
-        (
-            found
-            for query in alarm.get("Metrics", [])
-            if (found := _INSIGHTS.match(query.get("Expression", "")))
-        ),
-        None,
-    )
-
-
 def _metrics(client: Any, query: re.Match[str]) -> int:
-    """How many metrics there are that a query analyses."""
+    """The number of metrics that a query analyses."""
     pages = client.get_paginator("list_metrics").paginate(
         Namespace=query["namespace"], MetricName=query["metric"], RecentlyActive="PT3H"
     )

@@ -1,7 +1,7 @@
-"""What a fleet costs: every unit that is billed, from the configuration, times its list price. Pure.
+"""The cost model: each billed unit of a fleet times its list price. Pure.
 
-A `Usage` says how robots are driven, `bill` what that comes to item by item, and `thesis_bill` what the
-same driving cost in the layout that the project began from: a message, two items and a push a sample.
+`bill` computes the line items for a `Usage`. `thesis_bill` computes them for the same driving in the layout
+of the thesis that this project started from: each sample is one message, two items and one push.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ from iort_station.cost.line_items import (
     PUBNUB_UNIT,
     READ,
     WRITE,
-    Item,
+    LineItem,
     function,
     priced,
     rules,
@@ -26,33 +26,34 @@ from iort_station.cost.prices import PRICES, PUBNUB_MAU_PLANS, Price
 from iort_station.cost.sizes import OWN_ITEM_BYTES, Sizes, sizes_of
 from iort_station.cost.usage import Usage
 
-# A shard of a stream is a partition of the table. Lambda 2 is called once a window, or by as many records;
-# a test holds both to the stack. The thesis had no window: Lambda polls a shard four times a second.
+# A shard of a stream is a partition of the table. Lambda 2 is invoked once a window, or once these records
+# are there; a test compares both with the stack. The thesis had no window: Lambda polls a shard 4 times a
+# second.
 _PARTITION_WRITES = 1000.0
 WINDOW_S, RECORDS_A_CALL = 2.0, 500
 _THESIS_POLLS_PER_S, _THESIS_RECORDS_A_CALL = 4.0, 100
-# What functions log in bytes, in embedded metric format; a test holds these to functions/. Lambda 1 gathers
-# what it counts: a line an environment in `_GATHER_S`, or sooner with a hundred values of one metric; four a
-# message.
+# Bytes that the functions log in embedded metric format; a test compares them with functions/. Lambda 1
+# gathers its metrics: each environment logs a line in `_GATHER_S`, or sooner with a hundred values of one
+# metric; it has four values a message.
 _GATHER_S, _MOST_VALUES, _LIVE_LINE, _LIVE_VALUES = 10.0, 100.0, 480, 24
-# Lambda 2 writes one about itself, and one about each stream that it was given.
+# Lambda 2 logs one line about itself, and one about each stream of its event.
 _SUMMARIZE_LINE, _HEALTH_LINE, _PONG_LINE, _PRESENCE_LINE = 310, 300, 220, 230
-# A robot subscribes, a filter a packet, to its shadow's four answers, its pings' three and a command. Once
-# connected it fetches the shadow, of less than 1 KB: a question, and an answer that it acknowledges.
+# A robot subscribes, with one filter a packet, to four answers of its shadow, three of its pings, and
+# commands. Then it fetches its shadow of less than 1 KB: a request, and an answer that it acknowledges.
 SUBSCRIPTIONS = 8
 _SHADOW_MESSAGES = 3
 # `iort send` publishes, the robot receives and acknowledges.
 _COMMAND_MESSAGES = 3
-# The broker says of a connection when it began and when it ended.
+# The broker publishes when a connection begins and when it ends.
 _PRESENCE_EVENTS, _PRESENCE_MB, _PRESENCE_MS = 2, 256, 20.0
 
 
-def bill(usage: Usage, prices: Mapping[str, Price] = PRICES) -> list[Item]:
-    """What AWS bills a robot-hour, item by item; PubNub apart (`pubnub_bill`)."""
+def bill(usage: Usage, prices: Mapping[str, Price] = PRICES) -> list[LineItem]:
+    """AWS' line items for a robot-hour; PubNub's are in `pubnub_bill`."""
     return priced(_bill(usage), prices)
 
 
-def _bill(usage: Usage) -> list[Item]:
+def _bill(usage: Usage) -> list[LineItem]:
     usage.check()
     sizes = sizes_of(usage.rate_hz, usage.batch_s)
     hour = 3600.0
@@ -63,37 +64,41 @@ def _bill(usage: Usage) -> list[Item]:
     items += rules("agent, rtt", own, own_item)
     live = usage.live_hz * hour
     items += rules("live", live, sizes.live)
-    # Some pass the broker, where two more rules look at them.
+    # Some pass the broker, which evaluates two more rules for each.
     passing = usage.live_at_broker_per_s * hour * units(sizes.live, METER)
     items += [
-        Item("IoT Core", "live", "messages", "message", passing),
-        Item("IoT Core", "live", "rules fault and battery", "rule", 2 * passing),
-        Item("IoT Core", "live", "their actions, or the least billed", "action", 2 * passing),
+        LineItem("IoT Core", "live", "messages", "message", passing),
+        LineItem("IoT Core", "live", "rules fault and battery", "rule", 2 * passing),
+        LineItem("IoT Core", "live", "their actions, at least one billed", "action", 2 * passing),
     ]
     clock = usage.clock_pings_per_s * hour
     commands = usage.command_hz * hour
     items += [
-        Item("IoT Core", "commands", "sent, received, acknowledged", "message", _COMMAND_MESSAGES * commands),
-        Item("IoT Core", "ping", "the clock's pings and pongs", "message", 2 * clock),
-        Item("IoT Core", "ping", "the clock's rule", "rule", clock),
-        Item("IoT Core", "ping", "its action", "action", clock),
+        LineItem(
+            "IoT Core", "commands", "sent, received, acknowledged", "message", _COMMAND_MESSAGES * commands
+        ),
+        LineItem("IoT Core", "ping", "clock pings and pongs", "message", 2 * clock),
+        LineItem("IoT Core", "ping", "clock ping rule", "rule", clock),
+        LineItem("IoT Core", "ping", "action", "action", clock),
     ]
     items += _ping_items(usage.ping_hz * hour, sizes, all_lines=usage.function_logs == "all")
     writes = batches * units(sizes.telemetry_item, WRITE)
-    # Of one stream in an event: its batches, of which one query reads also the second before.
+    # The batches of one stream in an event; one query reads them and those of the second before.
     of_stream = usage.stream_batches_per_s
     found = max(1.0, of_stream * _shards_of(usage) / summarize_calls_per_s(usage))
     read = found + max(1.0, of_stream)
     reads = batches / found * units(ceil(read) * sizes.telemetry_item, READ)
-    # A batch lies in one second; a second whose batches come in two events is written twice.
+    # A second whose batches arrive in two events is written twice.
     writes_s = batches * min(1.0, 1 / of_stream + (of_stream > 1) / found)
     items += [
-        Item("DynamoDB", "record", "telemetry written", "write", writes),
-        Item("DynamoDB", "agent, rtt", "telemetry written", "write", own * units(own_item, WRITE)),
-        Item("DynamoDB", "record", "summary written", "write", writes_s * units(sizes.summary_item, WRITE)),
-        Item("DynamoDB", "agent, rtt", "summary written", "write", own),
-        Item("DynamoDB", "record", "batches read by Lambda 2", "read", reads),
-        Item("DynamoDB", "agent, rtt", "batches read by Lambda 2", "read", own),
+        LineItem("DynamoDB", "record", "telemetry written", "write", writes),
+        LineItem("DynamoDB", "agent, rtt", "telemetry written", "write", own * units(own_item, WRITE)),
+        LineItem(
+            "DynamoDB", "record", "summary written", "write", writes_s * units(sizes.summary_item, WRITE)
+        ),
+        LineItem("DynamoDB", "agent, rtt", "summary written", "write", own),
+        LineItem("DynamoDB", "record", "batches read by Lambda 2", "read", reads),
+        LineItem("DynamoDB", "agent, rtt", "batches read by Lambda 2", "read", own),
     ]
     seconds = min(batches, usage.streams * hour)
     kept = [
@@ -127,11 +132,13 @@ def _bill(usage: Usage) -> list[Item]:
     return items
 
 
-def thesis_bill(usage: Usage, prices: Mapping[str, Price] = PRICES) -> list[Item]:
-    """The same driving in the thesis' layout: each sample a message through the broker, which triggers
-    two rules, one item in each of two tables, and one invocation of Lambda 1; functions of 128 MB on
-    x86. Prices, retention and the milliseconds of an invocation are the same as ours; there are no pings,
-    no figures of the agent's own, no alarms and no metrics."""
+def thesis_bill(usage: Usage, prices: Mapping[str, Price] = PRICES) -> list[LineItem]:
+    """AWS' line items for the same driving in the thesis' layout.
+
+    Each sample is a message through the broker, triggers two rules, is stored in two tables, and invokes
+    Lambda 1. Functions have 128 MB on x86. Prices, retention and billed milliseconds are the same as ours.
+    The layout has no pings, no metrics of the agent, and no alarms.
+    """
     usage.check()
     sizes = sizes_of(usage.rate_hz, usage.batch_s)
     samples = usage.samples_per_s * 3600
@@ -143,15 +150,15 @@ def thesis_bill(usage: Usage, prices: Mapping[str, Price] = PRICES) -> list[Item
     live = function("live", "Lambda 1", samples, billed_ms=usage.live_ms, **functions)
     second = function("record", "Lambda 2", calls, billed_ms=usage.summarize_ms, **functions)
     items = [
-        Item("IoT Core", "connection", "minutes", "connection", 60),
-        Item("IoT Core", "connection", "CONNECT", "message", usage.connects_per_hour),
-        Item("IoT Core", "record", "messages", "message", samples * units(sizes.sample, METER)),
-        Item("IoT Core", "record", "rule to the table", "rule", samples),
-        Item("IoT Core", "record", "its action", "action", samples),
-        Item("IoT Core", "live", "rule to Lambda 1", "rule", samples),
-        Item("IoT Core", "live", "its action", "action", samples),
-        Item("DynamoDB", "record", "first table written", "write", written),
-        Item("DynamoDB", "record", "second table written", "write", written),
+        LineItem("IoT Core", "connection", "minutes", "connection", 60),
+        LineItem("IoT Core", "connection", "CONNECT", "message", usage.connects_per_hour),
+        LineItem("IoT Core", "record", "messages", "message", samples * units(sizes.sample, METER)),
+        LineItem("IoT Core", "record", "rule to the table", "rule", samples),
+        LineItem("IoT Core", "record", "action", "action", samples),
+        LineItem("IoT Core", "live", "rule to Lambda 1", "rule", samples),
+        LineItem("IoT Core", "live", "action", "action", samples),
+        LineItem("DynamoDB", "record", "first table written", "write", written),
+        LineItem("DynamoDB", "record", "second table written", "write", written),
         storage("record", "both tables kept", 2 * samples, sizes.sample_item, usage),
         *second,
         *live,
@@ -159,27 +166,30 @@ def thesis_bill(usage: Usage, prices: Mapping[str, Price] = PRICES) -> list[Item
     return priced(items, prices)
 
 
-def pubnub_bill(usage: Usage, prices: Mapping[str, Price] = PRICES, *, thesis: bool = False) -> list[Item]:
-    """What PubNub bills a robot-hour on its plan by transactions: a publish each, a receipt a viewer."""
+def pubnub_bill(
+    usage: Usage, prices: Mapping[str, Price] = PRICES, *, thesis: bool = False
+) -> list[LineItem]:
+    """PubNub's line items for a robot-hour on its plan by transactions."""
     usage.check()
     size = sizes_of(usage.rate_hz, usage.batch_s).update
     messages = (usage.samples_per_s if thesis else usage.live_hz) * 3600 * units(size, PUBNUB_UNIT)
     items = [
-        Item("PubNub", "live", "published", "pubnub_publish", messages),
-        Item("PubNub", "live", "received by viewers", "pubnub_receive", messages * usage.viewers),
+        LineItem("PubNub", "live", "published", "pubnub_publish", messages),
+        LineItem("PubNub", "live", "received by viewers", "pubnub_receive", messages * usage.viewers),
     ]
     return priced(items, prices)
 
 
 def pubnub_mau_dollars_per_month(usage: Usage) -> float | None:
-    """PubNub's plan by monthly active users: the viewers and Lambda 1; None above the listed plans."""
+    """The price of PubNub's plan by monthly active users (viewers and Lambda 1); None above the listed
+    plans."""
     users = usage.viewers + 1
     return next((dollars for most, dollars in PUBNUB_MAU_PLANS if users <= most), None)
 
 
 def summarize_calls_per_s(usage: Usage) -> float:
-    """Invocations of Lambda 2 a second, of the whole fleet: one a window and shard, or as many as events
-    of five hundred records need."""
+    """Invocations of Lambda 2 a second for the whole fleet: one per window and shard, or one per 500 records
+    if that is more."""
     records = usage.robots * (usage.batches_per_s + usage.own_batches_per_s)
     return min(records, max(_shards_of(usage) / WINDOW_S, records / RECORDS_A_CALL))
 
@@ -190,7 +200,7 @@ def _shards_of(usage: Usage) -> float:
 
 
 def _live_lines_per_s(usage: Usage) -> float:
-    """Of the whole fleet: each environment of Lambda 1 gathers what it counts."""
+    """Log lines a second of the whole fleet: each environment of Lambda 1 gathers its metrics."""
     messages = usage.robots * usage.live_hz
     environments = max(1, ceil(messages * usage.live_ms / 1000))
     return min(messages, max(environments / _GATHER_S, messages / _MOST_VALUES))
@@ -200,22 +210,24 @@ def _shards(writes_per_s: float) -> int:
     return max(1, ceil(writes_per_s / _PARTITION_WRITES))
 
 
-def _connecting(usage: Usage) -> list[Item]:
-    """The connection, and what each time takes that it is made: AWS meters CONNECT, SUBSCRIBE and a device's
-    PUBACK as messages, and not what the broker answers nor keep-alives."""
+def _connecting(usage: Usage) -> list[LineItem]:
+    """The connection's minutes, and the messages of each connect.
+
+    AWS meters CONNECT, SUBSCRIBE and a device's PUBACK, but neither the broker's answers nor keep-alives.
+    """
     lane, connects = "connection", usage.connects_per_hour
     events = _PRESENCE_EVENTS * connects
     return [
-        Item("IoT Core", lane, "minutes", "connection", 60),
-        Item("IoT Core", lane, "CONNECT and SUBSCRIBE", "message", connects * (1 + SUBSCRIPTIONS)),
-        Item(
+        LineItem("IoT Core", lane, "minutes", "connection", 60),
+        LineItem("IoT Core", lane, "CONNECT and SUBSCRIBE", "message", connects * (1 + SUBSCRIPTIONS)),
+        LineItem(
             "IoT Core",
             lane,
-            "the shadow's question, answer and PUBACK",
+            "shadow request, answer and PUBACK",
             "message",
             connects * _SHADOW_MESSAGES,
         ),
-        Item("IoT Core", lane, "the shadow read", "shadow", connects),
+        LineItem("IoT Core", lane, "the shadow read", "shadow", connects),
         *rules(lane, events, 0),
         *function(
             lane,
@@ -226,18 +238,18 @@ def _connecting(usage: Usage) -> list[Item]:
             logged=events * _PRESENCE_LINE,
             all_lines=usage.function_logs == "all",
         ),
-        Item("DynamoDB", lane, "robot's row written", "write", events),
+        LineItem("DynamoDB", lane, "robot's row written", "write", events),
     ]
 
 
-def _ping_items(pings: float, sizes: Sizes, *, all_lines: bool) -> list[Item]:
-    """Of each path: the ping in and the pong out; two of three pass a rule, one a function."""
+def _ping_items(pings: float, sizes: Sizes, *, all_lines: bool) -> list[LineItem]:
+    """Ping and pong on each path; two of the three paths pass a rule, and one passes a function."""
     if not pings:
         return []
     return [
-        Item("IoT Core", "ping", "pings and pongs", "message", 6 * pings * units(sizes.ping, METER)),
-        Item("IoT Core", "ping", "rules triggered", "rule", 2 * pings),
-        Item("IoT Core", "ping", "actions", "action", 2 * pings),
+        LineItem("IoT Core", "ping", "pings and pongs", "message", 6 * pings * units(sizes.ping, METER)),
+        LineItem("IoT Core", "ping", "rules triggered", "rule", 2 * pings),
+        LineItem("IoT Core", "ping", "actions", "action", 2 * pings),
         *function(
             "ping",
             "echo",

@@ -1,9 +1,8 @@
-"""AWS' own price list, read with the operator's credentials, and kept with the day it was read on.
+"""AWS' own price list: read with the operator's credentials, and kept in a file with its date.
 
-`GetProducts` answers with products as JSON texts: attributes, among them the usage type as a bill names it,
-and under ``terms`` the price of each tier. What is asked for, of `PRICES`, is in `PRODUCTS`. Sources: the
-service's API reference, and for CloudWatch's usage types "Analyzing, optimizing, and reducing CloudWatch
-costs".
+`GetProducts` returns products as JSON texts, with the usage type of a bill in their attributes and the price
+of each tier under ``terms``. `PRODUCTS` names the product of each entry in `PRICES`. Sources: the service's
+API reference, and "Analyzing, optimizing, and reducing CloudWatch costs" for CloudWatch's usage types.
 """
 
 from __future__ import annotations
@@ -21,18 +20,21 @@ from botocore.exceptions import ClientError
 from iort_station.cost.prices import PRICES, Price
 from iort_station.errors import StationError
 
-# The API's own region; what it tells is of all.
+# The region of the API, which knows all regions' prices.
 API_REGION = "us-east-1"
-# Nothing of these is in the price list under that name.
+# The price list has no such service.
 _NONE = frozenset({"NotFoundException", "InvalidParameterException"})
-# A price so many times ours, or so little, is of another unit.
+# A price that differs from ours by this factor has another unit.
 _MOST_TIMES = 10.0
 _SHOWN = 12
 
 
 class Product(NamedTuple):
-    """Where a price is: the service's code, and its usage type after the region's letters as a pattern, or
-    what the price's description says. ``everywhere``: of no region."""
+    """A product: its service code, and a pattern of its usage type without the region's prefix.
+
+    ``said`` is a pattern of the price's description, which may match instead. ``everywhere`` means that the
+    product belongs to no region.
+    """
 
     service: str
     usage: str
@@ -40,7 +42,7 @@ class Product(NamedTuple):
     everywhere: bool = False
 
 
-# What `said` stands beside is not in AWS' documentation, and assumed.
+# AWS does not document the usage types beside a `said`; they are assumed.
 PRODUCTS = {
     "connection": Product("AWSIoT", "ConnectionMinutes"),
     "message": Product("AWSIoT", "Messages"),
@@ -68,8 +70,8 @@ PRODUCTS = {
 
 
 class Listed(NamedTuple):
-    """What the price list said on a day: dollars for one unit by the names of `PRICES`, and why the
-    built-in price of a product is kept."""
+    """The price list of one day: dollars per unit by the names of `PRICES`; and the reasons why built-in
+    prices were kept."""
 
     read_on: str
     region: str
@@ -77,7 +79,7 @@ class Listed(NamedTuple):
     kept: dict[str, str]
 
     def prices(self) -> dict[str, Price]:
-        """The built-in prices with what was read instead."""
+        """The built-in prices, updated with those that were read."""
         listed = {
             name: PRICES[name]._replace(usd=each * PRICES[name].per, seen=f"AWS' price list, {self.read_on}")
             for name, each in self.each.items()
@@ -85,21 +87,19 @@ class Listed(NamedTuple):
         return {**PRICES, **listed}
 
     def changed(self) -> dict[str, tuple[float, float]]:
-        """The built-in price and the one that was read, in dollars for ``per`` units, where they differ."""
+        """The built-in and the read price where they differ, in dollars for ``per`` units."""
         both = {name: (PRICES[name].usd, each * PRICES[name].per) for name, each in self.each.items()}
         return {name: (ours, aws) for name, (ours, aws) in both.items() if abs(aws - ours) > 1e-6 * ours}
 
 
 def read(pricing: Any, region: str, today: date) -> Listed:
-    """What AWS' price list says, by a client of it.
-
-    Raises `StationError` where it may not be read, or knows nothing that we ask for.
-    """
+    """Read AWS' price list; raises `StationError` if that is not permitted, or the list has no product of
+    ours."""
     each: dict[str, float] = {}
     kept: dict[str, str] = {}
     products: dict[tuple[str, str | None], list[Mapping[str, Any]]] = {}
     for name, product in PRODUCTS.items():
-        # What is of no region is one product among those of all, so it is asked for by itself.
+        # A product without a region is requested by itself.
         usage = product.usage if product.everywhere else None
         key = product.service, usage
         if key not in products:
@@ -108,11 +108,11 @@ def read(pricing: Any, region: str, today: date) -> Listed:
         found = [one for one in products[key] if _is(one, product, region)]
         paid = sorted({price for one in found if (price := _first_paid(one))})
         if not found:
-            kept[name] = f"{product.service} has no {product.usage} in {region}{_there_are(products[key])}"
+            kept[name] = f"{product.service} has no {product.usage} in {region}{_known(products[key])}"
         elif len(paid) != 1:
             kept[name] = f"{product.service}, {product.usage}: expected one price, got {len(paid)}"
         elif not 1 / _MOST_TIMES < paid[0] / PRICES[name].each < _MOST_TIMES:
-            kept[name] = f"{product.service}, {product.usage}: ${paid[0]:g} is of another unit than ours"
+            kept[name] = f"{product.service}, {product.usage}: ${paid[0]:g} has another unit than ours"
         else:
             each[name] = paid[0]
     if all(PRODUCTS[name].everywhere for name in each):
@@ -139,7 +139,7 @@ def _products(pricing: Any, service: str, field: str, value: str) -> Iterator[Ma
 
 
 def _is(found: Mapping[str, Any], product: Product, region: str) -> bool:
-    # "EU-", "EUW1-", in us-east-1 often nothing, of KMS the region's own name.
+    # "EU-" or "EUW1-"; often nothing in us-east-1; the region's name for KMS.
     prefix = f"(?:EU-|[A-Z]{{3}}[0-9]-|{re.escape(region)}-)?"
     usage = str(found["product"]["attributes"].get("usagetype", ""))
     if re.fullmatch(prefix + product.usage, usage):
@@ -154,27 +154,27 @@ def _tiers(found: Mapping[str, Any]) -> Iterator[Mapping[str, Any]]:
 
 
 def _first_paid(found: Mapping[str, Any]) -> float | None:
-    """The price of the first tier that is not free, as everywhere in `PRICES`."""
+    """The price of the first tier that is not free, as in `PRICES`."""
     tiers = sorted(
         (float(tier["beginRange"]), float(tier["pricePerUnit"].get("USD", 0))) for tier in _tiers(found)
     )
     return next((dollars for _, dollars in tiers if dollars > 0), None)
 
 
-def _there_are(products: list[Mapping[str, Any]]) -> str:
+def _known(products: list[Mapping[str, Any]]) -> str:
     names = sorted({str(one["product"]["attributes"].get("usagetype", "")) for one in products})
     more = ", ..." if len(names) > _SHOWN else ""
     return f"; it has {', '.join(names[:_SHOWN])}{more}" if names else ""
 
 
 def kept_at(environment: Mapping[str, str]) -> Path:
-    """The file that `iort cost --refresh` keeps the prices in, by the environment."""
+    """The file in which `iort cost --refresh` keeps the prices."""
     home = environment.get("XDG_CACHE_HOME") or Path(environment.get("HOME", "~")).expanduser() / ".cache"
     return Path(home) / "iort" / "prices.json"
 
 
 def keep(listed: Listed, path: Path) -> None:
-    """Write what `load` reads."""
+    """Write the file that `load` reads."""
     path.parent.mkdir(parents=True, exist_ok=True)
     new = path.with_suffix(".new")
     new.write_text(json.dumps(listed._asdict(), indent=1) + "\n")
@@ -182,7 +182,7 @@ def keep(listed: Listed, path: Path) -> None:
 
 
 def load(path: Path) -> Listed | None:
-    """What was kept; None where nothing was. Raises `StationError` for a file that is none of ours."""
+    """The kept prices; None if there are none. Raises `StationError` for an invalid file."""
     try:
         found = json.loads(path.read_text())
         each = {name: _price(name, value) for name, value in found["each"].items()}
@@ -192,12 +192,12 @@ def load(path: Path) -> Listed | None:
         return None
     except (AttributeError, KeyError, TypeError, ValueError) as error:
         raise StationError(
-            f"{path} is no price list that `iort cost --refresh` wrote ({error}): refresh it, or delete it"
+            f"{path} must be a price list of `iort cost --refresh` ({error}): refresh or delete it"
         ) from error
 
 
 def _price(name: str, value: Any) -> float:
     dollars = float(value)
     if name not in PRODUCTS or not 0 < dollars < math.inf:
-        raise ValueError(f"{name[:40]} {dollars}: not one of our prices")
+        raise ValueError(f"{name[:40]} {dollars} is not one of our prices")
     return dollars

@@ -1,8 +1,7 @@
-"""List prices and default quotas, with the date they are of: the one table that the cost model reads.
+"""List prices and default quotas with their date, as the cost model reads them.
 
-They are public list prices in US dollars for `REGION`, without tax, free tier, volume tiers or
-anybody's discount, copied by hand from the pages named below. A bill is made from AWS' page, not from
-this one: `iort cost --refresh` reads AWS' own list (station/iort_station/cost/price_list.py).
+They are public list prices in US dollars for `REGION`, without tax, free tier, volume tiers and discounts,
+copied by hand from the pages below. `iort cost --refresh` reads AWS' own list instead (price_list.py).
 """
 
 from __future__ import annotations
@@ -16,10 +15,10 @@ MONTH_DAYS = MONTH_HOURS / 24
 
 
 class Price(NamedTuple):
-    """``usd`` for every ``per`` of ``unit``, on the pricing page ``page``.
+    """``usd`` for ``per`` of ``unit``, from the pricing page ``page``.
 
-    ``seen`` is where the number was found again after `AS_OF`, and of when; "" says that it was not: the
-    pages show most prices of a region by a script, which no stored copy of them holds.
+    ``seen`` names a second source of the number after `AS_OF`, with its date. It is empty for most prices,
+    since the pages load a region's prices by a script.
     """
 
     usd: float
@@ -30,7 +29,7 @@ class Price(NamedTuple):
 
     @property
     def each(self) -> float:
-        """Dollars for one of the unit."""
+        """Dollars for one unit."""
         return self.usd / self.per
 
 
@@ -65,7 +64,7 @@ PRICES = {
     "compute_x86": Price(0.0000166667, 1, "GB-second, x86", _LAMBDA, _ARTILLERY),
     "logs": Price(0.57, 1, "GB of log lines", _CLOUDWATCH),
     "metric": Price(0.30, 1, "metric a month", _CLOUDWATCH, "signoz.io, 2026-02-15"),
-    "metric_request": Price(0.01, 1000, "metric asked for by GetMetricData", _CLOUDWATCH),
+    "metric_request": Price(0.01, 1000, "metric requested by GetMetricData", _CLOUDWATCH),
     "alarm": Price(0.10, 1, "alarm a month", _CLOUDWATCH),
     "insights_alarm": Price(0.10, 1, "metric a month that a Metrics Insights alarm analyses", _CLOUDWATCH),
     "dashboard": Price(3.00, 1, "dashboard a month", _CLOUDWATCH, "factualminds.com, 2026-06-13"),
@@ -76,17 +75,16 @@ PRICES = {
     "pubnub_receive": Price(0.000033, 1, "edge transaction, up to 2 KB", _PUBNUB, _PAGE),
 }
 
-# PubNub's other kind of plan, by monthly active users: (users up to, dollars a month). Who connects is
-# a user: each viewer, and Lambda 1 as one; robots never connect to PubNub. Fair use bounds the messages,
-# and the free plan is for development only. Source: https://www.pubnub.com/pricing/, not found again since
-# AS_OF.
+# PubNub's plans by monthly active users: (users up to, dollars a month). Each viewer is a user, and Lambda 1
+# is one; robots do not connect to PubNub. Fair use limits the messages, and the free plan is for development
+# only. Source: https://www.pubnub.com/pricing/, without a second source since AS_OF.
 PUBNUB_MAU_PLANS = ((1_000, 98.0), (5_000, 370.0), (10_000, 550.0), (25_000, 1_130.0))
 
 
 class Quota(NamedTuple):
-    """A default quota of an account in `REGION`; ``adjustable`` ones grow on request.
+    """A default quota of an account in `REGION`; AWS raises ``adjustable`` ones on request.
 
-    ``seen`` as in `Price`. A new account may have less, of Lambda's executions for one.
+    ``seen`` is as in `Price`. A new account may have lower quotas, such as of Lambda's executions.
     """
 
     value: float
@@ -106,7 +104,7 @@ _SCALING = "docs.aws.amazon.com/lambda/latest/dg/services-sqs-scaling.html, unda
 QUOTAS = {
     "IoT Core: connections": Quota(500_000, "connections", True, _IOT_QUOTAS, _RAINMAKER),
     # The lower of two: AWS' pages of 2019 to 2023 say 500 a second, later ones 3,000 in most regions. Service
-    # Quotas tells an account's own.
+    # Quotas shows an account's own.
     "IoT Core: connects in a minute after an outage": Quota(
         500 * 60, "connects", True, _IOT_QUOTAS, "the page in two copies, undated: 500 and 3,000 a second"
     ),

@@ -1,4 +1,4 @@
-"""The cost model's tables, as rows of text: the command prints them, the README and the bench keep them."""
+"""The cost model's tables as rows of text, for the command, the README and the bench."""
 
 from __future__ import annotations
 
@@ -12,19 +12,19 @@ from iort_station.cost.prices import AS_OF, PRICES, REGION, Price
 from iort_station.cost.scale import Scale
 from iort_station.cost.usage import Usage, variations
 
-# A line of the robot-hour's table begins here, as its numbers do; what is below is in the totals alone.
+# The table of a robot-hour has no rows below this; the totals include them.
 _LEAST_DOLLARS = 0.00005
 
 
 class Rows(NamedTuple):
-    """A table: its column names and its lines."""
+    """A table: its column names and its rows."""
 
     head: tuple[str, ...]
     body: list[tuple[str, ...]]
 
 
 def robot_hour(usage: Usage, prices: Mapping[str, Price] = PRICES) -> Rows:
-    """Dollars a robot-hour by service and lane, thesis' layout beside ours, PubNub apart."""
+    """Dollars per robot-hour by service and lane, in the thesis' layout and in ours."""
     ours, thesis = model.bill(usage, prices), model.thesis_bill(usage, prices)
     pubnub = model.pubnub_bill(usage, prices), model.pubnub_bill(usage, prices, thesis=True)
     body: list[tuple[str, ...]] = []
@@ -42,14 +42,14 @@ def robot_hour(usage: Usage, prices: Mapping[str, Price] = PRICES) -> Rows:
     whole = line_items.total(thesis), line_items.total(ours)
     body.append(("total AWS", _dollars(whole[0]), _dollars(whole[1]), f"1/{whole[0] / whole[1]:.1f}"))
     unlogged = [sum(i.dollars for i in items if i.price != "logs") for items in (thesis, ours)]
-    body.append(("of it without log lines", *map(_dollars, unlogged), _ratio((unlogged[0], unlogged[1]))))
+    body.append(("total AWS without log lines", *map(_dollars, unlogged), _ratio((unlogged[0], unlogged[1]))))
     both = line_items.total(pubnub[1]), line_items.total(pubnub[0])
     body.append(("PubNub, plan by transactions", _dollars(both[0]), _dollars(both[1]), _ratio(both)))
     return Rows(("dollars a robot-hour", "a message a sample", "iort", "ratio"), body)
 
 
 def month(usage: Usage, prices: Mapping[str, Price] = PRICES) -> Rows:
-    """Dollars a month for the fleet, and what a deployment costs whoever drives."""
+    """Dollars per month for the fleet, and for the deployment itself."""
     aws = line_items.dollars_per_month(model.bill(usage, prices), usage)
     thesis = line_items.dollars_per_month(model.thesis_bill(usage, prices), usage)
     transactions = line_items.dollars_per_month(model.pubnub_bill(usage, prices), usage)
@@ -68,7 +68,7 @@ def month(usage: Usage, prices: Mapping[str, Price] = PRICES) -> Rows:
 
 
 def differences(listed: Listed) -> Rows:
-    """What AWS' price list says otherwise than the built-in prices."""
+    """The differences between AWS' price list and the built-in prices."""
     body: list[tuple[str, ...]] = [
         (f"{name}: {PRICES[name].per:,.0f} x {PRICES[name].unit}", f"{ours:g}", f"{aws:g}")
         for name, (ours, aws) in listed.changed().items()
@@ -79,7 +79,7 @@ def differences(listed: Listed) -> Rows:
 
 
 def what_if(usage: Usage, prices: Mapping[str, Price] = PRICES) -> Rows:
-    """One setting changed at a time: dollars a robot-hour, and the share of the thesis' layout."""
+    """Dollars per robot-hour with one setting changed at a time, compared with the thesis' layout."""
     body: list[tuple[str, ...]] = []
     for name, other in variations(usage):
         ours, thesis, pubnub = (
@@ -91,7 +91,7 @@ def what_if(usage: Usage, prices: Mapping[str, Price] = PRICES) -> Rows:
 
 
 def quotas(scale: Scale) -> Rows:
-    """What a fleet needs of each default quota, the one that breaks first on top."""
+    """The fleet's needs of each default quota; the quota that is used up first is on top."""
     body: list[tuple[str, ...]] = []
     for need in scale.needs:
         at = "never" if need.robots_at_quota is None else f"{need.robots_at_quota:,.0f}"
@@ -111,17 +111,17 @@ def quotas(scale: Scale) -> Rows:
 
 
 def times(value: float) -> str:
-    """A multiple, with as many digits as it deserves."""
+    """A multiple with two digits, or a whole number from 10 on."""
     if value >= 10:
         return f"{value:,.0f}"
     return f"{value:.2g}" if value >= 0.001 else "< 0.001"
 
 
-def _sum(items: list[line_items.Item], service: str, lane: str) -> float:
+def _sum(items: list[line_items.LineItem], service: str, lane: str) -> float:
     return sum(item.dollars for item in items if (item.service, item.lane) == (service, lane))
 
 
-def _shown(items: list[line_items.Item], service: str, lane: str) -> str:
+def _shown(items: list[line_items.LineItem], service: str, lane: str) -> str:
     dollars = _sum(items, service, lane)
     return _dollars(dollars) if dollars >= _LEAST_DOLLARS else ""
 

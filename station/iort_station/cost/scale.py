@@ -1,4 +1,4 @@
-"""What a fleet needs of AWS, held against the default quotas: which of them breaks first. Pure."""
+"""A fleet's needs compared with AWS' default quotas, to find the quota that is used up first. Pure."""
 
 from __future__ import annotations
 
@@ -11,12 +11,12 @@ from iort_station.cost.prices import PRICES, QUOTAS, Price, Quota
 from iort_station.cost.sizes import sizes_of
 from iort_station.cost.usage import Usage
 
-# The agent waits at least this long before it connects again; a test holds it to the agent.
+# The agent waits at least this long before it reconnects; a test compares it with the agent.
 SHORTEST_RECONNECT_S = 1.0
 
 
 class Need(NamedTuple):
-    """What a fleet needs of one quota, and with how many robots the quota is used up (None: never)."""
+    """A fleet's need of one quota, and the number of robots that use it up; None means never."""
 
     name: str
     needed: float
@@ -30,7 +30,7 @@ class Need(NamedTuple):
 
 
 class Scale(NamedTuple):
-    """A fleet on paper: needs in the order in which the quotas break, and dollars a month."""
+    """The estimate for a fleet: needs in the order in which the quotas are used up, and dollars per month."""
 
     robots: int
     needs: list[Need]
@@ -40,12 +40,12 @@ class Scale(NamedTuple):
 
     @property
     def breaks_first(self) -> Need:
-        """The quota that the fewest robots use up."""
+        """The need of the quota that the fewest robots use up."""
         return self.needs[0]
 
 
 def on_paper(usage: Usage, prices: Mapping[str, Price] = PRICES) -> Scale:
-    """What the fleet needs, all robots driving at once."""
+    """The estimate for a fleet whose robots all drive at once."""
     one = _per_robot(usage)
     quotas = dict(QUOTAS)
     if usage.live_concurrency:
@@ -71,7 +71,7 @@ def on_paper(usage: Usage, prices: Mapping[str, Price] = PRICES) -> Scale:
 
 
 _RESERVED = "Lambda 1: concurrency reserved by this deployment"
-# What does not grow with the fleet: each robot has a connection and partition keys of its own.
+# Quotas of one robot, which has its own connection and partition keys.
 _ONE_ROBOTS = frozenset(
     {
         "IoT Core: publishes of one connection",
@@ -87,9 +87,9 @@ def _per_robot(usage: Usage) -> dict[str, float]:
     publishes = batches + usage.live_hz + 3 * usage.ping_hz + usage.clock_pings_per_s
     telemetry = usage.batches_per_s * -(-sizes.telemetry_item // 1024) + usage.own_batches_per_s
     summary = usage.batches_per_s * -(-sizes.summary_item // 1024) + usage.own_batches_per_s
-    # Lambda 2 is bounded by the stream's shards, Lambda 1 by what it waits for.
+    # The stream's shards limit Lambda 2, so only Lambda 1 and the pings count.
     busy = usage.live_hz * usage.live_ms / 1000 + usage.ping_hz * 0.005
-    # What passes the broker is looked at by three rules.
+    # Three rules evaluate each message that passes the broker.
     live_rules = usage.live_hz + 2 * usage.live_at_broker_per_s
     return {
         _RESERVED: usage.live_hz * usage.live_ms / 1000,
@@ -97,7 +97,7 @@ def _per_robot(usage: Usage) -> dict[str, float]:
         "IoT Core: connects in a minute after an outage": 1,
         "IoT Core: connects of one client id": 1 / SHORTEST_RECONNECT_S,
         "IoT Core: subscriptions": SUBSCRIPTIONS,
-        # Basic Ingest is counted in: it passes the same gateway.
+        # Basic Ingest passes the same gateway.
         "IoT Core: publishes in": publishes,
         "IoT Core: rule evaluations": batches + live_rules + 2 * usage.ping_hz + usage.clock_pings_per_s,
         "IoT Core: publishes of one connection": publishes,

@@ -1,6 +1,6 @@
-"""How large the messages and items of a drive are, as `python -m bench.message_sizes` measured them.
+"""The sizes of messages and items, as measured by `python -m bench.message_sizes`.
 
-The command encodes a simulated drive with the agent's own code; a test holds this table to it.
+The command encodes a simulated drive with the agent's code; a test compares this table with it.
 """
 
 from __future__ import annotations
@@ -9,12 +9,12 @@ from bisect import bisect_left
 from dataclasses import dataclass
 from typing import NamedTuple
 
-# The telemetry item of the agent's own figures, one sample.
+# The telemetry item of one sample of the agent's metrics.
 OWN_ITEM_BYTES = 220
 
 
 class Measured(NamedTuple):
-    """Bytes of a batch's message and item, and of a second's summary, by the number of samples in them."""
+    """Bytes of a batch's message and item, and of a second's summary, by their number of samples."""
 
     samples: int
     record: int
@@ -22,8 +22,8 @@ class Measured(NamedTuple):
     summary_item: int
 
 
-# One second at this many samples a second. In a shorter batch above 50 Hz values change less from sample
-# to sample; it is up to a fifth smaller than this table says.
+# One second with this many samples. In a shorter batch above 50 Hz values change less between samples, so it
+# is up to a fifth smaller than in this table.
 TABLE = (
     Measured(1, 257, 240, 375),
     Measured(2, 277, 260, 522),
@@ -41,9 +41,9 @@ TABLE = (
 
 @dataclass(frozen=True)
 class Sizes:
-    """Bytes. Messages count their topic in, as AWS meters them; items count names and values.
+    """Bytes of messages with their topics, as AWS meters them, and of items with names and values.
 
-    ``sample`` is a sample as one flat JSON message.
+    ``sample`` is one sample as a flat JSON message.
     """
 
     record: int
@@ -57,7 +57,7 @@ class Sizes:
 
 
 def sizes_of(rate_hz: float, batch_s: float) -> Sizes:
-    """The sizes of a VESC's stream at this rate, in batches of this length."""
+    """The sizes for a VESC's stream at this rate, in batches of this length."""
     batch = _interpolated(rate_hz * batch_s)
     return Sizes(
         record=batch.record,
@@ -67,7 +67,7 @@ def sizes_of(rate_hz: float, batch_s: float) -> Sizes:
 
 
 def _interpolated(samples: float) -> Measured:
-    """The sizes for a number of samples, on a straight line between the two nearest rows."""
+    """The sizes for a number of samples, interpolated between the two nearest rows."""
     rounded = min(max(1, round(samples)), TABLE[-1].samples)
     i = bisect_left(TABLE, (rounded,))
     above, below = TABLE[i], TABLE[max(0, i - 1)]

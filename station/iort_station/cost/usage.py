@@ -1,4 +1,4 @@
-"""How a fleet is driven, as far as it makes a bill."""
+"""How a fleet is driven, with everything that affects its bill."""
 
 from __future__ import annotations
 
@@ -10,25 +10,26 @@ from iort_contract.messages.account import ACCOUNT_EVERY_S
 from iort_station.cost.prices import MONTH_DAYS
 from iort_station.errors import StationError
 
-# A car that measures no round trips still pings a rule for its clock's offset; a test holds it to the agent.
+# A car without round-trip pings still pings for its clock offset; a test compares this with the agent.
 CLOCK_PING_S = 30.0
 
 
 @dataclass(frozen=True, kw_only=True)
 class Usage:
-    """How the fleet is driven. The defaults are the agent's and the stacks' own.
+    """How a fleet is driven. The defaults are the agent's and the stacks' own.
 
-    A robot has ``streams``, each of ``rate_hz`` samples a second; ``live_hz`` are the live messages of all
-    of them and ``ping_hz`` the pings a path, a second and robot; a batch spans ``batch_s``;
-    ``agent_every_s`` between the agent's own figures; robots drive ``hours_per_day``; each of ``viewers``
-    watches the whole fleet all that time; items are kept ``retention_days``, ``recoverable`` to a point in
-    time in stage prod. A robot connects ``connects_per_hour`` and is sent ``command_hz`` commands a second.
-    ``alarms`` watch a metric each; those by Metrics Insights analyse up to ``insights_metrics`` together.
-    ``dashboards`` are the metrics on each; ``robot_metrics``, a deployment's parameter, adds to the last.
-    Somebody has them open on the live page ``dashboard_hours`` a month.
-    ``function_logs`` is the deployment's parameter: "all" adds Lambda's own lines about every invocation.
-    What only AWS can say, the billed milliseconds of an invocation, and of each batch that Lambda 2 finds
-    in one, are assumptions and named so.
+    Of a robot: it has ``streams`` of ``rate_hz`` samples a second each, sends ``live_hz`` live messages and
+    ``ping_hz`` pings per path a second, and gets ``command_hz`` commands a second. A batch spans ``batch_s``.
+    The agent sends its metrics ``agent_every_s``.
+
+    Of a deployment: items are kept ``retention_days``, and are ``recoverable`` to a point in time in stage
+    prod. Each of ``alarms`` watches a metric; the alarms by Metrics Insights analyse ``insights_metrics``
+    together. ``dashboards`` has the number of metrics on each; ``robot_metrics`` adds to the last. They are
+    open on the live page for ``dashboard_hours`` a month. ``function_logs`` "all" adds Lambda's own log
+    lines.
+
+    Only AWS knows the billed milliseconds; ``live_ms``, ``summarize_ms`` and ``summarize_batch_ms`` (for each
+    batch in an event) are assumptions. Each of ``viewers`` watches the whole fleet all the time.
     """
 
     robots: int = 1
@@ -60,62 +61,61 @@ class Usage:
     device_defender: bool = False
 
     def check(self) -> Usage:
-        """Itself; raises `StationError` for what no fleet can do."""
+        """Return itself; raises `StationError` for an impossible value."""
         for name, value in vars(self).items():
             if isinstance(value, (int, float)) and value < 0:
-                raise StationError(f"{name} {value}: allowed is 0 or more")
-        if self.robots < 1:
-            raise StationError(f"robots {self.robots}: allowed is 1 or more")
-        if self.streams < 1:
-            raise StationError(f"streams {self.streams}: allowed is 1 or more")
-        if not 0 < self.rate_hz <= 2000:
-            raise StationError(f"rate {self.rate_hz} Hz: allowed is more than 0 and up to 2000")
-        if self.batch_s > 1:
-            raise StationError(f"batch of {self.batch_s} s: allowed is 0 to 1, 0 sends each sample by itself")
-        if not 0 < self.hours_per_day <= 24:
-            raise StationError(f"{self.hours_per_day} hours a day: allowed is more than 0 and up to 24")
+                raise StationError(f"{name} must be at least 0, got {value}")
+        for name, holds, allowed in (
+            ("robots", self.robots >= 1, "at least 1"),
+            ("streams", self.streams >= 1, "at least 1"),
+            ("rate_hz", 0 < self.rate_hz <= 2000, "more than 0 and at most 2000"),
+            ("batch_s", self.batch_s <= 1, "0 to 1; 0 sends each sample by itself"),
+            ("hours_per_day", 0 < self.hours_per_day <= 24, "more than 0 and at most 24"),
+        ):
+            if not holds:
+                raise StationError(f"{name} must be {allowed}, got {getattr(self, name)}")
         return self
 
     @property
     def batches_per_s(self) -> float:
-        """Batches of the sources' streams, a robot."""
+        """Batches a second of a robot's sources."""
         return self.streams * self.stream_batches_per_s
 
     @property
     def samples_per_s(self) -> float:
-        """Samples of the sources' streams, a robot."""
+        """Samples a second of a robot's sources."""
         return self.streams * self.rate_hz
 
     @property
     def stream_batches_per_s(self) -> float:
-        """Batches of one of the sources' streams."""
+        """Batches a second of one stream."""
         return min(self.rate_hz, max(1.0, 1 / self.batch_s)) if self.batch_s else self.rate_hz
 
     @property
     def own_batches_per_s(self) -> float:
-        """Batches of the agent's own streams: its figures, its accounts, and round trips where it measures
+        """Batches a second of the agent's own streams: metrics, accounts, and round trips if it measures
         them."""
         figures = 1 / self.agent_every_s if self.agent_every_s else 0.0
         return figures + 1 / ACCOUNT_EVERY_S + min(1.0, 3 * self.ping_hz)
 
     @property
     def live_at_broker_per_s(self) -> float:
-        """Live messages that pass the broker, a robot, while its fault code stays what it is."""
+        """A robot's live messages a second that pass the broker while its fault code does not change."""
         return min(self.live_hz, self.streams / LIVE_BROKER_EVERY_S)
 
     @property
     def clock_pings_per_s(self) -> float:
-        """Pings through a rule, a robot, by which it knows the cloud's clock."""
+        """A robot's pings a second that measure its clock offset."""
         return 0.0 if self.ping_hz else 1 / CLOCK_PING_S
 
     @property
     def robot_hours_per_month(self) -> float:
-        """Of the whole fleet."""
+        """Robot-hours of the whole fleet."""
         return self.robots * self.hours_per_day * MONTH_DAYS
 
 
 def variations(usage: Usage) -> Iterator[tuple[str, Usage]]:
-    """The settings that change the bill, one at a time."""
+    """The usage with one setting changed at a time."""
     yield "as configured", usage
     for live_hz in (5.0, 2.0, 1.0, 0.0):
         if live_hz != usage.live_hz:
@@ -126,7 +126,7 @@ def variations(usage: Usage) -> Iterator[tuple[str, Usage]]:
         yield name, replace(usage, batch_s=batch_s)
     yield "round trips measured at 1 Hz", replace(usage, ping_hz=1.0)
     yield "commands at 10 Hz", replace(usage, command_hz=10.0)
-    yield "connecting anew every minute", replace(usage, connects_per_hour=60.0)
+    yield "reconnecting every minute", replace(usage, connects_per_hour=60.0)
     yield "with Lambda's own log lines", replace(usage, function_logs="all")
     yield "kept for 30 days", replace(usage, retention_days=30)
     yield "tables recoverable to a point in time (`prod`)", replace(usage, recoverable=True)

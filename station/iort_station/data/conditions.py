@@ -1,4 +1,4 @@
-"""Expressions over numpy's columns: the answers of `iort_contract.expression`, a column at a time."""
+"""Conditions and derived fields over numpy columns, with the same results as `iort_contract.expression`."""
 
 from __future__ import annotations
 
@@ -24,17 +24,16 @@ from iort_contract.expression import (
     Node,
     Some,
 )
-from iort_contract.limits import Value
+from iort_station.data.blocks import Column, values
 from iort_station.errors import StationError
 
-Column: TypeAlias = NDArray[Any]
 Columns: TypeAlias = Mapping[str, Column]
 
 
 def holds(node: Node, columns: Columns, n: int) -> NDArray[np.bool_]:
-    """Where the condition is true; a field that is not there is null.
+    """A mask of the ``n`` samples that meet a condition; a missing field is null.
 
-    Raises `StationError` where numbers and texts would be compared.
+    Raises `StationError` if the condition compares a number with a text.
     """
     fields = {name: columns.get(name) for name in expression.names(node)}
     if _has_text(node) or any(column is not None and column.dtype == object for column in fields.values()):
@@ -42,7 +41,7 @@ def holds(node: Node, columns: Columns, n: int) -> NDArray[np.bool_]:
         try:
             return np.array(expression.holds(node, lists, n), dtype=np.bool_)
         except MismatchError as error:
-            raise StationError(f"the condition cannot be answered: {error}") from error
+            raise StationError(f"the condition cannot be evaluated: {error}") from error
     null = np.full(n, np.nan)
     numbers = {name: null if column is None else column.astype(float) for name, column in fields.items()}
     with np.errstate(all="ignore"):
@@ -50,7 +49,7 @@ def holds(node: Node, columns: Columns, n: int) -> NDArray[np.bool_]:
 
 
 def derive(columns: Columns, vehicle: Vehicle | None) -> dict[str, Column]:
-    """What `iort_contract.catalog.derived.derive` gives, of whole columns."""
+    """The derived fields, as `iort_contract.catalog.derived.derive` computes them from lists."""
     numbers = {name: column for name, column in columns.items() if column.dtype.kind == "f"}
     with np.errstate(all="ignore"):
         return {
@@ -59,14 +58,6 @@ def derive(columns: Columns, vehicle: Vehicle | None) -> dict[str, Column]:
             )
             for entry, parameters in calculable(numbers, vehicle)
         }
-
-
-def values(column: Column) -> list[Value]:
-    """A column as Python's values: None where it is null, or beyond what a number holds."""
-    plain: list[Value] = column.tolist()
-    if column.dtype.kind == "f" and not (finite := np.isfinite(column)).all():
-        return [value if is_finite else None for value, is_finite in zip(plain, finite, strict=True)]
-    return plain
 
 
 def _finite(column: Column) -> Column:
@@ -85,7 +76,7 @@ def _has_text(node: Node) -> bool:
 
 
 def _evaluate(node: Node, numbers: Mapping[str, Column]) -> Any:
-    """Numbers with NaN for null, or a mask."""
+    """An array of numbers with NaN for null, or a mask."""
     if isinstance(node, Field):
         return numbers[node.name]
     if isinstance(node, Constant):
@@ -98,7 +89,7 @@ def _evaluate(node: Node, numbers: Mapping[str, Column]) -> Any:
         return np.abs(np.asarray(_evaluate(node.of, numbers), dtype=float))
     if isinstance(node, Comparison):
         left, right = (np.asarray(_evaluate(side, numbers), dtype=float) for side in (node.left, node.right))
-        # NaN makes all the others false by itself.
+        # NaN makes all other comparisons false by itself.
         known = ~(np.isnan(left) | np.isnan(right)) if node.symbol == "!=" else True
         return COMPARISONS[node.symbol](left, right) & known
     if isinstance(node, IsNull):

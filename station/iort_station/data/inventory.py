@@ -1,7 +1,8 @@
-"""What there is to ask for: robots, their parameters, their streams."""
+"""What a deployment has: robots, their parameters, streams and fields; and the errors that name them."""
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from collections.abc import Set as AbstractSet
 from contextlib import suppress
 from dataclasses import replace
@@ -10,23 +11,24 @@ from iort_contract.catalog.derived import PARAMETERS, SOURCES, Vehicle
 from iort_contract.catalog.streams import ACCOUNT_STREAM, OWN_STREAMS, TYPES_STREAM
 from iort_contract.catalog.vesc import VESC_STREAM
 from iort_contract.limits import ContractError
+from iort_contract.messages.batch import batch_id
 from iort_contract.messages.message_type import MessageType, message_type
-from iort_contract.tables import ROBOT, STREAMS
+from iort_contract.tables import BATCH, ROBOT, STREAMS
 from iort_station.cloud import Cloud
-from iort_station.data import reading
+from iort_station.data.batches import RefusedItems, blocks, stored, telemetry_table, topic_of
+from iort_station.data.blocks import Block, values
 from iort_station.data.selection import Selection
-from iort_station.data.stored import ATTRIBUTES, Refused, blocks
-from iort_station.data.times import iso
 from iort_station.data.units import VESC_KIND
 from iort_station.errors import StationError
 from iort_station.fleet import registry
+from iort_station.times import iso
 
-# Every driver's VescState has them, and hardly anything else.
-_OF_A_VESC = frozenset({"voltage_input", "current_motor", "duty_cycle"})
+# Every driver's VescState has these fields, and hardly any other message has.
+_VESC_FIELDS = frozenset({"voltage_input", "current_motor", "duty_cycle"})
 
 
 def vehicle_of(cloud: Cloud, robot: str) -> Vehicle | None:
-    """The robot's parameters in the registry; None where they are not there."""
+    """The robot's vehicle parameters from the registry; None if it has none."""
     row = registry.find(cloud, robot)
     if row is None or not row.get("speed_to_erpm_gain"):
         return None
@@ -34,11 +36,11 @@ def vehicle_of(cloud: Cloud, robot: str) -> Vehicle | None:
 
 
 def check_there(cloud: Cloud, robot: str, stream: str) -> None:
-    """Raise `StationError` where a robot or its stream does not exist, naming those that do.
+    """Raise `StationError` for an unknown robot or stream, naming the known ones.
 
-    What a robot that is no longer registered has sent stays, and is there.
+    The samples of a removed robot stay, and so does its name here.
     """
-    if reading.outermost(cloud, robot, stream, newest=False) is not None:
+    if _has_batches(cloud, robot, stream):
         return
     has = ", ".join(streams_of(cloud, robot))
     if not has:
@@ -47,81 +49,94 @@ def check_there(cloud: Cloud, robot: str, stream: str) -> None:
 
 
 def check_registered(cloud: Cloud, robot: str) -> None:
-    """Raise `StationError` where a robot is not registered, naming those that are."""
+    """Raise `StationError` for a robot that is not registered, naming those that are."""
     if registry.find(cloud, robot) is None:
         known = sorted(str(row[ROBOT]) for row in registry.listed(cloud))
-        raise StationError(f"there is no robot {robot}; there is {', '.join(known) or 'none at all'}")
+        raise StationError(f"robot {robot} is not registered; registered are: {', '.join(known) or 'none'}")
 
 
-def check_fields(cloud: Cloud, selection: Selection, there: AbstractSet[str]) -> None:
-    """Raise `StationError` where the selection names a field that is not ``there``, naming those that are."""
+def unknown_fields(cloud: Cloud, selection: Selection, there: AbstractSet[str]) -> StationError:
+    """The error for a selection that names a field other than those ``there``, naming the known ones."""
     unknown = sorted(selection.named() - there)
-    if not unknown:
-        return
-    stored = _fields(cloud, selection)
-    possible = stored | {name for name, sources in SOURCES.items() if stored.issuperset(sources)}
+    stored_fields = _fields(cloud, selection)
+    possible = stored_fields | {
+        name for name, sources in SOURCES.items() if stored_fields.issuperset(sources)
+    }
     for name in unknown:
         if name in possible and PARAMETERS[name]:
             parameter = PARAMETERS[name][0]
-            raise StationError(f"{name} needs the {parameter} of {selection.robot}, which the registry lacks")
-    raise StationError(
+            return StationError(
+                f"{name} needs the {parameter} of {selection.robot}, which the registry lacks"
+            )
+    return StationError(
         f"{selection.robot} has no {', '.join(unknown)} in {selection.stream} in this range; "
         f"it has {', '.join(sorted(possible))}"
     )
 
 
 def kind_of(cloud: Cloud, selection: Selection) -> MessageType | None:
-    """The type that a stream's messages have, by which their units are known: what the robot has said of it,
-    the last before the range ends, or else the first. A stream of which it has said nothing, as of a VESC's
-    log or serial port, is a VESC's where it has the fields of one."""
+    """The type of a stream's messages, which decides the units of its fields.
+
+    It is the type that the robot published last before the range ends, or else its first. A stream without a
+    published type, such as a VESC's log, has a VESC's type if it has a VESC's fields.
+    """
     if selection.stream in {VESC_STREAM, *OWN_STREAMS}:
         return None
-    kinds = []
-    types = reading.batches(cloud, Selection(robot=selection.robot, stream=TYPES_STREAM), ATTRIBUTES)
-    for block in blocks(types, Refused()):
-        names = block.columns.get("stream", ())
-        for i in [i for i, name in enumerate(names) if name == selection.stream]:
-            with suppress(ContractError):
-                sample = {name: column[i] for name, column in block.columns.items()}
-                kinds.append((int(block.times_us[i]), message_type(sample)))
-    end_us = selection.end_us
-    before = [kind for t_us, kind in kinds if end_us is None or t_us < end_us]
+    kinds = [
+        (t_us, kind) for t_us, kind in types_of(cloud, selection.robot) if kind.stream == selection.stream
+    ]
+    before = [kind for t_us, kind in kinds if selection.end_us is None or t_us < selection.end_us]
     if kinds:
         return before[-1] if before else kinds[0][1]
-    there = _fields(cloud, selection)
-    return MessageType(selection.stream, "", VESC_KIND, "", "") if there.issuperset(_OF_A_VESC) else None
+    is_vesc = _fields(cloud, selection).issuperset(_VESC_FIELDS)
+    return MessageType(selection.stream, "", VESC_KIND, "", "") if is_vesc else None
+
+
+def types_of(cloud: Cloud, robot: str) -> Iterator[tuple[int, MessageType]]:
+    """The message types that a robot has published, with the time of each, in order of time."""
+    for block in _blocks(cloud, robot, TYPES_STREAM):
+        columns = {name: values(column) for name, column in block.columns.items()}
+        for i, t_us in enumerate(block.times_us.tolist()):
+            with suppress(ContractError):
+                yield t_us, message_type({name: column[i] for name, column in columns.items()})
 
 
 def streams_of(cloud: Cloud, robot: str) -> list[str]:
-    """The streams of a robot that have something stored, as far as they are `known`."""
-    names = known(cloud, robot)
-    return [name for name in names if reading.outermost(cloud, robot, name, newest=True) is not None]
+    """The robot's `known` streams that have stored batches."""
+    return [name for name in known(cloud, robot) if _has_batches(cloud, robot, name)]
 
 
 def known(cloud: Cloud, robot: str) -> list[str]:
-    """Every stream that the robot's agent has said that it has, that Lambda 2 has seen, or that every robot
-    may have."""
+    """The streams that the robot's agent has announced, that Lambda 2 has seen, or that every robot has."""
     row = registry.find(cloud, robot) or {}
     seen = {str(name) for name in row.get(STREAMS, ())}
-    said = {
+    announced = {
         name
         for own in (TYPES_STREAM, ACCOUNT_STREAM)
-        for block in blocks(reading.batches(cloud, Selection(robot=robot, stream=own), ATTRIBUTES), Refused())
+        for block in _blocks(cloud, robot, own)
         for name in block.columns.get("stream", ())
         if isinstance(name, str)
     }
-    return sorted({VESC_STREAM, *OWN_STREAMS, *seen, *said})
-
-
-def _fields(cloud: Cloud, selection: Selection) -> set[str]:
-    """The fields of the first samples stored in the selection's range."""
-    whole = replace(selection, fields=None, condition=None)
-    page = next(reading.batches(cloud, whole, ATTRIBUTES), ())
-    return {name for block in blocks([page], Refused()) for name in block.columns}
+    return sorted({VESC_STREAM, *OWN_STREAMS, *seen, *announced})
 
 
 def extent(cloud: Cloud, robot: str, stream: str) -> tuple[str, str] | None:
-    """When a stream's oldest and newest batches start, as ISO 8601; None where there is none."""
-    first = reading.outermost(cloud, robot, stream, newest=False)
-    last = reading.outermost(cloud, robot, stream, newest=True)
-    return None if first is None or last is None else (iso(first), iso(last))
+    """The start times of a stream's oldest and newest batches as ISO 8601; None if it has none."""
+    table, topic = telemetry_table(cloud), topic_of(cloud, robot, stream)
+    ends = [table.first(topic, newest=newest, attributes=(BATCH,)) for newest in (False, True)]
+    first, last = ("" if item is None else iso(batch_id(item[BATCH]["S"]).t_us) for item in ends)
+    return (first, last) if first and last else None
+
+
+def _has_batches(cloud: Cloud, robot: str, stream: str) -> bool:
+    return telemetry_table(cloud).first(topic_of(cloud, robot, stream), attributes=(BATCH,)) is not None
+
+
+def _blocks(cloud: Cloud, robot: str, stream: str) -> Iterator[Block]:
+    return blocks(stored(cloud, Selection(robot=robot, stream=stream)), RefusedItems())
+
+
+def _fields(cloud: Cloud, selection: Selection) -> set[str]:
+    """The fields of the first stored samples in the selection's range."""
+    page = next(stored(cloud, replace(selection, fields=None, condition=None)), ())
+    return {name for block in blocks([page], RefusedItems()) for name in block.columns}

@@ -1,4 +1,4 @@
-"""Where a robot is, by the fields of its samples: in metres, or in degrees made into metres."""
+"""A robot's position from the fields of its samples, in metres or in degrees."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-# Where the position is in the usual messages: Pose2D and Odometry, PoseStamped, Point.
+# The position's fields in Pose2D, Odometry, PoseStamped and Point.
 _METRES = (
     ("x", "y"),
     ("position.x", "position.y"),
@@ -17,7 +17,7 @@ _METRES = (
     ("pose.pose.position.x", "pose.pose.position.y"),
     ("point.x", "point.y"),
 )
-# NavSatFix and geographic_msgs say latitude, VESC Tool's logs gnss_lat.
+# NavSatFix and geographic_msgs have latitude, VESC Tool's logs gnss_lat.
 _LATITUDE = re.compile(r"((?:.*[._])?)(?:lat(itude)?)")
 _DEGREES = re.compile(r"(?:.*[._])?(?:lat(itude)?|lon(gitude)?)(?:_(?:min|mean|max|last))?")
 # The mean radius of the Earth, IUGG.
@@ -26,34 +26,34 @@ _EARTH_M = 6_371_008.8
 Column = NDArray[Any]
 
 
-class Fields(NamedTuple):
-    """The fields that say where: x and y in metres, or latitude and longitude in ``degrees``."""
+class PositionFields(NamedTuple):
+    """The names of x and y in metres, or of latitude and longitude in ``degrees``."""
 
     names: tuple[str, str]
     degrees: bool = False
 
 
-def position_fields(names: Collection[str]) -> Fields | None:
-    """Those of these fields that say where a robot is; None where there are none."""
+def position_fields(names: Collection[str]) -> PositionFields | None:
+    """The position's fields among these names; None if there are none."""
     for pair in _METRES:
         if all(name in names for name in pair):
-            return Fields(pair)
+            return PositionFields(pair)
     for name in names:
         if match := _LATITUDE.fullmatch(name):
             longitude = f"{match[1]}lon{'gitude' if match[2] else ''}"
             if longitude in names:
-                return Fields((name, longitude), degrees=True)
+                return PositionFields((name, longitude), degrees=True)
     return None
 
 
 def in_degrees(name: str) -> bool:
-    """Whether a field, or a statistic of one, is a latitude or a longitude: its seventh decimal is 1 cm."""
+    """Whether a field or statistic is a latitude or longitude, whose seventh decimal is 1 cm."""
     return _DEGREES.fullmatch(name) is not None
 
 
-def fixes(columns: Mapping[str, Column], fields: Fields) -> tuple[Column, Column]:
-    """Latitude and longitude, both NaN where the receiver knew no place: it says 0, 0 then, or a status
-    below 0 (NavSatFix)."""
+def fixes(columns: Mapping[str, Column], fields: PositionFields) -> tuple[Column, Column]:
+    """Latitude and longitude; NaN without a fix, which receivers report as 0, 0 or as a negative status
+    (NavSatFix)."""
     latitude, longitude = (columns[name].astype(np.float64) for name in fields.names)
     with np.errstate(invalid="ignore"):
         known = (np.abs(latitude) <= 90) & (np.abs(longitude) <= 180) & ((latitude != 0) | (longitude != 0))
@@ -64,8 +64,7 @@ def fixes(columns: Mapping[str, Column], fields: Fields) -> tuple[Column, Column
 
 
 def local_metres(latitude: Column, longitude: Column, origin: tuple[float, float]) -> tuple[Column, Column]:
-    """Metres to the east and to the north of a place, as if the Earth were flat there (equirectangular):
-    within a part in a thousand for some 10 km."""
+    """Metres to the east and north of a place by equirectangular projection, to 0.1 % within about 10 km."""
     around = (longitude - origin[1] + 180) % 360 - 180
     east = np.radians(around) * _EARTH_M * np.cos(np.radians(origin[0]))
     return east, np.radians(latitude - origin[0]) * _EARTH_M

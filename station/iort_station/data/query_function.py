@@ -1,10 +1,11 @@
-"""Samples chosen by the query function in the cloud: functions/query.py."""
+"""Samples that the query function (functions/query.py) selects in the cloud."""
 
 from __future__ import annotations
 
 import json
 import ssl
 import urllib.request
+from collections import Counter
 from collections.abc import Iterator
 from dataclasses import replace
 
@@ -22,11 +23,9 @@ from iort_contract.messages.query import (
 )
 from iort_station.cloud import Cloud
 from iort_station.data import inventory
+from iort_station.data.batches import PageProgress, RefusedItems
 from iort_station.data.blocks import Block, column_of, join, ordered
-from iort_station.data.reading import Told
 from iort_station.data.selection import Selection
-from iort_station.data.sensors import Sensors
-from iort_station.data.stored import Refused
 from iort_station.errors import StationError
 
 _DOWNLOAD_S = 60
@@ -36,15 +35,14 @@ def samples(
     cloud: Cloud,
     selection: Selection,
     *,
-    refused: Refused,
-    sensors: Sensors,
+    refused: RefusedItems,
+    absent: Counter[str],
     scan: bool = False,
-    progress: Told | None = None,
+    progress: PageProgress | None = None,
 ) -> Iterator[Block]:
-    """The selection's samples, from as many invocations as it takes.
+    """The selection's samples, from as many invocations as needed.
 
-    Raises `StationError` where the function refuses or fails, and at the end where a field that was
-    named was in none of the samples.
+    Raises `StationError` if the function fails, and at the end for a field that no sample has.
     """
     request = QueryRequest(
         selection.robot,
@@ -65,15 +63,15 @@ def samples(
         there |= set(answer.fields)
         refused.count += answer.refused
         refused.reason = refused.reason or answer.reason
-        sensors.absent.update(answer.absent)
+        absent.update(answer.absent)
         if progress is not None and len(part.times_us):
             progress(answer.items, int(part.times_us[-1]))
         if answer.token is None:
             break
         request = replace(request, token=answer.token)
-    if there:
-        inventory.check_fields(cloud, selection, there)
-    # What a batch holds may reach into the next, which may be another invocation's.
+    if there and not selection.named() <= there:
+        raise inventory.unknown_fields(cloud, selection, there)
+    # A batch may overlap the next one, which another invocation may have read.
     block = ordered(join(parts))
     if len(block.times_us):
         names = selection.fields or tuple(block.columns)
@@ -110,4 +108,4 @@ def _download(cloud: Cloud, url: str) -> bytes:
         ) as response:
             return bytes(response.read())
     except OSError as error:
-        raise StationError(f"the result cannot be fetched: {error}") from error
+        raise StationError(f"the result cannot be downloaded: {error}") from error

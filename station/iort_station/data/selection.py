@@ -1,4 +1,4 @@
-"""What of a stream somebody asks for."""
+"""A selection: which samples and fields of a stream a query asks for."""
 
 from __future__ import annotations
 
@@ -11,13 +11,16 @@ from iort_contract.catalog.derived import SOURCES
 from iort_contract.expression import ExpressionError, Node
 from iort_contract.limits import ContractError
 from iort_contract.topics import check_robot, check_stream
-from iort_station.data.times import Time, time_us
 from iort_station.errors import StationError
+from iort_station.times import Time, time_us
 
 
 @dataclass(frozen=True, kw_only=True)
 class Selection:
-    """A range of a stream, start included and end not; the fields (None for all); and which samples."""
+    """A stream's samples from ``start_us`` (inclusive) to ``end_us`` (exclusive) that meet a condition.
+
+    ``fields`` are the fields to return; None means all. ``where`` is the condition's text.
+    """
 
     robot: str
     stream: str
@@ -28,19 +31,19 @@ class Selection:
     condition: Node | None = field(default=None, repr=False)
 
     def named(self) -> frozenset[str]:
-        """The fields that are named, to be given or to decide by."""
+        """The fields that the selection names, in its list or in its condition."""
         deciding = expression.names(self.condition) if self.condition is not None else frozenset()
         return deciding.union(self.fields or ())
 
     def needs(self, name: str) -> bool:
-        """Whether it takes this stored field to answer."""
+        """Whether the answer needs this stored field."""
         if self.fields is None:
             return True
         named = self.named()
         return name in named or any(name in sources for made, sources in SOURCES.items() if made in named)
 
     def holds_time(self, t_us: int) -> bool:
-        """Whether the range holds a time."""
+        """Whether the range includes a time."""
         return (self.start_us is None or self.start_us <= t_us) and (
             self.end_us is None or t_us < self.end_us
         )
@@ -55,7 +58,7 @@ def select(
     fields: Sequence[str] | None = None,
     where: str | None = None,
 ) -> Selection:
-    """A selection of what people write; raises `StationError` for what cannot be read."""
+    """Make a selection from times and a condition as people write them; raises `StationError`."""
     now_us = time.time_ns() // 1000
     try:
         check_robot(robot)

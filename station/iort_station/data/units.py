@@ -1,11 +1,9 @@
-"""Units of fields: by the type of the messages that they are in, and the driver that values came from."""
+"""Units of fields, by the type of their messages and by the driver that sent them."""
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Mapping
 from functools import lru_cache
-
-import numpy as np
 
 from iort_contract.catalog.derived import DERIVED
 from iort_contract.catalog.ros_types import ROS_UNITS, TYPE_UNITS
@@ -15,34 +13,15 @@ from iort_contract.limits import MessageError
 from iort_contract.messages.message_type import MessageType
 from iort_contract.ros1.definition import Fields, parse
 from iort_contract.tables import STATS
-from iort_station.data.blocks import Block
 
 VESC_KIND = "vesc_msgs/VescState"
-_MEAN = f"_{STATS[1]}"
-_BY_DRIVER = tuple(field.name for field in VESC.fields if field.ros2_unit is not None)
-
-
-class Driver:
-    """Tells by samples that pass whose units they have: a count of 1e-4 Ah is whole, what the ROS 2
-    driver made of it is not."""
-
-    def __init__(self) -> None:
-        self.ros2 = False
-
-    def told(self, found: Iterable[Block]) -> Iterator[Block]:
-        """The same blocks: samples, or the summary's seconds."""
-        for block in found:
-            self.ros2 = self.ros2 or any(
-                column.dtype.kind == "f" and bool((column > np.floor(column)).any())
-                for name, column in block.columns.items()
-                if name.startswith(_BY_DRIVER) and not name.endswith(_MEAN)
-            )
-            yield block
 
 
 def unit(stream: str, name: str, *, ros2: bool = False, kind: MessageType | None = None) -> str:
-    """The unit of a field, or of a statistic of it; empty where none is known. ``ros2`` for the ROS 2
-    driver's samples, ``kind`` is the type of the stream's messages."""
+    """The unit of a field or of one of its statistics; empty if unknown.
+
+    ``ros2`` tells that the samples are the ROS 2 driver's; ``kind`` is the type of the stream's messages.
+    """
     stem, _, statistic = name.rpartition("_")
     for field in (name, stem) if statistic in STATS else (name,):
         if found := _unit(stream, field, kind, ros2=ros2):
@@ -61,7 +40,7 @@ def _unit(stream: str, field: str, kind: MessageType | None, *, ros2: bool) -> s
         return found
     if field in LOG_UNITS and (stream == VESC_STREAM if kind is None else kind.kind == VESC_KIND):
         return LOG_UNITS[field]
-    # The driver's VescImu calls its own so, in units of its own.
+    # The driver's VescImu has fields of these names in other units.
     if kind is not None and kind.kind.startswith("vesc_msgs/"):
         return ""
     within, _, axis = field.rpartition(".")
@@ -72,13 +51,14 @@ def _unit(stream: str, field: str, kind: MessageType | None, *, ros2: bool) -> s
 def _by_type(kind: MessageType, path: str, *, ros2: bool) -> str:
     types = _types(kind.kind, kind.definition)
     body = [field for field in types.get(kind.kind, ()) if field.name != "header"]
-    # A header and one thing: the fields are the thing's, see contract/iort_contract/ros1/decode.py.
+    # With a header and one other field, the sample's fields are that field's: see
+    # contract/iort_contract/ros1/decode.py.
     starts = [body[0].kind, kind.kind] if len(body) == 1 else [kind.kind]
     return next(filter(None, (_on_the_way(types, start, path, ros2=ros2) for start in starts)), "")
 
 
 def _on_the_way(types: Mapping[str, Fields], kind: str, path: str, *, ros2: bool) -> str:
-    """The unit that a type on the way from this one gives the next step of the path."""
+    """The unit that a type along the path gives to the next part of the path."""
     for part in path.split("."):
         if part.isdecimal():
             continue
@@ -92,7 +72,7 @@ def _on_the_way(types: Mapping[str, Fields], kind: str, path: str, *, ros2: bool
 
 @lru_cache(maxsize=256)
 def _types(kind: str, definition: str) -> Mapping[str, Fields]:
-    """The fields of a type and of those within; none where the definition cannot be read."""
+    """The fields of a type and of the types inside it; empty for an invalid definition."""
     try:
         return parse(kind, definition).types
     except MessageError:

@@ -1,4 +1,4 @@
-"""The folder that a robot needs: car.yaml, certificate and key, readable by the owner alone."""
+"""A robot's bundle: car.yaml, certificate and key, readable only by their owner."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from iort_station.cloud import Cloud
 
 @dataclass(frozen=True)
 class Bundle:
-    """The folder that a robot needs: car.yaml and the files that it names."""
+    """The folder of car.yaml and the files that it names."""
 
     robot: str
     folder: Path
@@ -30,7 +30,7 @@ class Bundle:
 def write_bundle(
     cloud: Cloud, bundle: Bundle, certificate_pem: str, private_key_pem: str, settings: Mapping[str, Any]
 ) -> None:
-    """Write everything into the bundle's folder."""
+    """Write the bundle's files."""
     written = connection(cloud, bundle.folder, certificate_pem, private_key_pem)
     config: dict[str, Any] = {"robot": bundle.robot, **written}
     config["sources"] = [{"type": "sim", "stream": VESC_STREAM, "rate_hz": 50}]
@@ -42,7 +42,7 @@ def write_bundle(
 def connection(
     cloud: Cloud, folder: Path, certificate_pem: str, private_key_pem: str, *, prefix: str = ""
 ) -> dict[str, Any]:
-    """Write what the connection needs into the folder; the settings that name it."""
+    """Write the connection's files into the folder; returns the settings that name them."""
     files = {"certificate": f"{prefix}certificate.pem", "private_key": f"{prefix}private.key"}
     write_private(folder / files["certificate"], certificate_pem)
     write_private(folder / files["private_key"], private_key_pem)
@@ -58,12 +58,12 @@ def connection(
 
 
 def configure(bundle: Bundle, settings: Mapping[str, Any]) -> None:
-    """Change some of the agent's settings in a bundle's car.yaml."""
+    """Change settings in a bundle's car.yaml."""
     config = yaml.safe_load(bundle.config.read_text())
     write_private(bundle.config, yaml.safe_dump({**config, **settings}, sort_keys=False))
 
 
 def write_private(path: Path, text: str) -> None:
-    """Write a file that only its owner may read."""
+    """Write a file that only its owner can read."""
     with os.fdopen(os.open(path, os.O_WRONLY | os.O_CREAT | os.O_TRUNC, 0o600), "w") as file:
         file.write(text)

@@ -1,4 +1,4 @@
-"""A robot's certificates at AWS IoT, and how one is taken away."""
+"""A robot's certificates at AWS IoT: made, listed, revoked and deleted."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from iort_station.cloud import Cloud
 
 
 class Certificate(NamedTuple):
-    """``id`` is what AWS calls it; ``status`` is ACTIVE, INACTIVE, REVOKED or PENDING_ACTIVATION."""
+    """A certificate at AWS IoT; ``status`` is ACTIVE, INACTIVE, REVOKED or PENDING_ACTIVATION."""
 
     id: str
     arn: str
@@ -27,7 +27,7 @@ class Certificate(NamedTuple):
 
 
 class Made(NamedTuple):
-    """A certificate that was just made, and its private key, which is kept nowhere else; both as PEM."""
+    """A new certificate and its private key as PEM; nothing else keeps the key."""
 
     id: str
     arn: str
@@ -36,9 +36,9 @@ class Made(NamedTuple):
 
 
 def make(iot: Any, name: str) -> Made:
-    """An active certificate for a key that is made here, on the curve P-256, and never leaves this machine.
+    """Make a key on the curve P-256, which stays on this machine, and an active certificate for it.
 
-    Raises botocore's `ClientError` where AWS refuses.
+    Raises botocore's `ClientError` if AWS refuses.
     """
     key = ec.generate_private_key(ec.SECP256R1())
     request = x509.CertificateSigningRequestBuilder(
@@ -58,7 +58,7 @@ def fingerprint(pem: str) -> str:
 
 
 def attached(cloud: Cloud, robot: str) -> list[Certificate]:
-    """The certificates of the robot's thing, the oldest first; none where there is no thing."""
+    """The certificates of the robot's thing, the oldest first; empty without a thing."""
     iot = cloud.client("iot")
     try:
         pages = iot.get_paginator("list_thing_principals").paginate(thingName=robot)
@@ -76,12 +76,12 @@ def _described(iot: Any, arn: str) -> Certificate:
 
 
 def revoke(cloud: Cloud, certificate: Certificate) -> None:
-    """Make a certificate unusable, for good."""
+    """Revoke a certificate, permanently."""
     cloud.client("iot").update_certificate(certificateId=certificate.id, newStatus="REVOKED")
 
 
 def delete(cloud: Cloud, robot: str, certificate: Certificate) -> None:
-    """Take a revoked certificate off the robot, and delete it."""
+    """Detach a revoked certificate from the robot, and delete it."""
     iot, arn = cloud.client("iot"), certificate.arn
     iot.detach_policy(policyName=fleet_name(cloud.namespace), target=arn)
     iot.detach_thing_principal(thingName=robot, principal=arn)
@@ -89,11 +89,11 @@ def delete(cloud: Cloud, robot: str, certificate: Certificate) -> None:
 
 
 def once_detached(iot: Any, change: Callable[..., Any], **what: Any) -> None:
-    """Delete what has just been detached: AWS takes some seconds to know of it, and tells nobody when."""
+    """Delete something that was just detached: AWS takes seconds to register that, and sends no event."""
     for pause_s in (0.5, 1.0, 2.0, 4.0, 8.0, 16.0):
         try:
             change(**what)
-        except (  # noqa: PERF203 - trying again is what the loop is for
+        except (  # noqa: PERF203 - the loop retries
             iot.exceptions.DeleteConflictException,
             iot.exceptions.InvalidRequestException,
         ):
@@ -104,10 +104,10 @@ def once_detached(iot: Any, change: Callable[..., Any], **what: Any) -> None:
 
 
 def cut(cloud: Cloud, robot: str) -> bool:
-    """End the robot's session, its queued messages included; whether there was one."""
+    """End the robot's session with its queued messages; returns whether it had one."""
     data = cloud.client("iot-data")
     try:
-        # Its last will would be said by a robot that is none any more.
+        # A removed robot must not publish its last will.
         data.delete_connection(clientId=robot, cleanSession=True, preventWillMessage=True)
     except data.exceptions.ResourceNotFoundException:
         return False

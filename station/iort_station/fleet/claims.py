@@ -1,6 +1,6 @@
-"""Claims, which a robot exchanges for a certificate of its own key, and the names that they may have.
+"""Provisioning claims, which a robot exchanges for a certificate, and the names that they may have.
 
-A name is opened for one certificate and for a time; functions/admit.py holds every claim to that.
+A name is opened for one certificate and for a limited time; functions/admit.py enforces that.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ from iort_station.fleet.bundle import connection, write_private
 from iort_station.fleet.certificates import once_detached
 from iort_station.fleet.robots import F1TENTH
 
-# AWS' own claims connect for five minutes; one that connected in the last of them gets its answer.
+# AWS' own claims can connect for five minutes; the margin is for one that connects at the end.
 _CLAIM_S = 6 * 60
 DAYS = 30
 _DAY_S = 86_400
@@ -37,12 +37,11 @@ def claim(
 ) -> Path:
     """Write a claim into ``out``, which `iort-agent provision` or `renew` exchanges for a certificate.
 
-    It is good for five minutes and for ``robot``, which is entered with its ``vehicle`` parameters if it
-    is not registered yet; a name that is taken is opened for another certificate. ``lasting``, it is
-    good until it is revoked, to be put on many robots (``robot`` None); which names it may have,
-    `register` says.
+    It is valid for five minutes and for ``robot``. A new robot is registered with its ``vehicle`` parameters;
+    a registered one is opened for another certificate. A ``lasting`` claim is valid until it is revoked, for
+    many robots (``robot`` None) with the names of `register`.
 
-    Raises `StationError` for a name that is not allowed and a deployment without the template.
+    Raises `StationError` for an invalid name, and for a deployment without the template.
     """
     iot = cloud.client("iot")
     settings: dict[str, Any] = {}
@@ -61,7 +60,7 @@ def claim(
             number, certificate = created["certificateId"], created["certificatePem"]
             key = created["keyPair"]["PrivateKey"]
     except ClientError as error:
-        raise StationError(f"no claim can be made; are the current stacks deployed? {error}") from error
+        raise StationError(f"the claim failed; are the current stacks deployed? {error}") from error
     if robot is not None:
         for_s = DAYS * _DAY_S if lasting else _CLAIM_S
         known_by = registry.ClaimId(number, certificates.fingerprint(certificate))
@@ -81,10 +80,10 @@ def register(
     days: float = DAYS,
     vehicle: Mapping[str, float] = F1TENTH,
 ) -> None:
-    """Expect a robot: any of the fleet's claims may have its name, once, within the time; the machine
-    with the ``serial`` alone, if one is given.
+    """Pre-register a robot: a lasting claim can claim its name once, within ``days``. With ``serial``, only
+    the machine with this serial number can.
 
-    Raises `StationError` where the robot is registered already: `claim` opens its name again.
+    Raises `StationError` for a registered robot; `claim` opens its name again.
     """
     row = dict(vehicle) if serial is None else {**vehicle, SERIAL: serial}
     registry.enter(cloud, robot, row)
@@ -92,7 +91,7 @@ def register(
 
 
 def revoke_all(cloud: Cloud) -> int:
-    """Revoke and delete every lasting claim; how many there were."""
+    """Revoke and delete every lasting claim; returns their number."""
     iot, policy = cloud.client("iot"), claim_name(cloud.namespace)
     pages = iot.get_paginator("list_targets_for_policy").paginate(policyName=policy)
     targets = [target for page in pages for target in page["targets"]]
@@ -105,7 +104,7 @@ def revoke_all(cloud: Cloud) -> int:
 
 
 def _serial_of(iot: Any, robot: str) -> dict[str, str]:
-    """The serial number of a thing that exists, which provisioning must repeat; its name if it has none."""
+    """The serial number of an existing thing, which provisioning must repeat; its name if it has none."""
     try:
         attributes = iot.describe_thing(thingName=robot).get("attributes", {})
     except iot.exceptions.ResourceNotFoundException:

@@ -1,4 +1,4 @@
-"""The files that robots have uploaded: what there is, and how it comes here."""
+"""The files that robots have uploaded: listed, downloaded and deleted."""
 
 from __future__ import annotations
 
@@ -23,14 +23,14 @@ _CHUNK_BYTES = 1024 * 1024
 # DeleteObjects takes at most so many keys.
 _DELETE_SIZE = 1000
 
-# Hears how many bytes more are here, or how many things more are gone.
-Told = Callable[[int], None]
+# Receives the number of further bytes downloaded, or of further files deleted.
+CountProgress = Callable[[int], None]
 
 
 @dataclass(frozen=True)
 class StoredFile:
-    """A file in the bucket. ``second`` is when the robot last wrote it, ``stored_s`` when it arrived;
-    both since the epoch."""
+    """A file in the bucket. ``second`` is the time of the robot's last write, ``stored_s`` that of its
+    arrival; both since the epoch."""
 
     key: str
     robot: str
@@ -43,15 +43,15 @@ class StoredFile:
 def listed(
     cloud: Cloud, robot: str, *, start_us: int | None = None, end_us: int | None = None
 ) -> Iterator[StoredFile]:
-    """A robot's files that it last wrote within the range, both ends included, in that order, page by page.
+    """A robot's files that it last wrote in the range, both ends inclusive, in order of time.
 
-    Raises `StationError` for a name that is not allowed.
+    Raises `StationError` for an invalid name.
     """
     try:
         prefix = f"{FILES_PREFIX}{check_robot(robot)}/"
     except ContractError as error:
         raise StationError(str(error)) from error
-    # The time is in the key, so that S3 begins and we end where the range does.
+    # The key begins with the time, so only the range is listed.
     after = prefix if start_us is None else prefix + _day(start_us)
     pages = cloud.client("s3").get_paginator("list_objects_v2")
     for page in pages.paginate(Bucket=_bucket(cloud), Prefix=prefix, StartAfter=after):
@@ -59,7 +59,7 @@ def listed(
             try:
                 key = parse_file_key(one["Key"])
             except ContractError:
-                continue  # somebody else's, put there by hand
+                continue  # not a file of a robot
             if end_us is not None and key.second * 1_000_000 > end_us:
                 return
             if start_us is None or (key.second + 1) * 1_000_000 > start_us:
@@ -67,11 +67,12 @@ def listed(
                 yield StoredFile(one["Key"], key.robot, key.name, one["Size"], key.second, stored_s)
 
 
-def download(cloud: Cloud, file: StoredFile, out: Path, told: Told = lambda _bytes: None) -> Path:
-    """Bring a file to ``out/<its name>``, going on with a part that is there; its path.
+def download(
+    cloud: Cloud, file: StoredFile, out: Path, progress: CountProgress = lambda _bytes: None
+) -> Path:
+    """Download a file to ``out/<its name>``, continuing a partial download; returns its path.
 
-    Raises `StationError` where what arrives does not have the SHA-256 that the robot said, and where
-    another file is in the way.
+    Raises `StationError` for a wrong SHA-256, and if another file has this name.
     """
     client, bucket = cloud.client("s3"), _bucket(cloud)
     head = client.head_object(Bucket=bucket, Key=file.key)
@@ -79,34 +80,32 @@ def download(cloud: Cloud, file: StoredFile, out: Path, told: Told = lambda _byt
     path = out / file.name
     if path.exists():
         if _sha256(path).hexdigest() == said:
-            told(file.size)
+            progress(file.size)
             return path
-        raise StationError(f"{path} is there, and is another file: move it away, or give --out")
+        raise StationError(f"{path} is another file: move it away, or choose --out")
     path.parent.mkdir(parents=True, exist_ok=True)
     part = path.with_name(f"{path.name}.{said[:12]}.part")
     digest = _sha256(part) if part.exists() else hashlib.sha256()
     there = part.stat().st_size if part.exists() else 0
-    told(there)
+    progress(there)
     if there < file.size:
-        # Of the object that the head is of, and no other.
+        # The object must be the one of the head.
         wanted = {"Range": f"bytes={there}-"} if there else {}
         body = client.get_object(Bucket=bucket, Key=file.key, IfMatch=head["ETag"], **wanted)["Body"]
         with part.open("ab") as written:
             for chunk in _chunks(body, file.key):
                 digest.update(chunk)
                 written.write(chunk)
-                told(len(chunk))
+                progress(len(chunk))
     if digest.hexdigest() != said:
         part.unlink()
-        raise StationError(
-            f"{file.key}: what arrived is not what the robot sent: SHA-256 {digest.hexdigest()}"
-        )
+        raise StationError(f"{file.key}: SHA-256 must be {said}, got {digest.hexdigest()}")
     part.replace(path)
     return path
 
 
 def content(cloud: Cloud, key: str) -> bytes | None:
-    """What a file holds; None where it is not there, or not yet."""
+    """A file's content; None if it is not (yet) there."""
     client = cloud.client("s3")
     try:
         return bytes(client.get_object(Bucket=_bucket(cloud), Key=key)["Body"].read())
@@ -114,13 +113,13 @@ def content(cloud: Cloud, key: str) -> bytes | None:
         return None
 
 
-def empty(cloud: Cloud, told: Told = lambda _count: None) -> None:
-    """Delete everything in the bucket, uploads that were begun included: for a stack that is to go."""
+def empty(cloud: Cloud, progress: CountProgress = lambda _count: None) -> None:
+    """Delete everything in the bucket, including unfinished uploads, before its stack is deleted."""
     client, bucket = cloud.client("s3"), _bucket(cloud)
     uploads = client.get_paginator("list_multipart_uploads").paginate(Bucket=bucket)
     for begun in [one for page in uploads for one in page.get("Uploads", ())]:
         client.abort_multipart_upload(Bucket=bucket, Key=begun["Key"], UploadId=begun["UploadId"])
-        told(1)
+        progress(1)
     pages = client.get_paginator("list_objects_v2").paginate(Bucket=bucket)
     keys = iter([one["Key"] for page in pages for one in page.get("Contents", ())])
     while chunk := [{"Key": key} for key in islice(keys, _DELETE_SIZE)]:
@@ -128,7 +127,7 @@ def empty(cloud: Cloud, told: Told = lambda _count: None) -> None:
         if answer.get("Errors"):
             first = answer["Errors"][0]
             raise StationError(f"{first['Key']} cannot be deleted: {first['Code']} {first['Message']}")
-        told(len(chunk))
+        progress(len(chunk))
 
 
 def _bucket(cloud: Cloud) -> str:
@@ -144,7 +143,7 @@ def _chunks(body: Any, key: str) -> Iterator[bytes]:
         yield from body.iter_chunks(_CHUNK_BYTES)
     except (BotoCoreError, ClientError, HTTPError) as error:
         raise StationError(
-            f"{key}: the download broke off, and goes on when started again: {error}"
+            f"{key}: the download was interrupted; run it again to continue: {error}"
         ) from error
 
 

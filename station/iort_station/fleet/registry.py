@@ -1,4 +1,4 @@
-"""The registry: a row a robot, in the robots table. Who may have a name is decided by its row."""
+"""The registry: one row per robot in the robots table. A row decides who may claim the robot's name."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from typing import Any, NamedTuple
 
 from boto3.dynamodb.types import TypeSerializer
 
-from iort_contract.attributes import plain
+from iort_contract.dynamodb import plain
 from iort_contract.limits import ContractError
 from iort_contract.messages.page import RobotPresence
 from iort_contract.tables import (
@@ -31,7 +31,7 @@ _serialize = TypeSerializer().serialize
 
 
 def checked(robot: str) -> str:
-    """The name, if it may name a robot; raises `StationError` otherwise."""
+    """Return a valid robot name; raises `StationError`."""
     try:
         return check_robot(robot)
     except ContractError as error:
@@ -46,7 +46,7 @@ def listed(cloud: Cloud) -> Iterator[dict[str, Any]]:
 
 
 def _row(item: Mapping[str, Any]) -> dict[str, Any]:
-    """A row as JSON can have it: a set is a list in order."""
+    """A row for JSON: a set becomes a sorted list."""
     return {name: sorted(value) if isinstance(value, set) else value for name, value in plain(item).items()}
 
 
@@ -63,8 +63,7 @@ def vehicles(cloud: Cloud) -> dict[str, dict[str, float]]:
 
 
 def presence(cloud: Cloud) -> dict[str, RobotPresence]:
-    """Of every robot whether it is ``online`` and, as ``since_ms``, since when it is or is not; None where it
-    has never connected."""
+    """Whether each robot is ``online``, and ``since_ms`` when; None if it has never connected."""
     found: dict[str, RobotPresence] = {}
     for row in listed(cloud):
         online = bool(row.get(ONLINE))
@@ -74,7 +73,7 @@ def presence(cloud: Cloud) -> dict[str, RobotPresence]:
 
 
 def find(cloud: Cloud, robot: str) -> dict[str, Any] | None:
-    """A robot's row as it is now; None where it is not registered."""
+    """A robot's row; None if it is not registered."""
     answer = cloud.client("dynamodb").get_item(
         TableName=_table(cloud), Key=_key(checked(robot)), ConsistentRead=True
     )
@@ -82,7 +81,7 @@ def find(cloud: Cloud, robot: str) -> dict[str, Any] | None:
 
 
 def get(cloud: Cloud, robot: str) -> dict[str, Any]:
-    """A robot's row as it is now; raises `StationError` where it is not registered."""
+    """A robot's row; raises `StationError` if it is not registered."""
     row = find(cloud, robot)
     if row is None:
         raise StationError(f"robot {robot} is not registered")
@@ -90,9 +89,9 @@ def get(cloud: Cloud, robot: str) -> dict[str, Any]:
 
 
 def enter(cloud: Cloud, robot: str, row: Mapping[str, Any]) -> None:
-    """Write a new row, which is what makes a name taken: making a thing twice is no error.
+    """Write a new row, which reserves the name; AWS IoT does not refuse a second thing of the same name.
 
-    Raises `StationError` where the robot is registered already.
+    Raises `StationError` for a registered robot.
     """
     item = {ROBOT: checked(robot), **row}
     numbers = {name: Decimal(repr(value)) for name, value in item.items() if isinstance(value, int | float)}
@@ -109,9 +108,9 @@ def enter(cloud: Cloud, robot: str, row: Mapping[str, Any]) -> None:
 
 
 def set_vehicle(cloud: Cloud, robot: str, vehicle: Mapping[str, float]) -> dict[str, float]:
-    """Change these of a robot's vehicle parameters, and nothing else; what they were, those that it had.
+    """Change vehicle parameters of a robot; returns the old values of those that it had.
 
-    Raises `StationError` where the robot is not registered.
+    Raises `StationError` if it is not registered.
     """
     dynamodb = cloud.client("dynamodb")
     try:
@@ -130,15 +129,14 @@ def set_vehicle(cloud: Cloud, robot: str, vehicle: Mapping[str, float]) -> dict[
 
 
 class ClaimId(NamedTuple):
-    """What a claim's certificate is known by: AWS' id of it, and its SHA-256 in hex."""
+    """The identity of a claim's certificate: AWS' id, and its SHA-256 in hex."""
 
     id: str
     fingerprint: str
 
 
 def open_name(cloud: Cloud, robot: str, *, for_s: float, claim: ClaimId | None) -> None:
-    """Let one certificate be issued for a name: within the time, for this claim or for any. Which one was
-    issued before is forgotten."""
+    """Allow one certificate for a name within the time, for this claim or for any."""
     values = {":until": {"N": str(int(time.time() + for_s))}}
     update, before = f"SET {ADMIT_UNTIL_S} = :until", f"{ADMITTED_CERTIFICATE}, {ADMITTED_MS}"
     if claim is None:
@@ -157,7 +155,7 @@ def open_name(cloud: Cloud, robot: str, *, for_s: float, claim: ClaimId | None) 
 
 
 def close_name(cloud: Cloud, robot: str) -> None:
-    """Let no certificate be issued for a name any more."""
+    """Allow no further certificate for a name."""
     cloud.client("dynamodb").update_item(
         TableName=_table(cloud),
         Key=_key(robot),

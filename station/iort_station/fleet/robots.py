@@ -1,4 +1,4 @@
-"""The robots that may connect: thing, certificate, policy and the registry's row."""
+"""Adds and removes robots: thing, certificate, policy and the registry's row."""
 
 from __future__ import annotations
 
@@ -25,16 +25,16 @@ GAIN = "speed_to_erpm_gain"
 F1TENTH: Mapping[str, float] = asdict(derived.F1TENTH)
 
 
-# A gain or an offset of more, or a gain of less, is a slip of the hand.
+# Values beyond these are typing errors.
 _MOST, _LEAST = 1e9, 1e-9
 
 
 def checked_vehicle(vehicle: Mapping[str, float]) -> dict[str, float]:
-    """The vehicle parameters; raises `StationError` where one has another name or cannot be."""
+    """Return valid vehicle parameters; raises `StationError`."""
     for name, value in vehicle.items():
         if name not in F1TENTH:
-            raise StationError(f"{name} is no vehicle parameter; allowed are {', '.join(F1TENTH)}")
-        # NaN is on no side of a bound.
+            raise StationError(f"vehicle parameter must be one of {', '.join(F1TENTH)}, got {name}")
+        # NaN fails every comparison.
         if not abs(value) <= _MOST or (name == GAIN and abs(value) < _LEAST):
             no_zero = " and not 0" if name == GAIN else ""
             raise StationError(
@@ -51,19 +51,18 @@ def add(
     vehicle: Mapping[str, float] = F1TENTH,
     settings: Mapping[str, Any] | None = None,
 ) -> Bundle:
-    """Register a robot and write its bundle into ``out/<robot>``, readable by the owner alone.
+    """Register a robot and write its bundle into ``out/<robot>``, readable only by the owner.
 
-    ``vehicle`` are the parameters that Lambda 2 derives speed from; ``settings`` are more of the
-    agent's settings for car.yaml (the source is a simulated car unless they say otherwise).
+    Lambda 2 derives the speed from the ``vehicle`` parameters. ``settings`` are further settings for
+    car.yaml; the default source is a simulated car.
 
-    Raises `StationError` for a name that is not allowed, a robot that is already there, and a
-    deployment without the fleet stack.
+    Raises `StationError` for an invalid name, a registered robot, and a deployment without the fleet stack.
     """
     registry.checked(robot)
     folder = out / robot
     if folder.exists() and any(folder.iterdir()):
         raise StationError(f"{folder} is not empty; its keys would be lost")
-    # Before anything is registered: it will hold the only copy of the private key.
+    # Create it before anything is registered, since it will hold the only copy of the private key.
     folder.mkdir(parents=True, exist_ok=True, mode=0o700)
     registry.enter(cloud, robot, vehicle)
     iot, fleet = cloud.client("iot"), fleet_name(cloud.namespace)
@@ -77,7 +76,7 @@ def add(
         iot.attach_thing_principal(thingName=robot, principal=made.arn)
     except ClientError as error:
         raise StationError(
-            f"robot {robot} is registered in part; remove it and try again: {error}"
+            f"robot {robot} is only partly registered; remove it and try again: {error}"
         ) from error
     bundle = Bundle(robot, folder)
     write_bundle(cloud, bundle, made.pem, made.private_key_pem, settings or {})
@@ -85,13 +84,13 @@ def add(
 
 
 def remove(cloud: Cloud, robot: str) -> None:
-    """Take a robot away: its certificates are revoked, its session is cut, and then its certificates,
-    its thing, its shadow and its row are deleted. What it has sent stays.
+    """Remove a robot: revoke its certificates, end its session, and delete certificates, shadow, thing and
+    row. Its samples and files stay.
 
-    Raises `StationError` for a robot that is not registered.
+    Raises `StationError` if it is not registered.
     """
     registry.get(cloud, robot)
-    # No claim may give it a certificate meanwhile.
+    # A claim must not get it a new certificate now.
     registry.close_name(cloud, robot)
     held = certificates.attached(cloud, robot)
     for certificate in held:
@@ -99,11 +98,10 @@ def remove(cloud: Cloud, robot: str) -> None:
     certificates.cut(cloud, robot)
     for certificate in held:
         certificates.delete(cloud, robot, certificate)
-    # It may have come back before every server knew; without its policy it cannot do so again.
+    # It may have reconnected before all servers knew of the revocation; without its policy it cannot again.
     certificates.cut(cloud, robot)
     iot, data = cloud.client("iot"), cloud.client("iot-data")
-    # A robot that gets the name one day must not inherit what was wished of this one; there is none
-    # where it never connected.
+    # The next robot of this name must not inherit its settings. A robot that never connected has no shadow.
     with contextlib.suppress(data.exceptions.ResourceNotFoundException):
         data.delete_thing_shadow(thingName=robot, shadowName=SHADOW)
     certificates.once_detached(iot, iot.delete_thing, thingName=robot)

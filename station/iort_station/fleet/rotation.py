@@ -1,4 +1,4 @@
-"""Rotation: a robot's old certificates go when, and only when, it has settled down with its new one."""
+"""Rotation: deletes a robot's old certificates once it has stayed connected with its new one."""
 
 from __future__ import annotations
 
@@ -11,8 +11,8 @@ from iort_station.errors import StationError
 from iort_station.fleet import certificates, registry
 from iort_station.fleet.certificates import Certificate
 
-# `iort-agent renew` goes back to the old certificate when the new one has not connected for 60 s.
-# A connection that is older than that is one that it stays with.
+# `iort-agent renew` returns to the old certificate if the new one does not connect within 60 s, so a robot
+# keeps a connection that is older than that.
 SETTLED_S = 90.0
 _LOOK_S = 1.0
 
@@ -25,12 +25,12 @@ def finish(
     wait_s: float = 3600.0,
     progress: Callable[[str], None] = lambda _what: None,
 ) -> list[Certificate]:
-    """Wait until the robot has been connected with its newest certificate for ``settled_s`` seconds
-    without a break, then revoke and delete its other ones; these.
+    """Wait until the robot has been connected with its newest certificate for ``settled_s`` without a break,
+    then revoke and delete the others; returns these.
 
-    Nothing is changed before that, so that the robot always has a way in; it may be stopped and
-    called again at any time. ``progress`` hears what it waits for. Raises `StationError` for a robot
-    that is not registered or has no active certificate, and where it did not settle in ``wait_s``.
+    Nothing changes before that, so the robot can always connect, and the wait may be stopped and repeated.
+    ``progress`` receives what it waits for. Raises `StationError` if the robot is not registered, has no
+    active certificate, or does not settle within ``wait_s``.
     """
     registry.get(cloud, robot)
     deadline, settling, said = time.monotonic() + wait_s, None, ""
@@ -56,8 +56,8 @@ def finish(
             progress(now)
             said = now
         if time.monotonic() > deadline:
-            raise StationError(f"{now}; its old certificate stays. Try again later")
-        # The registry tells nobody when it changes.
+            raise StationError(f"{now}; its old certificate stays. Run this again later")
+        # The registry sends no events.
         time.sleep(_LOOK_S)
     old = [certificate for certificate in held if certificate.id != newest.id]
     for certificate in old:

@@ -1,6 +1,6 @@
-"""A robot's named shadow `agent` from the operator's side: what is in force, wishes, and answers.
+"""A robot's named shadow `agent` from the operator's side: desired settings, and the robot's reports.
 
-Units are those of the settings' names, which are car.yaml's.
+Settings have the names and units of car.yaml.
 """
 
 from __future__ import annotations
@@ -18,15 +18,15 @@ from iort_station.cloud import Cloud
 from iort_station.errors import StationError
 
 _POLL_S = 0.3
-# HTTP's Date is a whole second: a clock more than this off it is off.
+# HTTP's Date has whole seconds, so smaller differences may be rounding.
 _CLOCK_S = 2.0
-# No count and no time that a calendar has is as large.
+# Every valid count and time is smaller.
 _MOST = 10**14
 _Found = TypeVar("_Found")
 
 
-class Refusal(NamedTuple):
-    """A wish that the robot refused, and why."""
+class Rejection(NamedTuple):
+    """A desired setting that the robot rejected, and the reason."""
 
     name: str
     value: Any
@@ -34,34 +34,34 @@ class Refusal(NamedTuple):
 
 
 class State(NamedTuple):
-    """The shadow's version, and what stands in it; empty where the robot has none yet."""
+    """The shadow's version and content; empty if the robot has none yet."""
 
     version: int
     desired: Mapping[str, Any]
     reported: Mapping[str, Any]
 
     def settings(self) -> dict[str, Any]:
-        """What is in force: dotted name to value, as the robot reported it last."""
+        """The settings in use, by dotted name, as the robot last reported them."""
         own = {k: v for k, v in self.reported.items() if k not in {"rejected", COMMANDS, AGENT_VERSION}}
         return dict(sorted(_flat(own)))
 
-    def wished(self) -> dict[str, Any]:
-        """What is desired: dotted name to value."""
+    def desired_settings(self) -> dict[str, Any]:
+        """The desired settings, by dotted name."""
         return dict(_flat({name: value for name, value in self.desired.items() if name != OVER_SHARE}))
 
-    def refusals(self) -> list[Refusal]:
-        """The wishes that the robot refuses; none where it says so in another form."""
+    def rejections(self) -> list[Rejection]:
+        """The desired settings that the robot rejects; entries of another form are ignored."""
         found = _mapping(self.reported.get("rejected"))
         return [
-            Refusal(name, one.get("value"), str(one.get("reason", "")))
+            Rejection(name, one.get("value"), str(one.get("reason", "")))
             for name, one in sorted(found.items())
             if isinstance(one, dict)
         ]
 
 
 class Shadow:
-    """The shadow of a registered robot. Raises `StationError` for any other, and where this computer's
-    clock is so far off the cloud's that nothing it sends could be judged by its time."""
+    """The shadow of a registered robot. Raises `StationError` for any other, and if this computer's clock is
+    wrong, since robots judge commands by their time."""
 
     def __init__(self, cloud: Cloud, robot: str) -> None:
         try:
@@ -78,19 +78,13 @@ class Shadow:
         self.data = cloud.client("iot-data")
 
     def read(self) -> State:
-        """What stands in the shadow now."""
-        try:
-            answer = self.data.get_thing_shadow(thingName=self.robot, shadowName=SHADOW)
-        except self.data.exceptions.ResourceNotFoundException:
-            return State(0, {}, {})
-        document = json.loads(answer["payload"].read())
-        state = document.get("state", {})
-        return State(document.get("version", 0), state.get("desired") or {}, state.get("reported") or {})
+        """The shadow's current state."""
+        return _read(self.data, self.robot)
 
-    def wish(self, wishes: Mapping[str, Any]) -> None:
-        """Desire settings by dotted name; None withdraws a wish, and the file's value counts again."""
+    def desire(self, wanted: Mapping[str, Any]) -> None:
+        """Set desired settings by dotted name; None returns to the file's value."""
         desired: dict[str, Any] = {}
-        for name, value in wishes.items():
+        for name, value in wanted.items():
             first, _, rest = name.partition(".")
             if rest:
                 desired.setdefault(first, {})[rest] = value
@@ -100,16 +94,16 @@ class Shadow:
         self.data.update_thing_shadow(thingName=self.robot, shadowName=SHADOW, payload=payload)
 
     def wait(self, found: Callable[[State], _Found | None], seconds: float) -> _Found | None:
-        """What ``found`` says of the shadow as soon as it says something; None after ``seconds``."""
+        """Wait until ``found`` returns a value for the state; None after ``seconds``."""
         deadline = time.monotonic() + seconds
         while (value := found(self.read())) is None and time.monotonic() < deadline:
-            # A shadow tells its reader nothing by itself.
+            # A shadow sends no events to this API.
             time.sleep(_POLL_S)
         return value
 
 
 class OverShare(NamedTuple):
-    """What the cloud said of batches that it put off: how many, since when and when last."""
+    """The batches that the cloud put off: their number, and the first and last time."""
 
     batches: int
     since_ms: int
@@ -117,16 +111,10 @@ class OverShare(NamedTuple):
 
 
 def over_share(cloud: Cloud, robot: str) -> OverShare | None:
-    """What Lambda 2 said last of a robot that was over its share; None where it said nothing."""
-    data = cloud.client("iot-data")
-    try:
-        answer = data.get_thing_shadow(thingName=robot, shadowName=SHADOW)
-    except data.exceptions.ResourceNotFoundException:
-        return None
-    desired = json.loads(answer["payload"].read()).get("state", {}).get("desired") or {}
-    said = desired.get(OVER_SHARE)
+    """Lambda 2's last report on a robot over its share; None if it has none."""
+    said = _read(cloud.client("iot-data"), robot).desired.get(OVER_SHARE)
     names = (PUT_OFF, PUT_OFF_SINCE_MS, PUT_OFF_LAST_MS)
-    # The robot may write there as well.
+    # The robot can write this too, so it may be anything.
     if not isinstance(said, dict) or not all(
         type(said.get(name)) is int and 0 <= said[name] < _MOST for name in names
     ):
@@ -134,13 +122,23 @@ def over_share(cloud: Cloud, robot: str) -> OverShare | None:
     return OverShare(*(said[name] for name in names))
 
 
-def answered(wishes: Mapping[str, Any], state: State) -> bool | None:
-    """Whether the robot has answered all the wishes, which is True or None (not yet): each is in force
-    or refused. A wish withdrawn is answered when it is refused no longer."""
-    settings, refused = state.settings(), {refusal.name: refusal for refusal in state.refusals()}
-    for name, value in wishes.items():
-        if name in refused:
-            if value is None or not _same(refused[name].value, value):
+def _read(data: Any, robot: str) -> State:
+    try:
+        answer = data.get_thing_shadow(thingName=robot, shadowName=SHADOW)
+    except data.exceptions.ResourceNotFoundException:
+        return State(0, {}, {})
+    document = json.loads(answer["payload"].read())
+    state = document.get("state", {})
+    return State(document.get("version", 0), state.get("desired") or {}, state.get("reported") or {})
+
+
+def answered(wanted: Mapping[str, Any], state: State) -> bool | None:
+    """True once each desired setting is in use or rejected, otherwise None. A withdrawn setting is answered
+    once it is no longer rejected."""
+    settings, rejected = state.settings(), {one.name: one for one in state.rejections()}
+    for name, value in wanted.items():
+        if name in rejected:
+            if value is None or not _same(rejected[name].value, value):
                 return None
         elif value is not None and value != [] and settings.get(name) != value:
             return None
@@ -148,7 +146,7 @@ def answered(wishes: Mapping[str, Any], state: State) -> bool | None:
 
 
 def outcome(state: State, name: str, session: str, seq: int) -> str | None:
-    """What the robot says became of a command; None while it has said nothing of this one."""
+    """The robot's report on a command; None until it reports."""
     found = _mapping(_mapping(state.reported.get(COMMANDS)).get(name))
     if (found.get("session"), found.get("seq")) != (session, seq):
         return None
@@ -156,12 +154,12 @@ def outcome(state: State, name: str, session: str, seq: int) -> str | None:
 
 
 def _mapping(value: Any) -> Mapping[str, Any]:
-    """What a robot reports where an object is expected; an empty one for anything else."""
+    """A reported object; an empty one for any other value."""
     return value if isinstance(value, dict) else {}
 
 
 def _same(quoted: Any, value: Any) -> bool:
-    # The robot quotes what is long by its beginning.
+    # The robot cuts long values in its report.
     cut = isinstance(quoted, str) and quoted.endswith("...") and quoted != value
     return json.dumps(value).startswith(quoted[:-3]) if cut else bool(quoted == value)
 
@@ -181,5 +179,5 @@ def _check_clock(date: str | None, began_s: float, ended_s: float) -> None:
     off_s = max(began_s - (cloud_s + 1), cloud_s - ended_s)
     if off_s > _CLOCK_S:
         raise StationError(
-            f"this computer's clock is {off_s:.0f} s off the cloud's: set it (NTP), then try again"
+            f"this computer's clock differs by {off_s:.0f} s from the cloud's: set it (NTP), then try again"
         )

@@ -1,1 +1,2 @@
-"""Whether everything arrived and why not: audit, quarantine, replay, traces, CloudWatch."""
+"""What an operator does with stored data: audit, trace, quarantine, replay, recompute, CloudWatch. It uses
+data, fleet and `iort_station.cloud`."""

@@ -1,8 +1,8 @@
-"""Proof of delivery: the numbers of a stream's batches, expected, stored, missing, twice and late.
+"""The audit of a stream's delivery: batches expected, stored, missing, duplicated and late.
 
 Each run of the agent numbers its batches of a stream from 0 without gaps, and its first batches name the runs
 before it with their last numbers, as far as its queue knows. A number that is not stored is a batch that was
-lost, or is still in the car. Agents before that numbered on over restarts where the queue had a file.
+lost, or that still waits in the car. Earlier agents numbered on over restarts if the queue had a file.
 """
 
 from __future__ import annotations
@@ -12,33 +12,30 @@ from dataclasses import dataclass
 from itertools import pairwise
 from typing import Any, NamedTuple
 
-from iort_contract.attributes import plain
 from iort_contract.catalog.streams import AGENT_STREAM
+from iort_contract.dynamodb import plain, starting_between
 from iort_contract.limits import ContractError
-from iort_contract.messages.batch import Batch, RunEnd, batch_id, batches_between, decode_batch, run_ends
-from iort_contract.tables import BATCH, PREVIOUS, RECEIVED_MS, SAMPLES, TOPIC
-from iort_contract.topics import RECORD, build_topic
+from iort_contract.messages.batch import Batch, BatchId, RunEnd, batch_id, decode_batch, run_ends
+from iort_contract.tables import BATCH, PREVIOUS, RECEIVED_MS, SAMPLES
 from iort_station.cloud import Cloud
-from iort_station.data.items import of_topic
+from iort_station.data.batches import telemetry_table, topic_of
 
-# Later than the run's fastest batch by more than this. A batch is a second long, and the next one
-# that is sent at once arrives within milliseconds.
+# A batch is late if it took this much longer to arrive than the run's fastest one. It spans a second, and
+# arrives within milliseconds if nothing delays it.
 LATE_MS = 5_000
 
 
-class Stored(NamedTuple):
-    """What the telemetry table says of one batch, without its samples. ``received_ms`` is the cloud's."""
+class Header(NamedTuple):
+    """A stored batch without its samples; ``received_ms`` is the cloud's time."""
 
-    boot: str
-    seq: int
-    t_us: int
+    id: BatchId
     samples: int
     received_ms: int
     previous: tuple[RunEnd, ...] | None
 
 
 class Missing(NamedTuple):
-    """Numbers ``first`` to ``last`` that are not stored, between the samples' times of their neighbours."""
+    """The numbers ``first`` to ``last``, which are not stored; and the start times of their neighbours."""
 
     first: int
     last: int
@@ -47,14 +44,17 @@ class Missing(NamedTuple):
 
     @property
     def batches(self) -> int:
-        """How many."""
+        """The number of batches."""
         return self.last - self.first + 1
 
 
 @dataclass(frozen=True)
-class Run:
-    """One run of the agent: its batches from the lowest number to the highest, when its samples are, and
-    how many each batch has, by its number."""
+class RunAudit:
+    """The stored batches of one run of the agent, from the lowest number to the highest.
+
+    ``first_us`` and ``last_us`` are the start times of its earliest and latest batch. ``samples_of`` has the
+    number of samples by batch number.
+    """
 
     boot: str
     first_seq: int
@@ -71,7 +71,7 @@ class Run:
 
     @property
     def expected(self) -> int:
-        """Batches from the first number to the last, and those missing before the first."""
+        """The stored and the missing batches."""
         return self.batches + sum(gap.batches for gap in self.missing)
 
 
@@ -83,8 +83,7 @@ class LostRun(NamedTuple):
 
 
 class Shortfall(NamedTuple):
-    """A difference between what a run says it took and what is stored: how many samples, None where nobody
-    can know, and why."""
+    """Samples that a run took and that are not stored, with the cause; None if their number is unknown."""
 
     boot: str
     samples: int | None
@@ -93,16 +92,16 @@ class Shortfall(NamedTuple):
 
 @dataclass(frozen=True)
 class Audit:
-    """Of one stream: its runs in the order of their receipt, and the runs of which nothing is stored.
+    """The audit of one stream; its runs are in the order in which they arrived.
 
-    ``before_first`` numbers lie before the first stored one: expired, outside of the range asked for, or
-    lost. ``refused`` items are not batches. ``in_car`` and ``dropped`` are what the agent last said of
-    its queue, None where it said nothing. ``taken`` are the samples that the runs say they took, None where
-    none said so, and ``shortfalls`` in what the table differs from that.
+    ``before_first`` counts numbers before the first stored one: expired, outside the range, or lost.
+    ``refused`` counts items that are not batches. ``in_car`` and ``dropped`` are the agent's last metrics of
+    its queue; None if it sent none. ``taken`` counts the samples that the runs report in their accounts; None
+    without an account. ``shortfalls`` are the differences between the accounts and the table.
     """
 
     stream: str
-    runs: list[Run]
+    runs: list[RunAudit]
     before_first: int = 0
     refused: int = 0
     in_car: int | None = None
@@ -113,13 +112,13 @@ class Audit:
 
     @property
     def missing(self) -> int:
-        """Batches missing in all runs."""
+        """The number of missing batches in all runs."""
         stored_runs = sum(gap.batches for run in self.runs for gap in run.missing)
         return stored_runs + sum(run.batches for run in self.lost_runs)
 
     @property
     def complete(self) -> bool:
-        """Nothing is missing or unreadable, and there is something, or the agent says that there was not."""
+        """Whether everything is stored, or the agent reports that it took nothing."""
         there = bool(self.runs) or self.taken == 0
         return there and not self.missing and not self.refused and not self.shortfalls
 
@@ -127,26 +126,25 @@ class Audit:
 def audit(
     stream: str, items: Iterable[Mapping[str, Any]], *, late_ms: int = LATE_MS, from_start: bool = False
 ) -> Audit:
-    """Look at a stream's items, in any order. ``from_start`` counts numbers before the first as missing.
+    """Audit a stream's items, in any order. ``from_start`` counts numbers before the first as missing.
 
-    A batch is late by how much longer it took to arrive than the fastest of its run, so that the car's
-    clock may be off.
+    Lateness is relative to the fastest batch of the same run, so the car's clock may be wrong.
     """
-    boots: dict[str, list[Stored]] = {}
+    boots: dict[str, list[Header]] = {}
     refused = 0
-    for stored in map(_stored, items):
-        if stored is None:
+    for header in map(_header, items):
+        if header is None:
             refused += 1
         else:
-            boots.setdefault(stored.boot, []).append(stored)
-    # In the order in which the cloud got them: a car's clock may have been set back between two runs.
-    in_order = sorted(boots.values(), key=lambda found: min(s.received_ms for s in found))
+            boots.setdefault(header.id.boot, []).append(header)
+    # By arrival, since the car's clock may have been set back between two runs.
+    in_order = sorted(boots.values(), key=lambda found: min(header.received_ms for header in found))
     ends = _ends(in_order)
-    runs: list[Run] = []
+    runs: list[RunAudit] = []
     before_first = 0
-    numbered_on: Run | None = None
+    numbered_on: RunAudit | None = None
     for found in in_order:
-        run = _run(found, ends.get(found[0].boot, -1), late_ms)
+        run = _run(found, ends.get(found[0].id.boot, -1), late_ms)
         from_0 = any(stored.previous is not None for stored in found)
         first = _first(None if from_0 else numbered_on, run)
         if not runs and not from_start:
@@ -160,7 +158,7 @@ def audit(
     return Audit(stream, runs, before_first, refused, lost_runs=lost_runs)
 
 
-def _ends(runs: Iterable[Sequence[Stored]]) -> dict[str, int]:
+def _ends(runs: Iterable[Sequence[Header]]) -> dict[str, int]:
     """The last number of each run that a batch names."""
     ends: dict[str, int] = {}
     for found in runs:
@@ -170,11 +168,11 @@ def _ends(runs: Iterable[Sequence[Stored]]) -> dict[str, int]:
 
 
 def _lost_runs(
-    in_order: Sequence[Sequence[Stored]], ends: Mapping[str, int], *, from_start: bool
+    in_order: Sequence[Sequence[Header]], ends: Mapping[str, int], *, from_start: bool
 ) -> Iterator[LostRun]:
     """The named runs of which nothing is stored. Those before the first stored one have expired, or are out
     of the range, or were lost."""
-    names = [found[0].boot for found in in_order]
+    names = [found[0].id.boot for found in in_order]
     seen = set(names)
     for i, found in enumerate(in_order):
         for previous in (stored.previous for stored in found if stored.previous):
@@ -188,86 +186,63 @@ def _lost_runs(
                     yield LostRun(boot, ends[boot] + 1)
 
 
-def _run(found: Sequence[Stored], last: int, late_ms: int) -> Run:
-    by_seq: dict[int, Stored] = {}
-    duplicated = 0
-    for stored in found:
-        duplicated += stored.seq in by_seq
-        by_seq[stored.seq] = stored
+def _header(item: Mapping[str, Any]) -> Header | None:
+    """The item's header; None if it is not a batch."""
+    try:
+        previous = run_ends(item[PREVIOUS]) if PREVIOUS in item else None
+        header = Header(batch_id(item[BATCH]), int(item[SAMPLES]), int(item[RECEIVED_MS]), previous)
+    except (ContractError, KeyError, TypeError, ValueError, ArithmeticError):
+        return None
+    return header if header.samples >= 1 else None
+
+
+def _run(found: Sequence[Header], last: int, late_ms: int) -> RunAudit:
+    by_seq = {header.id.seq: header for header in found}
     seqs = sorted(by_seq)
-    missing = [Missing(a + 1, b - 1, by_seq[a].t_us, by_seq[b].t_us) for a, b in pairwise(seqs) if b > a + 1]
-    if last > seqs[-1]:
-        missing.append(Missing(seqs[-1] + 1, last, by_seq[seqs[-1]].t_us, None))
-    took_ms = [stored.received_ms - stored.t_us // 1000 for stored in found]
+    times_us = [header.id.t_us for header in found]
+    took_ms = [header.received_ms - header.id.t_us // 1000 for header in found]
     excess_ms = [took - min(took_ms) for took in took_ms]
-    return Run(
-        boot=found[0].boot,
+    missing = [
+        Missing(a + 1, b - 1, by_seq[a].id.t_us, by_seq[b].id.t_us) for a, b in pairwise(seqs) if b > a + 1
+    ]
+    if last > seqs[-1]:
+        missing.append(Missing(seqs[-1] + 1, last, by_seq[seqs[-1]].id.t_us, None))
+    return RunAudit(
+        boot=found[0].id.boot,
         first_seq=seqs[0],
         last_seq=seqs[-1],
-        first_us=min(stored.t_us for stored in found),
-        last_us=max(stored.t_us for stored in found),
+        first_us=min(times_us),
+        last_us=max(times_us),
         batches=len(seqs),
-        samples=sum(stored.samples for stored in by_seq.values()),
-        duplicated=duplicated,
+        samples=sum(header.samples for header in by_seq.values()),
+        duplicated=len(found) - len(seqs),
         late=sum(excess > late_ms for excess in excess_ms),
         latest_ms=max(excess_ms),
         missing=missing,
-        samples_of={seq: stored.samples for seq, stored in by_seq.items()},
+        samples_of={seq: header.samples for seq, header in by_seq.items()},
     )
 
 
-def _first(previous: Run | None, run: Run) -> int:
+def _first(previous: RunAudit | None, run: RunAudit) -> int:
     """The number that a run began with: 0, or the one after those of the run before, where runs numbered on.
     A number that starts again lower is a queue that was lost."""
     return previous.last_seq + 1 if previous is not None and run.first_seq > previous.last_seq else 0
 
 
-def _stored(item: Mapping[str, Any]) -> Stored | None:
-    """The item as a batch; None if it is not one."""
-    try:
-        t_us, boot, seq = batch_id(item[BATCH])
-        previous = run_ends(item[PREVIOUS]) if PREVIOUS in item else None
-        stored = Stored(boot, seq, t_us, int(item[SAMPLES]), int(item[RECEIVED_MS]), previous)
-    except (ContractError, KeyError, TypeError, ValueError, ArithmeticError):
-        return None
-    return stored if stored.samples >= 1 else None
-
-
-@dataclass(frozen=True)
-class Range:
-    """Of the batches' first samples, both ends included; None is open."""
-
-    first_us: int | None = None
-    last_us: int | None = None
-
-    def values(self) -> dict[str, dict[str, str]]:
-        """As DynamoDB's expression values."""
-        first, last = batches_between(self.first_us, self.last_us)
-        return {":first": {"S": first}, ":last": {"S": last}}
-
-
-def headers(cloud: Cloud, robot: str, stream: str, within: Range) -> Iterator[dict[str, Any]]:
-    """The stored batches without their samples, page by page: what an audit needs and no more."""
-    names = {"#topic": TOPIC, "#batch": BATCH, "#n": SAMPLES, "#at": RECEIVED_MS, "#previous": PREVIOUS}
-    pages = cloud.client("dynamodb").get_paginator("query")
-    for page in pages.paginate(
-        TableName=cloud.output("storage", "TelemetryTable"),
-        KeyConditionExpression="#topic = :topic AND #batch BETWEEN :first AND :last",
-        ProjectionExpression="#batch, #n, #at, #previous",
-        ExpressionAttributeNames=names,
-        ExpressionAttributeValues={
-            ":topic": {"S": build_topic(RECORD, robot, stream, cloud.namespace)},
-            **within.values(),
-        },
-        ConsistentRead=True,
-    ):
-        for item in page["Items"]:
-            # One attribute each, a string or a number, without the cost of a deserializer.
+def headers(
+    cloud: Cloud, robot: str, stream: str, first_us: int | None = None, last_us: int | None = None
+) -> Iterator[dict[str, Any]]:
+    """The stored batches that start between two times, both inclusive, without their samples."""
+    keys = starting_between(first_us, last_us)
+    attributes = (BATCH, SAMPLES, RECEIVED_MS, PREVIOUS)
+    for page in telemetry_table(cloud).pages(topic_of(cloud, robot, stream), keys, attributes=attributes):
+        for item in page.items:
+            # Strings and numbers only, so no deserializer is needed.
             yield {name: next(iter(value.values())) for name, value in item.items()}
 
 
 def last_figures(cloud: Cloud, robot: str) -> dict[str, float]:
-    """The newest sample of the agent's own figures; empty where it has sent none."""
+    """The agent's newest metrics; empty if it has sent none."""
     batch = last_batch(cloud, robot, AGENT_STREAM)
     if batch is None:
         return {}
@@ -276,14 +251,9 @@ def last_figures(cloud: Cloud, robot: str) -> dict[str, float]:
 
 
 def last_batch(cloud: Cloud, robot: str, stream: str) -> Batch | None:
-    """The newest stored batch of a stream; None where there is none that can be read."""
-    answer = cloud.client("dynamodb").query(
-        **of_topic(cloud, "TelemetryTable", robot, stream),
-        ScanIndexForward=False,
-        ConsistentRead=True,
-        Limit=1,
-    )
+    """The newest stored batch of a stream; None if it has none, or an invalid one."""
+    item = telemetry_table(cloud).first(topic_of(cloud, robot, stream), newest=True)
     try:
-        return next((decode_batch(plain(item)) for item in answer["Items"]), None)
+        return None if item is None else decode_batch(plain(item))
     except ContractError:
         return None

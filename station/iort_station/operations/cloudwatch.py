@@ -1,8 +1,4 @@
-"""CloudWatch's dashboards as they are deployed: the widgets of GetDashboard with the data of GetMetricData
-and the states of DescribeAlarms.
-
-What CloudWatch's console draws, on any cloud that answers these calls, the embedded one included.
-"""
+"""CloudWatch's deployed dashboards with their metrics and alarms, also on the embedded cloud."""
 
 from __future__ import annotations
 
@@ -20,16 +16,16 @@ from iort_station.cloud import Cloud
 from iort_station.errors import StationError
 
 _PERIOD_S = 300
-# GetMetricData's own limit of queries a call.
+# GetMetricData's limit of queries per call.
 _MAX_QUERIES = 500
-# A metric is named by its namespace and its name at least.
+# A metric has at least a namespace and a name.
 _LEAST_PARTS = 2
-# And DescribeAlarms' of names.
+# DescribeAlarms' limit of names per call.
 _MAX_NAMES = 100
 
 
 def dashboards(cloud: Cloud) -> list[str]:
-    """The names of the dashboards there are, this deployment's first."""
+    """The names of all dashboards; this deployment's come first."""
     pages = cloud.client("cloudwatch").get_paginator("list_dashboards").paginate()
     names = [str(entry["DashboardName"]) for page in pages for entry in page.get("DashboardEntries", [])]
     ours = cloud.namespace.lower()
@@ -37,12 +33,9 @@ def dashboards(cloud: Cloud) -> list[str]:
 
 
 def dashboard(cloud: Cloud, name: str, *, minutes: int, now_s: float | None = None) -> Dashboard:
-    """A dashboard's widgets with the last ``minutes`` of their metrics.
-
-    Raises `StationError` where there is none of that name, or its body cannot be read.
-    """
+    """A dashboard's widgets with the last ``minutes`` of their metrics; raises `StationError`."""
     client, widgets = cloud.client("cloudwatch"), body_of(cloud, name)
-    # To the full minute, which the newest period ends with.
+    # The newest period ends with a full minute.
     to_s = int(time.time() if now_s is None else now_s) // 60 * 60 + 60
     from_s = to_s - minutes * 60
     return {
@@ -54,24 +47,21 @@ def dashboard(cloud: Cloud, name: str, *, minutes: int, now_s: float | None = No
 
 
 def body_of(cloud: Cloud, name: str) -> list[Mapping[str, Any]]:
-    """A dashboard's widgets, as they are deployed.
-
-    Raises `StationError` where there is none of that name, or its body cannot be read.
-    """
+    """A dashboard's deployed widgets; raises `StationError` for an unknown name or an invalid body."""
     try:
         body = json.loads(cloud.client("cloudwatch").get_dashboard(DashboardName=name)["DashboardBody"])
         return list(body["widgets"])
     except ClientError as error:
-        raise StationError(f"there is no dashboard {name[:80]!r}") from error
+        raise StationError(f"dashboard {name[:80]!r} does not exist") from error
     except (KeyError, TypeError, ValueError) as error:
-        raise StationError(f"the body of dashboard {name[:80]!r} cannot be read") from error
+        raise StationError(f"dashboard {name[:80]!r} has an invalid body") from error
 
 
 def metrics(rows: Sequence[Sequence[Any]]) -> Iterator[tuple[list[str], dict[str, Any]]]:
-    """The rows of a widget's ``metrics``: namespace, name and dimensions, and the options beside them.
+    """The rows of a widget's ``metrics``: namespace, name and dimensions, and the row's options.
 
-    ``"."`` stands for what the row before has in that place, ``"..."`` for all that it has up to there; a
-    row of options alone is an expression.
+    ``"."`` repeats one entry of the previous row, ``"..."`` all its entries up to this place. A row with only
+    options is an expression.
     """
     before: list[str] = []
     for row in rows:
@@ -89,14 +79,15 @@ def metrics(rows: Sequence[Sequence[Any]]) -> Iterator[tuple[list[str], dict[str
 
 
 class Counted(NamedTuple):
-    """What dashboards are billed by: metrics that are named, and searches, which each find any number."""
+    """The billed contents of a dashboard: named metrics, and searches, which each find any number of
+    metrics."""
 
     metrics: int
     searches: int
 
 
 def count(widgets: Sequence[Mapping[str, Any]]) -> Counted:
-    """How many metrics a dashboard's widgets show, each as often as it is shown."""
+    """Count the metrics of a dashboard's widgets; a metric counts each time it is shown."""
     rows = [row for widget in widgets for row in widget.get("properties", {}).get("metrics", [])]
     named = sum(len(parts) >= _LEAST_PARTS for parts, _ in metrics(rows))
     searches = sum("SEARCH(" in str(options.get("expression", "")) for _, options in metrics(rows))
@@ -124,7 +115,7 @@ def _widget(client: Any, number: int, widget: Mapping[str, Any], from_s: int, to
     if widget.get("type") == "alarm":
         return _with_alarms(client, drawn, properties)
     if widget.get("type") == "log":
-        # Its rows are asked for by themselves: Logs Insights takes its time. See cloudwatch_logs.py.
+        # The page requests its rows separately, since Logs Insights is slow: see cloudwatch_logs.py.
         return {**drawn, "kind": "log"}
     if widget.get("type") != "metric" or "metrics" not in properties:
         return {**drawn, "text": f"a widget of type {widget.get('type')}: see the AWS console"}
@@ -142,7 +133,7 @@ def _widget(client: Any, number: int, widget: Mapping[str, Any], from_s: int, to
 
 
 def _with_alarms(client: Any, drawn: Widget, properties: Mapping[str, Any]) -> Widget:
-    """The widget with the state of its alarms, in its own order; one that is gone is left out."""
+    """The widget with the states of its alarms, in its order, without deleted ones."""
     names = [str(arn).partition(":alarm:")[2] for arn in properties.get("alarms", [])]
     try:
         found = [
@@ -153,7 +144,7 @@ def _with_alarms(client: Any, drawn: Widget, properties: Mapping[str, Any]) -> W
             )["MetricAlarms"]
         ]
     except ClientError as error:
-        return {**drawn, "text": f"CloudWatch does not tell its alarms: {_reason(error)}"}
+        return {**drawn, "text": f"CloudWatch refuses this widget's alarms: {_reason(error)}"}
     alarms: list[Alarm] = [
         {
             "name": alarm["AlarmName"],
@@ -174,7 +165,7 @@ def _reason(error: ClientError) -> str:
 def _queries(
     properties: Mapping[str, Any], period_s: int
 ) -> tuple[list[dict[str, Any]], dict[str, dict[str, Any]]]:
-    """GetMetricData's queries, and of those that are drawn the label and the axis by their id."""
+    """GetMetricData's queries, and the label and axis of each drawn one by its id."""
     queries: list[dict[str, Any]] = []
     shown: dict[str, dict[str, Any]] = {}
     for i, (parts, options) in enumerate(metrics(properties["metrics"])):
@@ -217,8 +208,8 @@ def _series(
     from_s: int,
     to_s: int,
 ) -> list[Series]:
-    # A SEARCH answers with a result a metric found: all with the query's id, told apart by their labels,
-    # and those of one label by their place.
+    # A SEARCH returns a result for each metric found. All have the query's id; their labels distinguish them,
+    # and results of the same label are distinguished by their order.
     found: dict[tuple[str, str, int], dict[float, float]] = {}
     pages = client.get_paginator("get_metric_data").paginate(
         MetricDataQueries=list(queries),

@@ -1,6 +1,6 @@
-"""The log widgets of CloudWatch's dashboards: the queries that they hold, answered by Logs Insights.
+"""The log widgets of CloudWatch's dashboards, answered by Logs Insights.
 
-What is asked is what a deployed dashboard says; a page cannot ask anything else of the logs.
+Only the queries of deployed dashboards are run, so the page cannot query other logs.
 """
 
 from __future__ import annotations
@@ -16,34 +16,34 @@ from iort_station.cloud import Cloud
 from iort_station.errors import StationError
 from iort_station.operations.cloudwatch import body_of
 
-# More rows than anybody reads in a widget, and more of a line.
+# The most rows of a widget, and the most characters of a cell.
 MAX_ROWS, MAX_TEXT = 100, 2_000
-# AWS tells nobody when a query has ended.
+# Logs Insights sends no event when a query ends.
 _POLL_S, _PATIENCE_S = 0.3, 60.0
 _UNDER_WAY = {"Scheduled", "Running", "Unknown"}
 _SOURCE = re.compile(r"""\s*SOURCE\s+(['"])(?P<group>[^'"]+)\1\s*(\||$)""")
-# A pointer to the whole record, for GetLogRecord.
+# The field for GetLogRecord.
 _POINTER = "@ptr"
 
 
 def rows(cloud: Cloud, name: str, number: int, *, minutes: int, now_s: float | None = None) -> Logs:
-    """What the widget ``number`` of a dashboard finds in the last ``minutes``.
+    """The rows that a dashboard's log widget finds in the last ``minutes``.
 
-    Raises `StationError` where there is no such log widget, or Logs Insights has no answer. Of the account's
-    other dashboards a page shows the metrics alone: logs say more than whoever can reach it may need to know.
+    Raises `StationError` if there is no such widget or no answer, and for another deployment's dashboard: its
+    logs may be confidential.
     """
     if not name.startswith(f"{cloud.namespace}-"):
         raise StationError(
-            f"dashboard {name[:80]!r} is another deployment's, whose logs stay in the AWS console"
+            f"dashboard {name[:80]!r} is another deployment's: see its logs in the AWS console"
         )
     widgets = body_of(cloud, name)
     widget = widgets[number] if number < len(widgets) else {}
     if widget.get("type") != "log":
-        raise StationError(f"widget {number} of dashboard {name[:80]!r} is none of logs")
+        raise StationError(f"widget {number} of dashboard {name[:80]!r} is not a log widget")
     properties: Mapping[str, Any] = widget.get("properties", {})
     groups, query = parsed(str(properties.get("query", "")))
     if not groups:
-        raise StationError("its query names no log group as SOURCE 'name': see the AWS console")
+        raise StationError("the widget's query must name a log group as SOURCE 'name': see the AWS console")
     to_s = int(time.time() if now_s is None else now_s)
     client = cloud.client("logs")
     asked = {"queryLanguage": properties["queryLanguage"]} if "queryLanguage" in properties else {}
@@ -66,7 +66,7 @@ def rows(cloud: Cloud, name: str, number: int, *, minutes: int, now_s: float | N
 
 
 def parsed(query: str) -> tuple[list[str], str]:
-    """The log groups of the ``SOURCE`` lines that a widget's query begins with, and the rest of it."""
+    """Split a widget's query into the log groups of its first ``SOURCE`` lines and the rest."""
     groups: list[str] = []
     while (source := _SOURCE.match(query)) is not None:
         groups.append(source["group"])
@@ -82,7 +82,7 @@ def _awaited(client: Any, query_id: str) -> Mapping[str, Any]:
         if status == "Complete":
             return answer
         if status not in _UNDER_WAY:
-            raise StationError(f"Logs Insights gave up on the query: {status.lower()}")
+            raise StationError(f"Logs Insights ended the query: {status.lower()}")
         if time.monotonic() >= until:
             client.stop_query(queryId=query_id)
             raise StationError(f"Logs Insights has no answer after {_PATIENCE_S:g} s")

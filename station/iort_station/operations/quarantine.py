@@ -1,4 +1,4 @@
-"""What was refused, as the quarantine table keeps it."""
+"""The quarantine: dead letters in its table, and the queues before it."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import Any
 
-from iort_contract.attributes import plain
+from iort_contract.dynamodb import plain
 from iort_contract.tables import (
     BY_RULE,
     ENTRY,
@@ -28,9 +28,9 @@ _LISTED = (ROBOT, ENTRY, SOURCE, TOPIC, REASON, FIRST_MS, LAST_MS, SEEN, REPLAYS
 
 
 @dataclass(frozen=True)
-class Entry:
-    """A message in quarantine. ``source`` says where it was refused (`BY_RULE` and its like),
-    ``first_ms`` and ``last_ms`` when, ``seen`` how often; ``payload`` is None in a list."""
+class DeadLetter:
+    """A refused message. ``source`` says where it was refused (`iort_contract.BY_RULE` and others),
+    ``first_ms`` and ``last_ms`` when, and ``seen`` how often. ``payload`` is None in a list."""
 
     robot: str
     id: str
@@ -46,14 +46,14 @@ class Entry:
 
 @dataclass(frozen=True)
 class Waiting:
-    """Messages in the queues: on the way into the table, and those that it did not take."""
+    """The number of messages on their way into the table, and of those that it refused."""
 
     rejected: int
     last: int
 
 
-def entries(cloud: Cloud, *, robot: str | None = None, since_ms: int = 0) -> Iterator[Entry]:
-    """What came last at ``since_ms`` or later, without the bytes; of all robots in no order."""
+def entries(cloud: Cloud, *, robot: str | None = None, since_ms: int = 0) -> Iterator[DeadLetter]:
+    """Dead letters last seen at ``since_ms`` or later, without payloads; in no order if of all robots."""
     names = {f"#{name}": name for name in _LISTED}
     request: dict[str, Any] = {
         "TableName": cloud.output("storage", "QuarantineTable"),
@@ -68,40 +68,39 @@ def entries(cloud: Cloud, *, robot: str | None = None, since_ms: int = 0) -> Ite
         request["KeyConditionExpression"] = f"#{ROBOT} = :robot"
         request["ExpressionAttributeValues"][":robot"] = {"S": robot}
     for page in cloud.client("dynamodb").get_paginator(operation).paginate(**request):
-        yield from map(_entry, page["Items"])
+        yield from map(_letter, page["Items"])
 
 
-def find(cloud: Cloud, entry_id: str) -> Entry:
-    """The entry with its bytes; raises `StationError` where there is none, or no longer."""
-    for entry in entries(cloud):
-        if entry.id == entry_id and (loaded := load(cloud, entry)):
+def find(cloud: Cloud, letter_id: str) -> DeadLetter:
+    """A dead letter with its payload; raises `StationError` for an unknown id."""
+    for letter in entries(cloud):
+        if letter.id == letter_id and (loaded := load(cloud, letter)):
             return loaded
-    raise StationError(f"nothing in quarantine has the id {entry_id}; `iort errors` lists what there is")
+    raise StationError(f"no dead letter has the id {letter_id}; `iort errors` lists them")
 
 
-def load(cloud: Cloud, entry: Entry) -> Entry | None:
-    """The entry as it is now, with its bytes; None where it is gone."""
+def load(cloud: Cloud, letter: DeadLetter) -> DeadLetter | None:
+    """The dead letter as it is now, with its payload; None if it was deleted."""
     answer = cloud.client("dynamodb").get_item(
-        TableName=cloud.output("storage", "QuarantineTable"), Key=key(entry), ConsistentRead=True
+        TableName=cloud.output("storage", "QuarantineTable"), Key=key(letter), ConsistentRead=True
     )
-    return _entry(answer["Item"]) if "Item" in answer else None
+    return _letter(answer["Item"]) if "Item" in answer else None
 
 
-def key(entry: Entry) -> dict[str, Any]:
-    """The entry's key in the table."""
-    return {ROBOT: {"S": entry.robot}, ENTRY: {"S": entry.id}}
+def key(letter: DeadLetter) -> dict[str, Any]:
+    """The dead letter's key in the table."""
+    return {ROBOT: {"S": letter.robot}, ENTRY: {"S": letter.id}}
 
 
 def waiting(cloud: Cloud) -> Waiting:
-    """What the queues hold, about."""
+    """The approximate number of messages in the queues."""
     return Waiting(rejected=_depth(cloud, "RejectedQueue"), last=_depth(cloud, "LastQueue"))
 
 
 def recover(cloud: Cloud) -> int:
-    """Give what the table did not take to it once more; how many messages that were.
+    """Send the messages that the table refused back to the first queue; returns their number.
 
-    A message is sent before it is deleted, so that none can be lost between the queues; one that is
-    moved twice is the same entry.
+    A message is sent before it is deleted, so none is lost; a message sent twice is the same dead letter.
     """
     sqs, moved = cloud.client("sqs"), 0
     last, rejected = cloud.output("quarantine", "LastQueue"), cloud.output("quarantine", "RejectedQueue")
@@ -121,10 +120,10 @@ def _depth(cloud: Cloud, queue: str) -> int:
     return sum(int(answer["Attributes"][name]) for name in names)
 
 
-def _entry(item: dict[str, Any]) -> Entry:
+def _letter(item: dict[str, Any]) -> DeadLetter:
     values = plain(item)
     source = values.get(SOURCE, "")
-    return Entry(
+    return DeadLetter(
         robot=values[ROBOT],
         id=values[ENTRY],
         source=source,

@@ -1,4 +1,4 @@
-"""Summaries made again from what is stored, after a vehicle's parameters were corrected."""
+"""Recomputes summaries from the stored batches, after a correction of the vehicle parameters."""
 
 from __future__ import annotations
 
@@ -19,60 +19,56 @@ from iort_contract.tables import (
     VEHICLE_CACHE_S,
 )
 from iort_station.cloud import Cloud
-from iort_station.data import inventory, reading
-from iort_station.data.reading import Item, Told
+from iort_station.data import inventory, summary
+from iort_station.data.batches import ATTRIBUTES, Item, PageProgress, stored
 from iort_station.data.selection import Selection
-from iort_station.data.stored import ATTRIBUTES
 from iort_station.errors import StationError
 from iort_station.operations.replay import summarize
 
-# As long as Lambda 2 may go on with the old parameters, and a little for what it is in the middle of.
+# Lambda 2 caches the old parameters for this long; the margin is for its running invocations.
 SETTLED_S = VEHICLE_CACHE_S + 5
-# What Lambda 2 is given of a batch: all that it would find in the stream.
+# The attributes of a batch that Lambda 2 would get from the table's stream.
 _IMAGE = tuple(dict.fromkeys((*ATTRIBUTES, TOPIC, ROBOT, RECEIVED_MS, EXPIRES_S)))
 # An event may have 6 MB, and takes a second or two.
 _AT_ONCE, _EVENT_BATCHES, _EVENT_BYTES = 4, 100, 2_000_000
 
 
 class Recomputed(NamedTuple):
-    """How many ``seconds`` of a stream were written; ``left_out`` counts stored items of which nothing
-    could be made."""
+    """The number of seconds written, and of stored items that cannot be summarised."""
 
     seconds: int
     left_out: int
 
 
 def wait_until_settled() -> None:
-    """Return when nothing summarises with the old parameters any more: what is made after this is right,
-    and what was made before it is there to be made again."""
+    """Wait until Lambda 2 no longer uses the old parameters."""
     threading.Event().wait(SETTLED_S)
 
 
 def streams(cloud: Cloud, robot: str, since_us: int | None) -> list[str]:
-    """The robot's streams whose summary has a speed, of those that are known by name."""
+    """The robot's known streams whose summary has a speed."""
     known = (name for name in inventory.streams_of(cloud, robot) if name not in OWN_STREAMS)
     return [name for name in known if _has_speed(cloud, _from(robot, name, since_us))]
 
 
 def recompute(
-    cloud: Cloud, robot: str, stream: str, since_us: int | None, *, progress: Told | None = None
+    cloud: Cloud, robot: str, stream: str, since_us: int | None, *, progress: PageProgress | None = None
 ) -> Recomputed:
-    """Have Lambda 2 summarise a stream again, from the second that ``since_us`` lies in; None is all that is
-    stored. Doing it again changes nothing.
+    """Have Lambda 2 summarise a stream again, from the second of ``since_us`` on; None means everything.
 
-    Raises `StationError` where Lambda 2 fails; what was made until then is good.
+    Raises `StationError` if Lambda 2 fails; the seconds written so far are correct. It may be run again.
     """
     selection = _from(robot, stream, since_us)
     event = {RECOMPUTE_FROM_S: 0 if selection.start_us is None else selection.start_us // 1_000_000}
-    pages = reading.told(reading.batches(cloud, selection, _IMAGE), progress)
-    # Neighbours may write the same second, each the same of it.
+    pages = stored(cloud, selection, _IMAGE, progress=progress)
+    # Neighbouring events may write the same second, with the same content.
     seconds: set[int] = set()
     left_out = 0
 
     def count(answer: dict[str, Any]) -> None:
         nonlocal left_out
         if RECOMPUTED not in answer:
-            raise StationError("Lambda 2 cannot summarise again: deploy the current stacks")
+            raise StationError("Lambda 2 cannot recompute: deploy the current stacks")
         seconds.update(answer[RECOMPUTED])
         left_out += len(answer["batchItemFailures"])
 
@@ -96,12 +92,12 @@ def _from(robot: str, stream: str, since_us: int | None) -> Selection:
 
 
 def _has_speed(cloud: Cloud, selection: Selection) -> bool:
-    pages = reading.seconds(cloud, selection)
+    pages = summary.stored(cloud, selection)
     return any(name.startswith("speed") for items in pages for item in items for name in item)
 
 
 def _parted(pages: Iterator[Sequence[Item]]) -> Iterator[list[Item]]:
-    """The items, as many together as fit in an event."""
+    """The items, in groups that fit in an event."""
     part: list[Item] = []
     size = 0
     for items in pages:

@@ -1,4 +1,4 @@
-"""Puts messages from quarantine back, once the cause is gone, and deletes what has arrived."""
+"""Replays dead letters from the quarantine, and deletes those that have arrived."""
 
 from __future__ import annotations
 
@@ -14,8 +14,8 @@ from typing import Any, NamedTuple
 
 from botocore.exceptions import BotoCoreError, ClientError
 
-from iort_contract.attributes import plain
 from iort_contract.checks import COMPACT, json_object
+from iort_contract.dynamodb import plain
 from iort_contract.limits import ContractError
 from iort_contract.messages.batch import Batch, decode_item
 from iort_contract.tables import (
@@ -33,11 +33,12 @@ from iort_contract.tables import (
 )
 from iort_contract.topics import RECORD
 from iort_station.cloud import Cloud
+from iort_station.data.batches import telemetry_table
 from iort_station.errors import StationError
-from iort_station.operations.quarantine import Entry, key, load
+from iort_station.operations.quarantine import DeadLetter, key, load
 from iort_station.recordings.old_batches import is_old, upgraded, upgraded_item
 
-# One that failed so often is for a person to look at.
+# After this many attempts a person must look at it.
 MAX_REPLAYS = 3
 _AT_ONCE = 8
 _CONFIRM_S = 30.0
@@ -45,125 +46,122 @@ _POLL_S = 0.2
 
 
 class Fate(str, Enum):
-    """What became of an entry."""
+    """The result of a replay."""
 
     REPLAYED = "replayed"
     WOULD = "would be replayed"
     FAILED = "failed again"
     REFUSED = "still refused"
     GIVEN_UP = "replayed too often"
-    GONE = "gone meanwhile"
-    NOT_FOR_REPLAY = "not for replay"
+    GONE = "no longer there"
+    NOT_FOR_REPLAY = "not replayable"
 
 
 class Outcome(NamedTuple):
-    """An entry's fate, and what there is to say of it."""
+    """A dead letter, its result, and an explanation."""
 
-    entry: Entry
+    letter: DeadLetter
     fate: Fate
     detail: str = ""
 
 
 class _NotForReplayError(StationError):
-    """An entry that has no batch in it."""
+    """A dead letter that holds no batch."""
 
 
 def replay(
-    cloud: Cloud, entries: Sequence[Entry], *, dry_run: bool = False, again: bool = False
+    cloud: Cloud, letters: Sequence[DeadLetter], *, dry_run: bool = False, again: bool = False
 ) -> Iterator[Outcome]:
-    """Put each entry back, eight at a time; what became of them, in the order in which they end.
+    """Replay dead letters, eight at a time.
 
-    A message of the record lane that a rule's action failed on is published to that rule again, and has
-    arrived when the table holds its batch. One that Lambda 2 failed on or refused is given to Lambda 2
-    again, which answers. Only then is the entry deleted. Every attempt is counted first, and after
-    `MAX_REPLAYS` (unless ``again``) there are no more. Live messages, pings and events are of their
-    moment and are not replayed. What was put off
-    waits once more. A batch of version 1 goes back as one of this version: its agent had not
-    been updated when the stacks were.
+    A record message whose rule failed is published to that rule again; it has arrived when the table holds
+    its batch. A batch that Lambda 2 refused is given to Lambda 2 again. Then the dead letter is deleted.
+    Each attempt is counted; after `MAX_REPLAYS` there are no more, unless ``again``. Live messages, pings and
+    events are outdated and are not replayed. Batches that were put off go back to their queue. A batch of
+    version 1, whose agent was not updated with the stacks, is replayed in this version.
     """
     one = partial(_outcome, cloud, dry_run=dry_run, again=again)
     with ThreadPoolExecutor(_AT_ONCE) as pool:
-        yield from pool.map(one, entries)
+        yield from pool.map(one, letters)
 
 
-def _outcome(cloud: Cloud, listed: Entry, *, dry_run: bool, again: bool) -> Outcome:
-    entry = load(cloud, listed)
-    if entry is None:
+def _outcome(cloud: Cloud, listed: DeadLetter, *, dry_run: bool, again: bool) -> Outcome:
+    letter = load(cloud, listed)
+    if letter is None:
         return Outcome(listed, Fate.GONE)
-    current, batch = entry, None
+    current, batch = letter, None
     try:
-        _check_kind(entry)
-        if entry.source != BY_LATER:
-            current = _current(entry)
+        _check_kind(letter)
+        if letter.source != BY_LATER:
+            current = _current(letter)
             batch = _batch(current)
     except _NotForReplayError as error:
         return Outcome(listed, Fate.NOT_FOR_REPLAY, str(error))
     except ContractError as error:
         return Outcome(listed, Fate.REFUSED, str(error))
-    if entry.replays >= MAX_REPLAYS and not again:
-        return Outcome(entry, Fate.GIVEN_UP, f"{entry.replays} times")
+    if letter.replays >= MAX_REPLAYS and not again:
+        return Outcome(letter, Fate.GIVEN_UP, f"{letter.replays} times")
     if dry_run:
-        return Outcome(entry, Fate.WOULD)
+        return Outcome(letter, Fate.WOULD)
     try:
-        _count(cloud, entry)
+        _count(cloud, letter)
         if batch is None:
-            problem = _put_off(cloud, entry)
-        elif _is_rules(entry):
+            problem = _put_off(cloud, letter)
+        elif _is_rules(letter):
             problem = _publish(cloud, current, batch)
-        elif current is not entry and not _stored(cloud, entry.topic, batch):
-            # Lambda 2 reads the table, and would find nothing to summarise.
-            problem = "it is in the old telemetry table: `iort adopt` comes first"
+        elif current is not letter and not _stored(cloud, letter.topic, batch):
+            # Lambda 2 reads the table, so the batch must be there.
+            problem = "it is in the old telemetry table: run `iort adopt` first"
         else:
             problem = _summarize(cloud, current)
         if problem:
-            return Outcome(entry, Fate.FAILED, problem)
-        _delete(cloud, entry)
+            return Outcome(letter, Fate.FAILED, problem)
+        _delete(cloud, letter)
     except (BotoCoreError, ClientError) as error:
-        return Outcome(entry, Fate.FAILED, str(error))
-    return Outcome(entry, Fate.REPLAYED)
+        return Outcome(letter, Fate.FAILED, str(error))
+    return Outcome(letter, Fate.REPLAYED)
 
 
-def _is_rules(entry: Entry) -> bool:
-    return entry.source.startswith(f"{BY_RULE} ")
+def _is_rules(letter: DeadLetter) -> bool:
+    return letter.source.startswith(f"{BY_RULE} ")
 
 
-def _check_kind(entry: Entry) -> None:
-    if entry.source in (BY_STREAM, BY_LATER) and entry.topic:
+def _check_kind(letter: DeadLetter) -> None:
+    if letter.source in (BY_STREAM, BY_LATER) and letter.topic:
         return
-    if not _is_rules(entry) or not entry.topic.startswith(f"{RECORD}/"):
-        raise _NotForReplayError("of its moment, or without a batch: only the record lane is replayed")
+    if not _is_rules(letter) or not letter.topic.startswith(f"{RECORD}/"):
+        raise _NotForReplayError("only batches of the record lane are replayed")
 
 
-def _current(entry: Entry) -> Entry:
-    """The entry as it is, or with a batch of this version where it has one of version 1; raises
-    `ContractError` where it has none of either."""
-    # An item that did not fit into the quarantine's was cut.
-    value = json_object(entry.payload or b"", "message")
-    if entry.source == BY_STREAM:
+def _current(letter: DeadLetter) -> DeadLetter:
+    """The dead letter with a batch of version 1 upgraded; raises `ContractError` for an invalid one."""
+    # The quarantine cuts items that are too large for it.
+    value = json_object(letter.payload or b"", "message")
+    if letter.source == BY_STREAM:
         new = upgraded_item(value) if is_old(plain(value)) else None
     else:
         new = upgraded(value) if is_old(value) else None
     if new is None:
-        return entry
+        return letter
     try:
-        return replace(entry, payload=COMPACT.encode(new).encode())
+        return replace(letter, payload=COMPACT.encode(new).encode())
     except ValueError as error:  # 1e400 can be read, and not be written
         raise ContractError(f"message: {error}") from error
 
 
-def _batch(entry: Entry) -> Batch:
-    """The batch in an entry; raises `ContractError` where it is none."""
-    value = json_object(entry.payload or b"", "message")
-    if entry.source == BY_STREAM:
+def _batch(letter: DeadLetter) -> Batch:
+    """The batch in a dead letter; raises `ContractError`."""
+    value = json_object(letter.payload or b"", "message")
+    if letter.source == BY_STREAM:
         return decode_item(plain(value))[1]
     item = {name: value[name] for name in ENVELOPE if name in value}
-    return decode_item({**item, TOPIC: entry.topic, RECEIVED_MS: entry.first_ms})[1]
+    return decode_item({**item, TOPIC: letter.topic, RECEIVED_MS: letter.first_ms})[1]
 
 
-def _count(cloud: Cloud, entry: Entry) -> None:
+def _count(cloud: Cloud, letter: DeadLetter) -> None:
     cloud.client("dynamodb").update_item(
         TableName=cloud.output("storage", "QuarantineTable"),
-        Key=key(entry),
+        Key=key(letter),
         UpdateExpression="ADD #replays :one",
         ConditionExpression="attribute_exists(#id)",
         ExpressionAttributeNames={"#replays": REPLAYS, "#id": ENTRY},
@@ -171,45 +169,38 @@ def _count(cloud: Cloud, entry: Entry) -> None:
     )
 
 
-def _publish(cloud: Cloud, entry: Entry, batch: Batch) -> str:
-    """Publish to the rule and wait for the item; what went wrong, or nothing."""
-    if _stored(cloud, entry.topic, batch):
+def _publish(cloud: Cloud, letter: DeadLetter, batch: Batch) -> str:
+    """Publish to the rule and wait for the stored batch; returns the error, or nothing."""
+    if _stored(cloud, letter.topic, batch):
         return ""
-    rule = entry.source.removeprefix(f"{BY_RULE} ")
-    cloud.client("iot-data").publish(topic=f"$aws/rules/{rule}/{entry.topic}", qos=1, payload=entry.payload)
+    rule = letter.source.removeprefix(f"{BY_RULE} ")
+    cloud.client("iot-data").publish(topic=f"$aws/rules/{rule}/{letter.topic}", qos=1, payload=letter.payload)
     deadline = time.monotonic() + _CONFIRM_S
     while time.monotonic() < deadline:
-        if _stored(cloud, entry.topic, batch):
+        if _stored(cloud, letter.topic, batch):
             return ""
-        now = load(cloud, entry)
-        if now and now.seen > entry.seen:
+        now = load(cloud, letter)
+        if now and now.seen > letter.seen:
             return now.reason
         threading.Event().wait(_POLL_S)
     return f"not in the telemetry table after {_CONFIRM_S:.0f} s"
 
 
-def _put_off(cloud: Cloud, entry: Entry) -> str:
-    """Have the batches that Lambda 2 put off wait once more: what fails comes back."""
+def _put_off(cloud: Cloud, letter: DeadLetter) -> str:
+    """Send batches that Lambda 2 put off to their queue again; returns the error, or nothing."""
     queue = cloud.output("processing", "PutOffQueue")
-    body = (entry.payload or b"").decode()
-    cloud.client("sqs").send_message(QueueUrl=queue, MessageBody=body, MessageGroupId=entry.robot)
+    body = (letter.payload or b"").decode()
+    cloud.client("sqs").send_message(QueueUrl=queue, MessageBody=body, MessageGroupId=letter.robot)
     return ""
 
 
 def _stored(cloud: Cloud, topic: str, batch: Batch) -> bool:
-    answer = cloud.client("dynamodb").get_item(
-        TableName=cloud.output("storage", "TelemetryTable"),
-        Key={TOPIC: {"S": topic}, BATCH: {"S": str(batch.id)}},
-        ProjectionExpression="#batch",
-        ExpressionAttributeNames={"#batch": BATCH},
-        ConsistentRead=True,
-    )
-    return "Item" in answer
+    return telemetry_table(cloud).get(topic, str(batch.id), attributes=(BATCH,)) is not None
 
 
-def _summarize(cloud: Cloud, entry: Entry) -> str:
-    """Give the item to Lambda 2; what went wrong, or nothing."""
-    image: dict[str, Any] = json.loads(entry.payload or b"{}")
+def _summarize(cloud: Cloud, letter: DeadLetter) -> str:
+    """Give the item to Lambda 2; returns the error, or nothing."""
+    image: dict[str, Any] = json.loads(letter.payload or b"{}")
     try:
         said = summarize(cloud, [image], {REPLAY: True})
     except StationError as error:
@@ -218,9 +209,9 @@ def _summarize(cloud: Cloud, entry: Entry) -> str:
 
 
 def summarize(cloud: Cloud, items: Sequence[Mapping[str, Any]], event: Mapping[str, Any]) -> dict[str, Any]:
-    """Give stored items to Lambda 2, in an event that says what for; its answer.
+    """Invoke Lambda 2 with stored items and the further entries of ``event``; returns its answer.
 
-    Raises `StationError` where it fails.
+    Raises `StationError` if it fails.
     """
     changes = [
         {
@@ -241,16 +232,16 @@ def summarize(cloud: Cloud, items: Sequence[Mapping[str, Any]], event: Mapping[s
     return {"batchItemFailures": [], **said}
 
 
-def _delete(cloud: Cloud, entry: Entry) -> None:
-    """Delete the entry, unless the same message was refused once more meanwhile."""
+def _delete(cloud: Cloud, letter: DeadLetter) -> None:
+    """Delete the dead letter, unless the same message was refused again in the meantime."""
     dynamodb = cloud.client("dynamodb")
     try:
         dynamodb.delete_item(
             TableName=cloud.output("storage", "QuarantineTable"),
-            Key=key(entry),
+            Key=key(letter),
             ConditionExpression="#last = :last",
             ExpressionAttributeNames={"#last": LAST_MS},
-            ExpressionAttributeValues={":last": {"N": str(entry.last_ms)}},
+            ExpressionAttributeValues={":last": {"N": str(letter.last_ms)}},
         )
     except dynamodb.exceptions.ConditionalCheckFailedException:
         return

@@ -1,7 +1,7 @@
-"""Where the time goes: a live update's way from the sample in the car to a subscriber, hop by hop.
+"""The delay of live updates from the sample in the car to a subscriber, hop by hop.
 
-Each hop begins and ends by a clock: the car's, AWS', PubNub's or ours. Where two clocks meet, the
-difference that was measured is taken off, and what it may be wrong by is said.
+A hop starts and ends by the clock of the car, AWS, PubNub or this machine. The measured offset between two
+clocks is subtracted, and its uncertainty is reported.
 """
 
 from __future__ import annotations
@@ -20,21 +20,21 @@ from iort_contract.messages.live import decode_live_update
 from iort_contract.topics import PING_PATHS
 from iort_station.errors import StationError
 
-# timestamp() in a rule is whole milliseconds, cut off: the middle is wrong by half of one at most.
+# timestamp() in a rule cuts off the microseconds; adding half a millisecond leaves this uncertainty.
 _STAMP_US = 500
 _TRIES = 8
 _ANSWER_S = 5.0
 
 
-class Clock(NamedTuple):
-    """What to add to a clock to have another, in microseconds, and by how much that may be wrong."""
+class ClockOffset(NamedTuple):
+    """The microseconds to add to one clock to get another, and their uncertainty."""
 
     offset_us: float
     uncertainty_us: float
 
 
 class Times(NamedTuple):
-    """When one update was where, in microseconds since the epoch, each by the clock of its place."""
+    """The times of one update at each place, in microseconds since the epoch by the place's clock."""
 
     sample_us: int
     sent_us: int
@@ -47,10 +47,7 @@ class Times(NamedTuple):
 
 @dataclass(frozen=True)
 class Hop:
-    """One hop of many updates: milliseconds, and by how much the clocks may falsify them.
-
-    ``uncertainty_ms`` is None where two clocks are compared as they are.
-    """
+    """The delays of one hop over many updates; ``uncertainty_ms`` is None for clocks that nobody compared."""
 
     name: str
     p50_ms: float
@@ -60,7 +57,7 @@ class Hop:
 
 @dataclass(frozen=True)
 class Trace:
-    """The hops in order, what they sum to, and the round trips that the car itself measured last."""
+    """The hops in order, their sum, and the car's newest round trips."""
 
     updates: int
     hops: list[Hop]
@@ -91,20 +88,20 @@ def times(update: Mapping[str, Any], pubnub_us: int, here_us: int) -> Times:
     )
 
 
-def clock_of(theirs_us: Callable[[], int], ours_us: Callable[[], int]) -> Clock:
-    """Our clock against another that answers, by Cristian's method: the fastest of some tries."""
+def clock_of(theirs_us: Callable[[], int], ours_us: Callable[[], int]) -> ClockOffset:
+    """The offset from our clock to another by Cristian's method: the fastest of several requests."""
     found = []
     for _ in range(_TRIES):
         sent = ours_us()
         their = theirs_us()
         received = ours_us()
-        found.append(Clock(their - (sent + received) / 2, (received - sent) / 2))
+        found.append(ClockOffset(their - (sent + received) / 2, (received - sent) / 2))
     return min(found, key=lambda clock: clock.uncertainty_us)
 
 
 @contextmanager
 def pubnub_clock(origin: str, *, tls: bool) -> Iterator[Callable[[], int]]:
-    """Asks PubNub for its time, in microseconds, over one connection; raises `StationError`."""
+    """Yield a function that asks PubNub for its time in microseconds; raises `StationError`."""
     kind = http.client.HTTPSConnection if tls else http.client.HTTPConnection
 
     def ask() -> int:
@@ -116,20 +113,20 @@ def pubnub_clock(origin: str, *, tls: bool) -> Iterator[Callable[[], int]]:
             connection.connect()
             yield ask
         except (OSError, http.client.HTTPException, ValueError) as error:
-            raise StationError(f"PubNub does not say its time: {error}") from error
+            raise StationError(f"PubNub's time cannot be read: {error}") from error
 
 
 def trace(
     updates: Sequence[Times],
     *,
-    here_to_pubnub: Clock,
+    here_to_pubnub: ClockOffset,
     car_uncertainty_ms: float | None,
     newest_rtt: Batch | None = None,
 ) -> Trace:
-    """Put updates together; at least one. ``car_uncertainty_ms`` is what the agent says of its offset."""
+    """Summarise at least one update; ``car_uncertainty_ms`` is the agent's own metric."""
     known = all(one.car_to_cloud_us is not None for one in updates)
     here = here_to_pubnub
-    legs: dict[str, list[float]] = {
+    delays: dict[str, list[float]] = {
         CAR: [one.sent_us - one.sample_us for one in updates],
         RULE: [one.rule_us - one.sent_us - (one.car_to_cloud_us or 0) for one in updates],
         LAMBDA: [one.lambda_us - one.rule_us for one in updates],
@@ -140,25 +137,25 @@ def trace(
         CAR: 0.0,
         RULE: car_uncertainty_ms if known else None,
         LAMBDA: _STAMP_US / 1000,
-        # AWS' clock and PubNub's are both set by NTP; nobody measures one against the other.
+        # Nobody compares the clocks of AWS and PubNub, which are both set by NTP.
         PUBNUB: None,
         HERE: here.uncertainty_us / 1000,
     }
-    whole = [sum(parts) for parts in zip(*legs.values(), strict=True)]
-    # What one hop takes from its neighbour falls out of the whole, but for the car's clock and ours.
+    whole = [sum(parts) for parts in zip(*delays.values(), strict=True)]
+    # In the sum, only the offsets of the car's clock and of ours remain.
     ends = (
         None if not known or car_uncertainty_ms is None else car_uncertainty_ms + here.uncertainty_us / 1000
     )
     return Trace(
         updates=len(updates),
-        hops=[_hop(name, values, uncertain[name]) for name, values in legs.items()],
+        hops=[_hop(name, values, uncertain[name]) for name, values in delays.items()],
         whole=_hop("sample to this subscriber", whole, ends),
         round_trips_ms=round_trips_ms(newest_rtt),
     )
 
 
 def round_trips_ms(newest: Batch | None) -> dict[str, float]:
-    """The median round trip of each path in a batch of the stream ``rtt``."""
+    """The median round trip of each path in a batch of stream ``rtt``."""
     found: dict[str, float] = {}
     if newest is None:
         return found

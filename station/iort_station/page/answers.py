@@ -14,9 +14,10 @@ from iort_contract.messages.files import ATTACHMENT_FIELDS
 from iort_contract.messages.page import Answer, HistoryAnswer
 from iort_contract.messages.page import Column as PageColumn
 from iort_contract.topics import check_robot
+from iort_station import data
 from iort_station.cloud import Cloud
-from iort_station.data import data, inventory
-from iort_station.data.conditions import Column, values
+from iort_station.data import inventory
+from iort_station.data.blocks import Column, values
 from iort_station.errors import StationError
 from iort_station.fleet import registry
 from iort_station.operations import cloudwatch, cloudwatch_logs

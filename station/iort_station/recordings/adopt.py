@@ -12,15 +12,14 @@ from typing import Any, NamedTuple
 
 from botocore.exceptions import ClientError
 
-from iort_contract.attributes import plain
 from iort_contract.catalog.streams import AGENT_STREAM
+from iort_contract.dynamodb import WRITE_ITEMS, TableError, TelemetryTable, plain
 from iort_contract.limits import ContractError
 from iort_contract.messages.batch import Batch, decode_item
-from iort_contract.table_writer import WRITE_SIZE, TableError, write
 from iort_contract.tables import BATCH, EXPIRES_S, RECEIVED_MS, T_US, TOPIC
 from iort_contract.topics import RECORD, Topic, build_topic
 from iort_station.cloud import Cloud
-from iort_station.data.reading import Item, ahead
+from iort_station.data.batches import Item, ahead
 from iort_station.errors import StationError
 from iort_station.recordings.old_batches import is_old, upgraded_item
 
@@ -91,11 +90,11 @@ def adopt(
     items read. Raises `StationError` if DynamoDB rejects a write; the items copied until then are good.
     """
     done = Adoption()
-    new_table = cloud.output("storage", "TelemetryTable")
+    new_table = TelemetryTable(cloud.client("dynamodb"), cloud.output("storage", "TelemetryTable"))
     for read, items in ahead(_pages(cloud, table, robot)):
         new = list(_adoptable(items, cloud.namespace, done))
-        for start in range(0, 0 if dry_run else len(new), WRITE_SIZE):
-            _write(cloud, new_table, new[start : start + WRITE_SIZE], units_per_s)
+        for start in range(0, 0 if dry_run else len(new), WRITE_ITEMS):
+            _write(new_table, new[start : start + WRITE_ITEMS], units_per_s)
         progress(read)
     return done
 
@@ -139,10 +138,10 @@ def _checked(item: Item, namespace: str) -> tuple[Topic, Batch]:
     return topic, batch
 
 
-def _write(cloud: Cloud, table: str, items: Sequence[Mapping[str, Any]], units_per_s: int) -> None:
+def _write(table: TelemetryTable, items: Sequence[Mapping[str, Any]], units_per_s: int) -> None:
     began = time.monotonic()
     try:
-        write(cloud.client("dynamodb"), table, [{"PutRequest": {"Item": item}} for item in items])
+        table.put(items)
     except TableError as error:
         raise StationError(f"{error}; do it again, or with fewer --units") from error
     spent_s = sum(map(_units, items)) / units_per_s

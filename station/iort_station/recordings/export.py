@@ -6,11 +6,11 @@ import itertools
 from collections.abc import Callable, Mapping
 
 from iort_contract.messages.message_type import MessageType
+from iort_station import data
 from iort_station.cloud import Cloud
-from iort_station.data import data, inventory
-from iort_station.data.reading import Told
+from iort_station.data import inventory
+from iort_station.data.batches import PageProgress, RefusedItems
 from iort_station.data.selection import Selection
-from iort_station.data.stored import Refused
 from iort_station.fleet import files
 from iort_station.recordings import messages
 from iort_station.recordings.published import Export
@@ -25,7 +25,7 @@ def write(
     file: Recording,
     *,
     say: Say = lambda _line: None,
-    progress: Told = lambda _more, _last_us: None,
+    progress: PageProgress = lambda _more, _last_us: None,
 ) -> int:
     """Write the messages of a selection and return their number; ``say`` takes lines about the result.
 
@@ -64,7 +64,7 @@ def _make(
 ) -> int:
     """Write messages made of the samples that are not ROS messages, and return their number."""
     robot, stream = selection.robot, selection.stream
-    blocks = data.samples(cloud, selection, refused=Refused(), messages=False)
+    blocks = data.samples(cloud, selection, refused=RefusedItems(), messages=False)
     # If topics share a stream, nobody can tell which one a selection of fields belongs to.
     shared = len({kind.topic for kind in known.values()}) > 1
     kind = None if shared else next(iter(reversed(list(known.values()))), None)

@@ -7,13 +7,11 @@ import math
 import re
 import struct
 from collections.abc import Iterator, Mapping, Sequence
-from contextlib import suppress
 from itertools import count
 from typing import Any, NamedTuple
 
-from iort_contract.catalog.streams import TYPES_STREAM
-from iort_contract.limits import ContractError, MessageError, Value
-from iort_contract.messages.message_type import MessageType, message_type
+from iort_contract.limits import MessageError, Value
+from iort_contract.messages.message_type import MessageType
 from iort_contract.ros1.decode import HEADER
 from iort_contract.ros1.definition import (
     HEADER_TYPE,
@@ -26,11 +24,8 @@ from iort_contract.ros1.definition import (
     parse,
 )
 from iort_station.cloud import Cloud
-from iort_station.data import data
-from iort_station.data.blocks import Block
-from iort_station.data.conditions import values
-from iort_station.data.selection import Selection
-from iort_station.data.stored import Refused
+from iort_station.data import inventory
+from iort_station.data.blocks import Block, values
 from iort_station.errors import StationError
 
 _HEADER_TEXT = "=" * 80 + "\nMSG: std_msgs/Header\nuint32 seq\ntime stamp\nstring frame_id\n"
@@ -43,17 +38,11 @@ def types(cloud: Cloud, robot: str, stream: str) -> dict[str, tuple[int, Message
     """The types that a robot has declared for a stream's messages, by id, and the time of the first
     declaration."""
     found: dict[str, tuple[int, MessageType]] = {}
-    whole = Selection(robot=robot, stream=TYPES_STREAM)
-    for block in data.samples(cloud, whole, refused=Refused()):
-        columns = {name: values(column) for name, column in block.columns.items()}
-        for i, t_us in enumerate(block.times_us.tolist()):
-            sample = {name: column[i] for name, column in columns.items()}
-            if sample.get("stream") == stream:
-                with suppress(ContractError):
-                    kind = message_type(sample)
-                    first_us, before = found.get(kind.id, (t_us, kind))
-                    # Some publishers send no definition.
-                    found[kind.id] = first_us, before if before.definition.strip() else kind
+    for t_us, kind in inventory.types_of(cloud, robot):
+        if kind.stream == stream:
+            first_us, before = found.get(kind.id, (t_us, kind))
+            # Some publishers send no definition.
+            found[kind.id] = first_us, before if before.definition.strip() else kind
     return found
 
 

@@ -5,8 +5,8 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any
 
-from iort_contract.attributes import plain
 from iort_contract.checks import check_header, check_version, integer
+from iort_contract.dynamodb import plain
 from iort_contract.limits import BATCH_VERSION, ContractError
 from iort_contract.messages.batch import BatchId
 from iort_contract.tables import BATCH, NONFINITE, T_US

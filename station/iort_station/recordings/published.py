@@ -6,17 +6,15 @@ import hashlib
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from typing import Any, NamedTuple
 
-from iort_contract.attributes import plain
+from iort_contract.dynamodb import plain
 from iort_contract.limits import ContractError
 from iort_contract.messages.batch import Batch, messages_of
 from iort_contract.messages.files import ATTACHMENT_AT, ATTACHMENT_FIELDS
 from iort_contract.messages.message_type import MessageType
 from iort_contract.ros1.message import filled
 from iort_station.cloud import Cloud
-from iort_station.data import reading
-from iort_station.data.reading import Told
+from iort_station.data.batches import PageProgress, RefusedItems, stored
 from iort_station.data.selection import Selection
-from iort_station.data.stored import ATTRIBUTES, Refused
 
 # Gives the content of an uploaded file by its key; None if the file is missing.
 Content = Callable[[str], "bytes | None"]
@@ -42,14 +40,13 @@ class Export:
     ) -> None:
         self.types = dict(types)
         self.others = self.empty = 0
-        self.refused = Refused()
+        self.refused = RefusedItems()
         self._cloud, self._selection, self._content = cloud, selection, content
         self._layouts = {name: kind.layout for name, kind in types.items()}
 
-    def messages(self, progress: Told | None = None) -> Iterator[Published]:
+    def messages(self, progress: PageProgress | None = None) -> Iterator[Published]:
         """The messages, in order of their batches' times."""
-        pages = reading.batches(self._cloud, self._selection, ATTRIBUTES)
-        for items in reading.told(pages, progress):
+        for items in stored(self._cloud, self._selection, progress=progress):
             for item in items:
                 yield from self._of(plain(item))
 

@@ -10,7 +10,8 @@ import pytest
 
 from iort_agent.errors import IdentityError, RefusedError
 from iort_agent.identity.pending import TOKEN_S, Pending, keep, kept
-from iort_agent.verbs.provision import Seams, provision, register_again
+from iort_agent.verbs.provision import provision
+from iort_agent.verbs.registration import Seams, register_again
 from iort_contract.limits import DEFAULT_NAMESPACE
 
 

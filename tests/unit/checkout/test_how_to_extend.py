@@ -9,6 +9,7 @@ import shutil
 import subprocess
 import sys
 from pathlib import Path
+from typing import Any
 
 import pytest
 
@@ -30,6 +31,15 @@ FOLDERS = (
     "tests",
 )
 SKIPPED = ("__pycache__", "*.egg-info", "build", "built", "images", "bench-*", "node_modules")
+SYNTHESIZE = """
+from pathlib import Path
+from aws_cdk import App
+from app import build
+from stacks.settings import Settings
+app = App(outdir="cdk.out")
+build(app, Settings(layer=Path("scripts")))
+app.synth()
+"""
 
 
 class Copy:
@@ -61,7 +71,7 @@ class Copy:
         return touched
 
     def _insert(self, file: Path, lines: list[str]) -> None:
-        before = "".join(f"{line[1:]}\n" for line in lines if line[:1] == " ")
+        before = "".join(f"{line[1:]}\n" for line in lines if not line.startswith("+"))
         after = "".join(f"{line[1:]}\n" for line in lines)
         text = file.read_text()
         assert text.count(before) == 1, f"{file} must have once:\n{before}"
@@ -82,7 +92,7 @@ class Copy:
             env=environment,
             capture_output=True,
             text=True,
-            timeout=120,
+            timeout=300,
         )
         assert done.returncode == 0, done.stderr
         return done.stdout
@@ -136,6 +146,55 @@ def test_a_derived_field(copy: Copy) -> None:
     formula = "`duty_cycle * voltage_input * current_motor`"
     assert f"| {formula} |" in (copy.root / "README.md").read_text()
     assert "export const motor_power_w = " in (copy.root / "station/web/src/base/contract.ts").read_text()
+
+
+def templates(copy: Copy) -> dict[str, dict[str, Any]]:
+    """The resources of each stack of the copy, by logical id."""
+    layer = copy.root / "build" / "layer" / "lambda"
+    layer.mkdir(parents=True)
+    (layer / "nothing.py").touch()
+    copy.run("app.py")
+    return {
+        path.name.removesuffix(".template.json"): json.loads(path.read_text())["Resources"]
+        for path in (copy.root / "cdk.out").glob("*.template.json")
+    }
+
+
+def of_type(resources: dict[str, Any], kind: str, name: str) -> Any:
+    """The properties of the one resource of a type whose logical id begins so."""
+    (found,) = (one for key, one in resources.items() if one["Type"] == kind and key.startswith(name))
+    return found["Properties"]
+
+
+def test_a_rule(copy: Copy) -> None:
+    assert len(set(copy.follow("A rule"))) == 3
+    stacks = templates(copy)
+    rule = of_type(stacks["iort-ingest"], "AWS::IoT::TopicRule", "Horn")
+    assert rule["TopicRulePayload"]["Sql"].endswith("FROM 'live/iort/+/+' WHERE sample.horn > 0")
+    assert rule["TopicRulePayload"]["ErrorAction"]
+    function = of_type(stacks["iort-processing"], "AWS::Lambda::Function", "Horn")
+    assert function["Handler"] == "functions.horn.handler"
+    assert of_type(stacks["iort-monitoring"], "AWS::CloudWatch::Alarm", "AlarmsHornErrors")
+    assert "HornsSounded" in json.dumps(
+        of_type(stacks["iort-monitoring"], "AWS::CloudWatch::Dashboard", "DashboardsRobots")
+    )
+    handler = (
+        "from functions.horn import handler; import os; os.environ['NAMESPACE'] = 'iort'; handler({}, None)"
+    )
+    assert json.loads(copy.run("-c", handler))["HornsSounded"] == 1
+    copy.run("-m", "scripts.docs_parts")
+    assert "| `horn` | counts who sounds the horn |" in (copy.root / "docs/processing.md").read_text()
+
+
+def test_a_function(copy: Copy) -> None:
+    assert len(set(copy.follow("A function"))) == 3
+    stacks = templates(copy)
+    function = of_type(stacks["iort-processing"], "AWS::Lambda::Function", "Count")
+    assert function["Environment"]["Variables"].keys() == {"NAMESPACE", "TELEMETRY_TABLE"}
+    policy = of_type(stacks["iort-processing"], "AWS::IAM::Policy", "CountRole")
+    actions = [one["Action"] for one in policy["PolicyDocument"]["Statement"]]
+    assert "dynamodb:Query" in actions
+    assert copy.show("callable(handler)", "from functions.count import handler") is True
 
 
 def test_a_verb(copy: Copy) -> None:

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 from ministack.services import iot
 
-from functions.shared import cut_off, stored
+from functions import live
+from functions.shared.summary import stored
 from iort_agent.mqtt import rate_limiter
 from iort_contract import limits
 from iort_contract.messages import commands, files
@@ -40,9 +41,9 @@ def test_each_limit_is_told_as_it_is() -> None:
     told = {
         "MAX_LAYOUT": MAX_LAYOUT,
         "SECOND_BATCHES": stored.SECOND_BATCHES,
-        "BURST": cut_off.BURST,
-        "A_SECOND": cut_off.A_SECOND,
-        "upload_gb_a_day": Settings.__dataclass_fields__["upload_gb_a_day"].default,
+        "REFUSALS": live.REFUSALS,
+        "REFUSALS_A_SECOND": live.REFUSALS_A_SECOND,
+        "upload_gb_a_day": Settings.model_fields["upload_gb_a_day"].default,
         **{name: getattr(of, name) for of in MODULES for name in table if hasattr(of, name)},
     }
     assert table.keys() == told.keys()

@@ -256,7 +256,7 @@ def test_the_shadows_documents_are_what_the_agent_takes_and_says() -> None:
     assert reported.keys() == {*settings.as_document(), "rejected", COMMANDS, AGENT_VERSION}
     state = State(1, {}, reported)
     assert outcome(state, "drive", COMMAND.session, COMMAND.seq) == ACCEPTED
-    assert [refusal.name for refusal in state.refusals()] == ["live.rate_hz"]
+    assert [refusal.name for refusal in state.rejections()] == ["live.rate_hz"]
     wishes, said = section("## The shadow").split("<!-- example: reported -->")
     assert {name for row in rows(wishes) for name in named(row[0])} == {*RULES, f"{FIELDS}.<stream>"}
     assert {name for row in rows(said) for name in named(row[0])} == reported.keys()

@@ -68,7 +68,7 @@ def test_the_house_keeps_its_walls(house: Path) -> None:
         ("embedded-cloud", "local/demo.py", "stacks.settings"),
         ("agent", "device/iort_agent/lanes/live.py", "iort_agent.config"),
         ("agent", "device/iort_agent/common/schema.py", "iort_agent.spool.memory"),
-        ("station", "station/iort_station/data/times.py", "iort_station.cli.console"),
+        ("station", "station/iort_station/data/blocks.py", "iort_station.cli.console"),
         ("contract", "contract/iort_contract/codec/columns.py", "iort_contract.messages.batch"),
         ("functions", "functions/live.py", "functions.alert"),
         ("circles", "device/iort_agent/sources/recording/player.py", "iort_agent.sources.recording.bag"),

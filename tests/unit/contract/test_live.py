@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 
 from iort_contract.catalog.vesc import VESC_FIELDS
 from iort_contract.limits import MAX_PUBNUB_BYTES, ContractError
-from iort_contract.messages.event import MESSAGE_BASE64, event_message, rule_event
+from iort_contract.messages.event import event_message, rule_event
 from iort_contract.messages.live import (
     LiveSample,
     decode_live,
@@ -20,6 +20,7 @@ from iort_contract.messages.live import (
     encode_live,
     live_update,
 )
+from iort_contract.tables import MESSAGE_BASE64
 from tests.unit.contract.contract_values import (
     BAD_HEADERS,
     BOOT,

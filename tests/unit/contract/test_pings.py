@@ -9,7 +9,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from iort_contract.cloud import pong_template
+from iort_contract.catalog.rules import RULES
 from iort_contract.limits import ContractError
 from iort_contract.messages.live import decode_pong, encode_ping
 from iort_contract.topics import PONG, RULE, build_topic
@@ -50,5 +50,5 @@ def test_pong_refused(pong):
 
 
 def test_pong_goes_to_the_robot_that_asked():
-    topic = pong_template("iort").replace("${topic(3)}", "car")
+    topic = RULES["pong"].action.topic("iort", robot="car")
     assert topic == build_topic(PONG, "car", RULE)

@@ -73,7 +73,6 @@ def test_an_answer_comes_as_it_was_sent(answer: QueryAnswer) -> None:
         {"samples": "%"},
         {"n": "many"},
         {"fields": [1]},
-        {"fields": None},
         {"absent": [1]},
         {"reason": 1},
     ],

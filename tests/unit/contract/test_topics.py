@@ -6,7 +6,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from iort_contract.cloud import channel, fleet_name, pong_template, pubnub_parameter, rule_sql
+from iort_contract.catalog.rules import RULES
+from iort_contract.cloud import channel, fleet_name, pubnub_parameter
 from iort_contract.limits import ContractError
 from iort_contract.topics import (
     LANES,
@@ -85,9 +86,8 @@ def test_hostile_names_are_refused_everywhere(name):
         lambda: channel(name),
         lambda: rule_name(name),
         lambda: rule_name("record", name),
-        lambda: rule_sql(name),
-        lambda: rule_sql("record", name),
-        lambda: pong_template(name),
+        lambda: RULES["record"].statement(name),
+        lambda: RULES["pong"].action.topic(name),
         lambda: pubnub_parameter(name),
         lambda: fleet_name(name),
     ):

@@ -12,7 +12,7 @@ import pytest
 from botocore.stub import Stubber
 
 from functions import admit
-from iort_contract.attributes import plain
+from iort_contract.dynamodb import plain
 from iort_contract.tables import (
     ADMIT_CLAIM,
     ADMIT_FINGERPRINT,
@@ -44,7 +44,6 @@ def robots(dynamodb, monkeypatch):
     """moto's robots table: `put` a row, `ask` the handler, `row` again."""
     monkeypatch.setenv("ROBOTS_TABLE", ROBOTS)
     monkeypatch.setenv("NAMESPACE", "iort")
-    admit._dynamodb.cache_clear()
 
     class Robots:
         @staticmethod
@@ -79,8 +78,7 @@ def robots(dynamodb, monkeypatch):
         def row(robot="car"):
             return plain(dynamodb.get_item(TableName=ROBOTS, Key={"robot": {"S": robot}}).get("Item", {}))
 
-    yield Robots
-    admit._dynamodb.cache_clear()
+    return Robots
 
 
 def test_an_opened_name_is_admitted_once(robots, capsys):

@@ -8,7 +8,7 @@ from boto3.dynamodb.types import TypeDeserializer, TypeSerializer
 from hypothesis import given
 from hypothesis import strategies as st
 
-from iort_contract.attributes import deserialize, plain
+from iort_contract.dynamodb import deserialize, plain
 
 numbers = st.integers(-(10**37), 10**37).map(Decimal)
 leaves = st.none() | st.booleans() | st.text() | st.binary() | numbers

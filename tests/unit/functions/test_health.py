@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import pytest
 
-from functions.shared.health import measure, together
 from functions.shared.metrics import MOST_VALUES
+from functions.shared.summary.health import measure, together
+from iort_contract.catalog.metrics import metrics_of
 from iort_contract.catalog.streams import AGENT_STREAM, RTT_STREAM
 from iort_contract.catalog.vesc import TEMPERATURES, hottest_degc
-from iort_contract.cloud import METRICS
 from iort_contract.messages.batch import Batch
 
 
@@ -55,7 +55,7 @@ def test_round_trips_and_the_agents_own():
 
 @pytest.mark.parametrize("stream", ["vesc", RTT_STREAM, AGENT_STREAM])
 def test_the_names_are_the_contracts(stream):
-    assert measure(stream, [batch({"x": [1.0]})]).keys() <= set(METRICS["health"])
+    assert measure(stream, [batch({"x": [1.0]})]).keys() <= set(metrics_of("health"))
 
 
 def test_several_robots_are_one_line_of_log_and_none_of_their_values_is_cut_off():

@@ -13,25 +13,25 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from functions import live
-from functions.live import LiveSettings, RefusedError, age_ms, process
+from functions.live import REFUSALS, Lane, RefusedError, age_ms
 from functions.quarantine import entries
-from functions.shared.cut_off import BURST, CutOff
 from functions.shared.delay_estimator import DelayEstimator
-from functions.shared.metrics import Gathered
 from functions.shared.pubnub_client import PublishError, PubNubPublisher
-from iort_contract.cloud import METRICS, pubnub_parameter
-from iort_contract.cloud import channel as pubnub_channel
+from iort_contract.catalog.environments import LiveEnvironment
+from iort_contract.catalog.metrics import metrics_of
+from iort_contract.cloud import channel as channel_of
+from iort_contract.cloud import pubnub_parameter
 from iort_contract.limits import LIVE_MAX_AGE_MS, MAX_PUBNUB_BYTES, SCHEMA_VERSION, ContractError
-from iort_contract.messages.event import MESSAGE_BASE64, event_message, rule_event
+from iort_contract.messages.event import event_message, rule_event
 from iort_contract.messages.live import LiveSample, encode_live
-from iort_contract.tables import BY_FUNCTION, RECEIVED_MS, TOPIC
+from iort_contract.tables import BY_FUNCTION, MESSAGE_BASE64, RECEIVED_MS, TOPIC
 from iort_contract.topics import LIVE, build_topic
 
 T_US = 1_700_000_000_000_000
 SENT_US = T_US + 4_000
 RECEIVED = (SENT_US + 30_000) // 1000
 NOW_US = SENT_US + 35_000
-SETTINGS = LiveSettings({"vesc": frozenset({"speed", "voltage_input"})})
+FIELDS = {"vesc": ["speed", "voltage_input"]}
 SAMPLE = {"speed": 1200, "voltage_input": 15.8, "fault_code": 0}
 
 
@@ -56,11 +56,11 @@ class Channels:
         self.sent.append((channel, message))
 
 
-def show(message, publish, *, settings=SETTINGS, legs=None, now_us=NOW_US):
+def show(message, publish, *, fields=FIELDS, legs=None, now_us=NOW_US):
     """What a new environment does with a message: it writes what it counts at once."""
-    process(
-        message, settings, publish, legs=legs or DelayEstimator(), counted=Gathered("live"), now_us=now_us
-    )
+    lane = Lane(fields, publish, keep=pytest.fail)
+    lane.estimator = legs or lane.estimator
+    lane.show(message, now_us)
 
 
 @pytest.fixture
@@ -73,7 +73,7 @@ def counted(capsys):
             entry = json.loads(line, parse_constant=pytest.fail)
             (directive,) = entry["_aws"]["CloudWatchMetrics"]
             for metric in directive["Metrics"]:
-                assert metric["Name"] in METRICS["live"]
+                assert metric["Name"] in metrics_of("live")
                 value = entry[metric["Name"]]
                 value = sum(value) if isinstance(value, list) else value
                 totals[metric["Name"]] = totals.get(metric["Name"], 0) + value
@@ -86,7 +86,7 @@ def test_the_chosen_fields_go_to_the_cars_channel_with_every_hops_time(counted):
     channels = Channels()
     show(event(), channels)
     ((channel, message),) = channels.sent
-    assert channel == pubnub_channel("car")
+    assert channel == channel_of("car")
     assert message == {
         "v": SCHEMA_VERSION,
         "robot": "car",
@@ -111,8 +111,8 @@ def test_a_stream_that_is_not_configured_sends_every_field():
 
 def test_a_stream_configured_with_no_field_sends_none_and_fields_that_are_not_there_are_not_made_up():
     channels = Channels()
-    show(event(), channels, settings=LiveSettings({"vesc": frozenset()}))
-    show(event(), channels, settings=LiveSettings({"vesc": frozenset({"speed", "absent"})}))
+    show(event(), channels, fields={"vesc": []})
+    show(event(), channels, fields={"vesc": ["speed", "absent"]})
     assert [message["sample"] for _, message in channels.sent] == [{}, {"speed": 1200}]
 
 
@@ -120,7 +120,7 @@ def test_what_is_shown_live_is_null_where_no_sensor_is_fitted():
     channels = Channels()
     sample = {"temp_motor": -273.15, "temp_fet": 31.5, "current_motor": -60}
     for fields in ({}, {"vesc": frozenset({"temp_motor"})}):
-        show(event(sample=sample), channels, settings=LiveSettings(fields))
+        show(event(sample=sample), channels, fields=fields)
     assert [message["sample"] for _, message in channels.sent] == [
         {"temp_motor": None, "temp_fet": 31.5, "current_motor": -60},
         {"temp_motor": None},
@@ -130,13 +130,13 @@ def test_what_is_shown_live_is_null_where_no_sensor_is_fitted():
 def test_another_deployment_has_channels_of_its_own():
     channels = Channels()
     show(event(namespace="lab2"), channels)
-    assert channels.sent[0][0] == pubnub_channel("car", "lab2")
+    assert channels.sent[0][0] == channel_of("car", "lab2")
 
 
 def test_the_robot_is_the_topics_whatever_the_message_claims():
     channels = Channels()
     show(event(robot="mine", channel="iort.other"), channels)
-    assert channels.sent[0][0] == pubnub_channel("mine")
+    assert channels.sent[0][0] == channel_of("mine")
     assert channels.sent[0][1]["robot"] == "mine"
 
 
@@ -263,11 +263,6 @@ def test_what_pubnub_does_not_take_is_counted_and_not_raised(counted, caplog):
     assert "car: status 403" in caplog.text
 
 
-def test_the_settings_come_from_the_environment(monkeypatch):
-    monkeypatch.setenv("LIVE_FIELDS", '{"vesc": ["speed", "speed"], "imu": []}')
-    assert LiveSettings.from_environment() == LiveSettings({"vesc": frozenset({"speed"}), "imu": frozenset()})
-
-
 ARN = "arn:aws:lambda:eu-west-1:000000000000:function:iort-processing-Live-1"
 
 
@@ -287,29 +282,11 @@ class Served:
     """One environment of the function, and what it did with each event."""
 
     def __init__(self, *, takes=True):
-        self.channels, self.queue, self.cut_off = Channels(), Queue(takes=takes), CutOff()
-        self.legs, self.counted, self.now_us = DelayEstimator(), Gathered("live"), NOW_US
+        self.channels, self.queue, self.now_us = Channels(), Queue(takes=takes), NOW_US
+        self.lane = Lane(FIELDS, self.channels, self.queue)
 
     def __call__(self, message):
-        def one():
-            process(
-                message,
-                SETTINGS,
-                self.channels,
-                legs=self.legs,
-                counted=self.counted,
-                now_us=self.now_us,
-            )
-
-        live.serve(
-            message,
-            one,
-            self.queue,
-            cut_off=self.cut_off,
-            counted=self.counted,
-            function_arn=ARN,
-            now_s=self.now_us / 1e6,
-        )
+        self.lane.serve(message, self.now_us, ARN)
 
 
 @pytest.mark.parametrize("malformed", MALFORMED, ids=range(len(MALFORMED)))
@@ -332,15 +309,15 @@ def test_what_the_queue_does_not_take_fails_the_invocation_so_that_lambda_sends_
 
 def test_a_robot_that_is_refused_over_and_over_is_cut_off_and_no_other_is(counted):
     served = Served()
-    for _ in range(BURST + 30):
+    for _ in range(REFUSALS + 30):
         served({**handed(b"x"), TOPIC: build_topic(LIVE, "bad", "vesc")})
     # Its good ones are not looked at either, and every other robot's are.
     served(event(robot="bad"))
     for i in range(40):
         served(event(robot=f"good{i}"))
-    assert len(served.queue.kept) == BURST
+    assert len(served.queue.kept) == REFUSALS
     assert [entries(body, list)[0].reason.count("LiveCutOff") for body in served.queue.kept] == [
-        *[0] * (BURST - 1),
+        *[0] * (REFUSALS - 1),
         1,
     ]
     assert [message["robot"] for _, message in served.channels.sent] == [f"good{i}" for i in range(40)]
@@ -350,54 +327,43 @@ def test_a_robot_that_is_refused_over_and_over_is_cut_off_and_no_other_is(counte
     served({**mended, RECEIVED_MS: served.now_us // 1000})
     assert served.channels.sent[-1][1]["robot"] == "bad"
     totals = counted()
-    assert (totals["LiveRefused"], totals["LiveCutOff"]) == (BURST, 31)
+    assert (totals["LiveRefused"], totals["LiveCutOff"]) == (REFUSALS, 31)
     assert totals["LivePublished"] == 41
 
 
-def test_an_allowance_is_had_again_with_time_and_whatever_the_clock_does():
-    cut_off = CutOff()
-    assert [cut_off.refused("car", 0.0) for _ in range(BURST)] == [False] * (BURST - 1) + [True]
-    assert cut_off.closed("car", 0.9)
-    assert not cut_off.closed("car", 1.1)
-    assert not cut_off.closed("other", 0.0)
-    # One refused message a second is never cut off.
-    steady = CutOff()
-    assert not any(steady.refused("car", float(second)) for second in range(1000))
-    assert cut_off.closed("car", -3600.0)
-
-
-def test_the_queue_is_that_of_the_environment(aws, monkeypatch):
-    client = boto3.client("sqs")
-    url = client.create_queue(QueueName="rejected")["QueueUrl"]
-    monkeypatch.setenv("REJECTED_QUEUE", url)
-    live._refusals.cache_clear()
-    try:
-        assert live._refusals().keep("body")
-        (message,) = client.receive_message(QueueUrl=url)["Messages"]
-        assert message["Body"] == "body"
-        client.delete_queue(QueueUrl=url)
-        assert not live._refusals().keep("body")
-    finally:
-        live._refusals.cache_clear()
+def test_a_robot_that_is_refused_once_a_second_is_never_cut_off(counted):
+    served = Served()
+    for second in range(100):
+        served.now_us = NOW_US + second * 1_000_000
+        served(handed(b"x"))
+    assert len(served.queue.kept) == 100
+    # A clock that is set back gives nothing twice.
+    served.now_us = NOW_US
+    for _ in range(REFUSALS + 1):
+        served(handed(b"x"))
+    assert "LiveCutOff" in counted()
 
 
 class Context:
     invoked_function_arn = ARN
 
 
-def test_the_handler_wires_settings_publisher_queue_and_clock(monkeypatch, counted):
-    channels, queue = Channels(), Queue()
-    monkeypatch.setattr(live, "_refusals", lambda: type("DeadLetterQueue", (), {"keep": staticmethod(queue)}))
-    monkeypatch.setattr(live, "_settings", lambda: SETTINGS)
-    monkeypatch.setattr(
-        live, "_publisher", lambda: type("Publisher", (), {"publish": staticmethod(channels)})
-    )
-    monkeypatch.setattr(live.time, "time_ns", lambda: NOW_US * 1000)
-    assert live.handler(event(), Context) is None
+def test_the_handler_has_fields_publisher_and_queue_of_its_environment(aws, monkeypatch, counted):
+    parameter = pubnub_parameter("lab2")
+    boto3.client("ssm").put_parameter(Name=parameter, Type="SecureString", Value=json.dumps(KEYS))
+    queue = boto3.client("sqs").create_queue(QueueName="rejected")["QueueUrl"]
+    given = LiveEnvironment("lab2", parameter, {"vesc": ["speed"], "imu": []}, queue)
+    for name, value in given.variables().items():
+        monkeypatch.setenv(name, value)
     assert live.handler(handed(b"x"), Context) is None
-    assert len(queue.kept) == 1
-    assert channels.sent[0][1]["hops"]["lambda_us"] == NOW_US
-    assert counted()["LivePublished"] == 1
+    (message,) = boto3.client("sqs").receive_message(QueueUrl=queue)["Messages"]
+    (entry,) = entries(message["Body"], lambda _info: [])
+    assert (entry.payload, live.lane().fields) == (b"x", {"vesc": ["speed"], "imu": []})
+    assert live.lane() is live.lane()
+    assert counted() == {"LiveRefused": 1}
+    boto3.client("sqs").delete_queue(QueueUrl=queue)
+    with pytest.raises(RefusedError):
+        live.handler(handed(b"x"), Context)
 
 
 # --- the publisher, without a network -------------------------------------------------------------
@@ -417,17 +383,6 @@ def test_the_keys_come_from_a_secure_parameter(aws, extra, origin, tls):
     assert (config.publish_key, config.subscribe_key) == tuple(KEYS.values())
     assert (config.origin, config.ssl) == (origin, tls)
     assert config.connect_timeout == config.non_subscribe_request_timeout == 1
-
-
-def test_the_publisher_is_made_once_an_environment(aws, monkeypatch):
-    name = pubnub_parameter("lab2")
-    boto3.client("ssm").put_parameter(Name=name, Type="SecureString", Value=json.dumps(KEYS))
-    monkeypatch.setenv("PUBNUB_PARAMETER", name)
-    live._publisher.cache_clear()
-    try:
-        assert live._publisher() is live._publisher()
-    finally:
-        live._publisher.cache_clear()
 
 
 def test_a_message_too_large_is_refused_before_it_is_sent():

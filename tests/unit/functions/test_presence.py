@@ -10,8 +10,8 @@ import boto3
 import pytest
 
 from functions import presence
-from iort_contract.attributes import plain
-from iort_contract.cloud import METRICS
+from iort_contract.catalog.metrics import metrics_of
+from iort_contract.dynamodb import plain
 from iort_contract.limits import ContractError
 from tests.fakes import ROBOTS
 
@@ -49,7 +49,6 @@ def table(dynamodb, monkeypatch):
     """moto's robots table with one robot; called with events, it gives the row that they make."""
     monkeypatch.setenv("ROBOTS_TABLE", ROBOTS)
     monkeypatch.setenv("NAMESPACE", "iort")
-    presence._dynamodb.cache_clear()
 
     def row_after(*events):
         dynamodb.put_item(TableName=ROBOTS, Item={"robot": {"S": "car"}, "speed_to_erpm_gain": {"N": "4614"}})
@@ -59,8 +58,7 @@ def table(dynamodb, monkeypatch):
         assert row.pop("speed_to_erpm_gain") == 4614
         return row
 
-    yield row_after
-    presence._dynamodb.cache_clear()
+    return row_after
 
 
 def test_a_connection_and_its_end(table):
@@ -186,7 +184,7 @@ def test_what_dynamodb_refuses_is_tried_again_by_lambda(table, monkeypatch):
 def test_counts(table, capsys):
     table(connected(), disconnected(), disconnected())
     lines = [json.loads(line) for line in capsys.readouterr().out.splitlines()]
-    counted = [{name: line[name] for name in METRICS["presence"] if name in line} for line in lines]
+    counted = [{name: line[name] for name in metrics_of("presence") if name in line} for line in lines]
     assert counted == [{"RobotsConnected": 1}, {"RobotsDisconnected": 1}, {"PresenceIgnored": 1}]
 
 

@@ -11,9 +11,9 @@ import pytest
 
 from functions.query import answer
 from iort_contract.messages.batch import Batch
-from iort_station.data import data
-from iort_station.data.conditions import values
-from iort_station.data.stored import Refused
+from iort_station import data
+from iort_station.data.batches import RefusedItems
+from iort_station.data.blocks import values
 from iort_station.errors import StationError
 from tests.fakes import ROBOTS, TELEMETRY, FakeDynamoDB, item_of, serialize, tables
 
@@ -21,36 +21,8 @@ START = 1_700_000_000_000_000
 ENOUGH_MS = 60_000
 
 
-class Paged(FakeDynamoDB):
-    """The client's own pages, each with the key that it ended with."""
-
-    def query(self, *, after=None, **query):
-        after = query.pop("ExclusiveStartKey", None)
-        found = [item for page in self.paginate(**query) for item in page["Items"]]
-        at = (
-            0
-            if after is None
-            else 1 + next(i for i, item in enumerate(found) if item["batch"] == after["batch"])
-        )
-        page = found[at : at + self.page_items]
-        more = at + len(page) < len(found)
-        return {"Items": page} | ({"LastEvaluatedKey": {"batch": page[-1]["batch"]}} if more else {})
-
-    def scan(self, **scan):
-        topic = scan["ExpressionAttributeValues"][":topic"]
-        assert "FilterExpression" in scan
-        found = [item for item in self.items[TELEMETRY].values() if item["topic"] == topic][::-1]
-        after = scan.get("ExclusiveStartKey")
-        at = (
-            0
-            if after is None
-            else 1 + next(i for i, item in enumerate(found) if item["batch"] == after["batch"])
-        )
-        return {"Items": found[at:]}
-
-
 def table(*batches, page_items=2):
-    client = Paged(page_items=page_items)
+    client = FakeDynamoDB(page_items=page_items)
     for batch in batches:
         client.put(TELEMETRY, item_of(batch))
     row = {"robot": "car", "speed_to_erpm_gain": 10}
@@ -153,7 +125,7 @@ def test_counts_what_is_no_batch():
     [
         ({"robot": "a/b"}, "robot name"),
         ({"where": "speed >"}, "invalid expression"),
-        ({"start_us": "now"}, "integer of microseconds"),
+        ({"start_us": "now"}, "must be an integer"),
         ({"fields": [1]}, "list of names"),
         ({"where": 7}, ""),
         ({"where": "speed > '3'"}, "speed is a number, '3' is a text"),
@@ -233,7 +205,7 @@ def test_a_sensor_that_is_not_fitted_is_null_and_counted(on, motor):
 def test_what_is_exported_as_messages_is_what_was_recorded():
     columns = {"temp_motor": COLD}
     cloud = Cloud(table(Batch("0badcafe", 0, [START + i for i in range(4)], columns)))
-    blocks = data.samples(cloud, data.select("car", "vesc"), refused=Refused())
+    blocks = data.samples(cloud, data.select("car", "vesc"), refused=RefusedItems())
     assert [value for block in blocks for value in block.columns["temp_motor"].tolist()] == COLD
 
 
@@ -243,7 +215,7 @@ def test_a_mistake_is_answered_from_there_as_from_here():
         ({"fields": ["volts"]}, "car has no volts in vesc in this range; it has name, speed"),
         ({"where": "speed > '3'"}, "cannot compare a number with a text: speed is a number"),
         ({"where": "speed > None"}, "None is only allowed as"),
-        ({"summary": True}, "the summary is read from here"),
+        ({"summary": True}, "query the summary without --on lambda"),
         ({"stream": "imu"}, "car has no stream imu"),
     ):
         with pytest.raises(StationError, match=reason):

@@ -7,8 +7,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from functions.shared.tables import attribute
-from iort_contract.attributes import plain
 from iort_contract.codec.seconds import flat_second
+from iort_contract.dynamodb import plain
 from iort_contract.messages.batch import Batch
 from iort_contract.statistics import summarize_second
 from iort_contract.tables import EXPIRES_S, OMITTED, SECOND, STATS, TOPIC

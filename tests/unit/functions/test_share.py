@@ -9,12 +9,13 @@ import pytest
 from botocore.exceptions import ClientError
 
 from functions import later
-from functions.shared import allowances, share
-from functions.shared.allowances import Allowances
-from functions.shared.processing import Bounds, process
-from functions.shared.share import KEYS, OverShareError, PutOff, Share, Told, waiting
+from functions.shared import rate_limiter
+from functions.shared.rate_limiter import RateLimiter
+from functions.shared.summary import share
+from functions.shared.summary.processing import Bounds, process
+from functions.shared.summary.share import KEYS, OverShareError, PutOff, Share, Told, waiting
 from iort_contract.catalog.vesc import VESC_STREAM
-from iort_contract.table_writer import TableError
+from iort_contract.dynamodb import TableError
 from iort_contract.tables import OVER_SHARE, PUT_OFF
 from iort_contract.topics import RECORD, SHADOW, build_topic
 from tests.unit.functions.summarizing import T0, S, Stream, batch, counted
@@ -96,7 +97,7 @@ def many(count, *, first=0):
 
 
 def test_an_allowance_is_had_again_with_time():
-    left = Allowances(burst=1.0, a_second=0.1)
+    left = RateLimiter(burst=1.0, a_second=0.1)
     assert left.spend("car", 0.0, 3.0) == -2.0
     assert left.left("other", 0.0) == 1.0
     assert left.left("car", 20.0) == pytest.approx(0.0)
@@ -107,8 +108,8 @@ def test_an_allowance_is_had_again_with_time():
 
 
 def test_allowances_are_of_a_bounded_number_of_robots():
-    left = Allowances(burst=1.0, a_second=0.1)
-    for i in range(allowances._ROBOTS + 1):
+    left = RateLimiter(burst=1.0, a_second=0.1)
+    for i in range(rate_limiter._ROBOTS + 1):
         left.spend(f"car{i}", 0.0, 0.5)
     assert (left.left("car0", 0.0), left.left("car1", 0.0)) == (1.0, 0.5)
 

@@ -8,22 +8,23 @@ import json
 import pytest
 
 from functions import alert, echo, presence
+from iort_contract.catalog.rules import RULES
 from iort_contract.catalog.vesc import FAULT_FIELD, VOLTAGE_FIELD
-from iort_contract.cloud import rule_sql
 from iort_contract.messages.batch import Batch, decode_batch, decode_item, encode_batch
-from iort_contract.messages.event import MESSAGE_BASE64, event_message
+from iort_contract.messages.event import event_message
 from iort_contract.messages.live import LiveSample, decode_pong, encode_live, encode_ping
 from iort_contract.tables import (
     AGENT_VERSION,
     ENVELOPE,
     EXPIRES_S,
+    MESSAGE_BASE64,
     NONFINITE,
     PREVIOUS,
     RECEIVED_MS,
     ROBOT,
     TOPIC,
 )
-from iort_contract.topics import FILE, LAMBDA, LIVE, PING, PONG, RECORD, RULE, RULES, SHADOW, build_topic
+from iort_contract.topics import FILE, LAMBDA, LIVE, PING, PONG, RECORD, RULE, SHADOW, build_topic
 from tests.iot_sql import Message, evaluate
 from verify.tools.spoofing import spoofed
 
@@ -58,7 +59,7 @@ def of_rule(request):
     """What a rule makes of a message on a topic."""
 
     def run(rule, topic, payload):
-        sql = rule_sql(rule, retention_s=RETENTION_S)
+        sql = RULES[rule].statement(retention_s=RETENTION_S)
         return evaluate(sql, Message(topic, payload, NOW_MS), payload_wins=request.param)
 
     return run
@@ -91,7 +92,7 @@ def test_lambda_2_gets_the_robot_of_the_topic_and_its_batch(of_rule):
     assert set(item) == {*ENVELOPE, TOPIC, RECEIVED_MS, EXPIRES_S}
 
 
-def test_a_key_that_a_batch_lacks_is_not_in_the_table(of_rule):
+def test_a_batch_without_nonfinite_has_none_in_the_table(of_rule):
     message = encode_batch(Batch("0badcafe", 3, [T_US], {"speed": [1.5]}))
     item = of_rule("record", WHOSE["record"], message)
     assert not {NONFINITE, PREVIOUS} & set(item)

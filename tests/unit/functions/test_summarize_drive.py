@@ -7,9 +7,8 @@ import random
 import pytest
 
 from functions import summarize
-from functions.shared import processing
-from iort_contract.attributes import plain
 from iort_contract.codec.seconds import flat_second
+from iort_contract.dynamodb import plain
 from iort_contract.messages.batch import Batch
 from tests.fakes import (
     NAMES,
@@ -23,7 +22,8 @@ from tests.unit.functions.summarizing import SECOND, T0, S, Stream, batch, count
 def test_the_handler_against_the_tables_of_the_template(dynamodb, monkeypatch, capsys):
     for name, table in NAMES.items():
         monkeypatch.setenv(f"{name.upper()}_TABLE", table)
-    monkeypatch.setenv("REJECTED_QUEUE", "https://sqs.example/rejected")
+    for queue in ("REJECTED", "PUT_OFF"):
+        monkeypatch.setenv(f"{queue}_QUEUE", f"https://sqs.example/{queue}")
     monkeypatch.setenv("ROBOT_METRICS", "false")
     dynamodb.put_item(TableName=ROBOTS, Item={"robot": {"S": "car"}, "speed_to_erpm_gain": {"N": "4614"}})
     stream = Stream(dynamodb)
@@ -32,15 +32,9 @@ def test_the_handler_against_the_tables_of_the_template(dynamodb, monkeypatch, c
     ]
     order = list(drive)
     random.Random(1).shuffle(order)
-    processing.stored_tables.cache_clear()
-    processing._refusals.cache_clear()
-    try:
-        for start in range(0, len(order), 13):
-            records = stream.store(*order[start : start + 13])
-            assert summarize.handler({"Records": records}, None) == {"batchItemFailures": []}
-    finally:
-        processing.stored_tables.cache_clear()
-        processing._refusals.cache_clear()
+    for start in range(0, len(order), 13):
+        records = stream.store(*order[start : start + 13])
+        assert summarize.handler({"Records": records}, None) == {"batchItemFailures": []}
     items = [flat_second(plain(item)) for item in dynamodb.scan(TableName=SUMMARY)["Items"]]
     assert sum(item["n"] for item in items) == 39 * 50
     by_second = {int(item["second"]) - SECOND: item for item in items}

@@ -10,11 +10,11 @@ import zlib
 import pytest
 
 from functions.shared import tables as tables_module
-from functions.shared.processing import process
+from functions.shared.summary.processing import process
 from iort_contract.codec.columns import DICTIONARY
+from iort_contract.dynamodb import TableError
 from iort_contract.limits import MAX_AHEAD_US, MAX_COLUMNS_BYTES
 from iort_contract.messages.batch import BatchId, encode_batch
-from iort_contract.table_writer import TableError
 from tests.fakes import (
     ROBOTS,
     FakeDynamoDB,

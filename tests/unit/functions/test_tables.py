@@ -11,10 +11,9 @@ from hypothesis import strategies as st
 
 from functions.shared import tables as tables_module
 from functions.shared.tables import attribute
-from iort_contract.attributes import plain
 from iort_contract.catalog.derived import Vehicle
+from iort_contract.dynamodb import TableError, plain
 from iort_contract.messages.batch import Batch, BatchId, batch_id
-from iort_contract.table_writer import TableError
 from iort_contract.tables import BATCH, EXPIRES_S, SECOND, TOPIC
 from tests.fakes import (
     ROBOTS,

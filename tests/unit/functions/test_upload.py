@@ -17,7 +17,8 @@ from hypothesis import strategies as st
 from functions import upload
 from functions.quarantine import entries
 from functions.shared.bucket import Bucket
-from functions.shared.upload_quota import Allotment
+from functions.shared.upload_quota import UploadQuota
+from iort_contract.catalog.environments import UploadEnvironment
 from iort_contract.limits import MAX_MESSAGE_BYTES, ContractError
 from iort_contract.messages.event import rule_event
 from iort_contract.messages.files import (
@@ -256,7 +257,7 @@ def ask(s3, dynamodb):
     """Asks as `car`, unless another robot is named."""
 
     def ask(request, robot="car", *, bytes_a_day=10**9, now_s=NOW_S):
-        allotment = Allotment(dynamodb, table=ROBOTS, bytes_a_day=bytes_a_day)
+        allotment = UploadQuota(dynamodb, table=ROBOTS, bytes_a_day=bytes_a_day)
         return upload.answer(robot, request, Bucket(s3, NAME), allotment, now_s)
 
     return ask
@@ -360,42 +361,32 @@ def test_a_robot_that_is_not_registered_gets_no_address(ask, dynamodb):
     assert "Item" not in dynamodb.get_item(TableName=ROBOTS, Key={ROBOT: {"S": "stranger"}})
 
 
-class Context:
-    invoked_function_arn = "arn:aws:lambda:eu-west-1:000000000000:function:upload"
+class Desk:
+    """One environment of the function: what it answered, and what went to the queue before the quarantine."""
 
+    def __init__(self, s3, dynamodb):
+        self.bucket = Bucket(s3, NAME)
+        self.quota = UploadQuota(dynamodb, table=ROBOTS, bytes_a_day=10**9)
+        self.answered, self.kept, self.takes = [], [], True
 
-class Queue:
-    """Stands for the queue before the quarantine."""
+    def __call__(self, event):
+        upload.serve(event, ARN, bucket=self.bucket, quota=self.quota, reply=self._reply, keep=self._keep)
 
-    def __init__(self):
-        self.bodies, self.takes = [], True
+    def _reply(self, topic, answer):
+        self.answered.append((topic.robot, answer))
 
-    def keep(self, body):
+    def _keep(self, body):
         if self.takes:
-            self.bodies.append(body)
+            self.kept.append(body)
         return self.takes
 
 
-@pytest.fixture
-def queue(monkeypatch):
-    made = Queue()
-    monkeypatch.setattr(upload, "_refusals", lambda: made)
-    return made
+ARN = "arn:aws:lambda:eu-west-1:000000000000:function:upload"
 
 
 @pytest.fixture
-def published(monkeypatch, s3, dynamodb):
-    sent = []
-
-    class Broker:
-        def publish(self, **arguments):
-            sent.append(arguments)
-
-    monkeypatch.setenv("NAMESPACE", "iort")
-    monkeypatch.setattr(upload, "_iot_data", Broker)
-    monkeypatch.setattr(upload, "_bucket", lambda: Bucket(s3, NAME))
-    monkeypatch.setattr(upload, "_allotment", lambda: Allotment(dynamodb, table=ROBOTS, bytes_a_day=10**9))
-    return sent
+def desk(s3, dynamodb):
+    return Desk(s3, dynamodb)
 
 
 def event(request, robot="car", **changes):
@@ -404,14 +395,13 @@ def event(request, robot="car", **changes):
     return rule_event(message, build_topic(PING, robot, FILE), 1_700_000_000_123)
 
 
-def test_the_handler_answers_the_robot_of_the_topic_and_counts(published, capsys, s3):
-    upload.handler(event(SMALL), Context)
+def test_the_robot_of_the_topic_is_answered_and_counted(desk, capsys, s3):
+    desk(event(SMALL))
     key = file_key("car", SMALL.file)
     s3.put_object(Bucket=NAME, Key=key, Body=b"small")
-    upload.handler(event(asking(b"small", done=True)), Context)
-    asked, stored = (decode_file_answer(one["payload"]) for one in published)
-    assert {(one["topic"], one["qos"]) for one in published} == {(build_topic(PONG, "car", FILE), 1)}
-    assert (asked.key, asked.stored, stored.stored) == (key, False, True)
+    desk(event(asking(b"small", done=True)))
+    (robot, asked), (_, stored) = desk.answered
+    assert (robot, asked.key, asked.stored, stored.stored) == ("car", key, False, True)
     first, second = map(json.loads, capsys.readouterr().out.splitlines())
     assert (first["FilesAsked"], "FilesStored" in first) == (1, False)
     assert (second["FilesStored"], second["StoredBytes"]) == (1, 5)
@@ -419,9 +409,9 @@ def test_the_handler_answers_the_robot_of_the_topic_and_counts(published, capsys
     assert units["StoredBytes"] == "Bytes"
 
 
-def test_the_handler_says_what_is_wrong_with_a_request(published, capsys):
-    upload.handler(event(SMALL, parts={"9": "x"}), Context)
-    (answer,) = (decode_file_answer(one["payload"]) for one in published)
+def test_a_robot_learns_what_is_wrong_with_its_request(desk, capsys):
+    desk(event(SMALL, parts={"9": "x"}))
+    ((_, answer),) = desk.answered
     assert answer.id == ID
     assert answer.refused == "part must be 1 to 1, got 9"
     assert answer.again_s is None
@@ -438,33 +428,38 @@ requests = st.dictionaries(st.sampled_from(["v", "id", "file", "parts", "parts_s
 
 @settings(suppress_health_check=[HealthCheck.function_scoped_fixture])
 @given(requests.map(lambda said: json.dumps(said).encode()) | st.binary(max_size=20))
-def test_every_malformed_request_is_answered_or_kept(published, queue, message):
-    published.clear()
-    queue.bodies.clear()
-    upload.handler(rule_event(message, build_topic(PING, "car", FILE), 1), Context)
-    assert (len(published), len(queue.bodies)) in {(1, 0), (0, 1)}
-    for one in published:
+def test_every_malformed_request_is_answered_or_kept(desk, message):
+    desk.answered.clear()
+    desk.kept.clear()
+    desk(rule_event(message, build_topic(PING, "car", FILE), 1))
+    assert (len(desk.answered), len(desk.kept)) in {(1, 0), (0, 1)}
+    for _, answer in desk.answered:
         # The robot knows it for the answer to what it asked.
-        assert decode_file_answer(one["payload"]).id == json.loads(message)["id"]
-    for body in queue.bodies:
+        sent = encode_file_answer(answer)
+        assert decode_file_answer(sent).id == json.loads(message)["id"]
+    for body in desk.kept:
         (entry,) = entries(body, list)
         assert (entry.source, entry.robot, entry.payload) == ("function upload", "car", message)
         assert entry.reason.startswith("Refused: ")
 
 
-def test_what_the_queue_does_not_take_fails_the_invocation(published, queue):
-    queue.takes = False
+def test_what_the_queue_does_not_take_fails_the_invocation(desk):
+    desk.takes = False
     with pytest.raises(ContractError):
-        upload.handler(rule_event(b"{}", build_topic(PING, "car", FILE), 1), Context)
+        desk(rule_event(b"{}", build_topic(PING, "car", FILE), 1))
 
 
-def test_the_clients_are_those_of_the_environment(aws, monkeypatch):
-    monkeypatch.setenv("FILES_BUCKET", NAME)
-    monkeypatch.setenv("AWS_ACCESS_KEY_ID", "k")
-    monkeypatch.setenv("AWS_SECRET_ACCESS_KEY", "s")
-    upload._bucket.cache_clear()
-    try:
-        address = upload._bucket().address("robots/car/x", SMALL.file)
-    finally:
-        upload._bucket.cache_clear()
+def test_the_handler_signs_and_publishes_with_the_clients_of_its_environment(aws, s3, dynamodb, monkeypatch):
+    from moto.backends import get_backend
+    from moto.core import DEFAULT_ACCOUNT_ID
+
+    class Context:
+        invoked_function_arn = ARN
+
+    for name, value in UploadEnvironment("iort", NAME, ROBOTS, "queue", 10**9).variables().items():
+        monkeypatch.setenv(name, value)
+    upload.handler(event(SMALL), Context)
+    ((topic, payload),) = get_backend("iot-data")[DEFAULT_ACCOUNT_ID]["eu-west-1"].published_payloads
+    (address,) = decode_file_answer(payload).addresses
+    assert topic == build_topic(PONG, "car", FILE)
     assert urlsplit(address.url).netloc == f"{NAME}.s3.eu-west-1.amazonaws.com"

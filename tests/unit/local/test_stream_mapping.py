@@ -13,9 +13,9 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from functions.shared import tables as tables_module
-from functions.shared.processing import process
+from functions.shared.summary.processing import process
+from iort_contract.dynamodb import TableError
 from iort_contract.messages.batch import Batch
-from iort_contract.table_writer import TableError
 from local.gaps.parts.stream_mapping import Answer, Condition, Settings, Shard
 from tests.fakes import TELEMETRY, FakeDynamoDB, item_of, record_of, summary_of, tables
 

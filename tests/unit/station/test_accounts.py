@@ -51,4 +51,4 @@ def test_whether_a_run_goes_on_is_told_by_the_clouds_clock():
         found = last_of([told(0, scan(100), t_us=T_US + off_us, received_us=T_US)])
         assert held_against(stored(2), found, T_US + 1_000_000).complete
         (short,) = held_against(stored(2), found, T_US + HOUR_US).shortfalls
-        assert "did not end in good order" in short.cause
+        assert "did not end properly" in short.cause

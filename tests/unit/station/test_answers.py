@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from iort_contract.messages.batch import Batch
-from iort_station.data.conditions import values
+from iort_station.data.blocks import values
 from iort_station.errors import StationError
 from iort_station.page.answers import MAX_ROWS, answers, history
 from tests.unit.station.test_data import START, cloud_of, ride
@@ -108,7 +108,7 @@ def test_an_empty_range_is_no_error():
     [
         ({"robot": ""}, "must have the parameter robot"),
         ({"robot": "../x"}, "robot name"),
-        ({"robot": "nobody"}, "there is no robot nobody"),
+        ({"robot": "nobody"}, "robot nobody is not registered"),
         ({"stream": "odom"}, "has no stream odom"),
         ({"from_us": "-1"}, "from_us"),
         ({"from_us": "9" * 400}, "from_us"),

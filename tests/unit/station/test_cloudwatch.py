@@ -129,7 +129,7 @@ def test_alarms_are_shown_in_the_widgets_order_with_state_and_reason(cloud):
 
 
 def test_a_dashboard_that_is_not_there_says_so(cloud):
-    with pytest.raises(StationError, match="no dashboard 'nobody'"):
+    with pytest.raises(StationError, match="dashboard 'nobody' does not exist"):
         cloudwatch.dashboard(cloud, "nobody", minutes=5, now_s=NOW_S)
 
 

@@ -75,15 +75,15 @@ def test_a_query_in_another_language_is_asked_in_it() -> None:
 
 @pytest.mark.parametrize("status", ["Failed", "Cancelled", "Timeout"])
 def test_a_query_that_fails_says_so(status: str) -> None:
-    with pytest.raises(StationError, match=f"gave up on the query: {status.lower()}"):
+    with pytest.raises(StationError, match=f"ended the query: {status.lower()}"):
         cloudwatch_logs.rows(Insights({"status": status}), NAME, 1, minutes=15)
 
 
 def test_nothing_else_can_be_asked_of_the_logs() -> None:
     for number in (0, 2):
-        with pytest.raises(StationError, match="none of logs"):
+        with pytest.raises(StationError, match="not a log widget"):
             cloudwatch_logs.rows(Insights(), NAME, number, minutes=15)
-    with pytest.raises(StationError, match="names no log group"):
+    with pytest.raises(StationError, match="must name a log group"):
         cloudwatch_logs.rows(
             Insights(query="SOURCE logGroups(namePrefix: ['a']) | fields x"), NAME, 1, minutes=15
         )

@@ -10,10 +10,10 @@ from typer.testing import CliRunner
 
 from bench import message_sizes
 from bench.load.simulated import simulated_drive
-from functions.shared.health import measure
 from functions.shared.metrics import Gathered, emit
+from functions.shared.summary.health import measure
 from iort_agent.lanes.pings import CLOCK_EVERY_S
-from iort_contract.cloud import METRICS
+from iort_contract.catalog.metrics import METRICS
 from iort_station.cli.main import app
 from iort_station.cost import line_items, model, report, scale
 from iort_station.cost.fixed_costs import (
@@ -71,7 +71,7 @@ def test_the_ratio_is_given_without_log_lines_too():
         sum(item.dollars for item in items if item.service != "CloudWatch")
         for items in (model.thesis_bill(_ONE), model.bill(_ONE))
     ]
-    (row,) = (row for row in report.robot_hour(_ONE).body if row[0] == "of it without log lines")
+    (row,) = (row for row in report.robot_hour(_ONE).body if row[0] == "total AWS without log lines")
     assert row[-1] == f"1/{unlogged[0] / unlogged[1]:.1f}"
 
 
@@ -83,7 +83,7 @@ def test_a_deployment_at_rest_pays_for_what_polls_watches_and_keeps():
     assert rest["alarms by Metrics Insights, at most"] == pytest.approx(4.8), "and none of those"
     assert rest["metrics"] == pytest.approx((36 - 10) * 0.30)
     # Twenty hours, twice a minute, 45 metrics each.
-    assert rest["metrics asked for by the live page"] == pytest.approx(20 * 120 * 45 * 0.00001)
+    assert rest["metrics requested by the live page"] == pytest.approx(20 * 120 * 45 * 0.00001)
     assert "key" not in rest
     assert deployment_dollars_per_month(replace(_ONE, customer_key=True))["key"] == 1.0
     fleet = deployment_dollars_per_month(replace(_ONE, robots=1000, device_defender=True))
@@ -212,7 +212,7 @@ def test_the_documents_count_what_is_watched_as_the_model_does():
     text = (ROOT / "docs" / "cloud.md").read_text()
     platform, robots = _ONE.dashboards
     for line in (
-        f"| {sum(map(len, METRICS.values()))} | $0.30 each | {FREE_METRICS} |",
+        f"| {len(METRICS)} | $0.30 each | {FREE_METRICS} |",
         f"| {_ONE.alarms} | $0.10 each | {FREE_ALARMS} |",
         f"| 4, of up to {_ONE.insights_metrics} metrics | $0.10 for each",
         f"| 2, of {platform} and {robots} metrics | $3 each | {FREE_DASHBOARDS}, of up to",

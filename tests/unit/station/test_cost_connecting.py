@@ -67,7 +67,7 @@ def test_an_hour_with_a_connect_has_these_messages_more_than_one_without():
     more, less = messages(_ONE), messages(replace(_ONE, connects_per_hour=0.0))
     assert {what: more[what] - less[what] for what in more if more[what] != less[what]} == {
         "CONNECT and SUBSCRIBE": 1 + model.SUBSCRIPTIONS,
-        "the shadow's question, answer and PUBACK": 3,
+        "shadow request, answer and PUBACK": 3,
     }
 
 

@@ -18,8 +18,8 @@ from iort_contract.limits import MAX_BATCH_SPAN_US
 from iort_contract.messages.batch import Batch
 from iort_contract.messages.message_type import MessageType
 from iort_contract.topics import build_topic
-from iort_station.data import conditions, data
-from iort_station.data.data import select
+from iort_station import data
+from iort_station.data import conditions, select
 from iort_station.errors import StationError
 from tests.fakes import ROBOTS, SUMMARY, TELEMETRY, FakeDynamoDB, item_of, serialize
 
@@ -221,15 +221,15 @@ def test_an_empty_range_is_no_error():
 @pytest.mark.parametrize(
     ("question", "answer"),
     [
-        ({"robot": "bus"}, "there is no robot bus; there is car"),
+        ({"robot": "bus"}, "robot bus is not registered; registered are: car"),
         ({"stream": "imu"}, "car has no stream imu; it has vesc"),
         ({"fields": ["volts"]}, "car has no volts in vesc in this range; it has speed, speed_mps"),
         ({"where": "volts > 1"}, "car has no volts"),
         ({"fields": ["speed_mps"]}, "speed_mps needs the speed_to_erpm_gain of car"),
         ({"where": "speed >"}, "invalid expression"),
-        ({"start": "yesterday"}, "time 'yesterday': allowed is now, -10m"),
+        ({"start": "yesterday"}, "time must be now, -10m"),
         ({"start": 5, "end": 4}, "ends before it starts"),
-        ({"every": "1 fortnight"}, "duration '1 fortnight'"),
+        ({"every": "1 fortnight"}, "got '1 fortnight'"),
         ({"robot": "a/b"}, "got 'a/b'"),
     ],
 )

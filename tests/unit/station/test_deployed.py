@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 
-from iort_station.cost.deployed import _watching
+from iort_station.cost.deployed import watching
 from iort_station.cost.fixed_costs import deployment_dollars_per_month
 from iort_station.cost.usage import Usage
 
@@ -49,7 +49,7 @@ class CloudWatch:
 
 
 def test_alarms_and_dashboards_are_counted_as_they_are_billed():
-    found = _watching(CloudWatch({"iort-robots": ROWS, "iort-platform": ROWS * 30, "other": ROWS[:1]}))
+    found = watching(CloudWatch({"iort-robots": ROWS, "iort-platform": ROWS * 30, "other": ROWS[:1]}))
     assert found == {
         "alarms": 1,
         "insights_metrics": 3,
@@ -61,6 +61,6 @@ def test_alarms_and_dashboards_are_counted_as_they_are_billed():
 
 
 def test_a_search_on_the_robots_dashboard_is_of_every_robot():
-    found = _watching(CloudWatch({"iort-robots": ROWS + SEARCH, "zebra": ROWS}))
+    found = watching(CloudWatch({"iort-robots": ROWS + SEARCH, "zebra": ROWS}))
     assert (found["dashboards"], found["robot_metrics"]) == ((2, 2), True)
-    assert not _watching(CloudWatch({}))["robot_metrics"]
+    assert not watching(CloudWatch({}))["robot_metrics"]

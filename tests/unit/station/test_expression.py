@@ -146,7 +146,7 @@ def test_a_number_compared_with_a_text_is_an_error_and_not_nothing_found(text, s
     assert said in str(in_the_cloud.value)
     with pytest.raises(StationError) as here:
         conditions.holds(node, {name: column(values) for name, values in samples.items()}, 4)
-    assert str(here.value) == f"the condition cannot be answered: {in_the_cloud.value}"
+    assert str(here.value) == f"the condition cannot be evaluated: {in_the_cloud.value}"
 
 
 numbers = st.one_of(st.none(), st.integers(-5, 5), st.floats(-1e308, 1e308))

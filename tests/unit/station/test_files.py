@@ -11,8 +11,8 @@ import pytest
 from typer.testing import CliRunner
 
 from iort_contract.messages.files import File, file_key
+from iort_station.cli.cloud_options import CloudOptions
 from iort_station.cli.main import app
-from iort_station.cli.where import Where
 from iort_station.cloud import Cloud
 from iort_station.errors import StationError
 from iort_station.fleet import files
@@ -139,7 +139,7 @@ def test_a_download_goes_on_and_what_it_brings_is_checked(cloud, store, tmp_path
 def test_a_content_that_is_not_what_the_robot_said_is_refused(cloud, store, tmp_path):
     store(b"evil", sha256="0" * 64)
     (file,) = files.listed(cloud, "car")
-    with pytest.raises(StationError, match="not what the robot sent"):
+    with pytest.raises(StationError, match="SHA-256 must be"):
         files.download(cloud, file, tmp_path)
     assert not list(tmp_path.iterdir())
 
@@ -150,7 +150,7 @@ def test_a_part_that_is_damaged_is_noticed_and_thrown_away(cloud, store, tmp_pat
     (file,) = files.listed(cloud, "car")
     part = tmp_path / f"drive.bag.{hashlib.sha256(content).hexdigest()[:12]}.part"
     part.write_bytes(b"XX")
-    with pytest.raises(StationError, match="not what the robot sent"):
+    with pytest.raises(StationError, match="SHA-256 must be"):
         files.download(cloud, file, tmp_path)
     assert files.download(cloud, file, tmp_path).read_bytes() == content
 
@@ -171,7 +171,7 @@ def test_empty_leaves_nothing(cloud, store, s3):
 
 @pytest.fixture
 def iort(cloud, monkeypatch):
-    monkeypatch.setattr(Where, "cloud", lambda _self: cloud)
+    monkeypatch.setattr(CloudOptions, "cloud", lambda _self: cloud)
 
     def run(*arguments, status=0, **how):
         done = CliRunner().invoke(app, ["files", *arguments], **how)

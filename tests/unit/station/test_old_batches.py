@@ -9,7 +9,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from iort_contract.attributes import plain
+from iort_contract.dynamodb import plain
 from iort_contract.limits import ContractError
 from iort_contract.messages.batch import Batch, decode_batch, encode_batch
 from iort_station.recordings.old_batches import is_old, upgraded, upgraded_item

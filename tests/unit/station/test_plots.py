@@ -8,7 +8,7 @@ from matplotlib.dates import date2num
 
 from iort_station.cli import plots
 from iort_station.cli.plots import Run
-from iort_station.data.data import Result
+from iort_station.data import Result
 from iort_station.errors import StationError
 
 START = 1_700_000_000_000_000

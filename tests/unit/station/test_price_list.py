@@ -253,7 +253,7 @@ def test_what_was_read_is_kept_with_its_day(tmp_path):
 def test_a_file_that_is_no_price_list_is_named(tmp_path, text):
     path = tmp_path / "prices.json"
     path.write_text(text)
-    with pytest.raises(StationError, match=r"prices\.json is no price list"):
+    with pytest.raises(StationError, match=r"prices\.json must be a price list"):
         load(path)
 
 

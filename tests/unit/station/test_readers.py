@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from iort_contract.attributes import plain
+from iort_contract.dynamodb import plain
 from iort_contract.limits import ContractError
 from iort_contract.messages.batch import Batch, batch_id, decode_batch, decode_item, messages_of
 from iort_contract.messages.commands import (
@@ -20,7 +20,7 @@ from iort_contract.messages.commands import (
     encode_fleet,
 )
 from iort_contract.messages.live import LiveSample, decode_live, encode_live
-from iort_station.data.stored import Refused, blocks
+from iort_station.data.batches import RefusedItems, blocks
 from iort_station.operations.audit import audit
 from tests.fakes import item_of, serialize
 
@@ -38,7 +38,7 @@ def stored(**changes):
 
 def by_columns(item):
     """Read by numpy, in the station."""
-    refused = Refused()
+    refused = RefusedItems()
     found = list(blocks([[item]], refused))
     assert refused.count == (not found)
     return bool(found)

@@ -7,8 +7,8 @@ import json
 
 import pytest
 
-from functions.shared.processing import process
-from functions.shared.processing import recompute as summarize_again
+from functions.shared.summary.processing import process
+from functions.shared.summary.processing import recompute as summarize_again
 from iort_contract.messages.batch import Batch
 from iort_station.errors import StationError
 from iort_station.fleet import robots
@@ -118,7 +118,10 @@ def test_a_lambda_that_does_not_know_how_is_named():
         ({"speed_to_erpm_gain": float("nan")}, "got nan"),
         ({"speed_to_erpm_gain": float("-inf")}, "must be a number from -1e.09 to 1e.09"),
         ({"speed_to_erpm_offset": 1e10}, "speed_to_erpm_offset must be"),
-        ({"serial": 1.0}, "serial is no vehicle parameter; allowed are speed_to_erpm_gain, speed_to_erpm_of"),
+        (
+            {"serial": 1.0},
+            "vehicle parameter must be one of speed_to_erpm_gain, speed_to_erpm_offset, got serial",
+        ),
     ],
 )
 def test_parameters_that_cannot_be_are_refused(vehicle, said):

@@ -10,7 +10,7 @@ import pytest
 from iort_contract.messages.batch import Batch, encode_batch
 from iort_contract.tables import BY_LATER, BY_RULE, BY_STREAM, PUT_OFF
 from iort_contract.topics import RECORD, build_topic
-from iort_station.operations.quarantine import Entry
+from iort_station.operations.quarantine import DeadLetter
 from iort_station.operations.replay import Fate, replay
 from tests.fakes import item_of, item_of_message
 from tests.unit.station.old_messages import old_message
@@ -48,7 +48,9 @@ class FakeCloud:
 
 
 def replayed(*, dry_run=True, **payloads):
-    listed = [Entry("car", name, source, TOPIC, "some", 1, 1, 1, 0) for name, (source, _) in payloads.items()]
+    listed = [
+        DeadLetter("car", name, source, TOPIC, "some", 1, 1, 1, 0) for name, (source, _) in payloads.items()
+    ]
     return list(replay(FakeCloud(payloads), listed, dry_run=dry_run))
 
 
@@ -74,7 +76,7 @@ class Queues(FakeCloud):
 def test_what_was_put_off_and_failed_waits_once_more():
     body = json.dumps({PUT_OFF: [[TOPIC, str(GOOD.id)]]})
     cloud = Queues({"late": (BY_LATER, body.encode())})
-    listed = [Entry("car", "late", BY_LATER, TOPIC, "some", 1, 1, 1, 0)]
+    listed = [DeadLetter("car", "late", BY_LATER, TOPIC, "some", 1, 1, 1, 0)]
     assert [outcome.fate for outcome in replay(cloud, listed)] == [Fate.REPLAYED]
     assert cloud.sent == [{"QueueUrl": "PutOffQueue", "MessageBody": body, "MessageGroupId": "car"}]
     assert cloud.deleted == ["late"]
@@ -150,9 +152,11 @@ def test_what_is_in_the_old_table_alone_is_not_given_to_lambda_2():
 def test_a_batch_is_replayed_whether_or_not_its_topic_has_basic_ingests_prefix(prefix):
     payload = encode_batch(GOOD)
     cloud = FakeCloud({"a": (f"{BY_RULE} iort_record", payload)}, topic=prefix + TOPIC)
-    listed = Entry("car", "a", f"{BY_RULE} iort_record", prefix + TOPIC, "some", 2_000_000_000_000, 1, 1, 0)
+    listed = DeadLetter(
+        "car", "a", f"{BY_RULE} iort_record", prefix + TOPIC, "some", 2_000_000_000_000, 1, 1, 0
+    )
     (outcome,) = replay(cloud, [listed], dry_run=True)
-    assert (outcome.fate, outcome.entry.topic) == (Fate.WOULD, TOPIC), outcome.detail
+    assert (outcome.fate, outcome.letter.topic) == (Fate.WOULD, TOPIC), outcome.detail
 
 
 def test_keys_that_the_rule_would_not_store_keep_no_batch_from_replay():

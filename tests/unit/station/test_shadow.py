@@ -25,9 +25,9 @@ def test_what_is_in_force_and_what_is_refused():
     assert STATE.settings() == {
         "fields.vesc": ["speed"], "live.enabled": True, "live.rate_hz": 10, "log_level": "info",
     }  # fmt: skip
-    assert STATE.refusals() == [("ping.rate_hz", 99, "ping.rate_hz: found 99")]
+    assert STATE.rejections() == [("ping.rate_hz", 99, "ping.rate_hz: found 99")]
     assert State(0, {}, {}).settings() == {}
-    assert State(1, {"live": {"rate_hz": 5}, "log_level": "debug"}, {}).wished() == {
+    assert State(1, {"live": {"rate_hz": 5}, "log_level": "debug"}, {}).desired_settings() == {
         "live.rate_hz": 5, "log_level": "debug",
     }  # fmt: skip
 
@@ -57,7 +57,9 @@ class Data:
 
 def test_what_the_cloud_said_of_a_share_is_no_wish():
     said = {"since_ms": 1, "last_ms": 2, "batches": 3}
-    assert State(1, {"over_share": said, "log_level": "debug"}, {}).wished() == {"log_level": "debug"}
+    assert State(1, {"over_share": said, "log_level": "debug"}, {}).desired_settings() == {
+        "log_level": "debug"
+    }
     assert over_share(Data({"over_share": said}), "car") == OverShare(batches=3, since_ms=1, last_ms=2)
     assert over_share(Data(None), "car") is None
     # The robot can write there, too.
@@ -113,4 +115,4 @@ def test_a_clock_that_is_off_is_refused():
 def test_a_robot_that_reports_in_another_form_stops_no_operator(said):
     state = State(1, {}, {"commands": said, "rejected": said})
     assert outcome(state, "drive", "feedbeef", 3) is None
-    assert state.refusals() == []
+    assert state.rejections() == []

@@ -13,7 +13,7 @@ from rich.console import Console
 
 from iort_station.cli import tables
 from iort_station.cli.options import Range
-from iort_station.data.data import Result
+from iort_station.data import Result
 from iort_station.errors import StationError
 
 

@@ -15,7 +15,7 @@ from iort_station.operations.trace import (
     LAMBDA,
     PUBNUB,
     RULE,
-    Clock,
+    ClockOffset,
     clock_of,
     round_trips_ms,
     times,
@@ -43,7 +43,7 @@ def _times(car_off_us, here_off_us, offset_us):
 def test_hops_are_right_whatever_the_clocks(car_off_us, here_off_us):
     found = trace(
         [_times(car_off_us, here_off_us, car_off_us)] * 3,
-        here_to_pubnub=Clock(here_off_us, 400),
+        here_to_pubnub=ClockOffset(here_off_us, 400),
         car_uncertainty_ms=1.5,
     )
     for hop in found.hops:
@@ -55,7 +55,7 @@ def test_hops_are_right_whatever_the_clocks(car_off_us, here_off_us):
 
 
 def test_a_car_that_does_not_know_its_offset_says_so():
-    found = trace([_times(0, 0, None)], here_to_pubnub=Clock(0, 0), car_uncertainty_ms=1.5)
+    found = trace([_times(0, 0, None)], here_to_pubnub=ClockOffset(0, 0), car_uncertainty_ms=1.5)
     assert {hop.name: hop.uncertainty_ms for hop in found.hops}[RULE] is None
     assert found.whole.uncertainty_ms is None
 
@@ -63,7 +63,7 @@ def test_a_car_that_does_not_know_its_offset_says_so():
 def test_the_fastest_answer_tells_the_clock():
     ours = itertools.chain([0, 1000], [2000, 2100], [3000, 3800], itertools.count(10_000, 5000))
     clock = clock_of(lambda: 1_000_000, lambda: next(ours))
-    assert clock == Clock(1_000_000 - 2050, 50)
+    assert clock == ClockOffset(1_000_000 - 2050, 50)
 
 
 def test_round_trips_are_the_medians_of_the_newest_batch():

@@ -19,10 +19,11 @@ from iort_agent.common.schema import Place, number, pairs, section, setting, tex
 from iort_agent.ros1.json_message import Writer
 from iort_agent.sources import FAIL, OK, Emit, Finding, SourceConfig, intake
 from iort_agent.sources.intake import Intake, Kind
-from iort_agent.sources.rosbridge.connection import TIMES, RosbridgeConnection, Times, Topic
+from iort_agent.sources.rosbridge.connection import RosbridgeConnection
 from iort_agent.sources.rosbridge.continuity import Numbers, Repeats
 from iort_agent.sources.rosbridge.inferred import infer
 from iort_agent.sources.rosbridge.rosapi import AGAIN_S, Rosapi, Structure
+from iort_agent.sources.rosbridge.subscription import TIMES, Times, Topic
 from iort_contract.limits import MessageError
 
 # Messages of a topic that are kept until its type is known.
@@ -33,13 +34,8 @@ _CHECK_S = 5.0
 
 @dataclass(frozen=True)
 class TopicConfig(intake.TopicConfig):
-    """How a topic is recorded.
-
-    ``type`` lets the server subscribe before anybody publishes. ``time`` is required: ``header`` is the time
-    of the measurement, by the clock of the computer that measured; ``arrival`` is the time of receipt, by the
-    agent's clock. ``fields`` are the wanted paths, or their beginnings (``pose.position``); without it, all.
-    ``throttle_ms`` is the shortest time between messages, kept by the server.
-    """
+    """How a topic is recorded. ``type`` lets the server subscribe before anybody publishes; ``throttle_ms``
+    is the shortest time between messages, kept by the server."""
 
     type: str | None = setting(text(), default=None)
     throttle_ms: int = setting(number(0, 3_600_000, whole=True, unit="ms"), 0)

@@ -13,7 +13,6 @@ programs that read one port each get half of the bytes.
 
 from __future__ import annotations
 
-import errno
 import importlib.util
 import logging
 import os
@@ -26,8 +25,8 @@ from typing import Any, Iterator, Mapping, Sequence
 
 from iort_agent.clock import Clock
 from iort_agent.common.schema import number, setting, text
-from iort_agent.errors import SourceError
 from iort_agent.sources import FAIL, OK, Emit, Finding, SourceConfig
+from iort_agent.sources.vesc.port import Library, load_pyserial, why
 from iort_agent.sources.vesc.protocol import (
     COMM_FW_VERSION,
     COMM_GET_VALUES,
@@ -133,7 +132,7 @@ class VescSource:
 
     def run(self, emit: Emit, stop: threading.Event) -> None:
         """Poll until ``stop`` is set. Raises `SourceError` without pyserial."""
-        library = _load_pyserial()
+        library = load_pyserial()
         backoff_s = _BACKOFF_S[0]
         while not stop.is_set():
             samples, opened = self.counts.samples, self.counts.opened
@@ -142,7 +141,7 @@ class VescSource:
                     self.counts.opened += 1
                     _Session(self._config, self._clock, self, port).run(emit, stop)
             except library.errors as error:
-                self.trouble(_why(error, was_open=self.counts.opened > opened))
+                self.trouble(why(error, was_open=self.counts.opened > opened))
             if self.counts.samples > samples:
                 backoff_s = _BACKOFF_S[0]
             # Jitter, because other programs may wait for this port, too.
@@ -170,7 +169,7 @@ class VescSource:
             self._unknown.add(len(payload))
             _log.error("%s: the answer is dropped: %s", self._config.port, error)
 
-    def _open(self, library: _Library) -> Any:
+    def _open(self, library: Library) -> Any:
         config = self._config
         port = library.Serial(
             config.port,
@@ -296,40 +295,3 @@ class _Session:
             counts, config = self._counts, self._config
             text = "%s: too slow for %g Hz: %d samples and %d skipped polls since the start"
             _log.warning(text, config.port, config.rate_hz, counts.samples, counts.skipped_polls)
-
-
-class _Library:
-    """pyserial, and the errors of a port that is not there, goes away or misbehaves."""
-
-    def __init__(self) -> None:
-        import termios  # noqa: PLC0415 - only where there is a port
-
-        import serial  # noqa: PLC0415 - optional
-
-        self.Serial = serial.Serial
-        self.errors = (OSError, termios.error)
-
-
-def _load_pyserial() -> _Library:
-    try:
-        # Only a robot that reads its VESC by itself needs it: pip install iort-agent[serial].
-        return _Library()
-    except ImportError as error:
-        raise SourceError(
-            "reading a VESC needs the package pyserial: pip install 'iort-agent[serial]'"
-        ) from error
-
-
-def _why(error: Exception, *, was_open: bool) -> str:
-    """The operating system's error, in words that help."""
-    # pyserial keeps the number of some errors, and only chains others.
-    numbers = {first for e in (error, error.__context__) if e is not None for first in e.args[:1]}
-    if numbers & {errno.ENOENT, errno.ENODEV, errno.ENXIO}:
-        return "is not there: waiting for it to be plugged in"
-    if numbers & {errno.EACCES, errno.EPERM}:
-        return "may not be opened: add the user to its group, mostly `sudo usermod -aG dialout $USER`"
-    if numbers & {errno.EBUSY, errno.EAGAIN}:
-        return "is in use by another program, perhaps the ROS driver of the VESC"
-    if errno.ENOTTY in numbers:
-        return "is no serial port"
-    return f"went away: {error}" if was_open else f"cannot be opened: {error}"

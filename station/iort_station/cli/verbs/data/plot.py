@@ -92,7 +92,8 @@ def plot(
 
 
 def _read(cloud: Cloud, robot: str, stream: str, within: Range, **asked: Any) -> Any:
-    from iort_station.data import data, inventory  # noqa: PLC0415 - as above
+    from iort_station import data  # noqa: PLC0415 - as above
+    from iort_station.data import inventory  # noqa: PLC0415 - as above
     from iort_station.data.conditions import derive  # noqa: PLC0415 - as above
 
     with reading(f"{robot} {stream}", within.start_us, within.end_us) as progress:

@@ -18,7 +18,7 @@ from iort_station.cli.progress import reading, say
 from iort_station.errors import StationError
 
 if TYPE_CHECKING:
-    from iort_station.data.data import Result
+    from iort_station.data import Result
 
 commands = typer.Typer()
 
@@ -79,7 +79,8 @@ def query(
     The default range is the last five minutes. A range includes its start and excludes its end.
     """
     # numpy takes longer to load than most commands to run.
-    from iort_station.data import data, inventory  # noqa: PLC0415 - see above
+    from iort_station import data  # noqa: PLC0415 - see above
+    from iort_station.data import inventory  # noqa: PLC0415 - see above
 
     if form is Format.parquet and output is None and sys.stdout.isatty():
         raise StationError("a terminal cannot show Parquet: give --output FILE, or use a pipe")

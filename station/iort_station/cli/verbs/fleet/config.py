@@ -43,7 +43,7 @@ def config(
     shadow = Shadow(context.obj.cloud(), robot)
     answer = not wanted or _change_and_wait(shadow, wanted, seconds)
     state = shadow.read()
-    rejected = [one for one in state.refusals() if not wanted or one.name in wanted]
+    rejected = [one for one in state.rejections() if not wanted or one.name in wanted]
     if as_json:
         reasons = {one.name: {"value": one.value, "reason": one.reason} for one in rejected}
         print_json({"settings": state.settings(), "refused": reasons, "answered": answer})
@@ -67,11 +67,11 @@ def config(
 def _change_and_wait(shadow: Shadow, wanted: Mapping[str, Any], seconds: float) -> bool:
     """Request the changes; whether the robot has answered in time."""
     before = shadow.read()
-    shadow.wish(wanted)
+    shadow.desire(wanted)
     with errors.status(f"waiting for {shadow.robot}"):
         if shadow.wait(lambda state: answered(wanted, state), seconds) is None:
             return False
-        old, requested = before.settings(), before.wished()
+        old, requested = before.settings(), before.desired_settings()
         withdrawn = [n for n, value in wanted.items() if value is None and requested.get(n) == old.get(n)]
         if withdrawn:
             # The file may hold the same value, which the robot does not report again.
@@ -98,7 +98,7 @@ def _show(robot: str, state: State, wanted: Mapping[str, Any]) -> None:
     if not state.reported:
         out.print(f"{robot} has reported no settings yet")
     said = {name: "  (withdrawn)" if value is None else "  (requested now)" for name, value in wanted.items()}
-    said |= {one.name: "  (car.yaml's: the change is rejected)" for one in state.refusals()}
+    said |= {one.name: "  (car.yaml's: the change is rejected)" for one in state.rejections()}
     for name, value in state.settings().items():
         shown = ",".join(value) if isinstance(value, list) else json.dumps(value).strip('"')
         out.print(f"{name}={shown}{said.get(name, '')}")

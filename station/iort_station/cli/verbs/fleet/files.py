@@ -18,10 +18,10 @@ from iort_station.cli.options import AsJson, bounds
 from iort_station.cli.progress import bar
 from iort_station.cloud import Cloud
 from iort_station.data.inventory import check_registered
-from iort_station.data.times import iso_s
 from iort_station.errors import StationError
 from iort_station.fleet import files
 from iort_station.fleet.files import StoredFile
+from iort_station.times import iso_s
 
 commands = typer.Typer(
     name="files", no_args_is_help=True, help="Bags, images and other files that robots have uploaded."

@@ -15,10 +15,10 @@ from iort_contract.topics import check_robot, check_stream
 from iort_station.cli.console import errors, out, print_json
 from iort_station.cli.options import AsJson, bounds
 from iort_station.data import inventory
-from iort_station.data.times import duration_us, iso, iso_s
 from iort_station.errors import StationError
 from iort_station.operations import accounts, audit
-from iort_station.operations.audit import Audit, Range
+from iort_station.operations.audit import Audit
+from iort_station.times import duration_us, iso, iso_s
 
 commands = typer.Typer()
 # How many gaps of a run are listed one by one.
@@ -48,7 +48,7 @@ def audit_(
     agent counted, and lists by cause what the agent did not record. Exit status 0 if every stream is complete
     and the agent left nothing out; 1 otherwise, or if nothing is stored.
     """
-    within = Range(*bounds(start, end, last, time.time_ns() // 1000))
+    within = bounds(start, end, last, time.time_ns() // 1000)
     cloud = context.obj.cloud()
     try:
         check_robot(robot)
@@ -60,10 +60,10 @@ def audit_(
     told = accounts.accounts(cloud, robot)
     with errors.status("reading") as status:
         for name in names:
-            counted = _counting(audit.headers(cloud, robot, name, within), name, status)
+            counted = _counting(audit.headers(cloud, robot, name, *within), name, status)
             one = audit.audit(name, counted, late_ms=duration_us(late) // 1000, from_start=from_start)
             # The agent counts a whole run, so a part of one cannot be compared.
-            if within == Range():
+            if within == (None, None):
                 one = accounts.held_against(one, told, now_us)
             if one.runs or one.refused or one.taken is not None or streams:
                 found.append(one)

@@ -11,9 +11,9 @@ from typing import Annotated, Any
 import typer
 from rich.table import Table
 
+from iort_station.cli.cloud_options import CloudOptions
 from iort_station.cli.console import out, print_json
 from iort_station.cli.options import AsJson
-from iort_station.cli.where import Where
 from iort_station.cost import line_items, model, report, scale
 from iort_station.cost.car import as_configured
 from iort_station.cost.deployed import as_deployed
@@ -121,12 +121,12 @@ def cost_(
         out.print(_table(title, rows))
 
 
-def _prices(where: Where, *, refresh: bool) -> Listed | None:
+def _prices(options: CloudOptions, *, refresh: bool) -> Listed | None:
     """AWS' price list of now or of the last --refresh; None for the built-in prices."""
     path = kept_at(os.environ)
     if not refresh:
         return load(path)
-    cloud = where.account(region=REGION)
+    cloud = options.account(region=REGION)
     listed = read(
         cloud.client("pricing", API_REGION), str(cloud.region_name), datetime.now(timezone.utc).date()
     )
@@ -147,7 +147,7 @@ def _as_json(usage: Usage, listed: Listed | None) -> dict[str, Any]:
     paper = scale.on_paper(usage, prices)
     ours, thesis = model.bill(usage, prices), model.thesis_bill(usage, prices)
 
-    def items(found: list[line_items.Item]) -> list[dict[str, Any]]:
+    def items(found: list[line_items.LineItem]) -> list[dict[str, Any]]:
         return [{**item._asdict(), "dollars_per_robot_hour": item.dollars} for item in found]
 
     return {

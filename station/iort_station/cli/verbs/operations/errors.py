@@ -15,10 +15,10 @@ from iort_station.cli.console import errors, out, print_json
 from iort_station.cli.options import AsJson, DryRun, OneRobot, since_us
 from iort_station.cli.progress import bar
 from iort_station.cloud import Cloud
-from iort_station.data.times import iso_s
 from iort_station.operations import quarantine, replay
-from iort_station.operations.quarantine import Entry
+from iort_station.operations.quarantine import DeadLetter
 from iort_station.operations.replay import Fate
+from iort_station.times import iso_s
 
 commands = typer.Typer()
 _HEX_WIDTH = 16
@@ -77,12 +77,12 @@ def replay_errors(
             outcomes.append(outcome)
             progress(1)
     if as_json:
-        print_json([{**_as_json(o.entry), "fate": o.fate.value, "detail": o.detail} for o in outcomes])
+        print_json([{**_as_json(o.letter), "fate": o.fate.value, "detail": o.detail} for o in outcomes])
     else:
         for outcome in outcomes:
             if outcome.fate not in (Fate.REPLAYED, Fate.NOT_FOR_REPLAY):
                 detail = f": {outcome.detail}" if outcome.detail else ""
-                line = f"{outcome.entry.id}  {outcome.entry.robot}  {outcome.fate.value}{detail}"
+                line = f"{outcome.letter.id}  {outcome.letter.robot}  {outcome.fate.value}{detail}"
                 out.print(_one_line(line), soft_wrap=True)
         counts = Counter(outcome.fate for outcome in outcomes)
         out.print(", ".join(f"{n} {fate.value}" for fate, n in counts.items()) or "nothing in quarantine")
@@ -90,12 +90,14 @@ def replay_errors(
         raise typer.Exit(1)
 
 
-def _entries(cloud: Cloud, robot: str | None, since: str | None, at: Callable[[Entry], int]) -> list[Entry]:
+def _entries(
+    cloud: Cloud, robot: str | None, since: str | None, at: Callable[[DeadLetter], int]
+) -> list[DeadLetter]:
     since_ms = 0 if since is None else since_us(since) // 1000
     return sorted(quarantine.entries(cloud, robot=robot, since_ms=since_ms), key=lambda e: (at(e), e.id))
 
 
-def _print(entry: Entry) -> None:
+def _print(entry: DeadLetter) -> None:
     """Print two lines: reasons are too long for a table in a narrow terminal."""
     times = f"{entry.seen} times" + (f", {entry.replays} replays" if entry.replays else "")
     out.print(
@@ -109,7 +111,7 @@ def _one_line(text: str) -> str:
     return "".join(character if character.isprintable() else " " for character in text)
 
 
-def _show(entry: Entry, *, as_json: bool) -> None:
+def _show(entry: DeadLetter, *, as_json: bool) -> None:
     payload = entry.payload or b""
     if as_json:
         print_json({**_as_json(entry), "payload_base64": base64.b64encode(payload).decode()})
@@ -146,7 +148,7 @@ def as_text(payload: bytes) -> str:
     return "\n".join(lines)
 
 
-def _as_json(entry: Entry) -> dict[str, Any]:
+def _as_json(entry: DeadLetter) -> dict[str, Any]:
     return {name: value for name, value in asdict(entry).items() if name != "payload"}
 
 

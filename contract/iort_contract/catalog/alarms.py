@@ -1,0 +1,76 @@
+"""The alarms: `Alarm`, and those on metrics of AWS. Alarms on our own metrics stand with their metrics."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+
+@dataclass(frozen=True)
+class Alarm:
+    """It goes off above the threshold, or ``below`` it: for ``periods`` in a row, or of ``within``.
+
+    A ``threshold`` that is a text names the setting that holds it, in units of ``factor``. ``meaning`` says
+    what happened, and ``action`` what the operator does.
+    """
+
+    meaning: str
+    action: str
+    threshold: float | str = 0
+    periods: int = 1
+    within: int = 0
+    below: bool = False
+    factor: float = 1
+
+
+# One for each queue, function, table and stream reader: the resource's name stands before the alarm's.
+WAITING = Alarm(
+    "messages are in quarantine",
+    "they wait for a minute in a burst, or for good because the quarantine's function fails (`Last` after "
+    "five attempts): look at that function's log group. They are kept for 14 days",
+)
+# A car that empties its queue after an outage exceeds its share for some minutes.
+PUT_OFF_WAITING = Alarm(
+    "a robot is over its share of Lambda 2, and its summaries are late",
+    "nothing is lost, and no other robot waits ([a robot's share](processing.md#a-robots-share)). Lambda 2's "
+    "log names the robot, `iort robots show` says how many batches wait; mend what it sends, or "
+    "`iort robots remove`",
+    periods=15,
+)
+ERRORS = Alarm(
+    "the function failed",
+    "its log group; an asynchronous event is tried again, a stream's batch too",
+)
+THROTTLED = Alarm(
+    "the table refused writes",
+    "a partition takes 1,000 units a second: one robot sends that much, or the table is new and grows",
+)
+BEHIND = Alarm(
+    "the stream is read late",
+    "summaries are late, nothing is lost for 24 hours: look at the function's errors and duration. A batch "
+    "that always fails ends in quarantine by itself",
+    threshold="stream_behind_s",
+    factor=1000,
+    periods=3,
+)
+# Messages that can be lost without being in quarantine, by AWS' namespace and metric. Account-wide, since AWS
+# documents no values for some of the dimensions.
+OF_THE_ACCOUNT = {
+    ("AWS/IoT", "ParseError"): Alarm(
+        "messages are not JSON, and a rule could not read them",
+        "`AWSIotLogsV2` has topic and client; an agent of ours never sends one. AWS IoT may call no error "
+        "action for it, so it need not be in quarantine",
+    ),
+    ("AWS/IoT", "ErrorActionFailure"): Alarm(
+        "failed messages of a rule did not reach the quarantine",
+        "they are lost: `AWSIotLogsV2`; the queue's and its key's policies",
+    ),
+    ("AWS/IoT", "RuleMessageThrottled"): Alarm(
+        "messages did not reach a rule",
+        "ask AWS for a higher quota of rules",
+    ),
+    ("AWS/Lambda", "DestinationDeliveryFailures"): Alarm(
+        "failures of a function are not in quarantine",
+        "the function's role, the queue and its key. A batch of the stream is still in the telemetry table: "
+        "`iort audit`",
+    ),
+}

@@ -1,0 +1,200 @@
+"""The metrics that the functions write, each with its unit, chart and alarm.
+
+Log lines, dashboards, alarms and the tables of docs/cloud.md are made from these entries, in this order.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import partial
+
+from iort_contract.catalog.alarms import Alarm
+
+METRIC_NAMESPACE = "iort"
+# The dimensions of every metric: the deployment's namespace and the function.
+METRIC_DEPLOYMENT, METRIC_FUNCTION = "Deployment", "Function"
+# The third dimension, with `robot_metrics`: AWS bills each robot's metrics.
+METRIC_ROBOT = "Robot"
+
+
+@dataclass(frozen=True)
+class Chart:
+    """A chart of a dashboard: it shows the metrics that name it."""
+
+    title: str
+
+
+QUEUES_CHART = Chart("Queues: messages waiting")
+LIVE_CHART = Chart("PubNub: live samples published")
+REPORTS_CHART = Chart("Agents: reports a minute, six from each")
+BATCHES_CHART = Chart("Samples and batches a minute")
+GAPS_CHART = Chart("Gaps: holes between samples, missing and refused batches")
+BACKLOG_CHART = Chart("Backlog: batches waiting in the fullest car")
+HOPS_CHART = Chart("Delay of live samples by hop, p95 ms")
+ROUND_TRIPS_CHART = Chart("Round trips of the cars' pings, p95 ms")
+BATTERY_CHART = Chart("Battery of the weakest car, V")
+TEMPERATURE_CHART = Chart("Temperature of the hottest controller, degC")
+FAULTS_CHART = Chart("Samples with a fault code, and alerts sent")
+PRESENCE_CHART = Chart("Robots: who comes and goes")
+ADMISSION_CHART = Chart("Robots: admitted and refused, and pongs sent")
+FILES_CHART = Chart("Robots: files")
+# The rows of the robots' dashboard. QUEUES_CHART and LIVE_CHART are on the platform's.
+ROBOT_CHARTS: tuple[tuple[Chart, ...], ...] = (
+    (REPORTS_CHART, BATCHES_CHART, GAPS_CHART, BACKLOG_CHART),
+    (HOPS_CHART, ROUND_TRIPS_CHART),
+    (BATTERY_CHART, TEMPERATURE_CHART, FAULTS_CHART),
+    (PRESENCE_CHART, ADMISSION_CHART, FILES_CHART),
+)
+
+
+@dataclass(frozen=True)
+class Metric:
+    """A metric, with its statistic of a minute.
+
+    ``function`` is its dimension; ``right`` is the chart's second axis. A metric ``of_a_robot`` has a chart
+    of every robot, with `robot_metrics`.
+    """
+
+    name: str
+    function: str
+    chart: Chart
+    right: bool = False
+    unit: str = "Count"
+    statistic: str = "Sum"
+    alarm: Alarm | None = None
+    of_a_robot: bool = False
+
+
+_delay = partial(Metric, unit="Milliseconds", statistic="p95")
+
+METRICS = {
+    metric.name: metric
+    for metric in (
+        Metric(
+            "Quarantined",
+            "quarantine",
+            QUEUES_CHART,
+            right=True,
+            alarm=Alarm(
+                "messages that could not be processed are in quarantine",
+                "`iort errors` lists them with their reasons; remove the cause, then `iort replay-errors`",
+            ),
+        ),
+        Metric("LivePublished", "live", LIVE_CHART),
+        Metric(
+            "PubNubFailed",
+            "live",
+            LIVE_CHART,
+            right=True,
+            # Of five minutes: a live lane at 0.01 Hz, the slowest allowed, sends in three of them.
+            alarm=Alarm(
+                "live samples did not reach PubNub",
+                "its keys (`iort pubnub`), its status page; the record lane is not touched",
+                periods=3,
+                within=5,
+            ),
+        ),
+        Metric("LiveStale", "live", LIVE_CHART, right=True),
+        Metric("LiveRefused", "live", LIVE_CHART, right=True),
+        Metric("LiveCutOff", "live", LIVE_CHART, right=True),
+        _delay("InCarMs", "live", HOPS_CHART),
+        _delay("UplinkMs", "live", HOPS_CHART),
+        _delay("ToLambdaMs", "live", HOPS_CHART),
+        _delay(
+            "CarToLambdaMs",
+            "live",
+            HOPS_CHART,
+            alarm=Alarm(
+                "live samples are late",
+                "the car's network; the hops on the robots' dashboard say which part of the way. Samples too "
+                "old to be shown count; only cars that know their clock's offset do",
+                threshold="car_to_lambda_ms",
+                periods=3,
+                within=5,
+            ),
+        ),
+        Metric("SampleGaps", "health", GAPS_CHART),
+        Metric(
+            "BatchesMissing",
+            "summarize",
+            GAPS_CHART,
+            alarm=Alarm(
+                "batches of a car are missing",
+                "[`iort audit`](audit.md) says which; a late one fills the hole, a dropped one does not",
+            ),
+        ),
+        Metric(
+            "BatchesRefused",
+            "summarize",
+            GAPS_CHART,
+            alarm=Alarm(
+                "batches cannot be decoded",
+                "an agent of another version, or not ours: they are in quarantine with their bytes",
+            ),
+        ),
+        Metric("BatchesPutOff", "summarize", GAPS_CHART),
+        Metric("SamplesSummarized", "summarize", BATCHES_CHART),
+        Metric("BatchesSummarized", "summarize", BATCHES_CHART),
+        Metric("AgentReports", "health", REPORTS_CHART),
+        # The worst car counts; a mean would hide it. From the record lane, which is lossless; the rules fault
+        # and battery are faster and name the car.
+        Metric(
+            "FaultSamples",
+            "health",
+            FAULTS_CHART,
+            of_a_robot=True,
+            alarm=Alarm(
+                "a car reports a fault",
+                "stop it and look; `iort query` with a condition on `fault_code` finds the car",
+            ),
+        ),
+        Metric(
+            "TemperatureDegC",
+            "health",
+            TEMPERATURE_CHART,
+            unit="None",
+            statistic="Maximum",
+            of_a_robot=True,
+            alarm=Alarm(
+                "a car's controller is hot",
+                "let it cool; a VESC throttles by itself from 85 degC",
+                threshold="high_temperature_degc",
+            ),
+        ),
+        Metric(
+            "BatteryVolts",
+            "health",
+            BATTERY_CHART,
+            unit="None",
+            statistic="Minimum",
+            of_a_robot=True,
+            alarm=Alarm(
+                "a car's battery is low",
+                "change it: a lithium cell below 3 V is damaged",
+                threshold="low_voltage_v",
+                below=True,
+            ),
+        ),
+        Metric("BacklogBatches", "health", BACKLOG_CHART, statistic="Maximum", of_a_robot=True),
+        _delay("RoundTripBrokerMs", "health", ROUND_TRIPS_CHART),
+        _delay("RoundTripRuleMs", "health", ROUND_TRIPS_CHART),
+        _delay("RoundTripLambdaMs", "health", ROUND_TRIPS_CHART),
+        Metric("AlertsSent", "alert", FAULTS_CHART, right=True),
+        Metric("AlertsHeld", "alert", FAULTS_CHART, right=True),
+        Metric("RobotsConnected", "presence", PRESENCE_CHART),
+        Metric("RobotsDisconnected", "presence", PRESENCE_CHART),
+        Metric("PresenceIgnored", "presence", PRESENCE_CHART),
+        Metric("RobotsAdmitted", "admit", ADMISSION_CHART),
+        Metric("RobotsRefused", "admit", ADMISSION_CHART),
+        Metric("PongsSent", "echo", ADMISSION_CHART, right=True),
+        Metric("FilesAsked", "upload", FILES_CHART),
+        Metric("FilesStored", "upload", FILES_CHART),
+        Metric("FilesRefused", "upload", FILES_CHART),
+        Metric("StoredBytes", "upload", FILES_CHART, unit="Bytes"),
+    )
+}
+
+
+def metrics_of(function: str) -> tuple[str, ...]:
+    """The names of a function's metrics."""
+    return tuple(metric.name for metric in METRICS.values() if metric.function == function)

@@ -1,0 +1,73 @@
+"""A message's dataclass from its envelope and back: each entry is a field, checked by its annotation."""
+
+from __future__ import annotations
+
+import base64
+from dataclasses import MISSING, fields
+from typing import Any, Callable, Mapping, TypeVar
+
+from iort_contract.checks import integer, shown, text
+from iort_contract.limits import ContractError
+from iort_contract.tables import T_US
+
+M = TypeVar("M")
+# Fields whose entry has another name.
+_ENTRIES = {"t_us": T_US}
+
+
+def read(kind: type[M], envelope: Mapping[str, Any]) -> M:
+    """The message in an envelope; raises `ContractError`. A missing entry has its field's default."""
+    found = {}
+    for field in fields(kind):  # type: ignore[arg-type]  # a dataclass
+        entry = _ENTRIES.get(field.name, field.name)
+        if entry in envelope or (field.default is MISSING and field.default_factory is MISSING):
+            found[field.name] = _READERS[str(field.type).split(" | ")[0]](envelope, entry)
+    return kind(**found)
+
+
+def entries(message: Any) -> dict[str, Any]:
+    """The entries of a message, without those at their field's default."""
+    return {
+        _ENTRIES.get(field.name, field.name): getattr(message, field.name)
+        for field in fields(message)
+        if field.default is MISSING or getattr(message, field.name) != field.default
+    }
+
+
+def _flag(envelope: Mapping[str, Any], key: str) -> bool:
+    value = envelope[key]
+    if not isinstance(value, bool):
+        raise ContractError(f"{key} must be true or false, got {shown(value)}")
+    return value
+
+
+def _names(envelope: Mapping[str, Any], key: str) -> tuple[str, ...]:
+    value = envelope.get(key)
+    if not isinstance(value, (list, tuple)) or not all(isinstance(name, str) for name in value):
+        raise ContractError(f"{key} must be a list of names, got {shown(value)}")
+    return tuple(value)
+
+
+def _object(envelope: Mapping[str, Any], key: str) -> Mapping[str, Any]:
+    value = envelope.get(key)
+    if not isinstance(value, Mapping):
+        raise ContractError(f"{key} must be an object, got {shown(value)}")
+    return value
+
+
+def _bytes(envelope: Mapping[str, Any], key: str) -> bytes:
+    try:
+        return base64.b64decode(text(envelope, key), validate=True)
+    except ValueError as error:
+        raise ContractError(f"{key} must be base64: {error}") from error
+
+
+_READERS: Mapping[str, Callable[[Mapping[str, Any], str], Any]] = {
+    "int": integer,
+    "str": text,
+    "bool": _flag,
+    "bytes": _bytes,
+    "tuple[str, ...]": _names,
+    "Mapping[str, Any]": _object,
+    "Mapping[str, int]": _object,
+}

@@ -1,0 +1,90 @@
+"""Makes clients of AWS' MQTT library from the robot's certificate files."""
+
+from __future__ import annotations
+
+import functools
+import logging
+from pathlib import Path
+from typing import Any
+
+from awscrt import io, mqtt5
+from awsiot import mqtt5_client_builder
+
+from iort_agent.errors import IdentityError
+from iort_agent.identity.certificate import Certificate, Validity, read_certificate, stamp
+
+_log = logging.getLogger(__name__)
+
+_ACK_TIMEOUT_S = 20
+# The client's own reconnects come so late that ours are always first.
+_NEVER_MS = 24 * 3600 * 1000
+
+
+class ClientFactory:
+    """Makes clients for one endpoint and one robot, and notices when the files are replaced."""
+
+    def __init__(
+        self,
+        *,
+        endpoint: str,
+        port: int,
+        client_id: str,
+        certificate: Path,
+        private_key: Path,
+        root_ca: Path | None,
+        keep_alive_s: int,
+        ping_timeout_s: float,
+    ) -> None:
+        self.certificate_file = certificate
+        self._files = (certificate, private_key, root_ca)
+        self._build = functools.partial(
+            mqtt5_client_builder.mtls_from_path,
+            str(certificate),
+            str(private_key),
+            endpoint=endpoint,
+            port=port,
+            ca_filepath=None if root_ca is None else str(root_ca),
+            client_id=client_id,
+            keep_alive_interval_sec=keep_alive_s,
+            ping_timeout_ms=round(ping_timeout_s * 1000),
+            ack_timeout_sec=_ACK_TIMEOUT_S,
+            session_behavior=mqtt5.ClientSessionBehaviorType.CLEAN,
+            offline_queue_behavior=mqtt5.ClientOperationQueueBehaviorType.FAIL_ALL_ON_DISCONNECT,
+            retry_jitter_mode=mqtt5.ExponentialBackoffJitterMode.NONE,
+            min_reconnect_delay_ms=_NEVER_MS,
+            max_reconnect_delay_ms=_NEVER_MS,
+        )
+        self._bootstrap: Any = None
+        self._stamp = stamp(*self._files)
+        self._certificate: Certificate | None = None
+
+    def make(self, **handlers: Any) -> Any:
+        """Make a client from the files as they are now. Raises whatever the library does for a wrong file."""
+        if self._bootstrap is None:
+            group = io.EventLoopGroup(1)
+            self._bootstrap = io.ClientBootstrap(group, io.DefaultHostResolver(group))
+        self._stamp = stamp(*self._files)
+        client = self._build(client_bootstrap=self._bootstrap, **handlers)
+        try:
+            self._certificate = read_certificate(self.certificate_file)
+        except IdentityError as error:
+            # The library accepts the file, so the agent connects without knowing its id and validity.
+            _log.warning("%s", error)
+            self._certificate = None
+        return client
+
+    def replaced(self) -> bool:
+        """Whether a file has changed since the last client was made; False while one is missing."""
+        now = stamp(*self._files)
+        return now != self._stamp and None not in now
+
+    def certificate_id(self) -> str | None:
+        """The id of the last client's certificate; None if it is unknown."""
+        return self._certificate.id if self._certificate is not None else None
+
+    def validity(self) -> Validity | None:
+        """The validity of the last client's certificate; None if it is unknown."""
+        try:
+            return self._certificate.validity() if self._certificate is not None else None
+        except IdentityError:
+            return None

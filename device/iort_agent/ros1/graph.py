@@ -1,0 +1,35 @@
+"""A ROS graph, as its users see it: `iort_agent.ros1.node.Node` is the real one."""
+
+from __future__ import annotations
+
+from typing import Callable, Mapping, Protocol
+
+from iort_contract.ros1.definition import Definition
+
+# Takes a message: the publisher's connection header, and the message's bytes.
+OnBytes = Callable[[Mapping[str, str], bytes], None]
+
+
+class Graph(Protocol):
+    """Topics to publish and to hear, in the messages' own bytes. No call blocks."""
+
+    def definition(self, kind: str) -> Definition:
+        """The definition of an installed type. Raises `SourceError` if it is not installed."""
+
+    def advertise(self, topic: str, kind: str) -> None:
+        """Become a publisher of the topic; again has no effect. Raises as `definition`."""
+
+    def publish(self, topic: str, data: bytes) -> bool:
+        """Publish a message on an advertised topic; False if there is no graph to publish in."""
+
+    def subscribe(self, topic: str, handler: OnBytes) -> None:
+        """Receive a topic's messages, of any type, in another thread."""
+
+    def waits(self) -> str | None:
+        """Why the graph cannot be joined, for a person."""
+
+    def start(self) -> None:
+        """Join the graph as soon as it is there."""
+
+    def close(self) -> None:
+        """Leave the graph once the published messages are written."""

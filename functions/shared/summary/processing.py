@@ -1,0 +1,239 @@
+"""An event of Lambda 2, from its records to the summary table, for every caller."""
+
+from __future__ import annotations
+
+import gc
+import logging
+import time
+from collections import Counter
+from collections.abc import Callable, Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
+from functools import cache
+from typing import Any
+
+import boto3
+from botocore.config import Config
+
+from functions.shared import clients
+from functions.shared.dead_letter import DeadLetterQueue, Refused
+from functions.shared.environment import variables
+from functions.shared.metrics import emit
+from functions.shared.summary.decoded import Decoded, decode_records
+from functions.shared.summary.health import measure, together
+from functions.shared.summary.seconds import Summaries, summarize_topic
+from functions.shared.summary.share import (
+    REQUESTS_S,
+    Change,
+    OverShareError,
+    Share,
+    robot_of,
+    robot_of_change,
+)
+from functions.shared.summary.stored import SECOND_BATCHES
+from functions.shared.tables import Tables
+from iort_contract.catalog.environments import LaterEnvironment
+from iort_contract.codec.seconds import Statistics
+from iort_contract.dynamodb import TableError
+from iort_contract.tables import RECOMPUTE_FROM_S, RECOMPUTED, REPLAY
+from iort_contract.topics import parse_topic
+
+# Topics to process in parallel; a client keeps ten connections.
+_AT_ONCE = 4
+# A stream keeps its records for 24 hours. Older ones were put into the table by hand (`iort adopt`, a
+# replay), and are no news of their car.
+_NEWS_MS = 24 * 3_600_000
+# A car adds to a second for a second, and a round reads it after that.
+_ROUNDS = 5
+_BEYOND = f"its second has {SECOND_BATCHES} batches of the stream before it, or too large ones"
+logging.getLogger("functions").setLevel(logging.INFO)
+
+
+Refuse = Callable[[Sequence[Refused]], Sequence[Refused]]
+
+
+@dataclass(frozen=True)
+class Bounds:
+    """The limits of a robot's share: the shares, the queue for waiting batches, and the robot's notice."""
+
+    share: Share
+    put_off: Callable[[Sequence[Change]], Sequence[Change]]
+    tell: Callable[[str, int, float], None]
+
+
+def process(
+    event: Mapping[str, Any],
+    tables: Tables,
+    refuse: Refuse,
+    *,
+    bounds: Bounds | None = None,
+    beside_others: bool = False,
+    robot_metrics: bool = False,
+    at_once: int = 1,
+    news_since_ms: int = 0,
+) -> dict[str, Any]:
+    """Summarise the event's records. Undecodable records go to ``refuse``, since a retry would not help.
+    Records over a robot's share wait, by ``bounds``. The answer names the records that were not taken there.
+
+    The good records after one of those are kept as well: the service sends them again, which changes nothing,
+    and no second waits until the retries end. For a replay the answer names all undecodable records, which
+    are in quarantine already. ``at_once`` topics are processed in parallel, since they are independent and
+    mostly wait for the table. Records received before ``news_since_ms`` are summarised, but not counted in
+    metrics that have an alarm. If another function may summarise the same seconds ``beside`` this one, they
+    are read again after writing.
+    """
+    decoded = decode_records(event["Records"], bounds.share if bounds else None)
+    topics = _summarized(tables, decoded, at_once, bounds.share if bounds else None)
+    _put(tables, topics)
+    if beside_others:
+        topics = _settled(tables, decoded, topics, at_once)
+    for name in map(parse_topic, topics):
+        tables.note_stream(name.robot, name.name)
+    for topic, summaries in topics.items():
+        decoded.refuse(topic, summaries.beyond, _BEYOND)
+    left = {one.number for one in (decoded.refused if event.get(REPLAY) else refuse(decoded.refused))}
+    if bounds is not None and decoded.put_off:
+        left |= _put_off(bounds, decoded)
+    good = [batch for batches in decoded.batches.values() for batch in batches]
+    news = decoded.news(news_since_ms)
+    emit(
+        "summarize",
+        BatchesSummarized=len(good),
+        SamplesSummarized=sum(len(batch.times_us) for batch in good),
+        BatchesRefused=len(decoded.refused),
+        BatchesMissing=sum(summaries.missing for topic, summaries in topics.items() if topic in news),
+        BatchesPutOff=len(decoded.put_off),
+    )
+    measured = [
+        (parse_topic(topic).robot, measure(parse_topic(topic).name, batches))
+        for topic, batches in news.items()
+    ]
+    if robot_metrics:
+        for robot, values in measured:
+            emit("health", robot=robot, **values)
+    else:
+        for values in together(values for _, values in measured):
+            emit("health", robot=None, **values)
+    return {"batchItemFailures": [{"itemIdentifier": number} for number in sorted(left)]}
+
+
+def _settled(
+    tables: Tables, decoded: Decoded, topics: dict[str, Summaries], at_once: int
+) -> dict[str, Summaries]:
+    """The summaries that are still right once they are written. What was stored since they were read may have
+    been summarised since, and just been overwritten. Raises `TableError` where that does not end: a robot may
+    add to its seconds as fast as they are read."""
+    for _ in range(_ROUNDS):
+        again = _summarized(tables, decoded, at_once)
+        if again == topics:
+            return topics
+        topics = again
+        _put(tables, topics)
+    raise TableError(f"seconds of {', '.join(topics)} change as fast as they are summarised")
+
+
+def _put(tables: Tables, topics: Mapping[str, Summaries]) -> None:
+    tables.put_seconds(
+        {
+            (topic, second): summary
+            for topic, summaries in topics.items()
+            for second, summary in summaries.seconds.items()
+        }
+    )
+
+
+def _put_off(bounds: Bounds, decoded: Decoded) -> set[str]:
+    """Queue the batches over their robot's share and notify the robot; return the sequence numbers that
+    failed."""
+    left = {change["SequenceNumber"] for change in bounds.put_off(decoded.put_off)}
+    for robot, batches in Counter(map(robot_of_change, decoded.put_off)).items():
+        bounds.tell(robot, batches, decoded.at_s)
+    return left
+
+
+def recompute(event: Mapping[str, Any], tables: Tables) -> dict[str, Any]:
+    """Summarise stored batches again with the vehicle's current parameters, which the operator has corrected.
+    Seconds before ``event[RECOMPUTE_FROM_S]`` stay unchanged.
+
+    Nothing is counted or quarantined a second time. The answer has the written seconds and the undecodable
+    records.
+    """
+    tables.forget_vehicles()
+    decoded = decode_records(event["Records"])
+    written: dict[tuple[str, int], Mapping[str, Statistics]] = {}
+    for topic, summaries in _summarized(tables, decoded, 1).items():
+        for second, summary in summaries.seconds.items():
+            if second >= event[RECOMPUTE_FROM_S]:
+                written[topic, second] = summary
+        decoded.refuse(topic, summaries.beyond, _BEYOND)
+    tables.put_seconds(written)
+    return {
+        RECOMPUTED: sorted(second for _, second in written),
+        "batchItemFailures": [{"itemIdentifier": refused.number} for refused in decoded.refused],
+    }
+
+
+def _summarized(
+    tables: Tables, decoded: Decoded, at_once: int, share: Share | None = None
+) -> dict[str, Summaries]:
+    """Summaries by topic. A topic whose robot is far over its share is missing: its batches wait."""
+    share = share or Share.unlimited()
+
+    def one(topic: str) -> Summaries | None:
+        meter = share.meter(robot_of(topic), decoded.at_s)
+        try:
+            meter.check()
+            return summarize_topic(tables, topic, decoded.batches[topic], meter.check)
+        except OverShareError:
+            return None
+        finally:
+            meter.charge(REQUESTS_S)
+
+    topics = list(decoded.batches)
+    if at_once == 1 or len(topics) == 1:
+        found = list(map(one, topics))
+    else:
+        with ThreadPoolExecutor(min(at_once, max(1, len(topics)))) as pool:
+            found = list(pool.map(one, topics))
+    summaries: dict[str, Summaries] = {}
+    for topic, made in zip(topics, found, strict=True):
+        if made is None:
+            decoded.wait(topic)
+        else:
+            summaries[topic] = made
+    return summaries
+
+
+@cache
+def stored_tables() -> Tables:
+    """The tables of this environment's deployment."""
+    given = variables(LaterEnvironment)
+    # Requests come from this code only. Validating them took a third of Lambda 2's CPU time.
+    client = boto3.client("dynamodb", config=Config(parameter_validation=False))
+    tables = Tables(
+        client,
+        telemetry=given.telemetry_table,
+        summary=given.summary_table,
+        robots=given.robots_table,
+    )
+    # botocore's models are a hundred thousand permanent objects; the garbage collector need not scan them.
+    gc.collect()
+    gc.freeze()
+    return tables
+
+
+def processed(
+    event: Mapping[str, Any], *, bounds: Bounds | None = None, beside_others: bool = False
+) -> dict[str, Any]:
+    """`process` with what this environment's deployment has."""
+    given = variables(LaterEnvironment)
+    return process(
+        event,
+        stored_tables(),
+        DeadLetterQueue(clients.sqs(), given.rejected_queue).refuse,
+        bounds=bounds,
+        beside_others=beside_others,
+        robot_metrics=given.robot_metrics,
+        at_once=_AT_ONCE,
+        news_since_ms=int(time.time() * 1000) - _NEWS_MS,
+    )

@@ -1,0 +1,1 @@
+"""What `make check` and the tests hold every template to. No stack is built here."""

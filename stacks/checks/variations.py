@@ -1,0 +1,49 @@
+"""Settings that the checks synthesize besides the defaults, to check every form.
+
+`make check` lints every one of them, and tests/stacks updates, measures and deploys them.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+from stacks.settings import ALL_LOGS, PROD
+
+# Parameters with two values each, to change and to change back; the base has every default. Settings that
+# only change properties of different resources change together: an app takes seconds to synthesize.
+FLIPS: dict[str, dict[str, Any]] = {
+    "stage": {"stage": PROD},
+    "mail": {"alarm_email": "lab@example.org"},
+    "budget": {"budget_usd": 50, "alarm_email": "lab@example.org"},
+    "kept key": {"keep_customer_key": True},
+    "account": {"device_defender": True, "iot_log_level": "error"},
+    "site": {"site": True},
+    "old table": {"old_telemetry": True},
+    "properties": {
+        "retention_days": 7,
+        "files_days": 30,
+        "upload_gb_a_day": 5,
+        "live_concurrency": 5,
+        "robot_metrics": True,
+        "function_logs": ALL_LOGS,
+        "tags": {"team": "lab"},
+        "low_voltage_v": 13.2,
+        "high_temperature_degc": 70.0,
+        "stream_behind_s": 30.0,
+        "car_to_lambda_ms": 1_000.0,
+    },
+}
+KEY: dict[str, Any] = {"customer_key": True}
+# Another namespace is another deployment, and so is the embedded cloud; the layer is a folder.
+NOT_FLIPPED = {"namespace", "embedded", "layer"}
+# The longest that the contract allows; resource names contain it.
+LONGEST_NAMESPACE = "n" * 16
+EVERYTHING: dict[str, Any] = {name: value for flip in FLIPS.values() for name, value in flip.items()} | KEY
+# `keep_customer_key` has no effect beside `customer_key`.
+VARIATIONS: dict[str, dict[str, Any]] = {
+    "default": {},
+    **FLIPS,
+    "key": KEY,
+    "everything": EVERYTHING,
+    "longest names": {**EVERYTHING, "namespace": LONGEST_NAMESPACE},
+}

@@ -1,0 +1,1 @@
+"""The stack that watches the others: dashboards, alarms and the budget."""

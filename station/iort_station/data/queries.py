@@ -1,0 +1,211 @@
+"""Queries: recorded samples as numpy arrays or a pandas frame."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
+from functools import cache, partial
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from iort_contract.catalog.derived import DERIVED
+from iort_contract.catalog.vesc import ABSENT_FROM, VESC_FIELDS, absent
+from iort_contract.messages.message_type import MessageType
+from iort_contract.tables import STATS
+from iort_station.cloud import Cloud
+from iort_station.data import inventory, query_function
+from iort_station.data.batches import PageProgress, RefusedItems, blocks, stored
+from iort_station.data.blocks import Block, Column, join, resample
+from iort_station.data.conditions import derive, holds
+from iort_station.data.selection import Selection, select
+from iort_station.data.summary import seconds
+from iort_station.data.units import unit
+from iort_station.errors import StationError
+from iort_station.times import Time, duration_us
+
+# Where samples are selected: on this machine, or by the query function in the cloud.
+CLIENT, LAMBDA = "client", "lambda"
+_BY_DRIVER = tuple(field.name for field in VESC_FIELDS.values() if field.ros2_unit is not None)
+_MEAN = f"_{STATS[1]}"
+
+
+@dataclass(frozen=True)
+class Result:
+    """Samples in order of time.
+
+    ``times_us`` are int64 microseconds since the epoch. ``columns`` has an array per field: float64 with NaN
+    for null, bool for flags, objects for texts. ``refused`` counts stored items that are not batches;
+    ``reason`` is the first one's error. ``absent`` counts values by field that became null because their
+    sensor is not fitted. ``ros2`` tells that charge and energy have the ROS 2 driver's units. ``kind_of``
+    returns the type of the stream's messages, if known.
+    """
+
+    robot: str
+    stream: str
+    times_us: NDArray[np.int64]
+    columns: Mapping[str, Column]
+    refused: int = 0
+    reason: str = ""
+    ros2: bool = False
+    absent: Mapping[str, int] = field(default_factory=dict)
+    kind_of: Callable[[], MessageType | None] = field(default=lambda: None, repr=False, compare=False)
+
+    def __len__(self) -> int:
+        return len(self.times_us)
+
+    def unit(self, name: str) -> str:
+        """The unit of a column; empty if unknown."""
+        return unit(self.stream, name, ros2=self.ros2, kind=self.kind_of())
+
+    def frame(self) -> Any:
+        """The samples as a pandas DataFrame, indexed by time in UTC."""
+        # The import takes half a second.
+        import pandas as pd  # noqa: PLC0415 - see above
+
+        index = pd.to_datetime(self.times_us, unit="us", utc=True).rename("time")
+        return pd.DataFrame(dict(self.columns), index=index)
+
+
+def query(
+    cloud: Cloud,
+    robot: str,
+    stream: str,
+    start: Time | None = None,
+    end: Time | None = None,
+    *,
+    fields: Sequence[str] | None = None,
+    where: str | None = None,
+    every: str | None = None,
+    summary: bool = False,
+    on: str = CLIENT,
+    scan: bool = False,
+    progress: PageProgress | None = None,
+) -> Result:
+    """The samples of a robot's stream from ``start`` (inclusive) to ``end`` (exclusive).
+
+    Times are microseconds since the epoch, datetimes, or texts such as ``-10m`` and ISO 8601; None is the
+    beginning or the end of the stored samples. ``fields`` and ``where``, a condition in the language of
+    `iort_contract.expression`, may name the derived fields ``speed_mps`` and ``power_w``. ``every`` (such as
+    ``"1s"``) averages samples, see `iort_station.data.blocks.resample`. ``summary`` reads the seconds that
+    Lambda 2 has written; a field then stands for its ``_min``, ``_mean``, ``_max`` and ``_last``.
+    ``on="lambda"`` selects the samples in the cloud. ``scan`` reads by Scan instead of Query.
+
+    Raises `StationError` for an unknown robot, stream or field, naming the known ones; and for an invalid
+    time or condition.
+    """
+    selection = select(robot, stream, start, end, fields=fields, where=where)
+    every_us = duration_us(every) if every is not None else None
+    refused, absent_values = RefusedItems(), Counter[str]()
+    if on == LAMBDA:
+        if summary:
+            raise StationError("the query function reads samples; query the summary without --on lambda")
+        found = query_function.samples(
+            cloud, selection, refused=refused, absent=absent_values, scan=scan, progress=progress
+        )
+    elif summary:
+        found = seconds(cloud, selection, scan=scan, progress=progress)
+    else:
+        found = samples(cloud, selection, refused=refused, absent=absent_values, scan=scan, progress=progress)
+    ros2 = False
+
+    def watched() -> Iterator[Block]:
+        nonlocal ros2
+        for block in found:
+            ros2 = ros2 or _has_fraction(block)
+            yield block
+
+    block = join(list(watched())) if every_us is None else resample(watched(), every_us)
+    if not len(block.times_us):
+        inventory.check_there(cloud, robot, stream)
+    return Result(
+        robot,
+        stream,
+        block.times_us,
+        block.columns,
+        refused.count,
+        refused.reason,
+        ros2,
+        absent_values,
+        cache(partial(inventory.kind_of, cloud, selection)),
+    )
+
+
+def samples(
+    cloud: Cloud,
+    selection: Selection,
+    *,
+    refused: RefusedItems | None = None,
+    absent: Counter[str] | None = None,
+    scan: bool = False,
+    progress: PageProgress | None = None,
+    messages: bool = True,
+) -> Iterator[Block]:
+    """The selection's samples block by block, for ranges that do not fit in memory.
+
+    ``absent`` counts values of sensors that are not fitted, which become null; without it they stay as
+    recorded. Without ``messages``, samples of ROS messages are skipped. Raises `StationError` at the end for
+    a named field that no sample has.
+    """
+    pages = stored(cloud, selection, scan=scan, progress=progress)
+    found = blocks(pages, refused or RefusedItems(), selection.needs, messages=messages)
+    named = selection.named()
+    derived = sorted(named & DERIVED.keys())
+    vehicle = inventory.vehicle_of(cloud, selection.robot) if derived else None
+    there: set[str] = set()
+    some = False
+    for whole in found:
+        block = _within(whole, selection)
+        block = block if absent is None else _without_absent(block, absent)
+        n = len(block.times_us)
+        some = some or n > 0
+        columns = dict(block.columns)
+        if derived:
+            made = derive(columns, vehicle)
+            columns |= {name: made[name] for name in derived if name in made}
+        there |= columns.keys()
+        names = block.columns if selection.fields is None else selection.fields
+        null = np.full(n, np.nan)
+        chosen = Block(block.times_us, {name: columns.get(name, null) for name in names})
+        if selection.condition is not None:
+            chosen = chosen.take(holds(selection.condition, columns, n))
+        if len(chosen.times_us):
+            yield chosen
+    if some and not named <= there:
+        raise inventory.unknown_fields(cloud, selection, there)
+
+
+def _has_fraction(block: Block) -> bool:
+    """Whether charge or energy has fractions, which only the ROS 2 driver sends; the ROS 1 driver counts."""
+    return any(
+        column.dtype.kind == "f" and bool((column > np.floor(column)).any())
+        for name, column in block.columns.items()
+        if name.startswith(_BY_DRIVER) and not name.endswith(_MEAN)
+    )
+
+
+def _within(block: Block, selection: Selection) -> Block:
+    """The block's samples in the selection's range."""
+    times = block.times_us
+    first = 0 if selection.start_us is None else int(times.searchsorted(selection.start_us))
+    last = len(times) if selection.end_us is None else int(times.searchsorted(selection.end_us))
+    return block if (first, last) == (0, len(times)) else block.take(slice(first, last))
+
+
+def _without_absent(block: Block, counts: Counter[str]) -> Block:
+    """The block with null for values of sensors that are not fitted, which ``counts`` counts by field."""
+    found: dict[str, Column] = {}
+    for name in block.columns.keys() & ABSENT_FROM.keys():
+        column = block.columns[name]
+        numbers = column.dtype.kind == "f"
+        if numbers:
+            mask = column <= ABSENT_FROM[name]
+        else:
+            mask = np.array([absent(name, value) for value in column.tolist()], dtype=np.bool_)
+        if mask.any():
+            found[name] = column.copy()
+            found[name][mask] = np.nan if numbers else None
+            counts[name] += int(mask.sum())
+    return Block(block.times_us, {**block.columns, **found}) if found else block

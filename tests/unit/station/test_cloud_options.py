@@ -1,0 +1,150 @@
+"""What a newcomer reads who has no account at hand, no region, or nothing deployed in it."""
+
+from __future__ import annotations
+
+import os
+from urllib.request import proxy_bypass
+
+import pytest
+from typer.testing import CliRunner
+
+from iort_station.cli.cloud_options import CloudOptions
+from iort_station.cli.main import app, said
+from iort_station.cloud import Cloud, find_embedded
+from iort_station.errors import StationError
+from iort_station.page import keys
+
+
+@pytest.fixture(autouse=True)
+def newcomer(monkeypatch, tmp_path):
+    """Nobody's machine: no settings of AWS, in the environment or at home."""
+    for name in [name for name in os.environ if name.startswith("AWS_")]:
+        monkeypatch.delenv(name)
+    monkeypatch.setenv("AWS_EC2_METADATA_DISABLED", "true")
+    for name in ("AWS_CONFIG_FILE", "AWS_SHARED_CREDENTIALS_FILE"):
+        monkeypatch.setenv(name, str(tmp_path / "nowhere"))
+
+
+@pytest.fixture
+def found(tmp_path):
+    def cloud(**options):
+        given = {"namespace": "iort", "profile": None, "region": None, "local": False, **options}
+        return CloudOptions(**given, embedded=tmp_path / "cloud.json").cloud()
+
+    return cloud
+
+
+def test_neither_account_nor_embedded_cloud_says_how_to_get_either(found):
+    with pytest.raises(StationError, match=r"no AWS region.*AWS_REGION.*`make demo`"):
+        found()
+
+
+def test_an_embedded_cloud_is_found_from_any_folder_of_its_checkout(tmp_path):
+    inside = tmp_path / "checkout" / "docs" / "examples"
+    inside.mkdir(parents=True)
+    assert find_embedded(inside) is None
+    described = tmp_path / "checkout" / "build" / "local" / "cloud.json"
+    described.parent.mkdir(parents=True)
+    described.touch()
+    assert find_embedded(inside) == find_embedded(tmp_path / "checkout") == described
+    assert find_embedded(tmp_path) is None
+
+
+def test_away_from_a_checkout_local_says_how_to_name_the_file(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    with pytest.raises(StationError, match=r"no embedded cloud is running.*IORT_EMBEDDED names its file"):
+        CloudOptions("iort", None, None, local=True, embedded=None).cloud()
+
+
+def test_the_environment_names_an_embedded_cloud(tmp_path):
+    named = {"IORT_EMBEDDED": str(tmp_path / "cloud.json")}
+    done = CliRunner().invoke(app, ["--local", "robots", "list"], env=named)
+    assert f"no embedded cloud is running: {tmp_path / 'cloud.json'} does not exist" in str(done.exception)
+
+
+def test_a_region_without_credentials_says_how_to_give_them(found, monkeypatch):
+    with pytest.raises(StationError, match="no AWS credentials: give --profile") as raised:
+        found(region="eu-west-1")
+    assert "make demo" not in str(raised.value), "who names a region means AWS"
+    monkeypatch.setenv("AWS_REGION", "eu-west-1")
+    with pytest.raises(StationError, match="no AWS credentials"):
+        found()
+
+
+def test_a_profile_that_is_not_there_is_named(found):
+    with pytest.raises(StationError, match="nobody"):
+        found(profile="nobody")
+
+
+def test_the_region_of_the_cdks_own_variable_is_taken(found, monkeypatch):
+    monkeypatch.setenv("AWS_REGION", "eu-central-1")
+    monkeypatch.setenv("AWS_ACCESS_KEY_ID", "a")
+    monkeypatch.setenv("AWS_SECRET_ACCESS_KEY", "b")
+    assert found().client("iot").meta.region_name == "eu-central-1"
+    assert found(region="eu-west-1").client("iot").meta.region_name == "eu-west-1"
+
+
+def test_an_embedded_cloud_asks_for_no_profile(monkeypatch):
+    monkeypatch.setenv("AWS_PROFILE", "nobody")
+    embedded = Cloud(region="eu-west-1", access_key_id="test", secret_access_key="test")
+    assert embedded.client("iot").meta.region_name == "eu-west-1"
+    with pytest.raises(StationError, match="nobody"):
+        Cloud(region="eu-west-1").check()
+
+
+@pytest.mark.parametrize(
+    ("name", "value"), [("NO_PROXY", "lab.example"), ("no_proxy", "lab.example"), (None, "")]
+)
+def test_an_embedded_cloud_is_asked_around_a_proxy(monkeypatch, tmp_path, name, value):
+    for each in ("NO_PROXY", "no_proxy"):
+        # What is set first is put back afterwards, also where it was not there.
+        monkeypatch.setenv(each, "")
+        monkeypatch.delenv(each)
+    if name:
+        monkeypatch.setenv(name, value)
+    monkeypatch.setenv("HTTPS_PROXY", "http://proxy.example:3128")
+    Cloud(endpoint_url="https://127.0.0.1:4566").save(tmp_path / "cloud.json")
+    for _ in range(2):
+        Cloud.load(tmp_path / "cloud.json")
+        assert (
+            os.environ["no_proxy"] == os.environ["NO_PROXY"] == ",".join(filter(None, [value, "127.0.0.1"]))
+        )
+    assert proxy_bypass("127.0.0.1")
+    assert not proxy_bypass("sts.amazonaws.com")
+
+
+def test_no_key_is_asked_for_before_there_is_a_cloud(tmp_path):
+    done = CliRunner().invoke(app, ["--embedded", str(tmp_path / "cloud.json"), "pubnub"], input="a\nb\n")
+    assert isinstance(done.exception, StationError)
+    assert "key" not in done.output
+
+
+@pytest.mark.parametrize(
+    ("publish", "subscribe", "said"),
+    [
+        ("sub-c-1", "pub-c-1", "the publish key must be pub-c-..., as PubNub's admin portal shows it"),
+        ("pub-c-1", "sec-c-1", "the subscribe key must be sub-c-..., as PubNub's admin portal shows it"),
+        ("", "sub-c-1", "the publish key"),
+    ],
+)
+def test_a_key_that_is_another_is_refused_and_not_repeated(publish, subscribe, said):
+    with pytest.raises(StationError, match=said) as raised:
+        keys.typed(publish, subscribe)
+    assert "-c-1" not in str(raised.value)
+
+
+def test_a_typed_key_loses_what_was_copied_with_it():
+    typed = keys.typed(" pub-c-1", "sub-c-1\n")
+    assert (typed.publish_key, typed.subscribe_key) == ("pub-c-1", "sub-c-1")
+
+
+def test_a_file_that_cannot_be_written_is_named(tmp_path):
+    with pytest.raises(FileNotFoundError) as raised:
+        (tmp_path / "no" / "ride.csv").write_text("")
+    assert said(raised.value) == f"{tmp_path}/no/ride.csv: No such file or directory"
+    assert said(OSError("of no file")) == "of no file"
+
+
+def test_a_stack_that_is_not_deployed_is_named_with_its_region(aws):
+    with pytest.raises(StationError, match=r"iort-storage is not deployed in eu-west-1: run `make deploy`"):
+        Cloud().output("storage", "TelemetryTable")
