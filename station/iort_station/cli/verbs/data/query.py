@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+from iort_contract.catalog.derived import DERIVED
 from iort_contract.catalog.vesc import NO_SENSOR_DEGC
 from iort_station.cli.console import Console
 from iort_station.cli.options import Every, From, Last, Range, Robot, Stream, To, names
@@ -49,7 +50,7 @@ def query(
     last: Last = None,
     fields: Annotated[
         str | None,
-        typer.Option(help="Comma-separated fields; speed_mps and power_w are derived."),
+        typer.Option(help=f"Comma-separated fields; {' and '.join(DERIVED)} are derived."),
     ] = None,
     where: Annotated[
         str | None, typer.Option(help="Filter, for example 'speed_mps > 1.2 and fault_code == 0'.")
