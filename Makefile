@@ -6,7 +6,7 @@ export PYTHONDONTWRITEBYTECODE :=
 # cdk.json runs `python app.py`.
 bootstrap preflight deploy diff destroy: export PATH := $(CURDIR)/$(BIN):$(PATH)
 
-.PHONY: help demo test test-oldest check setup prove-mixed wheels bench bench-guard bench-agent bench-page screenshots bench-fleet bench-cold verify-aws docs-parts layer bootstrap preflight deploy diff destroy lock clean
+.PHONY: help demo test test-fast test-oldest check setup prove-mixed wheels bench bench-guard bench-agent bench-page screenshots bench-fleet bench-cold verify-aws docs-parts layer bootstrap preflight deploy diff destroy lock clean
 
 help: ## show this
 	@grep -hE '^[a-z-]+:.*## ' Makefile | sed -E 's/^([a-z-]+):.*## /\1\t/' | expand -t 14
@@ -20,6 +20,10 @@ demo: setup ## drive a car through the embedded cloud: DURATION=20 BAG=drive.bag
 
 test: setup ## run every test: REQUIRE_ALL=1 makes a skip a failure, WORKERS=4 run side by side
 	@$(BIN)/python -m pytest --numprocesses $(or $(WORKERS),4) --dist loadscope --no-loadscope-reorder
+
+test-fast: setup ## run the unit tests that need no emulator, browser or ROS: while you work, WORKERS=2
+	@$(BIN)/python -m pytest tests/unit --numprocesses $(or $(WORKERS),2) --dist loadscope --no-loadscope-reorder \
+		-m "not slow" --hypothesis-profile fast
 
 test-oldest: setup ## run the robot's tests on its oldest Python, 3.8, which ROS Noetic has: OLDEST=/path/to/python3.8
 	@$(PYTHON) scripts/setup.py --oldest $(or $(OLDEST),any)

@@ -1,4 +1,4 @@
-"""What every test shares: the synthesized app, what a skip means, and who runs beside whom."""
+"""Fixtures and rules of all tests: the synthesized app, skips as failures, groups of a worker."""
 
 from __future__ import annotations
 
@@ -18,36 +18,25 @@ from tests.browser import browser, open_page  # noqa: F401 - fixtures
 # How long an example takes says something about the machine only.
 settings.register_profile("iort", deadline=None, suppress_health_check=[HealthCheck.too_slow])
 settings.load_profile("iort")
+# `make test-fast`; CI generates the usual number.
+settings.register_profile("fast", settings.get_profile("iort"), max_examples=10, stateful_step_count=10)
 
-# What shares something costly runs in one worker of `make test`: an embedded cloud, of which there are two
-# because the faults spend their time waiting; the demo, which starts its own; what synthesizes the app.
-# Paths or their beginnings, the first that fits.
+# Tests that share something costly run in one worker of `make test`: an embedded cloud, the demo, which
+# starts its own cloud, the synthesized app, the browser. The longest groups start first, because their
+# folders are collected first. A node id's beginning decides, and the first that fits.
 GROUPS = {
-    "tests/local/test_demo.py": "demo",
-    "tests/local/test_faults.py": "faults",
-    "tests/local/test_faults_ros.py": "faults",
-    "tests/local/test_uplink.py": "faults",
-    "tests/local/test_pubnub": "pubnub",
-    "tests/local/": "cloud",
-    "tests/ros/test_mixed_robot.py": "faults",
-    "tests/ros/test_two_publishers.py": "faults",
-    "tests/ros/test_two_robots.py": "cloud",
+    "tests/local/commands/test_demo.py": "demo",
+    "tests/local/commands/": "cloud of the data",
+    "tests/local/data/": "cloud of the data",
+    "tests/local/faults/": "cloud of the faults",
+    "tests/local/gaps/": "cloud of the robots",
+    "tests/local/pubnub/": "PubNub",
+    "tests/local/robots/": "cloud of the robots",
+    "tests/ros/test_mixed_robot.py": "cloud of the faults",
+    "tests/ros/test_two_publishers.py": "cloud of the faults",
+    "tests/ros/test_two_robots.py": "cloud of the data",
     "tests/stacks/": "app",
-    **dict.fromkeys(
-        [
-            "tests/unit/functions/test_admit.py",
-            "tests/unit/functions/test_alert.py",
-            "tests/unit/functions/test_presence.py",
-            "tests/unit/functions/test_quarantine.py",
-            "tests/unit/functions/test_query.py",
-            "tests/unit/functions/test_summarize_drive.py",
-            "tests/unit/functions/test_tables.py",
-            "tests/unit/functions/test_upload.py",
-            "tests/unit/station/test_adopt.py",
-            "tests/unit/station/test_data.py",
-        ],
-        "app",
-    ),
+    "tests/unit/functions/test_admit.py": "app",
     "tests/web/": "page",
 }
 

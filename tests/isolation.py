@@ -1,8 +1,8 @@
-"""Who may do what, in one table: (who, does, what, allowed). tests/local/test_isolation.py tries every row
-on the embedded cloud with enforcement on, tests/stacks/test_isolation.py asks the synthesized policies.
+"""One table of permissions: (who, action, resource, allowed).
 
-What each role of the stacks may do is declared in tests/stacks/roles.py; here is what is asked of
-all of them, so that a function that is new and not declared fails.
+tests/local/robots/test_isolation.py tries every row on the embedded cloud with enforcement on, and
+tests/stacks/test_isolation.py asks the synthesized policies. tests/stacks/roles.py declares the permissions of
+each role. This table asks all roles, so that a new function without a declaration fails.
 """
 
 from __future__ import annotations

@@ -8,7 +8,7 @@ from iort_station.cost.prices import MONTH_HOURS, PRICES
 
 # A run takes about half an hour; what is metered by the hour is counted for a whole one.
 _HOURS = 1.0
-# More than all questions together send and invoke (tests/local/test_verify.py counts them).
+# More than all questions together send and invoke (tests/local/gaps/test_verify.py counts them).
 MESSAGES, INVOCATIONS, WRITES = 5_000, 2_000, 5_000
 _ALARMS, _METRICS, _DASHBOARDS = 40, 200, 3
 _GB_SECONDS = INVOCATIONS * 0.5 * 1.0

@@ -1,9 +1,9 @@
 """The differences between ministack and AWS for which no small patch exists (local/patches/), one file each.
 
 A gap's docstring says what AWS does, what ministack does instead, which test shows it, and why it has no
-patch. `install` closes the gap in this process. `is_open` tells whether the imported ministack
-still has it, so that tests/local/test_gaps.py fails when a new release needs a gap no more. The code wraps
-private functions of ministack, which is pinned. It uses the contract, and nothing else of this project.
+patch. `install` closes the gap in this process. `is_open` tells whether the imported ministack still has it,
+so that tests/local/gaps/test_gaps.py fails when a new release needs a gap no more. The code wraps private
+functions of ministack, which is pinned. It uses the contract, and nothing else of this project.
 """
 
 from __future__ import annotations

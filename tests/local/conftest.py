@@ -21,7 +21,7 @@ from iort_station.fleet import robots
 from local.cloud import EmbeddedCloud
 from local.deployment import ROOT
 from local.pubnub.standin import PubNubStandIn
-from tests.local.pubnub_sdk import sdk
+from tests.local.pubnub.pubnub_sdk import sdk
 from tests.ports import free_port
 
 

@@ -12,7 +12,7 @@ import yaml
 from iort_agent.errors import AgentError
 from iort_agent.status.server import fetch
 from tests.local.conftest import until
-from tests.local.test_uplink import self_signed
+from tests.local.faults.test_uplink import self_signed
 from tests.ros.conftest import Graph, Process
 from tests.ros.test_downlink import connected, drive, has, start
 from tests.ros.test_source import Cars, turns, until_turns

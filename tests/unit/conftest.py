@@ -50,8 +50,21 @@ def aws(monkeypatch):
         yield
 
 
+@pytest.fixture(scope="session")
+def tables():
+    """The properties of the storage stack's tables, by logical id. One stack is synthesized, not the app."""
+    from aws_cdk import App, assertions
+
+    from stacks.settings import Settings
+    from stacks.storage import Storage
+
+    template = assertions.Template.from_stack(Storage(App(), Settings()))
+    found = template.find_resources("AWS::DynamoDB::Table")
+    return {logical: resource["Properties"] for logical, resource in found.items()}
+
+
 @pytest.fixture
-def dynamodb(aws, synthesized):
+def dynamodb(aws, tables):
     """moto's DynamoDB with the tables as the template declares them."""
     import boto3
 
@@ -59,7 +72,7 @@ def dynamodb(aws, synthesized):
 
     client = boto3.client("dynamodb")
     nouns = {**NAMES, QUARANTINE: QUARANTINE, "batches": NAMES["telemetry"]}
-    for logical, properties in synthesized.resources("AWS::DynamoDB::Table").items():
+    for logical, properties in tables.items():
         client.create_table(
             TableName=next(name for noun, name in nouns.items() if logical.lower().startswith(noun)),
             KeySchema=properties["KeySchema"],

@@ -2,7 +2,7 @@
 
 AWS: does not apply; the embedded cloud must not take a port of the machine that nobody gave it.
 ministack: with USE_SSL also listens on port 443 where the process may.
-Test: tests/local/test_listener_gap.py::test_every_listener_of_the_emulator_is_on_loopback
+Test: tests/local/gaps/test_listener_gap.py::test_every_listener_of_the_emulator_is_on_loopback
 Patch: none; ministack takes port 443 on purpose, so upstream would have to agree on a switch first
 """
 

@@ -13,6 +13,8 @@ import grimp
 import pytest
 from importlinter import api
 
+pytestmark = pytest.mark.slow
+
 ROOT = Path(__file__).resolve().parents[3]
 PACKAGES = (
     "contract/iort_contract",

@@ -1,4 +1,4 @@
-"""Every question can be answered otherwise. tests/local/test_verify_differs.py has clouds that do."""
+"""Every question can be answered otherwise. tests/local/gaps/test_verify_differs.py has clouds that do."""
 
 from __future__ import annotations
 

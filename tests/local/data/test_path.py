@@ -22,7 +22,7 @@ from iort_station.page.listener import Listener
 from local.cloud import EmbeddedCloud
 from local.figures import round_trips
 from tests.local.conftest import run_agent, until
-from tests.local.drives import Agent
+from tests.local.data.drives import Agent
 from tests.recordings import recording
 from verify.tools.robot import Robot
 

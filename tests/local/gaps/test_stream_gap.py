@@ -11,7 +11,7 @@ from ministack.core.responses import request_scope
 from ministack.services import dynamodb, lambda_svc, sqs
 
 from local.gaps.functions.stream_retries import StreamMappings
-from tests.local import series_table
+from tests.local.gaps import series_table
 
 ACCOUNT, REGION = "000000000000", "eu-west-1"
 QUEUE_ARN = f"arn:aws:sqs:{REGION}:{ACCOUNT}:gap-destination"

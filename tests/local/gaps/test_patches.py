@@ -14,7 +14,7 @@ import pytest
 from local import patched
 from local.deployment import ROOT
 from local.errors import LocalError
-from tests.local import gap_probes
+from tests.local.gaps import gap_probes
 
 PATCHES = [patch.stem for patch in patched.PATCHES]
 HEAD = re.compile(
@@ -24,7 +24,7 @@ HEAD = re.compile(
 )
 ASK = """
 import json, sys
-from tests.local import gap_probes
+from tests.local.gaps import gap_probes
 print(json.dumps({name: bool(getattr(gap_probes, name)()) for name in sys.argv[1:]}))
 """
 

@@ -16,7 +16,7 @@ from pubnub.pubnub import SubscribeListener
 
 from local.pubnub import standin as server
 from local.pubnub.standin import PubNubStandIn
-from tests.local.pubnub_sdk import PAYLOADS, WAIT_S, ask, poll, publish
+from tests.local.pubnub.pubnub_sdk import PAYLOADS, WAIT_S, ask, poll, publish
 
 
 def subscribe(pubnub, *channels):

@@ -44,7 +44,7 @@ from iort_station.operations import delivery
 from local.deployment import ROOT
 from tests.images import TOPIC, jpeg, write_bag
 from tests.local.conftest import until
-from tests.local.drives import Agent
+from tests.local.data.drives import Agent
 from verify.tools.robot import Robot
 
 CONTENT = b"a small file"

@@ -7,7 +7,7 @@ import json
 import pytest
 
 from iort_station.errors import StationError
-from tests.local.test_shadow import driving
+from tests.local.robots.test_shadow import driving
 
 
 def settings(outcome):

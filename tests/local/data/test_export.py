@@ -21,7 +21,7 @@ from iort_station.cloud import Cloud
 from iort_station.operations import delivery
 from tests.foxglove import flat, opened
 from tests.local.conftest import run_agent, until
-from tests.local.test_query import iort
+from tests.local.data.test_query import iort
 from tests.recordings import recording
 from verify.tools.robot import Robot
 

@@ -26,8 +26,8 @@ from iort_station.operations import accounts, audit, delivery
 from local.cloud import EmbeddedCloud
 from local.proxy import FREEZE, PASS, REFUSE, Proxy
 from tests.local.conftest import until
-from tests.local.drives import RATE_HZ, Agent, counted, counter_log
-from tests.local.test_uplink import set_status
+from tests.local.data.drives import RATE_HZ, Agent, counted, counter_log
+from tests.local.faults.test_uplink import set_status
 
 OUTAGE_S = 60
 DRIVE_S = 75

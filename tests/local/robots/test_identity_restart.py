@@ -19,7 +19,7 @@ from iort_agent.identity.certificate import parse_certificate
 from iort_contract.tables import ADMIT_CLAIM, ADMITTED_CERTIFICATE, ADMITTED_MS, ROBOT, SERIAL
 from iort_station.fleet import claims, registry
 from local.cloud import ROOT
-from tests.local.test_identity import certificates, command
+from tests.local.robots.test_identity import certificates, command
 from verify.tools.robot import Robot
 
 # Ends as a lost battery ends it: before AWS IoT is asked to register, or as soon as it has.

@@ -15,7 +15,7 @@ from iort_station.fleet import robots
 from iort_station.operations import delivery
 from local.cloud import EmbeddedCloud
 from tests.local.conftest import run_agent
-from tests.local.drives import Agent
+from tests.local.data.drives import Agent
 from tests.ros.mixed_compare import compare, read
 from tests.ros.mixed_robot import TOPICS, Maker, Topic
 from tests.ros1_types import Message, header

@@ -13,7 +13,7 @@ from pubnub.exceptions import PubNubException
 
 from iort_contract.limits import MAX_PUBNUB_BYTES
 from local.pubnub.standin import PubNubStandIn
-from tests.local.pubnub_sdk import WAIT_S, ask, poll, publish
+from tests.local.pubnub.pubnub_sdk import WAIT_S, ask, poll, publish
 
 
 @pytest.mark.parametrize(

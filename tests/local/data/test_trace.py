@@ -9,7 +9,7 @@ from pathlib import Path
 
 from local.deployment import ROOT
 from tests.local.conftest import until
-from tests.local.drives import Agent
+from tests.local.data.drives import Agent
 
 
 def _trace(embedded, *arguments):

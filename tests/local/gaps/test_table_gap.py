@@ -13,7 +13,7 @@ from ministack.services import dynamodb
 
 from local.gaps.parts.partition import Wanted
 from local.gaps.storage import number_checks, query_time
-from tests.local import series_table
+from tests.local.gaps import series_table
 
 ACCOUNT, REGION = "000000000000", "eu-west-1"
 TABLE = "ordered-gap"

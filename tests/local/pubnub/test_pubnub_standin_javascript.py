@@ -12,9 +12,9 @@ from pathlib import Path
 import pytest
 
 from local.pubnub.standin import PubNubStandIn
-from tests.local.pubnub_sdk import PAYLOADS, WAIT_S, publish
+from tests.local.pubnub.pubnub_sdk import PAYLOADS, WAIT_S, publish
 
-ROOT = Path(__file__).resolve().parents[2]
+ROOT = Path(__file__).resolve().parents[3]
 
 
 @pytest.fixture

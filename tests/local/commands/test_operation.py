@@ -20,7 +20,7 @@ from iort_contract.catalog.streams import AGENT_FIELDS, AGENT_STREAM
 from iort_station.operations import delivery
 from local.cloud import ROOT
 from tests.local.conftest import until
-from tests.local.test_uplink import self_signed, set_status
+from tests.local.faults.test_uplink import self_signed, set_status
 
 AGENT = Path(sys.executable).parent / "iort-agent"
 
