@@ -155,7 +155,8 @@ class Decoder:
         elif path is not None:
             shown = [i for i in _indexes(tuple(self._select or ()), _label(path)) if i < n]
             self._leave_out(path)
-        if kind in LETTERS and isinstance(shown, range):
+        # Empty arrays are no fields, so nothing limits their number: they must not cost names.
+        if n and kind in LETTERS and isinstance(shown, range):
             out.update(zip(_element_names(path or ""), struct.unpack_from(f"<{n}{LETTERS[kind]}", data, at)))
         elif extent is not None:
             for i in shown if extent.numbers else ():

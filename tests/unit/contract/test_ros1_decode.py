@@ -13,7 +13,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from iort_contract.limits import MessageError
+from iort_contract.limits import MAX_FIELDS, MessageError
+from iort_contract.ros1 import decode
 from iort_contract.ros1.decode import MAX_ELEMENTS, MAX_TEXT, Decoder, stamp_ns
 from iort_contract.ros1.definition import VARIABLE, parse
 from tests.flatten import flatten
@@ -194,9 +195,11 @@ def test_arrays_within_arrays_cost_no_more_than_a_view(n: int, fields: int) -> N
     for _ in kinds:
         data = u32(60) + data * 60
     decoder = Decoder(parse("a_msgs/A", definition))
+    named_before = decode._element_names.cache_info().misses
     tracemalloc.start()
     try:
         assert len(decoder.decode(data)) == fields
+        assert decode._element_names.cache_info().misses - named_before <= MAX_FIELDS + 1
         assert tracemalloc.get_traced_memory()[1] < 20_000_000
     finally:
         tracemalloc.stop()
