@@ -53,6 +53,19 @@ def test_every_path_and_module_that_a_page_names_exists(page: Path) -> None:
         assert missing_modules(text) == set()
 
 
+@pytest.mark.parametrize("page", PAGES, ids=lambda page: str(page.relative_to(ROOT)))
+def test_every_heading_that_a_page_links_to_exists(page: Path) -> None:
+    for path, anchor in re.findall(r"\]\(([^)#: ]*)#([^)]+)\)", page.read_text(encoding="utf-8")):
+        target = page.parent / path if path else page
+        assert anchor in anchors(target.read_text(encoding="utf-8")), f"{path}#{anchor}"
+
+
+def anchors(text: str) -> set[str]:
+    """The anchors of a page's headings, as GitHub makes them."""
+    headings = re.findall(r"^#+ (.+)$", text, re.MULTILINE)
+    return {re.sub(r"[^\w -]", "", heading.lower()).replace(" ", "-") for heading in headings}
+
+
 def test_a_missing_path_or_module_is_found() -> None:
     assert missing_paths("see `stacks/nowhere.py`, stacks/storage.py and docs/*.md") == {"stacks/nowhere.py"}
     assert missing_modules("`bench.nowhere` and `iort_contract.messages.batch.encode_batch`") == {
