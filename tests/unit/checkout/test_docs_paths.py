@@ -66,6 +66,14 @@ def anchors(text: str) -> set[str]:
     return {re.sub(r"[^\w -]", "", heading.lower()).replace(" ", "-") for heading in headings}
 
 
+@pytest.mark.parametrize("package", HOME)
+def test_the_readme_of_a_package_lists_folders_that_it_has(package: str) -> None:
+    text = (HOME[package] / "README.md").read_text(encoding="utf-8")
+    folders = re.findall(r"^\| `(?:\w+/)?(\w+)` \|", text, re.MULTILINE)
+    assert folders
+    assert [name for name in folders if not (HOME[package] / package / name).is_dir()] == []
+
+
 def test_a_missing_path_or_module_is_found() -> None:
     assert missing_paths("see `stacks/nowhere.py`, stacks/storage.py and docs/*.md") == {"stacks/nowhere.py"}
     assert missing_modules("`bench.nowhere` and `iort_contract.messages.batch.encode_batch`") == {
