@@ -13,7 +13,7 @@ from iort_contract.catalog.derived import Vehicle, derive
 from iort_contract.catalog.vesc import ABSENT_FROM, absent
 from iort_contract.codec.seconds import Statistics, packed_second
 from iort_contract.limits import Value
-from iort_contract.messages.batch import Batch, BatchId
+from iort_contract.messages.batch import Batch, BatchId, RunEnd
 from iort_contract.tables import ABSENT, BATCHES, GAPS, MISSING_BATCHES, NONFINITE, SAMPLES
 
 # A step this many times the median is a gap: one lost sample makes 2; the jitter of a loaded Jetson reached
@@ -87,17 +87,25 @@ def without_absent(
     return ({**columns, **found} if found else columns), absences
 
 
-def missing_before(batch: BatchId, near: Sequence[BatchId]) -> int:
+def missing_before(batch: BatchId, near: Sequence[BatchId], previous: Sequence[RunEnd] | None = None) -> int:
     """The number of batches missing just before one, by their sequence numbers.
 
-    ``near`` are the batches around it in order of time, with at least the one before. Numbers grow by one,
-    also over a restart if the spool is durable. A restart at a lower number with a new ``boot`` means a lost
-    spool; only its start is known. If two runs overlap in time, as when a recording is played twice, the
-    first batch of a run counts as complete.
+    ``near`` are the batches around it in order of time, with at least the one before. A batch that names the
+    runs before it, in ``previous``, is of a run that numbers from 0; of a named run that is near, the last
+    batches may be missing too. Without ``previous``, numbers may go on over a restart; a restart at a lower
+    number means that the spool was lost, and only its start is known. If two runs overlap in time, as when a
+    recording is played twice, the first batch of such a run counts as complete.
     """
     own = [other.seq for other in near if other.boot == batch.boot and other.seq < batch.seq]
     if own:
         return batch.seq - max(own) - 1
+    if previous is not None:
+        missing = batch.seq
+        for end in previous:
+            run = [other for other in near if other.boot == end.boot]
+            if run and max(run) < batch:
+                missing += max(0, end.seq - max(other.seq for other in run))
+        return missing
     before = [other for other in near if other.boot != batch.boot and other < batch]
     if not before:
         return batch.seq

@@ -17,8 +17,10 @@ STATS = ("min", "mean", "max", "last")
 # that were not finite.
 SAMPLES, BATCHES, MISSING_BATCHES = "n", "batches", "missing_batches"
 GAPS, NONFINITE = "gaps", "nonfinite"
+# In the first batches of a run: the runs before it, and the last number of each.
+PREVIOUS = "previous"
 # The keys of a batch's envelope; the record rule stores these and no others.
-ENVELOPE = ("v", BATCH, SAMPLES, NONFINITE, "codec", "samples")
+ENVELOPE = ("v", BATCH, SAMPLES, NONFINITE, PREVIOUS, "codec", "samples")
 # The fields of a ping; the answer repeats them.
 PING_FIELDS = ("v", "id", "sent_us", "padding")
 # A rule's message to a function: one opaque value, so that no key of it can replace one of the cloud's.

@@ -21,7 +21,7 @@ from iort_agent.lanes.streams import Streams
 from iort_agent.mqtt.rate_limiter import RateLimiter
 from iort_agent.mqtt.uplink import Link, Uplink
 from iort_agent.sources.run import SourceRun
-from iort_agent.spool.memory import Spool
+from iort_agent.spool.interface import Spool
 from iort_agent.status.account import Accounts
 from iort_agent.status.metrics import AgentMetrics, Rates
 

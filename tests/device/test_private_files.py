@@ -13,15 +13,14 @@ import pytest
 
 from iort_agent.cli import main
 from iort_agent.common.private_files import make_private, open_below, write_below
-from iort_agent.errors import AgentError, UploadError
+from iort_agent.errors import UploadError
 from iort_agent.files.config import FilesConfig
 from iort_agent.files.file import from_json, read, to_json
 from iort_agent.files.folder import STATE, Folder
 from iort_agent.lanes.attachment import Attachments
 from iort_agent.spool.file import SpoolFile
-from iort_agent.spool.memory import PROCESS
-from iort_agent.spool.reservation import Reservation
-from iort_agent.spool.sqlite import SqliteSpool
+from iort_agent.spool.interface import PROCESS
+from iort_agent.spool.sqlite import RETRY_S, SqliteSpool
 from iort_contract.catalog.vesc import VESC_STREAM
 from tests.agent_fakes import ManualClock
 from tests.unit.agent.test_agent import config_file
@@ -141,8 +140,8 @@ def test_attachments_are_written_only_below_their_folder(folder, secret):
 def test_only_the_owner_may_read_written_files_with_any_umask(folder, open_umask):
     clock = ManualClock()
     spool = SqliteSpool(folder / "queue.db", max_bytes=10**6, clock=clock)
-    spool.put(VESC_STREAM, 0, b"payload", samples=1)
-    assert spool.flush()
+    spool.put(VESC_STREAM, "0badcafe", 0, b"payload", samples=1)
+    spool.work()
     # With its log, while it is open.
     assert modes(folder) == {0o600}
     assert len(list(folder.iterdir())) == 4
@@ -161,31 +160,29 @@ def test_only_the_owner_may_read_written_files_with_any_umask(folder, open_umask
 
 def test_a_readable_queue_is_made_private(folder):
     path = folder / "queue.db"
-    SpoolFile(path, durability=PROCESS).close()
+    SpoolFile(path, PROCESS).close()
     path.chmod(0o644)
-    SpoolFile(path, durability=PROCESS).close()
+    SpoolFile(path, PROCESS).close()
     assert modes(folder) == {0o600}
 
 
-@pytest.mark.parametrize("name", ["queue.db", "queue.db-wal", "queue.db-shm"])
-def test_a_link_in_the_place_of_the_queue_is_said_and_batches_go_out(folder, secret, name):
+@pytest.mark.parametrize(
+    "name", ["queue.db", "queue.db-wal", "queue.db-shm", "queue.db.lock", "queue.db.seq"]
+)
+def test_a_link_in_the_place_of_the_queue_is_told_and_batches_go_out(folder, secret, name):
     (folder / name).symlink_to(secret)
-    spool = SqliteSpool(folder / "queue.db", max_bytes=10**6, clock=ManualClock())
-    assert "is a link, which is not followed" in spool.alarm
-    spool.put(VESC_STREAM, 0, b"payload", samples=1)
-    spool.flush()
+    clock = ManualClock()
+    spool = SqliteSpool(folder / "queue.db", max_bytes=10**6, clock=clock)
+    assert name in spool.alarm
+    spool.put(VESC_STREAM, "0badcafe", 0, b"payload", samples=1)
+    spool.work()
     assert spool.next(0).payload == b"payload"
-    # It is taken away: everything is written.
+    # Everything is written once the link is removed.
     (folder / name).unlink()
-    assert spool.flush()
+    clock.advance(RETRY_S)
+    spool.work()
     assert spool.alarm is None
     spool.close()
-
-
-def test_a_link_in_the_place_of_the_numbers_is_not_followed(folder, secret):
-    (folder / "queue.db.seq").symlink_to(secret)
-    with pytest.raises((OSError, AgentError)):
-        Reservation(folder / "queue.db.seq")
 
 
 def test_a_file_is_whole_or_not_there(folder):

@@ -71,6 +71,27 @@ def test_a_drive_is_proven_and_a_lost_batch_of_any_stream_is_found(embedded, bun
     assert _run(embedded, "nobody-like-that").exit_code == 1
 
 
+def test_runs_one_after_the_other_name_each_other(embedded, bundle):
+    """Over a restart with a queue file, a lost end of a run is found by the next run's word alone."""
+    car = bundle(
+        queue={"path": "spool.db"},
+        sources=[{"type": "sim", "stream": "wheels", "rate_hz": 100, "duration_s": 2}],
+        record={"batch_s": 0.25},
+        live={"enabled": False},
+    )
+    run_agent(car)
+    run_agent(car)
+    assert _run(embedded, car.robot, "--from-start").exit_code == 0
+    found = list(audit.headers(embedded.cloud, car.robot, "wheels", audit.Range()))
+    first = min(batch_id(item[BATCH]) for item in found).boot
+    last = max(batch_id(item[BATCH]) for item in found if batch_id(item[BATCH]).boot == first)
+    _delete(embedded, car.robot, "wheels", {BATCH: str(last)})
+    (wheels,) = json.loads(_run(embedded, car.robot, "--stream", "wheels", "--last", "1h").stdout)["streams"]
+    (gap,) = wheels["runs"][0]["missing"]
+    assert (gap["first"], gap["last"], gap["before_us"]) == (last.seq, last.seq, None)
+    assert not wheels["runs"][1]["missing"]
+
+
 def test_what_the_agent_did_not_record_is_told_by_cause(embedded, bundle):
     car = bundle()
     boot = "0badcafe0badcafe"

@@ -22,7 +22,7 @@ import pytest
 from iort_contract.catalog.streams import AGENT_STREAM
 from iort_contract.limits import LIVE_MAX_AGE_MS
 from iort_station.fleet import robots
-from iort_station.operations import audit, delivery
+from iort_station.operations import accounts, audit, delivery
 from local.cloud import EmbeddedCloud
 from local.proxy import FREEZE, PASS, REFUSE, Proxy
 from tests.local.conftest import until
@@ -224,8 +224,8 @@ def test_disk_full_and_free_again(embedded, bundle, proxy, tmp_path):
 
 @pytest.mark.parametrize("damage", ["payloads", "header"])
 def test_corrupt_spool_is_set_aside(embedded, bundle, proxy, tmp_path, damage):
-    """What was lost with the file is known by the car's count, or by the numbers alone if nothing of the
-    file can be read; what came afterwards is all there."""
+    """What was lost with the file is known by the car's count and the numbers. If nothing of the file can be
+    read, it is known that it was damaged. What came afterwards is all there."""
     log = counter_log(tmp_path / "counter.csv", 600)
     car = bundle(**_settings(log, proxy.port), metrics={"every_s": 1})
     proxy.mode = REFUSE
@@ -263,8 +263,7 @@ def test_corrupt_spool_is_set_aside(embedded, bundle, proxy, tmp_path, damage):
     assert report["spool"]["dropped_batches"] == known
     assert report["spool"]["dropped_samples"] == sum(samples for _, samples, _ in lost[:known])
 
-    # In the table is everything else, in order, and each number that is not there is one that was lost,
-    # or, where nothing could be read, was left out because it may have been used.
+    # In the table is everything else, in order, and each number that is not there is one that was lost.
     batches = list(delivery.batches(embedded.cloud, car.robot, "vesc"))
     stored = [(batch.seq, len(batch.times_us)) for batch in batches]
     assert stored[: len(kept)] == [(seq, samples) for seq, samples, _ in kept]
@@ -273,11 +272,10 @@ def test_corrupt_spool_is_set_aside(embedded, bundle, proxy, tmp_path, damage):
     items = audit.headers(embedded.cloud, car.robot, "vesc")
     runs = audit.audit("vesc", items, from_start=True).runs
     missing = [seq for run in runs for gap in run.missing for seq in range(gap.first, gap.last + 1)]
-    if known:
-        assert missing == [seq for seq, _, _ in lost]
-    else:
-        assert missing == list(range(stored[0][0]))
-        assert {seq for seq, _, _ in lost} <= set(missing)
+    assert missing == [seq for seq, _, _ in lost[:known]]
+    told = accounts.accounts(embedded.cloud, car.robot)[report["boot"]].not_recorded()["queue"]
+    assert told["damaged_files"] == 1
+    assert told.get("dropped_samples", 0) == report["spool"]["dropped_samples"]
 
 
 def test_certificate_revoked_on_the_way_and_replaced(embedded, bundle, proxy, tmp_path):

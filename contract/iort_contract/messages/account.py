@@ -63,6 +63,7 @@ LOST = frozenset(
         "missed",
         "interruptions",
         "dropped_samples",
+        "damaged_files",
         "bad_crc",
         "full",
         "disk",

@@ -42,11 +42,26 @@ from iort_contract.limits import (
 from iort_contract.ros1.columns import as_columns, from_columns, values_a_message, view
 from iort_contract.ros1.message import Messages
 from iort_contract.ros1.serialized import pack, unpack
-from iort_contract.tables import BATCH, NONFINITE, RECEIVED_MS, ROBOT, SAMPLES, TOPIC
+from iort_contract.tables import BATCH, NONFINITE, PREVIOUS, RECEIVED_MS, ROBOT, SAMPLES, TOPIC
 from iort_contract.topics import RECORD, Topic, parse_topic
 
 _BATCH_ID = re.compile(rf"(\d{{16}})-({BOOT.pattern})-(0|[1-9]\d{{0,15}})", re.ASCII)
 _MAX_BATCH_ID_US = 10**16
+
+
+_RUN_END = re.compile(rf"({BOOT.pattern})-(0|[1-9]\d{{0,15}})", re.ASCII)
+# A batch names at most this many runs before its own.
+MAX_PREVIOUS = 16
+
+
+class RunEnd(NamedTuple):
+    """A run of the agent, and the number of the last batch of a stream that it put into its queue."""
+
+    boot: str
+    seq: int
+
+    def __str__(self) -> str:
+        return f"{self.boot}-{self.seq}"
 
 
 class BatchId(NamedTuple):
@@ -83,15 +98,28 @@ def batches_between(first_us: int | None, last_us: int | None) -> tuple[str, str
     return (f"{first:016d}", f"{last:016d}~") if last >= 0 else ("~", "~")
 
 
+def run_ends(text: Any) -> tuple[RunEnd, ...]:
+    """Parse the runs before a batch's own, separated by spaces; raises `ContractError`."""
+    matches = [_RUN_END.fullmatch(one) for one in text.split(" ")] if isinstance(text, str) and text else []
+    ends = tuple(RunEnd(match.group(1), int(match.group(2))) for match in matches if match is not None)
+    if not isinstance(text, str) or len(ends) != len(matches) or len(ends) > MAX_PREVIOUS:
+        raise ContractError(f"{PREVIOUS} must be up to {MAX_PREVIOUS} of <run>-<number>, got {shown(text)}")
+    for end in ends:
+        check_header(end.boot, end.seq, 0)
+    return ends
+
+
 @dataclass(frozen=True)
 class Batch:
     """Samples of one stream.
 
-    ``boot`` names the agent's run. ``seq`` numbers the stream's batches without gaps, also across restarts if
-    the spool is durable. ``times_us`` are microseconds since the epoch, one per sample, in order and within
-    `MAX_BATCH_SPAN_US`. ``columns`` holds a list of equal length per field. ``nonfinite`` counts the NaNs and
-    infinities that became None. ``messages`` are the ROS messages behind the samples, if the batch holds them
-    as published; for encoding, ``columns`` then hold only additional fields.
+    ``boot`` names the agent's run. ``seq`` numbers the run's batches of the stream from 0 without gaps;
+    before batches had ``previous``, it went on where the run before had ended. ``times_us`` are microseconds
+    since the epoch, one per sample, in order and within `MAX_BATCH_SPAN_US`. ``columns`` holds a list of
+    equal length per field. ``nonfinite`` counts the NaNs and infinities that became None. ``messages`` are
+    the ROS messages behind the samples, if the batch holds them as published; for encoding, ``columns`` then
+    hold only additional fields. ``previous`` are the runs before this one; each batch of a run names them
+    until one has arrived.
     """
 
     boot: str
@@ -100,6 +128,7 @@ class Batch:
     columns: Mapping[str, Sequence[Value]]
     nonfinite: int = 0
     messages: Messages | None = None
+    previous: tuple[RunEnd, ...] | None = None
 
     @property
     def t_us(self) -> int:
@@ -138,10 +167,19 @@ def encode_batch(batch: Batch) -> bytes:
         BATCH: str(batch.id),
         SAMPLES: n,
         **({NONFINITE: nonfinite} if nonfinite else {}),
+        **_previous(batch),
         "codec": codec,
         "samples": samples,
     }
     return COMPACT.encode(envelope).encode()
+
+
+def _previous(batch: Batch) -> dict[str, str]:
+    if batch.previous is None:
+        return {}
+    text = " ".join(map(str, batch.previous))
+    run_ends(text)
+    return {PREVIOUS: text}
 
 
 def _wire_columns(batch: Batch, n: int) -> tuple[dict[str, list[Value]], int]:
@@ -189,6 +227,7 @@ class Opened(NamedTuple):
     written: Mapping[str, Any]
     serialized: bytes | None
     about: str
+    previous: tuple[RunEnd, ...] | None
 
 
 def open_batch(message: bytes | str | Mapping[str, Any]) -> Opened:
@@ -205,6 +244,7 @@ def open_batch(message: bytes | str | Mapping[str, Any]) -> Opened:
     first_us, boot, seq = batch_id(envelope.get(BATCH))
     n = integer(envelope, SAMPLES)
     nonfinite = check_nonfinite(integer(envelope, NONFINITE)) if NONFINITE in envelope else 0
+    previous = run_ends(envelope[PREVIOUS]) if PREVIOUS in envelope else None
     if not 1 <= n <= MAX_SAMPLES:
         raise ContractError(f"envelope must say 1 to {MAX_SAMPLES} samples, got {n}")
     text, _, behind = inflate(envelope.get("samples"), codec).partition(b"\n")
@@ -229,8 +269,8 @@ def open_batch(message: bytes | str | Mapping[str, Any]) -> Opened:
             name: [None, *column] if isinstance(column, list) else column for name, column in fields.items()
         }
     if codec == SERIALIZED_CODEC:
-        return Opened(boot, seq, times, nonfinite, fields, behind, "")
-    return Opened(boot, seq, times, nonfinite, fields, None, _text(behind))
+        return Opened(boot, seq, times, nonfinite, fields, behind, "", previous)
+    return Opened(boot, seq, times, nonfinite, fields, None, _text(behind), previous)
 
 
 def decode_batch(message: bytes | str | Mapping[str, Any]) -> Batch:
@@ -244,16 +284,16 @@ def decode_batch(message: bytes | str | Mapping[str, Any]) -> Batch:
 
 def decode_opened(opened: Opened) -> Batch:
     """Decode the values; raises `ContractError`."""
-    boot, seq, times, nonfinite, written, serialized, _ = opened
+    boot, seq, times, nonfinite, written, serialized, _, previous = opened
     n = len(times)
     columns: dict[str, Sequence[Value]] = {
         name: unpacked(name, column, n) for name, column in written.items()
     }
     if serialized is None:
-        return Batch(boot, seq, times, columns, nonfinite)
+        return Batch(boot, seq, times, columns, nonfinite, None, previous)
     messages = unpack(serialized, n)
     viewed, nulled = view(messages)
-    return Batch(boot, seq, times, {**viewed, **columns}, nonfinite + nulled, messages)
+    return Batch(boot, seq, times, {**viewed, **columns}, nonfinite + nulled, messages, previous)
 
 
 def messages_of(
@@ -320,6 +360,6 @@ def split_batch(batch: Batch) -> tuple[Batch, Batch]:
         messages = batch.messages
         if messages is not None:
             messages = messages._replace(raw=messages.raw[which])
-        return Batch(batch.boot, seq, batch.times_us[which], columns, nonfinite, messages)
+        return Batch(batch.boot, seq, batch.times_us[which], columns, nonfinite, messages, batch.previous)
 
     return part(slice(half), batch.seq, batch.nonfinite), part(slice(half, None), batch.seq + 1, 0)

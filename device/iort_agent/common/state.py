@@ -65,14 +65,13 @@ class Lanes:
 
 @dataclass(frozen=True)
 class StreamReport:
-    """The counts of a stream, as in `iort_agent.lanes.batch.StreamCounts`."""
+    """The counts of a stream, as in `iort_agent.lanes.batch_encoder.StreamCounts`."""
 
     samples: int
     stored: int
     batches: int
     refused: int
     nulled: int
-    first_seq: int
 
 
 @dataclass(frozen=True)

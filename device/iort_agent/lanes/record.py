@@ -25,7 +25,7 @@ from iort_agent.lanes.production import Production, Rate
 from iort_agent.mqtt.rate_limiter import PUBLISHES_PER_S, SHARE, RateLimiter
 from iort_agent.mqtt.uplink import Uplink
 from iort_agent.sources import SourceConfig
-from iort_agent.spool.memory import Entry, Spool
+from iort_agent.spool.interface import Entry, Spool
 from iort_contract.topics import record_topic
 
 _log = logging.getLogger(__name__)

@@ -6,11 +6,10 @@ import threading
 from typing import Iterable, Mapping
 
 from iort_agent.clock import Clock
-from iort_agent.lanes.batch import Batcher, StreamCounts
-from iort_agent.lanes.batch_encoder import Packer
+from iort_agent.lanes.batch_encoder import BatchEncoder, StreamCounts
 from iort_agent.lanes.config import RuntimeSettings
 from iort_agent.lanes.live import LiveLane
-from iort_agent.spool.memory import Spool
+from iort_agent.spool.interface import Spool
 from iort_contract.catalog.streams import TYPES_STREAM
 from iort_contract.limits import Value
 from iort_contract.topics import check_stream
@@ -35,8 +34,7 @@ class Streams:
         self._live, self._spool, self._clock = live, spool, clock
         self.settings = settings
         self._lock = threading.Lock()
-        self._batchers: dict[str, Batcher] = {}
-        self._counts: dict[str, StreamCounts] = {}
+        self._encoders: dict[str, BatchEncoder] = {}
         # The message types that sources have emitted, under lock.
         self._types: dict[tuple[Value, ...], Mapping[str, Value]] = {}
         self._fields: dict[str, Iterable[str]] = {}
@@ -57,11 +55,11 @@ class Streams:
 
     def record(self, stream: str, t_us: int, values: Mapping[str, Value]) -> None:
         """Take a sample for the record lane only."""
-        batcher = self._batchers.get(stream)
-        if batcher is None:
-            batcher = self._new_batcher(stream, values)
+        encoder = self._encoders.get(stream)
+        if encoder is None:
+            encoder = self._new_encoder(stream, values)
         if self.settings.record_enabled:
-            batcher.add(t_us, values)
+            encoder.add(t_us, values)
 
     def apply(self, settings: RuntimeSettings) -> None:
         """Use other settings from now on."""
@@ -72,13 +70,13 @@ class Streams:
 
     def tick(self) -> None:
         """Close the batches of silent streams; called several times a second."""
-        for batcher in list(self._batchers.values()):
-            batcher.tick()
+        for encoder in list(self._encoders.values()):
+            encoder.tick()
 
     def flush(self) -> None:
         """Close every batch."""
-        for batcher in list(self._batchers.values()):
-            batcher.flush()
+        for encoder in list(self._encoders.values()):
+            encoder.flush()
 
     def repeat_types(self) -> None:
         """Record the message types again. A reader needs them to turn columns into messages, and the earlier
@@ -93,14 +91,8 @@ class Streams:
         return dict(self._fields)
 
     def counts(self) -> dict[str, StreamCounts]:
-        """The counts of each stream, which keep changing."""
-        return self._counts.copy()
-
-    def counted(self) -> dict[str, tuple[StreamCounts, int]]:
-        """The counts of each stream at one moment, and the number of its next batch."""
-        found = {name: batcher.counts() for name, batcher in list(self._batchers.items())}
-        # The spool's own next number may already count a later batch.
-        return {name: (counts, counts.first_seq + counts.batches) for name, counts in found.items()}
+        """The counts of each stream, each of one moment."""
+        return {name: encoder.counts() for name, encoder in list(self._encoders.items())}
 
     def refused(self) -> int:
         """The samples of all streams that cannot be sent."""
@@ -113,14 +105,12 @@ class Streams:
             if len(self._types) > _MOST_TYPES:
                 del self._types[next(iter(self._types))]
 
-    def _new_batcher(self, stream: str, values: Mapping[str, Value]) -> Batcher:
+    def _new_encoder(self, stream: str, values: Mapping[str, Value]) -> BatchEncoder:
         with self._lock:
-            if stream not in self._batchers:
+            if stream not in self._encoders:
                 check_stream(stream)
                 self._fields.setdefault(stream, values.keys())
-                counts = self._counts[stream] = StreamCounts(first_seq=self._spool.next_seq(stream))
-                packer = Packer(stream=stream, boot=self._boot, spool=self._spool, counts=counts)
-                self._batchers[stream] = Batcher(
-                    packer.store, batch_s=self._batch_s, clock=self._clock, counts=counts
+                self._encoders[stream] = BatchEncoder(
+                    stream, boot=self._boot, batch_s=self._batch_s, spool=self._spool, clock=self._clock
                 )
-            return self._batchers[stream]
+            return self._encoders[stream]

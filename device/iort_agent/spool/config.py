@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Any
 
 from iort_agent.common.schema import Place, choice, number, setting
-from iort_agent.spool.memory import FULL, OVERWRITE_OLDEST, PROCESS, REJECT_NEW
+from iort_agent.spool.interface import FULL, OVERWRITE_OLDEST, PROCESS, REJECT_NEW
 
 
 def _queue_file(value: Any, where: Place) -> Path | None:

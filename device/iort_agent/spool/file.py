@@ -1,140 +1,206 @@
-"""The spool's SQLite file: what is in it, and what is done when it is damaged."""
+"""The spool's SQLite file: its tables, and the lock beside it."""
 
 from __future__ import annotations
 
 import contextlib
-import datetime as dt
+import fcntl
+import json
+import os
 import sqlite3
 import zlib
 from pathlib import Path
-from typing import Collection, Iterable, Mapping, NamedTuple
+from typing import Collection, Iterable, Mapping
 
 from iort_agent.common.private_files import make_private
 from iort_agent.errors import AgentError
-from iort_agent.spool.memory import FULL, Dropped, Entry
+from iort_agent.spool.interface import FULL, Backlog, Entry
+from iort_contract.messages.batch import MAX_PREVIOUS, RunEnd, batch_id
 
 _APPLICATION_ID = 0x696F7274  # "iort"
-_VERSION = 1
-# The index has what the ledger is made of, so that a start need not read the payloads.
-_SCHEMA = """
+_VERSION = 2
+_RUNS = """
+CREATE TABLE runs (
+    stream TEXT NOT NULL, boot TEXT NOT NULL, last_seq INTEGER NOT NULL, PRIMARY KEY (stream, boot)
+);
+"""
+# The index lets a start count the batches without reading the payloads.
+_SCHEMA = f"""
 BEGIN;
 CREATE TABLE batches (
     id INTEGER PRIMARY KEY, stream TEXT NOT NULL, seq INTEGER NOT NULL, samples INTEGER NOT NULL,
     bytes INTEGER NOT NULL, crc INTEGER NOT NULL, payload BLOB NOT NULL
 );
-CREATE INDEX ledger ON batches (id, bytes, samples);
-CREATE TABLE streams (stream TEXT PRIMARY KEY, next_seq INTEGER NOT NULL) WITHOUT ROWID;
-CREATE TABLE dropped (id INTEGER PRIMARY KEY, batches INTEGER NOT NULL, samples INTEGER NOT NULL);
-PRAGMA application_id = %d;
-PRAGMA user_version = %d;
+CREATE INDEX sizes ON batches (id, bytes, samples);
+{_RUNS}
+PRAGMA application_id = {_APPLICATION_ID};
+PRAGMA user_version = {_VERSION};
 COMMIT;
-""" % (_APPLICATION_ID, _VERSION)  # noqa: UP031 - braces would be doubled in nothing, but SQL reads plain
+"""
+# Version 1 numbered a stream's batches across runs.
+_FROM_VERSION_1 = f"""
+BEGIN;
+{_RUNS}
+DROP INDEX ledger;
+CREATE INDEX sizes ON batches (id, bytes, samples);
+DROP TABLE streams;
+DROP TABLE dropped;
+PRAGMA user_version = {_VERSION};
+"""
 # The write-ahead log is cut to this after a checkpoint, which comes every 1,000 pages.
 _LOG_BYTES = 4 * 1024 * 1024
-# So long is somebody waited for who looks into the file with another program.
+# How long to wait for another program that looks into the file.
 _BUSY_S = 1.0
+# A read ends at either limit; the limits of a transaction are `iort_agent.spool.sqlite`'s.
+READ_ENTRIES, READ_BYTES = 64, 512 * 1024
 _SHRINK_PAGES = 1024
-_SET_ASIDE_KEPT = 3
-_SALVAGE_GROUP = 256
-_SUFFIXES = ("", "-wal", "-shm")
+# A database, and the files that SQLite keeps beside it while it is open.
+SUFFIXES = ("", "-wal", "-shm")
+_LOCK_FLAGS = os.O_RDWR | os.O_CREAT | os.O_NOFOLLOW | os.O_CLOEXEC
 
 
-class ForeignFileError(sqlite3.DatabaseError):
-    """The file does not look like ours."""
+class QueueLock:
+    """Keeps a second agent away from the queue, from when it is made until `close`.
 
+    ``ours`` says whether an agent has had its queue here before. Raises `AgentError` if another agent has
+    the queue, `OSError` if the lock's file cannot be opened.
+    """
 
-class Content(NamedTuple):
-    """What is in the file, without the payloads: id, bytes and samples of each batch."""
+    def __init__(self, path: Path) -> None:
+        # Agents before queue files of version 2 lock this file.
+        self._old = Path(f"{path}.seq")
+        names = [Path(f"{path}.lock"), *([self._old] if self._old.exists() else [])]
+        self._fds: list[int] = []
+        try:
+            for name in names:
+                self._fds.append(os.open(name, _LOCK_FLAGS, 0o600))
+                self._lock(name, self._fds[-1])
+        except BaseException:
+            self.close()
+            raise
+        self.ours = any(os.fstat(fd).st_size > 0 for fd in self._fds)
 
-    batches: list[tuple[int, int, int]]
-    seqs: dict[str, int]
-    dropped: Dropped
+    def note_owner(self) -> None:
+        """Note this process as the queue's, once the queue's file is known to be one."""
+        self.ours = True
+        with contextlib.suppress(OSError):  # the lock holds without it, on a full disk too
+            os.ftruncate(self._fds[0], 0)
+            os.pwrite(self._fds[0], b"%d" % os.getpid(), 0)
+            self._old.unlink()
+
+    def close(self) -> None:
+        """Give the queue to whoever comes next."""
+        while self._fds:
+            os.close(self._fds.pop())
+
+    def _lock(self, path: Path, fd: int) -> None:
+        try:
+            fcntl.flock(fd, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError as error:
+            content = os.pread(fd, 32, 0)
+            process = int(content) if content.isdigit() else "unknown"
+            raise AgentError(
+                f"{path}: the queue is in use by another iort-agent (process {process}): "
+                "end that one, or give this robot a queue.path of its own"
+            ) from error
 
 
 class SpoolFile:
     """An open database. Every method may raise `sqlite3.Error`; used by one thread at a time."""
 
-    def __init__(self, path: Path, *, durability: str, max_file_bytes: int | None = None) -> None:
+    def __init__(self, path: Path, durability: str) -> None:
         # SQLite gives its log the file's permissions.
         make_private(path)
-        for suffix in _SUFFIXES[1:]:
+        for suffix in SUFFIXES[1:]:
             if Path(f"{path}{suffix}").is_symlink():
                 raise OSError(f"{path}{suffix} is a link, which is not followed: remove it")
-        self._db = sqlite3.connect(str(path), timeout=_BUSY_S, isolation_level=None, check_same_thread=False)
+        self.connection = sqlite3.connect(
+            str(path), timeout=_BUSY_S, isolation_level=None, check_same_thread=False
+        )
         self._path = path
         try:
-            self._set_up(path, durability, max_file_bytes)
+            self._set_up(durability)
         except BaseException:
             self.abandon()
             raise
 
-    def _set_up(self, path: Path, durability: str, max_file_bytes: int | None) -> None:
-        run = self._db.execute
+    def _set_up(self, durability: str) -> None:
+        run = self.connection.execute
         # Takes effect in a new file only, and lets the file shrink again.
         run("PRAGMA auto_vacuum = INCREMENTAL")
-        self._check_owner(path)
+        version = self._known_version()
         run("PRAGMA journal_mode = WAL")
         # FULL syncs the log with every commit; NORMAL leaves that to the kernel, and the checkpoint.
         run(f"PRAGMA synchronous = {'FULL' if durability == FULL else 'NORMAL'}")
         run(f"PRAGMA journal_size_limit = {_LOG_BYTES}")
-        if max_file_bytes is not None:
-            run(f"PRAGMA max_page_count = {max_file_bytes // self._number('page_size')}")
-        if not self._number("user_version"):
-            self._db.executescript(_SCHEMA)
-        self._inode = path.stat().st_ino
+        if version == 0:
+            self.connection.executescript(_SCHEMA)
+        elif version == 1:
+            self._upgrade()
+        self._stat = self._path.stat()
 
-    def _check_owner(self, path: Path) -> None:
-        """Refuse the file of another program: it must be neither written to nor moved away."""
+    def _known_version(self) -> int:
+        """The file's version, 0 for a new file. The file of another program must be neither written to nor
+        moved away."""
         owner, version = self._number("application_id"), self._number("user_version")
-        empty = self._db.execute("SELECT count(*) FROM sqlite_master").fetchone()[0] == 0
+        empty = self.connection.execute("SELECT count(*) FROM sqlite_master").fetchone()[0] == 0
         if empty and (owner, version) == (0, 0):
-            return
+            return 0
         if owner != _APPLICATION_ID:
-            raise ForeignFileError("it is a database of another program")
-        if version != _VERSION:
+            raise sqlite3.DatabaseError("it is a database of another program")
+        if version not in (1, _VERSION):
             raise AgentError(
-                f"{path}: was written by another version of iort-agent (format {version}, this one knows "
-                f"{_VERSION}): let that version send what is in it, or move the file away"
+                f"{self._path}: was written by another version of iort-agent (format {version}, this one "
+                f"knows 1 and {_VERSION}): let that version send what is in it, or move the file away"
             )
+        return version
 
-    @property
-    def connection(self) -> sqlite3.Connection:
-        """The connection, to read from."""
-        return self._db
+    def _upgrade(self) -> None:
+        """Make a file of version 1 one of this version. Its batches stay; the name of the run that wrote
+        them is in the batches."""
+        run = self.connection.execute
+        next_seqs = dict(run("SELECT stream, next_seq FROM streams"))
+        last = run("SELECT stream, payload, max(id) FROM batches GROUP BY stream").fetchall()
+        self.connection.executescript(_FROM_VERSION_1)
+        for stream, payload, _ in last:
+            with contextlib.suppress(ValueError, KeyError, TypeError):  # not a batch of today
+                boot = batch_id(json.loads(payload)["batch"]).boot
+                run("INSERT INTO runs VALUES (?, ?, ?)", (stream, boot, next_seqs[stream] - 1))
+        run("COMMIT")
 
     def in_place(self) -> bool:
         """Whether the file is still the one at its path; SQLite would go on in a removed one."""
         try:
-            return self._path.stat().st_ino == self._inode
+            return os.path.samestat(self._path.stat(), self._stat)
         except OSError:
             return False
 
-    def check(self) -> None:
-        """Read all of it; raises `sqlite3.DatabaseError` where it is damaged."""
-        (answer,) = self._db.execute("PRAGMA quick_check(1)").fetchone()
-        if answer != "ok":
-            raise sqlite3.DatabaseError(answer)
+    def totals(self) -> tuple[int, Backlog]:
+        """The highest id, and what is in the file."""
+        counts = "SELECT max(id), count(*), total(samples), total(bytes) FROM batches INDEXED BY sizes"
+        last, *kept = self.connection.execute(counts).fetchone()
+        return last or 0, Backlog(*map(int, kept))
 
-    def load(self) -> Content:
-        """What is in the file."""
-        batches = self._db.execute("SELECT id, bytes, samples FROM batches INDEXED BY ledger ORDER BY id")
-        seqs = dict(self._db.execute("SELECT stream, next_seq FROM streams"))
-        dropped = self._db.execute("SELECT batches, samples FROM dropped").fetchone()
-        return Content(batches.fetchall(), seqs, Dropped(*(dropped or (0, 0))))
+    def runs(self) -> dict[str, tuple[RunEnd, ...]]:
+        """The newest runs that the cloud may not know of, by stream, and the last number of each."""
+        found: dict[str, tuple[RunEnd, ...]] = {}
+        for stream, boot, seq in self.connection.execute("SELECT * FROM runs ORDER BY rowid"):
+            found[stream] = (*found.get(stream, ()), RunEnd(boot, seq))[-MAX_PREVIOUS:]
+        return found
 
     def commit(
         self,
         entries: Iterable[Entry],
         *,
         gone: Collection[int] = (),
-        seqs: Mapping[str, int] | None = None,
-        dropped: Dropped | None = None,
+        ends: Mapping[str, RunEnd] | None = None,
+        told: Collection[tuple[str, str]] = (),
     ) -> None:
-        """Write and delete batches, and note the streams' next numbers, in one transaction. Doing it
-        again does no harm: an error does not always mean that nothing was written."""
+        """In one transaction: write ``entries``, delete the batches ``gone``, note the last numbers ``ends``
+        by stream, and forget the runs ``told``, by stream and name. It may be repeated, since an error
+        does not always mean that nothing was written."""
         if not self.in_place():
             raise sqlite3.DatabaseError("it was removed")
-        run, many = self._db.execute, self._db.executemany
+        run, many = self.connection.execute, self.connection.executemany
         run("BEGIN IMMEDIATE")
         try:
             many("DELETE FROM batches WHERE id = ?", [(entry_id,) for entry_id in gone])
@@ -142,124 +208,65 @@ class SpoolFile:
                 "INSERT OR REPLACE INTO batches VALUES (?, ?, ?, ?, ?, ?, ?)",
                 [(e.id, e.stream, e.seq, e.samples, len(e.payload), _crc(e), e.payload) for e in entries],
             )
-            many("INSERT OR REPLACE INTO streams VALUES (?, ?)", list((seqs or {}).items()))
-            if dropped is not None:
-                run("INSERT OR REPLACE INTO dropped VALUES (0, ?, ?)", dropped)
+            ended = [(stream, end.boot, end.seq) for stream, end in (ends or {}).items()]
+            many("INSERT OR REPLACE INTO runs VALUES (?, ?, ?)", ended)
+            many("DELETE FROM runs WHERE stream = ? AND boot = ?", list(told))
             run("COMMIT")
         except BaseException:
             with contextlib.suppress(sqlite3.Error):
-                if self._db.in_transaction:
+                if self.connection.in_transaction:
                     run("ROLLBACK")
             raise
 
-    def read(self, first: int, max_bytes: int) -> list[Entry]:
-        """The batches from that id on, at least one if there is one, until they reach so many bytes.
+    def read(self, after: int, to: int) -> list[Entry]:
+        """The batches with an id greater than ``after``, up to ``to``: all of them, or as many as a read
+        may have. Raises `sqlite3.DatabaseError` if a batch is not as it was written."""
+        rows = "id > ? AND id <= ? ORDER BY id LIMIT ?"
+        return read_batches(self.connection, rows, (after, to, READ_ENTRIES))
 
-        Raises `sqlite3.DatabaseError` where a batch is not as it was written.
-        """
-        return _read(self._db, "id >= ?", first, max_bytes)
+    def oldest(self, after: int, max_batches: int) -> list[tuple[int, int, int]]:
+        """Id, samples and bytes of the oldest batches with an id greater than ``after``."""
+        sizes = "SELECT id, samples, bytes FROM batches INDEXED BY sizes WHERE id > ? ORDER BY id LIMIT ?"
+        return self.connection.execute(sizes, (after, max_batches)).fetchall()
 
     def move_ids(self, offset: int) -> None:
         """Add the offset, which is no less than any id, to the ids."""
-        self._db.execute("UPDATE batches SET id = id + ?", (offset,))
+        self.connection.execute("UPDATE batches SET id = id + ?", (offset,))
+
+    def check_writable(self) -> None:
+        """Raises `sqlite3.Error` if the disk does not work, or another program has locked the file."""
+        self.connection.execute("BEGIN IMMEDIATE")
+        self.connection.execute("ROLLBACK")
 
     def shrink(self) -> bool:
         """Give some unused pages back to the disk; whether there may be more."""
         if self._number("freelist_count") < _SHRINK_PAGES:
             return False
-        # Every page is a step, of which only a script takes more than the first.
-        self._db.executescript(f"PRAGMA incremental_vacuum({_SHRINK_PAGES})")
+        # Every page is a step, and only a script takes more than the first.
+        self.connection.executescript(f"PRAGMA incremental_vacuum({_SHRINK_PAGES})")
         return True
 
     def close(self) -> None:
         """Write everything into the one file, and on the disk, and close it."""
-        self._db.execute("PRAGMA wal_checkpoint(TRUNCATE)").fetchall()
-        self._db.close()
+        self.connection.execute("PRAGMA wal_checkpoint(TRUNCATE)").fetchall()
+        self.connection.close()
 
     def abandon(self) -> None:
         """Close it as it is."""
         with contextlib.suppress(sqlite3.Error):
-            self._db.close()
+            self.connection.close()
 
     def _number(self, pragma: str) -> int:
-        return int(self._db.execute(f"PRAGMA {pragma}").fetchone()[0])
+        return int(self.connection.execute(f"PRAGMA {pragma}").fetchone()[0])
 
 
-def is_damage(error: Exception) -> bool:
-    """Whether the file's content is at fault. A disk that is full, read-only or failing raises
-    `sqlite3.OperationalError`, and so does a file locked by another program."""
-    return isinstance(error, sqlite3.DatabaseError) and not isinstance(error, sqlite3.OperationalError)
-
-
-def set_aside(path: Path, now_us: int) -> Path:
-    """Rename the file, with its log; only the newest few of those set aside are kept."""
-    now = dt.datetime.fromtimestamp(now_us / 1_000_000, dt.timezone.utc)
-    aside = path.with_name(f"{path.name}.corrupt-{now:%Y%m%dT%H%M%S.%fZ}")
-    # The log first: alone, the database is still one, while the new one must not find this log.
-    for suffix in reversed(_SUFFIXES):
-        with contextlib.suppress(FileNotFoundError):
-            Path(f"{path}{suffix}").replace(f"{aside}{suffix}")
-    files = [str(file) for file in path.parent.glob(f"{path.name}.corrupt-*")]
-    ours = {file[:-4] if file.endswith(_SUFFIXES[1:]) else file for file in files}
-    for old in sorted(ours)[:-_SET_ASIDE_KEPT]:
-        remove(Path(old))
-    return aside
-
-
-def remove(path: Path) -> None:
-    """Remove a file, with its log, if it is there."""
-    for suffix in _SUFFIXES:
-        with contextlib.suppress(OSError):
-            Path(f"{path}{suffix}").unlink()
-
-
-class Salvage(NamedTuple):
-    """What has become of a damaged file's batches, as far as they are known: ids and samples."""
-
-    saved: dict[int, int]
-    lost: dict[int, int]
-
-
-def salvage(aside: Path | SpoolFile, into: SpoolFile, ids: Iterable[int] | None = None) -> Salvage:
-    """Copy what is still good in a damaged file, or one still open: of those ids, or of all."""
-    saved: dict[int, int] = {}
-    try:
-        db = aside.connection if isinstance(aside, SpoolFile) else sqlite3.connect(str(aside))
-    except sqlite3.Error:
-        return Salvage({}, {})
-    try:
-        known = _known(db) if ids is None else dict.fromkeys(ids, 0)
-        group: list[Entry] = []
-        for entry_id in sorted(known):
-            with contextlib.suppress(sqlite3.Error):
-                group += _read(db, "id = ?", entry_id)
-            if len(group) >= _SALVAGE_GROUP:
-                into.commit(group)
-                saved.update((entry.id, entry.samples) for entry in group)
-                group = []
-        into.commit(group)
-        saved.update((entry.id, entry.samples) for entry in group)
-    finally:
-        with contextlib.suppress(sqlite3.Error):
-            db.close()
-    return Salvage(saved, {entry_id: n for entry_id, n in known.items() if entry_id not in saved})
-
-
-def _known(db: sqlite3.Connection) -> dict[int, int]:
-    """The ids that either the table or its index still knows, and the samples."""
-    known: dict[int, int] = {}
-    for source in ("batches NOT INDEXED", "batches INDEXED BY ledger"):
-        for order in ("ASC", "DESC"):
-            with contextlib.suppress(sqlite3.Error):
-                known.update(db.execute(f"SELECT id, samples FROM {source} ORDER BY id {order}"))  # noqa: S608 - names of our own
-    return {i: n for i, n in known.items() if type(i) is int and type(n) is int}
-
-
-def _read(db: sqlite3.Connection, where: str, first: int, max_bytes: int | None = None) -> list[Entry]:
-    entries, total = [], 0
+def read_batches(db: sqlite3.Connection, where: str, values: tuple[int, ...]) -> list[Entry]:
+    """The batches that fulfil a condition, until they reach the size of a read. Raises
+    `sqlite3.DatabaseError` if one is not as it was written."""
+    entries, size = [], 0
     rows = db.execute(
-        f"SELECT id, stream, seq, samples, crc, payload FROM batches WHERE {where} ORDER BY id",  # noqa: S608 - conditions of our own
-        (first,),
+        f"SELECT id, stream, seq, samples, crc, payload FROM batches WHERE {where}",  # noqa: S608 - conditions of our own
+        values,
     )
     try:
         for entry_id, stream, seq, samples, crc, payload in rows:
@@ -267,8 +274,8 @@ def _read(db: sqlite3.Connection, where: str, first: int, max_bytes: int | None 
             if type(payload) is not bytes or crc != _crc(entry):
                 raise sqlite3.DatabaseError(f"batch {entry_id} is not as it was written")
             entries.append(entry)
-            total += len(payload)
-            if max_bytes is not None and total >= max_bytes:
+            size += len(payload)
+            if size >= READ_BYTES:
                 break
     finally:
         # A statement left open would keep the log from being emptied.

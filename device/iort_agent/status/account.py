@@ -5,9 +5,9 @@ from __future__ import annotations
 from typing import Any, Callable, Iterator, Mapping, Sequence, Tuple
 
 from iort_agent.clock import Clock
-from iort_agent.lanes.batch import StreamCounts
+from iort_agent.lanes.batch_encoder import StreamCounts
 from iort_agent.lanes.streams import Streams
-from iort_agent.spool.memory import Spool
+from iort_agent.spool.interface import Spool
 from iort_contract.catalog.streams import ACCOUNT_STREAM
 from iort_contract.messages.account import ACCOUNT_EVERY_S, SourceAccount, StreamAccount
 
@@ -42,29 +42,33 @@ class Accounts:
         batch is closed."""
         self._told, self._lost = self._clock.monotonic(), self._losses()
         now_us = self._clock.now_us()
-        counted = self._streams.counted()
+        counted = self._streams.counts()
         for name in sorted({*self._expected, *counted} - {ACCOUNT_STREAM}):
-            counts, next_seq = counted.get(name, (StreamCounts(), 0))
+            counts = counted.get(name, StreamCounts())
             account = StreamAccount(
                 stream=name,
                 taken=counts.samples,
                 stored=counts.stored,
                 refused=counts.refused,
                 nulled=counts.nulled,
-                first_seq=counts.first_seq,
-                next_seq=next_seq,
+                first_seq=0,
+                next_seq=counts.batches,
                 ended=ended,
             )
             self._streams.record(ACCOUNT_STREAM, now_us, account.sample())
         dropped = self._spool.dropped()
-        queue = {"dropped_batches": dropped.batches, "dropped_samples": dropped.samples}
+        queue = {
+            "dropped_batches": dropped.batches,
+            "dropped_samples": dropped.samples,
+            "damaged_files": self._spool.damaged,
+        }
         for source, report in [("queue", queue), *((name, report()) for name, report in self._reports)]:
             found = {path: count for path, count in _counts(report, "") if count}
             if found:
                 self._streams.record(ACCOUNT_STREAM, now_us, SourceAccount(source, found).sample())
 
     def _losses(self) -> int:
-        return self._streams.refused() + self._spool.dropped().samples
+        return self._streams.refused() + self._spool.dropped().samples + self._spool.damaged
 
 
 def _counts(report: Mapping[str, Any], prefix: str) -> Iterator[tuple[str, int]]:

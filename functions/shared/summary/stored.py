@@ -83,10 +83,11 @@ class Reader:
         # A robot may leave a hole before every batch.
         self.check()
         ids = [entry.batch.id for entry in stored]
-        missing = missing_before(batch.id, ids)
+        missing = missing_before(batch.id, ids, batch.previous)
         if missing:
             # Clocks may interleave: what is missing here may lie some seconds to the side.
-            missing = missing_before(batch.id, sorted({*ids, *self._numbers(batch.t_us // _SECOND_US)}))
+            near = sorted({*ids, *self._numbers(batch.t_us // _SECOND_US)})
+            missing = missing_before(batch.id, near, batch.previous)
         return missing
 
     def _numbers(self, second: int) -> list[BatchId]:

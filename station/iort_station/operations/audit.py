@@ -1,12 +1,13 @@
 """The audit of a stream's delivery: batches expected, stored, missing, duplicated and late.
 
-The agent numbers each stream's batches without gaps, also over restarts if its queue has a file. A number
-between two stored ones that is not stored is a batch that was lost, or that still waits in the car.
+Each run of the agent numbers its batches of a stream from 0 without gaps, and its first batches name the runs
+before it with their last numbers, as far as its queue knows. A number that is not stored is a batch that was
+lost, or that still waits in the car. Earlier agents numbered on over restarts if the queue had a file.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import pairwise
 from typing import Any, NamedTuple
@@ -14,8 +15,8 @@ from typing import Any, NamedTuple
 from iort_contract.catalog.streams import AGENT_STREAM
 from iort_contract.dynamodb import plain, starting_between
 from iort_contract.limits import ContractError
-from iort_contract.messages.batch import Batch, BatchId, batch_id, decode_batch
-from iort_contract.tables import BATCH, RECEIVED_MS, SAMPLES
+from iort_contract.messages.batch import Batch, BatchId, RunEnd, batch_id, decode_batch, run_ends
+from iort_contract.tables import BATCH, PREVIOUS, RECEIVED_MS, SAMPLES
 from iort_station.cloud import Cloud
 from iort_station.data.batches import telemetry_table, topic_of
 
@@ -30,6 +31,7 @@ class Header(NamedTuple):
     id: BatchId
     samples: int
     received_ms: int
+    previous: tuple[RunEnd, ...] | None
 
 
 class Missing(NamedTuple):
@@ -73,6 +75,13 @@ class RunAudit:
         return self.batches + sum(gap.batches for gap in self.missing)
 
 
+class LostRun(NamedTuple):
+    """A run that a later one names, and of whose batches none is stored."""
+
+    boot: str
+    batches: int
+
+
 class Shortfall(NamedTuple):
     """Samples that a run took and that are not stored, with the cause; None if their number is unknown."""
 
@@ -99,11 +108,13 @@ class Audit:
     dropped: int | None = None
     taken: int | None = None
     shortfalls: tuple[Shortfall, ...] = ()
+    lost_runs: tuple[LostRun, ...] = ()
 
     @property
     def missing(self) -> int:
         """The number of missing batches in all runs."""
-        return sum(gap.batches for run in self.runs for gap in run.missing)
+        stored_runs = sum(gap.batches for run in self.runs for gap in run.missing)
+        return stored_runs + sum(run.batches for run in self.lost_runs)
 
     @property
     def complete(self) -> bool:
@@ -128,34 +139,74 @@ def audit(
             boots.setdefault(header.id.boot, []).append(header)
     # By arrival, since the car's clock may have been set back between two runs.
     in_order = sorted(boots.values(), key=lambda found: min(header.received_ms for header in found))
+    ends = _ends(in_order)
     runs: list[RunAudit] = []
     before_first = 0
+    numbered_on: RunAudit | None = None
     for found in in_order:
-        run = _run(found, late_ms)
-        gap = _before(runs[-1] if runs else None, run)
+        run = _run(found, ends.get(found[0].id.boot, -1), late_ms)
+        from_0 = any(stored.previous is not None for stored in found)
+        first = _first(None if from_0 else numbered_on, run)
         if not runs and not from_start:
             before_first = run.first_seq
-        elif gap is not None:
-            run.missing.insert(0, gap)
+        elif run.first_seq > first:
+            after_us = runs[-1].last_us if runs else None
+            run.missing.insert(0, Missing(first, run.first_seq - 1, after_us, run.first_us))
         runs.append(run)
-    return Audit(stream, runs, before_first, refused)
+        numbered_on = numbered_on if from_0 else run
+    lost_runs = tuple(_lost_runs(in_order, ends, from_start=from_start))
+    return Audit(stream, runs, before_first, refused, lost_runs=lost_runs)
+
+
+def _ends(runs: Iterable[Sequence[Header]]) -> dict[str, int]:
+    """The last number of each run that a batch names."""
+    ends: dict[str, int] = {}
+    for found in runs:
+        for boot, seq in (end for stored in found for end in stored.previous or ()):
+            ends[boot] = max(seq, ends.get(boot, -1))
+    return ends
+
+
+def _lost_runs(
+    in_order: Sequence[Sequence[Header]], ends: Mapping[str, int], *, from_start: bool
+) -> Iterator[LostRun]:
+    """The named runs of which nothing is stored. Those before the first stored one have expired, or are out
+    of the range, or were lost."""
+    names = [found[0].id.boot for found in in_order]
+    seen = set(names)
+    for i, found in enumerate(in_order):
+        for previous in (stored.previous for stored in found if stored.previous):
+            named = [end.boot for end in previous]
+            # A run that was stored earlier and is not named is older than those that are.
+            within = from_start or not set(names[:i]) <= set(named)
+            for boot in named:
+                within |= boot in names
+                if within and boot not in seen:
+                    seen.add(boot)
+                    yield LostRun(boot, ends[boot] + 1)
 
 
 def _header(item: Mapping[str, Any]) -> Header | None:
     """The item's header; None if it is not a batch."""
     try:
-        header = Header(batch_id(item[BATCH]), int(item[SAMPLES]), int(item[RECEIVED_MS]))
+        previous = run_ends(item[PREVIOUS]) if PREVIOUS in item else None
+        header = Header(batch_id(item[BATCH]), int(item[SAMPLES]), int(item[RECEIVED_MS]), previous)
     except (ContractError, KeyError, TypeError, ValueError, ArithmeticError):
         return None
     return header if header.samples >= 1 else None
 
 
-def _run(found: list[Header], late_ms: int) -> RunAudit:
+def _run(found: Sequence[Header], last: int, late_ms: int) -> RunAudit:
     by_seq = {header.id.seq: header for header in found}
     seqs = sorted(by_seq)
     times_us = [header.id.t_us for header in found]
     took_ms = [header.received_ms - header.id.t_us // 1000 for header in found]
     excess_ms = [took - min(took_ms) for took in took_ms]
+    missing = [
+        Missing(a + 1, b - 1, by_seq[a].id.t_us, by_seq[b].id.t_us) for a, b in pairwise(seqs) if b > a + 1
+    ]
+    if last > seqs[-1]:
+        missing.append(Missing(seqs[-1] + 1, last, by_seq[seqs[-1]].id.t_us, None))
     return RunAudit(
         boot=found[0].id.boot,
         first_seq=seqs[0],
@@ -167,23 +218,15 @@ def _run(found: list[Header], late_ms: int) -> RunAudit:
         duplicated=len(found) - len(seqs),
         late=sum(excess > late_ms for excess in excess_ms),
         latest_ms=max(excess_ms),
-        missing=[
-            Missing(a + 1, b - 1, by_seq[a].id.t_us, by_seq[b].id.t_us)
-            for a, b in pairwise(seqs)
-            if b > a + 1
-        ],
+        missing=missing,
         samples_of={seq: header.samples for seq, header in by_seq.items()},
     )
 
 
-def _before(previous: RunAudit | None, run: RunAudit) -> Missing | None:
-    """The numbers missing between two runs. A run that starts at a lower number lost its queue; then only its
-    own start is known."""
-    continued = previous is not None and run.first_seq > previous.last_seq
-    first = previous.last_seq + 1 if previous is not None and continued else 0
-    if run.first_seq == first:
-        return None
-    return Missing(first, run.first_seq - 1, previous.last_us if previous else None, run.first_us)
+def _first(previous: RunAudit | None, run: RunAudit) -> int:
+    """The number that a run began with: 0, or the one after those of the run before, where runs numbered on.
+    A number that starts again lower is a queue that was lost."""
+    return previous.last_seq + 1 if previous is not None and run.first_seq > previous.last_seq else 0
 
 
 def headers(
@@ -191,7 +234,7 @@ def headers(
 ) -> Iterator[dict[str, Any]]:
     """The stored batches that start between two times, both inclusive, without their samples."""
     keys = starting_between(first_us, last_us)
-    attributes = (BATCH, SAMPLES, RECEIVED_MS)
+    attributes = (BATCH, SAMPLES, RECEIVED_MS, PREVIOUS)
     for page in telemetry_table(cloud).pages(topic_of(cloud, robot, stream), keys, attributes=attributes):
         for item in page.items:
             # Strings and numbers only, so no deserializer is needed.

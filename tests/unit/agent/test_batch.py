@@ -12,8 +12,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from iort_agent.lanes.batch import MAX_VALUES, Batcher, StreamCounts
-from iort_agent.lanes.batch_encoder import Packer
+from iort_agent.lanes.batch_encoder import MAX_VALUES, BatchEncoder, StreamCounts, _Open
 from iort_agent.spool.memory import MemorySpool
 from iort_contract.limits import MAX_BATCH_VALUES, MAX_MESSAGE_BYTES
 from iort_contract.messages.batch import Batch, decode_batch, messages_of
@@ -26,14 +25,16 @@ BOOT = "0123456789abcdef"
 
 
 class Line:
-    """A batcher, a packer and a spool in a row, as the agent wires them."""
+    """An encoder and a spool in a row, as the agent wires them."""
 
     def __init__(self, *, batch_s: float = 1.0) -> None:
         self.clock = ManualClock(now_us=T0)
-        self.counts = StreamCounts()
         self.spool = MemorySpool(max_bytes=2**40)
-        self.packer = Packer(stream="vesc", boot=BOOT, spool=self.spool, counts=self.counts)
-        self.batcher = Batcher(self.packer.store, batch_s=batch_s, clock=self.clock, counts=self.counts)
+        self.encoder = BatchEncoder("vesc", boot=BOOT, batch_s=batch_s, spool=self.spool, clock=self.clock)
+
+    @property
+    def counts(self) -> StreamCounts:
+        return self.encoder.counts()
 
     def messages(self) -> list[bytes]:
         out, after = [], 0
@@ -82,10 +83,10 @@ def test_every_sample_comes_out_once_and_as_it_was(
 ) -> None:
     line = Line(batch_s=batch_s)
     for t_us, values, pause_s in drive:
-        line.batcher.add(t_us, values)
+        line.encoder.add(t_us, values)
         line.clock.advance(pause_s)
-        line.batcher.tick()
-    line.batcher.flush()
+        line.encoder.tick()
+    line.encoder.flush()
 
     given = [(t_us, sorted(values.items(), key=repr)) for t_us, values, _ in drive]
     stored = [(t_us, sorted(values.items(), key=repr)) for t_us, values in line.samples()]
@@ -109,28 +110,28 @@ def test_every_sample_comes_out_once_and_as_it_was(
 def test_a_batch_closes_with_the_second() -> None:
     line = Line()
     for i in range(100):
-        line.batcher.add(T0 + i * 20_000, {"speed": i})
+        line.encoder.add(T0 + i * 20_000, {"speed": i})
         line.clock.advance(0.02)
     assert [len(batch.times_us) for batch in line.batches()] == [50]
-    line.batcher.flush()
+    line.encoder.flush()
     assert [len(batch.times_us) for batch in line.batches()] == [50, 50]
 
 
 def test_one_sample_a_message_as_the_thesis() -> None:
     line = Line(batch_s=0)
     for i in range(5):
-        line.batcher.add(T0 + i * 20_000, {"speed": i})
+        line.encoder.add(T0 + i * 20_000, {"speed": i})
     assert [len(batch.times_us) for batch in line.batches()] == [1, 1, 1, 1, 1]
 
 
 def test_a_silent_topic_closes_its_batch_by_the_clock() -> None:
     line = Line()
-    line.batcher.add(T0, {"speed": 1})
+    line.encoder.add(T0, {"speed": 1})
     line.clock.advance(0.9)
-    line.batcher.tick()
+    line.encoder.tick()
     assert line.batches() == []
     line.clock.advance(0.3)
-    line.batcher.tick()
+    line.encoder.tick()
     assert len(line.batches()) == 1
 
 
@@ -146,8 +147,8 @@ def test_a_silent_topic_closes_its_batch_by_the_clock() -> None:
 def test_times_are_kept_and_put_in_order_within_a_batch(stamps: list[int], batches: list[list[int]]) -> None:
     line = Line()
     for i, stamp in enumerate(stamps):
-        line.batcher.add(T0 + stamp, {"speed": i})
-    line.batcher.flush()
+        line.encoder.add(T0 + stamp, {"speed": i})
+    line.encoder.flush()
     assert [[t - T0 for t in batch.times_us] for batch in line.batches()] == batches
     assert sorted((t - T0, values["speed"]) for t, values in line.samples()) == sorted(
         (stamp, i) for i, stamp in enumerate(stamps)
@@ -157,9 +158,9 @@ def test_times_are_kept_and_put_in_order_within_a_batch(stamps: list[int], batch
 def test_samples_of_one_time_stay_in_the_order_in_which_they_came() -> None:
     line = Line()
     for i in (3, 1, 2):
-        line.batcher.add(T0 + 5, {"speed": i})
-    line.batcher.add(T0, {"speed": 0})
-    line.batcher.flush()
+        line.encoder.add(T0 + 5, {"speed": i})
+    line.encoder.add(T0, {"speed": 0})
+    line.encoder.flush()
     assert [values["speed"] for _, values in line.samples()] == [0, 3, 1, 2]
 
 
@@ -169,10 +170,10 @@ def test_clocks_that_interleave_take_no_more_batches_than_they_would_alone(behin
     line, period_us = Line(), 20_000
     for i in range(500):
         for t_us in (T0 + i * period_us, T0 + i * period_us - behind_us):
-            line.batcher.add(t_us, {"i": i})
+            line.encoder.add(t_us, {"i": i})
             line.clock.advance(period_us / 2e6)
-            line.batcher.tick()
-    line.batcher.flush()
+            line.encoder.tick()
+    line.encoder.flush()
     assert len(line.samples()) == 1000
     assert sum(t_us < T0 for t_us, _ in line.samples()) == behind_us // period_us
     # Ten seconds of each, and where they begin and end.
@@ -184,29 +185,29 @@ def test_clocks_that_interleave_take_no_more_batches_than_they_would_alone(behin
 def test_of_too_many_open_seconds_the_oldest_is_closed() -> None:
     line = Line()
     for second in range(20):
-        line.batcher.add(T0 + second * 1_000_000, {"speed": second})
+        line.encoder.add(T0 + second * 1_000_000, {"speed": second})
     assert [batch.t_us - T0 for batch in line.batches()] == [i * 1_000_000 for i in range(12)]
-    line.batcher.flush()
+    line.encoder.flush()
     assert [values["speed"] for _, values in line.samples()] == list(range(20))
 
 
 def test_a_second_that_was_closed_is_opened_again() -> None:
     line = Line()
-    line.batcher.add(T0, {"speed": 0})
+    line.encoder.add(T0, {"speed": 0})
     line.clock.advance(1.0)
-    line.batcher.add(T0 + 1_000_000, {"speed": 1})
+    line.encoder.add(T0 + 1_000_000, {"speed": 1})
     assert len(line.batches()) == 1
-    line.batcher.add(T0 + 10, {"speed": 2})
-    line.batcher.flush()
+    line.encoder.add(T0 + 10, {"speed": 2})
+    line.encoder.flush()
     assert [[t - T0 for t in batch.times_us] for batch in line.batches()] == [[0], [1_000_000], [10]]
     assert len({batch.id for batch in line.batches()}) == 3
 
 
 def test_before_1970_there_is_no_sample() -> None:
     line = Line()
-    line.batcher.add(-1, {"speed": 1})
-    line.batcher.add(0, {"speed": 2})
-    line.batcher.flush()
+    line.encoder.add(-1, {"speed": 1})
+    line.encoder.add(0, {"speed": 2})
+    line.encoder.flush()
     assert [values["speed"] for _, values in line.samples()] == [2]
     assert (line.counts.refused, line.counts.stored) == (1, 1)
 
@@ -215,9 +216,9 @@ def test_another_set_of_fields_is_another_message_and_not_another_second() -> No
     """Two arms that take turns on one topic: two messages a second, however they take them."""
     line = Line()
     for i in range(50):
-        line.batcher.add(T0 + 2 * i, {"a": i, "b": 2} if i % 2 else {"b": 3, "a": i})
-        line.batcher.add(T0 + 2 * i + 1, {"a": None})
-    line.batcher.flush()
+        line.encoder.add(T0 + 2 * i, {"a": i, "b": 2} if i % 2 else {"b": 3, "a": i})
+        line.encoder.add(T0 + 2 * i + 1, {"a": None})
+    line.encoder.flush()
     both, one = line.batches()
     assert dict(both.columns) == {"a": list(range(50)), "b": [2 if i % 2 else 3 for i in range(50)]}
     assert dict(one.columns) == {"a": [None] * 50}
@@ -227,8 +228,8 @@ def test_another_set_of_fields_is_another_message_and_not_another_second() -> No
 def test_samples_without_a_field_are_samples_too() -> None:
     line = Line()
     for i in range(3):
-        line.batcher.add(T0 + i, {})
-    line.batcher.flush()
+        line.encoder.add(T0 + i, {})
+    line.encoder.flush()
     (batch,) = line.batches()
     assert (batch.times_us, dict(batch.columns)) == ([T0, T0 + 1, T0 + 2], {})
 
@@ -236,11 +237,11 @@ def test_samples_without_a_field_are_samples_too() -> None:
 def test_messages_of_two_types_and_plain_samples_are_a_message_each() -> None:
     line = Line()
     for i in range(3):
-        line.batcher.add(T0 + i, RosMessage(struct.pack("<d", i / 2), A))
-        line.batcher.add(T0 + i, RosMessage(text("on"), B))
-        line.batcher.add(T0 + i, {"speed": 7})
-        line.batcher.add(T0 + i, RosMessage(text("on"), B, beside={"note": "n"}))
-    line.batcher.flush()
+        line.encoder.add(T0 + i, RosMessage(struct.pack("<d", i / 2), A))
+        line.encoder.add(T0 + i, RosMessage(text("on"), B))
+        line.encoder.add(T0 + i, {"speed": 7})
+        line.encoder.add(T0 + i, RosMessage(text("on"), B, beside={"note": "n"}))
+    line.encoder.flush()
     assert [dict(batch.columns) for batch in line.batches()] == [
         {"speed": [0, 0.5, 1]},
         {"mode": ["on"] * 3},
@@ -262,8 +263,8 @@ def test_a_message_that_its_type_does_not_fit_costs_nothing() -> None:
     line = Line()
     raws = [struct.pack("<d", 1.5), b"short", b"", struct.pack("<d", 2.5)]
     for i, raw in enumerate(raws):
-        line.batcher.add(T0 + i, RosMessage(raw, A))
-    line.batcher.flush()
+        line.encoder.add(T0 + i, RosMessage(raw, A))
+    line.encoder.flush()
     (payload,) = line.messages()
     batch, messages = messages_of(payload, {})
     assert messages is not None
@@ -277,8 +278,8 @@ def test_a_batch_of_messages_closes_near_the_limit_of_a_message(size: int) -> No
     line, noise = Line(), random.Random(size)
     raws = [random_bytes(noise, size) for _ in range(300_000 // size)]
     for i, raw in enumerate(raws):
-        line.batcher.add(T0 + i, RosMessage(raw, A))
-    line.batcher.flush()
+        line.encoder.add(T0 + i, RosMessage(raw, A))
+    line.encoder.flush()
     assert all(len(payload) <= MAX_MESSAGE_BYTES for payload in line.messages())
     found = [messages_of(payload, {})[1] for payload in line.messages()]
     assert [raw for messages in found if messages is not None for raw in messages.raw] == raws
@@ -291,8 +292,8 @@ def test_a_message_that_is_too_large_is_refused_alone() -> None:
     line, noise = Line(), random.Random(1)
     raws = [random_bytes(noise, 10), random_bytes(noise, 200_000), random_bytes(noise, 10)]
     for i, raw in enumerate(raws):
-        line.batcher.add(T0 + i, RosMessage(raw, A))
-    line.batcher.flush()
+        line.encoder.add(T0 + i, RosMessage(raw, A))
+    line.encoder.flush()
     found = [messages_of(payload, {})[1] for payload in line.messages()]
     assert [raw for messages in found if messages is not None for raw in messages.raw] == [raws[0], raws[2]]
     assert (line.counts.refused, line.counts.stored) == (1, 2)
@@ -303,8 +304,8 @@ def test_messages_stay_below_the_limit() -> None:
     names = [f"f{i}" for i in range(400)]
     for i in range(200):
         # Doubles without a pattern, which no compression helps.
-        line.batcher.add(T0 + i * 1000, {name: math.sin(i * 7919 + k) for k, name in enumerate(names)})
-    line.batcher.flush()
+        line.encoder.add(T0 + i * 1000, {name: math.sin(i * 7919 + k) for k, name in enumerate(names)})
+    line.encoder.flush()
     assert len(line.samples()) == 200
     assert all(len(message) <= MAX_MESSAGE_BYTES for message in line.messages())
     assert all(len(b.times_us) * 400 <= MAX_VALUES for b in line.batches())
@@ -314,7 +315,9 @@ def test_messages_stay_below_the_limit() -> None:
 def test_what_holds_too_many_values_for_a_batch_is_halved() -> None:
     line = Line()
     fields = dict.fromkeys((f"f{i}" for i in range(300)), 0)
-    line.packer.store([(t_us, fields) for t_us in range(400)])
+    # Nothing closes the batch before it is flushed: with so many fields, its values alone would.
+    line.encoder._open[0, 0] = _Open(0.0, [(t_us, fields) for t_us in range(400)])
+    line.encoder.flush()
     assert [t_us for t_us, _ in line.samples()] == list(range(400))
     assert [len(batch.times_us) for batch in line.batches()] == [100] * 4
     assert all(len(batch.times_us) * 300 <= MAX_BATCH_VALUES for batch in line.batches())
@@ -330,8 +333,8 @@ def test_what_holds_too_many_values_for_a_batch_is_halved() -> None:
 def test_a_bad_value_costs_only_its_sample(bad: Any) -> None:
     line = Line()
     for i in range(20):
-        line.batcher.add(T0 + i, {"speed": bad if i == 13 else i})
-    line.batcher.flush()
+        line.encoder.add(T0 + i, {"speed": bad if i == 13 else i})
+    line.encoder.flush()
     assert [values["speed"] for _, values in line.samples()] == [i for i in range(20) if i != 13]
     assert (line.counts.samples, line.counts.refused) == (20, 1)
     assert [batch.seq for batch in line.batches()] == list(range(line.counts.batches))
@@ -339,14 +342,14 @@ def test_a_bad_value_costs_only_its_sample(bad: Any) -> None:
 
 def test_a_sample_that_fits_no_message_is_refused() -> None:
     line = Line()
-    line.batcher.add(T0, {f"f{i}": math.sin(i) for i in range(513)})
-    line.batcher.add(T0 + 1, {"not a field": 1})
+    line.encoder.add(T0, {f"f{i}": math.sin(i) for i in range(513)})
+    line.encoder.add(T0 + 1, {"not a field": 1})
     # Distinct characters, so that compression does not make them fit.
     text = "".join(chr(0x4E00 + i) for i in range(4000))
-    line.batcher.add(T0 + 2, {f"f{i}": text[i:] + text[:i] for i in range(64)})
-    line.batcher.add(2**60, {"speed": 1})
-    line.batcher.add(T0 + 3, {"speed": 1})
-    line.batcher.flush()
+    line.encoder.add(T0 + 2, {f"f{i}": text[i:] + text[:i] for i in range(64)})
+    line.encoder.add(2**60, {"speed": 1})
+    line.encoder.add(T0 + 3, {"speed": 1})
+    line.encoder.flush()
     assert [values for _, values in line.samples()][-1] == {"speed": 1}
     assert line.counts.refused + len(line.samples()) == 5
     assert line.counts.refused >= 3
@@ -354,9 +357,9 @@ def test_a_sample_that_fits_no_message_is_refused() -> None:
 
 def test_nan_and_infinity_are_nulled_and_counted() -> None:
     line = Line()
-    line.batcher.add(T0, {"a": math.nan, "b": 1.5})
-    line.batcher.add(T0 + 1, {"a": -math.inf, "b": math.inf})
-    line.batcher.flush()
+    line.encoder.add(T0, {"a": math.nan, "b": 1.5})
+    line.encoder.add(T0 + 1, {"a": -math.inf, "b": math.inf})
+    line.encoder.flush()
     assert [values for _, values in line.samples()] == [{"a": None, "b": 1.5}, {"a": None, "b": None}]
     assert line.counts.nulled == 3
     assert line.batches()[0].nonfinite == 3

@@ -23,7 +23,7 @@ from iort_agent.common.logs import JournalFormatter, LineFormatter, Troubles, is
 from iort_agent.common.state import Status, read
 from iort_agent.config import load_config
 from iort_agent.errors import AgentError, NotRunningError
-from iort_agent.lanes.batch import StreamCounts
+from iort_agent.lanes.batch_encoder import StreamCounts
 from iort_agent.lanes.clock_offset import OffsetEstimator
 from iort_agent.mqtt.dispatch import Dispatcher
 from iort_agent.spool.memory import MemorySpool
@@ -189,7 +189,7 @@ def test_a_sample_of_the_agent_has_the_contracts_fields() -> None:
     clock = ManualClock()
     spool, uplink = MemorySpool(max_bytes=1000), Loopback(clock, Dispatcher())
     metrics = AgentMetrics(clock=clock, spool=spool, uplink=uplink, offset=OffsetEstimator(clock))
-    spool.put("vesc", 0, b"x" * 100, samples=1)
+    spool.put("vesc", "0badcafe", 0, b"x" * 100, samples=1)
     uplink.connect()
     clock.advance(2)
     values = metrics.sample(100)
@@ -364,7 +364,7 @@ def test_a_read_only_queue_is_found_and_the_agent_runs(
     with unprivileged():
         findings = {one.what: one for one in check(config, Path("agent.sock"))}
         spool = make_spool(config.queue, SystemClock())
-        spool.put("vesc", spool.next_seq("vesc"), b"x", samples=1)
+        spool.put("vesc", "0badcafe", 0, b"x", samples=1)
         (kept, alarm) = spool.next(0), spool.alarm
         spool.close()
     assert findings["queue"].level == FAIL

@@ -8,12 +8,15 @@ from typing import TYPE_CHECKING, Any
 
 import pytest
 
-from iort_agent.spool.memory import OVERWRITE_OLDEST, REJECT_NEW, MemorySpool, Spool
+from iort_agent.spool.interface import OVERWRITE_OLDEST, REJECT_NEW, Spool
+from iort_agent.spool.memory import MemorySpool
 from iort_agent.spool.sqlite import SqliteSpool
 from tests.agent_fakes import ManualClock
 
 if TYPE_CHECKING:
     MakeSpool = Callable[..., Spool]
+
+BOOT = "0badcafe0badcafe"
 
 
 @pytest.fixture(params=["memory", "sqlite"])
@@ -32,21 +35,27 @@ def make(request: pytest.FixtureRequest, tmp_path: Path) -> Iterator[MakeSpool]:
         spool.close()
 
 
-def fill(spool: Spool, count: int, size: int = 10, stream: str = "vesc") -> None:
-    for _ in range(count):
-        spool.put(stream, spool.next_seq(stream), b"x" * size, samples=5)
+def fill(
+    spool: Spool, count: int, size: int = 10, *, stream: str = "vesc", first: int = 0, boot: str = BOOT
+) -> None:
+    for seq in range(first, first + count):
+        spool.put(stream, boot, seq, b"x" * size, samples=5)
+
+
+def work(spool: Spool) -> None:
+    """What the spool's thread does."""
+    if isinstance(spool, SqliteSpool):
+        spool.work()
 
 
 def following(spool: Spool, after: int) -> Any:
     """The next batch, once it is to hand."""
-    entry = spool.next(after)
-    if entry is None and isinstance(spool, SqliteSpool):
-        spool.flush()
+    for _ in range(2):
         entry = spool.next(after)
-        if entry is None:
-            spool.flush()
-            entry = spool.next(after)
-    return entry
+        if entry is not None:
+            return entry
+        work(spool)
+    return spool.next(after)
 
 
 def kept(spool: Spool) -> list[int]:
@@ -70,14 +79,6 @@ def test_keeps_in_order_until_acknowledged(make: MakeSpool) -> None:
     assert spool.alarm is None
 
 
-def test_numbers_each_stream_by_itself(make: MakeSpool) -> None:
-    spool = make(max_bytes=1000)
-    fill(spool, 2, stream="vesc")
-    fill(spool, 1, stream="rtt")
-    fill(spool, 1, stream="vesc")
-    assert kept(spool) == [0, 1, 0, 2]
-
-
 def test_tells_when_there_is_a_batch(make: MakeSpool) -> None:
     spool = make(max_bytes=1000)
     found: list[Any] = []
@@ -85,25 +86,28 @@ def test_tells_when_there_is_a_batch(make: MakeSpool) -> None:
     fill(spool, 1)
     if isinstance(spool, SqliteSpool):
         assert found == [], "not before it is durable"
-        spool.flush()
+        spool.work()
     assert [entry.seq for entry in found] == [0]
 
 
 @pytest.mark.parametrize(("policy", "left"), [(OVERWRITE_OLDEST, [7, 8, 9]), (REJECT_NEW, [0, 1, 2])])
-def test_drops_as_the_policy_says(make: MakeSpool, policy: str, left: list[int]) -> None:
+@pytest.mark.parametrize("at_once", [True, False])
+def test_drops_as_the_policy_says(make: MakeSpool, policy: str, left: list[int], at_once: bool) -> None:
     spool = make(max_bytes=35, policy=policy)
-    fill(spool, 10)
+    for seq in range(10):
+        fill(spool, 1, first=seq)
+        if not at_once:
+            work(spool)
     assert kept(spool) == left
-    assert spool.dropped() == spool.dropped_ever() == (7, 35)
-    assert spool.backlog().payload_bytes == 30
-    assert spool.next_seq("vesc") == 10, "the numbers of dropped batches are not used again"
+    assert spool.dropped() == (7, 35)
+    assert spool.backlog() == (3, 15, 30)
 
 
 @pytest.mark.parametrize("policy", [OVERWRITE_OLDEST, REJECT_NEW])
 def test_a_batch_larger_than_the_spool_does_not_empty_it(make: MakeSpool, policy: str) -> None:
     spool = make(max_bytes=35, policy=policy)
     fill(spool, 2)
-    fill(spool, 1, size=36)
+    fill(spool, 1, size=36, first=2)
     assert kept(spool) == [0, 1]
     assert spool.dropped() == (1, 5)
 
@@ -116,3 +120,13 @@ def test_room_comes_back_with_acknowledgements(make: MakeSpool) -> None:
             spool.ack(entry.id)
     assert spool.dropped() == (0, 0)
     assert spool.backlog() == (0, 0, 0)
+
+
+def test_a_stream_has_told_of_the_runs_before_when_a_batch_of_it_has_arrived(make: MakeSpool) -> None:
+    spool = make(max_bytes=1000)
+    fill(spool, 1)
+    fill(spool, 1, stream="rtt")
+    assert spool.previous("vesc") == spool.previous("rtt") == ()
+    spool.ack(following(spool, 0).id)
+    assert spool.previous("vesc") is None
+    assert spool.previous("rtt") == ()

@@ -12,8 +12,7 @@ from types import FrameType
 from typing import Any
 
 from iort_agent.clock import SystemClock
-from iort_agent.lanes.batch import Batcher, StreamCounts
-from iort_agent.lanes.batch_encoder import Packer
+from iort_agent.lanes.batch_encoder import BatchEncoder
 from iort_agent.lanes.record import RecordLane
 from iort_agent.mqtt.rate_limiter import RateLimiter
 from iort_agent.sources.intake import Intake, TopicConfig
@@ -79,7 +78,7 @@ def watched(walked: set[str], *, here: bool = True) -> Iterator[None]:
 
 def send(folder: Path, t_us: int, walked: set[str]) -> bytes:
     """The batch that a robot publishes of one ROS message; making its parts is not on the walk."""
-    clock, uplink, counts, stop = SystemClock(), Uplink(), StreamCounts(), threading.Event()
+    clock, uplink, stop = SystemClock(), Uplink(), threading.Event()
     spool = make_spool(QueueConfig(path=folder / "queue.db"), clock)
     lane = RecordLane(
         robot="car",
@@ -89,20 +88,19 @@ def send(folder: Path, t_us: int, walked: set[str]) -> bytes:
         clock=clock,
         rate_limiter=RateLimiter(clock),
     )
-    packer = Packer(stream="speed", boot="0badcafe0badcafe", spool=spool, counts=counts)
-    batcher = Batcher(packer.store, batch_s=1, clock=clock, counts=counts)
+    encoder = BatchEncoder("speed", boot="0badcafe0badcafe", batch_s=1, spool=spool, clock=clock)
 
     def emit(stream: str, at_us: int, values: Any) -> None:
         # The message's type goes out as a sample of its own.
         if stream == "speed":
-            batcher.add(at_us, values)
+            encoder.add(at_us, values)
 
     sending = threading.Thread(target=lane.run, args=(stop,))
     sending.start()
     intake = Intake("/speed", TopicConfig(stream="speed", time="header"), emit=emit, clock=clock)
     with watched(walked):
         intake.take(CONNECTION, header(1, t_us, b"car") + bytes(8))
-        batcher.flush()
+        encoder.flush()
     taken = uplink.taken.wait(30)
     stop.set()
     lane.wake()

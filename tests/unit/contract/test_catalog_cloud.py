@@ -69,7 +69,7 @@ def test_no_key_of_a_message_can_stand_where_the_cloud_s_own_stands(rule):
 
 
 def test_the_record_rule_stores_what_a_batch_says_and_a_pong_what_a_ping_says():
-    batch = Batch("0badcafe", 0, [1], {"speed": [1.5]}, nonfinite=1)
+    batch = Batch("0badcafe", 0, [1], {"speed": [1.5]}, nonfinite=1, previous=())
     assert tuple(json.loads(encode_batch(batch))) == ENVELOPE
     assert tuple(json.loads(encode_ping(1, 1, "x"))) == PING_FIELDS
     assert RULES["record"].statement().startswith(f"SELECT {', '.join(ENVELOPE)}, topic() AS topic, ")

@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 
 from iort_contract.catalog.derived import Vehicle, derive
 from iort_contract.codec.seconds import flat_second
-from iort_contract.messages.batch import Batch, BatchId
+from iort_contract.messages.batch import Batch, BatchId, RunEnd
 from iort_contract.statistics import count_holes, missing_before, summarize_second
 
 S = 1_000_000
@@ -223,6 +223,35 @@ def test_missing_batches_by_their_numbers(previous, seq, boot, missing):
     assert missing_before(own, near) == missing
     # What comes later, and the batch itself, change nothing.
     assert missing_before(own, [*near, own, BatchId(T0 + 2, boot, seq + 1)]) == missing
+
+
+@pytest.mark.parametrize(
+    ("near", "seq", "previous", "missing"),
+    [
+        ([], 0, [], 0),
+        ([], 3, [], 3),
+        ([("aaaaaaaa", 0)], 0, [("aaaaaaaa", 0)], 0),
+        # A short run before, and the first batches lost.
+        ([("aaaaaaaa", 0)], 3, [("aaaaaaaa", 0)], 3),
+        # The end of the run before.
+        ([("aaaaaaaa", 7)], 0, [("aaaaaaaa", 9)], 2),
+        ([("aaaaaaaa", 7), ("bbbbbbbb", 4)], 1, [("aaaaaaaa", 9), ("bbbbbbbb", 4)], 3),
+        # Whether a run that is not near is stored cannot be told.
+        ([("aaaaaaaa", 7)], 0, [("dddddddd", 9)], 0),
+        ([("cccccccc", 1)], 2, [("aaaaaaaa", 9)], 0),
+    ],
+)
+def test_missing_batches_of_a_run_that_names_those_before(near, seq, previous, missing):
+    ids = [BatchId(T0 + i, *each) for i, each in enumerate(near)]
+    ends = [RunEnd(*each) for each in previous]
+    assert missing_before(BatchId(T0 + 9, "cccccccc", seq), ids, ends) == missing
+
+
+def test_of_a_run_that_goes_on_in_time_the_end_is_not_missed():
+    """A recording that is played twice: around the second one's first batch is only a part of the first."""
+    first = [BatchId(T0 + i * S, "aaaaaaaa", i) for i in range(5)]
+    again = BatchId(T0 + S, "bbbbbbbb", 0)
+    assert missing_before(again, sorted([*first, again]), [RunEnd("aaaaaaaa", 90)]) == 0
 
 
 @given(st.permutations(range(12)), st.sets(st.integers(0, 11), max_size=11))

@@ -19,6 +19,7 @@ from iort_contract.tables import (
     EXPIRES_S,
     MESSAGE_BASE64,
     NONFINITE,
+    PREVIOUS,
     RECEIVED_MS,
     ROBOT,
     TOPIC,
@@ -30,7 +31,7 @@ from verify.tools.spoofing import spoofed
 NOW_MS = 1_700_000_000_123
 T_US = 1_700_000_000_000_000
 RETENTION_S = 3600
-BATCH = encode_batch(Batch("0badcafe", 3, [T_US], {"speed": [1.5]}, nonfinite=2))
+BATCH = encode_batch(Batch("0badcafe", 3, [T_US], {"speed": [1.5]}, nonfinite=2, previous=()))
 SAMPLE = {FAULT_FIELD: 3, VOLTAGE_FIELD: 9.5}
 LIVE_MESSAGE = encode_live(LiveSample("0badcafe", 3, T_US, T_US, SAMPLE))
 PING_MESSAGE = encode_ping(7, T_US, "padding")
@@ -94,7 +95,7 @@ def test_lambda_2_gets_the_robot_of_the_topic_and_its_batch(of_rule):
 def test_a_batch_without_nonfinite_has_none_in_the_table(of_rule):
     message = encode_batch(Batch("0badcafe", 3, [T_US], {"speed": [1.5]}))
     item = of_rule("record", WHOSE["record"], message)
-    assert NONFINITE not in item
+    assert not {NONFINITE, PREVIOUS} & set(item)
     assert decode_item(item)[1] == decode_batch(message)
 
 

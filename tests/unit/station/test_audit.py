@@ -14,13 +14,19 @@ from tests.fakes import item_of
 T_US = 1_750_000_000_000_000
 
 
-def _item(seq, *, boot="0badcafe", n=50, late_ms=0, at=None):
+def _item(seq, *, boot="0badcafe", n=50, late_ms=0, at=None, previous=None):
     t_us = T_US + int((seq if at is None else at) * 1_000_000)
     return {
         "batch": str(BatchId(t_us, boot, seq)),
         "n": str(n),
         "received_ms": t_us // 1000 + 1020 + late_ms,
+        **({} if previous is None else {"previous": previous}),
     }
+
+
+def _run(boot, seqs, *, at, previous=""):
+    """Batches of a run whose first one names the runs before; each of a second, from ``at`` on."""
+    return [_item(seq, boot=boot, at=at + seq, previous=previous if seq == 0 else None) for seq in seqs]
 
 
 def test_a_whole_run_is_complete():
@@ -65,6 +71,54 @@ def test_a_queue_that_was_lost_starts_again_at_0():
     assert found.missing == 1
 
 
+def test_each_run_numbers_from_0_and_names_the_one_before():
+    items = _run("aaaaaaaa", range(3), at=0) + _run("bbbbbbbb", range(3), at=10, previous="aaaaaaaa-2")
+    assert audit("vesc", items).complete
+    assert audit("vesc", items, from_start=True).complete
+    without = [item for item in items if not item["batch"].endswith("-aaaaaaaa-2")]
+    (gap,) = audit("vesc", without).runs[0].missing
+    assert (gap.first, gap.last, gap.after_us, gap.before_us) == (2, 2, T_US + 1_000_000, None)
+    assert audit("vesc", without).runs[0].expected == 3
+
+
+def test_the_start_of_a_run_is_missed_however_short_the_run_before_was():
+    items = _run("aaaaaaaa", [0], at=0) + _run("bbbbbbbb", range(4), at=10, previous="aaaaaaaa-0")
+    # A batch names the runs before until one has arrived, so the first that arrives does.
+    late = [*items[:1], {**items[3], "previous": "aaaaaaaa-0"}, items[4]]
+    (gap,) = audit("vesc", late).runs[1].missing
+    assert (gap.first, gap.last, gap.after_us, gap.before_us) == (0, 1, T_US, T_US + 12_000_000)
+
+
+def test_a_run_of_which_nothing_is_stored_is_told_by_those_after_it():
+    a, b = _run("aaaaaaaa", range(3), at=0), _run("bbbbbbbb", range(5), at=10, previous="aaaaaaaa-2")
+    c = _run("cccccccc", range(2), at=20, previous="aaaaaaaa-2 bbbbbbbb-4")
+    assert audit("vesc", [*a, *b, *c]).complete
+    found = audit("vesc", [*a, *c])
+    assert (found.lost_runs, found.missing, found.complete) == ((("bbbbbbbb", 5),), 5, False)
+    # What comes before all that is stored may have expired, or is out of the range.
+    assert audit("vesc", c).complete
+    assert audit("vesc", [*b, *c]).complete
+    assert audit("vesc", c, from_start=True).lost_runs == (("aaaaaaaa", 3), ("bbbbbbbb", 5))
+    z = _run("dddddddd", range(2), at=-10)
+    assert audit("vesc", [*z, *b, *c]).lost_runs == (("aaaaaaaa", 3),)
+
+
+def test_numbers_that_went_on_and_numbers_from_0_are_told_apart():
+    """A car whose agent was updated: only the second run went on with the first one's numbers."""
+    old = [_item(seq, boot="aaaaaaaa") for seq in range(3)]
+    old += [_item(seq, boot="bbbbbbbb") for seq in range(3, 6)]
+    new = _run("cccccccc", range(2), at=10, previous="bbbbbbbb-5")
+    new += _run("dddddddd", range(9), at=20, previous="cccccccc-1")
+    assert audit("vesc", old + new).complete
+    for lost, missing in (("bbbbbbbb-3", 1), ("bbbbbbbb-5", 1), ("cccccccc-1", 1), ("dddddddd-4", 1)):
+        left = [item for item in old + new if not item["batch"].endswith(lost)]
+        assert audit("vesc", left).missing == missing, lost
+    # An agent of before that is installed again goes on where it had ended.
+    back = [_item(seq, boot="eeeeeeee", at=30 + seq) for seq in range(6, 9)]
+    assert audit("vesc", old + new + back).complete
+    assert audit("vesc", old + new + back[1:]).missing == 1
+
+
 def test_a_clock_set_back_between_runs_changes_nothing():
     before = [_item(seq) for seq in range(3)]
     after = [_item(seq, boot="deadbeef", at=seq - 1000, late_ms=2_000_000) for seq in range(3, 6)]
@@ -83,8 +137,9 @@ def test_a_number_stored_twice_is_counted_and_its_samples_are_not():
 
 
 def test_what_is_no_batch_is_counted():
-    found = audit("vesc", [_item(0), {"batch": "5"}, {**_item(1), "batch": "5-0badcafe-x"}])
-    assert (found.refused, found.complete) == (2, False)
+    wrong = [{"batch": "5"}, {**_item(1), "batch": "5-0badcafe-x"}, {**_item(2), "previous": "nobody"}]
+    found = audit("vesc", [_item(0), *wrong])
+    assert (found.refused, found.complete) == (3, False)
 
 
 @given(st.sets(st.integers(0, 300), min_size=1), st.integers(0, 2**32))

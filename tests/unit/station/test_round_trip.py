@@ -13,8 +13,7 @@ from hypothesis import strategies as st
 from rosbags.rosbag1 import Reader
 from rosbags.typesys import Stores, get_typestore
 
-from iort_agent.lanes.batch import Batcher, StreamCounts
-from iort_agent.lanes.batch_encoder import Packer
+from iort_agent.lanes.batch_encoder import BatchEncoder
 from iort_agent.sources.intake import Intake, TopicConfig
 from iort_agent.spool.memory import MemorySpool
 from iort_contract.topics import RECORD, build_topic
@@ -35,14 +34,13 @@ STEP_S = 0.01
 def round_trip(definition: Message, sent: Sequence[bytes]) -> list[bytes]:
     """The messages by the source, its batches, the queue, the table and the export; all but the network."""
     clock, spool = ManualClock(now_us=T0_US), MemorySpool(max_bytes=2**30)
-    batchers: dict[str, Batcher] = {}
+    encoders: dict[str, BatchEncoder] = {}
 
     def emit(stream: str, t_us: int, values: Any) -> None:
-        if stream not in batchers:
-            counts = StreamCounts()
-            packer = Packer(stream=stream, boot="0badcafe0badcafe", spool=spool, counts=counts)
-            batchers[stream] = Batcher(packer.store, batch_s=1, clock=clock, counts=counts)
-        batchers[stream].add(t_us, values)
+        if stream not in encoders:
+            boot = "0badcafe0badcafe"
+            encoders[stream] = BatchEncoder(stream, boot=boot, batch_s=1, spool=spool, clock=clock)
+        encoders[stream].add(t_us, values)
 
     intake = Intake("/made", TopicConfig(stream="made", time="arrival"), emit=emit, clock=clock)
     connection = {
@@ -54,8 +52,8 @@ def round_trip(definition: Message, sent: Sequence[bytes]) -> list[bytes]:
     for message in sent:
         intake.take(connection, message)
         clock.advance(STEP_S)
-    for batcher in batchers.values():
-        batcher.flush()
+    for encoder in encoders.values():
+        encoder.flush()
     cloud, at = cloud_of(), 0
     while entry := spool.next(at):
         at = entry.id

@@ -110,6 +110,8 @@ def _show(one: Audit) -> None:
             out.print(f"  missing {gap.first:,} to {gap.last:,}: between {after} and {before}")
         if len(run.missing) > _LISTED:
             out.print(f"  and {len(run.missing) - _LISTED} more gaps; --json prints all")
+    for lost in one.lost_runs:
+        out.print(f"  run {lost.boot[:8]}: none of its {lost.batches:,} batches is stored", style="red")
     if one.before_first:
         out.print(
             f"  the first stored number is {one.before_first:,}: before it is expired, out of range or lost"
