@@ -1,4 +1,4 @@
-"""The uplink against the embedded cloud's broker, through a proxy that fails as networks do."""
+"""The uplink against the embedded cloud's broker, through a proxy with network faults."""
 
 from __future__ import annotations
 
@@ -33,8 +33,8 @@ def proxy(embedded: EmbeddedCloud) -> Iterator[Proxy]:
         yield proxy
 
 
-class Told:
-    """What the uplink tells its handlers, and what arrives on the robot's ping topic."""
+class UplinkLog:
+    """Records the uplink's notices to its handlers, and the messages on the robot's ping topic."""
 
     def __init__(self, uplink: IotCore, robot: str) -> None:
         self.connections: list[bool] = []
@@ -45,14 +45,14 @@ class Told:
         uplink.subscribe(self.topic, lambda message: self.messages.append(message.payload))
 
     def echo(self, payload: bytes) -> None:
-        """A message there and back, which takes a subscription."""
+        """Send a message and receive it again, by a subscription."""
         until(lambda: self.uplink.subscribed(self.topic), seconds=120)
         self.uplink.publish(self.topic, payload, qos=1, done=lambda _: None)
         until(lambda: payload in self.messages)
 
 
 @contextmanager
-def connecting(bundle: robots.Bundle, proxy: Proxy, **other: Any) -> Iterator[Told]:
+def connecting(bundle: robots.Bundle, proxy: Proxy, **other: Any) -> Iterator[UplinkLog]:
     settings: dict[str, Any] = {
         "endpoint": "127.0.0.1",
         "port": proxy.port,
@@ -64,7 +64,7 @@ def connecting(bundle: robots.Bundle, proxy: Proxy, **other: Any) -> Iterator[To
         "dispatcher": Dispatcher(),
     }
     uplink = IotCore(**{**settings, **other})
-    told = Told(uplink, bundle.robot)
+    told = UplinkLog(uplink, bundle.robot)
     uplink.start()
     try:
         yield told
@@ -79,8 +79,9 @@ def set_status(embedded: EmbeddedCloud, robot: str, status: str) -> None:
 
 
 def paced(proxy: Proxy) -> bool:
-    """Whether attempts came about one a second at most: a busy machine sees one late, and the next one
-    in time, so they count together, and half of what they must have taken is enough."""
+    """Return whether attempts were at most about one a second. On a busy machine one attempt is late and
+    the next on time, so all are counted together, and half of the expected time is enough.
+    """
     return proxy.attempts[-1] - proxy.attempts[0] >= (len(proxy.attempts) - 1) / 2
 
 
@@ -92,7 +93,7 @@ def self_signed(folder: Path) -> None:
     )  # fmt: skip
 
 
-def test_it_connects_again_and_subscribes_again_after_a_reset(bundle, proxy):
+def test_the_uplink_reconnects_and_resubscribes_after_a_reset(bundle, proxy):
     with connecting(bundle(), proxy) as told:
         told.echo(b"before")
         proxy.reset()
@@ -104,14 +105,14 @@ def test_it_connects_again_and_subscribes_again_after_a_reset(bundle, proxy):
         assert "closed the connection" in (status.last_error or "")
 
 
-def test_a_connection_reset_every_moment_costs_one_attempt_a_second_at_most(bundle, proxy):
+def test_repeated_resets_cause_at_most_one_attempt_a_second(bundle, proxy):
     with connecting(bundle(), proxy):
         proxy.reset_every(0.3)
         assert proxy.wait_attempts(5, 120)
     assert paced(proxy)
 
 
-def test_refused_connections_are_tried_once_a_second_at_most_and_ever_less(bundle, proxy, caplog):
+def test_refused_connections_are_retried_with_backoff(bundle, proxy, caplog):
     proxy.mode = REFUSE
     with connecting(bundle(), proxy):
         assert proxy.wait_attempts(4, 120)
@@ -123,7 +124,7 @@ def test_refused_connections_are_tried_once_a_second_at_most_and_ever_less(bundl
     assert "again and again" in said[1]
 
 
-def test_a_broker_that_is_stopped_and_started(bundle, embedded):
+def test_the_uplink_survives_a_restart_of_the_broker(bundle, embedded):
     with Proxy("127.0.0.1", embedded.cloud.mqtt_port) as proxy, connecting(bundle(), proxy) as told:
         told.echo(b"before")
         proxy.mode = REFUSE
@@ -137,7 +138,7 @@ def test_a_broker_that_is_stopped_and_started(bundle, embedded):
         told.echo(b"after")
 
 
-def test_a_frozen_broker_is_noticed(bundle, proxy):
+def test_the_uplink_detects_a_frozen_broker(bundle, proxy):
     assert aws.KEEP_ALIVE_S + aws.PING_TIMEOUT_S <= 45
     with connecting(bundle(), proxy, keep_alive_s=2, ping_timeout_s=1) as told:
         told.echo(b"before")
@@ -148,7 +149,7 @@ def test_a_frozen_broker_is_noticed(bundle, proxy):
         told.echo(b"after")
 
 
-def test_half_a_second_of_latency_is_no_loss(bundle, embedded):
+def test_half_a_second_of_latency_does_not_disconnect(bundle, embedded):
     with (
         Proxy("127.0.0.1", embedded.cloud.mqtt_port, latency_s=0.5) as proxy,
         connecting(bundle(), proxy) as told,
@@ -157,7 +158,7 @@ def test_half_a_second_of_latency_is_no_loss(bundle, embedded):
         assert told.connections == [True]
 
 
-def test_takeover_is_shown_as_what_it_is(bundle, proxy, caplog):
+def test_a_takeover_is_reported_as_a_takeover(bundle, proxy, caplog):
     car = bundle()
     with connecting(car, proxy) as told:
         told.echo(b"before")
@@ -167,7 +168,7 @@ def test_takeover_is_shown_as_what_it_is(bundle, proxy, caplog):
         assert f"another client has connected as {car.robot}" in caplog.text
 
 
-def test_a_certificate_revoked_while_connected(embedded, bundle, proxy, caplog):
+def test_a_revoked_certificate_ends_the_connection(embedded, bundle, proxy, caplog):
     caplog.set_level(logging.INFO)
     car = bundle()
     with connecting(car, proxy) as told:
@@ -180,14 +181,14 @@ def test_a_certificate_revoked_while_connected(embedded, bundle, proxy, caplog):
         errors = [r for r in caplog.records if r.levelno == logging.ERROR]
         assert len(errors) == 1
         assert "`iort-agent check`" in errors[0].getMessage()
-        # Slowly now, but at once when the file changes.
+        # Attempts are slow now, but immediate after a change of the file.
         assert not proxy.wait_attempts(attempts + 1, 3)
         set_status(embedded, car.robot, "ACTIVE")
         os.utime(car.folder / "certificate.pem")
         told.echo(b"after")
 
 
-def test_another_robots_name_is_refused_and_said_once(bundle, proxy, caplog):
+def test_another_robots_name_is_rejected_and_logged_once(bundle, proxy, caplog):
     with connecting(bundle(), proxy, client_id="somebody-else"):
         until(lambda: "does not let it connect" in caplog.text)
         assert not proxy.wait_attempts(2, 3), f"the next attempt is due after {SLOW_SHORTEST_S} s"
@@ -195,7 +196,7 @@ def test_another_robots_name_is_refused_and_said_once(bundle, proxy, caplog):
     assert "not authorized" in error.getMessage()
 
 
-def test_an_unknown_certificate_is_replaced_by_a_good_one(bundle, proxy, caplog, tmp_path):
+def test_the_uplink_connects_after_an_unknown_certificate_is_replaced(bundle, proxy, caplog, tmp_path):
     car = bundle()
     good = tmp_path / "good"
     shutil.copytree(car.folder, good)
@@ -209,7 +210,7 @@ def test_an_unknown_certificate_is_replaced_by_a_good_one(bundle, proxy, caplog,
     assert paced(proxy)
 
 
-def test_an_expired_certificate_is_called_expired(bundle, proxy, caplog):
+def test_an_expired_certificate_is_reported_as_expired(bundle, proxy, caplog):
     class Later(SystemClock):
         def now_us(self) -> int:
             return 4_000_000_000_000_000
@@ -221,22 +222,22 @@ def test_an_expired_certificate_is_called_expired(bundle, proxy, caplog):
         assert not proxy.wait_attempts(2, 2)
 
 
-def test_a_broker_of_another_authority_is_not_talked_to(bundle, proxy, tmp_path, caplog):
+def test_a_broker_of_another_authority_is_not_trusted(bundle, proxy, tmp_path, caplog):
     car = bundle()
     self_signed(tmp_path)
     with connecting(car, proxy, root_ca=tmp_path / "certificate.pem") as told:
-        # The client waits up to half a minute after a failed handshake, on purpose.
+        # The client deliberately waits up to half a minute after a failed handshake.
         until(lambda: "TLS failed" in caplog.text)
         assert told.connections == []
 
 
-def test_without_a_root_ca_the_system_decides(bundle, proxy, caplog):
+def test_the_system_trust_store_applies_without_a_root_ca(bundle, proxy, caplog):
     with connecting(bundle(), proxy, root_ca=None) as told:
         until(lambda: "TLS failed" in caplog.text)
         assert told.connections == []
 
 
-def test_a_refused_subscription_is_said_once_and_spoils_no_other(bundle, proxy, caplog, monkeypatch):
+def test_a_rejected_subscription_is_logged_once_and_affects_no_other(bundle, proxy, caplog, monkeypatch):
     monkeypatch.setattr(subscriptions, "_AGAIN_S", 0.1)
     monkeypatch.setattr(subscriptions, "_AGAIN_SLOWLY_S", 0.1)
     with connecting(bundle(), proxy) as told:
@@ -248,7 +249,7 @@ def test_a_refused_subscription_is_said_once_and_spoils_no_other(bundle, proxy, 
         assert told.connections == [True]
 
 
-def test_a_subscription_made_while_connected(bundle, proxy):
+def test_a_subscription_while_connected_takes_effect(bundle, proxy):
     car = bundle()
     with connecting(car, proxy) as told:
         told.echo(b"before")
