@@ -103,7 +103,7 @@ def small(tmp_path):
     return path
 
 
-# --- what a file is ---------------------------------------------------------------------------------
+# --- names and hashes -----------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("size", [0, 1, PART_BYTES - 1, PART_BYTES, PART_BYTES + 1, 2 * PART_BYTES])
@@ -130,7 +130,7 @@ def test_a_file_is_hashed_whole_and_by_part(tmp_path, size):
         ("x" * 150 + ".bag", "x" * 96 + ".bag"),
     ],
 )
-def test_every_name_becomes_an_allowed_one(path, name, tmp_path):
+def test_each_name_becomes_an_allowed_name(path, name, tmp_path):
     from pathlib import PurePath
 
     assert wire_name(PurePath(path)) == name
@@ -151,7 +151,7 @@ def test_small_and_large_files_arrive(rig, small, large):
 
 
 @pytest.mark.parametrize("fault", ["reset", "mute", 500, 503, 403, 404, 412])
-def test_a_part_that_fails_is_sent_again_and_no_other(rig, large, fault):
+def test_only_a_failed_part_is_sent_again(rig, large, fault):
     first = rig.store.put
 
     def put(part, content):
@@ -185,7 +185,7 @@ def test_a_lost_answer_is_requested_again(rig, small):
     assert len({request.id for request in rig.store.requests}) == 4
 
 
-def test_a_refusal_of_the_cloud_is_raised_with_its_reason(rig, small):
+def test_a_rejection_by_the_cloud_is_raised_with_its_reason(rig, small):
     rig.store.refusals = [("no more than 5 bytes a day", 3600)]
     with pytest.raises(UploadError, match=r"notes.txt: refused: no more than 5 bytes a day") as caught:
         rig.upload(small)
