@@ -89,19 +89,19 @@ class Loopback:
         self._handlers.append(handler)
 
     def subscribe(self, topic_filter: str, handler: OnMessage) -> None:
-        """Receive what matches the filter."""
+        """Receive messages that match the filter."""
         self._subscriptions[topic_filter] = handler
 
     def subscribed(self, topic_filter: str) -> bool:
-        """Whether the filter was subscribed to and there is a connection."""
+        """Return whether the filter is subscribed and the broker connected."""
         return self._connected and topic_filter in self._subscriptions
 
     def connected(self) -> bool:
-        """Whether it is connected."""
+        """Return whether it is connected."""
         return self._connected
 
     def status(self) -> Connection:
-        """How the connection stands."""
+        """Return the state of the connection."""
         since_s = self._clock.monotonic() - self._switched
         return Connection(self._connected, since_s, self._connects, endpoint=self.endpoint)
 
@@ -172,5 +172,5 @@ class Loopback:
 
 
 def link_of(uplink: Uplink, clock: Clock, *, robot: str = "car1") -> Link:
-    """The link of a robot in the default namespace, with the limits of AWS."""
+    """Return the link of a robot in the default namespace, with the limits of AWS."""
     return Link(robot, "iort", uplink, clock, RateLimiter(clock))
