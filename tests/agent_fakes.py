@@ -58,12 +58,12 @@ class Published(NamedTuple):
     qos: int
 
 
-# Why the broker refuses a publish; None to accept it.
+# The broker's reason to reject a publish; None to accept it.
 Verdict = Callable[[Published], Optional[str]]
 
 
 class Loopback:
-    """A broker in memory that can be cut, slowed and made to refuse.
+    """A broker in memory that can disconnect, delay and reject.
 
     Publishes come back to matching subscriptions. ``hold`` delays acknowledgements, ``stalled`` also the
     notice that a message was written.
@@ -106,7 +106,7 @@ class Loopback:
         return Connection(self._connected, since_s, self._connects, endpoint=self.endpoint)
 
     def publish(self, topic: str, payload: bytes, *, qos: int, done: Done) -> None:
-        """Accept, refuse or hold the message, and hand it to the subscriptions."""
+        """Accept, reject or hold the message, and deliver it to the subscriptions."""
         if not self._connected:
             self._finish(done, UplinkError("not connected"))
             return

@@ -22,7 +22,7 @@ def browser() -> Iterator[Browser]:
     playwright_api = pytest.importorskip("playwright.sync_api", reason="playwright is not installed")
     program = chromium.found()
     if program is None:
-        pytest.skip("there is no chromium on this machine: apt-get install chromium, or name it in CHROMIUM")
+        pytest.skip("Chromium is not installed: apt-get install chromium, or name it in CHROMIUM")
     if not (BUILT / "index.html").is_file():
         pytest.skip("the live page is not built: npm run build")
     with playwright_api.sync_playwright() as play:

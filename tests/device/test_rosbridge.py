@@ -82,7 +82,7 @@ def test_messages_become_samples(server: RosbridgeStandin, log: pytest.LogCaptur
     ], "in order, and without the wrapper"
     assert {stream for stream, _, _ in running.samples} == {"vesc"}
     times = [t_us for _, t_us, _ in running.samples]
-    assert running.said == [], "of what type they are, only the server could say"
+    assert running.said == [], "only the server knows their type"
     assert before < times[0] <= times[-1] < time.time_ns() // 1000
     assert [record.getMessage()[:70] for record in log.records if record.levelname == "WARNING"] == [
         f"topic {CORE}: the server does not tell the structure of its mes"
@@ -105,7 +105,7 @@ def test_a_message_becomes_supported_values(server: RosbridgeStandin) -> None:
         server.publish("/odd", message)
         server.publish("/odd", {"a": float("nan"), "b": 1})
         running.wait_for(2)
-    assert math.isnan(running.samples[0][2].pop("pose.position.y")), "null is what the server makes of NaN"
+    assert math.isnan(running.samples[0][2].pop("pose.position.y")), "the server converts NaN to null"
     assert running.samples[0][2] == {
         "pose.position.x": 1.5,
         "covariance.0": 0.1,
@@ -177,7 +177,7 @@ def test_the_source_reconnects_and_resubscribes_each_time(
                 server.__exit__()
                 server.__enter__()
         server.wait_for("subscribe", 4)
-    assert [values["speed"] for _, _, values in running.samples] == [1, 2, 3], "nothing twice"
+    assert [values["speed"] for _, _, values in running.samples] == [1, 2, 3], "no sample is repeated"
     assert "connection lost" in log.text
 
 
@@ -317,7 +317,9 @@ def test_a_topic_that_is_advertised_later_is_found() -> None:
         asked = len([op for op in server.operations if op["op"] == "subscribe"])
     assert [values["speed"] for _, _, values in running.samples] == [2]
     assert asked >= 4
-    assert not [op for op in server.operations if op["op"] == "unsubscribe"], "nothing is ended for it"
+    assert not [op for op in server.operations if op["op"] == "unsubscribe"], (
+        "no topic is unsubscribed for it"
+    )
 
 
 def test_a_fragmented_message_is_reassembled(server: RosbridgeStandin, log: pytest.LogCaptureFixture) -> None:

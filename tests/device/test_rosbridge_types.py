@@ -80,7 +80,7 @@ def test_the_message_keeps_structure_that_the_plain_sample_loses() -> None:
         assert hearing.report() == {"messages": 1, "not_a_number": 1}
 
 
-def test_without_rosapi_the_plain_sample_is_sent_and_counted(server: RosbridgeStandin) -> None:
+def test_the_plain_sample_is_sent_and_counted_without_rosapi(server: RosbridgeStandin) -> None:
     with Running(config(server)) as running:
         server.wait_for("subscribe")
         server.publish(CORE, state(1))

@@ -1,4 +1,4 @@
-"""Uploads to a fake store that breaks, refuses and forgets."""
+"""Uploads to a fake store that fails, rejects and forgets."""
 
 from __future__ import annotations
 
@@ -165,7 +165,7 @@ def test_only_a_failed_part_is_sent_again(rig, large, fault):
     assert rig.store.puts == [1, 2, 2, 3]
 
 
-def test_after_a_break_only_the_missing_parts_are_sent(rig, large):
+def test_only_missing_parts_are_sent_after_a_break(rig, large):
     rig.store.put, put = lambda part, content: rig.stop.set() or put(part, content), rig.store.put
     with pytest.raises(UploadError, match="stopped"):
         rig.upload(large)
@@ -192,7 +192,7 @@ def test_a_rejection_by_the_cloud_is_raised_with_its_reason(rig, small):
     assert caught.value.again_s == 3600
 
 
-def test_after_several_failures_the_file_waits(rig, small):
+def test_a_file_waits_after_several_failures(rig, small):
     rig.store.faults = [500] * 100
     with pytest.raises(UploadError, match="the server says 500") as caught:
         rig.upload(small)
@@ -347,7 +347,7 @@ def test_a_new_process_neither_uploads_again_nor_reads_again(rig, bags, monkeypa
         b'{"read": {}, "done": [["a.bag", {"look": 1}]]}',
     ],
 )
-def test_after_a_damaged_state_files_are_read_again(rig, bags, damage):
+def test_files_are_read_again_after_a_damaged_state(rig, bags, damage):
     (bags / "a.bag").write_bytes(b"1")
     assert rig.folder(bags, settle_s=0).step(rig.stop)
     (bags / STATE).write_bytes(damage)
@@ -380,7 +380,7 @@ def test_a_file_that_changed_after_its_upload_is_uploaded_again(rig, bags):
     assert sorted(rig.store.objects.values()) == [b"1", b"12"]
 
 
-def test_a_refused_file_does_not_delay_others(rig, bags):
+def test_a_rejected_file_does_not_delay_others(rig, bags):
     for name, age in (("first.bag", 100), ("second.bag", 200)):
         (bags / name).write_bytes(name.encode())
         os.utime(bags / name, (age, age))
@@ -397,7 +397,7 @@ def test_a_refused_file_does_not_delay_others(rig, bags):
     assert b"first.bag" in rig.store.objects.values()
 
 
-def test_a_file_refused_repeatedly_waits_longer_each_time(rig, bags):
+def test_a_file_rejected_repeatedly_waits_longer_each_time(rig, bags):
     (bags / "a.bag").write_bytes(b"1")
     uploads = rig.folder(bags, settle_s=0)
     rig.store.refusals = [("again at once", 0)] * 10_000
@@ -453,7 +453,7 @@ def test_an_unexpected_error_does_not_end_the_uploads(rig, bags, caplog):
     assert list(rig.store.objects.values()) == [b"1"]
 
 
-def test_while_an_agent_runs_the_command_gives_advice(tmp_path, bags):
+def test_the_command_gives_advice_while_an_agent_runs(tmp_path, bags):
     file = tmp_path / "car.yaml"
     for name in ("certificate.pem", "private.key"):
         (tmp_path / name).write_text("")

@@ -113,8 +113,8 @@ def test_a_broken_frame_costs_only_its_own_sample(vesc: VescStandin, log: pytest
     assert len(expected) - len(running.samples) <= 1
     assert counts.timeouts >= 5
     assert counts.bad_crc >= 2
-    assert counts.opened == 1, "no reason to open the port afresh"
-    assert "WARNING" not in log.text, "nor to speak of it"
+    assert counts.opened == 1, "the port stays open"
+    assert "WARNING" not in log.text, "no warning is logged"
 
 
 def test_an_unknown_length_is_logged_once_and_never_misread(
@@ -158,7 +158,7 @@ def test_the_source_resumes_after_a_replug(vesc: VescStandin, log: pytest.LogCap
         running.wait_for(10, more=True)
         assert running.source.counts.opened == 4
     assert log.text.count("samples are coming again") == 3
-    assert numbers(running) == sorted(set(numbers(running))), "nothing twice"
+    assert numbers(running) == sorted(set(numbers(running))), "no sample is repeated"
 
 
 def test_the_source_finds_a_controller_plugged_in_later(

@@ -35,7 +35,7 @@ def counted(embedded: EmbeddedCloud, robot: str) -> list[int]:
     batches = list(delivery.batches(embedded.cloud, robot, "vesc"))
     for boot in {batch.boot for batch in batches}:
         seqs = [batch.seq for batch in batches if batch.boot == boot]
-        assert seqs == sorted(set(seqs)), "a batch number stands twice, or out of order"
+        assert seqs == sorted(set(seqs)), "a batch number is repeated or out of order"
     return [int(value) for batch in batches for value in batch.columns[FIELD]]
 
 

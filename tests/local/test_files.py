@@ -183,7 +183,7 @@ def raws(path: Path) -> list[bytes]:
         return [bytes(raw) for _, _, raw in reader.messages()]
 
 
-# --- what a robot may not, with its own certificate and its own hands -------------------------------
+# --- forbidden requests, sent by hand with the robot's own certificate ----------------------------------
 
 
 class FileRequester(Robot):

@@ -37,7 +37,7 @@ def test_every_gap_file_is_installed():
 
 @pytest.mark.parametrize("name", gaps.NAMES)
 def test_each_gap_still_exists(name):
-    assert gaps.load(name).is_open(), f"ministack needs local/gaps/{name.replace('.', '/')}.py no more"
+    assert gaps.load(name).is_open(), f"ministack needs local/gaps/{name.replace('.', '/')}.py no longer"
 
 
 @pytest.mark.parametrize("name", gaps.NAMES)

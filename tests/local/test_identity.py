@@ -36,7 +36,7 @@ def certificates(embedded: Any, robot: str) -> list[str]:
     return found
 
 
-def test_a_claim_becomes_a_robot_that_drives(embedded, tmp_path):
+def test_a_claim_provisions_a_robot_that_drives(embedded, tmp_path):
     claim = claims.claim(embedded.cloud, "claimed", out=tmp_path / "claim")
     command("provision", "--config", claim)
     bundle = robots.Bundle("claimed", tmp_path / "claim")

@@ -225,7 +225,7 @@ def refused(clients: dict[str, Any], probe: Probe) -> bool:
 def test_every_role_is_declared(deployed):
     roles = {one.arn for one in of(deployed, "AWS::IAM::Role")}
     # The embedded cloud leaves out other roles, for example those of account-wide settings.
-    assert roles <= ROLES.keys(), "declare what a new role may do in tests/stacks/roles.py"
+    assert roles <= ROLES.keys(), "declare the permissions of a new role in tests/stacks/roles.py"
 
 
 def test_every_role_is_denied_undeclared_access(deployed, role_clients):

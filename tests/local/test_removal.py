@@ -61,7 +61,7 @@ def test_a_teardown_leaves_other_deployments_untouched(embedded, bundle, lab, tm
     for noun in ("monitoring", "ingest"):
         assert destroyed(cloud, noun) == (True, ""), noun
     gone, why = destroyed(cloud, "fleet")
-    assert not gone, "robots hold the policy, and the stack goes all the same: what is the command for?"
+    assert not gone, "the stack can be deleted although robots have the policy, so the command is not needed"
     assert "lab-robot" in why
     assert "lab-claim" in why
 

@@ -92,4 +92,4 @@ def test_the_robot_gets_its_unit_and_its_udev_rule(agent):
 def test_each_environment_lacks_the_other_ones_packages(agent, station):
     assert not (agent.site / "iort_station").exists()
     assert not (station.site / "iort_agent").exists()
-    assert not (agent.site / "boto3").exists(), "an environment has what is declared, and nothing else"
+    assert not (agent.site / "boto3").exists(), "an environment has only declared packages"

@@ -18,7 +18,9 @@ def test_both_recorders_record_the_mixed_robot(ros_python: str) -> None:
     found = mixed.measure(program, ros_python, 2, lambda _: None)
     assert set(found.published) == set(topics())
     assert found.published["/map"] == 1
-    assert found.published["/joint_states"] == 2 * found.published["/sensors/core"], "of two publishers"
+    assert found.published["/joint_states"] == 2 * found.published["/sensors/core"], (
+        "the topic has two publishers"
+    )
     # On a busy machine `rosbag record` misses some of the fastest messages; the bench reports how many.
     assert set(found.recorded) == set(found.published)
     assert all(0 < count <= found.published[name] for name, count in found.recorded.items())

@@ -92,7 +92,7 @@ def test_a_lost_connection_or_the_agents_end_stops_the_car(driven: tuple[Process
     listener.until(lambda: len(speeds(listener)) == 6, "five stops")
     assert speeds(listener)[1:] == [0] * 5
     after = [when for when, _ in heard(listener)]
-    assert after[1] - after[0] < 10, "not only when the lease ended"
+    assert after[1] - after[0] < 10, "the car must stop before the lease ends"
 
 
 def test_an_invalid_message_is_rejected(driven: tuple[Process, Process]) -> None:

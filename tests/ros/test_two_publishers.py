@@ -47,14 +47,14 @@ def stored(
         for publisher in publishers:
             publisher.until(lambda publisher=publisher: publisher.lines[-1].startswith("sent "), "end")
 
-        def taken() -> dict[str, int]:
+        def samples_by_stream() -> dict[str, int]:
             try:
                 streams = fetch(car.folder / SOCKET)["streams"]
             except AgentError:
                 return {}  # the agent is too busy to answer
             return {name: streams.get(name, {}).get("samples", 0) for name in SENT}
 
-        until(lambda: taken() == SENT)
+        until(lambda: samples_by_stream() == SENT)
         assert agent.terminate() == 0, "\n".join(agent.errors)
     finally:
         graph.stop()

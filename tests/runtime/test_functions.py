@@ -54,7 +54,7 @@ TAKES = {
 @pytest.fixture(scope="module")
 def deployed(tmp_path_factory):
     if not LAYER.is_dir():
-        pytest.skip(f"{LAYER} is not there: run `make setup`")
+        pytest.skip(f"{LAYER} is missing: run `make setup`")
     return functions(tmp_path_factory.mktemp("app"), Settings(layer=LAYER))
 
 

@@ -47,7 +47,7 @@ def test_absent_cars_are_listed_until_they_send(
         # The car's view and the list both link to the history.
         page.goto(f"{server.url}#/car/car-2")
         past = page.get_by_role("link", name="What it did before")
-        until(past.is_visible, "the way to the past")
+        until(past.is_visible, "the link to the history")
         past.click()
         until(lambda: page.inner_text(".history .car-name") == "car-2", "the past")
         page.goto(f"{server.url}#/")

@@ -73,6 +73,6 @@ def test_the_page_waits_for_a_log_query_across_dashboard_updates(
         until(lambda: len(logs.queries) == 2, "the second query")
         logs.done.set()
         line = page.locator(".log-widget td.words")
-        until(lambda: line.count() == 1, "what was found")
+        until(lambda: line.count() == 1, "the matches")
         assert line.inner_text() == "15"
         assert [asked["minutes"] for asked in logs.queries] == ["60", "15"]

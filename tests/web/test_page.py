@@ -163,7 +163,9 @@ def test_the_delay_uses_the_clouds_clock(page: Page, car: Car) -> None:
     assert legs["toCloud"] == pytest.approx(4, abs=1.1)
     assert legs["total"] < hour_us / 1000
     assert page.evaluate("iort.robots['car-1'].state") == "live"
-    until(lambda: "corrected by the offset" in page.inner_text(".warning"), "the word on clocks")
+    until(
+        lambda: "corrected by the offset" in page.inner_text(".warning"), "the warning about the clock offset"
+    )
 
 
 def test_a_message_out_of_order_is_not_the_newest(page: Page, car: Car) -> None:
@@ -281,7 +283,7 @@ def test_the_page_reconnects_and_reports_it(page: Page, car: Car) -> None:
     assert "Connection lost" in page.inner_text("#banner")
     car.pubnub.start()
     until(lambda: page.evaluate("iort.link") == "live", "the page to connect again")
-    until(lambda: "Connected again" in page.inner_text("#banner"), "the good news")
+    until(lambda: "Connected again" in page.inner_text("#banner"), "the success message")
     show(page, car.send({**SAMPLE, "voltage_input": 12}))
     assert shown(page, "voltage_input") == "12.00"
 
@@ -339,7 +341,7 @@ def test_any_number_can_be_charted(page: Page, car: Car) -> None:
     panel = page.locator("section.panel[aria-label=Displacement]")
     show(page, car.send({**SAMPLE, "displacement": 77}))
     assert "77" in panel.inner_text()
-    until(lambda: tile.get_attribute("aria-pressed") == "true", "the tile to say so")
+    until(lambda: tile.get_attribute("aria-pressed") == "true", "the tile to be selected")
     panel.get_by_label("Close Displacement").click()
     assert panel.count() == 0
 
@@ -386,7 +388,7 @@ def test_memory_stays_bounded(page: Page, car: Car) -> None:
     assert sum(each["columns"] - 1 for each in kept) == bounds["columns"]
     for i in range(bounds["streams"] - 4 + 1):
         update = car.send({"x": 1}, stream=f"s{i}")
-    until(lambda: page.evaluate("iort.malformed") == 1, "the stream too many")
+    until(lambda: page.evaluate("iort.malformed") == 1, "the extra stream")
     assert update["stream"] not in page.evaluate("Object.keys(iort.robots['car-1'].streams)")
 
 

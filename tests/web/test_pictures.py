@@ -24,7 +24,7 @@ KEY = "robots/car-1/2026/05/04/100000-0123456789abcdef/camera/1-data.jpg"
 STREAM = "camera"
 
 
-def claims(picture: str | None, **change: Any) -> dict[str, Any]:
+def with_attachment(picture: str | None, **change: Any) -> dict[str, Any]:
     """Make a sample with an attachment on its field ``data``."""
     claim = {
         "key": KEY,
@@ -36,7 +36,7 @@ def claims(picture: str | None, **change: Any) -> dict[str, Any]:
     return {"format": "jpeg", **{f"data.{name}": value for name, value in {**claim, **change}.items()}}
 
 
-LEFT_OUT = claims(None, key=None, sha256=None, size=None, content_type=None)
+LEFT_OUT = with_attachment(None, key=None, sha256=None, size=None, content_type=None)
 
 
 def plain_jpeg(colour: tuple[int, int, int], size: tuple[int, int] = (96, 54)) -> str:
@@ -67,7 +67,7 @@ def test_a_cameras_thumbnail_is_drawn_and_stays_while_others_are_left_out(page: 
     show(page, car.send(LEFT_OUT, stream=STREAM))
     tile = page.locator("[data-picture=data]")
     assert "no picture yet" in tile.inner_text()
-    show(page, car.send(claims(plain_jpeg((200, 30, 30))), stream=STREAM))
+    show(page, car.send(with_attachment(plain_jpeg((200, 30, 30))), stream=STREAM))
     is_drawn(page, (200, 30, 30))
     for _ in range(3):
         show(page, car.send(LEFT_OUT, stream=STREAM))
@@ -79,20 +79,20 @@ def test_a_cameras_thumbnail_is_drawn_and_stays_while_others_are_left_out(page: 
     # Its five fields get no text tiles; the other fields do.
     labels = page.locator(f"[data-stream={STREAM}] .tile-label").all_inner_texts()
     assert labels == ["Data", "Format"]
-    show(page, car.send(claims(plain_jpeg((20, 160, 40))), stream=STREAM))
+    show(page, car.send(with_attachment(plain_jpeg((20, 160, 40))), stream=STREAM))
     is_drawn(page, (20, 160, 40))
 
 
 def test_the_page_draws_the_agents_thumbnails(page: Page, car: Car) -> None:
     made = thumbnail(jpeg(1), "image/jpeg")
     assert made is not None
-    show(page, car.send(claims(made), stream=STREAM))
+    show(page, car.send(with_attachment(made), stream=STREAM))
     canvas = page.locator("[data-picture=data] canvas")
     until(canvas.is_visible, "the picture")
     assert page.evaluate("(c) => [c.width, c.height]", canvas.element_handle()) == [96, 72]
 
 
-def hostile() -> dict[str, str]:
+def hostile_texts() -> dict[str, str]:
     """Return texts that are not our thumbnails; the last two declare a size above the limit."""
     small = bytearray(base64.b64decode(plain_jpeg((0, 0, 0))))
     at = small.index(b"\xff\xc0")
@@ -115,16 +115,16 @@ def hostile() -> dict[str, str]:
 
 def test_an_invalid_picture_is_reported(page: Page, car: Car) -> None:
     tile = page.locator("[data-picture=data]")
-    for what, text in hostile().items():
-        show(page, car.send(claims(plain_jpeg((10, 10, 200))), stream=STREAM))
+    for what, text in hostile_texts().items():
+        show(page, car.send(with_attachment(plain_jpeg((10, 10, 200))), stream=STREAM))
         until(tile.locator("canvas").is_visible, "a good one")
-        show(page, car.send(claims(text), stream=STREAM))
+        show(page, car.send(with_attachment(text), stream=STREAM))
         until(lambda: "is no picture" in tile.inner_text(), what)
         assert not tile.locator("canvas").is_visible()
-    show(page, car.send(claims(None), stream=STREAM))
+    show(page, car.send(with_attachment(None), stream=STREAM))
     until(lambda: "makes no thumbnails" in tile.inner_text(), "the reason")
-    show(page, car.send(claims(None, content_type="application/octet-stream"), stream=STREAM))
-    until(lambda: "no picture" in tile.inner_text(), "what it is")
+    show(page, car.send(with_attachment(None, content_type="application/octet-stream"), stream=STREAM))
+    until(lambda: "no picture" in tile.inner_text(), "the notice of an invalid picture")
 
 
 def test_a_field_named_like_an_attachment_is_shown_unchanged(page: Page, car: Car) -> None:
@@ -137,7 +137,7 @@ def test_the_history_shows_the_picture_of_the_selected_time(
     open_page: Callable[..., Page], pubnub: PubNubStandIn
 ) -> None:
     red, green = plain_jpeg((200, 30, 30)), plain_jpeg((20, 160, 40))
-    rows = [claims(red), LEFT_OUT, LEFT_OUT, claims(green), LEFT_OUT]
+    rows = [with_attachment(red), LEFT_OUT, LEFT_OUT, with_attachment(green), LEFT_OUT]
     fields = {name: {"mean": [row[name] for row in rows]} for name in rows[0]}
 
     def history(asked: Any) -> dict[str, Any]:

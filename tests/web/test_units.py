@@ -107,7 +107,7 @@ def test_the_page_counts_faulty_cars(page: Page, car: Car) -> None:
         show(page, each.send({**SAMPLE, "fault_code": code}))
     until(lambda: page.inner_text("#faulty") == "2 with a fault", "the count")
     show(page, cars[0].send({**SAMPLE, "fault_code": 0}))
-    until(lambda: page.inner_text("#faulty") == "1 with a fault", "one less")
+    until(lambda: page.inner_text("#faulty") == "1 with a fault", "the lower count")
     show(page, cars[2].send({**SAMPLE, "fault_code": 0}))
     drawn(page)
     until(lambda: page.inner_text("#faulty") == "", "none")
