@@ -58,12 +58,12 @@ class Published(NamedTuple):
     qos: int
 
 
-# Why the broker refuses a publish; None to accept it.
+# The broker's reason to reject a publish; None to accept it.
 Verdict = Callable[[Published], Optional[str]]
 
 
 class Loopback:
-    """A broker in memory that can be cut, slowed and made to refuse.
+    """A broker in memory that can disconnect, delay and reject.
 
     Publishes come back to matching subscriptions. ``hold`` delays acknowledgements, ``stalled`` also the
     notice that a message was written.
@@ -89,24 +89,24 @@ class Loopback:
         self._handlers.append(handler)
 
     def subscribe(self, topic_filter: str, handler: OnMessage) -> None:
-        """Receive what matches the filter."""
+        """Receive messages that match the filter."""
         self._subscriptions[topic_filter] = handler
 
     def subscribed(self, topic_filter: str) -> bool:
-        """Whether the filter was subscribed to and there is a connection."""
+        """Return whether the filter is subscribed and the broker connected."""
         return self._connected and topic_filter in self._subscriptions
 
     def connected(self) -> bool:
-        """Whether it is connected."""
+        """Return whether it is connected."""
         return self._connected
 
     def status(self) -> Connection:
-        """How the connection stands."""
+        """Return the state of the connection."""
         since_s = self._clock.monotonic() - self._switched
         return Connection(self._connected, since_s, self._connects, endpoint=self.endpoint)
 
     def publish(self, topic: str, payload: bytes, *, qos: int, done: Done) -> None:
-        """Accept, refuse or hold the message, and hand it to the subscriptions."""
+        """Accept, reject or hold the message, and deliver it to the subscriptions."""
         if not self._connected:
             self._finish(done, UplinkError("not connected"))
             return
@@ -172,5 +172,5 @@ class Loopback:
 
 
 def link_of(uplink: Uplink, clock: Clock, *, robot: str = "car1") -> Link:
-    """The link of a robot in the default namespace, with the limits of AWS."""
+    """Return the link of a robot in the default namespace, with the limits of AWS."""
     return Link(robot, "iort", uplink, clock, RateLimiter(clock))

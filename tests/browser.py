@@ -1,4 +1,4 @@
-"""One Chromium a module that looks at the page: playwright holds the thread's event loop meanwhile."""
+"""One Chromium for each module with page tests: meanwhile playwright holds the thread's event loop."""
 
 from __future__ import annotations
 
@@ -16,13 +16,13 @@ if TYPE_CHECKING:
 
 @pytest.fixture(scope="module")
 def browser() -> Iterator[Browser]:
-    # Imported here: every test loads this file, the robot's on Python 3.8, where the station does not run.
+    # Imported here: every test loads this file, and on the robot's Python 3.8 the station does not run.
     from iort_station.page.page import BUILT
 
     playwright_api = pytest.importorskip("playwright.sync_api", reason="playwright is not installed")
     program = chromium.found()
     if program is None:
-        pytest.skip("there is no chromium on this machine: apt-get install chromium, or name it in CHROMIUM")
+        pytest.skip("Chromium is not installed: apt-get install chromium, or name it in CHROMIUM")
     if not (BUILT / "index.html").is_file():
         pytest.skip("the live page is not built: npm run build")
     with playwright_api.sync_playwright() as play:
@@ -33,7 +33,7 @@ def browser() -> Iterator[Browser]:
 
 @pytest.fixture
 def open_page(browser: Browser) -> Iterator[Callable[..., Page]]:
-    """Opens an address in a window of its own and waits until it listens; no script may fail there."""
+    """Open an address in a new window and wait until the page is connected; a script error fails the test."""
     contexts, errors = [], []
 
     def open_(url: str, *, listening: bool = True, **options: Any) -> Page:
@@ -60,12 +60,12 @@ def until(true: Callable[[], Any], what: str, seconds: float = 60) -> None:
 
 
 def plain(text: str) -> str:
-    """A text with minus sign and thin spaces as a computer writes them."""
+    """Convert a text with minus signs and thin spaces to plain characters."""
     return text.replace("\u2212", "-").replace("\u202f", "")
 
 
 def shown(page: Page, name: str) -> str:
-    """The text of a value on the page."""
+    """Return the text of a value on the page."""
     return plain(page.locator(f"[data-value='{name}']").inner_text())
 
 
@@ -78,6 +78,6 @@ def show(page: Page, update: Mapping[str, Any]) -> None:
 
 
 def drawn(page: Page) -> None:
-    """Wait until the page has written its values once more: it does so at most 25 times a second."""
+    """Wait until the page has drawn its values again: it does so at most 25 times a second."""
     frames = "requestAnimationFrame(() => requestAnimationFrame(done))"
     page.evaluate(f"() => new Promise((done) => setTimeout(() => {frames}, 50))")

@@ -15,7 +15,7 @@ from hypothesis import HealthCheck, settings
 from local import patched
 from tests.browser import browser, open_page  # noqa: F401 - fixtures
 
-# How long an example takes says something about the machine only.
+# The duration of an example depends only on the machine.
 settings.register_profile("iort", deadline=None, suppress_health_check=[HealthCheck.too_slow])
 settings.load_profile("iort")
 # `make test-fast`; CI generates the usual number.
@@ -42,7 +42,9 @@ GROUPS = {
 
 
 def group(nodeid: str) -> str:
-    """What runs in one worker, in order: a group, a test of a ROS graph of its own, or a file."""
+    """Return the tests that run in one worker, in order: a group, a test with its own ROS graph, or a
+    file.
+    """
     for path, name in GROUPS.items():
         if nodeid.startswith(path):
             return name
@@ -51,14 +53,15 @@ def group(nodeid: str) -> str:
 
 @pytest.hookimpl(optionalhook=True)
 def pytest_configure() -> None:
-    """Tests import the ministack that the embedded cloud runs: the installed one with local/patches/."""
+    """Let tests import the ministack of the embedded cloud: the installed one with local/patches/."""
     if find_spec("ministack"):
         patched.use()
 
 
 def pytest_xdist_make_scheduler(config: pytest.Config, log: Any) -> Any:
-    """Under `make test`, groups are spread over the workers. (Marks cannot say it: of xdist 3.8, they
-    no longer reach the scheduler under pytest 9.)"""
+    """Under `make test`, spread the groups over the workers. (Marks cannot do this: xdist 3.8's marks no
+    longer reach the scheduler under pytest 9.)
+    """
     from xdist.scheduler import LoadScopeScheduling
 
     class Groups(LoadScopeScheduling):  # type: ignore[misc]  # xdist has no types for us
@@ -74,7 +77,7 @@ def skips_fail() -> bool:
 
 @pytest.hookimpl(wrapper=True)
 def pytest_runtest_makereport() -> Generator[None, Any, Any]:
-    """REQUIRE_ALL=1: a machine that is said to have everything has nothing to skip."""
+    """REQUIRE_ALL=1: a complete machine has no reason to skip a test."""
     report = yield
     return failed_if_skipped(report)
 
@@ -86,7 +89,7 @@ def pytest_make_collect_report() -> Generator[None, Any, Any]:
 
 
 def failed_if_skipped(report: Any) -> Any:
-    # An expected failure is reported as skipped, and is none.
+    # An expected failure is reported as skipped, but is not a skip.
     if report.skipped and skips_fail() and not hasattr(report, "wasxfail"):
         reason = report.longrepr[2] if isinstance(report.longrepr, tuple) else report.longrepr
         report.outcome = "failed"
@@ -96,8 +99,9 @@ def failed_if_skipped(report: Any) -> Any:
 
 @dataclass(frozen=True)
 class Synthesized:
-    """The app as it is deployed: a template a stack, the folder with the assets, which stacks are
-    protected from termination, and the paths of what the checkers' findings are acknowledged on."""
+    """The app as deployed: a template for each stack, the folder with the assets, the stacks with
+    termination protection, and the paths of acknowledged findings of the checkers.
+    """
 
     folder: Path
     templates: Mapping[str, dict[str, Any]]
@@ -105,7 +109,7 @@ class Synthesized:
     acknowledged: set[str]
 
     def resources(self, kind: str, stack: str | None = None) -> dict[str, dict[str, Any]]:
-        """Logical id to properties of every resource of a type."""
+        """Return logical id -> properties for every resource of a type."""
         return {
             name: resource.get("Properties", {})
             for noun, template in self.templates.items()
@@ -114,19 +118,19 @@ class Synthesized:
         }
 
     def asset(self, key: dict[str, Any]) -> Path:
-        """The folder that a resource's S3Key was made from."""
+        """Return the source folder of a resource's S3Key."""
         return self.folder / f"asset.{key['S3Key'].removesuffix('.zip')}"
 
 
 @pytest.fixture(scope="session")
 def synthesized(tmp_path_factory: pytest.TempPathFactory) -> Synthesized:
-    """app.build for stage dev, with what is set for the account as a whole."""
+    """Build the app for stage dev, with the settings of the whole account."""
     return _synthesize(tmp_path_factory, device_defender=True, iot_log_level="error")
 
 
 @pytest.fixture(scope="session")
 def production(tmp_path_factory: pytest.TempPathFactory) -> Synthesized:
-    """app.build with everything that a production stage can have."""
+    """Build the app with every feature of a production stage."""
     return _synthesize(
         tmp_path_factory,
         stage="prod",
@@ -141,7 +145,7 @@ def production(tmp_path_factory: pytest.TempPathFactory) -> Synthesized:
 
 
 def _synthesize(tmp_path_factory: pytest.TempPathFactory, **given: Any) -> Synthesized:
-    # Imported here, because CDK takes seconds to load.
+    # Imported here, because the CDK takes seconds to load.
     from aws_cdk import App
 
     from app import build

@@ -1,4 +1,4 @@
-"""DynamoDB in memory, as far as functions/shared/tables.py asks: what hypothesis can run a thousand times."""
+"""DynamoDB in memory, with the calls of functions/shared/tables.py, fast enough for hypothesis."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ from iort_contract.topics import RECORD, build_topic
 serialize = TypeSerializer().serialize
 
 TELEMETRY, SUMMARY, ROBOTS, QUARANTINE = "telemetry", "summary", "robots", "quarantine"
-# What Lambda 2 is given, as the arguments of Tables.
+# The arguments of Tables, as Lambda 2 gets them.
 NAMES = {"telemetry": TELEMETRY, "summary": SUMMARY, "robots": ROBOTS}
 KEYS = {TELEMETRY: (TOPIC, BATCH), SUMMARY: (TOPIC, SECOND), ROBOTS: (ROBOT,)}
 TOPIC_OF_CAR = build_topic(RECORD, "car", VESC_STREAM)
@@ -30,8 +30,9 @@ EXPIRES = 1_800_000_000
 
 
 class FakeDynamoDB:
-    """The client's calls. A page holds ``page_items`` items, as AWS' hold 1 MB; of every write
-    the first ``unprocessed`` attempts take only the first item."""
+    """Implements the client's calls. A page holds ``page_items`` items, where AWS' pages hold 1 MB; the
+    first ``unprocessed`` attempts of every write accept only the first item.
+    """
 
     def __init__(self, *, page_items: int = 2, unprocessed: int = 0) -> None:
         self.page_items, self.unprocessed = page_items, unprocessed
@@ -69,13 +70,13 @@ class FakeDynamoDB:
         self.calls["query"] += 1
         self.read += len(page)
         answer = {"Items": page, "Count": len(page)}
-        # DynamoDB stops at a limit without a look at what comes after.
+        # DynamoDB stops at a limit without reading the next item.
         if len(found) > size or (page and len(page) == query.get("Limit")):
             answer["LastEvaluatedKey"] = {name: page[-1][name] for name in KEYS[table]}
         return answer
 
     def scan(self, **scan: Any) -> dict[str, Any]:
-        """A topic's items in one page, in another order than a query's."""
+        """Return a topic's items in one page, in another order than a query."""
         self.calls["scan"] += 1
         values, table = scan["ExpressionAttributeValues"], scan["TableName"]
         assert "FilterExpression" in scan
@@ -92,7 +93,7 @@ class FakeDynamoDB:
         return {"Item": item} if item else {}
 
     def update_item(self, *, TableName: str, Key: dict[str, Any], **how: Any) -> dict[str, Any]:
-        """Add to a set of texts of an item that is there."""
+        """Add to a string set of an existing item."""
         self.calls["update_item"] += 1
         names, values = how["ExpressionAttributeNames"], how["ExpressionAttributeValues"]
         assert how["UpdateExpression"] == "ADD #streams :stream"
@@ -126,13 +127,13 @@ def _key(table: str, item: dict[str, Any]) -> tuple[Any, ...]:
 
 
 def _comparable(value: dict[str, str]) -> Any:
-    """A key attribute as DynamoDB orders it: numbers by their value, texts by their bytes."""
+    """Return a key attribute in DynamoDB's order: numbers by value, texts by bytes."""
     ((kind, content),) = value.items()
     return Decimal(content) if kind == "N" else content
 
 
 class _Scans:
-    """Everything in a table, in no order to rely on."""
+    """Every item of a table, in unspecified order."""
 
     def __init__(self, table: FakeDynamoDB) -> None:
         self._table = table
@@ -147,7 +148,7 @@ def tables(client: Any) -> Tables:
 
 
 def item_of(batch: Batch, topic: str = TOPIC_OF_CAR, expires_s: int = EXPIRES) -> dict[str, Any]:
-    """The telemetry item that the record rule makes of a batch."""
+    """Return the telemetry item that the record rule makes of a batch."""
     return item_of_message(encode_batch(batch), topic, expires_s)
 
 
@@ -158,7 +159,7 @@ def item_of_message(message: bytes, topic: str = TOPIC_OF_CAR, expires_s: int = 
 
 
 def record_of(item: dict[str, Any], number: int = 1, kind: str = "INSERT") -> dict[str, Any]:
-    """The stream record that the table makes of an item."""
+    """Return the stream record that the table makes of an item."""
     keys = {name: item[name] for name in KEYS[TELEMETRY]}
     change = {"Keys": keys, "SequenceNumber": f"{number:021}", "StreamViewType": "NEW_IMAGE"}
     if kind != "REMOVE":
@@ -167,6 +168,6 @@ def record_of(item: dict[str, Any], number: int = 1, kind: str = "INSERT") -> di
 
 
 def summary_of(client: FakeDynamoDB, topic: str = TOPIC_OF_CAR) -> dict[int, dict[str, Any]]:
-    """What the summary table holds of a topic, by second, with the flat names that everybody reads."""
+    """Return a topic's summary items by second, with the flat names of the readers."""
     stored = client.items[SUMMARY].items()
     return {int(key[1]): flat_second(plain(item)) for key, item in stored if key[0] == topic}

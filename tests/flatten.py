@@ -1,10 +1,12 @@
 """Flattens a ROS message into a sample: field path -> value.
 
-Nested messages give dotted paths and arrays give indexes: ``pose.position.x``, ``covariance.0``. The header
-and a type's constants are left out. A message of a header and exactly one nested message (VescStateStamped,
-PoseStamped) gives the nested message's fields without a prefix, since the stamp is the sample's time.
+Nested messages give dotted paths and arrays give indexes: ``pose.position.x``, ``covariance.0``. The
+header and a type's constants are left out. A message of a header and exactly one nested message
+(VescStateStamped, PoseStamped) gives the nested message's fields without a prefix, since the stamp is the
+sample's time.
 
-This is the rule of `iort_contract.ros1.decode`, for objects of other libraries. The decoder is tested by it.
+This is the rule of `iort_contract.ros1.decode`, for objects of other libraries. Tests compare the decoder
+with it.
 """
 
 from __future__ import annotations
@@ -12,14 +14,14 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping
 from typing import Any
 
-# Gives the fields of a message, without its constants; None for a value that is no message.
+# Returns a message's fields without its constants; None for a value that is not a message.
 Members = Callable[[Any], Mapping[str, Any] | None]
 
 HEADER = "header"
 
 
 def flatten(message: Any, members: Members) -> dict[str, Any]:
-    """The sample of a message."""
+    """Return the sample of a message."""
     fields = dict(members(message) or {})
     if len(fields) == 2 and HEADER in fields:
         (inner,) = (members(value) for name, value in fields.items() if name != HEADER)
@@ -41,7 +43,7 @@ def _put(flat: dict[str, Any], path: str, value: Any, members: Members) -> None:
             if name != HEADER:
                 _put(flat, f"{path}.{name}", member, members)
         return
-    # Turns numpy's arrays and numbers into plain Python values.
+    # Converts numpy's arrays and numbers to plain Python values.
     plain = value.tolist() if hasattr(value, "tolist") else value
     if isinstance(plain, (list, tuple, bytes, bytearray)):
         for i, item in enumerate(plain):

@@ -1,4 +1,4 @@
-"""Recordings as Foxglove sees them: read by the JavaScript libraries that it is made of."""
+"""Reads recordings by Foxglove's JavaScript libraries."""
 
 from __future__ import annotations
 
@@ -17,15 +17,15 @@ ROOT = Path(__file__).resolve().parent.parent
 
 
 class Opened(NamedTuple):
-    """A recording: topic to type and checksum, and topic to time in nanoseconds and message."""
+    """A recording: topic -> type and checksum, and topic -> (time in ns, message)."""
 
     types: dict[str, tuple[str, str]]
     messages: dict[str, list[tuple[int, dict[str, Any]]]]
 
 
 def opened(path: Path) -> Opened:
-    """The recording, every message of it decoded; skips the test where Node or the libraries are missing."""
-    # The environment's own first, which npm came with.
+    """Read a recording and decode every message; skip the test without Node or the libraries."""
+    # The environment's own Node first, since npm came with it.
     node = shutil.which("node", path=os.pathsep.join([str(Path(sys.executable).parent), os.environ["PATH"]]))
     modules = Path(os.environ.get("IORT_NODE_MODULES") or ROOT / "node_modules")
     if node is None or not (modules / "@mcap" / "core").is_dir():
@@ -43,14 +43,14 @@ def opened(path: Path) -> Opened:
 
 
 def flat(message: dict[str, Any]) -> dict[str, Any]:
-    """The fields of a message by the paths that samples have, without what headers hold."""
+    """Return a message's fields by the samples' paths, without headers."""
     return dict(_flat("", message))
 
 
 def _flat(path: str, value: Any) -> Iterator[tuple[str, Any]]:
     if isinstance(value, dict):
         for name, member in value.items():
-            # ROS 1's name in JavaScript; samples have ROS 2's.
+            # JavaScript has ROS 1's name; samples have ROS 2's.
             part = "nanosec" if name == "nsec" else name
             if name != "header":
                 yield from _flat(f"{path}.{part}" if path else part, member)

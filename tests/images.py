@@ -1,4 +1,4 @@
-"""Pictures as a camera gives them, and a recording of them."""
+"""Pictures as a camera makes them, and a recording of them."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ START_NS = 1_600_000_000_000_000_000
 
 
 def jpeg(seed: int = 0, *, width: int = 640, height: int = 480) -> bytes:
-    """Noise over a gradient, which compresses as badly as a gravel path does."""
+    """Make noise over a gradient, which compresses as badly as a gravel path."""
     noise = np.random.default_rng(seed).integers(0, 120, (height, width, 3), dtype=np.uint8)
     ramp = np.linspace(0, 120, width, dtype=np.uint8)[None, :, None]
     out = io.BytesIO()
@@ -24,7 +24,7 @@ def jpeg(seed: int = 0, *, width: int = 640, height: int = 480) -> bytes:
 
 
 def write_bag(path: Path, pictures: list[bytes], *, hz: float = 2.0) -> Path:
-    """A ROS 1 recording of CompressedImage."""
+    """Write a ROS 1 recording of CompressedImage."""
     store = get_typestore(Stores.ROS1_NOETIC)
     types = store.types
     with Writer(path) as writer:

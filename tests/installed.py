@@ -1,7 +1,7 @@
-"""Environments of their own with one wheel each, and nothing of the checkout but the locked dependencies.
+"""Environments with one wheel each, isolated from the checkout except for the locked dependencies.
 
-No network is needed: a declared dependency is linked, file by file, from the environment of the checkout.
-What a wheel does not declare is not there.
+No network is needed: each declared dependency is linked, file by file, from the checkout's environment.
+Undeclared packages are missing.
 """
 
 from __future__ import annotations
@@ -18,13 +18,14 @@ from pathlib import Path
 from packaging.requirements import Requirement
 
 OURS = re.compile(r"iort-(contract|agent|station)")
-# What a ROS workspace or a checkout may have on the path beside the installed packages.
+# Packages that a ROS workspace or a checkout may have on the path beside the installed ones.
 DECOYS = ("device", "contract", "station", "functions", "stacks", "local", "bench")
 
 
 class Installed:
-    """An environment with wheels and what they declare. Commands run in an empty folder, and find decoys
-    on PYTHONPATH."""
+    """An environment with wheels and their declared dependencies. Commands run in an empty folder, with
+    decoys on PYTHONPATH.
+    """
 
     def __init__(self, folder: Path, wheels: Iterable[Path]) -> None:
         self.bin = folder / "environment" / "bin"
@@ -47,7 +48,7 @@ class Installed:
             _link(needed, self.site)
 
     def start(self, command: str, *arguments: object, **environment: str) -> subprocess.Popen[str]:
-        """One of the environment's commands, with none of the settings of whoever runs the tests."""
+        """Start a command of the environment, without the test runner's settings."""
         return subprocess.Popen(
             [str(self.bin / command), *map(str, arguments)],
             cwd=self.folder,
@@ -64,7 +65,7 @@ class Installed:
         )
 
     def run(self, command: str, *arguments: object, **environment: str) -> str:
-        """What a command prints; it must succeed."""
+        """Run a command that must succeed; return its output."""
         with self.start(command, *arguments, **environment) as process:
             output, errors = process.communicate()
         assert process.returncode == 0, errors
@@ -72,7 +73,7 @@ class Installed:
 
 
 def _needed(ours: dict[str, Distribution]) -> Iterator[Distribution]:
-    """The distributions that these declare, and those that they declare in turn."""
+    """Return the declared distributions, and their dependencies in turn."""
     waiting = [(one, frozenset[str]()) for one in ours.values()]
     seen = set(waiting)
     while waiting:

@@ -1,6 +1,7 @@
-"""A second reading of AWS IoT's SQL, as far as our rules use it and AWS' documentation goes ("AWS IoT SQL
-reference"). Where AWS says nothing, a caller chooses: of two keys of one name, the payload's or the rule's
-own stays."""
+"""A second implementation of AWS IoT's SQL, for our rules, after AWS' documentation ("AWS IoT SQL
+reference"). AWS does not specify which of two equal keys stays, the payload's or the rule's; the caller
+chooses.
+"""
 
 from __future__ import annotations
 
@@ -16,14 +17,14 @@ _KEYWORDS = {"SELECT", "FROM", "WHERE", "AS", "AND"}
 
 
 class Undefined:
-    """AWS' value for what is not there; JSON leaves it out."""
+    """AWS' value for a missing attribute; JSON leaves it out."""
 
 
 UNDEFINED = Undefined()
 
 
 class Message:
-    """A message on its way through a rule; ``topic`` is without Basic Ingest's prefix."""
+    """A message in a rule; ``topic`` has no Basic Ingest prefix."""
 
     def __init__(self, topic: str, payload: bytes, now_ms: int = 0) -> None:
         self.topic, self.payload, self.now_ms = topic, payload, now_ms
@@ -34,7 +35,7 @@ class Message:
 
 
 def evaluate(sql: str, message: Message, *, payload_wins: bool = False) -> Any:
-    """What the rule's actions are given; None where the rule does not act. Its topic filter is not read."""
+    """Return the input of the rule's actions; None if the rule does not act. The topic filter is not read."""
     return _Query(sql).run(message, payload_wins=payload_wins)
 
 
@@ -125,7 +126,7 @@ class _Query:
     def _call(self, name: str) -> Callable[[Message], Any]:
         arguments: list[Callable[[Message], Any]] = []
         while not self._take(")"):
-            # The payload as it came, not as JSON.
+            # The payload as received, not parsed as JSON.
             arguments.append((lambda m: m.payload) if self._take("*") else self._sum())
             self._take(",")
         function = _FUNCTIONS[name]
@@ -165,7 +166,7 @@ def _at(value: Any, path: list[str]) -> Any:
 
 
 def _number(value: Any) -> int | float | None:
-    """By "Conversions, To decimal"; None is Undefined."""
+    """Convert by "Conversions, To decimal"; None is Undefined."""
     if isinstance(value, str) and re.fullmatch(r"-?\d+(\.\d+)?([eE]-?\d+)?", value):
         return float(value) if set(value) & set(".eE") else int(value)
     return value if isinstance(value, (int, float)) and not isinstance(value, bool) else None
@@ -187,7 +188,7 @@ def _operation(sign: str, left: Any, right: Any) -> Callable[[Message], Any]:
 
 
 def _compared(sign: str, a: Any, b: Any) -> Any:
-    """By "Operators": Undefined of what cannot be compared."""
+    """Compare by "Operators": values that cannot be compared give Undefined."""
     if a is UNDEFINED or b is UNDEFINED:
         return UNDEFINED
     if sign in ("=", "<>"):

@@ -28,7 +28,7 @@ from iort_contract.topics import (
     rule_name,
 )
 
-# Robot A is the one that tries; B is its neighbour.
+# Robot A makes the attempts; B is its neighbour.
 A, B = "isolated-a", "isolated-b"
 ROBOT, CLAIM = "robot A", "claim"
 CONNECT, PUBLISH, SUBSCRIBE, RECEIVE = "Connect", "Publish", "Subscribe", "Receive"
@@ -78,7 +78,7 @@ ROWS = [
             f"{_shadow(A)}/update",
         ),
         may_not=(
-            # Another robot's.
+            # Another robot's topics.
             record_topic(B, "vesc"),
             live_topic(B, "vesc"),
             build_topic(LIVE, B, "vesc"),
@@ -91,12 +91,13 @@ ROWS = [
             f"{_shadow(B)}/delete",
             f"$aws/things/{B}/jobs/start-next",
             f"$aws/things/{B}/jobs/1/update",
-            # What the operator and the cloud say.
+            # Messages of the operator and of the cloud.
             build_topic(CMD, A, "drive"),
             build_topic(PONG, A, RULE),
             f"$aws/events/presence/connected/{A}",
             f"$aws/events/presence/disconnected/{B}",
-            # Past Basic Ingest, and by it to other rules than its own, or with another's topic.
+            # Topics without Basic Ingest, Basic Ingest to other rules, and Basic Ingest with another
+            # deployment's or robot's topic.
             build_topic(RECORD, A, "vesc"),
             *(f"$aws/rules/{rule_name(rule)}/{RECORD}/iort/{A}/vesc" for rule in RULES if rule != "record"),
             *(f"$aws/rules/{rule_name(rule)}/{LIVE}/iort/{A}/vesc" for rule in RULES if rule != "live"),
@@ -113,7 +114,7 @@ ROWS = [
             "$aws/certificates/create/json",
             _CSR,
             _PROVISION,
-            # Other deployments, other levels.
+            # Other deployments, other topic levels.
             build_topic(LIVE, A, "vesc", "lab2"),
             f"{LIVE}/iort",
             f"{LIVE}/iort/{A}",
@@ -204,7 +205,7 @@ ROWS = [
         PUBLISH,
         may=(_CSR, _PROVISION),
         may_not=(
-            # A key that was made in the cloud has left it.
+            # AWS would create the private key and send it over the network.
             "$aws/certificates/create/json",
             "$aws/provisioning-templates/other/provision/json",
             record_topic(A, "vesc"),
@@ -236,8 +237,8 @@ ROWS = [
     ),
 ]
 
-# What every role of the stacks is asked to do to every resource of a kind; its own role may what is
-# declared for it, and nothing else.
+# Requests that every role of the stacks makes to every resource of a kind. Only the role that declares a
+# request may make it.
 TABLE_ACTIONS = (
     "GetItem",
     "PutItem",
@@ -255,7 +256,7 @@ OBJECTS = ("robots/isolated-b/x", "results/x", "x")
 PARAMETER_ACTIONS = ("GetParameter", "PutParameter", "DeleteParameter")
 FUNCTION_ACTIONS = ("InvokeFunction", "UpdateFunctionConfiguration")
 LOG_ACTIONS = ("CreateLogStream", "PutLogEvents", "GetLogEvents")
-# Of a thing: the shadow of the settings, another, and the one without a name.
+# A thing's shadows: the settings, another name, and the one without a name.
 SHADOWS = {f"{A}/{SHADOW}": SHADOW, f"{A}/other": "other", A: None}
 TOPICS = (
     build_topic(CMD, B, "drive"),

@@ -1,7 +1,7 @@
-"""A small evaluator of IAM and IoT policy statements, so that nothing rests on the emulator's alone.
+"""A small evaluator of IAM and IoT policy statements, independent of the emulator's evaluator.
 
-Source: IAM, "Policy evaluation logic"; AWS IoT Core, "Policy actions", "Thing policy variables". What it
-does not know, it refuses to evaluate.
+Source: IAM, "Policy evaluation logic"; AWS IoT Core, "Policy actions", "Thing policy variables". It
+rejects statements with unknown elements.
 """
 
 from __future__ import annotations
@@ -16,10 +16,10 @@ Statement = Mapping[str, Any]
 def allows(
     statements: Iterable[Statement], action: str, arn: str, variables: Mapping[str, str] | None = None
 ) -> bool:
-    """Whether a statement allows the action on the resource, and none denies it.
+    """Return whether a statement allows the action on the resource, and no statement denies it.
 
-    ``variables`` are the values of policy variables and condition keys; one that has none matches
-    nothing. Raises `NotImplementedError` for a statement with elements that are not known here.
+    ``variables`` are the values of policy variables and condition keys; a variable without a value matches
+    nothing. Raises `NotImplementedError` for a statement with unknown elements.
     """
     found = {
         statement["Effect"] for statement in statements if _matches(statement, action, arn, variables or {})
@@ -32,7 +32,7 @@ def _matches(statement: Statement, action: str, arn: str, variables: Mapping[str
     if unknown or statement["Effect"] not in ("Allow", "Deny"):
         raise NotImplementedError(str(statement))
     return (
-        # Actions are compared without regard to case, resources with.
+        # Actions are compared without regard to case, resources with regard to it.
         any(_like(one.lower(), action.lower()) for one in _list(statement["Action"]))
         and any(_like(one, arn, variables) for one in _list(statement["Resource"]))
         and all(
@@ -48,7 +48,7 @@ def _holds(operator: str, key: str, wanted: Any, variables: Mapping[str, str]) -
         return variables.get(key) in [str(one).lower() for one in _list(wanted)]
     if operator == "StringEquals":
         return variables.get(key) in _list(wanted)
-    # A key that the request does not have passes both.
+    # A key that is missing in the request passes both.
     if operator == "StringEqualsIfExists":
         return key not in variables or variables[key] in _list(wanted)
     if operator == "ForAllValues:StringLike":
@@ -65,7 +65,7 @@ def _like(pattern: str, text: str, variables: Mapping[str, str] | None = None) -
         elif part.startswith("${"):
             if part[2:-1] not in (variables or {}):
                 return False
-            # A value is text, whatever characters it has.
+            # A value is plain text, whatever its characters.
             expression += re.escape((variables or {})[part[2:-1]])
         else:
             expression += re.escape(part)

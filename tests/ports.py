@@ -1,4 +1,4 @@
-"""Ports for the servers of tests that must know theirs before they listen."""
+"""Ports for test servers that must know theirs before they listen."""
 
 from __future__ import annotations
 
@@ -6,15 +6,15 @@ import itertools
 import os
 import socket
 
-# Below those that Linux gives to connections (32768 on), and a range for each worker of pytest-xdist, so
-# that nobody takes one between here and its server's start.
+# Below Linux' range for outgoing connections (from 32768), with a range for each worker of pytest-xdist, so
+# that no other process takes a port before its server starts.
 _FIRST, _EACH = 12_000, 1_000
 _WORKER = int(os.environ.get("PYTEST_XDIST_WORKER", "gw0")[len("gw") :])
 _offsets = itertools.count(os.getpid())
 
 
 def free_port() -> int:
-    """A port of loopback on which nobody listens, and that no other test was given lately."""
+    """Return a free port of loopback that no other test was given recently."""
     while True:
         port = _FIRST + _WORKER * _EACH + next(_offsets) % _EACH
         with socket.socket() as probe:

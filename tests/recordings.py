@@ -1,4 +1,4 @@
-"""Where the recordings of real cars are: outside the project, because they are not ours to share."""
+"""Finds recordings of real cars; they are outside the project, because the project may not share them."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ ROOT = Path(__file__).resolve().parent.parent
 
 
 def recording(name: str) -> Path:
-    """The path of a recording; skips the test where the machine has none."""
+    """Return a recording's path; skip the test if it is missing."""
     folder = Path(os.environ.get("IORT_RECORDINGS") or ROOT.parent / "shared" / "data")
     if not (folder / name).is_file():
         pytest.skip(f"the recording {name} is not in {folder}; IORT_RECORDINGS may name the folder")

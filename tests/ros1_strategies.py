@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 from tests.ros1_types import HEADER, SIZES, STRING, Message, serialize
 
 _BUILTIN = (*SIZES, STRING)
-# What a real package calls its fields, and what a decoder may take for its own.
+# Field names of real packages, and names that a decoder may use itself.
 _NAMES = st.sampled_from(
     [
         "header",
@@ -52,7 +52,7 @@ _NUMBERS = {kind: _numbers(kind) for kind in SIZES}
 
 @st.composite
 def _text(draw: st.DrawFn, within: list[str], *, headed: bool) -> str:
-    """One type's own text, of builtin types and of those ``within``."""
+    """Draw one type's own text, with builtin types and those of ``within``."""
     lines = draw(st.lists(st.sampled_from(_CONSTANTS), max_size=2, unique=True))
     names = draw(st.lists(_NAMES, max_size=5, unique=True))
     if headed:
@@ -64,7 +64,7 @@ def _text(draw: st.DrawFn, within: list[str], *, headed: bool) -> str:
 
 @st.composite
 def definitions(draw: st.DrawFn) -> Message:
-    """A message type: nested or flat, with or without a header, also without any field."""
+    """Draw a message type: nested or flat, with or without a header, possibly without fields."""
     texts: dict[str, str] = {}
     for name in draw(st.sampled_from([[], ["Part"], ["Part", "Whole"]])):
         texts[f"made_msgs/{name}"] = draw(_text(list(texts), headed=draw(st.booleans())))
@@ -73,7 +73,7 @@ def definitions(draw: st.DrawFn) -> Message:
 
 
 class _Drawn:
-    """The values of a message, drawn."""
+    """Draws the values of a message."""
 
     def __init__(self, draw: st.DrawFn) -> None:
         self._draw = draw
@@ -90,5 +90,5 @@ class _Drawn:
 
 @st.composite
 def messages(draw: st.DrawFn, of: Message) -> bytes:
-    """A serialized message of a definition."""
+    """Draw a serialized message of a definition."""
     return serialize(of, _Drawn(draw))

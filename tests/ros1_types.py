@@ -1,7 +1,7 @@
-"""ROS 1 message types put together by hand, and their messages' bytes: no ROS and no library is needed.
+"""ROS 1 message types and the bytes of their messages, without ROS or a library.
 
-A `Message` is a type with every type within it; it knows the text that a publisher sends and its checksum.
-`serialize` makes a message of what a `Chance` says, byte by byte; `fields` reads one as a flat list,
+A `Message` is a type with its nested types; it has the text that a publisher sends and its checksum.
+`serialize` makes a message with values of a `Chance`, byte by byte; `fields` reads one as a flat list,
 `as_json` as rosbridge does.
 """
 
@@ -31,7 +31,9 @@ _FIELD = re.compile(r"(?P<base>[\w/]+?)(?P<array>\[(?P<length>\d*)\])?\s+(?P<nam
 
 
 class Field(NamedTuple):
-    """``kind`` is a full name; ``length`` is None for one value, `VARIABLE`, or of a fixed array."""
+    """``kind`` is a full name; ``length`` is None for one value, `VARIABLE`, or the length of a fixed
+    array.
+    """
 
     name: str
     kind: str
@@ -39,20 +41,20 @@ class Field(NamedTuple):
 
 
 class Chance(Protocol):
-    """What the values of a message are."""
+    """Chooses the values of a message."""
 
     def number(self, kind: str, name: str) -> bytes:
-        """One number of a type of `SIZES`, as it is on the wire."""
+        """Return a number of a type in `SIZES`, in its wire format."""
 
     def text(self, name: str) -> bytes:
-        """A text, which need not be UTF-8."""
+        """Return a text, possibly with invalid UTF-8."""
 
     def length(self, name: str) -> int:
-        """Of a variable array."""
+        """Return the length of a variable array."""
 
 
 class Message:
-    """A type and those within, from each type's own text."""
+    """A type and its nested types, from each type's own text."""
 
     def __init__(self, kind: str, texts: Mapping[str, str]) -> None:
         self.kind = kind
@@ -71,7 +73,7 @@ class Message:
 
     @property
     def stamped(self) -> bool:
-        """Whether it begins with a header."""
+        """Return whether it begins with a header."""
         return self.types[self.kind][:1] == [Field("header", HEADER, None)]
 
     def _read(self, kind: str) -> None:
@@ -98,7 +100,9 @@ class Message:
         return HEADER if name == "Header" else f"{kind.partition('/')[0]}/{name}"
 
     def _md5sum(self, kind: str) -> str:
-        """As genmsg computes it: the constants, then the fields, a nested type as its own checksum."""
+        """Compute it as genmsg does: the constants, then the fields, with a nested type as its own
+        checksum.
+        """
         constants, plain = [], []
         for match in self._lines(kind):
             base, name, full = match["base"], match["name"], self._full(kind, match["base"])
@@ -117,7 +121,7 @@ def header(seq: int, stamp_us: int, frame: bytes) -> bytes:
 
 
 def serialize(message: Message, chance: Chance, *, headed: bytes | None = None) -> bytes:
-    """A message of what chance says; ``headed`` is the header that it begins with."""
+    """Make a message with values of ``chance``; ``headed`` is its header."""
     out: list[bytes] = []
 
     def one(kind: str, name: str) -> None:
@@ -147,13 +151,14 @@ def serialize(message: Message, chance: Chance, *, headed: bytes | None = None) 
 
 
 def fields(message: Message, data: bytes) -> list[tuple[str, object]]:
-    """Path and value of everything in a message, in the wire's order; the length of an array and a text,
-    as bytes, are values, too. What is cut short or too long ends with a path that says so."""
+    """Return path and value of every part of a message, in wire order; array and text lengths, as bytes,
+    are values, too. A message that is too short or too long ends with a path that says so.
+    """
     found: list[tuple[str, object]] = []
 
     def one(kind: str, path: str, at: int) -> int:
         if kind in SIZES:
-            # NaN equals nothing, and -0.0 equals 0.0: bytes and value both.
+            # NaN equals nothing, and -0.0 equals 0.0: compare bytes and value.
             raw = data[at : at + SIZES[kind]]
             found.append((path, (*struct.unpack(f"<{_LETTERS[kind]}", raw), raw.hex())))
             return at + SIZES[kind]
@@ -191,8 +196,9 @@ def fields(message: Message, data: bytes) -> list[tuple[str, object]]:
 
 
 def as_json(message: Message, data: bytes) -> dict[str, Any]:
-    """A message as a rosbridge server makes an object of it, which keeps less than all: NaN and the
-    infinities are null, and what is not UTF-8 in a text is replaced."""
+    """Return a message as a rosbridge server's object, with its losses: NaN and the infinities become
+    null, and invalid UTF-8 in a text is replaced.
+    """
     at = 0
 
     def one(kind: str) -> Any:

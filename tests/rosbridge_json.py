@@ -1,4 +1,4 @@
-"""What rosbridge makes of a message: JSON, as rosbridge_suite 0.11.17 writes it."""
+"""Converts messages to JSON, as rosbridge_suite 0.11.17 does."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from iort_contract.ros1.definition import DURATION, LETTERS, STRING, TIME, Defin
 def as_rosbridge(
     definition: Definition, value: Any, field: Field | None = None, *, ros2: bool = False
 ) -> Any:
-    """A message as rosbridge turns it into JSON, by its message_conversion.py; bytes are its `uint8[]`."""
+    """Convert a message as rosbridge's message_conversion.py does; bytes are its `uint8[]`."""
     field = field or Field("", definition.kind, None)
     if field.length is not None and field.kind in ("uint8", "char"):
         return base64.standard_b64encode(bytes(value)).decode("ascii")

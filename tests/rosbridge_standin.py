@@ -1,10 +1,11 @@
-"""Stands in for a rosbridge server and its rosapi: aiohttp's WebSockets on loopback, in a thread of its own.
+"""Stands in for a rosbridge server and its rosapi: aiohttp's WebSockets on loopback, in a thread of its
+own.
 
 It does what rosbridge_suite 0.11.17 does in its subscribers.py, subscribe.py and rosapi: the clients share
-one ROS subscription a topic, which ends with the last of them; ``subscribe`` to a topic that is not
-advertised, without a type, is forgotten without an answer; what is latched comes with each subscription; a
-restarted master leaves it deaf until it subscribes anew; a service that is not there is answered with
-``result: false``.
+one ROS subscription for each topic, which ends with the last client; ``subscribe`` without a type to a
+topic that is not advertised is forgotten without an answer; a latched message comes with each
+subscription; after a restart of the master it is deaf until it subscribes again; a missing service is
+answered with ``result: false``.
 """
 
 from __future__ import annotations
@@ -27,9 +28,9 @@ from tests.ports import free_port
 class RosbridgeStandin:
     """Runs while it is entered; may be entered again, on the same port.
 
-    ``advertised`` is each topic's type, and without it every topic is there; ``definitions`` is each type's
-    text, which rosapi gives. With ``old``, rosapi does not know ``topics_and_raw_types``; without
-    ``definitions`` there is no rosapi.
+    ``advertised`` has each topic's type; without it every topic exists. ``definitions`` has each type's
+    text for rosapi; without it there is no rosapi. With ``old``, rosapi does not know
+    ``topics_and_raw_types``.
     """
 
     def __init__(
@@ -73,7 +74,7 @@ class RosbridgeStandin:
         assert not self._thread.is_alive()
 
     def wait_for(self, operation: str, count: int = 1, **members: Any) -> dict[str, Any]:
-        """The operation of that kind, once the client has sent it so often."""
+        """Return the operation of that kind, once the client has sent ``count`` of them."""
 
         def matching() -> list[dict[str, Any]]:
             wanted = {"op": operation, **members}
@@ -84,7 +85,7 @@ class RosbridgeStandin:
             return matching()[count - 1]
 
     def publish(self, topic: str, message: Any, *, latch: str | None = None) -> None:
-        """Publish in the graph; ``latch`` names a publisher that holds it for who comes later."""
+        """Publish in the graph; ``latch`` names a publisher that keeps it for later subscribers."""
         text = json.dumps({"op": "publish", "topic": topic, "msg": message})
         if latch is not None:
             self._latched.setdefault(topic, {})[latch] = text
@@ -100,11 +101,11 @@ class RosbridgeStandin:
         self._do(to_all())
 
     def restart_master(self) -> None:
-        """Start the ROS master again: publishers register anew, and the server does not."""
+        """Restart the ROS master: publishers register again, but the server does not."""
         self._master += 1
 
     def cut(self) -> None:
-        """Drop the connections without a word, as a router that is switched off does."""
+        """Drop the connections without a notice, as a powered-off router does."""
 
         async def abort() -> None:
             while self._transports:
@@ -177,7 +178,7 @@ class RosbridgeStandin:
             self._subscribers[topic] = self._master
         subscription.joined = True
         for text in self._latched.get(topic, {}).values():
-            # The client may be gone already.
+            # The client may have left already.
             with contextlib.suppress(ConnectionResetError):
                 await client.send_str(text)
 
@@ -212,13 +213,13 @@ class RosbridgeStandin:
             return {"type": topics.get(arguments["topic"], "")}
         if service == "/rosapi/message_details" and arguments["type"] in self.definitions:
             found = typedefs(arguments["type"], self.definitions[arguments["type"]])
-            # rosapi takes a char for a message, and fails.
+            # rosapi mistakes a char for a message, and fails.
             return None if any("char" in one["fieldtypes"] for one in found) else {"typedefs": found}
         return None
 
 
 class _Subscription:
-    """One client's subscription of a topic, under each of the identities that it gave."""
+    """A client's subscription of a topic, under each id that it gave."""
 
     def __init__(self) -> None:
         self.throttles: dict[str | None, float] = {}
@@ -234,7 +235,7 @@ class _Subscription:
 
 
 def typedefs(kind: str, text: str) -> list[dict[str, Any]]:
-    """What rosapi of ROS 1 says of a type: constants without their type, sorted by name."""
+    """Return rosapi's description of a type in ROS 1: constants without their type, sorted by name."""
     definition = parse(kind, text)
     found = []
     for name, fields in definition.types.items():

@@ -1,4 +1,4 @@
-"""A stand-in for the upload function and S3 in one: answers over a loopback uplink, takes PUTs by HTTPS."""
+"""A stand-in for the upload function and S3: it answers over a loopback uplink and accepts PUTs by HTTPS."""
 
 from __future__ import annotations
 
@@ -27,10 +27,10 @@ from tests.agent_fakes import Loopback
 
 
 class Store:
-    """What the bucket has, and the faults to make: each PUT takes one off ``faults``, while there are any.
+    """The bucket's content, and the faults to make: each PUT takes one from ``faults``, until it is empty.
 
     Faults: an HTTP status, ``reset`` (the connection ends in the middle of the body), ``mute`` (the body
-    is taken and never answered for).
+    is read and never answered).
     """
 
     def __init__(self, uplink: Loopback, url: str, *, robot: str = "car") -> None:
@@ -79,7 +79,7 @@ class Store:
         return part_range(request.file, part)[1]
 
     def put(self, part: int, content: bytes) -> int:
-        """Take a part, if it is what was announced; the HTTP status."""
+        """Accept a part if it equals the announced one; return the HTTP status."""
         if hashlib.sha256(content).hexdigest() != self.hashes[part]:
             return 400
         self.parts[part] = content
@@ -116,12 +116,12 @@ class _Server(http.server.ThreadingHTTPServer):
     daemon_threads = True
 
     def handle_error(self, *_: Any) -> None:
-        """A client that hangs up is what some tests are about."""
+        """Some tests disconnect on purpose."""
 
 
 @contextmanager
 def store(uplink: Loopback, folder: Path) -> Iterator[tuple[Store, Path]]:
-    """The stand-in, and the certificate to trust."""
+    """Yield the stand-in and the certificate to trust."""
     certificate, key = Authority().write(folder, "store", "127.0.0.1")
     context = ssl.SSLContext(ssl.PROTOCOL_TLS_SERVER)
     context.load_cert_chain(certificate, key)

@@ -1,7 +1,7 @@
 """Stands in for a VESC: a thread that answers requests over a pseudo-terminal.
 
-The client opens a symbolic link, as it would one in /dev/serial/by-id; `unplug` takes the terminal and
-the link away, `plug` brings both back with another terminal behind them.
+The client opens a symbolic link, as in /dev/serial/by-id; `unplug` removes the terminal and the link,
+`plug` restores both with another terminal.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ FIRMWARE = b"\x00\x06\x02" + b"60_MK6\x00" + bytes(12) + b"\x00\x00\x00"
 
 
 def framed(payload: bytes) -> bytes:
-    """A frame made by the description alone, without the code under test."""
+    """Make a frame by the description alone, without the code under test."""
     n = len(payload)
     head = struct.pack(">BB", 2, n) if n < 256 else struct.pack(">BH", 3, n)
     crc = 0
@@ -35,7 +35,7 @@ def framed(payload: bytes) -> bytes:
 
 
 def values(n: int = 0, *, length: int = 74, controller: int = 1) -> bytes:
-    """An answer of current firmware, number ``n`` in its tachometer; cut for older firmware."""
+    """Make an answer of current firmware, with number ``n`` in its tachometer; shorter for older firmware."""
     payload = struct.pack(
         ">BhhiiiihihiiiiiiBiBhhhiiB",
         4, 251, 333, 1234, 567, -12, 1230, 305, 8123, 118, 281, 1, 12908, 48, n, n + 1, 0,
@@ -50,7 +50,7 @@ Answer = Callable[[bytes, int], List[bytes]]
 class VescStandin:
     """Answers COMM_GET_VALUES and COMM_FW_VERSION; ``answer`` may be changed at any time.
 
-    ``answer`` takes the intact frame that would be sent and its number and returns what is sent instead.
+    ``answer`` gets the correct frame and its number, and returns the frames to send instead.
     """
 
     def __init__(self, link: Path) -> None:
@@ -78,15 +78,15 @@ class VescStandin:
         os.close(self._wake_out)
 
     def plug(self) -> None:
-        """A terminal appears, and with it the link."""
+        """Create a terminal and its link."""
         self._do(self._plug)
 
     def unplug(self) -> None:
-        """Both are gone, in the middle of whatever they were doing."""
+        """Remove both, at any moment."""
         self._do(self._unplug)
 
     def say(self, data: bytes) -> None:
-        """Send something that nobody asked for."""
+        """Send an unrequested frame."""
         self._do(lambda: self._write(data))
 
     def _do(self, command: Callable[[], None]) -> None:
@@ -126,7 +126,7 @@ class VescStandin:
                 received = self._serve(received + os.read(self._master, 4096))
 
     def _serve(self, received: bytes) -> bytes:
-        """Answer the whole requests; the bytes that are left."""
+        """Answer the complete requests; return the remaining bytes."""
         while len(received) >= 2 and len(received) >= received[1] + 5:
             one, received = received[: received[1] + 5], received[received[1] + 5 :]
             payload = one[2:-3]

@@ -1,4 +1,4 @@
-"""A source in a thread of its own, and its samples."""
+"""Runs a source in its own thread and collects its samples."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ class Running:
         assert self.failed is None
 
     def wait_for(self, count: int, *, more: bool = False) -> None:
-        """Wait for a number of samples, in all or from now on."""
+        """Wait for a number of samples, in total or from now on."""
         with self._more:
             wanted = count + (len(self.samples) if more else 0)
             assert self._more.wait_for(lambda: len(self.samples) >= wanted, 60), len(self.samples)
@@ -44,7 +44,7 @@ class Running:
     def _run(self) -> None:
         try:
             self.source.run(self._emit, self.stop)
-        except Exception as error:  # noqa: BLE001 - the test's to see
+        except Exception as error:  # noqa: BLE001 - the test reads the error
             self.failed = error
 
     def _emit(self, stream: str, t_us: int, values: Any) -> None:

@@ -1,4 +1,4 @@
-"""The network's thread keeps Python's state: a callback finds what an earlier one left."""
+"""The network's thread keeps Python's thread state: a callback finds what an earlier one stored."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from iort_agent.mqtt.native_thread import keep_state
 
 
 def _callbacks_find_their_state(at_the_first: Callable[[], None]) -> bool:
-    """Whether a callback in the thread of AWS' client finds what an earlier one left."""
+    """Return whether a callback in the thread of AWS' client finds what an earlier one stored."""
     left = threading.local()
     found: queue.SimpleQueue[bool] = queue.SimpleQueue()
 
@@ -48,7 +48,7 @@ def _callbacks_find_their_state(at_the_first: Callable[[], None]) -> bool:
 
 
 @pytest.mark.parametrize(("at_the_first", "kept"), [(keep_state, True), (lambda: None, False)])
-def test_a_kept_thread_has_its_state_in_the_next_callback(
+def test_a_kept_thread_keeps_its_state_for_the_next_callback(
     at_the_first: Callable[[], None], *, kept: bool
 ) -> None:
     assert _callbacks_find_their_state(at_the_first) is kept

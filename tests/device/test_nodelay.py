@@ -1,4 +1,4 @@
-"""Small messages leave at once."""
+"""Small messages leave without delay (TCP_NODELAY)."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ def nodelay(sock: socket.socket) -> bool:
     return bool(sock.getsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY))
 
 
-def test_only_the_sockets_to_that_port_are_set():
+def test_only_sockets_to_the_port_get_nodelay():
     with socket.create_server(("127.0.0.1", 0)) as broker, socket.create_server(("127.0.0.1", 0)) as other:
         port = broker.getsockname()[1]
         with ExitStack() as stack:
@@ -25,12 +25,12 @@ def test_only_the_sockets_to_that_port_are_set():
             assert nodelay(uplink)
             assert not nodelay(stranger)
             assert not nodelay(unconnected)
-            # The duplicate is closed, the socket is not.
+            # The duplicate is closed, but the socket stays open.
             uplink.sendall(b"x")
 
 
-def test_other_sockets_stay_as_they_are_under_a_default_timeout():
-    # rospy sets one; its own server socket must go on blocking.
+def test_other_sockets_stay_unchanged_under_a_default_timeout():
+    # rospy sets a default timeout; its own server socket must stay blocking.
     with socket.create_server(("127.0.0.1", 0)) as broker, socket.create_server(("127.0.0.1", 0)) as other:
         port = broker.getsockname()[1]
         before = socket.getdefaulttimeout()

@@ -169,7 +169,7 @@ def test_a_readable_queue_is_made_private(folder):
 @pytest.mark.parametrize(
     "name", ["queue.db", "queue.db-wal", "queue.db-shm", "queue.db.lock", "queue.db.seq"]
 )
-def test_a_link_in_the_place_of_the_queue_is_told_and_batches_go_out(folder, secret, name):
+def test_a_link_in_place_of_the_queue_is_reported_and_batches_are_sent(folder, secret, name):
     (folder / name).symlink_to(secret)
     clock = ManualClock()
     spool = SqliteSpool(folder / "queue.db", max_bytes=10**6, clock=clock)
@@ -185,7 +185,7 @@ def test_a_link_in_the_place_of_the_queue_is_told_and_batches_go_out(folder, sec
     spool.close()
 
 
-def test_a_file_is_whole_or_not_there(folder):
+def test_a_file_is_complete_or_absent(folder):
     write_below(folder, PurePath("a/b"), b"1", mode=0o640, mtime_ns=1_000)
     assert (folder / "a" / "b").stat().st_mtime_ns == 1_000
     assert stat.S_IMODE((folder / "a" / "b").stat().st_mode) == 0o640
@@ -197,7 +197,7 @@ def test_a_file_is_whole_or_not_there(folder):
     assert (folder / "a" / "b").read_bytes() == b"1"
 
 
-class Asking(io.StringIO):
+class UmaskRecorder(io.StringIO):
     """Standard output that notes with which umask it is written to."""
 
     def __init__(self):
@@ -212,7 +212,7 @@ class Asking(io.StringIO):
 
 
 def test_only_the_user_may_read_what_a_command_writes(tmp_path, open_umask):
-    asking = Asking()
+    asking = UmaskRecorder()
     with contextlib.redirect_stdout(asking):
         assert main(["--config", str(config_file(tmp_path, "{type: sim}")), "--check-config"]) == 0
     assert asking.umasks == {0o077}

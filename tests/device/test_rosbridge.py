@@ -1,4 +1,6 @@
-"""The rosbridge source against a server on loopback that restarts, falls silent and talks nonsense."""
+"""The rosbridge source against a server on loopback that restarts, falls silent and sends invalid
+messages.
+"""
 
 from __future__ import annotations
 
@@ -45,8 +47,8 @@ def log(caplog: pytest.LogCaptureFixture) -> pytest.LogCaptureFixture:
 SOON = Times(backoff_s=(0.05, 0.2), look_s=0.1, ask_again_s=60.0)
 
 
-class Quick(NamedTuple):
-    """A configuration whose source waits less."""
+class FastConfig(NamedTuple):
+    """A configuration whose source reconnects without long waits."""
 
     config: RosbridgeConfig
     times: Times = SOON
@@ -55,15 +57,15 @@ class Quick(NamedTuple):
         return RosbridgeSource(self.config, clock, self.times)
 
 
-def config(server: RosbridgeStandin, *topics: str, times: Times = SOON, **settings: Any) -> Quick:
+def config(server: RosbridgeStandin, *topics: str, times: Times = SOON, **settings: Any) -> FastConfig:
     topic = TopicConfig(**{"stream": "vesc", "time": "arrival", **settings})
-    return Quick(
+    return FastConfig(
         RosbridgeConfig(url=server.url, topics=tuple((name, topic) for name in topics or (CORE,))), times
     )
 
 
 def state(n: float = 0, **stamp: int) -> dict[str, Any]:
-    """As rosbridge of ROS 1 or ROS 2 sends a VescStateStamped, by the parts of its stamp."""
+    """Return a VescStateStamped as rosbridge of ROS 1 or ROS 2 sends it, given the parts of its stamp."""
     return {"header": {"stamp": stamp, "frame_id": "base_link"}, "state": {"speed": n, "fault_code": 0}}
 
 
@@ -80,14 +82,14 @@ def test_messages_become_samples(server: RosbridgeStandin, log: pytest.LogCaptur
     ], "in order, and without the wrapper"
     assert {stream for stream, _, _ in running.samples} == {"vesc"}
     times = [t_us for _, t_us, _ in running.samples]
-    assert running.said == [], "of what type they are, only the server could say"
+    assert running.said == [], "only the server knows their type"
     assert before < times[0] <= times[-1] < time.time_ns() // 1000
     assert [record.getMessage()[:70] for record in log.records if record.levelname == "WARNING"] == [
         f"topic {CORE}: the server does not tell the structure of its mes"
     ]
 
 
-def test_what_a_message_may_hold(server: RosbridgeStandin) -> None:
+def test_a_message_becomes_supported_values(server: RosbridgeStandin) -> None:
     message = {
         "header": {"stamp": {"sec": 1, "nanosec": 2}},
         "pose": {"position": {"x": 1.5, "y": None}},
@@ -103,7 +105,7 @@ def test_what_a_message_may_hold(server: RosbridgeStandin) -> None:
         server.publish("/odd", message)
         server.publish("/odd", {"a": float("nan"), "b": 1})
         running.wait_for(2)
-    assert math.isnan(running.samples[0][2].pop("pose.position.y")), "null is what the server makes of NaN"
+    assert math.isnan(running.samples[0][2].pop("pose.position.y")), "the server converts NaN to null"
     assert running.samples[0][2] == {
         "pose.position.x": 1.5,
         "covariance.0": 0.1,
@@ -117,7 +119,7 @@ def test_what_a_message_may_hold(server: RosbridgeStandin) -> None:
     assert running.source.report()["/odd"]["left_out"] == {"ranges": 1, "blob": 1}
 
 
-def test_selected_fields_only(server: RosbridgeStandin, log: pytest.LogCaptureFixture) -> None:
+def test_only_selected_fields_are_read(server: RosbridgeStandin, log: pytest.LogCaptureFixture) -> None:
     message = {"pose": {"x": 1, "y": 2}, "pose_age": 3, "ranges": list(range(100))}
     with Running(config(server, "/odd", fields=("pose", "ranges.77", "height"))) as running:
         server.wait_for("subscribe")
@@ -129,7 +131,7 @@ def test_selected_fields_only(server: RosbridgeStandin, log: pytest.LogCaptureFi
 
 
 @pytest.mark.parametrize("parts", [("secs", "nsecs"), ("sec", "nanosec")])
-def test_the_stamp_of_either_ros(server: RosbridgeStandin, parts: tuple[str, str]) -> None:
+def test_stamps_of_ros_1_and_ros_2_are_read(server: RosbridgeStandin, parts: tuple[str, str]) -> None:
     sec = int(time.time()) - 60
     with Running(config(server, time="header")) as running:
         server.wait_for("subscribe")
@@ -146,7 +148,7 @@ def test_the_stamp_of_either_ros(server: RosbridgeStandin, parts: tuple[str, str
         ({"header": {"stamp": 7}, "data": 1}, "using the time of arrival", "no_stamp"),
     ],
 )
-def test_a_stamp_not_to_be_believed(
+def test_an_implausible_stamp_is_replaced(
     server: RosbridgeStandin, log: pytest.LogCaptureFixture, message: Any, words: str, reason: str
 ) -> None:
     before = time.time_ns() // 1000
@@ -161,7 +163,7 @@ def test_a_stamp_not_to_be_believed(
 
 
 @pytest.mark.parametrize("how", ["closed", "cut"])
-def test_it_comes_back_and_resubscribes_each_time(
+def test_the_source_reconnects_and_resubscribes_each_time(
     server: RosbridgeStandin, log: pytest.LogCaptureFixture, how: str
 ) -> None:
     with Running(config(server)) as running:
@@ -175,11 +177,11 @@ def test_it_comes_back_and_resubscribes_each_time(
                 server.__exit__()
                 server.__enter__()
         server.wait_for("subscribe", 4)
-    assert [values["speed"] for _, _, values in running.samples] == [1, 2, 3], "nothing twice"
+    assert [values["speed"] for _, _, values in running.samples] == [1, 2, 3], "no sample is repeated"
     assert "connection lost" in log.text
 
 
-def test_started_before_the_server(log: pytest.LogCaptureFixture) -> None:
+def test_the_source_may_start_before_the_server(log: pytest.LogCaptureFixture) -> None:
     server = RosbridgeStandin(free_port())
     with Running(config(server)) as running:
         eventually(lambda: "nobody listens there: is rosbridge_server running?" in log.text)
@@ -190,13 +192,13 @@ def test_started_before_the_server(log: pytest.LogCaptureFixture) -> None:
     assert log.text.count("nobody listens there") == 1
 
 
-def test_a_quiet_connection_is_held_with_pings(server: RosbridgeStandin) -> None:
+def test_pings_keep_a_quiet_connection_open(server: RosbridgeStandin) -> None:
     with Running(config(server, times=SOON._replace(ping_s=0.5, dead_s=60.0))) as running:
         eventually(lambda: server.pings >= 4)
     assert running.source.connection.connects == 1
 
 
-def test_a_server_that_answers_nothing_is_left(
+def test_the_source_disconnects_from_a_server_without_answers(
     server: RosbridgeStandin, log: pytest.LogCaptureFixture
 ) -> None:
     server.deaf = True
@@ -209,7 +211,7 @@ IMPATIENT = SOON._replace(patience_s=0.5)
 
 
 def numbered(seq: int, **members: Any) -> dict[str, Any]:
-    """A stamped message of ROS 1, whose publisher counts."""
+    """Return a stamped message of ROS 1 whose publisher counts."""
     return {"header": {"seq": seq, "stamp": {"secs": seq, "nsecs": 5}, "frame_id": ""}, "n": seq, **members}
 
 
@@ -223,7 +225,7 @@ def test_a_slow_topic_keeps_its_subscription(server: RosbridgeStandin) -> None:
             time.sleep(0.05)  # the pace of a publisher
         server.publish("/slow", numbered(2))
         eventually(lambda: running.source.report()["/slow"]["messages"] == 2)
-        # The pace is known after an interruption.
+        # The source knows the pace after an interruption.
         server.cut()
         server.wait_for("subscribe", 4)
         began = time.monotonic()
@@ -244,7 +246,7 @@ def test_a_latched_message_is_stored_once(server: RosbridgeStandin, *, stamped: 
         server.cut()
         eventually(lambda: running.source.connection.connects == 2)
         eventually(lambda: running.source.report()["/map"].get("latched_again", 0) >= 3)
-        # What is latched does not prove the server deaf: the cut alone is one.
+        # A latched message does not prove that the server is deaf: the cut is the only interruption.
         assert running.source.report()["/map"]["interruptions"] == 1
         server.publish("/map", {**message, "changed": 1}, latch="/map_server")
         running.wait_for(2)
@@ -252,7 +254,7 @@ def test_a_latched_message_is_stored_once(server: RosbridgeStandin, *, stamped: 
     assert running.source.report()["/map"]["messages"] == 2
 
 
-def test_a_server_deaf_since_its_master_restarted(server: RosbridgeStandin) -> None:
+def test_a_deaf_server_is_resubscribed_after_a_master_restart(server: RosbridgeStandin) -> None:
     with Running(config(server, times=IMPATIENT)) as running:
         server.wait_for("subscribe")
         server.publish(CORE, numbered(1))
@@ -270,7 +272,7 @@ def test_a_server_deaf_since_its_master_restarted(server: RosbridgeStandin) -> N
 
 
 @pytest.mark.parametrize("how", ["closed", "cut"])
-def test_what_is_lost_in_an_interruption_is_counted(server: RosbridgeStandin, how: str) -> None:
+def test_messages_lost_in_an_interruption_are_counted(server: RosbridgeStandin, how: str) -> None:
     with Running(config(server, "/stamped", "/plain")) as running:
         server.wait_for("subscribe", 2)
         server.publish("/stamped", numbered(41))
@@ -280,7 +282,7 @@ def test_what_is_lost_in_an_interruption_is_counted(server: RosbridgeStandin, ho
             server.cut()
         else:
             server.__exit__()
-            # What is published now is lost: nobody serves it.
+            # Messages published now are lost, since no server forwards them.
             server.__enter__()
         server.wait_for("subscribe", 4)
         server.publish("/stamped", numbered(62))
@@ -294,7 +296,7 @@ def test_what_is_lost_in_an_interruption_is_counted(server: RosbridgeStandin, ho
         assert report["dark_s"] > 0
 
 
-def test_an_interruption_that_lasts_is_told_while_it_lasts(server: RosbridgeStandin) -> None:
+def test_a_long_interruption_is_reported_while_it_lasts(server: RosbridgeStandin) -> None:
     with Running(config(server)) as running:
         server.wait_for("subscribe")
         server.__exit__()
@@ -302,7 +304,7 @@ def test_an_interruption_that_lasts_is_told_while_it_lasts(server: RosbridgeStan
         server.__enter__()
 
 
-def test_a_topic_that_is_advertised_later_is_heard_soon() -> None:
+def test_a_topic_that_is_advertised_later_is_found() -> None:
     times = SOON._replace(ask_again_s=0.2)
     with RosbridgeStandin(advertised={}) as server, Running(config(server, times=times)) as running:
         server.wait_for("subscribe", 2)
@@ -315,12 +317,12 @@ def test_a_topic_that_is_advertised_later_is_heard_soon() -> None:
         asked = len([op for op in server.operations if op["op"] == "subscribe"])
     assert [values["speed"] for _, _, values in running.samples] == [2]
     assert asked >= 4
-    assert not [op for op in server.operations if op["op"] == "unsubscribe"], "nothing is ended for it"
+    assert not [op for op in server.operations if op["op"] == "unsubscribe"], (
+        "no topic is unsubscribed for it"
+    )
 
 
-def test_a_message_in_fragments_is_put_together(
-    server: RosbridgeStandin, log: pytest.LogCaptureFixture
-) -> None:
+def test_a_fragmented_message_is_reassembled(server: RosbridgeStandin, log: pytest.LogCaptureFixture) -> None:
     whole = json.dumps({"op": "publish", "topic": CORE, "msg": state(7)})
     parts = [whole[at : at + 20] for at in range(0, len(whole), 20)]
     with Running(config(server)) as running:
@@ -347,7 +349,7 @@ def test_a_message_in_fragments_is_put_together(
     ],
     ids=lambda text: text[:40],
 )  # fmt: skip
-def test_nonsense_does_not_stop_it(server: RosbridgeStandin, nonsense: str) -> None:
+def test_an_invalid_message_does_not_stop_the_source(server: RosbridgeStandin, nonsense: str) -> None:
     with Running(config(server)) as running:
         server.wait_for("subscribe")
         server.send(nonsense)
@@ -356,24 +358,22 @@ def test_nonsense_does_not_stop_it(server: RosbridgeStandin, nonsense: str) -> N
     assert running.source.connection.connects == 1
 
 
-def test_what_the_server_complains_of_is_told(
-    server: RosbridgeStandin, log: pytest.LogCaptureFixture
-) -> None:
+def test_the_servers_complaints_are_logged(server: RosbridgeStandin, log: pytest.LogCaptureFixture) -> None:
     with Running(config(server)):
         server.wait_for("subscribe")
         server.send('{"op": "status", "level": "error", "msg": "Unable to load vesc_msgs.msg"}')
         eventually(lambda: "the server says: Unable to load vesc_msgs.msg" in log.text)
 
 
-def test_something_else_listens_there(log: pytest.LogCaptureFixture) -> None:
+def test_another_server_on_the_port_is_reported(log: pytest.LogCaptureFixture) -> None:
     with RosbridgeStandin() as server:
         url = f"{server.url}/elsewhere"
         topics = ((CORE, TopicConfig(stream="vesc", time="arrival")),)
-        with Running(Quick(RosbridgeConfig(url=url, topics=topics))):
+        with Running(FastConfig(RosbridgeConfig(url=url, topics=topics))):
             eventually(lambda: "is no rosbridge server" in log.text)
 
 
-def test_without_websocket_client_it_says_what_to_install(
+def test_an_error_names_the_missing_websocket_package(
     server: RosbridgeStandin, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setitem(sys.modules, "websocket", None)
@@ -384,7 +384,7 @@ def test_without_websocket_client_it_says_what_to_install(
 CAR = "robot: car1\nendpoint: a.example\ncertificate: x\nprivate_key: x\nroot_ca: x\nsources:\n"
 
 
-def test_the_configuration(tmp_path: Path) -> None:
+def test_the_configuration_is_validated(tmp_path: Path) -> None:
     (tmp_path / "x").touch()
     (tmp_path / "car.yaml").write_text(
         CAR + "  - type: rosbridge\n    url: wss://robot.local:9090/\n    topics:\n"
@@ -397,7 +397,7 @@ def test_the_configuration(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("url", ["http://a:9090", "localhost:9090", "ws://", "ws://a:x", "ws://[", "7"])
-def test_a_wrong_address(tmp_path: Path, url: str) -> None:
+def test_a_wrong_address_is_rejected(tmp_path: Path, url: str) -> None:
     (tmp_path / "x").touch()
     (tmp_path / "car.yaml").write_text(
         CAR + f"  - {{type: rosbridge, url: '{url}', topics: {{/a: {{stream: a, time: arrival}}}}}}\n"

@@ -1,4 +1,4 @@
-"""The rosbridge source where the server says what its messages consist of, and where it does not."""
+"""The rosbridge source with a server that describes its message types, and with one that does not."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ SERVED = {
 
 
 @pytest.mark.parametrize("old", [False, True])
-def test_messages_go_the_way_of_ros_1_where_their_type_is_known(*, old: bool) -> None:
+def test_a_message_of_a_known_type_is_decoded_like_ros_1(*, old: bool) -> None:
     sec = int(time.time()) - 60
     with RosbridgeStandin(**SERVED, old=old) as server:
         with Running(config(server, time="header")) as running:
@@ -56,12 +56,12 @@ def test_messages_go_the_way_of_ros_1_where_their_type_is_known(*, old: bool) ->
     kind = message_type(running.said[0])
     assert (kind.topic, kind.kind) == (CORE, VESC)
     if not old:
-        # As genmsg of ROS computes it.
+        # genmsg of ROS computes it in this way.
         assert (kind.md5sum, kind.definition) == ("da885266203a97b33d0ad1d0fa9d1d9e", VESC_TEXT)
     assert running.source.report()[CORE] == {"messages": 3}
 
 
-def test_structure_is_kept_where_the_plain_sample_loses_it() -> None:
+def test_the_message_keeps_structure_that_the_plain_sample_loses() -> None:
     with RosbridgeStandin(**SERVED) as server, Running(config(server, "/scan")) as running:
         server.wait_for("subscribe")
         header = {"seq": 1, "stamp": {"secs": 1, "nsecs": 2}, "frame_id": "laser"}
@@ -75,12 +75,12 @@ def test_structure_is_kept_where_the_plain_sample_loses_it() -> None:
         hearing = running.source._hearings["/scan"]
         assert running.samples[0][2].keys() == {"ranges.0", "ranges.1"}
         assert running.samples[0][2]["ranges.1"] != running.samples[0][2]["ranges.1"]
-        # What is no column is in the message all the same.
+        # The message has values that are not columns, too.
         assert running.samples[0][2].raw == raw
         assert hearing.report() == {"messages": 1, "not_a_number": 1}
 
 
-def test_without_rosapi_the_plain_sample_is_sent_and_counted(server: RosbridgeStandin) -> None:
+def test_the_plain_sample_is_sent_and_counted_without_rosapi(server: RosbridgeStandin) -> None:
     with Running(config(server)) as running:
         server.wait_for("subscribe")
         server.publish(CORE, state(1))
@@ -88,7 +88,7 @@ def test_without_rosapi_the_plain_sample_is_sent_and_counted(server: RosbridgeSt
     assert running.source.report()[CORE] == {"messages": 1, "structure_not_kept": 1}
 
 
-def test_a_rosapi_that_does_not_answer_loses_nothing() -> None:
+def test_a_silent_rosapi_loses_no_message() -> None:
     with RosbridgeStandin(**SERVED) as server:
         server.silent_rosapi = True
         with Running(config(server)) as running:
@@ -100,7 +100,7 @@ def test_a_rosapi_that_does_not_answer_loses_nothing() -> None:
     assert running.source.report()[CORE]["structure_not_kept"] == 2_003
 
 
-def test_what_is_held_when_the_agent_ends_is_sent() -> None:
+def test_held_messages_are_sent_when_the_agent_ends() -> None:
     with RosbridgeStandin(**SERVED) as server:
         server.silent_rosapi = True
         with Running(config(server)) as running:
@@ -110,7 +110,7 @@ def test_what_is_held_when_the_agent_ends_is_sent() -> None:
     assert [values["speed"] for _, _, values in running.samples] == [5]
 
 
-def test_the_types_are_asked_for_again_after_a_reconnect() -> None:
+def test_types_are_requested_again_after_a_reconnect() -> None:
     with RosbridgeStandin(**SERVED) as server, Running(config(server)) as running:
         server.wait_for("subscribe")
         server.publish(CORE, {**state(1, secs=1, nsecs=2)})

@@ -1,4 +1,4 @@
-"""Uploads to a fake store that breaks, refuses and forgets."""
+"""Uploads to a fake store that fails, rejects and forgets."""
 
 from __future__ import annotations
 
@@ -103,7 +103,7 @@ def small(tmp_path):
     return path
 
 
-# --- what a file is ---------------------------------------------------------------------------------
+# --- names and hashes -----------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("size", [0, 1, PART_BYTES - 1, PART_BYTES, PART_BYTES + 1, 2 * PART_BYTES])
@@ -130,7 +130,7 @@ def test_a_file_is_hashed_whole_and_by_part(tmp_path, size):
         ("x" * 150 + ".bag", "x" * 96 + ".bag"),
     ],
 )
-def test_every_name_becomes_an_allowed_one(path, name, tmp_path):
+def test_each_name_becomes_an_allowed_name(path, name, tmp_path):
     from pathlib import PurePath
 
     assert wire_name(PurePath(path)) == name
@@ -151,7 +151,7 @@ def test_small_and_large_files_arrive(rig, small, large):
 
 
 @pytest.mark.parametrize("fault", ["reset", "mute", 500, 503, 403, 404, 412])
-def test_a_part_that_fails_is_sent_again_and_no_other(rig, large, fault):
+def test_only_a_failed_part_is_sent_again(rig, large, fault):
     first = rig.store.put
 
     def put(part, content):
@@ -165,7 +165,7 @@ def test_a_part_that_fails_is_sent_again_and_no_other(rig, large, fault):
     assert rig.store.puts == [1, 2, 2, 3]
 
 
-def test_after_a_break_only_the_missing_parts_are_sent(rig, large):
+def test_only_missing_parts_are_sent_after_a_break(rig, large):
     rig.store.put, put = lambda part, content: rig.stop.set() or put(part, content), rig.store.put
     with pytest.raises(UploadError, match="stopped"):
         rig.upload(large)
@@ -185,14 +185,14 @@ def test_a_lost_answer_is_requested_again(rig, small):
     assert len({request.id for request in rig.store.requests}) == 4
 
 
-def test_a_refusal_of_the_cloud_is_raised_with_its_reason(rig, small):
+def test_a_rejection_by_the_cloud_is_raised_with_its_reason(rig, small):
     rig.store.refusals = [("no more than 5 bytes a day", 3600)]
     with pytest.raises(UploadError, match=r"notes.txt: refused: no more than 5 bytes a day") as caught:
         rig.upload(small)
     assert caught.value.again_s == 3600
 
 
-def test_after_several_failures_the_file_waits(rig, small):
+def test_a_file_waits_after_several_failures(rig, small):
     rig.store.faults = [500] * 100
     with pytest.raises(UploadError, match="the server says 500") as caught:
         rig.upload(small)
@@ -347,7 +347,7 @@ def test_a_new_process_neither_uploads_again_nor_reads_again(rig, bags, monkeypa
         b'{"read": {}, "done": [["a.bag", {"look": 1}]]}',
     ],
 )
-def test_after_a_damaged_state_files_are_read_again(rig, bags, damage):
+def test_files_are_read_again_after_a_damaged_state(rig, bags, damage):
     (bags / "a.bag").write_bytes(b"1")
     assert rig.folder(bags, settle_s=0).step(rig.stop)
     (bags / STATE).write_bytes(damage)
@@ -380,7 +380,7 @@ def test_a_file_that_changed_after_its_upload_is_uploaded_again(rig, bags):
     assert sorted(rig.store.objects.values()) == [b"1", b"12"]
 
 
-def test_a_refused_file_does_not_delay_others(rig, bags):
+def test_a_rejected_file_does_not_delay_others(rig, bags):
     for name, age in (("first.bag", 100), ("second.bag", 200)):
         (bags / name).write_bytes(name.encode())
         os.utime(bags / name, (age, age))
@@ -397,7 +397,7 @@ def test_a_refused_file_does_not_delay_others(rig, bags):
     assert b"first.bag" in rig.store.objects.values()
 
 
-def test_a_file_refused_repeatedly_waits_longer_each_time(rig, bags):
+def test_a_file_rejected_repeatedly_waits_longer_each_time(rig, bags):
     (bags / "a.bag").write_bytes(b"1")
     uploads = rig.folder(bags, settle_s=0)
     rig.store.refusals = [("again at once", 0)] * 10_000
@@ -453,7 +453,7 @@ def test_an_unexpected_error_does_not_end_the_uploads(rig, bags, caplog):
     assert list(rig.store.objects.values()) == [b"1"]
 
 
-def test_while_an_agent_runs_the_command_gives_advice(tmp_path, bags):
+def test_the_command_gives_advice_while_an_agent_runs(tmp_path, bags):
     file = tmp_path / "car.yaml"
     for name in ("certificate.pem", "private.key"):
         (tmp_path / name).write_text("")

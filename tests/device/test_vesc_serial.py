@@ -1,4 +1,4 @@
-"""The VESC source over a real pseudo-terminal, against a stand-in that behaves and misbehaves."""
+"""The VESC source over a real pseudo-terminal, against a stand-in with faults."""
 
 from __future__ import annotations
 
@@ -42,7 +42,7 @@ def config(vesc: VescStandin, **settings: Any) -> VescConfig:
     return VescConfig(port=str(vesc.link), **{"rate_hz": 200.0, "timeout_s": 10.0, **settings})
 
 
-def test_values_at_the_rate_asked_for(vesc: VescStandin, log: pytest.LogCaptureFixture) -> None:
+def test_values_arrive_at_the_configured_rate(vesc: VescStandin, log: pytest.LogCaptureFixture) -> None:
     started = time.time_ns() // 1000
     with Running(config(vesc)) as running:
         running.wait_for(200)
@@ -52,14 +52,14 @@ def test_values_at_the_rate_asked_for(vesc: VescStandin, log: pytest.LogCaptureF
     assert (stream, first["voltage_input"], first["charge_drawn"]) == ("vesc", 11.8, 281)
     times = [t_us for _, t_us, _ in running.samples]
     assert started < times[0] < times[-1] < ended
-    # Deadlines 5 ms apart, of which a busy machine may skip some, and the first may be late.
+    # Deadlines are 5 ms apart; a busy machine may skip some, and the first may be late.
     assert times[199] - times[0] > 199 * 5_000 / 2
     assert vesc.asked[0] == b"\x00"
     assert "VESC with firmware 6.02 on 60_MK6" in log.text
     assert "WARNING" not in log.text
 
 
-def test_a_controller_behind_the_can_bus(vesc: VescStandin) -> None:
+def test_a_controller_behind_the_can_bus_is_read(vesc: VescStandin) -> None:
     with Running(config(vesc, can_id=17, stream="rear")) as running:
         running.wait_for(5)
     assert set(vesc.asked) == {b"\x22\x11\x00", b"\x22\x11\x04"}
@@ -67,7 +67,7 @@ def test_a_controller_behind_the_can_bus(vesc: VescStandin) -> None:
 
 
 @pytest.mark.parametrize("length", [54, 59, 73])
-def test_older_firmware(vesc: VescStandin, length: int) -> None:
+def test_older_firmware_is_read(vesc: VescStandin, length: int) -> None:
     vesc.length = length
     with Running(config(vesc)) as running:
         running.wait_for(20)
@@ -87,8 +87,8 @@ def test_garbage_around_every_answer_costs_no_sample(vesc: VescStandin) -> None:
     assert running.samples[50][2]["voltage_input"] == 11.8
 
 
-def test_frames_that_nobody_asked_for_are_passed_over(vesc: VescStandin) -> None:
-    """A script on the controller prints, another program's answer is still under way."""
+def test_unrequested_frames_are_ignored(vesc: VescStandin) -> None:
+    """A script on the controller prints; another program's answer is still in transit."""
     vesc.answer = lambda frame, n: [framed(b"\x15hello"), framed(FIRMWARE), frame]
     with Running(config(vesc)) as running:
         running.wait_for(20)
@@ -96,9 +96,7 @@ def test_frames_that_nobody_asked_for_are_passed_over(vesc: VescStandin) -> None
     assert (running.source.counts.unknown, running.source.counts.timeouts) == (0, 0)
 
 
-def test_half_frames_and_wrong_crcs_cost_their_own_sample_only(
-    vesc: VescStandin, log: pytest.LogCaptureFixture
-) -> None:
+def test_a_broken_frame_costs_only_its_own_sample(vesc: VescStandin, log: pytest.LogCaptureFixture) -> None:
     def answer(frame: bytes, n: int) -> list[bytes]:
         if n % 10 == 3:
             return [frame[:40]]
@@ -115,11 +113,11 @@ def test_half_frames_and_wrong_crcs_cost_their_own_sample_only(
     assert len(expected) - len(running.samples) <= 1
     assert counts.timeouts >= 5
     assert counts.bad_crc >= 2
-    assert counts.opened == 1, "no reason to open the port afresh"
-    assert "WARNING" not in log.text, "nor to speak of it"
+    assert counts.opened == 1, "the port stays open"
+    assert "WARNING" not in log.text, "no warning is logged"
 
 
-def test_an_unknown_length_is_said_once_and_never_misread(
+def test_an_unknown_length_is_logged_once_and_never_misread(
     vesc: VescStandin, log: pytest.LogCaptureFixture
 ) -> None:
     vesc.answer = lambda frame, n: [framed(values(n) + b"\x00\x00")]
@@ -131,7 +129,7 @@ def test_an_unknown_length_is_said_once_and_never_misread(
     assert "values must have one of 54, 56, 58, 59, 65, 73, 74 bytes, got 76" in errors[0].getMessage()
 
 
-def test_a_late_answer_is_not_taken_for_the_next_ones(vesc: VescStandin) -> None:
+def test_a_late_answer_is_not_used_for_the_next_request(vesc: VescStandin) -> None:
     """Every fifth answer comes only after its timeout, before the next request."""
     kept: list[bytes] = []
 
@@ -150,20 +148,22 @@ def test_a_late_answer_is_not_taken_for_the_next_ones(vesc: VescStandin) -> None
     assert numbers(running)[:6] == [0, 1, 2, 3, 5, 6]
 
 
-def test_unplugged_and_plugged_again(vesc: VescStandin, log: pytest.LogCaptureFixture) -> None:
+def test_the_source_resumes_after_a_replug(vesc: VescStandin, log: pytest.LogCaptureFixture) -> None:
     with Running(config(vesc)) as running:
         for i in range(3):
             running.wait_for(10, more=True)
             vesc.unplug()
-            eventually(lambda: log.text.count("waiting for it to be plugged in") == i + 1)  # noqa: B023 - it is called within the turn
+            eventually(lambda: log.text.count("waiting for it to be plugged in") == i + 1)  # noqa: B023 - called within the iteration
             vesc.plug()
         running.wait_for(10, more=True)
         assert running.source.counts.opened == 4
     assert log.text.count("samples are coming again") == 3
-    assert numbers(running) == sorted(set(numbers(running))), "nothing twice"
+    assert numbers(running) == sorted(set(numbers(running))), "no sample is repeated"
 
 
-def test_plugged_in_only_after_the_start(tmp_path: Path, log: pytest.LogCaptureFixture) -> None:
+def test_the_source_finds_a_controller_plugged_in_later(
+    tmp_path: Path, log: pytest.LogCaptureFixture
+) -> None:
     vesc = VescStandin(tmp_path / "vesc")
     with Running(config(vesc)) as running:
         eventually(lambda: "waiting for it to be plugged in" in log.text)
@@ -171,7 +171,7 @@ def test_plugged_in_only_after_the_start(tmp_path: Path, log: pytest.LogCaptureF
             running.wait_for(3)
 
 
-def test_silence_is_told_and_got_over(vesc: VescStandin, log: pytest.LogCaptureFixture) -> None:
+def test_silence_is_reported_and_overcome(vesc: VescStandin, log: pytest.LogCaptureFixture) -> None:
     with Running(config(vesc, timeout_s=0.05)) as running:
         running.wait_for(5)
         vesc.answer = lambda frame, n: []
@@ -183,7 +183,7 @@ def test_silence_is_told_and_got_over(vesc: VescStandin, log: pytest.LogCaptureF
     assert log.text.count("samples are coming again") == 1
 
 
-def test_a_wrong_baud_rate_looks_like_noise(vesc: VescStandin, log: pytest.LogCaptureFixture) -> None:
+def test_a_wrong_baud_rate_is_reported_as_noise(vesc: VescStandin, log: pytest.LogCaptureFixture) -> None:
     vesc.answer = lambda frame, n: [bytes(byte ^ 0x5A for byte in frame) * 20]
     with Running(config(vesc, timeout_s=0.05)):
         eventually(lambda: "is the baud rate right?" in log.text)
@@ -221,7 +221,7 @@ def test_two_programs_cannot_share_the_port(vesc: VescStandin, log: pytest.LogCa
         (lambda path: path.mkdir(), "cannot be opened"),
     ],
 )
-def test_what_is_no_serial_port(
+def test_a_file_other_than_a_serial_port_is_reported(
     tmp_path: Path, log: pytest.LogCaptureFixture, make: Callable[[Path], Any], words: str
 ) -> None:
     make(tmp_path / "port")
@@ -229,13 +229,13 @@ def test_what_is_no_serial_port(
         eventually(lambda: words in log.text)
 
 
-def test_a_port_of_another_group_says_which() -> None:
+def test_an_error_names_the_group_of_the_port() -> None:
     error = serial.SerialException(13, "could not open port /dev/ttyACM0: Permission denied")
     assert "usermod -aG dialout" in why(error, was_open=False)
 
 
 @pytest.mark.parametrize("trouble", ["plugged", "silent", "absent"])
-def test_stops_at_once(vesc: VescStandin, trouble: str) -> None:
+def test_the_source_stops_at_once(vesc: VescStandin, trouble: str) -> None:
     if trouble == "silent":
         vesc.answer = lambda frame, n: []
     if trouble == "absent":
@@ -247,13 +247,15 @@ def test_stops_at_once(vesc: VescStandin, trouble: str) -> None:
         assert not running.thread.is_alive(), "it waited for an answer"
 
 
-def test_without_pyserial_it_says_what_to_install(vesc: VescStandin, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_an_error_names_the_missing_pyserial_package(
+    vesc: VescStandin, monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.setitem(sys.modules, "serial", None)
     with pytest.raises(SourceError, match=r"pip install 'iort-agent\[serial\]'"):
         config(vesc).build(SystemClock()).run(lambda *_: None, threading.Event())
 
 
-def test_the_configuration(tmp_path: Path) -> None:
+def test_the_configuration_is_validated(tmp_path: Path) -> None:
     for name in ("cert.pem", "key.pem", "ca.pem"):
         (tmp_path / name).touch()
     (tmp_path / "car.yaml").write_text(

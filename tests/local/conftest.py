@@ -36,10 +36,10 @@ def embedded(tmp_path_factory: pytest.TempPathFactory) -> Iterator[EmbeddedCloud
 def bundle(
     embedded: EmbeddedCloud, tmp_path: Path, request: pytest.FixtureRequest
 ) -> Callable[..., robots.Bundle]:
-    """Registers a robot of its own for each test: `bundle("a", sources=[...])`."""
+    """Register a robot for each test: `bundle("a", sources=[...])`."""
 
     def register(suffix: str = "", **settings: Any) -> robots.Bundle:
-        # The end of the name tells the cases of a parametrized test apart.
+        # The end of the name tells parametrized cases apart.
         name = re.sub(r"[^A-Za-z0-9_-]+", "-", f"{request.node.name}{suffix}")[-50:].strip("-")
         return robots.add(embedded.cloud, name, out=tmp_path, settings=settings)
 
@@ -58,7 +58,7 @@ def iort(embedded: EmbeddedCloud) -> Callable[..., Any]:
 
 
 def run_agent(bundle: robots.Bundle, *, timeout_s: float = 300) -> dict[str, Any]:
-    """Run the installed agent to the end of its sources; its own report."""
+    """Run the installed agent to the end of its sources; return its report."""
     report = bundle.folder / "report.json"
     command = [Path(sys.executable).parent / "iort-agent", "--config", bundle.config, "--report", report]
     done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, timeout=timeout_s, check=False)
@@ -68,7 +68,7 @@ def run_agent(bundle: robots.Bundle, *, timeout_s: float = 300) -> dict[str, Any
 
 
 def until(condition: Callable[[], Any], *, seconds: float = 60.0) -> Any:
-    """The condition's first true value; the tables tell nobody when they change."""
+    """Poll for the condition's first true value; tables notify nobody of changes."""
     deadline = time.monotonic() + seconds
     while not (value := condition()):
         assert time.monotonic() < deadline, f"not true within {seconds} s"
@@ -85,7 +85,7 @@ def standin() -> Iterator[PubNubStandIn]:
 
 @pytest.fixture
 def client() -> Iterator[Callable[..., PubNub]]:
-    """Makes clients of PubNub's SDK, `client(standin, uuid="page")`; all are stopped before the server is."""
+    """Make PubNub SDK clients by `client(standin, uuid="page")`; stop them before the server stops."""
     made: list[PubNub] = []
 
     def make(standin: PubNubStandIn, **given: Any) -> PubNub:

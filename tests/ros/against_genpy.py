@@ -1,6 +1,6 @@
-"""Random message definitions, filled and serialised by ROS' own genpy, decoded by ours."""
+"""Compares our decoder with ROS' genpy, by random message definitions."""
 
-# ruff: noqa: T201 - what it says goes to the test that started it
+# ruff: noqa: T201 - standard output goes to the test that started it
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ def fields(chance, nested):
     lines = []
     for i in range(chance.randint(1, 6)):
         kind = chance.choice(KINDS + nested)
-        # A uint8[] is a blob, which we leave out.
+        # We leave out uint8[], which is a blob.
         length = "" if kind in ("uint8", "char") else chance.choice(["", "", "[]", "[3]"])
         lines.append(f"{kind}{length} f{i}  # comment")
         if chance.random() < 0.2:
@@ -59,7 +59,7 @@ def fill(chance, kind, classes):
 
 
 class Two:
-    """A time with the names that our samples give it."""
+    """A time with the member names of our samples."""
 
     def __init__(self, value):
         self.sec, self.nanosec = value.secs, value.nsecs

@@ -1,8 +1,8 @@
-"""The agent's ros1 source alone, in a process of its own; each sample is a line of JSON on standard output.
+"""The agent's ros1 source alone, in its own process; each sample is a line of JSON on standard output.
 
-Behind stream, time and values of a message stand its bytes, and the SHA-256 of its large fields.
-``collector.py CONFIG.json`` with the source's settings; ``quit`` on standard input ends it, and the
-source's report is the last line.
+A line has stream, time and values, then the message's bytes and the SHA-256 of its large fields. Usage:
+``collector.py CONFIG.json`` with the source's settings; ``quit`` on standard input ends it, and the last
+line is the source's report.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ from iort_contract.ros1.message import RosMessage
 
 
 def say(line: str) -> None:
-    """Write a line at once; print writes its end by itself, and two threads' lines would run together."""
+    """Write a line at once; print writes the newline separately, so two threads' lines would mix."""
     sys.stdout.write(f"{line}\n")
     sys.stdout.flush()
 

@@ -1,7 +1,7 @@
-"""A real ROS 1: a master, and publishers and the agent in processes of their own.
+"""A real ROS 1: a master, publishers and the agent, each in a process of its own.
 
-The agent's Python must see rospy: IORT_ROS_PYTHON names one; otherwise build/ros-venv is made of
-Debian's Python, once.
+The agent's Python needs rospy: IORT_ROS_PYTHON names one; otherwise build/ros-venv is made once from
+Debian's Python.
 """
 
 from __future__ import annotations
@@ -43,7 +43,7 @@ def ros_python() -> str:
 
 
 class Process:
-    """A child whose output is read as it comes; `quit` asks it to end by a line on its input."""
+    """A child whose output is read as it comes; the input line `quit` asks it to end."""
 
     def __init__(self, command: list[str], environment: dict[str, str]) -> None:
         self._process = subprocess.Popen(
@@ -72,7 +72,7 @@ class Process:
                 lines.append(line.rstrip("\n"))
                 self._news.notify_all()
         with self._news:
-            self._news.notify_all()  # it may have ended
+            self._news.notify_all()  # the process may have ended
 
     def until(self, condition: Callable[[], Any], what: str) -> Any:
         """Wait for output that makes the condition true."""
@@ -97,7 +97,7 @@ class Process:
         self._process.stdin.flush()
 
     def quit(self) -> list[str]:
-        """Ask it to end; all lines of its output."""
+        """Ask it to end; return all lines of its output."""
         if self._process.poll() is None:
             self.say("quit")
         assert self._process.wait(WAIT_S) == 0, "\n".join(self.errors[-25:])
@@ -106,11 +106,11 @@ class Process:
         return self.lines
 
     def wait(self) -> None:
-        """Wait for its own end."""
+        """Wait until it ends by itself."""
         assert self._process.wait(WAIT_S) == 0, "\n".join(self.errors[-25:])
 
     def terminate(self) -> int:
-        """End it as a supervisor does; its status."""
+        """End it as a supervisor does; return its status."""
         self._process.terminate()
         status = self._process.wait(WAIT_S)
         for reader in self._readers:
@@ -157,7 +157,7 @@ class Graph:
         deadline = time.monotonic() + WAIT_S
         while not self._answers():
             assert time.monotonic() < deadline, "\n".join(self.master.errors)
-            time.sleep(0.05)  # a process that comes up tells nobody
+            time.sleep(0.05)  # a process gives no notice when it is ready
 
     def _answers(self) -> bool:
         try:

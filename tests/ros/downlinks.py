@@ -1,8 +1,8 @@
-"""The downlinks of one robot or two, in one ROS graph and over a broker in memory.
+"""The downlinks of one or two robots, in one ROS graph and over a broker in memory.
 
-``downlinks.py CONFIG.json`` with ``downlink`` and ``share``. Each line of input is a command: ``send
-MILLISECONDS JSON`` (a lease and a message), ``pose ROBOT JSON``, ``await TOPIC COUNT`` (of subscribers;
-says ``heard``), ``cut``, ``quit``.
+Usage: ``downlinks.py CONFIG.json`` with ``downlink`` and ``share``. Each line of input is a command:
+``send MILLISECONDS JSON`` (a lease and a message), ``pose ROBOT JSON``, ``await TOPIC COUNT`` (waits for
+subscribers, then prints ``heard``), ``cut``, ``quit``.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ from tests.agent_fakes import Loopback, link_of
 
 
 def say(line: str) -> None:
-    """Write a line at once; print writes its end by itself, and two threads' lines would run together."""
+    """Write a line at once; print writes the newline separately, so two threads' lines would mix."""
     sys.stdout.write(f"{line}\n")
     sys.stdout.flush()
 
@@ -56,7 +56,7 @@ for seq, line in zip(itertools.count(), sys.stdin):
     if verb == "cut":
         uplink.cut()
     elif verb == "await":
-        # A subscriber knows of a connection before its publisher does, and rospy tells nobody.
+        # A subscriber knows of a connection before its publisher does, and rospy has no event for it.
         topic, _, count = rest.partition(" ")
         while graph.listeners(topic) < int(count):
             time.sleep(0.01)

@@ -1,4 +1,4 @@
-"""A rospy node that hears a topic: ``listener.py NAME TOPIC TYPE``; each message a line of JSON."""
+"""A rospy subscriber: ``listener.py NAME TOPIC TYPE`` prints each message as a line of JSON."""
 
 import json
 import sys
@@ -10,7 +10,7 @@ import rospy
 
 
 def say(line: str) -> None:
-    """Write a line at once; print writes its end by itself, and two threads' lines would run together."""
+    """Write a line at once; print writes the newline separately, so two threads' lines would mix."""
     sys.stdout.write(f"{line}\n")
     sys.stdout.flush()
 

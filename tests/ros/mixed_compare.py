@@ -1,9 +1,9 @@
 """Compares two bags message by message: `python -m tests.ros.mixed_compare RECORDED.bag EXPORTED.bag`.
 
-By topic, what one has and the other has not, as serialized; of what differs first, which field.
+By topic, it prints the serialized messages of only one bag, and the first field that differs.
 """
 
-# ruff: noqa: T201 - a command's words to its user
+# ruff: noqa: T201 - a command prints for its user
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from tests.ros1_types import Message, fields
 
 
 class Recorded(NamedTuple):
-    """A message in a bag: ``node`` published it, at ``t_ns`` it was recorded."""
+    """A message in a bag: ``node`` published it, and it was recorded at ``t_ns``."""
 
     topic: str
     node: str
@@ -28,32 +28,32 @@ class Recorded(NamedTuple):
 
 
 class Kind(NamedTuple):
-    """What a topic's messages are: package/Type, checksum, definition."""
+    """A topic's type: package/Type, checksum, definition."""
 
     name: str
     md5sum: str
     definition: str
 
     def message(self) -> Message:
-        """The type, to read messages with."""
+        """Return a reader of the type's messages."""
         own, *others = self.definition.split("=" * 80 + "\n")
         texts = dict(other.removeprefix("MSG: ").split("\n", 1) for other in others)
         return Message(self.name, {**{name: text.strip() for name, text in texts.items()}, self.name: own})
 
 
 class Bag(NamedTuple):
-    """What is in a bag, in order of time."""
+    """The contents of a bag, in order of time."""
 
     kinds: dict[str, Kind]
     messages: list[Recorded]
 
     def of(self, topic: str) -> list[Recorded]:
-        """A topic's messages."""
+        """Return a topic's messages."""
         return [one for one in self.messages if one.topic == topic]
 
 
 def read(*paths: Path) -> Bag:
-    """The bags, as if they were one."""
+    """Read the bags as one."""
     found: list[Recorded] = []
     kinds: dict[str, Kind] = {}
     for path in paths:
@@ -69,8 +69,9 @@ def read(*paths: Path) -> Bag:
 
 
 class Difference(NamedTuple):
-    """Of one topic: what was recorded and not exported, what was exported and not recorded, and an example
-    of either in words."""
+    """A topic's difference: recorded but not exported, exported but not recorded, and an example of either
+    in words.
+    """
 
     topic: str
     recorded: int
@@ -86,8 +87,7 @@ class Difference(NamedTuple):
 def compare(
     recorded: Bag, exported: Bag, *, same: Callable[[str, bytes], object] = lambda _topic, data: data
 ) -> list[Difference]:
-    """The topics that are not the same, as multisets; ``same`` says by what a topic's message is told from
-    others."""
+    """Return the topics that differ, as multisets; ``same`` maps a topic's message to its identity."""
     found = []
     for topic, kind in recorded.kinds.items():
         sent, came = recorded.of(topic), exported.of(topic)

@@ -1,4 +1,4 @@
-"""Hears every topic of the mixed robot, in a process of its own; a line a message: topic and base64."""
+"""Subscribes to every topic of the mixed robot, in its own process; prints topic and base64 per message."""
 
 import base64
 import sys
@@ -12,7 +12,7 @@ turn = threading.Lock()
 
 
 def say(message, topic):
-    # Topics have threads of their own, whose lines must not run together.
+    # Topics have their own threads, whose lines must not mix.
     with turn:
         sys.stdout.write(f"{topic} {base64.b64encode(message._buff).decode()}\n")
         sys.stdout.flush()

@@ -1,13 +1,12 @@
-"""One node of the mixed robot, in a process of its own: `mixed_publisher.py NODE --seconds 40`.
+"""One node of the mixed robot, in its own process: `mixed_publisher.py NODE --seconds 40`.
 
-Publishes bytes put together beforehand, of types that nobody has installed. Says ``ready`` when every topic
-has its subscribers, begins when it is told to by a line on its input, says ``sent {...}`` with the number
-of messages by topic, and ends with the next line. The ledger has a line for each message: topic and base64.
-Whenever a topic's number of connections has changed, it
-says so in JSON, with the number of the message that found it changed.
+It publishes prepared bytes of types that are not installed. It prints ``ready`` when every topic has its
+subscribers, begins at a line on its input, prints ``sent {...}`` with the number of messages by topic, and
+ends at the next line. The sent log has a line for each message: topic and base64. When a topic's number of
+connections changes, it prints JSON with the number of the message that found the change.
 """
 
-# ruff: noqa: T201 - what it says goes to the test that started it
+# ruff: noqa: T201 - standard output goes to the test that started it
 
 import argparse
 import base64
@@ -23,7 +22,7 @@ from tests.ros1_types import header
 parser = argparse.ArgumentParser()
 parser.add_argument("node", choices=NODES)
 parser.add_argument("--seconds", type=float, required=True)
-parser.add_argument("--ledger", type=argparse.FileType("w"), required=True)
+parser.add_argument("--sent-log", type=argparse.FileType("w"), required=True)
 parser.add_argument("--subscribers", type=int, default=2)
 parser.add_argument("--seed", type=int, default=1)
 parser.add_argument("--topics", nargs="*", help="these alone")
@@ -31,7 +30,7 @@ options = parser.parse_args()
 
 
 class Bytes(rospy.AnyMsg):
-    """A message that is its bytes."""
+    """A message that consists of its bytes."""
 
     def __init__(self, *content):
         super().__init__()
@@ -40,7 +39,7 @@ class Bytes(rospy.AnyMsg):
 
 
 class Publisher:
-    """One topic: every message with its own header, if the type has one."""
+    """One topic: every message has its own header, if the type has one."""
 
     def __init__(self, topic, seed):
         message = topic.message
@@ -62,9 +61,9 @@ class Publisher:
         stamp_us = now_us - now_us % topic.grid_us
         content = self._maker.made(self.sent, header(self.sent, stamp_us, options.node.encode()))
         self.publisher.publish(content)
-        options.ledger.write(f"{topic.name} {base64.b64encode(content).decode()}\n")
+        options.sent_log.write(f"{topic.name} {base64.b64encode(content).decode()}\n")
         self.sent += 1
-        # One of no rate is published once.
+        # A message without a rate is published once.
         self.due_s = self.sent / topic.rate_hz if topic.rate_hz else options.seconds
 
 
@@ -77,7 +76,7 @@ print("ready", flush=True)
 sys.stdin.readline()
 began = time.monotonic()
 while True:
-    # Whose turn it is; a loop over twenty topics costs less than a thread for each.
+    # Publish the topic that is due; a loop over twenty topics costs less than a thread for each.
     one = min(publishers, key=lambda one: one.due_s)
     if one.due_s >= options.seconds:
         break
@@ -85,7 +84,7 @@ while True:
     if ahead_s > 0:
         time.sleep(ahead_s)
     one.publish()
-options.ledger.close()
+options.sent_log.close()
 print("sent " + json.dumps({one.topic.name: one.sent for one in publishers}), flush=True)
 sys.stdin.readline()
 rospy.signal_shutdown("done")

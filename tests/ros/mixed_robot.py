@@ -1,6 +1,6 @@
-"""A robot of many topics: every shape of message that real ones have, and some that few expect.
+"""A robot of many topics: every common shape of message, and some rare ones.
 
-What `mixed_publisher.py` publishes, in processes under ROS' own Python, and the tests compare with.
+`mixed_publisher.py` publishes them, in processes under ROS' own Python, and the tests compare with them.
 """
 
 from __future__ import annotations
@@ -68,7 +68,8 @@ TEXTS = {
     "diagnostic_msgs/DiagnosticArray": "Header header\nDiagnosticStatus[] status",
     "vesc_msgs/VescState": vesc_message.STATE,
     "vesc_msgs/VescStateStamped": "Header header\nVescState state",
-    # Types of a lab's own. A field called header need not be a std_msgs/Header, nor a header come first.
+    # Custom types of a lab. A field called header need not be a std_msgs/Header, and a header need not come
+    # first.
     "lab_msgs/Contact": "Header header\nfloat32 force\nbool touching",
     "lab_msgs/LabelledContact": "string label\nContact grip",
     "lab_msgs/Packet": "uint16 id\nuint8 version\nstring note",
@@ -85,9 +86,10 @@ TEXTS = {
 
 
 class Topic(NamedTuple):
-    """A topic of one publisher. ``lengths`` are those of arrays, by the field's name; what is not named
-    has up to four elements, another number in each message. ``grid_us``: stamps lie on it; ``behind_us``: by
-    a clock that is so far behind."""
+    """A topic of one publisher. ``lengths`` has array lengths by field name; other arrays have up to four
+    elements, a different number in each message. Stamps are multiples of ``grid_us``, on a clock that is
+    ``behind_us`` late.
+    """
 
     name: str
     kind: str
@@ -109,7 +111,7 @@ class Topic(NamedTuple):
 _ARM, _GRIPPER = (dict.fromkeys(("name", "position", "velocity", "effort"), n) for n in (6, 2))
 _BEACONS = Topic("/beacons", "geometry_msgs/PointStamped", 50, grid_us=20_000)
 _JOINTS = Topic("/joint_states", "sensor_msgs/JointState", 50, _ARM)
-# Node -> what it publishes: two publishers of a topic are two nodes.
+# Node -> its topics: two publishers of a topic are two nodes.
 NODES: dict[str, list[Topic]] = {
     "base": [
         Topic("/sensors/core", "vesc_msgs/VescStateStamped", 50),
@@ -150,7 +152,7 @@ _WORDS = (b"", b"base_link", "grün".encode(), b"not UTF-8: \xff\xfe", b"\xc3", 
 
 
 class Values:
-    """What sensors say: a few digits, now and then an edge; covariances that do not change."""
+    """Values as sensors send them: a few digits, sometimes an edge case; covariances stay constant."""
 
     def __init__(self, seed: int, lengths: Mapping[str, int]) -> None:
         self._random = random.Random(seed)
@@ -167,7 +169,7 @@ class Values:
             return bytes([chance.getrandbits(1)])
         if kind in {"uint64", "int64"} and chance.random() < 0.3:
             return struct.pack("<Q" if kind == "uint64" else "<q", chance.choice(_EDGES[kind]))
-        # Both halves of an int8's, byte's and uint8's range; whole seconds within an hour for a time.
+        # Both halves of the ranges of int8, byte and uint8; whole seconds within an hour for a time.
         return bytes([chance.getrandbits(8)]) + bytes(SIZES[kind] - 1)
 
     def text(self, _name: str) -> bytes:
@@ -178,12 +180,12 @@ class Values:
 
 
 class Maker:
-    """The messages of one publisher, in order: the same for the same seed, but for the headers."""
+    """The messages of one publisher, in order: equal for equal seeds, except for the headers."""
 
     def __init__(self, topic: Topic, seed: int) -> None:
         self._topic, self._message = topic, topic.message
         self._values = Values(seed, topic.lengths)
-        # A message of a header is told apart by it; the rest of it may come again.
+        # The header makes a message unique; the rest of it may repeat.
         again = self._message.stamped and topic.rate_hz > 20
         self._bodies = [self._body() for _ in range(97)] if again else []
 

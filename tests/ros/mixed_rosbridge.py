@@ -1,4 +1,4 @@
-"""A rosbridge server of the mixed robot's graph: the stand-in, fed with what a node in the graph hears."""
+"""A rosbridge server of the mixed robot's graph: the stand-in, with messages from a node in the graph."""
 
 from __future__ import annotations
 
@@ -15,8 +15,9 @@ from tests.rosbridge_standin import RosbridgeStandin
 
 
 class GraphServer(RosbridgeStandin):
-    """Serves the graph's topics while it is entered. ``unheard`` are the messages, by topic, that nobody had
-    subscribed to when they came."""
+    """Serves the graph's topics while it is entered. ``unheard`` has the messages by topic that arrived
+    without a subscription.
+    """
 
     def __init__(self, graph: Graph) -> None:
         super().__init__(
@@ -42,7 +43,7 @@ class GraphServer(RosbridgeStandin):
 
     def _feed(self) -> None:
         done = 0
-        while not self._ended.wait(0.01):  # the pace of a server that has much to do
+        while not self._ended.wait(0.01):  # the pace of a busy server
             lines = self.feed.lines[done:]
             done += len(lines)
             for line in lines:
@@ -52,6 +53,6 @@ class GraphServer(RosbridgeStandin):
                 try:
                     self.publish(name, as_json(topic.message, data), latch="/base" if topic.latched else None)
                 except ConnectionResetError:
-                    heard = False  # its client has just gone
+                    heard = False  # its client has just left
                 if not heard and not topic.latched:
                     self.unheard[name].append(data)

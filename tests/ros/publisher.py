@@ -1,10 +1,10 @@
-"""A rospy publisher of a made-up type, in a process of its own: `publisher.py NAME TOPIC TYPE RATE ...`.
+"""A rospy publisher of a made-up type, in its own process: `publisher.py NAME TOPIC TYPE RATE ...`.
 
-Sends ``field`` values counting up; says ``ready`` when a subscriber is connected. Each line on standard
-input is a command: ``quit``.
+It sends values of ``field`` that count up, and prints ``ready`` when a subscriber is connected. The line
+``quit`` on standard input ends it.
 """
 
-# ruff: noqa: T201 - what it says goes to the test that started it
+# ruff: noqa: T201 - standard output goes to the test that started it
 
 import argparse
 import sys

@@ -1,6 +1,6 @@
-"""Random messages of ROS' own genpy, as rosbridge sends them, against what genpy writes of them."""
+"""Compares random genpy messages, sent as rosbridge sends them, with genpy's own bytes."""
 
-# ruff: noqa: T201 - what it says goes to the test that started it
+# ruff: noqa: T201 - standard output goes to the test that started it
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ def fields(chance, nested):
 
 
 def plain(value):
-    """A message of genpy as its fields' values."""
+    """Return a genpy message as its fields' values."""
     if isinstance(value, genpy.rostime.TVal):
         return {"sec": value.secs, "nanosec": value.nsecs}
     if isinstance(value, genpy.Message):
@@ -89,7 +89,7 @@ for case in range(150):
         message = fill(chance, kind, classes)
         buffer = io.BytesIO()
         message.serialize(buffer)
-        # What a subscriber gets, and rosbridge is one.
+        # A subscriber gets these bytes, and rosbridge is a subscriber.
         received = classes[kind]().deserialize(buffer.getvalue())
         sent = json.dumps(as_rosbridge(definition, plain(received)))
         written = Writer(definition).write(json.loads(sent))

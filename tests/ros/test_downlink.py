@@ -84,7 +84,7 @@ def test_a_renewed_lease_does_not_end(driven: tuple[Process, Process]) -> None:
 
 
 @pytest.mark.parametrize("end", ["cut", "quit"])
-def test_a_lost_connection_and_the_agents_end_stop_the_car(driven: tuple[Process, Process], end: str) -> None:
+def test_a_lost_connection_or_the_agents_end_stops_the_car(driven: tuple[Process, Process], end: str) -> None:
     downlink, listener = driven
     drive(downlink, 1.5, 10_000)
     listener.until(lambda: speeds(listener) == [1.5], "command")
@@ -92,10 +92,10 @@ def test_a_lost_connection_and_the_agents_end_stop_the_car(driven: tuple[Process
     listener.until(lambda: len(speeds(listener)) == 6, "five stops")
     assert speeds(listener)[1:] == [0] * 5
     after = [when for when, _ in heard(listener)]
-    assert after[1] - after[0] < 10, "not only when the lease ended"
+    assert after[1] - after[0] < 10, "the car must stop before the lease ends"
 
 
-def test_nonsense_is_refused(driven: tuple[Process, Process]) -> None:
+def test_an_invalid_message_is_rejected(driven: tuple[Process, Process]) -> None:
     downlink, listener = driven
     downlink.say('send 300 {"twist": {"linear": {"x": "fast"}}}')
     downlink.until_said("twist.linear.x: must be a number, got 'fast'")
@@ -104,7 +104,7 @@ def test_nonsense_is_refused(driven: tuple[Process, Process]) -> None:
     assert speeds(listener)[0] == 2.5
 
 
-def test_another_robots_pose_is_a_topic(graph: Graph) -> None:
+def test_another_robots_pose_appears_as_a_topic(graph: Graph) -> None:
     downlink = start(graph)
     downlink.say("pose car-2 " + json.dumps(POSE))
     listener = graph.run("listener.py", "map", "/fleet/car_2/pose", "geometry_msgs/PoseStamped")

@@ -1,8 +1,8 @@
-"""A robot of every shape of message, recorded by `rosbag record` and by the agent side by side: what the
-cloud gives back is what was recorded, message by message, or the audit says what is not and why.
+"""A robot with every shape of message, recorded by `rosbag record` and by the agent side by side: the
+cloud returns every recorded message, or the audit names the missing ones and the cause.
 
-In between, the network is away, the agent is killed, and a second one of the same robot is started by
-mistake. IORT_MIXED_S is how long it lasts, see `make prove-mixed`.
+Meanwhile, the network fails, the agent is killed, and a second agent of the same robot is started by
+mistake. IORT_MIXED_S sets the duration, see `make prove-mixed`.
 """
 
 from __future__ import annotations
@@ -39,9 +39,9 @@ RECORD = Path("/usr/lib/rosbag/record")
 DURATION_S = float(os.environ.get("IORT_MIXED_S") or 30)
 OUTAGE_S = max(10.0, DURATION_S / 5)
 SECOND_S = 5.0
-# An agent that is killed takes with it the batches that are open, which are a second long.
+# A killed agent loses its open batches, which are one second long.
 OPEN_S = 2.5
-# Nobody tells when the recorder and an agent have written what they have heard.
+# The recorder and an agent give no notice when they have written all they received.
 SETTLE_S = 2.0
 
 
@@ -51,28 +51,27 @@ Publisher = tuple[str, str]
 
 @dataclass(frozen=True, repr=False)
 class Drive:
-    """What was recorded, what came back, and what was published. ``same`` is what a topic's message
-    is told from others by."""
+    """The recorded, exported and published messages. ``same`` maps a topic's message to its identity."""
 
     recorded: Bag
     exported: Bag
     sent: dict[Publisher, list[bytes]]
-    # Topics whose export failed, and how.
+    # Topics whose export failed, and the error.
     failed: dict[str, str]
-    # Topic -> its messages that no agent was connected for.
+    # Topic -> its messages without a connected agent.
     unheard: dict[str, list[bytes]]
     killed_ns: int
     audit_status: int
     audit: dict[str, Any]
-    # The status and the log of the agents that were started by mistake.
+    # Status and log of the agents that were started by mistake.
     second: list[tuple[int | None, str]]
-    # How many agents have run, each of which is sent what is latched.
+    # The number of agents so far; each receives the latched messages.
     agents: int
     same: Callable[[str, bytes], object]
 
 
 class Mixed:
-    """The graph with its publishers, its recorder, and the agents beside it."""
+    """The graph with its publishers and its recorder, and the agents beside it."""
 
     def __init__(
         self, graph: Graph, cloud: EmbeddedCloud, proxy: Proxy, out: Path, server: GraphServer | None
@@ -95,26 +94,28 @@ class Mixed:
         self.agents = 0
 
     def agent(self, folder: Path | None = None) -> Process:
-        """An agent of the robot, of its own folder or of a copy of it."""
+        """Start an agent of the robot, from its own folder or a copy of it."""
         config = (folder or self.bundle.folder) / self.bundle.config.name
         self.agents += 1
-        # A robot of rosbridge needs no ROS, and has a Python of its own.
+        # A robot with rosbridge needs no ROS, and has its own Python.
         python = self.graph.python if self.server is None else sys.executable
         command = ["-m", "iort_agent.cli", "run", "--config", str(config), "--drain-s", "60"]
         return self.graph.start([python, *command])
 
     def same(self, topic: str, data: bytes) -> object:
-        """What a message is told from others by: all of it, or what rosbridge can say of it."""
+        """Return a message's identity: all of it, or as much as rosbridge can transmit."""
         return data if self.server is None else json.dumps(as_json(TOPICS[topic].message, data))
 
     def copy(self) -> Path:
-        """The folder on another computer: with the certificate, without the queue."""
+        """Copy the folder for another computer: with the certificate, without the queue."""
         made = self.out / "copy"
         shutil.copytree(self.bundle.folder, made, ignore=shutil.ignore_patterns("spool*", SOCKET, "*.lock"))
         return made
 
     def waiting(self) -> int | None:
-        """Batches in the queue and files before their upload; None while no agent answers."""
+        """Return the number of queued batches and of files before their upload; None while no agent
+        answers.
+        """
         try:
             status = fetch(self.bundle.folder / SOCKET)
         except AgentError:
@@ -123,7 +124,7 @@ class Mixed:
 
 
 def _connections(publishers: dict[str, Process]) -> Iterator[tuple[Publisher, int, int]]:
-    """What publishers said of their connections: publisher, number of the message, how many there were."""
+    """Return the publishers' records of connections: publisher, message number, number of connections."""
     for node, publisher in publishers.items():
         for line in list(publisher.lines):
             if line.startswith("{"):
@@ -165,7 +166,7 @@ def _driven(mixed: Mixed, embedded: EmbeddedCloud) -> Drive:  # noqa: F811 - the
             DURATION_S,
             "--seed",
             100 * i,
-            "--ledger",
+            "--sent-log",
             mixed.out / f"{node}.sent",
         )
         for i, node in enumerate(NODES)
@@ -187,12 +188,12 @@ def _driven(mixed: Mixed, embedded: EmbeddedCloud) -> Drive:  # noqa: F811 - the
     pause.wait(OUTAGE_S)
     mixed.proxy.mode = PASS
     at(0.45)
-    # The same command again, and the robot's folder elsewhere: rosbridge has no names that would tell.
+    # The same command again, and the robot's folder elsewhere: rosbridge has no node names to detect it.
     others = [mixed.agent(), *([mixed.agent(mixed.copy())] if mixed.server is None else [])]
     pause.wait(SECOND_S)
     second = [(process.terminate(), "\n".join(process.errors)) for process in others]
     if not agent.alive() or any("source failed" in line for line in agent.errors):
-        # It should not be so. The drive goes on with another one, so that what else differs is seen.
+        # This should not happen. The drive continues with another agent to reveal other differences.
         agent.terminate()
         agent = mixed.agent()
     at(0.8)
@@ -228,7 +229,7 @@ def _driven(mixed: Mixed, embedded: EmbeddedCloud) -> Drive:  # noqa: F811 - the
 def _unheard(
     publishers: dict[str, Process], before: dict[Publisher, int], sent: dict[Publisher, list[bytes]]
 ) -> dict[str, list[bytes]]:
-    """The messages from the kill until an agent was there again, by their publishers' own words."""
+    """Return the messages between the kill and the next agent, as recorded by their publishers."""
     changes = defaultdict(list)
     for publisher, n, connections in _connections(publishers):
         if n > before.get(publisher, -1):
@@ -245,7 +246,7 @@ def _unheard(
 
 
 def _export(mixed: Mixed, embedded: EmbeddedCloud) -> tuple[Bag, dict[str, str]]:  # noqa: F811 - the fixture's
-    """Every stream by itself, so that one that cannot be exported does not hide the others."""
+    """Export every stream separately, so that a failing export does not hide the others."""
     run, paths, failed = iort.__wrapped__(embedded), [], {}
     for name, topic in TOPICS.items():
         path = mixed.out / f"{topic.stream}.bag"
@@ -253,13 +254,13 @@ def _export(mixed: Mixed, embedded: EmbeddedCloud) -> tuple[Bag, dict[str, str]]
         if not done.exit_code:
             paths.append(path)
         elif "has no stream" not in str(done.exception):
-            # Of a stream whose messages were all refused nothing is stored, which the audit has to say.
+            # A stream whose messages were all rejected stores nothing, and the audit must report it.
             failed[name] = f"{done.exception!r}"
     return read(*paths), failed
 
 
 def named(audit: dict[str, Any], topic: str) -> int:
-    """How many of a topic's messages the audit says to be missing or altered, whatever the cause."""
+    """Return how many of a topic's messages the audit reports as missing or altered, for any cause."""
     of_stream = [one for one in audit["streams"] if one["stream"] == TOPICS[topic].stream]
     short = sum(fall["samples"] or 0 for one in of_stream for fall in one["shortfalls"])
     sources = [counts for run in audit["not_recorded"].values() for counts in run.values()]
@@ -268,8 +269,9 @@ def named(audit: dict[str, Any], topic: str) -> int:
 
 
 def differences(drive: Drive) -> list[Difference]:
-    """Where the bags differ, but for what no agent was there to hear, what the recorder itself has lost, and
-    what an agent heard again: a latched message is sent to each."""
+    """Compare the bags, except for messages without an agent, messages that the recorder lost, and
+    repeated latched messages: each agent receives them.
+    """
 
     def counted(topic: str, messages: Iterable[bytes]) -> Counter[object]:
         return Counter(drive.same(topic, data) for data in messages)
@@ -301,8 +303,9 @@ def differences(drive: Drive) -> list[Difference]:
 
 
 def to_be_named(drive: Drive, one: Difference) -> int:
-    """In how many messages a topic differs beside those of the open batch of the agent that was killed. Of
-    messages that are all alike nobody can tell which are missing, but how many were on their way then."""
+    """Return how many messages of a topic differ, without the open batch of the killed agent. For equal
+    messages only the number in transit at that time is known.
+    """
     since_ns = drive.killed_ns - int(OPEN_S * 1e9)
     then = [m for m in drive.recorded.of(one.topic) if since_ns <= m.t_ns <= drive.killed_ns + 1e9]
     there = Counter(drive.same(one.topic, m.data) for m in then)
@@ -310,8 +313,8 @@ def to_be_named(drive: Drive, one: Difference) -> int:
     return len(one.extra) + sum(left.values())
 
 
-def test_what_was_published_is_what_was_recorded(drive: Drive) -> None:
-    """The recorder's own queue is 100 messages: on a busy machine it loses some of the 1 kHz topics."""
+def test_the_recorder_has_the_published_messages(drive: Drive) -> None:
+    """The recorder's queue is 100 messages: on a busy machine it loses some of the 1 kHz topics."""
     recorded: dict[Publisher, list[bytes]] = defaultdict(list)
     for one in drive.recorded.messages:
         recorded[one.topic, one.node].append(one.data)
@@ -321,15 +324,15 @@ def test_what_was_published_is_what_was_recorded(drive: Drive) -> None:
     assert len(drive.recorded.messages) > 1_000 * DURATION_S
 
 
-def test_an_agent_that_is_there_goes_on_beside_a_second_one(drive: Drive) -> None:
+def test_a_running_agent_continues_beside_a_second_one(drive: Drive) -> None:
     status, said = drive.second[0]
     assert status == 1, said
     assert "the queue is in use by" in said or "already running" in said
-    # There is the agent, the others, and the one after the kill.
+    # The agents are the first one, the mistaken ones, and the one after the kill.
     assert drive.agents == 2 + len(drive.second)
 
 
-def test_every_message_comes_back_or_the_audit_says_why(drive: Drive) -> None:
+def test_every_message_is_exported_or_explained_by_the_audit(drive: Drive) -> None:
     found = differences(drive)
     silent = [one for one in found if named(drive.audit, one.topic) < to_be_named(drive, one)]
     failed = [f"{topic}: {why}" for topic, why in drive.failed.items()]

@@ -1,4 +1,4 @@
-"""What the node is called: two of one name, of which the later waits, and the command line's remappings."""
+"""The node's name: two nodes of one name, where the later waits, and the command line's remappings."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ WHEELS = {"type": "ros1", "topics": {"/wheel": {"stream": "wheel", "time": "head
 WAIT_S = 60
 
 
-def test_the_later_of_two_waits_until_the_first_is_gone(graph: Graph) -> None:
+def test_a_second_node_waits_until_the_first_has_ended(graph: Graph) -> None:
     cars = Cars(graph)
     cars.publisher("pub")
     first = cars.collector()
@@ -33,19 +33,19 @@ def test_the_later_of_two_waits_until_the_first_is_gone(graph: Graph) -> None:
     until_turns(first, max(turns(first)) + 50)
     assert turns(second) == []
     assert second.alive()
-    # Killed, it stays registered at the master; that counts for nothing.
+    # A killed node stays registered at the master; this has no effect.
     first.kill()
     until_turns(second, max(turns(first)) + 1)
     assert "waits" not in json.loads(second.quit()[-1])
 
 
-def test_who_loses_the_name_takes_it_again_when_it_is_free(graph: Graph) -> None:
+def test_a_node_takes_its_lost_name_again_when_it_is_free(graph: Graph) -> None:
     cars = Cars(graph)
     cars.publisher("pub")
     collector = cars.collector()
     until_turns(collector, 5)
     for i in range(2):
-        # Any other program, which does not ask.
+        # Another program takes the name without asking.
         taker = cars.publisher("iort_agent", topic=f"/elsewhere{i}")
         collector.until(lambda i=i: said(collector, WAITS) > i, "waiting")
         taker.kill()
@@ -54,12 +54,12 @@ def test_who_loses_the_name_takes_it_again_when_it_is_free(graph: Graph) -> None
     collector.quit()
 
 
-def test_of_two_that_start_at_once_one_waits_and_neither_ends(graph: Graph) -> None:
+def test_one_of_two_simultaneous_nodes_waits_and_neither_ends(graph: Graph) -> None:
     cars = Cars(graph)
     cars.publisher("pub")
     both = [cars.collector() for _ in range(2)]
     until(lambda: newest(*both) >= 300, seconds=WAIT_S)
-    # By now it is decided, for good: one has the name and all messages, the other waits.
+    # The outcome is final now: one has the name and all messages, the other waits.
     holder, before = registered(graph, "/iort_agent"), [newest(one) for one in both]
     until(lambda: newest(*both) >= 500, seconds=WAIT_S)
     assert registered(graph, "/iort_agent") == holder
@@ -68,7 +68,7 @@ def test_of_two_that_start_at_once_one_waits_and_neither_ends(graph: Graph) -> N
     assert [one.alive() for one in both] == [True, True]
 
 
-def test_a_node_that_is_told_to_end_ends_the_source(graph: Graph) -> None:
+def test_a_shut_down_node_ends_the_source(graph: Graph) -> None:
     cars = Cars(graph)
     cars.publisher("pub")
     collector = cars.collector()
@@ -78,9 +78,7 @@ def test_a_node_that_is_told_to_end_ends_the_source(graph: Graph) -> None:
     collector.until_said("the ROS node /iort_agent has ended: it was shut down from outside")
 
 
-def test_the_status_says_what_the_agent_waits_for_and_other_sources_go_on(
-    graph: Graph, tmp_path: Path
-) -> None:
+def test_the_status_names_the_waiting_source_and_other_sources_continue(graph: Graph, tmp_path: Path) -> None:
     taker = graph.run("listener.py", "iort_agent", "/elsewhere", "std_msgs/Float64")
     until(lambda: registered(graph, "/iort_agent"), seconds=WAIT_S)
     agent = agent_of(graph, tmp_path, WHEELS, {"type": "sim"})
@@ -94,7 +92,7 @@ def test_the_status_says_what_the_agent_waits_for_and_other_sources_go_on(
     assert agent.process.terminate() == 0, "\n".join(agent.process.errors)
 
 
-def test_what_roslaunch_adds_to_the_command_is_honoured(graph: Graph, tmp_path: Path) -> None:
+def test_roslaunch_arguments_are_honoured(graph: Graph, tmp_path: Path) -> None:
     master = graph.environment.pop("ROS_MASTER_URI")
     arguments = (
         f"__master:={master}", "__name:=recorder", f"__log:={tmp_path}/recorder-1.log", "__ns:=/lab",
@@ -107,9 +105,9 @@ def test_what_roslaunch_adds_to_the_command_is_honoured(graph: Graph, tmp_path: 
     until(lambda: agent.samples("wheel") > 5, seconds=WAIT_S)
     assert registered(graph, "/lab/recorder").startswith("http://127.0.0.1:")
     assert registered(graph, "/iort_agent") == ""
-    # What it says of the topic has the topic's name in the graph.
+    # Its log line has the topic's name in the graph.
     agent.process.until_said("topic /robot1/wheel: strange_msgs/Wheel")
-    # A master that is restarted is told of the topic by that name too.
+    # It registers at a restarted master by that name, too.
     graph.master.kill()
     agent.process.until_said("does not answer")
     graph.start_master()
@@ -117,7 +115,7 @@ def test_what_roslaunch_adds_to_the_command_is_honoured(graph: Graph, tmp_path: 
     assert agent.process.terminate() == 0, "\n".join(agent.process.errors)
 
 
-def test_commands_and_shares_are_remapped_too(graph: Graph) -> None:
+def test_commands_and_shares_are_remapped(graph: Graph) -> None:
     downlink = start(graph, "/cmd_vel:=/robot1/cmd_vel")
     listener = graph.run("listener.py", "driver", "/robot1/cmd_vel", "geometry_msgs/TwistStamped")
     connected(downlink, "/robot1/cmd_vel")
@@ -130,7 +128,7 @@ def newest(*collectors: Process) -> int:
 
 
 def agent_of(graph: Graph, folder: Path, *sources: dict[str, Any], arguments: tuple[str, ...] = ()) -> Agent:
-    """The real agent in a graph, with no broker in reach."""
+    """Return the real agent in a graph, without a reachable broker."""
     text = yaml.safe_dump(list(sources), default_flow_style=True, width=1000).strip()[1:-1]
     config = config_file(folder, text, "queue: {path: queue.db}\nport: 1")
     self_signed(folder)
@@ -150,7 +148,7 @@ class Agent(NamedTuple):
         try:
             return fetch(self.folder / "agent.sock")
         except AgentError:
-            return {}  # not yet
+            return {}  # no status yet
 
     def samples(self, stream: str) -> int:
         return int(self.status().get("streams", {}).get(stream, {}).get("samples", 0))
@@ -161,7 +159,7 @@ def said(process: Process, text: str) -> int:
 
 
 def registered(graph: Graph, name: str) -> str:
-    """The address of the node that the master knows by a name."""
+    """Return the address of the node that the master knows by a name."""
     with xmlrpc.client.ServerProxy(graph.environment["ROS_MASTER_URI"]) as master:
         _, _, uri = master.lookupNode("/test", name)
     return str(uri)

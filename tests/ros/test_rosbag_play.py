@@ -1,4 +1,4 @@
-"""What `iort export` writes as a bag, replayed by ROS' own player into a graph, is what was exported."""
+"""A bag from `iort export`, replayed by ROS' own player into a graph, has the exported messages."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ def player() -> list[str]:
 
 
 def driven(path: Path) -> tuple[dict[str, MessageType], dict[str, list[tuple[int, bytes]]]]:
-    """The types and the first messages of a real drive, as the agent reads them."""
+    """Return the types and the first messages of a real drive, as the agent reads them."""
     kinds: dict[str, MessageType] = {}
     messages: dict[str, list[tuple[int, bytes]]] = {stream: [] for stream in STREAMS.values()}
 
@@ -48,7 +48,7 @@ def driven(path: Path) -> tuple[dict[str, MessageType], dict[str, list[tuple[int
     return kinds, {stream: found[:COUNT] for stream, found in messages.items()}
 
 
-def test_every_message_comes_back_from_rosbag_play(graph: Graph, player: list[str], tmp_path: Path) -> None:
+def test_rosbag_play_replays_every_message(graph: Graph, player: list[str], tmp_path: Path) -> None:
     kinds, went = driven(recording("f1tenth-motor-servo.bag"))
     ride = tmp_path / "ride.bag"
     with recordings.bag(ride) as file:

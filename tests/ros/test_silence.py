@@ -1,4 +1,4 @@
-"""A topic that falls silent, as `iort-agent status` tells it: what is old never counts as new again."""
+"""`iort-agent status` on a silent topic: an old message never counts as new again."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ WAIT_S = 120
 
 
 class Car:
-    """The real agent in a graph, with no broker in reach, and what it says of itself."""
+    """The real agent in a graph, without a reachable broker, and its status."""
 
     def __init__(self, graph: Graph, folder: Path, plan_time: str) -> None:
         topics = {
@@ -46,7 +46,7 @@ class Car:
         try:
             return fetch(self._folder / SOCKET)
         except AgentError:
-            return {}  # not yet, or too busy to say
+            return {}  # no answer yet, or a busy agent
 
     def samples(self) -> dict[str, int]:
         streams = self.status().get("streams", {})
@@ -66,7 +66,7 @@ def publisher(graph: Graph, name: str, *options: object) -> Process:
 
 
 @pytest.mark.parametrize("plan_time", ["header", "arrival"])
-def test_a_silent_topic_is_stale_and_its_latched_message_never_new_again(
+def test_a_silent_topic_is_stale_and_its_latched_message_stays_old(
     graph: Graph, tmp_path: Path, plan_time: str
 ) -> None:
     latched = ["--latch", "--count", 1, "--stamp", int(time.time()) - 10]

@@ -1,4 +1,4 @@
-"""The ros1 source in a real graph: rospy publishers of types that the agent's Python has not."""
+"""The ros1 source in a real graph: rospy publishers of types that the agent's Python does not know."""
 
 from __future__ import annotations
 
@@ -59,7 +59,7 @@ def cars(graph: Graph) -> Cars:
 
 
 def samples(collector: Process, stream: str = "wheel") -> list[tuple[int, dict[str, Any]]]:
-    # rospy prints a line of its own where it is told to end.
+    # rospy prints a line of its own when it is asked to end.
     found = [json.loads(line) for line in list(collector.lines) if line.startswith("[")]
     return [(s[1], s[2]) for s in found if s[0] == stream]
 
@@ -72,7 +72,7 @@ def until_turns(collector: Process, least: int, stream: str = "wheel") -> None:
     collector.until(lambda: max(turns(collector, stream), default=-1) >= least, f"turn {least} of {stream}")
 
 
-def test_any_type_without_its_class_and_every_message_of_it(cars: Cars) -> None:
+def test_every_message_of_an_unknown_type_is_read(cars: Cars) -> None:
     collector = cars.collector()
     cars.publisher("pub", rate=200, count=300).until(lambda: True, "publisher")
     until_turns(collector, 299)
@@ -86,14 +86,14 @@ def test_any_type_without_its_class_and_every_message_of_it(cars: Cars) -> None:
     }  # fmt: skip
 
 
-def test_only_the_selected_fields(cars: Cars) -> None:
+def test_only_selected_fields_are_read(cars: Cars) -> None:
     collector = cars.collector(fields=["turns", "load.1"])
     cars.publisher("pub")
     until_turns(collector, 5)
     assert samples(collector)[-1][1].keys() == {"turns", "load.1"}
 
 
-def test_bytes_are_handed_over_where_the_topic_says_upload(cars: Cars) -> None:
+def test_a_topic_with_upload_hands_over_its_bytes(cars: Cars) -> None:
     definition = f"# A picture.\nHeader header\nuint32 turns\nuint8[] data\n{HEADER}"
     topics = {
         f"/{large}": {"stream": large, "time": "header", "large": large} for large in ("upload", "refuse")
@@ -112,12 +112,12 @@ def test_bytes_are_handed_over_where_the_topic_says_upload(cars: Cars) -> None:
     of = {stream: [line for line in lines if line[0] == stream] for stream in ("upload", "refuse")}
     assert [line[4] for line in of["upload"]] == [{"data": hashlib.sha256(content).hexdigest()}] * 5
     assert [line[4] for line in of["refuse"]] == [{}] * 5
-    # Either way the message is there, and the view has what a table shows.
+    # The message is available either way, and the view has the columns of a table.
     assert all(content in base64.b64decode(line[3]) for line in of["upload"] + of["refuse"])
     assert {tuple(values) for _, values in samples(collector, "refuse")} == {("turns",)}
 
 
-def test_started_before_the_master_and_the_master_started_again(cars: Cars) -> None:
+def test_the_source_survives_a_late_and_a_restarted_master(cars: Cars) -> None:
     cars.graph.master.kill()
     collector = cars.collector("/wheel", "/other")
     collector.until_said("no ROS master at")
@@ -128,7 +128,7 @@ def test_started_before_the_master_and_the_master_started_again(cars: Cars) -> N
     collector.until_said("does not answer")
     cars.graph.start_master()
     collector.until_said("had forgotten /wheel, /other: registered again")
-    # A publisher that came after the restart finds us, and the one from before was never interrupted.
+    # The source finds a publisher from after the restart, and the earlier publisher was never interrupted.
     cars.publisher("second", topic="/other")
     until_turns(collector, 20, "other")
     found = turns(collector)
@@ -136,7 +136,7 @@ def test_started_before_the_master_and_the_master_started_again(cars: Cars) -> N
 
 
 @pytest.mark.parametrize("end", ["quit", "kill"])
-def test_a_publisher_started_again(cars: Cars, end: str) -> None:
+def test_a_restarted_publisher_is_read_again(cars: Cars, end: str) -> None:
     collector = cars.collector()
     first = cars.publisher("pub")
     until_turns(collector, 20)
@@ -148,7 +148,7 @@ def test_a_publisher_started_again(cars: Cars, end: str) -> None:
     assert [turn for turn in found if turn >= 1000][:10] == list(range(1000, 1010))
 
 
-def test_a_changed_definition(cars: Cars) -> None:
+def test_a_changed_definition_is_followed(cars: Cars) -> None:
     collector = cars.collector()
     first = cars.publisher("pub")
     until_turns(collector, 5)
@@ -159,7 +159,7 @@ def test_a_changed_definition(cars: Cars) -> None:
     assert all(new == later for new, later in fields)
 
 
-def test_two_publishers_of_one_topic_with_two_definitions(cars: Cars) -> None:
+def test_two_publishers_of_one_topic_may_have_two_definitions(cars: Cars) -> None:
     collector = cars.collector()
     cars.publisher("one", count=50)
     cars.publisher("two", WHEEL_2, start=1000, count=50)
@@ -167,7 +167,7 @@ def test_two_publishers_of_one_topic_with_two_definitions(cars: Cars) -> None:
     assert sorted(turns(collector)) == [*range(50), *range(1000, 1050)]
 
 
-def test_stamps_of_a_simulation_are_flagged_and_not_believed(cars: Cars) -> None:
+def test_stamps_of_a_simulation_are_flagged_and_not_used(cars: Cars) -> None:
     collector = cars.collector()
     cars.publisher("pub", stamp=100, count=10)
     until_turns(collector, 9)
@@ -175,7 +175,7 @@ def test_stamps_of_a_simulation_are_flagged_and_not_believed(cars: Cars) -> None
     assert json.loads(collector.quit()[-1])["/wheel"]["unbelieved_stamps"] == 10
 
 
-def test_use_sim_time_is_seen_while_running(cars: Cars) -> None:
+def test_use_sim_time_is_detected_while_running(cars: Cars) -> None:
     collector = cars.collector()
     cars.publisher("pub")
     until_turns(collector, 5)

@@ -1,5 +1,6 @@
-"""Two publishers of one topic, each with a clock and a shape of its own: all is stored, in as few batches
-as there are clocks and seconds."""
+"""Two publishers of one topic, each with its own clock and message shape: every message is stored, in as
+few batches as possible for these clocks and seconds.
+"""
 
 from __future__ import annotations
 
@@ -19,7 +20,7 @@ from tests.ros.mixed_robot import TOPICS
 SECONDS = 10
 NAMES = ("/beacons", "/joint_states")
 SENT = {"beacons": 2 * 50 * SECONDS, "joint_states": (50 + 20) * SECONDS}
-# A batch is a second long, of the samples' time, and the first is cut. The beacons' clocks are 2 s apart.
+# A batch covers one second of the samples' time, and the first is cut. The beacons' clocks are 2 s apart.
 MOST_PER_S = {"beacons": 2.3, "joint_states": 1.3}
 
 
@@ -29,7 +30,7 @@ def stored(
     ros_python: str,  # noqa: F811 - the fixture
     tmp_path_factory: pytest.TempPathFactory,
 ) -> dict[str, delivery.Delivery]:
-    """What the table has of either stream."""
+    """Return the stored batches of either stream."""
     folder = tmp_path_factory.mktemp("two")
     topics = {name: {"stream": TOPICS[name].stream, "time": "header"} for name in NAMES}
     settings = {"sources": [{"type": "ros1", "topics": topics}], "queue": {"path": "spool.db"}}
@@ -46,14 +47,14 @@ def stored(
         for publisher in publishers:
             publisher.until(lambda publisher=publisher: publisher.lines[-1].startswith("sent "), "end")
 
-        def taken() -> dict[str, int]:
+        def samples_by_stream() -> dict[str, int]:
             try:
                 streams = fetch(car.folder / SOCKET)["streams"]
             except AgentError:
-                return {}  # too busy to say
+                return {}  # the agent is too busy to answer
             return {name: streams.get(name, {}).get("samples", 0) for name in SENT}
 
-        until(lambda: taken() == SENT)
+        until(lambda: samples_by_stream() == SENT)
         assert agent.terminate() == 0, "\n".join(agent.errors)
     finally:
         graph.stop()
@@ -63,7 +64,7 @@ def stored(
 def _publisher(graph: Graph, node: str, folder: Path):
     return graph.run(
         "mixed_publisher.py", node, "--seconds", SECONDS, "--subscribers", 1,
-        "--ledger", folder / f"{node}.sent", "--topics", *NAMES,
+        "--sent-log", folder / f"{node}.sent", "--topics", *NAMES,
     )  # fmt: skip
 
 
@@ -73,5 +74,7 @@ def test_every_message_is_stored(stored: dict[str, delivery.Delivery], stream: s
 
 
 @pytest.mark.parametrize("stream", SENT)
-def test_there_are_as_few_batches_as_seconds(stored: dict[str, delivery.Delivery], stream: str) -> None:
+def test_batches_per_second_stay_within_the_number_of_clocks(
+    stored: dict[str, delivery.Delivery], stream: str
+) -> None:
     assert stored[stream].batches_stored <= MOST_PER_S[stream] * (SECONDS + 2)

@@ -1,4 +1,4 @@
-"""Two robots, each with a ROS graph of its own, share poses and take commands through the cloud."""
+"""Two robots with a ROS graph each share poses and receive commands through the cloud."""
 
 from __future__ import annotations
 
@@ -51,7 +51,7 @@ def messages(listener: Process) -> list[Any]:
     return [json.loads(line)[1] for line in list(listener.lines) if line.startswith("[")]
 
 
-def test_two_robots_see_each_others_poses_and_take_commands(
+def test_two_robots_exchange_poses_and_receive_commands(
     embedded: EmbeddedCloud,  # noqa: F811 - the fixture
     bundle: Callable[..., robots.Bundle],  # noqa: F811 - the fixture
     iort: Callable[..., Any],  # noqa: F811 - the fixture
@@ -88,7 +88,7 @@ def test_two_robots_see_each_others_poses_and_take_commands(
             1000 * other <= m["pose"]["position"]["x"] < 1000 * other + 999 for m in messages(listener)
         )
 
-    # The operator drives one of them, and then says no more.
+    # The operator drives one of them, then stops sending.
     driver = graphs[0].run("listener.py", "driver", "/speed", "std_msgs/Float64")
     driver.until(lambda: "connected" in driver.lines, "connection")
     operator, started_us, seq = embedded.cloud.client("iot-data"), time.time_ns() // 1000, 0
@@ -98,10 +98,10 @@ def test_two_robots_see_each_others_poses_and_take_commands(
         operator.publish(topic=topic, qos=1, payload=encode_command(command))
         seq += 1
         assert seq < 1000, "\n".join(agents[0].errors)
-        time.sleep(0.1)  # an operator's stick
+        time.sleep(0.1)  # an operator's joystick
     driver.until(lambda: messages(driver)[-1]["data"] == 0, "stop")
 
-    # And by `iort send`, which knows what became of it.
+    # `iort send` also reports the command's result.
     sent = iort("send", cars[0].robot, "drive", '{"data": 2.5}', "--lease-ms", "2000", "--valid-ms", "60000",
                 "--seconds", "60")  # fmt: skip
     assert sent.exit_code == 0, sent.output + str(sent.exception) + "\n".join(agents[0].errors)

@@ -1,1 +1,1 @@
-"""The functions as AWS runs them: its own runtime interface client, a Runtime API, the layer, the logs."""
+"""Runs the functions as AWS does: its runtime interface client, a Runtime API, the layer, the logs."""

@@ -24,7 +24,7 @@ from tests.runtime.api import NEXT, Call, RuntimeApi, Services, served
 
 _ANSWER_S = 60.0
 REGION = "eu-west-1"
-# boto3 and what it needs, and the client that runs the functions with what that needs.
+# boto3 and the client that runs the functions, each with its dependencies.
 RUNTIME_PACKAGES = (
     *("boto3", "botocore", "dateutil", "jmespath", "s3transfer", "six", "urllib3"),
     *("awslambdaric", "runtime_client", "simplejson", "snapshot_restore_py"),

@@ -1,4 +1,4 @@
-"""An event for each function, as AWS sends it: the smallest one with which it does its work."""
+"""An event for each function, as AWS sends it: the smallest one that makes the function do its work."""
 
 from __future__ import annotations
 

@@ -1,5 +1,6 @@
 """Every deployed function under AWS' own runtime interface client: it starts, answers, fails and logs as
-Lambda expects."""
+Lambda expects.
+"""
 
 from __future__ import annotations
 
@@ -20,7 +21,7 @@ from tests.runtime.environment import RuntimeFailedError, started
 from tests.runtime.events import events
 
 LAYER = ROOT / "build" / "layer" / "local"
-# By function: the answer to its event, and the services that it asked for it.
+# Per function: the answer to its event, and the services that it calls.
 ANSWERS: dict[str, tuple[Any, set[str]]] = {
     "admit": ({"allowProvisioning": True}, {"UpdateItem"}),
     "alert": (None, {"UpdateItem", "Mail"}),
@@ -33,7 +34,7 @@ ANSWERS: dict[str, tuple[Any, set[str]]] = {
     "summarize": ({"batchItemFailures": []}, {"GetItem", "Query", "BatchWriteItem", "UpdateItem"}),
     "upload": (None, {"Objects", "UpdateItem", "Topic"}),
 }
-# What makes of an event that is none: Lambda's error document, or an answer all the same.
+# Answers to an empty event: Lambda's error document (RAISES), or a normal answer (TAKES).
 RAISES = {
     "alert": "KeyError",
     "echo": "KeyError",
@@ -53,16 +54,16 @@ TAKES = {
 @pytest.fixture(scope="module")
 def deployed(tmp_path_factory):
     if not LAYER.is_dir():
-        pytest.skip(f"{LAYER} is not there: run `make setup`")
+        pytest.skip(f"{LAYER} is missing: run `make setup`")
     return functions(tmp_path_factory.mktemp("app"), Settings(layer=LAYER))
 
 
-def test_every_function_is_started_here(deployed):
+def test_every_function_has_an_event_and_an_answer(deployed):
     assert deployed.keys() == ANSWERS.keys() == events().keys() == RAISES.keys() | TAKES.keys()
 
 
 @pytest.mark.parametrize("name", ANSWERS)
-def test_it_answers_its_event_within_its_memory(deployed, tmp_path, name):
+def test_each_function_answers_its_event_within_its_memory(deployed, tmp_path, name):
     expected, asked = ANSWERS[name]
     with started(deployed[name], tmp_path) as environment:
         answer = environment.invoke(events()[name])
@@ -73,14 +74,16 @@ def test_it_answers_its_event_within_its_memory(deployed, tmp_path, name):
             assert answer.document is expected
         # Python alone takes ten.
         assert 10 < environment.peak_mb() < deployed[name].memory_mb
-        # A second one in the same environment.
+        # A second event in the same environment.
         assert environment.invoke(events()[name]).kind == RESPONSE
     assert set(environment.services.asked) == asked
     check_log(environment)
 
 
 def check_log(environment):
-    """Records are JSON with a level, what is printed is a metric as CloudWatch reads it; no line has keys."""
+    """Check that records are JSON with a level, that printed lines are metrics in CloudWatch's format, and
+    that no line has keys.
+    """
     assert not [line for line in [*environment.printed, *environment.logged] if PUBNUB_KEY in line]
     records = [json.loads(line) for line in environment.logged]
     assert all(record.keys() >= {"timestamp", "level", "message", "requestId"} for record in records)
@@ -99,10 +102,10 @@ def check_log(environment):
 
 
 @pytest.mark.parametrize("name", RAISES)
-def test_its_failure_is_an_error_document_and_a_record_of_level_error(deployed, tmp_path, name):
+def test_a_failure_makes_an_error_document_and_an_error_record(deployed, tmp_path, name):
     with started(deployed[name], tmp_path) as environment:
         answer = environment.invoke({})
-        # An error costs no environment.
+        # An error does not end the environment.
         assert environment.invoke(events()[name]).kind == RESPONSE
     assert answer.kind == ERROR
     document = answer.document
@@ -114,20 +117,20 @@ def test_its_failure_is_an_error_document_and_a_record_of_level_error(deployed, 
 
 
 @pytest.mark.parametrize("name", TAKES)
-def test_it_answers_even_an_event_that_is_none(deployed, tmp_path, name):
+def test_a_function_may_answer_an_empty_event(deployed, tmp_path, name):
     with started(deployed[name], tmp_path) as environment:
         answer = environment.invoke({})
     assert (answer.kind, answer.document) == (RESPONSE, TAKES[name])
 
 
-def test_a_function_that_cannot_be_imported_says_so_at_its_start(deployed, tmp_path):
+def test_an_import_error_is_reported_at_the_start(deployed, tmp_path):
     bare = replace(deployed["live"], layer=None)
     with pytest.raises(RuntimeFailedError, match="No module named 'pubnub'"), started(bare, tmp_path):
         pass
 
 
-def test_the_layers_bytecode_is_deployed_and_enough(deployed, tmp_path):
-    """A module whose source would fail is imported from its bytecode, which is not compared with it."""
+def test_the_layers_bytecode_is_deployed_and_sufficient(deployed, tmp_path):
+    """A module is imported from its bytecode although its source would fail: Python does not compare them."""
     packages = deployed["live"].layer / "python"
     assert len(list(packages.rglob("*.pyc"))) > 200
     code = tmp_path / "code"
@@ -140,9 +143,10 @@ def test_the_layers_bytecode_is_deployed_and_enough(deployed, tmp_path):
 
 
 @pytest.mark.parametrize("log_format", ["JSON", "Text"])
-def test_a_printed_line_reaches_lambda_as_it_is_and_a_logged_one_does_not(deployed, tmp_path, log_format):
-    """Why metrics are printed: with logs in JSON, what `logging` writes stands inside a record, where
-    CloudWatch looks for no metric."""
+def test_a_printed_line_reaches_lambda_unchanged_unlike_a_logged_line(deployed, tmp_path, log_format):
+    """Metrics are printed for this reason: with logs in JSON, `logging` writes a line inside a record,
+    where CloudWatch does not search for metrics.
+    """
     code = tmp_path / "code"
     code.mkdir()
     line = '{"_aws":{"Timestamp":1,"CloudWatchMetrics":[]},"One":1}'

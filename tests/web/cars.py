@@ -1,4 +1,4 @@
-"""Cars that publish to PubNub's stand-in what Lambda 1 would, one message at a time."""
+"""Cars that publish to PubNub's stand-in as Lambda 1 would, one message at a time."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ SAMPLE: dict[str, Value] = {
 
 
 class Car:
-    """Publishes live updates as Lambda 1 does, over plain HTTP."""
+    """Publishes live updates over plain HTTP, as Lambda 1 does."""
 
     def __init__(self, pubnub: PubNubStandIn, name: str = "car-1", boot: str = "0a1b2c3d") -> None:
         self.pubnub, self.name, self.boot, self.seq = pubnub, name, boot, 0

@@ -1,4 +1,4 @@
-"""A page that is open at a car's view, and the car."""
+"""A page that shows a car, and the car."""
 
 from __future__ import annotations
 

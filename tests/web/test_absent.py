@@ -1,4 +1,4 @@
-"""Cars that are registered and not heard: the page says since when, and shows the way to what they did."""
+"""Registered cars without live messages: the page shows since when, and links to their history."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ REGISTERED = {
 }
 
 
-def test_cars_that_are_away_are_listed_until_they_are_heard(
+def test_absent_cars_are_listed_until_they_send(
     open_page: Callable[..., Page], pubnub: PubNubStandIn
 ) -> None:
     answers: dict[str, Any] = {
@@ -44,10 +44,10 @@ def test_cars_that_are_away_are_listed_until_they_are_heard(
         Car(pubnub, "car-3").send()
         until(lambda: absent.count() == 2, "one to be heard")
         assert page.locator("[data-robot=car-3]").is_visible()
-        # By its own view and by the list, to what it did.
+        # The car's view and the list both link to the history.
         page.goto(f"{server.url}#/car/car-2")
         past = page.get_by_role("link", name="What it did before")
-        until(past.is_visible, "the way to the past")
+        until(past.is_visible, "the link to the history")
         past.click()
         until(lambda: page.inner_text(".history .car-name") == "car-2", "the past")
         page.goto(f"{server.url}#/")
@@ -55,7 +55,7 @@ def test_cars_that_are_away_are_listed_until_they_are_heard(
         until(lambda: "#/history/car-2" in page.url, "the past again")
 
 
-def test_a_page_without_a_server_to_ask_lists_none(page: Page, url: str) -> None:
+def test_a_page_without_a_server_lists_no_absent_car(page: Page, url: str) -> None:
     assert not page.get_by_role("link", name="What it did before").is_visible()
     page.goto(f"{url}#/")
     assert not page.locator(".absent").is_visible()

@@ -1,4 +1,4 @@
-"""A log widget of a dashboard, whose answer takes longer than the dashboard beside it stays the newest."""
+"""A dashboard's log widget whose query takes longer than the interval between two dashboards."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ WIDGET = {
 
 
 class Logs:
-    """A server whose queries take until they are let go, and what it was asked."""
+    """A server whose queries wait until the test releases them; it records the requests."""
 
     def __init__(self) -> None:
         self.dashboards = 0
@@ -48,7 +48,7 @@ class Logs:
         return {"columns": ["@message"], "rows": [[asked["minutes"]]], "found": 1, "from_s": 0, "to_s": 60}
 
 
-def test_a_query_is_waited_for_while_the_dashboard_is_drawn_anew(
+def test_the_page_waits_for_a_log_query_across_dashboard_updates(
     open_page: Callable[..., Page], pubnub: PubNubStandIn
 ) -> None:
     logs = Logs()
@@ -64,15 +64,15 @@ def test_a_query_is_waited_for_while_the_dashboard_is_drawn_anew(
         until(lambda: len(logs.queries) == 1, "the first query")
         first = page.locator(".log-widget").element_handle()
         page.evaluate("document.querySelector('.widgets > *').dataset.old = 'yes'")
-        # As every half minute.
+        # The page does so every half minute.
         page.locator("#dashboard").dispatch_event("change")
         until(lambda: page.locator(".widgets > :not([data-old])").count() == 1, "the dashboard to be new")
         assert page.evaluate("(node) => node.isConnected", first)
-        # Another range is another query, and nobody waits for the first any longer.
+        # Another range is another query, and the page no longer waits for the first.
         page.locator("#minutes").select_option("15")
         until(lambda: len(logs.queries) == 2, "the second query")
         logs.done.set()
         line = page.locator(".log-widget td.words")
-        until(lambda: line.count() == 1, "what was found")
+        until(lambda: line.count() == 1, "the matches")
         assert line.inner_text() == "15"
         assert [asked["minutes"] for asked in logs.queries] == ["60", "15"]

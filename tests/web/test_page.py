@@ -1,4 +1,4 @@
-"""The live page in a real browser: values shown equal values sent, old looks old, and it comes back."""
+"""The live page in a real browser: it shows the sent values, marks old values, and recovers from faults."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ if TYPE_CHECKING:
     from playwright.sync_api import Page
 
 
-def test_it_says_what_it_waits_for(page: Page, pubnub: PubNubStandIn) -> None:
+def test_the_empty_page_says_that_it_waits_for_a_car(page: Page, pubnub: PubNubStandIn) -> None:
     text = page.inner_text("#empty")
     assert "Waiting for car-1" in text
     assert "iort.*" in text
@@ -29,7 +29,7 @@ def test_it_says_what_it_waits_for(page: Page, pubnub: PubNubStandIn) -> None:
     assert page.inner_text("#link") == "Connected"
 
 
-def test_values_shown_are_values_sent(page: Page, car: Car) -> None:
+def test_the_page_shows_the_sent_values(page: Page, car: Car) -> None:
     update = car.send()
     show(page, update)
     assert page.evaluate("iort.robots['car-1'].streams.vesc.sample") == update["sample"]
@@ -56,7 +56,7 @@ def test_values_shown_are_values_sent(page: Page, car: Car) -> None:
         assert plain(page.inner_text(f"[data-reading='{name}']")) == text
 
 
-def test_the_hottest_is_of_all_the_temperatures_that_the_alarm_counts(page: Page, car: Car) -> None:
+def test_the_hottest_value_covers_every_temperature_of_the_alarm(page: Page, car: Car) -> None:
     for hot in TEMPERATURES:
         show(page, car.send({**dict.fromkeys(TEMPERATURES, 0), "temperature_pcb": -4.5, hot: 81.5}))
         assert shown(page, "temperature") == "81.5"
@@ -64,7 +64,7 @@ def test_the_hottest_is_of_all_the_temperatures_that_the_alarm_counts(page: Page
     assert shown(page, "temperature") == "-4.5"
 
 
-def test_charge_and_energy_have_the_unit_of_the_driver_that_sent_them(page: Page, car: Car) -> None:
+def test_charge_and_energy_have_the_unit_of_their_driver(page: Page, car: Car) -> None:
     show(page, car.send({**SAMPLE, "charge_drawn": 0, "energy_drawn": 0}))
     page.click("[data-stream='vesc'] .tile:has([data-value='charge_drawn'])")
     show(page, car.send({**SAMPLE, "charge_drawn": 0.0019, "energy_drawn": 1}))
@@ -83,7 +83,7 @@ def test_every_newer_message_is_shown(page: Page, car: Car) -> None:
     assert page.evaluate("iort.outOfOrder") == 0
 
 
-def test_any_field_of_any_stream_is_shown(page: Page, car: Car) -> None:
+def test_the_page_shows_any_field_of_any_stream(page: Page, car: Car) -> None:
     sample: dict[str, Value] = {
         "pose.x": -1.25,
         "armed": True,
@@ -112,7 +112,7 @@ def test_text_from_a_robot_is_never_html(page: Page, car: Car, url: str) -> None
     assert page.evaluate("window.hacked") is None
 
 
-def test_a_script_of_somebody_elses_does_not_run(page: Page) -> None:
+def test_a_foreign_script_does_not_run(page: Page) -> None:
     page.evaluate(
         """() => {
           const script = document.createElement("script");
@@ -124,19 +124,19 @@ def test_a_script_of_somebody_elses_does_not_run(page: Page) -> None:
     assert page.evaluate("fetch('https://example.com').then(() => 'went', () => 'refused')") == "refused"
 
 
-def test_the_delay_is_that_measured_outside(page: Page, car: Car) -> None:
+def test_the_delay_equals_the_delay_measured_outside(page: Page, car: Car) -> None:
     bounds = []
     for _ in range(12):
         update = car.update()
         before_us = time.time_ns() // 1000
         car.publish(update)
         show(page, update)
-        # Of the same message: it arrived after it was published, and before it was seen here.
+        # Bounds for the same message: it arrived after it was published, and before the test saw it.
         sent_us = update["hops"]["sent_us"]
         bounds.append(((before_us - sent_us) / 1000, (time.time_ns() // 1000 - sent_us) / 1000))
     seen = page.evaluate("iort.delays('car-1')")
     assert len(seen) == len(bounds)
-    # The browser's time of day has whole milliseconds.
+    # The browser's wall clock has a resolution of 1 ms.
     for inside, (least, most) in zip(seen, bounds, strict=True):
         assert least - 1 <= inside <= most + 1
     delay = page.evaluate("iort.robots['car-1'].delay_ms")
@@ -150,7 +150,7 @@ def test_the_delay_is_that_measured_outside(page: Page, car: Car) -> None:
     until(lambda: page.locator("[data-value=leg_car]").inner_text() == "2.0", "the delay by hop")
 
 
-def test_the_delay_is_on_the_clouds_clock(page: Page, car: Car) -> None:
+def test_the_delay_uses_the_clouds_clock(page: Page, car: Car) -> None:
     update = car.update()
     hour_us = 3_600_000_000
     for hop, key in ((update, "t"), (update["hops"], "sent_us")):
@@ -163,7 +163,9 @@ def test_the_delay_is_on_the_clouds_clock(page: Page, car: Car) -> None:
     assert legs["toCloud"] == pytest.approx(4, abs=1.1)
     assert legs["total"] < hour_us / 1000
     assert page.evaluate("iort.robots['car-1'].state") == "live"
-    until(lambda: "corrected by the offset" in page.inner_text(".warning"), "the word on clocks")
+    until(
+        lambda: "corrected by the offset" in page.inner_text(".warning"), "the warning about the clock offset"
+    )
 
 
 def test_a_message_out_of_order_is_not_the_newest(page: Page, car: Car) -> None:
@@ -174,7 +176,7 @@ def test_a_message_out_of_order_is_not_the_newest(page: Page, car: Car) -> None:
     car.publish(second)
     until(lambda: page.evaluate("iort.outOfOrder") == 2, "the late messages")
     assert shown(page, "voltage_input") == "2.00"
-    # A new run of the agent starts from 0, and a message of the run before it is late for ever.
+    # A new run of the agent starts from 0, and a message of the previous run stays out of order.
     again = Car(car.pubnub, boot="ffffffff").send({**SAMPLE, "voltage_input": 3})
     show(page, again)
     assert shown(page, "voltage_input") == "3.00"
@@ -183,7 +185,7 @@ def test_a_message_out_of_order_is_not_the_newest(page: Page, car: Car) -> None:
     assert shown(page, "voltage_input") == "3.00"
 
 
-def test_malformed_messages_are_counted_and_do_no_harm(page: Page, car: Car) -> None:
+def test_malformed_messages_are_counted_and_ignored(page: Page, car: Car) -> None:
     good = car.update()
     bad: list[Any] = [
         7,
@@ -215,7 +217,7 @@ def test_malformed_messages_are_counted_and_do_no_harm(page: Page, car: Car) -> 
     assert shown(page, "voltage_input") == "11.65"
 
 
-def test_a_fault_stands_out_with_its_name_and_is_kept_in_the_log(page: Page, car: Car, url: str) -> None:
+def test_a_fault_is_highlighted_by_name_and_logged(page: Page, car: Car, url: str) -> None:
     rows = page.locator(".faults tbody tr[data-state]:not([data-state=none])")
     show(page, car.send({**SAMPLE, "fault_code": 5}))
     assert page.inner_text(".fault") == "Fault: MOSFET over-temperature (5)"
@@ -234,9 +236,9 @@ def test_a_fault_stands_out_with_its_name_and_is_kept_in_the_log(page: Page, car
     assert "unknown fault (99)" in card.inner_text()
 
 
-def test_old_values_look_stale_and_a_silent_car_is_gone(page: Page, car: Car) -> None:
+def test_old_values_look_stale_and_a_silent_car_disappears(page: Page, car: Car) -> None:
     show(page, car.send())
-    # What was shown, and how long the car had been silent then.
+    # The values shown before, and how long the car had been silent then.
     page.evaluate(
         """() => {
           const car = document.querySelector("#car");
@@ -260,7 +262,7 @@ def test_old_values_look_stale_and_a_silent_car_is_gone(page: Page, car: Car) ->
     until(lambda: page.get_attribute("#car", "data-state") == "live", "live again")
 
 
-def test_a_sample_that_was_long_under_way_is_stale(page: Page, car: Car) -> None:
+def test_a_sample_with_a_long_delay_is_stale(page: Page, car: Car) -> None:
     first = car.send()
     show(page, first)
     until(lambda: page.evaluate("iort.robots['car-1'].state") == "stale", "silence")
@@ -268,25 +270,25 @@ def test_a_sample_that_was_long_under_way_is_stale(page: Page, car: Car) -> None
     late["t"] = first["t"] + 1000
     car.publish(late)
     show(page, late)
-    # It has just been heard of, but what it says is old.
+    # The page has just received a message of the car, but its sample is old.
     assert page.evaluate("iort.robots['car-1'].state") == "stale"
     show(page, car.send())
     assert page.evaluate("iort.robots['car-1'].state") == "live"
 
 
-def test_it_connects_again_by_itself_and_says_so(page: Page, car: Car) -> None:
+def test_the_page_reconnects_and_reports_it(page: Page, car: Car) -> None:
     show(page, car.send())
     car.pubnub.stop()
     until(lambda: page.inner_text("#link") == "Connection lost", "the page to notice")
     assert "Connection lost" in page.inner_text("#banner")
     car.pubnub.start()
     until(lambda: page.evaluate("iort.link") == "live", "the page to connect again")
-    until(lambda: "Connected again" in page.inner_text("#banner"), "the good news")
+    until(lambda: "Connected again" in page.inner_text("#banner"), "the success message")
     show(page, car.send({**SAMPLE, "voltage_input": 12}))
     assert shown(page, "voltage_input") == "12.00"
 
 
-def test_a_pubnub_that_hangs_is_noticed(open_page: Callable[..., Page]) -> None:
+def test_the_page_detects_a_hanging_pubnub(open_page: Callable[..., Page]) -> None:
     with socket.create_server(("127.0.0.1", 0)) as silent:
         port = silent.getsockname()[1]
         with PageServer(
@@ -297,7 +299,7 @@ def test_a_pubnub_that_hangs_is_noticed(open_page: Callable[..., Page]) -> None:
             until(lambda: "does not answer" in page.inner_text("#banner"), "the reason")
 
 
-def test_a_car_registered_after_the_page_was_opened_has_its_speed_in_metres(
+def test_a_car_registered_after_the_page_opened_shows_metres_per_second(
     open_page: Callable[..., Page], pubnub: PubNubStandIn
 ) -> None:
     registered: dict[str, Any] = {}
@@ -310,7 +312,7 @@ def test_a_car_registered_after_the_page_was_opened_has_its_speed_in_metres(
         until(lambda: "m/s" in speed.inner_text(), "metres a second")
 
 
-def test_the_fleet_is_sorted_and_works_by_keyboard(page: Page, car: Car, url: str) -> None:
+def test_the_fleet_is_sorted_and_usable_by_keyboard(page: Page, car: Car, url: str) -> None:
     page.goto(f"{url}#/")
     for name in ("car-10", "car-2", "car-1"):
         show(page, Car(car.pubnub, name).send({**SAMPLE, "voltage_input": int(name[4:])}))
@@ -339,12 +341,12 @@ def test_any_number_can_be_charted(page: Page, car: Car) -> None:
     panel = page.locator("section.panel[aria-label=Displacement]")
     show(page, car.send({**SAMPLE, "displacement": 77}))
     assert "77" in panel.inner_text()
-    until(lambda: tile.get_attribute("aria-pressed") == "true", "the tile to say so")
+    until(lambda: tile.get_attribute("aria-pressed") == "true", "the tile to be selected")
     panel.get_by_label("Close Displacement").click()
     assert panel.count() == 0
 
 
-def test_xy_charts_appear_with_what_they_show(page: Page, car: Car) -> None:
+def test_xy_charts_appear_with_their_data(page: Page, car: Car) -> None:
     plane = page.locator("section.panel[aria-label=Trajectory]")
     show(page, car.send())
     assert page.locator("section.panel[aria-label='Speed and motor current']").is_visible()
@@ -355,7 +357,7 @@ def test_xy_charts_appear_with_what_they_show(page: Page, car: Car) -> None:
     assert page.locator("section.panel[aria-label='Accelerations, G-G']").is_visible()
 
 
-def test_nothing_jumps(page: Page, car: Car) -> None:
+def test_updates_do_not_move_the_layout(page: Page, car: Car) -> None:
     show(page, car.send())
     page.evaluate(
         """() => {
@@ -372,7 +374,7 @@ def test_nothing_jumps(page: Page, car: Car) -> None:
     assert sum(value for value, _ in shifts) < 0.01, "\n".join(map(str, shifts))
 
 
-def test_memory_is_bounded_whatever_comes(page: Page, car: Car) -> None:
+def test_memory_stays_bounded(page: Page, car: Car) -> None:
     bounds = page.evaluate("iort.bounds")
     script = """async ([robot, rows]) => {
       // What a robot may send is bounded by the worker; what is kept of it, by the page.
@@ -386,7 +388,7 @@ def test_memory_is_bounded_whatever_comes(page: Page, car: Car) -> None:
     assert sum(each["columns"] - 1 for each in kept) == bounds["columns"]
     for i in range(bounds["streams"] - 4 + 1):
         update = car.send({"x": 1}, stream=f"s{i}")
-    until(lambda: page.evaluate("iort.malformed") == 1, "the stream too many")
+    until(lambda: page.evaluate("iort.malformed") == 1, "the extra stream")
     assert update["stream"] not in page.evaluate("Object.keys(iort.robots['car-1'].streams)")
 
 
@@ -407,7 +409,7 @@ def test_a_phone_needs_no_sideways_scrolling(
         assert page.evaluate("document.documentElement.scrollWidth") == 375
 
 
-def test_nothing_can_be_changed_through_what_tests_read(page: Page, car: Car) -> None:
+def test_the_test_interface_is_read_only(page: Page, car: Car) -> None:
     show(page, car.send())
     page.evaluate(
         "() => { try { iort.robots['car-1'].streams.vesc.sample.speed = 1; iort.received = 9 } catch {} }"

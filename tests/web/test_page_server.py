@@ -1,4 +1,4 @@
-"""The page's web server, over loopback: what it serves, what it refuses, and what it never tells."""
+"""The page's web server, over loopback: its files, its rejections, and the secrets that it never sends."""
 
 from __future__ import annotations
 
@@ -91,7 +91,7 @@ def test_files_come_with_their_type_and_the_policy(built: Path, path: str, kind:
         "/page.bin",
     ],
 )
-def test_nothing_else_is_served(built: Path, path: str) -> None:
+def test_other_paths_are_not_served(built: Path, path: str) -> None:
     with PageServer(**TOLD, built=built) as page:
         answer, body = ask(page, path)
     assert answer.status == 404
@@ -99,7 +99,7 @@ def test_nothing_else_is_served(built: Path, path: str) -> None:
     assert "default-src 'none'" in answer.headers["Content-Security-Policy"]
 
 
-def test_a_file_that_the_browser_has_is_not_sent_again(built: Path) -> None:
+def test_a_cached_file_is_not_sent_again(built: Path) -> None:
     with PageServer(**TOLD, built=built) as page:
         etag = ask(page, "/page.js")[0].headers["ETag"]
         again, body = ask(page, "/page.js", headers={"If-None-Match": etag, "Accept-Encoding": "gzip"})
@@ -109,7 +109,7 @@ def test_a_file_that_the_browser_has_is_not_sent_again(built: Path) -> None:
     assert other.status == 200
 
 
-def test_a_slow_answer_delays_neither_a_file_nor_the_end(built: Path) -> None:
+def test_a_slow_answer_delays_neither_a_file_nor_the_shutdown(built: Path) -> None:
     asked, done = threading.Event(), threading.Event()
 
     def slow(_asked: Mapping[str, str]) -> dict[str, Any]:
@@ -131,19 +131,19 @@ def test_a_slow_answer_delays_neither_a_file_nor_the_end(built: Path) -> None:
         done.set()
 
 
-def test_it_takes_no_other_method(built: Path) -> None:
+def test_other_methods_are_rejected(built: Path) -> None:
     with PageServer(**TOLD, built=built) as page:
         assert ask(page, "/", "POST")[0].status == 405
 
 
-def test_the_page_is_told_where_to_listen_and_nothing_more(built: Path) -> None:
+def test_the_page_receives_only_its_pubnub_settings(built: Path) -> None:
     vehicles = {"car-1": {"speed_to_erpm_gain": 4614.0}}
     with PageServer(**TOLD, vehicles=vehicles, built=built) as page:
         told = json.loads(ask(page, "/config.json")[1])
     assert told == {**TOLD, "vehicles": vehicles, "token": "", "answers": False}
 
 
-def test_an_answer_with_numbers_that_json_does_not_have_comes_with_null(built: Path) -> None:
+def test_an_answer_has_null_for_nan_and_infinity(built: Path) -> None:
     answered = {"mean": [1.5, float("inf"), None], "of": {"x": float("nan")}, "n": 3}
     with PageServer(**TOLD, answers={"history": lambda _asked: answered}, built=built) as page:
         answer, body = ask(page, "/history.json")
@@ -166,12 +166,12 @@ def test_an_answer_with_numbers_that_json_does_not_have_comes_with_null(built: P
         ({"vehicles": {"car": {"speed_to_erpm_gain": float("nan")}}}, "speed_to_erpm_gain"),
     ],
 )
-def test_what_no_page_may_be_told_is_refused(change: dict[str, Any], says: str) -> None:
+def test_invalid_page_settings_are_rejected(change: dict[str, Any], says: str) -> None:
     with pytest.raises(StationError, match=says):
         config(**{**TOLD, **change})
 
 
-def test_a_busy_port_says_so(built: Path) -> None:
+def test_a_busy_port_raises_an_error(built: Path) -> None:
     with socket.create_server(("127.0.0.1", 0)) as taken:
         port = taken.getsockname()[1]
         with pytest.raises(StationError, match=f"port {port}: the port is in use"):
@@ -179,17 +179,17 @@ def test_a_busy_port_says_so(built: Path) -> None:
 
 
 @pytest.mark.parametrize("port", [-1, 70_000])
-def test_a_port_that_is_none_says_so(built: Path, port: int) -> None:
+def test_an_invalid_port_raises_an_error(built: Path, port: int) -> None:
     with pytest.raises(StationError, match="cannot serve the page"):
         PageServer(**TOLD, port=port, built=built).start()
 
 
-def test_a_page_that_is_not_built_says_how(tmp_path: Path) -> None:
+def test_an_error_explains_how_to_build_the_page(tmp_path: Path) -> None:
     with pytest.raises(StationError, match="make setup"):
         PageServer(**TOLD, built=tmp_path)
 
 
-def test_the_port_is_free_again_afterwards(built: Path) -> None:
+def test_the_port_is_free_after_the_shutdown(built: Path) -> None:
     with PageServer(**TOLD, built=built) as page:
         ask(page, "/")
         port = page.port
@@ -198,7 +198,7 @@ def test_the_port_is_free_again_afterwards(built: Path) -> None:
         assert ask(page, "/")[0].status == 200
 
 
-def test_a_silent_connection_does_not_keep_the_server_from_stopping(built: Path) -> None:
+def test_a_silent_connection_does_not_delay_the_shutdown(built: Path) -> None:
     page = PageServer(**TOLD, built=built).start()
     with socket.create_connection(("127.0.0.1", page.port)):
         page.stop()
@@ -206,7 +206,7 @@ def test_a_silent_connection_does_not_keep_the_server_from_stopping(built: Path)
 
 
 @pytest.mark.skipif(not socket.has_ipv6, reason="this machine has no IPv6")
-def test_it_serves_ipv6(built: Path) -> None:
+def test_the_server_supports_ipv6(built: Path) -> None:
     try:
         page = PageServer(**TOLD, built=built, host="::1").start()
     except StationError as error:
@@ -223,8 +223,8 @@ def test_it_serves_ipv6(built: Path) -> None:
     ["/", "/page.js", "/config.json", "/double.json?n=1", "/no", "http://elsewhere/page.js"],
 )
 @pytest.mark.parametrize("host", ["127.0.0.1", "0.0.0.0"])
-def test_no_path_answers_to_somebody_elses_name(built: Path, path: str, host: str) -> None:
-    """DNS rebinding: a page elsewhere has its own name point here, and would read what is answered."""
+def test_every_path_rejects_a_foreign_host_name(built: Path, path: str, host: str) -> None:
+    """DNS rebinding: a foreign page points its own name to this server to read the answers."""
     answers = {"double": lambda asked: {"twice": 2 * int(asked["n"])}}
     others = (
         "evil.example",
@@ -245,7 +245,7 @@ def test_no_path_answers_to_somebody_elses_name(built: Path, path: str, host: st
             assert ask(page, path, headers={"Host": name})[0].status == known, name
 
 
-def test_answers_come_as_json_with_the_words_of_what_failed(built: Path) -> None:
+def test_a_failed_answer_is_json_with_the_error(built: Path) -> None:
     def answer(asked: Mapping[str, str]) -> dict[str, Any]:
         if "n" not in asked:
             raise StationError("the request names no n")
@@ -260,7 +260,7 @@ def test_answers_come_as_json_with_the_words_of_what_failed(built: Path) -> None
     assert told["answers"] is True
 
 
-def test_pubnubs_sdk_is_passed_on_unmodified_and_with_its_licence() -> None:
+def test_the_pubnub_sdk_is_served_unmodified_with_its_licence() -> None:
     modules = BUILT.parents[3] / "node_modules" / "pubnub"
     if not (BUILT / "index.html").is_file():
         pytest.skip("the live page is not built: npm run build")

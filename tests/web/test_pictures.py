@@ -1,4 +1,4 @@
-"""A camera's thumbnails on the page: what is drawn is what was sent, and what is no picture does no harm."""
+"""A camera's thumbnails on the page: it draws the sent pictures and ignores invalid ones."""
 
 from __future__ import annotations
 
@@ -24,8 +24,8 @@ KEY = "robots/car-1/2026/05/04/100000-0123456789abcdef/camera/1-data.jpg"
 STREAM = "camera"
 
 
-def claims(picture: str | None, **change: Any) -> dict[str, Any]:
-    """A sample with a claim on its field ``data``."""
+def with_attachment(picture: str | None, **change: Any) -> dict[str, Any]:
+    """Make a sample with an attachment on its field ``data``."""
     claim = {
         "key": KEY,
         "sha256": "0" * 64,
@@ -36,7 +36,7 @@ def claims(picture: str | None, **change: Any) -> dict[str, Any]:
     return {"format": "jpeg", **{f"data.{name}": value for name, value in {**claim, **change}.items()}}
 
 
-LEFT_OUT = claims(None, key=None, sha256=None, size=None, content_type=None)
+LEFT_OUT = with_attachment(None, key=None, sha256=None, size=None, content_type=None)
 
 
 def plain_jpeg(colour: tuple[int, int, int], size: tuple[int, int] = (96, 54)) -> str:
@@ -47,7 +47,7 @@ def plain_jpeg(colour: tuple[int, int, int], size: tuple[int, int] = (96, 54)) -
 
 
 def middle(page: Page) -> list[int]:
-    """Red, green and blue in the middle of the picture."""
+    """Return red, green and blue in the middle of the picture."""
     script = """() => {
       const canvas = document.querySelector("[data-picture=data] canvas");
       const pixel = canvas.getContext("2d").getImageData(canvas.width / 2, canvas.height / 2, 1, 1);
@@ -67,7 +67,7 @@ def test_a_cameras_thumbnail_is_drawn_and_stays_while_others_are_left_out(page: 
     show(page, car.send(LEFT_OUT, stream=STREAM))
     tile = page.locator("[data-picture=data]")
     assert "no picture yet" in tile.inner_text()
-    show(page, car.send(claims(plain_jpeg((200, 30, 30))), stream=STREAM))
+    show(page, car.send(with_attachment(plain_jpeg((200, 30, 30))), stream=STREAM))
     is_drawn(page, (200, 30, 30))
     for _ in range(3):
         show(page, car.send(LEFT_OUT, stream=STREAM))
@@ -76,28 +76,29 @@ def test_a_cameras_thumbnail_is_drawn_and_stays_while_others_are_left_out(page: 
     assert "image/jpeg, 123.5 kB" in tile.inner_text()
     assert tile.get_attribute("title") == f"iort files get: {KEY}"
     assert tile.locator("canvas").get_attribute("aria-label") == "Data, 96 by 54 pixels"
-    # Its five fields are no tiles of text, and the others are.
+    # Its five fields get no text tiles; the other fields do.
     labels = page.locator(f"[data-stream={STREAM}] .tile-label").all_inner_texts()
     assert labels == ["Data", "Format"]
-    show(page, car.send(claims(plain_jpeg((20, 160, 40))), stream=STREAM))
+    show(page, car.send(with_attachment(plain_jpeg((20, 160, 40))), stream=STREAM))
     is_drawn(page, (20, 160, 40))
 
 
-def test_what_the_agent_makes_of_a_camera_is_drawn(page: Page, car: Car) -> None:
+def test_the_page_draws_the_agents_thumbnails(page: Page, car: Car) -> None:
     made = thumbnail(jpeg(1), "image/jpeg")
     assert made is not None
-    show(page, car.send(claims(made), stream=STREAM))
+    show(page, car.send(with_attachment(made), stream=STREAM))
     canvas = page.locator("[data-picture=data] canvas")
     until(canvas.is_visible, "the picture")
     assert page.evaluate("(c) => [c.width, c.height]", canvas.element_handle()) == [96, 72]
 
 
-def hostile() -> dict[str, str]:
-    """Texts that are no thumbnail of ours; the last two say that they are larger than any."""
+def hostile_texts() -> dict[str, str]:
+    """Return texts that are not our thumbnails; the last two declare a size above the limit."""
     small = bytearray(base64.b64decode(plain_jpeg((0, 0, 0))))
     at = small.index(b"\xff\xc0")
     small[at + 5 : at + 9] = (65_500).to_bytes(2, "big") * 2
-    # A whole picture behind a marker without length (TEM), where who takes one for granted sees the next.
+    # A complete picture behind a marker without length (TEM): a parser that expects a length reads the next
+    # one.
     whole = base64.b64decode(plain_jpeg((0, 200, 0), (300, 300)))[2:]
     little = base64.b64decode(plain_jpeg((0, 0, 0)))[2:]
     hidden = b"\xff\xd8\xff\x01" + (2 + len(whole)).to_bytes(2, "big") + whole + little
@@ -112,31 +113,31 @@ def hostile() -> dict[str, str]:
     }
 
 
-def test_what_is_no_picture_is_said_to_be_none(page: Page, car: Car) -> None:
+def test_an_invalid_picture_is_reported(page: Page, car: Car) -> None:
     tile = page.locator("[data-picture=data]")
-    for what, text in hostile().items():
-        show(page, car.send(claims(plain_jpeg((10, 10, 200))), stream=STREAM))
+    for what, text in hostile_texts().items():
+        show(page, car.send(with_attachment(plain_jpeg((10, 10, 200))), stream=STREAM))
         until(tile.locator("canvas").is_visible, "a good one")
-        show(page, car.send(claims(text), stream=STREAM))
+        show(page, car.send(with_attachment(text), stream=STREAM))
         until(lambda: "is no picture" in tile.inner_text(), what)
         assert not tile.locator("canvas").is_visible()
-    show(page, car.send(claims(None), stream=STREAM))
+    show(page, car.send(with_attachment(None), stream=STREAM))
     until(lambda: "makes no thumbnails" in tile.inner_text(), "the reason")
-    show(page, car.send(claims(None, content_type="application/octet-stream"), stream=STREAM))
-    until(lambda: "no picture" in tile.inner_text(), "what it is")
+    show(page, car.send(with_attachment(None, content_type="application/octet-stream"), stream=STREAM))
+    until(lambda: "no picture" in tile.inner_text(), "the notice of an invalid picture")
 
 
-def test_a_field_that_only_sounds_like_a_claim_is_shown_as_it_is(page: Page, car: Car) -> None:
+def test_a_field_named_like_an_attachment_is_shown_unchanged(page: Page, car: Car) -> None:
     show(page, car.send({**SAMPLE, "data.thumbnail": "text", "data.key": "k"}))
     assert page.locator("[data-picture]").count() == 0
     assert page.locator("[data-value='data.thumbnail']").inner_text() == "text"
 
 
-def test_the_past_shows_the_picture_of_the_time_that_is_looked_at(
+def test_the_history_shows_the_picture_of_the_selected_time(
     open_page: Callable[..., Page], pubnub: PubNubStandIn
 ) -> None:
     red, green = plain_jpeg((200, 30, 30)), plain_jpeg((20, 160, 40))
-    rows = [claims(red), LEFT_OUT, LEFT_OUT, claims(green), LEFT_OUT]
+    rows = [with_attachment(red), LEFT_OUT, LEFT_OUT, with_attachment(green), LEFT_OUT]
     fields = {name: {"mean": [row[name] for row in rows]} for name in rows[0]}
 
     def history(asked: Any) -> dict[str, Any]:
@@ -159,5 +160,5 @@ def test_the_past_shows_the_picture_of_the_time_that_is_looked_at(
         drawn(page)
         assert "0.5 s before" in tile.inner_text()
         is_drawn(page, (200, 30, 30))
-        # The claim's five fields are in no table of values.
+        # The table of values leaves out the attachment's five fields.
         assert page.locator(".compare tbody th").all_inner_texts() == ["Format"]

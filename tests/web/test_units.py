@@ -1,4 +1,4 @@
-"""Every number has its unit and every time its zone: in the cars' past as in what they do now."""
+"""Every number has a unit and every time a time zone, in the live view and in the history."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ SPEED_ERPM = (9228.0 + OFFSET_ERPM, 4614.0 + OFFSET_ERPM)
 
 
 def history(asked: Any) -> dict[str, Any]:
-    """Two samples, a second apart."""
+    """Return two samples, a second apart."""
     first = int(asked["from_us"]) / 1e6
     fields = {"speed": {"mean": list(SPEED_ERPM)}, "voltage_input": {"mean": [12.0, 11.5]}}
     return {"times_s": [first, first + 1], "fields": fields, "samples": 2, "ros2": False, "row_s": 0}
@@ -47,14 +47,14 @@ def server(pubnub: PubNubStandIn) -> Iterator[PageServer]:
         yield server
 
 
-def test_speed_is_the_cars_with_its_gain_and_its_offset(
+def test_the_speed_uses_the_cars_gain_and_offset(
     open_page: Callable[..., Page], server: PageServer, car: Car
 ) -> None:
     page = open_page(f"{server.url}#/car/car-1")
     show(page, car.send({**SAMPLE, "speed": SPEED_ERPM[0]}))
     assert shown(page, "speed_mps") == "2.00"
     assert plain(page.locator("[data-reading=speed]").inner_text()) == "2.00"
-    # In the past as now.
+    # The history shows the same.
     page.goto(f"{server.url}#/history/car-1")
     row = page.locator("tr[data-field=speed]")
     told = ["1.00", "2.00", "+1.00", "m/s"]
@@ -66,7 +66,7 @@ def test_speed_is_the_cars_with_its_gain_and_its_offset(
     assert panel.locator(".unit").inner_text() == "m/s"
 
 
-def test_a_car_that_is_not_known_has_its_motors_speed(
+def test_an_unknown_car_shows_its_motor_speed(
     open_page: Callable[..., Page], pubnub: PubNubStandIn, car: Car
 ) -> None:
     with served(pubnub, {}) as server:
@@ -82,7 +82,7 @@ def test_a_car_that_is_not_known_has_its_motors_speed(
 @pytest.mark.parametrize(
     ("timezone", "zone"), [("UTC", "UTC"), ("Asia/Kolkata", "GMT+5:30"), ("America/Phoenix", "GMT-7")]
 )
-def test_a_time_says_its_zone(
+def test_each_time_has_a_zone(
     open_page: Callable[..., Page], server: PageServer, car: Car, timezone: str, zone: str
 ) -> None:
     page = open_page(f"{server.url}#/history/car-1", timezone_id=timezone)
@@ -101,13 +101,13 @@ def test_ros_standard_messages_have_their_units(page: Page, car: Car) -> None:
     assert [plain(text).replace("\n", " ") for text in tiles] == ["1.50m/s²", "-0.25rad/s", "2.00m", "3"]
 
 
-def test_faults_are_counted_for_who_stands_across_the_room(page: Page, car: Car) -> None:
+def test_the_page_counts_faulty_cars(page: Page, car: Car) -> None:
     cars = [Car(car.pubnub, name) for name in ("a", "b", "c")]
     for each, code in zip(cars, (5, 0, 3), strict=True):
         show(page, each.send({**SAMPLE, "fault_code": code}))
     until(lambda: page.inner_text("#faulty") == "2 with a fault", "the count")
     show(page, cars[0].send({**SAMPLE, "fault_code": 0}))
-    until(lambda: page.inner_text("#faulty") == "1 with a fault", "one less")
+    until(lambda: page.inner_text("#faulty") == "1 with a fault", "the lower count")
     show(page, cars[2].send({**SAMPLE, "fault_code": 0}))
     drawn(page)
     until(lambda: page.inner_text("#faulty") == "", "none")
@@ -125,13 +125,13 @@ def contrast(one: str, other: str) -> float:
     return (high + 0.05) / (low + 0.05)
 
 
-def test_text_and_lines_can_be_read_in_both_themes() -> None:
+def test_text_and_lines_have_enough_contrast_in_both_themes() -> None:
     style = (ROOT / "station" / "web" / "style.css").read_text()
     pairs = re.findall(r"--([a-z0-9-]+): light-dark\((#\w{6}), (#\w{6})\)", style)
     colours = {name: (light, dark) for name, light, dark in pairs}
     lines = {"speed", "voltage", "motor", "battery", "duty", "delay", *(f"hue-{i}" for i in range(1, 7))}
     assert lines < colours.keys()
-    # WCAG's AA: 4.5 for text, 3 for what is drawn.
+    # WCAG level AA: 4.5 for text, 3 for graphics.
     wanted = dict.fromkeys(lines, 3.0) | dict.fromkeys(("text", "muted", "good", "warn", "bad"), 4.5)
     for theme, ground in product((0, 1), ("page", "panel")):
         for name, least in wanted.items():

@@ -1,4 +1,4 @@
-"""`make bench TARGET=aws`, as far as it can be tried without an account: on the embedded cloud's services."""
+"""`make bench TARGET=aws`, tested on the embedded cloud's services as far as possible without an account."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ def options(tmp_path, *only: str, yes: bool):
     return argparse.Namespace(only=list(only), target=AWS, namespace="iort", yes=yes, out=tmp_path)
 
 
-def test_two_runs_have_robots_of_their_own_and_leave_none(embedded):
+def test_each_run_has_its_own_robots_and_removes_them(embedded):
     iot, made = embedded.cloud.client("iot"), []
     for _ in range(2):
         with open_target(AWS, cloud=embedded.cloud) as target:
@@ -37,18 +37,18 @@ def test_two_runs_have_robots_of_their_own_and_leave_none(embedded):
             iot.describe_thing(thingName=name)
 
 
-def test_a_robot_that_cannot_be_removed_does_not_keep_the_others(embedded):
+def test_a_failed_removal_does_not_prevent_the_removal_of_other_robots(embedded):
     said = []
     with open_target(AWS, cloud=embedded.cloud, say=said.append) as target:
         kept, other = target.robot("bench-one").robot, target.robot("bench-other").robot
-        # As if somebody had been quicker.
+        # Another client removes the robot first.
         robots.remove(embedded.cloud, other)
     assert any(f"{other} could not be removed" in line for line in said)
     with pytest.raises(ClientError):
         embedded.cloud.client("iot").describe_thing(thingName=kept)
 
 
-def test_an_interrupt_puts_the_memory_back(embedded):
+def test_an_interrupt_restores_the_memory_size(embedded):
     cloud, was = embedded.cloud, memory_mb(embedded.cloud)
     seen = []
 
@@ -65,7 +65,7 @@ def test_an_interrupt_puts_the_memory_back(embedded):
     assert memory_mb(cloud) == was
 
 
-def test_nobody_there_to_agree_means_that_nothing_is_spent(embedded, tmp_path, capsys, monkeypatch):
+def test_a_run_without_consent_spends_nothing(embedded, tmp_path, capsys, monkeypatch):
     monkeypatch.setattr("sys.stdin", io.StringIO())
     before = embedded.cloud.client("iot").list_things()["things"]
     with pytest.raises(SystemExit) as ended:
@@ -78,13 +78,13 @@ def test_nobody_there_to_agree_means_that_nothing_is_spent(embedded, tmp_path, c
     assert not list(tmp_path.iterdir())
 
 
-def test_every_section_that_sends_something_has_its_price(embedded):
+def test_every_section_that_sends_requests_has_a_price(embedded):
     dollars = spending.estimate(embedded.cloud, list(SECTIONS))
     assert set(SECTIONS) - dollars.keys() == {"cost", "scale", "mixed", "fairness"}
     assert all(0 < usd < 1 for usd in dollars.values())
 
 
-def test_the_report_says_where_it_was_made(embedded, tmp_path):
+def test_the_report_names_its_target(embedded, tmp_path):
     with pytest.raises(SystemExit) as ended:
         run.run(options(tmp_path, "cost", "scale", yes=True), embedded.cloud)
     # The cost at the full live rate misses its target.

@@ -15,7 +15,7 @@ from iort_station.cost.usage import Usage
 from tests.ports import free_port
 
 
-def test_robot_is_added_listed_and_removed(iort, tmp_path):
+def test_a_robot_is_added_listed_and_removed(iort, tmp_path):
     added = iort("robots", "add", "cli-car", "--out", str(tmp_path), "--speed-to-erpm-gain", "3000")
     assert added.exit_code == 0, added.output
     key = tmp_path / "cli-car" / "private.key"
@@ -42,14 +42,14 @@ def test_robot_is_added_listed_and_removed(iort, tmp_path):
         (("pubnub", "--publish-key", "pub-c-1", "--subscribe-key", "sub-c-1"), "with its own keys"),
     ],
 )
-def test_error_says_what_is_wrong(iort, tmp_path, arguments, said):
+def test_an_error_states_its_cause(iort, tmp_path, arguments, said):
     outcome = iort(*arguments)
     assert outcome.exit_code != 0
     assert said in str(outcome.exception)
 
 
-def test_no_command_passes_on_what_a_robot_would_have_the_terminal_do(embedded, iort, bundle):
-    """What is reported by a shadow, or as a reason, may be any text."""
+def test_commands_escape_terminal_sequences_from_a_robot(embedded, iort, bundle):
+    """A robot controls these texts: its shadow, and reasons it gives."""
     robot = bundle().robot
     embedded.cloud.client("dynamodb").update_item(
         TableName=embedded.cloud.output("storage", "RobotsTable"),
@@ -64,7 +64,7 @@ def test_no_command_passes_on_what_a_robot_would_have_the_terminal_do(embedded, 
         assert "\x1b" not in outcome.output
 
 
-def test_a_robot_without_files_has_none_and_one_that_is_gone_keeps_them(embedded, iort, bundle):
+def test_files_are_listed_for_existing_and_removed_robots(embedded, iort, bundle):
     robot = bundle().robot
     none = iort("files", "list", robot)
     assert (none.exit_code, none.stdout, none.stderr) == (0, "", "no matching files\n")
@@ -77,7 +77,7 @@ def test_a_robot_without_files_has_none_and_one_that_is_gone_keeps_them(embedded
     assert (later.exit_code, later.stdout) == (0, "")
 
 
-def test_an_embedded_cloud_that_was_killed_is_told_from_one_that_runs(tmp_path):
+def test_a_killed_embedded_cloud_is_reported_as_not_answering(tmp_path):
     port = free_port()
     Cloud(endpoint_url=f"https://127.0.0.1:{port}").save(tmp_path / "cloud.json")
     outcome = CliRunner().invoke(
@@ -86,16 +86,16 @@ def test_an_embedded_cloud_that_was_killed_is_told_from_one_that_runs(tmp_path):
     assert f"{tmp_path / 'cloud.json'} does not answer" in str(outcome.exception)
 
 
-def test_the_cost_of_what_is_deployed(iort):
+def test_the_cost_covers_the_deployed_resources(iort):
     usage = json.loads(iort("cost", "--deployed", "--json").output)["usage"]
     assert (usage["live_concurrency"], usage["live_memory_mb"], usage["summarize_memory_mb"]) == (0, 256, 512)
     assert (usage["recoverable"], usage["customer_key"]) == (False, False)
-    # The embedded cloud has no alarms by Metrics Insights, and other tests' dashboards.
+    # The embedded cloud has no Metrics Insights alarms, but has dashboards of other tests.
     assert (usage["alarms"], usage["insights_metrics"]) == (Usage().alarms, 0)
     assert set(usage["dashboards"]) >= set(Usage().dashboards)
     assert usage["dashboards"][-1] == Usage().dashboards[-1]
 
 
-def test_robot_is_not_added_twice(iort, tmp_path):
+def test_a_robot_cannot_be_added_twice(iort, tmp_path):
     assert iort("robots", "add", "twice", "--out", str(tmp_path / "a")).exit_code == 0
     assert "already registered" in str(iort("robots", "add", "twice", "--out", str(tmp_path / "b")).exception)

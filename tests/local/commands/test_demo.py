@@ -1,4 +1,4 @@
-"""`make demo` as a user runs it: figures, exit status, clear refusals, and nothing left behind."""
+"""`make demo` as a user runs it: figures, exit status, clear errors, and no leftovers."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ def demo(folder: Path, *arguments: str, terminal: int | None = None) -> subproce
 
 
 class Terminal:
-    """A terminal for one process, and what has been written to it so far."""
+    """A terminal for one process, and the output so far."""
 
     def __init__(self, start: Callable[[int], subprocess.Popen[str]]) -> None:
         self._ours, theirs = os.openpty()
@@ -44,14 +44,14 @@ class Terminal:
         threading.Thread(target=self._read, daemon=True).start()
 
     def _read(self) -> None:
-        # Linux fails the read once nobody has the other end.
+        # Linux fails the read when the other end is closed.
         with suppress(OSError):
             while piece := os.read(self._ours, 65536):
                 self.text += piece.decode(errors="replace")
 
 
 def processes_of(folder: Path) -> list[str]:
-    """The command lines of living processes that name the folder or have it in their environment."""
+    """Return the command lines of processes whose command or environment has the folder."""
     found = []
     for process in Path("/proc").glob("[0-9]*"):
         try:
@@ -64,7 +64,7 @@ def processes_of(folder: Path) -> list[str]:
     return found
 
 
-def test_figures_are_those_of_the_recording(tmp_path):
+def test_the_figures_match_the_recording(tmp_path):
     bag, report = recording("f1tenth-motor-servo.bag"), tmp_path / "report.json"
     run = demo(tmp_path / "local", "--bag", str(bag), "--duration", "5", "--report", str(report))
     output, _ = run.communicate(timeout=TIMEOUT_S)
@@ -81,7 +81,7 @@ def test_figures_are_those_of_the_recording(tmp_path):
     assert not processes_of(tmp_path)
 
 
-def test_in_a_terminal_it_drives_on_alone_until_ctrl_c_and_leaves_nothing_running(tmp_path):
+def test_the_demo_runs_until_ctrl_c_and_leaves_no_process(tmp_path):
     folder = tmp_path / "local"
     terminal = Terminal(lambda theirs: demo(folder, "--duration", "1", terminal=theirs))
     first = terminal.process
@@ -115,7 +115,7 @@ def test_in_a_terminal_it_drives_on_alone_until_ctrl_c_and_leaves_nothing_runnin
         (("--port", "70000"), "PORT must be 1 to 65535, got 70000"),
     ],
 )
-def test_wrong_use_is_said_at_once(tmp_path, arguments, said):
+def test_wrong_use_is_reported_at_once(tmp_path, arguments, said):
     run = demo(tmp_path / "local", *arguments)
     output, _ = run.communicate(timeout=TIMEOUT_S)
     assert run.returncode == 2
@@ -123,7 +123,7 @@ def test_wrong_use_is_said_at_once(tmp_path, arguments, said):
     assert "Traceback" not in output
 
 
-def test_busy_port_is_named(tmp_path):
+def test_an_error_names_the_busy_port(tmp_path):
     with socket.create_server(("127.0.0.1", 0)) as taken:
         port = taken.getsockname()[1]
         run = demo(tmp_path / "local", "--port", str(port), "--duration", "1")
@@ -135,7 +135,7 @@ def test_busy_port_is_named(tmp_path):
 
 
 @pytest.mark.parametrize("content", [b"not a bag", b"", b"#ROSBAG V2.0\n" + bytes(500)])
-def test_recording_that_is_none_is_refused_at_once(tmp_path, content):
+def test_an_invalid_recording_is_rejected_at_once(tmp_path, content):
     bag = tmp_path / "x.bag"
     bag.write_bytes(content)
     run = demo(tmp_path / "local", "--bag", str(bag))
@@ -146,7 +146,7 @@ def test_recording_that_is_none_is_refused_at_once(tmp_path, content):
     assert not (tmp_path / "local").exists()
 
 
-def test_recording_without_a_vesc_topic_says_what_it_has(tmp_path):
+def test_an_error_lists_the_topics_of_a_recording_without_vesc(tmp_path):
     from rosbags.rosbag1 import Writer
     from rosbags.typesys import Stores, get_typestore
 
@@ -162,7 +162,7 @@ def test_recording_without_a_vesc_topic_says_what_it_has(tmp_path):
 
 
 @pytest.mark.parametrize("number", [signal.SIGHUP, signal.SIGKILL])
-def test_nothing_is_left_when_the_terminal_closes_or_it_is_killed(tmp_path, number):
+def test_no_process_remains_after_a_hangup_or_a_kill(tmp_path, number):
     folder = tmp_path / "local"
     run = demo(folder, "--duration", "600")
     until((folder / "agent.log").exists, seconds=300)

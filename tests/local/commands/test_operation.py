@@ -33,7 +33,7 @@ def findings(config: Path, *, status: int) -> dict[str, dict[str, str]]:
     return {one["what"]: one for one in json.loads(done.stdout)}
 
 
-def test_a_good_robot_is_all_right(bundle):
+def test_a_correct_robot_passes_every_check(bundle):
     car = bundle(queue={"path": "queue.db"})
     found = findings(car.config, status=0)
     assert {one["level"] for one in found.values()} == {OK}, found
@@ -41,7 +41,7 @@ def test_a_good_robot_is_all_right(bundle):
     assert "certificate's" in found["private key"]["text"]
 
 
-def test_a_revoked_certificate(embedded, bundle):
+def test_the_check_reports_a_revoked_certificate(embedded, bundle):
     car = bundle()
     set_status(embedded, car.robot, "REVOKED")
     found = findings(car.config, status=1)
@@ -50,7 +50,7 @@ def test_a_revoked_certificate(embedded, bundle):
     assert "not active" in found["broker"]["todo"]
 
 
-def test_another_robots_certificate(bundle):
+def test_the_check_reports_another_robots_certificate(bundle):
     one, other = bundle("one"), bundle("other")
     shutil.copy(other.folder / "certificate.pem", one.folder / "certificate.pem")
     found = findings(one.config, status=1)
@@ -59,7 +59,7 @@ def test_another_robots_certificate(bundle):
     assert "not authorized" in findings(one.config, status=1)["broker"]["text"]
 
 
-def test_another_authority_an_open_key_and_what_the_sources_need(bundle, tmp_path):
+def test_the_check_reports_a_wrong_authority_a_readable_key_and_failing_sources(bundle, tmp_path):
     topics = {"/a": {"stream": "a", "time": "arrival"}}
     car = bundle(
         sources=[
@@ -89,19 +89,19 @@ def ros_master(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
         server.shutdown()
 
 
-def test_a_ros_master(ros_master):
+def test_the_check_finds_a_ros_master(ros_master):
     *_, found = Ros1Config(topics=()).check("ros")
     assert (found.level, "process 4711" in found.text) == (OK, True)
 
 
-def test_no_ros_master(monkeypatch):
+def test_the_check_reports_a_missing_ros_master(monkeypatch):
     monkeypatch.setenv("ROS_MASTER_URI", "http://127.0.0.1:9")
     found: list[Finding] = list(Ros1Config(topics=()).check("ros"))
     assert found[-1].level == "fail"
     assert "roscore" in found[-1].todo
 
 
-def test_a_running_agent_tells_of_itself(embedded, bundle):
+def test_a_running_agent_reports_its_status(embedded, bundle):
     car = bundle(sources=[{"type": "sim", "stream": "vesc", "rate_hz": 50}], metrics={"every_s": 1}, queue={})
     with subprocess.Popen([AGENT, "run", "--config", car.config], cwd=ROOT) as agent:
         try:
@@ -110,7 +110,7 @@ def test_a_running_agent_tells_of_itself(embedded, bundle):
             until(lambda: _state(car.config)["clock"])
             state = until(lambda: (now := _state(car.config))["streams"]["vesc"]["per_s"] > 0 and now)
             assert state["connection"]["connected"]
-            # One machine, one clock: the emulator's stamps are ours.
+            # The emulator and the test share one clock.
             assert abs(state["clock"]["offset_ms"]) <= state["clock"]["uncertainty_ms"] + 1
             found = findings(car.config, status=0)
             assert found["broker"]["text"] == "the running agent is connected"

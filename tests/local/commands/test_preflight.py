@@ -1,4 +1,4 @@
-"""The preflight on the embedded cloud, which is deployed: it answers what it can, and nothing stops."""
+"""The preflight on the deployed embedded cloud: it answers the checks, and no finding stops a deployment."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from verify.preflight import command as preflight
 from verify.preflight.finding import Verdict
 
 
-def test_the_embedded_cloud_stops_nothing(embedded):
+def test_the_embedded_cloud_passes_the_preflight(embedded):
     findings = {one.item: one for one in preflight.look(embedded.cloud, Settings(embedded=True))}
     assert not preflight.stopped(list(findings.values())), findings
     said = {item: one.found for item, one in findings.items() if one.verdict is Verdict.FINE}
@@ -18,7 +18,7 @@ def test_the_embedded_cloud_stops_nothing(embedded):
     assert said["changed settings"] == "none that must not be"
 
 
-def test_another_namespace_is_a_first_deployment(embedded):
+def test_another_namespace_counts_as_a_first_deployment(embedded):
     settings = Settings(namespace="another", embedded=True)
     findings = {one.item: one for one in preflight.look(embedded.cloud, settings)}
     assert not preflight.stopped(list(findings.values())), findings

@@ -1,4 +1,4 @@
-"""Taking a deployment down as the README says, beside another one in the same account."""
+"""A deployment is taken down as the README says, beside another one in the same account."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from tests.local.conftest import until
 
 @pytest.fixture(scope="module")
 def lab(embedded, tmp_path_factory):
-    """A second deployment in the embedded account, which is the test's to remove."""
+    """Make a second deployment in the embedded account, which the test removes."""
     folder = tmp_path_factory.mktemp("lab")
     cloud = replace(embedded.cloud, namespace="lab")
     deploy(cloud, folder, lambda _step: None)
@@ -26,7 +26,7 @@ def lab(embedded, tmp_path_factory):
 
 
 def destroyed(cloud, noun):
-    """Delete a stack: whether it is gone, and what stood in the way."""
+    """Delete a stack; return whether it is gone, and the obstacles."""
     formation, name = cloud.client("cloudformation"), f"{cloud.namespace}-{noun}"
     formation.delete_stack(StackName=name)
 
@@ -44,7 +44,7 @@ def destroyed(cloud, noun):
     return False, " ".join(event.get("ResourceStatusReason", "") for event in failed)
 
 
-def test_a_deployment_is_taken_down_and_the_one_beside_it_stays(embedded, bundle, lab, tmp_path):
+def test_a_teardown_leaves_other_deployments_untouched(embedded, bundle, lab, tmp_path):
     cloud, description = lab
     kept = bundle()
     for name in ("lab-car1", "lab-car2"):
@@ -57,11 +57,11 @@ def test_a_deployment_is_taken_down_and_the_one_beside_it_stays(embedded, bundle
     def iort(*arguments, typed=None):
         return CliRunner().invoke(app, ["--local", "--embedded", str(description), *arguments], input=typed)
 
-    # Who uses another stack's outputs goes before it.
+    # Delete a stack before the stacks whose outputs it uses.
     for noun in ("monitoring", "ingest"):
         assert destroyed(cloud, noun) == (True, ""), noun
     gone, why = destroyed(cloud, "fleet")
-    assert not gone, "robots hold the policy, and the stack goes all the same: what is the command for?"
+    assert not gone, "the stack can be deleted although robots have the policy, so the command is not needed"
     assert "lab-robot" in why
     assert "lab-claim" in why
 

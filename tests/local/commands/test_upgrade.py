@@ -1,4 +1,6 @@
-"""A deployment from before batches had ids: what it has stored and what its robots still send is not lost."""
+"""An upgrade of a deployment from before batches had ids loses neither stored batches nor messages of old
+robots.
+"""
 
 from __future__ import annotations
 
@@ -23,7 +25,7 @@ DAY_S = 86_400
 
 
 def drive(start_us):
-    """Half a minute of a second a batch."""
+    """Make half a minute of one-second batches."""
     for i in range(BATCHES):
         times = [start_us + i * 1_000_000 + k * 100_000 for k in range(EACH)]
         yield Batch(RUN, i, times, {"speed": [float(i * EACH + k) for k in range(EACH)]})
@@ -31,7 +33,7 @@ def drive(start_us):
 
 @pytest.fixture
 def old_table(embedded):
-    """A table as deployments had it before; `old_table(robot, messages)` puts them in as the rule did."""
+    """Make a table of the old format; `old_table(robot, messages)` stores them as the old rule did."""
     client, name = embedded.cloud.client("dynamodb"), "telemetry-of-before"
     keys = [("topic", "HASH", "S"), ("t", "RANGE", "N")]
     client.create_table(
@@ -55,7 +57,9 @@ def old_table(embedded):
 
 
 def test_an_old_table_is_adopted(embedded, bundle, iort, old_table):
-    """All of it is in queries, audit and summaries; a second time changes nothing; what cannot be is told."""
+    """Queries, audit and summaries contain every batch; a second run changes nothing; failures are
+    reported.
+    """
     cloud, car = embedded.cloud, bundle()
     start_us = int(time.time() - 3 * DAY_S) * 1_000_000
     batches = list(drive(start_us))
@@ -91,7 +95,7 @@ def test_an_old_table_is_adopted(embedded, bundle, iort, old_table):
     (stream,) = json.loads(audit.stdout)["streams"]
     (run,) = stream["runs"]
     assert (run["batches"], run["samples"], run["missing_batches"]) == (BATCHES, BATCHES * EACH, 0)
-    # By the registry, where Lambda 2 has noted it.
+    # The registry has it from Lambda 2.
     assert iort("audit", car.robot).exit_code == 0
     adopted()
     assert there() == (items, speeds, fastest)
@@ -100,13 +104,13 @@ def test_an_old_table_is_adopted(embedded, bundle, iort, old_table):
     assert f"dt/iort/{car.robot}/lost at -7: time must be from 1970 on, got -7 us" in shown.stdout
 
 
-def test_without_a_table_it_says_what_to_do(iort):
+def test_an_error_without_an_old_table_gives_advice(iort):
     assert "old_telemetry=true" in str(iort("adopt").exception)
     assert "there is no table nowhere" in str(iort("adopt", "nowhere").exception)
 
 
-def test_what_an_agent_of_before_sends_waits_in_quarantine_and_is_put_back_once(embedded, bundle, iort):
-    """The stacks are updated first: the record rule cannot store what has no id."""
+def test_a_message_of_an_old_agent_waits_in_quarantine_and_is_put_back_once(embedded, bundle, iort):
+    """The stacks are updated first: the record rule cannot store a message without an id."""
     cloud, car = embedded.cloud, bundle()
     batches = list(drive(int(time.time()) * 1_000_000))[:3]
     with Robot(car.folder) as robot:

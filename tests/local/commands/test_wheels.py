@@ -40,7 +40,7 @@ def cloud(embedded: EmbeddedCloud) -> dict[str, str]:
     return {"IORT_EMBEDDED": str(embedded.folder / EMBEDDED.name)}
 
 
-def test_an_installed_car_is_driven_queried_and_watched(agent, station, cloud):
+def test_an_installed_car_can_be_driven_queried_and_watched(agent, station, cloud):
     station.run("iort", "robots", "add", "wheels", **cloud)
     car = station.folder / "wheels" / "car.yaml"
     settings = yaml.safe_load(car.read_text())
@@ -69,7 +69,7 @@ def test_an_installed_car_is_driven_queried_and_watched(agent, station, cloud):
     station.run("iort", "robots", "remove", "wheels", **cloud)
 
 
-def test_away_from_a_checkout_an_operator_is_told_how_to_name_the_cloud(station):
+def test_an_error_outside_a_checkout_explains_how_to_name_the_cloud(station):
     with station.start("iort", "--local", "robots", "list") as process:
         _, said = process.communicate()
     assert process.returncode == 1
@@ -77,7 +77,7 @@ def test_away_from_a_checkout_an_operator_is_told_how_to_name_the_cloud(station)
 
 
 @pytest.mark.parametrize("command", ["iort-agent", "iort"])
-def test_a_command_says_its_version(agent, station, built, command):
+def test_each_command_prints_its_version(agent, station, built, command):
     of = {"iort-agent": (agent, "device"), "iort": (station, "station")}
     environment, folder = of[command]
     _, version, *_ = built[folder].name.split("-")
@@ -89,7 +89,7 @@ def test_the_robot_gets_its_unit_and_its_udev_rule(agent):
     assert {path.name for path in shared.iterdir()} == {"iort-agent.service", "99-vesc.rules"}
 
 
-def test_neither_environment_has_the_others_packages(agent, station):
+def test_each_environment_lacks_the_other_ones_packages(agent, station):
     assert not (agent.site / "iort_station").exists()
     assert not (station.site / "iort_agent").exists()
-    assert not (agent.site / "boto3").exists(), "an environment has what is declared, and nothing else"
+    assert not (agent.site / "boto3").exists(), "an environment has only declared packages"

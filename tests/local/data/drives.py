@@ -1,4 +1,4 @@
-"""Drives whose every sample can be told apart: a log of a counter, played by the real agent."""
+"""Drives with distinguishable samples: the real agent plays a log of a counter."""
 
 from __future__ import annotations
 
@@ -17,12 +17,12 @@ from local.cloud import EmbeddedCloud
 from local.deployment import ROOT
 
 RATE_HZ = 50
-# The log's column and the contract's field in which the counter is.
+# The log's column and the contract's field of the counter.
 _COLUMN, FIELD = "erpm", "speed"
 
 
 def counter_log(path: Path, seconds: float) -> Path:
-    """A VESC Tool log in which the speed counts the samples, from 0."""
+    """Write a VESC Tool log whose speed counts the samples from 0."""
     count = int(seconds * RATE_HZ)
     step_ms = 1000 // RATE_HZ
     rows = (f"{1000 + i * step_ms};12.0;{i}" for i in range(count))
@@ -31,16 +31,16 @@ def counter_log(path: Path, seconds: float) -> Path:
 
 
 def counted(embedded: EmbeddedCloud, robot: str) -> list[int]:
-    """The counter in the table, in the table's order; a run's batches must be numbered in order too."""
+    """Return the counter from the table in order; batches of a run must be numbered in order, too."""
     batches = list(delivery.batches(embedded.cloud, robot, "vesc"))
     for boot in {batch.boot for batch in batches}:
         seqs = [batch.seq for batch in batches if batch.boot == boot]
-        assert seqs == sorted(set(seqs)), "a batch number stands twice, or out of order"
+        assert seqs == sorted(set(seqs)), "a batch number is repeated or out of order"
     return [int(value) for batch in batches for value in batch.columns[FIELD]]
 
 
 class Agent:
-    """The installed agent in a process of its own; ``before`` wraps its command, ``environment`` adds."""
+    """The installed agent in a process; ``before`` wraps its command, ``environment`` adds variables."""
 
     def __init__(
         self,
@@ -72,18 +72,18 @@ class Agent:
             self.log.extend(lines)
 
     def said(self, text: str) -> bool:
-        """Whether the log has a line with the text."""
+        """Return whether a log line contains the text."""
         return any(text in line for line in self.log)
 
     def status(self) -> dict[str, Any]:
-        """What `iort-agent status` says; empty while there is no agent to ask."""
+        """Return the output of `iort-agent status`; empty while no agent answers."""
         command = [*self._command, "status", *self._config, "--json"]
         done = subprocess.run(command, capture_output=True, text=True, cwd=ROOT, check=False, timeout=120)
         answer: dict[str, Any] = json.loads(done.stdout) if done.returncode == 0 else {}
         return answer
 
     def stop(self) -> None:
-        """Ask it to end in good order, as Ctrl-C and systemd do."""
+        """End it cleanly, as Ctrl-C and systemd do."""
         self.process.terminate()
 
     def kill(self) -> None:
@@ -93,7 +93,7 @@ class Agent:
         self._reader.join()
 
     def report(self, *, timeout_s: float = 300, status: int = 0) -> dict[str, Any]:
-        """Wait for its end, which must be a good one, or of that status; its own report."""
+        """Wait for the end with that status; return its report."""
         ended = self.process.wait(timeout_s)
         self._reader.join()
         assert ended == status, "".join(self.log[-30:])

@@ -1,4 +1,4 @@
-"""`iort audit` on the embedded cloud: complete after a drive; otherwise what is missing, and why."""
+"""`iort audit` on the embedded cloud: it reports missing batches and their cause."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ def _delete(embedded, robot, stream, item):
     )
 
 
-def test_a_drive_is_proven_and_a_lost_batch_of_any_stream_is_found(embedded, bundle):
+def test_the_audit_confirms_a_drive_and_finds_a_lost_batch_of_any_stream(embedded, bundle):
     car = bundle(
         sources=[{"type": "sim", "stream": "wheels", "rate_hz": 100, "duration_s": 2}],
         record={"batch_s": 0.25},
@@ -60,7 +60,7 @@ def test_a_drive_is_proven_and_a_lost_batch_of_any_stream_is_found(embedded, bun
     assert gap["first"] == gap["last"] == seq
     (short,) = wheels["shortfalls"]
     assert short["samples"] == samples
-    # The last batch of all leaves no gap in the numbers, but the agent's word that it was there.
+    # No later number reveals the loss of the last batch; the agent's own count does.
     for item in audit.headers(embedded.cloud, car.robot, "wheels"):
         _delete(embedded, car.robot, "wheels", item)
     (wheels,) = [
@@ -71,8 +71,8 @@ def test_a_drive_is_proven_and_a_lost_batch_of_any_stream_is_found(embedded, bun
     assert _run(embedded, "nobody-like-that").exit_code == 1
 
 
-def test_runs_one_after_the_other_name_each_other(embedded, bundle):
-    """Over a restart with a queue file, a lost end of a run is found by the next run's word alone."""
+def test_each_run_names_the_run_before_it(embedded, bundle):
+    """After a restart with a queue file, the next run's first batch reveals the lost end of a run."""
     car = bundle(
         queue={"path": "spool.db"},
         sources=[{"type": "sim", "stream": "wheels", "rate_hz": 100, "duration_s": 2}],
@@ -92,7 +92,7 @@ def test_runs_one_after_the_other_name_each_other(embedded, bundle):
     assert not wheels["runs"][1]["missing"]
 
 
-def test_what_the_agent_did_not_record_is_told_by_cause(embedded, bundle):
+def test_the_audit_reports_unrecorded_samples_by_cause(embedded, bundle):
     car = bundle()
     boot = "0badcafe0badcafe"
     told = [
@@ -120,7 +120,7 @@ def test_what_the_agent_did_not_record_is_told_by_cause(embedded, bundle):
     assert answer["not_recorded"] == {boot: {"ROS 1 topics /scan": {"/scan.malformed": 3}}}
 
 
-def test_a_stream_that_only_lambda_2_has_seen_is_audited(embedded, bundle):
+def test_the_audit_covers_a_stream_that_only_lambda_2_has_seen(embedded, bundle):
     car = bundle()
     with Robot(car.folder) as robot:
         robot.online()

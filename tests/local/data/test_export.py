@@ -1,4 +1,4 @@
-"""A recording in, through the cloud, a recording out."""
+"""A recording is uploaded through the cloud and exported again."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ VESC, SERVO = "/sensors/core", "/sensors/servo_position_command"
 
 
 def messages(path: Path, topic: str) -> tuple[Any, list[tuple[int, bytes]]]:
-    """Type, checksum and definition of a topic, and its messages with the time at which each was recorded."""
+    """Return a topic's type, checksum and definition, and its messages with their recording times."""
     with AnyReader([path]) as reader:
         (connection,) = (c for c in reader.connections if c.topic == topic)
         found = [(t_ns, bytes(raw)) for _, t_ns, raw in reader.messages(connections=[connection])]
@@ -37,14 +37,15 @@ def messages(path: Path, topic: str) -> tuple[Any, list[tuple[int, bytes]]]:
 
 
 def stamp_ns(raw: bytes) -> int:
-    """Of a message that begins with a header."""
+    """Return the stamp of a message that begins with a header."""
     _, sec, nanosec, _ = HEADER.unpack_from(raw)
     return int(sec) * 10**9 + int(nanosec)
 
 
 def data_of(cloud: Cloud, robot: str, stream: str) -> list[tuple[int, dict[str, Any]]]:
-    """What a query gives, as Foxglove's libraries give it: VescStateStamped has its fields in ``state``, and
-    an integer of 64 bits is a text."""
+    """Convert a queried message to the form of Foxglove's libraries. VescStateStamped has its fields in
+    ``state``, and a 64-bit integer is a text.
+    """
     found = data.query(cloud, robot, stream)
     within = "state." if stream == "vesc" else ""
     columns = {f"{within}{name}": column.tolist() for name, column in found.columns.items()}
@@ -67,7 +68,7 @@ LAB_COUNT = 200
 
 
 def lab_bag(path: Path) -> Path:
-    """A recording of a type that no library knows, whose frame changes half-way."""
+    """Write a recording of a type that no library knows, and change its frame half-way."""
     store = get_typestore(Stores.ROS1_NOETIC)
     store.register(get_types_from_msg(LAB_DEFINITION, LAB_TYPE))
     made = store.types
@@ -90,7 +91,7 @@ def lab_bag(path: Path) -> Path:
 
 
 @pytest.mark.timeout(300)
-def test_a_bag_comes_back_as_it_went_in(embedded, bundle, tmp_path):
+def test_an_exported_bag_equals_the_recorded_bag(embedded, bundle, tmp_path):
     original, lab = recording("f1tenth-motor-servo.bag"), lab_bag(tmp_path / "lab.bag")
     robot = bundle(
         sources=[
@@ -119,7 +120,8 @@ def test_a_bag_comes_back_as_it_went_in(embedded, bundle, tmp_path):
     assert done.returncode == 0, done.stderr
     assert "2,244 messages of vesc_msgs/VescStateStamped on /sensors/core" in done.stderr
 
-    # Byte for byte, under the definition that was recorded; at the time of their stamps where they have one.
+    # Messages are equal byte for byte, under the recorded definition, at the time of their stamps if they
+    # have one.
     for source, topic, count in ((original, VESC, 2244), (original, SERVO, 879), (lab, LAB, LAB_COUNT)):
         (kind, went), (again, came) = messages(source, topic), messages(exported, topic)
         assert kind == again
@@ -157,13 +159,13 @@ def test_a_bag_comes_back_as_it_went_in(embedded, bundle, tmp_path):
     assert "exists" in done.stderr
 
 
-def test_fields_that_come_later_are_exported_too(embedded: Any, bundle: Any, tmp_path: Path) -> None:
+def test_fields_that_appear_later_are_exported(embedded: Any, bundle: Any, tmp_path: Path) -> None:
     car, noise = bundle(), np.random.default_rng(1)
     t_us, n, batches = 1_760_000_000_000_000, 2000, 14
     wide = [{f"x{i}": noise.random(n).tolist() for i in range(4)} for _ in range(batches)]
     with Robot(car.folder) as robot:
         robot.online()
-        # More than a page of the table, and then another field.
+        # More than one page of the table, and then another field.
         for seq, columns in enumerate([*wide, {"y": [1.5]}]):
             times = [t_us + seq * 1_000_000 + i for i in range(len(next(iter(columns.values()))))]
             batch = Batch("0badcafe", seq, times, columns)

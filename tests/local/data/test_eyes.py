@@ -1,4 +1,4 @@
-"""The operator's eyes on the embedded cloud: a car's fault reaches a human, and the dashboards have data."""
+"""Monitoring on the embedded cloud: a car's fault reaches a human, and the dashboards have data."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ FAULT, LOW_V = 5, 9.5
 
 @pytest.fixture
 def inbox(embedded):
-    """What the alarm topic's subscribers get."""
+    """Collect the messages to the subscribers of the alarm topic."""
     cloud = embedded.cloud
     topic, sqs = cloud.output("processing", "AlarmTopic"), cloud.client("sqs")
     url = sqs.create_queue(QueueName=f"inbox-{time.time_ns()}")["QueueUrl"]
@@ -62,7 +62,7 @@ def test_a_fault_reaches_a_human_and_the_dashboards(embedded, bundle, inbox):
         drive = Batch("0" * 8, 0, [now_us + 20_000 * i for i in range(10)], columns)
         assert robot.publish(record_topic(robot.name, "vesc"), encode_batch(drive)) == "SUCCESS"
 
-        # From the rule, with robot, code and time: once a cause, though five messages said so.
+        # The rule sends robot, code and time once per cause, although five messages had it.
         def mails():
             return [mail for mail in inbox() if robot.name in mail["Message"]]
 
@@ -74,7 +74,7 @@ def test_a_fault_reaches_a_human_and_the_dashboards(embedded, bundle, inbox):
         }
         assert all(" UTC" in mail["Message"] for mail in told.values())
 
-    # From the record lane, by metric and alarm.
+    # The record lane sends the metric and the alarm.
     def alarmed():
         return [
             m for m in inbox() if m.get("Subject", "").startswith("ALARM") and "FaultSamples" in m["Message"]
@@ -97,7 +97,7 @@ def test_a_fault_reaches_a_human_and_the_dashboards(embedded, bundle, inbox):
     drawn = until(lambda: "FaultSamples" in (found := lines()) and found)
     assert max(drawn["FaultSamples"]) >= 10
     assert min(drawn["BatteryVolts"]) == LOW_V
-    # The emulator's own, and nothing that would stay empty in a healthy run.
+    # Skip the emulator's own metrics, and widgets that stay empty in a healthy run.
     wanted = {
         "record",
         "fault",
@@ -110,7 +110,7 @@ def test_a_fault_reaches_a_human_and_the_dashboards(embedded, bundle, inbox):
     assert wanted - {"Telemetry written"} <= drawn.keys()
 
 
-def test_what_a_function_warns_of_stands_on_the_platforms_dashboard(embedded, bundle):
+def test_the_platform_dashboard_shows_warnings_of_functions(embedded, bundle):
     bundle, name = bundle(), f"{embedded.namespace}-platform"
     with Robot(bundle.folder) as robot:
         robot.publish(build_topic(PING, robot.name, FILE), b"[]")
@@ -127,7 +127,7 @@ def test_what_a_function_warns_of_stands_on_the_platforms_dashboard(embedded, bu
     assert "Upload" in line["@log"]
 
 
-# After the first test, which awaits the moment that the alarm goes off.
+# Runs after the first test, which awaits the moment when the alarm goes off.
 @pytest.mark.parametrize(
     ("drive", "told"),
     [
@@ -136,8 +136,8 @@ def test_what_a_function_warns_of_stands_on_the_platforms_dashboard(embedded, bu
     ],
     ids=["fault, voltage unknown", "voltage low, fault unknown"],
 )
-def test_a_human_hears_of_one_though_the_other_is_null(bundle, inbox, tmp_path, drive, told):
-    """By the real agent, which sends most of its live messages where no alert can hear them."""
+def test_an_alert_fires_when_another_field_is_null(bundle, inbox, tmp_path, drive, told):
+    """The real agent sends most of its live messages where no alert can hear them."""
     log = tmp_path / "drive.csv"
     rows = (";".join(str(value) for value in (1000 + 20 * i, *drive(i))) for i in range(100))
     log.write_text("\n".join(["ms_today;input_voltage;fault_code", *rows]) + "\n")

@@ -1,4 +1,4 @@
-"""The embedded cloud's CloudWatch: what feeds it, what it finds, when its alarms go off."""
+"""The embedded cloud's CloudWatch: its sources, its searches and its alarms."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ def values(namespace, name, **dimensions):
     return sorted(point["Value"] for point in points for _ in range(int(point["Count"])))
 
 
-def test_wrapped_functions_take_what_the_wrappers_pass():
+def test_wrapped_functions_accept_the_wrappers_arguments():
     def parameters(function):
         return list(inspect.signature(function).parameters)
 
@@ -39,7 +39,7 @@ def test_wrapped_functions_take_what_the_wrappers_pass():
     assert parameters(cloudwatch._evaluate_alarm) == ["alarm"]
 
 
-def test_what_a_function_prints_is_a_metric(capsys, monkeypatch):
+def test_a_printed_metric_line_is_recorded(capsys, monkeypatch):
     monkeypatch.setenv("NAMESPACE", "lab2")
     emit("health", robot="car7", BatteryVolts=[11.5, 11.25], FaultSamples=3)
     log = f"START\n{capsys.readouterr().out}" + '{"_aws": broken\n{"_aws": {}}\nnot a metric'
@@ -50,15 +50,15 @@ def test_what_a_function_prints_is_a_metric(capsys, monkeypatch):
     assert values("iort", "FaultSamples", **whole) == [3]
 
 
-def test_a_minute_of_many_values_keeps_their_number_and_no_more_than_it_must():
+def test_a_minute_of_many_values_keeps_their_count_within_bounds():
     for value in range(1000):
         points.record("iort", "CarToLambdaMs", value, "Milliseconds")
     assert len(values("iort", "CarToLambdaMs")) == 1000
-    # The test may run over the end of a minute.
+    # The test may run past the end of a minute.
     assert len(cloudwatch._metrics["iort", "CarToLambdaMs", ""]) <= 2 * 120
 
 
-def test_a_search_finds_the_metric_whatever_its_action_is_called():
+def test_a_search_finds_a_metric_of_any_action_type():
     points.record("AWS/IoT", "Failure", 1, "Count", RuleName="iort_record", ActionType="DynamoDBv2")
     points.record("AWS/IoT", "Failure", 1, "Count", RuleName="iort_live", ActionType="Lambda")
     search = (
@@ -97,7 +97,7 @@ def point(at_s, value):
     bucket.append({"Timestamp": at_s, "Value": value, "Count": 1.0, "Unit": "Count", "Dimensions": {}})
 
 
-def test_an_alarm_needs_all_its_periods_and_its_own_dimensions():
+def test_an_alarm_needs_all_periods_and_its_own_dimensions():
     now_s = 1_700_000_100.0
     cloudwatch._metric_bucket(("iort", "FaultSamples", "Deployment=lab2")).append(
         {"Timestamp": now_s, "Value": 9.0, "Count": 1.0, "Unit": "Count", "Dimensions": {}}
@@ -107,7 +107,7 @@ def test_an_alarm_needs_all_its_periods_and_its_own_dimensions():
     assert not alarm_state.breaching(ALARM, now_s)
     point(now_s - 60, 1.0)
     assert alarm_state.breaching(ALARM, now_s)
-    # Over: a minute without data is no alarm.
+    # The alarm is over: a minute without data does not breach.
     assert not alarm_state.breaching(ALARM, now_s + 180)
     below = {**ALARM, "ComparisonOperator": "LessThanThreshold", "Threshold": 0.5}
     assert not alarm_state.breaching(below, now_s)
@@ -138,7 +138,7 @@ def test_an_invocation_is_counted(failed):
     assert age_ms >= 60_000
 
 
-def test_the_messages_that_wait_are_counted():
+def test_waiting_messages_are_counted():
     with request_scope("000000000000", "eu-west-1"):
         url = sqs._act_create_queue({"QueueName": "counted"}, "")["QueueUrl"]
         try:

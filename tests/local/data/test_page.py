@@ -1,4 +1,4 @@
-"""The page, in a real browser, on the embedded cloud: what the car sent is what is shown, live and later."""
+"""The page in a real browser, on the embedded cloud: it shows the car's values, live and later."""
 
 from __future__ import annotations
 
@@ -48,7 +48,7 @@ def served(embedded: EmbeddedCloud) -> PageServer:
     )
 
 
-def test_what_the_car_sent_is_what_is_shown_live_and_later(embedded, bundle, open_page):
+def test_the_page_shows_the_cars_values_live_and_later(embedded, bundle, open_page):
     source = {"type": "sim", "stream": VESC_STREAM, "rate_hz": RATE_HZ, "duration_s": DRIVE_S}
     car = bundle(sources=[source])
     listener = Listener(
@@ -66,12 +66,12 @@ def test_what_the_car_sent_is_what_is_shown_live_and_later(embedded, bundle, ope
         until(lambda: page.evaluate(script) == newest.seq, "the last message on the page")
         sample = page.evaluate(f"iort.robots['{car.robot}'].streams.{VESC_STREAM}.sample")
 
-        # The terminal has read the same.
+        # The terminal shows the same values.
         line = next(line for line in map(json.loads, watched.stdout) if line["t"] == newest.t_us)
         assert (line["robot"], line["sample"]) == (car.robot, sample)
         until(lambda: shown(page, "voltage_input") == f"{sample['voltage_input']:.2f}", "the voltage")
 
-        # Both ends of the comparison wait for a processor; where both had one at once they must agree.
+        # Both sides of the comparison wait for a processor; whenever both had one at once, they must agree.
         delays = page.evaluate(f"iort.delays('{car.robot}')")
         taken = _in_order(heard)
         assert len(delays) == len(taken)
@@ -82,7 +82,9 @@ def test_what_the_car_sent_is_what_is_shown_live_and_later(embedded, bundle, ope
 
 
 def _settled(listener, published):
-    """What was heard, once no more comes: the live lane may lose messages, so their number is no end."""
+    """Return the live messages after the last one; the live lane may lose messages, so their number is
+    unknown.
+    """
     end = time.monotonic() + 60
     while len(listener.heard) < published and time.monotonic() < end:
         count = len(listener.heard)
@@ -93,7 +95,7 @@ def _settled(listener, published):
 
 
 def _in_order(heard):
-    """Without what a message that was sent later has overtaken in the cloud: the page passes that over."""
+    """Remove messages that a later one has overtaken in the cloud; the page skips them, too."""
     newest, taken = {}, []
     for each in heard:
         if each.seq > newest.get(each.stream, -1):
@@ -125,7 +127,7 @@ def _look_back(page, url, robot, samples, newest):
     assert plain(counted.nth(2).inner_text()) == f"+{newest['displacement']:.0f}"
 
 
-def test_a_cameras_thumbnails_come_from_the_car_to_the_page(embedded, bundle, open_page, tmp_path):
+def test_a_cameras_thumbnails_reach_the_page(embedded, bundle, open_page, tmp_path):
     recording = write_bag(tmp_path / "camera.bag", [jpeg(seed) for seed in range(4)])
     source = {"type": "bag", "path": str(recording), "topics": {TOPIC: "camera"}, "large": "upload"}
     car = bundle(sources=[source], files={"large_folder": "large", "rate_kb_s": 0})
@@ -136,7 +138,7 @@ def test_a_cameras_thumbnails_come_from_the_car_to_the_page(embedded, bundle, op
         canvas = picture.locator("canvas")
         until(canvas.is_visible, "a picture")
         assert page.evaluate("(c) => [c.width, c.height]", canvas.element_handle()) == [96, 72]
-        # And from the table, by whoever comes later.
+        # A visitor who comes later reads it from the table.
         page.goto(f"{server.url}#/history/{car.robot}")
         until(lambda: "camera" in page.locator("#stream option").all_inner_texts(), "the streams")
         page.select_option("#stream", "camera")
@@ -153,7 +155,7 @@ def test_a_cameras_thumbnails_come_from_the_car_to_the_page(embedded, bundle, op
 
 
 def logged(cloud, group, *lines):
-    """Write lines into a log group of CloudWatch, a millisecond apart."""
+    """Write lines into a CloudWatch log group, a millisecond apart."""
     client, stream = cloud.client("logs"), str(time.time_ns())
     with suppress(client.exceptions.ResourceAlreadyExistsException):
         client.create_log_group(logGroupName=group)
@@ -163,7 +165,7 @@ def logged(cloud, group, *lines):
     client.put_log_events(logGroupName=group, logStreamName=stream, logEvents=events)
 
 
-def test_cloudwatchs_dashboards_are_drawn_from_its_metrics(embedded, open_page):
+def test_the_page_draws_cloudwatch_dashboards_from_their_metrics(embedded, open_page):
     cloudwatch = embedded.cloud.client("cloudwatch")
     rows = [
         ["Test/Page", "Laps", "Car", "a", {"stat": "Sum", "period": 60, "label": "laps of a"}],
@@ -220,7 +222,7 @@ def test_cloudwatchs_dashboards_are_drawn_from_its_metrics(embedded, open_page):
         page = open_page(f"{server.url}#/cloudwatch")
         names = page.locator("#dashboard option")
         until(lambda: f"{embedded.namespace}-test" in names.all_inner_texts(), "the dashboards")
-        # Our own deployment's stands first, and is drawn.
+        # Our own deployment comes first, and is drawn.
         assert names.first.inner_text().lower().startswith(embedded.namespace)
         alarms = page.locator("[data-widget='Alarms'] li")
         deployed = cloudwatch.describe_alarms(AlarmNamePrefix=embedded.namespace)["MetricAlarms"]
@@ -234,7 +236,7 @@ def test_cloudwatchs_dashboards_are_drawn_from_its_metrics(embedded, open_page):
         until(lambda: log.locator("tbody tr").count() == 2, "the lines of the log")
         assert log.locator("th").all_inner_texts() == ["timestamp", "log", "message"]
         assert log.locator("td.words").all_inner_texts() == ["[WARN] last", "[WARN] <b>bold</b>"]
-        # What is asked again draws over what stands there, and nothing of it is lost meanwhile.
+        # A repeated query draws over the old result, which stays visible meanwhile.
         logged(embedded.cloud, "page-test", "[WARN] newest")
         page.select_option("#minutes", "15")
         until(lambda: "newest" in log.locator("td.words").first.inner_text(), "the newest line")

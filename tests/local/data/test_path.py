@@ -1,4 +1,4 @@
-"""The main job on the embedded cloud: what a car sends is stored, summarised and shown, whole."""
+"""The main path on the embedded cloud: a car's messages are stored, summarised and shown completely."""
 
 from __future__ import annotations
 
@@ -35,14 +35,14 @@ def _listener(embedded: EmbeddedCloud, robot: str) -> Listener:
     )
 
 
-def test_simulated_drive_arrives_whole_on_both_lanes(embedded, bundle):
+def test_a_simulated_drive_arrives_completely_on_both_lanes(embedded, bundle):
     car = bundle(
         sources=[{"type": "sim", "stream": "vesc", "rate_hz": 50}],
         ping={"rate_hz": 5, "padding_bytes": 430},
     )
     with _listener(embedded, car.robot) as listener:
         agent = Agent(car)
-        # Where the machine is slow, what is sent while Lambda 1 starts is stale by then.
+        # On a slow machine, messages that are sent while Lambda 1 starts are stale.
         until(lambda: listener.heard and agent.status().get("streams", {}).get("vesc", {}).get("samples"))
         agent.stop()
         driven = agent.report()["streams"]["vesc"]["samples"]
@@ -54,7 +54,7 @@ def test_simulated_drive_arrives_whole_on_both_lanes(embedded, bundle):
     assert all(spread.n >= 1 and spread.p50 is not None for spread in trips.values()), trips
 
 
-def test_recorded_drive_arrives_whole_and_exact(embedded, bundle):
+def test_a_recorded_drive_arrives_completely_and_exactly(embedded, bundle):
     from rosbags.highlevel import AnyReader
 
     path = recording("f1tenth-motor-servo.bag")
@@ -93,7 +93,7 @@ def test_seconds_are_summarised_with_speed_in_mps(embedded, bundle):
         assert mps.tolist() == pytest.approx((erpm / 4614).tolist(), rel=1e-8, abs=1e-12), statistic
 
 
-def test_live_message_without_our_envelope_never_reaches_the_dashboard(embedded, bundle):
+def test_a_live_message_without_an_envelope_never_reaches_the_dashboard(embedded, bundle):
     car = bundle()
     live = build_topic(LIVE, car.robot, "vesc", embedded.namespace)
     seqs = itertools.count(7)
@@ -102,7 +102,7 @@ def test_live_message_without_our_envelope_never_reaches_the_dashboard(embedded,
         robot.publish(live, b'{"speed": 99}')
 
         def shown() -> bool:
-            # On a slow machine one may be stale before it is shown.
+            # On a slow machine a message may become stale before it is shown.
             now_us = time.time_ns() // 1000
             good = LiveSample("0badcafe", next(seqs), now_us, now_us, {"speed": 3})
             robot.publish(live, encode_live(good))
@@ -113,11 +113,11 @@ def test_live_message_without_our_envelope_never_reaches_the_dashboard(embedded,
     assert min(heard.seq for heard in listener.heard) >= 7
 
 
-def test_messages_that_a_stalled_broker_held_up_are_not_shown(embedded, bundle):
+def test_messages_delayed_by_a_stalled_broker_are_not_shown(embedded, bundle):
     car = bundle(sources=[{"type": "sim", "stream": "vesc", "rate_hz": 50}])
     with _listener(embedded, car.robot) as listener:
         agent = Agent(car)
-        # The car knows how far the cloud's clock is, and says so in its messages.
+        # The car knows its clock offset, and sends it in its messages.
         until(lambda: listener.heard and "offset_us" in listener.heard[-1].hops)
         stalled_us = time.time_ns() // 1000
         os.kill(embedded.emulator.pid, signal.SIGSTOP)
@@ -127,8 +127,8 @@ def test_messages_that_a_stalled_broker_held_up_are_not_shown(embedded, bundle):
         until(lambda: listener.heard[-1].hops["sent_us"] > resumed_us)
         agent.stop()
         agent.report()
-    # By what each hop stamped, on the one clock that all of them have here: nothing that Lambda 1 let
-    # through was older than it may be, and of what was sent during the stall something was held back.
+    # All hops share one clock here. By their stamps, Lambda 1 let only fresh messages through, and held back
+    # messages from the stall.
     oldest_us = 1000 * (LIVE_MAX_AGE_MS + CLOCK_MAX_UNCERTAINTY_MS)
     told = [heard for heard in listener.heard if "offset_us" in heard.hops]
     assert [heard for heard in told if heard.hops["lambda_us"] - heard.t_us > oldest_us] == []

@@ -1,4 +1,6 @@
-"""Whatever cannot be processed is found in quarantine with its bytes, and put back once the cause is gone."""
+"""Messages that cannot be processed are in quarantine with their bytes, and are put back once the cause is
+gone.
+"""
 
 from __future__ import annotations
 
@@ -34,7 +36,7 @@ def iort(embedded):
 
 @pytest.fixture
 def entry_of(embedded):
-    """The one entry of a robot, as soon as it is there, with its bytes."""
+    """Wait for a robot's only entry; return it with its bytes."""
 
     def wait(robot):
         (listed,) = until(lambda: list(quarantine.entries(embedded.cloud, robot=robot)), seconds=60)
@@ -53,13 +55,13 @@ def send(car, *messages, stream=VESC_STREAM, namespace="iort"):
 
 
 def batch(seq=0, **changes):
-    """A batch of now as its message, with some of the envelope changed."""
+    """Make the message of a current batch, with changes to its envelope."""
     t_us = (int(time.time()) + seq) * 1_000_000
     envelope = json.loads(encode_batch(Batch(RUN, seq, [t_us], {"speed": [1.5]})))
     return json.dumps({**envelope, **changes}).encode()
 
 
-# --- what ends in quarantine, and by whom -------------------------------------------------------------
+# --- messages in quarantine, and their origin ---------------------------------------------------------
 
 
 @pytest.mark.parametrize(
@@ -76,7 +78,7 @@ def batch(seq=0, **changes):
     ],
     ids=["text", "not-utf8", "no-key", "array", "key-of-another-type", "empty", "nested", "digits"],
 )
-def test_what_the_rule_cannot_store_is_kept_byte_by_byte(bundle, entry_of, payload):
+def test_a_message_that_the_rule_cannot_store_is_kept_byte_by_byte(bundle, entry_of, payload):
     car = bundle()
     send(car, payload)
     entry = entry_of(car.robot)
@@ -99,7 +101,7 @@ def test_what_the_rule_cannot_store_is_kept_byte_by_byte(bundle, entry_of, paylo
     ],
     ids=["version", "codec", "samples", "no-id", "years-ahead", "stream", "levels"],
 )
-def test_what_the_table_takes_and_lambda_2_cannot_is_kept(bundle, entry_of, changes, stream, reason):
+def test_a_stored_batch_that_lambda_2_cannot_read_is_kept(bundle, entry_of, changes, stream, reason):
     car = bundle()
     message = batch(**changes)
     send(car, message, stream=stream)
@@ -111,7 +113,7 @@ def test_what_the_table_takes_and_lambda_2_cannot_is_kept(bundle, entry_of, chan
         assert kept[name] in ({"S": value}, {"N": str(value)})
 
 
-def test_an_undecodable_batch_holds_up_no_neighbour(embedded, bundle, entry_of):
+def test_an_undecodable_batch_does_not_delay_its_neighbours(embedded, bundle, entry_of):
     car = bundle()
     send(car, batch(0), batch(1, samples="AAAA"), batch(2))
     until(lambda: delivery.samples_summarized(embedded.cloud, car.robot, VESC_STREAM) == 2, seconds=60)
@@ -119,7 +121,7 @@ def test_an_undecodable_batch_holds_up_no_neighbour(embedded, bundle, entry_of):
 
 
 @pytest.mark.parametrize("message", [b'{"speed": 99}', b"\xff\x00 no JSON"], ids=["JSON", "bytes"])
-def test_a_live_message_that_no_robot_of_ours_sends_is_kept_byte_by_byte(bundle, entry_of, message):
+def test_a_foreign_live_message_is_kept_byte_by_byte(bundle, entry_of, message):
     car = bundle()
     with Robot(car.folder) as robot:
         robot.online().publish(build_topic(LIVE, car.robot, VESC_STREAM), message)
@@ -130,7 +132,7 @@ def test_a_live_message_that_no_robot_of_ours_sends_is_kept_byte_by_byte(bundle,
 
 
 @pytest.mark.parametrize("path", [LAMBDA, FILE])
-def test_a_ping_that_is_no_json_is_kept_byte_by_byte(bundle, entry_of, path):
+def test_a_ping_without_json_is_kept_byte_by_byte(bundle, entry_of, path):
     car = bundle()
     with Robot(car.folder) as robot:
         robot.online().publish(build_topic(PING, car.robot, path), b"\xff\x00 no JSON")
@@ -144,7 +146,7 @@ def test_a_ping_that_is_no_json_is_kept_byte_by_byte(bundle, entry_of, path):
 
 
 def rejected(embedded, robot, message):
-    """What the record rule's error action sends when the table is throttled."""
+    """Make the message that the record rule's error action sends when the table is throttled."""
     document = {
         "ruleName": rule_name("record"),
         "topic": f"dt/iort/{robot}/{VESC_STREAM}",
@@ -172,7 +174,7 @@ def test_errors_are_listed_and_shown(bundle, iort, entry_of):
     assert "no dead letter has the id" in str(iort("errors", "0" * 16).exception)
 
 
-def test_a_throttled_batch_is_put_back_once_and_only_then_deleted(embedded, bundle, iort, entry_of):
+def test_a_throttled_batch_is_put_back_once_and_then_deleted(embedded, bundle, iort, entry_of):
     car = bundle()
     rejected(embedded, car.robot, batch(0))
     entry_of(car.robot)
@@ -186,7 +188,7 @@ def test_a_throttled_batch_is_put_back_once_and_only_then_deleted(embedded, bund
     assert "nothing in quarantine" in iort("replay-errors", "--robot", car.robot).stdout
 
 
-def test_what_is_still_wrong_stays_where_it_is(embedded, bundle, iort, entry_of):
+def test_a_message_that_is_still_invalid_stays_in_quarantine(embedded, bundle, iort, entry_of):
     car = bundle()
     send(car, b"not json")
     before = entry_of(car.robot)
@@ -195,8 +197,8 @@ def test_what_is_still_wrong_stays_where_it_is(embedded, bundle, iort, entry_of)
     assert entry_of(car.robot) == before
 
 
-def test_a_batch_on_which_lambda_2_fails_is_given_up_and_put_back(embedded, bundle, iort, entry_of):
-    """The summary table's name is wrong for a while: every attempt fails, and the stream goes on."""
+def test_a_batch_that_fails_in_lambda_2_is_quarantined_and_put_back(embedded, bundle, iort, entry_of):
+    """The summary table's name is wrong for a while: every attempt fails, and the stream continues."""
     cloud, car = embedded.cloud, bundle()
     client, name = cloud.client("lambda"), cloud.output("processing", "SummarizeFunction")
     right = client.get_function_configuration(FunctionName=name)["Environment"]["Variables"]
@@ -219,8 +221,8 @@ def test_a_batch_on_which_lambda_2_fails_is_given_up_and_put_back(embedded, bund
     assert list(quarantine.entries(cloud, robot=car.robot)) == []
 
 
-def test_what_the_quarantine_cannot_keep_ends_in_the_last_queue_and_comes_back(embedded, bundle, iort):
-    """Its function is broken: after five attempts the message waits where nothing takes it."""
+def test_a_message_that_quarantine_cannot_keep_is_put_back_from_the_last_queue(embedded, bundle, iort):
+    """The quarantine function is broken: after five attempts the message waits in the last queue."""
     cloud, car = embedded.cloud, bundle()
     sqs, last = cloud.client("sqs"), cloud.output("quarantine", "LastQueue")
     document = {"ruleName": "iort_record", "topic": f"dt/iort/{car.robot}/vesc", "failures": []}
@@ -232,11 +234,11 @@ def test_what_the_quarantine_cannot_keep_ends_in_the_last_queue_and_comes_back(e
     assert quarantine.load(cloud, entry).payload == b"never kept so far"
 
 
-# --- what one robot does to the others ----------------------------------------------------------------
+# --- effects of one robot on the others ---------------------------------------------------------------
 
 
-def hostile():
-    """Messages that no agent sends, which the record rule stores or refuses."""
+def hostile_messages():
+    """Make messages that no agent sends; the record rule stores or rejects them."""
     t_us = int(time.time()) * 1_000_000
     far = {f"a{i}": 1e125 for i in range(1000)}
     changes = [
@@ -257,9 +259,9 @@ def hostile():
     ]
 
 
-def test_a_hail_of_nonsense_leaves_the_others_their_summaries(bundle, embedded):
+def test_invalid_messages_do_not_delay_other_robots_summaries(bundle, embedded):
     cloud = embedded.cloud
-    send(bundle("bad"), *hostile())
+    send(bundle("bad"), *hostile_messages())
     good = bundle("good")
     send(good, batch())
     table, topic = summary_table(cloud), topic_of(cloud, good.robot, VESC_STREAM)

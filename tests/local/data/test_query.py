@@ -1,4 +1,4 @@
-"""The thesis' four ways to ask, over several pages, with the function's own role enforced."""
+"""The thesis' four ways to query, over several pages, with the function's own role enforced."""
 
 from __future__ import annotations
 
@@ -36,8 +36,7 @@ def store(embedded, robot, stream, batches):
 
 @pytest.fixture(scope="module")
 def noise(embedded: EmbeddedCloud) -> dict[str, list[float]]:
-    """Some 6 MB that cannot be compressed, which neither a page of DynamoDB nor an
-    answer of Lambda holds."""
+    """Make about 6 MB of incompressible samples, too large for a page of DynamoDB or an answer of Lambda."""
     chance = random.Random(1)
     columns = {f"f{i}": [chance.random() for _ in range(N)] for i in range(FIELDS)}
     batches = [
@@ -55,7 +54,7 @@ def noise(embedded: EmbeddedCloud) -> dict[str, list[float]]:
 
 @pytest.mark.parametrize("on", ["client", "lambda"])
 @pytest.mark.parametrize("scan", [False, True])
-def test_all_four_ways_give_the_same(embedded, noise, on, scan):
+def test_all_four_ways_return_the_same_samples(embedded, noise, on, scan):
     first, last = START + 1_000_001, START + 31_000_000
     found = data.query(
         embedded.cloud, ROBOT, STREAM, first, last, fields=["f0", "f7"], where="f7 > 0.5", on=on, scan=scan
@@ -66,7 +65,7 @@ def test_all_four_ways_give_the_same(embedded, noise, on, scan):
 
 
 @pytest.mark.parametrize("on", ["client", "lambda"])
-def test_what_takes_many_pages_comes_whole(embedded, noise, on):
+def test_a_result_of_many_pages_is_complete(embedded, noise, on):
     pages = []
     found = data.query(embedded.cloud, ROBOT, STREAM, on=on, progress=lambda items, _: pages.append(items))
     assert len(found) == N
@@ -88,7 +87,7 @@ def iort(*arguments: str, embedded: EmbeddedCloud, **how):
     )
 
 
-def test_the_command_writes_what_it_finds_and_says_how_much(embedded, noise, tmp_path):
+def test_the_command_writes_its_matches_and_their_number(embedded, noise, tmp_path):
     asked = ["query", ROBOT, STREAM, "--last", "all", "--fields", "f1"]
     done = iort(*asked, "--every", "10s", "--json", embedded=embedded)
     assert done.returncode == 0, done.stderr
@@ -105,7 +104,7 @@ def test_the_command_writes_what_it_finds_and_says_how_much(embedded, noise, tmp
 
 
 @pytest.mark.usefixtures("noise")
-def test_a_reader_that_has_seen_enough_is_no_error(embedded):
+def test_a_closed_pipe_is_not_an_error(embedded):
     iort_ = Path(sys.executable).parent / "iort"
     done = subprocess.run(
         f"'{iort_}' --local --embedded '{embedded.folder}/cloud.json' "
@@ -117,7 +116,7 @@ def test_a_reader_that_has_seen_enough_is_no_error(embedded):
     assert "Error" not in done.stderr
 
 
-def test_a_picture_of_it(embedded, noise, tmp_path):
+def test_the_command_draws_a_plot(embedded, noise, tmp_path):
     picture = tmp_path / "noise.svg"
     asked = ["plot", ROBOT, STREAM, "--last", "all", "--fields", "f0,f1", "--output", str(picture)]
     done = iort(*asked, "--kind", "distribution", embedded=embedded)

@@ -1,4 +1,6 @@
-"""A car was registered with the wrong gain: it is corrected, and its summaries are, on the embedded cloud."""
+"""A car was registered with the wrong gain: a correction also corrects its summaries, on the embedded
+cloud.
+"""
 
 from __future__ import annotations
 
@@ -21,7 +23,7 @@ SECONDS = 6
 
 
 def drive(embedded, car, stream="vesc"):
-    """Six seconds of one batch each, as they are summarised with the F1TENTH's gain; when they began."""
+    """Store six one-second batches, summarised with the F1TENTH's gain; return their start."""
     start_us = (int(time.time()) - 3600) * 1_000_000
     with Robot(car.folder) as robot:
         robot.online()
@@ -39,7 +41,7 @@ def speeds(embedded, robot, stream="vesc"):
     return found.columns["speed_mps_max"].tolist()
 
 
-def test_a_corrected_gain_is_in_queries_and_in_summaries(embedded, bundle, iort):
+def test_a_corrected_gain_applies_to_queries_and_summaries(embedded, bundle, iort):
     cloud, car = embedded.cloud, bundle()
     start_us = drive(embedded, car)
     old = [1060 * i / 4614 for i in range(SECONDS)]
@@ -50,7 +52,7 @@ def test_a_corrected_gain_is_in_queries_and_in_summaries(embedded, bundle, iort)
     assert "speed_to_erpm_gain 1060, was 4614" in done.stdout
     assert "vesc: 4 seconds recomputed" in done.stdout
     assert speeds(embedded, car.robot) == pytest.approx([*old[:2], 2, 3, 4, 5])
-    # Lambda 2 has answered with the new gain, whoever asks and how often.
+    # Lambda 2 answers with the new gain for every reader, every time.
     for on in ("client", "lambda"):
         found = data.query(cloud, car.robot, "vesc", fields=["speed_mps"], on=on)
         assert found.columns["speed_mps"][::10].tolist() == pytest.approx(range(SECONDS))
@@ -58,7 +60,7 @@ def test_a_corrected_gain_is_in_queries_and_in_summaries(embedded, bundle, iort)
         assert recompute.recompute(cloud, car.robot, "vesc", None) == Recomputed(SECONDS, 0)
         assert speeds(embedded, car.robot) == pytest.approx(range(SECONDS))
     assert inventory.vehicle_of(cloud, car.robot).speed_to_erpm_gain == 1060
-    # What comes afterwards has it too.
+    # Later samples have the new gain, too.
     drive(embedded, car, "esc")
     assert speeds(embedded, car.robot, "esc") == pytest.approx(range(SECONDS))
 
@@ -71,7 +73,7 @@ def test_a_corrected_gain_is_in_queries_and_in_summaries(embedded, bundle, iort)
         ("online=1", "got online"),
     ],
 )
-def test_what_cannot_be_changes_nothing(embedded, bundle, iort, parameter, said):
+def test_an_invalid_parameter_changes_nothing(embedded, bundle, iort, parameter, said):
     car = bundle()
     before = registry.get(embedded.cloud, car.robot)
     done = iort("robots", "set", car.robot, parameter)

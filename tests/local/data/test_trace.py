@@ -1,4 +1,4 @@
-"""`iort trace` of a car that drives on the embedded cloud."""
+"""`iort trace` of a driving car on the embedded cloud."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ def _trace(embedded, *arguments):
     )
 
 
-def test_every_hop_of_a_driving_car(embedded, bundle):
+def test_the_trace_shows_every_hop_of_a_driving_car(embedded, bundle):
     car = bundle(
         sources=[{"type": "sim", "stream": "vesc", "rate_hz": 20}],
         ping={"rate_hz": 5},
@@ -42,13 +42,13 @@ def test_every_hop_of_a_driving_car(embedded, bundle):
     assert found["updates"] == 10
     names = [hop["name"] for hop in found["hops"]]
     assert len(names) == len(set(names)) == 5
-    # One machine, one clock: what goes from place to place cannot arrive before it has left.
+    # All hops share one clock here: a message cannot arrive before it has left.
     for hop in found["hops"]:
         assert hop["p50_ms"] >= -1.0 - (hop["uncertainty_ms"] or 0.0), hop
     assert found["whole"]["p50_ms"] > 0
 
 
-def test_a_car_that_does_not_drive(embedded, bundle):
+def test_the_trace_reports_an_idle_car(embedded, bundle):
     done = _trace(embedded, bundle().robot, "--seconds", "0.5")
     assert done.returncode == 1
     assert "is it driving" in done.stderr

@@ -1,4 +1,4 @@
-"""Recordings of what is easily lost, played by the agent: all of it is in the table, and comes back."""
+"""Recordings with fragile contents, played by the agent: the table has all of it, and exports return it."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ Recorded = Mapping[str, tuple[Message, Sequence[bytes]]]
 
 
 def bag_of(path: Path, topics: Recorded, start_ns: int) -> Path:
-    """A bag of these messages, at 50 Hz."""
+    """Write a bag of these messages, at 50 Hz."""
     with Writer(path) as writer:
         for topic, (message, those) in topics.items():
             connection = writer.add_connection(
@@ -68,10 +68,10 @@ START_US = 1_700_000_000_000_000
 
 
 def shapes() -> Recorded:
-    """One topic a shape that is known to need care, and one a type of the mixed robot."""
+    """Return one topic for each shape that needs care, and one for each type of the mixed robot."""
     known = {f"/known/{name.replace(' ', '_')}": made for name, made in KNOWN.items()}
     for topic in TOPICS.values():
-        # An image that is too large for a message is another matter.
+        # Another test covers an image that is too large for a message.
         if topic.name != "/camera/large":
             maker = Maker(topic, 7)
             headers = [header(n, START_US + n * 1_000_000 // RATE_HZ, b"odom") for n in range(20)]
@@ -84,11 +84,11 @@ SHAPES = shapes()
 
 @pytest.fixture(scope="module")
 def shaped(embedded: EmbeddedCloud, tmp_path_factory: pytest.TempPathFactory) -> tuple[str, Path]:
-    """A robot that has played a bag of every shape, and the bag."""
+    """Return a robot that has played a bag of every shape, and the bag."""
     folder = tmp_path_factory.mktemp("shapes")
     path = bag_of(folder / "shapes.bag", SHAPES, START_US * 1000)
     streams = {topic: topic[1:].replace("/", "_") for topic in SHAPES}
-    # A source each, so that one that fails does not hide the others.
+    # One source each, so that a failing source does not hide the others.
     sources = [playing(path, {topic: stream}, stamps="original") for topic, stream in streams.items()]
     settings = {"sources": sources, "live": {"enabled": False}}
     car = robots.add(embedded.cloud, "shapes", out=folder, settings=settings)

@@ -1,8 +1,7 @@
-"""What goes wrong between a car and its cloud: every sample is in the table once, in order, all the same.
+"""Faults between a car and its cloud: every sample is in the table once and in order.
 
-The processes are real: the agent as it is installed, the embedded cloud's broker, and a proxy between
-the two that is killed, freezes, resets and delays. Faults of the network run side by side, each with
-a car of its own.
+The processes are real: the installed agent, the embedded cloud's broker, and a proxy between the two that is
+killed, freezes, resets and delays. Network faults run side by side, each with a car of its own.
 """
 
 from __future__ import annotations
@@ -85,7 +84,7 @@ FAULTS = {"killed": _killed, "frozen": _frozen, "reset": _reset, "slow": _slow}
 
 @pytest.fixture(scope="module")
 def drives(embedded: EmbeddedCloud, tmp_path_factory):
-    """Every fault of the network with a car of its own, all at once: name -> (car, agent, report)."""
+    """Run every network fault at once, each with its own car: name -> (car, agent, report)."""
     folder = tmp_path_factory.mktemp("faults")
     log = counter_log(folder / "counter.csv", DRIVE_S)
     finished = {}
@@ -111,7 +110,7 @@ def drives(embedded: EmbeddedCloud, tmp_path_factory):
 
 
 @pytest.mark.parametrize("name", FAULTS)
-def test_fault_of_the_network_loses_nothing(embedded, drives, name):
+def test_a_network_fault_loses_no_sample(embedded, drives, name):
     robot, agent, report = drives[name]
     assert counted(embedded, robot) == list(range(DRIVE_S * RATE_HZ))
     assert report["spool"]["dropped_samples"] == 0
@@ -121,7 +120,7 @@ def test_fault_of_the_network_loses_nothing(embedded, drives, name):
         assert agent.said("connected to")
 
 
-def test_live_lane_shows_now_while_the_backlog_drains(embedded, bundle, proxy, tmp_path):
+def test_the_live_lane_stays_current_while_the_backlog_drains(embedded, bundle, proxy, tmp_path):
     from iort_station.page.listener import Listener
 
     log = counter_log(tmp_path / "counter.csv", 600)
@@ -139,7 +138,7 @@ def test_live_lane_shows_now_while_the_backlog_drains(embedded, bundle, proxy, t
         until(lambda: len(listener.heard) >= 10)
         agent.stop()
         driven = agent.report()["streams"]["vesc"]["samples"]
-    # What was heard was new when it left the car, and nothing of the outage was shown.
+    # Live samples were fresh when they left the car; none is from the outage.
     oldest_us = 1000 * LIVE_MAX_AGE_MS
     assert min(heard.hops["sent_us"] for heard in listener.heard) > passed_us
     assert max(heard.hops["sent_us"] - heard.t_us for heard in listener.heard) < oldest_us
@@ -147,8 +146,8 @@ def test_live_lane_shows_now_while_the_backlog_drains(embedded, bundle, proxy, t
 
 
 @pytest.mark.parametrize("broker", [PASS, REFUSE])
-def test_killed_agent_goes_on_where_it_was(embedded, bundle, proxy, tmp_path, broker):
-    """What was in a closed batch survives; at most the open batch, a second, goes with the process."""
+def test_a_killed_agent_resumes_its_queue(embedded, bundle, proxy, tmp_path, broker):
+    """Closed batches survive; at most the open batch, one second long, is lost."""
     log = counter_log(tmp_path / "counter.csv", 10)
     car = bundle(**_settings(log, proxy.port))
     first = Agent(car)
@@ -168,7 +167,7 @@ def test_killed_agent_goes_on_where_it_was(embedded, bundle, proxy, tmp_path, br
 
 
 @pytest.mark.skipif(FAKETIME is None, reason="libfaketime is not installed: apt install faketime")
-def test_clock_set_back_an_hour(embedded, bundle, tmp_path):
+def test_samples_survive_a_clock_set_back_an_hour(embedded, bundle, tmp_path):
     log = counter_log(tmp_path / "counter.csv", 10)
     car = bundle(
         queue={"path": "spool.db"}, sources=[{"type": "bag", "path": str(log)}], metrics={"every_s": 1}
@@ -191,7 +190,7 @@ def test_clock_set_back_an_hour(embedded, bundle, tmp_path):
     batches = list(delivery.batches(embedded.cloud, car.robot, "vesc"))
     values = [int(v) for batch in sorted(batches, key=lambda b: b.seq) for v in batch.columns["speed"]]
     assert values == list(range(10 * RATE_HZ))
-    # The clock was set indeed, and the car knew by how much.
+    # The clock was really set, and the car measured the change.
     own = delivery.batches(embedded.cloud, car.robot, AGENT_STREAM)
     offsets_ms = [value for batch in own for value in batch.columns["clock_offset_ms"] if value is not None]
     assert max(offsets_ms) > 3_590_000, offsets_ms
@@ -199,7 +198,7 @@ def test_clock_set_back_an_hour(embedded, bundle, tmp_path):
 
 
 @as_root
-def test_disk_full_and_free_again(embedded, bundle, proxy, tmp_path):
+def test_recording_recovers_from_a_full_disk(embedded, bundle, proxy, tmp_path):
     disk = tmp_path / "disk"
     disk.mkdir()
     subprocess.run(["mount", "-t", "tmpfs", "-o", "size=2m", "tmpfs", str(disk)], check=True)
@@ -223,9 +222,10 @@ def test_disk_full_and_free_again(embedded, bundle, proxy, tmp_path):
 
 
 @pytest.mark.parametrize("damage", ["payloads", "header"])
-def test_corrupt_spool_is_set_aside(embedded, bundle, proxy, tmp_path, damage):
-    """What was lost with the file is known by the car's count and the numbers. If nothing of the file can be
-    read, it is known that it was damaged. What came afterwards is all there."""
+def test_a_corrupt_spool_is_set_aside(embedded, bundle, proxy, tmp_path, damage):
+    """The car's count and the batch numbers reveal the loss. If the file is unreadable, the damage is
+    reported. All later batches arrive.
+    """
     log = counter_log(tmp_path / "counter.csv", 600)
     car = bundle(**_settings(log, proxy.port), metrics={"every_s": 1})
     proxy.mode = REFUSE
@@ -263,7 +263,7 @@ def test_corrupt_spool_is_set_aside(embedded, bundle, proxy, tmp_path, damage):
     assert report["spool"]["dropped_batches"] == known
     assert report["spool"]["dropped_samples"] == sum(samples for _, samples, _ in lost[:known])
 
-    # In the table is everything else, in order, and each number that is not there is one that was lost.
+    # The table has everything else in order, and each missing number was lost.
     batches = list(delivery.batches(embedded.cloud, car.robot, "vesc"))
     stored = [(batch.seq, len(batch.times_us)) for batch in batches]
     assert stored[: len(kept)] == [(seq, samples) for seq, samples, _ in kept]
@@ -278,12 +278,12 @@ def test_corrupt_spool_is_set_aside(embedded, bundle, proxy, tmp_path, damage):
     assert told.get("dropped_samples", 0) == report["spool"]["dropped_samples"]
 
 
-def test_certificate_revoked_on_the_way_and_replaced(embedded, bundle, proxy, tmp_path):
+def test_no_sample_is_lost_when_a_certificate_is_revoked_and_replaced(embedded, bundle, proxy, tmp_path):
     log = counter_log(tmp_path / "counter.csv", 600)
     car = bundle(**_settings(log, proxy.port))
     agent = Agent(car)
     until(lambda: delivery.samples_summarized(embedded.cloud, car.robot, "vesc"))
-    # Which ends the session, too; on AWS within minutes.
+    # The revocation also ends the session; on AWS, within minutes.
     set_status(embedded, car.robot, "REVOKED")
     until(lambda: agent.said("inactive or revoked"), seconds=120)
     waiting = until(agent.status)["spool"]["samples"]
@@ -310,7 +310,7 @@ def test_certificate_revoked_on_the_way_and_replaced(embedded, bundle, proxy, tm
 
 
 @as_root
-def test_name_that_does_not_resolve_at_boot(embedded, bundle, tmp_path):
+def test_an_agent_starts_without_name_resolution(embedded, bundle, tmp_path):
     if shutil.which("unshare") is None:
         pytest.skip("unshare is not installed: apt install util-linux")
     log = counter_log(tmp_path / "counter.csv", 6)

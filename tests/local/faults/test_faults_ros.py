@@ -1,4 +1,4 @@
-"""A ROS master that is started again under a driving car: every sample is in the table once all the same."""
+"""The ROS master restarts while a car drives: every sample is in the table once."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from tests.ros.test_source import WHEEL
 LATER, COUNT = 1000, 100
 
 
-def test_ros_master_restarted(
+def test_a_restart_of_the_ros_master_loses_no_sample(
     embedded: EmbeddedCloud,
     bundle: Callable[..., robots.Bundle],
     graph: Graph,  # noqa: F811 - the fixture
@@ -37,23 +37,23 @@ def test_ros_master_restarted(
     publisher("first", "/wheel", *of_type)
     agent.until_said("connected to 127.0.0.1")
 
-    def taken(stream: str) -> int:
+    def samples_taken(stream: str) -> int:
         try:
             streams = fetch(car.folder / SOCKET)["streams"]
         except AgentError:
-            return 0  # too busy to say
+            return 0  # The agent is too busy to answer.
         return int(streams.get(stream, {}).get("samples", 0))
 
-    before = until(lambda: taken("wheel"))
+    before = until(lambda: samples_taken("wheel"))
     graph.master.kill()
     agent.until_said("does not answer")
     graph.start_master()
     agent.until_said("had forgotten /wheel, /other: registered again")
-    # Who is connected needs no master.
-    again = until(lambda: (now := taken("wheel")) > before and now)
-    # Who comes after the restart is found, and heard from its first sample on.
+    # Existing connections need no master.
+    again = until(lambda: (now := samples_taken("wheel")) > before and now)
+    # The agent finds publishers that start after the restart, and receives their first sample.
     publisher("second", "/other", *of_type, "--start", LATER, "--count", COUNT)
-    until(lambda: taken("other") >= COUNT)
+    until(lambda: samples_taken("other") >= COUNT)
     assert agent.terminate() == 0, "\n".join(agent.errors)
 
     streams = json.loads(written.read_text())["streams"]

@@ -1,4 +1,4 @@
-"""The uplink against the embedded cloud's broker, through a proxy that fails as networks do."""
+"""The uplink against the embedded cloud's broker, through a proxy with network faults."""
 
 from __future__ import annotations
 
@@ -33,8 +33,8 @@ def proxy(embedded: EmbeddedCloud) -> Iterator[Proxy]:
         yield proxy
 
 
-class Told:
-    """What the uplink tells its handlers, and what arrives on the robot's ping topic."""
+class UplinkLog:
+    """Records the uplink's notices to its handlers, and the messages on the robot's ping topic."""
 
     def __init__(self, uplink: IotCore, robot: str) -> None:
         self.connections: list[bool] = []
@@ -45,14 +45,14 @@ class Told:
         uplink.subscribe(self.topic, lambda message: self.messages.append(message.payload))
 
     def echo(self, payload: bytes) -> None:
-        """A message there and back, which takes a subscription."""
+        """Send a message and receive it again, by a subscription."""
         until(lambda: self.uplink.subscribed(self.topic), seconds=120)
         self.uplink.publish(self.topic, payload, qos=1, done=lambda _: None)
         until(lambda: payload in self.messages)
 
 
 @contextmanager
-def connecting(bundle: robots.Bundle, proxy: Proxy, **other: Any) -> Iterator[Told]:
+def connecting(bundle: robots.Bundle, proxy: Proxy, **other: Any) -> Iterator[UplinkLog]:
     settings: dict[str, Any] = {
         "endpoint": "127.0.0.1",
         "port": proxy.port,
@@ -64,10 +64,10 @@ def connecting(bundle: robots.Bundle, proxy: Proxy, **other: Any) -> Iterator[To
         "dispatcher": Dispatcher(),
     }
     uplink = IotCore(**{**settings, **other})
-    told = Told(uplink, bundle.robot)
+    log = UplinkLog(uplink, bundle.robot)
     uplink.start()
     try:
-        yield told
+        yield log
     finally:
         uplink.stop(5.0)
 
@@ -79,8 +79,9 @@ def set_status(embedded: EmbeddedCloud, robot: str, status: str) -> None:
 
 
 def paced(proxy: Proxy) -> bool:
-    """Whether attempts came about one a second at most: a busy machine sees one late, and the next one
-    in time, so they count together, and half of what they must have taken is enough."""
+    """Return whether attempts were at most about one a second. On a busy machine one attempt is late and
+    the next on time, so all are counted together, and half of the expected time is enough.
+    """
     return proxy.attempts[-1] - proxy.attempts[0] >= (len(proxy.attempts) - 1) / 2
 
 
@@ -92,26 +93,26 @@ def self_signed(folder: Path) -> None:
     )  # fmt: skip
 
 
-def test_it_connects_again_and_subscribes_again_after_a_reset(bundle, proxy):
-    with connecting(bundle(), proxy) as told:
-        told.echo(b"before")
+def test_the_uplink_reconnects_and_resubscribes_after_a_reset(bundle, proxy):
+    with connecting(bundle(), proxy) as log:
+        log.echo(b"before")
         proxy.reset()
-        until(lambda: told.connections[:2] == [True, False])
-        told.echo(b"after")
-        assert told.connections == [True, False, True]
-        status = told.uplink.status()
+        until(lambda: log.connections[:2] == [True, False])
+        log.echo(b"after")
+        assert log.connections == [True, False, True]
+        status = log.uplink.status()
         assert (status.connected, status.connects) == (True, 2)
         assert "closed the connection" in (status.last_error or "")
 
 
-def test_a_connection_reset_every_moment_costs_one_attempt_a_second_at_most(bundle, proxy):
+def test_repeated_resets_cause_at_most_one_attempt_a_second(bundle, proxy):
     with connecting(bundle(), proxy):
         proxy.reset_every(0.3)
         assert proxy.wait_attempts(5, 120)
     assert paced(proxy)
 
 
-def test_refused_connections_are_tried_once_a_second_at_most_and_ever_less(bundle, proxy, caplog):
+def test_refused_connections_are_retried_with_backoff(bundle, proxy, caplog):
     proxy.mode = REFUSE
     with connecting(bundle(), proxy):
         assert proxy.wait_attempts(4, 120)
@@ -119,59 +120,59 @@ def test_refused_connections_are_tried_once_a_second_at_most_and_ever_less(bundl
         assert proxy.wait_attempts(5, 120)
     assert paced(proxy)
     said = [r.getMessage() for r in caplog.records if "cannot connect" in r.message and r.levelno > 10]
-    assert len(said) == 2, "the loss, and after three in a row what it may mean"
+    assert len(said) == 2, "one line for the loss, one with the likely cause after three failures in a row"
     assert "again and again" in said[1]
 
 
-def test_a_broker_that_is_stopped_and_started(bundle, embedded):
-    with Proxy("127.0.0.1", embedded.cloud.mqtt_port) as proxy, connecting(bundle(), proxy) as told:
-        told.echo(b"before")
+def test_the_uplink_survives_a_restart_of_the_broker(bundle, embedded):
+    with Proxy("127.0.0.1", embedded.cloud.mqtt_port) as proxy, connecting(bundle(), proxy) as log:
+        log.echo(b"before")
         proxy.mode = REFUSE
-        until(lambda: not told.uplink.connected())
+        until(lambda: not log.uplink.connected())
         refused: list[Any] = []
-        told.uplink.publish(told.topic, b"lost", qos=1, done=refused.append)
+        log.uplink.publish(log.topic, b"lost", qos=1, done=refused.append)
         until(lambda: refused)
         assert "not connected" in str(refused[0])
         assert proxy.wait_attempts(3, 120)
         proxy.mode = PASS
-        told.echo(b"after")
+        log.echo(b"after")
 
 
-def test_a_frozen_broker_is_noticed(bundle, proxy):
+def test_the_uplink_detects_a_frozen_broker(bundle, proxy):
     assert aws.KEEP_ALIVE_S + aws.PING_TIMEOUT_S <= 45
-    with connecting(bundle(), proxy, keep_alive_s=2, ping_timeout_s=1) as told:
-        told.echo(b"before")
+    with connecting(bundle(), proxy, keep_alive_s=2, ping_timeout_s=1) as log:
+        log.echo(b"before")
         proxy.mode = FREEZE
-        until(lambda: told.connections == [True, False])
-        assert "no longer answers" in (told.uplink.status().last_error or "")
+        until(lambda: log.connections == [True, False])
+        assert "no longer answers" in (log.uplink.status().last_error or "")
         proxy.mode = PASS
-        told.echo(b"after")
+        log.echo(b"after")
 
 
-def test_half_a_second_of_latency_is_no_loss(bundle, embedded):
+def test_half_a_second_of_latency_does_not_disconnect(bundle, embedded):
     with (
         Proxy("127.0.0.1", embedded.cloud.mqtt_port, latency_s=0.5) as proxy,
-        connecting(bundle(), proxy) as told,
+        connecting(bundle(), proxy) as log,
     ):
-        told.echo(b"slow")
-        assert told.connections == [True]
+        log.echo(b"slow")
+        assert log.connections == [True]
 
 
-def test_takeover_is_shown_as_what_it_is(bundle, proxy, caplog):
+def test_a_takeover_is_reported_as_a_takeover(bundle, proxy, caplog):
     car = bundle()
-    with connecting(car, proxy) as told:
-        told.echo(b"before")
+    with connecting(car, proxy) as log:
+        log.echo(b"before")
         with Robot(car.folder) as other:
             other.online()
-            until(lambda: told.connections[:2] == [True, False])
+            until(lambda: log.connections[:2] == [True, False])
         assert f"another client has connected as {car.robot}" in caplog.text
 
 
-def test_a_certificate_revoked_while_connected(embedded, bundle, proxy, caplog):
+def test_a_revoked_certificate_ends_the_connection(embedded, bundle, proxy, caplog):
     caplog.set_level(logging.INFO)
     car = bundle()
-    with connecting(car, proxy) as told:
-        told.echo(b"before")
+    with connecting(car, proxy) as log:
+        log.echo(b"before")
         set_status(embedded, car.robot, "REVOKED")
         # AWS disconnects within minutes; the embedded cloud leaves it to the next connect.
         proxy.reset()
@@ -180,14 +181,14 @@ def test_a_certificate_revoked_while_connected(embedded, bundle, proxy, caplog):
         errors = [r for r in caplog.records if r.levelno == logging.ERROR]
         assert len(errors) == 1
         assert "`iort-agent check`" in errors[0].getMessage()
-        # Slowly now, but at once when the file changes.
+        # Attempts are slow now, but immediate after a change of the file.
         assert not proxy.wait_attempts(attempts + 1, 3)
         set_status(embedded, car.robot, "ACTIVE")
         os.utime(car.folder / "certificate.pem")
-        told.echo(b"after")
+        log.echo(b"after")
 
 
-def test_another_robots_name_is_refused_and_said_once(bundle, proxy, caplog):
+def test_another_robots_name_is_rejected_and_logged_once(bundle, proxy, caplog):
     with connecting(bundle(), proxy, client_id="somebody-else"):
         until(lambda: "does not let it connect" in caplog.text)
         assert not proxy.wait_attempts(2, 3), f"the next attempt is due after {SLOW_SHORTEST_S} s"
@@ -195,64 +196,64 @@ def test_another_robots_name_is_refused_and_said_once(bundle, proxy, caplog):
     assert "not authorized" in error.getMessage()
 
 
-def test_an_unknown_certificate_is_replaced_by_a_good_one(bundle, proxy, caplog, tmp_path):
+def test_the_uplink_connects_after_an_unknown_certificate_is_replaced(bundle, proxy, caplog, tmp_path):
     car = bundle()
     good = tmp_path / "good"
     shutil.copytree(car.folder, good)
     self_signed(car.folder)
-    with connecting(car, proxy) as told:
+    with connecting(car, proxy) as log:
         until(lambda: "certificate is unknown" in caplog.text)
-        assert told.connections == []
+        assert log.connections == []
         for name in ("private.key", "certificate.pem"):
             (good / name).replace(car.folder / name)
-        told.echo(b"good")
+        log.echo(b"good")
     assert paced(proxy)
 
 
-def test_an_expired_certificate_is_called_expired(bundle, proxy, caplog):
-    class Later(SystemClock):
+def test_an_expired_certificate_is_reported_as_expired(bundle, proxy, caplog):
+    class LateClock(SystemClock):
         def now_us(self) -> int:
             return 4_000_000_000_000_000
 
     car = bundle()
     self_signed(car.folder)
-    with connecting(car, proxy, clock=Later()):
+    with connecting(car, proxy, clock=LateClock()):
         until(lambda: "certificate expired on" in caplog.text)
         assert not proxy.wait_attempts(2, 2)
 
 
-def test_a_broker_of_another_authority_is_not_talked_to(bundle, proxy, tmp_path, caplog):
+def test_a_broker_of_another_authority_is_not_trusted(bundle, proxy, tmp_path, caplog):
     car = bundle()
     self_signed(tmp_path)
-    with connecting(car, proxy, root_ca=tmp_path / "certificate.pem") as told:
-        # The client waits up to half a minute after a failed handshake, on purpose.
+    with connecting(car, proxy, root_ca=tmp_path / "certificate.pem") as log:
+        # The client deliberately waits up to half a minute after a failed handshake.
         until(lambda: "TLS failed" in caplog.text)
-        assert told.connections == []
+        assert log.connections == []
 
 
-def test_without_a_root_ca_the_system_decides(bundle, proxy, caplog):
-    with connecting(bundle(), proxy, root_ca=None) as told:
+def test_the_system_trust_store_applies_without_a_root_ca(bundle, proxy, caplog):
+    with connecting(bundle(), proxy, root_ca=None) as log:
         until(lambda: "TLS failed" in caplog.text)
-        assert told.connections == []
+        assert log.connections == []
 
 
-def test_a_refused_subscription_is_said_once_and_spoils_no_other(bundle, proxy, caplog, monkeypatch):
+def test_a_rejected_subscription_is_logged_once_and_affects_no_other(bundle, proxy, caplog, monkeypatch):
     monkeypatch.setattr(subscriptions, "_AGAIN_S", 0.1)
     monkeypatch.setattr(subscriptions, "_AGAIN_SLOWLY_S", 0.1)
-    with connecting(bundle(), proxy) as told:
-        told.uplink.subscribe("cmd/iort/somebody-else/drive", lambda _: None)
-        told.echo(b"good")
+    with connecting(bundle(), proxy) as log:
+        log.uplink.subscribe("cmd/iort/somebody-else/drive", lambda _: None)
+        log.echo(b"good")
         until(lambda: "cannot subscribe" in caplog.text)
         threading.Event().wait(0.5)
         assert caplog.text.count("cannot subscribe") == 1
-        assert told.connections == [True]
+        assert log.connections == [True]
 
 
-def test_a_subscription_made_while_connected(bundle, proxy):
+def test_a_subscription_while_connected_takes_effect(bundle, proxy):
     car = bundle()
-    with connecting(car, proxy) as told:
-        told.echo(b"before")
+    with connecting(car, proxy) as log:
+        log.echo(b"before")
         heard: list[bytes] = []
         topic = build_topic(CMD, car.robot, "drive")
-        told.uplink.subscribe(topic, lambda message: heard.append(message.payload))
-        until(lambda: told.uplink.subscribed(topic))
+        log.uplink.subscribe(topic, lambda message: heard.append(message.payload))
+        until(lambda: log.uplink.subscribed(topic))

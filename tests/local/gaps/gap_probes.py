@@ -1,4 +1,4 @@
-"""Whether the imported ministack lacks what a patch in local/patches/ adds: one function each."""
+"""Probes for each patch in local/patches/: a function returns whether the imported ministack lacks it."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ SEND_MESSAGE_BATCH_REQUEST: tuple[Any, ...] = (
 
 
 def send_message_batch() -> bool:
-    """Ask for the action of a request."""
+    """Ask for a request's action."""
     return bool(iam_actions.extract_iam_action(*SEND_MESSAGE_BATCH_REQUEST) != "sqs:SendMessage")
 
 
@@ -46,7 +46,7 @@ STREAM_ARN_REQUEST: tuple[Any, ...] = (
 
 
 def stream_arn() -> bool:
-    """Ask for the resource of a request."""
+    """Ask for a request's resource."""
     return bool(iam_actions.extract_resource_arn(*STREAM_ARN_REQUEST) != "arn:stream")
 
 
@@ -63,12 +63,12 @@ SHADOW_ARN_REQUEST: tuple[Any, ...] = (
 
 
 def shadow_arn() -> bool:
-    """Ask for the resource of a request."""
+    """Ask for a request's resource."""
     return not iam_actions.extract_resource_arn(*SHADOW_ARN_REQUEST).endswith(":thing/car/one")
 
 
 def connect_timeout() -> bool:
-    """Look at the source for a time limit: no finite wait shows that a connection would stay for ever."""
+    """Read the source for a time limit: no finite wait shows that a connection would stay for ever."""
     source = inspect.getsource(iot._mtls_serve_conn) + inspect.getsource(iot._MtlsAcceptor)
     return "timeout" not in source and "wait_for" not in source
 
@@ -82,13 +82,13 @@ def certificate_from_csr() -> bool:
 
 
 def client_hello() -> bool:
-    """Look whether reading is paused within `connection_made`; newer Pythons do not show the effect."""
+    """Check whether reading is paused within `connection_made`; newer Pythons do not show the effect."""
 
     async def run() -> bool:
         transport = Mock()
         iot._MtlsAcceptor().connection_made(transport)
         paused = bool(transport.pause_reading.called)
-        # Let what it has started come to its end.
+        # Let its tasks finish.
         for _ in range(3):
             await asyncio.sleep(0)
         return paused
@@ -101,7 +101,7 @@ def client_hello() -> bool:
 
 
 def certificate_status() -> bool:
-    """Deactivate the certificate of a session, and look whether the session is still there."""
+    """Deactivate the certificate of a session, and check whether the session is still open."""
     account, region, number = "000000000000", "eu-west-1", "gaps-certificate-status"
 
     async def run() -> bool:
@@ -124,7 +124,7 @@ def certificate_status() -> bool:
 
 
 def bind_address() -> bool:
-    """Start the listener on a free port, and look at its address."""
+    """Start the listener on a free port, and read its address."""
 
     async def run() -> str:
         with patch.object(iot, "_mtls_port", lambda: 0), patch.dict(os.environ, BIND_HOST="127.0.0.1"):
@@ -148,7 +148,7 @@ AWS_MESSAGE_BYTES = 128 * 1024
 
 
 def message_size() -> bool:
-    """Publish one byte too many, to nobody."""
+    """Publish one byte too many, without subscribers."""
     payload = b"x" * (AWS_MESSAGE_BYTES + 1)
     try:
         asyncio.run(iot.broker_publish("000000000000", "eu-west-1", "gaps/message_size", payload))
@@ -158,7 +158,7 @@ def message_size() -> bool:
 
 
 def republish_topic() -> bool:
-    """Run a rule that republishes, and look where to."""
+    """Run a rule that republishes, and read the target topic."""
     topics = []
 
     async def publish(_account: str, _region: str, topic: str, *_: Any, **__: Any) -> None:
@@ -177,7 +177,7 @@ def sql_floor() -> bool:
 
 
 def sqs_action_tls() -> bool:
-    """Run the action, and look at what the queue's policy would see."""
+    """Run the action, and read the policy conditions of its request."""
     secure = []
 
     def send(*_: Any) -> dict[str, str]:
@@ -201,7 +201,7 @@ def unreadable_payload() -> bool:
 
 
 def queue_lock() -> bool:
-    """Send a message, and look whether the lock was taken. (A test in test_queue_gap.py loses messages.)"""
+    """Send a message, and check whether the lock was taken. (A test in test_queue_gap.py loses messages.)"""
     lock = MagicMock()
     with patch.object(sqs, "_queues_lock", lock), request_scope("000000000000", "eu-west-1"):
         url = sqs._act_create_queue({"QueueName": "gaps-queue-lock"}, "")["QueueUrl"]

@@ -1,4 +1,4 @@
-"""A table of the emulator's, in this process, with the keys that ours have."""
+"""An emulator table in this process, with our tables' key schema."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from ministack.services import dynamodb
 
 
 def create(name: str, kind: str = "N", **more: Any) -> None:
-    """Topic by time, which is of this kind; within a ``request_scope``."""
+    """Create a table of topic by time, where ``kind`` is the time's type; needs a ``request_scope``."""
     created = dynamodb._create_table(
         {
             "TableName": name,

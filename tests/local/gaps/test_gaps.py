@@ -1,4 +1,4 @@
-"""Every gap is closed by its file, and is still one: a ministack that closes one itself fails here."""
+"""Every gap is closed by its file and still exists: a test fails when a new ministack closes one itself."""
 
 from __future__ import annotations
 
@@ -29,19 +29,19 @@ def no_metrics_left():
     cloudwatch.reset()
 
 
-def test_every_file_of_the_folder_is_installed():
+def test_every_gap_file_is_installed():
     files = {path.relative_to(FOLDER).with_suffix("") for path in FOLDER.glob("*/*.py")}
     found = {".".join(path.parts) for path in files if path.name != "__init__" and path.parts[0] != "parts"}
     assert sorted(gaps.NAMES) == sorted(found)
 
 
 @pytest.mark.parametrize("name", gaps.NAMES)
-def test_a_gap_is_still_one(name):
-    assert gaps.load(name).is_open(), f"ministack needs local/gaps/{name.replace('.', '/')}.py no more"
+def test_each_gap_still_exists(name):
+    assert gaps.load(name).is_open(), f"ministack needs local/gaps/{name.replace('.', '/')}.py no longer"
 
 
 @pytest.mark.parametrize("name", gaps.NAMES)
-def test_a_gap_says_what_it_is(name):
+def test_each_gap_is_documented(name):
     form = FORM.fullmatch(gaps.load(name).__doc__)
     assert form
     assert "https://" in form["aws"] or form["aws"].startswith("does not apply;")
@@ -59,12 +59,12 @@ def test_a_gap_says_what_it_is(name):
         ("plain/topic", "plain/topic"),
     ],
 )
-def test_republish_topic_is_expanded(template, topic):
+def test_a_republish_topic_is_expanded(template, topic):
     action = iot._expand_republish_topic({"republish": {"topic": template}}, "ping/iort/car1/rule")
     assert action == {"republish": {"topic": topic}}
 
 
-def test_wrapped_functions_take_what_the_wrappers_pass():
+def test_wrapped_functions_accept_the_wrappers_arguments():
     assert list(inspect.signature(iot._run_rule_actions).parameters)[:5] == [
         "account_id", "region", "rule", "payload", "topic",
     ]  # fmt: skip
@@ -83,26 +83,26 @@ def test_wrapped_functions_take_what_the_wrappers_pass():
         assert callable(getattr(lambda_svc, name))
 
 
-def test_a_batch_is_sent_with_the_permission_for_one_message():
+def test_a_message_batch_needs_the_permission_of_one_message():
     for target in ("SendMessageBatch", "SendMessage"):
         request = ("sqs", "POST", "/", {"x-amz-target": f"AmazonSQS.{target}"}, b"{}", {})
         assert iam_actions.extract_iam_action(*request) == "sqs:SendMessage"
 
 
-def test_a_request_about_a_stream_names_it():
+def test_a_stream_request_names_its_stream():
     arn = iam_actions.extract_resource_arn
     asked = b'{"StreamArn": "arn:stream"}'
     assert arn("dynamodbstreams", "POST", "/", {}, asked, {}, "r", "0") == "arn:stream"
     assert arn("dynamodbstreams", "POST", "/", {}, b"{", {}, "r", "0") == "*"
 
 
-def test_a_request_about_a_named_shadow_names_it():
+def test_a_named_shadow_request_names_its_shadow():
     for query, found in (({"name": ["one"]}, "thing/car/one"), ({}, "thing/car")):
         request = ("iot-data", "GET", "/things/car/shadow", {}, b"", query, "r", "0")
         assert iam_actions.extract_resource_arn(*request) == f"arn:aws:iot:r:0:{found}"
 
 
-def test_floor():
+def test_floor_rounds_down_in_a_rule():
     evaluate = iot._eval_select_function
     assert evaluate("floor", ["3.7"], "", b"", {}) == 3
     assert evaluate("floor", ["x"], "", b"", {"x": -1.5}) == -2
@@ -118,19 +118,19 @@ def test_floor():
     ],
     ids=["nested", "digits", "negative"],
 )
-def test_a_payload_that_python_does_not_read_is_a_text_to_the_rules(payload):
+def test_rules_read_an_unparsable_payload_as_text(payload):
     assert iot._rule_message(payload) == payload.decode()
     assert iot._rule_message(b'{"t":1}') == {"t": 1}
     assert iot._rule_message(b"\xff") is iot._MISSING
 
 
-def test_large_publish_is_refused_before_anything_happens():
+def test_a_too_large_publish_is_rejected():
     large = b"x" * (iot._MAX_PAYLOAD_BYTES + 1)
     with pytest.raises(ConnectionError, match="payload must be at most 131072 bytes, got 131073"):
         asyncio.run(iot.broker_publish("0", "r", "t", large))
 
 
-def test_an_event_whose_invocation_breaks_the_emulator_goes_to_its_destination(monkeypatch):
+def test_an_event_that_breaks_the_emulator_goes_to_its_destination(monkeypatch):
     def broken(*_arguments):
         raise OSError("no space left on device")
 

@@ -1,4 +1,4 @@
-"""Where the emulator listens, and what becomes of a connection that never says who it is."""
+"""The emulator's listeners, and the end of connections that never authenticate."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from ministack.services import iot
 
 
 def listening(pid: int) -> set[tuple[str, int]]:
-    """The addresses and ports on which a process listens, as Linux says."""
+    """Return the addresses and ports on which a process listens, as Linux reports them."""
     inodes = set()
     for descriptor in Path(f"/proc/{pid}/fd").iterdir():
         target = str(descriptor.readlink())
@@ -43,11 +43,11 @@ CONNACK = b"\x20\x02\x00\x00"
 
 @pytest.fixture
 def ended(monkeypatch):
-    """Whether the emulator's own acceptor ends a connection within four times its wait."""
+    """Return whether the emulator's own acceptor ends a connection within four times its wait."""
     monkeypatch.setattr(iot, "_MTLS_CONNECT_SECONDS", WAIT_S)
 
     async def run(tls, said):
-        # Made beforehand: it takes longer than the wait.
+        # Made beforehand, since this takes longer than the wait.
         await iot._mtls_context()
         loop = asyncio.get_running_loop()
         server = await loop.create_server(iot._MtlsAcceptor, host="127.0.0.1", port=0)
@@ -71,10 +71,10 @@ def ended(monkeypatch):
     return lambda *, tls, said=b"": asyncio.run(run(tls, said))
 
 
-def test_a_connection_that_never_says_who_it_is_ends(ended):
+def test_a_connection_that_never_authenticates_is_closed(ended):
     assert ended(tls=False)
     assert ended(tls=True)
 
 
-def test_a_session_outlives_the_wait_for_it(ended):
+def test_a_session_outlives_the_connect_timeout(ended):
     assert not ended(tls=True, said=CONNECT)

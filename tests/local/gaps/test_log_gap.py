@@ -1,4 +1,4 @@
-"""An invocation's log ends where the worker says so, not when a clock does."""
+"""The worker marks the end of an invocation's log, without a timeout."""
 
 from __future__ import annotations
 
@@ -16,14 +16,14 @@ from local.gaps.functions import log_end
 
 @pytest.fixture(scope="module")
 def installed():
-    """The gap closed in this process, and opened again."""
+    """Close the gap in this process, and open it again."""
     kept = lambda_runtime._PYTHON_WORKER_SCRIPT, lambda_runtime.Worker._drain_stderr_bounded
     log_end.install()
     yield
     lambda_runtime._PYTHON_WORKER_SCRIPT, lambda_runtime.Worker._drain_stderr_bounded = kept
 
 
-def test_the_worker_says_where_each_invocations_log_ends(installed, tmp_path):
+def test_the_worker_marks_the_end_of_each_invocations_log(installed, tmp_path):
     handler = "def handler(event, context):\n    if event:\n        print(event)\n    return event\n"
     (tmp_path / "said.py").write_text(handler)
     init = {"code_dir": str(tmp_path), "module": "said", "handler": "handler"}
@@ -41,7 +41,7 @@ def test_the_worker_says_where_each_invocations_log_ends(installed, tmp_path):
     assert done.stderr.splitlines() == ["one", log_end.END, log_end.END, "two", log_end.END]
 
 
-def test_what_a_function_logs_says_how_bad_it_is(installed, tmp_path):
+def test_each_log_record_has_a_level(installed, tmp_path):
     handler = (
         "import logging\nlog = logging.getLogger('said')\nlog.setLevel(logging.INFO)\n"
         "def handler(event, context):\n    log.info('fine')\n    log.warning('not so %s', event)\n"
@@ -61,7 +61,7 @@ def test_what_a_function_logs_says_how_bad_it_is(installed, tmp_path):
     assert lines[0][1].endswith("Z")
 
 
-def test_what_comes_after_the_end_is_the_next_invocations(installed):
+def test_output_after_the_end_belongs_to_the_next_invocation(installed):
     lines = queue.Queue()
     for line in ("one", "two", log_end.END, "three", log_end.END, log_end.END):
         lines.put(line)

@@ -30,7 +30,7 @@ print(json.dumps({name: bool(getattr(gap_probes, name)()) for name in sys.argv[1
 
 
 def lacking(*folders):
-    """What a ministack lacks: the installed one, or the one in a folder."""
+    """Return the gaps of a ministack: the installed one, or the one in a folder."""
     environment = {**os.environ, "PYTHONPATH": os.pathsep.join(map(str, (*folders, ROOT)))}
     command = [sys.executable, "-c", ASK, *PATCHES]
     done = subprocess.run(
@@ -40,7 +40,7 @@ def lacking(*folders):
     return {name for name, lacks in json.loads(done.stdout.splitlines()[-1]).items() if lacks}
 
 
-def test_every_patch_has_its_probe():
+def test_every_patch_has_a_probe():
     own = {
         name
         for name, one in inspect.getmembers(gap_probes, inspect.isfunction)
@@ -49,16 +49,16 @@ def test_every_patch_has_its_probe():
     assert own == set(PATCHES)
 
 
-def test_the_pinned_ministack_lacks_what_each_patch_adds():
+def test_the_pinned_ministack_needs_every_patch():
     assert lacking() == set(PATCHES), "a new ministack does not need every patch of local/patches/"
 
 
-def test_the_patched_ministack_lacks_nothing():
+def test_the_patched_ministack_needs_no_patch():
     assert lacking(patched.folder()) == set()
 
 
 @pytest.mark.parametrize("patch", patched.PATCHES, ids=lambda patch: patch.stem)
-def test_a_patch_applies_alone_and_says_what_it_is_for(patch, tmp_path):
+def test_each_patch_applies_alone_and_states_its_purpose(patch, tmp_path):
     head = HEAD.fullmatch(patch.read_text().split("\n--- a/")[0])
     assert head
     assert "https://" in head["aws"] or head["aws"].startswith("does not apply;")
@@ -66,7 +66,7 @@ def test_a_patch_applies_alone_and_says_what_it_is_for(patch, tmp_path):
     patched.copy(patched.installed(), tmp_path, [patch])
 
 
-def test_a_patch_that_does_not_fit_is_told(tmp_path):
+def test_a_patch_that_does_not_apply_is_reported(tmp_path):
     wrong = tmp_path / "wrong.patch"
     wrong.write_text("--- a/ministack/app.py\n+++ b/ministack/app.py\n@@ -1 +1 @@\n-nothing like it\n+x\n")
     with pytest.raises(LocalError, match="does not fit"):

@@ -1,4 +1,4 @@
-"""Of ten thousand messages each arrives once, whoever sends them and whoever sweeps, receives and deletes."""
+"""Each of ten thousand messages arrives once, with concurrent senders, sweeps, receivers and deletions."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ ARN = f"arn:aws:sqs:{REGION}:{ACCOUNT}:"
 
 @pytest.fixture
 def queue():
-    """The url of a queue of ministack's, with a dead-letter queue."""
+    """Create a queue with a dead-letter queue in ministack; return its URL."""
     with request_scope(ACCOUNT, REGION):
         sqs._act_create_queue({"QueueName": "gap-last"}, "")
         redrive = json.dumps({"maxReceiveCount": 5, "deadLetterTargetArn": f"{ARN}gap-last"})
@@ -29,8 +29,9 @@ def queue():
 
 
 def drive(url, messages=MESSAGES):
-    """Send from some threads as rules and destinations do, take out in others as the mapping and an
-    operator do; how often each message came."""
+    """Send from several threads, as rules and destinations do, and receive in others, as the mapping and
+    an operator do; return how often each message came.
+    """
     came, sent = Counter(), threading.Event()
 
     def scoped(work, *arguments):
@@ -46,7 +47,7 @@ def drive(url, messages=MESSAGES):
 
     def receive():
         while True:
-            # Asked before it is looked: what is there then is all that will come.
+            # Read this before the look into the queue: afterwards no message can follow.
             over = sent.is_set()
             batch = sqs._receive_messages_for_esm(url, 10)
             came.update(json.loads(message["body"])["requestPayload"] for message in batch)
@@ -73,14 +74,14 @@ def test_each_of_ten_thousand_messages_arrives_once(queue):
 
 
 def test_every_function_that_changes_a_queue_takes_the_lock():
-    """Of the calls by which this project's messages come and go."""
+    """Checks the calls that add and remove this project's messages."""
     changing = {
         name: function
         for name, function in inspect.getmembers(sqs, inspect.isfunction)
         if '["messages"]' in (source := inspect.getsource(function))
         and any(word in source for word in ('["messages"] =', '["messages"].', '["visible_at"] ='))
     }
-    # Called by `_collect_msgs`.
+    # `_collect_msgs` calls it.
     del changing["_collect_fifo"]
     assert len(changing) > 8
     for name, function in changing.items():

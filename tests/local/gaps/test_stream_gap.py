@@ -1,4 +1,6 @@
-"""The embedded cloud's stream mappings, in this process: ministack's tables and queues, and our function."""
+"""The embedded cloud's stream mappings, in this process: ministack's tables and queues, and a test
+function.
+"""
 
 from __future__ import annotations
 
@@ -19,7 +21,7 @@ QUEUE_ARN = f"arn:aws:sqs:{REGION}:{ACCOUNT}:gap-destination"
 
 @pytest.fixture
 def cloud(monkeypatch):
-    """A table with a stream, a queue, and a function that answers what the test says."""
+    """Make a table with a stream, a queue, and a function whose answer the test sets."""
     with request_scope(ACCOUNT, REGION):
         series_table.create("gap", StreamSpecification={"StreamEnabled": True, "StreamViewType": "NEW_IMAGE"})
         sqs._act_create_queue({"QueueName": "gap-destination"}, "")
@@ -74,7 +76,7 @@ class Cloud:
         while not condition():
             assert time.monotonic() < deadline, self.seen
             if not self.mappings.poll():
-                # As the poller's own thread waits: for a finished invocation, or for a pause to end.
+                # Wait as the poller's own thread does: until an invocation or a pause ends.
                 lambda_svc._esm_wake.wait(0.05)
 
     @property
@@ -83,7 +85,7 @@ class Cloud:
         return [json.loads(message["body"]) for message in queue["messages"]]
 
 
-def test_records_come_in_order_and_in_batches(cloud):
+def test_records_arrive_in_order_and_in_batches(cloud):
     cloud.put(*range(10))
     cloud.poll_until(lambda: sum(map(len, cloud.seen)) == 10)
     assert cloud.seen == [[0, 1, 2, 3], [4, 5, 6, 7], [8, 9]]
@@ -93,7 +95,7 @@ def test_records_come_in_order_and_in_batches(cloud):
     assert cloud.told == []
 
 
-def test_the_record_that_fails_is_given_up_alone_and_the_destination_hears_of_it(cloud):
+def test_only_the_failing_record_goes_to_the_destination(cloud):
     cloud.answer = lambda numbers: {"error": 2 in numbers, "body": None}
     cloud.put(*range(5))
     cloud.poll_until(lambda: [4] in cloud.seen)
@@ -104,7 +106,7 @@ def test_the_record_that_fails_is_given_up_alone_and_the_destination_hears_of_it
     assert (info["batchSize"], info["startSequenceNumber"]) == (1, info["endSequenceNumber"])
 
 
-def test_a_partial_answer_is_tried_from_its_lowest_number(cloud):
+def test_a_partial_failure_is_retried_from_its_lowest_sequence_number(cloud):
     numbers = {}
 
     def answer(seen):
@@ -119,7 +121,7 @@ def test_a_partial_answer_is_tried_from_its_lowest_number(cloud):
     assert cloud.seen == [[0, 1, 2, 3], [2, 3]]
 
 
-def test_a_throttle_is_waited_out(cloud):
+def test_a_throttled_batch_is_retried_without_loss(cloud):
     answers = iter([{"throttle": True, "error": True}] * 3)
     cloud.answer = lambda _: next(answers, {"body": None})
     cloud.put(1)
@@ -127,7 +129,7 @@ def test_a_throttle_is_waited_out(cloud):
     assert cloud.told == []
 
 
-def test_a_window_gathers_what_comes_in_it(cloud):
+def test_a_batching_window_collects_its_records(cloud):
     lambda_svc._esms["gap-mapping"]["MaximumBatchingWindowInSeconds"] = 2
     now = 1_000.0
     cloud.mappings = StreamMappings(lambda: now)
@@ -142,7 +144,7 @@ def test_a_window_gathers_what_comes_in_it(cloud):
     assert cloud.seen == [[0, 1]]
 
 
-def test_the_poller_is_woken_when_the_window_is_over(cloud):
+def test_the_poller_wakes_at_the_end_of_the_window(cloud):
     lambda_svc._esms["gap-mapping"]["MaximumBatchingWindowInSeconds"] = 1
     cloud.put(0)
     lambda_svc._esm_wake.clear()

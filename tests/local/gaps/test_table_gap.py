@@ -1,4 +1,4 @@
-"""What the emulator's tables answer with the gap closed is what they answer without it."""
+"""The emulator's tables give the same answers with the gap closed and with the gap open."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ RANGES = st.one_of(
 
 @pytest.fixture(scope="module")
 def query():
-    """Asks both ways, and gives the answer if it is one."""
+    """Query in both ways, compare the answers, and return the answer if it is successful."""
     plain, evaluate = dynamodb._query, dynamodb._evaluate_condition
     narrowed = query_time.narrowing(plain)
     dynamodb._evaluate_condition = query_time.evaluating(evaluate)
@@ -43,17 +43,17 @@ def query():
 
 
 def key(kind, n):
-    """A sort key: a number, or a text whose order is not that of the numbers in it."""
+    """Make a sort key: a number, or a text with a different order than the number in it."""
     return {kind: str(n) if kind == "N" else f"{n}-ü~"}
 
 
 @pytest.fixture(scope="module", params=["N", "S"])
 def table(request):
-    """Holds numbers, whatever the order they came in."""
+    """Return a function that stores numbers in the table, in any order."""
     kind = request.param
     keep = query_time.ordering(dynamodb._set_item)
 
-    def hold(numbers):
+    def store(numbers):
         with request_scope(ACCOUNT, REGION):
             held = dynamodb._tables[TABLE]
             held["items"].clear()
@@ -62,10 +62,10 @@ def table(request):
                 keep(held, "a", *item["t"].values(), item)
             return held
 
-    hold.kind = kind
+    store.kind = kind
     with request_scope(ACCOUNT, REGION):
         series_table.create(TABLE, kind)
-    yield hold
+    yield store
     with request_scope(ACCOUNT, REGION):
         dynamodb._delete_table({"TableName": TABLE})
 
@@ -104,7 +104,7 @@ QUERIES = st.fixed_dictionaries(
 
 
 @given(st.lists(NUMBERS, unique=True), st.sets(NUMBERS, max_size=2), QUERIES)
-def test_a_query_answers_as_without(query, table, numbers, removed, wanted):
+def test_a_query_answers_as_unpatched(query, table, numbers, removed, wanted):
     held = table(numbers)
     for n in removed:
         with request_scope(ACCOUNT, REGION):
@@ -120,7 +120,7 @@ def test_a_query_answers_as_without(query, table, numbers, removed, wanted):
     query(**data)
 
 
-def test_pages_hold_every_item_once(query, table):
+def test_the_pages_contain_every_item_once(query, table):
     table(range(10))
     data, seen = asked((">=", 2), table.kind) | {"Limit": 3}, []
     while True:
@@ -132,7 +132,7 @@ def test_pages_hold_every_item_once(query, table):
     assert seen == [key(table.kind, n) for n in range(2, 10)]
 
 
-def test_only_what_is_asked_for_is_looked_at(query, table):
+def test_a_query_reads_only_the_requested_keys(query, table):
     partition = table(range(10, 100))["items"]["a"]
     with request_scope(ACCOUNT, REGION):
         found, wanted = query_time.asked(asked((">", 90), table.kind) | {"Limit": 2})
@@ -152,12 +152,12 @@ def test_only_what_is_asked_for_is_looked_at(query, table):
         {"TableName": "no-such-table"},
     ],
 )
-def test_what_is_wrong_is_refused_as_without(query, table, change):
+def test_an_invalid_query_is_rejected_as_unpatched(query, table, change):
     table(range(3))
     assert query(**{**asked((), table.kind), **change}) is None
 
 
-def test_a_copy_of_a_partition_is_one(table):
+def test_a_copy_of_a_partition_answers_like_the_original(table):
     held = table([3, 1, 2])["items"]
     assert copy.deepcopy(held)["a"].kind == table.kind
     copied = copy.deepcopy(held)["a"]
@@ -173,7 +173,7 @@ def test_a_copy_of_a_partition_is_one(table):
         st.none(),
     )
 )
-def test_numbers_are_read_as_without(text):
+def test_numbers_are_read_as_unpatched(text):
     for look, answer in (
         (dynamodb._ddb_canonicalize_number, lambda plain: plain),
         (dynamodb._number_error, lambda _: None),

@@ -1,4 +1,6 @@
-"""Every question of `make verify-aws`: the embedded cloud answers as is assumed of AWS, or as AWS did."""
+"""Every question of `make verify-aws`: the embedded cloud answers as assumed of AWS, or as measured on
+AWS.
+"""
 
 from __future__ import annotations
 
@@ -39,7 +41,7 @@ def test_the_embedded_cloud_answers_as_assumed_or_measured(target, check):
     assert answer.verdict is Verdict.AS_ASSUMED, (answer.reason, answer.seen)
 
 
-def test_pubnubs_keys_are_lent_to_a_deployment_without_and_taken_back(embedded, tmp_path):
+def test_pubnub_keys_are_lent_to_a_deployment_without_keys_and_removed(embedded, tmp_path):
     cloud = replace(embedded.cloud, namespace="other")
     with live.keys_lent(Target(EMBEDDED, cloud, tmp_path)):
         assert keys.load(cloud) == keys.load(embedded.cloud)
@@ -51,7 +53,7 @@ def test_pubnubs_keys_are_lent_to_a_deployment_without_and_taken_back(embedded, 
 
 
 class Recorder:
-    """A deployment that is there already, and says what it was told."""
+    """An existing deployment that records its calls."""
 
     def __init__(self) -> None:
         self.told = []
@@ -79,7 +81,7 @@ def options(out, **given):
     )
 
 
-def test_a_run_deploys_asks_reports_and_destroys(embedded, tmp_path):
+def test_a_run_deploys_queries_reports_and_destroys(embedded, tmp_path):
     recorder = Recorder()
     assert run.run(options(tmp_path), embedded.cloud, recorder) == 0
     assert recorder.told == [{}, "destroyed"]
@@ -90,14 +92,14 @@ def test_a_run_deploys_asks_reports_and_destroys(embedded, tmp_path):
     assert report.load(tmp_path / "report.json").seen.keys() == {one.name for one in RULES}
 
 
-def test_without_a_yes_nothing_is_made(embedded, tmp_path):
+def test_a_run_without_consent_deploys_nothing(embedded, tmp_path):
     recorder = Recorder()
     with pytest.raises(VerifyError, match="no terminal to ask"):
         run.run(options(tmp_path, yes=False), embedded.cloud, recorder)
     assert recorder.told == []
 
 
-def test_what_fails_is_taken_down_and_what_was_answered_is_reported(embedded, tmp_path):
+def test_a_failed_run_is_destroyed_and_its_answers_are_reported(embedded, tmp_path):
     class Failing(Recorder):
         def deploy(self, settings):
             super().deploy(settings)
@@ -112,7 +114,7 @@ def test_what_fails_is_taken_down_and_what_was_answered_is_reported(embedded, tm
     assert len(json.loads((tmp_path / "report.json").read_text())["answers"]) == 1
 
 
-def test_what_is_left_over_after_a_failure_is_told(embedded, tmp_path, capsys):
+def test_leftovers_after_a_failure_are_reported(embedded, tmp_path, capsys):
     class Failing(Recorder):
         def deploy(self, settings):
             raise VerifyError("cdk deploy failed")
@@ -129,7 +131,7 @@ def question(name, seen, ask):
     return Question(name=name, assumed="It is.", expected=seen, relied_on_by=("app.py",), ask=ask)
 
 
-def test_a_run_lends_pubnubs_keys_to_every_question(embedded, tmp_path):
+def test_a_run_lends_pubnub_keys_to_every_question(embedded, tmp_path):
     cloud = replace(embedded.cloud, namespace="other")
     lent = question("a.question", {"lent": True}, lambda target: {"lent": bool(keys.load(target.cloud))})
     assert run.run(options(tmp_path, only=(lent,)), cloud, Recorder()) == 0
@@ -137,17 +139,17 @@ def test_a_run_lends_pubnubs_keys_to_every_question(embedded, tmp_path):
         keys.load(cloud)
 
 
-class Gone(io.StringIO):
-    """A terminal that was closed."""
+class ClosedTerminal(io.StringIO):
+    """A closed terminal."""
 
     def write(self, _text):
         raise OSError(errno.EIO, "Input/output error")
 
 
-def test_a_terminal_that_has_gone_does_not_end_the_teardown(embedded, tmp_path, monkeypatch):
+def test_a_closed_terminal_does_not_stop_the_teardown(embedded, tmp_path, monkeypatch):
     def ask(target):
         target.robot("verify-gone")
-        monkeypatch.setattr(sys, "stdout", Gone())
+        monkeypatch.setattr(sys, "stdout", ClosedTerminal())
         signal.raise_signal(signal.SIGHUP)
 
     recorder = Recorder()
@@ -158,12 +160,12 @@ def test_a_terminal_that_has_gone_does_not_end_the_teardown(embedded, tmp_path, 
     assert not [row for row in robots.listed(embedded.cloud) if row[ROBOT].startswith("verify-gone")]
 
 
-def test_a_part_of_the_answers_does_not_take_the_place_of_all(monkeypatch, capsys):
+def test_partial_answers_do_not_replace_complete_answers(monkeypatch, capsys):
     monkeypatch.setattr(sys, "argv", ["verify", "--keep", "--only", "rules"])
     with pytest.raises(SystemExit):
         run.main()
     assert "leave --only away" in capsys.readouterr().err
 
 
-def test_the_price_is_told_before(capsys):
+def test_the_price_is_shown_before_the_run(capsys):
     assert price.told(price.estimate()).startswith("about $0.")

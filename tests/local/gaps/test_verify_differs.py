@@ -1,4 +1,6 @@
-"""The questions of `make verify-aws` notice a cloud that is not as assumed: the embedded one, changed."""
+"""The questions of `make verify-aws` detect a cloud that differs from the assumption: a changed embedded
+cloud.
+"""
 
 from __future__ import annotations
 
@@ -27,14 +29,14 @@ def iot(embedded):
 
 @pytest.fixture
 def asked(target):
-    """The answer to a question, by its name."""
+    """Return the answer to the question of that name."""
     questions = {question.name: question for question in ALL}
     return lambda name: ask(questions[name], target, time.monotonic)
 
 
 @pytest.fixture
 def rule_with_a_star(iot):
-    """The rule record stores whatever a message has beside the cloud's keys."""
+    """Let the rule record store every attribute of a message beside the cloud's keys."""
     name = rule_name("record")
     rule = iot.get_topic_rule(ruleName=name)["rule"]
     names = ("sql", "awsIotSqlVersion", "actions", "errorAction")
@@ -69,14 +71,14 @@ def template_without_hook(iot):
 
 
 @pytest.mark.usefixtures("rule_with_a_star")
-def test_a_rule_that_stores_what_nobody_named(asked):
+def test_a_rule_that_stores_unnamed_attributes_is_detected(asked):
     answer = asked("rules.record_spoofed")
     assert answer.verdict is Verdict.DIFFERS, answer.reason
     assert "unknown" in answer.seen["keys"]
 
 
 @pytest.mark.usefixtures("policy_that_allows_all")
-def test_a_policy_that_allows_all(asked):
+def test_a_policy_that_allows_everything_is_detected(asked):
     answer = asked("broker.foreign_topic")
     assert answer.verdict is Verdict.DIFFERS, answer.reason
     assert answer.seen["neighbour_heard"] == 1
@@ -85,7 +87,7 @@ def test_a_policy_that_allows_all(asked):
 
 
 @pytest.mark.usefixtures("template_without_hook")
-def test_a_template_without_its_hook(asked):
+def test_a_template_without_its_hook_is_detected(asked):
     answer = asked("provisioning.name_taken")
     assert answer.verdict is Verdict.DIFFERS, answer.reason
     assert answer.seen["certificates"] == 2

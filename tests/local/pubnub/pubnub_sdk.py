@@ -1,4 +1,4 @@
-"""PubNub's SDK and plain requests, for the tests of the stand-in."""
+"""PubNub's SDK and plain requests, for tests of the stand-in."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ WAIT_S = 60
 
 
 def sdk(standin, *, publish_key="pub", subscribe_key="sub", uuid="car"):
-    """A client of the real SDK, to be stopped before the server is."""
+    """Make a client of the real SDK; stop it before the server stops."""
     configuration = PNConfiguration()
     configuration.publish_key, configuration.subscribe_key = publish_key, subscribe_key
     configuration.uuid, configuration.origin, configuration.ssl = uuid, standin.origin, False

@@ -28,7 +28,7 @@ def standin():
 
 @pytest.fixture
 def publisher():
-    """Make publishers, each closed at the end."""
+    """Make publishers; close each at the end."""
     made = []
 
     def make(origin, **keys):
@@ -42,7 +42,7 @@ def publisher():
 
 @pytest.fixture(autouse=True)
 def quiet(caplog):
-    """Whatever happens, neither error nor log line may show a key, not even to who logs everything."""
+    """Check that neither an error nor a log line shows a key, at any log level."""
     with caplog.at_level(logging.DEBUG):
         yield
     for record in caplog.get_records("call"):
@@ -59,7 +59,7 @@ class Everything:
 
 
 def refused(publisher):
-    """The error of a publish. It waits a second for a connection and an answer each (test_live)."""
+    """Return the error of a publish. It waits a second each for a connection and an answer (test_live)."""
     with pytest.raises(PublishError) as caught:
         publisher.publish("iort.car", MESSAGE)
     assert "c-ours" not in str(caught.value)
@@ -74,7 +74,7 @@ def test_a_publish_arrives(standin, publisher):
     assert (standin.published, standin.refused) == (1, 0)
 
 
-def test_one_connection_is_kept(standin, publisher, monkeypatch):
+def test_publishes_share_one_connection(standin, publisher, monkeypatch):
     accepted = []
     connect = socket.create_connection
     monkeypatch.setattr(socket, "create_connection", lambda *a, **k: accepted.append(a) or connect(*a, **k))
@@ -85,12 +85,12 @@ def test_one_connection_is_kept(standin, publisher, monkeypatch):
     assert len(accepted) == 1
 
 
-def test_a_message_too_large_is_refused_here_or_there(standin, publisher):
+def test_a_too_large_message_is_rejected_by_the_client_or_the_server(standin, publisher):
     one = publisher(standin.origin)
     with pytest.raises(PublishError, match="bytes after URL encoding"):
         one.publish("iort.car", {"text": "x" * MAX_PUBNUB_BYTES})
     assert standin.refused == 0
-    # PubNub counts the channel and its own overhead too: what just passes here is refused there.
+    # PubNub counts the channel and its own overhead, too: this message passes here and is rejected there.
     just = MAX_PUBNUB_BYTES - len("%7B%22text%22%3A%22%22%7D")
     with pytest.raises(PublishError, match="status 413"):
         one.publish("iort.car", {"text": "x" * just})
@@ -98,12 +98,12 @@ def test_a_message_too_large_is_refused_here_or_there(standin, publisher):
     assert (standin.published, standin.refused) == (1, 1)
 
 
-def test_keys_that_are_refused_are_not_shown(standin, publisher):
+def test_rejected_keys_are_not_shown(standin, publisher):
     text = refused(publisher(standin.origin, publish_key="other-c-ours"))
     assert text == "PubNubException, status 400"
 
 
-def test_a_dead_server_is_an_error_and_its_return_is_noticed(publisher):
+def test_a_publish_fails_without_a_server_and_recovers_with_it(publisher):
     with PubNubStandIn(**KEYS) as standin:
         one = publisher(standin.origin)
         one.publish("iort.car", MESSAGE)
@@ -115,7 +115,7 @@ def test_a_dead_server_is_an_error_and_its_return_is_noticed(publisher):
         assert standin.published == 1
 
 
-def test_a_server_that_takes_and_never_answers_is_given_up(publisher):
+def test_a_publish_to_a_silent_server_times_out(publisher):
     with socket.create_server(("127.0.0.1", 0)) as silent:
         one = publisher(f"127.0.0.1:{silent.getsockname()[1]}")
         assert refused(one).startswith("PubNubException")
@@ -123,7 +123,7 @@ def test_a_server_that_takes_and_never_answers_is_given_up(publisher):
 
 @contextmanager
 def answering(status: int, body: bytes) -> Iterator[str]:
-    """A server that is not PubNub: a proxy's login page, a gateway's error."""
+    """A server other than PubNub: a proxy's login page, a gateway's error."""
 
     class Handler(http.server.BaseHTTPRequestHandler):
         def do_POST(self):
@@ -157,6 +157,6 @@ def answering(status: int, body: bytes) -> Iterator[str]:
         (429, b""),
     ],
 )
-def test_an_answer_that_is_not_a_confirmation_is_an_error_of_ours(publisher, status, body):
+def test_an_answer_without_confirmation_raises_a_publish_error(publisher, status, body):
     with answering(status, body) as origin:
         refused(publisher(origin))

@@ -1,4 +1,4 @@
-"""The stand-in for PubNub, as PubNub's own SDKs see it."""
+"""The stand-in for PubNub, tested with PubNub's own SDKs."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ def subscribe(pubnub, *channels):
 
 @pytest.mark.parametrize("post", [False, True], ids=["GET", "POST"])
 @pytest.mark.parametrize("payload", PAYLOADS, ids=[f"payload{i}" for i in range(len(PAYLOADS))])
-def test_sdk_receives_what_sdk_publishes(standin, client, payload, post):
+def test_the_sdk_receives_its_published_messages(standin, client, payload, post):
     received = subscribe(client(standin, uuid="page"), "iort.car")
     result = publish(client(standin), "iort.car", payload, post=post).result
     event = received.get(timeout=WAIT_S)
@@ -41,13 +41,13 @@ def test_sdk_receives_what_sdk_publishes(standin, client, payload, post):
     assert (standin.published, standin.delivered, standin.refused) == (1, 1, 0)
 
 
-def test_compressed_post(standin, client):
+def test_a_compressed_post_is_published(standin, client):
     received = subscribe(client(standin), "iort.car")
     client(standin).publish().channel("iort.car").message({"a": 1}).use_post(True).use_compression().sync()
     assert received.get(timeout=WAIT_S).message == {"a": 1}
 
 
-def test_wildcard_tells_the_channel_and_the_subscription(standin, client):
+def test_a_wildcard_message_names_channel_and_subscription(standin, client):
     received = subscribe(client(standin), "iort.*")
     publisher = client(standin)
     publish(publisher, "other.car", "not for us")
@@ -61,7 +61,7 @@ def test_wildcard_tells_the_channel_and_the_subscription(standin, client):
     ]
 
 
-def test_channel_named_beside_its_wildcard_arrives_once(standin, client):
+def test_a_channel_and_its_wildcard_deliver_a_message_once(standin, client):
     received = subscribe(client(standin), "iort.*", "iort.car", "else")
     publisher = client(standin)
     for channel in ("iort.car", "else", "iort.two"):
@@ -74,7 +74,7 @@ def test_channel_named_beside_its_wildcard_arrives_once(standin, client):
     ]
 
 
-def test_200_messages_in_order_while_the_sdk_polls_again_and_again(client):
+def test_200_messages_arrive_in_order_over_repeated_polls(client):
     with PubNubStandIn(poll_s=0.01) as standin:
         received, publisher = subscribe(client(standin), "iort.*"), client(standin)
         for number in range(200):
@@ -83,7 +83,7 @@ def test_200_messages_in_order_while_the_sdk_polls_again_and_again(client):
         assert received.empty()
 
 
-def test_200_messages_in_order_while_polls_are_abandoned(standin, client):
+def test_200_messages_arrive_in_order_over_abandoned_polls(standin, client):
     token, _ = poll(standin, "iort.*", 0)
     publisher = client(standin)
 
@@ -95,7 +95,7 @@ def test_200_messages_in_order_while_polls_are_abandoned(standin, client):
     thread.start()
     numbers = []
     for turn in itertools.count():
-        if turn % 2:  # asked, but gone before the answer
+        if turn % 2:  # the answer finds a closed connection
             with socket.create_connection((standin.host, standin.port)) as abandoned:
                 abandoned.sendall(
                     f"GET /v2/subscribe/sub/iort.*/0?tt={token} HTTP/1.1\r\nHost: x\r\n\r\n".encode()
@@ -109,7 +109,7 @@ def test_200_messages_in_order_while_polls_are_abandoned(standin, client):
     assert numbers == list(range(200))
 
 
-def test_first_subscribe_answers_at_once_and_later_ones_from_there(standin, client):
+def test_the_first_subscribe_answers_at_once_with_a_cursor(standin, client):
     publish(client(standin), "iort.car", "before")
     token, messages = poll(standin, "iort.car", 0)
     assert messages == []
@@ -118,7 +118,7 @@ def test_first_subscribe_answers_at_once_and_later_ones_from_there(standin, clie
     assert [message["d"] for message in messages] == ["after"]
 
 
-def test_message_on_the_wire(standin):
+def test_a_message_has_the_documented_wire_format(standin):
     token, _ = poll(standin, "iort.*", 0)
     response, body = ask(standin, "/publish/pub/sub/0/iort.car/0/%7B%22a%22%3A1%7D?uuid=me")
     assert response.headers["Content-Type"] == "text/javascript; charset=UTF-8"
@@ -137,13 +137,13 @@ def test_message_on_the_wire(standin):
     }
 
 
-def test_idle_poll_answers_empty_with_the_same_cursor():
+def test_an_idle_poll_answers_empty_with_the_same_cursor():
     with PubNubStandIn(poll_s=0.05) as standin:
         token, _ = poll(standin, "iort.car", 0)
         assert poll(standin, "iort.car", token) == (token, [])
 
 
-def test_cursor_from_a_clock_ahead_is_not_deaf(standin, client):
+def test_a_cursor_from_a_fast_clock_receives_messages(standin, client):
     future, received = "99999999999999999", queue.Queue()
     thread = threading.Thread(target=lambda: received.put(poll(standin, "iort.car", future)[1]))
     thread.start()
@@ -153,7 +153,7 @@ def test_cursor_from_a_clock_ahead_is_not_deaf(standin, client):
     assert [message["d"] for message in received.get()] == ["now"]
 
 
-def test_timetokens_grow_even_if_the_clock_does_not(standin, monkeypatch):
+def test_timetokens_grow_while_the_clock_stands_still(standin, monkeypatch):
     monkeypatch.setattr(server.time, "time_ns", lambda: 1_700_000_000_000_000_000)
     tokens = [json.loads(ask(standin, "/time/0")[1])[0] for _ in range(3)]
     assert tokens == sorted(set(tokens))
@@ -166,7 +166,7 @@ def wait_for_polls(standin, count):
         threading.Event().wait(0.002)
 
 
-def test_two_publishes_in_one_turn_of_the_loop(standin):
+def test_two_publishes_in_one_loop_turn_both_arrive(standin):
     token, _ = poll(standin, "iort.car", 0)
     received = queue.Queue()
     thread = threading.Thread(target=lambda: received.put(poll(standin, "iort.car", token)[1]))
@@ -188,7 +188,7 @@ def test_two_publishes_in_one_turn_of_the_loop(standin):
     assert [message["d"] for message in received.get()] == [1, 1]
 
 
-def test_subscriber_that_leaves_is_forgotten(standin):
+def test_a_subscriber_that_leaves_is_removed(standin):
     token, _ = poll(standin, "iort.car", 0)
     with socket.create_connection((standin.host, standin.port)) as gone:
         gone.sendall(f"GET /v2/subscribe/sub/iort.car/0?tt={token} HTTP/1.1\r\nHost: x\r\n\r\n".encode())
@@ -197,21 +197,21 @@ def test_subscriber_that_leaves_is_forgotten(standin):
 
 
 @pytest.mark.parametrize("action", ["heartbeat", "leave"])
-def test_presence(standin, action):
+def test_presence_requests_are_accepted(standin, action):
     response, body = ask(standin, f"/v2/presence/sub-key/sub/channel/iort.*/{action}?uuid=page")
     assert (response.status, json.loads(body)["status"]) == (200, 200)
 
 
-def test_time(standin, client):
+def test_the_time_request_is_answered(standin, client):
     assert abs(int(client(standin).time().sync().result) / 1e7 - time.time()) < 60
 
 
-def test_channel_group_subscription_is_let_through(standin):
+def test_a_channel_group_subscription_is_accepted(standin):
     response, _ = ask(standin, "/v2/subscribe/sub/,/0?tt=0&channel-group=fleet")
     assert response.status == 200
 
 
-def test_browser_preflight(standin):
+def test_a_browser_preflight_is_answered(standin):
     response, body = ask(
         standin,
         "/publish/pub/sub/0/iort.car/0",
@@ -231,24 +231,24 @@ def test_browser_preflight(standin):
 
 
 @pytest.mark.parametrize("path", ["/time/0", "/nowhere", "/v2/subscribe/sub/iort.car/0?tt=0"])
-def test_every_answer_may_be_read_by_a_page(standin, path):
+def test_every_answer_allows_cross_origin_reads(standin, path):
     assert ask(standin, path)[0].headers["Access-Control-Allow-Origin"] == "*"
 
 
-def test_sdk_goes_on_with_a_restarted_server(client):
+def test_the_sdk_continues_with_a_restarted_server(client):
     with PubNubStandIn() as standin:
         received = subscribe(client(standin), "iort.*")
         publish(client(standin), "iort.car", "before")
         assert received.get(timeout=WAIT_S).message == "before"
         wait_for_polls(standin, 1)
-        standin.stop()  # with a poll open, which takes minutes to end by itself
-    # Whether the SDK is back yet or not: its cursor is older than the message.
+        standin.stop()  # with an open poll, which takes minutes to end
+    # The SDK may be back or not: its cursor is older than the message.
     with PubNubStandIn(port=standin.port) as restarted:
         publish(client(restarted), "iort.car", "after")
         assert received.get(timeout=WAIT_S).message == "after"
 
 
-def test_stopping_twice_and_starting_again():
+def test_the_server_can_stop_twice_and_start_again():
     standin = PubNubStandIn()
     standin.stop()
     for _ in range(2):
@@ -257,7 +257,7 @@ def test_stopping_twice_and_starting_again():
         standin.stop()
 
 
-def test_busy_port_is_an_error(standin):
+def test_a_busy_port_raises_an_error(standin):
     with pytest.raises(OSError, match="ddress already in use"):
         PubNubStandIn(port=standin.port).start()
 

@@ -1,4 +1,4 @@
-"""The stand-in for PubNub, as PubNub's JavaScript SDK sees it."""
+"""The stand-in for PubNub, tested with PubNub's JavaScript SDK."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ ROOT = Path(__file__).resolve().parents[3]
 
 @pytest.fixture
 def javascript():
-    """Start the JavaScript SDK's subscriber; skip where Node or the package is absent."""
+    """Start the JavaScript SDK's subscriber; skip without Node or the package."""
     node = shutil.which("node")
     modules = Path(os.environ.get("IORT_NODE_MODULES") or ROOT / "node_modules")
     if node is None or not (modules / "pubnub").is_dir():
@@ -47,7 +47,7 @@ def lines(process):
         yield json.loads(line)
 
 
-def test_javascript_sdk_receives_what_python_publishes(standin, client, javascript):
+def test_the_javascript_sdk_receives_messages_from_python(standin, client, javascript):
     page = javascript(standin, "iort.*", len(PAYLOADS))
     printed = lines(page)
     assert next(printed) == {"status": "PNConnectedCategory"}
@@ -57,12 +57,12 @@ def test_javascript_sdk_receives_what_python_publishes(standin, client, javascri
     for payload in PAYLOADS:
         event = next(printed)
         assert (event["channel"], event["subscription"]) == ("iort.car", "iort.*")
-        if payload != [1, [2.5, -0.1], 2**63, 1e308]:  # JavaScript's numbers are doubles
+        if payload != [1, [2.5, -0.1], 2**63, 1e308]:  # JavaScript's numbers are doubles.
             assert event["message"] == payload
     assert page.wait(WAIT_S) == 0
 
 
-def test_javascript_sdk_reconnects_to_a_restarted_server(client, javascript):
+def test_the_javascript_sdk_reconnects_to_a_restarted_server(client, javascript):
     with PubNubStandIn() as standin:
         page = javascript(standin, "iort.*", 2)
         printed = lines(page)

@@ -1,4 +1,4 @@
-"""What the stand-in for PubNub refuses, and in which words: PubNub's own."""
+"""Requests that the stand-in for PubNub rejects, in PubNub's own words."""
 
 from __future__ import annotations
 
@@ -27,18 +27,18 @@ from tests.local.pubnub.pubnub_sdk import WAIT_S, ask, poll, publish
     ],
     ids=["good", "bomb", "broken", "cut short", "not UTF-8"],
 )
-def test_gzip(standin, body, answer):
+def test_a_gzip_body_is_decoded_or_rejected(standin, body, answer):
     _, text = ask(standin, "/publish/pub/sub/0/c/0", "POST", body, {"Content-Encoding": "gzip"})
     assert json.loads(text)[:2] == answer
 
 
-def test_too_many_polls_are_refused():
+def test_too_many_polls_are_rejected():
     with PubNubStandIn(max_polls=0) as standin:
         response, _ = ask(standin, "/v2/subscribe/sub/iort.car/0?tt=1")
     assert response.status == 429
 
 
-def test_subscriber_that_does_not_read_is_cut_off():
+def test_a_subscriber_that_does_not_read_is_disconnected():
     cut = threading.Event()
 
     class Watched(PubNubStandIn):
@@ -46,7 +46,7 @@ def test_subscriber_that_does_not_read_is_cut_off():
             try:
                 return await super().handle(request)
             finally:
-                # The first poll, from 0, is a client that closes its connection itself.
+                # The first poll, from 0, comes from a client that closes its own connection.
                 gone = request.transport is None or request.transport.is_closing()
                 if gone and request.query.get("tt", "0") != "0":
                     cut.set()
@@ -68,7 +68,7 @@ def test_subscriber_that_does_not_read_is_cut_off():
 
 
 @pytest.mark.parametrize("post", [False, True], ids=["GET", "POST"])
-def test_too_large(standin, client, post):
+def test_a_too_large_message_is_rejected(standin, client, post):
     pubnub = client(standin)
     room = MAX_PUBNUB_BYTES - 100 - len("c") - 2 * len("%22")
     assert publish(pubnub, "c", "x" * room, post=post).result.timetoken
@@ -79,7 +79,7 @@ def test_too_large(standin, client, post):
     assert (standin.published, standin.refused) == (1, 1)
 
 
-def test_post_of_megabytes_is_too_large(standin):
+def test_a_post_of_megabytes_is_rejected(standin):
     response, body = ask(standin, "/publish/pub/sub/0/c/0", "POST", json.dumps("x" * 3_000_000))
     assert (response.status, json.loads(body)[:2]) == (413, [0, "Message Too Large"])
 
@@ -87,7 +87,7 @@ def test_post_of_megabytes_is_too_large(standin):
 @pytest.mark.parametrize(
     "keys", [{"publish_key": "no"}, {"subscribe_key": "no"}], ids=["publish", "subscribe"]
 )
-def test_wrong_key(standin, client, keys):
+def test_a_wrong_key_is_rejected(standin, client, keys):
     with pytest.raises(PubNubException) as caught:
         publish(client(standin, **keys), "iort.car", 1)
     assert caught.value._status_code == 400
@@ -101,13 +101,13 @@ def test_wrong_key(standin, client, keys):
         ("/v2/presence/sub-key/no/channel/iort.car/heartbeat", "Presence"),
     ],
 )
-def test_wrong_key_of_a_subscriber(standin, path, service):
+def test_a_subscriber_with_a_wrong_key_is_rejected(standin, path, service):
     response, body = ask(standin, path)
     assert response.status == 400
     assert json.loads(body) == {"status": 400, "service": service, "error": True, "message": "Invalid Key"}
 
 
-def test_any_key_where_none_is_expected(client):
+def test_a_server_without_keys_accepts_any_key(client):
     with PubNubStandIn() as standin:
         assert publish(client(standin, publish_key="a", subscribe_key="b"), "iort.car", 1).result.timetoken
 
@@ -128,7 +128,7 @@ def test_any_key_where_none_is_expected(client):
         ("/", 404, "Not Found"),
     ],
 )
-def test_refused(standin, path, status, message):
+def test_an_invalid_request_is_rejected(standin, path, status, message):
     response, body = ask(standin, path)
     answer = json.loads(body)
     assert (response.status, answer["message"] if isinstance(answer, dict) else answer[1]) == (
@@ -138,6 +138,6 @@ def test_refused(standin, path, status, message):
     assert (standin.published, standin.refused) == (0, 1)
 
 
-def test_sdk_sends_nan_and_is_refused(standin, client):
+def test_nan_from_the_sdk_is_rejected(standin, client):
     with pytest.raises(PubNubException, match="Invalid JSON"):
         publish(client(standin), "iort.car", {"speed": float("nan")})

@@ -14,7 +14,7 @@ def settings(outcome):
     return json.loads(outcome.output)["settings"]
 
 
-def test_a_running_agent_is_changed_and_answers(iort, bundle):
+def test_a_running_agent_applies_a_setting_and_answers(iort, bundle):
     car = bundle(sources=[{"type": "sim", "stream": "vesc", "rate_hz": 50}])
     with driving(car):
         changed = iort("config", car.robot, "live.rate_hz=2", "fields.vesc=speed,voltage_input",
@@ -30,7 +30,7 @@ def test_a_running_agent_is_changed_and_answers(iort, bundle):
         assert answer["refused"]["live.rate_hz"]["value"] == 50
         assert "from 0.01 to 10 (Hz)" in answer["refused"]["live.rate_hz"]["reason"]
         assert answer["settings"]["ping.rate_hz"] == 1
-        # Asked without a change, it says what is refused still, and that is no failure of the question.
+        # A query without a change still shows the earlier rejection, but succeeds.
         shown = iort("config", car.robot)
         assert shown.exit_code == 0
         assert "ping.rate_hz=1" in shown.output
@@ -40,12 +40,12 @@ def test_a_running_agent_is_changed_and_answers(iort, bundle):
                          "--seconds", "120", "--json")  # fmt: skip
         assert withdrawn.exit_code == 0, withdrawn.output
         assert settings(withdrawn)["live.rate_hz"] == 10
-        # It takes commands of the names that its car.yaml has, which are none.
+        # The agent accepts only the commands in its car.yaml, and this file has none.
         unheard = iort("send", car.robot, "drive", "{}", "--seconds", "0")
         assert "downlink.cmd.drive" in str(unheard.exception)
 
 
-def test_a_robot_that_is_off_has_not_answered_and_the_wish_stands(iort, bundle):
+def test_a_change_for_an_offline_robot_stays_requested(iort, bundle):
     car = bundle()
     asked = iort("config", car.robot, "live.rate_hz=3", "--seconds", "0.1")
     assert isinstance(asked.exception, StationError)
@@ -61,7 +61,7 @@ def test_a_robot_that_is_off_has_not_answered_and_the_wish_stands(iort, bundle):
         (("send", "nobody", "drive", "{}"), "robot nobody is not registered"),
     ],
 )
-def test_what_cannot_be_asked_is_said(iort, arguments, said):
+def test_an_invalid_robot_is_rejected_with_the_reason(iort, arguments, said):
     assert said in str(iort(*arguments).exception)
 
 
@@ -74,7 +74,7 @@ def test_what_cannot_be_asked_is_said(iort, arguments, said):
         (("send", "CAR", "a/b", "{}"), "got 'a/b'"),
     ],
 )
-def test_what_cannot_be_sent_is_said(iort, bundle, arguments, said):
+def test_an_invalid_value_is_rejected_with_the_reason(iort, bundle, arguments, said):
     car = bundle()
     named = [car.robot if part == "CAR" else part for part in arguments]
     assert said in str(iort(*named).exception)

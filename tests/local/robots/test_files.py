@@ -67,7 +67,7 @@ class Bucket:
         return body
 
     def parts(self, robot: str) -> list[int]:
-        """The parts of the one upload that the robot has begun."""
+        """Return the parts of the robot's only unfinished upload."""
         listed = self.client.list_multipart_uploads(Bucket=self.name, Prefix=f"{FILES_PREFIX}{robot}/")
         for begun in listed.get("Uploads", ()):
             there = self.client.list_parts(Bucket=self.name, Key=begun["Key"], UploadId=begun["UploadId"])
@@ -81,7 +81,7 @@ def bucket(embedded):
 
 
 def upload(car, *files, env=None):
-    """The robot's own command."""
+    """Run the robot's own command."""
     command = [Path(sys.executable).parent / "iort-agent", "upload", "--config", car.config, "--json", *files]
     done = subprocess.run(
         command, cwd=ROOT, capture_output=True, text=True, check=False, timeout=180, env=env
@@ -89,7 +89,7 @@ def upload(car, *files, env=None):
     return done.returncode, json.loads(done.stdout or "[]"), done.stderr
 
 
-def test_the_robots_command_uploads_small_and_large_files(embedded, bundle, bucket, tmp_path):
+def test_the_upload_command_uploads_small_and_large_files(embedded, bundle, bucket, tmp_path):
     car = bundle()
     small, large = tmp_path / "notes.txt", tmp_path / "drive.bag"
     small.write_bytes(CONTENT)
@@ -102,7 +102,7 @@ def test_the_robots_command_uploads_small_and_large_files(embedded, bundle, buck
         assert bucket.content(result["key"]) == path.read_bytes()
         head = bucket.client.head_object(Bucket=bucket.name, Key=result["key"])
         assert head["Metadata"]["sha256"] == hashlib.sha256(path.read_bytes()).hexdigest()
-    # The same again is found there.
+    # A second upload finds the stored file.
     assert upload(car, small)[1][0]["key"] == results[0]["key"]
     # The operator's side.
     stored = {one.name: one for one in files.listed(embedded.cloud, car.robot)}
@@ -113,7 +113,7 @@ def test_the_robots_command_uploads_small_and_large_files(embedded, bundle, buck
     assert got.read_bytes() == large.read_bytes()
 
 
-def test_a_large_file_in_a_watched_folder_survives_the_agents_end(bundle, bucket, tmp_path):
+def test_a_large_upload_resumes_after_the_agent_is_killed(bundle, bucket, tmp_path):
     folder = tmp_path / "bags"
     folder.mkdir()
     large = folder / "drive.bag"
@@ -137,14 +137,14 @@ def test_a_large_file_in_a_watched_folder_survives_the_agents_end(bundle, bucket
     status = agent.status()["files"]
     agent.process.terminate()
     agent.report()
-    # What was there when it was killed was not sent again.
+    # Parts that were stored before the kill were not sent again.
     sizes = {1: PART_BYTES, 2: PART_BYTES, 3: len(content) - 2 * PART_BYTES}
     assert there
     assert status["sent_bytes"] == sum(size for part, size in sizes.items() if part not in there)
     assert (status["waiting"], status["uploaded"], status["last_error"]) == (0, 1, None)
 
 
-def test_pictures_of_a_recording_travel_as_claims(embedded, bundle, bucket, iort, tmp_path):
+def test_pictures_of_a_recording_are_uploaded_as_attachments(embedded, bundle, bucket, iort, tmp_path):
     pictures = [jpeg(seed) for seed in range(4)]
     assert min(map(len, pictures)) > iot._MAX_PAYLOAD_BYTES
     path = write_bag(tmp_path / "camera.bag", pictures, hz=2)
@@ -157,7 +157,7 @@ def test_pictures_of_a_recording_travel_as_claims(embedded, bundle, bucket, iort
         for name, values in batch.columns.items():
             columns.setdefault(name, []).extend(values)
     assert columns["format"] == ["jpeg"] * 4
-    # A content a second, of two samples a second.
+    # One content a second, of two samples a second.
     keys = columns["data.key"]
     assert [key is not None for key in keys] == [True, False, True, False]
     for i in (0, 2):
@@ -169,7 +169,7 @@ def test_pictures_of_a_recording_travel_as_claims(embedded, bundle, bucket, iort
     assert report["files"]["large"] == {"kept": 2, "not_due": 2, "left_out": 0}
     assert report["streams"]["camera"]["refused"] == 0
     assert not list((car.folder / "large").glob("*/*"))
-    # An export puts the contents back where they were; a picture whose turn it was not has an empty one.
+    # An export puts the contents back; a picture without an uploaded content is empty.
     exported = tmp_path / "exported.bag"
     done = iort("export", car.robot, "camera", "--output", str(exported))
     assert done.exit_code == 0, done.output
@@ -183,11 +183,11 @@ def raws(path: Path) -> list[bytes]:
         return [bytes(raw) for _, _, raw in reader.messages()]
 
 
-# --- what a robot may not, with its own certificate and its own hands -------------------------------
+# --- forbidden requests, sent by hand with the robot's own certificate ----------------------------------
 
 
-class Asking(Robot):
-    """A robot that asks about files by hand."""
+class FileRequester(Robot):
+    """A robot that sends file requests by hand."""
 
     def ask(self, request: FileRequest) -> FileAnswer:
         assert self.publish(build_topic(PING, self.name, FILE), encode_file_request(request)) == "SUCCESS"
@@ -199,7 +199,7 @@ class Asking(Robot):
 
 @pytest.fixture
 def robot(bundle):
-    with Asking(bundle().folder) as asking:
+    with FileRequester(bundle().folder) as asking:
         asking.online()
         assert asking.subscribe(build_topic(PONG, asking.name, FILE)) == "GRANTED_QOS_1"
         yield asking
@@ -213,7 +213,7 @@ def request_for(content: bytes, name: str = "notes.txt") -> FileRequest:
 
 @pytest.fixture
 def put(embedded):
-    """Send a body to an address as it is; the status, and the code of S3's error."""
+    """Send a body to an address unchanged; return the status and the code of S3's error."""
     context = ssl.create_default_context(cafile=embedded.cloud.ca_bundle)
 
     def send(address: Address, body: bytes) -> tuple[int, str]:
@@ -228,7 +228,7 @@ def put(embedded):
     return send
 
 
-def test_an_address_is_good_for_one_content_under_one_key_once(robot, put, bucket):
+def test_an_address_accepts_one_content_under_one_key_once(robot, put, bucket):
     (address,) = robot.ask(request_for(CONTENT)).addresses
     key = file_key(robot.name, request_for(CONTENT).file)
     more = {**address.headers, "content-length": str(len(CONTENT) + 1)}
@@ -250,7 +250,7 @@ def test_an_address_is_good_for_one_content_under_one_key_once(robot, put, bucke
     assert robot.ask(request_for(CONTENT)).stored
 
 
-def test_a_part_is_good_for_its_content(robot, put):
+def test_a_part_address_accepts_only_its_content(robot, put):
     content = bytes(PART_BYTES) + b"rest"
     sha256 = hashlib.sha256(content).hexdigest()
     file = File("drive.bag", "recording", "application/x-rosbag", len(content), sha256, T_US)
@@ -264,10 +264,10 @@ def test_a_part_is_good_for_its_content(robot, put):
 
 
 @pytest.mark.parametrize("name", ["../other/x", "/etc/passwd", "a//b", ".ssh"])
-def test_a_name_that_leads_elsewhere_is_refused(robot, name):
+def test_a_file_name_outside_the_folder_is_rejected(robot, name):
     envelope = json.loads(encode_file_request(request_for(CONTENT)))
     envelope["file"]["name"] = name
-    # Nor does it help to name another robot.
+    # The name of another robot in the request has no effect.
     envelope["robot"] = "another"
     robot.publish(build_topic(PING, robot.name, FILE), json.dumps(envelope).encode())
     answer = decode_file_answer(robot.next_message()[1])
@@ -275,7 +275,7 @@ def test_a_name_that_leads_elsewhere_is_refused(robot, name):
     assert "file name" in answer.refused
 
 
-def test_a_robot_neither_asks_nor_hears_for_another(robot):
+def test_a_robot_can_neither_request_nor_receive_for_another(robot):
     request = encode_file_request(request_for(CONTENT))
     assert robot.publish(build_topic(PING, "another", FILE), request) == "NOT_AUTHORIZED"
     assert robot.subscribe(build_topic(PONG, "another", FILE)) == "NOT_AUTHORIZED"
@@ -283,7 +283,7 @@ def test_a_robot_neither_asks_nor_hears_for_another(robot):
     assert robot.publish(build_topic(PONG, robot.name, FILE), b"{}") == "NOT_AUTHORIZED"
 
 
-def test_a_day_has_so_many_bytes(robot, embedded):
+def test_the_daily_upload_quota_is_enforced(robot, embedded):
     table = embedded.cloud.output("storage", "RobotsTable")
     assert robot.ask(request_for(CONTENT)).addresses
     embedded.cloud.client("dynamodb").update_item(
@@ -297,8 +297,8 @@ def test_a_day_has_so_many_bytes(robot, embedded):
     assert "bytes a day" in answer.refused
 
 
-def test_an_address_that_has_expired_is_one_to_ask_for_again(embedded, bucket, robot, tmp_path):
-    """Addresses live for 15 minutes; this one is signed for a second, by the operator's own key."""
+def test_an_expired_address_is_stale(embedded, bucket, robot, tmp_path):
+    """Addresses live for 15 minutes; this one is signed for a second, with the operator's own key."""
     cloud = embedded.cloud
     signer = boto3.client(
         "s3",

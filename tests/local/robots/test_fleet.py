@@ -1,4 +1,4 @@
-"""A robot's life as the registry tells it: expected, provisioned, connected, rotated, removed."""
+"""A robot's life in the registry: expected, provisioned, connected, rotated, removed."""
 
 from __future__ import annotations
 
@@ -55,7 +55,7 @@ def iort(embedded):
     return run
 
 
-def test_a_registered_machine_gets_its_name_and_no_other_does(embedded, tmp_path, iort):
+def test_only_the_registered_machine_gets_its_name(embedded, tmp_path, iort):
     assert iort("robots", "register", "expected", "--serial", "s1").exit_code == 0
     assert "expected until" in iort("robots", "list").output
     lasting = claims.claim(embedded.cloud, None, out=tmp_path, lasting=True)
@@ -69,18 +69,18 @@ def test_a_registered_machine_gets_its_name_and_no_other_does(embedded, tmp_path
     assert "expected until" not in iort("robots", "show", "expected").output
     (held,) = certificates.attached(embedded.cloud, "expected")
     assert (held.id, held.status) == (after[ADMITTED_CERTIFICATE], "ACTIVE")
-    # Once: the same machine and the same claim, but nobody has opened the name again.
+    # The same machine with the same claim gets the name once; a second time needs a new registration.
     command("provision", "--config", lasting, "--robot", "expected", status=1)
     shown = json.loads(iort("robots", "show", "expected", "--json").output)
     assert [one["id"] for one in shown["certificates"]] == [held.id]
 
 
-def test_a_claim_for_one_name_has_no_other(embedded, tmp_path):
+def test_a_claim_for_one_name_cannot_take_another(embedded, tmp_path):
     claims.register(embedded.cloud, "other-name")
     claim = claims.claim(embedded.cloud, "one-name", out=tmp_path)
     refused = command("provision", "--config", claim, "--robot", "nobodys-name", status=1)
     assert "AccessDenied" in refused.stderr
-    # And another claim does not have the name that was opened for this one.
+    # Another claim cannot take the name that was opened for this one.
     lasting = claims.claim(embedded.cloud, None, out=tmp_path / "lasting", lasting=True)
     refused = command("provision", "--config", lasting, "--robot", "one-name", status=1)
     assert "AccessDenied" in refused.stderr
@@ -106,7 +106,7 @@ def test_the_registry_follows_a_robot(embedded, bundle, iort):
         assert "online since" in iort("robots", "show", car.robot).output
 
 
-def test_removing_a_robot_cuts_its_session_for_good(embedded, bundle):
+def test_a_removed_robot_is_disconnected_and_cannot_reconnect(embedded, bundle):
     car = bundle()
     embedded.cloud.client("iot-data").update_thing_shadow(
         thingName=car.robot, shadowName="agent", payload=b'{"state": {"desired": {"log_level": "debug"}}}'
@@ -120,14 +120,14 @@ def test_removing_a_robot_cuts_its_session_for_good(embedded, bundle):
         assert not again.connected.is_set()
     with pytest.raises(StationError, match="not registered"):
         registry.get(embedded.cloud, car.robot)
-    # Whoever gets the name next inherits nothing.
+    # The next robot of that name inherits no shadow.
     data = embedded.cloud.client("iot-data")
     with pytest.raises(data.exceptions.ResourceNotFoundException):
         data.get_thing_shadow(thingName=car.robot, shadowName="agent")
 
 
 def test_a_session_ends_with_its_certificate(embedded, bundle):
-    """AWS does so within minutes; the emulator's gap is closed in local/patches/certificate_status.patch."""
+    """AWS does so within minutes; local/patches/certificate_status.patch closes the emulator's gap."""
     car = bundle()
     with Robot(car.folder) as robot:
         robot.online()
@@ -140,7 +140,7 @@ def test_a_session_ends_with_its_certificate(embedded, bundle):
     )
 
 
-def test_delete_connection_cuts_one_client_alone(embedded, bundle):
+def test_delete_connection_disconnects_only_one_client(embedded, bundle):
     first, second = bundle("-1"), bundle("-2")
     with Robot(first.folder) as one, Robot(second.folder) as two:
         one.online()
@@ -176,7 +176,7 @@ def test_rotation_waits_for_the_new_certificate(embedded, bundle, tmp_path):
         waiting = threading.Thread(target=finish)
         waiting.start()
         until(lambda: heard, seconds=WAIT_S)
-        # The old one is connected and stays so.
+        # The old certificate is connected and stays connected.
         assert "older certificate" in heard[0]
         assert robot.publish(f"live/iort/{car.robot}/vesc", STALE) == "SUCCESS"
         assert not done.is_set()
@@ -195,7 +195,7 @@ def _writing_to(claim, config):
     return claim
 
 
-def test_rotation_changes_nothing_for_a_robot_that_does_not_come(embedded, bundle):
+def test_rotation_keeps_the_old_certificate_of_an_offline_robot(embedded, bundle):
     car = bundle()
     with pytest.raises(StationError, match="not connected; its old certificate stays"):
         rotation.finish(embedded.cloud, car.robot, wait_s=0)
@@ -203,7 +203,7 @@ def test_rotation_changes_nothing_for_a_robot_that_does_not_come(embedded, bundl
     assert held.status == "ACTIVE"
 
 
-def test_revoked_claims_provision_nothing_more(embedded, tmp_path, iort):
+def test_a_revoked_claim_cannot_provision(embedded, tmp_path, iort):
     claims.register(embedded.cloud, "too-late")
     lasting = claims.claim(embedded.cloud, None, out=tmp_path, lasting=True)
     assert "lasting claims revoked: " in iort("robots", "revoke-claims").output
@@ -226,13 +226,13 @@ def test_revoked_claims_provision_nothing_more(embedded, tmp_path, iort):
         (("register", "a/b"), "got 'a/b'"),
     ],
 )
-def test_what_the_command_refuses(iort, arguments, said):
+def test_invalid_arguments_are_rejected(iort, arguments, said):
     outcome = iort("robots", *arguments)
     assert outcome.exit_code != 0
     assert said in str(outcome.exception)
 
 
-def test_removing_all_asks_first(embedded, bundle, iort):
+def test_the_removal_of_all_robots_needs_a_confirmation(embedded, bundle, iort):
     car = bundle()
     assert iort("robots", "remove", "--all").exit_code == 1
     assert registry.get(embedded.cloud, car.robot)

@@ -1,4 +1,4 @@
-"""A robot that is none of our agents, written from docs/messages.md alone, on the embedded cloud."""
+"""A robot with a foreign client, written from docs/messages.md alone, on the embedded cloud."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ CLIENT, PROVISION = EXAMPLES / "python_client.py", EXAMPLES / "python_provision.
 
 
 @pytest.mark.parametrize("example", [CLIENT, PROVISION])
-def test_the_examples_know_none_of_our_code(example):
+def test_the_examples_import_no_code_of_the_project(example):
     imported = set()
     for node in ast.walk(ast.parse(example.read_text())):
         if isinstance(node, ast.Import):
@@ -41,7 +41,7 @@ def car(request, bundle, embedded, tmp_path):
     return robots.Bundle(name, folder)
 
 
-def test_a_claim_is_good_for_its_own_name_alone(embedded, tmp_path):
+def test_a_claim_cannot_provision_another_name(embedded, tmp_path):
     claims.claim(embedded.cloud, "foreign-own", out=tmp_path)
     command = [sys.executable, PROVISION, tmp_path, "foreign-other"]
     done = subprocess.run(command, capture_output=True, text=True, timeout=120, check=False)
@@ -50,9 +50,9 @@ def test_a_claim_is_good_for_its_own_name_alone(embedded, tmp_path):
     assert not (tmp_path / "car.yaml").exists()
 
 
-def test_it_is_a_robot_as_any_other(embedded, car, iort):
+def test_a_foreign_client_works_like_any_robot(embedded, car, iort):
     listening = Listener(robot=car.robot, namespace=embedded.namespace, **embedded.keys.reading())
-    # What it has to say of an error stands among pytest's captured output.
+    # Its error output is in pytest's captured output.
     with (
         listening as listener,
         subprocess.Popen([sys.executable, CLIENT, car.folder], stdout=subprocess.PIPE, text=True) as client,

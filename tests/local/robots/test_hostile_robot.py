@@ -1,4 +1,4 @@
-"""A robot whose messages are refused over and over costs the others nothing, and nothing of it is lost."""
+"""Rejected messages of one robot do not affect other robots, and every message is kept."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ BAD, GOOD = 80, 20
 
 
 def environments(embedded):
-    """The processes of Lambda 1."""
+    """Return the processes of Lambda 1."""
     function = embedded.cloud.output("processing", "LiveFunction")
     found = set()
     for pid in descendants(embedded.emulator.pid):
@@ -37,14 +37,14 @@ def environments(embedded):
 
 
 def kept(embedded, robot):
-    """The messages of a robot in quarantine, and how often each came."""
+    """Return a robot's quarantined messages, and how often each was kept."""
     listed = quarantine.entries(embedded.cloud, robot=robot)
     return {quarantine.load(embedded.cloud, one).payload: one.seen for one in listed}
 
 
-def test_a_robot_refused_over_and_over_leaves_the_others_their_live_lane(embedded, bundle):
+def test_rejected_messages_do_not_delay_other_robots_live_lane(embedded, bundle):
     bad, good = bundle("bad"), bundle("good")
-    # Of a time to come, so that a slow machine makes none of them stale.
+    # A time in the future, so that no message is stale on a slow machine.
     t_us = (int(time.time()) + 3600) * 1_000_000
     topics = {car: build_topic(LIVE, car.robot, VESC_STREAM) for car in (bad, good)}
     before = environments(embedded)
@@ -63,7 +63,7 @@ def test_a_robot_refused_over_and_over_leaves_the_others_their_live_lane(embedde
                 other.publish(topics[good], encode_live(sample))
         until(lambda: len(listener.heard) == GOOD)
     assert sorted(heard.seq for heard in listener.heard) == list(range(0, BAD, BAD // GOOD))
-    # A refusal ended none: there may be one more, since several run at once.
+    # A rejection ended no process; one more may run, since several run at once.
     after = environments(embedded)
     assert before <= after
     assert len(after) <= (os.cpu_count() or 1)
@@ -73,7 +73,7 @@ def test_a_robot_refused_over_and_over_leaves_the_others_their_live_lane(embedde
     assert kept(embedded, good.robot) == {}
 
 
-def test_each_of_a_thousand_messages_that_no_rule_takes_is_kept_once(embedded, bundle):
+def test_each_of_a_thousand_unmatched_messages_is_kept_once(embedded, bundle):
     car = bundle()
     sent = {b"no JSON %d" % n for n in range(1000)}
     with Robot(car.folder) as robot:

@@ -1,4 +1,4 @@
-"""From a claim to a robot that drives, and to its next certificate, on the embedded cloud."""
+"""A claim becomes a driving robot with its next certificate, on the embedded cloud."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ def certificates(embedded: Any, robot: str) -> list[str]:
     return found
 
 
-def test_a_claim_becomes_a_robot_that_drives(embedded, tmp_path):
+def test_a_claim_provisions_a_robot_that_drives(embedded, tmp_path):
     claim = claims.claim(embedded.cloud, "claimed", out=tmp_path / "claim")
     command("provision", "--config", claim)
     bundle = robots.Bundle("claimed", tmp_path / "claim")
@@ -51,7 +51,7 @@ def test_a_claim_becomes_a_robot_that_drives(embedded, tmp_path):
     robots.remove(embedded.cloud, "claimed")
 
 
-def test_a_second_robot_cannot_take_a_name(embedded, tmp_path):
+def test_a_second_robot_cannot_take_a_taken_name(embedded, tmp_path):
     first = claims.claim(embedded.cloud, "taken", out=tmp_path / "first")
     command("provision", "--config", first)
     second = claims.claim(embedded.cloud, None, out=tmp_path / "second", lasting=True)
@@ -66,14 +66,14 @@ def test_a_second_robot_cannot_take_a_name(embedded, tmp_path):
     assert len(certificates(embedded, "taken")) == 1
 
 
-def test_a_lasting_claim_is_good_for_provisioning_only(embedded, tmp_path):
+def test_a_lasting_claim_allows_only_provisioning(embedded, tmp_path):
     claim = claims.claim(embedded.cloud, None, out=tmp_path, lasting=True)
     command("provision", "--config", claim, status=2)  # no name
     refused = command("provision", "--config", claim, "--robot", "lasting", status=1)
-    assert "AccessDenied" in refused.stderr  # nobody expects it
+    assert "AccessDenied" in refused.stderr  # the name is not registered
     claims.register(embedded.cloud, "lasting")
     command("provision", "--config", claim, "--robot", "lasting")
-    # As a robot the claim may do nothing at all.
+    # The claim may do nothing as a robot.
     for name in ("certificate.pem", "private.key"):
         (tmp_path / f"claim-{name}").replace(tmp_path / name)
     with Robot(tmp_path, client_id="lasting") as robot:
@@ -85,7 +85,7 @@ def test_a_lasting_claim_is_good_for_provisioning_only(embedded, tmp_path):
         assert robot.subscribe("$aws/certificates/create/json/accepted") == "NOT_AUTHORIZED"
 
 
-def test_a_used_up_claim_is_told(embedded, tmp_path):
+def test_a_revoked_claim_is_reported(embedded, tmp_path):
     claim = claims.claim(embedded.cloud, None, out=tmp_path, lasting=True)
     iot = embedded.cloud.client("iot")
     for certificate in iot.list_targets_for_policy(policyName=claim_name())["targets"]:
@@ -107,7 +107,7 @@ def test_an_existing_configuration_is_updated_and_keeps_its_comments(embedded, t
     assert yaml.safe_load(text)["port"] == embedded.cloud.mqtt_port
 
 
-def test_renewal_without_an_agent(embedded, bundle, tmp_path):
+def test_a_certificate_is_renewed_without_an_agent(embedded, bundle, tmp_path):
     car = bundle()
     before = (car.folder / "certificate.pem").read_text()
     claim = claims.claim(embedded.cloud, car.robot, out=tmp_path / "claim")
@@ -119,7 +119,7 @@ def test_renewal_without_an_agent(embedded, bundle, tmp_path):
         robot.online()
 
 
-def test_renewal_that_does_not_connect_leaves_the_old_certificate(embedded, bundle, tmp_path, monkeypatch):
+def test_a_failed_renewal_keeps_the_old_certificate(embedded, bundle, tmp_path, monkeypatch):
     from iort_agent.errors import IdentityError
     from iort_agent.verbs import provision
 
@@ -139,7 +139,7 @@ def test_renewal_that_does_not_connect_leaves_the_old_certificate(embedded, bund
     )
 
 
-def test_renewal_while_the_agent_runs(embedded, bundle, tmp_path):
+def test_a_certificate_is_renewed_while_the_agent_runs(embedded, bundle, tmp_path):
     car = bundle(sources=[{"type": "sim", "stream": "vesc", "rate_hz": 50}])
     claim = claims.claim(embedded.cloud, car.robot, out=tmp_path / "claim")
     report = tmp_path / "report.json"
@@ -148,7 +148,7 @@ def test_renewal_while_the_agent_runs(embedded, bundle, tmp_path):
             until(lambda: _connected(car.config))
             command("renew", "--config", car.config, "--claim", claim)
             state = json.loads(command("status", "--config", car.config, "--json").stdout)
-            # The old one is not needed any more.
+            # The old certificate is no longer needed.
             old, new = sorted(
                 certificates(embedded, car.robot),
                 key=lambda arn: arn.endswith(state["connection"]["certificate_id"]),

@@ -1,5 +1,6 @@
-"""Provisioning that is killed and started again, on the embedded cloud: whoever was issued the certificate
-gets the name, and nobody else."""
+"""Provisioning is killed and restarted on the embedded cloud: only the holder of the issued certificate gets
+the name.
+"""
 
 from __future__ import annotations
 
@@ -22,7 +23,7 @@ from local.cloud import ROOT
 from tests.local.robots.test_identity import certificates, command
 from verify.tools.robot import Robot
 
-# Ends as a lost battery ends it: before AWS IoT is asked to register, or as soon as it has.
+# The process dies as if the battery failed: before AWS IoT is asked to register, or right after.
 KILLED = """
 import os, signal, sys
 from pathlib import Path
@@ -47,7 +48,7 @@ NAME = ".provisioning.json"
 
 
 def killed(when: str, verb: str, file: Path, other: object) -> dict[str, Any]:
-    """Run a verb to that moment; what it left to take up."""
+    """Run a verb until it is killed; return the state file for the next run."""
     done = subprocess.run(
         [sys.executable, "-c", KILLED, when, verb, str(file), str(other)],
         cwd=ROOT,
@@ -65,7 +66,7 @@ def killed(when: str, verb: str, file: Path, other: object) -> dict[str, Any]:
 
 
 def made(embedded: Any, name: str, folder: Path, *, lasting: bool) -> Path:
-    """A claim of either kind with which the name may be had."""
+    """Make a claim of either kind that can take the name."""
     if not lasting:
         return claims.claim(embedded.cloud, name, out=folder)
     claims.register(embedded.cloud, name)
@@ -73,7 +74,7 @@ def made(embedded: Any, name: str, folder: Path, *, lasting: bool) -> Path:
 
 
 def drives(folder: Path, left: dict[str, Any]) -> None:
-    """The robot has the certificate that it was issued first, and connects with it."""
+    """Check that the robot has its first certificate and connects with it."""
     assert (folder / "certificate.pem").read_text() == left["certificate"]
     assert not (folder / NAME).exists()
     with Robot(folder) as robot:
@@ -82,7 +83,7 @@ def drives(folder: Path, left: dict[str, Any]) -> None:
 
 @pytest.mark.parametrize("lasting", [False, True])
 @pytest.mark.parametrize("when", ["before", "after"])
-def test_a_run_that_was_killed_is_taken_up(embedded, tmp_path, when, lasting):
+def test_a_killed_provisioning_is_resumed(embedded, tmp_path, when, lasting):
     name = f"killed-{when}-{lasting}"
     claim = made(embedded, name, tmp_path / "claim", lasting=lasting)
     left = killed(when, "provision", claim, name)
@@ -91,7 +92,7 @@ def test_a_run_that_was_killed_is_taken_up(embedded, tmp_path, when, lasting):
     assert len(certificates(embedded, name)) == 1
 
 
-def test_a_claim_that_has_ended_is_not_needed_any_more(embedded, tmp_path):
+def test_an_issued_certificate_needs_no_valid_claim(embedded, tmp_path):
     for when, status in (("after", 0), ("before", 1)):
         name = f"ended-{when}"
         claim = made(embedded, name, tmp_path / when, lasting=True)
@@ -104,7 +105,7 @@ def test_a_claim_that_has_ended_is_not_needed_any_more(embedded, tmp_path):
             drives(claim.parent, left)
         else:
             assert "the claim does not connect" in done.stderr
-            # It goes on with the next claim.
+            # The next claim continues the provisioning.
             assert (claim.parent / NAME).exists()
             claims.claim(embedded.cloud, None, out=claim.parent, lasting=True)
             command("provision", "--config", claim, "--robot", name)
@@ -112,7 +113,7 @@ def test_a_claim_that_has_ended_is_not_needed_any_more(embedded, tmp_path):
 
 
 def admit(embedded: Any, left: dict[str, Any], name: str) -> None:
-    """The hook admits the certificate, and nobody hears of it: AWS IoT gave up, and the robot is dead."""
+    """Admit the certificate by the hook without registration, as if AWS IoT timed out and the robot died."""
     row = registry.get(embedded.cloud, name)
     answer = embedded.cloud.client("lambda").invoke(
         FunctionName=embedded.cloud.output("fleet", "AdmitFunction"),
@@ -128,12 +129,12 @@ def admit(embedded: Any, left: dict[str, Any], name: str) -> None:
 
 
 @pytest.mark.parametrize("lasting", [False, True])
-def test_an_admission_that_was_spent_for_nothing_is_had_again(embedded, tmp_path, lasting):
+def test_an_unused_admission_can_be_repeated(embedded, tmp_path, lasting):
     name = f"spent-{lasting}"
     claim = made(embedded, name, tmp_path / "claim", lasting=lasting)
     left = killed("before", "provision", claim, name)
     admit(embedded, left, name)
-    # The disk is lost, and with it the certificate that has the name.
+    # The disk is lost, and with it the certificate of the name.
     (claim.parent / NAME).unlink()
     refused = command("provision", "--config", claim, "--robot", name, status=1)
     assert "AccessDenied" in refused.stderr
@@ -143,7 +144,7 @@ def test_an_admission_that_was_spent_for_nothing_is_had_again(embedded, tmp_path
     assert row[ADMITTED_CERTIFICATE] != parse_certificate(left["certificate"]).id
     (held,) = certificates(embedded, name)
     assert held.endswith(row[ADMITTED_CERTIFICATE])
-    # It came through, so that however late it is, nobody else may.
+    # The registration succeeded, so nobody else may take the name later.
     later(embedded, name)
     (claim.parent / "car.yaml").unlink()
     command("provision", "--config", claim, "--robot", name, status=1)
@@ -151,7 +152,7 @@ def test_an_admission_that_was_spent_for_nothing_is_had_again(embedded, tmp_path
 
 
 def later(embedded: Any, name: str) -> None:
-    """As if the admission was a minute ago."""
+    """Make the admission a minute old."""
     before_ms = time.time_ns() // 1_000_000 - SETTLED_MS
     embedded.cloud.client("dynamodb").update_item(
         TableName=embedded.cloud.output("storage", "RobotsTable"),
@@ -162,7 +163,7 @@ def later(embedded: Any, name: str) -> None:
     )
 
 
-def test_meanwhile_another_robot_does_not_get_the_name(embedded, tmp_path):
+def test_another_robot_cannot_take_the_name_during_provisioning(embedded, tmp_path):
     claim = made(embedded, "wanted", tmp_path / "first", lasting=False)
     left = killed("before", "provision", claim, "wanted")
     admit(embedded, left, "wanted")
@@ -175,7 +176,7 @@ def test_meanwhile_another_robot_does_not_get_the_name(embedded, tmp_path):
 
 
 @pytest.mark.parametrize("when", ["before", "after"])
-def test_a_renewal_that_was_killed_is_taken_up(embedded, bundle, tmp_path, when):
+def test_a_killed_renewal_is_resumed(embedded, bundle, tmp_path, when):
     car = bundle()
     before = (car.folder / "certificate.pem").read_text()
     claim = claims.claim(embedded.cloud, car.robot, out=tmp_path / "claim")

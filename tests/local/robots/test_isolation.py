@@ -1,5 +1,6 @@
-"""Least privilege, tried on the broker with enforcement on: every row of the isolation table, and who may
-not connect at all."""
+"""Least privilege on the broker with enforcement on: every row of the isolation table, and clients that may
+not connect.
+"""
 
 from __future__ import annotations
 
@@ -22,7 +23,7 @@ from verify.errors import VerifyError
 from verify.tools.robot import Robot, payload_for
 
 WAIT_S = 60
-# What a broker answers to what it lets pass.
+# The broker's answers to allowed requests.
 ALLOWED = {"SUCCESS", "NO_MATCHING_SUBSCRIBERS", "GRANTED_QOS_0", "GRANTED_QOS_1"}
 
 
@@ -32,7 +33,7 @@ def folders(embedded, tmp_path_factory):
     folders = {name: robots.add(embedded.cloud, name, out=out).folder for name in (A, B)}
     folders[CLAIM] = out / "claim"
     claims.claim(embedded.cloud, None, out=folders[CLAIM], lasting=True)
-    # As a robot has them.
+    # The robots' own form of a folder.
     for name in ("certificate.pem", "private.key"):
         (folders[CLAIM] / f"claim-{name}").rename(folders[CLAIM] / name)
     (folders[CLAIM] / "car.yaml").write_text((folders[A] / "car.yaml").read_text())
@@ -46,14 +47,14 @@ def robot_a(folders):
 
 
 class Session:
-    """A client that connects again when the broker has cut it off for what it tried."""
+    """A client that reconnects after the broker disconnects it for a forbidden request."""
 
     def __init__(self, folder: Path, client_id: str) -> None:
         self._new: Callable[[], Robot] = lambda: Robot(folder, client_id=client_id)
         self._robot: Robot | None = None
 
     def attempt(self, row: Row) -> bool:
-        """Whether the broker let it pass; a session that ends over it was refused it."""
+        """Return whether the broker allowed it; a session that ends was denied."""
         if self._robot is None:
             self._robot = self._new()
             self._robot.__enter__()
@@ -65,7 +66,7 @@ class Session:
                 else self._robot.subscribe(row.what)
             )
         except VerifyError:
-            # The library's error says no more than that there is no answer; the loss does.
+            # The library's error only reports a missing answer; the lost connection shows the denial.
             assert self._robot.lost.wait(WAIT_S), row
             said = "LOST"
         if self._robot.lost.is_set():
@@ -93,14 +94,14 @@ def rows(who: str, does: str) -> list[Row]:
 
 @pytest.mark.parametrize("does", [PUBLISH, SUBSCRIBE])
 @pytest.mark.parametrize(("who", "client"), [(ROBOT, A), (CLAIM, "iort-claim-1")])
-def test_the_broker_does_what_the_table_says(folders, who, client, does):
+def test_the_broker_follows_the_isolation_table(folders, who, client, does):
     with session(folders[A if who == ROBOT else CLAIM], client) as tried:
         told = [(row.what, tried.attempt(row), row.allowed) for row in rows(who, does)]
     assert [one for one in told if one[1] != one[2]] == []
 
 
 @pytest.mark.parametrize("who", [ROBOT, CLAIM])
-def test_who_may_connect_as_whom(folders, who):
+def test_a_client_can_connect_only_under_its_own_id(folders, who):
     for row in rows(who, CONNECT):
         with Robot(folders[A if who == ROBOT else CLAIM], client_id=row.what) as robot:
             if row.allowed:
@@ -110,8 +111,8 @@ def test_who_may_connect_as_whom(folders, who):
                 assert not robot.connected.is_set(), row
 
 
-def test_a_robot_receives_what_the_table_says_and_nothing_else(embedded, folders):
-    """Whatever it manages to subscribe to: words to others do not reach it."""
+def test_a_robot_receives_only_allowed_messages(embedded, folders):
+    """Messages to others do not reach it, whatever it subscribes to."""
     said = [row for row in rows(ROBOT, RECEIVE) if not row.what.startswith("$")]
     data, last = embedded.cloud.client("iot-data"), build_topic(CMD, A, "last")
     with Robot(folders[A]) as robot:
@@ -128,10 +129,10 @@ def test_a_robot_receives_what_the_table_says_and_nothing_else(embedded, folders
     assert heard == {row.what for row in said if row.allowed} | {last}
 
 
-# --- who may not connect at all ---------------------------------------------------------------------
+# --- clients that may not connect -------------------------------------------------------------------
 
 
-def test_without_a_certificate_nobody_connects(embedded):
+def test_a_client_without_a_certificate_cannot_connect(embedded):
     context = ssl.create_default_context(cadata=embedded.cloud.root_ca_pem)
     context.check_hostname = False
     connect = b"\x10\x11\x00\x04MQTT\x04\x02\x00\x3c\x00\x05thief"
@@ -147,7 +148,7 @@ def test_without_a_certificate_nobody_connects(embedded):
 
 
 @pytest.mark.parametrize("status", ["REVOKED", "INACTIVE"])
-def test_a_certificate_that_is_not_active_does_not_connect(embedded, bundle, status):
+def test_an_inactive_certificate_cannot_connect(embedded, bundle, status):
     car = bundle()
     iot = embedded.cloud.client("iot")
     (arn,) = iot.list_thing_principals(thingName=car.robot)["principals"]
@@ -155,7 +156,7 @@ def test_a_certificate_that_is_not_active_does_not_connect(embedded, bundle, sta
     refused(car.folder)
 
 
-def test_a_certificate_of_no_thing_does_not_connect(embedded, bundle):
+def test_a_certificate_without_a_thing_cannot_connect(embedded, bundle):
     car = bundle()
     iot = embedded.cloud.client("iot")
     (arn,) = iot.list_thing_principals(thingName=car.robot)["principals"]
@@ -163,7 +164,7 @@ def test_a_certificate_of_no_thing_does_not_connect(embedded, bundle):
     refused(car.folder)
 
 
-def test_a_certificate_without_a_policy_does_not_connect(embedded, bundle):
+def test_a_certificate_without_a_policy_cannot_connect(embedded, bundle):
     car = bundle()
     iot = embedded.cloud.client("iot")
     (arn,) = iot.list_thing_principals(thingName=car.robot)["principals"]
@@ -171,7 +172,7 @@ def test_a_certificate_without_a_policy_does_not_connect(embedded, bundle):
     refused(car.folder)
 
 
-def test_a_removed_robot_does_not_connect(embedded, tmp_path):
+def test_a_removed_robot_cannot_connect(embedded, tmp_path):
     bundle = robots.add(embedded.cloud, "isolated-removed", out=tmp_path)
     robots.remove(embedded.cloud, bundle.robot)
     refused(bundle.folder)
@@ -193,7 +194,7 @@ def test_robots_talk_to_each_other_over_the_broker(folders, robot_a):
         assert robot_b.next_message() == (build_topic(FLEET, A, "pose"), b'{"x": 1}')
 
 
-def test_rule_republishes_to_the_robot_that_asked(folders, robot_a):
+def test_a_rule_republishes_to_the_sender(folders, robot_a):
     robot_a.subscribe(f"{PONG}/iort/{A}/+")
     with Robot(folders[B]) as robot_b:
         robot_b.online().subscribe(f"{PONG}/iort/{B}/+")
@@ -205,12 +206,12 @@ def test_rule_republishes_to_the_robot_that_asked(folders, robot_a):
     assert not [topic for topic in heard_by_a if topic.startswith(PONG)]
 
 
-def test_largest_message_is_taken(folders):
+def test_the_largest_message_is_accepted(folders):
     with Robot(folders[B]) as robot:
         assert robot.online().publish(build_topic(FLEET, B, "image"), b"x" * MAX_MESSAGE_BYTES) == "SUCCESS"
 
 
-def test_message_above_128_kb_is_refused(embedded):
+def test_a_message_above_128_kb_is_rejected(embedded):
     data, topic = embedded.cloud.client("iot-data"), build_topic(FLEET, B, "image")
     data.publish(topic=topic, payload=b"x" * iot._MAX_PAYLOAD_BYTES)
     with pytest.raises(ClientError):

@@ -1,5 +1,6 @@
-"""Least privilege of the stacks' own roles, tried with each role's credentials: every role on every table,
-queue, bucket, parameter, function, log and topic. What is not declared for it is refused."""
+"""Least privilege of the stacks' roles: each role's credentials try every table, queue, bucket, parameter,
+function, log and topic. Undeclared access is denied.
+"""
 
 from __future__ import annotations
 
@@ -26,7 +27,7 @@ SERVICES = ("dynamodb", "sqs", "s3", "ssm", "lambda", "logs", "iot-data", "iam",
 
 
 class Resource(NamedTuple):
-    """``arn`` is how it is declared, ``physical`` how it is called."""
+    """``arn`` is the declared name, ``physical`` the deployed name."""
 
     kind: str
     arn: str
@@ -35,7 +36,7 @@ class Resource(NamedTuple):
 
 @pytest.fixture(scope="module")
 def deployed(embedded):
-    """Every resource of the stacks, as CloudFormation lists them."""
+    """Return every resource of the stacks, as CloudFormation lists them."""
     found = []
     cloudformation = embedded.cloud.client("cloudformation")
     for page in cloudformation.get_paginator("describe_stacks").paginate():
@@ -54,8 +55,8 @@ def deployed(embedded):
 
 
 @pytest.fixture(scope="module")
-def taken(embedded, deployed):
-    """Each role's clients."""
+def role_clients(embedded, deployed):
+    """Return the clients of each role."""
     return {role.arn: as_role(embedded, role.physical) for role in of(deployed, "AWS::IAM::Role")}
 
 
@@ -63,14 +64,15 @@ def of(deployed: list[Resource], kind: str) -> list[Resource]:
     return [one for one in deployed if one.kind == kind]
 
 
-# The services' descriptions, which would take longer to read for each role than all its calls.
+# Share the service descriptions: each role would spend more time on reading them than on its calls.
 _LOADER = botocore.loaders.create_loader()
 
 
 def as_role(embedded: Any, role: str) -> dict[str, Any]:
-    """Clients with the role's credentials. The role trusts its service alone, which
-    tests/stacks/test_policies.py holds it to; the operator, who may change that, lets the account take
-    it for the moment of taking it."""
+    """Return clients with the role's credentials. The role trusts only its service, and
+    tests/stacks/test_policies.py checks this; the operator may change the trust, and lets the account assume
+    the role for a moment.
+    """
     cloud = embedded.cloud
     iam = cloud.client("iam")
     described = iam.get_role(RoleName=role)["Role"]
@@ -78,16 +80,16 @@ def as_role(embedded: Any, role: str) -> dict[str, Any]:
     trust = [{"Effect": "Allow", "Action": "sts:AssumeRole", "Principal": account}]
     _trust(iam, role, {"Version": "2012-10-17", "Statement": trust})
     try:
-        taken = cloud.client("sts").assume_role(RoleArn=described["Arn"], RoleSessionName="test")
+        assumed = cloud.client("sts").assume_role(RoleArn=described["Arn"], RoleSessionName="test")
     finally:
         _trust(iam, role, described["AssumeRolePolicyDocument"])
     core = botocore.session.Session()
     core.register_component("data_loader", _LOADER)
     session = boto3.Session(
         botocore_session=core,
-        aws_access_key_id=taken["Credentials"]["AccessKeyId"],
-        aws_secret_access_key=taken["Credentials"]["SecretAccessKey"],
-        aws_session_token=taken["Credentials"]["SessionToken"],
+        aws_access_key_id=assumed["Credentials"]["AccessKeyId"],
+        aws_secret_access_key=assumed["Credentials"]["SecretAccessKey"],
+        aws_session_token=assumed["Credentials"]["SessionToken"],
         region_name=cloud.region,
     )
     config = Config(retries={"total_max_attempts": 1}, s3={"addressing_style": "path"})
@@ -100,7 +102,7 @@ def _trust(iam: Any, role: str, document: Any) -> None:
 
 
 class Probe(NamedTuple):
-    """One call: what is asked, by its action and declared ARN, and how."""
+    """One call: its action and declared ARN, the service, and the arguments."""
 
     action: str
     arn: str
@@ -165,7 +167,7 @@ def probes(deployed: list[Resource]) -> Iterator[Probe]:
         yield Probe(
             "iot:UpdateThingShadow", f"{IOT}:thing/{resource}", "iot-data", "update_thing_shadow", said
         )
-    # What no role of ours has to do with anything of.
+    # Requests to resources that no role uses.
     yield Probe("iam:ListRoles", "none", "iam", "list_roles", {})
     yield Probe("iot:ListCertificates", "none", "iot", "list_certificates", {})
     yield Probe(
@@ -173,8 +175,8 @@ def probes(deployed: list[Resource]) -> Iterator[Probe]:
     )
     for role in of(deployed, "AWS::IAM::Role"):
         arn = f"arn:aws:iam::{ACCOUNT}:role/{role.physical}"
-        taken = {"RoleArn": arn, "RoleSessionName": "probe"}
-        yield Probe("sts:AssumeRole", role.arn, "sts", "assume_role", taken)
+        assume_role = {"RoleArn": arn, "RoleSessionName": "probe"}
+        yield Probe("sts:AssumeRole", role.arn, "sts", "assume_role", assume_role)
 
 
 def _tables(deployed: list[Resource]) -> Iterator[Probe]:
@@ -186,7 +188,7 @@ def _tables(deployed: list[Resource]) -> Iterator[Probe]:
             key[sort[0]] = {sort[1]: "0"}
         query = {"KeyConditionExpression": "#k = :k", "ExpressionAttributeValues": {":k": {"S": "none"}}}
         names = {"ExpressionAttributeNames": {"#k": next(iter(key))}}
-        # What is allowed may happen, to an item that is not there and stays so.
+        # Allowed calls may happen, to an item that does not exist.
         there = {"ConditionExpression": "attribute_exists(#k)", **names}
         each = {
             "GetItem": ("get_item", {**at, "Key": key}),
@@ -222,14 +224,14 @@ def refused(clients: dict[str, Any], probe: Probe) -> bool:
 
 def test_every_role_is_declared(deployed):
     roles = {one.arn for one in of(deployed, "AWS::IAM::Role")}
-    # Others, such as those of account-wide settings, are left out on the embedded cloud.
-    assert roles <= ROLES.keys(), "declare what a new role may do in tests/stacks/roles.py"
+    # The embedded cloud leaves out other roles, for example those of account-wide settings.
+    assert roles <= ROLES.keys(), "declare the permissions of a new role in tests/stacks/roles.py"
 
 
-def test_every_role_is_refused_what_is_not_declared_for_it(deployed, taken):
+def test_every_role_is_denied_undeclared_access(deployed, role_clients):
     asked = list(probes(deployed))
     through, tried = [], 0
-    for role, clients in taken.items():
+    for role, clients in role_clients.items():
         for probe in asked:
             if declared(role, probe):
                 continue
@@ -240,8 +242,10 @@ def test_every_role_is_refused_what_is_not_declared_for_it(deployed, taken):
     assert tried > 1000
 
 
-def test_what_is_declared_is_not_refused(deployed, taken):
-    """The same calls, of those that leave nothing behind: so a refusal above is one for its reason."""
+def test_declared_access_is_allowed(deployed, role_clients):
+    """The same calls, only those without side effects, succeed where they are declared. This shows that a
+    denial above has the right cause.
+    """
     harmless = {
         "dynamodb:GetItem",
         "dynamodb:PutItem",
@@ -256,7 +260,7 @@ def test_what_is_declared_is_not_refused(deployed, taken):
     }
     asked = [probe for probe in probes(deployed) if probe.action in harmless]
     wrong, tried = [], set()
-    for role, clients in taken.items():
+    for role, clients in role_clients.items():
         for probe in asked:
             if declared(role, probe):
                 tried.add(probe.action)

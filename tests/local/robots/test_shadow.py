@@ -1,4 +1,4 @@
-"""Settings from the operator's side to a running agent and back, on the embedded cloud."""
+"""Runtime settings go from the operator to a running agent, and reports come back, on the embedded cloud."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ class Shadow:
     def __init__(self, embedded: Any, robot: str) -> None:
         self.data, self.robot = embedded.cloud.client("iot-data"), robot
 
-    def wish(self, **desired: Any) -> None:
+    def request(self, **desired: Any) -> None:
         payload = json.dumps({"state": {"desired": desired}})
         self.data.update_thing_shadow(thingName=self.robot, shadowName=SHADOW, payload=payload)
 
@@ -44,12 +44,12 @@ class Shadow:
         return found
 
 
-def test_wishes_come_into_force_and_bad_ones_are_refused_with_the_reason(embedded, bundle):
+def test_settings_take_effect_and_invalid_ones_are_rejected_with_the_reason(embedded, bundle):
     car = bundle(sources=[{"type": "sim", "stream": "vesc", "rate_hz": 50}])
     shadow = Shadow(embedded, car.robot)
     with driving(car):
         until(lambda: shadow.reported().get("live") == {"enabled": True, "rate_hz": 10})
-        shadow.wish(live={"rate_hz": 2}, fields={"vesc": ["speed", "voltage_input"]}, log_level="debug")
+        shadow.request(live={"rate_hz": 2}, fields={"vesc": ["speed", "voltage_input"]}, log_level="debug")
         until(lambda: shadow.reported().get("live") == {"enabled": True, "rate_hz": 2})
         assert shadow.reported()["fields"] == {"vesc": ["speed", "voltage_input"]}
         assert shadow.reported()["log_level"] == "debug"
@@ -59,26 +59,26 @@ def test_wishes_come_into_force_and_bad_ones_are_refused_with_the_reason(embedde
                 in [set(batch.columns) for batch in delivery.batches(embedded.cloud, car.robot, "vesc")]
             )
         )
-        shadow.wish(live={"rate_hz": 50}, fields={"vesc": ["sped"]})
+        shadow.request(live={"rate_hz": 50}, fields={"vesc": ["sped"]})
         until(lambda: len(shadow.reported().get("rejected", {})) == 2)
         rejected = shadow.reported()["rejected"]
         assert rejected["live.rate_hz"]["value"] == 50
         assert "from 0.01 to 10 (Hz)" in rejected["live.rate_hz"]["reason"]
         assert "did you mean speed?" in rejected["fields.vesc"]["reason"]
-        # A refused wish leaves the configuration file's value, and a good one ends the refusal.
+        # After a rejected setting the configuration file's value stays; a valid setting clears the rejection.
         assert shadow.reported()["live"]["rate_hz"] == 10
-        shadow.wish(live={"rate_hz": 10}, fields={"vesc": []})
+        shadow.request(live={"rate_hz": 10}, fields={"vesc": []})
         until(lambda: not shadow.reported().get("rejected"))
         assert not shadow.reported().get("fields")
 
 
-def test_wishes_made_while_it_was_off_come_into_force_at_the_start(embedded, bundle):
+def test_settings_made_while_the_agent_was_off_take_effect_at_its_start(embedded, bundle):
     car = bundle(sources=[{"type": "sim", "stream": "vesc", "rate_hz": 50}])
     shadow = Shadow(embedded, car.robot)
-    shadow.wish(record={"enabled": False}, ping={"rate_hz": 5})
+    shadow.request(record={"enabled": False}, ping={"rate_hz": 5})
     with driving(car):
         until(lambda: shadow.reported().get("record") == {"enabled": False})
-        shadow.wish(record={"enabled": None})
+        shadow.request(record={"enabled": None})
         until(lambda: shadow.reported().get("record") == {"enabled": True})
         assert shadow.reported()["ping"] == {"rate_hz": 5}
         until(lambda: list(delivery.batches(embedded.cloud, car.robot, "rtt")))

@@ -1,4 +1,6 @@
-"""A robot over its share of Lambda 2: no other robot waits for it, nothing of it is lost, and it is told."""
+"""A robot exceeds its share of Lambda 2: other robots do not wait, its messages are kept, and it is
+notified.
+"""
 
 from __future__ import annotations
 
@@ -24,15 +26,13 @@ GOOD = 8
 
 
 def seconds_of(embedded, robot):
-    """The summarised seconds of a robot, in the order in which they are read."""
+    """Return a robot's summarised seconds, in the order of a query."""
     pages = summary_table(embedded.cloud).pages(topic_of(embedded.cloud, robot, VESC_STREAM))
     return [int(item[SECOND]["N"]) for page in pages for item in page.items]
 
 
 @pytest.mark.parametrize(("rate_hz", "count"), [(15, 40), (100, 80)])
-def test_dear_batches_of_one_robot_wait_and_those_of_the_others_do_not(
-    embedded, bundle, iort, rate_hz, count
-):
+def test_expensive_batches_of_one_robot_do_not_delay_other_robots(embedded, bundle, iort, rate_hz, count):
     bad, good = bundle("bad"), bundle("good")
     messages = list(worst_batches(count))
     topics = {car: record_topic(car.robot, VESC_STREAM, embedded.namespace) for car in (bad, good)}
@@ -59,6 +59,6 @@ def test_dear_batches_of_one_robot_wait_and_those_of_the_others_do_not(
     assert shown[OVER_SHARE]["batches"] >= over.batches
     stored = list(delivery.batches(embedded.cloud, bad.robot, VESC_STREAM))
     assert [batch.seq for batch in stored] == list(range(count))
-    # It has stopped: what waited is summarised without anybody's doing.
+    # After the robot has stopped, the waiting batches are summarised automatically.
     until(lambda: len(seconds_of(embedded, bad.robot)) >= count, seconds=600)
     assert [s - first for s in seconds_of(embedded, good.robot)] == list(range(len(expected)))
