@@ -1,4 +1,4 @@
-"""The generated code of the page has the contract's fields and formulas; test_docs_parts.py keeps it current."""
+"""The page's generated code has the contract's fields and formulas. test_docs_parts.py keeps it current."""
 
 from __future__ import annotations
 

@@ -24,7 +24,7 @@ def test_every_folder_is_described_and_has_at_most_twelve_files():
     assert max(len(list(folder.iterdir())) for folder in [SOURCES, *folders]) <= 12
 
 
-def test_a_folder_uses_only_what_its_row_allows():
+def test_a_folder_uses_only_the_imports_of_its_row():
     rules = allowed()
     for path in SOURCES.glob("*/*.ts"):
         for imported in re.findall(r'from "(\.[^"]+)"', path.read_text()):

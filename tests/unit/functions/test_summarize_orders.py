@@ -87,8 +87,8 @@ def in_order(drive):
 
 
 def told(stream, drive):
-    """What the summary says; how many batches are missing only where numbers and times agree, for otherwise
-    it is told by what was there when the second was last made."""
+    """The summary, with missing batches only if numbers and times agree; otherwise that number depends on
+    the batches stored when the second was last summarised."""
     summary = clean(stream.summary())
     if not in_order(drive):
         for item in summary.values():

@@ -357,8 +357,8 @@ def test_a_robots_bytes_a_day_are_limited_and_a_large_file_counts_once(ask, dyna
 
 
 def test_an_unregistered_robot_gets_no_address(ask, dynamodb):
-    assert ask(SMALL, "stranger").refused
-    assert "Item" not in dynamodb.get_item(TableName=ROBOTS, Key={ROBOT: {"S": "stranger"}})
+    assert ask(SMALL, "unregistered").refused
+    assert "Item" not in dynamodb.get_item(TableName=ROBOTS, Key={ROBOT: {"S": "unregistered"}})
 
 
 class Desk:

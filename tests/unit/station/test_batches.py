@@ -59,7 +59,7 @@ HOSTILE = {
     "no fields": '{"dt":[0,5],"fields":null}',
     "infinite": '{"dt":[0,5],"fields":{"f0":[1e999,1]}}',
     "beyond 64 bits": '{"dt":[0,5],"fields":{"f0":[18446744073709551616,1]}}',
-    "dear": '{"dt":[0,5],"fields":{"f0":[' + "[]," * 50_000 + "0]}}",
+    "expensive": '{"dt":[0,5],"fields":{"f0":[' + "[]," * 50_000 + "0]}}",
     "beyond a float": '{"dt":[0,5],"fields":{"f0":[1' + 400 * "0" + ",1]}}",
 }
 
@@ -141,7 +141,7 @@ def test_messages_are_read_as_samples_or_skipped():
 
 @settings(max_examples=100)
 @given(st.lists(columns(), min_size=1, max_size=4), st.data())
-def test_the_station_reads_what_the_contract_reads(parts, data):
+def test_the_station_and_the_contract_read_the_same_batches(parts, data):
     """A page of valid and invalid batches in both codecs, with columns that change their type."""
     messages, expected, refused = [], [], 0
     for seq, column in enumerate(parts):

@@ -51,8 +51,8 @@ def test_the_live_lane_costs_a_rule_an_action_and_an_invocation_a_message():
     assert _units(items, "live", "message") == 360
     # Messages through the broker also trigger two more rules.
     assert _units(items, "live", "rule") == _units(items, "live", "action") == 4 * 3600 + 2 * 360
-    seldom = model.bill(replace(_ONE, live_hz=0.05))
-    assert _units(seldom, "live", "message") == _units(seldom, "live", "invocation") == 180
+    throttled = model.bill(replace(_ONE, live_hz=0.05))
+    assert _units(throttled, "live", "message") == _units(throttled, "live", "invocation") == 180
     assert _units(model.bill(replace(_ONE, live_hz=0.0)), "live", "invocation") == 0
 
 

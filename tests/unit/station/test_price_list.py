@@ -154,9 +154,9 @@ def test_a_changed_price_is_reported_and_used():
     line, rest = report.differences(listed).body
     assert line[1:] == ("0.15", "0.3")
     assert rest[0].startswith(f"as built in: {len(PRODUCTS) - 1} of")
-    dearer, before = (model.bill(Usage(), prices) for prices in (listed.prices(), PRICES))
+    changed, before = (model.bill(Usage(), prices) for prices in (listed.prices(), PRICES))
     more = sum(item.units for item in before if item.price == "rule") * 0.15e-6
-    assert line_items.total(dearer) == pytest.approx(line_items.total(before) + more)
+    assert line_items.total(changed) == pytest.approx(line_items.total(before) + more)
     assert "2026-11-22" in listed.prices()["rule"].seen
 
 
